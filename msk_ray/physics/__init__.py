@@ -1,0 +1,6 @@
+"""Batched MuJoCo Warp physics. Warp only: nothing here imports torch."""
+
+from msk_ray.physics.batch import WorldBatch
+from msk_ray.physics.graph import Graph
+
+__all__ = ["Graph", "WorldBatch"]

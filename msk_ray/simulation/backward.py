@@ -1,0 +1,78 @@
+"""The interface every way of differentiating an env step fulfils.
+
+Axes: W worlds. `nq, nv, na, nu` as in MuJoCo.
+"""
+
+from abc import ABC, abstractmethod
+from typing import NamedTuple
+
+from torch import Tensor
+
+from msk_ray.physics import WorldBatch
+
+
+class StepState(NamedTuple):
+    """Tensors of one side of an env step."""
+
+    qpos: Tensor
+    """Generalised positions [m, rad, unit quaternions], shape (W, nq)."""
+    qvel: Tensor
+    """Generalised velocities [m/s, rad/s], shape (W, nv)."""
+    act: Tensor
+    """Actuator activations, shape (W, na)."""
+
+
+class InputGradients(NamedTuple):
+    """Gradients with respect to the inputs of an env step; None where none was asked for."""
+
+    ctrl: Tensor | None
+    """Shape (W, nu)."""
+    qpos: Tensor | None
+    """In raw coordinates, shape (W, nq): for a unit quaternion q with tangent gradient g, 2 q⊗[0, g]."""
+    qvel: Tensor | None
+    """Shape (W, nv)."""
+    act: Tensor | None
+    """Shape (W, na)."""
+
+
+class Needs(NamedTuple):
+    """Which inputs a gradient is wanted for."""
+
+    ctrl: bool
+    qpos: bool
+    qvel: bool
+    act: bool
+
+
+class Backward(ABC):
+    """One way of differentiating an env step: records what it needs of the forward pass, then pulls cotangents back.
+
+    A Simulation calls `attach` once, replays `launch_step` for every forward pass, `record` right after it if a
+    gradient will be wanted, and `vjp` once for each recorded step, latest first.
+    """
+
+    name: str
+
+    @abstractmethod
+    def attach(self, batch: WorldBatch) -> None:
+        """Check that the model is supported and allocate for it.
+
+        Raises:
+            UnsupportedModelError: the model has a feature this mode cannot differentiate.
+        """
+
+    def launch_step(self, batch: WorldBatch) -> None:
+        """Launch one env step. A mode that keeps per-substep data overrides this; it is captured as a graph."""
+        batch.launch_step()
+
+    @abstractmethod
+    def record(self, ctrl: Tensor, start: StepState, end: StepState) -> tuple[Tensor, ...]:
+        """Tensors `vjp` will need of the step just made. They must not alias buffers the next step overwrites."""
+
+    @abstractmethod
+    def vjp(self, saved: tuple[Tensor, ...], cotangent: StepState, needs: Needs) -> InputGradients:
+        """Vector-Jacobian product of the recorded step: cotangents of its results, in raw coordinates, pulled back."""
+
+    def diagnostics(self) -> dict[str, float]:
+        """Figures gathered since the last call, by metric name."""
+        return {}

@@ -1,0 +1,158 @@
+"""`Simulation`: a batch of worlds whose step is an autograd function of torch tensors."""
+
+from typing import Any
+
+import mujoco
+import torch
+import warp as wp
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from msk_ray.errors import ConfigError, DeviceError
+from msk_ray.physics import Graph, WorldBatch
+from msk_ray.simulation.backward import Backward, Needs, StepState
+from msk_ray.simulation.buffers import BatchTensors, stream_of
+from msk_ray.simulation.tangent import Tangent
+
+
+def resolve_device(device: str) -> torch.device:
+    """The torch device of a name such as "cpu", "cuda" or "cuda:1".
+
+    Raises:
+        DeviceError: torch or Warp does not see that device.
+    """
+    try:
+        resolved = torch.device(device)
+    except RuntimeError:
+        raise DeviceError(f"unknown device {device!r}: write cpu, cuda or cuda:0") from None
+    if resolved.type == "cpu":
+        return resolved
+    if resolved.type != "cuda":
+        raise DeviceError(f"device {device!r} is not supported: write cpu, cuda or cuda:0")
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if (resolved.index or 0) >= count:
+        seen = f"{count} CUDA device(s)" if count else "no CUDA device"
+        raise DeviceError(
+            f"device {device!r} asked for, but torch sees {seen}: write --device cpu or fix the driver"
+        )
+    if not wp.is_cuda_available():
+        raise DeviceError("torch sees a CUDA device but Warp does not: check that driver and warp-lang fit")
+    return torch.device("cuda", resolved.index or 0)
+
+
+class WarpSimStep(torch.autograd.Function):
+    """(ctrl, qpos, qvel, act) to (qpos, qvel, act) one env step later, differentiable in all four."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, sim: "Simulation", ctrl: Tensor, qpos: Tensor, qvel: Tensor, act: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        start = StepState(qpos, qvel, act)
+        end = sim.advance(ctrl, start)
+        ctx.sim = sim
+        ctx.save_for_backward(*sim.require_backward().record(ctrl, start, end))
+        return end
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, qpos: Tensor, qvel: Tensor, act: Tensor) -> tuple[Tensor | None, ...]:
+        needs = Needs(*ctx.needs_input_grad[1:])
+        mode = ctx.sim.require_backward()
+        return (None, *mode.vjp(ctx.saved_tensors, StepState(qpos, qvel, act), needs))
+
+
+class Simulation:
+    """`nworld` worlds of one model, advanced by `mujoco_warp.step` × `substeps` under each control.
+
+    Args:
+        model: the compiled MuJoCo model; its timestep is the substep's.
+        nworld: number of worlds W.
+        substeps: physics steps per call of `step`.
+        backward: how to differentiate; None for forward only.
+        device: "cpu", "cuda" or "cuda:N".
+        nconmax, njmax: contacts and constraint rows per world; by default a bound from the geometry.
+        tolerance: solver tolerance, below mujoco_warp's floor of 1e-6 if wanted.
+
+    Raises:
+        UnsupportedModelError: the model cannot be stepped, or not differentiated by `backward`.
+        DeviceError: no such device.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        nworld: int,
+        substeps: int,
+        backward: Backward | None,
+        device: str | torch.device,
+        *,
+        nconmax: int | None = None,
+        njmax: int | None = None,
+        tolerance: float | None = None,
+    ) -> None:
+        if nworld < 1 or substeps < 1:
+            raise ConfigError(f"nworld and substeps must be at least 1, not {nworld} and {substeps}")
+        self.device = resolve_device(str(device))
+        self.model = model
+        self.nworld = nworld
+        self.substeps = substeps
+        self.backward = backward
+        self.tangent = Tangent(model, self.device)
+        self.batch = WorldBatch(
+            model, nworld, substeps, str(self.device), nconmax=nconmax, njmax=njmax, tolerance=tolerance
+        )
+        if backward is not None:
+            backward.attach(self.batch)
+            launches = lambda: backward.launch_step(self.batch)  # noqa: E731
+        else:
+            launches = self.batch.launch_step
+        self._buffers = BatchTensors(self.batch)
+        self._graph = Graph(launches, self.batch.device)
+        self.batch.check_overflow()
+
+    @property
+    def timestep(self) -> float:
+        """Duration of one call of `step` [s]."""
+        return float(self.model.opt.timestep) * self.substeps
+
+    def require_backward(self) -> Backward:
+        """The backward mode, which a forward-only simulation lacks."""
+        if self.backward is None:
+            raise ConfigError(
+                "this Simulation was made without a backward mode; wrap the call in torch.no_grad()"
+            )
+        return self.backward
+
+    def initial_state(self) -> StepState:
+        """The model's reference configuration at rest, in every world."""
+        zeros = lambda n: torch.zeros((self.nworld, n), device=self.device)  # noqa: E731
+        qpos0 = torch.as_tensor(self.model.qpos0, dtype=torch.float32, device=self.device)
+        return StepState(qpos0.expand(self.nworld, -1).clone(), zeros(self.model.nv), zeros(self.model.na))
+
+    def step(self, ctrl: Tensor, qpos: Tensor, qvel: Tensor, act: Tensor) -> StepState:
+        """Advance all worlds by one env step; a pure, differentiable function of its arguments.
+
+        Args:
+            ctrl: shape (W, nu). qpos: (W, nq). qvel: (W, nv). act: (W, na). float32 on `device`.
+
+        Returns:
+            New tensors (qpos, qvel, act).
+        """
+        if torch.is_grad_enabled() and any(t.requires_grad for t in (ctrl, qpos, qvel, act)):
+            return StepState(*WarpSimStep.apply(self, ctrl, qpos, qvel, act))
+        return self.advance(ctrl, StepState(qpos, qvel, act))
+
+    def advance(self, ctrl: Tensor, start: StepState) -> StepState:
+        """The forward pass alone, outside autograd."""
+        self._buffers.load(ctrl, start)
+        self._graph.replay(stream_of(self.device))
+        return self._buffers.read()
+
+    def diagnostics(self) -> dict[str, float]:
+        """Figures since the last call: share of worlds at a solver limit, and those of the backward mode.
+
+        Raises:
+            SimulationError: contacts or constraint rows were lost to a full buffer.
+        """
+        figures = {"solver_limit_share": self.batch.check_overflow()}
+        return figures | (self.backward.diagnostics() if self.backward is not None else {})

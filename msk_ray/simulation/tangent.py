@@ -1,0 +1,112 @@
+"""Tangent-space arithmetic on batched qpos: MuJoCo's mj_integratePos and mj_differentiatePos in torch.
+
+Rotations are perturbed in the local (body) frame, as MuJoCo's ball and free joint velocities are.
+"""
+
+import mujoco
+import torch
+from torch import Tensor
+
+
+def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
+    """Hamilton product of quaternions (w, x, y, z), shape (..., 4)."""
+    aw, ax, ay, az = a.unbind(-1)
+    bw, bx, by, bz = b.unbind(-1)
+    return torch.stack(
+        (
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ),
+        dim=-1,
+    )
+
+
+def quat_conjugate(q: Tensor) -> Tensor:
+    """Inverse rotation, shape (..., 4)."""
+    return q * q.new_tensor((1.0, -1.0, -1.0, -1.0))
+
+
+def quat_exp(rotation: Tensor) -> Tensor:
+    """Unit quaternion of a rotation vector [rad], shape (..., 3) to (..., 4)."""
+    half = 0.5 * rotation
+    angle = half.norm(dim=-1, keepdim=True)
+    # torch.sinc(x) is sin(πx)/(πx), exact at zero.
+    return torch.cat((torch.cos(angle), torch.sinc(angle / torch.pi) * half), dim=-1)
+
+
+def quat_log(q: Tensor) -> Tensor:
+    """Rotation vector [rad] of a unit quaternion, |angle| ≤ π, shape (..., 4) to (..., 3)."""
+    q = torch.where(q[..., :1] < 0, -q, q)
+    w, v = q[..., :1], q[..., 1:]
+    sin = v.norm(dim=-1, keepdim=True)
+    # angle / sin(angle/2) tends to 2 / w as the rotation tends to none.
+    scale = torch.where(sin > 1e-8, 2.0 * torch.atan2(sin, w) / sin.clamp_min(1e-8), 2.0 / w.clamp_min(0.5))
+    return scale * v
+
+
+def quat_rotate(q: Tensor, v: Tensor) -> Tensor:
+    """Rotate vectors (..., 3) from the local frame of q (..., 4) to its parent's."""
+    t = 2.0 * torch.linalg.cross(q[..., 1:], v)
+    return v + q[..., :1] * t + torch.linalg.cross(q[..., 1:], t)
+
+
+class Tangent:
+    """Where each joint of a model lives in qpos (nq) and in the tangent space (nv)."""
+
+    def __init__(self, model: mujoco.MjModel, device: torch.device) -> None:
+        self.nq, self.nv = model.nq, model.nv
+        linear_q: list[int] = []
+        linear_v: list[int] = []
+        self._rotations: list[tuple[slice, slice]] = []
+        for joint in range(model.njnt):
+            kind = model.jnt_type[joint]
+            q, v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+            if kind == mujoco.mjtJoint.mjJNT_FREE:
+                linear_q += [q, q + 1, q + 2]
+                linear_v += [v, v + 1, v + 2]
+                self._rotations.append((slice(q + 3, q + 7), slice(v + 3, v + 6)))
+            elif kind == mujoco.mjtJoint.mjJNT_BALL:
+                self._rotations.append((slice(q, q + 4), slice(v, v + 3)))
+            else:
+                linear_q.append(q)
+                linear_v.append(v)
+        self._linear_q = torch.tensor(linear_q, dtype=torch.long, device=device)
+        self._linear_v = torch.tensor(linear_v, dtype=torch.long, device=device)
+
+    def integrate(self, qpos: Tensor, delta: Tensor) -> Tensor:
+        """qpos ⊕ delta, shapes (..., nq) and (..., nv)."""
+        out = qpos.clone()
+        out[..., self._linear_q] += delta[..., self._linear_v]
+        for q, v in self._rotations:
+            out[..., q] = quat_multiply(qpos[..., q], quat_exp(delta[..., v]))
+        return out
+
+    def difference(self, start: Tensor, end: Tensor) -> Tensor:
+        """The delta (..., nv) with start ⊕ delta = end."""
+        out = start.new_empty((*start.shape[:-1], self.nv))
+        out[..., self._linear_v] = (end - start)[..., self._linear_q]
+        for q, v in self._rotations:
+            out[..., v] = quat_log(quat_multiply(quat_conjugate(start[..., q]), end[..., q]))
+        return out
+
+    def project(self, qpos: Tensor, gradient: Tensor) -> Tensor:
+        """Gradient in raw coordinates (..., nq) to tangent coordinates (..., nv).
+
+        d(q⊗exp(δ))/dδ at 0 is ½ q⊗[0, ·], so the tangent gradient is the vector part of ½ q*⊗g.
+        """
+        out = gradient.new_empty((*gradient.shape[:-1], self.nv))
+        out[..., self._linear_v] = gradient[..., self._linear_q]
+        for q, v in self._rotations:
+            out[..., v] = 0.5 * quat_multiply(quat_conjugate(qpos[..., q]), gradient[..., q])[..., 1:]
+        return out
+
+    def lift(self, qpos: Tensor, gradient: Tensor) -> Tensor:
+        """Gradient in tangent coordinates (..., nv) to raw ones (..., nq) without a component along q: 2 q⊗[0, g]."""
+        out = gradient.new_zeros((*gradient.shape[:-1], self.nq))
+        out[..., self._linear_q] = gradient[..., self._linear_v]
+        for q, v in self._rotations:
+            pure = torch.cat((torch.zeros_like(gradient[..., v][..., :1]), gradient[..., v]), dim=-1)
+            out[..., q] = 2.0 * quat_multiply(qpos[..., q], pure)
+        return out
