@@ -35,8 +35,7 @@ def contact_capacity(model: mujoco.MjModel) -> tuple[int, int] | None:
     """
     pairs = {(int(a), int(b)) for a, b in zip(model.pair_geom1, model.pair_geom2, strict=True)}
     dims = {
-        (int(a), int(b)): int(d)
-        for a, b, d in zip(model.pair_geom1, model.pair_geom2, model.pair_dim, strict=True)
+        (int(a), int(b)): int(d) for a, b, d in zip(model.pair_geom1, model.pair_geom2, model.pair_dim, strict=True)
     }
     for a in range(model.ngeom):
         for b in range(a + 1, model.ngeom):

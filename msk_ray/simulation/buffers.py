@@ -21,9 +21,7 @@ class BatchTensors:
     def __init__(self, batch: WorldBatch) -> None:
         data = batch.data
         self._ctrl = wp.to_torch(data.ctrl, requires_grad=False)
-        self._state = StepState(
-            *(wp.to_torch(a, requires_grad=False) for a in (data.qpos, data.qvel, data.act))
-        )
+        self._state = StepState(*(wp.to_torch(a, requires_grad=False) for a in (data.qpos, data.qvel, data.act)))
 
     def load(self, ctrl: Tensor, start: StepState) -> None:
         """Copy an env step's inputs in: ctrl (W, nu) and the state before it."""
