@@ -1,7 +1,18 @@
 """The differentiable step: the one place where torch and Warp meet."""
 
-from msk_ray.simulation.backward import Backward, InputGradients
+from msk_ray.simulation.backward import Backward, InputGradients, StepState
 from msk_ray.simulation.fd_jacobian import FdJacobian
 from msk_ray.simulation.simulation import Simulation, WarpSimStep
+from msk_ray.simulation.tape import Hybrid, TapeAll, TapePerSubstep
 
-__all__ = ["Backward", "FdJacobian", "InputGradients", "Simulation", "WarpSimStep"]
+__all__ = [
+    "Backward",
+    "FdJacobian",
+    "Hybrid",
+    "InputGradients",
+    "Simulation",
+    "StepState",
+    "TapeAll",
+    "TapePerSubstep",
+    "WarpSimStep",
+]

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from msk_ray.physics import Graph, WorldBatch
 from msk_ray.physics.adjoint import StepAdjoint
+from msk_ray.physics.adjoint.coverage import check_supported
 from msk_ray.physics.adjoint.stages import recompute_stages
 from msk_ray.simulation.backward import Backward, InputGradients, Needs, StepState
 from msk_ray.simulation.buffers import stream_of
@@ -49,6 +50,7 @@ class _Tape(Backward):
 
     def attach(self, batch: WorldBatch) -> None:
         mjm, worlds = batch.mjm, batch.nworld
+        check_supported(mjm, self.name)
         self._batch = batch
         self._device = torch.device(str(batch.device))
         self._pulled = 0
@@ -71,10 +73,7 @@ class _Tape(Backward):
         self._ctrl = wp.to_torch(batch.data.ctrl, requires_grad=False)
         adjoint = self._adjoint
         self._cotangent = StepState(
-            *(
-                wp.to_torch(a, requires_grad=False)
-                for a in (self._raw_qpos, adjoint.grad_qvel, adjoint.grad_act)
-            )
+            *(wp.to_torch(a, requires_grad=False) for a in (self._raw_qpos, adjoint.grad_qvel, adjoint.grad_act))
         )
         self._grad_ctrl = wp.to_torch(adjoint.grad_ctrl, requires_grad=False)
         self._graph: Graph | None = None
