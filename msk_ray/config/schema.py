@@ -14,6 +14,16 @@ Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 NonNegative = Annotated[float, Field(ge=0.0)]
 
 
+VARIANTS: dict[str, tuple[str, ...]] = {
+    "cartpole": (),
+    "ant": ("matched", "matched_hard_friction", "published"),
+}
+"""Named physics of each environment, the one that policies are scored under first."""
+
+CONTACT_FIELDS = ("cone", "impratio", "solref", "solimp", "friction", "solreffriction", "solref_limit", "solimp_limit")
+"""Fields of the physics section that mean something only in a model with contacts and joint limits."""
+
+
 class Section(BaseModel):
     """A frozen group of settings that refuses unknown keys."""
 
@@ -277,6 +287,19 @@ class Config(Section):
     critic: CriticConfig = CriticConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
     trial: TrialConfig = TrialConfig()
+
+    @model_validator(mode="after")
+    def _physics_fits_env(self) -> "Config":
+        variants = VARIANTS[self.env.name]
+        for field, name in (("physics.variant", self.physics.variant), ("evaluation.variant", self.evaluation.variant)):
+            if name is not None and name not in variants:
+                known = f"write one of {', '.join(variants)}" if variants else "leave it out"
+                raise ValueError(f"{field}: env {self.env.name} has no physics named {name!r}; {known}")
+        if self.env.name == "cartpole":
+            set_ = [name for name in CONTACT_FIELDS if getattr(self.physics, name) is not None]
+            if set_:
+                raise ValueError(f"physics.{set_[0]}: cartpole has no contacts or joint limits; leave it out")
+        return self
 
     @model_validator(mode="after")
     def _consistent(self) -> "Config":
