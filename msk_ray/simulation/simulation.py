@@ -55,8 +55,11 @@ class WarpSimStep(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, qpos: Tensor, qvel: Tensor, act: Tensor) -> tuple[Tensor | None, ...]:
         needs = Needs(*ctx.needs_input_grad[1:])
-        mode = ctx.sim.require_backward()
-        return (None, *mode.vjp(ctx.saved_tensors, StepState(qpos, qvel, act), needs))
+        cotangent = StepState(qpos, qvel, act)
+        gradients = ctx.sim.require_backward().vjp(ctx.saved_tensors, cotangent, needs)
+        # A linear map takes zero to zero, also in a world whose Jacobian is not finite: 0 × NaN must not leak out.
+        used = torch.cat(cotangent, dim=-1).ne(0).any(-1, keepdim=True)
+        return (None, *(None if g is None else torch.where(used, g, 0.0) for g in gradients))
 
 
 class Simulation:

@@ -1,0 +1,163 @@
+"""Reading configurations: YAML in, a checked `Config` out, or one line saying what to write instead."""
+
+import copy
+import difflib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, get_args
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from msk_ray.config.schema import Config
+from msk_ray.errors import ConfigError
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """The mapping in a YAML file.
+
+    Raises:
+        ConfigError: the file is missing, unreadable, not YAML, or not a mapping.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        siblings = sorted(p.stem for p in path.parent.glob("*.yaml")) if path.parent.is_dir() else []
+        hint = f"; {path.parent} holds: {', '.join(siblings)}" if siblings else ""
+        raise ConfigError(f"no such file: {path}{hint}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"cannot read {path}: {error}") from error
+    try:
+        data = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path} must hold a mapping of settings at its top level")
+    return data
+
+
+def parse_override(text: str) -> tuple[str, Any]:
+    """Split "a.b=value" into its dotted key and its value, read as YAML.
+
+    Raises:
+        ConfigError: no "=" in it, or the value is not YAML.
+    """
+    key, separator, value = text.partition("=")
+    if not separator or not key.strip():
+        raise ConfigError(f"--set {text!r}: write key=value, such as shac.horizon=16")
+    try:
+        return key.strip(), yaml.safe_load(value)
+    except yaml.YAMLError:
+        raise ConfigError(f"--set {text!r}: the value is not valid YAML") from None
+
+
+def apply_overrides(data: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """A copy of nested `data` with each dotted key of `overrides` set.
+
+    Raises:
+        ConfigError: a key goes through something that is not a section.
+    """
+    result = copy.deepcopy(dict(data))
+    for dotted, value in overrides.items():
+        *sections, leaf = dotted.split(".")
+        node = result
+        for section in sections:
+            child = node.setdefault(section, {})
+            if not isinstance(child, dict):
+                raise ConfigError(f"{dotted}: {section} is a value, not a section of settings")
+            node = child
+        node[leaf] = copy.deepcopy(value)
+    return result
+
+
+def parse_config(data: Mapping[str, Any], source: str = "config") -> Config:
+    """Check nested plain data and freeze it. `source` names it in errors.
+
+    Raises:
+        ConfigError: with the first fault on one line.
+    """
+    try:
+        return Config.model_validate(data)
+    except ValidationError as error:
+        raise ConfigError(f"{source}: {describe_fault(error)}") from None
+
+
+def read_config(path: Path) -> dict[str, Any]:
+    """The settings of a config file laid over those of the file its `extends` names, if any.
+
+    `extends` is a path relative to the file, and goes one level deep: what is extended may not extend another.
+
+    Raises:
+        ConfigError: as `read_yaml`, or a chain of `extends`.
+    """
+    data = read_yaml(path)
+    base_name = data.pop("extends", None)
+    if base_name is None:
+        return data
+    base_path = path.parent / str(base_name)
+    base = read_yaml(base_path)
+    if "extends" in base:
+        raise ConfigError(f"{path} extends {base_path}, which extends another file: extend that one directly")
+    return merge(base, data)
+
+
+def load_config(path: Path, overrides: Iterable[str] = ()) -> Config:
+    """Read a config file and apply "a.b=value" overrides to it.
+
+    Raises:
+        ConfigError: as `read_config`, `parse_override` and `parse_config`.
+    """
+    data = apply_overrides(read_config(path), dict(parse_override(text) for text in overrides))
+    return parse_config(data, str(path))
+
+
+def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """`over` laid over `base`, section by section."""
+    merged = copy.deepcopy(dict(base))
+    for key, value in over.items():
+        old = merged.get(key)
+        merged[key] = merge(old, value) if isinstance(old, dict) and isinstance(value, dict) else copy.deepcopy(value)
+    return merged
+
+
+def dump_yaml(data: Mapping[str, Any]) -> str:
+    """YAML text of plain data, in the order given."""
+    return yaml.safe_dump(dict(data), sort_keys=False, allow_unicode=True, width=100)
+
+
+def describe_fault(error: ValidationError, root: type[BaseModel] = Config) -> str:
+    """The first fault found while validating a `root`, and how many more there are, on one line."""
+    faults = error.errors()
+    first = faults[0]
+    # Discriminated unions put the tag into the location; it is no key of the file.
+    location = [
+        str(part) for part in first["loc"] if part not in ("cartpole", "ant", "constrained-int", "HorizonSchedule")
+    ]
+    where = ".".join(location)
+    if first["type"] == "extra_forbidden":
+        known = _keys_at(root, location[:-1], first["loc"])
+        near = difflib.get_close_matches(location[-1], known, n=1)
+        hint = f"did you mean {near[0]!r}?" if near else f"known keys: {', '.join(known)}"
+        text = f"{where}: unknown key; {hint}"
+    elif first["type"] == "value_error":
+        text = str(first["ctx"]["error"]) if "ctx" in first else first["msg"]
+    elif first["type"] == "missing":
+        text = f"{where}: missing"
+    elif first["type"].startswith("union_tag"):
+        text = f"{where or 'env'}: {first['msg']}; write env.name: cartpole or ant"
+    else:
+        text = f"{where}: {first['msg']}, not {first['input']!r}"
+    more = len(faults) - 1
+    return text + (f" (and {more} more fault{'s' if more > 1 else ''})" if more else "")
+
+
+def _keys_at(root: type[BaseModel], sections: list[str], location: tuple[Any, ...]) -> list[str]:
+    """Known keys of the section of `root` a fault lies in."""
+    model: Any = root
+    for section in sections:
+        annotation = model.model_fields[section].annotation
+        options = [a for a in get_args(annotation) or (annotation,) if isinstance(a, type) and issubclass(a, BaseModel)]
+        named = [o for o in options if "name" in o.model_fields and get_args(o.model_fields["name"].annotation)]
+        tagged = [o for o in named if get_args(o.model_fields["name"].annotation)[0] in location]
+        model = (tagged or options)[0]
+    return list(model.model_fields)

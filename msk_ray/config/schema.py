@@ -1,0 +1,318 @@
+"""The settings of a trial. Every field has a unit or range; unknown keys are refused.
+
+Sources of the defaults: SHAC (Xu et al. 2022, "Accelerated Policy Learning with Parallel Differentiable Simulation",
+arXiv:2204.07137) and the hyperparameters published with it.
+"""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt, model_validator
+
+Vec2 = tuple[float, float]
+Vec5 = tuple[float, float, float, float, float]
+Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
+NonNegative = Annotated[float, Field(ge=0.0)]
+
+
+VARIANTS: dict[str, tuple[str, ...]] = {
+    "cartpole": (),
+    "ant": ("matched", "matched_hard_friction", "published"),
+}
+"""Named physics of each environment, the one that policies are scored under first."""
+
+CONTACT_FIELDS = ("cone", "impratio", "solref", "solimp", "friction", "solreffriction", "solref_limit", "solimp_limit")
+"""Fields of the physics section that mean something only in a model with contacts and joint limits."""
+
+
+class Section(BaseModel):
+    """A frozen group of settings that refuses unknown keys."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+
+
+class EnvSettings(Section):
+    """What every environment has."""
+
+    nworld: PositiveInt = 64
+    """Worlds W simulated at once."""
+    episode_length: PositiveInt
+    """Env steps after which an episode is truncated."""
+    control_timestep: PositiveFloat = 1.0 / 60.0
+    """Duration of an env step [s]."""
+    stochastic_reset: bool = True
+    """Draw the initial state at random; False starts every episode in the same state."""
+
+
+class CartPoleEnvConfig(EnvSettings):
+    """Swing up a pole on a cart and keep it there. Angle 0 is upright."""
+
+    name: Literal["cartpole"]
+    episode_length: PositiveInt = 240
+    pole_angle_penalty: NonNegative = 1.0
+    """Weight of angle² [1/rad²], with the angle wrapped to ±π."""
+    pole_velocity_penalty: NonNegative = 0.1
+    """Weight of angular velocity² [s²/rad²]."""
+    cart_position_penalty: NonNegative = 0.05
+    """Weight of position² [1/m²]."""
+    cart_velocity_penalty: NonNegative = 0.1
+    """Weight of velocity² [s²/m²]."""
+    cart_action_penalty: NonNegative = 0.0
+    """Weight of action²."""
+
+
+class AntEnvConfig(EnvSettings):
+    """A four-legged walker whose reward asks for forward velocity."""
+
+    name: Literal["ant"]
+    episode_length: PositiveInt = 1000
+    forward_vel: float = 1.0
+    """Weight of the torso's velocity along +x [s/m]."""
+    heading: float = 1.0
+    """Weight of the cosine between the torso's forward axis and +x."""
+    up: float = 0.1
+    """Weight of the cosine between the torso's up axis and +z."""
+    height: float = 1.0
+    """Weight of the torso's height above `termination_height` [1/m]."""
+    action_penalty: NonNegative = 0.0
+    """Weight of the summed squared action."""
+    termination_height: float = 0.27
+    """Torso height below which an episode ends [m]."""
+    early_termination: bool = True
+    """End an episode on falling below `termination_height`."""
+
+
+EnvConfig = Annotated[CartPoleEnvConfig | AntEnvConfig, Field(discriminator="name")]
+
+
+class FdConfig(Section):
+    """Central differences of backward mode `fd_jacobian`."""
+
+    eps_ctrl: PositiveFloat = 3e-2
+    """Perturbation of ctrl and act [their own unit]."""
+    eps_qpos: PositiveFloat = 5e-3
+    """Perturbation of qpos along a tangent direction [m, rad]."""
+    eps_qvel: PositiveFloat = 1e-2
+    """Perturbation of qvel [m/s, rad/s]."""
+    max_worlds: PositiveInt = 131072
+    """Perturbed copies run at once; more are done in chunks."""
+
+
+class PhysicsConfig(Section):
+    """How the model is built, stepped and differentiated. Fields left null keep the variant's value."""
+
+    variant: str | None = None
+    """Named physics of the environment: for ant `published`, `matched` or `matched_hard_friction`."""
+    backward: Literal["fd_jacobian"] = "fd_jacobian"
+    """Backward mode of the step."""
+    fd: FdConfig = FdConfig()
+    substeps: PositiveInt | None = None
+    """Physics steps an env step. Set this or `timestep`; 4 if neither is set."""
+    timestep: PositiveFloat | None = None
+    """Duration of a physics step [s]; must divide the env's control_timestep."""
+    tolerance: PositiveFloat | None = None
+    """Constraint solver tolerance; mujoco_warp's default is 1e-6."""
+    iterations: PositiveInt | None = None
+    """Constraint solver iteration limit."""
+    ls_iterations: PositiveInt | None = None
+    """Line search iteration limit."""
+    integrator: Literal["Euler", "implicitfast", "RK4"] | None = None
+    cone: Literal["pyramidal", "elliptic"] | None = None
+    """Friction cone. The pyramid's edges make contact gradients explode over long horizons; the ellipse has none."""
+    impratio: PositiveFloat | None = None
+    """Ratio of frictional to normal constraint impedance."""
+    solref: Vec2 | None = None
+    """Contact time constant [s] and damping ratio."""
+    solimp: Vec5 | None = None
+    """Contact impedance d0, dwidth, width [m], midpoint, power."""
+    friction: PositiveFloat | None = None
+    """Sliding friction coefficient."""
+    solreffriction: Vec2 | None = None
+    """Solver reference of the friction directions alone [s, ratio], set on contact pairs; needs the elliptic cone.
+
+    Friction acts like a damper with this time constant: (0.02, 1) sticks, (1, 1) is viscous. `(0, 0)` uses solref.
+    """
+    joint_damping: NonNegative | None = None
+    """Damping of every actuated joint [N m s/rad]."""
+    armature: NonNegative | None = None
+    """Rotor inertia of every actuated joint [kg m²]."""
+    solref_limit: Vec2 | None = None
+    """Solver reference of joint limits; two negative values are -stiffness and -damping."""
+    solimp_limit: Vec5 | None = None
+    """Impedance of joint limits."""
+    gear: PositiveFloat | None = None
+    """Force or torque of a motor at full control [N, N m]."""
+    nconmax: PositiveInt | None = None
+    """Contacts a world; null takes a bound from the geometry."""
+    njmax: PositiveInt | None = None
+    """Constraint rows a world; null takes a bound from the geometry."""
+
+    @model_validator(mode="after")
+    def _friction_direction_needs_ellipse(self) -> "PhysicsConfig":
+        if self.solreffriction is not None and self.cone == "pyramidal":
+            raise ValueError("solreffriction acts with the elliptic cone only: write cone: elliptic")
+        return self
+
+    def resolve_substeps(self, control_timestep: float) -> int:
+        """Physics steps an env step of `control_timestep` [s].
+
+        Raises:
+            ValueError: `timestep` does not divide it, or `substeps` and `timestep` disagree.
+        """
+        if self.timestep is None:
+            return self.substeps or 4
+        ratio = control_timestep / self.timestep
+        whole = round(ratio)
+        if whole < 1 or abs(ratio - whole) > 1e-4 * whole:
+            nearest = control_timestep / max(1, whole)
+            raise ValueError(
+                f"physics.timestep {self.timestep:g} s does not divide env.control_timestep {control_timestep:g} s: "
+                f"write {nearest:.8g} ({max(1, whole)} substeps)"
+            )
+        if self.substeps is not None and self.substeps != whole:
+            raise ValueError(
+                f"physics.substeps {self.substeps} and physics.timestep {self.timestep:g} s disagree: "
+                f"an env step of {control_timestep:g} s has {whole} such substeps; write one of the two"
+            )
+        return whole
+
+
+class HorizonSchedule(Section):
+    """Rollout length by epoch: `start` at epoch 0, `end` from epoch `epochs` on, linear between."""
+
+    start: PositiveInt
+    end: PositiveInt
+    epochs: PositiveInt
+
+
+class NetworkConfig(Section):
+    """A multilayer perceptron."""
+
+    hidden: tuple[PositiveInt, ...] = (64, 64)
+    activation: Literal["elu", "silu", "relu", "tanh"] = "elu"
+    layer_norm: bool = True
+    """Normalise each hidden layer."""
+
+
+class ActorConfig(NetworkConfig):
+    """Policy network. Its output is squashed by tanh."""
+
+    stochastic: bool = True
+    """Gaussian with state-independent standard deviation; False is deterministic."""
+    log_std: float = -1.0
+    """Initial log standard deviation, before tanh."""
+
+
+class CriticConfig(NetworkConfig):
+    """Value network(s)."""
+
+    count: Annotated[int, Field(ge=1, le=2)] = 1
+    """Critics trained; with two, the smaller value is used."""
+
+
+class ShacConfig(Section):
+    """Short-Horizon Actor-Critic."""
+
+    horizon: PositiveInt | HorizonSchedule = 32
+    """Env steps H of a rollout the gradient flows through, constant or as {start, end, epochs}."""
+    gamma: Fraction = 0.99
+    """Discount."""
+    lam: Fraction = 0.95
+    """λ of the TD(λ) targets."""
+    critic_method: Literal["td-lambda", "one-step"] = "td-lambda"
+    """Targets of the critic."""
+    critic_iterations: PositiveInt = 16
+    """Passes over the rollout an epoch."""
+    critic_batches: PositiveInt = 4
+    """Minibatches a pass."""
+    target_critic_alpha: Fraction = 0.2
+    """target ← α·target + (1 − α)·critic after each epoch."""
+    actor_lr: PositiveFloat = 2e-3
+    critic_lr: PositiveFloat = 2e-3
+    lr_schedule: Literal["linear", "constant"] = "linear"
+    """`linear` goes from the given rate to `final_lr` at the last epoch."""
+    final_lr: PositiveFloat = 1e-5
+    betas: tuple[Fraction, Fraction] = (0.7, 0.95)
+    """Adam's moment decays."""
+    actor_grad_norm: PositiveFloat | None = 1.0
+    """Norm the actor's gradient is clipped to; null leaves it."""
+    critic_grad_norm: PositiveFloat | None = 1.0
+    """Norm each critic's gradient is clipped to; null leaves it."""
+    state_bptt: bool = True
+    """Let gradients flow through the state from one env step to the next; False cuts them after each step."""
+    state_grad_clip: PositiveFloat | None = None
+    """Bound on each world's state cotangent between env steps, in units of reward; null leaves it.
+
+    The loss is a mean over H·W, so a world's cotangent of norm c/(H·W) is what one reward of c would give.
+    """
+    normalize_obs: bool = True
+    """Normalise observations by their running mean and variance."""
+    normalize_return: bool = False
+    """Divide rewards by the running standard deviation of the return."""
+    reward_scale: PositiveFloat = 1.0
+    max_nonfinite_share: Fraction = 0.05
+    """Share of worlds whose gradient may be non-finite in an epoch before the trial stops with an error."""
+
+
+class EvaluationConfig(Section):
+    """Deterministic evaluation on fixed seeds: the only thing policies are ranked by."""
+
+    interval: PositiveInt = 10
+    """Epochs between evaluations."""
+    nworld: PositiveInt = 64
+    steps: PositiveInt | None = None
+    """Env steps; null takes the env's episode length."""
+    seed: Annotated[int, Field(ge=0)] = 1234
+    variant: str | None = None
+    """Physics the score is taken under; null takes the env's reference physics."""
+
+
+class TrialConfig(Section):
+    """How long, from which seed, and how often to save."""
+
+    epochs: PositiveInt = 500
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    checkpoint_interval: PositiveInt = 10
+    """Epochs between checkpoints."""
+    keep_checkpoints: Annotated[int, Field(ge=2)] = 2
+    """Newest checkpoints kept, beside the best."""
+
+
+class Config(Section):
+    """One trial."""
+
+    env: EnvConfig
+    physics: PhysicsConfig = PhysicsConfig()
+    shac: ShacConfig = ShacConfig()
+    actor: ActorConfig = ActorConfig()
+    critic: CriticConfig = CriticConfig()
+    evaluation: EvaluationConfig = EvaluationConfig()
+    trial: TrialConfig = TrialConfig()
+
+    @model_validator(mode="after")
+    def _physics_fits_env(self) -> "Config":
+        variants = VARIANTS[self.env.name]
+        for field, name in (("physics.variant", self.physics.variant), ("evaluation.variant", self.evaluation.variant)):
+            if name is not None and name not in variants:
+                known = f"write one of {', '.join(variants)}" if variants else "leave it out"
+                raise ValueError(f"{field}: env {self.env.name} has no physics named {name!r}; {known}")
+        if self.env.name == "cartpole":
+            set_ = [name for name in CONTACT_FIELDS if getattr(self.physics, name) is not None]
+            if set_:
+                raise ValueError(f"physics.{set_[0]}: cartpole has no contacts or joint limits; leave it out")
+        return self
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "Config":
+        self.physics.resolve_substeps(self.env.control_timestep)
+        horizon = self.shac.horizon
+        shortest = horizon if isinstance(horizon, int) else min(horizon.start, horizon.end)
+        if (shortest * self.env.nworld) % self.shac.critic_batches:
+            raise ValueError(
+                f"shac.critic_batches {self.shac.critic_batches} must divide shac.horizon × env.nworld "
+                f"({shortest} × {self.env.nworld})"
+            )
+        return self
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data that `parse_config` reads back."""
+        return self.model_dump(mode="json")

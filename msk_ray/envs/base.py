@@ -1,0 +1,198 @@
+"""What every environment shares: stepping, truncation against termination, reset and divergence.
+
+Axes: W worlds, O observation, A action.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from typing import ClassVar, Generic, NamedTuple, TypeVar
+
+import mujoco
+import torch
+from torch import Tensor
+
+from msk_ray.config import PhysicsConfig
+from msk_ray.config.schema import EnvSettings
+from msk_ray.simulation import Backward, Simulation, StepState
+
+Settings = TypeVar("Settings", bound=EnvSettings)
+
+# A world whose state leaves this bound has diverged: no model here reaches it while the solver works.
+_ABSURD = 1e6
+
+
+class EnvState(NamedTuple):
+    """Where every world is."""
+
+    physics: StepState
+    """Physical state, attached to the graph."""
+    action: Tensor
+    """Last action, shape (W, A), attached."""
+    age: Tensor
+    """Env steps since reset, shape (W,), int64."""
+
+    def detach(self) -> "EnvState":
+        """The same state, cut from the graph."""
+        return EnvState(StepState(*(t.detach() for t in self.physics)), self.action.detach(), self.age)
+
+
+class Transition(NamedTuple):
+    """One env step of all worlds."""
+
+    reward: Tensor
+    """Reward, shape (W,); 0 in a world that diverged."""
+    terms: dict[str, Tensor]
+    """Weighted parts of the reward, detached, each of shape (W,)."""
+    obs: Tensor
+    """Observation of the state reached, before any reset, shape (W, O)."""
+    terminated: Tensor
+    """The episode ended by itself (fell, diverged): nothing follows, shape (W,) bool."""
+    truncated: Tensor
+    """The episode was cut by the time limit: its value goes on, shape (W,) bool."""
+    diverged: Tensor
+    """The physics left all bounds, shape (W,) bool; counted in `terminated`."""
+
+
+class Env(ABC, Generic[Settings]):
+    """Batched environment over a `Simulation`.
+
+    Attributes:
+        state: current state of all worlds; `detach` it to start a new graph.
+        generator: source of reset states, on the environment's device.
+    """
+
+    action_size: int
+    obs_size: int
+    variants: ClassVar[tuple[str, ...]] = ()
+    """Named physics of this environment."""
+
+    def __init__(
+        self,
+        config: Settings,
+        physics: PhysicsConfig,
+        nworld: int,
+        device: str,
+        seed: int,
+        backward: Backward | None,
+    ) -> None:
+        self.config = config
+        self.nworld = nworld
+        self.model = self.build_model(config, physics)
+        self.sim = Simulation(
+            self.model,
+            nworld,
+            physics.resolve_substeps(config.control_timestep),
+            backward,
+            device,
+            nconmax=physics.nconmax,
+            njmax=physics.njmax,
+            tolerance=physics.tolerance,
+        )
+        self.device = self.sim.device
+        self.action_size = self.model.nu
+        self.generator = torch.Generator(device=self.device).manual_seed(seed)
+        self.state = self.reset_state()
+
+    @staticmethod
+    @abstractmethod
+    def build_model(config: Settings, physics: PhysicsConfig) -> mujoco.MjModel:
+        """Compile the model these settings describe."""
+
+    @classmethod
+    def reference_settings(cls, config: Settings) -> Settings:
+        """`config` with the reward weights that policies are scored under."""
+        weights = {n: f.default for n, f in type(config).model_fields.items() if n not in EnvSettings.model_fields}
+        keep = {"name", "early_termination", "termination_height"}
+        return config.model_copy(update={n: d for n, d in weights.items() if n not in keep})
+
+    @classmethod
+    def reference_physics(cls, physics: PhysicsConfig, variant: str | None) -> PhysicsConfig:
+        """The physics that policies are scored under: a named variant as it stands, or `physics` if there is none."""
+        if not cls.variants:
+            return physics
+        return PhysicsConfig(variant=variant or cls.variants[0], nconmax=physics.nconmax, njmax=physics.njmax)
+
+    @abstractmethod
+    def draw_physics(self) -> StepState:
+        """Initial physical states of all worlds, drawn from `generator` if resets are stochastic."""
+
+    @abstractmethod
+    def observe(self, state: StepState, action: Tensor) -> Tensor:
+        """Observation (W, O) of a state and the action that led to it."""
+
+    @abstractmethod
+    def reward_terms(self, state: StepState, action: Tensor) -> dict[str, Tensor]:
+        """Weighted parts (W,) that sum to the reward for reaching `state` by `action`."""
+
+    def fell(self, state: StepState) -> Tensor:
+        """Worlds (W,) bool whose episode ends by itself in `state`."""
+        return torch.zeros(self.nworld, dtype=torch.bool, device=self.device)
+
+    def outcome_terms(self, state: StepState) -> dict[str, Tensor]:
+        """Further per-world figures (W,) that evaluation averages over an episode."""
+        return {}
+
+    def success(self, tail: dict[str, Tensor]) -> Tensor | None:
+        """Worlds (W,) bool that met the task, from the outcome terms of an episode's last second, each (T, W)."""
+        return None
+
+    def reset_state(self) -> EnvState:
+        """Fresh initial states of all worlds."""
+        return EnvState(
+            self.draw_physics(),
+            torch.zeros((self.nworld, self.action_size), device=self.device),
+            torch.zeros(self.nworld, dtype=torch.int64, device=self.device),
+        )
+
+    def observation(self) -> Tensor:
+        """Observation (W, O) of the current state."""
+        return self.observe(self.state.physics, self.state.action)
+
+    def step(self, action: Tensor, *, auto_reset: bool = True) -> Transition:
+        """Advance all worlds under actions (W, A) in [-1, 1] and reset those whose episode ended.
+
+        A world whose physics left all bounds keeps its state of before, cut from the graph, for the observation
+        here returned, gets no reward for the step, and counts as terminated.
+        """
+        before = self.state.physics
+        after = self.sim.step(action, *before)
+        diverged = ~self._sound(after)
+        # `where` sends no cotangent into a diverged world's step, so its gradient cannot reach the batch.
+        after = StepState(*(torch.where(diverged[:, None], b.detach(), a) for b, a in zip(before, after, strict=True)))
+        terms = self.reward_terms(after, action)
+        reward = torch.where(diverged, 0.0, torch.stack(list(terms.values())).sum(0))
+        obs = self.observe(after, action)
+        age = self.state.age + 1
+        terminated = diverged | self.fell(after)
+        truncated = (age >= self.config.episode_length) & ~terminated
+        reached = EnvState(after, action, age)
+        self.state = self._reset_where(terminated | truncated, reached) if auto_reset else reached
+        return Transition(reward, {n: t.detach() for n, t in terms.items()}, obs, terminated, truncated, diverged)
+
+    def uniform(self, *shape: int) -> Tensor:
+        """Uniform numbers in [-1, 1) from the environment's generator; zeros if resets are not stochastic."""
+        if not self.config.stochastic_reset:
+            return torch.zeros((self.nworld, *shape), device=self.device)
+        return 2.0 * torch.rand((self.nworld, *shape), generator=self.generator, device=self.device) - 1.0
+
+    def _reset_where(self, done: Tensor, reached: EnvState) -> EnvState:
+        fresh = self.reset_state()
+        physics = StepState(
+            *(torch.where(done[:, None], f, r) for f, r in zip(fresh.physics, reached.physics, strict=True))
+        )
+        return EnvState(
+            physics,
+            torch.where(done[:, None], fresh.action, reached.action),
+            torch.where(done, fresh.age, reached.age),
+        )
+
+    @torch.no_grad()
+    def _sound(self, state: StepState) -> Tensor:
+        # NaN compares false, so one comparison finds both non-finite and absurd values.
+        sound = (state.qpos.abs() < _ABSURD).all(-1) & (state.qvel.abs() < _ABSURD).all(-1)
+        return sound & (state.act.abs() < _ABSURD).all(-1) if state.act.shape[-1] else sound
+
+
+def wrap_angle(angle: Tensor) -> Tensor:
+    """The same angle [rad] in [-π, π)."""
+    return torch.remainder(angle + math.pi, 2.0 * math.pi) - math.pi

@@ -1,0 +1,56 @@
+"""CartPole swing-up, as in SHAC's experiments (arXiv:2204.07137, appendix)."""
+
+import math
+
+import mujoco
+import torch
+from torch import Tensor
+
+from msk_ray.config import CartPoleEnvConfig, PhysicsConfig
+from msk_ray.envs.base import Env, wrap_angle
+from msk_ray.envs.models.cartpole import build_cartpole
+from msk_ray.simulation import StepState
+
+UPRIGHT_ANGLE = 0.3
+"""A pole within this angle of upright counts as held [rad]."""
+
+
+class CartPole(Env[CartPoleEnvConfig]):
+    """Observation (5): cart position [m], cart velocity [m/s], sin and cos of the pole angle, its rate [rad/s].
+
+    Starts hanging down, ± π/2 rad, with small velocities. Never terminates; truncated after `episode_length`.
+    """
+
+    obs_size = 5
+
+    @staticmethod
+    def build_model(config: CartPoleEnvConfig, physics: PhysicsConfig) -> mujoco.MjModel:
+        return build_cartpole(config, physics)
+
+    def draw_physics(self) -> StepState:
+        hanging = torch.tensor([0.0, math.pi], device=self.device)
+        qpos = hanging + self.uniform(2) * torch.tensor([0.5, math.pi / 2], device=self.device)
+        return StepState(qpos, 0.25 * self.uniform(2), torch.zeros((self.nworld, 0), device=self.device))
+
+    def observe(self, state: StepState, action: Tensor) -> Tensor:
+        x, angle = state.qpos.unbind(-1)
+        speed, rate = state.qvel.unbind(-1)
+        return torch.stack((x, speed, torch.sin(angle), torch.cos(angle), rate), dim=-1)
+
+    def reward_terms(self, state: StepState, action: Tensor) -> dict[str, Tensor]:
+        c = self.config
+        x, angle = state.qpos.unbind(-1)
+        speed, rate = state.qvel.unbind(-1)
+        return {
+            "pole_angle": -c.pole_angle_penalty * wrap_angle(angle) ** 2,
+            "pole_velocity": -c.pole_velocity_penalty * rate**2,
+            "cart_position": -c.cart_position_penalty * x**2,
+            "cart_velocity": -c.cart_velocity_penalty * speed**2,
+            "action": -c.cart_action_penalty * (action**2).sum(-1),
+        }
+
+    def outcome_terms(self, state: StepState) -> dict[str, Tensor]:
+        return {"upright": (wrap_angle(state.qpos[:, 1]).abs() < UPRIGHT_ANGLE).float()}
+
+    def success(self, tail: dict[str, Tensor]) -> Tensor | None:
+        return (tail["upright"] > 0).all(0)

@@ -1,0 +1,1 @@
+"""Model builders: settings in, a compiled MjModel out."""

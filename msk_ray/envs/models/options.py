@@ -1,0 +1,31 @@
+"""Solver and integrator settings that every model takes from its physics section."""
+
+import mujoco
+
+from msk_ray.config import PhysicsConfig
+
+_INTEGRATORS = {
+    "Euler": mujoco.mjtIntegrator.mjINT_EULER,
+    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    "RK4": mujoco.mjtIntegrator.mjINT_RK4,
+}
+_CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
+
+
+def apply_options(spec: mujoco.MjSpec, physics: PhysicsConfig, control_timestep: float) -> None:
+    """Set timestep, solver and cone of `spec`: Newton and dense Jacobians, Euler unless told otherwise."""
+    option = spec.option
+    option.timestep = control_timestep / physics.resolve_substeps(control_timestep)
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    option.integrator = _INTEGRATORS[physics.integrator or "Euler"]
+    if physics.cone is not None:
+        option.cone = _CONES[physics.cone]
+    if physics.impratio is not None:
+        option.impratio = physics.impratio
+    if physics.iterations is not None:
+        option.iterations = physics.iterations
+    if physics.ls_iterations is not None:
+        option.ls_iterations = physics.ls_iterations
+    if physics.tolerance is not None:
+        option.tolerance = physics.tolerance

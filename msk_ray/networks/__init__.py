@@ -1,0 +1,7 @@
+"""Policy, value networks and observation statistics."""
+
+from msk_ray.networks.actor import Actor
+from msk_ray.networks.critic import Critic
+from msk_ray.networks.normalizer import RunningMeanStd
+
+__all__ = ["Actor", "Critic", "RunningMeanStd"]

@@ -1,0 +1,23 @@
+"""The value function."""
+
+import torch
+from torch import Tensor, nn
+
+from msk_ray.config.schema import CriticConfig
+from msk_ray.networks.mlp import make_mlp
+
+
+class Critic(nn.Module):
+    """One or two value networks of a normalised observation."""
+
+    def __init__(self, config: CriticConfig, obs_size: int, generator: torch.Generator) -> None:
+        super().__init__()
+        self.members = nn.ModuleList(make_mlp(config, obs_size, 1, generator) for _ in range(config.count))
+
+    def forward(self, obs: Tensor) -> Tensor:
+        """Values (C, ...) of each of the C networks for observations (..., O)."""
+        return torch.stack([member(obs).squeeze(-1) for member in self.members])
+
+    def value(self, obs: Tensor) -> Tensor:
+        """Value (...): the smaller one where there are two networks."""
+        return self(obs).amin(0)

@@ -1,0 +1,32 @@
+"""The multilayer perceptron both networks are made of."""
+
+from itertools import pairwise
+
+import torch
+from torch import nn
+
+from msk_ray.config import NetworkConfig
+
+_ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "silu": nn.SiLU, "relu": nn.ReLU, "tanh": nn.Tanh}
+
+
+def make_mlp(config: NetworkConfig, inputs: int, outputs: int, generator: torch.Generator) -> nn.Sequential:
+    """Linear, activation and optional LayerNorm per hidden layer; a linear last layer.
+
+    Weights are orthogonal, with gain √2 in hidden layers and 1 in the last, biases zero, drawn from `generator`.
+    """
+    layers: list[nn.Module] = []
+    sizes = (inputs, *config.hidden)
+    for fan_in, fan_out in pairwise(sizes):
+        layers += [_linear(fan_in, fan_out, 2**0.5, generator), _ACTIVATIONS[config.activation]()]
+        if config.layer_norm:
+            layers.append(nn.LayerNorm(fan_out))
+    layers.append(_linear(sizes[-1], outputs, 1.0, generator))
+    return nn.Sequential(*layers)
+
+
+def _linear(fan_in: int, fan_out: int, gain: float, generator: torch.Generator) -> nn.Linear:
+    layer = nn.Linear(fan_in, fan_out)
+    nn.init.orthogonal_(layer.weight, gain=gain, generator=generator)
+    nn.init.zeros_(layer.bias)
+    return layer

@@ -1,0 +1,48 @@
+"""A progress line with an estimate of the time left."""
+
+import sys
+import time
+
+
+class Progress:
+    """Shows epoch, speed, scores and time left: in place on a terminal, a line every ten seconds elsewhere."""
+
+    def __init__(self, epochs: int, done: int) -> None:
+        self._epochs = epochs
+        self._first = done
+        self._start = time.monotonic()
+        self._last_line = -1e9
+        self._terminal = sys.stdout.isatty()
+        self._score = ""
+
+    def show(self, row: dict[str, float]) -> None:
+        """Take in a row of metrics."""
+        epoch = int(row["epoch"])
+        now = time.monotonic()
+        left = (now - self._start) / max(1, epoch - self._first) * (self._epochs - epoch)
+        if "eval/score" in row:
+            self._score = f"  eval {row['eval/score']:.1f} (best {row['eval/best_score']:.1f})"
+        text = (
+            f"epoch {epoch}/{self._epochs}  {row['env_steps_per_s']:,.0f} env steps/s  "
+            f"reward {row['train/reward']:.3f}{self._score}  {format_duration(left)} left"
+        )
+        if self._terminal:
+            print(f"\r\x1b[K{text}", end="", flush=True)
+        elif now - self._last_line >= 10.0 or epoch == self._epochs:
+            print(text, flush=True)
+            self._last_line = now
+
+    def close(self) -> None:
+        """End the line."""
+        if self._terminal:
+            print()
+
+
+def format_duration(seconds: float) -> str:
+    """Seconds as 45s, 3m20s or 2h05m."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole}s"
+    if whole < 3600:
+        return f"{whole // 60}m{whole % 60:02d}s"
+    return f"{whole // 3600}h{whole % 3600 // 60:02d}m"

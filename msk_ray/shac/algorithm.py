@@ -1,0 +1,242 @@
+"""The SHAC update: one rollout, one actor step, several critic passes."""
+
+import copy
+import time
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from msk_ray.config import Config
+from msk_ray.envs import Env
+from msk_ray.errors import SimulationError
+from msk_ray.networks import Actor, Critic, RunningMeanStd
+from msk_ray.shac import returns
+from msk_ray.shac.episodes import EpisodeTracker
+from msk_ray.shac.gate import CotangentGate
+from msk_ray.shac.rollout import Rollout, collect
+from msk_ray.shac.schedules import horizon_at, learning_rate_at
+
+
+class Shac:
+    """Actor, critic, their optimisers and the statistics they need, trained on one environment.
+
+    Attributes:
+        actor, critic, target_critic: the networks.
+        normalizer: observation statistics, or None if observations are used raw.
+    """
+
+    def __init__(self, config: Config, env: Env[Any]) -> None:
+        self.config = config
+        self.env = env
+        c = config.shac
+        device = env.device
+        init = torch.Generator().manual_seed(config.trial.seed)
+        self.actor = Actor(config.actor, env.obs_size, env.action_size, init).to(device)
+        self.critic = Critic(config.critic, env.obs_size, init).to(device)
+        self.target_critic = copy.deepcopy(self.critic).requires_grad_(False)
+        self.normalizer = RunningMeanStd((env.obs_size,)).to(device) if c.normalize_obs else None
+        self.return_statistics = RunningMeanStd(()).to(device) if c.normalize_return else None
+        self.actor_optimizer = torch.optim.Adam(self.actor.parameters(), lr=c.actor_lr, betas=c.betas)
+        self.critic_optimizer = torch.optim.Adam(self.critic.parameters(), lr=c.critic_lr, betas=c.betas)
+        self.noise_generator = torch.Generator(device=device).manual_seed(config.trial.seed + 1)
+        self.episodes = EpisodeTracker(env.nworld, device)
+        self._discounted = torch.zeros(env.nworld, device=device)
+
+    def update(self, epoch: int) -> dict[str, float]:
+        """Train one epoch, counted from 0.
+
+        Returns:
+            Metrics, with seconds spent in rollout, backward and critic.
+
+        Raises:
+            SimulationError: too many worlds had a non-finite gradient, the policy's gradient is not finite, or the
+                physics ran out of buffer space.
+        """
+        c = self.config.shac
+        horizon = horizon_at(c.horizon, epoch)
+        epochs = self.config.trial.epochs
+        actor_lr = learning_rate_at(c.actor_lr, c.final_lr, c.lr_schedule, epoch, epochs)
+        critic_lr = learning_rate_at(c.critic_lr, c.final_lr, c.lr_schedule, epoch, epochs)
+        _set_learning_rate(self.actor_optimizer, actor_lr)
+        _set_learning_rate(self.critic_optimizer, critic_lr)
+        clock = _Clock(self.env.device)
+
+        # A cotangent of norm 1/(H·W) is what a reward of one in one world sends back through the mean loss.
+        unit = 1.0 / (horizon * self.env.nworld)
+        gate = CotangentGate(
+            None if c.state_grad_clip is None else c.state_grad_clip * unit, self.env.nworld, self.env.device
+        )
+        rollout, loss, next_values, scaled_rewards = self._forward(horizon, gate)
+        rollout_s = clock.lap()
+
+        self.actor_optimizer.zero_grad()
+        loss.backward()
+        gradient_norm = self._step_actor(gate, unit)
+        backward_s = clock.lap()
+
+        critic_loss = self._train_critic(rollout, next_values.detach(), scaled_rewards)
+        if self.normalizer is not None:
+            self.normalizer.update(rollout.obs.flatten(0, 1))
+        critic_s = clock.lap()
+
+        metrics = {
+            "train/actor_loss": loss.detach(),
+            "train/critic_loss": critic_loss,
+            "train/reward": rollout.rewards.detach().mean(),
+            "train/value": next_values.detach().mean(),
+            "train/diverged": rollout.diverged.sum(),
+            "grad/actor_norm": gradient_norm,
+            **gate.statistics(unit),
+            **self.episodes.update(rollout.rewards.detach(), rollout.done),
+        }
+        if self.actor.log_std is not None:
+            metrics["train/std"] = self.actor.log_std.detach().exp().mean()
+        return {name: float(value) for name, value in metrics.items()} | {
+            "train/horizon": float(horizon),
+            "train/actor_lr": actor_lr,
+            "time/rollout_s": rollout_s,
+            "time/backward_s": backward_s,
+            "time/critic_s": critic_s,
+            **{f"physics/{name}": value for name, value in self.env.sim.diagnostics().items()},
+        }
+
+    @torch.no_grad()
+    def policy(self, obs: Tensor) -> Tensor:
+        """Deterministic actions (W, A) for raw observations (W, O)."""
+        action: Tensor = self.actor(self.normalizer.normalize(obs) if self.normalizer is not None else obs)
+        return action
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything a later `load_state_dict` needs to go on exactly, environment state included."""
+        state = self.env.state
+        return {
+            "modules": {name: module.state_dict() for name, module in self._modules().items()},
+            "actor_optimizer": self.actor_optimizer.state_dict(),
+            "critic_optimizer": self.critic_optimizer.state_dict(),
+            "noise_generator": self.noise_generator.get_state(),
+            "env_generator": self.env.generator.get_state(),
+            "env_state": [t.detach().clone() for t in (*state.physics, state.action, state.age)],
+            "episodes": self.episodes.state_dict(),
+            "discounted": self._discounted.clone(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from what `state_dict` gave."""
+        for name, module in self._modules().items():
+            module.load_state_dict(state["modules"][name])
+        self.actor_optimizer.load_state_dict(state["actor_optimizer"])
+        self.critic_optimizer.load_state_dict(state["critic_optimizer"])
+        # Generator states are host tensors whatever device they drive.
+        self.noise_generator.set_state(state["noise_generator"].cpu())
+        self.env.generator.set_state(state["env_generator"].cpu())
+        *physics, action, age = state["env_state"]
+        now = self.env.state
+        self.env.state = now._replace(physics=type(now.physics)(*physics), action=action, age=age)
+        self.episodes.load_state_dict(state["episodes"])
+        self._discounted = state["discounted"]
+
+    def _modules(self) -> dict[str, nn.Module]:
+        found: dict[str, nn.Module | None] = {
+            "actor": self.actor,
+            "critic": self.critic,
+            "target_critic": self.target_critic,
+            "normalizer": self.normalizer,
+            "return_statistics": self.return_statistics,
+        }
+        return {name: module for name, module in found.items() if module is not None}
+
+    def _forward(self, horizon: int, gate: CotangentGate) -> tuple[Rollout, Tensor, Tensor, Tensor]:
+        """Rollout, actor loss, attached values of the states reached (H, W), and detached rewards for the critic."""
+        c = self.config.shac
+        noise = torch.randn(
+            (horizon, self.env.nworld, self.env.action_size), generator=self.noise_generator, device=self.env.device
+        )
+        rollout = collect(self.env, self.actor, self.normalizer, noise, gate, state_bptt=c.state_bptt)
+        rewards = c.reward_scale * rollout.rewards
+        std: Tensor | float = 1.0
+        if self.return_statistics is not None:
+            std = torch.sqrt(self.return_statistics.var + 1e-6)
+            self._update_return_statistics(rewards.detach(), rollout.done)
+            rewards = rewards / std
+        next_values = self.target_critic.value(rollout.next_obs)
+        # The loss is scaled back so that the learning rate means the same with and without normalised returns.
+        loss = std * returns.actor_loss(rewards, next_values, rollout.terminated, rollout.done, c.gamma)
+        return rollout, loss, next_values, rewards.detach()
+
+    def _update_return_statistics(self, rewards: Tensor, done: Tensor) -> None:
+        assert self.return_statistics is not None
+        running = []
+        for reward, ended in zip(rewards, done, strict=True):
+            self._discounted = self._discounted * self.config.shac.gamma + reward
+            running.append(self._discounted)
+            self._discounted = torch.where(ended, 0.0, self._discounted)
+        self.return_statistics.update(torch.stack(running).flatten())
+
+    def _step_actor(self, gate: CotangentGate, unit: float) -> Tensor:
+        """Take the actor's step and return its gradient norm before clipping."""
+        limit = self.config.shac.actor_grad_norm
+        norm = nn.utils.clip_grad_norm_(self.actor.parameters(), float("inf") if limit is None else limit)
+        lost = float(gate.statistics(unit).get("grad/nonfinite_share", 0.0))
+        allowed = self.config.shac.max_nonfinite_share
+        if lost > allowed:
+            raise SimulationError(
+                f"nonfinite_gradient: the state cotangent of {lost:.1%} of the worlds was not finite "
+                f"(shac.max_nonfinite_share allows {allowed:.1%}); shorten shac.horizon, set shac.state_grad_clip or "
+                "soften the contacts"
+            )
+        if not bool(norm.isfinite()):
+            raise SimulationError("nonfinite_gradient: the policy gradient is not finite; lower shac.actor_lr")
+        self.actor_optimizer.step()
+        return norm
+
+    def _train_critic(self, rollout: Rollout, next_values: Tensor, rewards: Tensor) -> Tensor:
+        """Fit the critic to its targets, move the target critic, and return the last pass's mean loss."""
+        c = self.config.shac
+        if c.critic_method == "td-lambda":
+            targets = returns.td_lambda_targets(rewards, next_values, rollout.terminated, rollout.done, c.gamma, c.lam)
+        else:
+            targets = returns.one_step_targets(rewards, next_values, rollout.terminated, c.gamma)
+        obs = rollout.obs if self.normalizer is None else self.normalizer.normalize(rollout.obs)
+        obs, targets = obs.flatten(0, 1), targets.flatten()
+        size = obs.shape[0] // c.critic_batches
+        losses = torch.zeros(c.critic_batches, device=obs.device)
+        for _ in range(c.critic_iterations):
+            order = torch.randperm(obs.shape[0], generator=self.noise_generator, device=obs.device)
+            for batch in range(c.critic_batches):
+                picked = order[batch * size : (batch + 1) * size]
+                loss = (self.critic(obs[picked]) - targets[picked]).square().mean()
+                self.critic_optimizer.zero_grad()
+                loss.backward()
+                if c.critic_grad_norm is not None:
+                    for member in self.critic.members:
+                        nn.utils.clip_grad_norm_(member.parameters(), c.critic_grad_norm)
+                self.critic_optimizer.step()
+                losses[batch] = loss.detach()
+        with torch.no_grad():
+            for target, source in zip(self.target_critic.parameters(), self.critic.parameters(), strict=True):
+                target.lerp_(source, 1.0 - c.target_critic_alpha)
+        return losses.mean()
+
+
+def _set_learning_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:
+    for group in optimizer.param_groups:
+        group["lr"] = rate
+
+
+class _Clock:
+    """Seconds between laps, the device's queued work included."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+        self._last = self._now()
+
+    def _now(self) -> float:
+        if self._device.type == "cuda":
+            torch.cuda.synchronize(self._device)
+        return time.perf_counter()
+
+    def lap(self) -> float:
+        now = self._now()
+        elapsed, self._last = now - self._last, now
+        return elapsed

@@ -1,0 +1,46 @@
+"""Returns and lengths of whole training episodes, which span many rollouts."""
+
+import torch
+from torch import Tensor
+
+
+class EpisodeTracker:
+    """Accumulates return and length of each world's episode over rollouts."""
+
+    def __init__(self, nworld: int, device: torch.device) -> None:
+        self._return = torch.zeros(nworld, device=device)
+        self._length = torch.zeros(nworld, device=device)
+
+    def update(self, rewards: Tensor, done: Tensor) -> dict[str, Tensor]:
+        """Take in a rollout's rewards and ends, both (H, W).
+
+        Returns:
+            Mean return and length of the episodes that ended in it, and their number; only the number if none did.
+        """
+        # With C the running total, episodes of a world that ended in the rollout sum to C at its last end.
+        totals = self._return + rewards.cumsum(0)
+        lengths = self._length + torch.arange(1, len(rewards) + 1, device=rewards.device)[:, None]
+        steps = torch.arange(len(rewards), device=rewards.device)[:, None]
+        last = torch.where(done, steps, -1).amax(0)
+        ended = last >= 0
+        at = last.clamp_min(0)[None]
+        return_at = torch.where(ended, totals.gather(0, at)[0], 0.0)
+        length_at = torch.where(ended, lengths.gather(0, at)[0], 0.0)
+        self._return = totals[-1] - return_at
+        self._length = lengths[-1] - length_at
+        count = done.sum()
+        if not count:
+            return {"train/episodes": count}
+        return {
+            "train/episode_return": return_at.sum() / count,
+            "train/episode_length": length_at.sum() / count,
+            "train/episodes": count,
+        }
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Running totals."""
+        return {"return": self._return.clone(), "length": self._length.clone()}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Continue from what `state_dict` gave."""
+        self._return, self._length = state["return"], state["length"]

@@ -1,0 +1,74 @@
+"""What passes between env steps on the way back: each world's state cotangent, bounded and watched."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from msk_ray.simulation import StepState
+
+
+class CotangentGate:
+    """Bounds each world's state cotangent and counts what it saw in one backward pass.
+
+    A few worlds whose cotangents explode over the horizon would otherwise carry the whole policy gradient. The bound
+    keeps direction. A world whose cotangent is not finite passes nothing back, and is counted as such.
+
+    Args:
+        bound: largest norm let through; None bounds nothing.
+        nworld: number of worlds W.
+    """
+
+    def __init__(self, bound: float | None, nworld: int, device: torch.device) -> None:
+        self.bound = bound
+        self._norms: list[Tensor] = []
+        self._nonfinite = torch.zeros(nworld, dtype=torch.bool, device=device)
+
+    def __call__(self, state: StepState) -> StepState:
+        """The same state; its cotangent will pass the gate."""
+        if not any(t.requires_grad for t in state):
+            return state
+        return StepState(*_Gate.apply(self, *state))
+
+    def pull(self, cotangent: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+        """The cotangents let through, each (W, n)."""
+        norm = torch.cat(cotangent, dim=-1).norm(dim=-1)
+        finite = norm.isfinite()
+        self._nonfinite |= ~finite
+        self._norms.append(norm)
+        scale = torch.ones_like(norm) if self.bound is None else (self.bound / norm).clamp(max=1.0)
+        return tuple(torch.where(finite[:, None], scale[:, None] * g, 0.0) for g in cotangent)
+
+    def statistics(self, unit: float) -> dict[str, Tensor]:
+        """Median, 90th percentile and maximum of finite norms over worlds and steps in units of `unit`, and shares.
+
+        Returns scalars still on the device.
+        """
+        if not self._norms:
+            return {}
+        norms = torch.cat(self._norms)
+        finite = norms[norms.isfinite()]
+        if not finite.numel():
+            return {"grad/nonfinite_share": self._nonfinite.float().mean()}
+        quantiles = torch.quantile(finite, torch.tensor([0.5, 0.9], device=norms.device))
+        clipped = (norms > self.bound).float().mean() if self.bound is not None else norms.new_zeros(())
+        return {
+            "grad/state_median": quantiles[0] / unit,
+            "grad/state_p90": quantiles[1] / unit,
+            "grad/state_max": finite.max() / unit,
+            "grad/clipped_share": clipped,
+            "grad/nonfinite_share": self._nonfinite.float().mean(),
+        }
+
+
+class _Gate(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, gate: CotangentGate, *state: Tensor) -> tuple[Tensor, ...]:
+        ctx.gate = gate
+        return tuple(t.view_as(t) for t in state)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *cotangent: Tensor) -> tuple[Tensor | None, ...]:
+        return (None, *ctx.gate.pull(cotangent))

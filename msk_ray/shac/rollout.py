@@ -1,0 +1,58 @@
+"""One rollout of the horizon under the current policy, with its graph."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from msk_ray.envs import Env
+from msk_ray.networks import Actor, RunningMeanStd
+from msk_ray.shac.gate import CotangentGate
+
+
+@dataclass
+class Rollout:
+    """H steps of W worlds."""
+
+    obs: Tensor
+    """Raw observations the actions were chosen from, detached, shape (H, W, O)."""
+    next_obs: Tensor
+    """Normalised observations reached, before any reset, attached, shape (H, W, O)."""
+    rewards: Tensor
+    """Attached, shape (H, W)."""
+    terminated: Tensor
+    """Shape (H, W) bool."""
+    done: Tensor
+    """Terminated or truncated, shape (H, W) bool."""
+    diverged: Tensor
+    """Shape (H, W) bool."""
+
+
+def collect(
+    env: Env,
+    actor: Actor,
+    normalizer: RunningMeanStd | None,
+    noise: Tensor,
+    gate: CotangentGate,
+    *,
+    state_bptt: bool,
+) -> Rollout:
+    """Roll the policy out for as many steps as `noise` (H, W, A) has, from where the worlds are.
+
+    The graph starts anew at the first state. With `state_bptt` false it starts anew at every state, so that an
+    action's gradient comes from its own step alone. `normalizer` is held fixed during the rollout.
+    """
+    env.state = env.state.detach()
+    raw, reached, rewards, terminated, done, diverged = [], [], [], [], [], []
+    normalize = normalizer.normalize if normalizer is not None else lambda x: x
+    for step_noise in noise:
+        env.state = env.state._replace(physics=gate(env.state.physics)) if state_bptt else env.state.detach()
+        obs = env.observation()
+        transition = env.step(actor(normalize(obs), step_noise))
+        raw.append(obs.detach())
+        reached.append(normalize(transition.obs))
+        rewards.append(transition.reward)
+        terminated.append(transition.terminated)
+        done.append(transition.terminated | transition.truncated)
+        diverged.append(transition.diverged)
+    return Rollout(*(torch.stack(x) for x in (raw, reached, rewards, terminated, done, diverged)))

@@ -1,0 +1,91 @@
+"""`python -m msk_ray.train`: one trial in this process, without Ray. The thing to debug."""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from msk_ray.cli import RESUMABLE, Parser, StopRequest, run
+from msk_ray.config import Config, load_config
+from msk_ray.errors import StorageError
+
+DESCRIPTION = """\
+Train one policy with SHAC: one trial, in this process, without Ray.
+
+Writes into the log folder: config.yaml (every setting), metrics.jsonl (one row an epoch), TensorBoard events and
+checkpoints/ with the newest two and best.pt, the policy with the highest evaluation score."""
+
+EXAMPLES = """\
+  python -m msk_ray.train --config configs/cartpole.yaml
+  python -m msk_ray.train --config configs/ant.yaml --device cuda:0 --seed 1 --set shac.horizon=16
+  python -m msk_ray.train --config configs/ant.yaml --set 'shac.horizon={start: 8, end: 32, epochs: 100}'
+  python -m msk_ray.train --config configs/cartpole.yaml --logdir runs/mine --resume   # after a crash or Ctrl-C
+  tensorboard --logdir runs"""
+
+
+def parser() -> Parser:
+    """The command line."""
+    p = Parser("python -m msk_ray.train", DESCRIPTION, EXAMPLES)
+    p.add_argument("--config", type=Path, required=True, metavar="FILE", help="a file of configs/")
+    p.add_argument(
+        "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help="override a setting"
+    )
+    p.add_argument("--seed", type=int, help="same as --set trial.seed=N")
+    p.add_argument("--device", help="cpu or cuda:N; by default the first GPU, or the CPU if there is none")
+    p.add_argument("--logdir", type=Path, metavar="DIR", help="by default runs/train/CONFIG_seedN")
+    p.add_argument("--resume", action="store_true", help="go on from the newest whole checkpoint in the log folder")
+    return p
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    args = parser().parse_args(argv)
+    overrides = [*args.overrides, *([] if args.seed is None else [f"trial.seed={args.seed}"])]
+    config = load_config(args.config, overrides)
+    logdir = args.logdir or Path("runs") / "train" / f"{args.config.stem}_seed{config.trial.seed}"
+    _check_logdir(logdir, args.resume)
+    return _train(config, logdir.resolve(), args.device, args.resume)
+
+
+def _check_logdir(logdir: Path, resume: bool) -> None:
+    """Refuse to write over another trial."""
+    if (logdir / "metrics.jsonl").exists() and not resume:
+        raise StorageError(f"{logdir} holds a trial already: add --resume to go on with it, or name another --logdir")
+    if resume and not (logdir / "checkpoints").is_dir():
+        raise StorageError(f"--resume: no trial in {logdir}; leave --resume out to start one")
+
+
+def _train(config: Config, logdir: Path, device: str | None, resume: bool) -> int:
+    # torch and Warp take seconds to load; a wrong command line should not wait for them.
+    import torch
+
+    from msk_ray.progress import Progress
+    from msk_ray.training import Trainer
+
+    stop = StopRequest()
+    device = device or ("cuda:0" if torch.cuda.is_available() else "cpu")
+    print(f"{config.env.name}: {config.trial.epochs} epochs, {config.env.nworld} worlds, on {device}; into {logdir}")
+    print("preparing kernels (a first run compiles them, up to a minute) ...", flush=True)
+    trainer = Trainer(config, logdir, device)
+    if resume:
+        path, faults = trainer.restore_latest()
+        for fault in faults:
+            print(f"skipped: {fault}")
+        print(f"resumed from {path}" if path else "no whole checkpoint yet: starting anew")
+    progress = Progress(config.trial.epochs, trainer.epoch)
+    while not trainer.finished and not stop:
+        progress.show(trainer.run_epoch())
+    progress.close()
+    if not trainer.finished:
+        trainer.save()
+        trainer.close()
+        assert stop.signal is not None
+        print(f"stopped by {stop.signal.name} after epoch {trainer.epoch}; go on with --resume --logdir {logdir}")
+        return RESUMABLE
+    trainer.close()
+    print(f"best evaluation score {trainer.best_score:.1f}: {trainer.best_checkpoint}")
+    print(f"metrics: {logdir / 'metrics.jsonl'}; curves: tensorboard --logdir {logdir}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(run(main))

@@ -1,0 +1,108 @@
+"""Checkpoints that are either whole or not there.
+
+A checkpoint is `<name>.pt` and, written after it, `<name>.json` with its SHA-256: a file without a matching manifest
+is torn. Both are written to a temporary name, flushed to disk and renamed.
+"""
+
+import hashlib
+import io
+import json
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from msk_ray.errors import CheckpointError, StorageError
+
+FORMAT = 1
+_EPOCH_NAME = re.compile(r"epoch_(\d+)\.pt")
+
+
+def write_atomically(path: Path, payload: bytes) -> None:
+    """Replace `path` by `payload` in one step that survives a crash.
+
+    Raises:
+        StorageError: the disk is full or the folder not writable; what was there before is untouched.
+    """
+    temporary = path.with_name(f".{path.name}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            file.write(payload)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise StorageError(f"cannot write {path}: {error.strerror or error}") from error
+
+
+def write_checkpoint(path: Path, state: dict[str, Any], facts: dict[str, Any]) -> Path:
+    """Write `state` to `path` and its manifest, with `facts` such as the epoch, beside it."""
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    payload = buffer.getvalue()
+    # A manifest left from before would vouch for the wrong payload if a crash came between the two writes.
+    manifest_path(path).unlink(missing_ok=True)
+    write_atomically(path, payload)
+    manifest = {"format": FORMAT, "sha256": hashlib.sha256(payload).hexdigest(), "bytes": len(payload), **facts}
+    write_atomically(manifest_path(path), json.dumps(manifest, indent=1).encode())
+    return path
+
+
+def manifest_path(path: Path) -> Path:
+    """Where the manifest of a checkpoint lies."""
+    return path.with_suffix(".json")
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """The state in a checkpoint, on CPU.
+
+    Raises:
+        CheckpointError: it is missing, torn, or of another format.
+    """
+    try:
+        payload = path.read_bytes()
+        manifest = json.loads(manifest_path(path).read_text())
+    except FileNotFoundError as error:
+        raise CheckpointError(f"no such checkpoint: {error.filename}") from None
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"cannot read checkpoint {path}: {error}") from error
+    if manifest.get("format") != FORMAT:
+        raise CheckpointError(f"{path} has checkpoint format {manifest.get('format')}, this version reads {FORMAT}")
+    if hashlib.sha256(payload).hexdigest() != manifest.get("sha256"):
+        raise CheckpointError(
+            f"{path} is torn: {len(payload)} bytes of {manifest.get('bytes')}, checksum differs; use an older one of "
+            f"{path.parent}"
+        )
+    state: dict[str, Any] = torch.load(io.BytesIO(payload), map_location="cpu", weights_only=True)
+    return state
+
+
+def epoch_checkpoints(folder: Path) -> list[Path]:
+    """Numbered checkpoints of a folder, newest first."""
+    if not folder.is_dir():
+        return []
+    numbered = [(int(m.group(1)), p) for p in folder.iterdir() if (m := _EPOCH_NAME.fullmatch(p.name))]
+    return [path for _, path in sorted(numbered, reverse=True)]
+
+
+def newest_valid_checkpoint(folder: Path) -> tuple[Path | None, list[str]]:
+    """The newest numbered checkpoint that reads whole, and a line on each newer one that does not."""
+    faults = []
+    for path in epoch_checkpoints(folder):
+        try:
+            read_checkpoint(path)
+        except CheckpointError as error:
+            faults.append(str(error))
+        else:
+            return path, faults
+    return None, faults
+
+
+def prune_checkpoints(folder: Path, keep: int) -> None:
+    """Delete all but the `keep` newest numbered checkpoints."""
+    for path in epoch_checkpoints(folder)[keep:]:
+        path.unlink()
+        manifest_path(path).unlink(missing_ok=True)

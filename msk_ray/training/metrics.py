@@ -1,0 +1,80 @@
+"""A trial's own record: one JSON object a line, flushed as it happens, and TensorBoard beside it."""
+
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+from torch.utils.tensorboard import SummaryWriter
+
+from msk_ray.errors import StorageError
+from msk_ray.training.checkpoint import write_atomically
+
+METRICS_FILE = "metrics.jsonl"
+
+
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """Rows of a metrics file in order of epoch, each epoch once (its latest row); a torn last line is left out."""
+    if not path.is_file():
+        return []
+    rows: dict[int, dict[str, Any]] = {}
+    lines = path.read_text(encoding="utf-8").splitlines()
+    for number, line in enumerate(lines, start=1):
+        try:
+            row = json.loads(line)
+        except ValueError as error:
+            if number == len(lines):
+                break  # the writer was killed in the middle of it
+            raise StorageError(f"{path}, line {number} is not JSON: {error}") from error
+        rows[int(row["epoch"])] = row
+    return [rows[epoch] for epoch in sorted(rows)]
+
+
+class MetricsLog:
+    """Appends rows to `metrics.jsonl` and TensorBoard in a trial's folder.
+
+    A value that is not finite is written as null and named in the row's `nonfinite` list: JSON has no NaN.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / METRICS_FILE
+        self._board: SummaryWriter | None = None
+        self._folder = folder
+
+    def rewind(self, epoch: int) -> None:
+        """Drop rows after `epoch`, which a resumed trial will write again."""
+        rows = [row for row in read_metrics(self._path) if row["epoch"] <= epoch]
+        write_atomically(self._path, "".join(json.dumps(row) + "\n" for row in rows).encode())
+        self.close()
+        self._board = SummaryWriter(str(self._folder), purge_step=epoch + 1)
+
+    def write(self, row: dict[str, float]) -> None:
+        """Append one row; it is on its way to disk when this returns.
+
+        Raises:
+            StorageError: the disk is full or gone.
+        """
+        bad = [name for name, value in row.items() if not math.isfinite(value)]
+        clean: dict[str, Any] = {name: None if name in bad else value for name, value in row.items()}
+        clean["epoch"] = int(row["epoch"])
+        if bad:
+            clean["nonfinite"] = bad
+        try:
+            with self._path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(clean) + "\n")
+                file.flush()
+                os.fsync(file.fileno())
+            if self._board is None:
+                self._board = SummaryWriter(str(self._folder))
+            for name, value in row.items():
+                if name not in bad and name != "epoch":
+                    self._board.add_scalar(name, value, clean["epoch"])
+        except OSError as error:
+            raise StorageError(f"cannot write {self._path}: {error.strerror or error}") from error
+
+    def close(self) -> None:
+        """Flush and close TensorBoard's file."""
+        if self._board is not None:
+            self._board.close()
+            self._board = None

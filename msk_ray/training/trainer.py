@@ -1,0 +1,205 @@
+"""The trainer: epochs of SHAC with evaluation, logs and checkpoints in one folder."""
+
+import math
+import time
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+from msk_ray.config import Config, dump_yaml
+from msk_ray.envs import make_env
+from msk_ray.errors import CheckpointError, StorageError
+from msk_ray.shac import Shac
+from msk_ray.training.checkpoint import (
+    newest_valid_checkpoint,
+    prune_checkpoints,
+    read_checkpoint,
+    write_atomically,
+    write_checkpoint,
+)
+from msk_ray.training.evaluation import Evaluator
+from msk_ray.training.metrics import MetricsLog
+
+# Settings that may differ between a checkpoint and the trial that goes on from it.
+_EXTENDABLE = {"trial": {"checkpoint_interval", "keep_checkpoints"}}
+
+
+class Trainer:
+    """One trial in this process.
+
+    Writes `config.yaml`, `metrics.jsonl`, TensorBoard events and `checkpoints/` under `logdir`. Call `run_epoch` until
+    `finished`; or `restore_latest` first to go on from the newest whole checkpoint, which on CPU gives exactly the
+    metrics of an uninterrupted run.
+
+    Attributes:
+        epoch: epochs done.
+        best_score: highest evaluation score so far, -inf before the first.
+
+    Raises:
+        DeviceError, UnsupportedModelError, StorageError: as their messages say.
+    """
+
+    def __init__(self, config: Config, logdir: Path, device: str) -> None:
+        self.config = config
+        self.logdir = logdir
+        self.epoch = 0
+        self.env_steps = 0
+        self.best_score = -math.inf
+        self._seconds = 0.0
+        try:
+            self.checkpoints.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise StorageError(f"cannot create {self.checkpoints}: {error.strerror or error}") from error
+        write_atomically(logdir / "config.yaml", dump_yaml(config.as_dict()).encode())
+        self.env = make_env(config.env, config.physics, config.env.nworld, device, config.trial.seed)
+        self.shac = Shac(config, self.env)
+        self.evaluator = Evaluator(config, device)
+        self._log = MetricsLog(logdir)
+
+    @property
+    def checkpoints(self) -> Path:
+        """Folder of the checkpoints."""
+        return self.logdir / "checkpoints"
+
+    @property
+    def best_checkpoint(self) -> Path:
+        """Checkpoint of the policy with the best evaluation score."""
+        return self.checkpoints / "best.pt"
+
+    @property
+    def finished(self) -> bool:
+        """Whether all epochs are done."""
+        return self.epoch >= self.config.trial.epochs
+
+    def run_epoch(self) -> dict[str, float]:
+        """Train one epoch, evaluate and checkpoint when due, and write one row of metrics.
+
+        Returns:
+            The row: `epoch`, `env_steps`, `seconds` of training so far, `env_steps_per_s`, `train/*`, `grad/*`,
+            `time/*`, `physics/*`, and on evaluation epochs `eval/*`.
+
+        Raises:
+            SimulationError: the gradient or the physics failed; the last checkpoint stays as it is.
+        """
+        if self.epoch == 0:
+            self._evaluate_initial()
+        started = time.perf_counter()
+        metrics = self.shac.update(self.epoch)
+        self.epoch += 1
+        steps = int(metrics["train/horizon"]) * self.env.nworld
+        self.env_steps += steps
+        elapsed = time.perf_counter() - started
+        if self.epoch % self.config.evaluation.interval == 0 or self.finished:
+            metrics |= self._evaluate()
+        self._seconds += time.perf_counter() - started
+        row = self._row(metrics | {"env_steps_per_s": steps / elapsed})
+        self._log.write(row)
+        if self.epoch % self.config.trial.checkpoint_interval == 0 or self.finished:
+            self.save()
+        return row
+
+    def save(self) -> Path:
+        """Write a checkpoint of everything and return its path; one that is there already is kept."""
+        path = self.checkpoints / f"epoch_{self.epoch:06d}.pt"
+        self._write(path)
+        prune_checkpoints(self.checkpoints, self.config.trial.keep_checkpoints)
+        return path
+
+    def restore(self, path: Path, changed: Collection[str] = ()) -> None:
+        """Go on from a checkpoint.
+
+        Args:
+            path: the checkpoint.
+            changed: dotted settings that may differ from those it was written under.
+
+        Raises:
+            CheckpointError: it is missing, torn, or was written under other settings.
+        """
+        state = read_checkpoint(path)
+        difference = _first_difference(state["config"], self.config.as_dict(), changed)
+        if difference:
+            raise CheckpointError(f"{path} was written under other settings: {difference}")
+        self.shac.load_state_dict(_to_device(state["shac"], self.env.device))
+        self.epoch, self.env_steps = state["epoch"], state["env_steps"]
+        self.best_score, self._seconds = state["best_score"], state["seconds"]
+        self._log.rewind(self.epoch)
+
+    def restore_latest(self) -> tuple[Path | None, list[str]]:
+        """Go on from the newest whole checkpoint, if there is one.
+
+        Returns:
+            Its path or None, and a line on each newer checkpoint that was torn.
+        """
+        path, faults = newest_valid_checkpoint(self.checkpoints)
+        if path is not None:
+            self.restore(path)
+        return path, faults
+
+    def close(self) -> None:
+        """Flush the logs."""
+        self._log.close()
+
+    def _evaluate_initial(self) -> None:
+        self._log.write(self._row(self._evaluate()))
+
+    def _evaluate(self) -> dict[str, float]:
+        started = time.perf_counter()
+        figures = self.evaluator.run(self.shac.policy)
+        if figures["score"] > self.best_score:
+            self.best_score = figures["score"]
+            self._write(self.best_checkpoint)
+        return {f"eval/{name}": value for name, value in figures.items()} | {
+            "eval/best_score": self.best_score,
+            "time/evaluation_s": time.perf_counter() - started,
+        }
+
+    def _row(self, metrics: dict[str, float]) -> dict[str, float]:
+        return {"epoch": self.epoch, "env_steps": self.env_steps, "seconds": self._seconds, **metrics}
+
+    def _write(self, path: Path) -> None:
+        state = {
+            "config": self.config.as_dict(),
+            "epoch": self.epoch,
+            "env_steps": self.env_steps,
+            "seconds": self._seconds,
+            "best_score": self.best_score,
+            "shac": self.shac.state_dict(),
+        }
+        write_checkpoint(path, state, {"epoch": self.epoch, "best_score": self.best_score})
+
+
+def precompile(config: Config, device: str, logdir: Path) -> None:
+    """Compile every kernel this configuration needs into Warp's cache, by one epoch of a two-step horizon."""
+    tiny = config.as_dict()
+    tiny["shac"] |= {"horizon": 2, "critic_iterations": 1, "critic_batches": 1}
+    tiny["evaluation"] |= {"steps": 1}
+    tiny["trial"] |= {"epochs": 1}
+    trainer = Trainer(Config.model_validate(tiny), logdir, device)
+    trainer.run_epoch()
+    trainer.close()
+
+
+def _first_difference(
+    old: dict[str, Any], new: dict[str, Any], changed: Collection[str], prefix: str = ""
+) -> str | None:
+    """The first setting two configurations differ in, apart from those that may."""
+    for key in {**old, **new}:
+        if key in _EXTENDABLE.get(prefix.rstrip("."), set()) or f"{prefix}{key}" in changed:
+            continue
+        before, after = old.get(key), new.get(key)
+        if isinstance(before, dict) and isinstance(after, dict):
+            nested = _first_difference(before, after, changed, f"{prefix}{key}.")
+            if nested:
+                return nested
+        elif before != after:
+            return f"{prefix}{key} was {before!r}, now {after!r}"
+    return None
+
+
+def _to_device(value: Any, device: Any) -> Any:
+    """Nested containers with every tensor moved to a device."""
+    if isinstance(value, dict):
+        return {k: _to_device(v, device) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_to_device(v, device) for v in value]
+    return value.to(device) if hasattr(value, "to") else value
