@@ -32,7 +32,7 @@ _KEPT_DATA = (
 _KEPT_EFC = ("type", "id", "J", "J_rownnz", "J_rowadr", "J_colind", "D", "aref", "frictionloss", "pos", "margin")
 _KEPT_CONTACT = (
     *("dist", "pos", "frame", "includemargin", "friction", "solref", "solreffriction", "solimp", "dim", "geom"),
-    *("efc_address", "worldid"),
+    *("efc_address", "worldid", "geomcollisionid"),
 )
 
 

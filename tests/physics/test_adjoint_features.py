@@ -77,7 +77,8 @@ SCENES = {
     "motor": lambda: scene('<actuator><motor joint="a" gear="3" ctrllimited="true" ctrlrange="-1 1"/></actuator>'),
     "position": lambda: scene('<actuator><position joint="c" kp="30" kv="2"/><velocity joint="d" kv="3"/></actuator>'),
     "affine_gain": lambda: scene(
-        '<actuator><general joint="a" gaintype="affine" gainprm="3 2 -1" biastype="affine" biasprm=".3 -4 -1"/></actuator>'
+        '<actuator><general joint="a" gaintype="affine" gainprm="3 2 -1" biastype="affine"'
+        ' biasprm=".3 -4 -1"/></actuator>'
     ),
     "force_limit": lambda: scene(
         '<actuator><motor joint="a" gear="3" forcelimited="true" forcerange="-.2 .2"/><motor joint="c"/></actuator>'
@@ -125,7 +126,8 @@ SCENES = {
     "fast_fixed_tendon": lambda: _tendon(_FIXED.format('stiffness="5" damping=".6"'), _SERVO, option=_FAST),
     "fast_site_tendon": lambda: _tendon(_PATH.format('damping="2"'), _SERVO, option=_FAST),
     "fast_affine_gain": lambda: scene(
-        '<actuator><general joint="a" gaintype="affine" gainprm="3 2 -1" biastype="affine" biasprm=".3 -4 -1"/></actuator>',
+        '<actuator><general joint="a" gaintype="affine" gainprm="3 2 -1" biastype="affine"'
+        ' biasprm=".3 -4 -1"/></actuator>',
         option=_FAST,
     ),
     "fast_muscle": lambda: _tendon(_SPHERE.format('sidesite="side"'), _MUSCLE, option=_FAST),

@@ -140,7 +140,7 @@ def _lone_free_bodies(m: mujoco.MjModel) -> list[str]:
 
 
 def _branching_tendons(m: mujoco.MjModel) -> list[str]:
-    """Spatial tendons whose velocity-dependent force couples dofs that the inertia does not: implicitfast drops those."""
+    """Spatial tendons whose force couples dofs that the inertia does not: implicitfast drops those slopes."""
     if m.opt.integrator != int(_INTEGRATOR.mjINT_IMPLICITFAST):
         return []
     found = []
@@ -211,9 +211,37 @@ def _pairs(kinds: set[tuple[int, int]] | None, known: set[tuple[int, int]]) -> F
     return find
 
 
-_PLANE_ROUND = {(int(_GEOM.mjGEOM_PLANE), int(t)) for t in (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE)}
-_PLANE_CORNERED = {(int(_GEOM.mjGEOM_PLANE), int(t)) for t in (_GEOM.mjGEOM_BOX, _GEOM.mjGEOM_MESH)}
-_KNOWN_PAIRS = _PLANE_ROUND | _PLANE_CORNERED
+def _odd_surfaces(m: mujoco.MjModel) -> list[str]:
+    found: set[int] = set()
+    for field in ("geom_adhesion", "geom_surfacevel"):
+        values = getattr(m, field, None)
+        if values is not None:
+            found |= {int(i) for i in np.flatnonzero(np.any(np.asarray(values).reshape(m.ngeom, -1) != 0, axis=1))}
+    return _named(m, _OBJ.mjOBJ_GEOM, "geom", sorted(found))
+
+
+def _types(first: Iterable[int], second: Iterable[int]) -> set[tuple[int, int]]:
+    return {(int(a), int(b)) for a in first for b in second}
+
+
+_EXACT_PAIRS = (
+    _types(
+        [_GEOM.mjGEOM_PLANE],
+        [
+            *(_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_ELLIPSOID, _GEOM.mjGEOM_CYLINDER),
+            *(_GEOM.mjGEOM_BOX, _GEOM.mjGEOM_MESH),
+        ],
+    )
+    | _types(
+        [_GEOM.mjGEOM_SPHERE], [_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_BOX]
+    )
+    | _types([_GEOM.mjGEOM_CAPSULE], [_GEOM.mjGEOM_CAPSULE])
+)
+_SOLIDS = [
+    *(_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_ELLIPSOID, _GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_BOX),
+    _GEOM.mjGEOM_MESH,
+]
+_KNOWN_PAIRS = _EXACT_PAIRS | _types(_SOLIDS, _SOLIDS)
 _DYN = mujoco.mjtDyn
 
 
@@ -250,9 +278,23 @@ FEATURES: tuple[Feature, ...] = (
         False,
         _option(lambda m: bool(m.opt.density or m.opt.viscosity or np.any(m.opt.wind)), "option density or viscosity"),
     ),
-    Feature("contact of a plane with a sphere or capsule", True, _pairs(_PLANE_ROUND, set())),
-    Feature("contact of a plane with a box or mesh", True, _pairs(_PLANE_CORNERED, set())),
-    Feature("contact of other geometry pairs", False, _pairs(None, _KNOWN_PAIRS)),
+    Feature(
+        "contacts, pyramidal and elliptic cones, condim 1, 3, 4, 6", True, _option(lambda m: m.ngeom > 1, "geoms")
+    ),
+    Feature(
+        "contact of a plane with sphere, capsule, ellipsoid, cylinder, box, mesh; sphere with sphere, capsule, "
+        "cylinder, box; capsule with capsule",
+        True,
+        _pairs(_EXACT_PAIRS, set()),
+    ),
+    Feature(
+        "contact of other convex pairs (boxes, cylinders, ellipsoids, meshes)",
+        True,
+        _pairs(_KNOWN_PAIRS - _EXACT_PAIRS, set()),
+        "distance exact; the contact point and frame are taken to follow the mean of both bodies",
+    ),
+    Feature("contact with height fields and signed distance fields", False, _pairs(None, _KNOWN_PAIRS)),
+    Feature("contact adhesion and surface velocity", False, _odd_surfaces),
     Feature("fixed tendons", True, _tendon(lambda m: ~_spatial_tendons(m))),
     Feature("spatial tendons: sites, pulleys, sphere and cylinder wrapping", True, _tendon(_spatial_tendons)),
     Feature("tendons that wrap inside a geom", False, _inside_wraps),

@@ -18,6 +18,7 @@ from msk_ray.physics.adjoint import (
     actuation,
     bodies,
     contacts,
+    geometry,
     integrate,
     joints,
     rows,
@@ -588,7 +589,7 @@ class StepAdjoint:
             ],
         )
         wp.launch(
-            contacts.pull_geometry,
+            geometry.pull_geometry,
             dim=d.naconmax,
             inputs=[
                 m.body_rootid,
@@ -600,6 +601,7 @@ class StepAdjoint:
                 d.contact.pos,
                 d.contact.frame,
                 d.contact.geom,
+                d.contact.geomcollisionid,
                 d.contact.efc_address,
                 d.contact.worldid,
                 d.geom_xpos,
