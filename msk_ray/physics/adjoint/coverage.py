@@ -80,6 +80,13 @@ def _joint_transmission(*kinds: int) -> Finder:
     return _where(_OBJ.mjOBJ_ACTUATOR, "actuator", test)
 
 
+def _site_transmission(referred: bool) -> Finder:
+    def test(m: mujoco.MjModel) -> np.ndarray:
+        return np.asarray((m.actuator_trntype == int(_TRN.mjTRN_SITE)) & ((m.actuator_trnid[:, 1] >= 0) == referred))
+
+    return _where(_OBJ.mjOBJ_ACTUATOR, "actuator", test)
+
+
 def _tendon(test: Callable[[mujoco.MjModel], np.ndarray]) -> Finder:
     return _where(_OBJ.mjOBJ_TENDON, "tendon", test)
 
@@ -278,9 +285,7 @@ FEATURES: tuple[Feature, ...] = (
         False,
         _option(lambda m: bool(m.opt.density or m.opt.viscosity or np.any(m.opt.wind)), "option density or viscosity"),
     ),
-    Feature(
-        "contacts, pyramidal and elliptic cones, condim 1, 3, 4, 6", True, _option(lambda m: m.ngeom > 1, "geoms")
-    ),
+    Feature("contacts, pyramidal and elliptic cones, condim 1, 3, 4, 6", True, _option(lambda m: m.ngeom > 1, "geoms")),
     Feature(
         "contact of a plane with sphere, capsule, ellipsoid, cylinder, box, mesh; sphere with sphere, capsule, "
         "cylinder, box; capsule with capsule",
@@ -308,7 +313,12 @@ FEATURES: tuple[Feature, ...] = (
     ),
     Feature("implicitfast with a free body that has no other joints", False, _lone_free_bodies),
     Feature("joint and tendon equalities", True, _equality(_EQ.mjEQ_JOINT, _EQ.mjEQ_TENDON)),
-    Feature("connect and weld equalities", False, _equality(_EQ.mjEQ_CONNECT, _EQ.mjEQ_WELD)),
+    Feature(
+        "connect and weld equalities",
+        False,
+        _equality(_EQ.mjEQ_CONNECT, _EQ.mjEQ_WELD),
+        "mujoco_warp 4.0.0 builds their reference from the velocity stage of the step before: state outside the step",
+    ),
     Feature(
         "flex equalities",
         False,
@@ -328,9 +338,15 @@ FEATURES: tuple[Feature, ...] = (
         _where(_OBJ.mjOBJ_ACTUATOR, "actuator", _foreign_actuator),
     ),
     Feature("transmission to hinge and slide joints", True, _joint_transmission(_JNT.mjJNT_HINGE, _JNT.mjJNT_SLIDE)),
-    Feature("transmission to free and ball joints", False, _joint_transmission(_JNT.mjJNT_FREE, _JNT.mjJNT_BALL)),
+    Feature(
+        "transmission to free and ball joints, also in the parent's frame",
+        True,
+        _joint_transmission(_JNT.mjJNT_FREE, _JNT.mjJNT_BALL),
+        "a rotational servo more than half a turn from its target is not wrapped",
+    ),
     Feature("transmission to tendons", True, _actuator("actuator_trntype", _TRN.mjTRN_TENDON)),
-    Feature("transmission to sites", False, _actuator("actuator_trntype", _TRN.mjTRN_SITE)),
+    Feature("transmission to sites", True, _site_transmission(False)),
+    Feature("transmission to sites with a reference site", False, _site_transmission(True)),
     Feature(
         "transmission to slider-cranks and bodies (adhesion)",
         False,

@@ -77,9 +77,7 @@ def pair_score(
         dist_d, pos_d, normal_d = sphere_box(pos1, size1[0], pos2, mat2, size2)
         score = dist_weight * dist_d + wp.dot(pos_weight, pos_d) + wp.dot(normal_weight, normal_d)
     elif type1 == GeomType.CAPSULE and type2 == GeomType.CAPSULE:
-        dist_e, pos_e, normal_e = capsule_capsule(
-            pos1, axis1, size1[0], size1[1], pos2, axis2, size2[0], size2[1]
-        )
+        dist_e, pos_e, normal_e = capsule_capsule(pos1, axis1, size1[0], size1[1], pos2, axis2, size2[0], size2[1])
         score = dist_weight * dist_e[index]
         score += wp.dot(pos_weight, pos_e[index]) + wp.dot(normal_weight, normal_e[index])
     elif type1 == GeomType.PLANE and type2 == GeomType.CYLINDER:
@@ -96,10 +94,7 @@ def is_scored(type1: int, type2: int) -> bool:
     """Whether `pair_score` knows the pair."""
     if type1 == GeomType.SPHERE:
         return (
-            type2 == GeomType.SPHERE
-            or type2 == GeomType.CAPSULE
-            or type2 == GeomType.CYLINDER
-            or type2 == GeomType.BOX
+            type2 == GeomType.SPHERE or type2 == GeomType.CAPSULE or type2 == GeomType.CYLINDER or type2 == GeomType.BOX
         )
     if type1 == GeomType.CAPSULE:
         return type2 == GeomType.CAPSULE

@@ -25,6 +25,7 @@ from msk_ray.physics.adjoint import (
     scalar_rows,
     solve,
     tendons,
+    transmission,
     wrapping,
 )
 from msk_ray.physics.adjoint.stages import implicit_matrix
@@ -160,6 +161,7 @@ class StepAdjoint:
         self._pull_contacts(data)
         if self._has_actuators:
             self._pull_actuators(data)
+            self._pull_transmissions(data)
         if self._tables.has_turning_spring:
             self._pull_turning_springs(data)
         if self.mjm.ntendon:
@@ -680,6 +682,62 @@ class StepAdjoint:
                 self._rate_bar,
             ],
         )
+
+    def _pull_transmissions(self, d: Any) -> None:
+        m = self.model
+        if self._tables.has_turning_transmission:
+            wp.launch(
+                transmission.pull_turning_joints,
+                dim=(self.nworld, m.nactuator),
+                inputs=[
+                    m.jnt_type,
+                    m.jnt_qposadr,
+                    m.jnt_dofadr,
+                    m.actuator_trntype,
+                    m.actuator_trnid,
+                    m.actuator_gear,
+                    d.qpos,
+                    d.qvel,
+                    d.qacc,
+                    self._lam,
+                    self._mu,
+                    self._excess,
+                    d.moment_rowadr,
+                    d.actuator_moment,
+                    self._length_bar,
+                    self._rate_bar,
+                ],
+                outputs=[self._phi_qpos],
+            )
+        if self._tables.has_site_transmission:
+            wp.launch(
+                transmission.pull_sites,
+                dim=(self.nworld, m.nactuator),
+                inputs=[
+                    m.body_rootid,
+                    m.site_bodyid,
+                    m.actuator_trntype,
+                    m.actuator_trnid,
+                    m.actuator_gear,
+                    d.site_xpos,
+                    d.site_xmat,
+                    d.subtree_com,
+                    self._rate_bar,
+                    self._lam_field,
+                    d.cvel,
+                    self._qacc_field,
+                    self._mu_field,
+                    self._excess_field,
+                ],
+                outputs=[
+                    self._lam_bar,
+                    self._qvel_bar,
+                    self._qacc_bar,
+                    self._mu_bar,
+                    self._excess_bar,
+                    self._moved_bar,
+                ],
+            )
 
     def _sweep(self, d: Any) -> None:
         m = self.model
