@@ -66,7 +66,8 @@ class TapedStep:
             end = WarpState(*(wp.clone(getattr(data, n), requires_grad=tape is not None) for n in WarpState._fields))
         if tape is not None:
             held = wp.clone(ctrl, requires_grad=False)
-            tape.record_func(lambda: self._pull_back(held, ctrl, state, end, kept), [a for a in (ctrl, *state, *end) if a.requires_grad])
+            arrays = [array for array in (ctrl, *state, *end) if array.requires_grad]
+            tape.record_func(lambda: self._pull_back(held, ctrl, state, end, kept), arrays)
         return end
 
     def _pull_back(

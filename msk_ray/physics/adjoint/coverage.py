@@ -218,6 +218,13 @@ def _pairs(kinds: set[tuple[int, int]] | None, known: set[tuple[int, int]]) -> F
     return find
 
 
+def _odd_flags(m: mujoco.MjModel) -> list[str]:
+    """Enabled flags that change constraints in ways the adjoint does not follow."""
+    flags = mujoco.mjtEnableBit
+    names = ("DIAGEXACT", "SPECULATIVE", "IPC")
+    return [f"flag {n.lower()}" for n in names if m.opt.enableflags & int(getattr(flags, f"mjENBL_{n}", 0))]
+
+
 def _odd_surfaces(m: mujoco.MjModel) -> list[str]:
     found: set[int] = set()
     for field in ("geom_adhesion", "geom_surfacevel"):
@@ -348,10 +355,19 @@ FEATURES: tuple[Feature, ...] = (
     Feature("transmission to sites", True, _site_transmission(False)),
     Feature("transmission to sites with a reference site", False, _site_transmission(True)),
     Feature(
-        "transmission to slider-cranks and bodies (adhesion)",
+        "transmission to slider-cranks, bodies (adhesion), SO(3)",
         False,
-        _actuator("actuator_trntype", _TRN.mjTRN_SLIDERCRANK, _TRN.mjTRN_BODY),
+        _where(
+            _OBJ.mjOBJ_ACTUATOR,
+            "actuator",
+            lambda m: (
+                ~_among(
+                    m.actuator_trntype, (_TRN.mjTRN_JOINT, _TRN.mjTRN_JOINTINPARENT, _TRN.mjTRN_TENDON, _TRN.mjTRN_SITE)
+                )
+            ),
+        ),
     ),
+    Feature("flags diagexact, speculative, ipc", False, _odd_flags),
     Feature("flexes", False, _option(lambda m: m.nflex > 0, "flex")),
     Feature("plugins", False, _option(lambda m: m.nplugin > 0, "plugin")),
 )

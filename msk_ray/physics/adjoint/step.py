@@ -28,6 +28,7 @@ from msk_ray.physics.adjoint import (
     transmission,
     wrapping,
 )
+from msk_ray.physics.adjoint.coverage import colliding_pairs
 from msk_ray.physics.adjoint.stages import implicit_matrix
 from msk_ray.physics.adjoint.tables import build_tables
 
@@ -66,6 +67,8 @@ class StepAdjoint:
         )
         self._implicit_all = mjm.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         self._spring_on = not disabled & bit.mjDSBL_SPRING
+        types = {(int(mjm.geom_type[a]), int(mjm.geom_type[b])) for a, b in colliding_pairs(mjm)}
+        self._scored_pairs = bool(types & geometry.SCORED_PAIRS)
         self._elliptic = mjm.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
         self._has_actuators = mjm.nu > 0 and not disabled & bit.mjDSBL_ACTUATION
 
@@ -94,8 +97,8 @@ class StepAdjoint:
             self._lam_bar, self._qvel_bar, self._cacc_bar = spatials(), spatials(), spatials()
             self._qacc_bar, self._moved_bar, self._cacc_sum = spatials(), spatials(), spatials()
             self._mu_bar, self._excess_bar = spatials(), spatials()
-            self._length_bar = floats(worlds, mjm.nu)
-            self._rate_bar = wp.zeros((worlds, mjm.nu), dtype=wp.vec4)
+            self._length_bar = floats(worlds, model.nactuator)
+            self._rate_bar = wp.zeros((worlds, model.nactuator), dtype=wp.vec4)
             count = max(mjm.ntendon, 1)
             segments = max(self._tables.segment_tendon.size, 1)
             self._touch = wp.full((worlds, segments), wp.spatial_vector(*([MJ_MAXVAL] * 6)), dtype=wp.spatial_vector)
@@ -591,7 +594,7 @@ class StepAdjoint:
             ],
         )
         wp.launch(
-            geometry.pull_geometry,
+            geometry.pull_geometry_kernel(self._scored_pairs),
             dim=d.naconmax,
             inputs=[
                 m.body_rootid,
