@@ -43,7 +43,7 @@ class _Tape(Backward):
         substep_grad_clip: bound on the Euclidean norm of each world's state cotangent between substeps, in the
             cotangent's own units; direction is kept. None for no bound.
         residual_tolerance: a world is counted as unconverged where the solver left more than this share of its
-            forces unbalanced, |Ma - τ - Jᵀf| / (|Ma| + |τ| + |Jᵀf|).
+            forces unbalanced, |Ma - τ - Jᵀf| / |(Ma, τ, Jᵀf)|.
     """
 
     def __init__(self, substep_grad_clip: float | None = None, residual_tolerance: float = 1e-3) -> None:
@@ -71,7 +71,7 @@ class _Tape(Backward):
             self._saved = pool.allocate()
             self._raw_qpos = wp.zeros((worlds, mjm.nq), dtype=float)
             self._clipped = wp.zeros(worlds, dtype=int)
-            self._gauge = ResidualGauge(batch.model, worlds)
+            self._gauge = ResidualGauge(self._adjoint.inertia_address, worlds)
         self._ctrl = wp.to_torch(batch.data.ctrl, requires_grad=False)
         adjoint = self._adjoint
         self.cotangent = StepState(

@@ -113,6 +113,11 @@ class StepAdjoint:
             self._phi_pos = wp.zeros(ncon, dtype=wp.vec3)
             self._phi_frame = wp.zeros(ncon, dtype=wp.mat33)
 
+    @property
+    def inertia_address(self) -> wp.array:
+        """Place of M_ij (j ≤ i) in the sparse inertia, -1 where it is zero; shape (nv, nv)."""
+        return self._tables.inertia_address
+
     def start(self, qpos: wp.array, raw_qpos: wp.array) -> None:
         """Launch the change of a raw cotangent (W, nq) at `qpos` to tangent coordinates, and find the live worlds.
 
