@@ -16,7 +16,7 @@ from torch import Tensor
 from msk_ray.physics import Graph, WorldBatch
 from msk_ray.physics.adjoint import StepAdjoint
 from msk_ray.physics.adjoint.coverage import check_supported
-from msk_ray.physics.adjoint.stages import recompute_stages
+from msk_ray.physics.adjoint.stages import recompute_stages, refresh_velocity
 from msk_ray.simulation.backward import Backward, InputGradients, Needs, StepState
 from msk_ray.simulation.buffers import stream_of
 from msk_ray.simulation.pool import Pool
@@ -24,7 +24,7 @@ from msk_ray.simulation.residual import ResidualGauge
 
 # Arrays of mujoco_warp.Data that the adjoint of a substep reads, besides the checkpointed state.
 _KEPT_DATA = (
-    *("cdof", "cdof_dot", "cvel", "cinert", "M", "nefc", "nacon", "subtree_com", "xipos"),
+    *("cdof", "cdof_dot", "cvel", "cinert", "M", "nefc", "nacon", "subtree_com", "xipos", "xpos", "xmat"),
     *("geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "ten_J", "ten_length", "ten_velocity", "act_dot"),
     *("actuator_velocity", "actuator_force"),
     *("actuator_length", "moment_rownnz", "moment_rowadr", "moment_colind", "actuator_moment", "qfrc_actuator"),
@@ -140,6 +140,7 @@ class TapePerSubstep(_Tape):
         for state in self._states:
             for name in ("qpos", "qvel", "act"):
                 wp.copy(state[name], getattr(data, name))
+            refresh_velocity(batch.mjm, batch.model, data)
             mjw.step(batch.model, data)
             wp.copy(state["qacc"], data.qacc)
             self._gauge.launch(data)
@@ -179,6 +180,7 @@ class TapeAll(_Tape):
                 wp.copy(getattr(data, name), getattr(before, name))
             for name in ("qpos", "qvel", "act"):
                 wp.copy(state[name], getattr(before, name))
+            refresh_velocity(batch.mjm, batch.model, data)
             mjw.step(batch.model, data)
             wp.copy(state["qacc"], data.qacc)
             self._gauge.launch(data)
