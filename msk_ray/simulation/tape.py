@@ -8,7 +8,6 @@ nothing is solved); `tape_all` keeps them.
 from abc import abstractmethod
 from typing import Any
 
-import mujoco_warp as mjw
 import torch
 import warp as wp
 from torch import Tensor
@@ -16,7 +15,7 @@ from torch import Tensor
 from msk_ray.physics import Graph, WorldBatch
 from msk_ray.physics.adjoint import StepAdjoint
 from msk_ray.physics.adjoint.coverage import check_supported
-from msk_ray.physics.adjoint.stages import recompute_stages, refresh_velocity
+from msk_ray.physics.adjoint.stages import recompute_stages
 from msk_ray.simulation.backward import Backward, InputGradients, Needs, StepState
 from msk_ray.simulation.buffers import stream_of
 from msk_ray.simulation.pool import Pool
@@ -140,8 +139,7 @@ class TapePerSubstep(_Tape):
         for state in self._states:
             for name in ("qpos", "qvel", "act"):
                 wp.copy(state[name], getattr(data, name))
-            refresh_velocity(batch.mjm, batch.model, data)
-            mjw.step(batch.model, data)
+            batch.launch_substep(data)
             wp.copy(state["qacc"], data.qacc)
             self._gauge.launch(data)
         for name, array in self._last.items():
@@ -180,8 +178,7 @@ class TapeAll(_Tape):
                 wp.copy(getattr(data, name), getattr(before, name))
             for name in ("qpos", "qvel", "act"):
                 wp.copy(state[name], getattr(before, name))
-            refresh_velocity(batch.mjm, batch.model, data)
-            mjw.step(batch.model, data)
+            batch.launch_substep(data)
             wp.copy(state["qacc"], data.qacc)
             self._gauge.launch(data)
             before = data

@@ -115,7 +115,8 @@ SCENES = {
         "</equality>"
     ),
     "connect_world": lambda: scene(
-        '<equality><connect body1="hand" body2="world" anchor=".05 .02 0" solref=".05 1" solimp=".5 .9 .3 .5 2"/></equality>'
+        '<equality><connect body1="hand" body2="world" anchor=".05 .02 0" solref=".05 1" solimp=".5 .9 .3 .5 2"/>'
+        "</equality>"
     ),
     "connect_bodies": lambda: scene(
         '<equality><connect body1="hand" body2="other" anchor=".05 .02 0" solref=".1 1"/></equality>'

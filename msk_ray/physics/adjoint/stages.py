@@ -7,17 +7,7 @@ import mujoco_warp as mjw
 import numpy as np
 from mujoco_warp._src.derivative import deriv_smooth_vel
 
-
-def refresh_velocity(mjm: mujoco.MjModel, model: Any, data: Any) -> None:
-    """Launch the velocity stage early where constraints are built from it.
-
-    mujoco_warp 4.0.0 builds connect rows in its position stage from the body velocities in `data`, which are those of
-    the step before unless this comes first.
-    """
-    if np.any(mjm.eq_type == int(mujoco.mjtEq.mjEQ_CONNECT)):
-        mjw.kinematics(model, data)
-        mjw.com_pos(model, data)
-        mjw.com_vel(model, data)
+from msk_ray.physics.batch import refresh_velocity
 
 
 def recompute_stages(mjm: mujoco.MjModel, model: Any, data: Any) -> None:
