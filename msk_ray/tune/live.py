@@ -4,8 +4,10 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
+from ray.exceptions import RayActorError
 from ray.tune import Callback
 
 from msk_ray.cli import StopRequest
@@ -192,8 +194,11 @@ def time_left(running: list[tuple[int, float | None]], waiting: list[int], concu
     return slots[-1]
 
 
-def _reason(error_file: Any, trial: Any) -> str:
+def _reason(error_file: Path, trial: Any) -> str:
     """Why Ray gave a trial up, on one line."""
     if error_file.is_file():
-        return str(error_file.read_text(encoding="utf-8").strip().splitlines()[-1])
-    return f"its process died {trial.num_failures} times (killed, or out of memory)"
+        return error_file.read_text(encoding="utf-8").strip().splitlines()[-1]
+    error = trial.get_pickled_error()
+    if error is None or isinstance(error, RayActorError):
+        return f"its process died {trial.num_failures} times (killed, or out of memory)"
+    return str(error).strip().splitlines()[-1]
