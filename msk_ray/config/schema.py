@@ -102,8 +102,11 @@ class PhysicsConfig(Section):
 
     variant: str | None = None
     """Named physics of the environment: for ant `published`, `matched` or `matched_hard_friction`."""
-    backward: Literal["fd_jacobian"] = "fd_jacobian"
-    """Backward mode of the step."""
+    backward: Literal["tape_per_substep", "tape_all", "fd_jacobian", "hybrid"] = "tape_per_substep"
+    """Backward mode of the step. `tape_*` are exact; `fd_jacobian` differentiates any model by finite differences;
+    `hybrid` takes the state's gradient from the tape and the control's from finite differences, for diagnosis."""
+    substep_grad_clip: PositiveFloat | None = None
+    """Bound on each world's state cotangent between substeps, in the loss's own units; null leaves it. Tapes only."""
     fd: FdConfig = FdConfig()
     substeps: PositiveInt | None = None
     """Physics steps an env step. Set this or `timestep`; 4 if neither is set."""

@@ -1,13 +1,12 @@
 """Environments: observation and reward as torch functions of (qpos, qvel, act), so that both stay in the graph."""
 
-from collections.abc import Callable
 from typing import Any
 
 from msk_ray.config import EnvConfig, FdConfig, PhysicsConfig
 from msk_ray.envs.ant import Ant
 from msk_ray.envs.base import Env, EnvState, Transition
 from msk_ray.envs.cartpole import CartPole
-from msk_ray.simulation import Backward, FdJacobian
+from msk_ray.simulation import Backward, FdJacobian, Hybrid, TapeAll, TapePerSubstep
 
 __all__ = ["Ant", "CartPole", "Env", "EnvState", "Transition", "env_class", "make_backward", "make_env"]
 
@@ -16,12 +15,17 @@ def _fd_jacobian(fd: FdConfig) -> Backward:
     return FdJacobian(eps_ctrl=fd.eps_ctrl, eps_qpos=fd.eps_qpos, eps_qvel=fd.eps_qvel, max_worlds=fd.max_worlds)
 
 
-_BACKWARD: dict[str, Callable[[PhysicsConfig], Backward]] = {"fd_jacobian": lambda physics: _fd_jacobian(physics.fd)}
-
-
 def make_backward(physics: PhysicsConfig) -> Backward:
     """The backward mode a physics section names."""
-    return _BACKWARD[physics.backward](physics)
+    match physics.backward:
+        case "tape_per_substep":
+            return TapePerSubstep(physics.substep_grad_clip)
+        case "tape_all":
+            return TapeAll(physics.substep_grad_clip)
+        case "fd_jacobian":
+            return _fd_jacobian(physics.fd)
+        case "hybrid":
+            return Hybrid(TapePerSubstep(physics.substep_grad_clip), _fd_jacobian(physics.fd))
 
 
 _ENVS: dict[str, type[Env[Any]]] = {"cartpole": CartPole, "ant": Ant}

@@ -71,10 +71,7 @@ class _Tape(Backward):
         self._ctrl = wp.to_torch(batch.data.ctrl, requires_grad=False)
         adjoint = self._adjoint
         self._cotangent = StepState(
-            *(
-                wp.to_torch(a, requires_grad=False)
-                for a in (self._raw_qpos, adjoint.grad_qvel, adjoint.grad_act)
-            )
+            *(wp.to_torch(a, requires_grad=False) for a in (self._raw_qpos, adjoint.grad_qvel, adjoint.grad_act))
         )
         self._grad_ctrl = wp.to_torch(adjoint.grad_ctrl, requires_grad=False)
         self._graph: Graph | None = None
