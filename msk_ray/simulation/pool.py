@@ -22,11 +22,16 @@ class Pool:
         self._claims.append((lambda array: holder.__setitem__(name, array), shape, wp.float32))
 
     def adopt(self, holder: Any, name: str) -> None:
-        """Claim the place of the array `holder.name`, which is replaced; its contents are lost."""
+        """Claim the place of the array `holder.name`, which is replaced by a copy there."""
         old = getattr(holder, name)
         assert old.is_contiguous, name
         assert wp.types.type_size_in_bytes(old.dtype) % 4 == 0, name
-        self._claims.append((lambda array: setattr(holder, name, array), old.shape, old.dtype))
+
+        def place(array: wp.array) -> None:
+            wp.copy(array, old)
+            setattr(holder, name, array)
+
+        self._claims.append((place, old.shape, old.dtype))
 
     def allocate(self) -> Tensor:
         """Place all arrays; the buffer as one float32 tensor, which must outlive them."""

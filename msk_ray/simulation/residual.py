@@ -42,7 +42,7 @@ class ResidualGauge:
 
     def read(self, tolerance: float) -> dict[str, float]:
         """Largest and mean share over worlds, and the share of worlds past `tolerance` (solver_unconverged)."""
-        worst = self._worst.numpy()
+        worst = np.array(self._worst.numpy())  # a copy: on CPU, numpy() is a view
         self._worst.zero_()
         return {
             "solver_residual_max": float(np.max(worst)),

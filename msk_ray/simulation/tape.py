@@ -15,6 +15,7 @@ from torch import Tensor
 
 from msk_ray.physics import Graph, WorldBatch
 from msk_ray.physics.adjoint import StepAdjoint
+from msk_ray.physics.adjoint.coverage import check_supported
 from msk_ray.physics.adjoint.stages import recompute_stages
 from msk_ray.simulation.backward import Backward, InputGradients, Needs, StepState
 from msk_ray.simulation.buffers import stream_of
@@ -49,6 +50,7 @@ class _Tape(Backward):
 
     def attach(self, batch: WorldBatch) -> None:
         mjm, worlds = batch.mjm, batch.nworld
+        check_supported(mjm, self.name)
         self._batch = batch
         self._device = torch.device(str(batch.device))
         self._pulled = 0
@@ -70,7 +72,7 @@ class _Tape(Backward):
             self._gauge = ResidualGauge(batch.model, worlds)
         self._ctrl = wp.to_torch(batch.data.ctrl, requires_grad=False)
         adjoint = self._adjoint
-        self._cotangent = StepState(
+        self.cotangent = StepState(
             *(wp.to_torch(a, requires_grad=False) for a in (self._raw_qpos, adjoint.grad_qvel, adjoint.grad_act))
         )
         self._grad_ctrl = wp.to_torch(adjoint.grad_ctrl, requires_grad=False)
@@ -90,18 +92,23 @@ class _Tape(Backward):
     def vjp(self, saved: tuple[Tensor, ...], cotangent: StepState, needs: Needs) -> InputGradients:
         ctrl, kept = saved
         if self._graph is None:
-            self._graph = Graph(self._launch_backward, self._batch.device)
+            self._graph = Graph(self.launch_backward, self._batch.device)
             self._clipped.zero_()
         self._ctrl.copy_(ctrl)
         self._saved.copy_(kept)
-        for view, value in zip(self._cotangent, cotangent, strict=True):
+        for view, value in zip(self.cotangent, cotangent, strict=True):
             view.copy_(value)
         self._graph.replay(stream_of(self._device))
         self._pulled += 1
-        gradients = (self._grad_ctrl, *self._cotangent)
+        gradients = (self._grad_ctrl, *self.cotangent)
         return InputGradients(*(g.clone() if need else None for g, need in zip(gradients, needs, strict=True)))
 
-    def _launch_backward(self) -> None:
+    def bytes_recorded(self) -> int:
+        """Size of what one recorded env step keeps, all worlds together; its control comes on top."""
+        return self._saved.numel() * self._saved.element_size()
+
+    def launch_backward(self) -> None:
+        """Launch the pullback of a whole env step: from `cotangent` of its end to the same buffers for its start."""
         self._adjoint.start(self._last["qpos"], self._raw_qpos)
         for k in reversed(range(self._batch.substeps)):
             after = self._states[k + 1] if k + 1 < self._batch.substeps else self._last

@@ -75,5 +75,16 @@ def build_tables(mjm: mujoco.MjModel, model: Any) -> Tables:
     for i in range(mjm.nv):
         for k in range(start[i], start[i] + nnz[i]):
             address[i, column[k]] = k
-    arrays = [wp.array(a, dtype=int) for a in (lastdof, subtree_end, first, last, springs, address)]
-    return Tables(*arrays, has_turning_spring=turning)
+
+    def ints(values: np.ndarray) -> wp.array:
+        return wp.array(values, dtype=int)
+
+    return Tables(
+        body_lastdof=ints(lastdof),
+        body_subtree_end=ints(subtree_end),
+        dof_first=ints(first),
+        dof_last=ints(last),
+        dof_spring_qpos=ints(springs),
+        inertia_address=ints(address),
+        has_turning_spring=turning,
+    )
