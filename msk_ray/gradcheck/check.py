@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from msk_ray.errors import ConfigError, SimulationError
+from msk_ray.errors import ConfigError
 from msk_ray.gradcheck.oracle import INPUTS, Array, Linearization, Oracle, Point
 from msk_ray.gradcheck.states import STATE_KINDS, make_states
 from msk_ray.simulation import Backward, Simulation
@@ -31,8 +31,11 @@ class Limits:
     """Kink: the reference of two step sizes differs by more, relative."""
     side_disagreement: float = 1e-3
     """Kink: the reference's one-sided differences differ by more, relative."""
-    forward_mismatch: float = 1e-3
-    """Forward mismatch: Warp's results differ from C MuJoCo's by more, relative to the motion of the step."""
+    forward_mismatch: float = 3e-5
+    """Forward mismatch: Warp's results differ from C MuJoCo's by more, relative to the motion of the step.
+
+    Float32 alone gives up to 2e-5 on an ant in contact over 16 substeps; another contact frame 4e-5 to 1e-1.
+    """
 
 
 @dataclass(frozen=True)
@@ -68,6 +71,8 @@ class GradientReport:
     """States left out because Warp's own forward pass differs from C MuJoCo's there."""
     checked: int = 0
     """States compared."""
+    diagnostics: dict[str, float] = field(default_factory=dict)
+    """What the simulation and its backward mode report of themselves, the largest over the kinds of state."""
 
     @property
     def excluded(self) -> int:
@@ -178,6 +183,9 @@ def check_gradients(
         solver_tolerance: Warp's solver tolerance, below mujoco_warp's floor of 1e-6 if wanted.
         limits: what counts as a kink and as a forward mismatch.
 
+    Returns:
+        The comparisons; none where every state was excluded, which `max_rel_error` does not let pass.
+
     Raises:
         UnsupportedModelError: `backward` or mujoco_warp cannot treat the model.
         ConfigError: unknown kind of state, or a model without degrees of freedom.
@@ -197,7 +205,8 @@ def check_gradients(
         # Rounded, so that both sides pull the same numbers back.
         cotangents = rng.standard_normal((worlds, 2 * model.nv + model.na)).astype(np.float32).astype(np.float64)
         ends, gradients = simulated_gradients(sim, points, cotangents)
-        sim.diagnostics()  # raises if contacts were lost
+        for name, figure in sim.diagnostics().items():  # raises if contacts were lost
+            report.diagnostics[name] = max(report.diagnostics.get(name, -math.inf), figure)
         for world, (point, end) in enumerate(zip(points, ends, strict=True)):
             reference = oracle.linearize(point)
             if forward_mismatch(oracle, point, reference.end, end) > limits.forward_mismatch:
@@ -207,12 +216,6 @@ def check_gradients(
             else:
                 report.checked += 1
                 report.results += _comparisons(kind, world, reference, cotangents[world], gradients)
-    if not report.checked:
-        raise SimulationError(
-            f"nothing to compare: of {report.excluded} states {report.kinks} lie at a kink and in "
-            f"{report.forward_mismatches} Warp's forward pass differs from C MuJoCo's; "
-            "ask for other states or more worlds"
-        )
     return report
 
 

@@ -23,9 +23,13 @@ _INSIDE = 0.9
 
 
 def _span(model: mujoco.MjModel) -> tuple[Array, Array]:
-    """Middle and half width of the usable control range of each actuator, each (nu,); ±1 where unlimited."""
+    """Middle and half width of the usable control range of each actuator, each (nu,).
+
+    Without a range, [0, 1] for a muscle, whose activation dynamics clamp to it, and [-1, 1] for others.
+    """
     limited = model.actuator_ctrllimited.astype(bool)
-    low = np.where(limited, model.actuator_ctrlrange[:, 0], -1.0)
+    lowest = np.where(model.actuator_dyntype == mujoco.mjtDyn.mjDYN_MUSCLE, 0.0, -1.0)
+    low = np.where(limited, model.actuator_ctrlrange[:, 0], lowest)
     high = np.where(limited, model.actuator_ctrlrange[:, 1], 1.0)
     return (low + high) / 2.0, _INSIDE * (high - low) / 2.0
 
@@ -38,7 +42,10 @@ def _random_ctrl(model: mujoco.MjModel, rng: np.random.Generator) -> Array:
 def _gentle_ctrl(model: mujoco.MjModel, rng: np.random.Generator) -> Array:
     """Controls near zero, or near the nearest bound of a range without zero, but never on a bound."""
     middle, half = _span(model)
-    return np.clip(0.05 * half * rng.standard_normal(model.nu), middle - half, middle + half)
+    rest = np.clip(0.0, middle - half, middle + half)
+    nudge = 0.05 * half * rng.standard_normal(model.nu)
+    # Away from the bound that the rest may sit on.
+    return rest + np.where(rest == 0.0, nudge, np.abs(nudge) * np.sign(middle - rest))
 
 
 def _random_act(model: mujoco.MjModel, rng: np.random.Generator) -> Array:
@@ -88,7 +95,7 @@ def standing(oracle: Oracle, worlds: int, rng: np.random.Generator) -> list[Poin
             _gentle_ctrl(model, rng),
             _displaced(model, rest.qpos, 1e-3 * rng.standard_normal(model.nv)),
             rest.qvel + 1e-2 * rng.standard_normal(model.nv),
-            rest.act + 1e-2 * rng.uniform(0.1, 1.0, model.na) * np.where(rest.act > 0.5, -1.0, 1.0),
+            rest.act + 2e-2 * rng.uniform(0.5, 1.0, model.na) * np.where(rest.act > 0.5, -1.0, 1.0),
         )
         for _ in range(worlds)
     ]
