@@ -104,8 +104,20 @@ def test_step_is_pure_and_leaves_the_model_alone():
 def test_reference_in_contact_has_eight_digits(cone):
     model = mujoco.MjModel.from_xml_string(ant_xml(cone))
     oracle = Oracle(model, 16)
-    uncertainties = [oracle.linearize(p).uncertainty for p in make_states(model, "contact", 5, seed=0)]
-    assert np.median(uncertainties) < 1e-7
+    lines = [oracle.linearize(p) for p in make_states(model, "contact", 5, seed=0)]
+    assert np.median([max(line.step_disagreement.values()) for line in lines]) < 1e-7
+
+
+def test_stiff_contact_is_extrapolated():
+    """A ball pressed 0.3 mm into default contact, whose impedance changes within 1 mm: against a tenth of the step."""
+    model = ball_on_plane()
+    oracle = Oracle(model, 1)
+    start = point([], [0, 0, 0.1 - 3e-4, 1, 0, 0, 0], [0, 0, -0.01, 0, 0, 0])
+    line = oracle.linearize(start)
+    assert not line.at_kink(1e-3, 1e-2)
+    step = 1e-7
+    sides = [oracle.difference(line.end, oracle.step(oracle.displaced(start, "qpos", 2, s))) for s in (step, -step)]
+    np.testing.assert_allclose(line.jacobian["qpos"][:, 2], (sides[0] - sides[1]) / (2 * step), rtol=1e-6, atol=1e-7)
 
 
 def test_kink_through_the_state_is_seen():
@@ -113,7 +125,7 @@ def test_kink_through_the_state_is_seen():
     line = Oracle(slide_model(), 1).linearize(point([1.0], [0.0], [0.0]))
     assert line.step_disagreement["ctrl"] < 1e-6
     assert line.side_disagreement["ctrl"] == pytest.approx(2.0)
-    assert line.at_kink(1e-5, 1e-3)
+    assert line.at_kink(1e-3, 1e-2)
 
 
 def test_kink_beside_the_state_is_seen():
@@ -121,12 +133,12 @@ def test_kink_beside_the_state_is_seen():
     model = ball_on_plane()
     line = Oracle(model, 1).linearize(point([], [0, 0, 0.1 + 4e-6, 1, 0, 0, 0], [0, 0, -1.0, 0, 0, 0]))
     assert line.step_disagreement["qpos"] > 1e-2
-    assert line.at_kink(1e-5, 1e-3)
+    assert line.at_kink(1e-3, 1e-2)
 
 
 def test_smooth_state_is_no_kink():
     line = Oracle(slide_model(50.0), 4).linearize(point([0.5], [0.0], [1.0]))
-    assert not line.at_kink(1e-5, 1e-3)
+    assert not line.at_kink(1e-3, 1e-2)
 
 
 def test_divergence_is_an_error():
