@@ -87,12 +87,14 @@ EnvConfig = Annotated[CartPoleEnvConfig | AntEnvConfig, Field(discriminator="nam
 class FdConfig(Section):
     """Central differences of backward mode `fd_jacobian`."""
 
-    eps_ctrl: PositiveFloat = 3e-2
-    """Perturbation of ctrl and act [their own unit]."""
-    eps_qpos: PositiveFloat = 5e-3
+    eps_ctrl: PositiveFloat = 5e-3
+    """Perturbation of ctrl [its own unit]."""
+    eps_qpos: PositiveFloat = 5e-4
     """Perturbation of qpos along a tangent direction [m, rad]."""
-    eps_qvel: PositiveFloat = 1e-2
+    eps_qvel: PositiveFloat = 2e-3
     """Perturbation of qvel [m/s, rad/s]."""
+    eps_act: PositiveFloat = 5e-4
+    """Perturbation of act [its own unit]."""
     max_worlds: PositiveInt = 131072
     """Perturbed copies run at once; more are done in chunks."""
 
