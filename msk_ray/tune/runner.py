@@ -55,7 +55,7 @@ class Plan:
 
 
 @contextmanager
-def ray_session(address: str | None) -> Iterator[None]:
+def ray_session(address: str | None, dashboard: bool | None = None) -> Iterator[None]:
     """A Ray of our own on this machine, or the one at `address`.
 
     Raises:
@@ -75,7 +75,7 @@ def ray_session(address: str | None) -> Iterator[None]:
         paths = [package, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
         os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys(paths))
         # None starts the dashboard where its packages (ray[default]) are installed, and does without elsewhere.
-        context = ray.init(include_dashboard=None, dashboard_host="127.0.0.1", **quiet)
+        context = ray.init(include_dashboard=dashboard, dashboard_host="127.0.0.1", **quiet)
     else:
         try:
             context = ray.init(address=address, **quiet)
