@@ -8,7 +8,7 @@ import pytest
 import torch
 from conftest import ant_xml
 
-from msk_ray.errors import ConfigError, UnsupportedModelError
+from msk_ray.errors import ConfigError, SimulationError, UnsupportedModelError
 from msk_ray.gradcheck import STATE_KINDS, GradientReport, Limits, Oracle, Point, check_gradients
 from msk_ray.gradcheck.check import compare, forward_mismatch
 from msk_ray.simulation import FdJacobian, Simulation
@@ -160,6 +160,23 @@ def test_excluded_states_are_counted_by_cause_and_nothing_left_never_passes(cart
 def test_same_seed_same_report(cartpole):
     reports = [check_gradients(cartpole, FdJacobian(), states=list(STATE_KINDS), worlds=2, seed=7) for _ in range(2)]
     assert reports[0].results == reports[1].results
+
+
+def test_lost_contacts_of_the_perturbed_copies_are_an_error():
+    """Every copy of every world needs its room, not only the worlds that are stepped."""
+    model = mujoco.MjModel.from_xml_string(ant_xml("elliptic"))
+    backward = FdJacobian()
+    sim = Simulation(model, 1, 1, backward, "cpu", njmax=4)
+    # Lifted far off the ground, the world itself fits; its copies, moved by 1 m, do not.
+    backward.eps["qpos"] = 1.0
+    start = sim.initial_state()
+    qpos = start.qpos.clone()
+    qpos[:, 2] = 1.2
+    ctrl = torch.zeros(1, model.nu, requires_grad=True)
+    qpos.requires_grad_()
+    sim.step(ctrl, qpos, start.qvel, start.act).qvel.sum().backward()
+    with pytest.raises(SimulationError, match="njmax"):
+        sim.diagnostics()
 
 
 def test_bad_requests(cartpole):
