@@ -47,6 +47,10 @@ class StopRequest:
 
     def __init__(self) -> None:
         self.signal: signal.Signals | None = None
+        self.install()
+
+    def install(self) -> None:
+        """Take over the signals, again if a library has taken them meanwhile."""
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1):
             signal.signal(number, self._handle)
 

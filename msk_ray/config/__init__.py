@@ -2,8 +2,10 @@
 
 from msk_ray.config.load import (
     apply_overrides,
+    describe_fault,
     dump_yaml,
     load_config,
+    merge,
     parse_config,
     parse_override,
     read_config,
@@ -36,8 +38,10 @@ __all__ = [
     "ShacConfig",
     "TrialConfig",
     "apply_overrides",
+    "describe_fault",
     "dump_yaml",
     "load_config",
+    "merge",
     "parse_config",
     "parse_override",
     "read_config",

@@ -79,7 +79,7 @@ def parse_config(data: Mapping[str, Any], source: str = "config") -> Config:
     try:
         return Config.model_validate(data)
     except ValidationError as error:
-        raise ConfigError(f"{source}: {_describe(error)}") from None
+        raise ConfigError(f"{source}: {describe_fault(error)}") from None
 
 
 def read_config(path: Path) -> dict[str, Any]:
@@ -98,7 +98,7 @@ def read_config(path: Path) -> dict[str, Any]:
     base = read_yaml(base_path)
     if "extends" in base:
         raise ConfigError(f"{path} extends {base_path}, which extends another file: extend that one directly")
-    return _merge(base, data)
+    return merge(base, data)
 
 
 def load_config(path: Path, overrides: Iterable[str] = ()) -> Config:
@@ -111,12 +111,12 @@ def load_config(path: Path, overrides: Iterable[str] = ()) -> Config:
     return parse_config(data, str(path))
 
 
-def _merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     """`over` laid over `base`, section by section."""
     merged = copy.deepcopy(dict(base))
     for key, value in over.items():
         old = merged.get(key)
-        merged[key] = _merge(old, value) if isinstance(old, dict) and isinstance(value, dict) else copy.deepcopy(value)
+        merged[key] = merge(old, value) if isinstance(old, dict) and isinstance(value, dict) else copy.deepcopy(value)
     return merged
 
 
@@ -125,8 +125,8 @@ def dump_yaml(data: Mapping[str, Any]) -> str:
     return yaml.safe_dump(dict(data), sort_keys=False, allow_unicode=True, width=100)
 
 
-def _describe(error: ValidationError) -> str:
-    """The first fault, and how many more there are."""
+def describe_fault(error: ValidationError, root: type[BaseModel] = Config) -> str:
+    """The first fault found while validating a `root`, and how many more there are, on one line."""
     faults = error.errors()
     first = faults[0]
     # Discriminated unions put the tag into the location; it is no key of the file.
@@ -135,7 +135,7 @@ def _describe(error: ValidationError) -> str:
     ]
     where = ".".join(location)
     if first["type"] == "extra_forbidden":
-        known = _keys_at(location[:-1], first["loc"])
+        known = _keys_at(root, location[:-1], first["loc"])
         near = difflib.get_close_matches(location[-1], known, n=1)
         hint = f"did you mean {near[0]!r}?" if near else f"known keys: {', '.join(known)}"
         text = f"{where}: unknown key; {hint}"
@@ -151,9 +151,9 @@ def _describe(error: ValidationError) -> str:
     return text + (f" (and {more} more fault{'s' if more > 1 else ''})" if more else "")
 
 
-def _keys_at(sections: list[str], location: tuple[Any, ...]) -> list[str]:
-    """Known keys of the section a fault lies in."""
-    model: Any = Config
+def _keys_at(root: type[BaseModel], sections: list[str], location: tuple[Any, ...]) -> list[str]:
+    """Known keys of the section of `root` a fault lies in."""
+    model: Any = root
     for section in sections:
         annotation = model.model_fields[section].annotation
         options = [a for a in get_args(annotation) or (annotation,) if isinstance(a, type) and issubclass(a, BaseModel)]

@@ -10,8 +10,6 @@ from mujoco_warp import OverflowType
 
 from msk_ray.errors import SimulationError, UnsupportedModelError
 
-wp.config.log_level = wp.LOG_WARNING  # no line per loaded kernel: the commands own standard output
-
 # Contacts mujoco_warp can return for one pair of geoms, by the less common of the two types.
 _CONTACTS_PER_PAIR = {
     mujoco.mjtGeom.mjGEOM_SPHERE: 1,

@@ -3,5 +3,16 @@
 from msk_ray.simulation.backward import Backward, InputGradients, StepState
 from msk_ray.simulation.fd_jacobian import FdJacobian
 from msk_ray.simulation.simulation import Simulation, WarpSimStep
+from msk_ray.simulation.tape import Hybrid, TapeAll, TapePerSubstep
 
-__all__ = ["Backward", "FdJacobian", "InputGradients", "Simulation", "StepState", "WarpSimStep"]
+__all__ = [
+    "Backward",
+    "FdJacobian",
+    "Hybrid",
+    "InputGradients",
+    "Simulation",
+    "StepState",
+    "TapeAll",
+    "TapePerSubstep",
+    "WarpSimStep",
+]

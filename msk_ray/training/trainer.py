@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -104,14 +105,18 @@ class Trainer:
         prune_checkpoints(self.checkpoints, self.config.trial.keep_checkpoints)
         return path
 
-    def restore(self, path: Path) -> None:
+    def restore(self, path: Path, changed: Collection[str] = ()) -> None:
         """Go on from a checkpoint.
+
+        Args:
+            path: the checkpoint.
+            changed: dotted settings that may differ from those it was written under.
 
         Raises:
             CheckpointError: it is missing, torn, or was written under other settings.
         """
         state = read_checkpoint(path)
-        difference = _first_difference(state["config"], self.config.as_dict())
+        difference = _first_difference(state["config"], self.config.as_dict(), changed)
         if difference:
             raise CheckpointError(f"{path} was written under other settings: {difference}")
         self.shac.load_state_dict(_to_device(state["shac"], self.env.device))
@@ -174,14 +179,16 @@ def precompile(config: Config, device: str, logdir: Path) -> None:
     trainer.close()
 
 
-def _first_difference(old: dict[str, Any], new: dict[str, Any], prefix: str = "") -> str | None:
+def _first_difference(
+    old: dict[str, Any], new: dict[str, Any], changed: Collection[str], prefix: str = ""
+) -> str | None:
     """The first setting two configurations differ in, apart from those that may."""
     for key in {**old, **new}:
-        if key in _EXTENDABLE.get(prefix.rstrip("."), set()):
+        if key in _EXTENDABLE.get(prefix.rstrip("."), set()) or f"{prefix}{key}" in changed:
             continue
         before, after = old.get(key), new.get(key)
         if isinstance(before, dict) and isinstance(after, dict):
-            nested = _first_difference(before, after, f"{prefix}{key}.")
+            nested = _first_difference(before, after, changed, f"{prefix}{key}.")
             if nested:
                 return nested
         elif before != after:

@@ -1,0 +1,42 @@
+# Two commands do everything on a fresh machine: `make demo` and `make test`.
+PYTHON ?= python3
+VENV   ?= .venv
+RUN    := $(VENV)/bin/python
+STAMP  := $(VENV)/.installed
+
+.PHONY: help env demo test check unit gpu-test bench clean
+
+help:                ## this list
+	@grep -hE '^[a-z-]+: .*##|^[a-z-]+:  *##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 14
+
+env: $(STAMP)        ## a virtual environment in .venv with everything pinned by constraints.txt
+
+$(STAMP): pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit("msk_ray needs Python 3.11 or newer: make PYTHON=python3.12 ...") if sys.version_info < (3, 11) else None'
+	$(PYTHON) -m venv $(VENV)
+	$(RUN) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $@
+
+demo: env            ## a real small Ray Tune sweep (GPU if there is one), ending in its table, curves and best policy
+	rm -rf runs/demo
+	$(RUN) -m msk_ray.tune --space cartpole_smoke --name demo
+
+test: check unit     ## everything that CI runs
+
+check: env           ## formatting, lint, layers and types
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/lint-imports
+	$(VENV)/bin/mypy
+
+unit: env            ## the tests that need no GPU
+	$(RUN) -m pytest
+
+gpu-test: env        ## the tests that need a CUDA device
+	$(RUN) -m pytest -m gpu
+
+bench: env           ## speed tables of this machine, appended to benchmarks/results/
+	$(RUN) benchmarks/epoch.py
+
+clean:               ## remove the environment and caches, never runs/
+	rm -rf $(VENV) .pytest_cache .ruff_cache .mypy_cache .import_linter_cache *.egg-info

@@ -1,0 +1,65 @@
+"""What every benchmark writes beside its figures: device, versions, command; and where it appends its table."""
+
+import datetime
+import os
+import platform
+import shlex
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+RESULTS = Path(__file__).parent / "results"
+PACKAGES = ("torch", "warp-lang", "mujoco", "mujoco-warp")
+
+
+def device_name(device: str) -> str:
+    """Marketing name of the device a benchmark ran on, with the processors torch may use."""
+    import torch
+
+    if device.startswith("cuda"):
+        return str(torch.cuda.get_device_name(device))
+    model = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        names = [line.split(":", 1)[1].strip() for line in cpuinfo.read_text().splitlines() if "model name" in line]
+        model = names[0] if names else model
+    return f"{model}, {os.cpu_count()} cores, {torch.get_num_threads()} torch threads"
+
+
+def commit() -> str:
+    """Short git commit of the working tree, or "unknown" outside a clone."""
+    try:
+        answer = subprocess.run(
+            ["git", "describe", "--always", "--dirty"],
+            capture_output=True,
+            text=True,
+            cwd=Path(__file__).parent,
+            check=True,
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return answer.stdout.strip()
+
+
+def markdown_table(header: list[str], rows: list[list[str]]) -> str:
+    """A table with numbers right-aligned."""
+    lines = ["| " + " | ".join(header) + " |", "|" + " ---: |" * len(header)]
+    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
+
+
+def publish(name: str, title: str, device: str, table: str, results: Path = RESULTS) -> Path:
+    """Print a table and append it to results/NAME.md with what it takes to repeat it."""
+    packages = ", ".join(f"{package} {version(package)}" for package in PACKAGES)
+    today = datetime.datetime.now(datetime.UTC).date().isoformat()
+    text = (
+        f"## {title}\n\n{today}, {device_name(device)}; {packages}; Python {platform.python_version()}; "
+        f"commit {commit()}\n\n`python {' '.join(map(shlex.quote, sys.argv))}`\n\n{table}\n"
+    )
+    print(text)
+    results.mkdir(parents=True, exist_ok=True)
+    path = results / f"{name}.md"
+    with path.open("a", encoding="utf-8") as file:
+        file.write(text + "\n")
+    print(f"appended to {path}")
+    return path

@@ -1,0 +1,88 @@
+"""Models of the step benchmark, from small to humanoid-size and muscle-driven."""
+
+from collections.abc import Callable
+
+import mujoco
+
+_HEAD = """
+<mujoco>
+  <compiler angle="degree"/>
+  <option timestep="{timestep}" integrator="Euler" solver="Newton" cone="{cone}"/>
+  <default>
+    <joint damping="{damping}" armature=".05" limited="true" solreflimit="-122 -1.2" solimplimit=".9 .9 .01 .5 2"/>
+    <geom density="1000" friction=".75 .1 .1" solref=".065 1" solimp=".9 .9 .01 .5 2" contype="0" conaffinity="1"/>
+    <motor ctrllimited="true" ctrlrange="-1 1"/>
+  </default>
+  <worldbody>
+    <geom type="plane" size="40 40 1" contype="1" conaffinity="0"/>
+"""
+
+
+def cartpole() -> mujoco.MjModel:
+    """A cart with a pole: no contact."""
+    text = _HEAD.format(timestep=1 / 240, cone="pyramidal", damping=0.1) + (
+        """<body pos="0 0 1"><joint name="j" type="slide" axis="1 0 0" limited="false"/>
+        <geom type="sphere" size=".1" conaffinity="0"/>
+        <body><joint type="hinge" axis="0 1 0" limited="false"/>
+        <geom type="capsule" size=".04" fromto="0 0 0 0 0 1" conaffinity="0"/></body></body></worldbody>
+        <actuator><motor joint="j" gear="100"/></actuator></mujoco>"""
+    )
+    return mujoco.MjModel.from_xml_string(text)
+
+
+def ant(cone: str = "pyramidal") -> mujoco.MjModel:
+    """Free torso, four legs of two hinges: nv 14."""
+    legs = "".join(
+        f"""<body pos="{0.2 * x} {0.2 * y} 0">
+        <joint name="hip{i}" axis="0 0 1" range="-40 40"/>
+        <geom type="capsule" size=".08" fromto="0 0 0 {0.2 * x} {0.2 * y} 0"/>
+        <body pos="{0.2 * x} {0.2 * y} 0"><joint name="knee{i}" axis="{-y} {x} 0" range="-10 70"/>
+        <geom type="capsule" size=".08" fromto="0 0 0 {0.4 * x} {0.4 * y} 0"/></body></body>"""
+        for i, (x, y) in enumerate([(1, 1), (-1, 1), (-1, -1), (1, -1)])
+    )
+    motors = "".join(f'<motor joint="{j}{i}" gear="200"/>' for i in range(4) for j in ("hip", "knee"))
+    text = _HEAD.format(timestep=1 / 240, cone=cone, damping=11) + (
+        f"""<body pos="0 0 .5"><freejoint/><geom type="sphere" size=".25"/>{legs}</body></worldbody>
+        <actuator>{motors}</actuator></mujoco>"""
+    )
+    return mujoco.MjModel.from_xml_string(text)
+
+
+def biped() -> mujoco.MjModel:
+    """A humanoid-size tree: trunk, two arms and two legs of spheres and capsules, nv 27."""
+
+    def limb(name: str, at: str, first: tuple[str, ...], second: tuple[str, ...], length: float) -> str:
+        joints = [
+            "".join(f'<joint name="{name}{part}{k}" axis="{axis}" range="-60 60"/>' for k, axis in enumerate(axes))
+            for part, axes in (("a", first), ("b", second))
+        ]
+        return f"""<body pos="{at}">{joints[0]}<geom type="capsule" size=".05" fromto="0 0 0 0 0 {-length}"/>
+        <body pos="0 0 {-length}">{joints[1]}<geom type="capsule" size=".045" fromto="0 0 0 0 0 {-length}"/>
+        <geom type="sphere" size=".07" pos=".03 0 {-length}"/></body></body>"""
+
+    x, y, z = "1 0 0", "0 1 0", "0 0 1"
+    limbs = {
+        "right_leg": ("0 -.1 -.1", (x, y, z), (y, x), 0.4),
+        "left_leg": ("0 .1 -.1", (x, y, z), (y, x), 0.4),
+        "right_arm": ("0 -.2 .4", (x, y, z), (y,), 0.28),
+        "left_arm": ("0 .2 .4", (x, y, z), (y,), 0.28),
+    }
+    trunk = f"""<body pos="0 0 1"><freejoint/><geom type="sphere" size=".12"/>
+    {limb("right_leg", *limbs["right_leg"])}{limb("left_leg", *limbs["left_leg"])}
+    <body pos="0 0 .1"><joint name="waist0" axis="{x}" range="-30 30"/><joint name="waist1" axis="{y}" range="-30 30"/>
+    <joint name="waist2" axis="{z}" range="-30 30"/><geom type="capsule" size=".1" fromto="0 0 .1 0 0 .4"/>
+    {limb("right_arm", *limbs["right_arm"])}{limb("left_arm", *limbs["left_arm"])}</body></body></worldbody>"""
+    names = [f"waist{k}" for k in range(3)]
+    for limb_name, (_, first, second, _) in limbs.items():
+        names += [f"{limb_name}a{k}" for k in range(len(first))] + [f"{limb_name}b{k}" for k in range(len(second))]
+    motors = "".join(f'<motor joint="{n}" gear="80"/>' for n in names)
+    head = _HEAD.format(timestep=1 / 240, cone="pyramidal", damping=2)
+    return mujoco.MjModel.from_xml_string(f"{head}{trunk}<actuator>{motors}</actuator></mujoco>")
+
+
+MODELS: dict[str, Callable[[], mujoco.MjModel]] = {
+    "cartpole": cartpole,
+    "ant": ant,
+    "ant_elliptic": lambda: ant("elliptic"),
+    "biped": biped,
+}

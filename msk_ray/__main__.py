@@ -1,0 +1,36 @@
+"""`python -m msk_ray VERB` and the console script `msk-ray VERB`: every command under one name."""
+
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+
+from msk_ray.cli import run
+
+COMMANDS = {
+    "train": ("msk_ray.train", "train one policy in this process, without Ray"),
+    "tune": ("msk_ray.tune.__main__", "run a search space as a Ray Tune experiment"),
+    "gradcheck": ("msk_ray.gradcheck.__main__", "check a model's gradients against float64 finite differences"),
+}
+
+
+def usage() -> str:
+    """The list of commands."""
+    lines = [f"  {name:10} {text}" for name, (_, text) in COMMANDS.items()]
+    return "usage: msk-ray COMMAND [options]\n\n" + "\n".join(lines) + "\n\nmsk-ray COMMAND --help says more."
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command by name; returns the exit code."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(usage())
+        return 0
+    name, *rest = arguments
+    if name not in COMMANDS:
+        print(f"error: no command {name!r}; write one of {', '.join(COMMANDS)}", file=sys.stderr)
+        return 2
+    return run(import_module(COMMANDS[name][0]).main, rest)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,209 @@
+"""Actuators: slopes of force and activation with respect to control, activation, length and velocity."""
+
+import warp as wp
+from mujoco_warp._src.types import BiasType, DynType, GainType, vec10
+from mujoco_warp._src.util_misc import muscle_bias, muscle_dynamics, muscle_gain
+
+wp.set_module_options({"enable_backward": False})
+
+_MINVAL = wp.constant(1.0e-15)
+
+
+@wp.struct
+class ActuatorLaw:
+    """What one actuator's force and activation depend on besides (ctrl, act, length, velocity)."""
+
+    dyntype: int
+    gaintype: int
+    biastype: int
+    early: int
+    clamp_ctrl: int
+    clamp_act: int
+    clamp_force: int
+    dynprm: vec10
+    gainprm: vec10
+    biasprm: vec10
+    ctrlrange: wp.vec2
+    actrange: wp.vec2
+    forcerange: wp.vec2
+    lengthrange: wp.vec2
+    acc0: float
+    timestep: float
+
+
+@wp.func
+def next_activation(law: ActuatorLaw, ctrl: wp.float32, act: wp.float32) -> wp.float32:
+    """act' of a stateful actuator, from the control after its clamp."""
+    rate = wp.float32(0.0)
+    step = law.timestep
+    if law.dyntype == DynType.INTEGRATOR:
+        rate = ctrl
+    elif law.dyntype == DynType.MUSCLE:
+        rate = muscle_dynamics(ctrl, act, law.dynprm)
+    else:
+        tau = wp.max(law.dynprm[0], _MINVAL)
+        rate = (ctrl - act) / tau
+        if law.dyntype == DynType.FILTEREXACT:
+            step = tau * (1.0 - wp.exp(-law.timestep / tau))
+    after = act + step * rate
+    if law.clamp_act == 1:
+        after = wp.clamp(after, law.actrange[0], law.actrange[1])
+    return after
+
+
+@wp.func
+def actuator_force(law: ActuatorLaw, drive: wp.float32, length: wp.float32, velocity: wp.float32) -> wp.float32:
+    """Scalar force: gain(length, velocity)·drive + bias(length, velocity), clamped."""
+    gain = law.gainprm[0]
+    if law.gaintype == GainType.AFFINE:
+        gain = law.gainprm[0] + law.gainprm[1] * length + law.gainprm[2] * velocity
+    elif law.gaintype == GainType.MUSCLE:
+        gain = muscle_gain(length, velocity, law.lengthrange, law.acc0, law.gainprm)
+    bias = wp.float32(0.0)
+    if law.biastype == BiasType.AFFINE:
+        bias = law.biasprm[0] + law.biasprm[1] * length + law.biasprm[2] * velocity
+    elif law.biastype == BiasType.MUSCLE:
+        bias = muscle_bias(length, law.lengthrange, law.acc0, law.biasprm)
+    force = gain * drive + bias
+    if law.clamp_force == 1:
+        force = wp.clamp(force, law.forcerange[0], law.forcerange[1])
+    return force
+
+
+@wp.func
+def actuator_score(
+    law: ActuatorLaw,
+    ctrl: wp.float32,
+    act: wp.float32,
+    length: wp.float32,
+    velocity: wp.float32,
+    act_weight: wp.float32,
+    force_weight: wp.float32,
+) -> wp.float32:
+    """act_weight·act' + force_weight·force, whose slopes are the pullback of one actuator."""
+    command = ctrl
+    if law.clamp_ctrl == 1:
+        command = wp.clamp(ctrl, law.ctrlrange[0], law.ctrlrange[1])
+    drive = command
+    score = wp.float32(0.0)
+    if law.dyntype != DynType.NONE:
+        after = next_activation(law, command, act)
+        drive = act
+        if law.early == 1:
+            drive = after
+        score = act_weight * after
+    return score + force_weight * actuator_force(law, drive, length, velocity)
+
+
+@wp.kernel
+def pull_actuators(
+    # Model:
+    opt_timestep: wp.array[float],
+    clampctrl: bool,
+    jnt_actfrclimited: wp.array[bool],
+    jnt_actfrcrange: wp.array2d[wp.vec2],
+    dof_jntid: wp.array[int],
+    actuator_dyntype: wp.array[int],
+    actuator_gaintype: wp.array[int],
+    actuator_biastype: wp.array[int],
+    actuator_ctrladr: wp.array[int],
+    actuator_ctrlnum: wp.array[int],
+    actuator_actadr: wp.array[int],
+    actuator_actnum: wp.array[int],
+    actuator_dynprm: wp.array2d[vec10],
+    actuator_gainprm: wp.array2d[vec10],
+    actuator_biasprm: wp.array2d[vec10],
+    actuator_actlimited: wp.array[bool],
+    actuator_actrange: wp.array2d[wp.vec2],
+    actuator_actearly: wp.array[bool],
+    actuator_forcelimited: wp.array[bool],
+    actuator_forcerange: wp.array2d[wp.vec2],
+    actuator_ctrllimited: wp.array[bool],
+    actuator_ctrlrange: wp.array2d[wp.vec2],
+    actuator_acc0: wp.array2d[float],
+    actuator_lengthrange: wp.array2d[wp.vec2],
+    # In:
+    live_in: wp.array[int],
+    ctrl_in: wp.array2d[float],
+    act_in: wp.array2d[float],
+    qvel_in: wp.array2d[float],
+    length_in: wp.array2d[float],
+    moment_rownnz_in: wp.array2d[int],
+    moment_rowadr_in: wp.array2d[int],
+    moment_colind_in: wp.array2d[int],
+    moment_in: wp.array2d[float],
+    qfrc_actuator_in: wp.array2d[float],
+    lam_in: wp.array2d[float],
+    # Out:
+    grad_act_out: wp.array2d[float],
+    grad_ctrl_out: wp.array2d[float],
+    phi_qpos_out: wp.array2d[float],
+    phi_qvel_out: wp.array2d[float],
+    rate_bar_out: wp.array2d[float],
+    velocity_bar_out: wp.array2d[float],
+):
+    """Φ ∋ -(m·λ) F(len, m·v, act, ctrl) and ḡ·act': gradients of ctrl and act, and those through len and velocity.
+
+    rate_bar (∂Φ/∂(m·λ) = -F) and velocity_bar are kept for transmissions whose moment m turns with q.
+    """
+    worldid, uid = wp.tid()
+    law = ActuatorLaw()
+    law.timestep = opt_timestep[worldid % opt_timestep.shape[0]]
+    law.dyntype = actuator_dyntype[uid]
+    law.gaintype = actuator_gaintype[uid]
+    law.biastype = actuator_biastype[uid]
+    law.early = int(actuator_actearly[uid])
+    law.clamp_act = int(actuator_actlimited[uid])
+    law.clamp_force = int(actuator_forcelimited[uid])
+    law.dynprm = actuator_dynprm[worldid % actuator_dynprm.shape[0], uid]
+    law.gainprm = actuator_gainprm[worldid % actuator_gainprm.shape[0], uid]
+    law.biasprm = actuator_biasprm[worldid % actuator_biasprm.shape[0], uid]
+    law.actrange = actuator_actrange[worldid % actuator_actrange.shape[0], uid]
+    law.forcerange = actuator_forcerange[worldid % actuator_forcerange.shape[0], uid]
+    law.lengthrange = actuator_lengthrange[worldid % actuator_lengthrange.shape[0], uid]
+    law.acc0 = actuator_acc0[worldid % actuator_acc0.shape[0], uid]
+    ctrl = float(0.0)
+    source = actuator_ctrladr[uid]
+    if actuator_ctrlnum[uid] > 0:
+        ctrl = ctrl_in[worldid, source]
+        law.ctrlrange = actuator_ctrlrange[worldid % actuator_ctrlrange.shape[0], source]
+        law.clamp_ctrl = int(actuator_ctrllimited[source] and clampctrl)
+    act = float(0.0)
+    act_weight = float(0.0)
+    slot = actuator_actadr[uid] + actuator_actnum[uid] - 1
+    if law.dyntype != DynType.NONE:
+        act = act_in[worldid, slot]
+        act_weight = grad_act_out[worldid, slot]
+
+    start = moment_rowadr_in[worldid, uid]
+    end = start + moment_rownnz_in[worldid, uid]
+    rate = float(0.0)
+    velocity = float(0.0)
+    for k in range(start, end):
+        dof = moment_colind_in[worldid, k]
+        velocity += moment_in[worldid, k] * qvel_in[worldid, dof]
+        held = bool(False)
+        jnt = dof_jntid[dof]
+        if jnt_actfrclimited[jnt]:
+            # A joint at its actuator force limit passes nothing on.
+            bounds = jnt_actfrcrange[worldid % jnt_actfrcrange.shape[0], jnt]
+            total = qfrc_actuator_in[worldid, dof]
+            held = total <= bounds[0] or total >= bounds[1]
+        if not held:
+            rate += moment_in[worldid, k] * lam_in[worldid, dof]
+
+    length = length_in[worldid, uid]
+    _l, ctrl_slope, act_slope, length_slope, velocity_slope, _a, force = wp.grad(actuator_score)(
+        law, ctrl, act, length, velocity, act_weight, rate
+    )
+    live = live_in[worldid] != 0
+    if law.dyntype != DynType.NONE:
+        grad_act_out[worldid, slot] = wp.where(live, act_slope, 0.0)
+    if live and actuator_ctrlnum[uid] > 0:
+        grad_ctrl_out[worldid, source] += ctrl_slope
+    rate_bar_out[worldid, uid] = -force
+    velocity_bar_out[worldid, uid] = -velocity_slope
+    for k in range(start, end):
+        dof = moment_colind_in[worldid, k]
+        wp.atomic_add(phi_qpos_out, worldid, dof, -length_slope * moment_in[worldid, k])
+        wp.atomic_add(phi_qvel_out, worldid, dof, -velocity_slope * moment_in[worldid, k])

@@ -1,0 +1,326 @@
+"""Contacts: cotangents of rows to wrenches on two bodies, through the relative twist at the contact point.
+
+A contact's rows are fixed combinations of ρ_k(x), k < condim: the relative velocity at the contact point under a
+plain field x, along the frame's axes (k < 3), and the relative spin (k ≥ 3). Φ holds them under x = λ (row
+"velocity" of the multiplier), a (J a) and v (aref). The frame, the point and the distance move with both bodies.
+"""
+
+import warp as wp
+from mujoco_warp._src.math import make_frame
+from mujoco_warp._src.types import ConstraintType, GeomType, vec5
+
+from msk_ray.physics.adjoint.rows import cone_law, cone_slope, row_slopes, vec6
+from msk_ray.physics.adjoint.spatial import carried, point_velocity, wrench
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def frame_score(normal: wp.vec3, axis: wp.vec3, along_axis: wp.int32, weight: wp.mat33) -> wp.float32:
+    """⟨weight, frame⟩ of the contact frame built from a normal, and from a capsule's axis where that guides it."""
+    score = wp.float32(0.0)
+    if along_axis == 1:
+        b = wp.normalize(axis - normal * wp.dot(normal, axis))
+        score = wp.dot(weight[0], normal) + wp.dot(weight[1], b) + wp.dot(weight[2], wp.cross(normal, b))
+    elif along_axis == 2:
+        # Steep capsule: a fixed second axis, not made orthogonal to the normal.
+        score = wp.dot(weight[0], normal) + wp.dot(weight[1], axis) + wp.dot(weight[2], wp.cross(normal, axis))
+    else:
+        frame = make_frame(normal)
+        score = wp.dot(weight[0], frame[0]) + wp.dot(weight[1], frame[1]) + wp.dot(weight[2], frame[2])
+    return score
+
+
+@wp.func
+def _column(matrix: wp.mat33, k: int) -> wp.vec3:
+    return wp.vec3(matrix[0, k], matrix[1, k], matrix[2, k])
+
+
+@wp.func
+def components(frame: wp.mat33, slide: wp.vec3, spin: wp.vec3, dim: int) -> vec6:
+    """ρ: the relative velocity along the frame, then the relative spin."""
+    out = vec6()
+    for k in range(dim):
+        if k < 3:
+            out[k] = wp.dot(frame[k], slide)
+        else:
+            out[k] = wp.dot(frame[k - 3], spin)
+    return out
+
+
+@wp.func
+def along_frame(frame: wp.mat33, weight: vec6, first: int) -> wp.vec3:
+    """Σ weight[first + k] frame[k], k < 3: the cotangent of a velocity whose components have these weights."""
+    return weight[first] * frame[0] + weight[first + 1] * frame[1] + weight[first + 2] * frame[2]
+
+
+@wp.func
+def frame_weight(frame: wp.mat33, weight: vec6, slide: wp.vec3, spin: wp.vec3) -> wp.mat33:
+    """Cotangent of the frame where components with these weights are read off it."""
+    out = wp.mat33()
+    for k in range(3):
+        out[k] = weight[k] * slide + weight[k + 3] * spin
+    return out
+
+
+@wp.kernel
+def pull_contacts(
+    # Model:
+    opt_timestep: wp.array[float],
+    opt_disableflags: int,
+    opt_impratio_invsqrt: wp.array[float],
+    body_rootid: wp.array[int],
+    geom_bodyid: wp.array[int],
+    # In:
+    nacon_in: wp.array[int],
+    type_in: wp.array2d[int],
+    mass_in: wp.array2d[float],
+    jar_in: wp.array2d[float],
+    force_in: wp.array2d[float],
+    slope_in: wp.array2d[float],
+    contact_dist_in: wp.array[float],
+    contact_pos_in: wp.array[wp.vec3],
+    contact_frame_in: wp.array[wp.mat33],
+    contact_margin_in: wp.array[float],
+    contact_friction_in: wp.array[vec5],
+    contact_solref_in: wp.array[wp.vec2],
+    contact_solreffriction_in: wp.array[wp.vec2],
+    contact_solimp_in: wp.array[vec5],
+    contact_dim_in: wp.array[int],
+    contact_geom_in: wp.array[wp.vec2i],
+    contact_address_in: wp.array2d[int],
+    contact_worldid_in: wp.array[int],
+    subtree_com_in: wp.array2d[wp.vec3],
+    lam_field_in: wp.array2d[wp.spatial_vector],
+    qacc_field_in: wp.array2d[wp.spatial_vector],
+    cvel_in: wp.array2d[wp.spatial_vector],
+    # Out:
+    lam_bar_out: wp.array2d[wp.spatial_vector],
+    qacc_bar_out: wp.array2d[wp.spatial_vector],
+    qvel_bar_out: wp.array2d[wp.spatial_vector],
+    moved_bar_out: wp.array2d[wp.spatial_vector],
+    phi_dist_out: wp.array[float],
+    phi_pos_out: wp.array[wp.vec3],
+    phi_frame_out: wp.array[wp.mat33],
+):
+    """Φ ∋ -Σ_r ρ_r(λ) f_r(ρ(a) - aref): wrenches on both bodies, and cotangents of (dist, pos, frame)."""
+    con = wp.tid()
+    if con >= wp.min(nacon_in[0], contact_dist_in.shape[0]):
+        return
+    phi_dist_out[con] = 0.0
+    phi_pos_out[con] = wp.vec3(0.0)
+    phi_frame_out[con] = wp.mat33()
+    first = contact_address_in[con, 0]
+    if first < 0:
+        return
+    worldid = contact_worldid_in[con]
+    dim = contact_dim_in[con]
+    elliptic = type_in[worldid, first] == ConstraintType.CONTACT_ELLIPTIC
+    count = dim
+    if not elliptic and dim > 1:
+        count = 2 * (dim - 1)
+    if contact_address_in[con, count - 1] < 0:
+        return
+    friction = contact_friction_in[con]
+    mu = friction[0] * opt_impratio_invsqrt[worldid % opt_impratio_invsqrt.shape[0]]
+
+    # A contact none of whose rows pushes has no slope anywhere.
+    jar = vec6()
+    mass = vec6()
+    active = bool(False)
+    if elliptic:
+        for i in range(dim):
+            jar[i] = jar_in[worldid, first + i]
+            mass[i] = mass_in[worldid, first + i]
+    cone = cone_law(jar, mass, friction, mu, dim)
+    if elliptic:
+        active = cone.zone != 0
+    else:
+        for i in range(count):
+            active = active or slope_in[worldid, first + i] != 0.0
+    if not active:
+        return
+
+    geoms = contact_geom_in[con]
+    body1 = geom_bodyid[geoms[0]]
+    body2 = geom_bodyid[geoms[1]]
+    point = contact_pos_in[con]
+    frame = contact_frame_in[con]
+    arm1 = point - subtree_com_in[worldid, body_rootid[body1]]
+    arm2 = point - subtree_com_in[worldid, body_rootid[body2]]
+    lam1 = lam_field_in[worldid, body1]
+    lam2 = lam_field_in[worldid, body2]
+    acc1 = qacc_field_in[worldid, body1]
+    acc2 = qacc_field_in[worldid, body2]
+    vel1 = cvel_in[worldid, body1]
+    vel2 = cvel_in[worldid, body2]
+    lam_slide = point_velocity(lam2, arm2) - point_velocity(lam1, arm1)
+    acc_slide = point_velocity(acc2, arm2) - point_velocity(acc1, arm1)
+    vel_slide = point_velocity(vel2, arm2) - point_velocity(vel1, arm1)
+    lam_spin = wp.spatial_top(lam2) - wp.spatial_top(lam1)
+    acc_spin = wp.spatial_top(acc2) - wp.spatial_top(acc1)
+    vel_spin = wp.spatial_top(vel2) - wp.spatial_top(vel1)
+    rate = components(frame, lam_slide, lam_spin, dim)
+
+    timestep = opt_timestep[worldid % opt_timestep.shape[0]]
+    pos = contact_dist_in[con] - contact_margin_in[con]
+    solref = contact_solref_in[con]
+    solimp = contact_solimp_in[con]
+    normal_row = row_slopes(opt_disableflags, timestep, solref, solimp, pos)
+    lam_bar = vec6()
+    acc_bar = vec6()
+    vel_bar = vec6()
+    dist_bar = float(0.0)
+    if elliptic:
+        sideways = contact_solreffriction_in[con]
+        if sideways[0] == 0.0 and sideways[1] == 0.0:
+            sideways = solref
+        side_row = row_slopes(opt_disableflags, timestep, sideways, solimp, pos)
+        # ∂Φ/∂jar = S ρ(λ) =: y ,  jar = ρ(a) + b ρ(v) + k imp pos (normal row only)
+        y = cone_slope(cone, mass, friction, dim, rate)
+        work = float(0.0)
+        for i in range(dim):
+            lam_bar[i] = -cone.force[i]
+            acc_bar[i] = y[i]
+            vel_bar[i] = wp.where(i == 0, normal_row.damping, side_row.damping) * y[i]
+            work += rate[i] * cone.force[i]
+        # f is of degree one in D, whose ratios are fixed: ∂Φ/∂pos ∋ -ρ(λ)·f d(log D)
+        dist_bar = normal_row.stiffness * y[0] - normal_row.mass * work
+    else:
+        for i in range(count):
+            row = first + i
+            s = slope_in[worldid, row]
+            if s != 0.0:
+                f = force_in[worldid, row]
+                k = i / 2 + 1
+                lean = float(0.0)
+                if dim > 1:
+                    lean = friction[k - 1] * wp.where(i % 2 == 0, 1.0, -1.0)
+                # ρ_row = ρ₀ ± φ_k ρ_k
+                row_rate = rate[0]
+                if dim > 1:
+                    row_rate += lean * rate[k]
+                y_row = s * row_rate
+                lam_bar[0] -= f
+                acc_bar[0] += y_row
+                if dim > 1:
+                    lam_bar[k] -= lean * f
+                    acc_bar[k] += lean * y_row
+                dist_bar += normal_row.stiffness * y_row - normal_row.mass * row_rate * f
+        vel_bar = normal_row.damping * acc_bar
+
+    lam_force = along_frame(frame, lam_bar, 0)
+    acc_force = along_frame(frame, acc_bar, 0)
+    vel_force = along_frame(frame, vel_bar, 0)
+    lam_torque = along_frame(frame, lam_bar, 3)
+    acc_torque = along_frame(frame, acc_bar, 3)
+    vel_torque = along_frame(frame, vel_bar, 3)
+
+    phi_dist_out[con] = dist_bar
+    # ρ moves with the point as ω × dp  ⇒  p̄ = Σ_x ū(x) × ω(x)
+    phi_pos_out[con] = wp.cross(lam_force, lam_spin) + wp.cross(acc_force, acc_spin) + wp.cross(vel_force, vel_spin)
+    phi_frame_out[con] = (
+        frame_weight(frame, lam_bar, lam_slide, lam_spin)
+        + frame_weight(frame, acc_bar, acc_slide, acc_spin)
+        + frame_weight(frame, vel_bar, vel_slide, vel_spin)
+    )
+    for side in range(2):
+        body = body1
+        arm = arm1
+        sign = float(-1.0)
+        lam = lam1
+        acc = acc1
+        vel = vel1
+        if side == 1:
+            body = body2
+            arm = arm2
+            sign = float(1.0)
+            lam = lam2
+            acc = acc2
+            vel = vel2
+        if body > 0:
+            lam_wrench = sign * wrench(lam_force, lam_torque, arm)
+            acc_wrench = sign * wrench(acc_force, acc_torque, arm)
+            vel_wrench = sign * wrench(vel_force, vel_torque, arm)
+            wp.atomic_add(lam_bar_out, worldid, body, lam_wrench)
+            wp.atomic_add(qacc_bar_out, worldid, body, acc_wrench)
+            wp.atomic_add(qvel_bar_out, worldid, body, vel_wrench)
+            moved = carried(lam, lam_wrench) + carried(acc, acc_wrench) + carried(vel, vel_wrench)
+            wp.atomic_add(moved_bar_out, worldid, body, moved)
+
+
+@wp.kernel
+def pull_geometry(
+    # Model:
+    body_rootid: wp.array[int],
+    geom_bodyid: wp.array[int],
+    geom_type: wp.array[int],
+    geom_size: wp.array2d[wp.vec3],
+    # In:
+    nacon_in: wp.array[int],
+    contact_dist_in: wp.array[float],
+    contact_pos_in: wp.array[wp.vec3],
+    contact_frame_in: wp.array[wp.mat33],
+    contact_geom_in: wp.array[wp.vec2i],
+    contact_address_in: wp.array2d[int],
+    contact_worldid_in: wp.array[int],
+    geom_xpos_in: wp.array2d[wp.vec3],
+    geom_xmat_in: wp.array2d[wp.mat33],
+    subtree_com_in: wp.array2d[wp.vec3],
+    phi_dist_in: wp.array[float],
+    phi_pos_in: wp.array[wp.vec3],
+    phi_frame_in: wp.array[wp.mat33],
+    # Out:
+    moved_bar_out: wp.array2d[wp.spatial_vector],
+):
+    """Cotangents of (dist, pos, frame) to wrenches on the two bodies whose displacement moves them."""
+    con = wp.tid()
+    if con >= wp.min(nacon_in[0], contact_dist_in.shape[0]):
+        return
+    if contact_address_in[con, 0] < 0:
+        return
+    worldid = contact_worldid_in[con]
+    geoms = contact_geom_in[con]
+    body1 = geom_bodyid[geoms[0]]
+    body2 = geom_bodyid[geoms[1]]
+    dist = contact_dist_in[con]
+    point = contact_pos_in[con]
+    frame = contact_frame_in[con]
+    normal = frame[0]
+    dist_bar = phi_dist_in[con]
+    pos_bar = phi_pos_in[con]
+    weight = phi_frame_in[con]
+    com1 = subtree_com_in[worldid, body_rootid[body1]]
+    com2 = subtree_com_in[worldid, body_rootid[body2]]
+
+    along_axis = int(0)
+    axis = wp.vec3(0.0)
+    if geom_type[geoms[0]] == GeomType.PLANE and geom_type[geoms[1]] == GeomType.CAPSULE:
+        axis = _column(geom_xmat_in[worldid, geoms[1]], 2)
+        along_axis = int(1)
+        if wp.length(axis - normal * wp.dot(normal, axis)) < 0.5:
+            axis = frame[1]
+            along_axis = int(2)
+    normal_bar, axis_bar, _kind, _weight = wp.grad(frame_score)(normal, axis, along_axis, weight)
+
+    if geom_type[geoms[0]] == GeomType.PLANE:
+        # The core of the other geom that is nearest the plane is fixed to its body: a sphere's centre, a capsule's
+        # end, a box's corner, a mesh's vertex.
+        origin = geom_xpos_in[worldid, geoms[0]]
+        radius = float(0.0)
+        if geom_type[geoms[1]] == GeomType.SPHERE or geom_type[geoms[1]] == GeomType.CAPSULE:
+            radius = geom_size[worldid % geom_size.shape[0], geoms[1]][0]
+        core = point + normal * (radius + 0.5 * dist)
+        # pos = core - n (r + dist/2) ,  dist = n·(core - o) - r
+        reach = dist_bar - 0.5 * wp.dot(normal, pos_bar)
+        normal_bar += reach * (core - origin) - (radius + 0.5 * dist) * pos_bar
+        core_bar = pos_bar + reach * normal
+        if body2 > 0:
+            torque2 = wp.vec3(0.0)
+            if along_axis == 1:
+                torque2 = wp.cross(axis, axis_bar)
+            wp.atomic_add(moved_bar_out, worldid, body2, wrench(core_bar, torque2, core - com2))
+        if body1 > 0:
+            # n turns with the plane: dn = ω × n  ⇒  torque n × n̄
+            torque1 = wp.cross(normal, normal_bar)
+            wp.atomic_add(moved_bar_out, worldid, body1, wrench(-reach * normal, torque1, origin - com1))

@@ -1,0 +1,236 @@
+"""Which model features the adjoint differentiates: one table for the check before the first step and for the docs."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from msk_ray.errors import UnsupportedModelError
+
+_OBJ = mujoco.mjtObj
+_GEOM = mujoco.mjtGeom
+_TRN = mujoco.mjtTrn
+_JNT = mujoco.mjtJoint
+_EQ = mujoco.mjtEq
+
+
+Finder = Callable[[mujoco.MjModel], list[str]]
+
+
+@dataclass(frozen=True)
+class Feature:
+    """One row of the table."""
+
+    name: str
+    """What a user would call it."""
+    exact: bool
+    """Whether `tape_all` and `tape_per_substep` differentiate it."""
+    find: Finder
+    """Names of the elements of a model that use it."""
+    note: str = ""
+    """What is approximated or assumed."""
+
+
+def _named(model: mujoco.MjModel, kind: mujoco.mjtObj, word: str, ids: Iterable[int]) -> list[str]:
+    return [f"{word} {mujoco.mj_id2name(model, kind, int(i)) or int(i)!r}" for i in ids]
+
+
+def _among(values: np.ndarray, kinds: Iterable[int]) -> np.ndarray:
+    return np.isin(values, [int(k) for k in kinds])
+
+
+def _where(kind: mujoco.mjtObj, word: str, test: Callable[[mujoco.MjModel], np.ndarray]) -> Finder:
+    return lambda model: _named(model, kind, word, np.flatnonzero(test(model)))
+
+
+def _option(present: Callable[[mujoco.MjModel], bool], text: str) -> Finder:
+    return lambda model: [text] if present(model) else []
+
+
+def _joint_type(*kinds: int) -> Finder:
+    return _where(_OBJ.mjOBJ_JOINT, "joint", lambda m: _among(m.jnt_type, kinds))
+
+
+def _limited(*kinds: int) -> Finder:
+    return _where(_OBJ.mjOBJ_JOINT, "joint", lambda m: _among(m.jnt_type, kinds) & (m.jnt_limited != 0))
+
+
+def _spring(*kinds: int) -> Finder:
+    def test(m: mujoco.MjModel) -> np.ndarray:
+        stiff = np.asarray(m.jnt_stiffness) != 0
+        if hasattr(m, "jnt_stiffnesspoly"):
+            stiff = stiff | np.any(m.jnt_stiffnesspoly != 0, axis=-1)
+        return _among(m.jnt_type, kinds) & stiff
+
+    return _where(_OBJ.mjOBJ_JOINT, "joint", test)
+
+
+def _actuator(field: str, *kinds: int) -> Finder:
+    return _where(_OBJ.mjOBJ_ACTUATOR, "actuator", lambda m: _among(getattr(m, field), kinds))
+
+
+def _joint_transmission(*kinds: int) -> Finder:
+    def test(m: mujoco.MjModel) -> np.ndarray:
+        on_joint = _among(m.actuator_trntype, (_TRN.mjTRN_JOINT, _TRN.mjTRN_JOINTINPARENT))
+        joint = np.clip(m.actuator_trnid[:, 0], 0, max(m.njnt - 1, 0))
+        return on_joint & _among(m.jnt_type[joint], kinds) if m.njnt else on_joint
+
+    return _where(_OBJ.mjOBJ_ACTUATOR, "actuator", test)
+
+
+def _tendon(test: Callable[[mujoco.MjModel], np.ndarray]) -> Finder:
+    return _where(_OBJ.mjOBJ_TENDON, "tendon", test)
+
+
+def _foreign_actuator(m: mujoco.MjModel) -> np.ndarray:
+    return np.asarray(
+        (m.actuator_dyntype > int(mujoco.mjtDyn.mjDYN_MUSCLE))
+        | (m.actuator_gaintype > int(mujoco.mjtGain.mjGAIN_MUSCLE))
+        | (m.actuator_biastype > int(mujoco.mjtBias.mjBIAS_MUSCLE))
+    )
+
+
+def _equality(*kinds: int) -> Finder:
+    return _where(_OBJ.mjOBJ_EQUALITY, "equality", lambda m: _among(m.eq_type, kinds))
+
+
+def _spatial_tendons(m: mujoco.MjModel) -> np.ndarray:
+    first = m.wrap_type[m.tendon_adr] if m.ntendon else np.zeros(0)
+    return np.asarray(first != int(mujoco.mjtWrap.mjWRAP_JOINT))
+
+
+def colliding_pairs(m: mujoco.MjModel) -> set[tuple[int, int]]:
+    """Geom pairs that masks, parent filter and exclusions let through or that are listed, types in ascending order."""
+    filtered = not m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
+    excluded = {int(s) for s in m.exclude_signature}
+
+    def lets_through(a: int, b: int) -> bool:
+        if not ((m.geom_contype[a] & m.geom_conaffinity[b]) or (m.geom_contype[b] & m.geom_conaffinity[a])):
+            return False
+        body1, body2 = sorted((int(m.geom_bodyid[a]), int(m.geom_bodyid[b])))
+        weld1, weld2 = int(m.body_weldid[body1]), int(m.body_weldid[body2])
+        if weld1 == weld2 or (body1 << 16) + body2 in excluded:
+            return False
+        parents = [int(m.body_weldid[m.body_parentid[w]]) for w in (weld1, weld2)]
+        return not (filtered and weld1 and weld2 and (parents[0] == weld2 or parents[1] == weld1))
+
+    pairs = {(int(a), int(b)) for a, b in zip(m.pair_geom1, m.pair_geom2, strict=True)}
+    pairs |= {(a, b) for a in range(m.ngeom) for b in range(a + 1, m.ngeom) if lets_through(a, b)}
+    return {(a, b) if m.geom_type[a] <= m.geom_type[b] else (b, a) for a, b in pairs}
+
+
+def _pairs(kinds: set[tuple[int, int]] | None, known: set[tuple[int, int]]) -> Finder:
+    """Pairs of the given types, or with None all those of no `known` type."""
+
+    def find(m: mujoco.MjModel) -> list[str]:
+        if m.opt.disableflags & (mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT):
+            return []
+        out = []
+        for a, b in sorted(colliding_pairs(m)):
+            types = (int(m.geom_type[a]), int(m.geom_type[b]))
+            if (types in kinds) if kinds is not None else (types not in known):
+                names = _named(m, _OBJ.mjOBJ_GEOM, "geom", (a, b))
+                out.append(f"{names[0]} with {names[1]}")
+        return out
+
+    return find
+
+
+_PLANE_ROUND = {(int(_GEOM.mjGEOM_PLANE), int(t)) for t in (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE)}
+_PLANE_CORNERED = {(int(_GEOM.mjGEOM_PLANE), int(t)) for t in (_GEOM.mjGEOM_BOX, _GEOM.mjGEOM_MESH)}
+_KNOWN_PAIRS = _PLANE_ROUND | _PLANE_CORNERED
+_INTEGRATOR = mujoco.mjtIntegrator
+_DYN = mujoco.mjtDyn
+
+
+def _integrator(*kinds: int) -> Finder:
+    return _option(lambda m: m.opt.integrator in kinds, "option integrator")
+
+
+FEATURES: tuple[Feature, ...] = (
+    Feature("integrator Euler, implicit damping on or off", True, _integrator(_INTEGRATOR.mjINT_EULER)),
+    Feature("integrator implicitfast", False, _integrator(_INTEGRATOR.mjINT_IMPLICITFAST)),
+    Feature(
+        "integrators implicit, RK4, discrete",
+        False,
+        _option(
+            lambda m: m.opt.integrator not in (_INTEGRATOR.mjINT_EULER, _INTEGRATOR.mjINT_IMPLICITFAST),
+            "option integrator",
+        ),
+    ),
+    Feature("noslip iterations", False, _option(lambda m: m.opt.noslip_iterations > 0, "option noslip_iterations")),
+    Feature("joints free, hinge, slide", True, _joint_type(_JNT.mjJNT_FREE, _JNT.mjJNT_HINGE, _JNT.mjJNT_SLIDE)),
+    Feature("ball joints", True, _joint_type(_JNT.mjJNT_BALL)),
+    Feature("springs on hinge and slide joints", True, _spring(_JNT.mjJNT_HINGE, _JNT.mjJNT_SLIDE)),
+    Feature("springs on free and ball joints", False, _spring(_JNT.mjJNT_FREE, _JNT.mjJNT_BALL)),
+    Feature("limits of hinge and slide joints", True, _limited(_JNT.mjJNT_HINGE, _JNT.mjJNT_SLIDE)),
+    Feature("limits of ball joints", False, _limited(_JNT.mjJNT_BALL)),
+    Feature(
+        "dof friction loss",
+        False,
+        lambda m: _named(m, _OBJ.mjOBJ_JOINT, "joint", np.unique(m.dof_jntid[m.dof_frictionloss != 0])),
+    ),
+    Feature("gravity compensation", False, _where(_OBJ.mjOBJ_BODY, "body", lambda m: m.body_gravcomp != 0)),
+    Feature(
+        "fluid forces (density, viscosity, wind)",
+        False,
+        _option(lambda m: bool(m.opt.density or m.opt.viscosity or np.any(m.opt.wind)), "option density or viscosity"),
+    ),
+    Feature("contact of a plane with a sphere or capsule", True, _pairs(_PLANE_ROUND, set())),
+    Feature("contact of a plane with a box or mesh", True, _pairs(_PLANE_CORNERED, set())),
+    Feature("contact of other geometry pairs", False, _pairs(None, _KNOWN_PAIRS)),
+    Feature("tendons", False, _tendon(lambda m: np.ones(m.ntendon, dtype=bool))),
+    Feature(
+        "equality constraints",
+        False,
+        _where(_OBJ.mjOBJ_EQUALITY, "equality", lambda m: np.ones(m.neq, dtype=bool)),
+    ),
+    Feature(
+        "actuators: motor, position, velocity, affine, filter, integrator, muscle",
+        True,
+        _actuator(
+            "actuator_dyntype",
+            *(_DYN.mjDYN_NONE, _DYN.mjDYN_INTEGRATOR, _DYN.mjDYN_FILTER, _DYN.mjDYN_FILTEREXACT, _DYN.mjDYN_MUSCLE),
+        ),
+    ),
+    Feature(
+        "actuators with user or DC-motor dynamics, gain or bias",
+        False,
+        _where(_OBJ.mjOBJ_ACTUATOR, "actuator", _foreign_actuator),
+    ),
+    Feature("transmission to hinge and slide joints", True, _joint_transmission(_JNT.mjJNT_HINGE, _JNT.mjJNT_SLIDE)),
+    Feature("transmission to free and ball joints", False, _joint_transmission(_JNT.mjJNT_FREE, _JNT.mjJNT_BALL)),
+    Feature("transmission to tendons", False, _actuator("actuator_trntype", _TRN.mjTRN_TENDON)),
+    Feature("transmission to sites", False, _actuator("actuator_trntype", _TRN.mjTRN_SITE)),
+    Feature(
+        "transmission to slider-cranks and bodies (adhesion)",
+        False,
+        _actuator("actuator_trntype", _TRN.mjTRN_SLIDERCRANK, _TRN.mjTRN_BODY),
+    ),
+    Feature("flexes", False, _option(lambda m: m.nflex > 0, "flex")),
+    Feature("plugins", False, _option(lambda m: m.nplugin > 0, "plugin")),
+)
+
+
+def unsupported(model: mujoco.MjModel) -> dict[str, list[str]]:
+    """Elements of `model` by the name of the feature that the adjoint does not differentiate."""
+    found = {feature.name: feature.find(model) for feature in FEATURES if not feature.exact}
+    return {name: elements for name, elements in found.items() if elements}
+
+
+def check_supported(model: mujoco.MjModel, mode: str) -> None:
+    """Raise UnsupportedModelError naming every element that `mode` cannot differentiate."""
+    found = unsupported(model)
+    if found:
+        lines = [f"{name} ({', '.join(e[:5])}{' …' if len(e) > 5 else ''})" for name, e in found.items()]
+        raise UnsupportedModelError(
+            f"{mode} does not differentiate {'; '.join(lines)}. The mode fd_jacobian does: physics.backward=fd_jacobian"
+        )
+
+
+def table() -> str:
+    """The table as Markdown, feature by mode."""
+    rows = ["| feature | tape_all, tape_per_substep | fd_jacobian | note |", "|---|---|---|---|"]
+    rows += [f"| {f.name} | {'exact' if f.exact else 'raises'} | approximate | {f.note} |" for f in FEATURES]
+    return "\n".join(rows)

@@ -1,0 +1,231 @@
+"""Constraint rows at the known acceleration: their laws f(J a - aref), and slopes of impedance with position.
+
+Row laws (design of MuJoCo's solver): limits, frictionless and pyramidal rows f = -D·jar where jar < 0; equality
+f = -D·jar; friction loss the same, clamped. Elliptic contacts couple their rows through N = μ jar₀ and
+T = |φᵢ jarᵢ| and are finished in `contacts`.
+"""
+
+import warp as wp
+from mujoco_warp._src.constraint import _contact_kbimp
+from mujoco_warp._src.types import ConstraintType, vec5
+
+wp.set_module_options({"enable_backward": False})
+
+_MINIMP = wp.constant(1.0e-4)
+_MAXIMP = wp.constant(0.9999)
+
+
+class vec6(wp.types.vector(length=6, dtype=wp.float32)):  # type: ignore[misc]
+    """One number per contact dimension: normal, two tangents, torsion, two rolls."""
+
+
+@wp.func
+def impedance_slope(solimp: vec5, pos: float) -> float:
+    """d(impedance)/d(pos) of the piecewise power curve dmin + y(|pos|/width) (dmax - dmin)."""
+    low = wp.clamp(solimp[0], _MINIMP, _MAXIMP)
+    high = wp.clamp(solimp[1], _MINIMP, _MAXIMP)
+    width = solimp[2]
+    mid = wp.clamp(solimp[3], _MINIMP, _MAXIMP)
+    power = wp.max(1.0, solimp[4])
+    if low == high or width <= 1.0e-15:
+        return 0.0
+    x = wp.abs(pos) / width
+    if x <= 0.0 or x >= 1.0:
+        return 0.0
+    slope = float(1.0)
+    if power > 1.0:
+        if x <= mid:
+            slope = power * wp.pow(x / mid, power - 1.0)
+        else:
+            slope = power * wp.pow((1.0 - x) / (1.0 - mid), power - 1.0)
+    return wp.sign(pos) * slope * (high - low) / width
+
+
+@wp.struct
+class RowSlopes:
+    """How aref = -b·vel - k·imp·pos and D of one row answer to its position."""
+
+    damping: float  # b = -∂aref/∂vel [1/s]
+    stiffness: float  # -∂aref/∂pos [1/s²]
+    mass: float  # d(log D)/d(pos) [1/m]
+
+
+@wp.func
+def row_slopes(disableflags: int, timestep: float, solref: wp.vec2, solimp: vec5, pos: float) -> RowSlopes:
+    """Slopes of one row. D = imp / ((1 - imp) w)  ⇒  d(log D) = d(imp) / (imp (1 - imp))."""
+    kbi = _contact_kbimp(disableflags, timestep, solref, solimp, pos, False)
+    slope = impedance_slope(solimp, pos)
+    out = RowSlopes()
+    out.damping = kbi[1]
+    out.stiffness = kbi[0] * (kbi[2] + slope * pos)
+    out.mass = slope / (kbi[2] * (1.0 - kbi[2]))
+    return out
+
+
+@wp.kernel
+def densify_rows(
+    # In:
+    nefc_in: wp.array[int],
+    rownnz_in: wp.array2d[int],
+    rowadr_in: wp.array2d[int],
+    colind_in: wp.array3d[int],
+    sparse_in: wp.array3d[float],
+    # Out:
+    dense_out: wp.array3d[float],
+):
+    """Sparse constraint Jacobian to (W, njmax, nv)."""
+    worldid, row = wp.tid()
+    if row >= nefc_in[worldid]:
+        return
+    for j in range(dense_out.shape[2]):
+        dense_out[worldid, row, j] = 0.0
+    start = rowadr_in[worldid, row]
+    for k in range(start, start + rownnz_in[worldid, row]):
+        # A column may come twice (two bodies of one chain), so entries add up.
+        dense_out[worldid, row, colind_in[worldid, 0, k]] += sparse_in[worldid, 0, k]
+
+
+@wp.kernel
+def row_laws(
+    # Model:
+    nv: int,
+    # In:
+    nefc_in: wp.array[int],
+    type_in: wp.array2d[int],
+    jacobian_in: wp.array3d[float],
+    mass_in: wp.array2d[float],
+    aref_in: wp.array2d[float],
+    frictionloss_in: wp.array2d[float],
+    qacc_in: wp.array2d[float],
+    # Out:
+    jar_out: wp.array2d[float],
+    force_out: wp.array2d[float],
+    slope_out: wp.array2d[float],
+):
+    """jar = J a - aref, the force f of uncoupled rows, and their slope s = -∂f/∂jar. Elliptic rows get f = s = 0."""
+    worldid, row = wp.tid()
+    if row >= wp.min(nefc_in[worldid], jar_out.shape[1]):
+        return
+    jar = -aref_in[worldid, row]
+    for j in range(nv):
+        jar += jacobian_in[worldid, row, j] * qacc_in[worldid, j]
+    d = mass_in[worldid, row]
+    kind = type_in[worldid, row]
+    force = float(0.0)
+    slope = float(0.0)
+    if kind == ConstraintType.EQUALITY:
+        force = -d * jar
+        slope = d
+    elif kind == ConstraintType.FRICTION_DOF or kind == ConstraintType.FRICTION_TENDON:
+        loss = frictionloss_in[worldid, row]
+        force = wp.clamp(-d * jar, -loss, loss)
+        slope = wp.where(wp.abs(d * jar) < loss, d, 0.0)
+    elif kind != ConstraintType.CONTACT_ELLIPTIC and jar < 0.0:
+        force = -d * jar
+        slope = d
+    jar_out[worldid, row] = jar
+    force_out[worldid, row] = force
+    slope_out[worldid, row] = slope
+
+
+@wp.struct
+class Cone:
+    """Elliptic contact law at one jar: f and what S = -∂f/∂jar needs."""
+
+    zone: int  # 0 separating, 1 sticking, 2 sliding
+    force: vec6
+    tangent: vec6  # tᵢ = φᵢ² jarᵢ / T, zero at the normal
+    outer: float  # Dm: S holds Dm·g gᵀ with g = μ (1, -t)
+    inner: float  # κ: S holds κ (diag(φ²) - t tᵀ) over the tangents
+    mu: float
+
+
+@wp.func
+def cone_law(jar: vec6, mass: vec6, friction: vec5, mu: float, dim: int) -> Cone:
+    """Force of an elliptic contact. N = μ jar₀, T = |φ jar|; zones as in MuJoCo's solver."""
+    out = Cone()
+    out.mu = mu
+    normal = mu * jar[0]
+    square = float(0.0)
+    for i in range(1, dim):
+        u = friction[i - 1] * jar[i]
+        square += u * u
+    side = wp.sqrt(square)
+    if normal >= mu * side or (side <= 0.0 and normal >= 0.0):
+        out.zone = 0
+    elif mu * normal + side <= 0.0 or (side <= 0.0 and normal < 0.0):
+        out.zone = 1
+        for i in range(dim):
+            out.force[i] = -mass[i] * jar[i]
+    else:
+        out.zone = 2
+        out.outer = mass[0] / (mu * mu * (1.0 + mu * mu))
+        gap = normal - mu * side
+        # f₀ = -Dm (N - μT) μ ,  fᵢ = -f₀ φᵢ² jarᵢ / T
+        out.force[0] = -out.outer * gap * mu
+        for i in range(1, dim):
+            out.tangent[i] = friction[i - 1] * friction[i - 1] * jar[i] / side
+            out.force[i] = -out.force[0] * out.tangent[i]
+        out.inner = -out.outer * mu * gap / side
+    return out
+
+
+@wp.func
+def cone_slope(cone: Cone, mass: vec6, friction: vec5, dim: int, x: vec6) -> vec6:
+    """S x = -∂f/∂jar · x. Sliding: Dm g (g·x) + κ (φ² x - t (t·x)), g = μ (1, -t)."""
+    out = vec6()
+    if cone.zone == 1:
+        for i in range(dim):
+            out[i] = mass[i] * x[i]
+    elif cone.zone == 2:
+        along = float(0.0)
+        for i in range(1, dim):
+            along += cone.tangent[i] * x[i]
+        lead = cone.outer * cone.mu * cone.mu * (x[0] - along)
+        out[0] = lead
+        for i in range(1, dim):
+            phi = friction[i - 1]
+            out[i] = -lead * cone.tangent[i] + cone.inner * (phi * phi * x[i] - cone.tangent[i] * along)
+    return out
+
+
+@wp.kernel
+def scaled_jacobian(
+    # Model:
+    opt_impratio_invsqrt: wp.array[float],
+    # In:
+    nefc_in: wp.array[int],
+    type_in: wp.array2d[int],
+    id_in: wp.array2d[int],
+    jacobian_in: wp.array3d[float],
+    mass_in: wp.array2d[float],
+    jar_in: wp.array2d[float],
+    slope_in: wp.array2d[float],
+    contact_dim_in: wp.array[int],
+    contact_friction_in: wp.array[vec5],
+    contact_address_in: wp.array2d[int],
+    # Out:
+    scaled_out: wp.array3d[float],
+):
+    """S J, one thread a (row, dof); needed for elliptic cones only, whose S couples the rows of a contact."""
+    worldid, row, dof = wp.tid()
+    if row >= wp.min(nefc_in[worldid], jar_in.shape[1]):
+        return
+    if type_in[worldid, row] != ConstraintType.CONTACT_ELLIPTIC:
+        scaled_out[worldid, row, dof] = slope_in[worldid, row] * jacobian_in[worldid, row, dof]
+        return
+    con = id_in[worldid, row]
+    first = contact_address_in[con, 0]
+    dim = contact_dim_in[con]
+    jar = vec6()
+    mass = vec6()
+    column = vec6()
+    for i in range(dim):
+        jar[i] = jar_in[worldid, first + i]
+        mass[i] = mass_in[worldid, first + i]
+        column[i] = jacobian_in[worldid, first + i, dof]
+    friction = contact_friction_in[con]
+    mu = friction[0] * opt_impratio_invsqrt[worldid % opt_impratio_invsqrt.shape[0]]
+    cone = cone_law(jar, mass, friction, mu, dim)
+    product = cone_slope(cone, mass, friction, dim, column)
+    scaled_out[worldid, row, dof] = product[row - first]

@@ -1,0 +1,157 @@
+"""The two linear systems of a substep: (M + hB) μ = h v̄' and H λ = M μ with H = M + JᵀSJ."""
+
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+# Largest nv whose matrices fit the shared memory of one block (two tiles of nv² floats).
+TILE_LIMIT = 64
+
+
+@wp.kernel
+def build_matrices(
+    # Model:
+    coupled: bool,
+    inertia_address: wp.array2d[int],
+    # In:
+    nefc_in: wp.array[int],
+    inertia_in: wp.array2d[float],
+    step_in: wp.array2d[float],
+    step_dense: bool,
+    jacobian_in: wp.array3d[float],
+    slope_in: wp.array2d[float],
+    scaled_in: wp.array3d[float],
+    # Out:
+    implicit_out: wp.array3d[float],
+    hessian_out: wp.array3d[float],
+):
+    """M + hB and H = M + JᵀSJ as full matrices, one thread an entry of the lower triangle.
+
+    `step_in` is the diagonal hB, shape (W, nv), or with `step_dense` all of M + hB in M's sparse layout.
+    """
+    worldid, i, j = wp.tid()
+    if j > i:
+        return
+    address = inertia_address[i, j]
+    entry = float(0.0)
+    if address >= 0:
+        entry = inertia_in[worldid, address]
+    implicit = entry
+    if step_dense:
+        if address >= 0:
+            implicit = step_in[worldid, address]
+    elif i == j:
+        implicit += step_in[worldid, i]
+    implicit_out[worldid, i, j] = implicit
+    implicit_out[worldid, j, i] = implicit
+    # H_ij = M_ij + Σ_r J_ri (S J)_rj
+    for r in range(wp.min(nefc_in[worldid], slope_in.shape[1])):
+        if coupled:
+            entry += jacobian_in[worldid, r, i] * scaled_in[worldid, r, j]
+        else:
+            s = slope_in[worldid, r]
+            if s != 0.0:
+                entry += s * jacobian_in[worldid, r, i] * jacobian_in[worldid, r, j]
+    hessian_out[worldid, i, j] = entry
+    hessian_out[worldid, j, i] = entry
+
+
+@cache
+def solve_tiled(nv: int) -> Any:
+    """Both solves of a world in one block, for nv up to TILE_LIMIT."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def kernel(
+        # In:
+        implicit_in: wp.array3d[float],
+        hessian_in: wp.array3d[float],
+        rhs_in: wp.array2d[float],
+        damping_in: wp.array2d[float],
+        qacc_in: wp.array2d[float],
+        # Out:
+        mu_out: wp.array2d[float],
+        excess_out: wp.array2d[float],
+        lam_out: wp.array2d[float],
+    ):
+        worldid = wp.tid()
+        rhs = wp.tile_load(rhs_in[worldid], shape=wp.static(nv))
+        damping = wp.tile_load(damping_in[worldid], shape=wp.static(nv))
+        qacc = wp.tile_load(qacc_in[worldid], shape=wp.static(nv))
+        implicit = wp.tile_load(implicit_in[worldid], shape=(wp.static(nv), wp.static(nv)))
+        wp.tile_cholesky_inplace(implicit)
+        # (M + hB) μ = h v̄'
+        mu = wp.tile_cholesky_solve(implicit, rhs)
+        wp.tile_store(mu_out[worldid], mu)
+        # â = (M + hB)⁻¹ M a  ⇒  a - â = (M + hB)⁻¹ hB a
+        wp.tile_store(excess_out[worldid], wp.tile_cholesky_solve(implicit, wp.tile_map(wp.mul, damping, qacc)))
+        # M μ = h v̄' - hB μ ,  H λ = M μ
+        push = wp.tile_map(wp.sub, rhs, wp.tile_map(wp.mul, damping, mu))
+        hessian = wp.tile_load(hessian_in[worldid], shape=(wp.static(nv), wp.static(nv)))
+        wp.tile_cholesky_inplace(hessian)
+        wp.tile_store(lam_out[worldid], wp.tile_cholesky_solve(hessian, push))
+
+    return kernel
+
+
+@wp.func
+def _factor(matrix: wp.array2d[float], nv: int) -> None:
+    """Cholesky factor in the lower triangle, in place."""
+    for j in range(nv):
+        pivot = matrix[j, j]
+        for k in range(j):
+            pivot -= matrix[j, k] * matrix[j, k]
+        pivot = wp.sqrt(pivot)
+        matrix[j, j] = pivot
+        for i in range(j + 1, nv):
+            entry = matrix[i, j]
+            for k in range(j):
+                entry -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] = entry / pivot
+
+
+@wp.func
+def _substitute(factor: wp.array2d[float], nv: int, x: wp.array[float]) -> None:
+    """L Lᵀ x = x, in place."""
+    for i in range(nv):
+        entry = x[i]
+        for k in range(i):
+            entry -= factor[i, k] * x[k]
+        x[i] = entry / factor[i, i]
+    for s in range(nv):
+        i = nv - 1 - s
+        entry = x[i]
+        for k in range(i + 1, nv):
+            entry -= factor[k, i] * x[k]
+        x[i] = entry / factor[i, i]
+
+
+@wp.kernel
+def solve_serial(
+    # Model:
+    nv: int,
+    # In:
+    implicit_in: wp.array3d[float],
+    hessian_in: wp.array3d[float],
+    rhs_in: wp.array2d[float],
+    damping_in: wp.array2d[float],
+    qacc_in: wp.array2d[float],
+    # Out:
+    mu_out: wp.array2d[float],
+    excess_out: wp.array2d[float],
+    lam_out: wp.array2d[float],
+):
+    """The same two solves for any nv, one thread a world; factors overwrite the matrices."""
+    worldid = wp.tid()
+    _factor(implicit_in[worldid], nv)
+    for i in range(nv):
+        mu_out[worldid, i] = rhs_in[worldid, i]
+        excess_out[worldid, i] = damping_in[worldid, i] * qacc_in[worldid, i]
+    _substitute(implicit_in[worldid], nv, mu_out[worldid])
+    _substitute(implicit_in[worldid], nv, excess_out[worldid])
+    for i in range(nv):
+        lam_out[worldid, i] = rhs_in[worldid, i] - damping_in[worldid, i] * mu_out[worldid, i]
+    _factor(hessian_in[worldid], nv)
+    _substitute(hessian_in[worldid], nv, lam_out[worldid])

@@ -1,0 +1,24 @@
+"""Spatial algebra on MuJoCo's com-based vectors: motions [ω; v] and forces [torque; force] about one fixed point."""
+
+import warp as wp
+from mujoco_warp._src.math import motion_cross_force
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def point_velocity(motion: wp.spatial_vector, arm: wp.vec3) -> wp.vec3:
+    """Velocity of the point at `arm` from the reference point: v + ω × r."""
+    return wp.spatial_bottom(motion) + wp.cross(wp.spatial_top(motion), arm)
+
+
+@wp.func
+def wrench(force: wp.vec3, torque: wp.vec3, arm: wp.vec3) -> wp.spatial_vector:
+    """Force at `arm` and a free torque, about the reference point: [t + r × f; f]."""
+    return wp.spatial_vector(torque + wp.cross(arm, force), force)
+
+
+@wp.func
+def carried(motion: wp.spatial_vector, force: wp.spatial_vector) -> wp.spatial_vector:
+    """Cotangent of a body's displacement w where f·(w × V) is the change of f·V: w·(V ×* f)."""
+    return motion_cross_force(motion, force)

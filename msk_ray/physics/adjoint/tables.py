@@ -1,0 +1,90 @@
+"""Index tables of a model that the adjoint kernels read, worked out once on the host."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+import warp as wp
+
+_ROTATION_OFFSET = {mujoco.mjtJoint.mjJNT_FREE: 3, mujoco.mjtJoint.mjJNT_BALL: 0}
+
+
+@dataclass(frozen=True)
+class Tables:
+    """Device arrays of int32."""
+
+    body_lastdof: wp.array
+    """Last dof that moves each body, -1 for a fixed one; its ancestors follow by dof_parentid. Shape (nbody,)."""
+    body_subtree_end: wp.array
+    """One past the last body of each subtree: MuJoCo numbers bodies depth first. Shape (nbody,)."""
+    dof_first: wp.array
+    """First dof of the joint each dof belongs to; a free joint counts as three slides and a ball. Shape (nv,)."""
+    dof_last: wp.array
+    """Last dof of the same. Shape (nv,)."""
+    dof_spring_qpos: wp.array
+    """qpos address of a hinge or slide with a spring, else -1. Shape (nv,)."""
+    inertia_address: wp.array
+    """Place of M_ij (j ≤ i) in the sparse inertia, -1 where it is zero. Shape (nv, nv)."""
+    has_turning_spring: bool
+    """Whether a free or ball joint has a spring."""
+
+
+def _dof_groups(mjm: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    first = np.arange(mjm.nv, dtype=np.int32)
+    last = first.copy()
+    for joint in range(mjm.njnt):
+        offset = _ROTATION_OFFSET.get(mujoco.mjtJoint(mjm.jnt_type[joint]))
+        if offset is not None:
+            turn = int(mjm.jnt_dofadr[joint]) + offset
+            first[turn : turn + 3] = turn
+            last[turn : turn + 3] = turn + 2
+    return first, last
+
+
+def _has_spring(mjm: mujoco.MjModel, joint: int) -> bool:
+    poly = getattr(mjm, "jnt_stiffnesspoly", None)
+    bent = poly is not None and bool(np.any(poly[joint]))
+    return bool(mjm.jnt_stiffness[joint] != 0 or bent)
+
+
+def build_tables(mjm: mujoco.MjModel, model: Any) -> Tables:
+    """Tables for the C model `mjm` and its mujoco_warp copy `model`, on Warp's current device."""
+    lastdof = np.full(mjm.nbody, -1, dtype=np.int32)
+    subtree_end = np.arange(1, mjm.nbody + 1, dtype=np.int32)
+    for body in range(1, mjm.nbody):
+        count = int(mjm.body_dofnum[body])
+        inherited = lastdof[mjm.body_parentid[body]]
+        lastdof[body] = mjm.body_dofadr[body] + count - 1 if count else inherited
+    for body in range(mjm.nbody - 1, 0, -1):
+        parent = mjm.body_parentid[body]
+        subtree_end[parent] = max(subtree_end[parent], subtree_end[body])
+    first, last = _dof_groups(mjm)
+    springs = np.full(mjm.nv, -1, dtype=np.int32)
+    turning = False
+    disabled = bool(mjm.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SPRING)
+    for joint in range(mjm.njnt):
+        if disabled or not _has_spring(mjm, joint):
+            continue
+        if mjm.jnt_type[joint] in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
+            turning = True
+        else:
+            springs[mjm.jnt_dofadr[joint]] = mjm.jnt_qposadr[joint]
+    address = np.full((mjm.nv, mjm.nv), -1, dtype=np.int32)
+    nnz, start, column = model.M_rownnz.numpy(), model.M_rowadr.numpy(), model.M_colind.numpy()
+    for i in range(mjm.nv):
+        for k in range(start[i], start[i] + nnz[i]):
+            address[i, column[k]] = k
+
+    def ints(values: np.ndarray) -> wp.array:
+        return wp.array(values, dtype=int)
+
+    return Tables(
+        body_lastdof=ints(lastdof),
+        body_subtree_end=ints(subtree_end),
+        dof_first=ints(first),
+        dof_last=ints(last),
+        dof_spring_qpos=ints(springs),
+        inertia_address=ints(address),
+        has_turning_spring=turning,
+    )

@@ -1,0 +1,233 @@
+"""`tape_per_substep`, `tape_all` and `hybrid`: exact gradients by the adjoint of every substep.
+
+Both tapes checkpoint each substep's state and acceleration, in one buffer that is copied out per recorded env step.
+`tape_per_substep` recomputes the position and velocity stages in the backward pass (the acceleration is known, so
+nothing is solved); `tape_all` keeps them.
+"""
+
+from abc import abstractmethod
+from typing import Any
+
+import mujoco_warp as mjw
+import torch
+import warp as wp
+from torch import Tensor
+
+from msk_ray.physics import Graph, WorldBatch
+from msk_ray.physics.adjoint import StepAdjoint
+from msk_ray.physics.adjoint.coverage import check_supported
+from msk_ray.physics.adjoint.stages import recompute_stages
+from msk_ray.simulation.backward import Backward, InputGradients, Needs, StepState
+from msk_ray.simulation.buffers import stream_of
+from msk_ray.simulation.pool import Pool
+from msk_ray.simulation.residual import ResidualGauge
+
+# Arrays of mujoco_warp.Data that the adjoint of a substep reads, besides the checkpointed state.
+_KEPT_DATA = (
+    *("cdof", "cdof_dot", "cvel", "cinert", "M", "nefc", "nacon", "subtree_com", "geom_xpos", "geom_xmat"),
+    *("actuator_length", "moment_rownnz", "moment_rowadr", "moment_colind", "actuator_moment", "qfrc_actuator"),
+)
+_KEPT_EFC = ("type", "id", "J", "J_rownnz", "J_rowadr", "J_colind", "D", "aref", "frictionloss", "pos", "margin")
+_KEPT_CONTACT = (
+    *("dist", "pos", "frame", "includemargin", "friction", "solref", "solreffriction", "solimp", "dim", "geom"),
+    *("efc_address", "worldid"),
+)
+
+
+class _Tape(Backward):
+    """What the two tapes share: checkpoints, the backward graph, and reading it out.
+
+    Args:
+        substep_grad_clip: bound on the Euclidean norm of each world's state cotangent between substeps, in the
+            cotangent's own units; direction is kept. None for no bound.
+        residual_tolerance: a world is counted as unconverged where the solver left more than this share of its
+            forces unbalanced, |Ma - τ - Jᵀf| / (|Ma| + |τ| + |Jᵀf|).
+    """
+
+    def __init__(self, substep_grad_clip: float | None = None, residual_tolerance: float = 1e-3) -> None:
+        self.substep_grad_clip = substep_grad_clip
+        self.residual_tolerance = residual_tolerance
+
+    def attach(self, batch: WorldBatch) -> None:
+        mjm, worlds = batch.mjm, batch.nworld
+        check_supported(mjm, self.name)
+        self._batch = batch
+        self._device = torch.device(str(batch.device))
+        self._pulled = 0
+        with wp.ScopedDevice(batch.device):
+            self._adjoint = StepAdjoint(mjm, batch.model, batch.data)
+            pool = Pool(batch.device)
+            self._states: list[dict[str, wp.array]] = [{} for _ in range(batch.substeps)]
+            self._last: dict[str, wp.array] = {}
+            for state in (*self._states, self._last):
+                pool.floats(state, "qpos", worlds, mjm.nq)
+                pool.floats(state, "qvel", worlds, mjm.nv)
+            for state in self._states:
+                pool.floats(state, "act", worlds, mjm.na)
+                pool.floats(state, "qacc", worlds, mjm.nv)
+            self._prepare(pool)
+            self._saved = pool.allocate()
+            self._raw_qpos = wp.zeros((worlds, mjm.nq), dtype=float)
+            self._clipped = wp.zeros(worlds, dtype=int)
+            self._gauge = ResidualGauge(batch.model, worlds)
+        self._ctrl = wp.to_torch(batch.data.ctrl, requires_grad=False)
+        adjoint = self._adjoint
+        self.cotangent = StepState(
+            *(wp.to_torch(a, requires_grad=False) for a in (self._raw_qpos, adjoint.grad_qvel, adjoint.grad_act))
+        )
+        self._grad_ctrl = wp.to_torch(adjoint.grad_ctrl, requires_grad=False)
+        self._graph: Graph | None = None
+
+    def _prepare(self, pool: Pool) -> None:
+        """Claim further room in the buffer that is copied out per recorded step."""
+
+    @abstractmethod
+    def _stages(self, k: int) -> Any:
+        """Launch what puts the stages before substep k into a mujoco_warp.Data, and return it."""
+
+    def record(self, ctrl: Tensor, start: StepState, end: StepState) -> tuple[Tensor, ...]:
+        return (ctrl.detach().clone(), self._saved.clone())
+
+    @torch.no_grad()
+    def vjp(self, saved: tuple[Tensor, ...], cotangent: StepState, needs: Needs) -> InputGradients:
+        ctrl, kept = saved
+        if self._graph is None:
+            self._graph = Graph(self.launch_backward, self._batch.device)
+            self._clipped.zero_()
+        self._ctrl.copy_(ctrl)
+        self._saved.copy_(kept)
+        for view, value in zip(self.cotangent, cotangent, strict=True):
+            view.copy_(value)
+        self._graph.replay(stream_of(self._device))
+        self._pulled += 1
+        gradients = (self._grad_ctrl, *self.cotangent)
+        return InputGradients(*(g.clone() if need else None for g, need in zip(gradients, needs, strict=True)))
+
+    def bytes_recorded(self) -> int:
+        """Size of what one recorded env step keeps, all worlds together; its control comes on top."""
+        return self._saved.numel() * self._saved.element_size()
+
+    def launch_backward(self) -> None:
+        """Launch the pullback of a whole env step: from `cotangent` of its end to the same buffers for its start."""
+        self._adjoint.start(self._last["qpos"], self._raw_qpos)
+        for k in reversed(range(self._batch.substeps)):
+            after = self._states[k + 1] if k + 1 < self._batch.substeps else self._last
+            self._adjoint.pull_back(self._stages(k), after["qvel"])
+            if self.substep_grad_clip is not None and k > 0:
+                self._adjoint.clip(self.substep_grad_clip, self._clipped)
+        self._adjoint.finish(self._states[0]["qpos"], self._raw_qpos)
+
+    def diagnostics(self) -> dict[str, float]:
+        figures = self._gauge.read(self.residual_tolerance)
+        if self.substep_grad_clip is not None:
+            between = max(1, self._pulled * (self._batch.substeps - 1)) * self._batch.nworld
+            figures["substep_clip_share"] = float(self._clipped.numpy().sum()) / between
+            self._clipped.zero_()
+        self._pulled = 0
+        return figures
+
+
+class TapePerSubstep(_Tape):
+    """Checkpoints (qpos, qvel, act, qacc) of every substep; recomputes position and velocity stages in backward."""
+
+    name = "tape_per_substep"
+
+    def launch_step(self, batch: WorldBatch) -> None:
+        data = batch.data
+        batch.begin_step()
+        for state in self._states:
+            for name in ("qpos", "qvel", "act"):
+                wp.copy(state[name], getattr(data, name))
+            mjw.step(batch.model, data)
+            wp.copy(state["qacc"], data.qacc)
+            self._gauge.launch(data)
+        for name, array in self._last.items():
+            wp.copy(array, getattr(data, name))
+
+    def _stages(self, k: int) -> Any:
+        data = self._batch.data
+        for name, array in self._states[k].items():
+            wp.copy(getattr(data, name), array)
+        recompute_stages(self._batch.mjm, self._batch.model, data)
+        return data
+
+
+class TapeAll(_Tape):
+    """Keeps everything the adjoint of every substep reads: nothing is recomputed, at a price in memory."""
+
+    name = "tape_all"
+
+    def _prepare(self, pool: Pool) -> None:
+        batch = self._batch
+        self._datas = []
+        for _ in self._states:
+            data = batch.resized(batch.nworld).data
+            data.overflow = batch.data.overflow
+            data.ctrl = batch.data.ctrl
+            for holder, names in ((data, _KEPT_DATA), (data.efc, _KEPT_EFC), (data.contact, _KEPT_CONTACT)):
+                for name in names:
+                    pool.adopt(holder, name)
+            self._datas.append(data)
+
+    def launch_step(self, batch: WorldBatch) -> None:
+        before = batch.data
+        batch.begin_step()
+        for state, data in zip(self._states, self._datas, strict=True):
+            for name in ("qpos", "qvel", "act", "qacc_warmstart", "time"):
+                wp.copy(getattr(data, name), getattr(before, name))
+            for name in ("qpos", "qvel", "act"):
+                wp.copy(state[name], getattr(before, name))
+            mjw.step(batch.model, data)
+            wp.copy(state["qacc"], data.qacc)
+            self._gauge.launch(data)
+            before = data
+        for name in ("qpos", "qvel", "act"):
+            wp.copy(getattr(batch.data, name), getattr(before, name))
+        for name, array in self._last.items():
+            wp.copy(array, getattr(before, name))
+
+    def _stages(self, k: int) -> Any:
+        data = self._datas[k]
+        for name, array in self._states[k].items():
+            wp.copy(getattr(data, name), array)
+        return data
+
+
+class Hybrid(Backward):
+    """Gradients of the state from one mode and of the control from another, for diagnosis.
+
+    Args:
+        state: the mode that gives the gradients of (qpos, qvel, act). Its `launch_step` runs.
+        ctrl: the mode that gives the gradient of ctrl; one that needs no `launch_step` of its own (fd_jacobian).
+    """
+
+    name = "hybrid"
+
+    def __init__(self, state: Backward, ctrl: Backward) -> None:
+        self.state = state
+        self.ctrl = ctrl
+
+    def attach(self, batch: WorldBatch) -> None:
+        self.state.attach(batch)
+        self.ctrl.attach(batch)
+
+    def launch_step(self, batch: WorldBatch) -> None:
+        own = [m for m in (self.state, self.ctrl) if type(m).launch_step is not Backward.launch_step]
+        assert len(own) <= 1, "two modes that each launch the step their own way cannot be mixed"
+        (own[0] if own else self.state).launch_step(batch)
+
+    def record(self, ctrl: Tensor, start: StepState, end: StepState) -> tuple[Tensor, ...]:
+        first = self.state.record(ctrl, start, end)
+        self._split = len(first)
+        return (*first, *self.ctrl.record(ctrl, start, end))
+
+    def vjp(self, saved: tuple[Tensor, ...], cotangent: StepState, needs: Needs) -> InputGradients:
+        state = self.state.vjp(saved[: self._split], cotangent, needs._replace(ctrl=False))
+        ctrl = self.ctrl.vjp(saved[self._split :], cotangent, Needs(needs.ctrl, False, False, False))
+        return state._replace(ctrl=ctrl.ctrl)
+
+    def diagnostics(self) -> dict[str, float]:
+        return self.state.diagnostics() | self.ctrl.diagnostics()
+
+
+__all__ = ["Hybrid", "TapeAll", "TapePerSubstep"]

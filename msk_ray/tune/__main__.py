@@ -1,0 +1,171 @@
+"""`python -m msk_ray.tune`: an experiment of many trials, one GPU each, with Ray Tune."""
+
+import argparse
+import shutil
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from msk_ray.cli import RESUMABLE, Parser, run
+from msk_ray.config import dump_yaml, parse_override, read_yaml
+from msk_ray.errors import ConfigError
+from msk_ray.tune import experiment as experiments
+from msk_ray.tune.listing import text_table, trial_rows
+from msk_ray.tune.smoke import shrink
+from msk_ray.tune.space import Space, find_space, parse_seeds, parse_space
+from msk_ray.tune.trials import Trial, find_trial, resolve_trials
+
+DESCRIPTION = """\
+Run a search space: many SHAC trials side by side, one GPU (or CPU core) each, scored by deterministic evaluation,
+the hopeless ones stopped early.
+
+Writes runs/EXPERIMENT/: the trials' folders, and at the end summary.json, table.md and curves.png."""
+
+EXAMPLES = """\
+  python -m msk_ray.tune --space cartpole_smoke --cpu               # minutes on two cores
+  python -m msk_ray.tune --space ant_ablate --dry-run               # which trials would run?
+  python -m msk_ray.tune --space ant_ablate --smoke --cpu           # does all of it run at all?
+  python -m msk_ray.tune --space ant_lr --seeds 0-4 --gpus-per-trial 0.5
+  python -m msk_ray.tune --space ant_lr --set trial.epochs=100 --name ant_lr_short
+  python -m msk_ray.tune --space ant_lr --resume                    # after Ctrl-C, a crash or a lost node
+  python -m msk_ray.tune --space ant_lr --debug-trial 3             # that trial alone, here, without Ray
+
+exit codes: 0 all trials ended, 1 some ended in an error, 2 refused before any work began, 75 stopped on request and
+resumable."""
+
+
+def parser() -> Parser:
+    """The command line."""
+    p = Parser("python -m msk_ray.tune", DESCRIPTION, EXAMPLES)
+    p.add_argument("--space", required=True, metavar="NAME|FILE", help="a file, or a name in tune_spaces/")
+    p.add_argument(
+        "--set",
+        dest="overrides",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="override a setting of all trials",
+    )
+    p.add_argument("--seeds", metavar="LIST", help="seeds instead of the space's, such as 0-4 or 0,3,7")
+    p.add_argument("--smoke", action="store_true", help="shrink to minutes: every value of every factor, few epochs")
+    p.add_argument("--dry-run", action="store_true", help="print the resolved trials and stop")
+    p.add_argument("--debug-trial", metavar="K", help="run trial K (number or id of --dry-run) here, without Ray")
+    where = p.add_argument_group("where and how")
+    where.add_argument("--gpus-per-trial", type=float, metavar="G", help="GPUs a trial; below 1, trials share one")
+    where.add_argument("--cpu", action="store_true", help="run on CPU cores even if there are GPUs")
+    where.add_argument("--max-concurrent", type=int, metavar="N", help="at most N trials at once")
+    where.add_argument("--address", metavar="HOST:PORT", help="use a running Ray cluster; 'auto' finds the local one")
+    where.add_argument("--storage", type=Path, default=Path("runs"), metavar="DIR", help="by default runs/")
+    where.add_argument("--name", help="the experiment's name; by default the space's")
+    where.add_argument("--resume", action="store_true", help="go on with an experiment that was interrupted")
+    return p
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    args = parser().parse_args(argv)
+    if args.max_concurrent is not None and args.max_concurrent < 1:
+        raise ConfigError(f"--max-concurrent {args.max_concurrent}: at least 1")
+    space = _read_space(args)
+    trials = [] if space.file.search == "optuna" else resolve_trials(space)
+    if args.smoke and trials:
+        trials = shrink(space, trials)
+    if args.dry_run:
+        _print_trials(space, trials)
+        return 0
+    if args.debug_trial is not None:
+        return _debug(args, space, find_trial(trials, args.debug_trial))
+    return _run(args, space, trials)
+
+
+def _read_space(args: argparse.Namespace) -> Space:
+    """The space with the command line's changes laid over it, checked again as a whole."""
+    path = find_space(args.space)
+    data: dict[str, Any] = read_yaml(path)
+    changes = dict(parse_override(text) for text in args.overrides)
+    parameters = data.get("parameters")
+    for key in changes:
+        if isinstance(parameters, dict) and key in parameters:
+            raise ConfigError(f"--set {key}: the space varies it; edit {path.name}, or set another key")
+    if changes:
+        data["overrides"] = {**(data.get("overrides") or {}), **changes}
+    if args.seeds is not None:
+        parse_seeds(args.seeds)
+        data["seeds"] = args.seeds
+    return parse_space(data, path)
+
+
+def _print_trials(space: Space, trials: list[Trial]) -> None:
+    width = shutil.get_terminal_size((120, 24)).columns
+    print(space.file.question.strip() + "\n")
+    if space.file.search == "optuna":
+        print(f"{space.file.samples} trials, chosen by optuna as results come in, over:")
+        print(dump_yaml(space.file.parameters), end="")
+    else:
+        print(text_table(("#", "id", "changed", "seed", "epochs"), trial_rows(trials), width))
+    print(
+        f"\n{len(trials) or space.file.samples} trials · scheduler {space.file.scheduler.kind} · base {space.file.base}"
+    )
+
+
+def _debug(args: argparse.Namespace, space: Space, trial: Trial) -> int:
+    """One trial in this process, in a folder of its own."""
+    from msk_ray.training import Trainer
+    from msk_ray.tune.devices import local_gpus
+    from msk_ray.tune.records import read_record
+    from msk_ray.tune.trial_run import Hooks, run_trial
+
+    folder = (args.storage / "debug" / f"{space.name}_{trial.id}_{time.strftime('%Y%m%d_%H%M%S')}").resolve()
+    experiments.check_writable(folder)
+    device = "cpu" if args.cpu or local_gpus() == 0 else "cuda:0"
+    print(f"trial {trial.index} ({trial.id}): {trial.variant} seed={trial.seed} on {device}; into {folder}", flush=True)
+    hooks = Hooks(
+        on_evaluation=lambda e, ended, trainer: print(
+            f"epoch {e.epoch}/{trial.epochs}  score {e.score:.5g}", flush=True
+        )
+    )
+    ending = run_trial(trial, folder, device, space.file.stop, Trainer, hooks)
+    assert ending is not None  # nobody pauses it
+    print(f"{ending.outcome}: {ending.why}")
+    return 1 if read_record(trial, folder).errored else 0
+
+
+def _run(args: argparse.Namespace, space: Space, trials: list[Trial]) -> int:
+    name = experiments.check_name(args.name or space.name + ("-smoke" if args.smoke else ""))
+    path = (args.storage / name).resolve()
+    if args.resume:
+        if space.file.search == "optuna":
+            raise ConfigError("--resume: a search by optuna cannot go on; pass another --name")
+        experiment = experiments.reopen(path, trials)
+    # ray and torch take seconds to load; a wrong command line should not wait for them.
+    from msk_ray.tune import runner
+    from msk_ray.tune.devices import choose_placement, local_gpus
+    from msk_ray.tune.report import finish
+
+    if args.address is None:
+        placement = choose_placement(space.file.resources, args.gpus_per_trial, args.cpu, local_gpus())
+    if not args.resume:
+        experiment = experiments.create(path, space, trials, _options(args))
+
+    with runner.ray_session(args.address):
+        if args.address is not None:
+            placement = choose_placement(space.file.resources, args.gpus_per_trial, args.cpu, runner.cluster_gpus())
+        if not placement.gpus and not args.cpu:
+            print("no GPU here: trials run on CPU cores")
+        limit = args.max_concurrent or space.file.resources.max_concurrent
+        completed = runner.run_trials(runner.Plan(experiment, space, trials, placement, limit))
+    errors = finish(experiment)
+    if not completed:
+        print(f"stopped on request; go on with --resume --space {args.space} --name {name}")
+        return RESUMABLE
+    return 1 if errors else 0
+
+
+def _options(args: argparse.Namespace) -> dict[str, Any]:
+    return {key: str(value) if isinstance(value, Path) else value for key, value in vars(args).items()}
+
+
+if __name__ == "__main__":
+    sys.exit(run(main))

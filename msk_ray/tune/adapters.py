@@ -1,0 +1,92 @@
+"""The rules of `pruning` and the ranges of a space in Ray Tune's terms."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from ray import tune
+from ray.tune.schedulers import FIFOScheduler, PopulationBasedTraining, TrialScheduler
+from ray.tune.search import Searcher
+
+from msk_ray.errors import ConfigError
+from msk_ray.tune.operators import Listed, Operator, Range
+from msk_ray.tune.outcomes import Ending
+from msk_ray.tune.pruning import Pruner
+from msk_ray.tune.space import SchedulerSpec
+
+METRIC = "score"
+"""What trials report to Tune; `eval/score` under a name Tune does not take for a nested key."""
+
+
+class PruningScheduler(FIFOScheduler):
+    """Stops the trials a `Pruner` names, and says so."""
+
+    def __init__(
+        self, pruner: Pruner, time_attr: str, identify: Callable[[Any], str], on_stop: Callable[[str, Ending], None]
+    ) -> None:
+        """
+        Args:
+            pruner: the rule.
+            time_attr: key of a report that trials are compared at.
+            identify: id of the trial that a Ray trial runs.
+            on_stop: told the id and the ending before the trial is stopped.
+        """
+        super().__init__()
+        self._pruner = pruner
+        self._time_attr = time_attr
+        self._identify = identify
+        self._on_stop = on_stop
+
+    def on_trial_result(self, tune_controller: Any, trial: Any, result: dict[str, Any]) -> str:
+        if METRIC not in result:
+            return TrialScheduler.CONTINUE
+        trial_id = self._identify(trial)
+        ending = self._pruner.report(trial_id, result[self._time_attr], result[METRIC])
+        # A trial that has ended by itself still counts for the others, but has its own outcome.
+        if ending is None or result["ended"]:
+            return TrialScheduler.CONTINUE
+        self._on_stop(trial_id, ending)
+        return TrialScheduler.STOP
+
+
+def population_scheduler(spec: SchedulerSpec, budget: float, sampled: Mapping[str, Operator]) -> TrialScheduler:
+    """Population-based training over the sampled ranges. Values stay inside them, which Ray alone does not see to."""
+    ranges = {key: op for key, op in sampled.items() if isinstance(op, Range)}
+
+    def clip(config: dict[str, Any]) -> dict[str, Any]:
+        inside = {key: op.clip(config["params"][key]) for key, op in ranges.items()}
+        return config | {"params": config["params"] | inside}
+
+    return PopulationBasedTraining(
+        time_attr=spec.time_attr,
+        perturbation_interval=spec.interval * budget,
+        hyperparam_mutations={"params": {key: domain(op) for key, op in ranges.items()}},
+        quantile_fraction=spec.quantile,
+        resample_probability=spec.resample,
+        custom_explore_fn=clip,
+        log_config=False,
+    )
+
+
+def domain(op: Operator) -> Any:
+    """Ray's distribution for a sampled parameter; a choice is drawn by its labels."""
+    if isinstance(op, Listed):
+        return tune.choice([level.label for level in op.levels])
+    if op.kind == "randint":
+        return tune.randint(int(op.low), int(op.high) + 1)
+    return (tune.uniform if op.kind == "uniform" else tune.loguniform)(op.low, op.high)
+
+
+def optuna_search(seed: int) -> Searcher:
+    """Optuna's TPE sampler.
+
+    Raises:
+        ConfigError: Optuna is not installed.
+    """
+    try:
+        import optuna
+    except ImportError:
+        raise ConfigError("search: optuna needs the optuna package: pip install 'msk-ray[optuna]'") from None
+    from ray.tune.search.optuna import OptunaSearch
+
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    return OptunaSearch(metric=METRIC, mode="max", sampler=optuna.samplers.TPESampler(seed=seed))

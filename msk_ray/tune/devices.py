@@ -1,0 +1,70 @@
+"""What a trial runs on: GPUs if there are any and nothing else was asked for."""
+
+import os
+from dataclasses import dataclass
+
+from msk_ray.errors import ConfigError, DeviceError
+from msk_ray.tune.space import ResourcesSpec
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Resources of one trial."""
+
+    gpus: float
+    cpus: int
+
+    @property
+    def device(self) -> str:
+        """Name of the device inside the trial's process, which sees its own GPU only."""
+        return "cuda:0" if self.gpus else "cpu"
+
+    def concurrent(self, total_gpus: float, total_cpus: float, limit: int | None) -> int:
+        """Trials that fit at once, at least one."""
+        # A trial that needs a whole share of one GPU cannot use what is left over on two.
+        if self.gpus >= 1:
+            by_gpu = total_gpus // self.gpus
+        else:
+            by_gpu = total_gpus * (1 // self.gpus) if self.gpus else float("inf")
+        fitting = max(1, int(min(by_gpu, total_cpus // self.cpus)))
+        return fitting if limit is None else min(fitting, limit)
+
+
+def choose_placement(resources: ResourcesSpec, gpus_per_trial: float | None, cpu: bool, gpus: int) -> Placement:
+    """Where trials run.
+
+    Args:
+        resources: the space's section.
+        gpus_per_trial: what the command line asks for explicitly.
+        cpu: whether it asks for CPUs.
+        gpus: GPUs there are.
+
+    Raises:
+        ConfigError: the request makes no sense.
+        DeviceError: there are not enough GPUs for it.
+    """
+    if gpus_per_trial is not None:
+        if cpu:
+            raise ConfigError("--cpu and --gpus-per-trial exclude each other")
+        if gpus_per_trial <= 0 or (gpus_per_trial > 1 and gpus_per_trial % 1):
+            raise ConfigError(f"--gpus-per-trial {gpus_per_trial:g}: write 1, 2, ... or a share such as 0.5")
+        if gpus == 0:
+            raise DeviceError(f"--gpus-per-trial {gpus_per_trial:g}: no GPU here; pass --cpu to run on CPUs")
+    if cpu or gpus == 0:
+        return Placement(0.0, resources.cpus_per_trial)
+    wanted = resources.gpus_per_trial if gpus_per_trial is None else gpus_per_trial
+    if wanted > gpus:
+        raise DeviceError(f"{wanted:g} GPUs a trial asked for, {gpus} here")
+    return Placement(wanted, resources.cpus_per_trial)
+
+
+def local_gpus() -> int:
+    """GPUs of this machine that CUDA can use."""
+    import torch
+
+    return torch.cuda.device_count()
+
+
+def local_cpus() -> int:
+    """CPU cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

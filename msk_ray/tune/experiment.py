@@ -1,0 +1,239 @@
+"""An experiment's folder: what it is made of, how it is opened, and how it is read back without Ray.
+
+runs/<experiment>/
+    manifest.json     the trials: ids, changed parameters, full configs
+    space.yaml        the space as it was run
+    env.json          versions, devices, commit, command line
+    tune/             Ray's own state
+    trials/<id>/      config.yaml, metrics.jsonl, checkpoints/, outcome.json, output.log
+    summary.json, table.md, curves.png
+"""
+
+import json
+import os
+import platform
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import msk_ray
+from msk_ray.config import dump_yaml, parse_config
+from msk_ray.errors import StorageError
+from msk_ray.tune.outcomes import write_json, write_text
+from msk_ray.tune.space import Space
+from msk_ray.tune.trials import Trial, describe_changes
+
+FORMAT = 1
+STOP_FILE = "stop"
+"""While this file lies in the experiment's folder, trials save themselves and end at their next epoch."""
+_PACKAGES = ("msk-ray", "torch", "warp-lang", "mujoco", "mujoco-warp", "ray", "numpy")
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """An experiment on disk."""
+
+    path: Path
+    """Absolute."""
+
+    @property
+    def name(self) -> str:
+        return self.path.name
+
+    @property
+    def tune(self) -> Path:
+        """Folder of Ray's state."""
+        return self.path / "tune"
+
+    @property
+    def stop_file(self) -> Path:
+        return self.path / STOP_FILE
+
+    def trial_folder(self, trial_id: str) -> Path:
+        """Where a trial keeps everything."""
+        return self.path / "trials" / trial_id
+
+    def manifest(self) -> dict[str, Any]:
+        """The manifest as plain data.
+
+        Raises:
+            StorageError: missing, unreadable, or of another format.
+        """
+        path = self.path / "manifest.json"
+        try:
+            data: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise StorageError(f"{self.path} holds no experiment: manifest.json is missing") from None
+        except (OSError, ValueError) as error:
+            raise StorageError(f"cannot read {path}: {error}") from error
+        if data.get("format") != FORMAT:
+            raise StorageError(f"{path} has format {data.get('format')}, this version reads {FORMAT}")
+        return data
+
+    def trials(self) -> list[Trial]:
+        """The trials of the manifest."""
+        return [
+            Trial(
+                entry["index"],
+                entry["id"],
+                entry["changed"],
+                entry["values"],
+                parse_config(entry["config"], f"{self.path / 'manifest.json'}: trial {entry['id']}"),
+            )
+            for entry in self.manifest()["trials"]
+        ]
+
+    def set_trials(self, trials: Iterable[Trial]) -> None:
+        """Replace the manifest's list of trials."""
+        write_json(self.path / "manifest.json", self.manifest() | {"trials": [_entry(trial) for trial in trials]})
+
+
+def create(path: Path, space: Space, trials: list[Trial], options: dict[str, Any]) -> Experiment:
+    """Make a new experiment's folder and say in it what it is.
+
+    Raises:
+        StorageError: the folder cannot be written, or holds an experiment already.
+    """
+    experiment = Experiment(path)
+    if (path / "manifest.json").exists():
+        raise StorageError(f"{path} holds an experiment already: add --resume to go on with it, or pass another --name")
+    check_writable(path)
+    (path / "trials").mkdir(exist_ok=True)
+    written = space.file.model_dump(mode="json", exclude_unset=True)
+    write_text(path / "space.yaml", dump_yaml(written))
+    write_json(path / "env.json", environment())
+    manifest = {
+        "format": FORMAT,
+        "name": path.name,
+        "space": space.name,
+        "question": space.file.question.strip(),
+        "created": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+        "options": options,
+        "trials": [_entry(trial) for trial in trials],
+    }
+    # Last: a folder with a manifest is a whole experiment.
+    write_json(path / "manifest.json", manifest)
+    return experiment
+
+
+def reopen(path: Path, trials: list[Trial] | None) -> Experiment:
+    """Open an experiment to go on with it.
+
+    Args:
+        path: its folder.
+        trials: what the space resolves to now, to be compared; None to take the manifest's word.
+
+    Raises:
+        StorageError: there is none, it cannot be written, or its trials are not those of the space as it is now.
+    """
+    experiment = Experiment(path)
+    if not path.is_dir():
+        raise StorageError(f"--resume: no experiment at {path}; leave --resume out to start one")
+    recorded = experiment.trials()
+    check_writable(path)
+    difference = difference_of(recorded, trials) if trials is not None else None
+    if difference:
+        raise StorageError(
+            f"--resume: the space no longer gives the trials of {path}: {difference}; undo that, or pass another --name"
+        )
+    experiment.stop_file.unlink(missing_ok=True)
+    return experiment
+
+
+def difference_of(recorded: list[Trial], now: list[Trial]) -> str | None:
+    """How two lists of trials differ, on one line; None if they are the same."""
+    old, new = {trial.id: trial for trial in recorded}, {trial.id: trial for trial in now}
+    gone = [trial for trial in recorded if trial.id not in new]
+    added = [trial for trial in now if trial.id not in old]
+    if not gone and not added:
+        return None
+    # Trials at the same place were most likely one trial before an edit; then the edit itself says the most.
+    for before, after in zip(gone, added, strict=False):
+        if before.index == after.index:
+            return f"trial {before.index} changed: {describe_changes(before.config, after.config)}"
+    parts = [f"{len(gone)} gone ({_few(gone)})"] if gone else []
+    parts += [f"{len(added)} new ({_few(added)})"] if added else []
+    return ", ".join(parts)
+
+
+def check_writable(path: Path) -> None:
+    """Make the folder and write a file into it: permissions alone do not tell (full disks, read-only mounts).
+
+    Raises:
+        StorageError: it did not work.
+    """
+    probe = path / f".probe.{os.getpid()}"
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        probe.write_bytes(b"0" * 4096)
+        probe.unlink()
+    except OSError as error:
+        raise StorageError(f"cannot write to {path}: {error.strerror or error}; choose another --storage") from error
+
+
+def check_name(name: str) -> str:
+    """An experiment's name, which becomes a folder's.
+
+    Raises:
+        StorageError: it would not be a plain folder name.
+    """
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name):
+        raise StorageError(f"--name {name!r}: use letters, digits, '.', '_' and '-'")
+    return name
+
+
+def environment() -> dict[str, Any]:
+    """What the experiment ran with."""
+    return {
+        "command": sys.argv,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "host": platform.node(),
+        "cpus": os.cpu_count(),
+        "packages": {name: version for name in _PACKAGES if (version := _version(name))},
+        "commit": _commit(),
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _commit() -> str | None:
+    """The checkout's commit, `+` for uncommitted changes; None outside a checkout."""
+    root = Path(msk_ray.__file__).resolve().parent.parent
+    if not (root / ".git").exists():
+        return None
+    try:
+        head = subprocess.run(["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
+        changes = subprocess.run(
+            ["git", "-C", str(root), "status", "--porcelain"], capture_output=True, text=True, check=True
+        )
+    except (OSError, subprocess.CalledProcessError):
+        # git is not installed, or refuses a folder of another owner: the commit is unknown, which null says.
+        return None
+    return head.stdout.strip() + ("+" if changes.stdout.strip() else "")
+
+
+def _entry(trial: Trial) -> dict[str, Any]:
+    return {
+        "index": trial.index,
+        "id": trial.id,
+        "changed": trial.changed,
+        "values": trial.values,
+        "config": trial.config.as_dict(),
+    }
+
+
+def _few(trials: list[Trial]) -> str:
+    shown = ", ".join(f"{trial.variant} seed {trial.seed}" for trial in trials[:2])
+    return shown + (", ..." if len(trials) > 2 else "")

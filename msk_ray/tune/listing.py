@@ -1,0 +1,24 @@
+"""Tables for a terminal."""
+
+from collections.abc import Sequence
+
+from msk_ray.tune.trials import Trial
+
+
+def text_table(header: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> str:
+    """A table for a terminal of `width` columns; the last column is cut, never the others."""
+    body = [list(header), *[list(row) for row in rows]]
+    widths = [max(len(line[column]) for line in body) for column in range(len(header))]
+    lines = []
+    for number, line in enumerate(body):
+        cells = [cell.ljust(size) for cell, size in zip(line, widths, strict=True)]
+        text = "  ".join(cells).rstrip()
+        lines.append(text if len(text) <= width else text[: max(1, width - 1)] + "…")
+        if number == 0:
+            lines.append("─" * min(width, sum(widths) + 2 * (len(widths) - 1)))
+    return "\n".join(lines)
+
+
+def trial_rows(trials: Sequence[Trial]) -> list[tuple[str, ...]]:
+    """The resolved trials before they run."""
+    return [(str(t.index), t.id, t.variant, str(t.seed), str(t.epochs)) for t in trials]

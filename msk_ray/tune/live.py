@@ -1,0 +1,199 @@
+"""What the terminal shows while an experiment runs: a line an event, and now and then where everything stands."""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+from ray.tune import Callback
+
+from msk_ray.cli import StopRequest
+from msk_ray.progress import format_duration
+from msk_ray.tune.adapters import METRIC
+from msk_ray.tune.experiment import Experiment
+from msk_ray.tune.outcomes import Ending, Outcome, read_ending, write_ending
+from msk_ray.tune.trial_run import ERROR_FILE
+from msk_ray.tune.trials import Trial
+
+STATUS_INTERVAL_S = 30.0
+SHUTDOWN_GRACE_S = 120.0
+"""How long trials may take to reach the end of their epoch and save, after a request to stop."""
+
+
+@dataclass
+class _Running:
+    trial: Trial
+    since: float
+    first_epoch: int | None = None
+    epoch: int = 0
+    score: float = float("nan")
+    best: float = float("-inf")
+
+
+class Live(Callback):
+    """Follows the trials: prints, names the endings that only the driver sees, and stops everything on request."""
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        trials: list[Trial],
+        trial_of: Callable[[dict[str, Any]], Trial],
+        concurrent: int,
+        stop: StopRequest,
+    ) -> None:
+        self._experiment = experiment
+        self._waiting = {trial.id: trial for trial in trials}
+        self._trial_of = trial_of
+        self._concurrent = concurrent
+        self._stop = stop
+        self._running: dict[str, _Running] = {}
+        self._saving: set[str] = set()
+        self._ended = 0
+        self.started: list[Trial] = []
+        """Trials that were started, in that order, each once, numbered anew."""
+        self._best: tuple[float, Trial] | None = None
+        self._start = time.monotonic()
+        self._last_status = self._start
+        self._seconds_per_epoch: dict[str, float] = {}
+        self._stopping_since: float | None = None
+        self._armed = False
+
+    @property
+    def stopped(self) -> bool:
+        """Whether a request to stop has been carried out: every trial that ran has saved itself, or time is up."""
+        if self._stopping_since is None:
+            return False
+        return not self._saving or time.monotonic() - self._stopping_since > SHUTDOWN_GRACE_S
+
+    def on_step_end(self, iteration: int, trials: list[Any], **info: Any) -> None:
+        if not self._armed:
+            # Tune takes SIGUSR1 for itself when it starts.
+            self._stop.install()
+            self._armed = True
+        if self._stop and self._stopping_since is None:
+            self._begin_stop()
+        if time.monotonic() - self._last_status >= STATUS_INTERVAL_S:
+            self._last_status = time.monotonic()
+            self._say(self.status())
+
+    def on_trial_start(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
+        mine = self._trial_of(trial.config)
+        self._waiting.pop(mine.id, None)
+        again = mine.id in self._running
+        if all(mine.id != trial.id for trial in self.started):
+            self.started.append(replace(mine, index=len(self.started)))
+        self._running[mine.id] = _Running(mine, time.monotonic())
+        if self._stopping_since is None:
+            self._say(f"{mine.id} {'again' if again else 'start'}  {self._name(mine)}")
+
+    def on_trial_result(
+        self, iteration: int, trials: list[Any], trial: Any, result: dict[str, Any], **info: Any
+    ) -> None:
+        if METRIC not in result:
+            return
+        mine = self._trial_of(trial.config)
+        run = self._running.setdefault(mine.id, _Running(mine, time.monotonic()))
+        run.epoch, run.score = result["epoch"], result[METRIC]
+        if run.first_epoch is None:
+            # Speed is taken from the first report on: what came before includes start-up and compilation.
+            run.first_epoch, run.since = run.epoch, time.monotonic()
+        elif run.epoch > run.first_epoch:
+            self._seconds_per_epoch[mine.id] = (time.monotonic() - run.since) / (run.epoch - run.first_epoch)
+        run.best = max(run.best, run.score)
+        if self._best is None or run.score > self._best[0]:
+            self._best = run.score, mine
+            self._say(f"{mine.id} best so far: score {run.score:.5g} at epoch {run.epoch}/{mine.epochs}")
+
+    def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
+        mine = self._trial_of(trial.config)
+        self._say(f"{mine.id} its process died or raised; trying again from its newest checkpoint")
+
+    def on_trial_complete(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
+        mine = self._trial_of(trial.config)
+        self._saving.discard(mine.id)
+        run = self._running.pop(mine.id, None)
+        ending = read_ending(self._experiment.trial_folder(mine.id))
+        if ending is None:
+            return  # paused by a request to stop, or never begun
+        self._ended += 1
+        score = "" if run is None or run.best == float("-inf") else f"; best score {run.best:.5g}"
+        self._say(f"{mine.id} {ending.outcome}: {ending.why}{score}")
+
+    def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
+        mine = self._trial_of(trial.config)
+        folder = self._experiment.trial_folder(mine.id)
+        self._saving.discard(mine.id)
+        self._running.pop(mine.id, None)
+        self._ended += 1
+        ending = Ending(Outcome.ERROR, _reason(folder / ERROR_FILE, trial))
+        write_ending(folder, ending)
+        self._say(f"{mine.id} error: {ending.why}; see {folder}")
+
+    def pruned(self, trial_id: str, ending: Ending) -> None:
+        """A scheduler stops a trial: its process will not live to write its ending."""
+        write_ending(self._experiment.trial_folder(trial_id), ending)
+
+    def status(self) -> str:
+        """One line on where everything stands."""
+        parts = [f"{len(self._running)} running", f"{len(self._waiting)} waiting", f"{self._ended} ended"]
+        if self._best is not None:
+            parts.append(f"best {self._best[0]:.5g} ({self._best[1].id})")
+        running = [
+            (run.trial.epochs - run.epoch, self._seconds_per_epoch.get(run.trial.id)) for run in self._running.values()
+        ]
+        left = time_left(running, [trial.epochs for trial in self._waiting.values()], self._concurrent)
+        if left is not None:
+            parts.append(f"at most {format_duration(left)} left")
+        lines = [" · ".join(parts)]
+        for run in self._running.values():
+            score = "no evaluation yet" if math.isnan(run.score) else f"score {run.score:.5g} (best {run.best:.5g})"
+            lines.append(
+                f"    {run.trial.id}  epoch {run.epoch:>4}/{run.trial.epochs}  {score}  {self._name(run.trial)}"
+            )
+        return "\n".join(lines)
+
+    def _begin_stop(self) -> None:
+        assert self._stop.signal is not None
+        self._stopping_since = time.monotonic()
+        self._saving = set(self._running)
+        self._experiment.stop_file.touch()
+        self._say(f"{self._stop.signal.name}: {len(self._saving)} trials save themselves at the end of their epoch ...")
+
+    def _say(self, text: str) -> None:
+        print(f"[{format_duration(time.monotonic() - self._start):>6}] {text}", flush=True)
+
+    @staticmethod
+    def _name(trial: Trial) -> str:
+        return f"{trial.variant} seed={trial.seed}"
+
+
+def time_left(running: list[tuple[int, float | None]], waiting: list[int], concurrent: int) -> float | None:
+    """Seconds until all trials have run to their last epoch: an upper bound, as some will be stopped before.
+
+    Args:
+        running: for each running trial its epochs left and its seconds per epoch, None while unknown.
+        waiting: epochs of each trial not yet started.
+        concurrent: trials that run at once.
+
+    Returns:
+        None while no speed is known.
+    """
+    known = [speed for _, speed in running if speed is not None]
+    if not known:
+        return None
+    mean = sum(known) / len(known)
+    # Longest first onto the slot that is free earliest.
+    slots = sorted(left * (speed if speed is not None else mean) for left, speed in running)
+    slots = [0.0] * max(0, concurrent - len(slots)) + slots
+    for epochs in sorted(waiting, reverse=True):
+        slots[0] += epochs * mean
+        slots.sort()
+    return slots[-1]
+
+
+def _reason(error_file: Any, trial: Any) -> str:
+    """Why Ray gave a trial up, on one line."""
+    if error_file.is_file():
+        return str(error_file.read_text(encoding="utf-8").strip().splitlines()[-1])
+    return f"its process died {trial.num_failures} times (killed, or out of memory)"

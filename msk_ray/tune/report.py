@@ -1,0 +1,38 @@
+"""What an experiment leaves at its end: a table on the terminal, and summary.json, table.md and curves.png."""
+
+import shutil
+
+from msk_ray.tune.curves import draw_curves
+from msk_ray.tune.experiment import Experiment
+from msk_ray.tune.listing import text_table
+from msk_ray.tune.outcomes import write_json, write_text
+from msk_ray.tune.records import best_record, read_records
+from msk_ray.tune.table import HEADER, result_rows, summary, table_document, variant_rows
+
+
+def finish(experiment: Experiment) -> int:
+    """Write and print the results as they stand on disk.
+
+    Returns:
+        How many trials ended in an error.
+    """
+    manifest = experiment.manifest()
+    records = read_records(experiment)
+    width = max(100, shutil.get_terminal_size((160, 24)).columns)
+    write_json(experiment.path / "summary.json", summary(experiment.name, manifest["question"], records))
+    write_text(experiment.path / "table.md", table_document(experiment.name, manifest["question"], records))
+    draw_curves(records, experiment.path / "curves.png", experiment.name)
+    print("\n" + text_table(HEADER, result_rows(records), width))
+    if len({record.trial.seed for record in records}) > 1:
+        header = ("variant", "seeds", "mean score", "std", "min", "max")
+        print("\n" + text_table(header, variant_rows(records), width))
+    best = best_record(records)
+    if best is not None and best.best is not None:
+        print(
+            f"\nbest trial   {best.trial.id}: {best.trial.variant} seed={best.trial.seed}, score {best.best.score:.5g}"
+        )
+        print(f"best policy  {best.best_checkpoint or 'its checkpoint is missing'}")
+    print(f"table        {experiment.path / 'table.md'}")
+    print(f"curves       {experiment.path / 'curves.png'}")
+    print(f"trials       {experiment.path / 'trials'}", flush=True)
+    return sum(record.errored for record in records)

@@ -1,0 +1,287 @@
+"""Runs an experiment's trials with Ray Tune."""
+
+import os
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import ray
+from ray import tune
+from ray.exceptions import RayTaskError
+from ray.tune.search import BasicVariantGenerator
+from ray.tune.stopper import Stopper
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+import msk_ray
+from msk_ray.cli import StopRequest
+from msk_ray.config import Config, read_yaml
+from msk_ray.errors import DeviceError, MskRayError
+from msk_ray.progress import format_duration
+from msk_ray.training import Trainer, precompile
+from msk_ray.tune.adapters import METRIC, PruningScheduler, domain, optuna_search, population_scheduler
+from msk_ray.tune.devices import Placement
+from msk_ray.tune.experiment import Experiment
+from msk_ray.tune.live import Live
+from msk_ray.tune.operators import Listed
+from msk_ray.tune.pruning import Pruner, make_pruner
+from msk_ray.tune.records import read_record
+from msk_ray.tune.space import Space
+from msk_ray.tune.trainable import Job, make_trainable
+from msk_ray.tune.trial_run import TrainerLike
+from msk_ray.tune.trials import Trial, base_settings, env_steps_budget
+
+Precompile = Callable[[Config, str, Path], None]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything that decides how an experiment's trials are run."""
+
+    experiment: Experiment
+    space: Space
+    trials: list[Trial]
+    """All trials of the experiment, ended ones included; empty when a search makes them up."""
+    placement: Placement
+    max_concurrent: int | None
+    trainer_class: type[TrainerLike] = Trainer
+    precompile: Precompile | None = precompile
+    """Compiles a config's kernels on a node before trials start; None where there is nothing to compile."""
+
+
+@contextmanager
+def ray_session(address: str | None, dashboard: bool = True) -> Iterator[None]:
+    """A Ray of our own on this machine, or the one at `address`.
+
+    Raises:
+        DeviceError: the cluster at `address` cannot be reached.
+    """
+    os.environ.update(
+        RAY_AIR_NEW_OUTPUT="0",
+        RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO="1",  # a trial without GPUs sees none, rather than all
+        TUNE_DISABLE_AUTO_CALLBACK_LOGGERS="1",  # trials write their own metrics, at once
+        TUNE_DISABLE_SIGINT_HANDLER="1",  # a request to stop lets trials save themselves first
+    )
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    quiet: dict[str, Any] = {"logging_level": "ERROR", "log_to_driver": False}
+    if address is None:
+        # Workers must import the package this process runs, wherever it was started from.
+        package = str(Path(msk_ray.__file__).resolve().parent.parent)
+        paths = [package, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
+        os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys(paths))
+        context = ray.init(include_dashboard=dashboard, dashboard_host="127.0.0.1", **quiet)
+    else:
+        try:
+            context = ray.init(address=address, **quiet)
+        except ConnectionError as error:
+            raise DeviceError(f"--address {address}: no Ray cluster there: {str(error).splitlines()[0]}") from error
+    try:
+        if context.dashboard_url:
+            print(f"Ray dashboard: http://{context.dashboard_url}", flush=True)
+        yield
+    finally:
+        ray.shutdown()
+
+
+def cluster_gpus() -> int:
+    """GPUs of all nodes of the Ray session."""
+    return int(ray.cluster_resources().get("GPU", 0))
+
+
+def run_trials(plan: Plan) -> bool:
+    """Run what has not ended yet. Needs a Ray session.
+
+    Returns:
+        False if a request to stop ended it before its time; the experiment can be resumed.
+
+    Raises:
+        MskRayError: kernels could not be compiled for a trial, or the search is not installed.
+    """
+    experiment, space = plan.experiment, plan.space
+    remaining = [t for t in plan.trials if read_record(t, experiment.trial_folder(t.id)).ending is None]
+    if plan.trials and not remaining:
+        print("all trials have ended already")
+        return True
+    base = base_settings(space) if not plan.trials else {}
+    job = Job(
+        experiment,
+        space,
+        base,
+        {trial.id: trial for trial in plan.trials},
+        plan.placement.device,
+        plan.placement.cpus,
+        plan.trainer_class,
+    )
+    if plan.precompile is not None:
+        _precompile(plan, remaining or [_first_suggestion(job)])
+    total = ray.cluster_resources()
+    concurrent = plan.placement.concurrent(total.get("GPU", 0.0), total.get("CPU", 1.0), plan.max_concurrent)
+    stop = StopRequest()
+    live = Live(experiment, remaining, job.trial_of, concurrent, stop)
+    print(
+        f"{len(remaining) or space.file.samples} trials, {concurrent} at once on "
+        f"{f'{plan.placement.gpus:g} GPU each' if plan.placement.gpus else 'CPU'}; into {experiment.path}",
+        flush=True,
+    )
+    _fit(plan, job, live, remaining)
+    if not plan.trials:
+        # A search makes trials up as it goes; they enter the manifest once they are known.
+        experiment.set_trials(live.started)
+    return not stop
+
+
+def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial]) -> None:
+    spec, file = plan.space.file.scheduler, plan.space.file
+    budget = _budget(plan.space, plan.trials or [_first_suggestion(job)])
+    if spec.kind == "pbt":
+        scheduler: Any = population_scheduler(spec, budget, plan.space.sampled)
+    else:
+        pruner = make_pruner(spec, budget)
+        replay(pruner, spec.time_attr, plan)
+        scheduler = PruningScheduler(pruner, spec.time_attr, lambda trial: job.trial_of(trial.config).id, live.pruned)
+    resources = {"cpu": plan.placement.cpus} | ({"gpu": plan.placement.gpus} if plan.placement.gpus else {})
+    searching = file.search == "optuna"
+    tuner = tune.Tuner(
+        tune.with_resources(make_trainable(job), resources),
+        param_space=_param_space(job, remaining),
+        tune_config=tune.TuneConfig(
+            metric=METRIC,
+            mode="max",
+            scheduler=scheduler,
+            search_alg=optuna_search(file.sample_seed) if searching else BasicVariantGenerator(),
+            num_samples=file.samples if searching else 1,
+            max_concurrent_trials=plan.max_concurrent,
+            reuse_actors=False,  # a process of its own frees a trial's GPU memory, whatever it did
+            trial_dirname_creator=lambda trial: f"{job.trial_of(trial.config).id}_{trial.trial_id}",
+        ),
+        run_config=tune.RunConfig(
+            name="tune",
+            storage_path=str(plan.experiment.path),
+            verbose=0,
+            callbacks=[live],
+            stop=_StopWhen(live),
+            failure_config=tune.FailureConfig(max_failures=file.resources.max_failures),
+            checkpoint_config=tune.CheckpointConfig(num_to_keep=2),
+        ),
+    )
+    tuner.fit()
+
+
+def replay(pruner: Pruner, time_attr: str, plan: Plan) -> None:
+    """Feed a rule with the recorded evaluations of all trials, in the order they were made."""
+    seen = [
+        (evaluation.seconds, trial.id, evaluation)
+        for trial in plan.trials
+        for evaluation in read_record(trial, plan.experiment.trial_folder(trial.id)).evaluations
+        # The evaluation before the first epoch is never reported: it says nothing about a trial's settings.
+        if evaluation.epoch > 0
+    ]
+    for _, trial_id, evaluation in sorted(seen, key=lambda item: item[:2]):
+        pruner.report(trial_id, evaluation.time(time_attr), evaluation.score)
+
+
+class _StopWhen(Stopper):
+    """Ends the whole experiment once a request to stop has been carried out."""
+
+    def __init__(self, live: Live) -> None:
+        self._live = live
+
+    def __call__(self, trial_id: str, result: dict[str, Any]) -> bool:
+        return False
+
+    def stop_all(self) -> bool:
+        return self._live.stopped
+
+
+def _param_space(job: Job, remaining: list[Trial]) -> dict[str, Any]:
+    sampled = job.space.sampled
+    if not job.trials:
+        return {"params": {key: domain(op) for key, op in sampled.items()}}
+    if not job.population:
+        return {"id": tune.grid_search([trial.id for trial in remaining])}
+    # Members of a population move: each begins where its folder says it was last.
+    members = [(trial.id, _current_params(job, trial)) for trial in remaining]
+    by_id = dict(members)
+    return {
+        "id": tune.grid_search([trial_id for trial_id, _ in members]),
+        "params": tune.sample_from(lambda spec: by_id[_id_of(spec)]),
+    }
+
+
+def _id_of(spec: Any) -> str:
+    return str(spec["config"]["id"] if "config" in spec else spec["id"])
+
+
+def _current_params(job: Job, trial: Trial) -> dict[str, Any]:
+    params = {key: trial.values[key] for key in job.space.sampled}
+    written = job.experiment.trial_folder(trial.id) / "config.yaml"
+    if not written.is_file():
+        return params
+    settings = read_yaml(written)
+    for key in params:
+        node: Any = settings
+        for part in key.split("."):
+            node = node[part]
+        params[key] = node
+    return params
+
+
+def _budget(space: Space, trials: Sequence[Trial]) -> float:
+    """What the longest trial takes, in the scheduler's unit of time."""
+    attribute = space.file.scheduler.time_attr
+    if attribute == "env_steps":
+        return max(env_steps_budget(trial.config) for trial in trials)
+    if attribute == "epoch":
+        return max(trial.epochs for trial in trials)
+    return space.file.stop.wall_time_s or 0.0
+
+
+def _first_suggestion(job: Job) -> Trial:
+    """A stand-in for the trials a search will make up: same model, same length."""
+    params = {
+        key: op.levels[0].label if isinstance(op, Listed) else op.ends()[0].value
+        for key, op in job.space.sampled.items()
+    }
+    return job.trial_of({"params": params})
+
+
+def _precompile(plan: Plan, trials: Sequence[Trial]) -> None:
+    """Compile the kernels of every distinct model once on every node, so that trials find them in Warp's cache."""
+    models: dict[str, Trial] = {}
+    for trial in trials:
+        c = trial.config
+        models.setdefault(repr((c.env.name, c.physics, c.evaluation.variant)), trial)
+    nodes = [node for node in ray.nodes() if node["Alive"] and _fits(node["Resources"], plan.placement)]
+    started = time.monotonic()
+    print(f"compiling kernels of {len(models)} model(s) on {len(nodes)} node(s) ...", flush=True)
+    compile_model = plan.precompile
+    assert compile_model is not None
+
+    def task(config: Config, device: str) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            compile_model(config, device, Path(folder))
+
+    remote = ray.remote(task)
+    pending = [
+        remote.options(
+            num_cpus=plan.placement.cpus,
+            num_gpus=plan.placement.gpus,
+            scheduling_strategy=NodeAffinitySchedulingStrategy(node_id=node["NodeID"], soft=False),
+        ).remote(trial.config, plan.placement.device)
+        for node in nodes
+        for trial in models.values()
+    ]
+    try:
+        ray.get(pending)
+    except RayTaskError as error:
+        if isinstance(error.cause, MskRayError):
+            raise error.cause from None
+        raise
+    print(f"kernels ready after {format_duration(time.monotonic() - started)}", flush=True)
+
+
+def _fits(resources: dict[str, float], placement: Placement) -> bool:
+    return resources.get("CPU", 0.0) >= placement.cpus and resources.get("GPU", 0.0) >= placement.gpus

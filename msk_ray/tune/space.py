@@ -1,0 +1,247 @@
+"""The search space file: a question, a base config, and what is varied in it."""
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError
+
+import msk_ray
+from msk_ray.config import describe_fault, read_yaml
+from msk_ray.errors import ConfigError
+from msk_ray.tune.operators import Listed, Operator, Range, parse_operator
+
+Share = Annotated[float, Field(gt=0.0, lt=1.0)]
+
+MAX_SEEDS = 1000
+
+
+class Part(BaseModel):
+    """A frozen group of settings that refuses unknown keys."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+
+
+class AblateSpec(Part):
+    """One factor at a time: the baseline, and each variant laid over it. Keys are dotted config keys."""
+
+    baseline: dict[str, Any] = {}
+    variants: Annotated[dict[str, dict[str, Any]], Field(min_length=1)]
+
+
+class SchedulerSpec(Part):
+    """Which trials are stopped early because others do better."""
+
+    kind: Literal["asha", "median", "pbt", "none"] = "none"
+    time_attr: Literal["env_steps", "epoch", "seconds"] = "env_steps"
+    """What trials are compared at. Env steps is fair between horizons, and trials need not run in lockstep."""
+    grace: Share = 0.1
+    """Share of the longest trial's budget that no trial is stopped within."""
+    reduction: Annotated[float, Field(ge=1.5, le=16)] = 3.0
+    """asha: one in this many goes on past each rung; rungs are grace × reductionⁿ."""
+    min_trials: PositiveInt | None = None
+    """Trials that must have come as far before one is stopped; null is `reduction` rounded up (asha), 3 (median)."""
+    interval: Share = 0.1
+    """pbt: share of the budget between two exchanges."""
+    quantile: Annotated[float, Field(gt=0.0, le=0.5)] = 0.25
+    """pbt: this share of the worst trials goes on from the best ones."""
+    resample: Annotated[float, Field(ge=0.0, le=1.0)] = 0.25
+    """pbt: probability that an exchanged value is drawn anew instead of being moved by a fifth."""
+
+
+class PlateauSpec(Part):
+    """Stop a trial whose best score no longer rises."""
+
+    patience: PositiveInt
+    """Evaluations without a rise."""
+    min_delta: Annotated[float, Field(ge=0.0)] = 0.0
+    """What counts as a rise [score]."""
+    grace: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.2
+    """Share of the trial's epochs before which it is not stopped."""
+
+
+class StopSpec(Part):
+    """When a trial ends by itself before its last epoch."""
+
+    nonfinite: bool = True
+    """End a trial whose score or loss is NaN or infinite."""
+    plateau: PlateauSpec | None = None
+    wall_time_s: Annotated[float, Field(gt=0.0)] | None = None
+    """Seconds of work a trial may take, over all its attempts."""
+    target: float | None = None
+    """Score at which a trial has done its work."""
+
+
+class ResourcesSpec(Part):
+    """What a trial gets, and how often it is tried again."""
+
+    gpus_per_trial: Annotated[float, Field(gt=0.0)] = 1.0
+    """GPUs of a trial where there are any; below 1, trials share one."""
+    cpus_per_trial: PositiveInt = 1
+    """CPU cores, and threads, of a trial."""
+    max_concurrent: PositiveInt | None = None
+    max_failures: Annotated[int, Field(ge=0)] = 3
+    """How often a trial whose process or node died goes on from its checkpoint."""
+
+
+class SmokeSpec(Part):
+    """What `--smoke` changes beyond the general rule."""
+
+    overrides: dict[str, Any] = {}
+    max_trials: PositiveInt = 8
+
+
+class SpaceFile(Part):
+    """A search space as written."""
+
+    question: str
+    """What the experiment is to answer."""
+    base: str
+    """Config file, relative to the space file, the working directory, or the folder that holds `configs/`."""
+    overrides: dict[str, Any] = {}
+    """Dotted config keys set in every trial."""
+    parameters: dict[str, Any] = {}
+    """Dotted config keys that are varied, each with one operator."""
+    ablate: AblateSpec | None = None
+    seeds: str | int | list[int] = "0"
+    """Seeds every trial is run with: "0-4", "0,3", 7 or [0, 3]."""
+    samples: PositiveInt = 1
+    """Draws of the sampled parameters (choice, uniform, loguniform, randint), for each point of the grid."""
+    sample_seed: Annotated[int, Field(ge=0)] = 0
+    """Seed of those draws."""
+    search: Literal["random", "optuna"] = "random"
+    scheduler: SchedulerSpec = SchedulerSpec()
+    stop: StopSpec = StopSpec()
+    resources: ResourcesSpec = ResourcesSpec()
+    smoke: SmokeSpec = SmokeSpec()
+
+
+class Space(Part):
+    """A checked search space, with its operators and seeds read."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
+
+    name: str
+    file: SpaceFile
+    base_path: Path
+    parameters: dict[str, Operator]
+    seeds: tuple[int, ...]
+
+    @property
+    def sampled(self) -> dict[str, Operator]:
+        """The parameters that are drawn rather than enumerated."""
+        return {k: op for k, op in self.parameters.items() if isinstance(op, Range) or op.kind == "choice"}
+
+    @property
+    def grids(self) -> dict[str, Listed]:
+        """The parameters whose values are all tried."""
+        return {k: op for k, op in self.parameters.items() if isinstance(op, Listed) and op.kind == "grid"}
+
+
+def find_space(name: str) -> Path:
+    """The file a space's name or path means: as given, in `tune_spaces/` here, or beside the package.
+
+    Raises:
+        ConfigError: there is none; the message lists those there are.
+    """
+    folders = [Path.cwd() / "tune_spaces", _repository() / "tune_spaces"]
+    if name.endswith((".yaml", ".yml")) or "/" in name:
+        path = Path(name)
+        if not path.is_file():
+            raise ConfigError(f"no such space file: {name}")
+        return path.resolve()
+    for folder in folders:
+        if (folder / f"{name}.yaml").is_file():
+            return (folder / f"{name}.yaml").resolve()
+    known = sorted({path.stem for folder in folders for path in folder.glob("*.yaml")})
+    raise ConfigError(f"unknown space {name!r}; known: {', '.join(known) or 'none'}, or give a path to a .yaml file")
+
+
+def load_space(path: Path) -> Space:
+    """Read and check a space file.
+
+    Raises:
+        ConfigError: as `parse_space`, or the file cannot be read.
+    """
+    return parse_space(read_yaml(path), path)
+
+
+def parse_space(data: Mapping[str, Any], path: Path) -> Space:
+    """Check a space's plain data. `path` names it in errors and anchors its `base`.
+
+    Raises:
+        ConfigError: with the first fault on one line.
+    """
+    try:
+        file = SpaceFile.model_validate(data)
+    except ValidationError as error:
+        raise ConfigError(f"{path}: {describe_fault(error, SpaceFile)}") from None
+    try:
+        parameters = {key: parse_operator(key, value) for key, value in file.parameters.items()}
+        seeds = parse_seeds(file.seeds)
+        _check_combination(file, parameters, seeds)
+        base_path = _find_base(file.base, path)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+    return Space(name=path.stem, file=file, base_path=base_path, parameters=parameters, seeds=seeds)
+
+
+def parse_seeds(text: str | int | list[int]) -> tuple[int, ...]:
+    """Seeds written as "0-4", "0,3,10-12", 7 or [0, 3], in order and without repeats.
+
+    Raises:
+        ConfigError: not such a list.
+    """
+    pieces = [str(piece) for piece in text] if isinstance(text, list) else str(text).split(",")
+    seeds: dict[int, None] = {}
+    for piece in pieces:
+        match = re.fullmatch(r"\s*(\d+)(?:\s*-\s*(\d+))?\s*", piece)
+        if match is None:
+            raise ConfigError(f"seeds {text!r}: write whole numbers such as 0-4 or 0,3,7")
+        first, last = int(match[1]), int(match[2] or match[1])
+        if last < first:
+            raise ConfigError(f"seeds {text!r}: {first}-{last} runs backwards; write {last}-{first}")
+        if last - first >= MAX_SEEDS:
+            raise ConfigError(f"seeds {text!r}: more than {MAX_SEEDS} seeds")
+        seeds.update(dict.fromkeys(range(first, last + 1)))
+    return tuple(seeds)
+
+
+def _check_combination(file: SpaceFile, parameters: Mapping[str, Operator], seeds: tuple[int, ...]) -> None:
+    """Refuse settings that are each fine and make no sense together."""
+    grids = [key for key, op in parameters.items() if isinstance(op, Listed) and op.kind == "grid"]
+    sampled = [key for key in parameters if key not in grids]
+    if "trial.seed" in parameters:
+        raise ConfigError("parameters.trial.seed: seeds are an axis of their own; write seeds: 0-4")
+    if file.ablate is not None and parameters:
+        raise ConfigError("ablate varies one factor at a time; drop parameters, or write the factors as grids there")
+    if file.samples > 1 and not sampled:
+        raise ConfigError("samples: nothing is drawn; give a parameter choice, uniform, loguniform or randint")
+    if file.search == "optuna":
+        if grids:
+            raise ConfigError(f"parameters.{grids[0]}.grid: search: optuna cannot enumerate; write choice instead")
+        if not sampled:
+            raise ConfigError("search: optuna needs parameters with choice, uniform, loguniform or randint")
+        if len(seeds) > 1:
+            raise ConfigError("search: optuna runs every suggestion once; give a single seed")
+    if file.scheduler.time_attr == "seconds" and file.scheduler.kind != "none" and file.stop.wall_time_s is None:
+        raise ConfigError("scheduler.time_attr: seconds needs stop.wall_time_s, the budget that grace is a share of")
+    if file.scheduler.kind == "pbt":
+        if not any(isinstance(parameters[key], Range) for key in sampled):
+            raise ConfigError("scheduler.kind: pbt needs a parameter with a range to move in (uniform, loguniform)")
+        if file.search == "optuna":
+            raise ConfigError("scheduler.kind: pbt chooses values itself; write search: random")
+
+
+def _find_base(base: str, space_path: Path) -> Path:
+    candidates = [space_path.parent / base, Path.cwd() / base, space_path.parent.parent / base, _repository() / base]
+    for candidate in candidates:
+        if candidate.is_file():
+            return candidate.resolve()
+    raise ConfigError(f"base: no such config file: {base}")
+
+
+def _repository() -> Path:
+    """The folder the package lies in; in a checkout it also holds `configs/` and `tune_spaces/`."""
+    return Path(msk_ray.__file__).resolve().parent.parent

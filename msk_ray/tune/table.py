@@ -1,0 +1,110 @@
+"""The result of an experiment as a table, a list and plain data."""
+
+import statistics
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from msk_ray.tune.records import TrialRecord, best_record
+
+HEADER = ("trial", "changed", "seed", "score", "at epoch", "epochs", "stopped", "path", "why")
+
+
+def result_rows(records: Sequence[TrialRecord]) -> list[tuple[str, ...]]:
+    """One row a trial, the highest score first."""
+    ordered = sorted(records, key=lambda record: -record.best.score if record.best else float("inf"))
+    return [_row(record) for record in ordered]
+
+
+def variant_rows(records: Sequence[TrialRecord]) -> list[tuple[str, ...]]:
+    """One row a variant: seeds, mean, standard deviation and range of the best scores. The highest mean first."""
+    groups: dict[str, list[float]] = {}
+    for record in records:
+        scores = groups.setdefault(record.trial.variant, [])
+        if record.best is not None:
+            scores.append(record.best.score)
+    rows = []
+    for variant, scores in groups.items():
+        if not scores:
+            rows.append((float("-inf"), (variant, "0", "-", "-", "-", "-")))
+            continue
+        mean = statistics.fmean(scores)
+        deviation = f"{statistics.stdev(scores):.4g}" if len(scores) > 1 else "-"
+        texts = (variant, str(len(scores)), f"{mean:.5g}", deviation, f"{min(scores):.5g}", f"{max(scores):.5g}")
+        rows.append((mean, texts))
+    return [texts for _, texts in sorted(rows, key=lambda row: -row[0])]
+
+
+def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines) + "\n"
+
+
+def summary(name: str, question: str, records: Sequence[TrialRecord]) -> dict[str, Any]:
+    """Everything the tables show, as plain data. Paths are relative to the experiment's folder."""
+    best = best_record(records)
+    return {
+        "experiment": name,
+        "question": question,
+        "best": None if best is None else _facts(best),
+        "trials": [_facts(record) for record in records],
+    }
+
+
+def table_document(name: str, question: str, records: Sequence[TrialRecord]) -> str:
+    """The Markdown report of an experiment."""
+    parts = [f"# {name}\n", f"{question}\n" if question else "", markdown(HEADER, result_rows(records))]
+    if len({record.trial.seed for record in records}) > 1:
+        header = ("variant", "seeds", "mean score", "std", "min", "max")
+        parts += ["By variant, over seeds:\n", markdown(header, variant_rows(records))]
+    best = best_record(records)
+    if best is not None:
+        parts.append(f"Best policy: `{_relative(best)}` ({best.trial.variant}, seed {best.trial.seed}).\n")
+    parts.append("![Learning curves](curves.png)\n")
+    return "\n".join(part for part in parts if part)
+
+
+def outcome_name(record: TrialRecord) -> str:
+    """The outcome's name; `interrupted` or `waiting` for a trial without one."""
+    if record.ending is not None:
+        return str(record.ending.outcome)
+    return "interrupted" if record.epochs_done else "waiting"
+
+
+def _row(record: TrialRecord) -> tuple[str, ...]:
+    trial, best = record.trial, record.best
+    return (
+        trial.id,
+        trial.variant,
+        str(trial.seed),
+        "-" if best is None else f"{best.score:.5g}",
+        "-" if best is None else str(best.epoch),
+        f"{record.epochs_done}/{trial.epochs}",
+        outcome_name(record),
+        f"trials/{trial.id}",
+        record.ending.why if record.ending is not None else "",
+    )
+
+
+def _facts(record: TrialRecord) -> dict[str, Any]:
+    best = record.best
+    return {
+        "id": record.trial.id,
+        "changed": record.trial.changed,
+        "values": record.trial.values,
+        "seed": record.trial.seed,
+        "score": None if best is None else best.score,
+        "score_epoch": None if best is None else best.epoch,
+        "epochs": record.epochs_done,
+        "epochs_planned": record.trial.epochs,
+        "seconds": record.seconds,
+        "outcome": outcome_name(record),
+        "why": record.ending.why if record.ending is not None else "",
+        "folder": f"trials/{record.trial.id}",
+        "best_checkpoint": str(_relative(record)) if record.best_checkpoint else None,
+    }
+
+
+def _relative(record: TrialRecord) -> Path:
+    return Path("trials") / record.trial.id / "checkpoints" / "best.pt"

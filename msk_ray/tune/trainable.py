@@ -1,0 +1,182 @@
+"""The function Ray Tune runs in a trial's process: `run_trial` with reports, gauges and its output in a file."""
+
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from ray import tune
+from ray.util.metrics import Gauge
+
+from msk_ray.config import parse_config
+from msk_ray.tune.adapters import METRIC
+from msk_ray.tune.experiment import Experiment
+from msk_ray.tune.operators import Listed, describe
+from msk_ray.tune.records import evaluations_of, read_rows
+from msk_ray.tune.space import Space
+from msk_ray.tune.stopping import Evaluation
+from msk_ray.tune.trial_run import Hooks, TrainerLike, run_trial
+from msk_ray.tune.trials import Trial, make_trial, overlay
+
+_GAUGES = {
+    "score": "eval/score",
+    "best_score": "eval/best_score",
+    "epoch": "epoch",
+    "env_steps_per_s": "env_steps_per_s",
+    "episode_return": "train/episode_return",
+}
+"""Gauge name → metric; the dashboard's metrics port serves them as `ray_msk_ray_<name>`."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """What the process of a trial needs to know beyond its Tune config."""
+
+    experiment: Experiment
+    space: Space
+    base: dict[str, Any]
+    trials: dict[str, Trial]
+    """Trials by id; empty when a search makes them up."""
+    device: str
+    threads: int
+    trainer_class: type[TrainerLike]
+
+    @property
+    def population(self) -> bool:
+        """Whether trials exchange their state and settings."""
+        return self.space.file.scheduler.kind == "pbt"
+
+    def trial_of(self, config: Mapping[str, Any]) -> Trial:
+        """The trial that a Tune config stands for.
+
+        It is `{id}`, `{id, params}` in a population, where params move, or `{params}` from a search.
+        """
+        params = config.get("params", {})
+        if "id" not in config:
+            values, changed = {}, {}
+            for key, op in self.space.sampled.items():
+                level = (
+                    next((lv for lv in op.levels if lv.label == params[key]), None) if isinstance(op, Listed) else None
+                )
+                values[key] = params[key] if level is None else level.value
+                changed[key] = describe(params[key])
+            return make_trial(self.space, self.base, changed, values, self.space.seeds[0], 0)
+        trial = self.trials[config["id"]]
+        if not params:
+            return trial
+        settings = parse_config(overlay(trial.config.as_dict(), params), f"trial {trial.id}")
+        return replace(trial, config=settings)
+
+
+def make_trainable(job: Job) -> Callable[[dict[str, Any]], None]:
+    """The function a Tune trial runs."""
+
+    def trainable(config: dict[str, Any]) -> None:
+        trial = job.trial_of(config)
+        folder = job.experiment.trial_folder(trial.id)
+        folder.mkdir(parents=True, exist_ok=True)
+        _redirect_output(folder / "output.log")
+        _limit_threads(job.threads)
+        gauges = _Gauges(job.experiment.name, trial)
+        hooks = Hooks(
+            on_epoch=gauges.show,
+            on_evaluation=_report_with_checkpoint if job.population else _report,
+            pause=job.experiment.stop_file.exists,
+        )
+        with tempfile.TemporaryDirectory() as scratch:
+            run_trial(
+                trial,
+                folder,
+                job.device,
+                job.space.file.stop,
+                _exchanging(job, folder) if job.population else job.trainer_class,
+                hooks,
+                _handed_checkpoint(Path(scratch)) if job.population else None,
+            )
+
+    return trainable
+
+
+def _report(evaluation: Evaluation, ended: bool, trainer: TrainerLike) -> None:
+    """Report to Tune. State stays out of it: a retried trial goes on from its own folder, where a torn newest
+    checkpoint is passed over; Ray would insist on it at every retry."""
+    tune.report(_figures(evaluation, ended))
+
+
+def _report_with_checkpoint(evaluation: Evaluation, ended: bool, trainer: TrainerLike) -> None:
+    """Report with state, which Ray hands on to another member of the population."""
+    path = trainer.save()
+    with tempfile.TemporaryDirectory() as folder:
+        for file in (path, path.with_suffix(".json")):
+            shutil.copy(file, folder)
+        tune.report(_figures(evaluation, ended), checkpoint=tune.Checkpoint.from_directory(folder))
+
+
+def _figures(evaluation: Evaluation, ended: bool) -> dict[str, Any]:
+    return {
+        METRIC: evaluation.score,
+        "epoch": evaluation.epoch,
+        "env_steps": evaluation.env_steps,
+        "seconds": evaluation.seconds,
+        "ended": ended,
+    }
+
+
+def _handed_checkpoint(scratch: Path) -> Path | None:
+    """The checkpoint Ray hands to this trial, if any: its own after a crash, or a better member's."""
+    handed = tune.get_checkpoint()
+    if handed is None:
+        return None
+    handed.to_directory(str(scratch))
+    return next(iter(sorted(scratch.glob("epoch_*.pt"))))
+
+
+def _exchanging(job: Job, folder: Path) -> type[TrainerLike]:
+    """A trainer that accepts a checkpoint of another member of the population."""
+    moving = {*job.space.sampled, "trial.seed"}
+
+    class Exchanging(job.trainer_class):  # type: ignore[name-defined]
+        def restore(self, path: Path) -> None:
+            super().restore(path, changed=moving)
+            # best.pt is this trial's own; a better member's best score would keep it from ever being replaced.
+            own = [evaluation.score for evaluation in evaluations_of(read_rows(folder))]
+            self.best_score = max(own, default=float("-inf"))
+
+    return Exchanging
+
+
+def _redirect_output(path: Path) -> None:
+    """Send everything this process prints, from any language, to the end of a file."""
+    file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os.dup2(file, 1)
+    os.dup2(file, 2)
+    os.close(file)
+
+
+def _limit_threads(threads: int) -> None:
+    import torch
+
+    torch.set_num_threads(threads)
+
+
+class _Gauges:
+    """The trial's newest figures as gauges on Ray's metrics port."""
+
+    def __init__(self, experiment: str, trial: Trial) -> None:
+        tags = {"experiment": experiment, "trial": trial.id, "variant": trial.variant, "seed": str(trial.seed)}
+        self._gauges = {}
+        for name, metric in _GAUGES.items():
+            gauge = Gauge(f"msk_ray_{name}", description=metric, tag_keys=tuple(tags))
+            gauge.set_default_tags(tags)
+            self._gauges[metric] = gauge
+
+    def show(self, row: Mapping[str, float]) -> None:
+        for metric, gauge in self._gauges.items():
+            if metric in row:
+                gauge.set(row[metric])

@@ -1,0 +1,148 @@
+"""One trial from wherever it stands to its end. Knows nothing of Ray, so it can be stepped through with a debugger."""
+
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+from msk_ray.config import Config
+from msk_ray.errors import MskRayError, SimulationError
+from msk_ray.tune.outcomes import Ending, Outcome, read_ending, write_ending, write_text
+from msk_ray.tune.records import evaluations_of, read_rows
+from msk_ray.tune.space import StopSpec
+from msk_ray.tune.stopping import Evaluation, ending_of
+from msk_ray.tune.trials import Trial
+
+ERROR_FILE = "error.txt"
+
+
+class TrainerLike(Protocol):
+    """What a trial needs of `msk_ray.training.Trainer`."""
+
+    epoch: int
+
+    def __init__(self, config: Config, logdir: Path, device: str) -> None: ...
+
+    @property
+    def finished(self) -> bool: ...
+
+    def run_epoch(self) -> dict[str, float]: ...
+
+    def save(self) -> Path: ...
+
+    def restore(self, path: Path) -> None: ...
+
+    def restore_latest(self) -> tuple[Path | None, list[str]]: ...
+
+    def close(self) -> None: ...
+
+
+@dataclass(frozen=True)
+class Hooks:
+    """What the surroundings of a trial want to know and may ask for."""
+
+    on_epoch: Callable[[Mapping[str, float]], None] = field(default=lambda row: None)
+    """Called with every row of metrics."""
+    on_evaluation: Callable[[Evaluation, bool, TrainerLike], None] = field(default=lambda e, last, trainer: None)
+    """Called after each evaluation with whether the trial has ended, and the trainer."""
+    pause: Callable[[], bool] = field(default=lambda: False)
+    """Asked before every epoch; True makes the trial save itself and return."""
+
+
+def run_trial(
+    trial: Trial,
+    folder: Path,
+    device: str,
+    stop: StopSpec,
+    trainer_class: type[TrainerLike],
+    hooks: Hooks,
+    checkpoint: Path | None = None,
+) -> Ending | None:
+    """Train until the trial ends, by its last epoch or by one of its own rules.
+
+    Goes on from the newest whole checkpoint in `folder`, or from `checkpoint` if one is given. The ending is written
+    to `folder`.
+
+    Returns:
+        How it ended; None if it was paused before.
+
+    Raises:
+        Exception: anything that is neither a failed simulation nor a fault the user can mend. Its traceback is kept in
+            `folder`, and the trial may be tried again.
+    """
+    done = read_ending(folder) if folder.is_dir() else None
+    if done is not None:
+        return done
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        ending = _train(trial, folder, device, stop, trainer_class, hooks, checkpoint)
+    except SimulationError as error:
+        # The message begins with what happened, such as "nonfinite_gradient: ...".
+        ending = Ending(Outcome.NONFINITE if str(error).startswith("nonfinite") else Outcome.DIVERGED, str(error))
+    except MskRayError as error:
+        ending = Ending(Outcome.ERROR, str(error))
+    except Exception:
+        write_text(folder / ERROR_FILE, traceback.format_exc())
+        raise
+    if ending is not None:
+        write_ending(folder, ending)
+    return ending
+
+
+def _train(
+    trial: Trial,
+    folder: Path,
+    device: str,
+    stop: StopSpec,
+    trainer_class: type[TrainerLike],
+    hooks: Hooks,
+    checkpoint: Path | None,
+) -> Ending | None:
+    trainer = trainer_class(trial.config, folder, device)
+    try:
+        if checkpoint is not None:
+            trainer.restore(checkpoint)
+        else:
+            path, faults = trainer.restore_latest()
+            for fault in faults:
+                print(f"checkpoint skipped: {fault}", flush=True)
+            print(f"going on from {path}" if path else "starting", flush=True)
+        return _loop(trial, folder, stop, trainer, hooks)
+    finally:
+        trainer.close()
+
+
+def _loop(trial: Trial, folder: Path, stop: StopSpec, trainer: TrainerLike, hooks: Hooks) -> Ending | None:
+    if trainer.epoch > 0:
+        rows = [row for row in read_rows(folder) if row["epoch"] <= trainer.epoch]
+        seen = evaluations_of(rows)
+        ending = ending_of(stop, rows[-1], seen, trial.epochs, rows[-1]["seconds"]) if rows else None
+        if seen:
+            # The process may have died between the checkpoint and the report; a repeated report changes nothing.
+            hooks.on_evaluation(seen[-1], ending is not None, trainer)
+        if ending is not None:
+            return ending
+    evaluations: list[Evaluation] | None = None
+    while not hooks.pause():
+        row = trainer.run_epoch()
+        hooks.on_epoch(row)
+        evaluation = Evaluation.from_row(row)
+        if evaluations is None:
+            # Holds also the evaluation before the first epoch, which no row returned here shows.
+            evaluations = evaluations_of([r for r in read_rows(folder) if r["epoch"] <= row["epoch"]])
+        elif evaluation is not None:
+            evaluations.append(evaluation)
+        ending = ending_of(stop, row, evaluations, trial.epochs, row["seconds"])
+        if ending is not None and ending.outcome is Outcome.NONFINITE:
+            return ending
+        if evaluation is not None:
+            if ending is not None:
+                # Before the report: whoever hears of the last evaluation must find the ending.
+                write_ending(folder, ending)
+            hooks.on_evaluation(evaluation, ending is not None, trainer)
+        if ending is not None:
+            return ending
+    if trainer.epoch > 0:
+        trainer.save()
+    return None

@@ -1,0 +1,237 @@
+"""From a space to its trials: every combination resolved, checked against the config schema, and given a stable id."""
+
+import difflib
+import hashlib
+import itertools
+import json
+import random
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from msk_ray.config import Config, merge, parse_config, read_config
+from msk_ray.errors import ConfigError
+from msk_ray.tune.operators import Level, Listed, Range, describe
+from msk_ray.tune.space import Space
+
+ID_DIGITS = 8
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One training run of an experiment."""
+
+    index: int
+    """Place in the experiment, from 0."""
+    id: str
+    """Hash of what is trained, seed included; the name of the trial's folder."""
+    changed: dict[str, str]
+    """What sets this trial apart, parameter → value as text, without the seed."""
+    values: dict[str, Any]
+    """The same as data: dotted key → value."""
+    config: Config
+
+    @property
+    def seed(self) -> int:
+        return self.config.trial.seed
+
+    @property
+    def epochs(self) -> int:
+        return self.config.trial.epochs
+
+    @property
+    def variant(self) -> str:
+        """The changed parameters on one line; equal for all seeds of a variant."""
+        return variant_text(self.changed)
+
+
+def variant_text(changed: Mapping[str, str]) -> str:
+    """`actor_lr=0.002, horizon=16, hard friction`: keys without their sections, and whole sections by label alone."""
+    parts = [f"{key.rsplit('.', 1)[1]}={value}" if "." in key else value for key, value in changed.items()]
+    return ", ".join(parts) or "base"
+
+
+def resolve_trials(space: Space) -> list[Trial]:
+    """All trials of an enumerable space, in the order they are started: every variant with the first seed, then the
+    next seed.
+
+    Raises:
+        ConfigError: a setting that does not exist or fit, two parameters that set the same key, or two trials that
+            come out equal.
+    """
+    base = base_settings(space)
+    check_ranges(space, base)
+    trials: list[Trial] = []
+    by_id: dict[str, Trial] = {}
+    variants = list(_variants(space))
+    for seed in space.seeds:
+        for changed, values in variants:
+            trial = make_trial(space, base, changed, values, seed, len(trials))
+            twin = by_id.setdefault(trial.id, trial)
+            if twin is not trial:
+                raise ConfigError(
+                    f"{space.name}: {trial.variant!r} and {twin.variant!r} (seed {seed}) come out as the same trial; "
+                    "drop one of them"
+                )
+            trials.append(trial)
+    return trials
+
+
+def base_settings(space: Space) -> dict[str, Any]:
+    """The space's base config with its own overrides laid over it, as nested plain data, checked.
+
+    Raises:
+        ConfigError: the base cannot be read, or is no valid config.
+    """
+    settings = overlay(read_config(space.base_path), space.file.overrides)
+    parse_config(settings, f"{space.name}: {space.base_path.name} with the space's overrides")
+    return settings
+
+
+def make_trial(
+    space: Space, base: Mapping[str, Any], changed: dict[str, str], values: dict[str, Any], seed: int, index: int
+) -> Trial:
+    """The trial that `values` (dotted key → value) and a seed make of the base settings.
+
+    Raises:
+        ConfigError: the result is no valid config.
+    """
+    name = f"{space.name}: trial {index} ({variant_text(changed)})"
+    config = parse_config(overlay(overlay(base, values), {"trial.seed": seed}), name)
+    return Trial(index, trial_id(config), dict(changed), dict(values), config)
+
+
+def trial_id(config: Config) -> str:
+    """First digits of the SHA-256 of a config's content. Equal configs have equal ids wherever they are resolved."""
+    text = json.dumps(config.as_dict(), sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()[:ID_DIGITS]
+
+
+def overlay(settings: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """A copy of nested `settings` with each dotted key of `values` set; a mapping is laid over the section it names.
+
+    Raises:
+        ConfigError: a key goes through something that is not a section.
+    """
+    result = dict(settings)
+    for dotted, value in values.items():
+        *sections, leaf = dotted.split(".")
+        node: Any = result
+        for section in sections:
+            node = node.get(section, {})
+            if not isinstance(node, Mapping):
+                raise ConfigError(f"{dotted}: {section} is a value, not a section of settings")
+        nested = {leaf: value}
+        for section in reversed(sections):
+            nested = {section: nested}
+        result = merge(result, nested)
+    return result
+
+
+def check_ranges(space: Space, base: Mapping[str, Any]) -> None:
+    """Refuse a range one end of which is no valid setting: found now rather than by the unlucky draw.
+
+    Other parameters stand at their first level or lower end meanwhile.
+
+    Raises:
+        ConfigError: naming the parameter and the end.
+    """
+    first = {key: op.levels[0] if isinstance(op, Listed) else op.ends()[0] for key, op in space.parameters.items()}
+    for key, op in space.parameters.items():
+        if isinstance(op, Range):
+            for end in op.ends():
+                values = {k: level.value for k, level in first.items()} | {key: end.value}
+                parse_config(overlay(base, values), f"{space.name}: {key} {op.kind} at its end {end.label}")
+    _check_collisions(space)
+
+
+def _variants(space: Space) -> Iterator[tuple[dict[str, str], dict[str, Any]]]:
+    """(labels, values) of every variant, seeds apart."""
+    if space.file.ablate is not None:
+        yield from _ablations(space)
+        return
+    rng = random.Random(space.file.sample_seed)
+    # The draw is the outer loop: more samples append trials and leave the earlier ones as they are.
+    for _ in range(space.file.samples):
+        for point in grid_points(space.grids):
+            drawn = {key: _draw(op, rng) for key, op in space.sampled.items()}
+            levels = {key: (point | drawn)[key] for key in space.parameters}
+            yield {key: level.label for key, level in levels.items()}, {k: level.value for k, level in levels.items()}
+
+
+def grid_points(grids: Mapping[str, Listed]) -> Iterator[dict[str, Level]]:
+    """Every combination of the grids' levels; the last parameter turns fastest."""
+    for combination in itertools.product(*(op.levels for op in grids.values())):
+        yield dict(zip(grids, combination, strict=True))
+
+
+def _draw(op: Listed | Range, rng: random.Random) -> Level:
+    return op.draw(rng) if isinstance(op, Range) else rng.choice(op.levels)
+
+
+def _ablations(space: Space) -> Iterator[tuple[dict[str, str], dict[str, Any]]]:
+    ablate = space.file.ablate
+    assert ablate is not None
+    yield {"variant": "baseline"}, dict(ablate.baseline)
+    for name, changes in ablate.variants.items():
+        yield {"variant": name}, {**ablate.baseline, **changes}
+
+
+def _check_collisions(space: Space) -> None:
+    """Refuse two parameters that set the same config key."""
+    owner: dict[str, str] = {}
+    for key, op in space.parameters.items():
+        levels: Iterable[Level] = op.levels if isinstance(op, Listed) else op.ends()
+        for leaf in sorted({leaf for level in levels for leaf in _leaves(key, level.value)}):
+            other = owner.setdefault(leaf, key)
+            if other != key:
+                raise ConfigError(f"{space.name}: parameters {other!r} and {key!r} both set {leaf}")
+
+
+def _leaves(key: str, value: Any) -> Iterator[str]:
+    if isinstance(value, Mapping) and value:
+        for name, item in value.items():
+            yield from _leaves(f"{key}.{name}", item)
+    else:
+        yield key
+
+
+def env_steps_budget(config: Config) -> int:
+    """Env steps a trial takes when it runs to its last epoch: the sum over epochs of horizon × worlds."""
+    # msk_ray.shac loads torch, which a dry run need not wait for.
+    from msk_ray.shac.schedules import horizon_at
+
+    return config.env.nworld * sum(horizon_at(config.shac.horizon, epoch) for epoch in range(config.trial.epochs))
+
+
+def find_trial(trials: list[Trial], text: str) -> Trial:
+    """The trial that a number or (the beginning of) an id means.
+
+    Raises:
+        ConfigError: there is none, or more than one.
+    """
+    if text.isdigit() and len(text) < ID_DIGITS and int(text) < len(trials):
+        return trials[int(text)]
+    matches = [trial for trial in trials if trial.id.startswith(text)]
+    if len(matches) == 1:
+        return matches[0]
+    near = difflib.get_close_matches(text, [trial.id for trial in trials], n=1)
+    hint = f"did you mean {near[0]}?" if near else f"give 0 to {len(trials) - 1}, or an id from --dry-run"
+    raise ConfigError(f"no trial {text!r}; {hint}")
+
+
+def describe_changes(old: Config, new: Config) -> str:
+    """`shac.actor_lr 0.002 → 0.001, …`: the settings in which two configs differ."""
+    before, after = _flat(old.as_dict()), _flat(new.as_dict())
+    keys = [key for key in {**before, **after} if before.get(key) != after.get(key)]
+    return ", ".join(f"{key} {describe(before.get(key))} → {describe(after.get(key))}" for key in keys)
+
+
+def _flat(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in data.items():
+        if isinstance(value, Mapping):
+            flat |= _flat(value, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = value
+    return flat

@@ -1,0 +1,90 @@
+"""Configurations: what is shipped loads; what is wrong is refused with what to write instead."""
+
+from pathlib import Path
+
+import pytest
+
+from msk_ray.config import apply_overrides, load_config, parse_config, parse_override
+from msk_ray.errors import ConfigError
+
+CARTPOLE = {"env": {"name": "cartpole"}}
+
+
+def test_every_shipped_config_loads(root: Path) -> None:
+    files = sorted((root / "configs").rglob("*.yaml"))
+    assert len(files) >= 11
+    for file in files:
+        load_config(file)
+
+
+def test_a_config_survives_a_round_trip() -> None:
+    config = parse_config({**CARTPOLE, "shac": {"horizon": {"start": 8, "end": 32, "epochs": 10}}})
+    assert parse_config(config.as_dict()) == config
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        ({**CARTPOLE, "shac": {"horizn": 3}}, "shac.horizn: unknown key; did you mean 'horizon'?"),
+        ({**CARTPOLE, "phsics": {}}, "did you mean 'physics'?"),
+        ({"env": {"name": "ant", "uup": 1.0}}, "env.uup: unknown key; did you mean 'up'?"),
+        ({**CARTPOLE, "shac": {"gamma": 3}}, "shac.gamma: Input should be less than or equal to 1, not 3"),
+        ({**CARTPOLE, "physics": {"timestep": 0.003}}, "does not divide env.control_timestep"),
+        ({**CARTPOLE, "physics": {"timestep": 1 / 240, "substeps": 3}}, "disagree"),
+        ({"env": {"name": "ant"}, "physics": {"variant": "soft"}}, "write one of matched,"),
+        ({**CARTPOLE, "physics": {"friction": 0.5}}, "cartpole has no contacts"),
+        ({"env": {"name": "ant"}, "physics": {"cone": "pyramidal", "solreffriction": [1, 1]}}, "cone: elliptic"),
+        ({"env": {"name": "hopper"}}, "write env.name: cartpole or ant"),
+        ({**CARTPOLE, "shac": {"critic_batches": 7}}, "critic_batches 7 must divide"),
+        ({}, "env: missing"),
+    ],
+)
+def test_a_fault_is_named_on_one_line(data: dict, message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse_config(data)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_overrides_reach_nested_settings() -> None:
+    key, value = parse_override("shac.horizon={start: 4, end: 8, epochs: 2}")
+    data = apply_overrides(CARTPOLE, {key: value, "env.nworld": 16})
+    config = parse_config(data)
+    assert config.env.nworld == 16
+    assert config.shac.horizon.end == 8
+    assert CARTPOLE == {"env": {"name": "cartpole"}}, "the original is left alone"
+
+
+def test_an_override_without_a_value_is_refused() -> None:
+    with pytest.raises(ConfigError, match="write key=value"):
+        parse_override("shac.horizon")
+
+
+def test_extends_lays_one_file_over_another(tmp_path: Path) -> None:
+    (tmp_path / "base.yaml").write_text("env: {name: ant, nworld: 32, up: 0.5}\n")
+    (tmp_path / "child.yaml").write_text("extends: base.yaml\nenv: {up: 0.2}\n")
+    config = load_config(tmp_path / "child.yaml")
+    assert (config.env.nworld, config.env.up) == (32, 0.2)
+    (tmp_path / "grandchild.yaml").write_text("extends: child.yaml\n")
+    with pytest.raises(ConfigError, match="extends another file"):
+        load_config(tmp_path / "grandchild.yaml")
+
+
+def test_a_missing_file_lists_its_neighbours(tmp_path: Path) -> None:
+    (tmp_path / "ant.yaml").write_text("")
+    with pytest.raises(ConfigError, match=r"no such file.*holds: ant"):
+        load_config(tmp_path / "aunt.yaml")
+
+
+@pytest.mark.parametrize("text", ["- 1\n- 2\n", "a: [1,\n", ""])
+def test_a_file_that_is_no_mapping_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "bad.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=r"bad\.yaml"):
+        load_config(path)
+
+
+def test_substeps_follow_from_either_setting() -> None:
+    assert parse_config({**CARTPOLE, "physics": {"timestep": 1 / 480}}).physics.resolve_substeps(1 / 60) == 8
+    assert parse_config({**CARTPOLE, "physics": {"substeps": 5}}).physics.resolve_substeps(1 / 60) == 5
+    assert parse_config(CARTPOLE).physics.resolve_substeps(1 / 60) == 4

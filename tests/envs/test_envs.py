@@ -1,0 +1,160 @@
+"""Environments: documented numbers, resets, truncation against termination, divergence."""
+
+import math
+
+import mujoco
+import pytest
+import torch
+
+from msk_ray.config import AntEnvConfig, CartPoleEnvConfig, PhysicsConfig
+from msk_ray.envs import Ant, CartPole, make_env
+from msk_ray.envs.models.ant import VARIANTS, build_ant
+from msk_ray.simulation import StepState
+
+
+@pytest.fixture(scope="module")
+def cartpole() -> CartPole:
+    return make_env(CartPoleEnvConfig(name="cartpole", episode_length=3), PhysicsConfig(), 4, "cpu", 0)
+
+
+@pytest.fixture(scope="module")
+def ant() -> Ant:
+    config = AntEnvConfig(name="ant", episode_length=50)
+    return make_env(config, PhysicsConfig(), 4, "cpu", 0, differentiable=False)
+
+
+def place(env, qpos, qvel=None) -> None:
+    """Put every world into one state."""
+    fresh = env.reset_state()
+    qpos = torch.tensor(qpos).expand(env.nworld, -1).clone()
+    qvel = torch.zeros(env.nworld, env.model.nv) if qvel is None else torch.tensor(qvel).expand(env.nworld, -1).clone()
+    env.state = fresh._replace(physics=StepState(qpos, qvel, fresh.physics.act))
+
+
+def test_cartpole_reward_and_observation_by_hand(cartpole: CartPole) -> None:
+    state = StepState(torch.tensor([[0.5, math.pi + 1.0]]), torch.tensor([[2.0, 3.0]]), torch.zeros(1, 0))
+    terms = cartpole.reward_terms(state, torch.tensor([[0.5]]))
+    # angle wraps to 1 − π
+    assert terms["pole_angle"].item() == pytest.approx(-((1 - math.pi) ** 2), rel=1e-5)
+    assert terms["pole_velocity"].item() == pytest.approx(-0.9)
+    assert terms["cart_position"].item() == pytest.approx(-0.0125)
+    assert terms["cart_velocity"].item() == pytest.approx(-0.4)
+    obs = cartpole.observe(state, torch.zeros(1, 1))[0]
+    assert obs.tolist() == pytest.approx([0.5, 2.0, -math.sin(1.0), -math.cos(1.0), 3.0], rel=1e-5)
+
+
+def test_an_episode_is_truncated_at_its_length_and_starts_anew(cartpole: CartPole) -> None:
+    cartpole.state = cartpole.reset_state()
+    with torch.no_grad():
+        transitions = [cartpole.step(torch.zeros(4, 1)) for _ in range(3)]
+    assert [t.truncated.all().item() for t in transitions] == [False, False, True]
+    assert not any(t.terminated.any() for t in transitions)
+    assert (cartpole.state.age == 0).all()
+    # The observation returned is the one before the reset.
+    assert not torch.allclose(transitions[-1].obs, cartpole.observation())
+
+
+def test_ant_observation_is_in_the_documented_order(ant: Ant) -> None:
+    torch.manual_seed(0)
+    qpos = torch.cat(
+        (torch.tensor([5.0, -3.0, 0.6]), torch.tensor([math.cos(0.2), 0.0, 0.0, math.sin(0.2)]), torch.arange(8.0))
+    )
+    qvel = torch.arange(14.0)
+    state = StepState(qpos[None], qvel[None], torch.zeros(1, 0))
+    action = torch.linspace(-1, 1, 8)[None]
+    obs = ant.observe(state, action)[0]
+    assert obs.shape == (37,)
+    assert obs[0] == pytest.approx(0.6)
+    assert torch.allclose(obs[1:5], qpos[3:7])
+    assert torch.allclose(obs[5:8], qvel[:3])
+    # yaw by 0.4 rad turns the body-frame rate (3, 4, 5)
+    c, s = math.cos(0.4), math.sin(0.4)
+    assert torch.allclose(obs[8:11], torch.tensor([3 * c - 4 * s, 3 * s + 4 * c, 5.0]), atol=1e-5)
+    assert torch.allclose(obs[11:19], torch.arange(8.0))
+    assert torch.allclose(obs[19:27], 0.1 * torch.arange(6.0, 14.0))
+    assert obs[27] == pytest.approx(1.0)
+    assert obs[28] == pytest.approx(c, abs=1e-6)
+    assert torch.allclose(obs[29:], action[0])
+
+
+def test_ant_standing_reward_by_hand(ant: Ant) -> None:
+    state = StepState(torch.tensor([[0.0, 0, 0.77, 1, 0, 0, 0, *[0.0] * 8]]), torch.zeros(1, 14), torch.zeros(1, 0))
+    state.qvel[0, 0] = 1.5
+    total = sum(ant.reward_terms(state, torch.zeros(1, 8)).values())
+    assert total.item() == pytest.approx(1.5 + 0.1 + 1.0 + 0.5)
+
+
+def test_an_ant_that_falls_terminates_and_restarts(ant: Ant) -> None:
+    place(ant, [0.0, 0, 0.2, 1, 0, 0, 0, 0, 1, 0, -1, 0, -1, 0, 1])
+    with torch.no_grad():
+        transition = ant.step(torch.zeros(4, 8))
+    assert transition.terminated.all()
+    assert not transition.truncated.any()
+    assert (transition.obs[:, 0] < 0.27).all(), "the observation is the fallen one"
+    assert (ant.state.physics.qpos[:, 2] > 0.5).all(), "the state is a fresh one"
+
+
+def test_a_diverged_world_is_reset_counted_and_kept_out_of_the_gradient() -> None:
+    env = make_env(CartPoleEnvConfig(name="cartpole"), PhysicsConfig(), 3, "cpu", 0)
+    qvel = env.state.physics.qvel.clone()
+    qvel[1, 0] = float("nan")
+    env.state = env.state._replace(physics=env.state.physics._replace(qvel=qvel))
+    action = torch.zeros(3, 1, requires_grad=True)
+    transition = env.step(action)
+    assert transition.diverged.tolist() == [False, True, False]
+    assert transition.terminated.tolist() == [False, True, False]
+    assert transition.reward[1] == 0
+    transition.reward.sum().backward()
+    assert action.grad.isfinite().all()
+    assert action.grad[1] == 0
+    assert (action.grad[[0, 2]] != 0).all()
+    assert env.state.physics.qvel.isfinite().all()
+
+
+def test_resets_are_the_same_for_the_same_seed_and_differ_between_worlds() -> None:
+    make = lambda seed: make_env(AntEnvConfig(name="ant"), PhysicsConfig(), 4, "cpu", seed, differentiable=False)  # noqa: E731
+    first, again, other = make(5).state.physics.qpos, make(5).state.physics.qpos, make(6).state.physics.qpos
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+    assert not torch.equal(first[0], first[1])
+    assert torch.allclose(first[:, 3:7].norm(dim=-1), torch.ones(4))
+
+
+@pytest.mark.parametrize("variant", sorted(VARIANTS))
+def test_every_ant_variant_has_the_documented_layout(variant: str) -> None:
+    model = build_ant(AntEnvConfig(name="ant"), PhysicsConfig(variant=variant))
+    assert (model.nq, model.nv, model.nu, model.npair) == (15, 14, 8, 13)
+    assert model.opt.timestep == pytest.approx(1 / 240)
+    assert [model.joint(i).name for i in range(1, 9)] == [f"{j}_{k}" for k in range(1, 5) for j in ("hip", "ankle")]
+    assert [model.actuator(i).trnid[0] for i in range(8)] == list(range(1, 9))
+
+
+def test_physics_knobs_reach_the_model() -> None:
+    knobs = PhysicsConfig(
+        variant="published", cone="elliptic", solref=(0.05, 1.0), friction=0.4, solreffriction=(0.33, 1.0),
+        joint_damping=3.0, armature=0.2, gear=77.0, substeps=8, impratio=2.0,
+    )  # fmt: skip
+    model = build_ant(AntEnvConfig(name="ant"), knobs)
+    assert model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+    assert model.opt.timestep == pytest.approx(1 / 480)
+    assert model.opt.impratio == 2.0
+    assert (model.pair_solref == [0.05, 1.0]).all()
+    assert (model.pair_friction[:, :2] == 0.4).all()
+    assert (model.pair_solreffriction == [0.33, 1.0]).all()
+    assert (model.dof_damping[6:] == 3.0).all()
+    assert (model.dof_damping[:6] == 0.0).all()
+    assert (model.dof_armature[6:] == 0.2).all()
+    assert (model.actuator_gear[:, 0] == 77.0).all()
+
+
+def test_a_pyramid_drops_the_softened_friction_it_cannot_have() -> None:
+    model = build_ant(AntEnvConfig(name="ant"), PhysicsConfig(variant="matched", cone="pyramidal"))
+    assert (model.pair_solreffriction == 0).all()
+
+
+def test_scores_are_taken_under_reference_weights_and_physics() -> None:
+    trained = AntEnvConfig(name="ant", forward_vel=5.0, up=0.0, nworld=7)
+    reference = Ant.reference_settings(trained)
+    assert (reference.forward_vel, reference.up, reference.nworld) == (1.0, 0.1, 7)
+    physics = Ant.reference_physics(PhysicsConfig(variant="published", friction=0.1), None)
+    assert physics == PhysicsConfig(variant="matched")

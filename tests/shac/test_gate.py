@@ -1,0 +1,36 @@
+"""The per-world bound on the state cotangent."""
+
+import torch
+
+from msk_ray.shac.gate import CotangentGate
+from msk_ray.simulation import StepState
+
+
+def pulled(gate: CotangentGate, cotangent: torch.Tensor) -> torch.Tensor:
+    qpos = torch.zeros_like(cotangent).requires_grad_()
+    empty = torch.zeros(len(cotangent), 0)
+    passed = gate(StepState(qpos, empty, empty))
+    passed.qpos.backward(cotangent)
+    return qpos.grad
+
+
+def test_long_cotangents_are_shortened_and_keep_their_direction() -> None:
+    gate = CotangentGate(1.0, 3, torch.device("cpu"))
+    out = pulled(gate, torch.tensor([[3.0, 4.0], [0.3, 0.4], [0.0, 0.0]]))
+    assert torch.allclose(out, torch.tensor([[0.6, 0.8], [0.3, 0.4], [0.0, 0.0]]))
+    statistics = gate.statistics(unit=0.5)
+    assert torch.isclose(statistics["grad/clipped_share"], torch.tensor(1 / 3))
+    assert torch.isclose(statistics["grad/state_max"], torch.tensor(10.0))
+
+
+def test_a_world_that_is_not_finite_passes_nothing_and_is_counted() -> None:
+    for bound in (None, 1.0):
+        gate = CotangentGate(bound, 2, torch.device("cpu"))
+        out = pulled(gate, torch.tensor([[float("nan"), 1.0], [0.5, 0.0]]))
+        assert torch.allclose(out, torch.tensor([[0.0, 0.0], [0.5, 0.0]]))
+        assert gate.statistics(1.0)["grad/nonfinite_share"] == 0.5
+
+
+def test_nothing_is_bounded_without_a_bound() -> None:
+    gate = CotangentGate(None, 1, torch.device("cpu"))
+    assert torch.allclose(pulled(gate, torch.tensor([[1e6, 0.0]])), torch.tensor([[1e6, 0.0]]))

@@ -1,0 +1,141 @@
+"""Exact gradients of whole env steps against float64 central differences of C MuJoCo."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from oracle import INPUTS, Point, differences, relative, rollout, simulate
+from scenes import ant, ant_points, cartpole, random_weights
+
+from msk_ray.errors import UnsupportedModelError
+from msk_ray.simulation import Simulation
+from msk_ray.simulation.tape import TapeAll, TapePerSubstep
+
+
+def float32(*values: np.ndarray) -> Point:
+    """Rounded to float32, so that both sides start from the same numbers."""
+    return Point(*(np.asarray(v, dtype=np.float32).astype(float) for v in values))
+
+
+def errors_of(model, points, substeps, mode):
+    """Relative error by input over the states that are no kink and where the Warp forward agrees; and how many."""
+    weights = random_weights(model, len(points), 3)
+    end, found, _ = simulate(model, mode, points, substeps, weights)
+    errors = {name: [] for name in INPUTS}
+    for i, point in enumerate(points):
+        expected, kink = differences(model, point, substeps, {n: w[i] for n, w in weights.items()})
+        ahead = float(np.abs(end.qvel[i].detach().numpy() - rollout(model, point, substeps).qvel).max())
+        if kink < 1e-2 and ahead < 1e-3:
+            for name in INPUTS:
+                errors[name].append(relative(found[name][i], expected[name]))
+    return errors, len(errors["qpos"])
+
+
+@pytest.mark.parametrize("substeps", [1, 16])
+def test_cartpole(substeps):
+    model = cartpole()
+    rng = np.random.default_rng(0)
+    points = [
+        float32(rng.normal(size=2), rng.normal(size=2), np.zeros(0), rng.uniform(-0.9, 0.9, size=1)) for _ in range(6)
+    ]
+    errors, kept = errors_of(model, points, substeps, TapePerSubstep())
+    assert kept == 6
+    assert max(max(errors[n]) for n in INPUTS) < 1e-5
+
+
+@pytest.mark.parametrize("substeps", [1, 16])
+@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+def test_ant_in_contact(cone, substeps):
+    model = ant(cone)
+    points = ant_points(model, 20, seed=1)
+    errors, kept = errors_of(model, points, substeps, TapePerSubstep())
+    assert kept >= 15
+    print({n: (np.median(e), max(e)) for n, e in errors.items()}, kept)
+    assert np.median(errors["ctrl"]) < 1e-5
+    assert np.median(errors["qvel"]) < 1e-5
+    assert np.median(errors["qpos"]) < 1e-4
+    assert max(max(errors[n]) for n in INPUTS) < 1e-2
+
+
+def test_both_tapes_give_the_same_gradient():
+    model = ant("elliptic")
+    points = ant_points(model, 4, seed=2)
+    weights = random_weights(model, 4, 5)
+    _, one, _ = simulate(model, TapePerSubstep(), points, 8, weights)
+    _, other, _ = simulate(model, TapeAll(), points, 8, weights)
+    for name in INPUTS:
+        assert relative(one[name], other[name]) < 1e-6
+
+
+def test_worlds_do_not_touch_each_other():
+    model = ant("elliptic")
+    points = ant_points(model, 4, seed=3)
+    weights = random_weights(model, 4, 6)
+    _, clean, _ = simulate(model, TapePerSubstep(), points, 4, weights)
+    for w in weights.values():
+        w[1] = 0.0
+    points[2].qvel[:] = np.nan
+    _, found, _ = simulate(model, TapePerSubstep(), points, 4, weights)
+    for name in ("ctrl", "qpos", "qvel"):
+        assert np.all(found[name][1] == 0.0)
+        assert np.any(np.isnan(found[name][2]))
+        for world in (0, 3):
+            assert relative(found[name][world], clean[name][world]) < 1e-6
+
+
+def test_a_zero_cotangent_gives_zeros_even_in_a_diverged_world():
+    model = cartpole()
+    points = [float32(np.full(2, np.nan), np.zeros(2), np.zeros(0), np.zeros(1)) for _ in range(2)]
+    weights = {n: np.zeros_like(w) for n, w in random_weights(model, 2, 0).items()}
+    _, found, _ = simulate(model, TapePerSubstep(), points, 2, weights)
+    assert all(np.all(found[n] == 0.0) for n in INPUTS)
+
+
+def test_clip_keeps_direction_and_counts():
+    model = cartpole()
+    points = [float32(np.zeros(2), np.zeros(2), np.zeros(0), np.zeros(1)) for _ in range(2)]
+    weights = random_weights(model, 2, 1)
+    weights["qpos"][0] *= 1e-3
+    weights["qvel"][0] *= 1e-3
+    mode = TapePerSubstep(substep_grad_clip=0.5)
+    _, found, sim = simulate(model, mode, points, 2, weights)
+    _, free, _ = simulate(model, TapePerSubstep(), points, 2, weights)
+    np.testing.assert_allclose(found["qvel"][0], free["qvel"][0], rtol=1e-6)
+    assert relative(found["qvel"][1], free["qvel"][1]) > 1e-2
+    assert sim.diagnostics()["substep_clip_share"] == 0.5
+
+
+def test_residual_is_reported():
+    model = ant()
+    points = ant_points(model, 3, seed=4)
+    _, _, sim = simulate(model, TapePerSubstep(), points, 2, random_weights(model, 3, 2))
+    figures = sim.diagnostics()
+    assert 0.0 < figures["solver_residual_max"] < 1e-4
+    assert figures["solver_unconverged_share"] == 0.0
+    assert sim.diagnostics()["solver_residual_max"] == 0.0
+
+
+def test_backward_through_two_env_steps():
+    model = cartpole()
+    sim = Simulation(model, 3, 4, TapePerSubstep(), "cpu", tolerance=1e-12)
+    start = sim.initial_state()
+    ctrl = torch.full((3, 1), 0.3, requires_grad=True)
+
+    def loss(u: torch.Tensor) -> torch.Tensor:
+        state = sim.step(u, *start)
+        state = sim.step(0.5 * u, *state)
+        return (state.qpos.square() + state.qvel).sum()
+
+    (found,) = torch.autograd.grad(loss(ctrl), ctrl)
+    with torch.no_grad():
+        expected = (loss(ctrl + 1e-2) - loss(ctrl - 1e-2)) / 2e-2
+    assert abs(float(found.sum() - expected)) < 1e-3 * abs(float(expected))
+
+
+def test_unsupported_features_are_named():
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><option integrator="RK4" density="1"/>
+        <worldbody><body><joint name="j" type="slide"/><geom size=".1"/></body></worldbody></mujoco>"""
+    )
+    with pytest.raises(UnsupportedModelError, match=r"RK4.*density.*fd_jacobian"):
+        Simulation(model, 1, 1, TapePerSubstep(), "cpu")

@@ -1,0 +1,55 @@
+"""`python -m msk_ray.train` with inputs a user may get wrong: one line, a non-zero exit, nothing written."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+
+def train(root: Path, cwd: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    environment = os.environ | {"PYTHONPATH": str(root)}
+    return subprocess.run(
+        [sys.executable, "-m", "msk_ray.train", *arguments], cwd=cwd, env=environment, capture_output=True, text=True
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--set", "shac.horizn=3"], "did you mean 'horizon'?"),
+        (["--set", "shac.horizon=0"], "shac.horizon"),
+        (["--set", "shac.horizon"], "write key=value"),
+        (["--set", "physics.timestep=0.003"], "does not divide"),
+        (["--config", "configs/nope.yaml"], "no such file"),
+        (["--device", "cuda:7"], "cuda:7"),
+        (["--device", "tpu"], "write cpu, cuda or cuda:0"),
+        (["--resume", "--logdir", "nowhere"], "no trial in nowhere"),
+        (["--logdir", "/proc/nowhere"], "cannot create"),
+    ],
+)
+def test_bad_input_is_one_line(root: Path, tmp_path: Path, arguments: list[str], message: str) -> None:
+    (tmp_path / "configs").mkdir()
+    base = [] if "--config" in arguments else ["--config", str(root / "configs" / "cartpole.yaml")]
+    result = train(root, tmp_path, *base, *arguments)
+    assert result.returncode == 2
+    errors = [line for line in result.stderr.splitlines() if not line.startswith("Warp ")]
+    assert len(errors) == 1, result.stderr
+    assert errors[0].startswith("error: ")
+    assert message in errors[0]
+    assert not list(tmp_path.rglob("metrics.jsonl"))
+
+
+def test_a_folder_that_holds_a_trial_is_left_alone(root: Path, tmp_path: Path) -> None:
+    (tmp_path / "metrics.jsonl").write_text('{"epoch": 0}\n')
+    result = train(root, tmp_path, "--config", str(root / "configs" / "cartpole.yaml"), "--logdir", str(tmp_path))
+    assert result.returncode == 2
+    assert "add --resume" in result.stderr
+    assert (tmp_path / "metrics.jsonl").read_text() == '{"epoch": 0}\n'
+
+
+def test_help_teaches_by_example(root: Path, tmp_path: Path) -> None:
+    result = train(root, tmp_path, "--help")
+    assert result.returncode == 0
+    assert "--config configs/cartpole.yaml" in result.stdout

@@ -1,0 +1,81 @@
+"""Checkpoints are whole or refused."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from msk_ray.errors import CheckpointError, StorageError
+from msk_ray.training.checkpoint import (
+    epoch_checkpoints,
+    manifest_path,
+    newest_valid_checkpoint,
+    prune_checkpoints,
+    read_checkpoint,
+    write_atomically,
+    write_checkpoint,
+)
+
+
+def test_what_is_written_is_read_back(tmp_path: Path) -> None:
+    path = write_checkpoint(tmp_path / "epoch_000001.pt", {"x": torch.arange(3), "n": 7}, {"epoch": 1})
+    state = read_checkpoint(path)
+    assert torch.equal(state["x"], torch.arange(3))
+    assert state["n"] == 7
+
+
+@pytest.mark.parametrize("damage", ["truncate", "flip", "zero", "no_manifest", "bad_manifest", "format"])
+def test_damage_is_found(tmp_path: Path, damage: str) -> None:
+    path = write_checkpoint(tmp_path / "epoch_000001.pt", {"x": torch.arange(1000)}, {})
+    payload = bytearray(path.read_bytes())
+    match damage:
+        case "truncate":
+            path.write_bytes(payload[: len(payload) // 2])
+        case "flip":
+            payload[len(payload) // 2] ^= 1
+            path.write_bytes(payload)
+        case "zero":
+            path.write_bytes(bytes(len(payload)))
+        case "no_manifest":
+            manifest_path(path).unlink()
+        case "bad_manifest":
+            manifest_path(path).write_text("{")
+        case "format":
+            manifest_path(path).write_text(manifest_path(path).read_text().replace('"format": 1', '"format": 9'))
+    with pytest.raises(CheckpointError) as caught:
+        read_checkpoint(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_newest_whole_checkpoint_is_found_past_a_torn_one(tmp_path: Path) -> None:
+    for epoch in (5, 10, 100):
+        write_checkpoint(tmp_path / f"epoch_{epoch:06d}.pt", {"epoch": epoch}, {})
+    (tmp_path / "epoch_000100.pt").write_bytes(b"torn")
+    path, faults = newest_valid_checkpoint(tmp_path)
+    assert path == tmp_path / "epoch_000010.pt"
+    assert len(faults) == 1
+    assert "epoch_000100.pt is torn" in faults[0]
+    assert newest_valid_checkpoint(tmp_path / "nowhere") == (None, [])
+
+
+def test_only_the_newest_are_kept(tmp_path: Path) -> None:
+    for epoch in (1, 2, 3, 10):
+        write_checkpoint(tmp_path / f"epoch_{epoch:06d}.pt", {}, {})
+    write_checkpoint(tmp_path / "best.pt", {}, {})
+    prune_checkpoints(tmp_path, 2)
+    assert [p.name for p in epoch_checkpoints(tmp_path)] == ["epoch_000010.pt", "epoch_000003.pt"]
+    assert len(list(tmp_path.iterdir())) == 6
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "file"
+    write_atomically(path, b"old")
+
+    def full_disk(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("msk_ray.training.checkpoint.os.fsync", full_disk)
+    with pytest.raises(StorageError, match="No space left on device"):
+        write_atomically(path, b"new")
+    assert path.read_bytes() == b"old"
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]

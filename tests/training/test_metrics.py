@@ -1,0 +1,36 @@
+"""The trial's own record."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from msk_ray.errors import StorageError
+from msk_ray.training.metrics import MetricsLog, read_metrics
+
+
+def test_rows_are_on_disk_at_once_and_nan_is_named(tmp_path: Path) -> None:
+    log = MetricsLog(tmp_path)
+    log.write({"epoch": 1, "a": 2.0, "b": float("nan")})
+    line = (tmp_path / "metrics.jsonl").read_text().splitlines()[0]
+    assert json.loads(line) == {"epoch": 1, "a": 2.0, "b": None, "nonfinite": ["b"]}
+    log.close()
+
+
+def test_rewinding_drops_later_rows(tmp_path: Path) -> None:
+    log = MetricsLog(tmp_path)
+    for epoch in range(5):
+        log.write({"epoch": epoch, "a": 0.0})
+    log.rewind(2)
+    log.write({"epoch": 3, "a": 1.0})
+    log.close()
+    assert [(r["epoch"], r["a"]) for r in read_metrics(tmp_path / "metrics.jsonl")] == [(0, 0), (1, 0), (2, 0), (3, 1)]
+
+
+def test_reading_keeps_the_latest_row_of_an_epoch_and_forgives_a_torn_end(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.jsonl"
+    path.write_text('{"epoch": 1, "a": 1}\n{"epoch": 2, "a": 2}\n{"epoch": 1, "a": 3}\n{"epoch": 3, "a')
+    assert [(r["epoch"], r["a"]) for r in read_metrics(path)] == [(1, 3), (2, 2)]
+    path.write_text('{"epo\n{"epoch": 2}\n')
+    with pytest.raises(StorageError, match="line 1 is not JSON"):
+        read_metrics(path)

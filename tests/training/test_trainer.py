@@ -1,0 +1,131 @@
+"""The trainer: learns, resumes exactly, refuses what does not fit."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+
+from msk_ray.config import Config
+from msk_ray.errors import CheckpointError
+from msk_ray.training import Trainer, read_metrics
+from msk_ray.training.checkpoint import epoch_checkpoints
+
+
+def comparable(rows: list[dict]) -> list[dict]:
+    """Rows without wall-clock figures."""
+    timed = ("seconds", "env_steps_per_s")
+    return [{k: v for k, v in row.items() if k not in timed and not k.startswith("time/")} for row in rows]
+
+
+def train(config: Config, folder: Path) -> list[dict]:
+    trainer = Trainer(config, folder, "cpu")
+    while not trainer.finished:
+        trainer.run_epoch()
+    trainer.close()
+    return read_metrics(folder / "metrics.jsonl")
+
+
+def test_a_trial_leaves_its_record(tiny_cartpole: Config, tmp_path: Path) -> None:
+    rows = train(tiny_cartpole, tmp_path)
+    assert [row["epoch"] for row in rows] == list(range(7))
+    assert [row["epoch"] for row in rows if "eval/score" in row] == [0, 2, 4, 6]
+    assert rows[-1]["env_steps"] == 6 * 8 * 8
+    assert rows[-1]["eval/best_score"] == max(row["eval/score"] for row in rows if "eval/score" in row)
+    assert [p.name for p in epoch_checkpoints(tmp_path / "checkpoints")] == ["epoch_000006.pt", "epoch_000004.pt"]
+    assert (tmp_path / "checkpoints" / "best.pt").is_file()
+    assert list(tmp_path.glob("events*"))
+    assert yaml.safe_load((tmp_path / "config.yaml").read_text()) == tiny_cartpole.as_dict()
+
+
+def test_resuming_gives_the_metrics_of_an_uninterrupted_run(tiny_cartpole: Config, tmp_path: Path) -> None:
+    whole = train(tiny_cartpole, tmp_path / "whole")
+    first = Trainer(tiny_cartpole, tmp_path / "cut", "cpu")
+    for _ in range(5):  # the newest checkpoint is of epoch 4; epoch 5 is lost and done again
+        first.run_epoch()
+    first.close()
+    second = Trainer(tiny_cartpole, tmp_path / "cut", "cpu")
+    path, faults = second.restore_latest()
+    assert path is not None
+    assert path.name == "epoch_000004.pt"
+    assert not faults
+    while not second.finished:
+        second.run_epoch()
+    second.close()
+    assert comparable(read_metrics(tmp_path / "cut" / "metrics.jsonl")) == comparable(whole)
+
+
+def test_killing_the_train_command_loses_nothing(root: Path, tiny_cartpole: Config, tmp_path: Path) -> None:
+    config = tiny_cartpole.as_dict()
+    config["trial"] |= {"epochs": 40}
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(config))
+    whole = train(Config.model_validate(config), tmp_path / "whole")
+    command = [
+        sys.executable, "-m", "msk_ray.train", "--config", str(tmp_path / "config.yaml"), "--device", "cpu",
+        "--logdir", str(tmp_path / "killed"),
+    ]  # fmt: skip
+    process = subprocess.Popen(command, cwd=root, stdout=subprocess.DEVNULL)
+    metrics = tmp_path / "killed" / "metrics.jsonl"
+    deadline = time.monotonic() + 120
+    while not (metrics.exists() and len(metrics.read_text().splitlines()) > 12):
+        assert process.poll() is None, "the run ended before it could be killed"
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert len(read_metrics(metrics)) < 41
+    subprocess.run([*command, "--resume"], cwd=root, check=True, stdout=subprocess.DEVNULL)
+    assert comparable(read_metrics(metrics)) == comparable(whole)
+
+
+def test_sigterm_saves_and_says_resumable(root: Path, tiny_cartpole: Config, tmp_path: Path) -> None:
+    config = tiny_cartpole.as_dict()
+    config["trial"] |= {"epochs": 100000, "checkpoint_interval": 100000}
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(config))
+    process = subprocess.Popen(
+        [sys.executable, "-m", "msk_ray.train", "--config", str(tmp_path / "config.yaml"), "--device", "cpu",
+         "--logdir", str(tmp_path / "run")],
+        cwd=root, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    metrics = tmp_path / "run" / "metrics.jsonl"
+    deadline = time.monotonic() + 120
+    while not (metrics.exists() and len(metrics.read_text().splitlines()) > 3):
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    process.terminate()
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 75
+    assert "stopped by SIGTERM" in output
+    assert len(epoch_checkpoints(tmp_path / "run" / "checkpoints")) == 1
+    rows = [json.loads(line) for line in metrics.read_text().splitlines()]
+    assert f"epoch_{rows[-1]['epoch']:06d}.pt" == epoch_checkpoints(tmp_path / "run" / "checkpoints")[0].name
+
+
+def test_a_checkpoint_of_other_settings_is_refused(tiny_cartpole: Config, tmp_path: Path) -> None:
+    train(tiny_cartpole, tmp_path / "a")
+    other = tiny_cartpole.as_dict()
+    other["shac"]["gamma"] = 0.9
+    trainer = Trainer(Config.model_validate(other), tmp_path / "b", "cpu")
+    with pytest.raises(CheckpointError, match=r"shac\.gamma was 0\.99, now 0\.9"):
+        trainer.restore(tmp_path / "a" / "checkpoints" / "best.pt")
+
+
+def test_a_torn_checkpoint_falls_back_to_the_one_before(tiny_cartpole: Config, tmp_path: Path) -> None:
+    whole = train(tiny_cartpole, tmp_path)
+    newest = epoch_checkpoints(tmp_path / "checkpoints")[0]
+    newest.write_bytes(newest.read_bytes()[:100])
+    trainer = Trainer(tiny_cartpole, tmp_path, "cpu")
+    path, faults = trainer.restore_latest()
+    assert path is not None
+    assert path.name == "epoch_000004.pt"
+    assert "epoch_000006.pt is torn" in faults[0]
+    while not trainer.finished:
+        trainer.run_epoch()
+    trainer.close()
+    assert comparable(read_metrics(tmp_path / "metrics.jsonl")) == comparable(whole)
