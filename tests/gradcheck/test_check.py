@@ -13,6 +13,7 @@ from msk_ray.gradcheck import STATE_KINDS, GradientReport, Limits, Oracle, Point
 from msk_ray.gradcheck.check import compare, forward_mismatch
 from msk_ray.simulation import FdJacobian, Simulation
 from msk_ray.simulation.backward import InputGradients
+from msk_ray.simulation.modes import make_backward
 
 
 class Altered(FdJacobian):
@@ -75,6 +76,24 @@ def test_fd_jacobian_on_an_ant_moving_in_contact(substeps, inputs):
     assert report.checked >= 12
     for name in inputs:
         assert np.median(errors(report, name)) < 2e-2
+
+
+@pytest.mark.parametrize("substeps", [1, 16])
+def test_adjoint_on_an_ant_in_contact(substeps):
+    """Two derivations that share no code, in all but rounding the same."""
+    model = mujoco.MjModel.from_xml_string(ant_xml("elliptic"))
+    report = check_gradients(
+        model,
+        make_backward("tape_per_substep"),
+        substeps=substeps,
+        states=["standing", "contact"],
+        worlds=12,
+        solver_tolerance=1e-9,
+    )
+    assert report.checked >= 20
+    assert report.max_rel_error < 1e-4
+    for name in ("ctrl", "qpos", "qvel"):
+        assert np.median(errors(report, name)) < 2e-5
 
 
 @pytest.mark.parametrize("name", ["ctrl", "qpos", "qvel"])
