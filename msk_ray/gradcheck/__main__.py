@@ -32,6 +32,7 @@ Exit code: 0 within the tolerance, 1 past it, 2 for a model that is not supporte
 EXAMPLES = """\
   python -m msk_ray.gradcheck my_robot.xml
   python -m msk_ray.gradcheck my_robot.xml --substeps 16 --states standing,contact --worlds 20 --tolerance 1e-2
+  python -m msk_ray.gradcheck my_robot.xml --mode fd_jacobian --tolerance 5e-2    # a model the adjoint refuses
   python -m msk_ray.gradcheck my_robot.xml --json > gradients.json"""
 
 MANY_EXCLUDED = 0.25
@@ -53,7 +54,12 @@ def parser() -> Parser:
     """The command line."""
     p = Parser("python -m msk_ray.gradcheck", DESCRIPTION, EXAMPLES)
     p.add_argument("model", type=Path, metavar="MODEL.xml", help="an MJCF or URDF file, or a compiled .mjb")
-    p.add_argument("--mode", default="fd_jacobian", metavar="MODE", help="backward mode (default %(default)s)")
+    p.add_argument(
+        "--mode",
+        default="tape_per_substep",
+        metavar="MODE",
+        help="backward mode (default %(default)s); fd_jacobian takes any model, an unknown name lists them all",
+    )
     p.add_argument("--substeps", type=_positive(int), default=1, metavar="N", help="physics steps (default 1)")
     p.add_argument(
         "--states",

@@ -74,6 +74,14 @@ class FdJacobian(Backward):
             *(gradients.get(n, torch.zeros_like(shapes[n])) if getattr(needs, n) else None for n in shapes)
         )
 
+    def diagnostics(self) -> dict[str, float]:
+        """Share of perturbed copies whose solver met an iteration limit since the last call.
+
+        Raises:
+            SimulationError: a copy lost contacts or constraint rows, so that its differences are not slopes.
+        """
+        return {"fd_solver_limit_share": max((c.check_overflow() for c in self._copies.values()), default=0.0)}
+
     def _slopes(
         self, chunk: list[tuple[str, int]], width: int, ctrl: Tensor, start: StepState, weights: StepState
     ) -> Tensor:
@@ -110,6 +118,9 @@ class _Copies:
         self._buffers = BatchTensors(self._batch)
         self._graph = Graph(self._batch.launch_step, self._batch.device)
         self._device = torch.device(str(batch.device))
+
+    def check_overflow(self) -> float:
+        return self._batch.check_overflow()
 
     def advance(self, inputs: dict[str, Tensor]) -> StepState:
         self._buffers.load(inputs["ctrl"], StepState(inputs["qpos"], inputs["qvel"], inputs["act"]))

@@ -55,7 +55,7 @@ class Plan:
 
 
 @contextmanager
-def ray_session(address: str | None, dashboard: bool = True) -> Iterator[None]:
+def ray_session(address: str | None, dashboard: bool | None = None) -> Iterator[None]:
     """A Ray of our own on this machine, or the one at `address`.
 
     Raises:
@@ -74,6 +74,7 @@ def ray_session(address: str | None, dashboard: bool = True) -> Iterator[None]:
         package = str(Path(msk_ray.__file__).resolve().parent.parent)
         paths = [package, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
         os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys(paths))
+        # None starts the dashboard where its packages (ray[default]) are installed, and does without elsewhere.
         context = ray.init(include_dashboard=dashboard, dashboard_host="127.0.0.1", **quiet)
     else:
         try:
@@ -83,6 +84,8 @@ def ray_session(address: str | None, dashboard: bool = True) -> Iterator[None]:
     try:
         if context.dashboard_url:
             print(f"Ray dashboard: http://{context.dashboard_url}", flush=True)
+        else:
+            print("no Ray dashboard: pip install 'ray[default]' to have one", flush=True)
         yield
     finally:
         ray.shutdown()

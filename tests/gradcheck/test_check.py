@@ -8,11 +8,12 @@ import pytest
 import torch
 from conftest import ant_xml
 
-from msk_ray.errors import ConfigError, UnsupportedModelError
+from msk_ray.errors import ConfigError, SimulationError, UnsupportedModelError
 from msk_ray.gradcheck import STATE_KINDS, GradientReport, Limits, Oracle, Point, check_gradients
 from msk_ray.gradcheck.check import compare, forward_mismatch
 from msk_ray.simulation import FdJacobian, Simulation
 from msk_ray.simulation.backward import InputGradients
+from msk_ray.simulation.modes import make_backward
 
 
 class Altered(FdJacobian):
@@ -75,6 +76,24 @@ def test_fd_jacobian_on_an_ant_moving_in_contact(substeps, inputs):
     assert report.checked >= 12
     for name in inputs:
         assert np.median(errors(report, name)) < 2e-2
+
+
+@pytest.mark.parametrize("substeps", [1, 16])
+def test_adjoint_on_an_ant_in_contact(substeps):
+    """Two derivations that share no code, in all but rounding the same."""
+    model = mujoco.MjModel.from_xml_string(ant_xml("elliptic"))
+    report = check_gradients(
+        model,
+        make_backward("tape_per_substep"),
+        substeps=substeps,
+        states=["standing", "contact"],
+        worlds=12,
+        solver_tolerance=1e-9,
+    )
+    assert report.checked >= 20
+    assert report.max_rel_error < 1e-4
+    for name in ("ctrl", "qpos", "qvel"):
+        assert np.median(errors(report, name)) < 2e-5
 
 
 @pytest.mark.parametrize("name", ["ctrl", "qpos", "qvel"])
@@ -160,6 +179,23 @@ def test_excluded_states_are_counted_by_cause_and_nothing_left_never_passes(cart
 def test_same_seed_same_report(cartpole):
     reports = [check_gradients(cartpole, FdJacobian(), states=list(STATE_KINDS), worlds=2, seed=7) for _ in range(2)]
     assert reports[0].results == reports[1].results
+
+
+def test_lost_contacts_of_the_perturbed_copies_are_an_error():
+    """Every copy of every world needs its room, not only the worlds that are stepped."""
+    model = mujoco.MjModel.from_xml_string(ant_xml("elliptic"))
+    backward = FdJacobian()
+    sim = Simulation(model, 1, 1, backward, "cpu", njmax=4)
+    # Lifted far off the ground, the world itself fits; its copies, moved by 1 m, do not.
+    backward.eps["qpos"] = 1.0
+    start = sim.initial_state()
+    qpos = start.qpos.clone()
+    qpos[:, 2] = 1.2
+    ctrl = torch.zeros(1, model.nu, requires_grad=True)
+    qpos.requires_grad_()
+    sim.step(ctrl, qpos, start.qvel, start.act).qvel.sum().backward()
+    with pytest.raises(SimulationError, match="njmax"):
+        sim.diagnostics()
 
 
 def test_bad_requests(cartpole):

@@ -23,6 +23,11 @@ def test_table_and_success(cartpole_file, capsys):
         assert text in out
 
 
+def test_mode_is_taken(cartpole_file, capsys):
+    assert run(main, [str(cartpole_file), *FAST, "--mode", "fd_jacobian", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["mode"] == "fd_jacobian"
+
+
 def test_past_tolerance(cartpole_file, capsys):
     assert run(main, [str(cartpole_file), *FAST, "--tolerance", "1e-12"]) == 1
     assert "past the tolerance" in capsys.readouterr().out
@@ -34,7 +39,7 @@ def test_json(cartpole_file):
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
-    assert (report["model"], report["mode"]) == (str(cartpole_file), "fd_jacobian")
+    assert (report["model"], report["mode"]) == (str(cartpole_file), "tape_per_substep")
     assert (report["substeps"], report["worlds"], report["excluded"]) == (4, 2, 0)
     assert len(report["results"]) == 2 * 3
     for result in report["results"]:
