@@ -58,6 +58,10 @@ class Plan:
 def ray_session(address: str | None, dashboard: bool | None = None) -> Iterator[None]:
     """A Ray of our own on this machine, or the one at `address`.
 
+    Args:
+        address: of a running cluster.
+        dashboard: whether to start one; None starts it where its packages (ray[default]) are installed.
+
     Raises:
         DeviceError: the cluster at `address` cannot be reached.
     """
@@ -84,7 +88,7 @@ def ray_session(address: str | None, dashboard: bool | None = None) -> Iterator[
     try:
         if context.dashboard_url:
             print(f"Ray dashboard: http://{context.dashboard_url}", flush=True)
-        else:
+        elif dashboard is None:
             print("no Ray dashboard: pip install 'ray[default]' to have one", flush=True)
         yield
     finally:
