@@ -13,7 +13,7 @@ from msk_ray.config import dump_yaml, parse_override, read_yaml
 from msk_ray.errors import ConfigError
 from msk_ray.tune import experiment as experiments
 from msk_ray.tune.listing import text_table, trial_rows
-from msk_ray.tune.smoke import shrink
+from msk_ray.tune.smoke import shrink, without_pruning
 from msk_ray.tune.space import Space, find_space, parse_seeds, parse_space
 from msk_ray.tune.trials import Trial, find_trial, resolve_trials
 
@@ -70,8 +70,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         raise ConfigError(f"--max-concurrent {args.max_concurrent}: at least 1")
     space = _read_space(args)
     trials = [] if space.file.search == "optuna" else resolve_trials(space)
-    if args.smoke and trials:
-        trials = shrink(space, trials)
+    if args.smoke:
+        trials = shrink(space, trials) if trials else []
+        space = without_pruning(space)
     if args.dry_run:
         _print_trials(space, trials)
         return 0

@@ -109,7 +109,8 @@ class Live(Callback):
 
     def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         mine = self._trial_of(trial.config)
-        self._say(f"{mine.id} its process died or raised; trying again from its newest checkpoint")
+        why = _reason(self._experiment.trial_folder(mine.id) / ERROR_FILE, trial)
+        self._say(f"{mine.id} {why}; trying again from its newest checkpoint")
 
     def on_trial_complete(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         mine = self._trial_of(trial.config)
@@ -200,5 +201,6 @@ def _reason(error_file: Path, trial: Any) -> str:
         return error_file.read_text(encoding="utf-8").strip().splitlines()[-1]
     error = trial.get_pickled_error()
     if error is None or isinstance(error, RayActorError):
-        return f"its process died {trial.num_failures} times (killed, or out of memory)"
+        times = "" if trial.num_failures < 2 else f", {trial.num_failures} times now"
+        return f"its process died (killed, or out of memory){times}"
     return str(error).strip().splitlines()[-1]

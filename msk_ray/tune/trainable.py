@@ -169,7 +169,9 @@ class _Gauges:
     """The trial's newest figures as gauges on Ray's metrics port."""
 
     def __init__(self, experiment: str, trial: Trial) -> None:
-        tags = {"experiment": experiment, "trial": trial.id, "variant": trial.variant, "seed": str(trial.seed)}
+        # Ray takes no other characters in tags.
+        variant = trial.variant.replace("→", "->").encode("ascii", "backslashreplace").decode()
+        tags = {"experiment": experiment, "trial": trial.id, "variant": variant, "seed": str(trial.seed)}
         self._gauges = {}
         for name, metric in _GAUGES.items():
             gauge = Gauge(f"msk_ray_{name}", description=metric, tag_keys=tuple(tags))

@@ -27,11 +27,12 @@ def test_halving_in_lockstep_stops_the_worse_at_its_next_report() -> None:
     rule = SuccessiveHalving((100,), 2)
     assert rule.report("bad", 100, 1.0) is None  # nobody to compare with yet
     assert rule.report("good", 100, 2.0) is None
-    ending = rule.report("bad", 150, 1.5)
+    ending = rule.report("bad", 140, 1.5)
     assert ending is not None
     assert ending.outcome is Outcome.STOPPED_ASHA
     assert "number 2 of 2 at rung 100" in ending.why
-    assert rule.report("good", 150, 0.0) is None  # judged by what it had at the rung
+    assert rule.report("good", 140, 0.0) is None  # judged by what it had at the rung
+    assert rule.report("bad", 142, 1.5) is None  # past 100 · √2 the rung at 100 says nothing any more
 
 
 def test_halving_waits_for_enough_trials() -> None:
