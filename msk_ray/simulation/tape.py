@@ -24,13 +24,15 @@ from msk_ray.simulation.residual import ResidualGauge
 
 # Arrays of mujoco_warp.Data that the adjoint of a substep reads, besides the checkpointed state.
 _KEPT_DATA = (
-    *("cdof", "cdof_dot", "cvel", "cinert", "M", "nefc", "nacon", "subtree_com", "geom_xpos", "geom_xmat"),
+    *("cdof", "cdof_dot", "cvel", "cinert", "M", "nefc", "nacon", "subtree_com", "xipos"),
+    *("geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "ten_J", "ten_length", "ten_velocity", "act_dot"),
+    *("actuator_velocity", "actuator_force"),
     *("actuator_length", "moment_rownnz", "moment_rowadr", "moment_colind", "actuator_moment", "qfrc_actuator"),
 )
 _KEPT_EFC = ("type", "id", "J", "J_rownnz", "J_rowadr", "J_colind", "D", "aref", "frictionloss", "pos", "margin")
 _KEPT_CONTACT = (
     *("dist", "pos", "frame", "includemargin", "friction", "solref", "solreffriction", "solimp", "dim", "geom"),
-    *("efc_address", "worldid"),
+    *("efc_address", "worldid", "geomcollisionid"),
 )
 
 

@@ -1,8 +1,8 @@
 """Actuators: slopes of force and activation with respect to control, activation, length and velocity."""
 
 import warp as wp
-from mujoco_warp._src.types import BiasType, DynType, GainType, vec10
-from mujoco_warp._src.util_misc import muscle_bias, muscle_dynamics, muscle_gain
+from mujoco_warp._src.types import BiasType, DynType, GainType, JointType, TrnType, vec10
+from mujoco_warp._src.util_misc import muscle_bias, muscle_dynamics, muscle_gain, muscle_gain_vel_deriv
 
 wp.set_module_options({"enable_backward": False})
 
@@ -20,6 +20,7 @@ class ActuatorLaw:
     clamp_ctrl: int
     clamp_act: int
     clamp_force: int
+    implicit: int
     dynprm: vec10
     gainprm: vec10
     biasprm: vec10
@@ -71,6 +72,30 @@ def actuator_force(law: ActuatorLaw, drive: wp.float32, length: wp.float32, velo
 
 
 @wp.func
+def force_velocity_slope(
+    law: ActuatorLaw, ctrl: wp.float32, drive: wp.float32, length: wp.float32, velocity: wp.float32
+) -> wp.float32:
+    """dF/d(velocity) as mujoco_warp's implicit integrators take it: a stateless actuator's control is not clamped."""
+    gain = wp.float32(0.0)
+    if law.gaintype == GainType.AFFINE:
+        gain = law.gainprm[2]
+    elif law.gaintype == GainType.MUSCLE:
+        gain = muscle_gain_vel_deriv(length, velocity, law.lengthrange, law.acc0, law.gainprm)
+    bias = wp.float32(0.0)
+    if law.biastype == BiasType.AFFINE:
+        bias = law.biasprm[2]
+    push = drive
+    if law.dyntype == DynType.NONE:
+        push = ctrl
+    slope = gain * push + bias
+    if law.clamp_force == 1:
+        force = actuator_force(law, drive, length, velocity)
+        if force <= law.forcerange[0] or force >= law.forcerange[1]:
+            slope = wp.float32(0.0)
+    return slope
+
+
+@wp.func
 def actuator_score(
     law: ActuatorLaw,
     ctrl: wp.float32,
@@ -79,8 +104,9 @@ def actuator_score(
     velocity: wp.float32,
     act_weight: wp.float32,
     force_weight: wp.float32,
+    slope_weight: wp.float32,
 ) -> wp.float32:
-    """act_weight·act' + force_weight·force, whose slopes are the pullback of one actuator."""
+    """act_weight·act' + force_weight·F + slope_weight·dF/dv, whose slopes are the pullback of one actuator."""
     command = ctrl
     if law.clamp_ctrl == 1:
         command = wp.clamp(ctrl, law.ctrlrange[0], law.ctrlrange[1])
@@ -92,6 +118,8 @@ def actuator_score(
         if law.early == 1:
             drive = after
         score = act_weight * after
+    if law.implicit == 1:
+        score += slope_weight * force_velocity_slope(law, ctrl, drive, length, velocity)
     return score + force_weight * actuator_force(law, drive, length, velocity)
 
 
@@ -100,9 +128,15 @@ def pull_actuators(
     # Model:
     opt_timestep: wp.array[float],
     clampctrl: bool,
+    implicit_all: bool,
+    inertia_address: wp.array2d[int],
+    jnt_type: wp.array[int],
     jnt_actfrclimited: wp.array[bool],
     jnt_actfrcrange: wp.array2d[wp.vec2],
     dof_jntid: wp.array[int],
+    actuator_trntype: wp.array[int],
+    actuator_trnid: wp.array[wp.vec2i],
+    actuator_gear: wp.array2d[wp.spatial_vector],
     actuator_dyntype: wp.array[int],
     actuator_gaintype: wp.array[int],
     actuator_biastype: wp.array[int],
@@ -133,18 +167,27 @@ def pull_actuators(
     moment_colind_in: wp.array2d[int],
     moment_in: wp.array2d[float],
     qfrc_actuator_in: wp.array2d[float],
+    qacc_in: wp.array2d[float],
     lam_in: wp.array2d[float],
+    mu_in: wp.array2d[float],
+    excess_in: wp.array2d[float],
     # Out:
     grad_act_out: wp.array2d[float],
     grad_ctrl_out: wp.array2d[float],
     phi_qpos_out: wp.array2d[float],
     phi_qvel_out: wp.array2d[float],
-    rate_bar_out: wp.array2d[float],
-    velocity_bar_out: wp.array2d[float],
+    ten_length_bar_out: wp.array2d[float],
+    ten_qvel_bar_out: wp.array2d[float],
+    ten_lam_bar_out: wp.array2d[float],
+    ten_mu_bar_out: wp.array2d[float],
+    ten_smooth_bar_out: wp.array2d[float],
+    length_bar_out: wp.array2d[float],
+    rate_bar_out: wp.array2d[wp.vec4],
 ):
-    """Φ ∋ -(m·λ) F(len, m·v, act, ctrl) and ḡ·act': gradients of ctrl and act, and those through len and velocity.
+    """Φ ∋ -(m·λ) F(len, m·v, act, ctrl) - h κ dF/dv and ḡ·act': gradients of ctrl and act, and those of len and rates.
 
-    rate_bar (∂Φ/∂(m·λ) = -F) and velocity_bar are kept for transmissions whose moment m turns with q.
+    With implicit integration κ = Σ m_i m_j μ_i â_j over the pairs that M couples. A tendon's cotangents go to its
+    tendon. For other transmissions whose moment m turns with q, `rate_bar` keeps ∂Φ/∂(m·λ, m·v, m·μ, m·â).
     """
     worldid, uid = wp.tid()
     law = ActuatorLaw()
@@ -192,18 +235,56 @@ def pull_actuators(
         if not held:
             rate += moment_in[worldid, k] * lam_in[worldid, dof]
 
+    law.implicit = 0
+    h = law.timestep
+    kappa = float(0.0)
+    rate_mu = float(0.0)
+    rate_smooth = float(0.0)
+    if implicit_all:
+        law.implicit = 1
+        for k in range(start, end):
+            i = moment_colind_in[worldid, k]
+            rate_mu += moment_in[worldid, k] * mu_in[worldid, i]
+            rate_smooth += moment_in[worldid, k] * (qacc_in[worldid, i] - excess_in[worldid, i])
+            for m in range(start, end):
+                j = moment_colind_in[worldid, m]
+                if inertia_address[wp.max(i, j), wp.min(i, j)] >= 0:
+                    smooth = qacc_in[worldid, j] - excess_in[worldid, j]
+                    kappa += moment_in[worldid, k] * moment_in[worldid, m] * mu_in[worldid, i] * smooth
+
     length = length_in[worldid, uid]
-    _l, ctrl_slope, act_slope, length_slope, velocity_slope, _a, force = wp.grad(actuator_score)(
-        law, ctrl, act, length, velocity, act_weight, rate
+    _l, ctrl_slope, act_slope, length_slope, velocity_slope, _a, force, slope = wp.grad(actuator_score)(
+        law, ctrl, act, length, velocity, act_weight, rate, h * kappa
     )
     live = live_in[worldid] != 0
     if law.dyntype != DynType.NONE:
         grad_act_out[worldid, slot] = wp.where(live, act_slope, 0.0)
     if live and actuator_ctrlnum[uid] > 0:
         grad_ctrl_out[worldid, source] += ctrl_slope
-    rate_bar_out[worldid, uid] = -force
-    velocity_bar_out[worldid, uid] = -velocity_slope
+    length_bar_out[worldid, uid] = -length_slope
+    # ∂Φ/∂(m·λ) = -F ,  ∂Φ/∂(m·μ) = -h F' m·â ,  ∂Φ/∂(m·â) = -h F' m·μ
+    rate_bar = wp.vec4(-force, -velocity_slope, -h * slope * rate_smooth, -h * slope * rate_mu)
+    if not implicit_all:
+        rate_bar[2] = 0.0
+        rate_bar[3] = 0.0
+    rate_bar_out[worldid, uid] = rate_bar
+    kind = actuator_trntype[uid]
+    if kind == TrnType.TENDON:
+        t = actuator_trnid[uid][0]
+        gear = actuator_gear[worldid % actuator_gear.shape[0], uid][0]
+        wp.atomic_add(ten_length_bar_out, worldid, t, -gear * length_slope)
+        wp.atomic_add(ten_qvel_bar_out, worldid, t, gear * rate_bar[1])
+        wp.atomic_add(ten_lam_bar_out, worldid, t, gear * rate_bar[0])
+        wp.atomic_add(ten_mu_bar_out, worldid, t, gear * rate_bar[2])
+        wp.atomic_add(ten_smooth_bar_out, worldid, t, gear * rate_bar[3])
+        return
+    # Length is the integral of the moment for hinges and slides; where it is not, `transmission` does it.
+    straight = bool(False)
+    if kind == TrnType.JOINT or kind == TrnType.JOINTINPARENT:
+        joint = jnt_type[actuator_trnid[uid][0]]
+        straight = joint == JointType.HINGE or joint == JointType.SLIDE
     for k in range(start, end):
         dof = moment_colind_in[worldid, k]
-        wp.atomic_add(phi_qpos_out, worldid, dof, -length_slope * moment_in[worldid, k])
-        wp.atomic_add(phi_qvel_out, worldid, dof, -velocity_slope * moment_in[worldid, k])
+        wp.atomic_add(phi_qvel_out, worldid, dof, rate_bar[1] * moment_in[worldid, k])
+        if straight:
+            wp.atomic_add(phi_qpos_out, worldid, dof, -length_slope * moment_in[worldid, k])

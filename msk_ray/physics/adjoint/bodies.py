@@ -15,6 +15,8 @@ from mujoco_warp._src.math import inert_vec, motion_cross_force
 from mujoco_warp._src.types import vec10
 from mujoco_warp._src.util_misc import _poly_force_deriv
 
+from msk_ray.physics.adjoint.spatial import carried, wrench
+
 wp.set_module_options({"enable_backward": False})
 
 
@@ -24,8 +26,13 @@ def body_fields(
     opt_gravity: wp.array[wp.vec3],
     gravity_on: bool,
     body_lastdof: wp.array[int],
+    body_rootid: wp.array[int],
+    body_mass: wp.array2d[float],
+    body_gravcomp: wp.array2d[float],
     dof_parentid: wp.array[int],
     # In:
+    xipos_in: wp.array2d[wp.vec3],
+    subtree_com_in: wp.array2d[wp.vec3],
     cdof_in: wp.array2d[wp.spatial_vector],
     cdof_dot_in: wp.array2d[wp.spatial_vector],
     cvel_in: wp.array2d[wp.spatial_vector],
@@ -45,6 +52,8 @@ def body_fields(
     qvel_bar_out: wp.array2d[wp.spatial_vector],
     cacc_bar_out: wp.array2d[wp.spatial_vector],
     qacc_bar_out: wp.array2d[wp.spatial_vector],
+    mu_bar_out: wp.array2d[wp.spatial_vector],
+    excess_bar_out: wp.array2d[wp.spatial_vector],
     moved_bar_out: wp.array2d[wp.spatial_vector],
 ):
     """Fields of λ, a, μ and a - â, the acceleration A, and the cotangents that inertia gives them."""
@@ -88,7 +97,20 @@ def body_fields(
     # ∂/∂A = I L
     cacc_bar_out[worldid, bodyid] = inert_vec(inertia, lam)
     qacc_bar_out[worldid, bodyid] = zero
-    moved_bar_out[worldid, bodyid] = zero
+    # -μᵀM(a - â) = -Σ_b V_b(μ)·I V_b(a - â), bilinear in two plain fields
+    mu_bar_out[worldid, bodyid] = -inert_vec(inertia, excess)
+    excess_bar_out[worldid, bodyid] = -inert_vec(inertia, mu)
+    moved = zero
+    comp = body_gravcomp[worldid % body_gravcomp.shape[0], bodyid]
+    if gravity_on and comp != 0.0:
+        # Φ ∋ -u(λ)·F at the body's centre of mass, F = -gravity m comp fixed in the world
+        mass = body_mass[worldid % body_mass.shape[0], bodyid]
+        push = comp * mass * opt_gravity[worldid % opt_gravity.shape[0]]
+        arm = xipos_in[worldid, bodyid] - subtree_com_in[worldid, body_rootid[bodyid]]
+        along = wrench(push, wp.vec3(0.0), arm)
+        lam_bar_out[worldid, bodyid] = lam_bar_out[worldid, bodyid] + along
+        moved = carried(lam, along) + wrench(wp.cross(push, wp.spatial_top(lam)), wp.vec3(0.0), arm)
+    moved_bar_out[worldid, bodyid] = moved
 
 
 @wp.kernel
@@ -147,7 +169,6 @@ def sweep_up(
     cdof_in: wp.array2d[wp.spatial_vector],
     cdof_dot_in: wp.array2d[wp.spatial_vector],
     cvel_in: wp.array2d[wp.spatial_vector],
-    cinert_in: wp.array2d[vec10],
     lam_field_in: wp.array2d[wp.spatial_vector],
     qacc_field_in: wp.array2d[wp.spatial_vector],
     cacc_in: wp.array2d[wp.spatial_vector],
@@ -157,6 +178,8 @@ def sweep_up(
     qvel_bar_in: wp.array2d[wp.spatial_vector],
     cacc_sum_in: wp.array2d[wp.spatial_vector],
     qacc_bar_in: wp.array2d[wp.spatial_vector],
+    mu_bar_in: wp.array2d[wp.spatial_vector],
+    excess_bar_in: wp.array2d[wp.spatial_vector],
     moved_bar_in: wp.array2d[wp.spatial_vector],
     phi_qpos_in: wp.array2d[float],
     phi_qvel_in: wp.array2d[float],
@@ -183,9 +206,8 @@ def sweep_up(
         qvel_bar += qvel_bar_in[worldid, b]
         qacc_bar += qacc_bar_in[worldid, b]
         moved_bar += moved_bar_in[worldid, b]
-        # -μᵀM(a - â) = -Σ_b V_b(μ)·I V_b(a - â), bilinear in two plain fields
-        mu_bar -= inert_vec(cinert_in[worldid, b], excess_field_in[worldid, b])
-        excess_bar -= inert_vec(cinert_in[worldid, b], mu_field_in[worldid, b])
+        mu_bar += mu_bar_in[worldid, b]
+        excess_bar += excess_bar_in[worldid, b]
     cacc_bar = cacc_sum_in[worldid, body]
 
     # Fields just before this joint, and V̄ without what only joints before it (or it itself) feel.

@@ -6,34 +6,12 @@ plain field x, along the frame's axes (k < 3), and the relative spin (k ≥ 3). 
 """
 
 import warp as wp
-from mujoco_warp._src.math import make_frame
-from mujoco_warp._src.types import ConstraintType, GeomType, vec5
+from mujoco_warp._src.types import ConstraintType, vec5
 
 from msk_ray.physics.adjoint.rows import cone_law, cone_slope, row_slopes, vec6
 from msk_ray.physics.adjoint.spatial import carried, point_velocity, wrench
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.func
-def frame_score(normal: wp.vec3, axis: wp.vec3, along_axis: wp.int32, weight: wp.mat33) -> wp.float32:
-    """⟨weight, frame⟩ of the contact frame built from a normal, and from a capsule's axis where that guides it."""
-    score = wp.float32(0.0)
-    if along_axis == 1:
-        b = wp.normalize(axis - normal * wp.dot(normal, axis))
-        score = wp.dot(weight[0], normal) + wp.dot(weight[1], b) + wp.dot(weight[2], wp.cross(normal, b))
-    elif along_axis == 2:
-        # Steep capsule: a fixed second axis, not made orthogonal to the normal.
-        score = wp.dot(weight[0], normal) + wp.dot(weight[1], axis) + wp.dot(weight[2], wp.cross(normal, axis))
-    else:
-        frame = make_frame(normal)
-        score = wp.dot(weight[0], frame[0]) + wp.dot(weight[1], frame[1]) + wp.dot(weight[2], frame[2])
-    return score
-
-
-@wp.func
-def _column(matrix: wp.mat33, k: int) -> wp.vec3:
-    return wp.vec3(matrix[0, k], matrix[1, k], matrix[2, k])
 
 
 @wp.func
@@ -247,80 +225,3 @@ def pull_contacts(
             wp.atomic_add(qvel_bar_out, worldid, body, vel_wrench)
             moved = carried(lam, lam_wrench) + carried(acc, acc_wrench) + carried(vel, vel_wrench)
             wp.atomic_add(moved_bar_out, worldid, body, moved)
-
-
-@wp.kernel
-def pull_geometry(
-    # Model:
-    body_rootid: wp.array[int],
-    geom_bodyid: wp.array[int],
-    geom_type: wp.array[int],
-    geom_size: wp.array2d[wp.vec3],
-    # In:
-    nacon_in: wp.array[int],
-    contact_dist_in: wp.array[float],
-    contact_pos_in: wp.array[wp.vec3],
-    contact_frame_in: wp.array[wp.mat33],
-    contact_geom_in: wp.array[wp.vec2i],
-    contact_address_in: wp.array2d[int],
-    contact_worldid_in: wp.array[int],
-    geom_xpos_in: wp.array2d[wp.vec3],
-    geom_xmat_in: wp.array2d[wp.mat33],
-    subtree_com_in: wp.array2d[wp.vec3],
-    phi_dist_in: wp.array[float],
-    phi_pos_in: wp.array[wp.vec3],
-    phi_frame_in: wp.array[wp.mat33],
-    # Out:
-    moved_bar_out: wp.array2d[wp.spatial_vector],
-):
-    """Cotangents of (dist, pos, frame) to wrenches on the two bodies whose displacement moves them."""
-    con = wp.tid()
-    if con >= wp.min(nacon_in[0], contact_dist_in.shape[0]):
-        return
-    if contact_address_in[con, 0] < 0:
-        return
-    worldid = contact_worldid_in[con]
-    geoms = contact_geom_in[con]
-    body1 = geom_bodyid[geoms[0]]
-    body2 = geom_bodyid[geoms[1]]
-    dist = contact_dist_in[con]
-    point = contact_pos_in[con]
-    frame = contact_frame_in[con]
-    normal = frame[0]
-    dist_bar = phi_dist_in[con]
-    pos_bar = phi_pos_in[con]
-    weight = phi_frame_in[con]
-    com1 = subtree_com_in[worldid, body_rootid[body1]]
-    com2 = subtree_com_in[worldid, body_rootid[body2]]
-
-    along_axis = int(0)
-    axis = wp.vec3(0.0)
-    if geom_type[geoms[0]] == GeomType.PLANE and geom_type[geoms[1]] == GeomType.CAPSULE:
-        axis = _column(geom_xmat_in[worldid, geoms[1]], 2)
-        along_axis = int(1)
-        if wp.length(axis - normal * wp.dot(normal, axis)) < 0.5:
-            axis = frame[1]
-            along_axis = int(2)
-    normal_bar, axis_bar, _kind, _weight = wp.grad(frame_score)(normal, axis, along_axis, weight)
-
-    if geom_type[geoms[0]] == GeomType.PLANE:
-        # The core of the other geom that is nearest the plane is fixed to its body: a sphere's centre, a capsule's
-        # end, a box's corner, a mesh's vertex.
-        origin = geom_xpos_in[worldid, geoms[0]]
-        radius = float(0.0)
-        if geom_type[geoms[1]] == GeomType.SPHERE or geom_type[geoms[1]] == GeomType.CAPSULE:
-            radius = geom_size[worldid % geom_size.shape[0], geoms[1]][0]
-        core = point + normal * (radius + 0.5 * dist)
-        # pos = core - n (r + dist/2) ,  dist = n·(core - o) - r
-        reach = dist_bar - 0.5 * wp.dot(normal, pos_bar)
-        normal_bar += reach * (core - origin) - (radius + 0.5 * dist) * pos_bar
-        core_bar = pos_bar + reach * normal
-        if body2 > 0:
-            torque2 = wp.vec3(0.0)
-            if along_axis == 1:
-                torque2 = wp.cross(axis, axis_bar)
-            wp.atomic_add(moved_bar_out, worldid, body2, wrench(core_bar, torque2, core - com2))
-        if body1 > 0:
-            # n turns with the plane: dn = ω × n  ⇒  torque n × n̄
-            torque1 = wp.cross(normal, normal_bar)
-            wp.atomic_add(moved_bar_out, worldid, body1, wrench(-reach * normal, torque1, origin - com1))

@@ -13,6 +13,7 @@ _GEOM = mujoco.mjtGeom
 _TRN = mujoco.mjtTrn
 _JNT = mujoco.mjtJoint
 _EQ = mujoco.mjtEq
+_INTEGRATOR = mujoco.mjtIntegrator
 
 
 Finder = Callable[[mujoco.MjModel], list[str]]
@@ -100,6 +101,79 @@ def _spatial_tendons(m: mujoco.MjModel) -> np.ndarray:
     return np.asarray(first != int(mujoco.mjtWrap.mjWRAP_JOINT))
 
 
+def _tendon_armature(m: mujoco.MjModel) -> np.ndarray:
+    """Tendons with armature of their own or of an actuator on them."""
+    has = np.array(m.tendon_armature != 0)
+    geared = getattr(m, "actuator_armature", np.zeros(m.nu))
+    for u in np.flatnonzero(geared):
+        if m.actuator_trntype[u] == int(_TRN.mjTRN_TENDON):
+            has[m.actuator_trnid[u, 0]] = True
+    return has
+
+
+def _inside_wraps(m: mujoco.MjModel) -> list[str]:
+    """Tendons with a sidesite inside its geom at the reference pose, which makes the path wrap inside."""
+    kinds = [int(mujoco.mjtWrap.mjWRAP_SPHERE), int(mujoco.mjtWrap.mjWRAP_CYLINDER)]
+    data = mujoco.MjData(m)
+    mujoco.mj_kinematics(m, data)
+    found = []
+    for tendon in range(m.ntendon):
+        for place in range(m.tendon_adr[tendon], m.tendon_adr[tendon] + m.tendon_num[tendon]):
+            side = round(float(m.wrap_prm[place]))
+            if int(m.wrap_type[place]) in kinds and side >= 0:
+                geom = int(m.wrap_objid[place])
+                if np.linalg.norm(data.site_xpos[side] - data.geom_xpos[geom]) < m.geom_size[geom, 0]:
+                    found.append(tendon)
+    return _named(m, _OBJ.mjOBJ_TENDON, "tendon", sorted(set(found)))
+
+
+def _lone_free_bodies(m: mujoco.MjModel) -> list[str]:
+    """Free bodies whose tree has their six dofs only: implicitfast adds their gyroscopic slope, an asymmetric block."""
+    if m.opt.integrator != int(_INTEGRATOR.mjINT_IMPLICITFAST):
+        return []
+    lone = [
+        int(m.jnt_bodyid[j])
+        for j in np.flatnonzero(m.jnt_type == int(_JNT.mjJNT_FREE))
+        if m.tree_dofnum[m.dof_treeid[m.jnt_dofadr[j]]] == 6
+    ]
+    return _named(m, _OBJ.mjOBJ_BODY, "body", lone)
+
+
+def _branching_tendons(m: mujoco.MjModel) -> list[str]:
+    """Spatial tendons whose force couples dofs that the inertia does not: implicitfast drops those slopes."""
+    if m.opt.integrator != int(_INTEGRATOR.mjINT_IMPLICITFAST):
+        return []
+    found = []
+    for tendon in np.flatnonzero(_spatial_tendons(m)):
+        bodies = {
+            int(owner[m.wrap_objid[place]])
+            for place in range(m.tendon_adr[tendon], m.tendon_adr[tendon] + m.tendon_num[tendon])
+            for kind, owner in (
+                (mujoco.mjtWrap.mjWRAP_SITE, m.site_bodyid),
+                (mujoco.mjtWrap.mjWRAP_SPHERE, m.geom_bodyid),
+                (mujoco.mjtWrap.mjWRAP_CYLINDER, m.geom_bodyid),
+            )
+            if int(m.wrap_type[place]) == int(kind)
+        }
+        if not _one_chain(m, bodies):
+            found.append(int(tendon))
+    return _named(m, _OBJ.mjOBJ_TENDON, "tendon", found)
+
+
+def _one_chain(m: mujoco.MjModel, bodies: set[int]) -> bool:
+    """Whether of any two bodies one carries the other."""
+
+    def carriers(body: int) -> set[int]:
+        out = {body}
+        while body:
+            body = int(m.body_parentid[body])
+            out.add(body)
+        return out
+
+    moving = {int(m.body_weldid[b]) for b in bodies} - {0}
+    return all(a in carriers(b) or b in carriers(a) for a in moving for b in moving)
+
+
 def colliding_pairs(m: mujoco.MjModel) -> set[tuple[int, int]]:
     """Geom pairs that masks, parent filter and exclusions let through or that are listed, types in ascending order."""
     filtered = not m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
@@ -137,10 +211,37 @@ def _pairs(kinds: set[tuple[int, int]] | None, known: set[tuple[int, int]]) -> F
     return find
 
 
-_PLANE_ROUND = {(int(_GEOM.mjGEOM_PLANE), int(t)) for t in (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE)}
-_PLANE_CORNERED = {(int(_GEOM.mjGEOM_PLANE), int(t)) for t in (_GEOM.mjGEOM_BOX, _GEOM.mjGEOM_MESH)}
-_KNOWN_PAIRS = _PLANE_ROUND | _PLANE_CORNERED
-_INTEGRATOR = mujoco.mjtIntegrator
+def _odd_surfaces(m: mujoco.MjModel) -> list[str]:
+    found: set[int] = set()
+    for field in ("geom_adhesion", "geom_surfacevel"):
+        values = getattr(m, field, None)
+        if values is not None:
+            found |= {int(i) for i in np.flatnonzero(np.any(np.asarray(values).reshape(m.ngeom, -1) != 0, axis=1))}
+    return _named(m, _OBJ.mjOBJ_GEOM, "geom", sorted(found))
+
+
+def _types(first: Iterable[int], second: Iterable[int]) -> set[tuple[int, int]]:
+    return {(int(a), int(b)) for a in first for b in second}
+
+
+_EXACT_PAIRS = (
+    _types(
+        [_GEOM.mjGEOM_PLANE],
+        [
+            *(_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_ELLIPSOID, _GEOM.mjGEOM_CYLINDER),
+            *(_GEOM.mjGEOM_BOX, _GEOM.mjGEOM_MESH),
+        ],
+    )
+    | _types(
+        [_GEOM.mjGEOM_SPHERE], [_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_BOX]
+    )
+    | _types([_GEOM.mjGEOM_CAPSULE], [_GEOM.mjGEOM_CAPSULE])
+)
+_SOLIDS = [
+    *(_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_ELLIPSOID, _GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_BOX),
+    _GEOM.mjGEOM_MESH,
+]
+_KNOWN_PAIRS = _EXACT_PAIRS | _types(_SOLIDS, _SOLIDS)
 _DYN = mujoco.mjtDyn
 
 
@@ -150,7 +251,7 @@ def _integrator(*kinds: int) -> Finder:
 
 FEATURES: tuple[Feature, ...] = (
     Feature("integrator Euler, implicit damping on or off", True, _integrator(_INTEGRATOR.mjINT_EULER)),
-    Feature("integrator implicitfast", False, _integrator(_INTEGRATOR.mjINT_IMPLICITFAST)),
+    Feature("integrator implicitfast", True, _integrator(_INTEGRATOR.mjINT_IMPLICITFAST)),
     Feature(
         "integrators implicit, RK4, discrete",
         False,
@@ -163,28 +264,55 @@ FEATURES: tuple[Feature, ...] = (
     Feature("joints free, hinge, slide", True, _joint_type(_JNT.mjJNT_FREE, _JNT.mjJNT_HINGE, _JNT.mjJNT_SLIDE)),
     Feature("ball joints", True, _joint_type(_JNT.mjJNT_BALL)),
     Feature("springs on hinge and slide joints", True, _spring(_JNT.mjJNT_HINGE, _JNT.mjJNT_SLIDE)),
-    Feature("springs on free and ball joints", False, _spring(_JNT.mjJNT_FREE, _JNT.mjJNT_BALL)),
+    Feature("springs on free and ball joints", True, _spring(_JNT.mjJNT_FREE, _JNT.mjJNT_BALL)),
     Feature("limits of hinge and slide joints", True, _limited(_JNT.mjJNT_HINGE, _JNT.mjJNT_SLIDE)),
-    Feature("limits of ball joints", False, _limited(_JNT.mjJNT_BALL)),
+    Feature("limits of ball joints", True, _limited(_JNT.mjJNT_BALL)),
     Feature(
         "dof friction loss",
-        False,
+        True,
         lambda m: _named(m, _OBJ.mjOBJ_JOINT, "joint", np.unique(m.dof_jntid[m.dof_frictionloss != 0])),
     ),
-    Feature("gravity compensation", False, _where(_OBJ.mjOBJ_BODY, "body", lambda m: m.body_gravcomp != 0)),
+    Feature("gravity compensation", True, _where(_OBJ.mjOBJ_BODY, "body", lambda m: m.body_gravcomp != 0)),
     Feature(
         "fluid forces (density, viscosity, wind)",
         False,
         _option(lambda m: bool(m.opt.density or m.opt.viscosity or np.any(m.opt.wind)), "option density or viscosity"),
     ),
-    Feature("contact of a plane with a sphere or capsule", True, _pairs(_PLANE_ROUND, set())),
-    Feature("contact of a plane with a box or mesh", True, _pairs(_PLANE_CORNERED, set())),
-    Feature("contact of other geometry pairs", False, _pairs(None, _KNOWN_PAIRS)),
-    Feature("tendons", False, _tendon(lambda m: np.ones(m.ntendon, dtype=bool))),
     Feature(
-        "equality constraints",
+        "contacts, pyramidal and elliptic cones, condim 1, 3, 4, 6", True, _option(lambda m: m.ngeom > 1, "geoms")
+    ),
+    Feature(
+        "contact of a plane with sphere, capsule, ellipsoid, cylinder, box, mesh; sphere with sphere, capsule, "
+        "cylinder, box; capsule with capsule",
+        True,
+        _pairs(_EXACT_PAIRS, set()),
+    ),
+    Feature(
+        "contact of other convex pairs (boxes, cylinders, ellipsoids, meshes)",
+        True,
+        _pairs(_KNOWN_PAIRS - _EXACT_PAIRS, set()),
+        "distance exact; the contact point and frame are taken to follow the mean of both bodies",
+    ),
+    Feature("contact with height fields and signed distance fields", False, _pairs(None, _KNOWN_PAIRS)),
+    Feature("contact adhesion and surface velocity", False, _odd_surfaces),
+    Feature("fixed tendons", True, _tendon(lambda m: ~_spatial_tendons(m))),
+    Feature("spatial tendons: sites, pulleys, sphere and cylinder wrapping", True, _tendon(_spatial_tendons)),
+    Feature("tendons that wrap inside a geom", False, _inside_wraps),
+    Feature("tendon springs and dampers", True, _tendon(lambda m: (m.tendon_stiffness != 0) | (m.tendon_damping != 0))),
+    Feature("tendon limits", True, _tendon(lambda m: m.tendon_limited != 0)),
+    Feature("tendon friction loss", True, _tendon(lambda m: m.tendon_frictionloss != 0)),
+    Feature("tendon armature", False, _tendon(_tendon_armature)),
+    Feature("tendon bound on actuator force", False, _tendon(lambda m: m.tendon_actfrclimited != 0)),
+    Feature(
+        "implicitfast with velocity-dependent force on a spatial tendon between branches", False, _branching_tendons
+    ),
+    Feature("implicitfast with a free body that has no other joints", False, _lone_free_bodies),
+    Feature("joint and tendon equalities", True, _equality(_EQ.mjEQ_JOINT, _EQ.mjEQ_TENDON)),
+    Feature("connect and weld equalities", False, _equality(_EQ.mjEQ_CONNECT, _EQ.mjEQ_WELD)),
+    Feature(
+        "flex equalities",
         False,
-        _where(_OBJ.mjOBJ_EQUALITY, "equality", lambda m: np.ones(m.neq, dtype=bool)),
+        _where(_OBJ.mjOBJ_EQUALITY, "equality", lambda m: m.eq_type > int(_EQ.mjEQ_TENDON)),
     ),
     Feature(
         "actuators: motor, position, velocity, affine, filter, integrator, muscle",
@@ -201,7 +329,7 @@ FEATURES: tuple[Feature, ...] = (
     ),
     Feature("transmission to hinge and slide joints", True, _joint_transmission(_JNT.mjJNT_HINGE, _JNT.mjJNT_SLIDE)),
     Feature("transmission to free and ball joints", False, _joint_transmission(_JNT.mjJNT_FREE, _JNT.mjJNT_BALL)),
-    Feature("transmission to tendons", False, _actuator("actuator_trntype", _TRN.mjTRN_TENDON)),
+    Feature("transmission to tendons", True, _actuator("actuator_trntype", _TRN.mjTRN_TENDON)),
     Feature("transmission to sites", False, _actuator("actuator_trntype", _TRN.mjTRN_SITE)),
     Feature(
         "transmission to slider-cranks and bodies (adhesion)",

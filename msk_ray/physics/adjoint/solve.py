@@ -96,6 +96,78 @@ def solve_tiled(nv: int) -> Any:
     return kernel
 
 
+@cache
+def solve_two_tiled(nv: int) -> Any:
+    """A⁻¹ of two right-hand sides, for nv up to TILE_LIMIT."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def kernel(
+        # In:
+        matrix_in: wp.array3d[float],
+        first_in: wp.array2d[float],
+        second_in: wp.array2d[float],
+        # Out:
+        first_out: wp.array2d[float],
+        second_out: wp.array2d[float],
+    ):
+        worldid = wp.tid()
+        matrix = wp.tile_load(matrix_in[worldid], shape=(wp.static(nv), wp.static(nv)))
+        wp.tile_cholesky_inplace(matrix)
+        first = wp.tile_load(first_in[worldid], shape=wp.static(nv))
+        wp.tile_store(first_out[worldid], wp.tile_cholesky_solve(matrix, first))
+        second = wp.tile_load(second_in[worldid], shape=wp.static(nv))
+        wp.tile_store(second_out[worldid], wp.tile_cholesky_solve(matrix, second))
+
+    return kernel
+
+
+@wp.kernel
+def solve_two_serial(
+    # Model:
+    nv: int,
+    # In:
+    matrix_in: wp.array3d[float],
+    first_in: wp.array2d[float],
+    second_in: wp.array2d[float],
+    # Out:
+    first_out: wp.array2d[float],
+    second_out: wp.array2d[float],
+):
+    """The same for any nv, one thread a world; the factor overwrites the matrix."""
+    worldid = wp.tid()
+    _factor(matrix_in[worldid], nv)
+    for i in range(nv):
+        first_out[worldid, i] = first_in[worldid, i]
+        second_out[worldid, i] = second_in[worldid, i]
+    _substitute(matrix_in[worldid], nv, first_out[worldid])
+    _substitute(matrix_in[worldid], nv, second_out[worldid])
+
+
+@wp.kernel
+def damping_product(
+    # Model:
+    inertia_address: wp.array2d[int],
+    # In:
+    inertia_in: wp.array2d[float],
+    step_in: wp.array2d[float],
+    x_in: wp.array2d[float],
+    start_in: wp.array2d[float],
+    scale_in: float,
+    # Out:
+    y_out: wp.array2d[float],
+):
+    """hB x, or with a negative scale start + scale · hB x; hB = (M + hB) - M in M's sparse layout."""
+    worldid, i = wp.tid()
+    total = float(0.0)
+    for j in range(x_in.shape[1]):
+        address = inertia_address[wp.max(i, j), wp.min(i, j)]
+        if address >= 0:
+            total += (step_in[worldid, address] - inertia_in[worldid, address]) * x_in[worldid, j]
+    y_out[worldid, i] = scale_in * total
+    if scale_in < 0.0:
+        y_out[worldid, i] = start_in[worldid, i] + scale_in * total
+
+
 @wp.func
 def _factor(matrix: wp.array2d[float], nv: int) -> None:
     """Cholesky factor in the lower triangle, in place."""

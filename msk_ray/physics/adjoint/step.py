@@ -12,8 +12,22 @@ from typing import Any
 
 import mujoco
 import warp as wp
+from mujoco_warp._src.types import MJ_MAXVAL
 
-from msk_ray.physics.adjoint import actuation, bodies, contacts, integrate, rows, scalar_rows, solve
+from msk_ray.physics.adjoint import (
+    actuation,
+    bodies,
+    contacts,
+    geometry,
+    integrate,
+    joints,
+    rows,
+    scalar_rows,
+    solve,
+    tendons,
+    wrapping,
+)
+from msk_ray.physics.adjoint.stages import implicit_matrix
 from msk_ray.physics.adjoint.tables import build_tables
 
 _BLOCK = 32
@@ -49,6 +63,8 @@ class StepAdjoint:
             mjm.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
             and not disabled & (bit.mjDSBL_EULERDAMP | bit.mjDSBL_DAMPER)
         )
+        self._implicit_all = mjm.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        self._spring_on = not disabled & bit.mjDSBL_SPRING
         self._elliptic = mjm.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
         self._has_actuators = mjm.nu > 0 and not disabled & bit.mjDSBL_ACTUATION
 
@@ -63,7 +79,7 @@ class StepAdjoint:
             self.live = wp.ones(worlds, dtype=int)
             self.grad_qpos, self.grad_qvel = floats(worlds, nv), floats(worlds, nv)
             self.grad_act, self.grad_ctrl = floats(worlds, mjm.na), floats(worlds, mjm.nu)
-            self._rhs, self._step = floats(worlds, nv), floats(worlds, nv)
+            self._rhs, self._damping_step = floats(worlds, nv), floats(worlds, nv)
             self._damping = wp.zeros((worlds, nv), dtype=wp.vec3)
             self._phi_qpos, self._phi_qvel = floats(worlds, nv), floats(worlds, nv)
             self._mu, self._excess, self._lam = floats(worlds, nv), floats(worlds, nv), floats(worlds, nv)
@@ -76,7 +92,18 @@ class StepAdjoint:
             self._mu_field, self._excess_field = spatials(), spatials()
             self._lam_bar, self._qvel_bar, self._cacc_bar = spatials(), spatials(), spatials()
             self._qacc_bar, self._moved_bar, self._cacc_sum = spatials(), spatials(), spatials()
-            self._rate_bar, self._velocity_bar = floats(worlds, mjm.nu), floats(worlds, mjm.nu)
+            self._mu_bar, self._excess_bar = spatials(), spatials()
+            self._length_bar = floats(worlds, mjm.nu)
+            self._rate_bar = wp.zeros((worlds, mjm.nu), dtype=wp.vec4)
+            count = max(mjm.ntendon, 1)
+            segments = max(self._tables.segment_tendon.size, 1)
+            self._touch = wp.full((worlds, segments), wp.spatial_vector(*([MJ_MAXVAL] * 6)), dtype=wp.spatial_vector)
+            self._ten_length_bar, self._ten_qvel_bar = floats(worlds, count), floats(worlds, count)
+            self._ten_lam_bar, self._ten_qacc_bar = floats(worlds, count), floats(worlds, count)
+            self._ten_mu_bar, self._ten_smooth_bar = floats(worlds, count), floats(worlds, count)
+            if self._implicit_all:
+                self._step = floats(worlds, model.nC)
+                self._push = floats(worlds, nv)
             ncon = data.naconmax
             self._phi_dist = floats(ncon)
             self._phi_pos = wp.zeros(ncon, dtype=wp.vec3)
@@ -127,10 +154,16 @@ class StepAdjoint:
         jacobian = self._constraint_laws(data)
         self._solve(data, jacobian)
         self._fields(data)
+        if self.mjm.ntendon:
+            self._start_tendons(data)
         self._pull_rows(data, jacobian)
         self._pull_contacts(data)
         if self._has_actuators:
             self._pull_actuators(data)
+        if self._tables.has_turning_spring:
+            self._pull_turning_springs(data)
+        if self.mjm.ntendon:
+            self._pull_tendons(data)
         self._sweep(data)
 
     def _pull_integrator(self, d: Any, qvel_next: wp.array) -> None:
@@ -157,7 +190,7 @@ class StepAdjoint:
             ],
             outputs=[
                 self._damping,
-                self._step,
+                self._damping_step,
                 self.grad_qpos,
                 self.grad_qvel,
                 self._rhs,
@@ -216,6 +249,8 @@ class StepAdjoint:
 
     def _solve(self, d: Any, jacobian: wp.array) -> None:
         m = self.model
+        if self._implicit_all:
+            implicit_matrix(m, d, self._step)
         wp.launch(
             solve.build_matrices,
             dim=(self.nworld, m.nv, m.nv),
@@ -224,21 +259,50 @@ class StepAdjoint:
                 self._tables.inertia_address,
                 d.nefc,
                 d.M,
-                self._step,
-                False,
+                self._step if self._implicit_all else self._damping_step,
+                self._implicit_all,
                 jacobian,
                 self._slope,
                 self._scaled,
             ],
             outputs=[self._implicit, self._hessian],
         )
-        inputs = [self._implicit, self._hessian, self._rhs, self._step, d.qacc]
+        if self._implicit_all:
+            self._solve_implicit(d)
+            return
+        inputs = [self._implicit, self._hessian, self._rhs, self._damping_step, d.qacc]
         outputs = [self._mu, self._excess, self._lam]
         if m.nv <= solve.TILE_LIMIT:
             kernel = solve.solve_tiled(m.nv)
             wp.launch_tiled(kernel, dim=self.nworld, inputs=inputs, outputs=outputs, block_dim=_BLOCK)
         else:
             wp.launch(solve.solve_serial, dim=self.nworld, inputs=[m.nv, *inputs], outputs=outputs)
+
+    def _solve_implicit(self, d: Any) -> None:
+        """μ, a - â and λ where B is a matrix: (M + hB)(a - â) = hB a ,  H λ = h v̄' - hB μ."""
+        m = self.model
+        address = self._tables.inertia_address
+
+        def product(x: wp.array, scale: float) -> None:
+            wp.launch(
+                solve.damping_product,
+                dim=(self.nworld, m.nv),
+                inputs=[address, d.M, self._step, x, self._rhs, scale],
+                outputs=[self._push],
+            )
+
+        def solve_two(matrix: wp.array, first: wp.array, second: wp.array, outputs: list[wp.array]) -> None:
+            inputs = [matrix, first, second]
+            if m.nv <= solve.TILE_LIMIT:
+                kernel = solve.solve_two_tiled(m.nv)
+                wp.launch_tiled(kernel, dim=self.nworld, inputs=inputs, outputs=outputs, block_dim=_BLOCK)
+            else:
+                wp.launch(solve.solve_two_serial, dim=self.nworld, inputs=[m.nv, *inputs], outputs=outputs)
+
+        product(d.qacc, 1.0)
+        solve_two(self._implicit, self._rhs, self._push, [self._mu, self._excess])
+        product(self._mu, -1.0)
+        solve_two(self._hessian, self._push, self._push, [self._lam, self._lam])
 
     def _fields(self, d: Any) -> None:
         m = self.model
@@ -249,7 +313,12 @@ class StepAdjoint:
                 m.opt.gravity,
                 self._gravity_on,
                 self._tables.body_lastdof,
+                m.body_rootid,
+                m.body_mass,
+                m.body_gravcomp,
                 m.dof_parentid,
+                d.xipos,
+                d.subtree_com,
                 d.cdof,
                 d.cdof_dot,
                 d.cvel,
@@ -270,34 +339,210 @@ class StepAdjoint:
                 self._qvel_bar,
                 self._cacc_bar,
                 self._qacc_bar,
+                self._mu_bar,
+                self._excess_bar,
                 self._moved_bar,
             ],
         )
 
     def _pull_rows(self, d: Any, jacobian: wp.array) -> None:
         m = self.model
-        if m.jnt_limited_slide_hinge_adr.size:
+        if not self._tables.has_scalar_rows:
+            return
+        wp.launch(
+            scalar_rows.pull_rows,
+            dim=(self.nworld, self._njmax),
+            inputs=[
+                m.opt.timestep,
+                m.opt.disableflags,
+                m.qpos0,
+                m.jnt_type,
+                m.jnt_qposadr,
+                m.jnt_dofadr,
+                m.jnt_solref,
+                m.jnt_solimp,
+                m.dof_solref,
+                m.dof_solimp,
+                m.ten_J_rownnz,
+                m.ten_J_rowadr,
+                m.ten_J_colind,
+                m.tendon_solref_lim,
+                m.tendon_solimp_lim,
+                m.tendon_solref_fri,
+                m.tendon_solimp_fri,
+                m.tendon_range,
+                m.tendon_length0,
+                m.eq_type,
+                m.eq_obj1id,
+                m.eq_obj2id,
+                m.eq_solref,
+                m.eq_solimp,
+                m.eq_data,
+                d.nefc,
+                d.efc.type,
+                d.efc.id,
+                jacobian,
+                d.efc.pos,
+                d.efc.margin,
+                self._force,
+                self._slope,
+                d.qpos,
+                d.qvel,
+                d.qacc,
+                self._lam,
+                d.ten_J,
+                d.ten_length,
+            ],
+            outputs=[
+                self._phi_qpos,
+                self._phi_qvel,
+                self._ten_length_bar,
+                self._ten_qvel_bar,
+                self._ten_lam_bar,
+                self._ten_qacc_bar,
+            ],
+        )
+
+    def _start_tendons(self, d: Any) -> None:
+        m = self.model
+        wp.launch(
+            tendons.start_tendons,
+            dim=(self.nworld, m.ntendon),
+            inputs=[
+                m.opt.timestep,
+                bool(self._spring_on),
+                bool(self._damper_on),
+                self._implicit_all,
+                m.tendon_actuatorid,
+                m.ten_J_rownnz,
+                m.ten_J_rowadr,
+                m.ten_J_colind,
+                m.tendon_stiffness,
+                m.tendon_stiffnesspoly,
+                m.tendon_damping,
+                m.tendon_dampingpoly,
+                m.tendon_lengthspring,
+                m.actuator_trntype,
+                m.actuator_trnid,
+                m.actuator_damping,
+                m.actuator_dampingpoly,
+                m.actuator_gear,
+                self._tables.inertia_address,
+                d.qvel,
+                d.qacc,
+                d.ten_J,
+                d.ten_length,
+                self._lam,
+                self._mu,
+                self._excess,
+            ],
+            outputs=[
+                self._ten_length_bar,
+                self._ten_qvel_bar,
+                self._ten_lam_bar,
+                self._ten_qacc_bar,
+                self._ten_mu_bar,
+                self._ten_smooth_bar,
+            ],
+        )
+
+    def _pull_tendons(self, d: Any) -> None:
+        m = self.model
+        t = self._tables
+        wp.launch(
+            tendons.pull_tendons,
+            dim=(self.nworld, m.ntendon, m.max_ten_J_rownnz),
+            inputs=[
+                m.ten_J_rownnz,
+                m.ten_J_rowadr,
+                m.ten_J_colind,
+                m.tendon_adr,
+                m.wrap_type,
+                d.ten_J,
+                self._ten_length_bar,
+                self._ten_qvel_bar,
+            ],
+            outputs=[self._phi_qpos, self._phi_qvel],
+        )
+        if not t.segment_tendon.size:
+            return
+        if t.has_wrapping:
             wp.launch(
-                scalar_rows.pull_limits,
-                dim=(self.nworld, self._njmax),
+                wrapping.touch_paths,
+                dim=(self.nworld, t.segment_tendon.size),
                 inputs=[
-                    m.opt.timestep,
-                    m.opt.disableflags,
-                    m.jnt_dofadr,
-                    m.jnt_solref,
-                    m.jnt_solimp,
-                    d.nefc,
-                    d.efc.type,
-                    d.efc.id,
-                    jacobian,
-                    d.efc.pos,
-                    d.efc.margin,
-                    self._force,
-                    self._slope,
-                    self._lam,
+                    m.geom_size,
+                    m.wrap_type,
+                    m.wrap_objid,
+                    m.wrap_prm,
+                    t.segment_first,
+                    t.segment_geom,
+                    t.segment_last,
+                    d.geom_xpos,
+                    d.geom_xmat,
+                    d.site_xpos,
                 ],
-                outputs=[self._phi_qpos, self._phi_qvel],
+                outputs=[self._touch],
             )
+        wp.launch(
+            tendons.pull_paths,
+            dim=(self.nworld, t.segment_tendon.size),
+            inputs=[
+                m.body_rootid,
+                m.geom_bodyid,
+                m.geom_size,
+                m.site_bodyid,
+                m.wrap_type,
+                m.wrap_objid,
+                m.wrap_prm,
+                m.wrap_pulley_scale,
+                t.segment_tendon,
+                t.segment_first,
+                t.segment_geom,
+                t.segment_last,
+                self._touch,
+                d.geom_xpos,
+                d.geom_xmat,
+                d.site_xpos,
+                d.subtree_com,
+                self._lam_field,
+                self._qacc_field,
+                d.cvel,
+                self._mu_field,
+                self._excess_field,
+                self._ten_lam_bar,
+                self._ten_qacc_bar,
+                self._ten_qvel_bar,
+                self._ten_mu_bar,
+                self._ten_smooth_bar,
+            ],
+            outputs=[
+                self._lam_bar,
+                self._qacc_bar,
+                self._qvel_bar,
+                self._mu_bar,
+                self._excess_bar,
+                self._moved_bar,
+            ],
+        )
+
+    def _pull_turning_springs(self, d: Any) -> None:
+        m = self.model
+        wp.launch(
+            joints.pull_turning_springs,
+            dim=(self.nworld, m.njnt),
+            inputs=[
+                m.qpos_spring,
+                m.jnt_type,
+                m.jnt_qposadr,
+                m.jnt_dofadr,
+                m.jnt_stiffness,
+                m.jnt_stiffnesspoly,
+                d.qpos,
+                self._lam,
+            ],
+            outputs=[self._phi_qpos],
+        )
 
     def _pull_contacts(self, d: Any) -> None:
         m = self.model
@@ -344,7 +589,7 @@ class StepAdjoint:
             ],
         )
         wp.launch(
-            contacts.pull_geometry,
+            geometry.pull_geometry,
             dim=d.naconmax,
             inputs=[
                 m.body_rootid,
@@ -356,6 +601,7 @@ class StepAdjoint:
                 d.contact.pos,
                 d.contact.frame,
                 d.contact.geom,
+                d.contact.geomcollisionid,
                 d.contact.efc_address,
                 d.contact.worldid,
                 d.geom_xpos,
@@ -377,9 +623,15 @@ class StepAdjoint:
             inputs=[
                 m.opt.timestep,
                 clampctrl,
+                self._implicit_all,
+                self._tables.inertia_address,
+                m.jnt_type,
                 m.jnt_actfrclimited,
                 m.jnt_actfrcrange,
                 m.dof_jntid,
+                m.actuator_trntype,
+                m.actuator_trnid,
+                m.actuator_gear,
                 m.actuator_dyntype,
                 m.actuator_gaintype,
                 m.actuator_biastype,
@@ -409,15 +661,23 @@ class StepAdjoint:
                 d.moment_colind,
                 d.actuator_moment,
                 d.qfrc_actuator,
+                d.qacc,
                 self._lam,
+                self._mu,
+                self._excess,
             ],
             outputs=[
                 self.grad_act,
                 self.grad_ctrl,
                 self._phi_qpos,
                 self._phi_qvel,
+                self._ten_length_bar,
+                self._ten_qvel_bar,
+                self._ten_lam_bar,
+                self._ten_mu_bar,
+                self._ten_smooth_bar,
+                self._length_bar,
                 self._rate_bar,
-                self._velocity_bar,
             ],
         )
 
@@ -446,7 +706,7 @@ class StepAdjoint:
                 m.jnt_stiffnesspoly,
                 m.qpos_spring,
                 bool(self._damper_on),
-                self._euler_damping,
+                self._euler_damping or self._implicit_all,
                 m.opt.timestep,
                 self.live,
                 d.qpos,
@@ -459,7 +719,6 @@ class StepAdjoint:
                 d.cdof,
                 d.cdof_dot,
                 d.cvel,
-                d.cinert,
                 self._lam_field,
                 self._qacc_field,
                 self._cacc,
@@ -469,6 +728,8 @@ class StepAdjoint:
                 self._qvel_bar,
                 self._cacc_sum,
                 self._qacc_bar,
+                self._mu_bar,
+                self._excess_bar,
                 self._moved_bar,
                 self._phi_qpos,
                 self._phi_qvel,

@@ -26,6 +26,18 @@ class Tables:
     """qpos address of a hinge or slide with a spring, else -1. Shape (nv,)."""
     inertia_address: wp.array
     """Place of M_ij (j ≤ i) in the sparse inertia, -1 where it is zero. Shape (nv, nv)."""
+    segment_tendon: wp.array
+    """Tendon of each stretch of path between two neighbouring sites, with or without a geom. Shape (segments,)."""
+    segment_first: wp.array
+    """Place in the wrap list of its first site. Shape (segments,)."""
+    segment_geom: wp.array
+    """Place of the geom it may wrap around, -1 for none. Shape (segments,)."""
+    segment_last: wp.array
+    """Place of its last site. Shape (segments,)."""
+    has_wrapping: bool
+    """Whether any tendon passes a wrapping geom."""
+    has_scalar_rows: bool
+    """Whether any joint or tendon makes constraint rows."""
     has_turning_spring: bool
     """Whether a free or ball joint has a spring."""
 
@@ -48,6 +60,34 @@ def _has_spring(mjm: mujoco.MjModel, joint: int) -> bool:
     return bool(mjm.jnt_stiffness[joint] != 0 or bent)
 
 
+def _segments(mjm: mujoco.MjModel) -> np.ndarray:
+    """(tendon, first, geom, last) of every stretch between two sites, shape (segments, 4)."""
+    wrap = mujoco.mjtWrap
+    out = []
+    for tendon in range(mjm.ntendon):
+        first = int(mjm.tendon_adr[tendon])
+        end = first + int(mjm.tendon_num[tendon])
+        for place in range(first, end - 1):
+            kinds = [int(k) for k in mjm.wrap_type[place : place + 2]]
+            if kinds[0] != int(wrap.mjWRAP_SITE):
+                continue
+            if kinds[1] == int(wrap.mjWRAP_SITE):
+                out.append((tendon, place, -1, place + 1))
+            elif kinds[1] in (int(wrap.mjWRAP_SPHERE), int(wrap.mjWRAP_CYLINDER)):
+                out.append((tendon, place, place + 1, place + 2))
+    return np.array(out, dtype=np.int32).reshape(-1, 4)
+
+
+def _has_scalar_rows(mjm: mujoco.MjModel) -> bool:
+    return bool(
+        np.any(mjm.jnt_limited)
+        or np.any(mjm.dof_frictionloss)
+        or np.any(mjm.tendon_limited)
+        or np.any(mjm.tendon_frictionloss)
+        or np.any(np.isin(mjm.eq_type, [int(mujoco.mjtEq.mjEQ_JOINT), int(mujoco.mjtEq.mjEQ_TENDON)]))
+    )
+
+
 def build_tables(mjm: mujoco.MjModel, model: Any) -> Tables:
     """Tables for the C model `mjm` and its mujoco_warp copy `model`, on Warp's current device."""
     lastdof = np.full(mjm.nbody, -1, dtype=np.int32)
@@ -66,7 +106,7 @@ def build_tables(mjm: mujoco.MjModel, model: Any) -> Tables:
     for joint in range(mjm.njnt):
         if disabled or not _has_spring(mjm, joint):
             continue
-        if mjm.jnt_type[joint] in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
+        if int(mjm.jnt_type[joint]) in (int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)):
             turning = True
         else:
             springs[mjm.jnt_dofadr[joint]] = mjm.jnt_qposadr[joint]
@@ -75,6 +115,8 @@ def build_tables(mjm: mujoco.MjModel, model: Any) -> Tables:
     for i in range(mjm.nv):
         for k in range(start[i], start[i] + nnz[i]):
             address[i, column[k]] = k
+
+    segments = _segments(mjm)
 
     def ints(values: np.ndarray) -> wp.array:
         return wp.array(values, dtype=int)
@@ -86,5 +128,11 @@ def build_tables(mjm: mujoco.MjModel, model: Any) -> Tables:
         dof_last=ints(last),
         dof_spring_qpos=ints(springs),
         inertia_address=ints(address),
+        segment_tendon=ints(segments[:, 0].copy()),
+        segment_first=ints(segments[:, 1].copy()),
+        segment_geom=ints(segments[:, 2].copy()),
+        segment_last=ints(segments[:, 3].copy()),
+        has_wrapping=bool(np.any(segments[:, 2] >= 0)),
+        has_scalar_rows=_has_scalar_rows(mjm),
         has_turning_spring=turning,
     )
