@@ -1,6 +1,7 @@
 """What the terminal shows while an experiment runs: a line an event, and now and then where everything stands."""
 
 import math
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -56,10 +57,16 @@ class Live(Callback):
         """Trials that were started, in that order, each once, numbered anew."""
         self._best: tuple[float, Trial] | None = None
         self._start = time.monotonic()
+        # Kept, because what Ray itself prints is sent elsewhere while trials run.
+        self._out = sys.stdout
         self._last_status = self._start
         self._seconds_per_epoch: dict[str, float] = {}
         self._stopping_since: float | None = None
         self._armed = False
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Ray pickles callbacks into its own state, which is never read back: resuming begins from the trials' folders.
+        return {key: value for key, value in self.__dict__.items() if key != "_out"}
 
     @property
     def stopped(self) -> bool:
@@ -164,7 +171,7 @@ class Live(Callback):
         self._say(f"{self._stop.signal.name}: {len(self._saving)} trials save themselves at the end of their epoch ...")
 
     def _say(self, text: str) -> None:
-        print(f"[{format_duration(time.monotonic() - self._start):>6}] {text}", flush=True)
+        print(f"[{format_duration(time.monotonic() - self._start):>6}] {text}", file=self._out, flush=True)
 
     @staticmethod
     def _name(trial: Trial) -> str:

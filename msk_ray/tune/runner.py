@@ -6,7 +6,7 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -183,7 +183,7 @@ def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial]) -> None:
 
 @contextmanager
 def _log_to(path: Path) -> Iterator[None]:
-    """Send what Ray logs and warns of in this process to a file; what matters of it is said by `Live`."""
+    """Send what Ray logs, prints and warns of in this process to a file; what matters of it is said by `Live`."""
     logger = logging.getLogger("ray")
     handlers, level = logger.handlers, logger.level
     file = logging.FileHandler(path, encoding="utf-8")
@@ -191,7 +191,8 @@ def _log_to(path: Path) -> Iterator[None]:
     logger.handlers = [file]
     logger.setLevel(logging.INFO)
     # Of Ray's advice on settings chosen here on purpose, such as a process of its own for each trial.
-    with warnings.catch_warnings():
+    # Its notices of dead workers are printed, past any logger.
+    with warnings.catch_warnings(), path.open("a", encoding="utf-8") as log, redirect_stdout(log), redirect_stderr(log):
         warnings.filterwarnings("ignore", category=UserWarning, module=r"ray\.")
         try:
             yield

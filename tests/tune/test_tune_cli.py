@@ -58,6 +58,7 @@ def test_dry_run_imports_neither_ray_nor_torch(space_file: Path, root: Path) -> 
         (["--space", "SPACE", "--debug-trial", "7"], "no trial '7'"),
         (["--space", "SPACE", "--name", "a/b"], "letters, digits"),
         (["--space", "SPACE", "--resume"], "no experiment at"),
+        (["--space", "SPACE", "--retry-errored"], "goes with --resume"),
         (["--space", "SPACE", "--gpus-per-trial", "1", "--cpu"], "exclude each other"),
         (["--space", "SPACE", "--storage", "/proc/x"], "cannot write to"),
     ],

@@ -48,7 +48,9 @@ def outcomes(records: list[TrialRecord]) -> list[str | None]:
     return [record.ending and str(record.ending.outcome) for record in records]
 
 
-def test_faults_are_named_and_a_killed_trial_goes_on(make_space: Any, tmp_path: Path) -> None:
+def test_faults_are_named_and_a_killed_trial_goes_on(
+    make_space: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     behaviours = [0.0, KILL, NAN, SIMULATION_ERROR, BUG]
     space = make_space(parameters={"env.cart_position_penalty": {"grid": behaviours}}, resources={"max_failures": 1})
     completed, records = go(space, tmp_path / "runs" / "faults")
@@ -57,6 +59,9 @@ def test_faults_are_named_and_a_killed_trial_goes_on(make_space: Any, tmp_path: 
     assert [record.epochs_done for record in records] == [20, 20, 5, 4, 4]
     assert "train/actor_loss is nan at epoch 5" in records[2].ending.why  # type: ignore[union-attr]
     assert records[4].ending.why == "RuntimeError: made up"  # type: ignore[union-attr]
+    shown = capsys.readouterr()
+    assert "its process died (killed, or out of memory); trying again" in shown.out
+    assert "raylet" not in shown.out + shown.err  # Ray's own notices are in ray.log
     # The killed trial has every epoch once, with the scores of the one that was left alone.
     scores = [[row["eval/score"] for row in read_rows(r.folder) if "eval/score" in row] for r in records[:2]]
     assert scores[0] == scores[1]

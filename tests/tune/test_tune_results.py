@@ -82,6 +82,13 @@ def test_an_existing_experiment_is_refused_and_a_changed_space_named(
         experiments.reopen(experiment.path.with_name("other"), [])
 
 
+def test_errored_trials_can_be_tried_again(experiment: experiments.Experiment) -> None:
+    folders = [experiment.trial_folder(trial.id) for trial in experiment.trials()]
+    write_ending(folders[0], Ending(Outcome.ERROR, "died"))
+    experiment.clear_endings({Outcome.ERROR})
+    assert [read_ending(folder) is None for folder in folders] == [True, False, False, True]
+
+
 def test_space_is_kept_as_written(experiment: experiments.Experiment) -> None:
     assert "actor_lr" in (experiment.path / "space.yaml").read_text()
     environment = json.loads((experiment.path / "env.json").read_text())
