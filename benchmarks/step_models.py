@@ -53,9 +53,7 @@ def biped() -> mujoco.MjModel:
 
     def limb(name: str, at: str, first: tuple[str, ...], second: tuple[str, ...], length: float) -> str:
         joints = [
-            "".join(
-                f'<joint name="{name}{part}{k}" axis="{axis}" range="-60 60"/>' for k, axis in enumerate(axes)
-            )
+            "".join(f'<joint name="{name}{part}{k}" axis="{axis}" range="-60 60"/>' for k, axis in enumerate(axes))
             for part, axes in (("a", first), ("b", second))
         ]
         return f"""<body pos="{at}">{joints[0]}<geom type="capsule" size=".05" fromto="0 0 0 0 0 {-length}"/>

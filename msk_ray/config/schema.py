@@ -87,12 +87,14 @@ EnvConfig = Annotated[CartPoleEnvConfig | AntEnvConfig, Field(discriminator="nam
 class FdConfig(Section):
     """Central differences of backward mode `fd_jacobian`."""
 
-    eps_ctrl: PositiveFloat = 3e-2
-    """Perturbation of ctrl and act [their own unit]."""
-    eps_qpos: PositiveFloat = 5e-3
+    eps_ctrl: PositiveFloat = 5e-3
+    """Perturbation of ctrl [its own unit]."""
+    eps_qpos: PositiveFloat = 5e-4
     """Perturbation of qpos along a tangent direction [m, rad]."""
-    eps_qvel: PositiveFloat = 1e-2
+    eps_qvel: PositiveFloat = 2e-3
     """Perturbation of qvel [m/s, rad/s]."""
+    eps_act: PositiveFloat = 5e-4
+    """Perturbation of act [its own unit]."""
     max_worlds: PositiveInt = 131072
     """Perturbed copies run at once; more are done in chunks."""
 
@@ -102,8 +104,11 @@ class PhysicsConfig(Section):
 
     variant: str | None = None
     """Named physics of the environment: for ant `published`, `matched` or `matched_hard_friction`."""
-    backward: Literal["fd_jacobian"] = "fd_jacobian"
-    """Backward mode of the step."""
+    backward: Literal["tape_per_substep", "tape_all", "fd_jacobian", "hybrid"] = "tape_per_substep"
+    """Backward mode of the step. `tape_*` are exact; `fd_jacobian` differentiates any model by finite differences;
+    `hybrid` takes the state's gradient from the tape and the control's from finite differences, for diagnosis."""
+    substep_grad_clip: PositiveFloat | None = None
+    """Bound on each world's state cotangent between substeps, in the loss's own units; null leaves it. Tapes only."""
     fd: FdConfig = FdConfig()
     substeps: PositiveInt | None = None
     """Physics steps an env step. Set this or `timestep`; 4 if neither is set."""

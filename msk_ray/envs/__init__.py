@@ -1,27 +1,14 @@
 """Environments: observation and reward as torch functions of (qpos, qvel, act), so that both stay in the graph."""
 
-from collections.abc import Callable
 from typing import Any
 
-from msk_ray.config import EnvConfig, FdConfig, PhysicsConfig
+from msk_ray.config import EnvConfig, PhysicsConfig
 from msk_ray.envs.ant import Ant
 from msk_ray.envs.base import Env, EnvState, Transition
 from msk_ray.envs.cartpole import CartPole
-from msk_ray.simulation import Backward, FdJacobian
+from msk_ray.simulation.modes import configured_backward
 
-__all__ = ["Ant", "CartPole", "Env", "EnvState", "Transition", "env_class", "make_backward", "make_env"]
-
-
-def _fd_jacobian(fd: FdConfig) -> Backward:
-    return FdJacobian(eps_ctrl=fd.eps_ctrl, eps_qpos=fd.eps_qpos, eps_qvel=fd.eps_qvel, max_worlds=fd.max_worlds)
-
-
-_BACKWARD: dict[str, Callable[[PhysicsConfig], Backward]] = {"fd_jacobian": lambda physics: _fd_jacobian(physics.fd)}
-
-
-def make_backward(physics: PhysicsConfig) -> Backward:
-    """The backward mode a physics section names."""
-    return _BACKWARD[physics.backward](physics)
+__all__ = ["Ant", "CartPole", "Env", "EnvState", "Transition", "env_class", "make_env"]
 
 
 _ENVS: dict[str, type[Env[Any]]] = {"cartpole": CartPole, "ant": Ant}
@@ -41,5 +28,5 @@ def make_env(
         UnsupportedModelError: the model cannot be stepped, or not differentiated by `physics.backward`.
         DeviceError: no such device.
     """
-    backward = make_backward(physics) if differentiable else None
+    backward = configured_backward(physics) if differentiable else None
     return env_class(config)(config, physics, nworld, device, seed, backward)

@@ -35,49 +35,54 @@ class Ant(Env[AntEnvConfig]):
     obs_size = 37
     variants = VARIANTS["ant"]
 
+    reward_names = ("forward_vel", "up", "heading", "height", "action")
+
     @staticmethod
     def build_model(config: AntEnvConfig, physics: PhysicsConfig) -> mujoco.MjModel:
         return build_ant(config, physics)
 
-    def draw_physics(self) -> StepState:
-        stand = torch.tensor([0.0, 0.0, STAND_HEIGHT, 1.0, 0.0, 0.0, 0.0, *STAND_JOINTS], device=self.device)
-        position = stand[:3] + 0.1 * self.uniform(3)
-        axis = torch.nn.functional.normalize(self.uniform(3), dim=-1)
-        rotation = quat_multiply(stand[3:7].expand(self.nworld, 4), quat_exp(math.pi / 24 * self.uniform(1) * axis))
-        joints = stand[7:] + 0.2 * self.uniform(8)
-        qvel = 0.25 * self.uniform(14)
-        return StepState(
-            torch.cat((position, rotation, joints), -1), qvel, torch.zeros((self.nworld, 0), device=self.device)
-        )
+    def prepare(self) -> None:
+        c = self.config
+        # World z of the torso's z axis and world x of its x axis are w² - x² - y² + z² and w² + x² - y² - z².
+        self._axes = torch.tensor(((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)), device=self.device)
+        # All terms but the action penalty are linear in the observation.
+        linear = torch.zeros(self.obs_size, len(self.reward_names))
+        for term, (entry, weight) in enumerate(((5, c.forward_vel), (27, c.up), (28, c.heading), (0, c.height))):
+            linear[entry, term] = weight
+        offset = torch.tensor((0.0, 0.0, 0.0, -c.height * c.termination_height, 0.0))
+        self._linear, self._offset = linear.to(self.device), offset.to(self.device)
+        self._stand = torch.tensor((0.0, 0.0, STAND_HEIGHT, 1.0, 0.0, 0.0, 0.0, *STAND_JOINTS), device=self.device)
+
+    def draw_physics(self, count: int) -> StepState:
+        stand = self._stand
+        position = stand[:3] + 0.1 * self.uniform(count, 3)
+        axis = torch.nn.functional.normalize(self.uniform(count, 3), dim=-1)
+        rotation = quat_multiply(stand[3:7].expand(count, 4), quat_exp(math.pi / 24 * self.uniform(count, 1) * axis))
+        joints = stand[7:] + 0.2 * self.uniform(count, 8)
+        qvel = 0.25 * self.uniform(count, 14)
+        return StepState(torch.cat((position, rotation, joints), -1), qvel, torch.zeros((count, 0), device=self.device))
 
     def observe(self, state: StepState, action: Tensor) -> Tensor:
         orientation = state.qpos[:, 3:7]
-        up, heading = self._axes(orientation)
         return torch.cat(
             (
-                state.qpos[:, 2:3],
-                orientation,
+                state.qpos[:, 2:7],
                 state.qvel[:, 0:3],
                 quat_rotate(orientation, state.qvel[:, 3:6]),  # MuJoCo's angular velocity is in the body frame
                 state.qpos[:, 7:],
                 _JOINT_VELOCITY_SCALE * state.qvel[:, 6:],
-                up[:, None],
-                heading[:, None],
+                orientation.square() @ self._axes,
                 action,
             ),
             dim=-1,
         )
 
-    def reward_terms(self, state: StepState, action: Tensor) -> dict[str, Tensor]:
-        c = self.config
-        up, heading = self._axes(state.qpos[:, 3:7])
-        return {
-            "forward_vel": c.forward_vel * state.qvel[:, 0],
-            "up": c.up * up,
-            "heading": c.heading * heading,
-            "height": c.height * (state.qpos[:, 2] - c.termination_height),
-            "action": -c.action_penalty * (action**2).sum(-1),
-        }
+    def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+        terms = torch.addmm(self._offset, obs, self._linear)
+        if self.config.action_penalty == 0.0:
+            return terms
+        effort = -self.config.action_penalty * action.square().sum(-1, keepdim=True)
+        return torch.cat((terms[:, :-1], effort), dim=-1)
 
     def fell(self, state: StepState) -> Tensor:
         if not self.config.early_termination:
@@ -86,9 +91,3 @@ class Ant(Env[AntEnvConfig]):
 
     def outcome_terms(self, state: StepState) -> dict[str, Tensor]:
         return {"vx": state.qvel[:, 0]}
-
-    @staticmethod
-    def _axes(orientation: Tensor) -> tuple[Tensor, Tensor]:
-        """World z of the torso's z axis and world x of its x axis, each (W,), from rotation matrix entries."""
-        w, x, y, z = orientation.unbind(-1)
-        return w * w - x * x - y * y + z * z, w * w + x * x - y * y - z * z

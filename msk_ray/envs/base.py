@@ -41,8 +41,8 @@ class Transition(NamedTuple):
 
     reward: Tensor
     """Reward, shape (W,); 0 in a world that diverged."""
-    terms: dict[str, Tensor]
-    """Weighted parts of the reward, detached, each of shape (W,)."""
+    terms: Tensor
+    """Weighted parts of the reward, detached, shape (W, T), named by the environment's `reward_names`."""
     obs: Tensor
     """Observation of the state reached, before any reset, shape (W, O)."""
     terminated: Tensor
@@ -63,6 +63,8 @@ class Env(ABC, Generic[Settings]):
 
     action_size: int
     obs_size: int
+    reward_names: ClassVar[tuple[str, ...]]
+    """Names of the T parts of the reward."""
     variants: ClassVar[tuple[str, ...]] = ()
     """Named physics of this environment."""
 
@@ -91,6 +93,8 @@ class Env(ABC, Generic[Settings]):
         self.device = self.sim.device
         self.action_size = self.model.nu
         self.generator = torch.Generator(device=self.device).manual_seed(seed)
+        self._fresh: list[StepState] = []
+        self.prepare()
         self.state = self.reset_state()
 
     @staticmethod
@@ -112,17 +116,20 @@ class Env(ABC, Generic[Settings]):
             return physics
         return PhysicsConfig(variant=variant or cls.variants[0], nconmax=physics.nconmax, njmax=physics.njmax)
 
+    def prepare(self) -> None:
+        """Put constants on the device: copying one there in every step would make the host wait for the GPU."""
+
     @abstractmethod
-    def draw_physics(self) -> StepState:
-        """Initial physical states of all worlds, drawn from `generator` if resets are stochastic."""
+    def draw_physics(self, count: int) -> StepState:
+        """`count` initial physical states, drawn with `uniform`."""
 
     @abstractmethod
     def observe(self, state: StepState, action: Tensor) -> Tensor:
         """Observation (W, O) of a state and the action that led to it."""
 
     @abstractmethod
-    def reward_terms(self, state: StepState, action: Tensor) -> dict[str, Tensor]:
-        """Weighted parts (W,) that sum to the reward for reaching `state` by `action`."""
+    def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+        """Weighted parts (W, T) that sum to the reward for reaching `state`, observed as `obs`, by `action`."""
 
     def fell(self, state: StepState) -> Tensor:
         """Worlds (W,) bool whose episode ends by itself in `state`."""
@@ -139,10 +146,15 @@ class Env(ABC, Generic[Settings]):
     def reset_state(self) -> EnvState:
         """Fresh initial states of all worlds."""
         return EnvState(
-            self.draw_physics(),
+            self._fresh.pop() if self._fresh else self.draw_physics(self.nworld),
             torch.zeros((self.nworld, self.action_size), device=self.device),
             torch.zeros(self.nworld, dtype=torch.int64, device=self.device),
         )
+
+    def stock_resets(self, steps: int) -> None:
+        """Draw the initial states that the next `steps` env steps may need, all at once."""
+        drawn = self.draw_physics(steps * self.nworld)
+        self._fresh = [StepState(*parts) for parts in zip(*(t.split(self.nworld) for t in drawn), strict=True)]
 
     def observation(self) -> Tensor:
         """Observation (W, O) of the current state."""
@@ -159,21 +171,21 @@ class Env(ABC, Generic[Settings]):
         diverged = ~self._sound(after)
         # `where` sends no cotangent into a diverged world's step, so its gradient cannot reach the batch.
         after = StepState(*(torch.where(diverged[:, None], b.detach(), a) for b, a in zip(before, after, strict=True)))
-        terms = self.reward_terms(after, action)
-        reward = torch.where(diverged, 0.0, torch.stack(list(terms.values())).sum(0))
         obs = self.observe(after, action)
+        terms = self.reward_terms(after, action, obs)
+        reward = torch.where(diverged, 0.0, terms.sum(-1))
         age = self.state.age + 1
         terminated = diverged | self.fell(after)
         truncated = (age >= self.config.episode_length) & ~terminated
         reached = EnvState(after, action, age)
         self.state = self._reset_where(terminated | truncated, reached) if auto_reset else reached
-        return Transition(reward, {n: t.detach() for n, t in terms.items()}, obs, terminated, truncated, diverged)
+        return Transition(reward, terms.detach(), obs, terminated, truncated, diverged)
 
     def uniform(self, *shape: int) -> Tensor:
         """Uniform numbers in [-1, 1) from the environment's generator; zeros if resets are not stochastic."""
         if not self.config.stochastic_reset:
-            return torch.zeros((self.nworld, *shape), device=self.device)
-        return 2.0 * torch.rand((self.nworld, *shape), generator=self.generator, device=self.device) - 1.0
+            return torch.zeros(shape, device=self.device)
+        return 2.0 * torch.rand(shape, generator=self.generator, device=self.device) - 1.0
 
     def _reset_where(self, done: Tensor, reached: EnvState) -> EnvState:
         fresh = self.reset_state()
@@ -189,8 +201,7 @@ class Env(ABC, Generic[Settings]):
     @torch.no_grad()
     def _sound(self, state: StepState) -> Tensor:
         # NaN compares false, so one comparison finds both non-finite and absurd values.
-        sound = (state.qpos.abs() < _ABSURD).all(-1) & (state.qvel.abs() < _ABSURD).all(-1)
-        return sound & (state.act.abs() < _ABSURD).all(-1) if state.act.shape[-1] else sound
+        return (torch.cat(state, dim=-1).abs() < _ABSURD).all(-1)
 
 
 def wrap_angle(angle: Tensor) -> Tensor:

@@ -22,32 +22,38 @@ class CartPole(Env[CartPoleEnvConfig]):
     """
 
     obs_size = 5
+    reward_names = ("pole_angle", "pole_velocity", "cart_position", "cart_velocity", "action")
 
     @staticmethod
     def build_model(config: CartPoleEnvConfig, physics: PhysicsConfig) -> mujoco.MjModel:
         return build_cartpole(config, physics)
 
-    def draw_physics(self) -> StepState:
-        hanging = torch.tensor([0.0, math.pi], device=self.device)
-        qpos = hanging + self.uniform(2) * torch.tensor([0.5, math.pi / 2], device=self.device)
-        return StepState(qpos, 0.25 * self.uniform(2), torch.zeros((self.nworld, 0), device=self.device))
+    def prepare(self) -> None:
+        c = self.config
+        penalties = (
+            c.pole_angle_penalty,
+            c.pole_velocity_penalty,
+            c.cart_position_penalty,
+            c.cart_velocity_penalty,
+            c.cart_action_penalty,
+        )
+        self._weights = -torch.tensor(penalties, device=self.device)
+        self._hanging = torch.tensor((0.0, math.pi), device=self.device)
+        self._spread = torch.tensor((0.5, math.pi / 2), device=self.device)
+
+    def draw_physics(self, count: int) -> StepState:
+        qpos = self._hanging + self._spread * self.uniform(count, 2)
+        return StepState(qpos, 0.25 * self.uniform(count, 2), torch.zeros((count, 0), device=self.device))
 
     def observe(self, state: StepState, action: Tensor) -> Tensor:
         x, angle = state.qpos.unbind(-1)
         speed, rate = state.qvel.unbind(-1)
         return torch.stack((x, speed, torch.sin(angle), torch.cos(angle), rate), dim=-1)
 
-    def reward_terms(self, state: StepState, action: Tensor) -> dict[str, Tensor]:
-        c = self.config
+    def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
         x, angle = state.qpos.unbind(-1)
         speed, rate = state.qvel.unbind(-1)
-        return {
-            "pole_angle": -c.pole_angle_penalty * wrap_angle(angle) ** 2,
-            "pole_velocity": -c.pole_velocity_penalty * rate**2,
-            "cart_position": -c.cart_position_penalty * x**2,
-            "cart_velocity": -c.cart_velocity_penalty * speed**2,
-            "action": -c.cart_action_penalty * (action**2).sum(-1),
-        }
+        return self._weights * torch.stack((wrap_angle(angle), rate, x, speed, action[:, 0]), dim=-1) ** 2
 
     def outcome_terms(self, state: StepState) -> dict[str, Tensor]:
         return {"upright": (wrap_angle(state.qpos[:, 1]).abs() < UPRIGHT_ANGLE).float()}

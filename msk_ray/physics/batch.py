@@ -164,7 +164,7 @@ class WorldBatch:
         Raises:
             SimulationError: contacts or constraint rows were lost because a buffer was too small.
         """
-        bits = self.data.overflow.numpy()
+        bits = self.data.overflow.numpy().copy()  # on CPU numpy() is a view, and the next line clears it
         self.data.overflow.zero_()
         lost = np.bitwise_or.reduce(bits) & ~int(_ITERATION_BITS)
         if lost:

@@ -12,6 +12,7 @@ from msk_ray.envs import Env
 from msk_ray.errors import SimulationError
 from msk_ray.networks import Actor, Critic, RunningMeanStd
 from msk_ray.shac import returns
+from msk_ray.shac.critic_fit import CriticFit
 from msk_ray.shac.episodes import EpisodeTracker
 from msk_ray.shac.gate import CotangentGate
 from msk_ray.shac.rollout import Rollout, collect
@@ -38,7 +39,7 @@ class Shac:
         self.normalizer = RunningMeanStd((env.obs_size,)).to(device) if c.normalize_obs else None
         self.return_statistics = RunningMeanStd(()).to(device) if c.normalize_return else None
         self.actor_optimizer = torch.optim.Adam(self.actor.parameters(), lr=c.actor_lr, betas=c.betas)
-        self.critic_optimizer = torch.optim.Adam(self.critic.parameters(), lr=c.critic_lr, betas=c.betas)
+        self.critic_fit = CriticFit(self.critic, c.critic_lr, c.betas, c.critic_grad_norm)
         self.noise_generator = torch.Generator(device=device).manual_seed(config.trial.seed + 1)
         self.episodes = EpisodeTracker(env.nworld, device)
         self._discounted = torch.zeros(env.nworld, device=device)
@@ -58,8 +59,9 @@ class Shac:
         epochs = self.config.trial.epochs
         actor_lr = learning_rate_at(c.actor_lr, c.final_lr, c.lr_schedule, epoch, epochs)
         critic_lr = learning_rate_at(c.critic_lr, c.final_lr, c.lr_schedule, epoch, epochs)
-        _set_learning_rate(self.actor_optimizer, actor_lr)
-        _set_learning_rate(self.critic_optimizer, critic_lr)
+        for group in self.actor_optimizer.param_groups:
+            group["lr"] = actor_lr
+        self.critic_fit.set_learning_rate(critic_lr)
         clock = _Clock(self.env.device)
 
         # A cotangent of norm 1/(H·W) is what a reward of one in one world sends back through the mean loss.
@@ -72,7 +74,8 @@ class Shac:
 
         self.actor_optimizer.zero_grad()
         loss.backward()
-        gradient_norm = self._step_actor(gate, unit)
+        gate_statistics = gate.statistics(unit)
+        gradient_norm = self._step_actor(float(gate_statistics.get("grad/nonfinite_share", 0.0)))
         backward_s = clock.lap()
 
         critic_loss = self._train_critic(rollout, next_values.detach(), scaled_rewards)
@@ -87,7 +90,7 @@ class Shac:
             "train/value": next_values.detach().mean(),
             "train/diverged": rollout.diverged.sum(),
             "grad/actor_norm": gradient_norm,
-            **gate.statistics(unit),
+            **gate_statistics,
             **self.episodes.update(rollout.rewards.detach(), rollout.done),
         }
         if self.actor.log_std is not None:
@@ -113,7 +116,7 @@ class Shac:
         return {
             "modules": {name: module.state_dict() for name, module in self._modules().items()},
             "actor_optimizer": self.actor_optimizer.state_dict(),
-            "critic_optimizer": self.critic_optimizer.state_dict(),
+            "critic_optimizer": self.critic_fit.optimizer.state_dict(),
             "noise_generator": self.noise_generator.get_state(),
             "env_generator": self.env.generator.get_state(),
             "env_state": [t.detach().clone() for t in (*state.physics, state.action, state.age)],
@@ -126,7 +129,7 @@ class Shac:
         for name, module in self._modules().items():
             module.load_state_dict(state["modules"][name])
         self.actor_optimizer.load_state_dict(state["actor_optimizer"])
-        self.critic_optimizer.load_state_dict(state["critic_optimizer"])
+        self.critic_fit.load_state_dict(state["critic_optimizer"])
         # Generator states are host tensors whatever device they drive.
         self.noise_generator.set_state(state["noise_generator"].cpu())
         self.env.generator.set_state(state["env_generator"].cpu())
@@ -173,11 +176,14 @@ class Shac:
             self._discounted = torch.where(ended, 0.0, self._discounted)
         self.return_statistics.update(torch.stack(running).flatten())
 
-    def _step_actor(self, gate: CotangentGate, unit: float) -> Tensor:
-        """Take the actor's step and return its gradient norm before clipping."""
+    def _step_actor(self, lost: float) -> Tensor:
+        """Take the actor's step, `lost` being the share of worlds without a finite gradient.
+
+        Returns:
+            The gradient's norm before clipping.
+        """
         limit = self.config.shac.actor_grad_norm
         norm = nn.utils.clip_grad_norm_(self.actor.parameters(), float("inf") if limit is None else limit)
-        lost = float(gate.statistics(unit).get("grad/nonfinite_share", 0.0))
         allowed = self.config.shac.max_nonfinite_share
         if lost > allowed:
             raise SimulationError(
@@ -199,29 +205,11 @@ class Shac:
             targets = returns.one_step_targets(rewards, next_values, rollout.terminated, c.gamma)
         obs = rollout.obs if self.normalizer is None else self.normalizer.normalize(rollout.obs)
         obs, targets = obs.flatten(0, 1), targets.flatten()
-        size = obs.shape[0] // c.critic_batches
-        losses = torch.zeros(c.critic_batches, device=obs.device)
-        for _ in range(c.critic_iterations):
-            order = torch.randperm(obs.shape[0], generator=self.noise_generator, device=obs.device)
-            for batch in range(c.critic_batches):
-                picked = order[batch * size : (batch + 1) * size]
-                loss = (self.critic(obs[picked]) - targets[picked]).square().mean()
-                self.critic_optimizer.zero_grad()
-                loss.backward()
-                if c.critic_grad_norm is not None:
-                    for member in self.critic.members:
-                        nn.utils.clip_grad_norm_(member.parameters(), c.critic_grad_norm)
-                self.critic_optimizer.step()
-                losses[batch] = loss.detach()
+        loss = self.critic_fit.run(obs, targets, c.critic_iterations, c.critic_batches, self.noise_generator)
         with torch.no_grad():
             for target, source in zip(self.target_critic.parameters(), self.critic.parameters(), strict=True):
                 target.lerp_(source, 1.0 - c.target_critic_alpha)
-        return losses.mean()
-
-
-def _set_learning_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:
-    for group in optimizer.param_groups:
-        group["lr"] = rate
+        return loss
 
 
 class _Clock:

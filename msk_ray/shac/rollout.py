@@ -43,6 +43,7 @@ def collect(
     action's gradient comes from its own step alone. `normalizer` is held fixed during the rollout.
     """
     env.state = env.state.detach()
+    env.stock_resets(len(noise))
     raw, reached, rewards, terminated, done, diverged = [], [], [], [], [], []
     normalize = normalizer.normalize if normalizer is not None else lambda x: x
     for step_noise in noise:

@@ -13,22 +13,32 @@ class FdJacobian(Backward):
     """Perturbed copies of every world run as extra worlds of one batch; differences are taken in tangent space.
 
     Works with every model and integrator mujoco_warp steps. Cost: 2·(nu + 2·nv + na) extra worlds a world, fewer
-    where some inputs need no gradient. Accuracy is bounded by float32: about 1e-4 relative on smooth motion, 1e-2 in
-    stiff contact, where the step is only piecewise smooth.
+    where some inputs need no gradient.
+
+    Accuracy: rounding of float32 is divided by the perturbation, and a kink or jump inside it is taken for a slope.
+    Medians over 1 to 16 substeps with the defaults: 1e-6 to 5e-4 on a cartpole, 1e-5 to 1e-3 on an ant that stands.
+    On an ant that moves in contact 1e-4 to 1e-3 for ctrl and qvel, but there a qpos gradient is wrong by any factor
+    wherever a touch begins or ends inside the perturbation: a tenth of the states at 1 substep, half of them at 16.
 
     Args:
-        eps_ctrl: perturbation of ctrl and act [their own unit].
+        eps_ctrl: perturbation of ctrl [its own unit].
         eps_qpos: perturbation of qpos along a tangent direction [m, rad].
         eps_qvel: perturbation of qvel [m/s, rad/s].
+        eps_act: perturbation of act [its own unit]; small because a resting muscle's lies just above its clamp at 0.
         max_worlds: perturbed copies are run in chunks of at most this many worlds.
     """
 
     name = "fd_jacobian"
 
     def __init__(
-        self, eps_ctrl: float = 1e-2, eps_qpos: float = 1e-3, eps_qvel: float = 1e-2, max_worlds: int = 131072
+        self,
+        eps_ctrl: float = 5e-3,
+        eps_qpos: float = 5e-4,
+        eps_qvel: float = 2e-3,
+        eps_act: float = 5e-4,
+        max_worlds: int = 131072,
     ) -> None:
-        self.eps = {"ctrl": eps_ctrl, "qpos": eps_qpos, "qvel": eps_qvel, "act": eps_ctrl}
+        self.eps = {"ctrl": eps_ctrl, "qpos": eps_qpos, "qvel": eps_qvel, "act": eps_act}
         self.max_worlds = max_worlds
         self._copies: dict[int, _Copies] = {}
 
@@ -63,6 +73,14 @@ class FdJacobian(Backward):
         return InputGradients(
             *(gradients.get(n, torch.zeros_like(shapes[n])) if getattr(needs, n) else None for n in shapes)
         )
+
+    def diagnostics(self) -> dict[str, float]:
+        """Share of perturbed copies whose solver met an iteration limit since the last call.
+
+        Raises:
+            SimulationError: a copy lost contacts or constraint rows, so that its differences are not slopes.
+        """
+        return {"fd_solver_limit_share": max((c.check_overflow() for c in self._copies.values()), default=0.0)}
 
     def _slopes(
         self, chunk: list[tuple[str, int]], width: int, ctrl: Tensor, start: StepState, weights: StepState
@@ -100,6 +118,9 @@ class _Copies:
         self._buffers = BatchTensors(self._batch)
         self._graph = Graph(self._batch.launch_step, self._batch.device)
         self._device = torch.device(str(batch.device))
+
+    def check_overflow(self) -> float:
+        return self._batch.check_overflow()
 
     def advance(self, inputs: dict[str, Tensor]) -> StepState:
         self._buffers.load(inputs["ctrl"], StepState(inputs["qpos"], inputs["qvel"], inputs["act"]))

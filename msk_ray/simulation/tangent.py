@@ -25,7 +25,7 @@ def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
 
 def quat_conjugate(q: Tensor) -> Tensor:
     """Inverse rotation, shape (..., 4)."""
-    return q * q.new_tensor((1.0, -1.0, -1.0, -1.0))
+    return torch.cat((q[..., :1], -q[..., 1:]), dim=-1)
 
 
 def quat_exp(rotation: Tensor) -> Tensor:
@@ -48,8 +48,9 @@ def quat_log(q: Tensor) -> Tensor:
 
 def quat_rotate(q: Tensor, v: Tensor) -> Tensor:
     """Rotate vectors (..., 3) from the local frame of q (..., 4) to its parent's."""
-    t = 2.0 * torch.linalg.cross(q[..., 1:], v)
-    return v + q[..., :1] * t + torch.linalg.cross(q[..., 1:], t)
+    w, u = q[..., :1], q[..., 1:]
+    t = 2.0 * torch.linalg.cross(u, v)
+    return v + w * t + torch.linalg.cross(u, t)
 
 
 class Tangent:

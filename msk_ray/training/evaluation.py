@@ -50,7 +50,7 @@ class Evaluator:
         alive = torch.ones(env.nworld, dtype=torch.bool, device=env.device)
         score, length = zeros.clone(), zeros.clone()
         fell, diverged = ~alive, ~alive
-        terms: dict[str, Tensor] = {}
+        terms = torch.zeros((env.nworld, len(env.reward_names)), device=env.device)
         outcomes: dict[str, Tensor] = {}
         tail: list[dict[str, Tensor]] = []
         for step in range(self.steps):
@@ -58,7 +58,7 @@ class Evaluator:
             outcome = env.outcome_terms(env.state.physics)
             score += torch.where(alive, transition.reward, 0.0)
             length += alive
-            _accumulate(terms, transition.terms, alive)
+            terms += torch.where(alive[:, None], transition.terms, 0.0)
             _accumulate(outcomes, outcome, alive)
             if step >= self.steps - self._tail:
                 tail.append({name: torch.where(alive, value, 0.0) for name, value in outcome.items()})
@@ -74,7 +74,7 @@ class Evaluator:
             "length": length.mean(),
             "fall_rate": fell.float().mean(),
             "diverged_rate": diverged.float().mean(),
-            **{f"term/{name}": value.mean() for name, value in terms.items()},
+            **{f"term/{name}": value for name, value in zip(env.reward_names, terms.mean(0), strict=True)},
             **{name: value.sum() / length.sum() for name, value in outcomes.items()},
         }
         if tail and len(tail) == self._tail:

@@ -13,7 +13,8 @@ from msk_ray.config import dump_yaml, parse_override, read_yaml
 from msk_ray.errors import ConfigError
 from msk_ray.tune import experiment as experiments
 from msk_ray.tune.listing import text_table, trial_rows
-from msk_ray.tune.smoke import shrink
+from msk_ray.tune.outcomes import Outcome
+from msk_ray.tune.smoke import shrink, without_pruning
 from msk_ray.tune.space import Space, find_space, parse_seeds, parse_space
 from msk_ray.tune.trials import Trial, find_trial, resolve_trials
 
@@ -60,6 +61,9 @@ def parser() -> Parser:
     where.add_argument("--storage", type=Path, default=Path("runs"), metavar="DIR", help="by default runs/")
     where.add_argument("--name", help="the experiment's name; by default the space's")
     where.add_argument("--resume", action="store_true", help="go on with an experiment that was interrupted")
+    where.add_argument(
+        "--retry-errored", action="store_true", help="with --resume: try trials again that ended in an error"
+    )
     return p
 
 
@@ -68,10 +72,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser().parse_args(argv)
     if args.max_concurrent is not None and args.max_concurrent < 1:
         raise ConfigError(f"--max-concurrent {args.max_concurrent}: at least 1")
+    if args.retry_errored and not args.resume:
+        raise ConfigError("--retry-errored goes with --resume")
     space = _read_space(args)
     trials = [] if space.file.search == "optuna" else resolve_trials(space)
-    if args.smoke and trials:
-        trials = shrink(space, trials)
+    if args.smoke:
+        trials = shrink(space, trials) if trials else []
+        space = without_pruning(space)
     if args.dry_run:
         _print_trials(space, trials)
         return 0
@@ -139,6 +146,8 @@ def _run(args: argparse.Namespace, space: Space, trials: list[Trial]) -> int:
         if space.file.search == "optuna":
             raise ConfigError("--resume: a search by optuna cannot go on; pass another --name")
         experiment = experiments.reopen(path, trials)
+        if args.retry_errored:
+            experiment.clear_endings({Outcome.ERROR})
     # ray and torch take seconds to load; a wrong command line should not wait for them.
     from msk_ray.tune import runner
     from msk_ray.tune.devices import choose_placement, local_gpus

@@ -48,23 +48,28 @@ class PruningScheduler(FIFOScheduler):
         return TrialScheduler.STOP
 
 
-def population_scheduler(spec: SchedulerSpec, budget: float, sampled: Mapping[str, Operator]) -> TrialScheduler:
-    """Population-based training over the sampled ranges. Values stay inside them, which Ray alone does not see to."""
-    ranges = {key: op for key, op in sampled.items() if isinstance(op, Range)}
+class Population(PopulationBasedTraining):
+    """Population-based training over the sampled ranges of a space.
 
-    def clip(config: dict[str, Any]) -> dict[str, Any]:
-        inside = {key: op.clip(config["params"][key]) for key, op in ranges.items()}
-        return config | {"params": config["params"] | inside}
+    Values stay inside their ranges, and a member that goes on from a better one stays itself: Ray alone would let it
+    leave the ranges, and copy the better one's whole config, identity included.
+    """
 
-    return PopulationBasedTraining(
-        time_attr=spec.time_attr,
-        perturbation_interval=spec.interval * budget,
-        hyperparam_mutations={"params": {key: domain(op) for key, op in ranges.items()}},
-        quantile_fraction=spec.quantile,
-        resample_probability=spec.resample,
-        custom_explore_fn=clip,
-        log_config=False,
-    )
+    def __init__(self, spec: SchedulerSpec, budget: float, sampled: Mapping[str, Operator]) -> None:
+        self._ranges = {key: op for key, op in sampled.items() if isinstance(op, Range)}
+        super().__init__(
+            time_attr=spec.time_attr,
+            perturbation_interval=spec.interval * budget,
+            hyperparam_mutations={"params": {key: domain(op) for key, op in self._ranges.items()}},
+            quantile_fraction=spec.quantile,
+            resample_probability=spec.resample,
+            log_config=False,
+        )
+
+    def _get_new_config(self, trial: Any, trial_to_clone: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+        config, operations = super()._get_new_config(trial, trial_to_clone)
+        moved = {key: op.clip(config["params"][key]) for key, op in self._ranges.items()}
+        return {"id": trial.config["id"], "params": config["params"] | moved}, operations
 
 
 def domain(op: Operator) -> Any:

@@ -11,6 +11,7 @@ from msk_ray.tune.records import TrialRecord
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
+from matplotlib.ticker import EngFormatter
 
 MAX_LABELS = 16
 _STOPPED = {Outcome.STOPPED_ASHA, Outcome.STOPPED_MEDIAN, Outcome.STOPPED_PLATEAU, Outcome.NONFINITE, Outcome.DIVERGED}
@@ -33,6 +34,7 @@ def draw_curves(records: Sequence[TrialRecord], path: Path, title: str) -> None:
         _draw_variant(axes, group, colours[number], label)
     axes.set_title(title)
     axes.set_xlabel("env steps")
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.set_ylabel("evaluation score")
     axes.grid(alpha=0.3)
     axes.margins(x=0.02)

@@ -16,7 +16,7 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -25,7 +25,7 @@ from typing import Any
 import msk_ray
 from msk_ray.config import dump_yaml, parse_config
 from msk_ray.errors import StorageError
-from msk_ray.tune.outcomes import write_json, write_text
+from msk_ray.tune.outcomes import OUTCOME_FILE, Outcome, read_ending, write_json, write_text
 from msk_ray.tune.space import Space
 from msk_ray.tune.trials import Trial, describe_changes
 
@@ -88,6 +88,14 @@ class Experiment:
             )
             for entry in self.manifest()["trials"]
         ]
+
+    def clear_endings(self, outcomes: Collection[Outcome]) -> None:
+        """Take back the endings of trials that ended in one of these ways, so that they go on."""
+        for trial in self.trials():
+            folder = self.trial_folder(trial.id)
+            ending = read_ending(folder)
+            if ending is not None and ending.outcome in outcomes:
+                (folder / OUTCOME_FILE).unlink()
 
     def set_trials(self, trials: Iterable[Trial]) -> None:
         """Replace the manifest's list of trials."""

@@ -1,11 +1,14 @@
 """What the terminal shows while an experiment runs: a line an event, and now and then where everything stands."""
 
 import math
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
+from ray.exceptions import RayActorError
 from ray.tune import Callback
 
 from msk_ray.cli import StopRequest
@@ -54,10 +57,16 @@ class Live(Callback):
         """Trials that were started, in that order, each once, numbered anew."""
         self._best: tuple[float, Trial] | None = None
         self._start = time.monotonic()
+        # Kept, because what Ray itself prints is sent elsewhere while trials run.
+        self._out = sys.stdout
         self._last_status = self._start
         self._seconds_per_epoch: dict[str, float] = {}
         self._stopping_since: float | None = None
         self._armed = False
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Ray pickles callbacks into its own state, which is never read back: resuming begins from the trials' folders.
+        return {key: value for key, value in self.__dict__.items() if key != "_out"}
 
     @property
     def stopped(self) -> bool:
@@ -107,7 +116,8 @@ class Live(Callback):
 
     def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         mine = self._trial_of(trial.config)
-        self._say(f"{mine.id} its process died or raised; trying again from its newest checkpoint")
+        why = _reason(self._experiment.trial_folder(mine.id) / ERROR_FILE, trial)
+        self._say(f"{mine.id} {why}; trying again from its newest checkpoint")
 
     def on_trial_complete(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         mine = self._trial_of(trial.config)
@@ -161,7 +171,7 @@ class Live(Callback):
         self._say(f"{self._stop.signal.name}: {len(self._saving)} trials save themselves at the end of their epoch ...")
 
     def _say(self, text: str) -> None:
-        print(f"[{format_duration(time.monotonic() - self._start):>6}] {text}", flush=True)
+        print(f"[{format_duration(time.monotonic() - self._start):>6}] {text}", file=self._out, flush=True)
 
     @staticmethod
     def _name(trial: Trial) -> str:
@@ -192,8 +202,12 @@ def time_left(running: list[tuple[int, float | None]], waiting: list[int], concu
     return slots[-1]
 
 
-def _reason(error_file: Any, trial: Any) -> str:
+def _reason(error_file: Path, trial: Any) -> str:
     """Why Ray gave a trial up, on one line."""
     if error_file.is_file():
-        return str(error_file.read_text(encoding="utf-8").strip().splitlines()[-1])
-    return f"its process died {trial.num_failures} times (killed, or out of memory)"
+        return error_file.read_text(encoding="utf-8").strip().splitlines()[-1]
+    error = trial.get_pickled_error()
+    if error is None or isinstance(error, RayActorError):
+        times = "" if trial.num_failures < 2 else f", {trial.num_failures} times now"
+        return f"its process died (killed, or out of memory){times}"
+    return str(error).strip().splitlines()[-1]

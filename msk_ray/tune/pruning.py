@@ -1,8 +1,9 @@
 """Rules by which trials are stopped because others do better. Pure: fed with evaluations, they answer with a reason.
 
 Ray's own ASHA decides once, when a trial first reaches a rung, against those that came before it: trials that run in
-lockstep find the rung empty and pass unjudged. Here a trial is judged again at each later report by the newest rung it
-has reached, so the order of arrival matters little, and replaying recorded evaluations gives the same rungs.
+lockstep find the rung empty and pass unjudged. Here a trial is judged again by the newest rung it has reached at each
+report until half way (as a ratio) to the next rung, so the order of arrival matters little, and replaying recorded
+evaluations gives the same rungs.
 """
 
 import math
@@ -52,7 +53,10 @@ class SuccessiveHalving:
                 # The first report past a rung counts there, whatever follows: repeated rows change nothing.
                 scores.setdefault(trial, score)
                 newest = index
-        return None if newest is None else self._judge(trial, newest)
+        # Far past its rung, a trial is left to the next one: latecomers should not undo most of its work.
+        if newest is None or time >= self._rungs[newest] * math.sqrt(self._reduction):
+            return None
+        return self._judge(trial, newest)
 
     def _judge(self, trial: str, index: int) -> Ending | None:
         scores = self._scores[index]

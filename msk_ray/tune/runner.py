@@ -1,10 +1,12 @@
 """Runs an experiment's trials with Ray Tune."""
 
+import logging
 import os
 import tempfile
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +24,7 @@ from msk_ray.config import Config, read_yaml
 from msk_ray.errors import DeviceError, MskRayError
 from msk_ray.progress import format_duration
 from msk_ray.training import Trainer, precompile
-from msk_ray.tune.adapters import METRIC, PruningScheduler, domain, optuna_search, population_scheduler
+from msk_ray.tune.adapters import METRIC, Population, PruningScheduler, domain, optuna_search
 from msk_ray.tune.devices import Placement
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.live import Live
@@ -53,8 +55,12 @@ class Plan:
 
 
 @contextmanager
-def ray_session(address: str | None, dashboard: bool = True) -> Iterator[None]:
+def ray_session(address: str | None, dashboard: bool | None = None) -> Iterator[None]:
     """A Ray of our own on this machine, or the one at `address`.
+
+    Args:
+        address: of a running cluster.
+        dashboard: whether to start one; None starts it where its packages (ray[default]) are installed.
 
     Raises:
         DeviceError: the cluster at `address` cannot be reached.
@@ -72,6 +78,7 @@ def ray_session(address: str | None, dashboard: bool = True) -> Iterator[None]:
         package = str(Path(msk_ray.__file__).resolve().parent.parent)
         paths = [package, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
         os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys(paths))
+        # None starts the dashboard where its packages (ray[default]) are installed, and does without elsewhere.
         context = ray.init(include_dashboard=dashboard, dashboard_host="127.0.0.1", **quiet)
     else:
         try:
@@ -81,6 +88,8 @@ def ray_session(address: str | None, dashboard: bool = True) -> Iterator[None]:
     try:
         if context.dashboard_url:
             print(f"Ray dashboard: http://{context.dashboard_url}", flush=True)
+        elif dashboard is None:
+            print("no Ray dashboard: pip install 'ray[default]' to have one", flush=True)
         yield
     finally:
         ray.shutdown()
@@ -137,7 +146,7 @@ def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial]) -> None:
     spec, file = plan.space.file.scheduler, plan.space.file
     budget = _budget(plan.space, plan.trials or [_first_suggestion(job)])
     if spec.kind == "pbt":
-        scheduler: Any = population_scheduler(spec, budget, plan.space.sampled)
+        scheduler: Any = Population(spec, budget, plan.space.sampled)
     else:
         pruner = make_pruner(spec, budget)
         replay(pruner, spec.time_attr, plan)
@@ -155,7 +164,7 @@ def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial]) -> None:
             num_samples=file.samples if searching else 1,
             max_concurrent_trials=plan.max_concurrent,
             reuse_actors=False,  # a process of its own frees a trial's GPU memory, whatever it did
-            trial_dirname_creator=lambda trial: f"{job.trial_of(trial.config).id}_{trial.trial_id}",
+            trial_dirname_creator=lambda trial: f"{trial.config.get('id', 'trial')}_{trial.trial_id}",
         ),
         run_config=tune.RunConfig(
             name="tune",
@@ -164,10 +173,33 @@ def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial]) -> None:
             callbacks=[live],
             stop=_StopWhen(live),
             failure_config=tune.FailureConfig(max_failures=file.resources.max_failures),
-            checkpoint_config=tune.CheckpointConfig(num_to_keep=2),
+            # None are deleted: only a population reports them, and another member may be about to take one over.
+            checkpoint_config=tune.CheckpointConfig(num_to_keep=None),
         ),
     )
-    tuner.fit()
+    with _log_to(plan.experiment.path / "ray.log"):
+        tuner.fit()
+
+
+@contextmanager
+def _log_to(path: Path) -> Iterator[None]:
+    """Send what Ray logs, prints and warns of in this process to a file; what matters of it is said by `Live`."""
+    logger = logging.getLogger("ray")
+    handlers, level = logger.handlers, logger.level
+    file = logging.FileHandler(path, encoding="utf-8")
+    file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    logger.handlers = [file]
+    logger.setLevel(logging.INFO)
+    # Of Ray's advice on settings chosen here on purpose, such as a process of its own for each trial.
+    # Its notices of dead workers are printed, past any logger.
+    with warnings.catch_warnings(), path.open("a", encoding="utf-8") as log, redirect_stdout(log), redirect_stderr(log):
+        warnings.filterwarnings("ignore", category=UserWarning, module=r"ray\.")
+        try:
+            yield
+        finally:
+            logger.handlers = handlers
+            logger.setLevel(level)
+            file.close()
 
 
 def replay(pruner: Pruner, time_attr: str, plan: Plan) -> None:
@@ -203,16 +235,11 @@ def _param_space(job: Job, remaining: list[Trial]) -> dict[str, Any]:
     if not job.population:
         return {"id": tune.grid_search([trial.id for trial in remaining])}
     # Members of a population move: each begins where its folder says it was last.
-    members = [(trial.id, _current_params(job, trial)) for trial in remaining]
-    by_id = dict(members)
+    params = {trial.id: _current_params(job, trial) for trial in remaining}
     return {
-        "id": tune.grid_search([trial_id for trial_id, _ in members]),
-        "params": tune.sample_from(lambda spec: by_id[_id_of(spec)]),
+        "id": tune.grid_search(list(params)),
+        "params": tune.sample_from(lambda spec: params[spec.config["id"]]),
     }
-
-
-def _id_of(spec: Any) -> str:
-    return str(spec["config"]["id"] if "config" in spec else spec["id"])
 
 
 def _current_params(job: Job, trial: Trial) -> dict[str, Any]:

@@ -69,12 +69,14 @@ def run_trial(
 
     Raises:
         Exception: anything that is neither a failed simulation nor a fault the user can mend. Its traceback is kept in
-            `folder`, and the trial may be tried again.
+            `error.txt`, and the trial may be tried again.
     """
     done = read_ending(folder) if folder.is_dir() else None
     if done is not None:
         return done
     folder.mkdir(parents=True, exist_ok=True)
+    # What an earlier attempt stumbled over stays in the trial's output; this file is about the latest one.
+    (folder / ERROR_FILE).unlink(missing_ok=True)
     try:
         ending = _train(trial, folder, device, stop, trainer_class, hooks, checkpoint)
     except SimulationError as error:
@@ -83,6 +85,7 @@ def run_trial(
     except MskRayError as error:
         ending = Ending(Outcome.ERROR, str(error))
     except Exception:
+        traceback.print_exc()
         write_text(folder / ERROR_FILE, traceback.format_exc())
         raise
     if ending is not None:

@@ -31,9 +31,15 @@ def place(env, qpos, qvel=None) -> None:
     env.state = fresh._replace(physics=StepState(qpos, qvel, fresh.physics.act))
 
 
+def named_terms(env, state: StepState, action: torch.Tensor) -> dict[str, torch.Tensor]:
+    terms = env.reward_terms(state, action, env.observe(state, action))
+    return dict(zip(env.reward_names, terms[0], strict=True))
+
+
 def test_cartpole_reward_and_observation_by_hand(cartpole: CartPole) -> None:
     state = StepState(torch.tensor([[0.5, math.pi + 1.0]]), torch.tensor([[2.0, 3.0]]), torch.zeros(1, 0))
-    terms = cartpole.reward_terms(state, torch.tensor([[0.5]]))
+    action = torch.tensor([[0.5]])
+    terms = named_terms(cartpole, state, action)
     # angle wraps to 1 − π
     assert terms["pole_angle"].item() == pytest.approx(-((1 - math.pi) ** 2), rel=1e-5)
     assert terms["pole_velocity"].item() == pytest.approx(-0.9)
@@ -80,8 +86,17 @@ def test_ant_observation_is_in_the_documented_order(ant: Ant) -> None:
 def test_ant_standing_reward_by_hand(ant: Ant) -> None:
     state = StepState(torch.tensor([[0.0, 0, 0.77, 1, 0, 0, 0, *[0.0] * 8]]), torch.zeros(1, 14), torch.zeros(1, 0))
     state.qvel[0, 0] = 1.5
-    total = sum(ant.reward_terms(state, torch.zeros(1, 8)).values())
+    total = sum(named_terms(ant, state, torch.zeros(1, 8)).values())
     assert total.item() == pytest.approx(1.5 + 0.1 + 1.0 + 0.5)
+
+
+def test_ant_reward_terms_follow_their_weights() -> None:
+    config = AntEnvConfig(name="ant", forward_vel=3.0, up=2.0, heading=0.5, height=4.0, action_penalty=0.25)
+    env = make_env(config, PhysicsConfig(), 1, "cpu", 0, differentiable=False)
+    state = StepState(torch.tensor([[0.0, 0, 0.77, 1, 0, 0, 0, *[0.0] * 8]]), torch.zeros(1, 14), torch.zeros(1, 0))
+    state.qvel[0, 0] = 1.5
+    terms = {name: value.item() for name, value in named_terms(env, state, torch.full((1, 8), 0.5)).items()}
+    assert terms == pytest.approx({"forward_vel": 4.5, "up": 2.0, "heading": 0.5, "height": 2.0, "action": -0.5})
 
 
 def test_an_ant_that_falls_terminates_and_restarts(ant: Ant) -> None:

@@ -1,0 +1,227 @@
+"""`python -m msk_ray.gradcheck MODEL.xml`: is the gradient of this model right?"""
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from msk_ray.cli import Parser, run
+from msk_ray.errors import ConfigError, UnsupportedModelError
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from msk_ray.gradcheck.check import GradientReport
+
+DESCRIPTION = """\
+Check gradients of an env step of MODEL.xml against float64 central differences of C MuJoCo.
+
+Every state gets a random cotangent on (qpos', qvel', act') after --substeps physics steps; the gradients with respect
+to ctrl, qpos, qvel and act are compared in tangent space. States where the step has a kink, and states where the Warp
+forward pass itself differs from C MuJoCo, are left out and counted.
+
+  rel_error   |g - g_ref| / |g_ref|    0 is right
+  cosine      between g and g_ref      1 is right; tells direction from magnitude
+  norm_ratio  |g| / |g_ref|            1 is right; far above 1 means exploding gradients
+
+Exit code: 0 within the tolerance, 1 past it, 2 for a model that is not supported or a wrong command line."""
+
+EXAMPLES = """\
+  python -m msk_ray.gradcheck my_robot.xml
+  python -m msk_ray.gradcheck my_robot.xml --substeps 16 --states standing,contact --worlds 20 --tolerance 1e-2
+  python -m msk_ray.gradcheck my_robot.xml --mode fd_jacobian --tolerance 5e-2    # a model the adjoint refuses
+  python -m msk_ray.gradcheck my_robot.xml --json > gradients.json"""
+
+MANY_EXCLUDED = 0.25
+"""Share of excluded states from which the table says that it speaks for few states."""
+
+
+def _positive(kind: type) -> Any:
+    def parse(text: str) -> Any:
+        value = kind(text)
+        if not (value > 0 and math.isfinite(value)):
+            raise argparse.ArgumentTypeError(f"must be above zero, not {text}")
+        return value
+
+    parse.__name__ = kind.__name__  # argparse names it where the text is no number
+    return parse
+
+
+def parser() -> Parser:
+    """The command line."""
+    p = Parser("python -m msk_ray.gradcheck", DESCRIPTION, EXAMPLES)
+    p.add_argument("model", type=Path, metavar="MODEL.xml", help="an MJCF or URDF file, or a compiled .mjb")
+    p.add_argument(
+        "--mode",
+        default="tape_per_substep",
+        metavar="MODE",
+        help="backward mode (default %(default)s); fd_jacobian takes any model, an unknown name lists them all",
+    )
+    p.add_argument("--substeps", type=_positive(int), default=1, metavar="N", help="physics steps (default 1)")
+    p.add_argument(
+        "--states",
+        default="standing,random",
+        metavar="KINDS",
+        help="comma-separated: standing, random, contact (in touch, under random controls), policy (along a smooth "
+        "rollout); default %(default)s",
+    )
+    p.add_argument("--worlds", type=_positive(int), default=8, metavar="W", help="states of each kind (default 8)")
+    p.add_argument(
+        "--tolerance", type=_positive(float), default=1e-2, metavar="T", help="largest rel_error (default %(default)s)"
+    )
+    p.add_argument("--seed", type=int, default=0, help="of states and cotangents (default 0)")
+    p.add_argument("--device", default="cpu", help="cpu or cuda:N (default cpu)")
+    p.add_argument(
+        "--solver-tolerance", type=_positive(float), metavar="T", help="of Warp's solver; by default the model's own"
+    )
+    p.add_argument(
+        "--forward-tolerance",
+        type=_positive(float),
+        metavar="T",
+        help="forward mismatch from which a state is left out, relative to its motion (default 3e-5)",
+    )
+    p.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
+    return p
+
+
+def load_model(path: Path) -> "mujoco.MjModel":
+    """Compile a model file.
+
+    Raises:
+        ConfigError: there is no such file, or MuJoCo does not accept it.
+    """
+    import mujoco
+
+    if not path.is_file():
+        raise ConfigError(f"no model file {path}")
+    try:
+        if path.suffix == ".mjb":
+            return mujoco.MjModel.from_binary_path(str(path))
+        return mujoco.MjModel.from_xml_path(str(path))
+    except (ValueError, mujoco.FatalError) as error:
+        raise ConfigError(f"MuJoCo cannot load {path}: {' '.join(str(error).split())}") from error
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    args = parser().parse_args(argv)
+    if args.seed < 0:
+        raise ConfigError(f"--seed must not be negative, not {args.seed}")
+    # torch and Warp take seconds to load; a wrong command line should not wait for them.
+    from msk_ray.gradcheck.check import GradientReport, Limits, check_gradients
+    from msk_ray.simulation.modes import make_backward
+
+    backward = make_backward(args.mode)
+    model = load_model(args.model)
+    limits = Limits() if args.forward_tolerance is None else Limits(forward_mismatch=args.forward_tolerance)
+    try:
+        report = check_gradients(
+            model,
+            backward,
+            substeps=args.substeps,
+            states=[kind.strip() for kind in args.states.split(",") if kind.strip()],
+            worlds=args.worlds,
+            seed=args.seed,
+            device=args.device,
+            solver_tolerance=args.solver_tolerance,
+            limits=limits,
+        )
+    except UnsupportedModelError as error:
+        if args.json:
+            empty = GradientReport(args.mode, args.substeps, args.worlds)
+            print(json.dumps(as_json(empty, str(args.model), args.tolerance, [str(error)])))
+        raise
+    if args.json:
+        print(json.dumps(as_json(report, str(args.model), args.tolerance, [])))
+    else:
+        print_table(report, str(args.model), args.tolerance)
+    if not report.checked:
+        raise ConfigError(
+            f"nothing could be compared: {_excluded(report)}; take other --states, more --worlds or --forward-tolerance"
+        )
+    return 0 if report.max_rel_error <= args.tolerance else 1
+
+
+def _finite(value: float | None) -> float | None:
+    """JSON has no infinity: null stands for it."""
+    return value if value is not None and math.isfinite(value) else None
+
+
+def as_json(report: "GradientReport", model: str, tolerance: float, unsupported: list[str]) -> dict[str, Any]:
+    """The report as JSON types; one result a state and input, null for what is not finite or not defined."""
+    return {
+        "model": model,
+        "mode": report.mode,
+        "substeps": report.substeps,
+        "worlds": report.worlds,
+        "checked": report.checked,
+        "excluded": report.excluded,
+        "excluded_kinks": report.kinks,
+        "excluded_forward_mismatches": report.forward_mismatches,
+        "results": [
+            {
+                "state": r.state,
+                "world": r.world,
+                "input": r.input,
+                "rel_error": _finite(r.rel_error),
+                "cosine": r.cosine,
+                "norm_ratio": r.norm_ratio,
+            }
+            for r in report.results
+        ],
+        "max_rel_error": _finite(report.max_rel_error),
+        "tolerance": tolerance,
+        "diagnostics": {name: _finite(figure) for name, figure in report.diagnostics.items()},
+        "ok": not unsupported and report.max_rel_error <= tolerance,
+        "unsupported": unsupported,
+    }
+
+
+def _excluded(report: "GradientReport") -> str:
+    total = report.checked + report.excluded
+    return (
+        f"{report.excluded} of {total} states left out ({report.kinks} at a kink, {report.forward_mismatches} where "
+        "the Warp forward pass differs from C MuJoCo)"
+    )
+
+
+def print_table(report: "GradientReport", model: str, tolerance: float) -> None:
+    """One row a kind of state and input, over the states compared."""
+    import numpy as np
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=f"{model}: {report.mode}, {report.substeps} substep(s)", title_justify="left")
+    for heading in ("state", "input", "states", "rel_error median", "rel_error max", "cosine min", "norm_ratio"):
+        table.add_column(heading, justify="left" if heading in ("state", "input") else "right", no_wrap=True)
+    for state, name in dict.fromkeys((r.state, r.input) for r in report.results):
+        rows = report.of(name, state)
+        errors = [r.rel_error for r in rows]
+        cosines = [r.cosine for r in rows if r.cosine is not None]
+        ratios = [r.norm_ratio for r in rows if r.norm_ratio is not None]
+        style = "" if max(errors) <= tolerance else "red"
+        table.add_row(
+            state,
+            name,
+            str(len(rows)),
+            f"{np.median(errors):.1e}",
+            f"{max(errors):.1e}",
+            f"{min(cosines):.6f}" if cosines else "-",
+            f"{min(ratios):.4f} … {max(ratios):.4f}" if ratios else "-",
+            style=style,
+        )
+    # A pipe or file has no width: wide enough that no column is cut.
+    console = Console(width=None if sys.stdout.isatty() else 120, soft_wrap=True, highlight=False)
+    console.print(table)
+    console.print(_excluded(report))
+    if report.checked and report.excluded > MANY_EXCLUDED * (report.checked + report.excluded):
+        console.print("note: many states were left out, so this speaks for the others only")
+    verdict = "ok" if report.max_rel_error <= tolerance else "past the tolerance"
+    console.print(f"largest relative error {report.max_rel_error:.1e}, tolerance {tolerance:.1e}: {verdict}")
+
+
+if __name__ == "__main__":
+    sys.exit(run(main))

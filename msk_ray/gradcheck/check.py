@@ -1,0 +1,229 @@
+"""Gradients of a Simulation against the float64 reference, state by state.
+
+Axes: W worlds of one kind of state, R = 2 nv + na rows, the tangent of (qpos', qvel', act').
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from msk_ray.errors import ConfigError
+from msk_ray.gradcheck.oracle import INPUTS, Array, Linearization, Oracle, Point
+from msk_ray.gradcheck.states import STATE_KINDS, make_states
+from msk_ray.simulation import Backward, Simulation
+from msk_ray.simulation.backward import StepState
+
+_VANISHING = 1e-9
+"""A reference gradient below this share of its cotangent is zero up to the rounding of the differences."""
+_STANDARD_GRAVITY = 9.81
+
+
+@dataclass(frozen=True)
+class Limits:
+    """When a state is left out of the comparison."""
+
+    step_disagreement: float = 1e-3
+    """Kink: the reference's two step sizes differ by more, relative; it may then itself be wrong by 1 % of that."""
+    side_disagreement: float = 1e-2
+    """Kink: the reference's one-sided differences differ by more, relative; 3e-3 is smooth, stiff contact."""
+    forward_mismatch: float = 3e-5
+    """Forward mismatch: Warp's results differ from C MuJoCo's by more, relative to the motion of the step.
+
+    Float32 alone gives up to 2e-5 on an ant in contact over 16 substeps; another contact frame 4e-5 to 1e-1.
+    """
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One input's gradient at one state."""
+
+    state: str
+    """Kind of state."""
+    world: int
+    """Which of that kind."""
+    input: str
+    """ctrl, qpos, qvel or act."""
+    rel_error: float
+    """‖g − g_ref‖ / ‖g_ref‖; where the reference vanishes, ‖g‖ / ‖cotangent‖. Infinite where g is not finite."""
+    cosine: float | None
+    """Of the angle between g and g_ref; None where either vanishes or is not finite."""
+    norm_ratio: float | None
+    """‖g‖ / ‖g_ref‖; None where the reference vanishes or g is not finite."""
+
+
+@dataclass
+class GradientReport:
+    """What a check found."""
+
+    mode: str
+    substeps: int
+    worlds: int
+    """States of each kind."""
+    results: list[Comparison] = field(default_factory=list)
+    kinks: int = 0
+    """States left out because the step is not differentiable there."""
+    forward_mismatches: int = 0
+    """States left out because Warp's own forward pass differs from C MuJoCo's there."""
+    checked: int = 0
+    """States compared."""
+    diagnostics: dict[str, float] = field(default_factory=dict)
+    """What the simulation and its backward mode report of themselves, the largest over the kinds of state."""
+
+    @property
+    def excluded(self) -> int:
+        """States left out."""
+        return self.kinks + self.forward_mismatches
+
+    @property
+    def max_rel_error(self) -> float:
+        """The largest relative error; infinite where nothing could be compared, so that it never passes."""
+        return max((r.rel_error for r in self.results), default=math.inf)
+
+    def of(self, name: str, state: str | None = None) -> list[Comparison]:
+        """Comparisons of one input, of one kind of state or all."""
+        return [r for r in self.results if r.input == name and state in (None, r.state)]
+
+
+def compare(gradient: Array, reference: Array, cotangent_norm: float) -> tuple[float, float | None, float | None]:
+    """(relative error, cosine, norm ratio) of a gradient."""
+    if not np.all(np.isfinite(gradient)):
+        return math.inf, None, None
+    norm, expected = float(np.linalg.norm(gradient)), float(np.linalg.norm(reference))
+    if expected <= _VANISHING * cotangent_norm:
+        return norm / cotangent_norm, None, None
+    error = float(np.linalg.norm(gradient - reference)) / expected
+    cosine = float(gradient @ reference) / (norm * expected) if norm > 0.0 else None
+    return error, cosine, norm / expected
+
+
+def forward_mismatch(oracle: Oracle, start: Point, expected: Point, actual: Point) -> float:
+    """How far a float32 step ends from the float64 one, relative to the motion of that step; infinite if not finite.
+
+    Positions are measured against their own change, velocities against the speeds before and after, both with a
+    floor of one env step of free fall; activations absolutely, they being of order one. Rounding of the state
+    itself, which no step can avoid, is subtracted from the positions' difference.
+    """
+    if not all(np.all(np.isfinite(v)) for v in (actual.qpos, actual.qvel, actual.act)):
+        return math.inf
+    nv = oracle.model.nv
+    error, motion = oracle.difference(expected, actual), oracle.difference(start, expected)
+    duration = oracle.model.opt.timestep * oracle.substeps
+    speed = float(np.linalg.norm(start.qvel) + np.linalg.norm(expected.qvel)) + duration * _STANDARD_GRAVITY
+    rounding = 8.0 * float(np.finfo(np.float32).eps) * float(np.linalg.norm(expected.qpos))
+    position = max(0.0, float(np.linalg.norm(error[:nv])) - rounding)
+    return max(
+        position / (float(np.linalg.norm(motion[:nv])) + duration * speed),
+        float(np.linalg.norm(error[nv : 2 * nv])) / speed,
+        float(np.max(np.abs(error[2 * nv :]), initial=0.0)),
+    )
+
+
+def _stack(sim: Simulation, points: Sequence[Point], name: str) -> Tensor:
+    rows = np.stack([getattr(point, name) for point in points])
+    return torch.as_tensor(rows, dtype=torch.float32, device=sim.device).requires_grad_()
+
+
+def _numpy(tensor: Tensor) -> Array:
+    return tensor.detach().cpu().numpy().astype(np.float64)
+
+
+def simulated_gradients(
+    sim: Simulation, points: Sequence[Point], cotangents: Array
+) -> tuple[list[Point], dict[str, Array]]:
+    """Results of one env step of `sim` from W points, and gradients of ⟨cotangent, results⟩ in tangent coordinates.
+
+    Args:
+        points: one a world.
+        cotangents: tangent cotangents of (qpos', qvel', act'), shape (W, R).
+
+    Returns:
+        The results, and by input the gradients, shape (W, columns of that input).
+    """
+    inputs = {name: _stack(sim, points, name) for name in INPUTS}
+    end = sim.step(**inputs)
+    weights = torch.as_tensor(cotangents, dtype=torch.float32, device=sim.device)
+    on_qpos, on_qvel, on_act = weights.split([sim.model.nv, sim.model.nv, sim.model.na], dim=1)
+    raw = StepState(sim.tangent.lift(end.qpos.detach(), on_qpos), on_qvel, on_act)
+    gradients = dict(zip(inputs, torch.autograd.grad(end, list(inputs.values()), list(raw)), strict=True))
+    gradients["qpos"] = sim.tangent.project(inputs["qpos"].detach(), gradients["qpos"])
+    arrays = [_numpy(value) for value in end]
+    ends = [Point(point.ctrl, *(array[w] for array in arrays)) for w, point in enumerate(points)]
+    return ends, {name: _numpy(value) for name, value in gradients.items()}
+
+
+def check_gradients(
+    model: mujoco.MjModel,
+    backward: Backward,
+    *,
+    substeps: int = 1,
+    states: Sequence[str] = ("standing", "random"),
+    worlds: int = 4,
+    seed: int = 0,
+    device: str = "cpu",
+    solver_tolerance: float | None = None,
+    limits: Limits | None = None,
+) -> GradientReport:
+    """Compare gradients of one env step by `backward` with float64 central differences of C MuJoCo.
+
+    Every state gets its own random normal cotangent on all of (qpos', qvel', act').
+
+    Args:
+        model: the compiled model.
+        backward: a mode that no Simulation uses yet.
+        substeps: physics steps an env step.
+        states: kinds of state, of `STATE_KINDS`.
+        worlds: states of each kind, W.
+        seed: of the states and cotangents.
+        device: where Warp runs.
+        solver_tolerance: Warp's solver tolerance, below mujoco_warp's floor of 1e-6 if wanted.
+        limits: what counts as a kink and as a forward mismatch.
+
+    Returns:
+        The comparisons; none where every state was excluded, which `max_rel_error` does not let pass.
+
+    Raises:
+        UnsupportedModelError: `backward` or mujoco_warp cannot treat the model.
+        ConfigError: unknown kind of state, or a model without degrees of freedom.
+        SimulationError: the model diverges in C MuJoCo.
+    """
+    unknown = [kind for kind in states if kind not in STATE_KINDS]
+    if unknown or not states:
+        raise ConfigError(f"unknown kinds of state {unknown}: write some of {', '.join(STATE_KINDS)}")
+    if model.nv == 0:
+        raise ConfigError("the model has no degrees of freedom, so there is no gradient to check")
+    sim = Simulation(model, worlds, substeps, backward, device, tolerance=solver_tolerance)
+    oracle, limits = Oracle(model, substeps), limits or Limits()
+    report = GradientReport(backward.name, substeps, worlds)
+    for kind in dict.fromkeys(states):
+        points = make_states(model, kind, worlds, seed)
+        rng = np.random.default_rng([seed, list(STATE_KINDS).index(kind), 1])
+        # Rounded, so that both sides pull the same numbers back.
+        cotangents = rng.standard_normal((worlds, 2 * model.nv + model.na)).astype(np.float32).astype(np.float64)
+        ends, gradients = simulated_gradients(sim, points, cotangents)
+        for name, figure in sim.diagnostics().items():  # raises if contacts were lost
+            report.diagnostics[name] = max(report.diagnostics.get(name, -math.inf), figure)
+        for world, (point, end) in enumerate(zip(points, ends, strict=True)):
+            reference = oracle.linearize(point)
+            if forward_mismatch(oracle, point, reference.end, end) > limits.forward_mismatch:
+                report.forward_mismatches += 1
+            elif reference.at_kink(limits.step_disagreement, limits.side_disagreement):
+                report.kinks += 1
+            else:
+                report.checked += 1
+                report.results += _comparisons(kind, world, reference, cotangents[world], gradients)
+    return report
+
+
+def _comparisons(
+    kind: str, world: int, reference: Linearization, cotangent: Array, gradients: dict[str, Array]
+) -> list[Comparison]:
+    norm = float(np.linalg.norm(cotangent))
+    return [
+        Comparison(kind, world, name, *compare(gradients[name][world], expected, norm))
+        for name, expected in reference.pull_back(cotangent).items()
+    ]

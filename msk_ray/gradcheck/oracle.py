@@ -1,0 +1,205 @@
+"""Derivatives of an env step by float64 central differences of C MuJoCo.
+
+Independent of everything it judges: no Warp, no torch, no adjoint, only `mj_step` called at perturbed inputs.
+
+Axes: R = 2 nv + na rows, the tangent of (qpos', qvel', act'); nu, nv, na as in MuJoCo.
+"""
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from msk_ray.errors import SimulationError
+
+Array = NDArray[np.float64]
+
+INPUTS = ("ctrl", "qpos", "qvel", "act")
+"""What a step is differentiated with respect to; qpos along tangent directions."""
+
+FINE_STEP, COARSE_STEP = 1e-6, 1e-5
+"""The two perturbations [each input's own unit].
+
+Above the rounding of float64 by enough that the fine one still has eight digits, and the coarse one wide enough to
+reach across a kink that float32 rounding of the state could cross.
+"""
+
+_DIVERGED = (
+    mujoco.mjtWarning.mjWARN_BADQPOS,
+    mujoco.mjtWarning.mjWARN_BADQVEL,
+    mujoco.mjtWarning.mjWARN_BADQACC,
+)
+
+
+@dataclass(frozen=True)
+class Point:
+    """The inputs of one env step, or with `ctrl` held, its results."""
+
+    ctrl: Array
+    """Controls, shape (nu,)."""
+    qpos: Array
+    """Generalised positions [m, rad, unit quaternions], shape (nq,)."""
+    qvel: Array
+    """Generalised velocities [m/s, rad/s], shape (nv,)."""
+    act: Array
+    """Actuator activations, shape (na,)."""
+
+
+@dataclass(frozen=True)
+class Linearization:
+    """An env step's results and its derivatives there."""
+
+    end: Point
+    """Results of the step."""
+    jacobian: Mapping[str, Array]
+    """Derivative of the tangent of (qpos', qvel', act') by each input, shape (R, columns of that input)."""
+    step_disagreement: Mapping[str, float]
+    """By input, ‖J(fine) − J(coarse)‖ / ‖J(fine)‖.
+
+    Up to 1e-4 where the step is smooth but sharply curved (impedances that change over a millimetre), which the
+    extrapolation to no perturbation takes out; far above on a kink.
+    """
+    side_disagreement: Mapping[str, float]
+    """By input, ‖J(forward) − J(backward)‖ / ‖J(fine)‖ of the fine one-sided differences.
+
+    Of order FINE_STEP times the curvature where the step is smooth, of order one on a kink. It sees the kink that
+    the two central differences agree about: the one that passes through the state itself.
+    """
+
+    def at_kink(self, step_limit: float, side_limit: float) -> bool:
+        """Whether the step is not differentiable here, within the reach of COARSE_STEP."""
+        # Written so that a NaN counts as a kink.
+        return not (
+            all(value <= step_limit for value in self.step_disagreement.values())
+            and all(value <= side_limit for value in self.side_disagreement.values())
+        )
+
+    def pull_back(self, cotangent: Array) -> dict[str, Array]:
+        """Gradients of ⟨cotangent, (qpos', qvel', act')⟩ by input, for a tangent cotangent of shape (R,)."""
+        return {name: block.T @ cotangent for name, block in self.jacobian.items()}
+
+
+def reference_model(model: mujoco.MjModel) -> mujoco.MjModel:
+    """A copy whose solver runs to float64 convergence and whose step depends on (ctrl, qpos, qvel, act) alone.
+
+    The constraint problem is convex with one optimum, so the solver, its warm start and its iteration limits may
+    change without changing the step that is meant.
+    """
+    reference = copy.copy(model)
+    option = reference.opt
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    option.tolerance = 1e-15
+    option.iterations = 200
+    option.ls_tolerance = 1e-12
+    option.ls_iterations = 200
+    # A warm start carries the solver's rounding from one evaluation into the next; an automatic reset would turn a
+    # divergence into a plausible state.
+    option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_WARMSTART | mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    return reference
+
+
+class Oracle:
+    """Env steps of C MuJoCo in float64 and their derivatives.
+
+    Args:
+        model: the compiled model; it is not changed.
+        substeps: calls of `mj_step` an env step, under one control.
+    """
+
+    def __init__(self, model: mujoco.MjModel, substeps: int) -> None:
+        self.model = reference_model(model)
+        self.substeps = substeps
+        self._data = mujoco.MjData(self.model)
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Columns of each input."""
+        return {"ctrl": self.model.nu, "qpos": self.model.nv, "qvel": self.model.nv, "act": self.model.na}
+
+    def step(self, point: Point) -> Point:
+        """One env step from `point`; a pure function.
+
+        Raises:
+            SimulationError: the state diverged.
+        """
+        data = self._data
+        data.time = 0.0
+        data.ctrl[:] = point.ctrl
+        data.qpos[:] = point.qpos
+        data.qvel[:] = point.qvel
+        data.act[:] = point.act
+        mujoco.mj_step(self.model, data, nstep=self.substeps)
+        if any(data.warning[kind].number for kind in _DIVERGED):
+            mujoco.mj_resetData(self.model, data)
+            raise SimulationError(
+                f"C MuJoCo diverged within {self.substeps} substeps: lower the model's timestep or take other states"
+            )
+        return Point(point.ctrl, data.qpos.copy(), data.qvel.copy(), data.act.copy())
+
+    def touching(self, point: Point) -> bool:
+        """Whether any contact at `point` carries a constraint."""
+        data = self._data
+        data.qpos[:] = point.qpos
+        mujoco.mj_fwdPosition(self.model, data)
+        return bool(np.any(data.contact.efc_address >= 0))
+
+    def displaced(self, point: Point, name: str, column: int, amount: float) -> Point:
+        """`point` with one input moved by `amount` along one coordinate, along a tangent direction for qpos."""
+        fields = {key: getattr(point, key).copy() for key in INPUTS}
+        if name == "qpos":
+            direction = np.zeros(self.model.nv)
+            direction[column] = 1.0
+            mujoco.mj_integratePos(self.model, fields["qpos"], direction, amount)
+        else:
+            fields[name][column] += amount
+        return Point(**fields)
+
+    def difference(self, start: Point, end: Point) -> Array:
+        """Tangent (R,) that leads from `start` to `end`; its qpos rows live in the tangent space at `start`."""
+        rotation = np.zeros(self.model.nv)
+        mujoco.mj_differentiatePos(self.model, rotation, 1.0, start.qpos, end.qpos)
+        return np.concatenate((rotation, end.qvel - start.qvel, end.act - start.act))
+
+    def linearize(self, point: Point) -> Linearization:
+        """Results and full Jacobian of one env step, by central differences of two step sizes, extrapolated.
+
+        Costs 1 + 4·(nu + 2 nv + na) env steps.
+
+        Raises:
+            SimulationError: the state, or one next to it, diverged.
+        """
+        end = self.step(point)
+        jacobian: dict[str, Array] = {}
+        steps: dict[str, float] = {}
+        sides: dict[str, float] = {}
+        for name, columns in self.sizes.items():
+            if columns == 0:
+                continue
+            forward, backward = self._one_sided(point, end, name, columns, FINE_STEP)
+            fine = (forward + backward) / 2.0
+            forward_coarse, backward_coarse = self._one_sided(point, end, name, columns, COARSE_STEP)
+            coarse = (forward_coarse + backward_coarse) / 2.0
+            scale = max(float(np.linalg.norm(fine)), np.finfo(float).tiny)
+            # Richardson: the error of a central difference goes with the square of its step, so this cancels it.
+            ratio = (COARSE_STEP / FINE_STEP) ** 2
+            jacobian[name] = fine + (fine - coarse) / (ratio - 1.0)
+            steps[name] = float(np.linalg.norm(fine - coarse)) / scale
+            sides[name] = float(np.linalg.norm(forward - backward)) / scale
+        return Linearization(end, jacobian, steps, sides)
+
+    def _one_sided(self, point: Point, end: Point, name: str, columns: int, amount: float) -> tuple[Array, Array]:
+        """Forward and backward difference quotients, each (R, columns)."""
+        forward, backward = (
+            np.stack(
+                [
+                    self.difference(end, self.step(self.displaced(point, name, column, signed))) / signed
+                    for column in range(columns)
+                ],
+                axis=1,
+            )
+            for signed in (amount, -amount)
+        )
+        return forward, backward

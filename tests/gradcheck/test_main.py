@@ -1,0 +1,108 @@
+"""The command: exit codes, JSON, one-line errors."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from msk_ray.cli import run
+from msk_ray.gradcheck.__main__ import main
+
+FAST = ["--worlds", "2", "--states", "random"]
+UNSUPPORTED = """
+<mujoco><worldbody>
+  <body mocap="true"/><body><joint/><geom size=".1"/></body>
+</worldbody></mujoco>"""
+
+
+def test_table_and_success(cartpole_file, capsys):
+    assert run(main, [str(cartpole_file), *FAST]) == 0
+    out = capsys.readouterr().out
+    for text in ("ctrl", "qpos", "qvel", "rel_error", "cosine", "norm_ratio", "0 of 2 states left out", "ok"):
+        assert text in out
+
+
+def test_mode_is_taken(cartpole_file, capsys):
+    assert run(main, [str(cartpole_file), *FAST, "--mode", "fd_jacobian", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["mode"] == "fd_jacobian"
+
+
+def test_past_tolerance(cartpole_file, capsys):
+    assert run(main, [str(cartpole_file), *FAST, "--tolerance", "1e-12"]) == 1
+    assert "past the tolerance" in capsys.readouterr().out
+
+
+def test_json(cartpole_file):
+    """In a process of its own: standard output must hold the object and nothing else."""
+    command = [sys.executable, "-m", "msk_ray.gradcheck", str(cartpole_file), *FAST, "--substeps", "4", "--json"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert (report["model"], report["mode"]) == (str(cartpole_file), "tape_per_substep")
+    assert (report["substeps"], report["worlds"], report["excluded"]) == (4, 2, 0)
+    assert len(report["results"]) == 2 * 3
+    for result in report["results"]:
+        assert result.keys() >= {"state", "input", "rel_error", "cosine", "norm_ratio"}
+        assert result["state"] == "random"
+        assert result["input"] in ("ctrl", "qpos", "qvel")
+    assert report["max_rel_error"] == max(r["rel_error"] for r in report["results"]) < 1e-2
+    assert report["unsupported"] == []
+
+
+def test_unsupported_model(tmp_path, capsys):
+    path = tmp_path / "mocap.xml"
+    path.write_text(UNSUPPORTED)
+    assert run(main, [str(path), "--json"]) == 2
+    captured = capsys.readouterr()
+    report = json.loads(captured.out)
+    assert report["results"] == []
+    assert report["max_rel_error"] is None
+    assert "mocap" in report["unsupported"][0]
+    assert captured.err.startswith("error: ")
+    assert captured.err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["--mode", "magic"], "fd_jacobian"),
+        (["--states", "flying"], "standing, random, contact, policy"),
+        (["--states", ","], "standing, random, contact, policy"),
+        (["--seed", "-1"], "--seed"),
+        (["--device", "abacus"], "abacus"),
+        ([*FAST, "--forward-tolerance", "1e-30"], "2 of 2 states"),
+    ],
+)
+def test_bad_input_is_one_line(cartpole_file, capsys, arguments, named):
+    assert run(main, [str(cartpole_file), *arguments]) == 2
+    err = capsys.readouterr().err
+    assert named in err
+    assert err.count("\n") == 1
+
+
+def test_bad_files(tmp_path, capsys):
+    assert run(main, [str(tmp_path / "none.xml")]) == 2
+    assert "no model file" in capsys.readouterr().err
+    broken = tmp_path / "broken.xml"
+    broken.write_text("<mujoco><worldbdy/></mujoco>")
+    assert run(main, [str(broken)]) == 2
+    err = capsys.readouterr().err
+    assert "worldbdy" in err
+    assert err.count("\n") == 1
+
+
+def test_numbers_are_checked_by_the_parser(cartpole_file, capsys):
+    for flag in ("--worlds", "--substeps", "--tolerance"):
+        with pytest.raises(SystemExit) as stop:
+            main([str(cartpole_file), flag, "0"])
+        assert stop.value.code == 2
+
+
+def test_help_has_examples(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["--help"])
+    assert stop.value.code == 0
+    out = capsys.readouterr().out
+    assert "examples:" in out
+    assert "--substeps 16" in out

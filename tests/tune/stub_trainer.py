@@ -1,0 +1,106 @@
+"""A trainer of milliseconds: its score rises towards a height set by the learning rate; some settings misbehave.
+
+Which way is chosen by `env.cart_position_penalty`: 1 kills its own process once, 2 gives NaN, 3 raises
+SimulationError, 4 raises an unforeseen error every time. Anything else trains.
+"""
+
+import hashlib
+import json
+import math
+import os
+import signal
+import time
+from collections.abc import Collection
+from pathlib import Path
+
+from msk_ray.config import Config, dump_yaml
+from msk_ray.errors import SimulationError
+
+KILL, NAN, SIMULATION_ERROR, BUG = 1.0, 2.0, 3.0, 4.0
+MISBEHAVE_AT = 5
+
+
+class StubTrainer:
+    """Same surface as `msk_ray.training.Trainer`."""
+
+    seconds_per_epoch = 0.02
+
+    def __init__(self, config: Config, logdir: Path, device: str) -> None:
+        self.config, self.logdir, self.device = config, logdir, device
+        self.epoch = 0
+        self.best_score = -math.inf
+        (logdir / "checkpoints").mkdir(parents=True, exist_ok=True)
+        (logdir / "config.yaml").write_text(dump_yaml(config.as_dict()))
+        self.behaviour = getattr(config.env, "cart_position_penalty", None)
+
+    @property
+    def finished(self) -> bool:
+        return self.epoch >= self.config.trial.epochs
+
+    def score(self) -> float:
+        """100 for a rate of 0.01, 50 for 0.001, 0 for 0.0001, approached over ten epochs."""
+        height = 100 + 50 * math.log10(self.config.shac.actor_lr / 0.01)
+        return height * (1 - math.exp(-self.epoch / 10))
+
+    def run_epoch(self) -> dict[str, float]:
+        time.sleep(self.seconds_per_epoch)
+        if self.epoch == 0:
+            self._write({**self._row(), "eval/score": 0.0})
+        self.epoch += 1
+        row = self._row()
+        if self.epoch == MISBEHAVE_AT:
+            self._misbehave(row)
+        if self.epoch % self.config.evaluation.interval == 0 or self.finished:
+            score = self.score()
+            row["eval/score"] = score
+            if score > self.best_score:
+                self.best_score = score
+                (self.logdir / "checkpoints" / "best.pt").write_text(str(score))
+            row["eval/best_score"] = self.best_score
+        self._write(row)
+        if self.epoch % self.config.trial.checkpoint_interval == 0 or self.finished:
+            self.save()
+        return row
+
+    def _row(self) -> dict[str, float]:
+        steps = 100 * self.epoch
+        return {"epoch": self.epoch, "env_steps": steps, "seconds": 0.02 * self.epoch, "env_steps_per_s": 5000.0}
+
+    def _misbehave(self, row: dict[str, float]) -> None:
+        marker = self.logdir / "died_once"
+        if self.behaviour == KILL and not marker.exists():
+            marker.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        if self.behaviour == NAN:
+            row["train/actor_loss"] = math.nan
+        if self.behaviour == SIMULATION_ERROR:
+            raise SimulationError("nonfinite_gradient: made up")
+        if self.behaviour == BUG:
+            raise RuntimeError("made up")
+
+    def _write(self, row: dict[str, float]) -> None:
+        bad = [key for key, value in row.items() if not math.isfinite(value)]
+        clean = {key: None if key in bad else value for key, value in row.items()}
+        with (self.logdir / "metrics.jsonl").open("a") as file:
+            file.write(json.dumps(clean | ({"nonfinite": bad} if bad else {})) + "\n")
+
+    def save(self) -> Path:
+        path = self.logdir / "checkpoints" / f"epoch_{self.epoch:06d}.pt"
+        payload = json.dumps({"epoch": self.epoch, "best_score": self.best_score}).encode()
+        path.write_bytes(payload)
+        path.with_suffix(".json").write_text(json.dumps({"sha256": hashlib.sha256(payload).hexdigest()}))
+        return path
+
+    def restore(self, path: Path, changed: Collection[str] = ()) -> None:
+        state = json.loads(path.read_bytes())
+        self.epoch, self.best_score = state["epoch"], state["best_score"]
+
+    def restore_latest(self) -> tuple[Path | None, list[str]]:
+        found = sorted((self.logdir / "checkpoints").glob("epoch_*.pt"))
+        if not found:
+            return None, []
+        self.restore(found[-1])
+        return found[-1], []
+
+    def close(self) -> None:
+        pass

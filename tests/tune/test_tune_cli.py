@@ -1,0 +1,99 @@
+"""The command line without Ray: dry runs, and refusals that cost one line and no work."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from msk_ray.cli import run
+from msk_ray.config import dump_yaml
+from msk_ray.tune.__main__ import main
+
+
+@pytest.fixture
+def space_file(tmp_path: Path, space_data: dict[str, Any]) -> Path:
+    path = tmp_path / "small.yaml"
+    path.write_text(dump_yaml(space_data))
+    return path
+
+
+def test_dry_run_prints_the_trials(space_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(main, ["--space", str(space_file), "--dry-run", "--seeds", "3-4", "--set", "trial.epochs=7"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    rows = [line.split() for line in lines if line[:1].isdigit() and "actor_lr" in line]
+    assert [(row[0], row[2], row[3], row[4]) for row in rows] == [
+        ("0", "actor_lr=0.01", "3", "7"),
+        ("1", "actor_lr=0.001", "3", "7"),
+        ("2", "actor_lr=0.01", "4", "7"),
+        ("3", "actor_lr=0.001", "4", "7"),
+    ]
+    assert lines[-1].startswith("4 trials · scheduler none")
+
+
+def test_dry_run_imports_neither_ray_nor_torch(space_file: Path, root: Path) -> None:
+    code = (
+        "import sys; from msk_ray.tune.__main__ import main; "
+        f"main(['--space', {str(space_file)!r}, '--dry-run', '--smoke']); "
+        "sys.exit(bool({'ray', 'torch'} & set(sys.modules)))"
+    )
+    result = subprocess.run([sys.executable, "-c", code], cwd=root, env={**os.environ, "PYTHONPATH": str(root)})
+    assert result.returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--space", "ant_abate"], "unknown space 'ant_abate'; known: ant_ablate"),
+        (["--space", "nowhere/x.yaml"], "no such space file"),
+        (["--space", "SPACE", "--set", "shac.gama=1"], "did you mean 'gamma'"),
+        (["--space", "SPACE", "--set", "shac.gamma"], "write key=value"),
+        (["--space", "SPACE", "--set", "shac.gamma=2"], "less than or equal to 1"),
+        (["--space", "SPACE", "--set", "shac.actor_lr=1"], "the space varies it"),
+        (["--space", "SPACE", "--set", "physics.timestep=0.005"], "does not divide"),
+        (["--space", "SPACE", "--seeds", "x"], "whole numbers such as 0-4"),
+        (["--space", "SPACE", "--max-concurrent", "0"], "at least 1"),
+        (["--space", "SPACE", "--debug-trial", "7"], "no trial '7'"),
+        (["--space", "SPACE", "--name", "a/b"], "letters, digits"),
+        (["--space", "SPACE", "--resume"], "no experiment at"),
+        (["--space", "SPACE", "--retry-errored"], "goes with --resume"),
+        (["--space", "SPACE", "--gpus-per-trial", "1", "--cpu"], "exclude each other"),
+        (["--space", "SPACE", "--storage", "/proc/x"], "cannot write to"),
+    ],
+)
+def test_malformed_input_is_one_line_and_exit_2(
+    arguments: list[str],
+    message: str,
+    space_file: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    assert run(main, [str(space_file) if a == "SPACE" else a for a in arguments]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert message in error
+    assert error.count("\n") == 1
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_one_gpu_a_trial_without_gpu(
+    space_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("msk_ray.tune.devices.local_gpus", lambda: 0)
+    assert run(main, ["--space", str(space_file), "--gpus-per-trial", "1"]) == 2
+    assert capsys.readouterr().err == "error: --gpus-per-trial 1: no GPU here; pass --cpu to run on CPUs\n"
+    assert not (tmp_path / "runs").exists()
+
+
+def test_help_teaches_with_examples(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    text = capsys.readouterr().out
+    assert text.count("python -m msk_ray.tune --space") >= 6
+    assert "exit codes" in text

@@ -1,0 +1,138 @@
+"""Real Ray, a trainer of milliseconds: stopping, faults, pausing and resuming."""
+
+import json
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import stub_trainer
+from ray import cloudpickle
+from stub_trainer import BUG, KILL, NAN, SIMULATION_ERROR, StubTrainer
+
+from msk_ray.config import read_yaml
+from msk_ray.tune import experiment as experiments
+from msk_ray.tune import runner
+from msk_ray.tune.devices import Placement
+from msk_ray.tune.records import TrialRecord, read_records, read_rows
+from msk_ray.tune.report import finish
+from msk_ray.tune.space import Space
+from msk_ray.tune.trials import resolve_trials
+
+
+@pytest.fixture(scope="module", autouse=True)
+def session() -> Iterator[None]:
+    """One Ray for all tests here."""
+    cloudpickle.register_pickle_by_value(stub_trainer)
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)}
+    with runner.ray_session(None, dashboard=False):
+        yield
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+def go(space: Space, path: Path, resume: bool = False) -> tuple[bool, list[TrialRecord]]:
+    trials = [] if space.file.search == "optuna" else resolve_trials(space)
+    experiment = experiments.reopen(path, trials) if resume else experiments.create(path, space, trials, {})
+    plan = runner.Plan(experiment, space, trials, Placement(0.0, 1), None, StubTrainer, precompile=None)
+    completed = runner.run_trials(plan)
+    finish(experiment)
+    return completed, read_records(experiment)
+
+
+def outcomes(records: list[TrialRecord]) -> list[str | None]:
+    return [record.ending and str(record.ending.outcome) for record in records]
+
+
+def test_faults_are_named_and_a_killed_trial_goes_on(
+    make_space: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    behaviours = [0.0, KILL, NAN, SIMULATION_ERROR, BUG]
+    space = make_space(parameters={"env.cart_position_penalty": {"grid": behaviours}}, resources={"max_failures": 1})
+    completed, records = go(space, tmp_path / "runs" / "faults")
+    assert completed
+    assert outcomes(records) == ["finished", "finished", "nonfinite", "nonfinite", "error"]
+    assert [record.epochs_done for record in records] == [20, 20, 5, 4, 4]
+    assert "train/actor_loss is nan at epoch 5" in records[2].ending.why  # type: ignore[union-attr]
+    assert records[4].ending.why == "RuntimeError: made up"  # type: ignore[union-attr]
+    shown = capsys.readouterr()
+    assert "its process died (killed, or out of memory); trying again" in shown.out
+    assert "raylet" not in shown.out + shown.err  # Ray's own notices are in ray.log
+    # The killed trial has every epoch once, with the scores of the one that was left alone.
+    scores = [[row["eval/score"] for row in read_rows(r.folder) if "eval/score" in row] for r in records[:2]]
+    assert scores[0] == scores[1]
+    assert len(scores[0]) == 11
+    facts = json.loads((tmp_path / "runs" / "faults" / "summary.json").read_text())
+    assert [trial["outcome"] for trial in facts["trials"]] == outcomes(records)
+    for name in ("table.md", "curves.png", "env.json", "manifest.json"):
+        assert (tmp_path / "runs" / "faults" / name).is_file()
+
+
+def test_asha_stops_the_bad_ones_and_a_stop_request_is_resumable(
+    make_space: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    space = make_space(
+        parameters={"shac.actor_lr": {"grid": [1e-2, 3e-3, 3e-4, 2e-4]}},
+        scheduler={"kind": "asha", "grace": 0.2, "reduction": 2},
+        overrides={"trial.epochs": 60},
+    )
+    path = tmp_path / "runs" / "asha"
+    timer = threading.Thread(target=_terminate_when, args=(path,))
+    timer.start()
+    completed, records = go(space, path)
+    timer.join()
+    assert not completed
+    assert None in outcomes(records)
+    completed, records = go(space, path, resume=True)
+    assert completed
+    assert outcomes(records)[0] == "finished"
+    assert "stopped_asha" in outcomes(records)
+    stopped = next(record for record in records if str(record.ending and record.ending.outcome) == "stopped_asha")
+    assert stopped.epochs_done < 60
+    assert read_rows(records[0].folder)[-1]["epoch"] == 60
+    assert "SIGTERM: " in capsys.readouterr().out
+    assert go(space, path, resume=True)[0]  # nothing left to do
+
+
+def test_population_stays_in_its_range(make_space: Any, tmp_path: Path) -> None:
+    space = make_space(
+        parameters={"shac.actor_lr": {"loguniform": [1e-4, 1e-2]}},
+        samples=2,
+        scheduler={"kind": "pbt", "interval": 0.3, "quantile": 0.5},
+        overrides={"evaluation.interval": 6, "trial.epochs": 18},
+    )
+    completed, records = go(space, tmp_path / "runs" / "pbt")
+    assert completed
+    assert outcomes(records) == ["finished"] * 2
+    before = [record.trial.config.shac.actor_lr for record in records]
+    after = [read_yaml(record.folder / "config.yaml")["shac"]["actor_lr"] for record in records]
+    assert before != after  # the worse one moved
+    assert all(1e-4 <= rate <= 1e-2 for rate in after)
+
+
+def test_optuna_trials_enter_the_manifest(make_space: Any, tmp_path: Path) -> None:
+    pytest.importorskip("optuna")
+    space = make_space(
+        parameters={"shac.actor_lr": {"loguniform": [1e-3, 1e-2]}, "shac.horizon": {"choice": [8, 16]}},
+        samples=3,
+        search="optuna",
+        overrides={"trial.epochs": 4},
+    )
+    completed, records = go(space, tmp_path / "runs" / "optuna")
+    assert completed
+    assert len(records) >= 2
+    assert set(outcomes(records)) == {"finished"}
+
+
+def _terminate_when(path: Path) -> None:
+    """SIGTERM to this process once a trial has begun to train."""
+    deadline = time.monotonic() + 60
+    while not list(path.glob("trials/*/checkpoints/epoch_000004.pt")):
+        if time.monotonic() > deadline:
+            return
+        time.sleep(0.05)
+    os.kill(os.getpid(), signal.SIGTERM)

@@ -1,0 +1,139 @@
+"""Records, tables, curves and the experiment's folder."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from msk_ray.errors import ConfigError, DeviceError, StorageError
+from msk_ray.tune import experiment as experiments
+from msk_ray.tune.curves import draw_curves
+from msk_ray.tune.devices import Placement, choose_placement
+from msk_ray.tune.listing import text_table
+from msk_ray.tune.outcomes import Ending, Outcome, read_ending, write_ending
+from msk_ray.tune.records import best_record, read_record
+from msk_ray.tune.space import ResourcesSpec
+from msk_ray.tune.table import markdown, outcome_name, result_rows, summary, table_document, variant_rows
+from msk_ray.tune.trials import resolve_trials
+
+
+def fill(experiment: experiments.Experiment, trial_id: str, scores: list[float | None], ending: Ending | None) -> None:
+    """Metrics with an evaluation every second epoch, one of them written twice."""
+    folder = experiment.trial_folder(trial_id)
+    (folder / "checkpoints").mkdir(parents=True)
+    (folder / "checkpoints" / "best.pt").touch()
+    rows: list[dict[str, Any]] = []
+    for i, score in enumerate(scores):
+        row: dict[str, Any] = {"epoch": 2 * i, "env_steps": 200 * i, "seconds": 1.0 * i, "eval/score": score}
+        rows.append(row | ({"nonfinite": ["eval/score"]} if score is None else {}))
+    text = "".join(json.dumps(row) + "\n" for row in [*rows, rows[-1]])
+    (folder / "metrics.jsonl").write_text(text + '{"epoch": 9')  # torn in the middle of a row
+    if ending is not None:
+        write_ending(folder, ending)
+
+
+@pytest.fixture
+def experiment(make_space: Any, tmp_path: Path) -> experiments.Experiment:
+    """Two rates, two seeds: finished, stopped, NaN, and never started."""
+    space = make_space(seeds="0-1")
+    trials = resolve_trials(space)
+    made = experiments.create(tmp_path / "runs" / "e", space, trials, {})
+    fill(made, trials[0].id, [0.0, 5.0, 4.0], Ending(Outcome.FINISHED, "all done"))
+    fill(made, trials[1].id, [0.0, 1.0], Ending(Outcome.STOPPED_ASHA, "number 2 of 2 | rung"))
+    fill(made, trials[2].id, [0.0, 7.0, None], Ending(Outcome.NONFINITE, "score is nan"))
+    return made
+
+
+def test_records_and_tables(experiment: experiments.Experiment, tmp_path: Path) -> None:
+    records = [read_record(t, experiment.trial_folder(t.id)) for t in experiment.trials()]
+    assert [len(r.evaluations) for r in records] == [3, 2, 3, 0]
+    assert [outcome_name(r) for r in records] == ["finished", "stopped_asha", "nonfinite", "waiting"]
+    best = best_record(records)
+    assert best is records[2]
+    rows = result_rows(records)
+    assert [row[3] for row in rows] == ["7", "5", "1", "-"]
+    assert rows[1][1:7] == ("actor_lr=0.01", "0", "5", "2", "4/20", "finished")
+    # Rate 0.01: best scores 5 and 7, mean 6, deviation √2.
+    assert variant_rows(records)[0] == ("actor_lr=0.01", "2", "6", "1.414", "5", "7")
+    document = table_document("e", "Which?", records)
+    assert "number 2 of 2 \\| rung" in document
+    assert f"trials/{records[2].trial.id}/checkpoints/best.pt" in document
+    facts = json.loads(json.dumps(summary("e", "Which?", records), allow_nan=False))
+    assert facts["best"]["id"] == records[2].trial.id
+    draw_curves(records, tmp_path / "curves.png", "e")
+    assert (tmp_path / "curves.png").stat().st_size > 10_000
+    draw_curves([], tmp_path / "empty.png", "nothing")
+
+
+def test_an_existing_experiment_is_refused_and_a_changed_space_named(
+    experiment: experiments.Experiment, make_space: Any
+) -> None:
+    space = make_space(seeds="0-1")
+    with pytest.raises(StorageError, match="holds an experiment already: add --resume"):
+        experiments.create(experiment.path, space, [], {})
+    experiments.reopen(experiment.path, resolve_trials(space))
+    edited = make_space(seeds="0-1", overrides={"shac.gamma": 0.5})
+    with pytest.raises(StorageError, match=r"trial 0 changed: shac.gamma 0.99 → 0.5"):
+        experiments.reopen(experiment.path, resolve_trials(edited))
+    with pytest.raises(StorageError, match=r"2 gone \(actor_lr=0.01 seed 1"):
+        experiments.reopen(experiment.path, resolve_trials(make_space()))
+    with pytest.raises(StorageError, match="no experiment at"):
+        experiments.reopen(experiment.path.with_name("other"), [])
+
+
+def test_errored_trials_can_be_tried_again(experiment: experiments.Experiment) -> None:
+    folders = [experiment.trial_folder(trial.id) for trial in experiment.trials()]
+    write_ending(folders[0], Ending(Outcome.ERROR, "died"))
+    experiment.clear_endings({Outcome.ERROR})
+    assert [read_ending(folder) is None for folder in folders] == [True, False, False, True]
+
+
+def test_space_is_kept_as_written(experiment: experiments.Experiment) -> None:
+    assert "actor_lr" in (experiment.path / "space.yaml").read_text()
+    environment = json.loads((experiment.path / "env.json").read_text())
+    assert environment["packages"]["ray"]
+
+
+def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(StorageError, match="cannot write to"):
+        experiments.check_writable(tmp_path / "file" / "runs")
+    with pytest.raises(StorageError, match="letters, digits"):
+        experiments.check_name("../x")
+
+
+def test_endings_round_trip(tmp_path: Path) -> None:
+    assert read_ending(tmp_path) is None
+    write_ending(tmp_path, Ending(Outcome.WALL_TIME, "60 s"))
+    assert read_ending(tmp_path) == Ending(Outcome.WALL_TIME, "60 s")
+    assert [path.name for path in tmp_path.iterdir()] == ["outcome.json"]
+
+
+def test_placement() -> None:
+    resources = ResourcesSpec()
+    assert choose_placement(resources, None, cpu=False, gpus=0) == Placement(0.0, 1)
+    assert choose_placement(resources, None, cpu=True, gpus=4) == Placement(0.0, 1)
+    assert choose_placement(resources, 0.5, cpu=False, gpus=1).device == "cuda:0"
+    with pytest.raises(DeviceError, match="no GPU here; pass --cpu"):
+        choose_placement(resources, 1.0, cpu=False, gpus=0)
+    with pytest.raises(DeviceError, match="4 GPUs a trial asked for, 2 here"):
+        choose_placement(resources, 4.0, cpu=False, gpus=2)
+    for wrong in (0.0, -1.0, 1.5):
+        with pytest.raises(ConfigError, match="write 1, 2"):
+            choose_placement(resources, wrong, cpu=False, gpus=4)
+    with pytest.raises(ConfigError, match="exclude"):
+        choose_placement(resources, 1.0, cpu=True, gpus=4)
+
+
+def test_concurrent_trials() -> None:
+    assert Placement(0.0, 1).concurrent(0, 2, None) == 2
+    assert Placement(1.0, 1).concurrent(4, 64, None) == 4
+    assert Placement(0.4, 1).concurrent(2, 64, None) == 4  # two on each GPU; 0.2 of each is left over
+    assert Placement(1.0, 1).concurrent(4, 64, 3) == 3
+
+
+def test_text_table_cuts_the_end_only() -> None:
+    text = text_table(("id", "why"), [("a1", "x" * 50)], width=20)
+    assert text.splitlines()[2] == "a1  " + "x" * 15 + "…"
+    assert markdown(("a",), [("1|2",)]) == "| a |\n| --- |\n| 1\\|2 |\n"
