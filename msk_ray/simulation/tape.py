@@ -23,7 +23,7 @@ from msk_ray.simulation.residual import ResidualGauge
 
 # Arrays of mujoco_warp.Data that the adjoint of a substep reads, besides the checkpointed state.
 _KEPT_DATA = (
-    *("cdof", "cdof_dot", "cvel", "cinert", "M", "nefc", "nacon", "subtree_com", "xipos", "xpos", "xmat"),
+    *("cdof", "cdof_dot", "cvel", "cinert", "M", "nefc", "nacon", "subtree_com", "xipos", "xpos", "xquat", "xmat"),
     *("geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "ten_J", "ten_length", "ten_velocity", "act_dot"),
     *("actuator_velocity", "actuator_force"),
     *("actuator_length", "moment_rownnz", "moment_rowadr", "moment_colind", "actuator_moment", "qfrc_actuator"),

@@ -124,6 +124,12 @@ SCENES = {
     "connect_sites": lambda: scene(
         '<equality><connect site1="s4" site2="s1" solref=".1 1"/><joint joint1="a" polycoef=".1 0 0 0 0"/></equality>'
     ),
+    "weld_world": lambda: scene('<equality><weld body1="hand" solref=".1 1" solimp=".5 .9 .6 .5 2"/></equality>'),
+    "weld_bodies": lambda: scene(
+        '<equality><weld body1="other" body2="hand" anchor=".1 .02 .03" relpose=".1 .2 -.3 .8 .3 .2 .4" torquescale=".3" '
+        'solref=".1 1"/></equality>'
+    ),
+    "weld_sites": lambda: scene('<equality><weld site1="s4" site2="s5" solref=".1 1" torquescale="2"/></equality>'),
     "equality_tendon": lambda: scene(
         f"<tendon>{_FIXED.format('')}{_FIXED2}{_PATH_P}"
         '</tendon><equality><tendon tendon1="t" tendon2="t2" polycoef=".1 .5 .2 0 0"/><tendon tendon1="p"/>'

@@ -28,11 +28,6 @@ def test_own_models_are_covered():
         ('<option integrator="RK4"/><worldbody><body><joint/><geom size=".1"/></body></worldbody>', "RK4"),
         ('<option density="1.2"/><worldbody><body><joint/><geom size=".1"/></body></worldbody>', "fluid"),
         (
-            '<worldbody><body name="b"><joint/><geom size=".1"/></body></worldbody>'
-            '<equality><weld name="pin" body1="b"/></equality>',
-            "equality pin",
-        ),
-        (
             '<option integrator="implicitfast"/><worldbody><body name="ball"><freejoint/><geom size=".1"/></body>'
             "</worldbody>",
             "body ball",

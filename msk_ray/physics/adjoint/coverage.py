@@ -324,12 +324,11 @@ FEATURES: tuple[Feature, ...] = (
     Feature("implicitfast with a free body that has no other joints", False, _lone_free_bodies),
     Feature("joint and tendon equalities", True, _equality(_EQ.mjEQ_JOINT, _EQ.mjEQ_TENDON)),
     Feature(
-        "connect equalities",
+        "connect and weld equalities",
         True,
-        _equality(_EQ.mjEQ_CONNECT),
+        _equality(_EQ.mjEQ_CONNECT, _EQ.mjEQ_WELD),
         "the velocity stage runs once more before each substep, which mujoco_warp 4.0.0 leaves a step behind here",
     ),
-    Feature("weld equalities", False, _equality(_EQ.mjEQ_WELD)),
     Feature(
         "flex equalities",
         False,

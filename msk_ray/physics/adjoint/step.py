@@ -69,7 +69,9 @@ class StepAdjoint:
         )
         self._implicit_all = mjm.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         self._spring_on = not disabled & bit.mjDSBL_SPRING
-        self._has_connects = bool(np.any(mjm.eq_type == int(mujoco.mjtEq.mjEQ_CONNECT)))
+        self._has_anchors = bool(
+            np.any(np.isin(mjm.eq_type, [int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)]))
+        )
         types = {(int(mjm.geom_type[a]), int(mjm.geom_type[b])) for a, b in colliding_pairs(mjm)}
         self._scored_pairs = bool(types & geometry.SCORED_PAIRS)
         self._elliptic = mjm.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
@@ -360,9 +362,9 @@ class StepAdjoint:
 
     def _pull_rows(self, d: Any, jacobian: wp.array) -> None:
         m = self.model
-        if self._has_connects:
+        if self._has_anchors:
             wp.launch(
-                equality.pull_connects,
+                equality.pull_anchors,
                 dim=(self.nworld, self._njmax),
                 inputs=[
                     m.opt.timestep,
@@ -376,12 +378,14 @@ class StepAdjoint:
                     m.eq_solref,
                     m.eq_solimp,
                     m.eq_data,
+                    m.site_quat,
                     d.nefc,
                     d.efc.type,
                     d.efc.id,
                     self._slope,
                     self._force,
                     d.xpos,
+                    d.xquat,
                     d.xmat,
                     d.site_xpos,
                     d.subtree_com,
