@@ -126,8 +126,8 @@ SCENES = {
     ),
     "weld_world": lambda: scene('<equality><weld body1="hand" solref=".1 1" solimp=".5 .9 .6 .5 2"/></equality>'),
     "weld_bodies": lambda: scene(
-        '<equality><weld body1="other" body2="hand" anchor=".1 .02 .03" relpose=".1 .2 -.3 .8 .3 .2 .4" torquescale=".3" '
-        'solref=".1 1"/></equality>'
+        '<equality><weld body1="other" body2="hand" anchor=".1 .02 .03" relpose=".1 .2 -.3 .8 .3 .2 .4" '
+        'torquescale=".3" solref=".1 1"/></equality>'
     ),
     "weld_sites": lambda: scene('<equality><weld site1="s4" site2="s5" solref=".1 1" torquescale="2"/></equality>'),
     "equality_tendon": lambda: scene(

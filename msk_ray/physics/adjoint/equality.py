@@ -3,8 +3,8 @@
 A connect's rows are the world components of the relative motion of two anchors, 1 minus 2. Unlike contacts their
 reference holds the whole acceleration of the anchors, so jar = acc₁ - acc₂ + b (u₁ - u₂) + k imp (p₁ - p₂) with
 acc = A + α × r + ω × u(p), the acceleration of a body-fixed point; gravity, in A of every body, drops out.
-A weld adds three rows for ts·vec(Q), Q = q₂* q₁ the relative orientation and ts its torque scale, whose first and second
-rates come from both bodies' spins and angular accelerations; `turn_score` holds them and is differentiated as it is.
+A weld adds three rows for ts·vec(Q), Q = q₂* q₁ the relative orientation and ts its torque scale, whose two rates come
+from both bodies' spins and angular accelerations; `turn_score` holds them and is differentiated as it is.
 """
 
 import warp as wp
