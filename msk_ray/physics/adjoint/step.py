@@ -233,7 +233,7 @@ class StepAdjoint(ForcePullbacks):
         product(d.qacc, 1.0)
         solve_two(self._implicit, self._rhs, self._push, [self._mu, self._excess])
         product(self._mu, -1.0)
-        solve_two(self._hessian, self._push, self._push, [self._lam, self._lam])
+        solve_two(self._hessian, self._push, self._push, [self._lam, self._push])
 
     def _fields(self, d: Any) -> None:
         m = self.model
