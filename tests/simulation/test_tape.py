@@ -6,6 +6,7 @@ import pytest
 import torch
 from oracle import INPUTS, Point, differences, relative, rollout, simulate
 from scenes import ant, ant_points, cartpole, random_weights
+from test_adjoint_features import SCENES, random_points
 
 from msk_ray.errors import UnsupportedModelError
 from msk_ray.simulation import FdJacobian, Simulation
@@ -65,6 +66,17 @@ def test_both_tapes_give_the_same_gradient():
     _, other, _ = simulate(model, TapeAll(), points, 8, weights)
     for name in INPUTS:
         assert relative(one[name], other[name]) < 1e-6
+
+
+@pytest.mark.parametrize("name", ["fast_muscle", "weld_sites", "pulley", "site", "sparse", "joint_force_limit"])
+def test_both_tapes_agree_on_other_features(name):
+    model = SCENES[name]()
+    points = random_points(model, 3, seed=9)
+    weights = random_weights(model, 3, 5)
+    _, one, _ = simulate(model, TapePerSubstep(), points, 4, weights)
+    _, other, _ = simulate(model, TapeAll(), points, 4, weights)
+    for key in INPUTS:
+        assert relative(one[key], other[key]) < 1e-6
 
 
 def test_worlds_do_not_touch_each_other():
