@@ -80,9 +80,40 @@ def biped() -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_string(f"{head}{trunk}<actuator>{motors}</actuator></mujoco>")
 
 
+def muscle_arms(arms: int = 4) -> mujoco.MjModel:
+    """Two-joint arms of six muscles each, half of them wrapped around the elbow: nv 3 and nu 6 an arm."""
+    bodies, tendons, muscles = "", "", ""
+    for k in range(arms):
+        bodies += f"""<body pos="0 {0.5 * k} 1"><joint axis="0 1 0" range="-90 90"/><joint axis="1 0 0" range="-60 60"/>
+        <geom type="capsule" size=".04" fromto="0 0 0 .3 0 0"/>
+        <geom name="elbow{k}" type="cylinder" size=".045 .05" pos=".3 0 0" euler="90 0 0" density="1"/>
+        <site name="a{k}" pos=".05 0 .06"/><site name="b{k}" pos=".05 0 -.06"/><site name="side{k}" pos=".3 0 .1"/>
+        <body pos=".3 0 0"><joint axis="0 1 0" range="-120 120"/>
+        <geom type="capsule" size=".03" fromto="0 0 0 .3 0 0"/><site name="c{k}" pos=".1 0 .04"/>
+        <site name="d{k}" pos=".1 0 -.04"/></body></body><site name="e{k}" pos="0 {0.5 * k} 1.1"/>
+        <site name="f{k}" pos="0 {0.5 * k} .9"/>"""
+        paths = [
+            (f"a{k}", f"c{k}", f'<geom geom="elbow{k}" sidesite="side{k}"/>'),
+            (f"b{k}", f"d{k}", ""),
+            (f"e{k}", f"a{k}", ""),
+            (f"f{k}", f"b{k}", ""),
+            (f"e{k}", f"c{k}", f'<geom geom="elbow{k}" sidesite="side{k}"/>'),
+            (f"f{k}", f"d{k}", f'<geom geom="elbow{k}"/>'),
+        ]
+        for i, (start, end, geom) in enumerate(paths):
+            name = f"m{k}_{i}"
+            tendons += f'<spatial name="{name}"><site site="{start}"/>{geom}<site site="{end}"/></spatial>'
+            muscles += f'<muscle tendon="{name}" force="300" range=".7 1.2" lengthrange=".05 .5" tausmooth=".2"/>'
+    text = _HEAD.format(timestep=0.002, cone="elliptic", damping=0.3)
+    return mujoco.MjModel.from_xml_string(
+        f"{text}{bodies}</worldbody><tendon>{tendons}</tendon><actuator>{muscles}</actuator></mujoco>"
+    )
+
+
 MODELS: dict[str, Callable[[], mujoco.MjModel]] = {
     "cartpole": cartpole,
     "ant": ant,
     "ant_elliptic": lambda: ant("elliptic"),
     "biped": biped,
+    "muscle_arms": muscle_arms,
 }

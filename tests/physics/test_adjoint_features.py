@@ -131,6 +131,23 @@ SCENES = {
         option=_FAST,
     ),
     "fast_muscle": lambda: _tendon(_SPHERE.format('sidesite="side"'), _MUSCLE, option=_FAST),
+    "ball_servo": lambda: scene('<actuator><position joint="turn" gear="1 .5 -.3" kp="5" kv=".5"/></actuator>'),
+    "ball_in_parent": lambda: scene(
+        '<actuator><general jointinparent="turn" gear="1 .5 -.3" gainprm="2" biastype="affine" biasprm="0 -5 -.5"/>'
+        "</actuator>"
+    ),
+    "free_motor": lambda: scene(
+        '<actuator><motor joint="f" gear="1 2 -1 .5 .3 .2"/>'
+        '<motor jointinparent="f" gear="1 2 -1 .5 .3 .2"/></actuator>',
+        world='<body pos="1 0 1"><freejoint name="f"/><geom type="box" size=".1 .2 .3"/></body>',
+    ),
+    "site": lambda: scene(
+        '<actuator><general site="s4" gear="3 1 -2 .1 .2 -.3" biastype="affine" biasprm="1 0 -.4"/></actuator>'
+    ),
+    "fast_site": lambda: scene(
+        '<actuator><general site="s4" gear="3 1 -2 .1 .2 -.3" biastype="affine" biasprm="1 0 -.4"/></actuator>',
+        option=_FAST,
+    ),
     "sparse": lambda: _tendon(_FIXED.format('range="-.1 .1"'), _SERVO, option='jacobian="sparse"'),
 }
 

@@ -278,6 +278,8 @@ def pull_actuators(
         wp.atomic_add(ten_mu_bar_out, worldid, t, gear * rate_bar[2])
         wp.atomic_add(ten_smooth_bar_out, worldid, t, gear * rate_bar[3])
         return
+    if kind == TrnType.SITE:
+        return
     # Length is the integral of the moment for hinges and slides; where it is not, `transmission` does it.
     straight = bool(False)
     if kind == TrnType.JOINT or kind == TrnType.JOINTINPARENT:

@@ -31,10 +31,12 @@ class Feature:
     """Names of the elements of a model that use it."""
     note: str = ""
     """What is approximated or assumed."""
+    partly: bool = False
+    """Whether some slopes are approximated, as the note says."""
 
 
 def _named(model: mujoco.MjModel, kind: mujoco.mjtObj, word: str, ids: Iterable[int]) -> list[str]:
-    return [f"{word} {mujoco.mj_id2name(model, kind, int(i)) or int(i)!r}" for i in ids]
+    return [f"{word} {mujoco.mj_id2name(model, kind, int(i)) or int(i)}" for i in ids]
 
 
 def _among(values: np.ndarray, kinds: Iterable[int]) -> np.ndarray:
@@ -76,6 +78,13 @@ def _joint_transmission(*kinds: int) -> Finder:
         on_joint = _among(m.actuator_trntype, (_TRN.mjTRN_JOINT, _TRN.mjTRN_JOINTINPARENT))
         joint = np.clip(m.actuator_trnid[:, 0], 0, max(m.njnt - 1, 0))
         return on_joint & _among(m.jnt_type[joint], kinds) if m.njnt else on_joint
+
+    return _where(_OBJ.mjOBJ_ACTUATOR, "actuator", test)
+
+
+def _site_transmission(referred: bool) -> Finder:
+    def test(m: mujoco.MjModel) -> np.ndarray:
+        return np.asarray((m.actuator_trntype == int(_TRN.mjTRN_SITE)) & ((m.actuator_trnid[:, 1] >= 0) == referred))
 
     return _where(_OBJ.mjOBJ_ACTUATOR, "actuator", test)
 
@@ -211,6 +220,13 @@ def _pairs(kinds: set[tuple[int, int]] | None, known: set[tuple[int, int]]) -> F
     return find
 
 
+def _odd_flags(m: mujoco.MjModel) -> list[str]:
+    """Enabled flags that change constraints in ways the adjoint does not follow."""
+    flags = mujoco.mjtEnableBit
+    names = ("DIAGEXACT", "SPECULATIVE", "IPC")
+    return [f"flag {n.lower()}" for n in names if m.opt.enableflags & int(getattr(flags, f"mjENBL_{n}", 0))]
+
+
 def _odd_surfaces(m: mujoco.MjModel) -> list[str]:
     found: set[int] = set()
     for field in ("geom_adhesion", "geom_surfacevel"):
@@ -278,9 +294,7 @@ FEATURES: tuple[Feature, ...] = (
         False,
         _option(lambda m: bool(m.opt.density or m.opt.viscosity or np.any(m.opt.wind)), "option density or viscosity"),
     ),
-    Feature(
-        "contacts, pyramidal and elliptic cones, condim 1, 3, 4, 6", True, _option(lambda m: m.ngeom > 1, "geoms")
-    ),
+    Feature("contacts, pyramidal and elliptic cones, condim 1, 3, 4, 6", True, _option(lambda m: m.ngeom > 1, "geoms")),
     Feature(
         "contact of a plane with sphere, capsule, ellipsoid, cylinder, box, mesh; sphere with sphere, capsule, "
         "cylinder, box; capsule with capsule",
@@ -291,7 +305,8 @@ FEATURES: tuple[Feature, ...] = (
         "contact of other convex pairs (boxes, cylinders, ellipsoids, meshes)",
         True,
         _pairs(_KNOWN_PAIRS - _EXACT_PAIRS, set()),
-        "distance exact; the contact point and frame are taken to follow the mean of both bodies",
+        "the distance's slope is exact; point and frame are taken to follow the mean of both bodies",
+        partly=True,
     ),
     Feature("contact with height fields and signed distance fields", False, _pairs(None, _KNOWN_PAIRS)),
     Feature("contact adhesion and surface velocity", False, _odd_surfaces),
@@ -308,7 +323,12 @@ FEATURES: tuple[Feature, ...] = (
     ),
     Feature("implicitfast with a free body that has no other joints", False, _lone_free_bodies),
     Feature("joint and tendon equalities", True, _equality(_EQ.mjEQ_JOINT, _EQ.mjEQ_TENDON)),
-    Feature("connect and weld equalities", False, _equality(_EQ.mjEQ_CONNECT, _EQ.mjEQ_WELD)),
+    Feature(
+        "connect and weld equalities",
+        False,
+        _equality(_EQ.mjEQ_CONNECT, _EQ.mjEQ_WELD),
+        "mujoco_warp 4.0.0 builds their reference from the velocity stage of the step before: state outside the step",
+    ),
     Feature(
         "flex equalities",
         False,
@@ -328,14 +348,29 @@ FEATURES: tuple[Feature, ...] = (
         _where(_OBJ.mjOBJ_ACTUATOR, "actuator", _foreign_actuator),
     ),
     Feature("transmission to hinge and slide joints", True, _joint_transmission(_JNT.mjJNT_HINGE, _JNT.mjJNT_SLIDE)),
-    Feature("transmission to free and ball joints", False, _joint_transmission(_JNT.mjJNT_FREE, _JNT.mjJNT_BALL)),
-    Feature("transmission to tendons", True, _actuator("actuator_trntype", _TRN.mjTRN_TENDON)),
-    Feature("transmission to sites", False, _actuator("actuator_trntype", _TRN.mjTRN_SITE)),
     Feature(
-        "transmission to slider-cranks and bodies (adhesion)",
-        False,
-        _actuator("actuator_trntype", _TRN.mjTRN_SLIDERCRANK, _TRN.mjTRN_BODY),
+        "transmission to free and ball joints, also in the parent's frame",
+        True,
+        _joint_transmission(_JNT.mjJNT_FREE, _JNT.mjJNT_BALL),
+        "a rotational servo more than half a turn from its target is not wrapped",
     ),
+    Feature("transmission to tendons", True, _actuator("actuator_trntype", _TRN.mjTRN_TENDON)),
+    Feature("transmission to sites", True, _site_transmission(False)),
+    Feature("transmission to sites with a reference site", False, _site_transmission(True)),
+    Feature(
+        "transmission to slider-cranks, bodies (adhesion), SO(3)",
+        False,
+        _where(
+            _OBJ.mjOBJ_ACTUATOR,
+            "actuator",
+            lambda m: (
+                ~_among(
+                    m.actuator_trntype, (_TRN.mjTRN_JOINT, _TRN.mjTRN_JOINTINPARENT, _TRN.mjTRN_TENDON, _TRN.mjTRN_SITE)
+                )
+            ),
+        ),
+    ),
+    Feature("flags diagexact, speculative, ipc", False, _odd_flags),
     Feature("flexes", False, _option(lambda m: m.nflex > 0, "flex")),
     Feature("plugins", False, _option(lambda m: m.nplugin > 0, "plugin")),
 )
@@ -360,5 +395,7 @@ def check_supported(model: mujoco.MjModel, mode: str) -> None:
 def table() -> str:
     """The table as Markdown, feature by mode."""
     rows = ["| feature | tape_all, tape_per_substep | fd_jacobian | note |", "|---|---|---|---|"]
-    rows += [f"| {f.name} | {'exact' if f.exact else 'raises'} | approximate | {f.note} |" for f in FEATURES]
+    for f in FEATURES:
+        state = ("partly exact" if f.partly else "exact") if f.exact else "raises"
+        rows.append(f"| {f.name} | {state} | approximate | {f.note} |")
     return "\n".join(rows)

@@ -6,6 +6,9 @@ against cylinder or ellipsoid: the collision function itself is differentiated. 
 n·(relative velocity at the point), exactly; the point and the frame are taken to follow the mean of both bodies.
 """
 
+from functools import cache
+from typing import Any
+
 import warp as wp
 from mujoco_warp._src.collision_primitive_core import (
     capsule_capsule,
@@ -77,9 +80,7 @@ def pair_score(
         dist_d, pos_d, normal_d = sphere_box(pos1, size1[0], pos2, mat2, size2)
         score = dist_weight * dist_d + wp.dot(pos_weight, pos_d) + wp.dot(normal_weight, normal_d)
     elif type1 == GeomType.CAPSULE and type2 == GeomType.CAPSULE:
-        dist_e, pos_e, normal_e = capsule_capsule(
-            pos1, axis1, size1[0], size1[1], pos2, axis2, size2[0], size2[1]
-        )
+        dist_e, pos_e, normal_e = capsule_capsule(pos1, axis1, size1[0], size1[1], pos2, axis2, size2[0], size2[1])
         score = dist_weight * dist_e[index]
         score += wp.dot(pos_weight, pos_e[index]) + wp.dot(normal_weight, normal_e[index])
     elif type1 == GeomType.PLANE and type2 == GeomType.CYLINDER:
@@ -96,10 +97,7 @@ def is_scored(type1: int, type2: int) -> bool:
     """Whether `pair_score` knows the pair."""
     if type1 == GeomType.SPHERE:
         return (
-            type2 == GeomType.SPHERE
-            or type2 == GeomType.CAPSULE
-            or type2 == GeomType.CYLINDER
-            or type2 == GeomType.BOX
+            type2 == GeomType.SPHERE or type2 == GeomType.CAPSULE or type2 == GeomType.CYLINDER or type2 == GeomType.BOX
         )
     if type1 == GeomType.CAPSULE:
         return type2 == GeomType.CAPSULE
@@ -113,123 +111,143 @@ def turning_torque(mat: wp.mat33, bar: wp.mat33) -> wp.vec3:
     return out + wp.cross(_column(mat, 2), _column(bar, 2))
 
 
-@wp.kernel
-def pull_geometry(
-    # Model:
-    body_rootid: wp.array[int],
-    geom_bodyid: wp.array[int],
-    geom_type: wp.array[int],
-    geom_size: wp.array2d[wp.vec3],
-    # In:
-    nacon_in: wp.array[int],
-    contact_dist_in: wp.array[float],
-    contact_pos_in: wp.array[wp.vec3],
-    contact_frame_in: wp.array[wp.mat33],
-    contact_geom_in: wp.array[wp.vec2i],
-    contact_index_in: wp.array[int],
-    contact_address_in: wp.array2d[int],
-    contact_worldid_in: wp.array[int],
-    geom_xpos_in: wp.array2d[wp.vec3],
-    geom_xmat_in: wp.array2d[wp.mat33],
-    subtree_com_in: wp.array2d[wp.vec3],
-    phi_dist_in: wp.array[float],
-    phi_pos_in: wp.array[wp.vec3],
-    phi_frame_in: wp.array[wp.mat33],
-    # Out:
-    moved_bar_out: wp.array2d[wp.spatial_vector],
-):
-    """Cotangents of (dist, pos, frame) to wrenches on the two bodies whose displacement moves them."""
-    con = wp.tid()
-    if con >= wp.min(nacon_in[0], contact_dist_in.shape[0]):
-        return
-    if contact_address_in[con, 0] < 0:
-        return
-    worldid = contact_worldid_in[con]
-    geoms = contact_geom_in[con]
-    type1 = geom_type[geoms[0]]
-    type2 = geom_type[geoms[1]]
-    body1 = geom_bodyid[geoms[0]]
-    body2 = geom_bodyid[geoms[1]]
-    dist = contact_dist_in[con]
-    point = contact_pos_in[con]
-    frame = contact_frame_in[con]
-    normal = frame[0]
-    dist_bar = phi_dist_in[con]
-    pos_bar = phi_pos_in[con]
-    weight = phi_frame_in[con]
-    com1 = subtree_com_in[worldid, body_rootid[body1]]
-    com2 = subtree_com_in[worldid, body_rootid[body2]]
-    pos1 = geom_xpos_in[worldid, geoms[0]]
-    pos2 = geom_xpos_in[worldid, geoms[1]]
-    mat1 = geom_xmat_in[worldid, geoms[0]]
-    mat2 = geom_xmat_in[worldid, geoms[1]]
-    zero = wp.vec3(0.0)
+@cache
+def pull_geometry_kernel(scored: bool) -> Any:
+    """The kernel for models with or without a pair that `pair_score` knows; without it is much smaller."""
 
-    along_axis = int(0)
-    axis = zero
-    if type1 == GeomType.PLANE and type2 == GeomType.CAPSULE:
-        axis = _column(mat2, 2)
-        along_axis = 1
-        if wp.length(axis - normal * wp.dot(normal, axis)) < 0.5:
-            axis = frame[1]
-            along_axis = 2
-    normal_bar, axis_bar, _kind, _weight = wp.grad(frame_score)(normal, axis, along_axis, weight)
+    @wp.kernel(module="unique", enable_backward=False)
+    def pull_geometry(
+        # Model:
+        body_rootid: wp.array[int],
+        geom_bodyid: wp.array[int],
+        geom_type: wp.array[int],
+        geom_size: wp.array2d[wp.vec3],
+        # In:
+        nacon_in: wp.array[int],
+        contact_dist_in: wp.array[float],
+        contact_pos_in: wp.array[wp.vec3],
+        contact_frame_in: wp.array[wp.mat33],
+        contact_geom_in: wp.array[wp.vec2i],
+        contact_index_in: wp.array[int],
+        contact_address_in: wp.array2d[int],
+        contact_worldid_in: wp.array[int],
+        geom_xpos_in: wp.array2d[wp.vec3],
+        geom_xmat_in: wp.array2d[wp.mat33],
+        subtree_com_in: wp.array2d[wp.vec3],
+        phi_dist_in: wp.array[float],
+        phi_pos_in: wp.array[wp.vec3],
+        phi_frame_in: wp.array[wp.mat33],
+        # Out:
+        moved_bar_out: wp.array2d[wp.spatial_vector],
+    ):
+        """Cotangents of (dist, pos, frame) to wrenches on the two bodies whose displacement moves them."""
+        con = wp.tid()
+        if con >= wp.min(nacon_in[0], contact_dist_in.shape[0]):
+            return
+        if contact_address_in[con, 0] < 0:
+            return
+        worldid = contact_worldid_in[con]
+        geoms = contact_geom_in[con]
+        type1 = geom_type[geoms[0]]
+        type2 = geom_type[geoms[1]]
+        body1 = geom_bodyid[geoms[0]]
+        body2 = geom_bodyid[geoms[1]]
+        dist = contact_dist_in[con]
+        point = contact_pos_in[con]
+        frame = contact_frame_in[con]
+        normal = frame[0]
+        dist_bar = phi_dist_in[con]
+        pos_bar = phi_pos_in[con]
+        weight = phi_frame_in[con]
+        com1 = subtree_com_in[worldid, body_rootid[body1]]
+        com2 = subtree_com_in[worldid, body_rootid[body2]]
+        pos1 = geom_xpos_in[worldid, geoms[0]]
+        pos2 = geom_xpos_in[worldid, geoms[1]]
+        mat1 = geom_xmat_in[worldid, geoms[0]]
+        mat2 = geom_xmat_in[worldid, geoms[1]]
+        zero = wp.vec3(0.0)
 
-    # Wrenches on the bodies: force at a point, and torque.
-    force1 = zero
-    torque1 = zero
-    place1 = pos1
-    force2 = zero
-    torque2 = zero
-    place2 = pos2
-    if is_scored(type1, type2):
-        size1 = geom_size[worldid % geom_size.shape[0], geoms[0]]
-        size2 = geom_size[worldid % geom_size.shape[0], geoms[1]]
-        _t1, _t2, _i, pos1_bar, mat1_bar, _s1, pos2_bar, mat2_bar, _s2, _d, _p, _n = wp.grad(pair_score)(
-            type1,
-            type2,
-            contact_index_in[con],
-            pos1,
-            mat1,
-            size1,
-            pos2,
-            mat2,
-            size2,
-            dist_bar,
-            pos_bar,
-            normal_bar,
-        )
-        force1 = pos1_bar
-        force2 = pos2_bar
-        torque1 = turning_torque(mat1, mat1_bar)
-        torque2 = turning_torque(mat2, mat2_bar)
-    elif type1 == GeomType.PLANE:
-        # The core of the other geom that is nearest the plane is fixed to its body: a sphere's centre, a capsule's
-        # end, a box's corner, a mesh's vertex.
-        radius = float(0.0)
-        if type2 == GeomType.SPHERE or type2 == GeomType.CAPSULE:
-            radius = geom_size[worldid % geom_size.shape[0], geoms[1]][0]
-        core = point + normal * (radius + 0.5 * dist)
-        # pos = core - n (r + dist/2) ,  dist = n·(core - o) - r
-        reach = dist_bar - 0.5 * wp.dot(normal, pos_bar)
-        turned = normal_bar + reach * (core - pos1) - (radius + 0.5 * dist) * pos_bar
-        force2 = pos_bar + reach * normal
-        place2 = core
-        if along_axis == 1:
-            torque2 = wp.cross(axis, axis_bar)
-        # n turns with the plane: dn = ω × n  ⇒  torque n × n̄
-        force1 = -reach * normal
-        torque1 = wp.cross(normal, turned)
-    else:
-        # dist moves with n·(u₂ - u₁) at the point; point and frame with the mean of both bodies.
-        spin = wp.cross(frame[0], weight[0]) + wp.cross(frame[1], weight[1]) + wp.cross(frame[2], weight[2])
-        force1 = 0.5 * pos_bar - dist_bar * normal
-        force2 = 0.5 * pos_bar + dist_bar * normal
-        torque1 = 0.5 * spin
-        torque2 = 0.5 * spin
-        place1 = point
-        place2 = point
-    if body1 > 0:
-        wp.atomic_add(moved_bar_out, worldid, body1, wrench(force1, torque1, place1 - com1))
-    if body2 > 0:
-        wp.atomic_add(moved_bar_out, worldid, body2, wrench(force2, torque2, place2 - com2))
+        along_axis = int(0)
+        axis = zero
+        if type1 == GeomType.PLANE and type2 == GeomType.CAPSULE:
+            axis = _column(mat2, 2)
+            along_axis = 1
+            if wp.length(axis - normal * wp.dot(normal, axis)) < 0.5:
+                axis = frame[1]
+                along_axis = 2
+        normal_bar, axis_bar, _kind, _weight = wp.grad(frame_score)(normal, axis, along_axis, weight)
+
+        # Wrenches on the bodies: force at a point, and torque.
+        force1 = zero
+        torque1 = zero
+        place1 = pos1
+        force2 = zero
+        torque2 = zero
+        place2 = pos2
+        known = bool(False)
+        if wp.static(scored):
+            known = is_scored(type1, type2)
+        if wp.static(scored):
+            if known:
+                size1 = geom_size[worldid % geom_size.shape[0], geoms[0]]
+                size2 = geom_size[worldid % geom_size.shape[0], geoms[1]]
+                _t1, _t2, _i, pos1_bar, mat1_bar, _s1, pos2_bar, mat2_bar, _s2, _d, _p, _n = wp.grad(pair_score)(
+                    type1,
+                    type2,
+                    contact_index_in[con],
+                    pos1,
+                    mat1,
+                    size1,
+                    pos2,
+                    mat2,
+                    size2,
+                    dist_bar,
+                    pos_bar,
+                    normal_bar,
+                )
+                force1 = pos1_bar
+                force2 = pos2_bar
+                torque1 = turning_torque(mat1, mat1_bar)
+                torque2 = turning_torque(mat2, mat2_bar)
+        if not known and type1 == GeomType.PLANE:
+            # The core of the other geom that is nearest the plane is fixed to its body: a sphere's centre, a capsule's
+            # end, a box's corner, a mesh's vertex.
+            radius = float(0.0)
+            if type2 == GeomType.SPHERE or type2 == GeomType.CAPSULE:
+                radius = geom_size[worldid % geom_size.shape[0], geoms[1]][0]
+            core = point + normal * (radius + 0.5 * dist)
+            # pos = core - n (r + dist/2) ,  dist = n·(core - o) - r
+            reach = dist_bar - 0.5 * wp.dot(normal, pos_bar)
+            turned = normal_bar + reach * (core - pos1) - (radius + 0.5 * dist) * pos_bar
+            force2 = pos_bar + reach * normal
+            place2 = core
+            if along_axis == 1:
+                torque2 = wp.cross(axis, axis_bar)
+            # n turns with the plane: dn = ω × n  ⇒  torque n × n̄
+            force1 = -reach * normal
+            torque1 = wp.cross(normal, turned)
+        if not known and type1 != GeomType.PLANE:
+            # dist moves with n·(u₂ - u₁) at the point; point and frame with the mean of both bodies.
+            spin = wp.cross(frame[0], weight[0]) + wp.cross(frame[1], weight[1]) + wp.cross(frame[2], weight[2])
+            force1 = 0.5 * pos_bar - dist_bar * normal
+            force2 = 0.5 * pos_bar + dist_bar * normal
+            torque1 = 0.5 * spin
+            torque2 = 0.5 * spin
+            place1 = point
+            place2 = point
+        if body1 > 0:
+            wp.atomic_add(moved_bar_out, worldid, body1, wrench(force1, torque1, place1 - com1))
+        if body2 > 0:
+            wp.atomic_add(moved_bar_out, worldid, body2, wrench(force2, torque2, place2 - com2))
+
+    return pull_geometry
+
+
+SCORED_PAIRS = frozenset(
+    {
+        *((int(GeomType.SPHERE), int(t)) for t in (GeomType.SPHERE, GeomType.CAPSULE, GeomType.CYLINDER, GeomType.BOX)),
+        (int(GeomType.CAPSULE), int(GeomType.CAPSULE)),
+        *((int(GeomType.PLANE), int(t)) for t in (GeomType.CYLINDER, GeomType.ELLIPSOID)),
+    }
+)
+"""Geometry types, ascending, that `pair_score` knows."""

@@ -251,3 +251,15 @@ def clip_norm(
         for i in range(grad_act_out.shape[1]):
             grad_act_out[worldid, i] = scale * grad_act_out[worldid, i]
         clipped_out[worldid] += 1
+
+
+@wp.kernel
+def add_into(
+    # In:
+    x_in: wp.array2d[float],
+    # Out:
+    y_out: wp.array2d[float],
+):
+    """y += x, as gradients add up."""
+    i, j = wp.tid()
+    y_out[i, j] = y_out[i, j] + x_in[i, j]

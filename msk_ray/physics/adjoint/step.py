@@ -25,8 +25,10 @@ from msk_ray.physics.adjoint import (
     scalar_rows,
     solve,
     tendons,
+    transmission,
     wrapping,
 )
+from msk_ray.physics.adjoint.coverage import colliding_pairs
 from msk_ray.physics.adjoint.stages import implicit_matrix
 from msk_ray.physics.adjoint.tables import build_tables
 
@@ -65,6 +67,8 @@ class StepAdjoint:
         )
         self._implicit_all = mjm.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         self._spring_on = not disabled & bit.mjDSBL_SPRING
+        types = {(int(mjm.geom_type[a]), int(mjm.geom_type[b])) for a, b in colliding_pairs(mjm)}
+        self._scored_pairs = bool(types & geometry.SCORED_PAIRS)
         self._elliptic = mjm.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
         self._has_actuators = mjm.nu > 0 and not disabled & bit.mjDSBL_ACTUATION
 
@@ -93,8 +97,8 @@ class StepAdjoint:
             self._lam_bar, self._qvel_bar, self._cacc_bar = spatials(), spatials(), spatials()
             self._qacc_bar, self._moved_bar, self._cacc_sum = spatials(), spatials(), spatials()
             self._mu_bar, self._excess_bar = spatials(), spatials()
-            self._length_bar = floats(worlds, mjm.nu)
-            self._rate_bar = wp.zeros((worlds, mjm.nu), dtype=wp.vec4)
+            self._length_bar = floats(worlds, model.nactuator)
+            self._rate_bar = wp.zeros((worlds, model.nactuator), dtype=wp.vec4)
             count = max(mjm.ntendon, 1)
             segments = max(self._tables.segment_tendon.size, 1)
             self._touch = wp.full((worlds, segments), wp.spatial_vector(*([MJ_MAXVAL] * 6)), dtype=wp.spatial_vector)
@@ -160,6 +164,7 @@ class StepAdjoint:
         self._pull_contacts(data)
         if self._has_actuators:
             self._pull_actuators(data)
+            self._pull_transmissions(data)
         if self._tables.has_turning_spring:
             self._pull_turning_springs(data)
         if self.mjm.ntendon:
@@ -589,7 +594,7 @@ class StepAdjoint:
             ],
         )
         wp.launch(
-            geometry.pull_geometry,
+            geometry.pull_geometry_kernel(self._scored_pairs),
             dim=d.naconmax,
             inputs=[
                 m.body_rootid,
@@ -680,6 +685,62 @@ class StepAdjoint:
                 self._rate_bar,
             ],
         )
+
+    def _pull_transmissions(self, d: Any) -> None:
+        m = self.model
+        if self._tables.has_turning_transmission:
+            wp.launch(
+                transmission.pull_turning_joints,
+                dim=(self.nworld, m.nactuator),
+                inputs=[
+                    m.jnt_type,
+                    m.jnt_qposadr,
+                    m.jnt_dofadr,
+                    m.actuator_trntype,
+                    m.actuator_trnid,
+                    m.actuator_gear,
+                    d.qpos,
+                    d.qvel,
+                    d.qacc,
+                    self._lam,
+                    self._mu,
+                    self._excess,
+                    d.moment_rowadr,
+                    d.actuator_moment,
+                    self._length_bar,
+                    self._rate_bar,
+                ],
+                outputs=[self._phi_qpos],
+            )
+        if self._tables.has_site_transmission:
+            wp.launch(
+                transmission.pull_sites,
+                dim=(self.nworld, m.nactuator),
+                inputs=[
+                    m.body_rootid,
+                    m.site_bodyid,
+                    m.actuator_trntype,
+                    m.actuator_trnid,
+                    m.actuator_gear,
+                    d.site_xpos,
+                    d.site_xmat,
+                    d.subtree_com,
+                    self._rate_bar,
+                    self._lam_field,
+                    d.cvel,
+                    self._qacc_field,
+                    self._mu_field,
+                    self._excess_field,
+                ],
+                outputs=[
+                    self._lam_bar,
+                    self._qvel_bar,
+                    self._qacc_bar,
+                    self._mu_bar,
+                    self._excess_bar,
+                    self._moved_bar,
+                ],
+            )
 
     def _sweep(self, d: Any) -> None:
         m = self.model

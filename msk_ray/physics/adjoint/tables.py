@@ -38,6 +38,10 @@ class Tables:
     """Whether any tendon passes a wrapping geom."""
     has_scalar_rows: bool
     """Whether any joint or tendon makes constraint rows."""
+    has_turning_transmission: bool
+    """Whether an actuator drives a free or ball joint."""
+    has_site_transmission: bool
+    """Whether an actuator drives a site."""
     has_turning_spring: bool
     """Whether a free or ball joint has a spring."""
 
@@ -76,6 +80,15 @@ def _segments(mjm: mujoco.MjModel) -> np.ndarray:
             elif kinds[1] in (int(wrap.mjWRAP_SPHERE), int(wrap.mjWRAP_CYLINDER)):
                 out.append((tendon, place, place + 1, place + 2))
     return np.array(out, dtype=np.int32).reshape(-1, 4)
+
+
+def _drives_turning_joint(mjm: mujoco.MjModel) -> bool:
+    kinds = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+    turning = (int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL))
+    return any(
+        int(mjm.actuator_trntype[u]) in kinds and int(mjm.jnt_type[mjm.actuator_trnid[u, 0]]) in turning
+        for u in range(mjm.nu)
+    )
 
 
 def _has_scalar_rows(mjm: mujoco.MjModel) -> bool:
@@ -134,5 +147,7 @@ def build_tables(mjm: mujoco.MjModel, model: Any) -> Tables:
         segment_last=ints(segments[:, 3].copy()),
         has_wrapping=bool(np.any(segments[:, 2] >= 0)),
         has_scalar_rows=_has_scalar_rows(mjm),
+        has_turning_transmission=_drives_turning_joint(mjm),
+        has_site_transmission=bool(np.any(mjm.actuator_trntype == int(mujoco.mjtTrn.mjTRN_SITE))),
         has_turning_spring=turning,
     )
