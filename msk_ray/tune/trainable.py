@@ -1,7 +1,9 @@
 """The function Ray Tune runs in a trial's process: `run_trial` with reports, gauges and its output in a file."""
 
 import faulthandler
+import json
 import os
+import platform
 import shutil
 import sys
 import tempfile
@@ -18,6 +20,7 @@ from msk_ray.config import parse_config
 from msk_ray.tune.adapters import METRIC
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.operators import Listed, describe
+from msk_ray.tune.outcomes import write_text
 from msk_ray.tune.records import evaluations_of, read_rows
 from msk_ray.tune.space import Space
 from msk_ray.tune.stopping import Evaluation
@@ -83,6 +86,7 @@ def make_trainable(job: Job) -> Callable[[dict[str, Any]], None]:
         folder.mkdir(parents=True, exist_ok=True)
         _redirect_output(folder / "output.log")
         _limit_threads(job.threads)
+        _record_device(folder / "device.json")
         gauges = _Gauges(job.experiment.name, trial)
         with tempfile.TemporaryDirectory() as scratch, _watchdog(folder, job.space.file.resources.hang_s) as alive:
 
@@ -194,6 +198,21 @@ def _limit_threads(threads: int) -> None:
     import torch
 
     torch.set_num_threads(threads)
+
+
+def _record_device(path: Path) -> None:
+    """Keep which host, process and GPUs the trial was given: the evidence that it had them to itself."""
+    import torch
+
+    cuda = torch.cuda.is_available()
+    facts = {
+        "host": platform.node(),
+        "pid": os.getpid(),
+        "visible": os.environ.get("CUDA_VISIBLE_DEVICES", ""),
+        "count": torch.cuda.device_count() if cuda else 0,
+        "name": torch.cuda.get_device_name(0) if cuda else "cpu",
+    }
+    write_text(path, json.dumps(facts) + "\n")
 
 
 class _Gauges:
