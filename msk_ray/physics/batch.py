@@ -77,6 +77,18 @@ def check_state(model: mujoco.MjModel) -> None:
         )
 
 
+def refresh_velocity(mjm: mujoco.MjModel, model: Any, data: Any) -> None:
+    """Launch the velocity stage early where constraints are built from it.
+
+    mujoco_warp 4.0.0 builds connect and weld rows in its position stage from the body velocities in `data`, which are
+    those of the step before unless this comes first. C MuJoCo takes the present ones.
+    """
+    if np.any(np.isin(mjm.eq_type, [int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)])):
+        mjw.kinematics(model, data)
+        mjw.com_pos(model, data)
+        mjw.com_vel(model, data)
+
+
 class WorldBatch:
     """Model and data of `nworld` worlds on one device, with the launches of one env step.
 
@@ -139,7 +151,12 @@ class WorldBatch:
         """Launch one env step on the current contents of data.{ctrl, qpos, qvel, act}."""
         self.begin_step()
         for _ in range(self.substeps):
-            mjw.step(self.model, self.data)
+            self.launch_substep(self.data)
+
+    def launch_substep(self, data: Any) -> None:
+        """Launch one physics step on `data`, this batch's own or another of the same model and size."""
+        refresh_velocity(self.mjm, self.model, data)
+        mjw.step(self.model, data)
 
     def check_overflow(self) -> float:
         """Share of worlds whose solver met an iteration limit since the last call.

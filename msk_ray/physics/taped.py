@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import mujoco_warp as mjw
 import warp as wp
 
 from msk_ray.physics.adjoint import StepAdjoint
@@ -60,7 +59,7 @@ class TapedStep:
             batch.begin_step()
             for _ in range(batch.substeps):
                 saved = {name: wp.clone(getattr(data, name), requires_grad=False) for name in ("qpos", "qvel", "act")}
-                mjw.step(batch.model, data)
+                batch.launch_substep(data)
                 saved["qacc"] = wp.clone(data.qacc, requires_grad=False)
                 kept.append(saved)
             end = WarpState(*(wp.clone(getattr(data, n), requires_grad=tape is not None) for n in WarpState._fields))

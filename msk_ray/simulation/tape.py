@@ -8,7 +8,6 @@ nothing is solved); `tape_all` keeps them.
 from abc import abstractmethod
 from typing import Any
 
-import mujoco_warp as mjw
 import torch
 import warp as wp
 from torch import Tensor
@@ -24,7 +23,7 @@ from msk_ray.simulation.residual import ResidualGauge
 
 # Arrays of mujoco_warp.Data that the adjoint of a substep reads, besides the checkpointed state.
 _KEPT_DATA = (
-    *("cdof", "cdof_dot", "cvel", "cinert", "M", "nefc", "nacon", "subtree_com", "xipos"),
+    *("cdof", "cdof_dot", "cvel", "cinert", "M", "nefc", "nacon", "subtree_com", "xipos", "xpos", "xmat"),
     *("geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "ten_J", "ten_length", "ten_velocity", "act_dot"),
     *("actuator_velocity", "actuator_force"),
     *("actuator_length", "moment_rownnz", "moment_rowadr", "moment_colind", "actuator_moment", "qfrc_actuator"),
@@ -43,7 +42,7 @@ class _Tape(Backward):
         substep_grad_clip: bound on the Euclidean norm of each world's state cotangent between substeps, in the
             cotangent's own units; direction is kept. None for no bound.
         residual_tolerance: a world is counted as unconverged where the solver left more than this share of its
-            forces unbalanced, |Ma - τ - Jᵀf| / (|Ma| + |τ| + |Jᵀf|).
+            forces unbalanced, |Ma - τ - Jᵀf| / |(Ma, τ, Jᵀf)|.
     """
 
     def __init__(self, substep_grad_clip: float | None = None, residual_tolerance: float = 1e-3) -> None:
@@ -71,7 +70,7 @@ class _Tape(Backward):
             self._saved = pool.allocate()
             self._raw_qpos = wp.zeros((worlds, mjm.nq), dtype=float)
             self._clipped = wp.zeros(worlds, dtype=int)
-            self._gauge = ResidualGauge(batch.model, worlds)
+            self._gauge = ResidualGauge(self._adjoint.inertia_address, worlds)
         self._ctrl = wp.to_torch(batch.data.ctrl, requires_grad=False)
         adjoint = self._adjoint
         self.cotangent = StepState(
@@ -140,7 +139,7 @@ class TapePerSubstep(_Tape):
         for state in self._states:
             for name in ("qpos", "qvel", "act"):
                 wp.copy(state[name], getattr(data, name))
-            mjw.step(batch.model, data)
+            batch.launch_substep(data)
             wp.copy(state["qacc"], data.qacc)
             self._gauge.launch(data)
         for name, array in self._last.items():
@@ -179,7 +178,7 @@ class TapeAll(_Tape):
                 wp.copy(getattr(data, name), getattr(before, name))
             for name in ("qpos", "qvel", "act"):
                 wp.copy(state[name], getattr(before, name))
-            mjw.step(batch.model, data)
+            batch.launch_substep(data)
             wp.copy(state["qacc"], data.qacc)
             self._gauge.launch(data)
             before = data

@@ -114,6 +114,16 @@ SCENES = {
         '<equality><joint joint1="a" joint2="c" polycoef=".1 .5 .2 -.1 .05"/><joint joint1="d" polycoef=".02 0 0 0 0"/>'
         "</equality>"
     ),
+    "connect_world": lambda: scene(
+        '<equality><connect body1="hand" body2="world" anchor=".05 .02 0" solref=".05 1" solimp=".5 .9 .3 .5 2"/>'
+        "</equality>"
+    ),
+    "connect_bodies": lambda: scene(
+        '<equality><connect body1="hand" body2="other" anchor=".05 .02 0" solref=".1 1"/></equality>'
+    ),
+    "connect_sites": lambda: scene(
+        '<equality><connect site1="s4" site2="s1" solref=".1 1"/><joint joint1="a" polycoef=".1 0 0 0 0"/></equality>'
+    ),
     "equality_tendon": lambda: scene(
         f"<tendon>{_FIXED.format('')}{_FIXED2}{_PATH_P}"
         '</tendon><equality><tendon tendon1="t" tendon2="t2" polycoef=".1 .5 .2 0 0"/><tendon tendon1="p"/>'

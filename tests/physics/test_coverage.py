@@ -29,7 +29,7 @@ def test_own_models_are_covered():
         ('<option density="1.2"/><worldbody><body><joint/><geom size=".1"/></body></worldbody>', "fluid"),
         (
             '<worldbody><body name="b"><joint/><geom size=".1"/></body></worldbody>'
-            '<equality><connect name="pin" body1="b" anchor="0 0 0"/></equality>',
+            '<equality><weld name="pin" body1="b"/></equality>',
             "equality pin",
         ),
         (

@@ -8,8 +8,8 @@ from oracle import INPUTS, Point, differences, relative, rollout, simulate
 from scenes import ant, ant_points, cartpole, random_weights
 
 from msk_ray.errors import UnsupportedModelError
-from msk_ray.simulation import Simulation
-from msk_ray.simulation.tape import TapeAll, TapePerSubstep
+from msk_ray.simulation import FdJacobian, Simulation
+from msk_ray.simulation.tape import Hybrid, TapeAll, TapePerSubstep
 
 
 def float32(*values: np.ndarray) -> Point:
@@ -139,3 +139,50 @@ def test_unsupported_features_are_named():
     )
     with pytest.raises(UnsupportedModelError, match=r"RK4.*density.*fd_jacobian"):
         Simulation(model, 1, 1, TapePerSubstep(), "cpu")
+
+
+def test_hybrid_takes_ctrl_from_one_mode_and_state_from_the_other():
+    model = cartpole()
+    points = [float32(np.full(2, 0.2), np.ones(2), np.zeros(0), np.full(1, 0.3)) for _ in range(2)]
+    weights = random_weights(model, 2, 4)
+    _, exact, _ = simulate(model, TapePerSubstep(), points, 4, weights)
+    _, approximate, _ = simulate(model, FdJacobian(), points, 4, weights)
+    _, mixed, _ = simulate(model, Hybrid(state=TapePerSubstep(), ctrl=FdJacobian()), points, 4, weights)
+    np.testing.assert_allclose(mixed["qpos"], exact["qpos"])
+    np.testing.assert_allclose(mixed["qvel"], exact["qvel"])
+    np.testing.assert_allclose(mixed["ctrl"], approximate["ctrl"], rtol=1e-6)
+
+
+def test_chain_through_a_policy_network():
+    """Eight env steps of four substeps under a feedback policy, against differences of the whole loss in float64."""
+    model = cartpole()
+    torch.manual_seed(0)
+    policy = torch.nn.Sequential(torch.nn.Linear(4, 8), torch.nn.Tanh(), torch.nn.Linear(8, 1), torch.nn.Tanh())
+    sim = Simulation(model, 1, 4, TapePerSubstep(), "cpu", tolerance=1e-12)
+    start = float32(np.array([0.1, 0.3]), np.array([0.2, -0.4]), np.zeros(0), np.zeros(1))
+
+    def as_tensor(value: np.ndarray) -> torch.Tensor:
+        return torch.tensor(value, dtype=torch.float32)[None]
+
+    qpos, qvel, act = as_tensor(start.qpos), as_tensor(start.qvel), as_tensor(start.act)
+    for _ in range(8):
+        qpos, qvel, act = sim.step(policy(torch.cat((qpos, qvel), -1)), qpos, qvel, act)
+    loss = (qpos.square() + 0.1 * qvel).sum()
+    found = torch.cat([g.flatten() for g in torch.autograd.grad(loss, list(policy.parameters()))]).double().numpy()
+
+    vector = torch.nn.utils.parameters_to_vector(policy.parameters()).double()
+    policy.double()
+
+    def loss_at(parameters: torch.Tensor) -> float:
+        torch.nn.utils.vector_to_parameters(parameters, policy.parameters())
+        point = start
+        for _ in range(8):
+            with torch.no_grad():
+                ctrl = policy(torch.tensor(np.concatenate((point.qpos, point.qvel)))).numpy()
+            data = rollout(model, Point(point.qpos, point.qvel, point.act, ctrl), 4)
+            point = Point(data.qpos.copy(), data.qvel.copy(), data.act.copy(), ctrl)
+        return float(np.sum(point.qpos**2 + 0.1 * point.qvel))
+
+    steps = 1e-5 * torch.eye(len(vector), dtype=torch.float64)
+    expected = np.array([(loss_at(vector + s) - loss_at(vector - s)) / 2e-5 for s in steps])
+    assert relative(found, expected) < 1e-3

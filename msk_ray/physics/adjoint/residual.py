@@ -6,42 +6,43 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
-def residual_share(
+def residual_squares(
     # Model:
-    nv: int,
-    inertia_rownnz: wp.array[int],
-    inertia_rowadr: wp.array[int],
-    inertia_colind: wp.array[int],
+    inertia_address: wp.array2d[int],
     # In:
     inertia_in: wp.array2d[float],
     qacc_in: wp.array2d[float],
     smooth_in: wp.array2d[float],
     constraint_in: wp.array2d[float],
     # Out:
-    product_out: wp.array2d[float],
+    gap_out: wp.array[float],
+    size_out: wp.array[float],
+):
+    """Adds one dof's (Ma - τ - Jᵀf)² to its world's gap, and (Ma)² + τ² + (Jᵀf)² to its size."""
+    worldid, i = wp.tid()
+    product = float(0.0)
+    for j in range(inertia_address.shape[0]):
+        address = inertia_address[wp.max(i, j), wp.min(i, j)]
+        if address >= 0:
+            product += inertia_in[worldid, address] * qacc_in[worldid, j]
+    tau = smooth_in[worldid, i]
+    push = constraint_in[worldid, i]
+    r = product - tau - push
+    wp.atomic_add(gap_out, worldid, r * r)
+    wp.atomic_add(size_out, worldid, product * product + tau * tau + push * push)
+
+
+@wp.kernel
+def residual_share(
+    # Out:
+    gap_out: wp.array[float],
+    size_out: wp.array[float],
     worst_out: wp.array[float],
 ):
-    """Keeps the largest |Ma - τ - Jᵀf| / (|Ma| + |τ| + |Jᵀf|) of each world; NaN stays NaN."""
+    """Keeps the largest √(gap/size) of each world and clears both for the next step; NaN stays NaN."""
     worldid = wp.tid()
-    for i in range(nv):
-        product_out[worldid, i] = 0.0
-    for i in range(nv):
-        start = inertia_rowadr[i]
-        for k in range(start, start + inertia_rownnz[i]):
-            j = inertia_colind[k]
-            entry = inertia_in[worldid, k]
-            product_out[worldid, i] += entry * qacc_in[worldid, j]
-            if j != i:
-                product_out[worldid, j] += entry * qacc_in[worldid, i]
-    gap = float(0.0)
-    size = float(1.0e-12)
-    for i in range(nv):
-        ma = product_out[worldid, i]
-        tau = smooth_in[worldid, i]
-        push = constraint_in[worldid, i]
-        r = ma - tau - push
-        gap += r * r
-        size += ma * ma + tau * tau + push * push
-    share = wp.sqrt(gap / size)
+    share = wp.sqrt(gap_out[worldid] / (size_out[worldid] + 1.0e-12))
     if not (share <= worst_out[worldid]):
         worst_out[worldid] = share
+    gap_out[worldid] = 0.0
+    size_out[worldid] = 0.0

@@ -46,7 +46,8 @@ class RowSlopes:
     """How aref = -b·vel - k·imp·pos and D of one row answer to its position."""
 
     damping: float  # b = -∂aref/∂vel [1/s]
-    stiffness: float  # -∂aref/∂pos [1/s²]
+    spring: float  # k imp [1/s²]
+    stiffness: float  # -∂aref/∂pos, with the slope of imp [1/s²]
     mass: float  # d(log D)/d(pos) [1/m]
 
 
@@ -57,6 +58,7 @@ def row_slopes(disableflags: int, timestep: float, solref: wp.vec2, solimp: vec5
     slope = impedance_slope(solimp, pos)
     out = RowSlopes()
     out.damping = kbi[1]
+    out.spring = kbi[0] * kbi[2]
     out.stiffness = kbi[0] * (kbi[2] + slope * pos)
     out.mass = slope / (kbi[2] * (1.0 - kbi[2]))
     return out

@@ -7,9 +7,12 @@ import mujoco_warp as mjw
 import numpy as np
 from mujoco_warp._src.derivative import deriv_smooth_vel
 
+from msk_ray.physics.batch import refresh_velocity
+
 
 def recompute_stages(mjm: mujoco.MjModel, model: Any, data: Any) -> None:
     """Launch the position and velocity stages of the state in `data`."""
+    refresh_velocity(mjm, model, data)
     mjw.fwd_position(model, data, factorize=False)
     implicit = mjm.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     if implicit or np.any(mjm.jnt_actfrclimited):

@@ -11,6 +11,7 @@ slope of the constraint forces):
 from typing import Any
 
 import mujoco
+import numpy as np
 import warp as wp
 from mujoco_warp._src.types import MJ_MAXVAL
 
@@ -18,6 +19,7 @@ from msk_ray.physics.adjoint import (
     actuation,
     bodies,
     contacts,
+    equality,
     geometry,
     integrate,
     joints,
@@ -67,6 +69,7 @@ class StepAdjoint:
         )
         self._implicit_all = mjm.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         self._spring_on = not disabled & bit.mjDSBL_SPRING
+        self._has_connects = bool(np.any(mjm.eq_type == int(mujoco.mjtEq.mjEQ_CONNECT)))
         types = {(int(mjm.geom_type[a]), int(mjm.geom_type[b])) for a, b in colliding_pairs(mjm)}
         self._scored_pairs = bool(types & geometry.SCORED_PAIRS)
         self._elliptic = mjm.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
@@ -112,6 +115,11 @@ class StepAdjoint:
             self._phi_dist = floats(ncon)
             self._phi_pos = wp.zeros(ncon, dtype=wp.vec3)
             self._phi_frame = wp.zeros(ncon, dtype=wp.mat33)
+
+    @property
+    def inertia_address(self) -> wp.array:
+        """Place of M_ij (j ≤ i) in the sparse inertia, -1 where it is zero; shape (nv, nv)."""
+        return self._tables.inertia_address
 
     def start(self, qpos: wp.array, raw_qpos: wp.array) -> None:
         """Launch the change of a raw cotangent (W, nq) at `qpos` to tangent coordinates, and find the live worlds.
@@ -352,6 +360,37 @@ class StepAdjoint:
 
     def _pull_rows(self, d: Any, jacobian: wp.array) -> None:
         m = self.model
+        if self._has_connects:
+            wp.launch(
+                equality.pull_connects,
+                dim=(self.nworld, self._njmax),
+                inputs=[
+                    m.opt.timestep,
+                    m.opt.disableflags,
+                    m.body_rootid,
+                    m.site_bodyid,
+                    m.eq_type,
+                    m.eq_objtype,
+                    m.eq_obj1id,
+                    m.eq_obj2id,
+                    m.eq_solref,
+                    m.eq_solimp,
+                    m.eq_data,
+                    d.nefc,
+                    d.efc.type,
+                    d.efc.id,
+                    self._slope,
+                    self._force,
+                    d.xpos,
+                    d.xmat,
+                    d.site_xpos,
+                    d.subtree_com,
+                    self._lam_field,
+                    d.cvel,
+                    self._cacc,
+                ],
+                outputs=[self._lam_bar, self._qvel_bar, self._cacc_bar, self._moved_bar],
+            )
         if not self._tables.has_scalar_rows:
             return
         wp.launch(
