@@ -127,7 +127,8 @@ class Live(Callback):
         if ending is None:
             return  # paused by a request to stop, or never begun
         self._ended += 1
-        score = "" if run is None or run.best == float("-inf") else f"; best score {run.best:.5g}"
+        compared = ending.outcome in (Outcome.STOPPED_ASHA, Outcome.STOPPED_MEDIAN)  # their reason names the score
+        score = "" if run is None or compared or run.best == float("-inf") else f"; best score {run.best:.5g}"
         self._say(f"{mine.id} {ending.outcome}: {ending.why}{score}")
 
     def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
