@@ -1,4 +1,4 @@
-"""How right the gradients are: every mode against float64 central differences of C MuJoCo, on the environments' models."""
+"""How right gradients are: each mode against float64 central differences of C MuJoCo, on the environments' models."""
 
 import argparse
 import statistics
@@ -9,7 +9,7 @@ from record import RESULTS, markdown_table, publish
 from msk_ray.config import load_config
 from msk_ray.envs import env_class
 from msk_ray.gradcheck import check_gradients
-from msk_ray.simulation.modes import make_backward
+from msk_ray.simulation.modes import configured_backward
 
 
 def main() -> None:
@@ -17,7 +17,7 @@ def main() -> None:
     p = argparse.ArgumentParser(description=__doc__)
     p.add_argument("configs", nargs="+", type=Path, help="trials whose models are checked")
     p.add_argument("--modes", nargs="+", default=["tape_per_substep", "fd_jacobian"])
-    p.add_argument("--substeps", type=int, nargs="+", default=[1, 16])
+    p.add_argument("--substeps", type=int, nargs="+", default=[1, 4, 16])
     p.add_argument("--states", nargs="+", default=["standing", "contact"])
     p.add_argument("--worlds", type=int, default=24, help="states of each kind")
     p.add_argument("--solver-tolerance", type=float, help="of Warp's solver; by default the model's own")
@@ -33,7 +33,7 @@ def main() -> None:
                 for state in args.states:
                     report = check_gradients(
                         model,
-                        make_backward(mode),
+                        configured_backward(config.physics.model_copy(update={"backward": mode})),
                         substeps=substeps,
                         states=(state,),
                         worlds=args.worlds,
