@@ -28,7 +28,9 @@ def device_name(device: str) -> str:
 
 
 def commit() -> str:
-    """Short git commit of the working tree, or "unknown" outside a clone."""
+    """Short git commit of the working tree; outside a clone what MSK_RAY_COMMIT says, or "unknown"."""
+    if "MSK_RAY_COMMIT" in os.environ:
+        return os.environ["MSK_RAY_COMMIT"]
     try:
         answer = subprocess.run(
             ["git", "describe", "--always", "--dirty"],

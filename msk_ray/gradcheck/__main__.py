@@ -33,6 +33,7 @@ EXAMPLES = """\
   python -m msk_ray.gradcheck my_robot.xml
   python -m msk_ray.gradcheck my_robot.xml --substeps 16 --states standing,contact --worlds 20 --tolerance 1e-2
   python -m msk_ray.gradcheck my_robot.xml --mode fd_jacobian --tolerance 5e-2    # a model the adjoint refuses
+  python -m msk_ray.gradcheck configs/ant.yaml --substeps 4 --states contact
   python -m msk_ray.gradcheck my_robot.xml --json > gradients.json"""
 
 MANY_EXCLUDED = 0.25
@@ -53,7 +54,12 @@ def _positive(kind: type) -> Any:
 def parser() -> Parser:
     """The command line."""
     p = Parser("python -m msk_ray.gradcheck", DESCRIPTION, EXAMPLES)
-    p.add_argument("model", type=Path, metavar="MODEL.xml", help="an MJCF or URDF file, or a compiled .mjb")
+    p.add_argument(
+        "model",
+        type=Path,
+        metavar="MODEL.xml",
+        help="an MJCF or URDF file, a compiled .mjb, or a trial's .yaml: the model it trains on",
+    )
     p.add_argument(
         "--mode",
         default="tape_per_substep",
@@ -97,6 +103,12 @@ def load_model(path: Path) -> "mujoco.MjModel":
 
     if not path.is_file():
         raise ConfigError(f"no model file {path}")
+    if path.suffix in (".yaml", ".yml"):
+        from msk_ray.config import load_config
+        from msk_ray.envs import env_class
+
+        config = load_config(path)
+        return env_class(config.env).build_model(config.env, config.physics)
     try:
         if path.suffix == ".mjb":
             return mujoco.MjModel.from_binary_path(str(path))

@@ -1,7 +1,12 @@
 """Batched MuJoCo Warp physics. Warp only: nothing here imports torch."""
 
-from msk_ray.physics.batch import WorldBatch
-from msk_ray.physics.graph import Graph
-from msk_ray.physics.taped import TapedStep, WarpState
+import warp as wp
+
+# Before anything initialises Warp: a line for each of some thirty modules loaded would bury what a user wants to see.
+wp.config.log_level = wp.LOG_WARNING
+
+from msk_ray.physics.batch import WorldBatch  # noqa: E402
+from msk_ray.physics.graph import Graph  # noqa: E402
+from msk_ray.physics.taped import TapedStep, WarpState  # noqa: E402
 
 __all__ = ["Graph", "TapedStep", "WarpState", "WorldBatch"]

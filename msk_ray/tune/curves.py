@@ -20,7 +20,8 @@ _STOPPED = {Outcome.STOPPED_ASHA, Outcome.STOPPED_MEDIAN, Outcome.STOPPED_PLATEA
 def draw_curves(records: Sequence[TrialRecord], path: Path, title: str) -> None:
     """Draw score over env steps into `path`.
 
-    The line is the mean over seeds, the band their range. A cross ends a trial that was stopped before its time.
+    The line is the mean over seeds, the band their range. A cross ends a trial that was stopped before its time. The
+    axis reaches down to the worst untrained or best score; a policy that falls apart may leave it.
     """
     groups: dict[str, list[TrialRecord]] = {}
     for record in records:
@@ -36,6 +37,9 @@ def draw_curves(records: Sequence[TrialRecord], path: Path, title: str) -> None:
     axes.set_xlabel("env steps")
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.set_ylabel("evaluation score")
+    bottom = _lowest_of_interest(records)
+    if bottom is not None and bottom > axes.get_ylim()[0]:
+        axes.set_ylim(bottom=bottom)
     axes.grid(alpha=0.3)
     axes.margins(x=0.02)
     if ranked:
@@ -66,6 +70,14 @@ def _curve(record: TrialRecord) -> tuple[np.ndarray, np.ndarray]:
     points = [(e.env_steps, e.score) for e in record.evaluations if np.isfinite(e.score)]
     array = np.array(points or [(0, np.nan)], dtype=float)
     return array[:, 0], array[:, 1]
+
+
+def _lowest_of_interest(records: Sequence[TrialRecord]) -> float | None:
+    """The lowest first or best score, with a margin of a tenth of their range; None if they do not differ."""
+    ends = [_curve(record)[1] for record in records if record.best is not None]
+    scores = [score for y in ends for score in (y[0], y.max())]
+    span = max(scores) - min(scores) if scores else 0.0
+    return min(scores) - 0.1 * span if span else None
 
 
 def _mean_best(group: list[TrialRecord]) -> float:

@@ -16,7 +16,7 @@ from msk_ray.progress import format_duration
 from msk_ray.tune.adapters import METRIC
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.outcomes import Ending, Outcome, read_ending, write_ending
-from msk_ray.tune.trial_run import ERROR_FILE
+from msk_ray.tune.trial_run import ERROR_FILE, HANG_FILE
 from msk_ray.tune.trials import Trial
 
 STATUS_INTERVAL_S = 30.0
@@ -116,7 +116,7 @@ class Live(Callback):
 
     def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         mine = self._trial_of(trial.config)
-        why = _reason(self._experiment.trial_folder(mine.id) / ERROR_FILE, trial)
+        why = _reason(self._experiment.trial_folder(mine.id), trial)
         self._say(f"{mine.id} {why}; trying again from its newest checkpoint")
 
     def on_trial_complete(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
@@ -127,7 +127,8 @@ class Live(Callback):
         if ending is None:
             return  # paused by a request to stop, or never begun
         self._ended += 1
-        score = "" if run is None or run.best == float("-inf") else f"; best score {run.best:.5g}"
+        compared = ending.outcome in (Outcome.STOPPED_ASHA, Outcome.STOPPED_MEDIAN)  # their reason names the score
+        score = "" if run is None or compared or run.best == float("-inf") else f"; best score {run.best:.5g}"
         self._say(f"{mine.id} {ending.outcome}: {ending.why}{score}")
 
     def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
@@ -136,7 +137,7 @@ class Live(Callback):
         self._saving.discard(mine.id)
         self._running.pop(mine.id, None)
         self._ended += 1
-        ending = Ending(Outcome.ERROR, _reason(folder / ERROR_FILE, trial))
+        ending = Ending(Outcome.ERROR, _reason(folder, trial))
         write_ending(folder, ending)
         self._say(f"{mine.id} error: {ending.why}; see {folder}")
 
@@ -202,8 +203,11 @@ def time_left(running: list[tuple[int, float | None]], waiting: list[int], concu
     return slots[-1]
 
 
-def _reason(error_file: Path, trial: Any) -> str:
-    """Why Ray gave a trial up, on one line."""
+def _reason(folder: Path, trial: Any) -> str:
+    """Why a trial's process ended before its time, on one line."""
+    hang_file, error_file = folder / HANG_FILE, folder / ERROR_FILE
+    if hang_file.is_file() and hang_file.stat().st_size:
+        return f"it hung; where is in {hang_file}"
     if error_file.is_file():
         return error_file.read_text(encoding="utf-8").strip().splitlines()[-1]
     error = trial.get_pickled_error()

@@ -30,7 +30,10 @@ class NeverPrune:
 
 
 class SuccessiveHalving:
-    """ASHA: at each rung one in `reduction` trials goes on (rounded up)."""
+    """ASHA: at each rung one in `reduction` trials goes on (rounded up).
+
+    Trials are compared by their best score so far, as in the final ranking; single evaluations scatter too much.
+    """
 
     def __init__(self, rungs: Sequence[float], reduction: float, min_trials: int | None = None) -> None:
         """
@@ -41,17 +44,19 @@ class SuccessiveHalving:
         """
         self._rungs = tuple(rungs)
         self._scores: list[dict[str, float]] = [{} for _ in rungs]
+        self._best: dict[str, float] = {}
         self._reduction = reduction
         self._min_trials = math.ceil(reduction) if min_trials is None else min_trials
 
     def report(self, trial: str, time: float, score: float) -> Ending | None:
         if not math.isfinite(score):
             return None
+        best = self._best[trial] = max(score, self._best.get(trial, score))
         newest: int | None = None
         for index, (rung, scores) in enumerate(zip(self._rungs, self._scores, strict=True)):
             if time >= rung:
                 # The first report past a rung counts there, whatever follows: repeated rows change nothing.
-                scores.setdefault(trial, score)
+                scores.setdefault(trial, best)
                 newest = index
         # Far past its rung, a trial is left to the next one: latecomers should not undo most of its work.
         if newest is None or time >= self._rungs[newest] * math.sqrt(self._reduction):
@@ -69,7 +74,7 @@ class SuccessiveHalving:
         cutoff = sorted(scores.values(), reverse=True)[survivors - 1]
         return Ending(
             Outcome.STOPPED_ASHA,
-            f"score {scores[trial]:.4g} is number {better + 1} of {len(scores)} at rung {self._rungs[index]:.6g}; "
+            f"best score {scores[trial]:.4g} is number {better + 1} of {len(scores)} at rung {self._rungs[index]:.6g}; "
             f"{survivors} go on, from {cutoff:.4g}",
         )
 

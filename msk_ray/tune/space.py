@@ -83,6 +83,8 @@ class ResourcesSpec(Part):
     max_concurrent: PositiveInt | None = None
     max_failures: Annotated[int, Field(ge=0)] = 3
     """How often a trial whose process or node died goes on from its checkpoint."""
+    hang_s: Annotated[float, Field(gt=0.0)] | None = 1800.0
+    """Seconds without an epoch after which a trial's process is ended and tried again; null waits for ever."""
 
 
 class SmokeSpec(Part):

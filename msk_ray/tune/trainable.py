@@ -1,12 +1,14 @@
 """The function Ray Tune runs in a trial's process: `run_trial` with reports, gauges and its output in a file."""
 
+import faulthandler
 import json
 import os
 import platform
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +24,7 @@ from msk_ray.tune.outcomes import write_text
 from msk_ray.tune.records import evaluations_of, read_rows
 from msk_ray.tune.space import Space
 from msk_ray.tune.stopping import Evaluation
-from msk_ray.tune.trial_run import Hooks, TrainerLike, run_trial
+from msk_ray.tune.trial_run import HANG_FILE, Hooks, TrainerLike, run_trial
 from msk_ray.tune.trials import Trial, make_trial, overlay
 
 _GAUGES = {
@@ -86,12 +88,17 @@ def make_trainable(job: Job) -> Callable[[dict[str, Any]], None]:
         _limit_threads(job.threads)
         _record_device(folder / "device.json")
         gauges = _Gauges(job.experiment.name, trial)
-        hooks = Hooks(
-            on_epoch=gauges.show,
-            on_evaluation=_report_with_checkpoint if job.population else _report,
-            pause=job.experiment.stop_file.exists,
-        )
-        with tempfile.TemporaryDirectory() as scratch:
+        with tempfile.TemporaryDirectory() as scratch, _watchdog(folder, job.space.file.resources.hang_s) as alive:
+
+            def on_epoch(row: Mapping[str, float]) -> None:
+                alive()
+                gauges.show(row)
+
+            hooks = Hooks(
+                on_epoch=on_epoch,
+                on_evaluation=_report_with_checkpoint if job.population else _report,
+                pause=job.experiment.stop_file.exists,
+            )
             run_trial(
                 trial,
                 folder,
@@ -161,6 +168,30 @@ def _redirect_output(path: Path) -> None:
     os.dup2(file, 1)
     os.dup2(file, 2)
     os.close(file)
+
+
+@contextmanager
+def _watchdog(folder: Path, limit_s: float | None) -> Iterator[Callable[[], None]]:
+    """End this process if the function given is not called for `limit_s`, and leave its stacks in `hang.txt`.
+
+    faulthandler counts in a thread of its own below Python, so that a call that hangs in a driver is caught too.
+    """
+    path = folder / HANG_FILE
+    path.unlink(missing_ok=True)
+    if limit_s is None:
+        yield lambda: None
+        return
+    with path.open("w", encoding="utf-8") as file:
+
+        def alive() -> None:
+            faulthandler.dump_traceback_later(limit_s, exit=True, file=file)
+
+        alive()
+        try:
+            yield alive
+        finally:
+            faulthandler.cancel_dump_traceback_later()
+    path.unlink()
 
 
 def _limit_threads(threads: int) -> None:

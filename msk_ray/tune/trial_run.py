@@ -15,6 +15,7 @@ from msk_ray.tune.stopping import Evaluation, ending_of
 from msk_ray.tune.trials import Trial
 
 ERROR_FILE = "error.txt"
+HANG_FILE = "hang.txt"
 
 
 class TrainerLike(Protocol):

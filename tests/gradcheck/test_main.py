@@ -28,6 +28,11 @@ def test_mode_is_taken(cartpole_file, capsys):
     assert json.loads(capsys.readouterr().out)["mode"] == "fd_jacobian"
 
 
+def test_a_config_stands_for_its_model(root, capsys):
+    assert run(main, [str(root / "configs" / "cartpole.yaml"), *FAST]) == 0
+    assert "configs/cartpole.yaml" in capsys.readouterr().out
+
+
 def test_past_tolerance(cartpole_file, capsys):
     assert run(main, [str(cartpole_file), *FAST, "--tolerance", "1e-12"]) == 1
     assert "past the tolerance" in capsys.readouterr().out

@@ -1,7 +1,7 @@
 """A trainer of milliseconds: its score rises towards a height set by the learning rate; some settings misbehave.
 
 Which way is chosen by `env.cart_position_penalty`: 1 kills its own process once, 2 gives NaN, 3 raises
-SimulationError, 4 raises an unforeseen error every time. Anything else trains.
+SimulationError, 4 raises an unforeseen error every time, 5 hangs once. Anything else trains.
 """
 
 import hashlib
@@ -16,7 +16,7 @@ from pathlib import Path
 from msk_ray.config import Config, dump_yaml
 from msk_ray.errors import SimulationError
 
-KILL, NAN, SIMULATION_ERROR, BUG = 1.0, 2.0, 3.0, 4.0
+KILL, NAN, SIMULATION_ERROR, BUG, HANG = 1.0, 2.0, 3.0, 4.0, 5.0
 MISBEHAVE_AT = 5
 
 
@@ -71,6 +71,9 @@ class StubTrainer:
         if self.behaviour == KILL and not marker.exists():
             marker.touch()
             os.kill(os.getpid(), signal.SIGKILL)
+        if self.behaviour == HANG and not marker.exists():
+            marker.touch()
+            time.sleep(1000)
         if self.behaviour == NAN:
             row["train/actor_loss"] = math.nan
         if self.behaviour == SIMULATION_ERROR:

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import stub_trainer
 from ray import cloudpickle
-from stub_trainer import BUG, KILL, NAN, SIMULATION_ERROR, StubTrainer
+from stub_trainer import BUG, HANG, KILL, NAN, SIMULATION_ERROR, StubTrainer
 
 from msk_ray.config import read_yaml
 from msk_ray.tune import experiment as experiments
@@ -48,23 +48,27 @@ def outcomes(records: list[TrialRecord]) -> list[str | None]:
     return [record.ending and str(record.ending.outcome) for record in records]
 
 
-def test_faults_are_named_and_a_killed_trial_goes_on(
+def test_faults_are_named_and_killed_or_hung_trials_go_on(
     make_space: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    behaviours = [0.0, KILL, NAN, SIMULATION_ERROR, BUG]
-    space = make_space(parameters={"env.cart_position_penalty": {"grid": behaviours}}, resources={"max_failures": 1})
+    behaviours = [0.0, KILL, NAN, SIMULATION_ERROR, BUG, HANG]
+    space = make_space(
+        parameters={"env.cart_position_penalty": {"grid": behaviours}}, resources={"max_failures": 1, "hang_s": 3.0}
+    )
     completed, records = go(space, tmp_path / "runs" / "faults")
     assert completed
-    assert outcomes(records) == ["finished", "finished", "nonfinite", "nonfinite", "error"]
-    assert [record.epochs_done for record in records] == [20, 20, 5, 4, 4]
+    assert outcomes(records) == ["finished", "finished", "nonfinite", "nonfinite", "error", "finished"]
+    assert [record.epochs_done for record in records] == [20, 20, 5, 4, 4, 20]
     assert "train/actor_loss is nan at epoch 5" in records[2].ending.why  # type: ignore[union-attr]
     assert records[4].ending.why == "RuntimeError: made up"  # type: ignore[union-attr]
     shown = capsys.readouterr()
     assert "its process died (killed, or out of memory); trying again" in shown.out
     assert "raylet" not in shown.out + shown.err  # Ray's own notices are in ray.log
+    assert "it hung; where is in" in shown.out
     # The killed trial has every epoch once, with the scores of the one that was left alone.
-    scores = [[row["eval/score"] for row in read_rows(r.folder) if "eval/score" in row] for r in records[:2]]
-    assert scores[0] == scores[1]
+    intact = (records[0], records[1], records[5])
+    scores = [[row["eval/score"] for row in read_rows(r.folder) if "eval/score" in row] for r in intact]
+    assert scores[0] == scores[1] == scores[2]
     assert len(scores[0]) == 11
     facts = json.loads((tmp_path / "runs" / "faults" / "summary.json").read_text())
     assert [trial["outcome"] for trial in facts["trials"]] == outcomes(records)

@@ -35,6 +35,13 @@ def test_halving_in_lockstep_stops_the_worse_at_its_next_report() -> None:
     assert rule.report("bad", 142, 1.5) is None  # past 100 · √2 the rung at 100 says nothing any more
 
 
+def test_halving_compares_best_scores_so_far() -> None:
+    rule = SuccessiveHalving((100,), 2)
+    rule.report("a", 50, 5.0)
+    rule.report("a", 100, 1.0)
+    assert rule.report("b", 100, 4.0) is not None  # a counts with 5
+
+
 def test_halving_waits_for_enough_trials() -> None:
     rule = SuccessiveHalving((100,), 3)
     assert rule.report("a", 100, 3.0) is None
