@@ -1,17 +1,20 @@
 """Checks gradients of a model against float64 central differences of C MuJoCo."""
 
+from msk_ray.gradcheck.chain import ChainComparison, check_chain
 from msk_ray.gradcheck.check import Comparison, GradientReport, Limits, check_gradients
 from msk_ray.gradcheck.oracle import Linearization, Oracle, Point
 from msk_ray.gradcheck.states import STATE_KINDS, make_states
 
 __all__ = [
     "STATE_KINDS",
+    "ChainComparison",
     "Comparison",
     "GradientReport",
     "Limits",
     "Linearization",
     "Oracle",
     "Point",
+    "check_chain",
     "check_gradients",
     "make_states",
 ]
