@@ -9,6 +9,8 @@ from msk_ray.cli import run
 COMMANDS = {
     "train": ("msk_ray.train", "train one policy in this process, without Ray"),
     "tune": ("msk_ray.tune.__main__", "run a search space as a Ray Tune experiment"),
+    "status": ("msk_ray.status", "show where experiments stand, from their files"),
+    "doctor": ("msk_ray.doctor", "check that this machine can run trials, and say what to mend"),
     "gradcheck": ("msk_ray.gradcheck.__main__", "check a model's gradients against float64 finite differences"),
 }
 

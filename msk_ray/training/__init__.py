@@ -1,8 +1,8 @@
 """One trial: train, evaluate, log, checkpoint, resume. Knows nothing of Ray."""
 
+from msk_ray.metrics_file import read_metrics
 from msk_ray.training.checkpoint import newest_valid_checkpoint, read_checkpoint
 from msk_ray.training.evaluation import Evaluator
-from msk_ray.training.metrics import read_metrics
 from msk_ray.training.trainer import Trainer, precompile
 
 __all__ = ["Evaluator", "Trainer", "newest_valid_checkpoint", "precompile", "read_checkpoint", "read_metrics"]

@@ -9,26 +9,8 @@ from typing import Any
 from torch.utils.tensorboard import SummaryWriter
 
 from msk_ray.errors import StorageError
+from msk_ray.metrics_file import METRICS_FILE, read_metrics
 from msk_ray.training.checkpoint import write_atomically
-
-METRICS_FILE = "metrics.jsonl"
-
-
-def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """Rows of a metrics file in order of epoch, each epoch once (its latest row); a torn last line is left out."""
-    if not path.is_file():
-        return []
-    rows: dict[int, dict[str, Any]] = {}
-    lines = path.read_text(encoding="utf-8").splitlines()
-    for number, line in enumerate(lines, start=1):
-        try:
-            row = json.loads(line)
-        except ValueError as error:
-            if number == len(lines):
-                break  # the writer was killed in the middle of it
-            raise StorageError(f"{path}, line {number} is not JSON: {error}") from error
-        rows[int(row["epoch"])] = row
-    return [rows[epoch] for epoch in sorted(rows)]
 
 
 class MetricsLog:

@@ -67,14 +67,18 @@ class Experiment:
         """
         path = self.path / "manifest.json"
         try:
-            data: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+            data = json.loads(path.read_text(encoding="utf-8"))
         except FileNotFoundError:
             raise StorageError(f"{self.path} holds no experiment: manifest.json is missing") from None
         except (OSError, ValueError) as error:
             raise StorageError(f"cannot read {path}: {error}") from error
-        if data.get("format") != FORMAT:
-            raise StorageError(f"{path} has format {data.get('format')}, this version reads {FORMAT}")
-        return data
+        if not isinstance(data, dict) or data.get("format") != FORMAT:
+            found = data.get("format") if isinstance(data, dict) else None
+            raise StorageError(f"{path} has format {found}, this version reads {FORMAT}")
+        if not isinstance(data.get("trials"), list):
+            raise StorageError(f"{path} has no trials")
+        manifest: dict[str, Any] = data
+        return manifest
 
     def trials(self) -> list[Trial]:
         """The trials of the manifest."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from msk_ray.training import read_metrics
+from msk_ray.metrics_file import METRICS_FILE, read_metrics
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.outcomes import Ending, Outcome, read_ending
 from msk_ray.tune.stopping import Evaluation
@@ -59,7 +59,7 @@ def read_records(experiment: Experiment) -> list[TrialRecord]:
 
 def read_rows(folder: Path) -> list[dict[str, float]]:
     """A trial's metrics, each epoch once. Values the file marks as not finite are NaN."""
-    return [_with_nan(row) for row in read_metrics(folder / "metrics.jsonl")]
+    return [_with_nan(row) for row in read_metrics(folder / METRICS_FILE)]
 
 
 def evaluations_of(rows: Sequence[Mapping[str, float]]) -> list[Evaluation]:

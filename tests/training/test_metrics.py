@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from msk_ray.errors import StorageError
-from msk_ray.training.metrics import MetricsLog, read_metrics
+from msk_ray.metrics_file import read_metrics
+from msk_ray.training.metrics import MetricsLog
 
 
 def test_rows_are_on_disk_at_once_and_nan_is_named(tmp_path: Path) -> None:

@@ -1,0 +1,342 @@
+"""`python -m msk_ray.doctor`: can this machine run trials? If not, what is to be mended?"""
+
+import json
+import os
+import platform
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+
+import msk_ray
+from msk_ray.cli import Parser, run
+from msk_ray.errors import MskRayError, StorageError
+from msk_ray.tune.experiment import check_writable
+
+DESCRIPTION = """\
+Check that this machine can run trials: versions, GPU and driver, gradients of one step, Ray, the storage folder.
+
+Each line says ok, or what to do. Exit code: 0 if nothing is broken, 1 if something is."""
+
+EXAMPLES = """\
+  python -m msk_ray.doctor
+  python -m msk_ray.doctor --device cuda:1 --storage /shared/runs
+  python -m msk_ray.doctor --device cpu          # leave the GPUs alone"""
+
+RAY_LIMIT_S = 90.0
+"""Ray comes up in seconds; on a loaded machine with a cold disk it may take ten times as long."""
+MIN_FREE_GB = 2.0
+"""A sweep's checkpoints and logs take about so much."""
+GRADIENT_TOLERANCE = 1e-2
+PING = [sys.executable, "-m", "msk_ray.tune.ping"]
+_SLOW_S = 0.5
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a check found."""
+
+    subject: str
+    text: str
+    """What is so, or what to do."""
+    broken: bool = False
+
+
+@dataclass(frozen=True)
+class GpuFacts:
+    """What driver, torch and Warp say about GPUs."""
+
+    driver: str | None
+    """Version of the NVIDIA driver; None without one."""
+    driver_gpus: int
+    driver_cuda: tuple[int, int] | None
+    """Highest CUDA version the driver runs, by Warp; None if Warp sees no driver."""
+    torch_cuda: str | None
+    """CUDA version torch was built with; None for a CPU build."""
+    torch_gpus: int
+    warp_cuda: tuple[int, int] | None
+    """CUDA version Warp was built with; None for a build without CUDA."""
+    warp_gpus: int
+    visible: str | None
+    """CUDA_VISIBLE_DEVICES."""
+
+
+def parser() -> Parser:
+    """The command line."""
+    p = Parser("python -m msk_ray.doctor", DESCRIPTION, EXAMPLES)
+    p.add_argument("--device", help="cpu or cuda:N; by default the first GPU, or the CPU if there is none")
+    p.add_argument("--storage", type=Path, default=Path("runs"), metavar="DIR", help="by default runs/")
+    return p
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    args = parser().parse_args(argv)
+    checks: list[Callable[[], list[Finding]]] = [
+        check_python,
+        check_packages,
+        lambda: check_gpus(args.device),
+        lambda: [check_gradient(args.device)],
+        lambda: [check_ray()],
+        lambda: [check_storage(args.storage)],
+    ]
+    broken = 0
+    for check in checks:
+        # Each line as soon as it is known: kernels may take a minute to compile.
+        for finding in check():
+            print(f"{'MEND' if finding.broken else 'ok':5} {finding.subject:9} {finding.text}", flush=True)
+            broken += finding.broken
+    print("all is well" if not broken else f"{broken} thing(s) to mend")
+    return 1 if broken else 0
+
+
+def check_python() -> list[Finding]:
+    """Python, system and cores."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    text = f"{platform.python_version()} on {platform.system()} {platform.machine()}, {cores} cores"
+    if platform.system() != "Linux":
+        return [Finding("python", f"{text}: trials are developed and tested on Linux only; use Linux or WSL 2", True)]
+    return [Finding("python", text)]
+
+
+def check_packages() -> list[Finding]:
+    """Whether the packages installed are those that the project asks for."""
+    from packaging.requirements import Requirement
+
+    try:
+        wanted = [Requirement(text) for text in metadata.requires("msk-ray") or []]
+    except metadata.PackageNotFoundError:
+        return [Finding("packages", "msk-ray is not installed here: run pip install -e . in its folder", True)]
+    return package_findings(
+        {r.name: str(r.specifier) for r in wanted if r.marker is None or r.marker.evaluate({"extra": ""})},
+        {distribution.name.lower(): distribution.version for distribution in metadata.distributions()},
+    )
+
+
+def package_findings(wanted: dict[str, str], installed: dict[str, str]) -> list[Finding]:
+    """One line on all packages that fit, and one on each that does not.
+
+    Args:
+        wanted: name → version specifier.
+        installed: name in lower case → version.
+    """
+    from packaging.specifiers import SpecifierSet
+
+    good, bad = [], []
+    for name, specifier in wanted.items():
+        version = installed.get(name.lower())
+        if version is None:
+            bad.append(Finding("packages", f"{name} is missing: pip install '{name}{specifier}'", True))
+        elif not SpecifierSet(specifier, prereleases=True).contains(version):
+            bad.append(Finding("packages", f"{name} {version} does not fit: pip install '{name}{specifier}'", True))
+        else:
+            good.append(f"{name} {version}")
+    return [*([Finding("packages", f"msk-ray {msk_ray.__version__}, {', '.join(good)}")] if good else []), *bad]
+
+
+def check_gpus(device: str | None) -> list[Finding]:
+    """Whether driver, torch and Warp fit one another."""
+    return gpu_findings(_gpu_facts(), device)
+
+
+def gpu_findings(facts: GpuFacts, device: str | None) -> list[Finding]:
+    """What the facts mean for trials on `device` (None for the first GPU there is)."""
+    wants_gpu = device is not None and device != "cpu"
+    if not facts.driver_gpus and not facts.torch_gpus and not facts.warp_gpus:
+        if wants_gpu:
+            return [Finding("gpu", f"no GPU here, and {device} was asked for: pass --device cpu", True)]
+        return [Finding("gpu", "no GPU here: fine for work on CPU; trials run on CPU cores")]
+    if device == "cpu":
+        return [Finding("gpu", f"{facts.driver_gpus} GPU(s), left alone as asked")]
+    if facts.visible is not None and not facts.visible.strip(" -1"):
+        return [
+            Finding(
+                "gpu", f"CUDA_VISIBLE_DEVICES={facts.visible!r} hides all GPUs: unset it, or pass --device cpu", True
+            )
+        ]
+    found = []
+    if facts.torch_cuda is None:
+        found.append(Finding("gpu", "torch is a build for CPU only: install one with CUDA from pytorch.org", True))
+    elif not facts.torch_gpus:
+        found.append(Finding("gpu", _no_gpu("torch", facts.torch_cuda, facts), True))
+    if facts.warp_cuda is None:
+        found.append(Finding("gpu", "Warp is a build without CUDA: pip install --force-reinstall warp-lang", True))
+    elif not facts.warp_gpus or (facts.driver_cuda is not None and facts.driver_cuda[0] < facts.warp_cuda[0]):
+        found.append(Finding("gpu", _no_gpu("Warp", "{}.{}".format(*facts.warp_cuda), facts), True))
+    if found:
+        return found
+    if wants_gpu and (index := _index(device)) is not None and index >= facts.torch_gpus:
+        last = facts.torch_gpus - 1
+        return [Finding("gpu", f"{device} was asked for, GPUs here are cuda:0 to cuda:{last}: name one of them", True)]
+    driver_cuda = "?" if facts.driver_cuda is None else "{}.{}".format(*facts.driver_cuda)
+    return [
+        Finding(
+            "gpu",
+            f"{facts.torch_gpus} GPU(s); driver {facts.driver or '?'} runs CUDA up to {driver_cuda}, "
+            f"torch built for {facts.torch_cuda}, Warp for {'{}.{}'.format(*facts.warp_cuda or (0, 0))}",
+        )
+    ]
+
+
+def check_gradient(device: str | None) -> Finding:
+    """Gradients of one step of CartPole by the analytic backward pass, against float64 differences of C MuJoCo."""
+    import torch
+
+    from msk_ray.config import CartPoleEnvConfig, PhysicsConfig
+    from msk_ray.envs import env_class
+    from msk_ray.gradcheck import check_gradients
+    from msk_ray.simulation import TapePerSubstep
+
+    where = device or ("cuda:0" if torch.cuda.is_available() else "cpu")
+    env = CartPoleEnvConfig(name="cartpole")
+    started = time.monotonic()
+    try:
+        model = env_class(env).build_model(env, PhysicsConfig())
+        report = check_gradients(model, TapePerSubstep(), substeps=1, worlds=4, device=where)
+    except (MskRayError, RuntimeError, ValueError, OSError) as error:
+        # Compilers, drivers and memory fail with errors of these kinds; whatever it is, it is the finding.
+        return Finding("gradient", f"one step on {where} failed: {_one_line(error)}", True)
+    seconds = time.monotonic() - started
+    text = f"one step on {where}: largest relative error {report.max_rel_error:.1e} ({seconds:.0f} s with compilation)"
+    if report.max_rel_error > GRADIENT_TOLERANCE:
+        return Finding("gradient", f"{text}, past {GRADIENT_TOLERANCE:g}: reinstall warp-lang and mujoco-warp", True)
+    return Finding("gradient", text)
+
+
+def check_ray(limit_s: float = RAY_LIMIT_S) -> Finding:
+    """Whether Ray starts and a worker runs a task, within `limit_s` seconds."""
+    started = time.monotonic()
+    package = str(Path(msk_ray.__file__).resolve().parent.parent)
+    paths = [package, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
+    # Its output goes to a file: Ray's daemons inherit a pipe, and would keep its reader waiting when all else is done.
+    with tempfile.TemporaryFile("w+") as output:
+        process = subprocess.Popen(
+            PING,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
+            start_new_session=True,
+        )
+        try:
+            code = process.wait(limit_s)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            return Finding(
+                "ray",
+                f"did not start within {limit_s:.0f} s: look into /tmp/ray/session_latest/logs; "
+                "a proxy, a firewall on 127.0.0.1 or a full /tmp are usual causes",
+                True,
+            )
+        output.seek(0)
+        lines = output.read().strip().splitlines()
+    if code != 0:
+        return Finding("ray", f"does not start: {lines[-1] if lines else f'exit code {code}'}", True)
+    facts = json.loads(lines[-1])
+    seconds = time.monotonic() - started
+    return Finding("ray", f"starts and runs a task in {seconds:.0f} s; {facts['cpus']:g} CPUs, {facts['gpus']:g} GPUs")
+
+
+def check_storage(storage: Path) -> Finding:
+    """Whether files can be made, flushed to disk and renamed in the storage folder."""
+    folder = storage.resolve()
+    try:
+        with _made(folder):
+            check_writable(folder)
+            seconds = _write_as_a_trial_does(folder)
+            free = shutil.disk_usage(folder).free / 1e9
+    except StorageError as error:
+        return Finding("storage", str(error), True)
+    except OSError as error:
+        return Finding("storage", f"{folder}: {error.strerror or error}; choose another --storage", True)
+    if free < MIN_FREE_GB:
+        return Finding("storage", f"{folder} has {free:.1f} GB left: make room, or choose another --storage", True)
+    slow = f"; slow: a row of metrics takes {seconds:.1f} s to reach the disk" if seconds > _SLOW_S else ""
+    return Finding("storage", f"{folder} can be written, {free:.0f} GB free{slow}")
+
+
+def _write_as_a_trial_does(folder: Path) -> float:
+    """Flush a file to disk and rename it; returns the seconds it took."""
+    started = time.monotonic()
+    with tempfile.TemporaryDirectory(prefix=".doctor", dir=folder) as scratch:
+        path = Path(scratch) / "a"
+        with path.open("wb") as file:
+            file.write(b"0" * 4096)
+            file.flush()
+            os.fsync(file.fileno())
+        path.replace(Path(scratch) / "b")
+    return time.monotonic() - started
+
+
+@contextmanager
+def _made(folder: Path) -> Iterator[None]:
+    """Take away afterwards the folders that the check itself has to make."""
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    try:
+        yield
+    finally:
+        for path in missing:
+            if path.is_dir():
+                path.rmdir()
+
+
+def _gpu_facts() -> GpuFacts:
+    import torch
+    import warp as wp
+
+    # Importing it sets Warp's log level, which keeps it from listing devices on start.
+    import msk_ray.physics  # noqa: F401
+
+    wp.init()
+    driver, count = _driver()
+    return GpuFacts(
+        driver,
+        count,
+        wp.get_cuda_driver_version() if wp.is_cuda_available() else None,
+        torch.version.cuda,
+        torch.cuda.device_count() if torch.cuda.is_available() else 0,
+        wp.get_cuda_toolkit_version(),
+        wp.get_cuda_device_count(),
+        os.environ.get("CUDA_VISIBLE_DEVICES"),
+    )
+
+
+def _driver() -> tuple[str | None, int]:
+    """Driver version and number of GPUs by nvidia-smi; (None, 0) without a driver that works."""
+    if shutil.which("nvidia-smi") is None:
+        return None, 0
+    query = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
+    try:
+        result = subprocess.run(query, capture_output=True, text=True, timeout=30)
+    except subprocess.TimeoutExpired:
+        return "that does not answer", 0
+    versions = result.stdout.split() if result.returncode == 0 else []
+    return (versions[0], len(versions)) if versions else (None, 0)
+
+
+def _no_gpu(who: str, built_for: str, facts: GpuFacts) -> str:
+    runs = "" if facts.driver_cuda is None else ", which runs CUDA up to {}.{}".format(*facts.driver_cuda)
+    return (
+        f"{who} is built for CUDA {built_for} and cannot use the GPU with driver {facts.driver or '?'}{runs}: "
+        f"update the driver, or install a {who} build for an older CUDA"
+    )
+
+
+def _index(device: str | None) -> int | None:
+    number = (device or "").partition(":")[2]
+    return int(number) if number.isdigit() else None
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split()) or repr(error)
+
+
+if __name__ == "__main__":
+    sys.exit(run(main))

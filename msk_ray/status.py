@@ -1,0 +1,268 @@
+"""`python -m msk_ray.status`: where experiments stand, read from their files."""
+
+import argparse
+import difflib
+import shutil
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from msk_ray.cli import Parser, run
+from msk_ray.errors import MskRayError, StorageError
+from msk_ray.progress import format_duration
+from msk_ray.tune.experiment import Experiment
+from msk_ray.tune.standing import (
+    Observer,
+    Standing,
+    State,
+    best_of,
+    counts,
+    find_experiments,
+    remaining,
+)
+
+if TYPE_CHECKING:
+    from rich.console import Console, RenderableType
+    from rich.table import Table
+
+DESCRIPTION = """\
+Show where an experiment stands, trial by trial; without EXPERIMENT, which experiments there are.
+
+Reads files alone, so it works while the sweep runs, after it died, and from another machine on a shared storage.
+
+  running  wrote something lately           waiting  not started yet
+  stale    silent for ten of its epochs     else     how it ended: finished, asha, plateau, nonfinite, error ..."""
+
+EXAMPLES = """\
+  python -m msk_ray.status                              # the experiments in runs/
+  python -m msk_ray.status ant_ablate --watch           # until all trials have ended; Ctrl-C leaves
+  python -m msk_ray.status ant_ablate --storage /shared/runs"""
+
+WIDE = 140
+"""Terminals of so many columns show hosts, GPU models and reasons too."""
+_STYLES = {State.RUNNING: "green", State.STALE: "yellow", State.UNREADABLE: "red", State.WAITING: "dim"}
+_FAILED = ("error", "nonfinite", "diverged")
+
+
+def parser() -> Parser:
+    """The command line."""
+    p = Parser("python -m msk_ray.status", DESCRIPTION, EXAMPLES)
+    p.add_argument("experiment", nargs="?", metavar="EXPERIMENT", help="its name in the storage folder, or its folder")
+    p.add_argument("--watch", action="store_true", help="show it anew again and again")
+    p.add_argument("--interval", type=_seconds, default=2.0, metavar="S", help="of --watch [s], by default 2")
+    p.add_argument("--storage", type=Path, default=Path("runs"), metavar="DIR", help="by default runs/")
+    return p
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    args = parser().parse_args(argv)
+    if args.experiment is None:
+        if args.watch:
+            raise StorageError(f"--watch: which experiment? {_known(args.storage)}")
+        return _list(args.storage)
+    observer = Observer(Experiment(find(args.experiment, args.storage)))
+    if args.watch:
+        return _watch(observer, args.interval)
+    _console().print(view(observer, _width()))
+    return 0
+
+
+def find(name: str, storage: Path) -> Path:
+    """The folder of an experiment given by name or path.
+
+    Raises:
+        StorageError: there is none.
+    """
+    for path in (storage / name, Path(name)):
+        if path.is_dir():
+            return path.resolve()
+    near = difflib.get_close_matches(name, [path.name for path in find_experiments(storage)], n=1)
+    raise StorageError(
+        f"no experiment {name!r} in {storage}; " + (f"did you mean {near[0]!r}?" if near else _known(storage))
+    )
+
+
+def view(observer: Observer, width: int, rows: int | None = None) -> "RenderableType":
+    """An experiment as a table for a terminal of `width` columns, at most `rows` trials.
+
+    Raises:
+        StorageError: the folder holds no readable experiment.
+    """
+    from rich.console import Group
+    from rich.text import Text
+
+    standings = observer.look(time.time())
+    lines: list[RenderableType] = [Text(headline(observer.experiment, standings))]
+    if not standings:
+        return Group(*lines, Text("no trial has started yet"))
+    shown = standings if rows is None else standings[: max(1, rows)]
+    lines.append(trial_table(shown, width))
+    if len(shown) < len(standings):
+        lines.append(Text(f"... and {len(standings) - len(shown)} more", style="dim"))
+    if width < WIDE:  # a wide table has a column for it
+        lines += [Text(f"{s.id}: {s.note}", style="red") for s in shown if s.state is State.UNREADABLE]
+    if observer.experiment.stop_file.exists() and any(s.state is not State.ENDED for s in standings):
+        lines.append(Text("stopped on request: python -m msk_ray.tune --resume goes on"))
+    return Group(*lines)
+
+
+def headline(experiment: Experiment, standings: Sequence[Standing]) -> str:
+    """`ant_lr · 2 running · 3 ended · best 12.3 (1a2b3c4d) · at most 2h05m left`."""
+    parts = [experiment.name, *(f"{n} {state}" for state, n in counts(standings).items())]
+    best = best_of(standings)
+    if best is not None:
+        parts.append(f"best {best.progress.best:.5g} ({best.id})")
+    left = remaining(standings)
+    if left is not None:
+        parts.append(f"at most {format_duration(left)} left")
+    return " · ".join(parts)
+
+
+def trial_table(standings: Sequence[Standing], width: int) -> "Table":
+    """One row a trial. Only what was changed may wrap; in a wide table hosts and reasons are shown too."""
+    from rich import box
+    from rich.table import Table
+
+    wide = width >= WIDE
+    table = Table(box=box.SIMPLE_HEAD, width=width, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
+    table.add_column("trial", no_wrap=True)
+    table.add_column("changed", ratio=3, overflow="fold", min_width=10)
+    table.add_column("state", no_wrap=True)
+    for heading in ("epoch", "best", "steps/s"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("GPU", no_wrap=True, max_width=None if wide else 4)
+    for heading in ("left", "beat"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    if wide:
+        table.add_column("why", ratio=2, no_wrap=True, overflow="ellipsis")
+    seeds = len({standing.seed for standing in standings}) > 1
+    for standing in standings:
+        style = "red" if standing.outcome in _FAILED else _STYLES.get(standing.state, "")
+        table.add_row(*_cells(standing, wide, seeds), style=style)
+    return table
+
+
+def _cells(standing: Standing, wide: bool, seeds: bool) -> list[str]:
+    progress, device = standing.progress, standing.device
+    # "stopped_asha" is an outcome's name; in a narrow column "asha" says the same.
+    state = (standing.outcome if wide else standing.outcome.removeprefix("stopped_")) or str(standing.state)
+    gpu = f"{device.host}:{device.gpu} {device.name}".strip() if wide and device.host else device.gpu
+    cells = [
+        standing.id,
+        standing.variant + (f", seed {standing.seed}" if seeds else ""),
+        state,
+        f"{progress.epoch}/{standing.epochs}",
+        "-" if progress.best is None else f"{progress.best:.4g}",
+        short_number(progress.env_steps_per_s) if progress.env_steps_per_s is not None else "-",
+        gpu,
+        "-" if standing.seconds_left is None else format_duration(standing.seconds_left),
+        "-" if standing.heartbeat_age is None else format_age(standing.heartbeat_age),
+    ]
+    return [*cells, standing.note] if wide else cells
+
+
+def short_number(value: float) -> str:
+    """Three digits and a unit: 950, 12.3k, 1.2M."""
+    for unit, size in (("G", 1e9), ("M", 1e6), ("k", 1e3)):
+        if value >= 0.9995 * size:
+            return f"{value / size:.3g}{unit}"
+    return f"{value:.3g}"
+
+
+def format_age(seconds: float) -> str:
+    """As `format_duration`, in days from two days on."""
+    return f"{seconds / 86400:.0f}d" if seconds >= 2 * 86400 else format_duration(seconds)
+
+
+def _watch(observer: Observer, interval: float) -> int:
+    """Show the experiment until all its trials have ended, or until Ctrl-C."""
+    console = _console()
+    try:
+        if console.is_terminal:
+            _watch_terminal(observer, console, interval)
+        else:
+            while not _over(observer):
+                console.print(view(observer, _width()))
+                time.sleep(interval)
+    except KeyboardInterrupt:
+        pass  # the way to leave
+    console.print(view(observer, _width()))
+    return 0
+
+
+def _watch_terminal(observer: Observer, console: "Console", interval: float) -> None:
+    from rich.live import Live
+
+    with Live(console=console, screen=True, auto_refresh=False) as live:
+        while not _over(observer):
+            # The heading, the table's two lines and a note below it need room too.
+            live.update(view(observer, _width(), console.height - 6), refresh=True)
+            time.sleep(interval)
+
+
+def _over(observer: Observer) -> bool:
+    standings = observer.look(time.time())
+    return bool(standings) and all(standing.state in (State.ENDED, State.UNREADABLE) for standing in standings)
+
+
+def _list(storage: Path) -> int:
+    from rich import box
+    from rich.table import Table
+
+    paths = find_experiments(storage)
+    if not paths:
+        raise StorageError(f"no experiment in {storage}: start one with python -m msk_ray.tune, or name its --storage")
+    table = Table(box=box.SIMPLE_HEAD, width=_width(), pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
+    for heading in ("experiment", "trials", "best"):
+        table.add_column(heading, no_wrap=True)
+    table.add_column("state", ratio=2, overflow="fold")
+    table.add_column("question", ratio=3, no_wrap=True, overflow="ellipsis")
+    for path in paths:
+        table.add_row(path.name, *_summary(Experiment(path)))
+    _console().print(table)
+    return 0
+
+
+def _summary(experiment: Experiment) -> tuple[str, str, str, str]:
+    try:
+        standings = Observer(experiment).look(time.time())
+        question = experiment.manifest()["question"]
+    except MskRayError as error:
+        return "-", "-", str(error), ""
+    best = best_of(standings)
+    return (
+        str(len(standings)),
+        "-" if best is None else f"{best.progress.best:.4g}",
+        ", ".join(f"{n} {state}" for state, n in counts(standings).items()) or "no trial has started yet",
+        question,
+    )
+
+
+def _known(storage: Path) -> str:
+    names = [path.name for path in find_experiments(storage)]
+    return f"there are {', '.join(names[-5:])}" if names else "it holds none; name another --storage"
+
+
+def _seconds(text: str) -> float:
+    value = float(text)
+    if not 0.1 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"at least 0.1, not {text}")
+    return value
+
+
+def _width() -> int:
+    # A pipe or file has no width: wide enough for most names.
+    return shutil.get_terminal_size((120, 40)).columns
+
+
+def _console() -> "Console":
+    from rich.console import Console
+
+    return Console(width=None if sys.stdout.isatty() else _width(), highlight=False)
+
+
+if __name__ == "__main__":
+    sys.exit(run(main))

@@ -1,0 +1,129 @@
+"""`doctor`: every line says ok or what to do, and something broken is found."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from msk_ray import doctor
+from msk_ray.cli import run
+from msk_ray.doctor import GpuFacts, check_ray, check_storage, gpu_findings, main, package_findings
+
+NO_GPU = GpuFacts(None, 0, None, "12.8", 0, (12, 9), 0, None)
+TWO = GpuFacts("570.1", 2, (12, 8), "12.8", 2, (12, 9), 2, None)
+
+
+def test_a_machine_without_gpu_is_fine_for_cpu_work() -> None:
+    (finding,) = gpu_findings(NO_GPU, None)
+    assert not finding.broken
+    assert "fine for work on CPU" in finding.text
+    (finding,) = gpu_findings(NO_GPU, "cuda:0")
+    assert finding.broken
+    assert "--device cpu" in finding.text
+
+
+def test_gpus_that_fit() -> None:
+    (finding,) = gpu_findings(TWO, "cuda:1")
+    assert not finding.broken
+    assert finding.text == "2 GPU(s); driver 570.1 runs CUDA up to 12.8, torch built for 12.8, Warp for 12.9"
+
+
+@pytest.mark.parametrize(
+    ("facts", "device", "to_do"),
+    [
+        (replace(TWO, torch_cuda=None, torch_gpus=0), None, "torch is a build for CPU only"),
+        (replace(TWO, torch_cuda="13.0", torch_gpus=0), None, "torch is built for CUDA 13.0 and cannot use the GPU"),
+        (replace(TWO, warp_cuda=None, warp_gpus=0), None, "Warp is a build without CUDA"),
+        (replace(TWO, warp_cuda=(13, 4), warp_gpus=0), None, "update the driver, or install a Warp build"),
+        (replace(TWO, warp_cuda=(13, 4)), None, "driver 570.1, which runs CUDA up to 12.8"),
+        (replace(TWO, visible="", torch_gpus=0, warp_gpus=0), None, "hides all GPUs: unset it"),
+        (TWO, "cuda:2", "cuda:0 to cuda:1: name one of them"),
+    ],
+)
+def test_gpus_that_do_not_fit(facts: GpuFacts, device: str | None, to_do: str) -> None:
+    (finding,) = gpu_findings(facts, device)
+    assert finding.broken
+    assert to_do in finding.text
+    if device is None:
+        (left_alone,) = gpu_findings(facts, "cpu")
+        assert not left_alone.broken
+
+
+def test_packages() -> None:
+    fine, old, missing = package_findings(
+        {"a": ">=1.0", "B": ">=2,<3", "c": ">=1"},
+        {"a": "1.5+cpu", "b": "3.0"},
+    )
+    assert (fine.broken, old.broken, missing.broken) == (False, True, True)
+    assert "pip install 'B>=2,<3'" in old.text
+    assert "c is missing" in missing.text
+
+
+def test_storage_is_left_as_it_was(tmp_path: Path) -> None:
+    finding = check_storage(tmp_path / "a" / "b")
+    assert not finding.broken, finding
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "file").touch()
+    assert "choose another --storage" in check_storage(tmp_path / "file" / "runs").text
+
+
+def test_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "MIN_FREE_GB", 1e9)
+    finding = check_storage(tmp_path)
+    assert finding.broken
+    assert "make room" in finding.text
+
+
+@pytest.fixture
+def fake_ping(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A script that runs in the place of the one that starts Ray."""
+    path = tmp_path / "ping"
+    monkeypatch.setattr(doctor, "PING", [str(path)])
+    return path
+
+
+def write_script(path: Path, body: str) -> None:
+    path.write_text(f"#!/bin/sh\n{body}\n")
+    path.chmod(0o755)
+
+
+def test_ray_that_works_fails_or_hangs(fake_ping: Path) -> None:
+    write_script(fake_ping, """echo noise; echo '{"worker": {}, "cpus": 4.0, "gpus": 1.0}'""")
+    finding = check_ray()
+    assert not finding.broken
+    assert finding.text.endswith("4 CPUs, 1 GPUs")
+    write_script(fake_ping, "echo 'ConnectionError: nobody there' >&2; exit 3")
+    finding = check_ray()
+    assert (finding.broken, finding.text) == (True, "does not start: ConnectionError: nobody there")
+    write_script(fake_ping, f"echo $$ > {fake_ping}.pid; sleep 100")
+    finding = check_ray(limit_s=0.5)
+    assert finding.broken
+    assert "did not start within" in finding.text
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(Path(f"{fake_ping}.pid").read_text()), 0)
+
+
+def test_the_whole_on_cpu(
+    tmp_path: Path, fake_ping: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_script(fake_ping, """echo '{"worker": {}, "cpus": 4.0, "gpus": 0.0}'""")
+    monkeypatch.setattr(doctor, "_gpu_facts", lambda: NO_GPU)
+    assert run(main, ["--device", "cpu", "--storage", str(tmp_path / "runs")]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[:2] for line in lines[:-1]] == [
+        ["ok", name] for name in ("python", "packages", "gpu", "gradient", "ray", "storage")
+    ]
+    assert lines[-1] == "all is well"
+
+
+def test_something_broken_gives_exit_1(
+    tmp_path: Path, fake_ping: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_script(fake_ping, "exit 9")
+    monkeypatch.setattr(doctor, "_gpu_facts", lambda: NO_GPU)
+    assert run(main, ["--device", "cuda:0", "--storage", "/proc/x"]) == 1
+    text = capsys.readouterr().out
+    for line in ("MEND  gpu", "MEND  gradient", "MEND  ray       does not start: exit code 9", "MEND  storage"):
+        assert line in text
+    assert "4 thing(s) to mend" in text

@@ -1,0 +1,235 @@
+"""`status` on folders in every condition: at work, dead, torn, empty, missing."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from msk_ray.cli import run
+from msk_ray.config import dump_yaml
+from msk_ray.status import main, short_number
+from msk_ray.tune import experiment as experiments
+from msk_ray.tune.outcomes import Ending, Outcome, write_ending
+from msk_ray.tune.space import parse_space
+from msk_ray.tune.standing import Observer, State, best_of, progress_of, remaining
+from msk_ray.tune.trials import resolve_trials
+
+NOW = time.time()
+GPU = {"host": "node7", "pid": 1, "visible": "3", "count": 1, "name": "NVIDIA H200"}
+
+
+def row(epoch: int, score: float | None = None) -> dict[str, Any]:
+    """An epoch takes 4 s and gives 12 345 env steps/s."""
+    base = {"epoch": epoch, "env_steps": 100 * epoch, "seconds": 4.0 * epoch, "env_steps_per_s": 12345.0}
+    return base if score is None else base | {"eval/score": score}
+
+
+def fill(folder: Path, rows: list[dict[str, Any]], age: float, device: dict[str, Any] | None = None) -> None:
+    """A trial's folder whose metrics are `age` seconds old and whose process started before."""
+    folder.mkdir(parents=True)
+    (folder / "device.json").write_text(json.dumps(device or GPU))
+    os.utime(folder / "device.json", (NOW - age - 100, NOW - age - 100))
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(r) + "\n" for r in rows) + '{"epoch": 9')
+    os.utime(folder / "metrics.jsonl", (NOW - age, NOW - age))
+
+
+@pytest.fixture
+def experiment(tmp_path: Path) -> experiments.Experiment:
+    """Six rates: running, silent, finished, stopped, never started, and one with a broken file."""
+    (tmp_path / "base.yaml").write_text(dump_yaml({"env": {"name": "cartpole"}, "trial": {"epochs": 20}}))
+    data = {
+        "question": "Which rate?",
+        "base": "base.yaml",
+        "parameters": {"shac.actor_lr": {"grid": [1e-2, 2e-2, 3e-2, 4e-2, 5e-2, 6e-2]}},
+    }
+    space = parse_space(data, tmp_path / "small.yaml")
+    trials = resolve_trials(space)
+    made = experiments.create(tmp_path / "runs" / "rates", space, trials, {})
+    folders = [made.trial_folder(trial.id) for trial in trials]
+    fill(folders[0], [row(0, 1.0), row(5, 7.0), row(8)], age=5.0)
+    fill(folders[1], [row(0, 1.0), row(4, 3.0)], age=41.0 * 4)  # ten epochs are 40 s, but never less than 60 s
+    fill(folders[2], [row(0), row(20, 9.0)], age=999.0, device=GPU | {"count": 0})
+    write_ending(folders[2], Ending(Outcome.FINISHED, "all done"))
+    fill(folders[3], [row(0), row(4, 2.0)], age=999.0)
+    write_ending(folders[3], Ending(Outcome.STOPPED_ASHA, "number 3 of 3"))
+    fill(folders[5], [row(1)], age=1.0)
+    (folders[5] / "outcome.json").write_text('{"outc')
+    return made
+
+
+def test_states_from_files(experiment: experiments.Experiment) -> None:
+    standings = Observer(experiment).look(NOW)
+    assert [s.state for s in standings] == [
+        State.RUNNING,
+        State.STALE,
+        State.UNREADABLE,
+        State.ENDED,
+        State.ENDED,
+        State.WAITING,
+    ]
+    running = standings[0]
+    assert (running.progress.epoch, running.progress.best, running.progress.env_steps_per_s) == (8, 7.0, 12345.0)
+    assert running.seconds_left == (20 - 8) * 4.0
+    assert running.heartbeat_age == pytest.approx(5.0, abs=0.1)
+    assert (running.device.gpu, standings[3].device.gpu) == ("3", "cpu")
+    assert [s.outcome for s in standings[3:5]] == ["finished", "stopped_asha"]  # the higher score first
+    best = best_of(standings)
+    assert best is standings[3]
+    # One trial at a time and 4 s an epoch: 12 epochs of the running one, 16 of the silent, 20 of the waiting.
+    assert remaining(standings) == (12 + 16 + 20) * 4.0
+
+
+@pytest.mark.parametrize(("age", "state"), [(59.0, State.RUNNING), (61.0, State.STALE), (-50.0, State.RUNNING)])
+def test_stale_after_a_minute_at_four_seconds_an_epoch(
+    experiment: experiments.Experiment, age: float, state: State
+) -> None:
+    folder = experiment.trial_folder(experiment.trials()[0].id)
+    os.utime(folder / "metrics.jsonl", (NOW - age, NOW - age))
+    os.utime(folder / "device.json", (NOW - 900, NOW - 900))
+    assert next(s for s in Observer(experiment).look(NOW) if s.id == folder.name).state is state
+
+
+def test_a_process_that_has_just_started_may_take_minutes_to_compile(experiment: experiments.Experiment) -> None:
+    folder = experiment.trial_folder(experiment.trials()[1].id)
+    for age, state in ((500.0, State.RUNNING), (700.0, State.STALE)):
+        os.utime(folder / "metrics.jsonl", (NOW - 5000, NOW - 5000))
+        os.utime(folder / "device.json", (NOW - age, NOW - age))
+        assert next(s for s in Observer(experiment).look(NOW) if s.id == folder.name).state is state
+
+
+def test_a_changed_file_is_read_again_and_another_is_not(
+    experiment: experiments.Experiment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from msk_ray.tune import standing
+
+    read: list[str] = []
+    original = standing.read_rows
+    monkeypatch.setattr(standing, "read_rows", lambda folder: (read.append(folder.name), original(folder))[1])
+    observer = Observer(experiment)
+    observer.look(NOW)
+    read.clear()
+    folder = experiment.trial_folder(experiment.trials()[0].id)
+    (folder / "metrics.jsonl").write_text(json.dumps(row(9, 8.0)) + "\n")
+    first = observer.look(NOW)[0]
+    assert read == [folder.name]
+    assert (first.progress.epoch, first.progress.best) == (9, 8.0)
+
+
+def test_trials_a_search_makes_up_are_found_before_the_manifest_knows_them(experiment: experiments.Experiment) -> None:
+    trials = experiment.trials()
+    (experiment.trial_folder(trials[0].id) / "config.yaml").write_text(dump_yaml(trials[0].config.as_dict()))
+    experiment.set_trials(trials[1:])
+    found = next(s for s in Observer(experiment).look(NOW) if s.id == trials[0].id)
+    assert (found.state, found.variant, found.epochs) == (State.RUNNING, "actor_lr=0.01", 20)
+
+
+def test_progress_of_nothing_and_of_scores_that_are_no_numbers() -> None:
+    assert progress_of([]).best is None
+    rows = [row(1, float("nan")), row(2, float("nan"))]
+    assert (progress_of(rows).best, progress_of(rows).epoch, progress_of(rows).seconds_per_epoch) == (None, 2, 4.0)
+
+
+@pytest.mark.parametrize("width", [80, 200])
+def test_the_table_fits_the_terminal(
+    experiment: experiments.Experiment,
+    width: int,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("COLUMNS", str(width))
+    assert run(main, ["rates", "--storage", str(experiment.path.parent)]) == 0
+    text = capsys.readouterr().out
+    lines = text.splitlines()
+    assert max(map(len, lines)) <= width
+    assert lines[0].startswith("rates · 1 running · 1 stale · 1 waiting · 2 ended · 1 unreadable · best 9")
+    running = next(line.split() for line in lines if "running" in line and "8/20" in line)
+    for cell in ("actor_lr=0.01", "8/20", "7", "12.3k", "48s"):
+        assert cell in running, running
+    assert "asha" in text
+    assert "JSONDecodeError" in text  # what is wrong with the broken file
+    assert ("node7:3 NVIDIA H200" in text) == (width == 200)
+    assert ("number 3 of 3" in text) == (width == 200)
+
+
+def test_an_experiment_by_path_with_a_request_to_stop(
+    experiment: experiments.Experiment, capsys: pytest.CaptureFixture[str]
+) -> None:
+    experiment.stop_file.touch()
+    assert run(main, [str(experiment.path)]) == 0
+    assert "stopped on request" in capsys.readouterr().out
+
+
+def test_list_of_experiments(experiment: experiments.Experiment, capsys: pytest.CaptureFixture[str]) -> None:
+    storage = experiment.path.parent
+    (storage / "debug").mkdir()
+    (storage / "torn").mkdir()
+    (storage / "torn" / "env.json").write_text("{}")
+    (storage / "garbled").mkdir()
+    (storage / "garbled" / "manifest.json").write_text('{"format": 1, "tri')
+    assert run(main, ["--storage", str(storage)]) == 0
+    text = capsys.readouterr().out
+    assert "Which rate?" in text
+    assert "1 running" in text
+    assert "manifest.json is" in text
+    assert "cannot read" in text
+    assert "debug" not in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["rate"], "did you mean 'rates'?"),
+        (["nothing"], "there are rates"),
+        (["torn"], "holds no experiment: manifest.json is missing"),
+        (["garbled"], "cannot read"),
+        (["odd"], "has no trials"),
+        (["--watch"], "which experiment? there are"),
+    ],
+)
+def test_what_is_no_experiment_is_one_line(
+    experiment: experiments.Experiment, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    storage = experiment.path.parent
+    for name, text in (("torn", None), ("garbled", '{"format": 1, "tri'), ("odd", '{"format": 1}')):
+        if name in arguments:
+            (storage / name).mkdir()
+            if text is not None:
+                (storage / name / "manifest.json").write_text(text)
+    assert run(main, [*arguments, "--storage", str(storage)]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_an_empty_storage_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(main, ["--storage", str(tmp_path / "none")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_watch_ends_with_the_last_trial(experiment: experiments.Experiment, capsys: pytest.CaptureFixture[str]) -> None:
+    for trial in experiment.trials():
+        (experiment.trial_folder(trial.id)).mkdir(exist_ok=True)
+        write_ending(experiment.trial_folder(trial.id), Ending(Outcome.FINISHED, "done"))
+    assert run(main, ["rates", "--watch", "--storage", str(experiment.path.parent)]) == 0
+    assert "6 ended" in capsys.readouterr().out
+
+
+def test_neither_ray_nor_torch_is_loaded(experiment: experiments.Experiment, root: Path) -> None:
+    code = (
+        "import sys; from msk_ray.status import main; "
+        f"main(['rates', '--storage', {str(experiment.path.parent)!r}]); "
+        "sys.exit(bool({'ray', 'torch', 'warp', 'mujoco', 'numpy'} & set(sys.modules)))"
+    )
+    result = subprocess.run([sys.executable, "-c", code], cwd=root, env={**os.environ, "PYTHONPATH": str(root)})
+    assert result.returncode == 0
+
+
+@pytest.mark.parametrize(("value", "text"), [(0.0, "0"), (950.0, "950"), (12345.0, "12.3k"), (999999.0, "1M")])
+def test_short_numbers(value: float, text: str) -> None:
+    assert short_number(value) == text
