@@ -1,5 +1,10 @@
 """Errors a user can mend. Each message is one line that says what to write or do instead."""
 
+import errno
+from enum import StrEnum
+
+_STORAGE_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS, errno.ESTALE}
+
 
 class MskRayError(Exception):
     """Base of every error whose cause lies outside the code; entry points print it as one line and exit 2."""
@@ -23,9 +28,48 @@ class StorageError(MskRayError):
     """A folder cannot be written, or already holds something else."""
 
 
+class StorageFailure(StorageError):
+    """Writing failed in the middle of the work: the disk is full or gone. What was saved before is whole, and work can
+    be resumed from it."""
+
+    exit_code = 75  # EX_TEMPFAIL
+
+
+def storage_failure(error: BaseException) -> StorageFailure | None:
+    """The failed storage behind an exception, itself or one that it came from; None if it has another cause."""
+    seen: BaseException | None = error
+    while seen is not None:
+        if isinstance(seen, StorageFailure):
+            return seen
+        if isinstance(seen, OSError) and seen.errno in _STORAGE_ERRORS:
+            return StorageFailure(f"cannot write {seen.filename or 'to the storage'}: {seen.strerror}")
+        # Ray carries the exception of another process as `cause`.
+        seen = getattr(seen, "cause", None) or seen.__cause__ or seen.__context__
+    return None
+
+
 class UnsupportedModelError(MskRayError):
     """A model feature cannot be differentiated by the chosen backward mode."""
 
 
+class Failure(StrEnum):
+    """How a simulation can fail; a trial's outcome has the same name."""
+
+    DIVERGED = "diverged"
+    """Worlds diverged, or contacts or constraint rows were lost."""
+    NONFINITE = "nonfinite"
+    """A gradient was NaN or infinite."""
+    OUT_OF_MEMORY = "out_of_memory"
+    """The device has less memory than the settings need."""
+
+
 class SimulationError(MskRayError):
-    """The physics could not be computed as asked: buffers overflowed, or too many worlds diverged."""
+    """The physics could not be computed as asked."""
+
+    def __init__(self, message: str, failure: Failure = Failure.DIVERGED) -> None:
+        super().__init__(message, failure)  # both, so that the error survives pickling between processes
+        self.message = message
+        self.failure = failure
+
+    def __str__(self) -> str:
+        return self.message

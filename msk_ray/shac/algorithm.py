@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from msk_ray.config import Config
 from msk_ray.envs import Env
-from msk_ray.errors import SimulationError
+from msk_ray.errors import Failure, SimulationError
 from msk_ray.networks import Actor, Critic, RunningMeanStd
 from msk_ray.shac import returns
 from msk_ray.shac.critic_fit import CriticFit
@@ -189,10 +189,13 @@ class Shac:
             raise SimulationError(
                 f"nonfinite_gradient: the state cotangent of {lost:.1%} of the worlds was not finite "
                 f"(shac.max_nonfinite_share allows {allowed:.1%}); shorten shac.horizon, set shac.state_grad_clip or "
-                "soften the contacts"
+                "soften the contacts",
+                Failure.NONFINITE,
             )
         if not bool(norm.isfinite()):
-            raise SimulationError("nonfinite_gradient: the policy gradient is not finite; lower shac.actor_lr")
+            raise SimulationError(
+                "nonfinite_gradient: the policy gradient is not finite; lower shac.actor_lr", Failure.NONFINITE
+            )
         self.actor_optimizer.step()
         return norm
 

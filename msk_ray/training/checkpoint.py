@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from msk_ray.errors import CheckpointError, StorageError
+from msk_ray.errors import CheckpointError, StorageFailure
 
 FORMAT = 1
 _EPOCH_NAME = re.compile(r"epoch_(\d+)\.pt")
@@ -24,7 +24,7 @@ def write_atomically(path: Path, payload: bytes) -> None:
     """Replace `path` by `payload` in one step that survives a crash.
 
     Raises:
-        StorageError: the disk is full or the folder not writable; what was there before is untouched.
+        StorageFailure: the disk is full or the folder not writable; what was there before is untouched.
     """
     temporary = path.with_name(f".{path.name}.tmp")
     try:
@@ -35,7 +35,7 @@ def write_atomically(path: Path, payload: bytes) -> None:
         temporary.replace(path)
     except OSError as error:
         temporary.unlink(missing_ok=True)
-        raise StorageError(f"cannot write {path}: {error.strerror or error}") from error
+        raise StorageFailure(f"cannot write {path}: {error.strerror or error}") from error
 
 
 def write_checkpoint(path: Path, state: dict[str, Any], facts: dict[str, Any]) -> Path:

@@ -8,7 +8,7 @@ from typing import Any
 
 from torch.utils.tensorboard import SummaryWriter
 
-from msk_ray.errors import StorageError
+from msk_ray.errors import StorageFailure
 from msk_ray.metrics_file import METRICS_FILE, read_metrics
 from msk_ray.training.checkpoint import write_atomically
 
@@ -25,7 +25,9 @@ class MetricsLog:
         self._folder = folder
 
     def rewind(self, epoch: int) -> None:
-        """Drop rows after `epoch`, which a resumed trial will write again."""
+        """Drop rows after `epoch`, which a resumed trial will write again, and with them a torn last line."""
+        if not self._path.is_file():
+            return
         rows = [row for row in read_metrics(self._path) if row["epoch"] <= epoch]
         write_atomically(self._path, "".join(json.dumps(row) + "\n" for row in rows).encode())
         self.close()
@@ -35,7 +37,7 @@ class MetricsLog:
         """Append one row; it is on its way to disk when this returns.
 
         Raises:
-            StorageError: the disk is full or gone.
+            StorageFailure: the disk is full or gone.
         """
         bad = [name for name, value in row.items() if not math.isfinite(value)]
         clean: dict[str, Any] = {name: None if name in bad else value for name, value in row.items()}
@@ -53,7 +55,7 @@ class MetricsLog:
                 if name not in bad and name != "epoch":
                     self._board.add_scalar(name, value, clean["epoch"])
         except OSError as error:
-            raise StorageError(f"cannot write {self._path}: {error.strerror or error}") from error
+            raise StorageFailure(f"cannot write {self._path}: {error.strerror or error}") from error
 
     def close(self) -> None:
         """Flush and close TensorBoard's file."""

@@ -18,6 +18,7 @@ from msk_ray.training.checkpoint import (
     write_checkpoint,
 )
 from msk_ray.training.evaluation import Evaluator
+from msk_ray.training.memory import named_out_of_memory
 from msk_ray.training.metrics import MetricsLog
 
 # Settings that may differ between a checkpoint and the trial that goes on from it.
@@ -36,7 +37,7 @@ class Trainer:
         best_score: highest evaluation score so far, -inf before the first.
 
     Raises:
-        DeviceError, UnsupportedModelError, StorageError: as their messages say.
+        DeviceError, UnsupportedModelError, StorageError, SimulationError: as their messages say.
     """
 
     def __init__(self, config: Config, logdir: Path, device: str) -> None:
@@ -51,9 +52,11 @@ class Trainer:
         except OSError as error:
             raise StorageError(f"cannot create {self.checkpoints}: {error.strerror or error}") from error
         write_atomically(logdir / "config.yaml", dump_yaml(config.as_dict()).encode())
-        self.env = make_env(config.env, config.physics, config.env.nworld, device, config.trial.seed)
-        self.shac = Shac(config, self.env)
-        self.evaluator = Evaluator(config, device)
+        self._device = device
+        with named_out_of_memory(device, config.env.nworld):
+            self.env = make_env(config.env, config.physics, config.env.nworld, device, config.trial.seed)
+            self.shac = Shac(config, self.env)
+            self.evaluator = Evaluator(config, device)
         self._log = MetricsLog(logdir)
 
     @property
@@ -79,8 +82,13 @@ class Trainer:
             `time/*`, `physics/*`, and on evaluation epochs `eval/*`.
 
         Raises:
-            SimulationError: the gradient or the physics failed; the last checkpoint stays as it is.
+            SimulationError: the gradient or the physics failed, or the device ran out of memory; the last checkpoint
+                stays as it is.
         """
+        with named_out_of_memory(self._device, self.env.nworld):
+            return self._run_epoch()
+
+    def _run_epoch(self) -> dict[str, float]:
         if self.epoch == 0:
             self._evaluate_initial()
         started = time.perf_counter()
@@ -125,7 +133,7 @@ class Trainer:
         self._log.rewind(self.epoch)
 
     def restore_latest(self) -> tuple[Path | None, list[str]]:
-        """Go on from the newest whole checkpoint, if there is one.
+        """Go on from the newest whole checkpoint, or from the start if there is none.
 
         Returns:
             Its path or None, and a line on each newer checkpoint that was torn.
@@ -133,6 +141,9 @@ class Trainer:
         path, faults = newest_valid_checkpoint(self.checkpoints)
         if path is not None:
             self.restore(path)
+        else:
+            # An attempt that died before its first checkpoint may have left rows, the last of them torn.
+            self._log.rewind(-1)
         return path, faults
 
     def close(self) -> None:

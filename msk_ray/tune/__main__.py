@@ -64,6 +64,11 @@ def parser() -> Parser:
     where.add_argument(
         "--retry-errored", action="store_true", help="with --resume: try trials again that ended in an error"
     )
+    where.add_argument(
+        "--retry",
+        metavar="OUTCOMES",
+        help="the same for other outcomes, such as nonfinite,diverged: from their newest checkpoint",
+    )
     return p
 
 
@@ -72,8 +77,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser().parse_args(argv)
     if args.max_concurrent is not None and args.max_concurrent < 1:
         raise ConfigError(f"--max-concurrent {args.max_concurrent}: at least 1")
-    if args.retry_errored and not args.resume:
-        raise ConfigError("--retry-errored goes with --resume")
+    retried = _retried(args)
+    if retried and not args.resume:
+        raise ConfigError(f"--retry{'-errored' if args.retry_errored else ''} goes with --resume")
     space = _read_space(args)
     trials = [] if space.file.search == "optuna" else resolve_trials(space)
     if args.smoke:
@@ -85,6 +91,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     if args.debug_trial is not None:
         return _debug(args, space, find_trial(trials, args.debug_trial))
     return _run(args, space, trials)
+
+
+def _retried(args: argparse.Namespace) -> set[Outcome]:
+    """The outcomes whose trials are to be tried again."""
+    known = [str(outcome) for outcome in Outcome if outcome is not Outcome.FINISHED]
+    names = args.retry.split(",") if args.retry is not None else []
+    for name in names:
+        if name not in known:
+            raise ConfigError(f"--retry {name!r}: write one or more of {','.join(known)}")
+    return {Outcome(name) for name in names} | ({Outcome.ERROR} if args.retry_errored else set())
 
 
 def _read_space(args: argparse.Namespace) -> Space:
@@ -146,8 +162,7 @@ def _run(args: argparse.Namespace, space: Space, trials: list[Trial]) -> int:
         if space.file.search == "optuna":
             raise ConfigError("--resume: a search by optuna cannot go on; pass another --name")
         experiment = experiments.reopen(path, trials)
-        if args.retry_errored:
-            experiment.clear_endings({Outcome.ERROR})
+        experiment.clear_endings(_retried(args))
     # ray and torch take seconds to load; a wrong command line should not wait for them.
     from msk_ray.tune import runner
     from msk_ray.tune.devices import choose_placement, local_gpus

@@ -1,6 +1,7 @@
 """What the terminal shows while an experiment runs: a line an event, and now and then where everything stands."""
 
 import math
+import pickle
 import sys
 import time
 from collections.abc import Callable
@@ -12,6 +13,7 @@ from ray.exceptions import RayActorError
 from ray.tune import Callback
 
 from msk_ray.cli import StopRequest
+from msk_ray.errors import StorageFailure, storage_failure
 from msk_ray.progress import format_duration
 from msk_ray.tune.adapters import METRIC
 from msk_ray.tune.experiment import Experiment
@@ -63,6 +65,8 @@ class Live(Callback):
         self._last_status = self._start
         self._seconds_per_epoch: dict[str, float] = {}
         self._stopping_since: float | None = None
+        self.storage_failure: StorageFailure | None = None
+        """What a trial met when it wrote; then everything is stopped, as every trial would meet it."""
         self._armed = False
 
     def __getstate__(self) -> dict[str, Any]:
@@ -116,6 +120,8 @@ class Live(Callback):
             self._say(f"{mine.id} best so far: score {run.score:.5g} at epoch {run.epoch}/{mine.epochs}")
 
     def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
+        if self._meet_storage_failure(trial):
+            return
         mine = self._trial_of(trial.config)
         why = _reason(self._experiment.trial_folder(mine.id), trial)
         self._say(f"{mine.id} {why}; trying again from its newest checkpoint")
@@ -133,6 +139,8 @@ class Live(Callback):
         self._say(f"{mine.id} {ending.outcome}: {ending.why}{score}")
 
     def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
+        if self._meet_storage_failure(trial):
+            return
         mine = self._trial_of(trial.config)
         folder = self._experiment.trial_folder(mine.id)
         self._saving.discard(mine.id)
@@ -165,11 +173,34 @@ class Live(Callback):
             )
         return "\n".join(lines)
 
-    def _begin_stop(self) -> None:
-        assert self._stop.signal is not None
+    def _meet_storage_failure(self, trial: Any) -> bool:
+        """Whether the disk failed a trial; then all are stopped, and none has ended by that."""
+        error = _error_of(trial)
+        failure = None if error is None else storage_failure(error)
+        if failure is None:
+            return False
+        trial_id = self._trial_of(trial.config).id
+        self._running.pop(trial_id, None)
+        if self.storage_failure is None:
+            self.storage_failure = failure
+            self._say(f"{trial_id} {failure}; stopping all trials ...")
+        if self._stopping_since is None:
+            self._stop_trials()
+        self._saving.discard(trial_id)
+        return True
+
+    def _stop_trials(self) -> None:
         self._stopping_since = time.monotonic()
         self._saving = set(self._running)
-        self._experiment.stop_file.touch()
+        try:
+            self._experiment.stop_file.touch()
+        except OSError as error:
+            # Then the trials meet the same disk at their next row, and end by that.
+            self._say(f"cannot write {self._experiment.stop_file}: {error.strerror}")
+
+    def _begin_stop(self) -> None:
+        assert self._stop.signal is not None
+        self._stop_trials()
         self._say(f"{self._stop.signal.name}: {len(self._saving)} trials save themselves at the end of their epoch ...")
 
     def _say(self, text: str) -> None:
@@ -180,6 +211,18 @@ class Live(Callback):
         return f"{trial.variant} seed={trial.seed}"
 
 
+def _error_of(trial: Any) -> Exception | None:
+    """The exception that ended a Ray trial's process; None if there was none.
+
+    Ray's own accessor reads the storage, where the file arrives later, or never on a full disk.
+    """
+    path = trial.pickled_error_file
+    if path is None or not Path(path).is_file():
+        return None
+    error: Exception = pickle.loads(Path(path).read_bytes())
+    return error
+
+
 def _reason(folder: Path, trial: Any) -> str:
     """Why a trial's process ended before its time, on one line."""
     hang_file, error_file = folder / HANG_FILE, folder / ERROR_FILE
@@ -187,7 +230,7 @@ def _reason(folder: Path, trial: Any) -> str:
         return f"it hung; where is in {hang_file}"
     if error_file.is_file():
         return error_file.read_text(encoding="utf-8").strip().splitlines()[-1]
-    error = trial.get_pickled_error()
+    error = _error_of(trial)
     if error is None or isinstance(error, RayActorError):
         times = "" if trial.num_failures < 2 else f", {trial.num_failures} times now"
         return f"its process died (killed, or out of memory){times}"

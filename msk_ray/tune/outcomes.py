@@ -7,6 +7,8 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
+from msk_ray.errors import StorageFailure
+
 OUTCOME_FILE = "outcome.json"
 
 
@@ -29,6 +31,8 @@ class Outcome(StrEnum):
     """A score, loss or gradient was NaN or infinite."""
     DIVERGED = "diverged"
     """Too many simulated worlds diverged."""
+    OUT_OF_MEMORY = "out_of_memory"
+    """Its device has less memory than its settings need."""
     ERROR = "error"
     """An exception, or its process died too often."""
 
@@ -61,11 +65,19 @@ def write_json(path: Path, data: Any) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write text so that a reader never sees half a file, and the file survives a crash right after."""
+    """Write text so that a reader never sees half a file, and the file survives a crash right after.
+
+    Raises:
+        StorageFailure: the disk is full or the folder not writable; what was there before is untouched.
+    """
     # Another process may write the same file: each has its own temporary.
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    with temporary.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    try:
+        with temporary.open("w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise StorageFailure(f"cannot write {path}: {error.strerror or error}") from error

@@ -21,7 +21,7 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 import msk_ray
 from msk_ray.cli import StopRequest
 from msk_ray.config import Config, read_yaml
-from msk_ray.errors import DeviceError, MskRayError
+from msk_ray.errors import DeviceError, MskRayError, StorageFailure, storage_failure
 from msk_ray.progress import format_duration
 from msk_ray.training import Trainer, precompile
 from msk_ray.tune.adapters import METRIC, Population, PruningScheduler, domain, optuna_search
@@ -107,6 +107,7 @@ def run_trials(plan: Plan) -> bool:
         False if a request to stop ended it before its time; the experiment can be resumed.
 
     Raises:
+        StorageFailure: the disk is full or gone; the experiment can be resumed once it is back.
         MskRayError: kernels could not be compiled for a trial, or the search is not installed.
     """
     experiment, space = plan.experiment, plan.space
@@ -177,8 +178,21 @@ def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial]) -> None:
             checkpoint_config=tune.CheckpointConfig(num_to_keep=None),
         ),
     )
-    with _log_to(plan.experiment.path / "ray.log"):
-        tuner.fit()
+    try:
+        with _log_to(plan.experiment.path / "ray.log"):
+            tuner.fit()
+    except Exception as error:
+        # The driver may meet a full disk before any trial does.
+        failure = live.storage_failure or storage_failure(error)
+        if failure is None:
+            raise
+        raise _advised(failure) from error
+    if live.storage_failure is not None:
+        raise _advised(live.storage_failure)
+
+
+def _advised(failure: StorageFailure) -> StorageFailure:
+    return StorageFailure(f"{failure}; mend that and go on with --resume")
 
 
 @contextmanager

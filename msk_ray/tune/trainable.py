@@ -17,6 +17,7 @@ from ray import tune
 from ray.util.metrics import Gauge
 
 from msk_ray.config import parse_config
+from msk_ray.errors import storage_failure
 from msk_ray.tune.adapters import METRIC
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.operators import Listed, describe
@@ -82,7 +83,16 @@ def make_trainable(job: Job) -> Callable[[dict[str, Any]], None]:
 
     def trainable(config: dict[str, Any]) -> None:
         trial = job.trial_of(config)
-        folder = job.experiment.trial_folder(trial.id)
+        try:
+            attempt(trial, job.experiment.trial_folder(trial.id))
+        except Exception as error:
+            # Whatever stumbled over a full disk first, a line of output perhaps: the driver must hear of the disk.
+            failure = storage_failure(error)
+            if failure is None:
+                raise
+            raise failure from error
+
+    def attempt(trial: Trial, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         _redirect_output(folder / "output.log")
         _limit_threads(job.threads)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Protocol
 
 from msk_ray.config import Config
-from msk_ray.errors import MskRayError, SimulationError
+from msk_ray.errors import MskRayError, SimulationError, StorageFailure
 from msk_ray.tune.outcomes import Ending, Outcome, read_ending, write_ending, write_text
 from msk_ray.tune.records import evaluations_of, read_rows
 from msk_ray.tune.space import StopSpec
@@ -69,6 +69,7 @@ def run_trial(
         How it ended; None if it was paused before.
 
     Raises:
+        StorageFailure: the disk is full or gone; the trial can go on once it is back.
         Exception: anything that is neither a failed simulation nor a fault the user can mend. Its traceback is kept in
             `error.txt`, and the trial may be tried again.
     """
@@ -81,8 +82,10 @@ def run_trial(
     try:
         ending = _train(trial, folder, device, stop, trainer_class, hooks, checkpoint)
     except SimulationError as error:
-        # The message begins with what happened, such as "nonfinite_gradient: ...".
-        ending = Ending(Outcome.NONFINITE if str(error).startswith("nonfinite") else Outcome.DIVERGED, str(error))
+        ending = Ending(Outcome(error.failure.value), str(error))
+    except StorageFailure:
+        # The disk's fault, not the trial's: it has not ended, and goes on once there is room.
+        raise
     except MskRayError as error:
         ending = Ending(Outcome.ERROR, str(error))
     except Exception:

@@ -35,3 +35,13 @@ def test_reading_keeps_the_latest_row_of_an_epoch_and_forgives_a_torn_end(tmp_pa
     path.write_text('{"epo\n{"epoch": 2}\n')
     with pytest.raises(StorageError, match="line 1 is not JSON"):
         read_metrics(path)
+
+
+def test_rewinding_to_before_the_first_row_drops_a_torn_one(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.jsonl"
+    path.write_text('{"epoch": 0, "a": 1}\n{"epoch": 1')
+    log = MetricsLog(tmp_path)
+    log.rewind(-1)
+    log.write({"epoch": 0, "a": 2.0})
+    log.close()
+    assert [(r["epoch"], r["a"]) for r in read_metrics(path)] == [(0, 2)]

@@ -14,7 +14,7 @@ from collections.abc import Collection
 from pathlib import Path
 
 from msk_ray.config import Config, dump_yaml
-from msk_ray.errors import SimulationError
+from msk_ray.errors import Failure, SimulationError
 
 KILL, NAN, SIMULATION_ERROR, BUG, HANG = 1.0, 2.0, 3.0, 4.0, 5.0
 MISBEHAVE_AT = 5
@@ -77,7 +77,7 @@ class StubTrainer:
         if self.behaviour == NAN:
             row["train/actor_loss"] = math.nan
         if self.behaviour == SIMULATION_ERROR:
-            raise SimulationError("nonfinite_gradient: made up")
+            raise SimulationError("nonfinite_gradient: made up", Failure.NONFINITE)
         if self.behaviour == BUG:
             raise RuntimeError("made up")
 
