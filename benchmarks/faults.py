@@ -189,6 +189,9 @@ def _same(a: Any, b: Any) -> bool:
     return bool(a == b)
 
 
+_drivers: list[subprocess.Popen[bytes]] = []
+
+
 class Sweep:
     """One experiment, launched as often as its faults ask for."""
 
@@ -233,6 +236,7 @@ class Sweep:
                 env=environment,
                 start_new_session=True,
             )
+        _drivers.append(self._driver)
 
     def wait(self) -> int:
         """Exit code of the driver; ended after a limit, which then counts as a loss."""
@@ -487,6 +491,10 @@ def _scratch(keep: bool) -> Iterator[Path]:
     try:
         yield path
     finally:
+        for driver in _drivers:  # one is still there if the campaign itself was interrupted
+            if driver.poll() is None:
+                driver.kill()
+                driver.wait()
         if keep:
             print(f"kept: {path}")
         else:
@@ -494,13 +502,13 @@ def _scratch(keep: bool) -> Iterator[Path]:
 
 
 CAMPAIGNS: dict[str, Callable[[Reference, Path, random.Random], list[Tally]]] = {
-    "workers": inside_workers,
-    "nan": nan,
-    "driver": lambda *a: killed(*a, "driver SIGKILL", 3, signal.SIGKILL),
-    "sigterm": lambda *a: killed(*a, "driver SIGTERM", 3, signal.SIGTERM),
-    "raylet": lambda *a: killed(*a, "raylet SIGKILL", 3, signal.SIGKILL, True),
-    "checkpoints": damaged,
     "disk": full_disk,
+    "raylet": lambda *a: killed(*a, "raylet SIGKILL", 3, signal.SIGKILL, True),
+    "nan": nan,
+    "workers": inside_workers,
+    "checkpoints": damaged,
+    "sigterm": lambda *a: killed(*a, "driver SIGTERM", 3, signal.SIGTERM),
+    "driver": lambda *a: killed(*a, "driver SIGKILL", 3, signal.SIGKILL),
 }
 
 

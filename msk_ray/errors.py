@@ -39,12 +39,16 @@ def storage_failure(error: BaseException) -> StorageFailure | None:
     """The failed storage behind an exception, itself or one that it came from; None if it has another cause."""
     seen: BaseException | None = error
     while seen is not None:
+        # Ray wraps the exception of another process, which it carries as `cause`, into one of the same class.
+        inner = getattr(seen, "cause", None)
+        if isinstance(inner, BaseException):
+            seen = inner
+            continue
         if isinstance(seen, StorageFailure):
             return seen
         if isinstance(seen, OSError) and seen.errno in _STORAGE_ERRORS:
             return StorageFailure(f"cannot write {seen.filename or 'to the storage'}: {seen.strerror}")
-        # Ray carries the exception of another process as `cause`.
-        seen = getattr(seen, "cause", None) or seen.__cause__ or seen.__context__
+        seen = seen.__cause__ or seen.__context__
     return None
 
 

@@ -22,7 +22,7 @@ from msk_ray.training.memory import named_out_of_memory
 from msk_ray.training.metrics import MetricsLog
 
 # Settings that may differ between a checkpoint and the trial that goes on from it.
-_EXTENDABLE = {"trial": {"checkpoint_interval", "keep_checkpoints"}}
+_EXTENDABLE = {"trial": {"epochs", "checkpoint_interval", "keep_checkpoints"}}
 
 
 class Trainer:

@@ -4,7 +4,7 @@ import argparse
 import shutil
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ from msk_ray.cli import RESUMABLE, Parser, run
 from msk_ray.config import dump_yaml, parse_override, read_yaml
 from msk_ray.errors import ConfigError
 from msk_ray.tune import experiment as experiments
+from msk_ray.tune.extension import extended_space, parse_extension
 from msk_ray.tune.listing import text_table, trial_rows
 from msk_ray.tune.outcomes import Outcome
 from msk_ray.tune.smoke import shrink, without_pruning
@@ -31,6 +32,7 @@ EXAMPLES = """\
   python -m msk_ray.tune --space ant_lr --seeds 0-4 --gpus-per-trial 0.5
   python -m msk_ray.tune --space ant_lr --set trial.epochs=100 --name ant_lr_short
   python -m msk_ray.tune --space ant_lr --resume                    # after Ctrl-C, a crash or a lost node
+  python -m msk_ray.tune --space ant_lr --extend epochs=600         # it has ended; go on to more epochs
   python -m msk_ray.tune --space ant_lr --debug-trial 3             # that trial alone, here, without Ray
 
 exit codes: 0 all trials ended, 1 some ended in an error, 2 refused before any work began, 75 stopped on request and
@@ -62,6 +64,14 @@ def parser() -> Parser:
     where.add_argument("--name", help="the experiment's name; by default the space's")
     where.add_argument("--resume", action="store_true", help="go on with an experiment that was interrupted")
     where.add_argument(
+        "--extend",
+        action="append",
+        default=[],
+        metavar="KIND=TOTAL",
+        help="go on with an experiment that has ended, with more: epochs=N (those that ran to their end go on to N), "
+        "samples=N or seeds=LIST (new trials beside the old ones); totals, not additions",
+    )
+    where.add_argument(
         "--retry-errored", action="store_true", help="with --resume: try trials again that ended in an error"
     )
     where.add_argument(
@@ -80,7 +90,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     retried = _retried(args)
     if retried and not args.resume:
         raise ConfigError(f"--retry{'-errored' if args.retry_errored else ''} goes with --resume")
-    space = _read_space(args)
+    extension = parse_extension(args.extend)
+    if extension and args.smoke:
+        raise ConfigError("--extend: a smoke run has nothing to extend; leave --smoke out")
+    space = _read_space(args, _recorded_extension(args) | extension)
+    if extension and (space.file.search == "optuna" or space.file.scheduler.kind == "pbt"):
+        raise ConfigError("--extend: optuna and pbt cannot go on from a recorded experiment; pass another --name")
     trials = [] if space.file.search == "optuna" else resolve_trials(space)
     if args.smoke:
         trials = shrink(space, trials) if trials else []
@@ -90,7 +105,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     if args.debug_trial is not None:
         return _debug(args, space, find_trial(trials, args.debug_trial))
-    return _run(args, space, trials)
+    return _run(args, space, trials, extension)
 
 
 def _retried(args: argparse.Namespace) -> set[Outcome]:
@@ -103,7 +118,20 @@ def _retried(args: argparse.Namespace) -> set[Outcome]:
     return {Outcome(name) for name in names} | ({Outcome.ERROR} if args.retry_errored else set())
 
 
-def _read_space(args: argparse.Namespace) -> Space:
+def _experiment_path(args: argparse.Namespace) -> Path:
+    name: str = args.name or find_space(args.space).stem + ("-smoke" if args.smoke else "")
+    storage: Path = args.storage
+    return (storage / experiments.check_name(name)).resolve()
+
+
+def _recorded_extension(args: argparse.Namespace) -> dict[str, Any]:
+    """How the experiment to go on with was extended before; its space file knows nothing of that."""
+    experiment = experiments.Experiment(_experiment_path(args))
+    going_on = (args.resume or args.extend) and (experiment.path / "manifest.json").is_file()
+    return experiment.extension() if going_on else {}
+
+
+def _read_space(args: argparse.Namespace, extension: Mapping[str, Any]) -> Space:
     """The space with the command line's changes laid over it, checked again as a whole."""
     path = find_space(args.space)
     data: dict[str, Any] = read_yaml(path)
@@ -117,7 +145,7 @@ def _read_space(args: argparse.Namespace) -> Space:
     if args.seeds is not None:
         parse_seeds(args.seeds)
         data["seeds"] = args.seeds
-    return parse_space(data, path)
+    return parse_space(extended_space(data, extension), path)
 
 
 def _print_trials(space: Space, trials: list[Trial]) -> None:
@@ -155,13 +183,15 @@ def _debug(args: argparse.Namespace, space: Space, trial: Trial) -> int:
     return 1 if read_record(trial, folder).errored else 0
 
 
-def _run(args: argparse.Namespace, space: Space, trials: list[Trial]) -> int:
-    name = experiments.check_name(args.name or space.name + ("-smoke" if args.smoke else ""))
-    path = (args.storage / name).resolve()
-    if args.resume:
+def _run(args: argparse.Namespace, space: Space, trials: list[Trial], extension: Mapping[str, Any]) -> int:
+    path = _experiment_path(args)
+    going_on = args.resume or bool(extension)
+    if going_on:
         if space.file.search == "optuna":
             raise ConfigError("--resume: a search by optuna cannot go on; pass another --name")
-        experiment = experiments.reopen(path, trials)
+        experiment = experiments.reopen(path, trials, extension)
+        # As recorded: with the ids they began with, and the epochs they were extended to.
+        trials = experiment.trials()
         experiment.clear_endings(_retried(args))
     # ray and torch take seconds to load; a wrong command line should not wait for them.
     from msk_ray.tune import runner
@@ -170,7 +200,7 @@ def _run(args: argparse.Namespace, space: Space, trials: list[Trial]) -> int:
 
     if args.address is None:
         placement = choose_placement(space.file.resources, args.gpus_per_trial, args.cpu, local_gpus())
-    if not args.resume:
+    if not going_on:
         experiment = experiments.create(path, space, trials, _options(args))
 
     with runner.ray_session(args.address):
@@ -182,7 +212,7 @@ def _run(args: argparse.Namespace, space: Space, trials: list[Trial]) -> int:
         completed = runner.run_trials(runner.Plan(experiment, space, trials, placement, limit))
     errors = finish(experiment)
     if not completed:
-        print(f"stopped on request; go on with --resume --space {args.space} --name {name}")
+        print(f"stopped on request; go on with --resume --space {args.space} --name {path.name}")
         return RESUMABLE
     return 1 if errors else 0
 

@@ -8,6 +8,7 @@ from ray.tune.schedulers import FIFOScheduler, PopulationBasedTraining, TrialSch
 from ray.tune.search import Searcher
 
 from msk_ray.errors import ConfigError
+from msk_ray.tune.journal import Journal, Report
 from msk_ray.tune.operators import Listed, Operator, Range
 from msk_ray.tune.outcomes import Ending
 from msk_ray.tune.pruning import Pruner
@@ -18,21 +19,32 @@ METRIC = "score"
 
 
 class PruningScheduler(FIFOScheduler):
-    """Stops the trials a `Pruner` names, and says so."""
+    """Stops the trials a `Pruner` names, and says so.
+
+    A report that is heard again, from a trial that went on from its checkpoint, has been judged already.
+    """
 
     def __init__(
-        self, pruner: Pruner, time_attr: str, identify: Callable[[Any], str], on_stop: Callable[[str, Ending], None]
+        self,
+        pruner: Pruner,
+        time_attr: str,
+        journal: Journal,
+        identify: Callable[[Any], str],
+        on_stop: Callable[[str, Ending], None],
     ) -> None:
         """
         Args:
-            pruner: the rule.
+            pruner: the rule, as far as the journal goes.
             time_attr: key of a report that trials are compared at.
+            journal: what the rule has been told; what it is told now is added.
             identify: id of the trial that a Ray trial runs.
             on_stop: told the id and the ending before the trial is stopped.
         """
         super().__init__()
         self._pruner = pruner
         self._time_attr = time_attr
+        self._journal = journal
+        self._heard = {report.trial: report.epoch for report in journal.read()}
         self._identify = identify
         self._on_stop = on_stop
 
@@ -40,7 +52,14 @@ class PruningScheduler(FIFOScheduler):
         if METRIC not in result:
             return TrialScheduler.CONTINUE
         trial_id = self._identify(trial)
-        ending = self._pruner.report(trial_id, result[self._time_attr], result[METRIC])
+        report = Report(
+            trial_id, result["epoch"], result["env_steps"], result["seconds"], result[METRIC], result["ended"]
+        )
+        if report.epoch <= self._heard.get(trial_id, -1):
+            return TrialScheduler.CONTINUE
+        self._heard[trial_id] = report.epoch
+        self._journal.append(report)
+        ending = self._pruner.report(trial_id, report.time(self._time_attr), report.score)
         # A trial that has ended by itself still counts for the others, but has its own outcome.
         if ending is None or result["ended"]:
             return TrialScheduler.CONTINUE

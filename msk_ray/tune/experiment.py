@@ -16,7 +16,7 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -25,6 +25,7 @@ from typing import Any
 import msk_ray
 from msk_ray.config import dump_yaml, parse_config
 from msk_ray.errors import StorageError
+from msk_ray.tune.extension import extend_trials
 from msk_ray.tune.outcomes import OUTCOME_FILE, Outcome, read_ending, write_json, write_text
 from msk_ray.tune.space import Space
 from msk_ray.tune.trials import Trial, describe_changes
@@ -101,6 +102,31 @@ class Experiment:
             if ending is not None and ending.outcome in outcomes:
                 (folder / OUTCOME_FILE).unlink()
 
+    def extension(self) -> dict[str, Any]:
+        """How the experiment was extended since it was made: epochs, samples, seeds."""
+        recorded: dict[str, Any] = self.manifest().get("extended", {})
+        return recorded
+
+    def extend(self, trials: Iterable[Trial], extension: Mapping[str, Any]) -> None:
+        """Replace the manifest's list of trials by a longer one, and say in it what was asked for."""
+        extended = {"extended": self.extension() | dict(extension)}
+        write_json(
+            self.path / "manifest.json", self.manifest() | extended | {"trials": [_entry(trial) for trial in trials]}
+        )
+
+    def clear_outgrown(self) -> None:
+        """Take back the endings of trials that finished before their epochs were extended."""
+        from msk_ray.training import read_metrics  # loads torch, which a dry run need not wait for
+
+        for trial in self.trials():
+            folder = self.trial_folder(trial.id)
+            ending = read_ending(folder)
+            if ending is None or ending.outcome is not Outcome.FINISHED:
+                continue
+            rows = read_metrics(folder / "metrics.jsonl")
+            if rows and rows[-1]["epoch"] < trial.epochs:
+                (folder / OUTCOME_FILE).unlink()
+
     def set_trials(self, trials: Iterable[Trial]) -> None:
         """Replace the manifest's list of trials."""
         write_json(self.path / "manifest.json", self.manifest() | {"trials": [_entry(trial) for trial in trials]})
@@ -134,26 +160,35 @@ def create(path: Path, space: Space, trials: list[Trial], options: dict[str, Any
     return experiment
 
 
-def reopen(path: Path, trials: list[Trial] | None) -> Experiment:
+def reopen(path: Path, trials: list[Trial] | None, extension: Mapping[str, Any] | None = None) -> Experiment:
     """Open an experiment to go on with it.
 
     Args:
         path: its folder.
-        trials: what the space resolves to now, to be compared; None to take the manifest's word.
+        trials: what the space, extended, resolves to now, to be compared; None to take the manifest's word.
+        extension: what to extend it by: epochs, samples, seeds.
 
     Raises:
         StorageError: there is none, it cannot be written, or its trials are not those of the space as it is now.
+        ConfigError: the extension takes something away.
     """
     experiment = Experiment(path)
     if not path.is_dir():
         raise StorageError(f"--resume: no experiment at {path}; leave --resume out to start one")
     recorded = experiment.trials()
     check_writable(path)
+    if extension:
+        assert trials is not None
+        recorded = extend_trials(recorded, trials, extension.get("epochs"))
+        experiment.extend(recorded, extension)
     difference = difference_of(recorded, trials) if trials is not None else None
     if difference:
         raise StorageError(
-            f"--resume: the space no longer gives the trials of {path}: {difference}; undo that, or pass another --name"
+            f"--resume: the space no longer gives the trials of {path}: {difference}; undo that, or pass another "
+            "--name (--extend adds samples, seeds or epochs)"
         )
+    # Also without a new extension: an earlier one may have been interrupted right after its manifest.
+    experiment.clear_outgrown()
     experiment.stop_file.unlink(missing_ok=True)
     return experiment
 

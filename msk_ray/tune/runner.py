@@ -27,9 +27,11 @@ from msk_ray.training import Trainer, precompile
 from msk_ray.tune.adapters import METRIC, Population, PruningScheduler, domain, optuna_search
 from msk_ray.tune.devices import Placement
 from msk_ray.tune.experiment import Experiment
+from msk_ray.tune.journal import JOURNAL_FILE, Journal, replay
 from msk_ray.tune.live import Live
 from msk_ray.tune.operators import Listed
-from msk_ray.tune.pruning import Pruner, make_pruner
+from msk_ray.tune.outcomes import read_ending, write_ending
+from msk_ray.tune.pruning import make_pruner
 from msk_ray.tune.records import read_record
 from msk_ray.tune.space import Space
 from msk_ray.tune.trainable import Job, make_trainable
@@ -111,6 +113,7 @@ def run_trials(plan: Plan) -> bool:
         MskRayError: kernels could not be compiled for a trial, or the search is not installed.
     """
     experiment, space = plan.experiment, plan.space
+    _finish_pruning(plan)
     remaining = [t for t in plan.trials if read_record(t, experiment.trial_folder(t.id)).ending is None]
     if plan.trials and not remaining:
         print("all trials have ended already")
@@ -143,6 +146,22 @@ def run_trials(plan: Plan) -> bool:
     return not stop
 
 
+def _journal(plan: Plan) -> Journal:
+    return Journal(plan.experiment.path / JOURNAL_FILE)
+
+
+def _finish_pruning(plan: Plan) -> None:
+    """Write the ending of a trial that the rule had just stopped when the driver died."""
+    spec = plan.space.file.scheduler
+    reports = _journal(plan).read()
+    if not reports or not plan.trials or spec.kind == "pbt":
+        return
+    ending = replay(make_pruner(spec, _budget(plan.space, plan.trials)), spec.time_attr, reports)
+    folder = plan.experiment.trial_folder(reports[-1].trial)
+    if ending is not None and read_ending(folder) is None:
+        write_ending(folder, ending)
+
+
 def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial]) -> None:
     spec, file = plan.space.file.scheduler, plan.space.file
     budget = _budget(plan.space, plan.trials or [_first_suggestion(job)])
@@ -150,8 +169,11 @@ def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial]) -> None:
         scheduler: Any = Population(spec, budget, plan.space.sampled)
     else:
         pruner = make_pruner(spec, budget)
-        replay(pruner, spec.time_attr, plan)
-        scheduler = PruningScheduler(pruner, spec.time_attr, lambda trial: job.trial_of(trial.config).id, live.pruned)
+        journal = _journal(plan)
+        replay(pruner, spec.time_attr, journal.read())
+        scheduler = PruningScheduler(
+            pruner, spec.time_attr, journal, lambda trial: job.trial_of(trial.config).id, live.pruned
+        )
     resources = {"cpu": plan.placement.cpus} | ({"gpu": plan.placement.gpus} if plan.placement.gpus else {})
     searching = file.search == "optuna"
     tuner = tune.Tuner(
@@ -214,19 +236,6 @@ def _log_to(path: Path) -> Iterator[None]:
             logger.handlers = handlers
             logger.setLevel(level)
             file.close()
-
-
-def replay(pruner: Pruner, time_attr: str, plan: Plan) -> None:
-    """Feed a rule with the recorded evaluations of all trials, in the order they were made."""
-    seen = [
-        (evaluation.seconds, trial.id, evaluation)
-        for trial in plan.trials
-        for evaluation in read_record(trial, plan.experiment.trial_folder(trial.id)).evaluations
-        # The evaluation before the first epoch is never reported: it says nothing about a trial's settings.
-        if evaluation.epoch > 0
-    ]
-    for _, trial_id, evaluation in sorted(seen, key=lambda item: item[:2]):
-        pruner.report(trial_id, evaluation.time(time_attr), evaluation.score)
 
 
 class _StopWhen(Stopper):

@@ -88,7 +88,7 @@ def make_trainable(job: Job) -> Callable[[dict[str, Any]], None]:
         except Exception as error:
             # Whatever stumbled over a full disk first, a line of output perhaps: the driver must hear of the disk.
             failure = storage_failure(error)
-            if failure is None:
+            if failure is None or failure is error:
                 raise
             raise failure from error
 

@@ -19,10 +19,8 @@ from msk_ray.training.memory import named_out_of_memory
     ],
 )
 def test_a_failed_allocation_names_the_setting_to_lower(error: Exception) -> None:
-    with (
-        pytest.raises(SimulationError, match=r"lower env\.nworld \(now 64\)") as caught,
-        named_out_of_memory("cpu", 64),
-    ):
+    advice = r"lower env\.nworld \(now 64\)"
+    with pytest.raises(SimulationError, match=advice) as caught, named_out_of_memory("cpu", 64):
         raise error
     assert caught.value.failure is Failure.OUT_OF_MEMORY
     assert "\n" not in str(caught.value)

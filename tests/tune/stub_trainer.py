@@ -1,9 +1,11 @@
 """A trainer of milliseconds: its score rises towards a height set by the learning rate; some settings misbehave.
 
 Which way is chosen by `env.cart_position_penalty`: 1 kills its own process once, 2 gives NaN, 3 raises
-SimulationError, 4 raises an unforeseen error every time, 5 hangs once. Anything else trains.
+SimulationError, 4 raises an unforeseen error every time, 5 hangs once, 6 finds the disk full once, 7 runs out of
+memory. Anything else trains.
 """
 
+import errno
 import hashlib
 import json
 import math
@@ -16,7 +18,7 @@ from pathlib import Path
 from msk_ray.config import Config, dump_yaml
 from msk_ray.errors import Failure, SimulationError
 
-KILL, NAN, SIMULATION_ERROR, BUG, HANG = 1.0, 2.0, 3.0, 4.0, 5.0
+KILL, NAN, SIMULATION_ERROR, BUG, HANG, FULL_DISK, MEMORY = 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0
 MISBEHAVE_AT = 5
 
 
@@ -74,6 +76,11 @@ class StubTrainer:
         if self.behaviour == HANG and not marker.exists():
             marker.touch()
             time.sleep(1000)
+        if self.behaviour == FULL_DISK and not marker.exists():
+            marker.touch()
+            raise OSError(errno.ENOSPC, "No space left on device")
+        if self.behaviour == MEMORY:
+            raise SimulationError("out_of_memory: made up", Failure.OUT_OF_MEMORY)
         if self.behaviour == NAN:
             row["train/actor_loss"] = math.nan
         if self.behaviour == SIMULATION_ERROR:

@@ -12,9 +12,10 @@ from typing import Any
 import pytest
 import stub_trainer
 from ray import cloudpickle
-from stub_trainer import BUG, HANG, KILL, NAN, SIMULATION_ERROR, StubTrainer
+from stub_trainer import BUG, FULL_DISK, HANG, KILL, MEMORY, NAN, SIMULATION_ERROR, StubTrainer
 
 from msk_ray.config import read_yaml
+from msk_ray.errors import StorageFailure
 from msk_ray.tune import experiment as experiments
 from msk_ray.tune import runner
 from msk_ray.tune.devices import Placement
@@ -74,6 +75,19 @@ def test_faults_are_named_and_killed_or_hung_trials_go_on(
     assert [trial["outcome"] for trial in facts["trials"]] == outcomes(records)
     for name in ("table.md", "curves.png", "env.json", "manifest.json"):
         assert (tmp_path / "runs" / "faults" / name).is_file()
+
+
+def test_a_full_disk_stops_everything_and_ends_nothing(
+    make_space: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    space = make_space(parameters={"env.cart_position_penalty": {"grid": [FULL_DISK, MEMORY]}})
+    path = tmp_path / "runs" / "disk"
+    with pytest.raises(StorageFailure, match="No space left on device; mend that and go on with --resume"):
+        go(space, path)
+    assert "stopping all trials" in capsys.readouterr().out
+    completed, records = go(space, path, resume=True)
+    assert completed
+    assert outcomes(records) == ["finished", "out_of_memory"]
 
 
 def test_asha_stops_the_bad_ones_and_a_stop_request_is_resumable(
