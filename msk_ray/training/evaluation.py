@@ -35,6 +35,18 @@ class Episodes(NamedTuple):
     success: Tensor | None
     """Met the task, shape (W,) bool; None where the environment defines no success, or ended early everywhere."""
 
+    def cpu(self) -> "Episodes":
+        """The same on the CPU."""
+        return self._replace(
+            score=self.score.cpu(),
+            length=self.length.cpu(),
+            fell=self.fell.cpu(),
+            diverged=self.diverged.cpu(),
+            terms=self.terms.cpu(),
+            outcomes={name: value.cpu() for name, value in self.outcomes.items()},
+            success=None if self.success is None else self.success.cpu(),
+        )
+
 
 class Evaluator:
     """Runs a policy from the same initial states every time, under reference rewards and reference physics.
