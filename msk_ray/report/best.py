@@ -1,5 +1,6 @@
 """The best policy of an experiment: its evaluation and its film strip, made once for each checkpoint and kept."""
 
+import io
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,6 +27,8 @@ class Best:
     """Entries of its `eval.json` that belong to this checkpoint, the canonical one first."""
     strip: Path | None = None
     strip_text: str = ""
+    narrow_strip: Path | None = None
+    """The same frames two a row, for a phone."""
     notes: tuple[str, ...] = field(default=())
     """What could not be had, and why."""
 
@@ -67,12 +70,19 @@ def look_at_best(trial: TrialReading, folder: Path, prefix: str, make: bool, dev
             notes.append(f"Its film strip could not be drawn: {explain(error)}.")
     elif text is None:
         notes.append("Its film strip is not drawn yet: add --best always.")
-    return Best(trial, tuple(entries), strip if text is not None else None, text or "", tuple(notes))
+    if text is None:
+        return Best(trial, tuple(entries), notes=tuple(notes))
+    return Best(trial, tuple(entries), strip, text, narrow_strip(strip), tuple(notes))
+
+
+def narrow_strip(strip: Path) -> Path:
+    """Where the version of a strip for narrow screens lies."""
+    return strip.with_name(f"{strip.stem}_narrow.png")
 
 
 def strip_text(path: Path, sha: str) -> str | None:
     """What a strip shows, in words; None if there is none of the checkpoint with this hash."""
-    if not path.is_file():
+    if not path.is_file() or not narrow_strip(path).is_file():
         return None
     try:
         with Image.open(path) as image:
@@ -99,25 +109,39 @@ def _draw(path: Path, out: Path, sha: str, device: str | None) -> None:
     from msk_ray.evaluate.measure import Bench, Request, default_device
     from msk_ray.training import load_policy
     from msk_ray.visualize.episodes import record
+    from msk_ray.visualize.film import grid, strip
     from msk_ray.visualize.render import View, headless_backend
-    from msk_ray.visualize.strips import episode_strip, log_strip
+    from msk_ray.visualize.strips import episode_frames, log_strip
 
     headless_backend()
     policy = load_policy(path)
     print(f"drawing an episode of {path} ...", flush=True)
     recording = record(Bench(device or default_device()), policy, Request(worlds=1))
-    image = episode_strip(recording, FRAMES, View(*_FRAME))
+    frames, times = episode_frames(recording, FRAMES, View(*_FRAME))
     text = (
-        f"{FRAMES} frames of one episode at equal times, under {recording.physics} physics: score "
+        f"{len(frames)} frames of one episode at equal times, under {recording.physics} physics: score "
         f"{float(recording.episodes.score[0]):.5g} in {recording.length(0) * recording.timestep:.1f} s, "
         f"ended by {recording.ending(0)}"
     )
     stamp = PngImagePlugin.PngInfo()
     stamp.add_text(_STAMP, sha)
     stamp.add_text("Description", text)
+    image = strip(frames, times)
+    rows = range(0, len(frames), 2)
+    narrow = grid([frames[row : row + 2] for row in rows], [""] * len(rows), [times[row : row + 2] for row in rows])
     out.parent.mkdir(parents=True, exist_ok=True)
-    image.save(out, pnginfo=stamp)
+    # The wide one last: with its stamp on disk, both are there.
+    _save(narrow, narrow_strip(out), PngImagePlugin.PngInfo())
+    _save(image, out, stamp)
     trial = path.parent.parent
     if not (trial / "config.yaml").is_file():
         raise CheckpointError(f"{trial} has lost its config.yaml")
     log_strip(image, trial, policy.epoch)
+
+
+def _save(image: Image.Image, path: Path, facts: PngImagePlugin.PngInfo) -> None:
+    from msk_ray.training.checkpoint import write_atomically
+
+    buffer = io.BytesIO()
+    image.save(buffer, "png", pnginfo=facts)
+    write_atomically(path, buffer.getvalue())

@@ -135,9 +135,17 @@ def _colour(number: int) -> str:
 
 def gradient_health(reading: Reading, name: str) -> Picture | None:
     """Norms, clipping and failures of gradients over training; None if no trial recorded any."""
-    present = [metric for metric in HEALTH if any(_health_curve(t, metric) for t in reading.trials)]
-    if not present:
+    recorded = [metric for metric in HEALTH if any(_health_curve(t, metric) for t in reading.trials)]
+    if not recorded:
         return None
+    # What stayed zero throughout is said in words.
+    zero = [
+        metric
+        for metric in recorded
+        if not any(np.nanmax(c[1]) for t in reading.trials if (c := _health_curve(t, metric)))
+    ]
+    present = [metric for metric in recorded if metric not in zero] or recorded[:1]
+    zero = [metric for metric in zero if metric not in present]
     best = reading.best
 
     def draw(figure: Figure, narrow: bool) -> None:
@@ -156,21 +164,13 @@ def gradient_health(reading: Reading, name: str) -> Picture | None:
         figure.legend(handles=handles, loc="outside upper center", ncols=3, fontsize=8)
 
     rows = math.ceil(len(present) / 2)
-    worst = max(
-        (
-            float(np.nanmax(t.columns[m]))
-            for t in reading.trials
-            for m in present
-            if _health_curve(t, m) and "nonfinite" in m
-        ),
-        default=0.0,
-    )
     return picture(
         name,
         "Gradient health",
         f"{len(present)} measures of gradients and physics over env steps, a line a trial: "
-        f"{', '.join(HEALTH[m][0] for m in present)}. Largest share of worlds without a gradient: {worst:.2%}.",
-        "Of many points the largest of each stretch is drawn: peaks are not lost. A cotangent is in units of reward: "
+        f"{', '.join(HEALTH[m][0] for m in present)}.",
+        (f"Zero throughout: {', '.join(HEALTH[m][0] for m in zero)}. " if zero else "")
+        + "Of many points the largest of each stretch is drawn: peaks are not lost. A cotangent is in units of reward: "
         "1 is what one reward would send back.",
         draw,
         (9.0, 1.0 + 2.3 * rows),
@@ -238,7 +238,8 @@ def stopping_map(reading: Reading, name: str) -> Picture | None:
         axes.set_ylim(len(ordered) - 0.4, -0.6)
         if len(ordered) <= LABELLED:
             labels = [t.trial.variant + (f", seed {t.trial.seed}" if seeds else "") for t in ordered]
-            axes.set_yticks(range(len(ordered)), [shorten(label, 22 if narrow else 48) for label in labels], fontsize=7)
+            names = [t.trial.id if narrow else shorten(label, 48) for t, label in zip(ordered, labels, strict=True)]
+            axes.set_yticks(range(len(ordered)), names, fontsize=7)
         else:
             axes.set_ylabel("trials, the best score first")
         steps_axis(axes)

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
+from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 
 from msk_ray.report.pictures import GREY, PALETTE, Picture, picture, shorten
@@ -78,7 +78,7 @@ def _draw_ranking(axes: Axes, found: Sequence[Effect], shares: bool) -> None:
     colours = [GREY if effect.factor == "seed" else PALETTE[0] for effect in found]
     axes.barh(places, values, color=colours, height=0.65)
     axes.set_yticks(places, [shorten(_leaf(e.factor), 18) for e in found], fontsize=8)
-    axes.invert_yaxis()
+    axes.set_ylim(max(len(found), 5) - 0.5, -0.5)
     axes.set_xlabel("share of variance (ω²)" if shares else "spread of mean scores", fontsize=8)
     axes.tick_params(axis="x", labelsize=8)
     axes.set_xlim(0.0, 1.02 if shares else None)
@@ -121,13 +121,14 @@ def parallel_coordinates(reading: Reading, found: Sequence[Effect], name: str) -
 
     def draw(figure: Figure, narrow: bool) -> None:
         axes = figure.add_subplot()
-        ways = colormaps["viridis"]
+        # Without its lightest part, which is hard to see on white.
+        ways = ListedColormap(colormaps["viridis"](np.linspace(0.0, 0.88, 256)))
         x = np.arange(heights.shape[1])
         if narrow:
             axes.set_ylim(heights.shape[1] - 0.6, -0.4)
         for row in np.argsort(scores):
             along = (heights[row], x) if narrow else (x, heights[row])
-            axes.plot(*along, color=ways(0.92 * norm(scores[row])), linewidth=1.0, alpha=0.75)
+            axes.plot(*along, color=ways(norm(scores[row])), linewidth=1.0, alpha=0.75)
         ticks = [labels for _, labels in columns] + [[(0.0, f"{low:.4g}"), (1.0, f"{high:.4g}")]]
         for place, own in enumerate(ticks):
             if narrow:

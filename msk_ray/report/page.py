@@ -68,7 +68,15 @@ class Section:
 
     def files(self, trial: TrialReading) -> list[tuple[str, str]]:
         """(name, link) of a trial's files that are there."""
-        return [(Path(name).name, self.link(trial.folder / name)) for name in _FILES if (trial.folder / name).is_file()]
+        return [(Path(name).stem, self.link(trial.folder / name)) for name in _FILES if (trial.folder / name).is_file()]
+
+    def devices(self) -> dict[str, int]:
+        """Kinds of devices, and how many trials ran on each."""
+        counts: dict[str, int] = {}
+        for trial in self.reading.trials:
+            if trial.device:
+                counts[trial.device] = counts.get(trial.device, 0) + 1
+        return counts
 
     def link(self, path: Path) -> str:
         return Path(os.path.relpath(path, self.folder)).as_posix()

@@ -90,4 +90,4 @@ def shorten(text: str, length: int) -> str:
 
 def format_steps(steps: float) -> str:
     """1.5M, 20k."""
-    return EngFormatter(sep="")(steps)
+    return EngFormatter(sep="", places=1)(steps)

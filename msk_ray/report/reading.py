@@ -22,7 +22,7 @@ from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.operators import describe
 from msk_ray.tune.outcomes import Ending, Outcome, read_ending
 from msk_ray.tune.space import SpaceFile
-from msk_ray.tune.standing import OUTPUT_FILE, State, heartbeat_age, patience, progress_of
+from msk_ray.tune.standing import DEVICE_FILE, OUTPUT_FILE, State, heartbeat_age, patience, progress_of
 from msk_ray.tune.stopping import SCORE
 from msk_ray.tune.trials import Trial
 
@@ -56,6 +56,8 @@ class TrialReading:
     ending: Ending | None = None
     note: str = ""
     """What is wrong with its files."""
+    device: str = ""
+    """GPU model, or cpu; empty if it was not recorded."""
 
     @property
     def epochs_done(self) -> int:
@@ -208,6 +210,7 @@ def _read_trial(trial: Trial, folder: Path, now: float) -> TrialReading:
         columns = columns_of(rows)
         ending = read_ending(folder)
         progress = progress_of([_numbers(row) for row in rows[-12:]])
+        device = _device(folder / DEVICE_FILE)
     except _UNREADABLE as error:
         return TrialReading(trial, folder, {}, State.UNREADABLE, note=explain(error))
     age = heartbeat_age(folder, now)
@@ -217,7 +220,11 @@ def _read_trial(trial: Trial, folder: Path, now: float) -> TrialReading:
         state = State.WAITING
     else:
         state = State.STALE if age > patience(folder, progress) else State.RUNNING
-    return TrialReading(trial, folder, columns, state, ending)
+    return TrialReading(trial, folder, columns, state, ending, device=device)
+
+
+def _device(path: Path) -> str:
+    return str(json.loads(path.read_text(encoding="utf-8"))["name"]) if path.is_file() else ""
 
 
 def columns_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
