@@ -188,6 +188,11 @@ class HorizonSchedule(Section):
     end: PositiveInt
     epochs: PositiveInt
 
+    def at(self, epoch: int) -> int:
+        """Env steps at `epoch`, counted from 0."""
+        progress = min(1.0, epoch / self.epochs)
+        return round(self.start + (self.end - self.start) * progress)
+
 
 class NetworkConfig(Section):
     """A multilayer perceptron."""

@@ -198,10 +198,9 @@ def _leaves(key: str, value: Any) -> Iterator[str]:
 
 def env_steps_budget(config: Config) -> int:
     """Env steps a trial takes when it runs to its last epoch: the sum over epochs of horizon × worlds."""
-    # msk_ray.shac loads torch, which a dry run need not wait for.
-    from msk_ray.shac.schedules import horizon_at
-
-    return config.env.nworld * sum(horizon_at(config.shac.horizon, epoch) for epoch in range(config.trial.epochs))
+    horizon, epochs = config.shac.horizon, config.trial.epochs
+    steps = horizon * epochs if isinstance(horizon, int) else sum(horizon.at(epoch) for epoch in range(epochs))
+    return config.env.nworld * steps
 
 
 def find_trial(trials: list[Trial], text: str) -> Trial:
