@@ -70,7 +70,7 @@ def learning_curves(groups: Mapping[str, Sequence[TrialReading]], baseline: str 
             steps, mean, *_ = _mean_and_range(curves[variant])
             axes.plot(steps, mean, color=GREY, linewidth=0.7, alpha=0.6, zorder=1)
         for number, variant in enumerate(named):
-            _draw_variant(axes, curves[variant], number, shorten(variant, 34 if narrow else 60))
+            _draw_variant(axes, curves[variant], number, shorten(variant, 34 if narrow else 44))
             for trial in groups[variant]:
                 if trial.ending is not None and trial.ending.outcome in _STOPPED and len(trial.curve[0]):
                     x, y = trial.curve
