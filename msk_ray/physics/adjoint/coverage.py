@@ -251,7 +251,7 @@ _EXACT_PAIRS = (
     | _types(
         [_GEOM.mjGEOM_SPHERE], [_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_BOX]
     )
-    | _types([_GEOM.mjGEOM_CAPSULE], [_GEOM.mjGEOM_CAPSULE])
+    | _types([_GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_BOX], [_GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_BOX])
 )
 _SOLIDS = [
     *(_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_ELLIPSOID, _GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_BOX),
@@ -297,16 +297,16 @@ FEATURES: tuple[Feature, ...] = (
     Feature("contacts, pyramidal and elliptic cones, condim 1, 3, 4, 6", True, _option(lambda m: m.ngeom > 1, "geoms")),
     Feature(
         "contact of a plane with sphere, capsule, ellipsoid, cylinder, box, mesh; sphere with sphere, capsule, "
-        "cylinder, box; capsule with capsule",
+        "cylinder, box; capsules and boxes with each other",
         True,
         _pairs(_EXACT_PAIRS, set()),
     ),
     Feature(
-        "contact of other convex pairs (boxes, cylinders, ellipsoids, meshes)",
+        "contact of other convex pairs (with cylinders, ellipsoids or meshes)",
         True,
         _pairs(_KNOWN_PAIRS - _EXACT_PAIRS, set()),
-        "the distance's slope is exact; point and frame are taken to follow the mean of both bodies, which puts qpos "
-        "off by 0.5 % (box lying on box) to its own size (capsule on box)",
+        "the distance's slope is exact; point and frame are taken to follow the mean of both bodies, which puts the "
+        "gradient to qpos off by about half its size",
         partly=True,
     ),
     Feature("contact with height fields and signed distance fields", False, _pairs(None, _KNOWN_PAIRS)),
