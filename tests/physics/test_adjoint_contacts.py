@@ -87,3 +87,11 @@ def test_contact_dimensions(cone, condim, option):
     worst, kept = compare(model, landing_points(model, 5, False), 4)
     assert kept >= 2
     assert max(worst) < 1e-3
+
+
+@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+def test_conjugate_gradient_solver(cone):
+    model = falling("sphere", "capsule", cone, 3, 'solver="CG"')
+    worst, kept = compare(model, landing_points(model, 5, False), 4)
+    assert kept >= 2
+    assert max(worst) < 1e-3

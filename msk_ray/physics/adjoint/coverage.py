@@ -276,6 +276,12 @@ FEATURES: tuple[Feature, ...] = (
             "option integrator",
         ),
     ),
+    Feature(
+        "solvers Newton and CG",
+        True,
+        _option(lambda m: m.opt.solver != mujoco.mjtSolver.mjSOL_PGS, "option solver"),
+        "as far as the solver has converged: its residual is reported; CG in float32 stops about ten times earlier",
+    ),
     Feature("noslip iterations", False, _option(lambda m: m.opt.noslip_iterations > 0, "option noslip_iterations")),
     Feature("joints free, hinge, slide", True, _joint_type(_JNT.mjJNT_FREE, _JNT.mjJNT_HINGE, _JNT.mjJNT_SLIDE)),
     Feature("ball joints", True, _joint_type(_JNT.mjJNT_BALL)),
