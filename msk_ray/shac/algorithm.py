@@ -125,6 +125,12 @@ class Shac:
         action: Tensor = self.actor(self.normalizer.normalize(obs) if self.normalizer is not None else obs)
         return action
 
+    def policy_state_dict(self) -> dict[str, Any]:
+        """State of the modules that `policy` uses."""
+        return {
+            name: module.state_dict() for name, module in self._modules().items() if name in ("actor", "normalizer")
+        }
+
     def state_dict(self) -> dict[str, Any]:
         """Everything a later `load_state_dict` needs to go on exactly, environment state included."""
         state = self.env.state
