@@ -167,9 +167,9 @@ def episode_table(recording: "Recording") -> str:
 
 
 def _draw(args: argparse.Namespace, recording: "Recording", checkpoint: Path, epoch: int) -> None:
-    from msk_ray.visualize.film import save_image, write_frames, write_video
+    from msk_ray.visualize.film import save_image, strip, write_frames, write_video
     from msk_ray.visualize.render import View, frames
-    from msk_ray.visualize.strips import episode_strip
+    from msk_ray.visualize.strips import episode_frames
 
     width, height = args.size or (640, 480)
     view = View(width, height, args.camera)
@@ -190,7 +190,7 @@ def _draw(args: argparse.Namespace, recording: "Recording", checkpoint: Path, ep
             print(f"{write_frames(film, args.save_frames)} frames in {args.save_frames}/")
     if args.strip:
         width, height = args.size or (320, 240)
-        image = episode_strip(recording, args.frames or 8, View(width, height, args.camera))
+        image = strip(*episode_frames(recording, args.frames or 8, View(width, height, args.camera)))
         save_image(image, args.strip)
         print(f"strip of {args.frames or 8} frames in {args.strip}")
         if args.tensorboard:

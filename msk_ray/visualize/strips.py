@@ -12,7 +12,7 @@ from msk_ray.training import load_policy
 from msk_ray.training.checkpoint import milestones
 from msk_ray.training.metrics import log_image
 from msk_ray.visualize.episodes import Recording, record
-from msk_ray.visualize.film import grid, strip
+from msk_ray.visualize.film import grid
 from msk_ray.visualize.render import View, frames
 
 STRIP_FOLDER = "film"
@@ -20,15 +20,15 @@ STRIP_FOLDER = "film"
 longer follow the trial's."""
 
 
-def episode_strip(recording: Recording, count: int, view: View, world: int = 0) -> Image.Image:
-    """`count` frames of one episode at equal times, from its first state to its last.
+def episode_frames(recording: Recording, count: int, view: View, world: int = 0) -> tuple[list[np.ndarray], list[str]]:
+    """`count` frames of one episode at equal times, from its first state to its last, and their times as text.
 
     Raises:
         DeviceError: no OpenGL platform works here.
     """
     states = recording.world(world)
     indices = _spread(len(states), count)
-    return strip(list(frames(states.at(indices), view)), _times(indices, recording))
+    return list(frames(states.at(indices), view)), _times(indices, recording)
 
 
 def progression(
