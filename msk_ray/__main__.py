@@ -14,6 +14,7 @@ COMMANDS = {
     "report": ("msk_ray.report.__main__", "write an experiment's report: curves, tables, the best policy"),
     "status": ("msk_ray.status", "show where experiments stand, from their files"),
     "doctor": ("msk_ray.doctor", "check that this machine can run trials, and say what to mend"),
+    "diagnose": ("msk_ray.diagnose.__main__", "compare a policy's gradients with float64 differences, by horizon"),
     "gradcheck": ("msk_ray.gradcheck.__main__", "check a model's gradients against float64 finite differences"),
 }
 

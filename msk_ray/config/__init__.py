@@ -12,9 +12,13 @@ from msk_ray.config.load import (
     read_yaml,
 )
 from msk_ray.config.schema import (
+    AdaptiveHorizon,
     AntEnvConfig,
     CartPoleEnvConfig,
     Config,
+    ContactCurriculum,
+    ContactStart,
+    EntropyConfig,
     EnvConfig,
     EvaluationConfig,
     FdConfig,
@@ -26,9 +30,13 @@ from msk_ray.config.schema import (
 )
 
 __all__ = [
+    "AdaptiveHorizon",
     "AntEnvConfig",
     "CartPoleEnvConfig",
     "Config",
+    "ContactCurriculum",
+    "ContactStart",
+    "EntropyConfig",
     "EnvConfig",
     "EvaluationConfig",
     "FdConfig",

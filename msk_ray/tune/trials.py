@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from msk_ray.config import Config, merge, parse_config, read_config
+from msk_ray.config import AdaptiveHorizon, Config, HorizonSchedule, merge, parse_config, read_config
 from msk_ray.errors import ConfigError
 from msk_ray.tune.operators import Level, Listed, Range, describe
 from msk_ray.tune.space import Space
@@ -197,10 +197,14 @@ def _leaves(key: str, value: Any) -> Iterator[str]:
 
 
 def env_steps_budget(config: Config) -> int:
-    """Env steps a trial takes when it runs to its last epoch: the sum over epochs of horizon × worlds."""
+    """Env steps a trial takes when it runs to its last epoch: the sum over epochs of horizon × worlds.
+
+    An adaptive horizon is taken to stay where it starts.
+    """
     horizon, epochs = config.shac.horizon, config.trial.epochs
-    steps = horizon * epochs if isinstance(horizon, int) else sum(horizon.at(epoch) for epoch in range(epochs))
-    return config.env.nworld * steps
+    if isinstance(horizon, HorizonSchedule):
+        return config.env.nworld * sum(horizon.at(epoch) for epoch in range(epochs))
+    return config.env.nworld * epochs * (horizon.start if isinstance(horizon, AdaptiveHorizon) else horizon)
 
 
 def find_trial(trials: list[Trial], text: str) -> Trial:
