@@ -78,7 +78,8 @@ def _draw_ranking(axes: Axes, found: Sequence[Effect], shares: bool) -> None:
     colours = [GREY if effect.factor == "seed" else PALETTE[0] for effect in found]
     axes.barh(places, values, color=colours, height=0.65)
     for place, effect in enumerate(found):
-        text = f"{effect.spread:.3g}" if not shares else "≤ 0" if (effect.share or 0.0) <= 0.0 else f"{effect.share:.2f}"
+        share = effect.share or 0.0
+        text = f"{effect.spread:.3g}" if not shares else f"{share:.2f}" if share > 0.0 else "≤ 0"
         axes.text(values[place], place, f" {text}", va="center", fontsize=8)
     axes.set_yticks(places, [shorten(_leaf(e.factor), 18) for e in found], fontsize=8)
     axes.set_ylim(max(len(found), 5) - 0.5, -0.5)
