@@ -9,7 +9,7 @@ from typing import Any, get_args
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from msk_ray.config.schema import Config
+from msk_ray.config.schema import VARIANTS, Config
 from msk_ray.errors import ConfigError
 
 
@@ -130,9 +130,7 @@ def describe_fault(error: ValidationError, root: type[BaseModel] = Config) -> st
     faults = error.errors()
     first = faults[0]
     # Discriminated unions put the tag into the location; it is no key of the file.
-    location = [
-        str(part) for part in first["loc"] if part not in ("cartpole", "ant", "constrained-int", "HorizonSchedule")
-    ]
+    location = [str(part) for part in first["loc"] if part not in (*VARIANTS, "constrained-int", "HorizonSchedule")]
     where = ".".join(location)
     if first["type"] == "extra_forbidden":
         known = _keys_at(root, location[:-1], first["loc"])
@@ -144,7 +142,7 @@ def describe_fault(error: ValidationError, root: type[BaseModel] = Config) -> st
     elif first["type"] == "missing":
         text = f"{where}: missing"
     elif first["type"].startswith("union_tag"):
-        text = f"{where or 'env'}: {first['msg']}; write env.name: cartpole or ant"
+        text = f"{where or 'env'}: {first['msg']}; write env.name: {' or '.join(VARIANTS)}"
     else:
         text = f"{where}: {first['msg']}, not {first['input']!r}"
     more = len(faults) - 1
