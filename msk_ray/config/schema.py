@@ -143,7 +143,7 @@ class LegEnvSettings(EnvSettings):
     """Reward for every step without a fall."""
     effort: NonNegative = 0.2
     """Weight of the mean squared activation: nothing at rest."""
-    joint_limit: NonNegative = 1.0
+    joint_limit: NonNegative = 0.1
     """Weight of the summed squared overshoot past joint limits less a margin of 0.05 rad, in units of 0.1 rad."""
     smoothness: NonNegative = 0.02
     """Weight of the mean squared change of the action."""

@@ -89,7 +89,9 @@ class LegEnv(Env[LegSettings], Generic[LegSettings]):
         self._flexion_dofs = self._index([self.model.joint(f"hip_flexion_{s}").dofadr[0] for s in "rl"])
         with torch.no_grad():
             state = self.draw_physics(self.nworld)
-            self.obs_size = self.observe(state, torch.zeros((self.nworld, self.action_size), device=self.device)).shape[-1]
+            self.obs_size = self.observe(state, torch.zeros((self.nworld, self.action_size), device=self.device)).shape[
+                -1
+            ]
 
     @abstractmethod
     def prepare_model(self) -> None:
@@ -197,5 +199,3 @@ class LegEnv(Env[LegSettings], Generic[LegSettings]):
     def reference_physics(cls, physics: PhysicsConfig, variant: str | None) -> PhysicsConfig:
         """`physics` with the model's own contacts and limits."""
         return physics.model_copy(update=dict.fromkeys(CONTACT_FIELDS))
-
-

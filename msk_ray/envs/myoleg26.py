@@ -3,6 +3,7 @@
 import math
 
 import mujoco
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -59,7 +60,7 @@ class MyoLeg26(LegEnv[MyoLeg26EnvConfig]):
         self._upright_pose = self._tensor(model.key("stand").qpos[:6])
 
     def _tensor(self, values: object) -> Tensor:
-        return torch.tensor(values, dtype=torch.float32, device=self.device)
+        return torch.as_tensor(np.array(values), dtype=torch.float32, device=self.device)
 
     def begin_epoch(self, epoch: int) -> None:
         a = self.config.assist
@@ -83,7 +84,7 @@ class MyoLeg26(LegEnv[MyoLeg26EnvConfig]):
         # Places stay: a foot must not start inside the ground. Hinges, the pelvis's among them, are shaken.
         qpos[:, 3:] += noise * self.uniform(count, self.model.nq - 3)
         qpos[:, 6:] = qpos[:, 6:].clamp(*self._ranges)
-        qpos[:, 1] += 0.5 * noise * (1.0 + self.uniform(count, 1)[:, 0])
+        qpos[:, 1] += 0.2 * noise * (1.0 + self.uniform(count, 1)[:, 0])
         qvel += 10.0 * noise * self.uniform(count, self.model.nv)
         return StepState(qpos, qvel, act)
 

@@ -60,9 +60,13 @@ def test_lengths_rates_and_their_gradients(which: str) -> None:
                 ends.append(lengths_and_rates(model, moved, qvel[w]) @ weights[w])
             expected_q[i] = (ends[0] - ends[1]) / (2 * eps)
             expected_v[i] = (
-                lengths_and_rates(model, qpos[w], qvel[w] + eps * direction)
-                - lengths_and_rates(model, qpos[w], qvel[w] - eps * direction)
-            ) @ weights[w] / (2 * eps)
+                (
+                    lengths_and_rates(model, qpos[w], qvel[w] + eps * direction)
+                    - lengths_and_rates(model, qpos[w], qvel[w] - eps * direction)
+                )
+                @ weights[w]
+                / (2 * eps)
+            )
             # The raw gradient's slope along this tangent direction.
             moved = qpos[w].copy()
             mujoco.mj_integratePos(model, moved, direction, 1e-7)

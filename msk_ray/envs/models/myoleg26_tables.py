@@ -61,9 +61,7 @@ class Muscle(NamedTuple):
 
 
 PELVIS: Final = Segment("pelvis", "world", (0.0, 0.0, 0.0), 11.777, (-0.0707, 0.0, 0.0), (0.1028, 0.0871, 0.0579))
-TORSO: Final = Segment(
-    "torso", "pelvis", (-0.1007, 0.0815, 0.0), 34.2366, (-0.03, 0.32, 0.0), (1.4745, 0.7555, 1.4314)
-)
+TORSO: Final = Segment("torso", "pelvis", (-0.1007, 0.0815, 0.0), 34.2366, (-0.03, 0.32, 0.0), (1.4745, 0.7555, 1.4314))
 """Trunk, head and arms as one segment, fixed to the pelvis."""
 
 # gait14dof22. The subtalar joint is locked, so its talus is part of the foot: 0.1 kg at the ankle, which `talus` keeps.

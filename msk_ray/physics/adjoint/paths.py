@@ -79,7 +79,15 @@ class TendonAdjoint(StepAdjoint):
         """Launch the pullback of `length_bar` and `rate_bar` at the state in `data`."""
         self.launch_forward(data)
         mjw.com_vel(self.model, data)
-        for array in (self.grad_qpos, self.grad_qvel, self._phi_qpos, self._phi_qvel, self._lam, self._mu, self._excess):
+        for array in (
+            self.grad_qpos,
+            self.grad_qvel,
+            self._phi_qpos,
+            self._phi_qvel,
+            self._lam,
+            self._mu,
+            self._excess,
+        ):
             array.zero_()
         data.qacc.zero_()
         self._fields(data)
