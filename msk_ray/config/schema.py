@@ -147,8 +147,9 @@ class LegEnvSettings(EnvSettings):
     """Weight of the summed squared overshoot past joint limits less a margin of 0.05 rad, in units of 0.1 rad."""
     smoothness: NonNegative = 0.02
     """Weight of the mean squared change of the action."""
-    drift: NonNegative = 0.1
-    """Weight of the squared sideways speed [s²/m²]."""
+    capture: NonNegative = 5.0
+    """Weight of the squared distance of the pelvis's capture point from its line, and from its start if it is asked to
+    stand [1/m²]. The capture point is where it would come to rest as a pendulum: place + velocity / √(g / height)."""
     sway: NonNegative = 0.02
     """Weight of the squared angular velocity of the pelvis [s²/rad²]."""
     symmetry: NonNegative = 0.0

@@ -3,6 +3,7 @@
 Axes: W worlds, U muscles, N hinges of the legs.
 """
 
+import math
 from abc import abstractmethod
 from typing import Generic, NamedTuple, TypeVar
 
@@ -18,6 +19,7 @@ from msk_ray.simulation.tendons import Tendons
 
 LegSettings = TypeVar("LegSettings", bound=LegEnvSettings)
 
+_GRAVITY = 9.81
 _LIMIT_MARGIN = 0.05
 """Joints pay from this far inside their limits on [rad]."""
 _LIMIT_UNIT = 0.1
@@ -25,7 +27,7 @@ _VELOCITY_SCALE = 0.1
 """Of joint velocities in the observation [s/rad]."""
 _REWARD_FIELDS = (
     *("forward_vel", "speed_scale", "progress", "upright", "heading", "height", "alive", "effort", "joint_limit"),
-    *("smoothness", "drift", "sway", "symmetry"),
+    *("smoothness", "capture", "sway", "symmetry"),
 )
 
 
@@ -38,6 +40,8 @@ class Root(NamedTuple):
     """Cosine between the trunk's up axis and +z."""
     heading: Tensor
     """Cosine between the pelvis's forward axis and +x."""
+    place: Tensor
+    """Forward and to the left of the start [m], (W, 2)."""
     pose: Tensor
     """What the observation tells of place and orientation (W, k)."""
     velocity: Tensor
@@ -70,7 +74,7 @@ class LegEnv(Env[LegSettings], Generic[LegSettings]):
 
     reward_names = (
         *("forward_vel", "progress", "upright", "heading", "height", "alive", "effort", "joint_limit"),
-        *("smoothness", "drift", "sway", "symmetry"),
+        *("smoothness", "capture", "sway", "symmetry"),
     )
     stand_height: float
     """Pelvis height of the standing pose [m]."""
@@ -82,6 +86,7 @@ class LegEnv(Env[LegSettings], Generic[LegSettings]):
         rest = self.config.rest_excitation
         self._odds = (1.0 - rest) / rest
         self.prepare_model()
+        self._pendulum_time = math.sqrt(self.stand_height / _GRAVITY)
         ranges = torch.tensor(self.model.jnt_range[self.hinges], dtype=torch.float32, device=self.device)
         self._limits = ranges[:, 0] + _LIMIT_MARGIN, ranges[:, 1] - _LIMIT_MARGIN
         self._hinge_qpos = self._index(self.model.jnt_qposadr[self.hinges])
@@ -149,6 +154,8 @@ class LegEnv(Env[LegSettings], Generic[LegSettings]):
         angles = state.qpos[:, self._hinge_qpos]
         overshoot = (torch.relu(low - angles) + torch.relu(angles - high)) / _LIMIT_UNIT
         change = action - self.state.action
+        place = root.place + root.velocity[:, :2] * self._pendulum_time
+        capture = place[:, 1].square() + (place[:, 0].square() if c.target_speed == 0.0 else 0.0)
         flexion = state.qvel[:, self._flexion_dofs].sum(-1)
         terms = (
             c.forward_vel * torch.exp(-((speed - c.target_speed) / c.speed_scale).square()),
@@ -160,7 +167,7 @@ class LegEnv(Env[LegSettings], Generic[LegSettings]):
             -c.effort * state.act.square().mean(-1),
             -c.joint_limit * overshoot.square().sum(-1),
             -c.smoothness * change.square().mean(-1),
-            -c.drift * root.velocity[:, 1].square(),
+            -c.capture * capture,
             -c.sway * root.spin.square().sum(-1),
             -c.symmetry * flexion.square(),
         )

@@ -20,7 +20,8 @@ _GRAVITY = 9.81
 
 
 class MyoLeg26(LegEnv[MyoLeg26EnvConfig]):
-    """The pose of the pelvis in the observation (4): its place to the right of the line [m], tilt, list, rotation [rad].
+    """The pose of the pelvis in the observation (4): its place to the right of its line [m], its tilt, list and
+    rotation [rad].
 
     The pelvis is three slides and three hinges, so that tilt and list are coordinates and no quaternion is needed.
     """
@@ -110,6 +111,7 @@ class MyoLeg26(LegEnv[MyoLeg26EnvConfig]):
             height=q[:, 1] - self.ground_height(q[:, 0]),
             up=up,
             heading=heading,
+            place=torch.stack((q[:, 0], -q[:, 2]), dim=-1),
             pose=q[:, 2:6],
             velocity=torch.stack((v[:, 0], -v[:, 2], v[:, 1]), dim=-1),
             spin=torch.stack((spin_x, -spin_z, spin_y), dim=-1),

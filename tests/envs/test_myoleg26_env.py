@@ -145,11 +145,12 @@ def test_reward_by_hand(env: MyoLeg26) -> None:
         found = terms(env, state, torch.full((2, 26), 0.5))
     finally:
         env.config = config
+    lateral = 0.5 * math.sqrt(env.stand_height / 9.81)
     assert found == pytest.approx(
         {
             "forward_vel": math.exp(-((1.25 / 0.6) ** 2)), "progress": 0.0, "upright": 0.5, "heading": 0.2,
             "height": -5.0 * 0.01, "alive": 0.5, "effort": -0.2 * 0.25,
-            "joint_limit": -0.1 * 1.5**2, "smoothness": -0.02 * 0.25, "drift": -0.1 * 0.25, "sway": -0.02 * 4.0,
+            "joint_limit": -0.1 * 1.5**2, "smoothness": -0.02 * 0.25, "capture": -5.0 * lateral**2, "sway": -0.02 * 4.0,
             "symmetry": -0.1 * 9.0,
         },
         rel=1e-4, abs=1e-6,

@@ -1,4 +1,4 @@
-"""The 26-muscle model against C MuJoCo in float64: the step, its gradient, and the gradient through eight control steps."""
+"""The 26-muscle model against C MuJoCo in float64: the step, its gradient, and that through eight control steps."""
 
 import mujoco
 import numpy as np

@@ -5,14 +5,15 @@ pelvis [m], its tilt, list and rotation [rad], then hip flexion, adduction, rota
 and of the left. The left leg mirrors the right at the plane z = 0 of the pelvis.
 
 Fibres. Tendons are rigid here, so a fibre takes the whole excursion of its path, which at the fibre lengths of the
-sources leaves the force-length curve. Each muscle is refitted: L0 is the least length, not below the source's, for which the
-lengths over all joint ranges lie in `WINDOW` of the curve and the length in the anatomical position within
+sources leaves the force-length curve. Each muscle is refitted: L0 is the least length, not below the source's, for
+which the lengths over all joint ranges lie in `WINDOW` of the curve and the length in the anatomical position within
 `REFERENCE_SHIFT` of its published place (`FIBRE_REFERENCE`). Largest shortening speeds are kept in m/s, so the joint
 speed at which a muscle goes slack is the published one.
 
 Force-length curve. MuJoCo's active curve (two parabolas meeting at half force) from 0 to 2 L0 is the one of its kind
 closest to the Gaussian exp(-(l - 1)²/0.45) of Thelen (2003) that the sources use: 0.50 against 0.57 at 0.5 and 1.5 L0.
-Its passive curve with a parameter of 0.5 is the closest of its kind to Thelen's up to 1.4 L0: 0.16 F there against 0.18.
+Its passive curve with a parameter of 0.5 is the closest of its kind to Thelen's up to 1.4 L0, where it gives 0.16 F
+against 0.18.
 """
 
 import mujoco
@@ -113,7 +114,7 @@ def path_lengths(model: mujoco.MjModel) -> dict[str, PathLengths]:
     samples: dict[str, list[float]] = {name: [] for name in names}
     for crossed in _MUSCLE_JOINTS.values():
         addresses = [int(model.jnt_qposadr[model.joint(f"{name}_r").id]) for name in crossed]
-        grids = [np.linspace(*model.joint(f"{name}_r").range, _GRID) for name in crossed]
+        grids = [_grid(model.joint(f"{name}_r").range) for name in crossed]
         data.qpos[:] = model.qpos0
         for angles in np.stack(np.meshgrid(*grids), axis=-1).reshape(-1, len(crossed)):
             data.qpos[addresses] = angles
@@ -125,6 +126,11 @@ def path_lengths(model: mujoco.MjModel) -> dict[str, PathLengths]:
     return {
         name: PathLengths(float(reference[model.tendon(f"{name}_r").id]), np.array(samples[name])) for name in names
     }
+
+
+def _grid(ends: NDArray[np.float64]) -> NDArray[np.float64]:
+    low, high = ends
+    return np.linspace(float(low), float(high), _GRID)
 
 
 def fit_fibre(muscle: tables.Muscle, lengths: PathLengths) -> tuple[float, float]:

@@ -1,7 +1,7 @@
 """Keyframes of `myoleg26`: standing, and just after either foot struck the ground at walking speed.
 
-Angles are chosen, heights and the trailing knee are solved for, so that soles touch the ground and no joint is beyond its
-range. Walking velocities are those of a pelvis moving forward over feet that do not slip.
+Angles are chosen, heights and the trailing knee are solved for, so that soles touch the ground and no joint is beyond
+its range. Walking velocities are those of a pelvis moving forward over feet that do not slip.
 """
 
 from typing import Final

@@ -2,8 +2,8 @@
 
 Sources:
     gait14dof22  "A reduced 3D gait model with 14 degrees of freedom and 22 muscles", gait14dof22musc_20170320.osim of
-                 osim-rl (MIT licence): Delp et al. 1990 (IEEE Trans Biomed Eng 37:757), Anderson & Pandy 1999, Yamaguchi
-                 & Zajac 1989; strengths after Handsfield et al. 2014 and Rajagopal et al. 2016.
+                 osim-rl (MIT licence): Delp et al. 1990 (IEEE Trans Biomed Eng 37:757), Anderson & Pandy 1999,
+                 Yamaguchi & Zajac 1989; strengths after Handsfield et al. 2014 and Rajagopal et al. 2016.
     gait2392     gait2392_thelen2003muscle.osim of opensim-models (Delp et al. 1990; Thelen 2003).
 
 Frames are those of the sources: x forward, y up, z to the right, of the right leg; the builder mirrors it. Lengths [m],
@@ -11,8 +11,8 @@ masses [kg], inertias [kg m²] about the centre of mass, forces [N], angles [rad
 
 What is not in the sources: `OUTLINE` (contact primitives laid along the sole and trunk), joint ranges (those of daily
 activity rather than the ±120° of the sources, so that fibres can stay inside their range), the cylinder that replaces
-the moving and conditional path points of the knee extensors, the origin of gastrocnemius, 9 mm further up in place of its
-conditional point, and the hamstrings' conditional point, which is always on their path.
+the moving and conditional path points of the knee extensors, the origin of gastrocnemius, 9 mm further up in place of
+its conditional point, and the hamstrings' conditional point, which is always on their path.
 """
 
 from typing import Final, NamedTuple
@@ -95,7 +95,7 @@ JOINTS: Final = (
 )
 
 CYLINDERS: Final = {"patella": ("femur", (-0.0036, -0.395, 0.0), 0.038, 0.05)}
-"""By name: segment, centre, radius and half length of a cylinder along the knee's axis. Its radius is the moment arm."""
+"""By name: segment, centre, radius and half length of a cylinder along the knee's axis; its radius is a moment arm."""
 
 MUSCLES: Final = (
     Muscle(
@@ -218,7 +218,7 @@ FIBRE_REFERENCE: Final = {
     "edl": 1.07,
     "fdl": 1.05,
 }
-"""Fibre length in the anatomical position over its optimum: (path length - tendon slack length) / fibre of the sources."""
+"""Fibre length in the anatomical position over its optimum: (path - tendon slack length) / fibre of the sources."""
 
 OUTLINE: Final = {
     "calcn": (((0.012, 0.005, 0.0), 0.035), ((0.158, -0.005, 0.032), 0.025), ((0.168, -0.005, -0.025), 0.025)),

@@ -32,8 +32,8 @@ class Terrain:
         self.slope = config.slope if config.kind == "slope" else 0.0
         rng = np.random.default_rng(config.seed)
         self._field: NDArray[np.float64] | None = None
-        self.edges = np.zeros(0)
-        self.levels = np.zeros(1)
+        self.edges: NDArray[np.floating] = np.zeros(0)
+        self.levels: NDArray[np.floating] = np.zeros(1)
         strips = config.start + config.step_depth * np.arange(_PIECES)
         if config.kind == "steps":
             self.edges, self.levels = strips, config.step_height * np.arange(_PIECES + 1)

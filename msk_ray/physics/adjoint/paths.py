@@ -1,7 +1,7 @@
 """Lengths and rates of all tendons as functions of (q, v), and their exact pullback.
 
-With cotangents l̄ and ρ̄ of a tendon's length and rate, Φ = Σ l̄ l + ρ̄ J v has no other fields than v, so the launches of a
-substep's adjoint give ∂Φ/∂q and ∂Φ/∂v once λ, μ, a and a - â are zero.
+With cotangents l̄ and ρ̄ of a tendon's length and rate, Φ = Σ l̄ l + ρ̄ J v has no other fields than v, so the launches
+of a substep's adjoint give ∂Φ/∂q and ∂Φ/∂v once λ, μ, a and a - â are zero.
 """
 
 from typing import Any
