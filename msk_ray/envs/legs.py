@@ -86,11 +86,11 @@ class LegEnv(Env[LegSettings], Generic[LegSettings]):
         rest = self.config.rest_excitation
         self._odds = (1.0 - rest) / rest
         self.prepare_model()
+        self._hinge_qpos = self._index(self.model.jnt_qposadr[self.hinges])
+        self._hinge_dofs = self._index(self.model.jnt_dofadr[self.hinges])
         self._pendulum_time = math.sqrt(self.stand_height / _GRAVITY)
         ranges = torch.tensor(self.model.jnt_range[self.hinges], dtype=torch.float32, device=self.device)
         self._limits = ranges[:, 0] + _LIMIT_MARGIN, ranges[:, 1] - _LIMIT_MARGIN
-        self._hinge_qpos = self._index(self.model.jnt_qposadr[self.hinges])
-        self._hinge_dofs = self._index(self.model.jnt_dofadr[self.hinges])
         self._flexion_dofs = self._index([self.model.joint(f"hip_flexion_{s}").dofadr[0] for s in "rl"])
         with torch.no_grad():
             state = self.draw_physics(self.nworld)
@@ -185,7 +185,7 @@ class LegEnv(Env[LegSettings], Generic[LegSettings]):
             "vx": root.velocity[:, 0],
             "upright": root.up,
             "activation": state.act.square().mean(-1),
-            "distance": state.qpos[:, 0],
+            "distance": root.place[:, 0],
         }
 
     def success(self, tail: dict[str, Tensor]) -> Tensor | None:
