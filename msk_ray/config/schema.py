@@ -161,7 +161,7 @@ class LegEnvSettings(EnvSettings):
     early_termination: bool = True
     """End an episode on a fall."""
     rest_excitation: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.05
-    """Excitation of every muscle at action 0."""
+    """Least excitation of a muscle at action 0; one that the standing keyframe excites more starts from that."""
     success_speed: NonNegative = 0.8
     """Mean speed over the episode from which walking counts as a success [m/s]."""
 

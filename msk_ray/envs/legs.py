@@ -68,8 +68,8 @@ class LegEnv(Env[LegSettings], Generic[LegSettings]):
 
     All of it is attached: lengths and rates have exact gradients, forces follow from them.
 
-    Actions are squashed into excitations by the logistic curve that takes action 0 to `rest_excitation` and ±1 to 0
-    and 1, with a slope that is nowhere zero.
+    Actions are squashed into excitations by the logistic curve that takes action 0 to the excitation of standing
+    (`rest_excitation` at least) and ±1 to 0 and 1, with a slope that is nowhere zero.
     """
 
     reward_names = (
@@ -83,9 +83,10 @@ class LegEnv(Env[LegSettings], Generic[LegSettings]):
         self.curves = MuscleCurves(self.model, self.device)
         self.action_size = len(self.curves.actuators)
         self._tendons = Tendons(self.sim.batch)
-        rest = self.config.rest_excitation
-        self._odds = (1.0 - rest) / rest
         self.prepare_model()
+        held = torch.tensor(self.model.key("stand").ctrl, dtype=torch.float32, device=self.device)
+        rest = held[self.curves.actuators].clamp_min(self.config.rest_excitation)
+        self._odds = (1.0 - rest) / rest
         self._hinge_qpos = self._index(self.model.jnt_qposadr[self.hinges])
         self._hinge_dofs = self._index(self.model.jnt_dofadr[self.hinges])
         self._pendulum_time = math.sqrt(self.stand_height / _GRAVITY)

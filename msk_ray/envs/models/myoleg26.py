@@ -29,8 +29,8 @@ from msk_ray.envs.models.terrain import Terrain
 SIDES = ("r", "l")
 CURVE = (0.0, 2.0)
 """Fibre lengths, in L0, between which a muscle pulls actively."""
-WINDOW = (0.4, 1.6)
-"""Fibre lengths, in L0, that the joint ranges may reach; active force is 0.32 F or more there."""
+WINDOW = (0.3, 1.6)
+"""Fibre lengths, in L0, that the joint ranges may reach; active force is 0.18 F or more there."""
 REFERENCE_SHIFT = 0.05
 """Largest change of a fibre's length in the anatomical position, in L0."""
 PASSIVE = 0.5

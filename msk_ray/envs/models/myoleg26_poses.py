@@ -15,10 +15,13 @@ from msk_ray.envs.models.myoleg26_tables import OUTLINE
 WALKING_SPEED: Final = 1.25
 """Of the walking keyframes [m/s]."""
 REST_ACTIVATION: Final = 0.05
+"""Of every muscle in the walking keyframes."""
+_LEAST_EFFORT: Final = 1e-6
+_SOLVER_STEPS: Final = 3000
 _PRESSED: Final = 5e-4
 """Depth to which the lowest point of a sole enters the ground [m], so that contact is there from the first step."""
 
-STAND: Final = {"pelvis_tilt": -0.05, "hip_flexion": 0.05, "knee_angle": -0.1, "ankle_angle": 0.1}
+STAND: Final = {"pelvis_tilt": -0.07, "hip_flexion": 0.05, "knee_angle": -0.1, "ankle_angle": 0.12}
 """Standing [rad], feet flat, knees a little bent: the centre of mass lies over the middle of the feet."""
 _TRUNK: Final = {"pelvis_tilt": -0.05}
 # Angles about heel strike of level walking (Winter 1991, "The biomechanics and motor control of human gait"): hip
@@ -35,11 +38,57 @@ def add_keyframes(spec: mujoco.MjSpec) -> None:
     ctrl[: model.na] = REST_ACTIVATION
     stand = _posed(model, STAND, {}, {})
     stand.qpos[_address(model, "pelvis_ty")] -= _lowest(model, stand, "rl") + _PRESSED
-    spec.add_key(name="stand", qpos=stand.qpos, act=act, ctrl=ctrl)
+    held = ctrl.copy()
+    held[: model.na] = holding_activations(model, stand.qpos)
+    spec.add_key(name="stand", qpos=stand.qpos, act=held[: model.na], ctrl=held)
     for leading, trailing in (("l", "r"), ("r", "l")):
         data = _double_support(model, leading, trailing)
         name = "walk_left" if leading == "l" else "walk_right"
         spec.add_key(name=name, qpos=data.qpos, qvel=_rolling(model, data, leading, trailing), act=act, ctrl=ctrl)
+
+
+def holding_activations(model: mujoco.MjModel, qpos: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Least activations (na,) that hold a pose still, its contacts pushing upward without friction.
+
+    Solves min |A x - b|² + ε |a|², x = (a, f) ≥ 0, by accelerated projected gradients: A takes activations and contact
+    forces [body weights] to generalised forces, b is what gravity and passive muscles ask for.
+    """
+    data = mujoco.MjData(model)
+    forces = []
+    for activation in (0.0, 1.0):
+        data.qpos[:] = qpos
+        data.act[:] = activation
+        mujoco.mj_forward(model, data)
+        forces.append(data.actuator_force[: model.na].copy())
+    moment = np.zeros((model.nu, model.nv))
+    mujoco.mju_sparse2dense(
+        moment, data.actuator_moment.ravel(), data.moment_rownnz, data.moment_rowadr, data.moment_colind.ravel()
+    )
+    moment = moment[: model.na]
+    weight = float(-model.opt.gravity[2] * model.body_subtreemass[0])
+    columns = [moment.T * (forces[1] - forces[0])]
+    for k in range(data.ncon):
+        jacobian = np.zeros((3, model.nv))
+        body = int(model.geom_bodyid[data.contact.geom[k]].max())
+        mujoco.mj_jac(model, data, jacobian, None, data.contact.pos[k], body)
+        columns.append(weight * jacobian[2:3].T)
+    matrix = np.concatenate(columns, axis=1)
+    wanted = data.qfrc_bias - moment.T @ forces[0]
+    # Rows of joints of very different strength: each counts by the torque its muscles can give.
+    scale = 1.0 / np.maximum(np.linalg.norm(matrix, axis=1), 1.0)
+    matrix, wanted = matrix * scale[:, None], wanted * scale
+    ridge = np.zeros(matrix.shape[1])
+    ridge[: model.na] = _LEAST_EFFORT
+    rate = 1.0 / (np.linalg.norm(matrix, 2) ** 2 + _LEAST_EFFORT)
+    x = momentum = np.zeros(matrix.shape[1])
+    speed = 1.0
+    for _ in range(_SOLVER_STEPS):
+        slope = matrix.T @ (matrix @ momentum - wanted) + ridge * momentum
+        new = np.maximum(momentum - rate * slope, 0.0)
+        faster = (1.0 + np.sqrt(1.0 + 4.0 * speed**2)) / 2.0
+        momentum = new + (speed - 1.0) / faster * (new - x)
+        x, speed = new, faster
+    return x[: model.na]
 
 
 def _address(model: mujoco.MjModel, joint: str) -> int:

@@ -212,13 +212,17 @@ FIBRE_REFERENCE: Final = {
     "iliopsoas": 1.09,
     "rectfem": 0.89,
     "vasti": 0.81,
-    "gastroc": 1.20,
-    "soleus": 1.08,
+    "gastroc": 1.00,
+    "soleus": 1.00,
     "tibant": 0.97,
     "edl": 1.07,
     "fdl": 1.05,
 }
-"""Fibre length in the anatomical position over its optimum: (path - tendon slack length) / fibre of the sources."""
+"""Fibre length in the anatomical position over its optimum: (path - tendon slack length) / fibre of the sources.
+
+Gastrocnemius and soleus would be at 1.20 and 1.08, where a rigid tendon leaves the calf so tight that quiet standing needs
+the shin muscles; 1.00 is nearer to their sarcomeres (Ward et al. 2009, Clin Orthop Relat Res 467:1074).
+"""
 
 OUTLINE: Final = {
     "calcn": (((0.012, 0.005, 0.0), 0.035), ((0.158, -0.005, 0.032), 0.025), ((0.168, -0.005, -0.025), 0.025)),
