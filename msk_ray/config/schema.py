@@ -299,6 +299,11 @@ class HorizonSchedule(Section):
     end: PositiveInt
     epochs: PositiveInt
 
+    def at(self, epoch: int) -> int:
+        """Env steps at `epoch`, counted from 0."""
+        progress = min(1.0, epoch / self.epochs)
+        return round(self.start + (self.end - self.start) * progress)
+
 
 class AdaptiveHorizon(Section):
     """Rollout length that follows the gradient: longer while cotangents stay small, shorter when they grow.

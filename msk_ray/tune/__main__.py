@@ -23,7 +23,7 @@ DESCRIPTION = """\
 Run a search space: many SHAC trials side by side, one GPU (or CPU core) each, scored by deterministic evaluation,
 the hopeless ones stopped early.
 
-Writes runs/EXPERIMENT/: the trials' folders, and at the end summary.json, table.md and curves.png."""
+Writes runs/EXPERIMENT/: the trials' folders, and at the end summary.json, table.md and report/."""
 
 EXAMPLES = """\
   python -m msk_ray.tune --space cartpole_smoke --cpu               # minutes on two cores
@@ -196,7 +196,7 @@ def _run(args: argparse.Namespace, space: Space, trials: list[Trial], extension:
     # ray and torch take seconds to load; a wrong command line should not wait for them.
     from msk_ray.tune import runner
     from msk_ray.tune.devices import choose_placement, local_gpus
-    from msk_ray.tune.report import finish
+    from msk_ray.tune.report import finish, write_report
 
     if args.address is None:
         placement = choose_placement(space.file.resources, args.gpus_per_trial, args.cpu, local_gpus())
@@ -214,6 +214,7 @@ def _run(args: argparse.Namespace, space: Space, trials: list[Trial], extension:
     if not completed:
         print(f"stopped on request; go on with --resume --space {args.space} --name {path.name}")
         return RESUMABLE
+    write_report(experiment)
     return 1 if errors else 0
 
 

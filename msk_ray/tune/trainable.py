@@ -20,6 +20,7 @@ from msk_ray.config import parse_config
 from msk_ray.errors import storage_failure
 from msk_ray.tune.adapters import METRIC
 from msk_ray.tune.experiment import Experiment
+from msk_ray.tune.hparams import log_hparams
 from msk_ray.tune.operators import Listed, describe
 from msk_ray.tune.outcomes import write_text
 from msk_ray.tune.records import evaluations_of, read_rows
@@ -97,6 +98,7 @@ def make_trainable(job: Job) -> Callable[[dict[str, Any]], None]:
         _redirect_output(folder / "output.log")
         _limit_threads(job.threads)
         _record_device(folder / "device.json")
+        log_hparams(folder, trial)
         gauges = _Gauges(job.experiment.name, trial)
         with tempfile.TemporaryDirectory() as scratch, _watchdog(folder, job.space.file.resources.hang_s) as alive:
 

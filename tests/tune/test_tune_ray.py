@@ -73,7 +73,7 @@ def test_faults_are_named_and_killed_or_hung_trials_go_on(
     assert len(scores[0]) == 11
     facts = json.loads((tmp_path / "runs" / "faults" / "summary.json").read_text())
     assert [trial["outcome"] for trial in facts["trials"]] == outcomes(records)
-    for name in ("table.md", "curves.png", "env.json", "manifest.json"):
+    for name in ("table.md", "env.json", "manifest.json"):
         assert (tmp_path / "runs" / "faults" / name).is_file()
 
 

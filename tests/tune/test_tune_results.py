@@ -1,4 +1,4 @@
-"""Records, tables, curves and the experiment's folder."""
+"""Records, tables and the experiment's folder."""
 
 import json
 from pathlib import Path
@@ -8,7 +8,6 @@ import pytest
 
 from msk_ray.errors import ConfigError, DeviceError, StorageError
 from msk_ray.tune import experiment as experiments
-from msk_ray.tune.curves import draw_curves
 from msk_ray.tune.devices import Placement, choose_placement
 from msk_ray.tune.listing import text_table
 from msk_ray.tune.outcomes import Ending, Outcome, read_ending, write_ending
@@ -61,9 +60,6 @@ def test_records_and_tables(experiment: experiments.Experiment, tmp_path: Path) 
     assert f"trials/{records[2].trial.id}/checkpoints/best.pt" in document
     facts = json.loads(json.dumps(summary("e", "Which?", records), allow_nan=False))
     assert facts["best"]["id"] == records[2].trial.id
-    draw_curves(records, tmp_path / "curves.png", "e")
-    assert (tmp_path / "curves.png").stat().st_size > 10_000
-    draw_curves([], tmp_path / "empty.png", "nothing")
 
 
 def test_an_existing_experiment_is_refused_and_a_changed_space_named(
