@@ -81,12 +81,15 @@ def ray_session(address: str | None, dashboard: bool | None = None) -> Iterator[
         paths = [package, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
         os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys(paths))
         # None starts the dashboard where its packages (ray[default]) are installed, and does without elsewhere.
-        context = ray.init(include_dashboard=dashboard, dashboard_host="127.0.0.1", **quiet)
+        # By default Ray would join whatever cluster a `ray start` on this machine once left a note of.
+        context = ray.init("local", include_dashboard=dashboard, dashboard_host="127.0.0.1", **quiet)
     else:
         try:
             context = ray.init(address=address, **quiet)
         except ConnectionError as error:
-            raise DeviceError(f"--address {address}: no Ray cluster there: {str(error).splitlines()[0]}") from error
+            raise DeviceError(
+                f"no Ray cluster at {address} (--address or RAY_ADDRESS): {str(error).splitlines()[0]}"
+            ) from error
     try:
         if context.dashboard_url:
             print(f"Ray dashboard: http://{context.dashboard_url}", flush=True)
