@@ -14,6 +14,7 @@ from typing import Any
 import ray
 from ray import tune
 from ray.exceptions import RayTaskError
+from ray.tune import Callback
 from ray.tune.search import BasicVariantGenerator
 from ray.tune.stopper import Stopper
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
@@ -21,7 +22,7 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 import msk_ray
 from msk_ray.cli import StopRequest
 from msk_ray.config import Config, read_yaml
-from msk_ray.errors import DeviceError, MskRayError, StorageFailure, storage_failure
+from msk_ray.errors import ClusterLost, DeviceError, MskRayError, StorageFailure, storage_failure
 from msk_ray.progress import format_duration
 from msk_ray.training import Trainer, precompile
 from msk_ray.tune.adapters import METRIC, Population, PruningScheduler, domain, optuna_search
@@ -179,6 +180,7 @@ def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial]) -> None:
         )
     resources = {"cpu": plan.placement.cpus} | ({"gpu": plan.placement.gpus} if plan.placement.gpus else {})
     searching = file.search == "optuna"
+    node = _OwnNode()
     tuner = tune.Tuner(
         tune.with_resources(make_trainable(job), resources),
         param_space=_param_space(job, remaining),
@@ -196,7 +198,7 @@ def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial]) -> None:
             name="tune",
             storage_path=str(plan.experiment.path),
             verbose=0,
-            callbacks=[live],
+            callbacks=[live, node],
             stop=_StopWhen(live),
             failure_config=tune.FailureConfig(max_failures=file.resources.max_failures),
             # None are deleted: only a population reports them, and another member may be about to take one over.
@@ -207,6 +209,8 @@ def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial]) -> None:
         with _log_to(plan.experiment.path / "ray.log"):
             tuner.fit()
     except Exception as error:
+        if node.lost is not None:
+            raise node.lost from error
         # The driver may meet a full disk before any trial does.
         failure = live.storage_failure or storage_failure(error)
         if failure is None:
@@ -214,6 +218,25 @@ def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial]) -> None:
         raise _advised(failure) from error
     if live.storage_failure is not None:
         raise _advised(live.storage_failure)
+
+
+class _OwnNode(Callback):
+    """Ends the experiment when this process's own Ray node has died: Ray itself waits for ever for another one."""
+
+    INTERVAL_S = 2.0
+
+    def __init__(self) -> None:
+        self._id = ray.get_runtime_context().get_node_id()
+        self._checked = time.monotonic()
+        self.lost: ClusterLost | None = None
+
+    def on_step_end(self, iteration: int, trials: list[Any], **info: Any) -> None:
+        if time.monotonic() - self._checked < self.INTERVAL_S:
+            return
+        self._checked = time.monotonic()
+        if any(node["NodeID"] == self._id and not node["Alive"] for node in ray.nodes()):
+            self.lost = ClusterLost("the Ray node of this machine has died (raylet killed?); go on with --resume")
+            raise self.lost
 
 
 def _advised(failure: StorageFailure) -> StorageFailure:
