@@ -202,6 +202,7 @@ class Sweep:
         self._storage = storage or scratch / "runs"
         self.path = self._storage / name
         self._launches = 0
+        self._rows_at_launch = 0
         self._driver: subprocess.Popen[bytes] | None = None
         self._started = time.monotonic()
         self._family: dict[int, str] = {}
@@ -226,6 +227,7 @@ class Sweep:
         arguments = ["--space", str(self._scratch / "space.yaml"), "--name", self.name, "--storage", str(self._storage)]
         arguments += ["--cpu", "--max-concurrent", "2", *(["--resume"] if self._launches else []), *more]
         self._launches += 1
+        self._rows_at_launch = self.rows()
         paths = [str(REPOSITORY), *filter(None, [os.environ.get("PYTHONPATH")])]
         environment = os.environ | {"RAY_TMPDIR": str(self._scratch), "PYTHONPATH": os.pathsep.join(paths)}
         with (self._scratch / f"{self.name}.log").open("ab") as log:
@@ -254,9 +256,11 @@ class Sweep:
         return sum(len(read_rows(self.path / "trials" / trial.id)) for trial in self.trials)
 
     def wait_for_rows(self, count: int) -> bool:
-        """False if the driver ended before the trials had so many rows."""
+        """Wait for so many rows, one of them new since the launch; False if the driver ended before."""
         assert self._driver is not None
         deadline = time.monotonic() + LAUNCH_LIMIT_S
+        # Trials of a dead raylet train on for a moment, perhaps past the next share already.
+        count = max(count, self._rows_at_launch + 1)
         while self.rows() < count:
             if self._driver.poll() is not None or time.monotonic() > deadline:
                 return False

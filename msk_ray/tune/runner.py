@@ -28,6 +28,7 @@ from msk_ray.training import Trainer, precompile
 from msk_ray.tune.adapters import METRIC, Population, PruningScheduler, domain, optuna_search
 from msk_ray.tune.devices import Placement
 from msk_ray.tune.experiment import Experiment
+from msk_ray.tune.gauges import StateGauge
 from msk_ray.tune.journal import JOURNAL_FILE, Journal, replay
 from msk_ray.tune.live import Live
 from msk_ray.tune.operators import Listed
@@ -198,7 +199,8 @@ def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial]) -> None:
             name="tune",
             storage_path=str(plan.experiment.path),
             verbose=0,
-            callbacks=[live, node],
+            # Live first: it writes the endings that only the driver knows.
+            callbacks=[live, StateGauge(plan.experiment, remaining, job.trial_of), node],
             stop=_StopWhen(live),
             failure_config=tune.FailureConfig(max_failures=file.resources.max_failures),
             # None are deleted: only a population reports them, and another member may be about to take one over.
