@@ -1,6 +1,6 @@
 """Every file in `cluster/`, against the schema of who reads it; and every key in it, misspelt, is found.
 
-Without a cloud: Ray's own check of cluster YAML, EC2's own RunInstances from botocore, Kubernetes' own schema of pods and
+Without a cloud: Ray's check of cluster YAML, EC2's RunInstances from botocore, Kubernetes' schema of pods and
 claims, shellcheck, hadolint. Where whoever reads a file publishes no schema that can be had offline (KubeRay, Google's
 machines, Grafana), `schemas/` holds a strict one of the fields that are set, and no other field passes.
 """
@@ -224,7 +224,7 @@ def test_commands_that_nodes_run(name: str, tmp_path: Path) -> None:
     # One command writes $PATH into a file, to be expanded there.
     script.write_text('#!/usr/bin/env bash\n# shellcheck disable=SC2016\n{\n: "${RAY_HEAD_IP:?}"\n' + text + "\n}\n")
     assert shellcheck(script) == ""
-    starts = re.findall(r"ray start[^;]*", text)
+    starts = re.findall(r"ray start[^;\n]*", text)
     assert len(starts) == 2
     for start in starts:
         check_start(start)
