@@ -37,7 +37,7 @@ from msk_ray.tune.space import load_space
 from msk_ray.tune.trials import Trial, resolve_trials
 
 REPOSITORY = Path(msk_ray.__file__).resolve().parent.parent
-EPOCHS = 20
+EPOCHS = 40
 SPACE = {
     "question": "What does a sweep survive?",
     "base": "configs/cartpole.yaml",
@@ -54,7 +54,7 @@ SPACE = {
     "seeds": "0-1",
     "resources": {"max_failures": 20, "hang_s": 20.0},
 }
-"""Four trials of twenty epochs, checkpointed every second one."""
+"""Four trials of forty epochs, checkpointed every second one."""
 TIMING = ("seconds", "env_steps_per_s", "time/")
 DISK_MIB = 48
 RESUMABLE = 75
@@ -412,15 +412,18 @@ def damaged(reference: Reference, scratch: Path, rng: random.Random) -> list[Tal
     def strike() -> int:
         code = sweep.kill(signal.SIGKILL)
         sweep.leftovers()  # else a dying trial may still write a whole one
-        name = waiting.pop(0)
+        # The kinds in turn; a strike before any checkpoint hits nothing, and its kind has its turn again.
+        name = waiting.pop(0) if waiting else min(hit, key=hit.__getitem__)
         for trial in sweep.running():
             found = sorted((sweep.path / "trials" / trial.id / "checkpoints").glob("epoch_*.pt"))
             if found:
                 kinds[name](found[-1])
                 hit[name] += 1
+        if not hit[name]:
+            waiting.insert(0, name)
         return code
 
-    _strike(sweep, rng, len(kinds), strike)
+    _strike(sweep, rng, len(kinds) + 2, strike)
     return [
         _judge(reference, sweep, f"driver SIGKILL and newest checkpoint {name}", hit[name], "--resume")
         for name in kinds

@@ -2,6 +2,7 @@
 
 import logging
 import os
+import socket
 import tempfile
 import time
 import warnings
@@ -25,6 +26,7 @@ from msk_ray.config import Config, read_yaml
 from msk_ray.errors import ClusterLost, DeviceError, MskRayError, StorageFailure, storage_failure
 from msk_ray.progress import format_duration
 from msk_ray.training import Trainer, precompile
+from msk_ray.tune import standby
 from msk_ray.tune.adapters import METRIC, Population, PruningScheduler, domain, optuna_search
 from msk_ray.tune.devices import Placement
 from msk_ray.tune.experiment import Experiment
@@ -36,10 +38,12 @@ from msk_ray.tune.outcomes import read_ending, write_ending
 from msk_ray.tune.pruning import make_pruner
 from msk_ray.tune.records import read_record
 from msk_ray.tune.space import Space
+from msk_ray.tune.standby import Standby, nodes_for
 from msk_ray.tune.trainable import Job, make_trainable
 from msk_ray.tune.trial_run import TrainerLike
 from msk_ray.tune.trials import Trial, base_settings, env_steps_budget
 
+_KNOCK_S = 20.0
 Precompile = Callable[[Config, str, Path], None]
 
 
@@ -56,6 +60,8 @@ class Plan:
     trainer_class: type[TrainerLike] = Trainer
     precompile: Precompile | None = precompile
     """Compiles a config's kernels on a node before trials start; None where there is nothing to compile."""
+    standby: bool = True
+    """Whether processes are kept ready for the trials that come next."""
 
 
 @contextmanager
@@ -76,7 +82,11 @@ def ray_session(address: str | None, dashboard: bool | None = None) -> Iterator[
         TUNE_DISABLE_SIGINT_HANDLER="1",  # a request to stop lets trials save themselves first
     )
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    quiet: dict[str, Any] = {"logging_level": "ERROR", "log_to_driver": False}
+    common: dict[str, Any] = {
+        "logging_level": "ERROR",
+        "log_to_driver": False,
+        "runtime_env": {"worker_process_setup_hook": standby.HOOK},
+    }
     if address is None:
         # Workers must import the package this process runs, wherever it was started from.
         package = str(Path(msk_ray.__file__).resolve().parent.parent)
@@ -84,11 +94,12 @@ def ray_session(address: str | None, dashboard: bool | None = None) -> Iterator[
         os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys(paths))
         # None starts the dashboard where its packages (ray[default]) are installed, and does without elsewhere.
         # By default Ray would join whatever cluster a `ray start` on this machine once left a note of.
-        context = ray.init("local", include_dashboard=dashboard, dashboard_host="127.0.0.1", **quiet)
+        context = ray.init("local", include_dashboard=dashboard, dashboard_host="127.0.0.1", **common)
     else:
         try:
-            context = ray.init(address=address, **quiet)
-        except ConnectionError as error:
+            _knock(address)
+            context = ray.init(address=address, **common)
+        except OSError as error:  # ConnectionError too
             raise DeviceError(
                 f"no Ray cluster at {address} (--address or RAY_ADDRESS): {str(error).splitlines()[0]}"
             ) from error
@@ -100,6 +111,17 @@ def ray_session(address: str | None, dashboard: bool | None = None) -> Iterator[
         yield
     finally:
         ray.shutdown()
+
+
+def _knock(address: str) -> None:
+    """See whether anybody listens at HOST:PORT: Ray itself would try for minutes.
+
+    Raises:
+        OSError: nobody does.
+    """
+    host, _, port = address.rpartition(":")
+    if "://" not in address and port.isdigit():
+        socket.create_connection((host, int(port)), timeout=_KNOCK_S).close()
 
 
 def cluster_gpus() -> int:
@@ -182,6 +204,7 @@ def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial]) -> None:
     resources = {"cpu": plan.placement.cpus} | ({"gpu": plan.placement.gpus} if plan.placement.gpus else {})
     searching = file.search == "optuna"
     node = _OwnNode()
+    spare = [Standby(plan.placement, plan.max_concurrent, live.waiting)] if plan.standby else []
     tuner = tune.Tuner(
         tune.with_resources(make_trainable(job), resources),
         param_space=_param_space(job, remaining),
@@ -189,7 +212,10 @@ def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial]) -> None:
             metric=METRIC,
             mode="max",
             scheduler=scheduler,
-            search_alg=optuna_search(file.sample_seed) if searching else BasicVariantGenerator(),
+            search_alg=optuna_search(file.sample_seed)
+            if searching
+            # Tune limits a generator it was given no more than this one limits itself.
+            else BasicVariantGenerator(max_concurrent=plan.max_concurrent or 0),
             num_samples=file.samples if searching else 1,
             max_concurrent_trials=plan.max_concurrent,
             reuse_actors=False,  # a process of its own frees a trial's GPU memory, whatever it did
@@ -200,7 +226,7 @@ def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial]) -> None:
             storage_path=str(plan.experiment.path),
             verbose=0,
             # Live first: it writes the endings that only the driver knows.
-            callbacks=[live, StateGauge(plan.experiment, remaining, job.trial_of), node],
+            callbacks=[live, StateGauge(plan.experiment, remaining, job.trial_of), node, *spare],
             stop=_StopWhen(live),
             failure_config=tune.FailureConfig(max_failures=file.resources.max_failures),
             # None are deleted: only a population reports them, and another member may be about to take one over.
@@ -332,7 +358,7 @@ def _precompile(plan: Plan, trials: Sequence[Trial]) -> None:
     for trial in trials:
         c = trial.config
         models.setdefault(repr((c.env.name, c.physics, c.evaluation.variant)), trial)
-    nodes = [node for node in ray.nodes() if node["Alive"] and _fits(node["Resources"], plan.placement)]
+    nodes = nodes_for(plan.placement)
     started = time.monotonic()
     print(f"compiling kernels of {len(models)} model(s) on {len(nodes)} node(s) ...", flush=True)
     compile_model = plan.precompile
@@ -359,7 +385,3 @@ def _precompile(plan: Plan, trials: Sequence[Trial]) -> None:
             raise error.cause from None
         raise
     print(f"kernels ready after {format_duration(time.monotonic() - started)}", flush=True)
-
-
-def _fits(resources: dict[str, float], placement: Placement) -> bool:
-    return resources.get("CPU", 0.0) >= placement.cpus and resources.get("GPU", 0.0) >= placement.gpus

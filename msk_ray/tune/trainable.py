@@ -7,6 +7,7 @@ import platform
 import shutil
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -209,6 +210,7 @@ def _record_device(path: Path) -> None:
     facts = {
         "host": platform.node(),
         "pid": os.getpid(),
+        "began": time.time(),
         "visible": os.environ.get("CUDA_VISIBLE_DEVICES", ""),
         "count": torch.cuda.device_count() if cuda else 0,
         "name": torch.cuda.get_device_name(0) if cuda else "cpu",
