@@ -220,8 +220,8 @@ FIBRE_REFERENCE: Final = {
 }
 """Fibre length in the anatomical position over its optimum: (path - tendon slack length) / fibre of the sources.
 
-Gastrocnemius and soleus would be at 1.20 and 1.08, where a rigid tendon leaves the calf so tight that quiet standing needs
-the shin muscles; 1.00 is nearer to their sarcomeres (Ward et al. 2009, Clin Orthop Relat Res 467:1074).
+Gastrocnemius and soleus would be at 1.20 and 1.08, where a rigid tendon leaves the calf so tight that quiet standing
+needs the shin muscles; 1.00 is nearer to their sarcomeres (Ward et al. 2009, Clin Orthop Relat Res 467:1074).
 """
 
 OUTLINE: Final = {
