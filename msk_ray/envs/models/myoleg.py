@@ -146,6 +146,7 @@ def build_myoleg(env: MyoLegEnvConfig, physics: PhysicsConfig) -> mujoco.MjModel
         _keep_plane_contacts(spec)
     for key in list(spec.keys):
         spec.delete(key)
+    spec.nkey = 0  # a size asked for in the file would add nameless keys before ours
     model = spec.compile()
     joints = {model.joint(j).name for j in range(model.njnt)}
     if not joints >= {"hip_flexion_r", "hip_flexion_l"} or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
