@@ -9,8 +9,12 @@ from msk_ray.cli import run
 COMMANDS = {
     "train": ("msk_ray.train", "train one policy in this process, without Ray"),
     "tune": ("msk_ray.tune.__main__", "run a search space as a Ray Tune experiment"),
+    "evaluate": ("msk_ray.evaluate.__main__", "evaluate policies: fixed seeds, no noise, every reward term"),
+    "visualize": ("msk_ray.visualize.__main__", "watch a policy: viewer, video, frames, film strip"),
+    "report": ("msk_ray.report.__main__", "write an experiment's report: curves, tables, the best policy"),
     "status": ("msk_ray.status", "show where experiments stand, from their files"),
     "doctor": ("msk_ray.doctor", "check that this machine can run trials, and say what to mend"),
+    "diagnose": ("msk_ray.diagnose.__main__", "compare a policy's gradients with float64 differences, by horizon"),
     "gradcheck": ("msk_ray.gradcheck.__main__", "check a model's gradients against float64 finite differences"),
 }
 

@@ -12,10 +12,14 @@ from msk_ray.config.load import (
     read_yaml,
 )
 from msk_ray.config.schema import (
+    AdaptiveHorizon,
     AntEnvConfig,
     AssistConfig,
     CartPoleEnvConfig,
     Config,
+    ContactCurriculum,
+    ContactStart,
+    EntropyConfig,
     EnvConfig,
     EvaluationConfig,
     FdConfig,
@@ -31,10 +35,14 @@ from msk_ray.config.schema import (
 )
 
 __all__ = [
+    "AdaptiveHorizon",
     "AntEnvConfig",
     "AssistConfig",
     "CartPoleEnvConfig",
     "Config",
+    "ContactCurriculum",
+    "ContactStart",
+    "EntropyConfig",
     "EnvConfig",
     "EvaluationConfig",
     "FdConfig",

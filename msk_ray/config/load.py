@@ -4,10 +4,10 @@ import copy
 import difflib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, get_args
+from typing import Annotated, Any, get_args, get_origin
 
 import yaml
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, Tag, ValidationError
 
 from msk_ray.config.schema import VARIANTS, Config
 from msk_ray.errors import ConfigError
@@ -128,9 +128,10 @@ def dump_yaml(data: Mapping[str, Any]) -> str:
 def describe_fault(error: ValidationError, root: type[BaseModel] = Config) -> str:
     """The first fault found while validating a `root`, and how many more there are, on one line."""
     faults = error.errors()
-    first = faults[0]
+    # A misspelt key is often missing under its right name too; the misspelling is what to mend.
+    first = min(faults, key=lambda fault: fault["type"] != "extra_forbidden")
     # Discriminated unions put the tag into the location; it is no key of the file.
-    location = [str(part) for part in first["loc"] if part not in (*VARIANTS, "constrained-int", "HorizonSchedule")]
+    location = [str(part) for part in first["loc"] if part not in _TAGS]
     where = ".".join(location)
     if first["type"] == "extra_forbidden":
         known = _keys_at(root, location[:-1], first["loc"])
@@ -149,13 +150,27 @@ def describe_fault(error: ValidationError, root: type[BaseModel] = Config) -> st
     return text + (f" (and {more} more fault{'s' if more > 1 else ''})" if more else "")
 
 
+_TAGS = (*VARIANTS, "constant", "schedule", "adaptive")
+"""Tags of discriminated unions, which pydantic puts into a fault's location."""
+
+
+def _is_model(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, BaseModel)
+
+
+def _own_name(model: type[BaseModel]) -> tuple[Any, ...]:
+    field = model.model_fields.get("name")
+    return get_args(field.annotation) if field is not None else ()
+
+
 def _keys_at(root: type[BaseModel], sections: list[str], location: tuple[Any, ...]) -> list[str]:
     """Known keys of the section of `root` a fault lies in."""
     model: Any = root
     for section in sections:
         annotation = model.model_fields[section].annotation
-        options = [a for a in get_args(annotation) or (annotation,) if isinstance(a, type) and issubclass(a, BaseModel)]
-        named = [o for o in options if "name" in o.model_fields and get_args(o.model_fields["name"].annotation)]
-        tagged = [o for o in named if get_args(o.model_fields["name"].annotation)[0] in location]
-        model = (tagged or options)[0]
+        # A member of a union is Annotated with its tag, or names itself in its field `name`.
+        options = [get_args(a) if get_origin(a) is Annotated else (a,) for a in get_args(annotation) or (annotation,)]
+        models = [(o[0], [m.tag for m in o[1:] if isinstance(m, Tag)]) for o in options if _is_model(o[0])]
+        named = [(m, [*tags, *_own_name(m)]) for m, tags in models]
+        model = next((m for m, tags in named if any(tag in location for tag in tags)), named[0][0])
     return list(model.model_fields)

@@ -6,7 +6,7 @@ arXiv:2204.07137) and the hyperparameters published with it.
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, PositiveFloat, PositiveInt, Tag, model_validator
 
 Vec2 = tuple[float, float]
 Vec5 = tuple[float, float, float, float, float]
@@ -300,6 +300,86 @@ class HorizonSchedule(Section):
     epochs: PositiveInt
 
 
+class AdaptiveHorizon(Section):
+    """Rollout length that follows the gradient: longer while cotangents stay small, shorter when they grow.
+
+    After each epoch H ← H (target / p90)^rate within bounds, p90 being the 90th percentile of the state cotangents'
+    norms in units of reward. Adaptive horizons are the idea of AHAC (Georgiev et al. 2024, arXiv:2405.17784), which
+    follows a constraint on contact forces; this one follows the cotangents themselves.
+    """
+
+    start: PositiveInt
+    shortest: PositiveInt = 4
+    longest: PositiveInt = 64
+    target: PositiveFloat
+    """Wanted 90th percentile of the cotangent norms, before any bound [reward]."""
+    rate: Annotated[float, Field(gt=0.0, le=1.0)] = 0.1
+
+    @model_validator(mode="after")
+    def _bounds(self) -> "AdaptiveHorizon":
+        if not self.shortest <= self.start <= self.longest:
+            raise ValueError(
+                f"adaptive horizon: start {self.start} must lie between shortest {self.shortest} and longest "
+                f"{self.longest}"
+            )
+        return self
+
+
+def _kind_of_horizon(value: Any) -> str:
+    if isinstance(value, dict):
+        return "adaptive" if "target" in value else "schedule"
+    if isinstance(value, AdaptiveHorizon):
+        return "adaptive"
+    return "schedule" if isinstance(value, HorizonSchedule) else "constant"
+
+
+Horizon = Annotated[
+    Annotated[PositiveInt, Tag("constant")]
+    | Annotated[HorizonSchedule, Tag("schedule")]
+    | Annotated[AdaptiveHorizon, Tag("adaptive")],
+    Discriminator(_kind_of_horizon),
+]
+
+
+class EntropyConfig(Section):
+    """Bonus α for the policy's entropy, as in SAPO (Xing et al. 2024, arXiv:2412.12089); values become soft values."""
+
+    coefficient: PositiveFloat = 0.01
+    """α [reward per nat], or where it starts if there is a target."""
+    target: float | None = None
+    """Entropy per action dimension [nat] that α is adapted to hold; null keeps α. Uniform actions have ln 2 = 0.69."""
+    rate: PositiveFloat = 5e-3
+    """Change of log α per epoch and nat of missing entropy."""
+
+
+class ContactStart(Section):
+    """Contact physics at the start of a curriculum; fields left null stay as the trial's physics has them."""
+
+    solref: tuple[PositiveFloat, PositiveFloat] | None = None
+    """Contact time constant [s] and damping ratio."""
+    solimp: Vec5 | None = None
+    solreffriction: tuple[PositiveFloat, PositiveFloat] | None = None
+    """Time constant [s] and damping ratio of the friction directions; (1, 1) is viscous."""
+    friction: PositiveFloat | None = None
+    """Sliding friction coefficient."""
+
+    @model_validator(mode="after")
+    def _something(self) -> "ContactStart":
+        if not self.model_dump(exclude_none=True):
+            raise ValueError("write at least one of solref, solimp, solreffriction, friction")
+        return self
+
+
+class ContactCurriculum(Section):
+    """Train first in softer contacts, and go over to those of `physics` step by step."""
+
+    start: ContactStart
+    epochs: PositiveInt
+    """Steps from `start` to the trial's physics, one an epoch."""
+    reward: float | None = None
+    """Mean reward per env step an epoch must reach for a step to be taken; null takes one every epoch."""
+
+
 class NetworkConfig(Section):
     """A multilayer perceptron."""
 
@@ -328,8 +408,9 @@ class CriticConfig(NetworkConfig):
 class ShacConfig(Section):
     """Short-Horizon Actor-Critic."""
 
-    horizon: PositiveInt | HorizonSchedule = 32
-    """Env steps H of a rollout the gradient flows through, constant or as {start, end, epochs}."""
+    horizon: Horizon = 32
+    """Env steps H of a rollout the gradient flows through: constant, {start, end, epochs}, or by the gradient as
+    {start, target}."""
     gamma: Fraction = 0.99
     """Discount."""
     lam: Fraction = 0.95
@@ -360,6 +441,8 @@ class ShacConfig(Section):
 
     The loss is a mean over H·W, so a world's cotangent of norm c/(H·W) is what one reward of c would give.
     """
+    entropy: EntropyConfig | None = None
+    """Bonus for the policy's entropy; null gives none."""
     normalize_obs: bool = True
     """Normalise observations by their running mean and variance."""
     normalize_return: bool = False
@@ -398,6 +481,8 @@ class Config(Section):
 
     env: EnvConfig
     physics: PhysicsConfig = PhysicsConfig()
+    curriculum: ContactCurriculum | None = None
+    """Softer contacts to begin with; null trains in `physics` from the start."""
     shac: ShacConfig = ShacConfig()
     actor: ActorConfig = ActorConfig()
     critic: CriticConfig = CriticConfig()
@@ -421,13 +506,26 @@ class Config(Section):
     def _consistent(self) -> "Config":
         self.physics.resolve_substeps(self.env.control_timestep)
         horizon = self.shac.horizon
-        shortest = horizon if isinstance(horizon, int) else min(horizon.start, horizon.end)
+        if isinstance(horizon, HorizonSchedule):
+            shortest = min(horizon.start, horizon.end)
+        else:
+            shortest = horizon if isinstance(horizon, int) else horizon.shortest
         if (shortest * self.env.nworld) % self.shac.critic_batches:
             raise ValueError(
                 f"shac.critic_batches {self.shac.critic_batches} must divide shac.horizon × env.nworld "
                 f"({shortest} × {self.env.nworld})"
             )
+        if self.shac.entropy is not None and not self.actor.stochastic:
+            raise ValueError("shac.entropy needs a stochastic policy: write actor.stochastic: true")
+        if self.curriculum is not None:
+            self._check_curriculum()
         return self
+
+    def _check_curriculum(self) -> None:
+        if self.env.name == "cartpole":
+            raise ValueError("curriculum: cartpole has no contacts; leave it out")
+        if self.physics.backward not in ("tape_per_substep", "tape_all"):
+            raise ValueError("curriculum needs physics.backward: tape_per_substep or tape_all")
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data that `parse_config` reads back."""

@@ -58,7 +58,8 @@ class Env(ABC, Generic[Settings]):
 
     Attributes:
         state: current state of all worlds; `detach` it to start a new graph.
-        generator: source of reset states, on the environment's device.
+        generator: source of reset states, on the environment's device; one on the CPU may be put in its place, which
+            draws the same states for every device.
     """
 
     action_size: int
@@ -192,7 +193,8 @@ class Env(ABC, Generic[Settings]):
         """Uniform numbers in [-1, 1) from the environment's generator; zeros if resets are not stochastic."""
         if not self.config.stochastic_reset:
             return torch.zeros(shape, device=self.device)
-        return 2.0 * torch.rand(shape, generator=self.generator, device=self.device) - 1.0
+        drawn = torch.rand(shape, generator=self.generator, device=self.generator.device)
+        return 2.0 * drawn.to(self.device) - 1.0
 
     def _reset_where(self, done: Tensor, reached: EnvState) -> EnvState:
         fresh = self.reset_state()

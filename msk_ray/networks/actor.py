@@ -1,5 +1,7 @@
 """The policy."""
 
+import math
+
 import torch
 from torch import Tensor, nn
 
@@ -26,3 +28,16 @@ class Actor(nn.Module):
         if noise is not None and self.log_std is not None:
             action = action + self.log_std.exp() * noise
         return torch.tanh(action)
+
+    def sample(self, obs: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Actions (..., A) for normalised observations (..., O) and noise (..., A), and −log π of each, shape (...).
+
+        For a = tanh(u), u = μ + σn:  −log π(a) = Σ ½n² + log σ + ½ log 2π + log(1 − tanh² u)
+        (Haarnoja et al. 2018, arXiv:1801.01290, appendix C). Differentiable in both results.
+        """
+        assert self.log_std is not None
+        raw = self.mean(obs) + self.log_std.exp() * noise
+        # log(1 − tanh² u) = 2 (log 2 − u − softplus(−2u)), which stays finite where tanh² rounds to 1.
+        squash = 2.0 * (math.log(2.0) - raw - nn.functional.softplus(-2.0 * raw))
+        gaussian = 0.5 * noise.square() + self.log_std + 0.5 * math.log(2.0 * math.pi)
+        return torch.tanh(raw), (gaussian + squash).sum(-1)

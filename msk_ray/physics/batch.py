@@ -7,6 +7,7 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 from mujoco_warp import OverflowType
+from numpy.typing import NDArray
 
 from msk_ray.errors import SimulationError, UnsupportedModelError
 
@@ -157,6 +158,18 @@ class WorldBatch:
         """Launch one physics step on `data`, this batch's own or another of the same model and size."""
         refresh_velocity(self.mjm, self.model, data)
         mjw.step(self.model, data)
+
+    def set_contact_pairs(self, fields: dict[str, NDArray[np.float64]]) -> None:
+        """Change what contact pairs are made of, from the next step on; recorded graphs follow.
+
+        Args:
+            fields: of solref (P, 2), solreffriction (P, 2), solimp (P, 5), friction (P, 5), those that change, for the
+                P pairs in the model's order.
+        """
+        for name, value in fields.items():
+            array = getattr(self.model, f"pair_{name}")
+            # In place: a recorded graph reads this memory.
+            array.assign(np.asarray(value, np.float32).reshape(array.shape[0], array.shape[1], -1).squeeze())
 
     def check_overflow(self) -> float:
         """Share of worlds whose solver met an iteration limit since the last call.

@@ -1,22 +1,26 @@
 """The SHAC update: one rollout, one actor step, several critic passes."""
 
 import copy
+import math
 import time
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from msk_ray.config import Config
+from msk_ray.config import AdaptiveHorizon, Config
 from msk_ray.envs import Env
 from msk_ray.errors import Failure, SimulationError
 from msk_ray.networks import Actor, Critic, RunningMeanStd
 from msk_ray.shac import returns
 from msk_ray.shac.critic_fit import CriticFit
+from msk_ray.shac.curriculum import ContactSchedule
+from msk_ray.shac.entropy import EntropyBonus
 from msk_ray.shac.episodes import EpisodeTracker
 from msk_ray.shac.gate import CotangentGate
+from msk_ray.shac.gradient_noise import HalvesWatch
 from msk_ray.shac.rollout import Rollout, collect
-from msk_ray.shac.schedules import horizon_at, learning_rate_at
+from msk_ray.shac.schedules import adapted_horizon, horizon_at, learning_rate_at
 
 
 class Shac:
@@ -43,6 +47,9 @@ class Shac:
         self.noise_generator = torch.Generator(device=device).manual_seed(config.trial.seed + 1)
         self.episodes = EpisodeTracker(env.nworld, device)
         self._discounted = torch.zeros(env.nworld, device=device)
+        self._horizon = float(c.horizon.start) if isinstance(c.horizon, AdaptiveHorizon) else None
+        self._entropy = EntropyBonus(c.entropy, env.action_size) if c.entropy is not None else None
+        self._contacts = ContactSchedule(config.curriculum, env) if config.curriculum is not None else None
 
     def update(self, epoch: int) -> dict[str, float]:
         """Train one epoch, counted from 0.
@@ -55,7 +62,7 @@ class Shac:
                 physics ran out of buffer space.
         """
         c = self.config.shac
-        horizon = horizon_at(c.horizon, epoch)
+        horizon = self._horizon_now(epoch)
         epochs = self.config.trial.epochs
         actor_lr = learning_rate_at(c.actor_lr, c.final_lr, c.lr_schedule, epoch, epochs)
         critic_lr = learning_rate_at(c.critic_lr, c.final_lr, c.lr_schedule, epoch, epochs)
@@ -70,7 +77,9 @@ class Shac:
         gate = CotangentGate(
             None if c.state_grad_clip is None else c.state_grad_clip * unit, self.env.nworld, self.env.device
         )
-        rollout, loss, next_values, scaled_rewards = self._forward(horizon, gate)
+        halves = HalvesWatch(self.actor)
+        with halves.watching():
+            rollout, loss, next_values, scaled_rewards = self._forward(horizon, gate)
         rollout_s = clock.lap()
 
         self.actor_optimizer.zero_grad()
@@ -91,25 +100,37 @@ class Shac:
             "train/value": next_values.detach().mean(),
             "train/diverged": rollout.diverged.sum(),
             "grad/actor_norm": gradient_norm,
+            "grad/halves_cosine": halves.cosine(),
             **gate_statistics,
             **self.episodes.update(rollout.rewards.detach(), rollout.done),
         }
         if self.actor.log_std is not None:
             metrics["train/std"] = self.actor.log_std.detach().exp().mean()
-        return {name: float(value) for name, value in metrics.items()} | {
-            "train/horizon": float(horizon),
-            "train/actor_lr": actor_lr,
-            "time/rollout_s": rollout_s,
-            "time/backward_s": backward_s,
-            "time/critic_s": critic_s,
-            **{f"physics/{name}": value for name, value in self.env.sim.diagnostics().items()},
-        }
+        numbers = {name: float(value) for name, value in metrics.items()}
+        return (
+            numbers
+            | self._adapt(numbers, rollout)
+            | {
+                "train/horizon": float(horizon),
+                "train/actor_lr": actor_lr,
+                "time/rollout_s": rollout_s,
+                "time/backward_s": backward_s,
+                "time/critic_s": critic_s,
+                **{f"physics/{name}": value for name, value in self.env.sim.diagnostics().items()},
+            }
+        )
 
     @torch.no_grad()
     def policy(self, obs: Tensor) -> Tensor:
         """Deterministic actions (W, A) for raw observations (W, O)."""
         action: Tensor = self.actor(self.normalizer.normalize(obs) if self.normalizer is not None else obs)
         return action
+
+    def policy_state_dict(self) -> dict[str, Any]:
+        """State of the modules that `policy` uses."""
+        return {
+            name: module.state_dict() for name, module in self._modules().items() if name in ("actor", "normalizer")
+        }
 
     def state_dict(self) -> dict[str, Any]:
         """Everything a later `load_state_dict` needs to go on exactly, environment state included."""
@@ -123,6 +144,9 @@ class Shac:
             "env_state": [t.detach().clone() for t in (*state.physics, state.action, state.age)],
             "episodes": self.episodes.state_dict(),
             "discounted": self._discounted.clone(),
+            "horizon": self._horizon,
+            "entropy_coefficient": None if self._entropy is None else self._entropy.coefficient,
+            "curriculum": None if self._contacts is None else self._contacts.progress,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -139,6 +163,35 @@ class Shac:
         self.env.state = now._replace(physics=type(now.physics)(*physics), action=action, age=age)
         self.episodes.load_state_dict(state["episodes"])
         self._discounted = state["discounted"]
+        self._horizon = state.get("horizon")
+        if self._entropy is not None:
+            self._entropy.coefficient = state["entropy_coefficient"]
+        if self._contacts is not None:
+            self._contacts.set_progress(state["curriculum"])
+
+    def _horizon_now(self, epoch: int) -> int:
+        configured = self.config.shac.horizon
+        if isinstance(configured, AdaptiveHorizon):
+            assert self._horizon is not None
+            return round(self._horizon)
+        return horizon_at(configured, epoch)
+
+    def _adapt(self, metrics: dict[str, float], rollout: Rollout) -> dict[str, float]:
+        """Move horizon, entropy bonus and contacts on after an epoch with these metrics; returns where they stood."""
+        stood: dict[str, float] = {}
+        if isinstance(self.config.shac.horizon, AdaptiveHorizon):
+            assert self._horizon is not None
+            p90 = metrics.get("grad/state_p90", math.nan)
+            self._horizon = adapted_horizon(self.config.shac.horizon, self._horizon, p90)
+        if self._entropy is not None:
+            assert rollout.surprise is not None
+            entropy = float(rollout.surprise.detach().mean())
+            stood |= {"train/entropy": entropy, "train/entropy_coefficient": self._entropy.coefficient}
+            self._entropy.adapt(entropy)
+        if self._contacts is not None:
+            stood["train/curriculum"] = self._contacts.progress
+            self._contacts.advance(metrics["train/reward"])
+        return stood
 
     def _modules(self) -> dict[str, nn.Module]:
         found: dict[str, nn.Module | None] = {
@@ -156,8 +209,19 @@ class Shac:
         noise = torch.randn(
             (horizon, self.env.nworld, self.env.action_size), generator=self.noise_generator, device=self.env.device
         )
-        rollout = collect(self.env, self.actor, self.normalizer, noise, gate, state_bptt=c.state_bptt)
+        rollout = collect(
+            self.env,
+            self.actor,
+            self.normalizer,
+            noise,
+            gate,
+            state_bptt=c.state_bptt,
+            with_surprise=self._entropy is not None,
+        )
         rewards = c.reward_scale * rollout.rewards
+        if self._entropy is not None:
+            assert rollout.surprise is not None
+            rewards = rewards + self._entropy.coefficient * rollout.surprise
         std: Tensor | float = 1.0
         if self.return_statistics is not None:
             std = torch.sqrt(self.return_statistics.var + 1e-6)

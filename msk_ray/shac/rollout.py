@@ -26,6 +26,8 @@ class Rollout:
     """Terminated or truncated, shape (H, W) bool."""
     diverged: Tensor
     """Shape (H, W) bool."""
+    surprise: Tensor | None
+    """−log π of the actions taken [nat], attached, shape (H, W); None if it was not asked for."""
 
 
 def collect(
@@ -36,6 +38,7 @@ def collect(
     gate: CotangentGate,
     *,
     state_bptt: bool,
+    with_surprise: bool = False,
 ) -> Rollout:
     """Roll the policy out for as many steps as `noise` (H, W, A) has, from where the worlds are.
 
@@ -45,15 +48,29 @@ def collect(
     env.state = env.state.detach()
     env.stock_resets(len(noise))
     raw, reached, rewards, terminated, done, diverged = [], [], [], [], [], []
+    surprise = []
     normalize = normalizer.normalize if normalizer is not None else lambda x: x
     for step_noise in noise:
         env.state = env.state._replace(physics=gate(env.state.physics)) if state_bptt else env.state.detach()
         obs = env.observation()
-        transition = env.step(actor(normalize(obs), step_noise))
+        if with_surprise:
+            action, surprising = actor.sample(normalize(obs), step_noise)
+            surprise.append(surprising)
+        else:
+            action = actor(normalize(obs), step_noise)
+        transition = env.step(action)
         raw.append(obs.detach())
         reached.append(normalize(transition.obs))
         rewards.append(transition.reward)
         terminated.append(transition.terminated)
         done.append(transition.terminated | transition.truncated)
         diverged.append(transition.diverged)
-    return Rollout(*(torch.stack(x) for x in (raw, reached, rewards, terminated, done, diverged)))
+    return Rollout(
+        torch.stack(raw),
+        torch.stack(reached),
+        torch.stack(rewards),
+        torch.stack(terminated),
+        torch.stack(done),
+        torch.stack(diverged),
+        torch.stack(surprise) if surprise else None,
+    )

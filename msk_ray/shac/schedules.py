@@ -1,6 +1,8 @@
 """Values that change over training. Pure functions of the epoch, counted from 0."""
 
-from msk_ray.config import HorizonSchedule
+import math
+
+from msk_ray.config import AdaptiveHorizon, HorizonSchedule
 
 
 def horizon_at(schedule: int | HorizonSchedule, epoch: int) -> int:
@@ -16,3 +18,12 @@ def learning_rate_at(initial: float, final: float, schedule: str, epoch: int, ep
     if schedule == "constant":
         return initial
     return initial + (min(final, initial) - initial) * min(1.0, epoch / epochs)
+
+
+def adapted_horizon(config: AdaptiveHorizon, horizon: float, cotangent: float) -> float:
+    """Horizon after an epoch at `horizon` (not rounded) whose cotangents had this 90th percentile [reward].
+
+    H ← H (target / p90)^rate within bounds. A percentile that is not finite shrinks H by 2^rate.
+    """
+    ratio = config.target / cotangent if math.isfinite(cotangent) and cotangent > 0.0 else 0.5
+    return min(max(horizon * ratio**config.rate, config.shortest), config.longest)

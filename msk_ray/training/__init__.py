@@ -3,6 +3,16 @@
 from msk_ray.metrics_file import read_metrics
 from msk_ray.training.checkpoint import newest_valid_checkpoint, read_checkpoint
 from msk_ray.training.evaluation import Evaluator
+from msk_ray.training.policy import SavedPolicy, load_policy
 from msk_ray.training.trainer import Trainer, precompile
 
-__all__ = ["Evaluator", "Trainer", "newest_valid_checkpoint", "precompile", "read_checkpoint", "read_metrics"]
+__all__ = [
+    "Evaluator",
+    "SavedPolicy",
+    "Trainer",
+    "load_policy",
+    "newest_valid_checkpoint",
+    "precompile",
+    "read_checkpoint",
+    "read_metrics",
+]

@@ -18,6 +18,7 @@ from msk_ray.errors import CheckpointError, StorageFailure
 
 FORMAT = 1
 _EPOCH_NAME = re.compile(r"epoch_(\d+)\.pt")
+_POLICY_NAME = re.compile(r"policy_(\d+)\.pt")
 
 
 def write_atomically(path: Path, payload: bytes) -> None:
@@ -56,6 +57,25 @@ def manifest_path(path: Path) -> Path:
     return path.with_suffix(".json")
 
 
+def read_manifest(path: Path) -> dict[str, Any]:
+    """The manifest of the checkpoint at `path`: format, sha256, bytes, and facts such as the epoch.
+
+    Raises:
+        CheckpointError: it is missing, unreadable, or of another format.
+    """
+    try:
+        manifest = json.loads(manifest_path(path).read_text())
+    except FileNotFoundError as error:
+        raise CheckpointError(f"no such checkpoint: {error.filename}") from None
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"cannot read checkpoint {path}: {error}") from error
+    found = manifest.get("format") if isinstance(manifest, dict) else None
+    if found != FORMAT:
+        raise CheckpointError(f"{path} has checkpoint format {found}, this version reads {FORMAT}")
+    facts: dict[str, Any] = manifest
+    return facts
+
+
 def read_checkpoint(path: Path) -> dict[str, Any]:
     """The state in a checkpoint, on CPU.
 
@@ -64,13 +84,11 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     """
     try:
         payload = path.read_bytes()
-        manifest = json.loads(manifest_path(path).read_text())
     except FileNotFoundError as error:
         raise CheckpointError(f"no such checkpoint: {error.filename}") from None
-    except (OSError, ValueError) as error:
+    except OSError as error:
         raise CheckpointError(f"cannot read checkpoint {path}: {error}") from error
-    if manifest.get("format") != FORMAT:
-        raise CheckpointError(f"{path} has checkpoint format {manifest.get('format')}, this version reads {FORMAT}")
+    manifest = read_manifest(path)
     if hashlib.sha256(payload).hexdigest() != manifest.get("sha256"):
         raise CheckpointError(
             f"{path} is torn: {len(payload)} bytes of {manifest.get('bytes')}, checksum differs; use an older one of "
@@ -82,10 +100,23 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 def epoch_checkpoints(folder: Path) -> list[Path]:
     """Numbered checkpoints of a folder, newest first."""
+    return [path for _, path in reversed(_numbered(folder, _EPOCH_NAME))]
+
+
+def milestones(folder: Path) -> list[tuple[int, Path]]:
+    """The policies kept along a trial's way, as (epoch, path), oldest first."""
+    return _numbered(folder, _POLICY_NAME)
+
+
+def milestone_path(folder: Path, epoch: int) -> Path:
+    """Where the policy of an epoch is kept."""
+    return folder / f"policy_{epoch:06d}.pt"
+
+
+def _numbered(folder: Path, name: re.Pattern[str]) -> list[tuple[int, Path]]:
     if not folder.is_dir():
         return []
-    numbered = [(int(m.group(1)), p) for p in folder.iterdir() if (m := _EPOCH_NAME.fullmatch(p.name))]
-    return [path for _, path in sorted(numbered, reverse=True)]
+    return sorted((int(m.group(1)), p) for p in folder.iterdir() if (m := name.fullmatch(p.name)))
 
 
 def newest_valid_checkpoint(folder: Path) -> tuple[Path | None, list[str]]:

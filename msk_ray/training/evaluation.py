@@ -2,16 +2,50 @@
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from msk_ray.config import Config
+from msk_ray.config import Config, PhysicsConfig
 from msk_ray.envs import env_class, make_env
+from msk_ray.simulation import StepState
 
 Policy = Callable[[Tensor], Tensor]
+OnStep = Callable[[StepState, Tensor], None]
 _CHECK_EVERY = 25
 """Env steps between looks at whether any world still runs."""
+
+
+class Episodes(NamedTuple):
+    """The first episode of each world; W worlds, T reward terms."""
+
+    score: Tensor
+    """Return, shape (W,)."""
+    length: Tensor
+    """Env steps, shape (W,)."""
+    fell: Tensor
+    """Ended by itself, shape (W,) bool; diverged ones not counted."""
+    diverged: Tensor
+    """Ended because the physics left all bounds, shape (W,) bool."""
+    terms: Tensor
+    """Return of each reward term, shape (W, T)."""
+    outcomes: dict[str, Tensor]
+    """Sum over the episode of each of the environment's outcome terms, shape (W,)."""
+    success: Tensor | None
+    """Met the task, shape (W,) bool; None where the environment defines no success, or ended early everywhere."""
+
+    def cpu(self) -> "Episodes":
+        """The same on the CPU."""
+        return self._replace(
+            score=self.score.cpu(),
+            length=self.length.cpu(),
+            fell=self.fell.cpu(),
+            diverged=self.diverged.cpu(),
+            terms=self.terms.cpu(),
+            outcomes={name: value.cpu() for name, value in self.outcomes.items()},
+            success=None if self.success is None else self.success.cpu(),
+        )
 
 
 class Evaluator:
@@ -19,32 +53,44 @@ class Evaluator:
 
     The score is R_ref: the return of each world's first episode under the environment's own reward weights, whatever
     weights the trial trains on, and under the physics `evaluation.variant` names (the environment's reference if
-    null). So trials with different rewards or contacts are comparable.
+    null). So trials with different rewards or contacts are comparable. Initial states are drawn on the CPU: they are
+    the same on every device.
+
+    Args:
+        config: the trial; its `evaluation` section says worlds, steps and seed.
+        device: "cpu" or "cuda:N".
+        physics: physics to evaluate under instead of the reference.
     """
 
-    def __init__(self, config: Config, device: str) -> None:
+    def __init__(self, config: Config, device: str, physics: PhysicsConfig | None = None) -> None:
         e = config.evaluation
         self._seed = e.seed
         env_type = env_class(config.env)
         settings = env_type.reference_settings(config.env)
         steps = e.steps or settings.episode_length
         settings = settings.model_copy(update={"episode_length": steps})
-        physics = env_type.reference_physics(config.physics, e.variant)
+        if physics is None:
+            physics = env_type.reference_physics(config.physics, e.variant)
         self.env = make_env(settings, physics, e.nworld, device, e.seed, differentiable=False)
+        self.env.generator = torch.Generator()
         self.steps = steps
         self._tail = min(steps, math.ceil(1.0 / settings.control_timestep))
 
     @torch.no_grad()
-    def run(self, policy: Policy) -> dict[str, float]:
-        """Evaluate a policy from raw observations (W, O) to actions (W, A).
+    def episodes(self, policy: Policy, seed: int | None = None, on_step: OnStep | None = None) -> Episodes:
+        """Run every world's first episode.
 
-        Returns:
-            `score` and its standard deviation over worlds, mean episode `length`, `fall_rate`, `diverged_rate`, mean
-            return of each reward term, episode means of the environment's outcome terms, and `success_rate` where
-            the environment defines success.
+        Args:
+            policy: raw observations (W, O) to actions (W, A).
+            seed: of the initial states; None takes `evaluation.seed`.
+            on_step: called with the physical state before each env step and the actions (W, A) taken in it, and once
+                more at the end with the last state and action.
+
+        Raises:
+            SimulationError: contacts or constraint rows were lost to a full buffer.
         """
         env = self.env
-        env.generator.manual_seed(self._seed)
+        env.generator.manual_seed(self._seed if seed is None else seed)
         env.state = env.reset_state()
         zeros = torch.zeros(env.nworld, device=env.device)
         alive = torch.ones(env.nworld, dtype=torch.bool, device=env.device)
@@ -54,7 +100,10 @@ class Evaluator:
         outcomes: dict[str, Tensor] = {}
         tail: list[dict[str, Tensor]] = []
         for step in range(self.steps):
-            transition = env.step(policy(env.observation()), auto_reset=False)
+            action = policy(env.observation())
+            if on_step is not None:
+                on_step(env.state.physics, action)
+            transition = env.step(action, auto_reset=False)
             outcome = env.outcome_terms(env.state.physics)
             score += torch.where(alive, transition.reward, 0.0)
             length += alive
@@ -67,20 +116,35 @@ class Evaluator:
             alive &= ~transition.terminated
             if step % _CHECK_EVERY == 0 and not alive.any():
                 break
+        if on_step is not None:
+            on_step(env.state.physics, env.state.action)
         env.sim.diagnostics()  # raises if contacts were lost
-        figures = {
-            "score": score.mean(),
-            "score_std": score.std() if env.nworld > 1 else zeros.sum(),
-            "length": length.mean(),
-            "fall_rate": fell.float().mean(),
-            "diverged_rate": diverged.float().mean(),
-            **{f"term/{name}": value for name, value in zip(env.reward_names, terms.mean(0), strict=True)},
-            **{name: value.sum() / length.sum() for name, value in outcomes.items()},
-        }
+        success = None
         if tail and len(tail) == self._tail:
-            success = env.success({name: torch.stack([t[name] for t in tail]) for name in tail[0]})
-            if success is not None:
-                figures["success_rate"] = (success & alive).float().mean()
+            met = env.success({name: torch.stack([t[name] for t in tail]) for name in tail[0]})
+            success = None if met is None else met & alive
+        return Episodes(score, length, fell, diverged, terms, outcomes, success)
+
+    def run(self, policy: Policy) -> dict[str, float]:
+        """Evaluate a policy from raw observations (W, O) to actions (W, A).
+
+        Returns:
+            `score` and its standard deviation over worlds, mean episode `length`, `fall_rate`, `diverged_rate`, mean
+            return of each reward term, step means of the environment's outcome terms, and `success_rate` where the
+            environment defines success.
+        """
+        e = self.episodes(policy)
+        figures = {
+            "score": e.score.mean(),
+            "score_std": e.score.std() if len(e.score) > 1 else torch.zeros(()),
+            "length": e.length.mean(),
+            "fall_rate": e.fell.float().mean(),
+            "diverged_rate": e.diverged.float().mean(),
+            **{f"term/{name}": value for name, value in zip(self.env.reward_names, e.terms.mean(0), strict=True)},
+            **{name: value.sum() / e.length.sum() for name, value in e.outcomes.items()},
+        }
+        if e.success is not None:
+            figures["success_rate"] = e.success.float().mean()
         return {name: float(value) for name, value in figures.items()}
 
 

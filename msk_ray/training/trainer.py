@@ -11,6 +11,7 @@ from msk_ray.envs import make_env
 from msk_ray.errors import CheckpointError, StorageError
 from msk_ray.shac import Shac
 from msk_ray.training.checkpoint import (
+    milestone_path,
     newest_valid_checkpoint,
     prune_checkpoints,
     read_checkpoint,
@@ -23,12 +24,15 @@ from msk_ray.training.metrics import MetricsLog
 
 # Settings that may differ between a checkpoint and the trial that goes on from it.
 _EXTENDABLE = {"trial": {"epochs", "checkpoint_interval", "keep_checkpoints"}}
+_MILESTONES = 8
+"""Policies kept along the way beside the first; they are what `visualize --progression` shows."""
 
 
 class Trainer:
     """One trial in this process.
 
-    Writes `config.yaml`, `metrics.jsonl`, TensorBoard events and `checkpoints/` under `logdir`. Call `run_epoch` until
+    Writes `config.yaml`, `metrics.jsonl`, TensorBoard events and `checkpoints/` under `logdir`; there the newest whole
+    states, `best.pt`, and the policies alone (`policy_*.pt`) of about every eighth of the way. Call `run_epoch` until
     `finished`; or `restore_latest` first to go on from the newest whole checkpoint, which on CPU gives exactly the
     metrics of an uninterrupted run.
 
@@ -159,10 +163,29 @@ class Trainer:
         if figures["score"] > self.best_score:
             self.best_score = figures["score"]
             self._write(self.best_checkpoint)
+        if self._at_milestone():
+            self._write_policy(figures["score"])
         return {f"eval/{name}": value for name, value in figures.items()} | {
             "eval/best_score": self.best_score,
             "time/evaluation_s": time.perf_counter() - started,
         }
+
+    def _at_milestone(self) -> bool:
+        """Whether this evaluation is the first one past another eighth of the trial, or the one before training.
+
+        Told from the epoch alone, so that a resumed trial keeps the same ones.
+        """
+        epochs, previous = self.config.trial.epochs, self.epoch - self.config.evaluation.interval
+        return self.epoch == 0 or _MILESTONES * self.epoch // epochs > _MILESTONES * previous // epochs
+
+    def _write_policy(self, score: float) -> None:
+        state = {
+            "config": self.config.as_dict(),
+            "epoch": self.epoch,
+            "env_steps": self.env_steps,
+            "shac": {"modules": self.shac.policy_state_dict()},
+        }
+        write_checkpoint(milestone_path(self.checkpoints, self.epoch), state, {"epoch": self.epoch, "score": score})
 
     def _row(self, metrics: dict[str, float]) -> dict[str, float]:
         return {"epoch": self.epoch, "env_steps": self.env_steps, "seconds": self._seconds, **metrics}

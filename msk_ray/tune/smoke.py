@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from msk_ray.config import Config
+from msk_ray.config import AdaptiveHorizon, Config
 from msk_ray.tune.space import Space
 from msk_ray.tune.trials import Trial, base_settings, make_trial
 
@@ -62,6 +62,9 @@ def shorten(config: Config) -> dict[str, Any]:
     horizon: Any = config.shac.horizon
     if isinstance(horizon, int):
         horizon = _quarter(horizon)
+    elif isinstance(horizon, AdaptiveHorizon):
+        lengths = {name: _quarter(getattr(horizon, name)) for name in ("start", "shortest", "longest")}
+        horizon = {**lengths, "target": horizon.target, "rate": horizon.rate}
     else:
         horizon = {"start": _quarter(horizon.start), "end": _quarter(horizon.end), "epochs": EPOCHS - 1}
     steps = config.evaluation.steps or config.env.episode_length

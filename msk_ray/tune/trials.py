@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from msk_ray.config import Config, merge, parse_config, read_config
+from msk_ray.config import AdaptiveHorizon, Config, merge, parse_config, read_config
 from msk_ray.errors import ConfigError
 from msk_ray.tune.operators import Level, Listed, Range, describe
 from msk_ray.tune.space import Space
@@ -197,11 +197,16 @@ def _leaves(key: str, value: Any) -> Iterator[str]:
 
 
 def env_steps_budget(config: Config) -> int:
-    """Env steps a trial takes when it runs to its last epoch: the sum over epochs of horizon × worlds."""
+    """Env steps a trial takes when it runs to its last epoch: the sum over epochs of horizon × worlds.
+
+    An adaptive horizon is taken to stay where it starts.
+    """
     # msk_ray.shac loads torch, which a dry run need not wait for.
     from msk_ray.shac.schedules import horizon_at
 
-    return config.env.nworld * sum(horizon_at(config.shac.horizon, epoch) for epoch in range(config.trial.epochs))
+    horizon = config.shac.horizon
+    fixed = horizon.start if isinstance(horizon, AdaptiveHorizon) else horizon
+    return config.env.nworld * sum(horizon_at(fixed, epoch) for epoch in range(config.trial.epochs))
 
 
 def find_trial(trials: list[Trial], text: str) -> Trial:

@@ -88,3 +88,25 @@ def test_substeps_follow_from_either_setting() -> None:
     assert parse_config({**CARTPOLE, "physics": {"timestep": 1 / 480}}).physics.resolve_substeps(1 / 60) == 8
     assert parse_config({**CARTPOLE, "physics": {"substeps": 5}}).physics.resolve_substeps(1 / 60) == 5
     assert parse_config(CARTPOLE).physics.resolve_substeps(1 / 60) == 4
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("shac.horizon=half", "shac.horizon: Input should be a valid integer"),
+        ("shac.horizon={start: 4, ende: 8, epochs: 2}", "shac.horizon.ende: unknown key; did you mean 'end'?"),
+        (
+            "shac.horizon={start: 4, target: 8, longset: 9}",
+            "shac.horizon.longset: unknown key; did you mean 'longest'?",
+        ),
+        ("shac.horizon={start: 2, target: 8}", "must lie between shortest 4 and longest 64"),
+        ("curriculum={start: {}, epochs: 3}", "write at least one of solref"),
+        ("curriculum={start: {friction: 2}, epochs: 3}", "curriculum: cartpole has no contacts"),
+        ("shac.entropy={coefficient: 0}", "shac.entropy.coefficient: Input should be greater than 0"),
+    ],
+)
+def test_faults_in_what_adapts_are_named(override, message):
+    with pytest.raises(ConfigError) as caught:
+        parse_config(apply_overrides({"env": {"name": "cartpole"}}, dict([parse_override(override)])))
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)

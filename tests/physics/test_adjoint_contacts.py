@@ -12,7 +12,9 @@ _SHAPES = {
     "ellipsoid": 'type="ellipsoid" size=".1 .07 .12"',
     "cylinder": 'type="cylinder" size=".08 .1"',
     "box": 'type="box" size=".08 .07 .06"',
+    "mesh": 'type="mesh" mesh="wedge"',
 }
+_WEDGE = '<asset><mesh name="wedge" vertex="-.1 -.08 -.05 .1 -.08 -.05 0 .1 -.05 0 0 .12"/></asset>'
 
 
 def falling(shape: str, ground: str, cone: str = "elliptic", condim: int = 3, option: str = "") -> mujoco.MjModel:
@@ -28,7 +30,7 @@ def falling(shape: str, ground: str, cone: str = "elliptic", condim: int = 3, op
         mujoco.MjModel.from_xml_string(
             f"""<mujoco><option timestep=".004" cone="{cone}" {option}/>
             <default><geom condim="{condim}" friction=".6 .02 .01" solref=".05 1" solimp=".8 .9 .05 .5 2"/></default>
-            <worldbody>{below}<body pos="0 0 0"><freejoint/><geom {top}/>
+            {_WEDGE}<worldbody>{below}<body pos="0 0 0"><freejoint/><geom {top}/>
             <geom type="sphere" size=".02" pos=".2 .1 .05" contype="0" conaffinity="0"/></body></worldbody></mujoco>"""
         )
     )
@@ -66,7 +68,8 @@ def landing_points(model: mujoco.MjModel, count: int, on_plane: bool) -> list[Po
     [
         *[(shape, "plane") for shape in _SHAPES],
         *[("sphere", ground) for ground in ("sphere", "capsule", "cylinder", "box")],
-        ("capsule", "capsule"),
+        *[("capsule", ground) for ground in ("capsule", "box")],
+        ("box", "box"),
     ],
 )
 def test_exact_pairs(shape, ground, substeps):
@@ -81,6 +84,14 @@ def test_exact_pairs(shape, ground, substeps):
 @pytest.mark.parametrize("option", ["", 'impratio="3"', 'jacobian="sparse"'])
 def test_contact_dimensions(cone, condim, option):
     model = falling("sphere", "capsule", cone, condim, option)
+    worst, kept = compare(model, landing_points(model, 5, False), 4)
+    assert kept >= 2
+    assert max(worst) < 1e-3
+
+
+@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+def test_conjugate_gradient_solver(cone):
+    model = falling("sphere", "capsule", cone, 3, 'solver="CG"')
     worst, kept = compare(model, landing_points(model, 5, False), 4)
     assert kept >= 2
     assert max(worst) < 1e-3

@@ -105,8 +105,8 @@ def test_find_trial(make_space: Any) -> None:
     trials = resolve_trials(make_space())
     assert find_trial(trials, "1") is trials[1]
     assert find_trial(trials, trials[0].id[:6]) is trials[0]
-    with pytest.raises(ConfigError, match="no trial '9'"):
-        find_trial(trials, "9")
+    with pytest.raises(ConfigError, match="no trial 'walker'"):
+        find_trial(trials, "walker")
 
 
 def test_cover_shows_every_level_with_few_trials(make_space: Any) -> None:

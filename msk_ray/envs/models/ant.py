@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from msk_ray.config import AntEnvConfig, PhysicsConfig
-from msk_ray.envs.models.options import apply_options
+from msk_ray.envs.models.options import add_sky, apply_options
 
 STAND_HEIGHT = 0.75
 STAND_JOINTS = (0.0, 1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0)
@@ -109,6 +109,7 @@ def build_ant(env: AntEnvConfig, physics: PhysicsConfig) -> mujoco.MjModel:
     spec.modelname = "ant"
     spec.compiler.degree = True
     apply_options(spec, physics.model_copy(update={"cone": p.cone}), env.control_timestep)
+    add_sky(spec)
     world = spec.worldbody
     spec.add_texture(
         name="grid",

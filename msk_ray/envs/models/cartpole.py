@@ -3,7 +3,7 @@
 import mujoco
 
 from msk_ray.config import CartPoleEnvConfig, PhysicsConfig
-from msk_ray.envs.models.options import apply_options
+from msk_ray.envs.models.options import add_sky, apply_options
 
 CART_MASS = 1.0
 POLE_MASS = 0.25
@@ -21,9 +21,13 @@ def build_cartpole(env: CartPoleEnvConfig, physics: PhysicsConfig) -> mujoco.MjM
     spec.compiler.degree = False
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     apply_options(spec, physics, env.control_timestep)
+    add_sky(spec)
     world = spec.worldbody
     world.add_light(pos=[0, -2, 4], dir=[0, 0.4, -1])
-    world.add_camera(name="side", pos=[0, -4.5, 0.3], xyaxes=[1, 0, 0, 0, 0.0, 1])
+    for metre in range(-4, 5):
+        # Marks along the rail: the camera follows the cart, and they show that it moves.
+        mark = {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "contype": 0, "conaffinity": 0, "rgba": [0.3, 0.3, 0.3, 1]}
+        world.add_geom(name=f"mark_{metre}", pos=[metre, 0.12, 0], size=[0.05, 0, 0], **mark)
     world.add_geom(
         name="rail",
         type=mujoco.mjtGeom.mjGEOM_CAPSULE,
@@ -40,6 +44,9 @@ def build_cartpole(env: CartPoleEnvConfig, physics: PhysicsConfig) -> mujoco.MjM
         armature=physics.armature or 0.0,
     )
     cart.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.15, 0.08, 0.06], mass=CART_MASS, rgba=[0.2, 0.35, 0.6, 1])
+    cart.add_camera(
+        name="side", mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACK, pos=[0, -4.5, 0.3], xyaxes=[1, 0, 0, 0, 0.0, 1]
+    )
     pole = cart.add_body(name="pole")
     pole.add_joint(name="hinge", type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 1, 0])
     pole.add_geom(

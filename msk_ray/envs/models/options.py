@@ -12,6 +12,19 @@ _INTEGRATORS = {
 _CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
 
 
+def add_sky(spec: mujoco.MjSpec) -> None:
+    """A light background for pictures; the physics does not know of it."""
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=[0.93, 0.95, 0.98],
+        rgb2=[0.62, 0.70, 0.80],
+        width=64,
+        height=384,
+    )
+
+
 def apply_options(spec: mujoco.MjSpec, physics: PhysicsConfig, control_timestep: float) -> None:
     """Set timestep, solver and cone of `spec`: Newton and dense Jacobians, Euler unless told otherwise."""
     option = spec.option

@@ -35,7 +35,7 @@ class StepBuffers:
         held = [int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)]
         self._has_anchors = bool(np.any(np.isin(mjm.eq_type, held)))
         types = {(int(mjm.geom_type[a]), int(mjm.geom_type[b])) for a, b in colliding_pairs(mjm)}
-        self._scored_pairs = bool(types & geometry.SCORED_PAIRS)
+        self._pair_kinds = geometry.PairKinds.of(mjm, types)
         self._elliptic = mjm.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
         self._has_actuators = mjm.nu > 0 and not disabled & bit.mjDSBL_ACTUATION
 

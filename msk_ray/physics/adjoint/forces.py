@@ -299,7 +299,7 @@ class ForcePullbacks(StepBuffers):
             ],
         )
         wp.launch(
-            geometry.pull_geometry_kernel(self._scored_pairs),
+            geometry.pull_geometry_kernel(self._pair_kinds),
             dim=d.naconmax,
             inputs=[
                 m.body_rootid,

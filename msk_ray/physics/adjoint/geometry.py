@@ -2,13 +2,15 @@
 
 Plane against sphere, capsule, box or mesh: the core of the other geom that is nearest the plane (centre, end, corner,
 vertex) is fixed to its body. Sphere against sphere, capsule, cylinder or box, capsule against capsule, and plane
-against cylinder or ellipsoid: the collision function itself is differentiated. Any other pair: the distance moves by
-n·(relative velocity at the point), exactly; the point and the frame are taken to follow the mean of both bodies.
+against cylinder or ellipsoid: the collision function itself is differentiated. Boxes against boxes and capsules: the
+law of the features that touch (`box_laws`). Any other pair: the distance moves by n·(relative velocity at the point),
+exactly; the point and the frame are taken to follow the mean of both bodies.
 """
 
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
+import mujoco
 import warp as wp
 from mujoco_warp._src.collision_primitive_core import (
     capsule_capsule,
@@ -22,7 +24,8 @@ from mujoco_warp._src.collision_primitive_core import (
 from mujoco_warp._src.math import make_frame
 from mujoco_warp._src.types import GeomType
 
-from msk_ray.physics.adjoint.spatial import wrench
+from msk_ray.physics.adjoint.box_pairs import box_box_wrenches, capsule_box_wrenches
+from msk_ray.physics.adjoint.spatial import column, turning_torque, wrench
 
 wp.set_module_options({"enable_backward": False})
 
@@ -44,11 +47,6 @@ def frame_score(normal: wp.vec3, axis: wp.vec3, along_axis: wp.int32, weight: wp
 
 
 @wp.func
-def _column(matrix: wp.mat33, k: int) -> wp.vec3:
-    return wp.vec3(matrix[0, k], matrix[1, k], matrix[2, k])
-
-
-@wp.func
 def pair_score(
     type1: wp.int32,
     type2: wp.int32,
@@ -64,8 +62,8 @@ def pair_score(
     normal_weight: wp.vec3,
 ) -> wp.float32:
     """Weighted sum of (dist, pos, normal) of contact `index` of a pair, by mujoco_warp's own collision functions."""
-    axis1 = _column(mat1, 2)
-    axis2 = _column(mat2, 2)
+    axis1 = column(mat1, 2)
+    axis2 = column(mat2, 2)
     score = wp.float32(0.0)
     if type1 == GeomType.SPHERE and type2 == GeomType.SPHERE:
         dist_a, pos_a, normal_a = sphere_sphere(pos1, size1[0], pos2, size2[0])
@@ -104,16 +102,27 @@ def is_scored(type1: int, type2: int) -> bool:
     return type1 == GeomType.PLANE and (type2 == GeomType.CYLINDER or type2 == GeomType.ELLIPSOID)
 
 
-@wp.func
-def turning_torque(mat: wp.mat33, bar: wp.mat33) -> wp.vec3:
-    """dR = [ω] R  ⇒  torque Σ_k R_k × R̄_k over the columns."""
-    out = wp.cross(_column(mat, 0), _column(bar, 0)) + wp.cross(_column(mat, 1), _column(bar, 1))
-    return out + wp.cross(_column(mat, 2), _column(bar, 2))
+class PairKinds(NamedTuple):
+    """Kinds of geometry pairs that a model can bring into contact; each costs compile time only where it occurs."""
+
+    scored: bool
+    """A pair that `pair_score` knows."""
+    boxes: bool
+    """Box with box or capsule."""
+    native_ccd: bool
+    """Whether boxes collide by MuJoCo's native convex collision."""
+
+    @classmethod
+    def of(cls, mjm: mujoco.MjModel, types: set[tuple[int, int]]) -> "PairKinds":
+        """Those of a model whose colliding geometry types (ascending) are `types`."""
+        native = not mjm.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_NATIVECCD
+        return cls(bool(types & SCORED_PAIRS), bool(types & BOX_PAIRS), bool(native))
 
 
 @cache
-def pull_geometry_kernel(scored: bool) -> Any:
-    """The kernel for models with or without a pair that `pair_score` knows; without it is much smaller."""
+def pull_geometry_kernel(kinds: PairKinds) -> Any:
+    """The kernel for models with these kinds of pairs."""
+    scored, boxes, native_ccd = kinds.scored, kinds.boxes, int(kinds.native_ccd)
 
     @wp.kernel(module="unique", enable_backward=False)
     def pull_geometry(
@@ -170,7 +179,7 @@ def pull_geometry_kernel(scored: bool) -> Any:
         along_axis = int(0)
         axis = zero
         if type1 == GeomType.PLANE and type2 == GeomType.CAPSULE:
-            axis = _column(mat2, 2)
+            axis = column(mat2, 2)
             along_axis = 1
             if wp.length(axis - normal * wp.dot(normal, axis)) < 0.5:
                 axis = frame[1]
@@ -209,6 +218,43 @@ def pull_geometry_kernel(scored: bool) -> Any:
                 force2 = pos2_bar
                 torque1 = turning_torque(mat1, mat1_bar)
                 torque2 = turning_torque(mat2, mat2_bar)
+        if wp.static(boxes):
+            if type2 == GeomType.BOX and (type1 == GeomType.BOX or type1 == GeomType.CAPSULE):
+                known = bool(True)
+                half1 = geom_size[worldid % geom_size.shape[0], geoms[0]]
+                half2 = geom_size[worldid % geom_size.shape[0], geoms[1]]
+                if type1 == GeomType.CAPSULE:
+                    force1, torque1, force2, torque2 = capsule_box_wrenches(
+                        contact_index_in[con],
+                        pos1,
+                        mat1,
+                        half1,
+                        pos2,
+                        mat2,
+                        half2,
+                        dist,
+                        point,
+                        normal,
+                        dist_bar,
+                        pos_bar,
+                        normal_bar,
+                    )
+                else:
+                    force1, torque1, force2, torque2 = box_box_wrenches(
+                        wp.static(native_ccd),
+                        pos1,
+                        mat1,
+                        half1,
+                        pos2,
+                        mat2,
+                        half2,
+                        dist,
+                        point,
+                        normal,
+                        dist_bar,
+                        pos_bar,
+                        normal_bar,
+                    )
         if not known and type1 == GeomType.PLANE:
             # The core of the other geom that is nearest the plane is fixed to its body: a sphere's centre, a capsule's
             # end, a box's corner, a mesh's vertex.
@@ -251,3 +297,6 @@ SCORED_PAIRS = frozenset(
     }
 )
 """Geometry types, ascending, that `pair_score` knows."""
+
+BOX_PAIRS = frozenset({(int(GeomType.BOX), int(GeomType.BOX)), (int(GeomType.CAPSULE), int(GeomType.BOX))})
+"""Those that `box_laws` knows."""

@@ -22,3 +22,16 @@ def wrench(force: wp.vec3, torque: wp.vec3, arm: wp.vec3) -> wp.spatial_vector:
 def carried(motion: wp.spatial_vector, force: wp.spatial_vector) -> wp.spatial_vector:
     """Cotangent of a body's displacement w where f·(w × V) is the change of f·V: w·(V ×* f)."""
     return motion_cross_force(motion, force)
+
+
+@wp.func
+def column(matrix: wp.mat33, k: int) -> wp.vec3:
+    """Column k of a matrix."""
+    return wp.vec3(matrix[0, k], matrix[1, k], matrix[2, k])
+
+
+@wp.func
+def turning_torque(mat: wp.mat33, bar: wp.mat33) -> wp.vec3:
+    """dR = [ω] R  ⇒  torque Σ_k R_k × R̄_k over the columns."""
+    out = wp.cross(column(mat, 0), column(bar, 0)) + wp.cross(column(mat, 1), column(bar, 1))
+    return out + wp.cross(column(mat, 2), column(bar, 2))

@@ -1,0 +1,125 @@
+"""`python -m msk_ray.diagnose`: how good are the gradients where the policy really is?"""
+
+import json
+import statistics
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from msk_ray.cli import Parser, run
+from msk_ray.config.schema import VARIANTS
+from msk_ray.errors import ConfigError, StorageError
+
+if TYPE_CHECKING:
+    from msk_ray.diagnose.probe import Quality
+
+DESCRIPTION = """\
+Compare the policy gradient of the environment's reward with float64 central differences of C MuJoCo, over several
+horizons, from states the policy meets, under several physics.
+
+cosine      1: backpropagation points where the differences do; below about 0.9 the horizon is too long for this physics
+norm ratio  1: it is as long; far above, products of Jacobians explode
+cotangent   norm of the gradient to the starting state [reward]: what shac.state_grad_clip bounds
+
+A config is diagnosed with a fresh policy, a checkpoint with its own. Writes table.md, rows.json and quality.png."""
+
+EXAMPLES = """\
+  python -m msk_ray.diagnose configs/ant.yaml --variants matched published
+  python -m msk_ray.diagnose runs/train/ant_seed0/checkpoints/best.pt --states standing gait --horizons 1 8 32"""
+
+
+def parser() -> Parser:
+    """The command line."""
+    p = Parser("python -m msk_ray.diagnose", DESCRIPTION, EXAMPLES)
+    p.add_argument("subject", type=Path, metavar="CHECKPOINT_OR_CONFIG")
+    p.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help="for a config")
+    p.add_argument("--variants", nargs="+", metavar="NAME", help="named physics; by default all of the environment")
+    p.add_argument("--states", nargs="+", choices=("reset", "standing", "gait"), help="by default all that apply")
+    p.add_argument("--horizons", nargs="+", type=int, default=[1, 4, 8, 16, 32], metavar="H", help="env steps")
+    p.add_argument("--worlds", type=int, default=4, help="starting states of each kind")
+    p.add_argument("--directions", type=int, default=16, help="random directions in parameter space")
+    p.add_argument("--seed", type=int, default=0)
+    p.add_argument("--device", default="cpu", help="cpu or cuda:N")
+    p.add_argument("--output", type=Path, metavar="DIR", help="by default runs/diagnose/NAME")
+    return p
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    args = parser().parse_args(argv)
+    for name in ("worlds", "directions"):
+        if getattr(args, name) < 1:
+            raise ConfigError(f"--{name} must be at least 1, not {getattr(args, name)}")
+    if min(args.horizons) < 1:
+        raise ConfigError(f"--horizons must be at least 1, not {min(args.horizons)}")
+
+    # torch and Warp take seconds to load; a wrong command line should not wait for them.
+    from msk_ray.diagnose.picture import draw
+    from msk_ray.diagnose.probe import probe, read_subject
+
+    subject = read_subject(args.subject, args.overrides)
+    known = VARIANTS[subject.config.env.name]
+    for name in args.variants or ():
+        if name not in known:
+            raise ConfigError(
+                f"env {subject.config.env.name} has no physics named {name!r}; "
+                + (f"write {', '.join(known)}" if known else "leave --variants out")
+            )
+    states = args.states or (("reset", "standing") if subject.modules is None else ("reset", "standing", "gait"))
+    name = args.subject.stem if subject.modules is None else f"{args.subject.parent.parent.name}_{args.subject.stem}"
+    output = args.output or Path("runs") / "diagnose" / name
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StorageError(f"cannot create {output}: {error.strerror or error}") from error
+
+    rows: list[Quality] = []
+    print(f"{'physics':24}{'from':10}{'horizon':>8}{'cosine: median, least':>24}{'norm ratio':>20}{'cotangent':>12}")
+    chosen: Sequence[str | None] = args.variants or known or (None,)
+    group: list[Quality] = []
+    found = probe(
+        subject,
+        chosen,
+        states,
+        args.horizons,
+        worlds=args.worlds,
+        directions=args.directions,
+        seed=args.seed,
+        device=args.device,
+    )
+    for row in found:
+        rows.append(row)
+        group.append(row)
+        if len(group) == args.worlds:
+            print("".join(_cells(group)), flush=True)
+            group = []
+    header = ["physics", "from", "horizon", "cosine: median, least", "norm ratio", "cotangent"]
+    lines = ["| " + " | ".join(header) + " |", "|" + " --- |" * len(header)]
+    for i in range(0, len(rows), args.worlds):
+        lines.append("| " + " | ".join(cell.strip() for cell in _cells(rows[i : i + args.worlds])) + " |")
+    (output / "table.md").write_text("\n".join(lines) + "\n")
+    (output / "rows.json").write_text(json.dumps([asdict(row) for row in rows], indent=1))
+    draw(rows, output / "quality.png")
+    print(f"written: {output / 'table.md'}, {output / 'rows.json'}, {output / 'quality.png'}")
+    return 0
+
+
+def _cells(group: "Sequence[Quality]") -> list[str]:
+    """One line of the table: the worlds of one physics, state and horizon."""
+    first = group[0]
+    ratio = [row.norm_ratio for row in group]
+    cosine = [row.cosine for row in group]
+    return [
+        f"{first.variant:24}",
+        f"{first.state:10}",
+        f"{first.horizon:>8}",
+        f"{statistics.median(cosine):>14.4f}, {min(cosine):>8.4f}",
+        f"{min(ratio):>9.3g} … {max(ratio):<8.3g}",
+        f"{statistics.median(row.cotangent for row in group):>12.3g}",
+    ]
+
+
+if __name__ == "__main__":
+    sys.exit(run(main))

@@ -1,0 +1,253 @@
+"""The policy gradient of an environment's own reward over several horizons, against float64 differences.
+
+The gradient is that of the undiscounted return of H env steps of the deterministic policy, without resets and without
+the critic's bootstrap. The reference is C MuJoCo in float64 under the same policy and reward, displaced along random
+directions of the policy's parameters: a policy has too many parameters to displace each.
+"""
+
+import copy
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from msk_ray.config import Config, PhysicsConfig, load_config
+from msk_ray.envs import Env, EnvState, make_env
+from msk_ray.errors import CheckpointError, ConfigError, SimulationError
+from msk_ray.gradcheck import Oracle, Point
+from msk_ray.networks import Actor, RunningMeanStd
+from msk_ray.simulation import StepState
+from msk_ray.training import load_policy
+
+STATE_KINDS = ("reset", "standing", "gait")
+"""Where trajectories start: fresh resets; settled under zero action; the policy's own motion after a while."""
+
+_SETTLE, _STRIDE = 60, 120
+"""Env steps before a standing and a gait state."""
+_STEP = 1e-6
+"""Length of a displacement in parameter space; rounding of float64 leaves six digits."""
+
+Step = Callable[[Tensor, StepState], StepState]
+
+
+class PolicyNetwork(nn.Module):
+    """Raw observations (W, O) to deterministic actions (W, A)."""
+
+    def __init__(self, actor: Actor, normalizer: RunningMeanStd | None) -> None:
+        super().__init__()
+        self.actor = actor
+        self.normalizer = normalizer
+
+    def forward(self, obs: Tensor) -> Tensor:
+        action: Tensor = self.actor(obs if self.normalizer is None else self.normalizer.normalize(obs))
+        return action
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is diagnosed: a trial's settings and a policy for it, trained or fresh."""
+
+    name: str
+    config: Config
+    modules: dict[str, Any] | None
+    """State of the actor and the normalizer; None for a fresh policy."""
+
+    def network(self, env: Env[Any]) -> PolicyNetwork:
+        """The policy's network for an environment, on its device.
+
+        Raises:
+            CheckpointError: it was trained on other observations or actions.
+        """
+        generator = torch.Generator().manual_seed(self.config.trial.seed)
+        actor = Actor(self.config.actor, env.obs_size, env.action_size, generator)
+        trained = self.modules is not None and self.config.shac.normalize_obs
+        normalizer = RunningMeanStd((env.obs_size,)) if trained else None
+        if self.modules is not None:
+            try:
+                actor.load_state_dict(self.modules["actor"])
+                if normalizer is not None:
+                    normalizer.load_state_dict(self.modules["normalizer"])
+            except (KeyError, RuntimeError) as error:
+                raise CheckpointError(f"{self.name} does not fit its environment: {error}") from error
+        return PolicyNetwork(actor, normalizer).to(env.device)
+
+
+def read_subject(path: Path, overrides: Sequence[str] = ()) -> Subject:
+    """A checkpoint (.pt) or a trial's config (.yaml).
+
+    Raises:
+        CheckpointError, ConfigError: it cannot be read, or settings are to be overridden in a checkpoint.
+    """
+    if path.suffix == ".pt":
+        if overrides:
+            raise ConfigError("--set works with a config; a checkpoint comes with its own settings")
+        saved = load_policy(path)
+        return Subject(str(path), saved.config, saved.modules)
+    return Subject(str(path), load_config(path, overrides), None)
+
+
+@dataclass(frozen=True)
+class Quality:
+    """One world's policy gradient over one horizon."""
+
+    variant: str
+    state: str
+    horizon: int
+    world: int
+    cosine: float
+    """Between the derivatives along the directions, backpropagated and by differences."""
+    norm_ratio: float
+    """Length of the first over that of the second."""
+    norm: float
+    """Norm of the backpropagated gradient to all parameters [reward]."""
+    cotangent: float
+    """Norm of the gradient to the starting state [reward]."""
+
+
+def probe(
+    subject: Subject,
+    variants: Sequence[str | None],
+    states: Sequence[str],
+    horizons: Sequence[int],
+    *,
+    worlds: int,
+    directions: int,
+    seed: int,
+    device: str,
+) -> Iterator[Quality]:
+    """Compare gradients, variant by variant and state by state.
+
+    Args:
+        subject: policy and settings.
+        variants: named physics of the environment; None for the subject's own.
+        states: of `STATE_KINDS`; "gait" needs a trained policy.
+        horizons: env steps H.
+        worlds: starting states of each kind.
+        directions: random directions in parameter space.
+        seed: of starting states and directions.
+        device: where Warp runs.
+
+    Raises:
+        ConfigError: "gait" asked of a fresh policy.
+        SimulationError: the policy falls everywhere before its gait state.
+    """
+    if "gait" in states and subject.modules is None:
+        raise ConfigError("--states gait needs a trained policy: give a checkpoint instead of a config")
+    for variant in variants:
+        physics = subject.config.physics if variant is None else PhysicsConfig(variant=variant)
+        env = make_env(subject.config.env, physics, worlds, device, seed)
+        network = subject.network(env)
+        for state in states:
+            start = _starting_state(env, network, state)
+            yield from _compare(
+                env, network, start, sorted(horizons), directions, seed, variant or "own physics", state
+            )
+
+
+@torch.no_grad()
+def _starting_state(env: Env[Any], network: PolicyNetwork, kind: str) -> EnvState:
+    env.state = env.reset_state()
+    for _ in range({"reset": 0, "standing": _SETTLE, "gait": _STRIDE}[kind]):
+        action = network(env.observation()) if kind == "gait" else torch.zeros_like(env.state.action)
+        # A world that ends on the way starts anew, so that all worlds count.
+        env.step(action)
+    if kind == "gait" and int(env.state.age.max()) < _STRIDE:
+        raise SimulationError(f"the policy falls in every world within {_STRIDE} env steps: it has no gait to diagnose")
+    return env.state.detach()
+
+
+def _returns(env: Env[Any], network: nn.Module, step: Step, start: EnvState, horizons: Sequence[int]) -> list[Tensor]:
+    """Return (W,) of the first H env steps for each horizon."""
+    physics, action = start.physics, start.action
+    total = torch.zeros(len(action), dtype=action.dtype, device=action.device)
+    found = []
+    for t in range(1, horizons[-1] + 1):
+        action = network(env.observe(physics, action))
+        physics = step(action, physics)
+        total = total + env.reward_terms(physics, action, env.observe(physics, action)).sum(-1)
+        if t in horizons:
+            found.append(total)
+    return found
+
+
+def _compare(
+    env: Env[Any],
+    network: PolicyNetwork,
+    start: EnvState,
+    horizons: Sequence[int],
+    count: int,
+    seed: int,
+    variant: str,
+    state: str,
+) -> Iterator[Quality]:
+    parameters = list(network.actor.mean.parameters())
+    leaves = StepState(*(t.clone().requires_grad_(True) for t in start.physics))
+    returns = _returns(env, network, lambda a, s: env.sim.step(a, *s), start._replace(physics=leaves), horizons)
+    size = sum(p.numel() for p in parameters)
+    directions = np.random.default_rng(seed).normal(size=(count, size))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    expected = _differences(env, network, start, horizons, directions)
+    for i, (horizon, per_world) in enumerate(zip(horizons, returns, strict=True)):
+        for world in range(len(per_world)):
+            gradients = torch.autograd.grad(
+                per_world[world], [*parameters, *leaves], retain_graph=True, allow_unused=True
+            )
+            flat = torch.cat([g.flatten() for g in gradients[: len(parameters)] if g is not None])
+            along = directions @ flat.double().cpu().numpy()
+            other = expected[i, world]
+            sizes = float(np.linalg.norm(along)), float(np.linalg.norm(other))
+            to_state = torch.cat([g[world].flatten() for g in gradients[len(parameters) :] if g is not None])
+            yield Quality(
+                variant,
+                state,
+                horizon,
+                world,
+                float(along @ other) / (sizes[0] * sizes[1]),
+                sizes[0] / sizes[1],
+                float(flat.norm()),
+                float(to_state.norm()),
+            )
+
+
+@torch.no_grad()
+def _differences(
+    env: Env[Any], network: PolicyNetwork, start: EnvState, horizons: Sequence[int], directions: np.ndarray
+) -> np.ndarray:
+    """Derivatives (H, W, K) of the return along directions (K, P), by C MuJoCo in float64."""
+    exact = copy.deepcopy(network).double().cpu()
+    ideal = _double(env)
+    oracle = Oracle(env.model, env.sim.substeps)
+    parameters = list(exact.actor.mean.parameters())
+    at = nn.utils.parameters_to_vector(parameters)
+
+    def step(action: Tensor, state: StepState) -> StepState:
+        ends = [
+            oracle.step(Point(*(t[w].numpy() for t in (action, state.qpos, state.qvel, state.act))))
+            for w in range(len(action))
+        ]
+        return StepState(*(torch.from_numpy(np.stack([getattr(e, n) for e in ends])) for n in StepState._fields))
+
+    begin = EnvState(
+        StepState(*(t.double().cpu() for t in start.physics)), start.action.double().cpu(), start.age.cpu()
+    )
+
+    def displaced(direction: np.ndarray) -> Tensor:
+        nn.utils.vector_to_parameters(at + _STEP * torch.from_numpy(direction), parameters)
+        return torch.stack(_returns(ideal, exact, step, begin, horizons))
+
+    slopes = [(displaced(d) - displaced(-d)) / (2.0 * _STEP) for d in directions]
+    return torch.stack(slopes, dim=-1).numpy()
+
+
+def _double(env: Env[Any]) -> Env[Any]:
+    """The environment with its constants in float64 on the CPU: for observations and rewards, not for steps."""
+    ideal = copy.copy(env)
+    for name, value in vars(env).items():
+        if isinstance(value, Tensor):
+            setattr(ideal, name, value.cpu().double() if value.is_floating_point() else value.cpu())
+    ideal.device = torch.device("cpu")
+    return ideal

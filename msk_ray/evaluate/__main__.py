@@ -1,0 +1,193 @@
+"""`python -m msk_ray.evaluate`: deterministic evaluation on fixed seeds."""
+
+import argparse
+import shutil
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from msk_ray.cli import Parser, run
+from msk_ray.errors import CheckpointError, MskRayError
+from msk_ray.evaluate.targets import Kind, Target, best_checkpoint, best_of_trial, find_target
+from msk_ray.tune.experiment import Experiment
+from msk_ray.tune.listing import text_table
+from msk_ray.tune.outcomes import write_json
+from msk_ray.tune.space import parse_seeds
+
+if TYPE_CHECKING:
+    from msk_ray.evaluate.measure import Bench, Request
+
+DESCRIPTION = """\
+Evaluate a policy: without noise, from fixed initial states, under the environment's own reward weights.
+
+Prints score, speed, falls, episode length and every reward term with its spread over episodes, and keeps them in the
+trial's eval.json. On an experiment it evaluates the best policy of each trial, ranks them, and writes the ranking into
+the experiment's eval.json. Without options the score is the one trials are ranked by (eval/score), to the last digit on
+the same device."""
+
+EXAMPLES = """\
+  python -m msk_ray.evaluate runs/demo                                   # every trial's best policy, ranked
+  python -m msk_ray.evaluate runs/demo/trials/1a2b3c4d                   # that trial's best policy
+  python -m msk_ray.evaluate runs/demo/trials/1a2b3c4d/checkpoints/epoch_000100.pt
+  python -m msk_ray.evaluate ant_lr --physics reference,published,own    # how much of it is the physics?
+  python -m msk_ray.evaluate ant_lr --worlds 256 --seeds 0-4             # fresh initial states
+
+exit codes: 0 done, 1 a policy could not be evaluated, 2 refused."""
+
+
+def parser() -> Parser:
+    """The command line."""
+    p = Parser("python -m msk_ray.evaluate", DESCRIPTION, EXAMPLES)
+    p.add_argument(
+        "target", metavar="CHECKPOINT|TRIAL|EXPERIMENT", help="a .pt file, a folder, or an experiment's name"
+    )
+    p.add_argument("--worlds", type=positive, metavar="W", help="episodes a seed; by default the trial's own, 64")
+    p.add_argument("--seeds", metavar="LIST", help="of the initial states, such as 0-4; by default the trial's own")
+    p.add_argument("--steps", type=positive, metavar="N", help="env steps an episode, at most")
+    p.add_argument(
+        "--physics",
+        default="reference",
+        metavar="LIST",
+        help="reference (what scores are taken under), own (what the trial trains on) or the environment's named ones",
+    )
+    p.add_argument("--device", help="cpu or cuda:N; by default the first GPU, or the CPU if there is none")
+    p.add_argument("--storage", type=Path, default=Path("runs"), metavar="DIR", help="of experiments; by default runs/")
+    return p
+
+
+def positive(text: str) -> int:
+    """A whole number from 1 on."""
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"a whole number from 1 on, not {text}")
+    return int(text)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    args = parser().parse_args(argv)
+    target = find_target(args.target, args.storage)
+    seeds = parse_seeds(args.seeds) if args.seeds is not None else None
+    names = [name.strip() for name in args.physics.split(",")]
+    if target.kind is not Kind.EXPERIMENT:
+        best_checkpoint(target)  # torch and Warp take seconds to load; a wrong path should not wait for them
+
+    from msk_ray.evaluate.measure import Bench, Request, default_device
+
+    bench = Bench(args.device or default_device())
+    requests = [Request(name, args.worlds, seeds, args.steps) for name in names]
+    if target.kind is Kind.EXPERIMENT:
+        return evaluate_experiment(Experiment(target.path), bench, requests)
+    return _evaluate_one(target, bench, requests)
+
+
+def _evaluate_one(target: Target, bench: "Bench", requests: "Sequence[Request]") -> int:
+    from msk_ray.evaluate.measure import eval_file_of, store_evaluation
+    from msk_ray.training import load_policy
+
+    path = best_checkpoint(target)
+    policy = load_policy(path)
+    for request in requests:
+        entry = bench.evaluate(policy, request)
+        store_evaluation(eval_file_of(path), entry)
+        print(policy_text(entry) + "\n")
+    print(f"written into {eval_file_of(path)}")
+    return 0
+
+
+def policy_text(entry: dict[str, Any]) -> str:
+    """An evaluation for a terminal."""
+    seeds = ",".join(map(str, entry["seeds"]))
+    rows = [
+        (name, *(f"{values[part]:.5g}" for part in ("mean", "std", "min", "max")))
+        for name, values in figure_rows(entry)
+    ]
+    shares = [f"{name} {entry[key]:.1%}" for key, name in SHARES.items() if key in entry]
+    return (
+        f"{entry['checkpoint']}, epoch {entry['epoch']}, under {entry['physics']} physics: {entry['worlds']} worlds, "
+        f"seeds {seeds}, {entry['steps']} steps, on {entry['device']}\n"
+        + text_table(("per episode", "mean", "std", "min", "max"), rows, 120)
+        + "\n"
+        + " · ".join(shares)
+    )
+
+
+SHARES = {"fall_rate": "fell", "diverged_rate": "diverged", "success_rate": "succeeded"}
+
+
+def figure_rows(entry: dict[str, Any]) -> list[tuple[str, dict[str, float]]]:
+    """Score, length, outcome terms such as the speed, and reward terms of an evaluation, by name."""
+    return [
+        ("score", entry["score"]),
+        ("length", entry["length"]),
+        *entry["outcomes"].items(),
+        *((f"term/{name}", values) for name, values in entry["terms"].items()),
+    ]
+
+
+def evaluate_experiment(experiment: Experiment, bench: "Bench", requests: "Sequence[Request]") -> int:
+    """Evaluate the best policy of each trial, keep the figures beside it, and rank them.
+
+    A trial whose policy cannot be evaluated is named and does not hold up the others.
+
+    Returns:
+        The exit code: 1 if there was such a trial.
+    """
+    from msk_ray.evaluate.measure import EVAL_FILE, FORMAT, eval_file_of, store_evaluation
+    from msk_ray.training import load_policy
+
+    trials = experiment.trials()
+    rankings: list[list[dict[str, Any]]] = []
+    failed = {}
+    for request in requests:
+        ranking = []
+        for number, trial in enumerate(trials, start=1):
+            try:
+                path = best_of_trial(experiment.trial_folder(trial.id))
+                entry = bench.evaluate(load_policy(path), request)
+                store_evaluation(eval_file_of(path), entry)
+            except MskRayError as error:
+                failed[trial.id] = str(error)
+                print(f"{number}/{len(trials)}  {trial.id}  {error}", flush=True)
+                continue
+            ranking.append({"trial": trial.id, "variant": trial.variant, "seed": trial.seed, **entry})
+            print(f"{number}/{len(trials)}  {trial.id}  {entry['score']['mean']:.5g}", flush=True)
+        ranking.sort(key=lambda entry: -entry["score"]["mean"])
+        rankings.append(ranking)
+    if not any(rankings):
+        raise CheckpointError(f"no policy of {experiment.path} could be evaluated")
+    missing = [{"trial": trial, "why": why} for trial, why in failed.items()]
+    path = experiment.path / EVAL_FILE
+    ranked = [{"physics": entries[0]["physics"], "ranking": entries} for entries in rankings if entries]
+    write_json(path, {"format": FORMAT, "experiment": experiment.name, "rankings": ranked, "failed": missing})
+    width = max(100, shutil.get_terminal_size((160, 24)).columns)
+    for entries in filter(None, rankings):
+        print(f"\nunder {entries[0]['physics']} physics\n{ranking_text(entries, width)}")
+    print(f"\nwritten into {path}")
+    return 1 if failed else 0
+
+
+def ranking_text(ranking: Sequence[dict[str, Any]], width: int) -> str:
+    """A ranking for a terminal."""
+    outcomes = list(ranking[0]["outcomes"])
+    header = ("#", "trial", "score", "std", *outcomes, "length", "fell", "seed", "epoch", "changed")
+    rows = [
+        (
+            str(place),
+            entry["trial"],
+            f"{entry['score']['mean']:.5g}",
+            f"{entry['score']['std']:.3g}",
+            *(f"{entry['outcomes'][name]['mean']:.3g}" if name in entry["outcomes"] else "-" for name in outcomes),
+            f"{entry['length']['mean']:.0f}",
+            f"{entry['fall_rate']:.0%}",
+            str(entry["seed"]),
+            str(entry["epoch"]),
+            entry["variant"],
+        )
+        for place, entry in enumerate(ranking, start=1)
+    ]
+    return text_table(header, rows, width)
+
+
+if __name__ == "__main__":
+    sys.exit(run(main))

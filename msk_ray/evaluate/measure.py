@@ -1,0 +1,199 @@
+"""Evaluations of one policy under one physics: figures with their spread over episodes."""
+
+import datetime
+import json
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from msk_ray.config import Config, PhysicsConfig
+from msk_ray.envs import env_class
+from msk_ray.errors import ConfigError, StorageError
+from msk_ray.evaluate.targets import trial_folder_of
+from msk_ray.training import Evaluator, SavedPolicy
+from msk_ray.training.evaluation import Episodes
+from msk_ray.training.memory import named_out_of_memory
+from msk_ray.tune.outcomes import write_json
+
+FORMAT = 1
+EVAL_FILE = "eval.json"
+REFERENCE, OWN = "reference", "own"
+_PACKAGES = ("msk-ray", "torch", "warp-lang", "mujoco", "mujoco-warp")
+
+
+@dataclass(frozen=True)
+class Request:
+    """How to evaluate. None takes what the trial's own evaluation uses."""
+
+    physics: str = REFERENCE
+    """`reference`, `own` (what the trial trains on), or a named physics of the environment."""
+    worlds: int | None = None
+    seeds: tuple[int, ...] | None = None
+    steps: int | None = None
+
+
+def named_physics(config: Config, name: str) -> tuple[str, PhysicsConfig]:
+    """The physics a name means for a trial, and the name to show.
+
+    Raises:
+        ConfigError: its environment has no such physics.
+    """
+    env_type = env_class(config.env)
+    if name == REFERENCE:
+        variant = config.evaluation.variant or (env_type.variants[0] if env_type.variants else OWN)
+        return variant, env_type.reference_physics(config.physics, config.evaluation.variant)
+    if name == OWN:
+        return OWN, config.physics
+    if name not in env_type.variants:
+        known = ", ".join((REFERENCE, OWN, *env_type.variants))
+        raise ConfigError(f"--physics {name!r}: env {config.env.name} has no such physics; write one of {known}")
+    return name, env_type.reference_physics(config.physics, name)
+
+
+class Bench:
+    """Evaluates policies on one device; trials of equal environment, physics and size share one simulation."""
+
+    def __init__(self, device: str) -> None:
+        self._device = device
+        self._evaluators: dict[str, Evaluator] = {}
+
+    def evaluator(self, config: Config, request: Request) -> tuple[Evaluator, str]:
+        """The evaluator a request asks for, and the name of its physics.
+
+        Raises:
+            ConfigError, DeviceError, UnsupportedModelError, SimulationError: as their messages say.
+        """
+        shown, physics = named_physics(config, request.physics)
+        changes = {"nworld": request.worlds, "steps": request.steps}
+        own = config.evaluation.model_copy(update={k: v for k, v in changes.items() if v is not None})
+        config = config.model_copy(update={"evaluation": own})
+        settings = env_class(config.env).reference_settings(config.env)
+        key = repr((settings, physics, own.nworld, own.steps, own.seed))
+        if key not in self._evaluators:
+            with named_out_of_memory(self._device, own.nworld):
+                self._evaluators[key] = Evaluator(config, self._device, physics)
+        return self._evaluators[key], shown
+
+    def evaluate(self, policy: SavedPolicy, request: Request) -> dict[str, Any]:
+        """One entry of `eval.json`: what was evaluated, how, and the figures.
+
+        Raises:
+            MskRayError: as `evaluator`, or the checkpoint does not fit its environment.
+        """
+        evaluator, physics = self.evaluator(policy.config, request)
+        own = policy.config.evaluation
+        seeds = request.seeds or (own.seed,)
+        with named_out_of_memory(self._device, evaluator.env.nworld):
+            runs = [evaluator.episodes(policy.on(evaluator.env), seed) for seed in seeds]
+        reference = named_physics(policy.config, REFERENCE)[1]
+        canonical = (
+            evaluator.env.nworld == own.nworld
+            and seeds == (own.seed,)
+            and request.steps in (None, own.steps or policy.config.env.episode_length)
+            and named_physics(policy.config, request.physics)[1] == reference
+        )
+        return {
+            "checkpoint": policy.path.name,
+            "sha256": policy.sha256,
+            "epoch": policy.epoch,
+            "env_steps": policy.env_steps,
+            "physics": physics,
+            "canonical": canonical,
+            "worlds": evaluator.env.nworld,
+            "seeds": list(seeds),
+            "steps": evaluator.steps,
+            **figures(runs, evaluator.env.reward_names),
+            "scores": [round(float(s), 6) for run in runs for s in run.score],
+            "score_by_seed": {str(seed): float(run.score.mean()) for seed, run in zip(seeds, runs, strict=True)},
+            "device": device_name(self._device),
+            "packages": {name: metadata.version(name) for name in _PACKAGES},
+            "python": platform.python_version(),
+            "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        }
+
+
+def figures(runs: Sequence[Episodes], reward_names: Sequence[str]) -> dict[str, Any]:
+    """Figures over the episodes of all runs.
+
+    Returns:
+        `score`, `length`, `outcomes` and `terms`, each {mean, std, min, max} over episodes (std with n − 1; 0 of one
+        episode), and the shares `fall_rate`, `diverged_rate` and, where defined, `success_rate`. An outcome term's
+        mean is over env steps, its spread over the episodes' own means.
+    """
+    score, length, terms = (torch.cat([getattr(run, name) for run in runs]) for name in ("score", "length", "terms"))
+    sums = {name: torch.cat([run.outcomes[name] for run in runs]) for name in runs[0].outcomes}
+    outcomes = {
+        name: spread(total / length) | {"mean": float(total.sum() / length.sum())} for name, total in sums.items()
+    }
+    result: dict[str, Any] = {
+        "score": spread(score),
+        "length": spread(length),
+        "outcomes": outcomes,
+        "terms": {name: spread(terms[:, column]) for column, name in enumerate(reward_names)},
+        "fall_rate": float(torch.cat([run.fell for run in runs]).float().mean()),
+        "diverged_rate": float(torch.cat([run.diverged for run in runs]).float().mean()),
+    }
+    successes = [run.success for run in runs if run.success is not None]
+    if len(successes) == len(runs):
+        result["success_rate"] = float(torch.cat(successes).float().mean())
+    return result
+
+
+def spread(values: Tensor) -> dict[str, float]:
+    """Mean, standard deviation, minimum and maximum of values (E,)."""
+    return {
+        "mean": float(values.mean()),
+        "std": float(values.std()) if len(values) > 1 else 0.0,
+        "min": float(values.min()),
+        "max": float(values.max()),
+    }
+
+
+def device_name(device: str) -> str:
+    """`cpu`, or a GPU's model."""
+    return str(torch.cuda.get_device_name(device)) if device.startswith("cuda") else "cpu"
+
+
+def default_device() -> str:
+    """The first GPU, or the CPU if there is none."""
+    return "cuda:0" if torch.cuda.is_available() else "cpu"
+
+
+def eval_file_of(checkpoint: Path) -> Path:
+    """Where evaluations of a checkpoint are kept: in its trial's folder."""
+    return trial_folder_of(checkpoint) / EVAL_FILE
+
+
+def read_evaluations(path: Path) -> list[dict[str, Any]]:
+    """The entries of an `eval.json`; none if there is no such file.
+
+    Raises:
+        StorageError: it is not such a file.
+    """
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return []
+    except (OSError, ValueError) as error:
+        raise StorageError(f"cannot read {path}: {error}; remove it to have it written anew") from error
+    entries = data.get("evaluations") if isinstance(data, dict) and data.get("format") == FORMAT else None
+    if not isinstance(entries, list):
+        raise StorageError(f"{path} holds no evaluations of format {FORMAT}; remove it to have it written anew")
+    return entries
+
+
+def store_evaluation(path: Path, entry: Mapping[str, Any]) -> None:
+    """Put an entry into an `eval.json`, in place of one of the same checkpoint, physics and size.
+
+    Raises:
+        StorageError: the file is there and holds something else, or cannot be written.
+    """
+    key = ("checkpoint", "physics", "worlds", "seeds", "steps")
+    kept = [old for old in read_evaluations(path) if any(old.get(k) != entry[k] for k in key)]
+    write_json(path, {"format": FORMAT, "evaluations": [*kept, dict(entry)]})

@@ -1,0 +1,119 @@
+"""What a user may name: a checkpoint, a trial's folder, or an experiment."""
+
+import difflib
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+
+from msk_ray.errors import CheckpointError, StorageError
+from msk_ray.tune.experiment import Experiment
+from msk_ray.tune.records import best_record, read_records
+from msk_ray.tune.standing import find_experiments
+
+BEST = "best.pt"
+
+
+class Kind(StrEnum):
+    """What a target is."""
+
+    CHECKPOINT = "checkpoint"
+    TRIAL = "trial"
+    EXPERIMENT = "experiment"
+
+
+@dataclass(frozen=True)
+class Target:
+    """Something to look at, on disk."""
+
+    kind: Kind
+    path: Path
+    """Absolute; a file for a checkpoint, else a folder."""
+
+
+def find_target(text: str, storage: Path) -> Target:
+    """The checkpoint, trial or experiment that a path means, or the experiment of that name in `storage`.
+
+    Raises:
+        StorageError: there is none.
+    """
+    for path in (storage / text, Path(text)):
+        if path.is_file():
+            if path.suffix != ".pt":
+                raise StorageError(f"{path} is no checkpoint: give a .pt file, a trial's folder or an experiment")
+            return Target(Kind.CHECKPOINT, path.resolve())
+        if path.is_dir():
+            return Target(_kind_of(path), path.resolve())
+    names = [path.name for path in find_experiments(storage)]
+    near = difflib.get_close_matches(text, names, n=1)
+    if near:
+        hint = f"did you mean {near[0]!r}?"
+    else:
+        hint = f"{storage} holds {', '.join(names[-5:]) or 'no experiment'}; give a .pt file, a trial's folder or one"
+    raise StorageError(f"no checkpoint, trial or experiment {text!r}; {hint}")
+
+
+def find_experiment(text: str, storage: Path) -> Experiment:
+    """The experiment that a name or a path means.
+
+    Raises:
+        StorageError: there is none, or it is something else.
+    """
+    target = find_target(text, storage)
+    if target.kind is not Kind.EXPERIMENT:
+        raise StorageError(f"{target.path} is a {target.kind}, not an experiment")
+    return Experiment(target.path)
+
+
+def best_checkpoint(target: Target) -> Path:
+    """The one checkpoint a target stands for: itself, a trial's best, or that of the best trial.
+
+    Raises:
+        CheckpointError: there is none yet.
+    """
+    if target.kind is Kind.CHECKPOINT:
+        return target.path
+    return best_of_trial(best_trial_folder(target))
+
+
+def best_trial_folder(target: Target) -> Path:
+    """The folder of the one trial a target stands for.
+
+    Raises:
+        CheckpointError: no trial of the experiment was evaluated yet.
+    """
+    if target.kind is Kind.CHECKPOINT:
+        return trial_folder_of(target.path)
+    if target.kind is Kind.TRIAL:
+        return target.path
+    best = best_record(read_records(Experiment(target.path)))
+    if best is None:
+        raise CheckpointError(f"no trial of {target.path} was evaluated yet; come back after its first evaluation")
+    return best.folder
+
+
+def best_of_trial(folder: Path) -> Path:
+    """The checkpoint of a trial's best policy.
+
+    Raises:
+        CheckpointError: there is none yet.
+    """
+    path = folder / "checkpoints" / BEST
+    if not path.is_file():
+        raise CheckpointError(f"{folder} has no checkpoints/{BEST}: the trial was not evaluated yet, or lost it")
+    return path
+
+
+def trial_folder_of(checkpoint: Path) -> Path:
+    """The folder of the trial a checkpoint belongs to; the checkpoint's own folder if it lies alone."""
+    return checkpoint.parent.parent if checkpoint.parent.name == "checkpoints" else checkpoint.parent
+
+
+def _kind_of(path: Path) -> Kind:
+    if any((path / part).exists() for part in ("manifest.json", "space.yaml", "trials")):
+        return Kind.EXPERIMENT
+    if any((path / part).exists() for part in ("checkpoints", "config.yaml", "metrics.jsonl")):
+        return Kind.TRIAL
+    if path.name == "checkpoints":
+        raise StorageError(f"{path}: give one of its .pt files, or the trial's folder above it")
+    # An experiment that died before its first file is an empty folder; what is wrong with it is said by who reads it.
+    return Kind.EXPERIMENT

@@ -1,0 +1,1 @@
+"""What did an experiment find? One page from the files on disk, whatever condition they are in."""

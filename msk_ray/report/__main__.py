@@ -1,0 +1,91 @@
+"""`python -m msk_ray.report`: an experiment's results on one page, from the files on disk."""
+
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from msk_ray.cli import Parser, run
+from msk_ray.errors import ConfigError
+from msk_ray.evaluate.targets import find_experiment
+from msk_ray.report.best import Best, look_at_best
+from msk_ray.report.page import compare, make_section, write_page
+from msk_ray.report.reading import Condition, Reading, check_folder, read_experiment
+
+DESCRIPTION = """\
+Write one self-contained page about an experiment, or several side by side: learning curves, the ablation table with
+confidence intervals, what each parameter does, which trial stopped when and why, gradient health, failures by name, the
+best policy with its evaluation and film strip, and the command to repeat it all.
+
+Reads files alone, so it works while the sweep runs and after it died, and says what is missing. Writes
+EXPERIMENT/report/index.html and every picture as PNG beside it."""
+
+EXAMPLES = """\
+  python -m msk_ray.report demo                            # runs/demo/report/index.html
+  python -m msk_ray.report ant_ablate --baseline matched   # differences are taken from this variant
+  python -m msk_ray.report ant_lr ant_horizon --out both   # side by side
+  python -m msk_ray.report demo --best never               # numbers and curves alone: seconds, no simulation"""
+
+
+def parser() -> Parser:
+    """The command line."""
+    p = Parser("python -m msk_ray.report", DESCRIPTION, EXAMPLES)
+    p.add_argument("experiments", nargs="+", metavar="EXPERIMENT", help="names in the storage folder, or folders")
+    p.add_argument(
+        "--baseline",
+        metavar="TEXT",
+        help="variant to compare with: (part of) its name; by default `baseline`, or the first",
+    )
+    p.add_argument(
+        "--best",
+        choices=("auto", "always", "never"),
+        default="auto",
+        help="evaluate the best policy and draw its film strip; auto leaves that out while trials run",
+    )
+    p.add_argument("--out", type=Path, metavar="DIR", help="by default report/ in the (first) experiment's folder")
+    p.add_argument("--device", help="for the best policy: cpu or cuda:N; by default the first GPU, or the CPU")
+    p.add_argument("--storage", type=Path, default=Path("runs"), metavar="DIR", help="by default runs/")
+    return p
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    args = parser().parse_args(argv)
+    experiments = [find_experiment(name, args.storage) for name in args.experiments]
+    if len({experiment.path for experiment in experiments}) < len(experiments):
+        raise ConfigError("the same experiment twice: name each one once")
+    for experiment in experiments:
+        check_folder(experiment)
+    folder = (args.out or experiments[0].path / "report").resolve()
+    now = time.time()
+    readings = [read_experiment(experiment, now) for experiment in experiments]
+    sections = []
+    for number, reading in enumerate(readings):
+        prefix = f"{number + 1}_" if len(readings) > 1 else ""
+        sections.append(make_section(reading, folder, prefix, args.baseline, None))
+    together = compare(readings) if len(readings) > 1 else None
+    bests = [
+        _best(reading, folder, f"{n + 1}_" if len(readings) > 1 else "", args.best, args.device)
+        for n, reading in enumerate(readings)
+    ]
+    sections = [replace(section, best=best) for section, best in zip(sections, bests, strict=True)]
+    command = "python -m msk_ray.report " + " ".join(reading.name for reading in readings)
+    page = write_page(sections, together, folder, now, command)
+    for reading in readings:
+        for note in reading.notes:
+            print(f"{reading.name}: {note}")
+    print(f"report       {page}")
+    return 0
+
+
+def _best(reading: Reading, folder: Path, prefix: str, mode: str, device: str | None) -> Best | None:
+    trial = reading.best
+    if trial is None:
+        return None
+    make = mode == "always" or (mode == "auto" and reading.condition is not Condition.RUNNING)
+    return look_at_best(trial, folder, prefix, make, device)
+
+
+if __name__ == "__main__":
+    sys.exit(run(main))

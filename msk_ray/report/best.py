@@ -1,0 +1,147 @@
+"""The best policy of an experiment: its evaluation and its film strip, made once for each checkpoint and kept."""
+
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from PIL import Image, PngImagePlugin
+
+from msk_ray.errors import CheckpointError, MskRayError
+from msk_ray.evaluate.targets import best_of_trial
+from msk_ray.report.reading import TrialReading, explain
+
+STRIP = "strip"
+FRAMES = 8
+_FRAME = (256, 192)
+_STAMP = "checkpoint"
+
+
+@dataclass(frozen=True)
+class Best:
+    """What is known of the best trial's best policy."""
+
+    trial: TrialReading
+    evaluations: tuple[Mapping[str, Any], ...] = ()
+    """Entries of its `eval.json` that belong to this checkpoint, the canonical one first."""
+    strip: Path | None = None
+    strip_text: str = ""
+    narrow_strip: Path | None = None
+    """The same frames two a row, for a phone."""
+    notes: tuple[str, ...] = field(default=())
+    """What could not be had, and why."""
+
+
+def look_at_best(trial: TrialReading, folder: Path, prefix: str, make: bool, device: str | None) -> Best:
+    """Gather the evaluation and the strip of a trial's best policy.
+
+    Args:
+        folder: of the report's pictures.
+        prefix: of the strip's file name.
+        make: evaluate and draw what is not there yet; else only what is there is shown.
+        device: of the simulation; None takes the first GPU, or the CPU.
+    """
+    # These load torch, which a report of plain numbers need not wait for.
+    from msk_ray.evaluate.measure import EVAL_FILE, read_evaluations
+    from msk_ray.training.checkpoint import read_manifest
+
+    notes: list[str] = []
+    try:
+        path = best_of_trial(trial.folder)
+        sha = read_manifest(path)["sha256"]
+    except (MskRayError, KeyError) as error:
+        return Best(trial, notes=(f"There is no policy to look at: {explain(error)}.",))
+    entries: list[dict[str, Any]] = []
+    try:
+        entries = _own(read_evaluations(trial.folder / EVAL_FILE), sha)
+        if make and not any(entry["canonical"] for entry in entries):
+            _evaluate(path, device)
+            entries = _own(read_evaluations(trial.folder / EVAL_FILE), sha)
+    except (MskRayError, OSError) as error:
+        notes.append(f"It could not be evaluated: {explain(error)}.")
+    strip = folder / f"{prefix}{STRIP}.png"
+    text = strip_text(strip, sha)
+    if text is None and make:
+        try:
+            _draw(path, strip, sha, device)
+            text = strip_text(strip, sha)
+        except (MskRayError, OSError) as error:
+            notes.append(f"Its film strip could not be drawn: {explain(error)}.")
+    elif text is None:
+        notes.append("Its film strip is not drawn yet: add --best always.")
+    if text is None:
+        return Best(trial, tuple(entries), notes=tuple(notes))
+    return Best(trial, tuple(entries), strip, text, narrow_strip(strip), tuple(notes))
+
+
+def narrow_strip(strip: Path) -> Path:
+    """Where the version of a strip for narrow screens lies."""
+    return strip.with_name(f"{strip.stem}_narrow.png")
+
+
+def strip_text(path: Path, sha: str) -> str | None:
+    """What a strip shows, in words; None if there is none of the checkpoint with this hash."""
+    if not path.is_file() or not narrow_strip(path).is_file():
+        return None
+    try:
+        with Image.open(path) as image:
+            facts = dict(image.info)
+    except OSError:
+        return None  # torn: it is drawn anew
+    return str(facts.get("Description", "")) if facts.get(_STAMP) == sha else None
+
+
+def _own(entries: list[dict[str, Any]], sha: str) -> list[dict[str, Any]]:
+    return sorted((e for e in entries if e["sha256"] == sha), key=lambda entry: not entry["canonical"])
+
+
+def _evaluate(path: Path, device: str | None) -> None:
+    from msk_ray.evaluate.measure import Bench, Request, default_device, eval_file_of, store_evaluation
+    from msk_ray.training import load_policy
+
+    policy = load_policy(path)
+    print(f"evaluating {path} ...", flush=True)
+    store_evaluation(eval_file_of(path), Bench(device or default_device()).evaluate(policy, Request()))
+
+
+def _draw(path: Path, out: Path, sha: str, device: str | None) -> None:
+    from msk_ray.evaluate.measure import Bench, Request, default_device
+    from msk_ray.training import load_policy
+    from msk_ray.visualize.episodes import record
+    from msk_ray.visualize.film import grid, strip
+    from msk_ray.visualize.render import View, headless_backend
+    from msk_ray.visualize.strips import episode_frames, log_strip
+
+    headless_backend()
+    policy = load_policy(path)
+    print(f"drawing an episode of {path} ...", flush=True)
+    recording = record(Bench(device or default_device()), policy, Request(worlds=1))
+    frames, times = episode_frames(recording, FRAMES, View(*_FRAME))
+    text = (
+        f"{len(frames)} frames of one episode at equal times, under {recording.physics} physics: score "
+        f"{float(recording.episodes.score[0]):.5g} in {recording.length(0) * recording.timestep:.1f} s, "
+        f"ended by {recording.ending(0)}"
+    )
+    stamp = PngImagePlugin.PngInfo()
+    stamp.add_text(_STAMP, sha)
+    stamp.add_text("Description", text)
+    image = strip(frames, times)
+    rows = range(0, len(frames), 2)
+    narrow = grid([frames[row : row + 2] for row in rows], [""] * len(rows), [times[row : row + 2] for row in rows])
+    out.parent.mkdir(parents=True, exist_ok=True)
+    # The wide one last: with its stamp on disk, both are there.
+    _save(narrow, narrow_strip(out), PngImagePlugin.PngInfo())
+    _save(image, out, stamp)
+    trial = path.parent.parent
+    if not (trial / "config.yaml").is_file():
+        raise CheckpointError(f"{trial} has lost its config.yaml")
+    log_strip(image, trial, policy.epoch)
+
+
+def _save(image: Image.Image, path: Path, facts: PngImagePlugin.PngInfo) -> None:
+    from msk_ray.training.checkpoint import write_atomically
+
+    buffer = io.BytesIO()
+    image.save(buffer, "png", pnginfo=facts)
+    write_atomically(path, buffer.getvalue())

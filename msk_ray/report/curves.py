@@ -1,0 +1,280 @@
+"""Pictures over training: learning curves, gradient health, and which trial stopped when."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from msk_ray.report.pictures import DASHES, GREY, PALETTE, POINTS, Picture, picture, shorten, steps_axis, thin_peaks
+from msk_ray.report.reading import Reading, TrialReading
+from msk_ray.tune.outcomes import Outcome
+from msk_ray.tune.pruning import rungs
+
+NAMED = 8
+"""Variants drawn in a colour of their own."""
+LABELLED = 60
+"""Trials named at their bar."""
+_STOPPED = {
+    Outcome.STOPPED_ASHA,
+    Outcome.STOPPED_MEDIAN,
+    Outcome.STOPPED_PLATEAU,
+    Outcome.NONFINITE,
+    Outcome.DIVERGED,
+}
+_LOOK = {
+    "finished": ("#009E73", "o"),
+    "stopped_target": ("#009E73", "*"),
+    "stopped_asha": ("#E69F00", "x"),
+    "stopped_median": ("#E69F00", "+"),
+    "stopped_plateau": ("#56B4E9", "s"),
+    "wall_time": ("#56B4E9", "D"),
+    "nonfinite": ("#D55E00", "X"),
+    "diverged": ("#D55E00", "v"),
+    "out_of_memory": ("#D55E00", "P"),
+    "error": ("#D55E00", "^"),
+    "running": ("#0072B2", ">"),
+    "interrupted": (GREY, "|"),
+    "waiting": (GREY, "."),
+    "unreadable": ("#000000", "1"),
+}
+HEALTH = {
+    "grad/actor_norm": ("norm of the policy's gradient", True),
+    "grad/state_p90": ("state cotangent, 90th percentile [rewards]", True),
+    "grad/clipped_share": ("share of cotangents clipped", False),
+    "grad/nonfinite_share": ("share of worlds without a gradient", False),
+    "physics/solver_limit_share": ("share of worlds at the solver's limit", False),
+    "train/diverged": ("worlds diverged an epoch", False),
+}
+"""Metric → what it is, and whether it is drawn on a logarithmic axis."""
+
+Curve = tuple[np.ndarray, np.ndarray]
+
+
+def learning_curves(groups: Mapping[str, Sequence[TrialReading]], baseline: str | None, name: str) -> Picture | None:
+    """Score over env steps, a line a variant and a band over its seeds; None if nothing was evaluated."""
+    curves = {v: [t.curve for t in trials if len(t.curve[0])] for v, trials in groups.items()}
+    ranked = sorted((v for v in curves if curves[v]), key=lambda v: -_mean_best(curves[v]))
+    if not ranked:
+        return None
+    named = ranked[:NAMED] + ([baseline] if baseline in ranked[NAMED:] else [])
+    rest = [v for v in ranked if v not in named]
+
+    def draw(figure: Figure, narrow: bool) -> None:
+        axes = figure.add_subplot()
+        for variant in rest:
+            steps, mean, *_ = _mean_and_range(curves[variant])
+            axes.plot(steps, mean, color=GREY, linewidth=0.7, alpha=0.6, zorder=1)
+        for number, variant in enumerate(named):
+            _draw_variant(axes, curves[variant], number, shorten(variant, 34 if narrow else 60))
+            for trial in groups[variant]:
+                if trial.ending is not None and trial.ending.outcome in _STOPPED and len(trial.curve[0]):
+                    x, y = trial.curve
+                    axes.plot(x[-1], y[-1], "x", color=_colour(number), markersize=7, markeredgewidth=2)
+        _limit_below(axes, [curve for own in curves.values() for curve in own])
+        steps_axis(axes)
+        axes.set_ylabel("evaluation score")
+        axes.grid(alpha=0.3)
+        handles, labels = axes.get_legend_handles_labels()
+        if rest:
+            handles.append(Line2D([], [], color=GREY, linewidth=0.7))
+            labels.append(f"{len(rest)} more")
+        place = {"loc": "outside lower center"} if narrow else {"loc": "outside right upper"}
+        figure.legend(handles, labels, fontsize=8, title="best first", title_fontsize=8, **place)
+
+    seeds = max(len(own) for own in curves.values())
+    best = _mean_best(curves[ranked[0]])
+    return picture(
+        name,
+        "Learning curves",
+        f"Evaluation score over env steps of {len(ranked)} variants; the best is {ranked[0]} with a mean best score of "
+        f"{best:.5g}.",
+        ("Mean over seeds, band: their range. " if seeds > 1 else "")
+        + "A cross ends a trial that was stopped before its time; from there the mean is over those that went on.",
+        draw,
+    )
+
+
+def _draw_variant(axes: Axes, curves: Sequence[Curve], number: int, label: str) -> None:
+    steps, mean, low, high = _mean_and_range(curves)
+    axes.plot(steps, mean, DASHES[number // len(PALETTE)], color=_colour(number), label=label, linewidth=1.9, zorder=3)
+    if len(curves) > 1:
+        axes.fill_between(steps, low, high, color=_colour(number), alpha=0.16, linewidth=0, zorder=2)
+
+
+def _mean_and_range(curves: Sequence[Curve]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Steps, mean, minimum and maximum, each (N,), of curves that may end at different steps."""
+    steps = np.unique(np.concatenate([x for x, _ in curves]))
+    if len(steps) > POINTS:
+        steps = np.unique(np.append(np.linspace(steps[0], steps[-1], POINTS), [x[-1] for x, _ in curves]))
+    # A curve ends where its trial did: beyond, it has no value, and the mean is over those that went on.
+    values = np.array([np.interp(steps, x, y, left=np.nan, right=np.nan) for x, y in curves])
+    keep = ~np.isnan(values).all(0)
+    steps, values = steps[keep], values[:, keep]
+    return steps, np.nanmean(values, 0), np.nanmin(values, 0), np.nanmax(values, 0)
+
+
+def _limit_below(axes: Axes, curves: Sequence[Curve]) -> None:
+    """Let the axis reach down to the worst first or best score: a policy that falls apart may leave it."""
+    scores = [score for _, y in curves for score in (y[0], y.max())]
+    bottom = min(scores) - 0.1 * (max(scores) - min(scores))
+    if max(scores) > min(scores) and bottom > axes.get_ylim()[0]:
+        axes.set_ylim(bottom=bottom)
+
+
+def _mean_best(curves: Sequence[Curve]) -> float:
+    return float(np.mean([y.max() for _, y in curves]))
+
+
+def _colour(number: int) -> str:
+    return PALETTE[number % len(PALETTE)]
+
+
+def gradient_health(reading: Reading, name: str) -> Picture | None:
+    """Norms, clipping and failures of gradients over training; None if no trial recorded any."""
+    recorded = [metric for metric in HEALTH if any(_health_curve(t, metric) for t in reading.trials)]
+    if not recorded:
+        return None
+    # What stayed zero throughout is said in words.
+    zero = [
+        metric
+        for metric in recorded
+        if not any(np.nanmax(c[1]) for t in reading.trials if (c := _health_curve(t, metric)))
+    ]
+    present = [metric for metric in recorded if metric not in zero] or recorded[:1]
+    zero = [metric for metric in zero if metric not in present]
+    best = reading.best
+
+    def draw(figure: Figure, narrow: bool) -> None:
+        columns = 1 if narrow else 2
+        grid = figure.subplots(math.ceil(len(present) / columns), columns, squeeze=False).ravel()
+        for axes in grid[len(present) :]:
+            axes.set_axis_off()
+        for axes, metric in zip(grid, present, strict=False):
+            _draw_health(axes, reading, metric)
+        handles = [
+            Line2D([], [], color=GREY, label="a trial"),
+            Line2D([], [], color="#D55E00", linestyle="--", label="a trial that failed"),
+        ]
+        if best is not None:
+            handles.append(Line2D([], [], color="#0072B2", linewidth=2, label="the best trial"))
+        figure.legend(handles=handles, loc="outside upper center", ncols=3, fontsize=8)
+
+    rows = math.ceil(len(present) / 2)
+    return picture(
+        name,
+        "Gradient health",
+        f"{len(present)} measures of gradients and physics over env steps, a line a trial: "
+        f"{', '.join(HEALTH[m][0] for m in present)}.",
+        (f"Zero throughout: {', '.join(HEALTH[m][0] for m in zero)}. " if zero else "")
+        + "Of many points the largest of each stretch is drawn: peaks are not lost. A cotangent is in units of reward: "
+        "1 is what one reward would send back.",
+        draw,
+        (9.0, 1.0 + 2.3 * rows),
+        (4.2, 1.0 + 2.2 * len(present)),
+    )
+
+
+def _health_curve(trial: TrialReading, metric: str) -> Curve | None:
+    values = trial.columns.get(metric)
+    if values is None or not np.isfinite(values).any():
+        return None
+    keep = np.isfinite(values)
+    return trial.columns["env_steps"][keep], values[keep]
+
+
+def _draw_health(axes: Axes, reading: Reading, metric: str) -> None:
+    title, logarithmic = HEALTH[metric]
+    best = reading.best
+    lines: dict[bool, list[np.ndarray]] = {False: [], True: []}
+    largest = 0.0
+    for trial in reading.trials:
+        curve = _health_curve(trial, metric)
+        if curve is None:
+            continue
+        x, y = thin_peaks(*curve)
+        largest = max(largest, float(y.max()))
+        if trial is best:
+            axes.plot(x, y, color="#0072B2", linewidth=1.6, zorder=4)
+        else:
+            lines[trial.failed].append(np.column_stack((x, y)))
+    alpha = max(0.25, min(0.8, 12 / max(1, len(reading.trials))))
+    axes.add_collection(LineCollection(lines[False], colors=GREY, linewidths=0.8, alpha=alpha, zorder=2))
+    axes.add_collection(LineCollection(lines[True], colors="#D55E00", linewidths=1.0, linestyles="--", zorder=3))
+    axes.autoscale_view()
+    if logarithmic and largest > 0.0:
+        axes.set_yscale("log")
+    elif largest == 0.0:
+        axes.set_ylim(-0.05, 1.0)
+    axes.set_title(title, fontsize=9)
+    axes.tick_params(labelsize=8)
+    steps_axis(axes)
+    axes.grid(alpha=0.3)
+
+
+def stopping_map(reading: Reading, name: str) -> Picture | None:
+    """A bar a trial, as long as it ran, its end marked by how it ended; None if none has begun."""
+    begun = [trial for trial in reading.trials if trial.epochs_done]
+    if not begun:
+        return None
+    ordered = sorted(begun, key=lambda t: (t.score is None, -(t.score or 0.0), t.trial.index))
+    seeds = len(reading.seeds) > 1
+    lines = _rung_steps(reading)
+
+    def draw(figure: Figure, narrow: bool) -> None:
+        axes = figure.add_subplot()
+        for place, trial in enumerate(ordered):
+            colour, marker = _LOOK.get(trial.outcome, (GREY, "."))
+            end = float(trial.columns["env_steps"][-1])
+            axes.plot(
+                [0.0, end], [place, place], color=colour, linewidth=1.2 if len(ordered) > LABELLED else 2.5, alpha=0.7
+            )
+            axes.plot(end, place, marker, color=colour, markersize=4 if len(ordered) > LABELLED else 7)
+        for step in lines:
+            axes.axvline(step, color="black", linestyle=":", linewidth=0.9)
+        axes.set_ylim(len(ordered) - 0.4, -0.6)
+        if len(ordered) <= LABELLED:
+            labels = [t.trial.variant + (f", seed {t.trial.seed}" if seeds else "") for t in ordered]
+            names = [t.trial.id if narrow else shorten(label, 48) for t, label in zip(ordered, labels, strict=True)]
+            axes.set_yticks(range(len(ordered)), names, fontsize=7)
+        else:
+            axes.set_ylabel("trials, the best score first")
+        steps_axis(axes)
+        shown = list(dict.fromkeys(t.outcome for t in ordered))
+        handles = [
+            Line2D([], [], color=_LOOK.get(o, (GREY, "."))[0], marker=_LOOK.get(o, (GREY, "."))[1], label=o)
+            for o in shown
+        ]
+        if lines:
+            handles.append(Line2D([], [], color="black", linestyle=":", label="rung of asha"))
+        figure.legend(handles=handles, loc="outside upper center", ncols=2 if narrow else 5, fontsize=8)
+
+    counts: dict[str, int] = {}
+    for trial in ordered:
+        counts[trial.outcome] = counts.get(trial.outcome, 0) + 1
+    height = 1.6 + (0.24 * len(ordered) if len(ordered) <= LABELLED else min(9.0, 0.04 * len(ordered)))
+    return picture(
+        name,
+        "Which trial stopped when",
+        f"{len(ordered)} trials as bars of env steps, the best score on top: "
+        + ", ".join(f"{n} {outcome}" for outcome, n in counts.items())
+        + ".",
+        "The best score on top. Why each one stopped is in the table of trials.",
+        draw,
+        (9.0, height),
+        (4.2, max(3.0, height)),
+    )
+
+
+def _rung_steps(reading: Reading) -> list[float]:
+    """Env steps at which asha compares trials; none for other rules, or if they are compared at something else."""
+    spec = reading.space.scheduler if reading.space is not None else None
+    if spec is None or spec.kind != "asha" or spec.time_attr != "env_steps":
+        return []
+    from msk_ray.tune.trials import env_steps_budget  # loads torch
+
+    budget = max(env_steps_budget(trial.trial.config) for trial in reading.trials)
+    return list(rungs(spec.grace * budget, budget, spec.reduction))

@@ -1,0 +1,203 @@
+"""Pictures of what the parameters do to the score: ranked effects, and all trials over all parameters."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import ListedColormap, Normalize
+from matplotlib.figure import Figure
+
+from msk_ray.report.pictures import GREY, PALETTE, Picture, picture, shorten
+from msk_ray.report.reading import Reading, TrialReading
+from msk_ray.report.statistics import Effect, effects, mean_interval
+
+PANELS = 4
+"""Parameters whose levels are drawn one by one."""
+AXES = 8
+"""Parameters of the parallel coordinates."""
+_DECADES = 30.0
+"""Numbers whose largest is so many times the smallest are drawn on a logarithmic axis."""
+
+
+def ranked_effects(reading: Reading) -> list[Effect]:
+    """Effects of the experiment's parameters on the best score, the largest first."""
+    return effects(
+        [(t.trial.changed, t.trial.values, t.trial.seed, t.score) for t in reading.trials if t.score is not None]
+    )
+
+
+def parameter_effects(found: Sequence[Effect], name: str) -> Picture | None:
+    """Parameters ranked, and the scores at each level of the first ones; None without a parameter."""
+    if not found:
+        return None
+    panels = list(found[:PANELS])
+    shares = any(effect.share is not None for effect in found)
+
+    def draw(figure: Figure, narrow: bool) -> None:
+        rows = 2 if len(panels) > 2 else 1
+        if narrow:
+            parts: Any = figure.subfigures(2, 1, height_ratios=(0.6 + 0.3 * len(found), 2.0 * len(panels)))
+            grid = parts[1].subplots(len(panels), 1, squeeze=False).ravel()
+        else:
+            parts = figure.subfigures(1, 2, width_ratios=(1.0, 1.6))
+            grid = parts[1].subplots(rows, math.ceil(len(panels) / rows), squeeze=False).ravel()
+            for axes in grid[len(panels) :]:
+                axes.set_axis_off()
+        _draw_ranking(parts[0].add_subplot(), found, shares)
+        for axes, effect in zip(grid, panels, strict=False):
+            _draw_levels(axes, effect)
+
+    first = found[0]
+    share = "" if first.share is None else f", {max(0.0, first.share):.0%} of the variance"
+    return picture(
+        name,
+        "What the parameters do",
+        f"{len(found)} parameters ranked by their effect on the best score. First: {first.factor}{share}, "
+        f"{first.spread:.4g} between its best and its worst level.",
+        (
+            "First: share of the scores' variance that a parameter explains alone, less what chance would (ω²; "
+            "Hays 1963). Then: best scores at each level, with their mean and its 95 % bootstrap interval. "
+            if shares
+            else "First: between the mean scores of a parameter's best and worst level; with one trial a level that "
+            "cannot be told from chance. Then: the scores. "
+        )
+        + "Trials stopped early count with the best score they had.",
+        draw,
+        (9.0, 5.4),
+        (4.2, 1.2 + 0.3 * len(found) + 2.2 * len(panels)),
+    )
+
+
+def _draw_ranking(axes: Axes, found: Sequence[Effect], shares: bool) -> None:
+    values = [(max(0.0, e.share) if e.share is not None else 0.0) if shares else e.spread for e in found]
+    places = range(len(found))
+    colours = [GREY if effect.factor == "seed" else PALETTE[0] for effect in found]
+    axes.barh(places, values, color=colours, height=0.65)
+    axes.set_yticks(places, [shorten(_leaf(e.factor), 18) for e in found], fontsize=8)
+    axes.set_ylim(max(len(found), 5) - 0.5, -0.5)
+    axes.set_xlabel("share of variance (ω²)" if shares else "spread of mean scores", fontsize=8)
+    axes.tick_params(axis="x", labelsize=8)
+    axes.set_xlim(0.0, 1.02 if shares else None)
+    axes.grid(alpha=0.3, axis="x")
+
+
+def _draw_levels(axes: Axes, effect: Effect) -> None:
+    levels = list(effect.levels.items())
+    if len(levels) > 10:
+        # Too many to tell apart: the best and the worst ones.
+        ordered = sorted(levels, key=lambda level: -float(np.mean(level[1])))
+        levels = [*ordered[:5], *ordered[-5:]]
+    jitter = np.random.default_rng(0)
+    for place, (_, scores) in enumerate(levels):
+        spots = place + 0.16 * (jitter.random(len(scores)) - 0.5)
+        axes.plot(spots, scores, "o", color=GREY, markersize=3, alpha=0.7)
+        mean, interval = float(np.mean(scores)), mean_interval(scores)
+        axes.plot([place - 0.3, place + 0.3], [mean, mean], color=PALETTE[1], linewidth=2)
+        if interval is not None:
+            axes.plot([place, place], [interval.low, interval.high], color=PALETTE[1], linewidth=1.4)
+    rotation = 30 if max(len(label) for label, _ in levels) > 6 or len(levels) > 5 else 0
+    axes.set_xticks(range(len(levels)), [shorten(label, 16) for label, _ in levels], fontsize=7, rotation=rotation)
+    axes.tick_params(axis="y", labelsize=7)
+    axes.set_title(_leaf(effect.factor), fontsize=9)
+    axes.set_ylabel("best score", fontsize=8)
+    axes.grid(alpha=0.3, axis="y")
+
+
+def parallel_coordinates(reading: Reading, found: Sequence[Effect], name: str) -> Picture | None:
+    """A line a trial through its parameters to its score; None with fewer than two trials or no parameter."""
+    factors = [effect.factor for effect in found if effect.factor != "seed"][:AXES]
+    trials = [t for t in reading.trials if t.score is not None and all(f in t.trial.changed for f in factors)]
+    if len(trials) < 2 or not factors:
+        return None
+    scores = np.array([t.score for t in trials], dtype=float)
+    columns = [_coordinate(factor, trials) for factor in factors]
+    low, high = float(scores.min()), float(scores.max())
+    heights = np.column_stack([*(places for places, _ in columns), (scores - low) / (high - low or 1.0)])
+    norm = Normalize(low, high)
+
+    def draw(figure: Figure, narrow: bool) -> None:
+        axes = figure.add_subplot()
+        # Without its lightest part, which is hard to see on white.
+        ways = ListedColormap(colormaps["viridis"](np.linspace(0.0, 0.88, 256)))
+        x = np.arange(heights.shape[1])
+        if narrow:
+            axes.set_ylim(heights.shape[1] - 0.6, -0.4)
+        for row in np.argsort(scores):
+            along = (heights[row], x) if narrow else (x, heights[row])
+            axes.plot(*along, color=ways(norm(scores[row])), linewidth=1.0, alpha=0.75)
+        ticks = [labels for _, labels in columns] + [[(0.0, f"{low:.4g}"), (1.0, f"{high:.4g}")]]
+        for place, own in enumerate(ticks):
+            if narrow:
+                axes.axhline(place, color="black", linewidth=0.8)
+            else:
+                axes.axvline(place, color="black", linewidth=0.8)
+            for height, label in own:
+                spot = (height, place + 0.16) if narrow else (place + 0.03, height)
+                box = {"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.6}
+                ha = ("left" if height < 0.1 else "right" if height > 0.9 else "center") if narrow else "left"
+                axes.text(*spot, shorten(label, 16), fontsize=7, ha=ha, va="center", bbox=box)
+        names = [shorten(_leaf(f), 18) for f in factors] + ["best score"]
+        if narrow:
+            axes.set_yticks(x, names, fontsize=8)
+            axes.set_xticks([])
+            axes.set_xlim(-0.03, 1.03)
+        else:
+            axes.set_xticks(x, names, fontsize=8)
+            axes.set_yticks([])
+            axes.set_xlim(-0.05, x[-1] + 0.35)
+        for side in axes.spines.values():
+            side.set_visible(False)
+        if high > low:
+            bar = figure.colorbar(
+                ScalarMappable(norm, ways),
+                ax=axes,
+                orientation="horizontal" if narrow else "vertical",
+                shrink=0.8,
+                pad=0.02,
+            )
+            bar.set_label("best score", fontsize=8)
+            bar.ax.tick_params(labelsize=7)
+
+    best = trials[int(np.argmax(scores))]
+    return picture(
+        name,
+        "All trials over all parameters",
+        f"Parallel coordinates of {len(trials)} trials over {', '.join(_leaf(f) for f in factors)} and the best score; "
+        f"the best has {best.trial.variant}.",
+        "A line is a trial, its colour the best score. Numbers that span a factor of 30 lie on a logarithmic axis.",
+        draw,
+        (9.0, 4.6),
+        (4.2, 1.4 + 1.0 * heights.shape[1]),
+    )
+
+
+def _coordinate(factor: str, trials: Sequence[TrialReading]) -> tuple[np.ndarray, list[tuple[float, str]]]:
+    """Heights (N,) from 0 to 1 of the trials on a parameter's axis, and the axis' labels as (height, text)."""
+    values = [trial.trial.values.get(factor) for trial in trials]
+    labels = [trial.trial.changed[factor] for trial in trials]
+    if all(_is_number(value) for value in values) and len(set(values)) > 1:
+        numbers = np.array(values, dtype=float)
+        if numbers.min() > 0.0 and numbers.max() > _DECADES * numbers.min():
+            numbers = np.log10(numbers)
+        heights = (numbers - numbers.min()) / (numbers.max() - numbers.min())
+        marks = dict(zip(heights.round(6).tolist(), labels, strict=True))
+        chosen = sorted(marks)
+        if len(chosen) > 6:
+            chosen = [chosen[round(share * (len(chosen) - 1))] for share in (0.0, 0.25, 0.5, 0.75, 1.0)]
+        return heights, [(height, marks[height]) for height in dict.fromkeys(chosen)]
+    levels = list(dict.fromkeys(labels))
+    places = {label: place / max(1, len(levels) - 1) for place, label in enumerate(levels)}
+    shown = levels if len(levels) <= 12 else []
+    return np.array([places[label] for label in labels]), [(places[label], label) for label in shown]
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _leaf(factor: str) -> str:
+    return factor.rsplit(".", 1)[-1]

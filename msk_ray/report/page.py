@@ -1,0 +1,179 @@
+"""The page: one HTML file that needs nothing else, and its pictures beside it."""
+
+import base64
+import os
+import shlex
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from msk_ray import __version__
+from msk_ray.errors import StorageFailure
+from msk_ray.progress import format_duration
+from msk_ray.report.best import Best
+from msk_ray.report.curves import gradient_health, learning_curves, stopping_map
+from msk_ray.report.influence import parallel_coordinates, parameter_effects, ranked_effects
+from msk_ray.report.pictures import Picture, format_steps
+from msk_ray.report.reading import Condition, Reading, TrialReading
+from msk_ray.report.tables import baseline_of, failures, outcome_counts, outcome_figures, variant_rows
+from msk_ray.tune.outcomes import write_text
+
+PAGE = "index.html"
+_FILES = ("config.yaml", "metrics.jsonl", "output.log", "error.txt", "eval.json", "checkpoints/best.pt")
+_WORDS = {
+    Condition.RUNNING: "Trials are still running: this is the state at the time above.",
+    Condition.INTERRUPTED: "It is not at its end, and no trial shows a sign of life: it was stopped or has crashed. "
+    "python -m msk_ray.tune --resume goes on.",
+    Condition.WAITING: "No trial has begun yet.",
+    Condition.EMPTY: "It has no trials: it was interrupted before its first file was whole, or has not begun.",
+    Condition.FINISHED: "",
+}
+
+
+@dataclass(frozen=True)
+class Section:
+    """One experiment of the page."""
+
+    reading: Reading
+    slug: str
+    baseline: str | None
+    best: Best | None
+    pictures: dict[str, Picture]
+    folder: Path
+    """Of the page, which links are relative to."""
+
+    @property
+    def words(self) -> str:
+        return _WORDS[self.reading.condition]
+
+    def rows(self) -> Any:
+        return variant_rows(self.reading, self.baseline)
+
+    def failures(self) -> Any:
+        return failures(self.reading)
+
+    def counts(self) -> dict[str, int]:
+        return outcome_counts(self.reading)
+
+    def figures(self) -> list[str]:
+        return outcome_figures(self.reading.trials)
+
+    def ordered(self) -> list[TrialReading]:
+        """Trials, the best score first."""
+        return sorted(self.reading.trials, key=lambda t: (t.score is None, -(t.score or 0.0), t.trial.index))
+
+    def files(self, trial: TrialReading) -> list[tuple[str, str]]:
+        """(name, link) of a trial's files that are there."""
+        return [(Path(name).stem, self.link(trial.folder / name)) for name in _FILES if (trial.folder / name).is_file()]
+
+    def devices(self) -> dict[str, int]:
+        """Kinds of devices, and how many trials ran on each."""
+        counts: dict[str, int] = {}
+        for trial in self.reading.trials:
+            if trial.device:
+                counts[trial.device] = counts.get(trial.device, 0) + 1
+        return counts
+
+    def link(self, path: Path) -> str:
+        return Path(os.path.relpath(path, self.folder)).as_posix()
+
+    def command(self) -> str:
+        """The command line that was run, as one would type it."""
+        argv = self.reading.environment.get("command")
+        if not isinstance(argv, list) or not argv:
+            return ""
+        program = Path(str(argv[0]))
+        if program.name == "__main__.py":
+            # `python -m msk_ray.tune` shows up as the path of the file it runs.
+            parts = program.parent.parts
+            start = parts.index("msk_ray") if "msk_ray" in parts else len(parts) - 1
+            words = ["python", "-m", ".".join(parts[start:])]
+        else:
+            words = [program.name]
+        return shlex.join([*words, *map(str, argv[1:])])
+
+
+def make_section(reading: Reading, folder: Path, prefix: str, baseline: str | None, best: Best | None) -> Section:
+    """Draw an experiment's pictures.
+
+    Raises:
+        ConfigError: there is no variant of the name asked for.
+    """
+    chosen = baseline_of(reading, baseline)
+    found = ranked_effects(reading)
+    drawn = {
+        "curves": learning_curves(reading.variants, chosen, f"{prefix}curves"),
+        "effects": parameter_effects(found, f"{prefix}effects"),
+        "parallel": parallel_coordinates(reading, found, f"{prefix}parallel"),
+        "stops": stopping_map(reading, f"{prefix}stops"),
+        "health": gradient_health(reading, f"{prefix}health"),
+    }
+    pictures = {key: picture for key, picture in drawn.items() if picture is not None}
+    slug = "".join(c if c.isalnum() else "-" for c in reading.name)
+    return Section(reading, slug, chosen, best, pictures, folder)
+
+
+def compare(readings: Sequence[Reading]) -> Picture | None:
+    """Learning curves of several experiments together; None if none was evaluated."""
+    groups = {
+        f"{reading.name}: {variant}": trials for reading in readings for variant, trials in reading.variants.items()
+    }
+    return learning_curves(groups, None, "together")
+
+
+def write_page(sections: Sequence[Section], together: Picture | None, folder: Path, now: float, command: str) -> Path:
+    """Write the page and its pictures.
+
+    Returns:
+        The page's path.
+
+    Raises:
+        StorageFailure: the folder cannot be written.
+    """
+    environment = Environment(
+        loader=PackageLoader("msk_ray.report", "page"),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=StrictUndefined,
+    )
+    environment.filters.update(
+        number=_number, signed=_signed, percent=_percent, duration=format_duration, steps=format_steps, uri=_uri
+    )
+    text = environment.get_template("report.html.j2").render(
+        sections=sections,
+        together=together,
+        written=time.strftime("%Y-%m-%d %H:%M %Z", time.localtime(now)),
+        command=command,
+        version=__version__,
+        strip_uri=lambda path: _uri(path.read_bytes()),
+    )
+    pictures = [picture for section in sections for picture in section.pictures.values()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for picture in [*pictures, *([together] if together is not None else [])]:
+            (folder / f"{picture.name}.png").write_bytes(picture.wide)
+    except OSError as error:
+        raise StorageFailure(f"cannot write {folder}: {error.strerror or error}") from error
+    write_text(folder / PAGE, text)
+    return folder / PAGE
+
+
+def _uri(png: bytes) -> str:
+    return "data:image/png;base64," + base64.b64encode(png).decode()
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.5g}".replace("-", "\N{MINUS SIGN}")
+
+
+def _signed(value: float | None) -> str:
+    return "–" if value is None else f"{value:+.4g}".replace("-", "\N{MINUS SIGN}")
+
+
+def _percent(value: float) -> str:
+    return f"{value:.1%}"

@@ -1,0 +1,93 @@
+"""Pictures of the page: each drawn twice with matplotlib, for a wide screen or paper and for a phone."""
+
+import io
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+
+Draw = Callable[[Figure, bool], None]
+"""Draws into an empty figure; told whether it is the narrow one."""
+
+PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8B5A2B", "#4B0082")
+"""Colours that are told apart with any colour vision (Okabe and Ito 2008, the two last ones added)."""
+DASHES = ("-", "--", "-.", ":")
+GREY = "#9a9a9a"
+POINTS = 300
+"""A curve is drawn with so many points at most."""
+_WIDE_DPI, _NARROW_DPI = 120, 150
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure of the page."""
+
+    name: str
+    """Its file's name without suffix."""
+    title: str
+    alt: str
+    """What it shows, in words."""
+    caption: str
+    wide: bytes
+    """PNG."""
+    narrow: bytes | None
+    """PNG for screens up to 600 pixels; None takes the wide one."""
+
+
+def picture(
+    name: str,
+    title: str,
+    alt: str,
+    caption: str,
+    draw: Draw,
+    wide: tuple[float, float] = (9.0, 5.0),
+    narrow: tuple[float, float] = (4.2, 4.6),
+) -> Picture:
+    """Draw a picture in both sizes [inches]."""
+    return Picture(name, title, alt, caption, _png(draw, wide, False), _png(draw, narrow, True))
+
+
+def _png(draw: Draw, size: tuple[float, float], narrow: bool) -> bytes:
+    figure = Figure(figsize=size, layout="constrained")
+    draw(figure, narrow)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=_NARROW_DPI if narrow else _WIDE_DPI)
+    return buffer.getvalue()
+
+
+def thin(x: np.ndarray, *curves: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Curves (N,) over `x` with POINTS points at most: the first, the last, and others at equal distances."""
+    if len(x) <= POINTS:
+        return (x, *curves)
+    keep = np.unique(np.round(np.linspace(0, len(x) - 1, POINTS)).astype(int))
+    return (x[keep], *(curve[keep] for curve in curves))
+
+
+def thin_peaks(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """As `thin` for a curve whose peaks matter: of each stretch of points its largest value, at its own place."""
+    if len(x) <= POINTS:
+        return x, y
+    edges = np.linspace(0, len(x), POINTS + 1).astype(int)
+    keep = [a + int(np.argmax(np.nan_to_num(y[a:b], nan=-np.inf))) for a, b in itertools.pairwise(edges)]
+    return x[keep], y[keep]
+
+
+def steps_axis(axes: Axes) -> None:
+    """Env steps along x, in thousands and millions."""
+    axes.set_xlabel("env steps")
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.margins(x=0.02)
+
+
+def shorten(text: str, length: int) -> str:
+    """`text`, cut to `length` characters."""
+    return text if len(text) <= length else text[: length - 1] + "…"
+
+
+def format_steps(steps: float) -> str:
+    """1.5M, 20k."""
+    return EngFormatter(sep="", places=1)(steps)

@@ -1,0 +1,141 @@
+"""What the scores of few trials say: intervals over seeds, and which parameters matter. Pure functions."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+DRAWS = 10_000
+CONFIDENCE = 0.95
+BINS = 4
+"""Groups of equal size that a drawn number is sorted into."""
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A confidence interval."""
+
+    low: float
+    high: float
+
+    def excludes(self, value: float) -> bool:
+        return not self.low <= value <= self.high
+
+
+def mean_interval(scores: Sequence[float]) -> Interval | None:
+    """Percentile bootstrap of the mean: the scores are drawn again with replacement, DRAWS times; the interval holds
+    the middle 95 % of the means. None of fewer than two scores.
+
+    Efron and Tibshirani 1993, "An Introduction to the Bootstrap", chapter 13; over runs with different seeds as in
+    Agarwal et al. 2021, "Deep Reinforcement Learning at the Edge of the Statistical Precipice", arXiv:2108.13264. With
+    fewer than about ten seeds such an interval is too narrow.
+    """
+    return _interval(_means(scores, 0)) if len(scores) > 1 else None
+
+
+def difference_interval(scores: Sequence[float], baseline: Sequence[float]) -> Interval | None:
+    """Percentile bootstrap of mean(scores) − mean(baseline), both drawn again independently; as `mean_interval`.
+
+    None unless both have at least two scores.
+    """
+    if min(len(scores), len(baseline)) < 2:
+        return None
+    return _interval(_means(scores, 0) - _means(baseline, 1))
+
+
+def _means(scores: Sequence[float], seed: int) -> np.ndarray:
+    values = np.asarray(scores, dtype=float)
+    picks = np.random.default_rng(seed).integers(0, len(values), (DRAWS, len(values)))
+    return values[picks].mean(1)
+
+
+def _interval(statistic: np.ndarray) -> Interval:
+    tail = 100.0 * (1.0 - CONFIDENCE) / 2.0
+    low, high = np.percentile(statistic, (tail, 100.0 - tail))
+    return Interval(float(low), float(high))
+
+
+@dataclass(frozen=True)
+class Effect:
+    """How the score depends on one parameter, whatever the others are."""
+
+    factor: str
+    levels: dict[str, list[float]]
+    """Scores of the trials at each level, in order of the level."""
+    share: float | None
+    """Of the variance of the scores, ω²; None if every trial has a level of its own."""
+
+    @property
+    def spread(self) -> float:
+        """Between the best and the worst level's mean score."""
+        means = [sum(scores) / len(scores) for scores in self.levels.values()]
+        return max(means) - min(means)
+
+
+def effects(trials: Sequence[tuple[Mapping[str, str], Mapping[str, Any], int, float]]) -> list[Effect]:
+    """Parameters ranked by the share of the scores' variance that they explain, the largest first.
+
+    Args:
+        trials: each one's parameters as text and as data, its seed, and its score.
+
+    Returns:
+        An effect for each parameter with at least two levels, and one called `seed` for comparison if there are
+        several seeds.
+    """
+    factors = list(dict.fromkeys(key for changed, *_ in trials for key in changed))
+    found = []
+    for factor in factors:
+        rows = [
+            (changed[factor], values.get(factor), score) for changed, values, _, score in trials if factor in changed
+        ]
+        found.append(_effect(factor, levels_of(rows)))
+    by_seed: dict[str, list[float]] = {}
+    for _, _, seed, score in sorted(trials, key=lambda trial: trial[2]):
+        by_seed.setdefault(str(seed), []).append(score)
+    found.append(_effect("seed", by_seed))
+    kept = [effect for effect in found if len(effect.levels) > 1]
+    return sorted(kept, key=lambda e: (-math.inf if e.share is None else -e.share, -e.spread))
+
+
+def levels_of(rows: Sequence[tuple[str, Any, float]]) -> dict[str, list[float]]:
+    """Scores by level. Of numbers with many values, as drawn ones have, the levels are quarters of equal size."""
+    numbers = [value for _, value, _ in rows if isinstance(value, int | float) and not isinstance(value, bool)]
+    levels: dict[str, list[float]] = {}
+    if len(numbers) == len(rows) and len(set(numbers)) > 2 * BINS:
+        edges = np.quantile(numbers, np.linspace(0.0, 1.0, BINS + 1))
+        bins = np.clip(np.searchsorted(edges, numbers, side="right") - 1, 0, BINS - 1)
+        for place in range(BINS):
+            label = f"{edges[place]:.3g} … {edges[place + 1]:.3g}"
+            scores = [score for (_, _, score), own in zip(rows, bins, strict=True) if own == place]
+            if scores:
+                levels[label] = scores
+        return levels
+    numeric = len(numbers) == len(rows)
+    for label, _, score in sorted(rows, key=lambda row: row[1]) if numeric else rows:
+        levels.setdefault(label, []).append(score)
+    return levels
+
+
+def variance_share(groups: Sequence[Sequence[float]]) -> float | None:
+    """ω² = (SS_between − (k − 1) MS_within) / (SS_total + MS_within) of k groups, n values: the share of the variance
+    that lies between groups, less what chance alone would put there; below 0 means none.
+
+    Hays 1963, "Statistics for Psychologists", chapter 12. None if no group has two values; 0 if all are equal.
+    """
+    values = np.concatenate([np.asarray(group, dtype=float) for group in groups])
+    k, n = len(groups), len(values)
+    if n <= k:
+        return None
+    mean = values.mean()
+    between = sum(len(group) * (float(np.mean(group)) - mean) ** 2 for group in groups)
+    total = float(((values - mean) ** 2).sum())
+    if total == 0.0:
+        return 0.0
+    within = (total - between) / (n - k)
+    return float((between - (k - 1) * within) / (total + within))
+
+
+def _effect(factor: str, levels: dict[str, list[float]]) -> Effect:
+    return Effect(factor, levels, variance_share(list(levels.values())) if len(levels) > 1 else None)

@@ -1,0 +1,136 @@
+"""The page's tables as plain data."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from msk_ray.errors import ConfigError
+from msk_ray.report.reading import Reading, TrialReading
+from msk_ray.report.statistics import Interval, difference_interval, mean_interval
+from msk_ray.tune.outcomes import Outcome
+from msk_ray.tune.standing import State
+
+_PLAIN_FIGURES = ("score", "score_std", "length", "fall_rate", "diverged_rate", "best_score")
+BASELINE = "baseline"
+
+MEANINGS = {
+    Outcome.NONFINITE: "a score, loss or gradient was NaN or infinite",
+    Outcome.DIVERGED: "too many simulated worlds diverged, or contacts were lost",
+    Outcome.OUT_OF_MEMORY: "the device has less memory than the settings need",
+    Outcome.ERROR: "an exception, or the process died too often",
+    State.UNREADABLE: "the trial's files make no sense",
+    "interrupted": "no sign of life for too long, and no ending",
+}
+
+
+@dataclass(frozen=True)
+class VariantRow:
+    """One variant over its seeds."""
+
+    variant: str
+    scores: list[float]
+    """Best score of each seed that was evaluated."""
+    planned: int
+    mean: float | None
+    interval: Interval | None
+    difference: float | None
+    """Of the mean from the baseline's; None for the baseline itself, or without scores."""
+    difference_interval: Interval | None
+    is_baseline: bool
+    figures: dict[str, float]
+    """Mean over seeds of further evaluation figures at the best evaluation, such as the speed."""
+
+    @property
+    def verdict(self) -> str:
+        if self.is_baseline:
+            return "baseline"
+        if self.difference is None:
+            return "no score"
+        if self.difference_interval is None:
+            return "one seed"
+        if not self.difference_interval.excludes(0.0):
+            return "unclear"
+        return "better" if self.difference > 0 else "worse"
+
+
+def baseline_of(reading: Reading, asked: str | None) -> str | None:
+    """The variant that others are compared with: the one asked for, the one called baseline, or the first.
+
+    Raises:
+        ConfigError: no variant, or more than one, is called so.
+    """
+    variants = list(reading.variants)
+    if asked is not None:
+        found = [v for v in variants if v == asked] or [v for v in variants if asked in v]
+        if len(found) != 1:
+            known = "; ".join((found or variants)[:8])
+            raise ConfigError(
+                f"--baseline {asked!r}: {'more than one' if found else 'no'} variant of {reading.name} is called so; "
+                f"write one of: {known}"
+            )
+        return found[0]
+    if BASELINE in variants:
+        return BASELINE
+    return variants[0] if variants else None
+
+
+def outcome_figures(trials: Sequence[TrialReading]) -> list[str]:
+    """Names of the evaluation's outcome figures, such as `vx` and `success_rate`; without the plain ones and terms."""
+    names: dict[str, None] = {}
+    for trial in trials:
+        names.update(dict.fromkeys(name for name in trial.columns if name.startswith("eval/")))
+    short = [name.removeprefix("eval/") for name in names]
+    return [name for name in short if "/" not in name and name not in _PLAIN_FIGURES]
+
+
+def variant_rows(reading: Reading, baseline: str | None) -> list[VariantRow]:
+    """A row a variant, the highest mean first, those without a score last."""
+    groups = reading.variants
+    reference = _scores(groups[baseline]) if baseline is not None else []
+    names = outcome_figures(reading.trials)
+    rows = []
+    for variant, trials in groups.items():
+        scores = _scores(trials)
+        mean = sum(scores) / len(scores) if scores else None
+        own = variant == baseline
+        compared = mean is not None and bool(reference) and not own
+        figures = {}
+        for name in names:
+            found = [trial.best_row[f"eval/{name}"] for trial in trials if f"eval/{name}" in trial.best_row]
+            if found:
+                figures[name] = sum(found) / len(found)
+        rows.append(
+            VariantRow(
+                variant,
+                scores,
+                len(trials),
+                mean,
+                mean_interval(scores),
+                mean - sum(reference) / len(reference) if compared and mean is not None else None,
+                difference_interval(scores, reference) if compared else None,
+                own,
+                figures,
+            )
+        )
+    return sorted(rows, key=lambda row: (row.mean is None, -(row.mean or 0.0)))
+
+
+def failures(reading: Reading) -> list[tuple[str, str, list[TrialReading]]]:
+    """(name, meaning, trials) of each way trials failed, the most frequent first; interrupted ones too."""
+    found: dict[str, list[TrialReading]] = {}
+    for trial in reading.trials:
+        if trial.failed or trial.state is State.STALE:
+            found.setdefault(trial.outcome, []).append(trial)
+    ordered = sorted(found.items(), key=lambda item: -len(item[1]))
+    return [(name, MEANINGS.get(name, ""), trials) for name, trials in ordered]
+
+
+def outcome_counts(reading: Reading) -> dict[str, int]:
+    """How many trials ended, or stand, in each way; the most frequent first."""
+    counts: dict[str, int] = {}
+    for trial in reading.trials:
+        counts[trial.outcome] = counts.get(trial.outcome, 0) + 1
+    return dict(sorted(counts.items(), key=lambda item: -item[1]))
+
+
+def _scores(trials: Sequence[TrialReading]) -> list[float]:
+    return [trial.score for trial in trials if trial.score is not None]

@@ -1,0 +1,78 @@
+"""Contacts that begin soft and become those of the trial's physics as training goes on."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from msk_ray.config import ContactCurriculum
+from msk_ray.envs import Env
+from msk_ray.errors import ConfigError
+
+
+def between(start: Sequence[float], end: Sequence[float], progress: float) -> list[float]:
+    """Numbers on the way from `start` (progress 0) to `end` (1): by constant ratio if both are positive, else evenly.
+
+    Time constants span decades, where an even step would change nothing at first and everything in the end.
+    """
+    mixed = []
+    for a, b in zip(start, end, strict=True):
+        if a > 0.0 and b > 0.0:
+            mixed.append(math.exp((1.0 - progress) * math.log(a) + progress * math.log(b)))
+        else:
+            mixed.append((1.0 - progress) * a + progress * b)
+    return mixed
+
+
+class ContactSchedule:
+    """Keeps an environment's contact pairs where the curriculum says they are.
+
+    Raises:
+        ConfigError: the model's contacts are no explicit pairs.
+
+    Attributes:
+        progress: 0 at the curriculum's start, 1 where the trial's own physics is reached.
+    """
+
+    def __init__(self, config: ContactCurriculum, env: Env[Any]) -> None:
+        self.config = config
+        self.progress = 0.0
+        self._env = env
+        model = env.model
+        if not model.npair:
+            raise ConfigError(f"curriculum: env {env.config.name} has no contact pairs to soften; leave it out")
+        self._ends = {
+            "solref": np.array(model.pair_solref),
+            "solimp": np.array(model.pair_solimp),
+            "solreffriction": np.array(model.pair_solreffriction),
+            "friction": np.array(model.pair_friction),
+        }
+        self._apply()
+
+    def advance(self, reward: float) -> None:
+        """Take in an epoch's mean reward per env step, and move on if the curriculum does."""
+        if self.config.reward is None or reward >= self.config.reward:
+            self.set_progress(self.progress + 1.0 / self.config.epochs)
+
+    def set_progress(self, progress: float) -> None:
+        """Go to a point of the curriculum."""
+        # Sums of 1/epochs may miss 1 by rounding.
+        self.progress = 1.0 if progress > 1.0 - 1e-9 else progress
+        self._apply()
+
+    def _apply(self) -> None:
+        start = self.config.start.model_dump(exclude_none=True)
+        fields = {}
+        for name, end in self._ends.items():
+            if name not in start or self.progress == 1.0:
+                fields[name] = end
+                continue
+            rows = []
+            for row, solref in zip(end, self._ends["solref"], strict=True):
+                # A zero solreffriction stands for solref.
+                target = solref if name == "solreffriction" and not row.any() else row
+                first = [start[name]] * 2 + list(row[2:]) if name == "friction" else list(start[name])
+                rows.append(between(first, list(target), self.progress))
+            fields[name] = np.array(rows)
+        self._env.sim.batch.set_contact_pairs(fields)

@@ -1,0 +1,77 @@
+"""A policy read back from a checkpoint: the actor and the statistics of its observations, nothing to train."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from msk_ray.config import Config, parse_config
+from msk_ray.envs import Env
+from msk_ray.errors import CheckpointError
+from msk_ray.networks import Actor, RunningMeanStd
+from msk_ray.training.checkpoint import read_checkpoint, read_manifest
+from msk_ray.training.evaluation import Policy
+
+
+@dataclass(frozen=True)
+class SavedPolicy:
+    """The deterministic policy of a checkpoint and the trial it comes from."""
+
+    path: Path
+    config: Config
+    epoch: int
+    env_steps: int
+    sha256: str
+    """Of the checkpoint's file."""
+    modules: dict[str, Any]
+    """State of the actor and, if observations are normalised, of the normalizer."""
+
+    def on(self, env: Env[Any]) -> Policy:
+        """The policy on an environment's device: raw observations (W, O) to actions (W, A).
+
+        Raises:
+            CheckpointError: it was trained on other observations or actions.
+        """
+        actor = Actor(self.config.actor, env.obs_size, env.action_size, torch.Generator()).to(env.device)
+        normalizer = RunningMeanStd((env.obs_size,)).to(env.device) if self.config.shac.normalize_obs else None
+        try:
+            actor.load_state_dict(self.modules["actor"])
+            if normalizer is not None:
+                normalizer.load_state_dict(self.modules["normalizer"])
+        except (KeyError, RuntimeError) as error:
+            what = str(error).splitlines()[-1].strip()
+            raise CheckpointError(
+                f"{self.path} does not fit env {self.config.env.name} as it is now ({what}): use the commit it was "
+                "written with"
+            ) from error
+
+        @torch.no_grad()
+        def policy(obs: Tensor) -> Tensor:
+            action: Tensor = actor(obs if normalizer is None else normalizer.normalize(obs))
+            return action
+
+        return policy
+
+
+def load_policy(path: Path) -> SavedPolicy:
+    """Read the policy in a checkpoint, on CPU.
+
+    Raises:
+        CheckpointError: the checkpoint is missing, torn, of another format, or holds no policy.
+        ConfigError: its settings are not known to this version.
+    """
+    state = read_checkpoint(path)
+    try:
+        config, epoch, env_steps, modules = (
+            state["config"],
+            state["epoch"],
+            state["env_steps"],
+            state["shac"]["modules"],
+        )
+    except (KeyError, TypeError) as error:
+        raise CheckpointError(f"{path} holds no policy: {error} is missing") from error
+    return SavedPolicy(
+        path, parse_config(config, f"{path}: its settings"), epoch, env_steps, read_manifest(path)["sha256"], modules
+    )

@@ -1,0 +1,221 @@
+"""`python -m msk_ray.visualize`: watch a policy."""
+
+import argparse
+import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from msk_ray.cli import Parser, run
+from msk_ray.errors import CheckpointError, ConfigError
+from msk_ray.evaluate.__main__ import positive
+from msk_ray.evaluate.targets import Target, best_checkpoint, best_trial_folder, find_target, trial_folder_of
+from msk_ray.tune.listing import text_table
+
+if TYPE_CHECKING:
+    from msk_ray.evaluate.measure import Bench, Request
+    from msk_ray.visualize.episodes import Recording
+
+DESCRIPTION = """\
+Watch a policy: in MuJoCo's viewer where there is a display, or as video, frames, film strip or statistics without one.
+
+Episodes are those of the evaluation: without noise, from fixed initial states, under reference physics unless
+--physics says otherwise. Contact forces are drawn as arrows (as long as the model for its whole weight), muscles from
+blue (relaxed) to red (active). Of a trial its best policy is shown, of an experiment that of its best trial."""
+
+EXAMPLES = """\
+  python -m msk_ray.visualize runs/demo                                  # the viewer
+  python -m msk_ray.visualize runs/demo --no-render --episodes 10        # statistics, no pictures
+  python -m msk_ray.visualize runs/demo/trials/1a2b3c4d --video out.mp4 --fps 30
+  python -m msk_ray.visualize runs/demo --strip out.png --frames 8
+  python -m msk_ray.visualize runs/demo --save-frames frames/
+  python -m msk_ray.visualize --progression runs/demo --strip out.png    # policies over training × time
+
+Without a display, EGL or OSMesa draws, whichever works; MUJOCO_GL=egl or osmesa asks for one of them."""
+
+PROGRESSION_FRAMES = 6
+
+
+def parser() -> Parser:
+    """The command line."""
+    p = Parser("python -m msk_ray.visualize", DESCRIPTION, EXAMPLES)
+    p.add_argument("target", nargs="?", metavar="CHECKPOINT|TRIAL|EXPERIMENT", help="what to watch")
+    what = p.add_argument_group("instead of the viewer")
+    what.add_argument("--no-render", action="store_true", help="statistics of the episodes, no pictures")
+    what.add_argument("--video", type=Path, metavar="FILE", help="an .mp4")
+    what.add_argument("--save-frames", type=Path, metavar="DIR", help="numbered .png files")
+    what.add_argument("--strip", type=Path, metavar="FILE", help="frames side by side, at equal times over an episode")
+    what.add_argument(
+        "--progression",
+        metavar="EXPERIMENT|TRIAL",
+        help="a row for each policy kept along the (best) trial's way; written where --strip says, or progression.png",
+    )
+    how = p.add_argument_group("how")
+    how.add_argument(
+        "--episodes", type=positive, metavar="N", help="one by default, ten with --no-render; the viewer goes on"
+    )
+    how.add_argument(
+        "--seed", type=int, metavar="N", help="of the initial states; by default the trial's evaluation seed"
+    )
+    how.add_argument("--steps", type=positive, metavar="N", help="env steps an episode, at most")
+    how.add_argument("--physics", default="reference", metavar="NAME", help="reference, own, or a named one")
+    how.add_argument(
+        "--frames", type=positive, metavar="N", help="of a strip, by default 8; of a row of --progression 6"
+    )
+    how.add_argument("--fps", type=float, default=30.0, metavar="F", help="frames a simulated second, by default 30")
+    how.add_argument("--speed", type=float, default=1.0, metavar="X", help="of the viewer, by default 1 (real time)")
+    how.add_argument("--size", type=_size, metavar="WxH", help="of a frame, such as 640x480; both even")
+    how.add_argument("--camera", default="", metavar="NAME", help="one of the model's; by default its first")
+    how.add_argument("--tensorboard", action="store_true", help="put the strip into the trial's TensorBoard too")
+    how.add_argument("--device", help="of the simulation: cpu or cuda:N; by default the first GPU, or the CPU")
+    how.add_argument(
+        "--storage", type=Path, default=Path("runs"), metavar="DIR", help="of experiments; by default runs/"
+    )
+    return p
+
+
+def _size(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d+)x(\d+)", text)
+    if match is None or any(int(n) < 16 or int(n) % 2 for n in match.groups()):
+        raise argparse.ArgumentTypeError(f"write WIDTHxHEIGHT, both even and at least 16, such as 640x480, not {text}")
+    return int(match[1]), int(match[2])
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    args = parser().parse_args(argv)
+    target = _check(args)
+    from msk_ray.evaluate.measure import Bench, Request, default_device
+    from msk_ray.training import load_policy
+
+    seeds = None if args.seed is None else (args.seed,)
+    bench = Bench(args.device or default_device())
+    if args.progression is not None:
+        return _progression(args, target, bench, Request(args.physics, 1, seeds, args.steps))
+    policy = load_policy(best_checkpoint(target))
+    drawing = args.video or args.save_frames or args.strip
+    if not drawing and not args.no_render:
+        from msk_ray.visualize.viewer import watch
+
+        request = Request(args.physics, 1, seeds, args.steps)
+        print(f"{policy.path}, epoch {policy.epoch}; close the window to end", flush=True)
+        done = watch(bench, policy, request, args.episodes, args.speed)
+        print(f"{done} episodes")
+        return 0
+    from msk_ray.visualize.episodes import record
+
+    count = args.episodes or (10 if args.no_render else 1)
+    recording = record(bench, policy, Request(args.physics, count, seeds, args.steps))
+    print(f"{policy.path}, epoch {policy.epoch}, under {recording.physics} physics")
+    print(episode_table(recording))
+    if drawing:
+        _draw(args, recording, policy.path, policy.epoch)
+    return 0
+
+
+def _check(args: argparse.Namespace) -> Target:
+    """What the command line asks for, refused before anything slow if it cannot be done."""
+    given = args.progression if args.progression is not None else args.target
+    if given is None or (args.progression is not None and args.target is not None):
+        raise ConfigError("name one thing to watch: a checkpoint, a trial, or an experiment")
+    if args.fps <= 0.0 or args.speed <= 0.0:
+        raise ConfigError("--fps and --speed must be above 0")
+    target = find_target(given, args.storage)
+    best_checkpoint(target)
+    drawing = args.video or args.save_frames or args.strip or args.progression is not None
+    if args.no_render and drawing:
+        raise ConfigError("--no-render draws nothing: leave it out, or --video, --save-frames, --strip, --progression")
+    if args.tensorboard and not args.strip:
+        raise ConfigError("--tensorboard goes with --strip FILE")
+    if args.video is not None:
+        from msk_ray.visualize.film import check_video_path
+
+        check_video_path(args.video)
+    if drawing:
+        from msk_ray.visualize.render import headless_backend
+
+        headless_backend()
+    elif not args.no_render:
+        from msk_ray.visualize.viewer import check_display
+
+        check_display()
+    return target
+
+
+def episode_table(recording: "Recording") -> str:
+    """Statistics of the episodes for a terminal."""
+    episodes = recording.episodes
+    names = list(episodes.outcomes)
+    means = {name: episodes.outcomes[name] / episodes.length for name in names}
+    rows = [
+        (
+            str(world),
+            f"{float(episodes.score[world]):.5g}",
+            str(recording.length(world)),
+            f"{recording.length(world) * recording.timestep:.2f}",
+            *(f"{float(means[name][world]):.3g}" for name in names),
+            recording.ending(world),
+        )
+        for world in range(recording.count)
+    ]
+    if recording.count > 1:
+        columns = [episodes.score, episodes.length, episodes.length * recording.timestep, *means.values()]
+        texts = [f"{float(c.mean()):.4g} ± {float(c.std()):.2g}" for c in columns]
+        rows.append(("mean ± std", *texts, f"{float(episodes.fell.float().mean()):.0%} fell"))
+    return text_table(("episode", "score", "steps", "seconds", *names, "ended by"), rows, 160)
+
+
+def _draw(args: argparse.Namespace, recording: "Recording", checkpoint: Path, epoch: int) -> None:
+    from msk_ray.visualize.film import save_image, strip, write_frames, write_video
+    from msk_ray.visualize.render import View, frames
+    from msk_ray.visualize.strips import episode_frames
+
+    width, height = args.size or (640, 480)
+    view = View(width, height, args.camera)
+    if args.video or args.save_frames:
+        film = (
+            frame for world in range(recording.count) for frame in frames(recording.frames_at(world, args.fps), view)
+        )
+        if args.video:
+            args.video.parent.mkdir(parents=True, exist_ok=True)
+            print(f"{write_video(film, args.video, args.fps)} frames in {args.video}")
+        if args.save_frames:
+            if args.video:
+                film = (
+                    frame
+                    for world in range(recording.count)
+                    for frame in frames(recording.frames_at(world, args.fps), view)
+                )
+            print(f"{write_frames(film, args.save_frames)} frames in {args.save_frames}/")
+    if args.strip:
+        width, height = args.size or (320, 240)
+        image = strip(*episode_frames(recording, args.frames or 8, View(width, height, args.camera)))
+        save_image(image, args.strip)
+        print(f"strip of {args.frames or 8} frames in {args.strip}")
+        if args.tensorboard:
+            from msk_ray.visualize.strips import log_strip
+
+            print(f"TensorBoard: {log_strip(image, trial_folder_of(checkpoint), epoch)}")
+
+
+def _progression(args: argparse.Namespace, target: Target, bench: "Bench", request: "Request") -> int:
+    from msk_ray.visualize.film import save_image
+    from msk_ray.visualize.render import View
+    from msk_ray.visualize.strips import progression
+
+    folder = best_trial_folder(target)
+    width, height = args.size or (240, 180)
+    out = args.strip or Path("progression.png")
+    view = View(width, height, args.camera)
+    image, rows = progression(bench, folder, request, args.frames or PROGRESSION_FRAMES, view)
+    if image is None:
+        raise CheckpointError(f"{folder / 'checkpoints'} keeps no policies along the way (policy_*.pt)")
+    save_image(image, out)
+    print("\n".join(rows))
+    print(f"{len(rows)} policies of {folder} in {out}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(run(main))

@@ -1,0 +1,81 @@
+"""Episodes of a policy with every state kept, for drawing and for statistics."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from msk_ray.evaluate.measure import Bench, Request
+from msk_ray.simulation import StepState
+from msk_ray.training import SavedPolicy
+from msk_ray.training.evaluation import Episodes
+from msk_ray.visualize.render import States
+
+
+@dataclass(frozen=True)
+class Recording:
+    """W episodes of one policy, from fixed initial states, without noise."""
+
+    episodes: Episodes
+    physics: str
+    timestep: float
+    """Duration of an env step [s]."""
+    model: Any
+    states: StepState
+    """Shapes (T + 1, W, ·), on the CPU."""
+    actions: Tensor
+    """Shape (T + 1, W, A); the last one is that of the step before."""
+
+    @property
+    def count(self) -> int:
+        """Episodes W."""
+        return len(self.episodes.score)
+
+    def length(self, world: int) -> int:
+        """Env steps of an episode."""
+        return int(self.episodes.length[world])
+
+    def world(self, world: int) -> States:
+        """The states of one episode, from its first to the one it ended in."""
+        steps = slice(0, self.length(world) + 1)
+        qpos, qvel, act, ctrl = (t[steps, world].double().numpy() for t in (*self.states, self.actions))
+        return States(self.model, qpos, qvel, act, ctrl)
+
+    def frames_at(self, world: int, fps: float) -> States:
+        """One episode's states at so many a second of simulated time."""
+        count = int(self.length(world) * self.timestep * fps) + 1
+        return self.world(world).at(np.round(np.arange(count) / (fps * self.timestep)).astype(int))
+
+    def ending(self, world: int) -> str:
+        """`fell`, `diverged`, or `time` for an episode that lasted to its limit."""
+        if bool(self.episodes.diverged[world]):
+            return "diverged"
+        return "fell" if bool(self.episodes.fell[world]) else "time"
+
+
+def record(bench: Bench, policy: SavedPolicy, request: Request) -> Recording:
+    """Run `request.worlds` episodes from the first of the request's seeds and keep every state.
+
+    Raises:
+        MskRayError: as `Bench.evaluator`, or the checkpoint does not fit its environment.
+    """
+    evaluator, physics = bench.evaluator(policy.config, request)
+    states: list[StepState] = []
+    actions: list[Tensor] = []
+
+    def keep(state: StepState, action: Tensor) -> None:
+        states.append(StepState(*(t.cpu() for t in state)))
+        actions.append(action.cpu())
+
+    seed = request.seeds[0] if request.seeds else None
+    episodes = evaluator.episodes(policy.on(evaluator.env), seed, keep)
+    return Recording(
+        episodes.cpu(),
+        physics,
+        policy.config.env.control_timestep,
+        evaluator.env.model,
+        StepState(*(torch.stack(parts) for parts in zip(*states, strict=True))),
+        torch.stack(actions),
+    )

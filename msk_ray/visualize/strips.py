@@ -1,0 +1,90 @@
+"""Film strips of episodes, and grids of them over training."""
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from msk_ray.errors import CheckpointError
+from msk_ray.evaluate.measure import Bench, Request
+from msk_ray.evaluate.targets import BEST
+from msk_ray.training import load_policy
+from msk_ray.training.checkpoint import milestones
+from msk_ray.training.metrics import log_image
+from msk_ray.visualize.episodes import Recording, record
+from msk_ray.visualize.film import grid
+from msk_ray.visualize.render import View, frames
+
+STRIP_FOLDER = "film"
+"""In a trial's folder, with events of its own: TensorBoard reads one file of a folder after the other, and would no
+longer follow the trial's."""
+
+
+def episode_frames(recording: Recording, count: int, view: View, world: int = 0) -> tuple[list[np.ndarray], list[str]]:
+    """`count` frames of one episode at equal times, from its first state to its last, and their times as text.
+
+    Raises:
+        DeviceError: no OpenGL platform works here.
+    """
+    states = recording.world(world)
+    indices = _spread(len(states), count)
+    return list(frames(states.at(indices), view)), _times(indices, recording)
+
+
+def progression(
+    bench: Bench, trial: Path, request: Request, count: int, view: View
+) -> tuple[Image.Image | None, list[str]]:
+    """A row of `count` frames for each policy kept along a trial's way, and for its best.
+
+    All rows show the same times, those of the longest episode; a row ends where its episode did.
+
+    Returns:
+        The picture, or None if the trial keeps no policies, and each row's title.
+
+    Raises:
+        CheckpointError: a policy is torn. DeviceError: no OpenGL platform works here.
+    """
+    folder = trial / "checkpoints"
+    paths = [path for _, path in milestones(folder)]
+    if not paths:
+        return None, []
+    best = folder / BEST
+    policies = [load_policy(path) for path in paths]
+    if best.is_file():
+        policies.append(load_policy(best))
+    recordings = [record(bench, policy, request) for policy in policies]
+    indices = _spread(max(recording.length(0) for recording in recordings) + 1, count)
+    rows, captions, titles = [], [], []
+    for policy, recording in zip(policies, recordings, strict=True):
+        shown = indices[indices <= recording.length(0)]
+        rows.append(list(frames(recording.world(0).at(shown), view)))
+        captions.append(_times(shown, recording))
+        name = "best, " if policy.path == best else ""
+        ending = recording.ending(0)
+        titles.append(
+            f"{name}epoch {policy.epoch}: score {float(recording.episodes.score[0]):.4g}"
+            + (f", {ending} after {recording.length(0) * recording.timestep:.1f} s" if ending != "time" else "")
+        )
+    return grid(rows, titles, captions), titles
+
+
+def log_strip(image: Image.Image, trial: Path, epoch: int) -> Path:
+    """Put a strip into a trial's TensorBoard as `film/evaluation`, at its policy's epoch.
+
+    Raises:
+        CheckpointError: `trial` is no trial's folder.
+    """
+    if not (trial / "config.yaml").is_file():
+        raise CheckpointError(f"--tensorboard: {trial} is no trial's folder")
+    folder = trial / STRIP_FOLDER
+    log_image(folder, "film/evaluation", np.asarray(image), epoch)
+    return folder
+
+
+def _spread(length: int, count: int) -> np.ndarray:
+    """`count` indices from 0 to length - 1 at equal distances; fewer if there are not as many."""
+    return np.unique(np.round(np.linspace(0, length - 1, count)).astype(int))
+
+
+def _times(indices: np.ndarray, recording: Recording) -> list[str]:
+    return [f"{index * recording.timestep:.2f} s" for index in indices]

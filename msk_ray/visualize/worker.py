@@ -1,0 +1,81 @@
+"""The process that draws: states in from a file, raw frames out on its standard output.
+
+A process of its own, because a broken OpenGL library ends the process that tries it, and because MuJoCo settles on one
+OpenGL platform when it is first imported.
+
+    MUJOCO_GL=egl python -m msk_ray.visualize.worker --probe
+    MUJOCO_GL=egl python -m msk_ray.visualize.worker MODEL.mjb STATES.npz WIDTH HEIGHT [CAMERA]
+"""
+
+import os
+import sys
+from typing import BinaryIO
+
+import mujoco
+import numpy as np
+
+from msk_ray.visualize.look import Look, default_camera
+
+PROBE = """<mujoco><worldbody><light pos="0 0 3"/><geom type="box" size="1 1 1" rgba="1 0 0 1"/></worldbody></mujoco>"""
+
+
+def probe() -> int:
+    """Draw a box; 0 if something of it can be seen."""
+    model = mujoco.MjModel.from_xml_string(PROBE)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    with mujoco.Renderer(model, 32, 32) as renderer:
+        renderer.update_scene(data)
+        return 0 if int(np.ptp(renderer.render())) > 0 else 1
+
+
+def draw(
+    model: mujoco.MjModel, states: dict[str, np.ndarray], width: int, height: int, camera: str, out: BinaryIO
+) -> None:
+    """Write a frame (height, width, 3) of bytes for each state.
+
+    Args:
+        states: `qpos` (F, nq), `qvel` (F, nv), `act` (F, na), `ctrl` (F, nu).
+        camera: name; empty takes the default one.
+    """
+    model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
+    model.vis.global_.offheight = max(model.vis.global_.offheight, height)
+    data = mujoco.MjData(model)
+    look = Look(model)
+    option = mujoco.MjvOption()
+    look.switch_on(option)
+    view: str | mujoco.MjvCamera = camera or default_camera(model)
+    with mujoco.Renderer(model, height, width) as renderer:
+        for number in range(len(states["qpos"])):
+            for field, values in states.items():
+                getattr(data, field)[:] = values[number]
+            # Contact forces belong to the state drawn, so they are solved for anew here.
+            mujoco.mj_forward(model, data)
+            look.colour(data.act)
+            renderer.update_scene(data, view, option)
+            out.write(renderer.render().tobytes())
+            out.flush()
+
+
+def main() -> int:
+    """Entry point; returns the exit code."""
+    # Frames alone go to standard output: what libraries print there is sent to the errors.
+    frames = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    if sys.argv[1:] == ["--probe"]:
+        return probe()
+    path, states, width, height, *camera = sys.argv[1:]
+    with np.load(states) as arrays:
+        draw(
+            mujoco.MjModel.from_binary_path(path),
+            {name: arrays[name] for name in arrays.files},
+            int(width),
+            int(height),
+            camera[0] if camera else "",
+            frames,
+        )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

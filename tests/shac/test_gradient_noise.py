@@ -1,0 +1,38 @@
+import torch
+
+from msk_ray.shac.gradient_noise import HalvesWatch
+
+
+def network() -> torch.nn.Sequential:
+    torch.manual_seed(0)
+    return torch.nn.Sequential(torch.nn.Linear(3, 5), torch.nn.Tanh(), torch.nn.Linear(5, 2))
+
+
+def test_the_cosine_is_that_of_two_separate_backward_passes() -> None:
+    net = network()
+    steps = [torch.randn(8, 3) for _ in range(4)]
+
+    def loss_of(worlds: slice) -> torch.Tensor:
+        return sum((net(x)[worlds].sin().sum() for x in steps), torch.zeros(()))
+
+    weights = [net[0].weight, net[2].weight]
+    halves = [
+        torch.cat([g.flatten() for g in torch.autograd.grad(loss_of(w), weights)]) for w in (slice(0, 4), slice(4, 8))
+    ]
+    expected = torch.nn.functional.cosine_similarity(*halves, dim=0)
+
+    watch = HalvesWatch(net)
+    with watch.watching():
+        loss = loss_of(slice(0, 8))
+    loss.backward()
+    torch.testing.assert_close(watch.cosine(), expected)
+
+
+def test_equal_worlds_agree_and_opposite_ones_do_not() -> None:
+    net = network()
+    for sign, cosine in ((1.0, 1.0), (-1.0, -1.0)):
+        watch = HalvesWatch(net)
+        with watch.watching():
+            out = net(torch.ones(4, 3))
+        (out * torch.tensor([1.0, 1.0, sign, sign])[:, None]).sum().backward()
+        torch.testing.assert_close(watch.cosine(), torch.tensor(cosine))
