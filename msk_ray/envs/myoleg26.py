@@ -78,7 +78,9 @@ class MyoLeg26(LegEnv[MyoLeg26EnvConfig]):
     def draw_physics(self, count: int) -> StepState:
         noise = self.config.reset_noise
         if len(self._starts.qpos) > 1 and self.config.stochastic_reset:
-            pick = torch.randint(len(self._starts.qpos), (count,), generator=self.generator, device=self.device)
+            source = self.generator.device
+            pick = torch.randint(len(self._starts.qpos), (count,), generator=self.generator, device=source)
+            pick = pick.to(self.device)
         else:
             pick = torch.zeros(count, dtype=torch.long, device=self.device)
         qpos, qvel, act = (part[pick].clone() for part in self._starts)
