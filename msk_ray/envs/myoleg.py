@@ -88,7 +88,7 @@ class MyoLeg(LegEnv[MyoLegEnvConfig]):
         place = q[:, :3] @ self._axes.T
         return Root(
             height=q[:, 2] - self._ground,
-            up=up[:, 2],
+            up=up,
             heading=forward[:, 0],
             place=place[:, :2],
             pose=torch.cat((place[:, 1:2], forward, up), dim=-1),

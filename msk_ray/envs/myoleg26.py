@@ -103,11 +103,11 @@ class MyoLeg26(LegEnv[MyoLeg26EnvConfig]):
         sin_tilt, cos_tilt = torch.sin(tilt), torch.cos(tilt)
         sin_lean, cos_lean = torch.sin(lean), torch.cos(lean)
         # R = Rz(tilt) Rx(list) Ry(rotation) in axes x forward, y up, z right.
-        up = cos_tilt * cos_lean
+        up = torch.stack((-sin_tilt * cos_lean, -sin_lean, cos_tilt * cos_lean), dim=-1)
         heading = cos_tilt * torch.cos(turn) - sin_tilt * sin_lean * torch.sin(turn)
         # ω = ẑ tilt' + Rz x̂ list' + Rz Rx ŷ rotation', in the same axes; the world's are x, -z, y.
         spin_x = cos_tilt * v[:, 4] - sin_tilt * cos_lean * v[:, 5]
-        spin_y = sin_tilt * v[:, 4] + up * v[:, 5]
+        spin_y = sin_tilt * v[:, 4] + up[:, 2] * v[:, 5]
         spin_z = v[:, 3] + sin_lean * v[:, 5]
         return Root(
             height=q[:, 1] - self.ground_height(q[:, 0]),
