@@ -133,7 +133,7 @@ class LegEnvSettings(EnvSettings):
     """Speed error at which the term above has fallen to 1/e [m/s]."""
     progress: float = 0.0
     """Weight of the forward speed, up to target_speed [s/m]: a slope where the term above is flat."""
-    upright: float = 0.5
+    upright: float = 2.0
     """Weight of the cosine between the trunk's up axis and +z."""
     heading: float = 0.2
     """Weight of the cosine between the pelvis's forward axis and +x."""
@@ -148,8 +148,9 @@ class LegEnvSettings(EnvSettings):
     smoothness: NonNegative = 0.02
     """Weight of the mean squared change of the action."""
     capture: NonNegative = 5.0
-    """Weight of the squared distance of the pelvis's capture point from its line, and from its start if it is asked to
-    stand [1/m²]. The capture point is where it would come to rest as a pendulum: place + velocity / √(g / height)."""
+    """Weight of the squared distance of the capture point from the line walked on, and from the start if asked to stand
+    [1/m²]. That is where the body would come to rest as a pendulum, x + v / √(g / height), with x and v of its centre
+    of mass taken from pelvis and lean of the trunk."""
     sway: NonNegative = 0.02
     """Weight of the squared angular velocity of the pelvis [s²/rad²]."""
     symmetry: NonNegative = 0.0

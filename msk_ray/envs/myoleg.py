@@ -9,7 +9,7 @@ from torch import Tensor
 
 from msk_ray.config import MyoLegEnvConfig, PhysicsConfig
 from msk_ray.envs.legs import LegEnv, Root
-from msk_ray.envs.models.myoleg import Couplings, build_myoleg, find_model
+from msk_ray.envs.models.myoleg import Couplings, build_myoleg, find_model, ground_height
 from msk_ray.simulation import StepState
 from msk_ray.simulation.tangent import quat_rotate
 
@@ -40,7 +40,8 @@ class MyoLeg(LegEnv[MyoLegEnvConfig]):
             if model.jnt_type[j] == hinge and model.jnt_limited[j] and j not in couplings.joints
         ]
         stand = model.key("stand").qpos
-        self.stand_height = float(stand[2])
+        self._ground = ground_height(model)
+        self.stand_height = float(stand[2]) - self._ground
         axes = world_axes(model)
         start = np.zeros(9)
         mujoco.mju_quat2Mat(start, stand[3:7])
@@ -86,8 +87,8 @@ class MyoLeg(LegEnv[MyoLegEnvConfig]):
         spin = quat_rotate(orientation, v[:, 3:6]) @ self._axes.T  # MuJoCo's is in the body frame
         place = q[:, :3] @ self._axes.T
         return Root(
-            height=q[:, 2],
-            up=up[:, 2],
+            height=q[:, 2] - self._ground,
+            up=up,
             heading=forward[:, 0],
             place=place[:, :2],
             pose=torch.cat((place[:, 1:2], forward, up), dim=-1),

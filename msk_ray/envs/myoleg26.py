@@ -78,7 +78,9 @@ class MyoLeg26(LegEnv[MyoLeg26EnvConfig]):
     def draw_physics(self, count: int) -> StepState:
         noise = self.config.reset_noise
         if len(self._starts.qpos) > 1 and self.config.stochastic_reset:
-            pick = torch.randint(len(self._starts.qpos), (count,), generator=self.generator, device=self.device)
+            source = self.generator.device
+            pick = torch.randint(len(self._starts.qpos), (count,), generator=self.generator, device=source)
+            pick = pick.to(self.device)
         else:
             pick = torch.zeros(count, dtype=torch.long, device=self.device)
         qpos, qvel, act = (part[pick].clone() for part in self._starts)
@@ -101,11 +103,11 @@ class MyoLeg26(LegEnv[MyoLeg26EnvConfig]):
         sin_tilt, cos_tilt = torch.sin(tilt), torch.cos(tilt)
         sin_lean, cos_lean = torch.sin(lean), torch.cos(lean)
         # R = Rz(tilt) Rx(list) Ry(rotation) in axes x forward, y up, z right.
-        up = cos_tilt * cos_lean
+        up = torch.stack((-sin_tilt * cos_lean, -sin_lean, cos_tilt * cos_lean), dim=-1)
         heading = cos_tilt * torch.cos(turn) - sin_tilt * sin_lean * torch.sin(turn)
         # ω = ẑ tilt' + Rz x̂ list' + Rz Rx ŷ rotation', in the same axes; the world's are x, -z, y.
         spin_x = cos_tilt * v[:, 4] - sin_tilt * cos_lean * v[:, 5]
-        spin_y = sin_tilt * v[:, 4] + up * v[:, 5]
+        spin_y = sin_tilt * v[:, 4] + up[:, 2] * v[:, 5]
         spin_z = v[:, 3] + sin_lean * v[:, 5]
         return Root(
             height=q[:, 1] - self.ground_height(q[:, 0]),

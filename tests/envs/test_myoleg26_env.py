@@ -63,7 +63,7 @@ def test_up_heading_and_spin_agree_with_the_body_in_c_mujoco(env: MyoLeg26) -> N
     velocity = np.zeros(6)
     mujoco.mj_objectVelocity(env.model, data, mujoco.mjtObj.mjOBJ_BODY, env.model.body("pelvis").id, velocity, 0)
     root = env.root(state)
-    assert root.up[0].item() == pytest.approx(axes[2, 1], abs=1e-6)
+    assert root.up[0].tolist() == pytest.approx(axes[:, 1].tolist(), abs=1e-6)
     assert root.heading[0].item() == pytest.approx(axes[0, 0], abs=1e-6)
     assert root.velocity[0].tolist() == pytest.approx(state.qvel[0, [0, 2, 1]].mul(torch.tensor([1, -1, 1])).tolist())
     assert root.spin[0].tolist() == pytest.approx(velocity[:3].tolist(), abs=1e-5)
@@ -144,10 +144,11 @@ def test_reward_by_hand(env: MyoLeg26) -> None:
         found = terms(env, state, torch.full((2, 26), 0.5))
     finally:
         env.config = config
-    lateral = 0.5 * math.sqrt(env.stand_height / 9.81)
+    # 0.5 m/s to the right, and a trunk that turns rightward by 2 rad/s
+    lateral = (0.5 + 0.18 * 2.0) * math.sqrt(env.stand_height / 9.81)
     assert found == pytest.approx(
         {
-            "forward_vel": math.exp(-((1.25 / 0.6) ** 2)), "progress": 0.0, "upright": 0.5, "heading": 0.2,
+            "forward_vel": math.exp(-((1.25 / 0.6) ** 2)), "progress": 0.0, "upright": 2.0, "heading": 0.2,
             "height": -5.0 * 0.01, "alive": 0.5, "effort": -0.2 * 0.25,
             "joint_limit": -0.1 * 1.5**2, "smoothness": -0.02 * 0.25, "capture": -5.0 * lateral**2, "sway": -0.02 * 4.0,
             "symmetry": -0.1 * 9.0,

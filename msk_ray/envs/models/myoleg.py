@@ -128,8 +128,8 @@ def _myo_sim(name: str) -> Source | None:
 def build_myoleg(env: MyoLegEnvConfig, physics: PhysicsConfig) -> mujoco.MjModel:
     """Compile the model found, with this trial's solver settings and, as keyframe `stand`, its standing pose.
 
-    Changed are the smoothing of every muscle's activation, and height fields, which are switched off: all of these
-    models have a plane under them.
+    Changed are the smoothing of every muscle's activation and, in the packages' models, what is touched: scenery but
+    for its plane (height fields, a pedestal), and pairs of meshes, have no exact gradient and are switched off.
 
     Raises:
         ConfigError: as `find_model`, or the model has no free root joint or no `hip_flexion_r`.
@@ -142,17 +142,42 @@ def build_myoleg(env: MyoLegEnvConfig, physics: PhysicsConfig) -> mujoco.MjModel
     for actuator in spec.actuators:
         if actuator.dyntype == mujoco.mjtDyn.mjDYN_MUSCLE:
             actuator.dynprm[2] = SMOOTHING
-    for geom in spec.geoms:
-        if geom.type == mujoco.mjtGeom.mjGEOM_HFIELD:
-            geom.contype = geom.conaffinity = 0
+    if source.package != "file":
+        _keep_plane_contacts(spec)
     for key in list(spec.keys):
         spec.delete(key)
+    spec.nkey = 0  # a size asked for in the file would add nameless keys before ours
     model = spec.compile()
     joints = {model.joint(j).name for j in range(model.njnt)}
     if not joints >= {"hip_flexion_r", "hip_flexion_l"} or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
         raise ConfigError(f"env.model: {source.name} has no free joint first, or no joints hip_flexion_r and _l")
     spec.add_key(name="stand", qpos=standing_pose(model))
     return spec.compile()
+
+
+def _keep_plane_contacts(spec: mujoco.MjSpec) -> None:
+    for geom in spec.worldbody.geoms:
+        if geom.type != mujoco.mjtGeom.mjGEOM_PLANE:
+            geom.contype = geom.conaffinity = 0
+    meshes = [geom for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_MESH]
+    for geom in meshes:
+        geom.conaffinity = 0  # its contype still meets the plane's conaffinity
+    names = {geom.name for geom in meshes}
+    for pair in list(spec.pairs):
+        if {pair.geomname1, pair.geomname2} <= names:
+            spec.delete(pair)
+
+
+def ground_height(model: mujoco.MjModel) -> float:
+    """Height of the world's highest plane [m].
+
+    Raises:
+        ConfigError: it has none.
+    """
+    planes = (model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)) & (model.geom_bodyid == 0)
+    if not planes.any():
+        raise ConfigError("env.model: there is no ground plane; add one to the model's worldbody")
+    return float(model.geom_pos[planes, 2].max())
 
 
 class Couplings:
@@ -198,7 +223,8 @@ def standing_pose(model: mujoco.MjModel) -> NDArray[np.float64]:
         data.qpos[:] = pose
         data.qpos[2] = height
         mujoco.mj_fwdPosition(model, data)
-        return bool(data.ncon and data.contact.dist.min() < -_SINKING)
+        on_ground = np.any(model.geom_bodyid[data.contact.geom] == 0, axis=1)
+        return bool(data.contact.dist[on_ground].min(initial=0.0) < -_SINKING)
 
     above, below = float(pose[2]) + 1.0, float(pose[2]) - 1.0
     if touches(above) or not touches(below):
