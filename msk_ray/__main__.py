@@ -11,6 +11,7 @@ COMMANDS = {
     "tune": ("msk_ray.tune.__main__", "run a search space as a Ray Tune experiment"),
     "evaluate": ("msk_ray.evaluate.__main__", "evaluate policies: fixed seeds, no noise, every reward term"),
     "visualize": ("msk_ray.visualize.__main__", "watch a policy: viewer, video, frames, film strip"),
+    "gait": ("msk_ray.gait.__main__", "measure how a leg policy walks, beside people"),
     "report": ("msk_ray.report.__main__", "write an experiment's report: curves, tables, the best policy"),
     "status": ("msk_ray.status", "show where experiments stand, from their files"),
     "doctor": ("msk_ray.doctor", "check that this machine can run trials, and say what to mend"),

@@ -9,7 +9,7 @@ from typing import Annotated, Any, get_args, get_origin
 import yaml
 from pydantic import BaseModel, Tag, ValidationError
 
-from msk_ray.config.schema import Config
+from msk_ray.config.schema import VARIANTS, Config
 from msk_ray.errors import ConfigError
 
 
@@ -143,14 +143,14 @@ def describe_fault(error: ValidationError, root: type[BaseModel] = Config) -> st
     elif first["type"] == "missing":
         text = f"{where}: missing"
     elif first["type"].startswith("union_tag"):
-        text = f"{where or 'env'}: {first['msg']}; write env.name: cartpole or ant"
+        text = f"{where or 'env'}: {first['msg']}; write env.name: {' or '.join(VARIANTS)}"
     else:
         text = f"{where}: {first['msg']}, not {first['input']!r}"
     more = len(faults) - 1
     return text + (f" (and {more} more fault{'s' if more > 1 else ''})" if more else "")
 
 
-_TAGS = ("cartpole", "ant", "constant", "schedule", "adaptive")
+_TAGS = (*VARIANTS, "constant", "schedule", "adaptive")
 """Tags of discriminated unions, which pydantic puts into a fault's location."""
 
 

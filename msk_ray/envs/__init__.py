@@ -6,12 +6,14 @@ from msk_ray.config import EnvConfig, PhysicsConfig
 from msk_ray.envs.ant import Ant
 from msk_ray.envs.base import Env, EnvState, Transition
 from msk_ray.envs.cartpole import CartPole
+from msk_ray.envs.myoleg import MyoLeg
+from msk_ray.envs.myoleg26 import MyoLeg26
 from msk_ray.simulation.modes import configured_backward
 
-__all__ = ["Ant", "CartPole", "Env", "EnvState", "Transition", "env_class", "make_env"]
+__all__ = ["Ant", "CartPole", "Env", "EnvState", "MyoLeg", "MyoLeg26", "Transition", "env_class", "make_env"]
 
 
-_ENVS: dict[str, type[Env[Any]]] = {"cartpole": CartPole, "ant": Ant}
+_ENVS: dict[str, type[Env[Any]]] = {"cartpole": CartPole, "ant": Ant, "myoleg26": MyoLeg26, "myoleg": MyoLeg}
 
 
 def env_class(config: EnvConfig) -> type[Env[Any]]:

@@ -120,6 +120,13 @@ class Env(ABC, Generic[Settings]):
     def prepare(self) -> None:
         """Put constants on the device: copying one there in every step would make the host wait for the GPU."""
 
+    def begin_epoch(self, epoch: int) -> None:
+        """Called before each training epoch, counted from 0: what changes with training changes here."""
+
+    def control(self, action: Tensor) -> Tensor:
+        """Controls (W, nu) of the model for actions (W, A) in the current state."""
+        return action
+
     @abstractmethod
     def draw_physics(self, count: int) -> StepState:
         """`count` initial physical states, drawn with `uniform`."""
@@ -168,7 +175,7 @@ class Env(ABC, Generic[Settings]):
         here returned, gets no reward for the step, and counts as terminated.
         """
         before = self.state.physics
-        after = self.sim.step(action, *before)
+        after = self.sim.step(self.control(action), *before)
         diverged = ~self._sound(after)
         # `where` sends no cotangent into a diverged world's step, so its gradient cannot reach the batch.
         after = StepState(*(torch.where(diverged[:, None], b.detach(), a) for b, a in zip(before, after, strict=True)))

@@ -32,13 +32,22 @@ class ChainComparison:
 
 
 class ChainPolicy(nn.Module):
-    """ctrl = ½ tanh(MLP(qpos, qvel)): a small feedback policy over the raw state, 8 hidden units."""
+    """ctrl = c + s tanh(MLP(qpos, qvel)): a small feedback policy over the raw state, 8 hidden units.
+
+    s is ½ about c = 0, but ¼ about ½ for a muscle, whose activation clamps its excitation to [0, 1].
+    """
+
+    centre: Tensor
+    span: Tensor
 
     def __init__(self, model: mujoco.MjModel, seed: int) -> None:
         super().__init__()
         generator = torch.Generator().manual_seed(seed)
         self.first = nn.Linear(model.nq + model.nv, 8)
         self.last = nn.Linear(8, model.nu)
+        muscle = torch.from_numpy(model.actuator_dyntype == int(mujoco.mjtDyn.mjDYN_MUSCLE))
+        self.register_buffer("centre", torch.where(muscle, 0.5, 0.0))
+        self.register_buffer("span", torch.where(muscle, 0.25, 0.5))
         for layer in (self.first, self.last):
             nn.init.normal_(layer.weight, std=layer.in_features**-0.5, generator=generator)
             nn.init.zeros_(layer.bias)
@@ -46,7 +55,7 @@ class ChainPolicy(nn.Module):
     def forward(self, qpos: Tensor, qvel: Tensor) -> Tensor:
         """Controls (W, nu)."""
         hidden = torch.tanh(self.first(torch.cat((qpos, qvel), dim=-1)))
-        return 0.5 * torch.tanh(self.last(hidden))
+        return self.centre + self.span * torch.tanh(self.last(hidden))
 
 
 def check_chain(

@@ -70,6 +70,7 @@ class Shac:
             group["lr"] = actor_lr
         self.critic_fit.set_learning_rate(critic_lr)
         clock = _Clock(self.env.device)
+        self.env.begin_epoch(epoch)
 
         # A cotangent of norm 1/(H·W) is what a reward of one in one world sends back through the mean loss.
         unit = 1.0 / (horizon * self.env.nworld)

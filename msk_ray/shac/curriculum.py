@@ -8,6 +8,7 @@ import numpy as np
 
 from msk_ray.config import ContactCurriculum
 from msk_ray.envs import Env
+from msk_ray.errors import ConfigError
 
 
 def between(start: Sequence[float], end: Sequence[float], progress: float) -> list[float]:
@@ -27,6 +28,9 @@ def between(start: Sequence[float], end: Sequence[float], progress: float) -> li
 class ContactSchedule:
     """Keeps an environment's contact pairs where the curriculum says they are.
 
+    Raises:
+        ConfigError: the model's contacts are no explicit pairs.
+
     Attributes:
         progress: 0 at the curriculum's start, 1 where the trial's own physics is reached.
     """
@@ -36,6 +40,8 @@ class ContactSchedule:
         self.progress = 0.0
         self._env = env
         model = env.model
+        if not model.npair:
+            raise ConfigError(f"curriculum: env {env.config.name} has no contact pairs to soften; leave it out")
         self._ends = {
             "solref": np.array(model.pair_solref),
             "solimp": np.array(model.pair_solimp),

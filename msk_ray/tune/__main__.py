@@ -1,6 +1,7 @@
 """`python -m msk_ray.tune`: an experiment of many trials, one GPU each, with Ray Tune."""
 
 import argparse
+import os
 import shutil
 import sys
 import time
@@ -59,7 +60,13 @@ def parser() -> Parser:
     where.add_argument("--gpus-per-trial", type=float, metavar="G", help="GPUs a trial; below 1, trials share one")
     where.add_argument("--cpu", action="store_true", help="run on CPU cores even if there are GPUs")
     where.add_argument("--max-concurrent", type=int, metavar="N", help="at most N trials at once")
-    where.add_argument("--address", metavar="HOST:PORT", help="use a running Ray cluster; 'auto' finds the local one")
+    where.add_argument(
+        "--address",
+        metavar="HOST:PORT",
+        default=os.environ.get("RAY_ADDRESS") or None,
+        help="use a running Ray cluster, by default the one RAY_ADDRESS names, instead of starting one; 'auto' finds "
+        "what `ray start` began here",
+    )
     where.add_argument("--storage", type=Path, default=Path("runs"), metavar="DIR", help="by default runs/")
     where.add_argument("--name", help="the experiment's name; by default the space's")
     where.add_argument("--resume", action="store_true", help="go on with an experiment that was interrupted")

@@ -73,6 +73,10 @@ class Live(Callback):
         # Ray pickles callbacks into its own state, which is never read back: resuming begins from the trials' folders.
         return {key: value for key, value in self.__dict__.items() if key != "_out"}
 
+    def waiting(self) -> int:
+        """How many trials have not started yet, as far as they are known."""
+        return len(self._waiting)
+
     @property
     def stopped(self) -> bool:
         """Whether a request to stop has been carried out: every trial that ran has saved itself, or time is up."""

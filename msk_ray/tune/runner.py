@@ -2,6 +2,7 @@
 
 import logging
 import os
+import socket
 import tempfile
 import time
 import warnings
@@ -14,6 +15,7 @@ from typing import Any
 import ray
 from ray import tune
 from ray.exceptions import RayTaskError
+from ray.tune import Callback
 from ray.tune.search import BasicVariantGenerator
 from ray.tune.stopper import Stopper
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
@@ -21,12 +23,14 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 import msk_ray
 from msk_ray.cli import StopRequest
 from msk_ray.config import Config, read_yaml
-from msk_ray.errors import DeviceError, MskRayError, StorageFailure, storage_failure
+from msk_ray.errors import ClusterLost, DeviceError, MskRayError, StorageFailure, storage_failure
 from msk_ray.progress import format_duration
 from msk_ray.training import Trainer, precompile
+from msk_ray.tune import standby
 from msk_ray.tune.adapters import METRIC, Population, PruningScheduler, domain, optuna_search
 from msk_ray.tune.devices import Placement
 from msk_ray.tune.experiment import Experiment
+from msk_ray.tune.gauges import StateGauge
 from msk_ray.tune.journal import JOURNAL_FILE, Journal, replay
 from msk_ray.tune.live import Live
 from msk_ray.tune.operators import Listed
@@ -34,10 +38,12 @@ from msk_ray.tune.outcomes import read_ending, write_ending
 from msk_ray.tune.pruning import make_pruner
 from msk_ray.tune.records import read_record
 from msk_ray.tune.space import Space
+from msk_ray.tune.standby import Standby, nodes_for
 from msk_ray.tune.trainable import Job, make_trainable
 from msk_ray.tune.trial_run import TrainerLike
 from msk_ray.tune.trials import Trial, base_settings, env_steps_budget
 
+_KNOCK_S = 20.0
 Precompile = Callable[[Config, str, Path], None]
 
 
@@ -54,6 +60,8 @@ class Plan:
     trainer_class: type[TrainerLike] = Trainer
     precompile: Precompile | None = precompile
     """Compiles a config's kernels on a node before trials start; None where there is nothing to compile."""
+    standby: bool = True
+    """Whether processes are kept ready for the trials that come next."""
 
 
 @contextmanager
@@ -74,19 +82,27 @@ def ray_session(address: str | None, dashboard: bool | None = None) -> Iterator[
         TUNE_DISABLE_SIGINT_HANDLER="1",  # a request to stop lets trials save themselves first
     )
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    quiet: dict[str, Any] = {"logging_level": "ERROR", "log_to_driver": False}
+    common: dict[str, Any] = {
+        "logging_level": "ERROR",
+        "log_to_driver": False,
+        "runtime_env": {"worker_process_setup_hook": standby.HOOK},
+    }
     if address is None:
         # Workers must import the package this process runs, wherever it was started from.
         package = str(Path(msk_ray.__file__).resolve().parent.parent)
         paths = [package, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
         os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys(paths))
         # None starts the dashboard where its packages (ray[default]) are installed, and does without elsewhere.
-        context = ray.init(include_dashboard=dashboard, dashboard_host="127.0.0.1", **quiet)
+        # By default Ray would join whatever cluster a `ray start` on this machine once left a note of.
+        context = ray.init("local", include_dashboard=dashboard, dashboard_host="127.0.0.1", **common)
     else:
         try:
-            context = ray.init(address=address, **quiet)
-        except ConnectionError as error:
-            raise DeviceError(f"--address {address}: no Ray cluster there: {str(error).splitlines()[0]}") from error
+            _knock(address)
+            context = ray.init(address=address, **common)
+        except OSError as error:  # ConnectionError too
+            raise DeviceError(
+                f"no Ray cluster at {address} (--address or RAY_ADDRESS): {str(error).splitlines()[0]}"
+            ) from error
     try:
         if context.dashboard_url:
             print(f"Ray dashboard: http://{context.dashboard_url}", flush=True)
@@ -95,6 +111,17 @@ def ray_session(address: str | None, dashboard: bool | None = None) -> Iterator[
         yield
     finally:
         ray.shutdown()
+
+
+def _knock(address: str) -> None:
+    """See whether anybody listens at HOST:PORT: Ray itself would try for minutes.
+
+    Raises:
+        OSError: nobody does.
+    """
+    host, _, port = address.rpartition(":")
+    if "://" not in address and port.isdigit():
+        socket.create_connection((host, int(port)), timeout=_KNOCK_S).close()
 
 
 def cluster_gpus() -> int:
@@ -176,6 +203,8 @@ def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial]) -> None:
         )
     resources = {"cpu": plan.placement.cpus} | ({"gpu": plan.placement.gpus} if plan.placement.gpus else {})
     searching = file.search == "optuna"
+    node = _OwnNode()
+    spare = [Standby(plan.placement, plan.max_concurrent, live.waiting)] if plan.standby else []
     tuner = tune.Tuner(
         tune.with_resources(make_trainable(job), resources),
         param_space=_param_space(job, remaining),
@@ -183,7 +212,10 @@ def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial]) -> None:
             metric=METRIC,
             mode="max",
             scheduler=scheduler,
-            search_alg=optuna_search(file.sample_seed) if searching else BasicVariantGenerator(),
+            search_alg=optuna_search(file.sample_seed)
+            if searching
+            # Tune limits a generator it was given no more than this one limits itself.
+            else BasicVariantGenerator(max_concurrent=plan.max_concurrent or 0),
             num_samples=file.samples if searching else 1,
             max_concurrent_trials=plan.max_concurrent,
             reuse_actors=False,  # a process of its own frees a trial's GPU memory, whatever it did
@@ -193,7 +225,8 @@ def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial]) -> None:
             name="tune",
             storage_path=str(plan.experiment.path),
             verbose=0,
-            callbacks=[live],
+            # Live first: it writes the endings that only the driver knows.
+            callbacks=[live, StateGauge(plan.experiment, remaining, job.trial_of), node, *spare],
             stop=_StopWhen(live),
             failure_config=tune.FailureConfig(max_failures=file.resources.max_failures),
             # None are deleted: only a population reports them, and another member may be about to take one over.
@@ -204,6 +237,8 @@ def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial]) -> None:
         with _log_to(plan.experiment.path / "ray.log"):
             tuner.fit()
     except Exception as error:
+        if node.lost is not None:
+            raise node.lost from error
         # The driver may meet a full disk before any trial does.
         failure = live.storage_failure or storage_failure(error)
         if failure is None:
@@ -211,6 +246,25 @@ def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial]) -> None:
         raise _advised(failure) from error
     if live.storage_failure is not None:
         raise _advised(live.storage_failure)
+
+
+class _OwnNode(Callback):
+    """Ends the experiment when this process's own Ray node has died: Ray itself waits for ever for another one."""
+
+    INTERVAL_S = 2.0
+
+    def __init__(self) -> None:
+        self._id = ray.get_runtime_context().get_node_id()
+        self._checked = time.monotonic()
+        self.lost: ClusterLost | None = None
+
+    def on_step_end(self, iteration: int, trials: list[Any], **info: Any) -> None:
+        if time.monotonic() - self._checked < self.INTERVAL_S:
+            return
+        self._checked = time.monotonic()
+        if any(node["NodeID"] == self._id and not node["Alive"] for node in ray.nodes()):
+            self.lost = ClusterLost("the Ray node of this machine has died (raylet killed?); go on with --resume")
+            raise self.lost
 
 
 def _advised(failure: StorageFailure) -> StorageFailure:
@@ -304,7 +358,7 @@ def _precompile(plan: Plan, trials: Sequence[Trial]) -> None:
     for trial in trials:
         c = trial.config
         models.setdefault(repr((c.env.name, c.physics, c.evaluation.variant)), trial)
-    nodes = [node for node in ray.nodes() if node["Alive"] and _fits(node["Resources"], plan.placement)]
+    nodes = nodes_for(plan.placement)
     started = time.monotonic()
     print(f"compiling kernels of {len(models)} model(s) on {len(nodes)} node(s) ...", flush=True)
     compile_model = plan.precompile
@@ -331,7 +385,3 @@ def _precompile(plan: Plan, trials: Sequence[Trial]) -> None:
             raise error.cause from None
         raise
     print(f"kernels ready after {format_duration(time.monotonic() - started)}", flush=True)
-
-
-def _fits(resources: dict[str, float], placement: Placement) -> bool:
-    return resources.get("CPU", 0.0) >= placement.cpus and resources.get("GPU", 0.0) >= placement.gpus

@@ -7,6 +7,7 @@ import platform
 import shutil
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -14,12 +15,12 @@ from pathlib import Path
 from typing import Any
 
 from ray import tune
-from ray.util.metrics import Gauge
 
 from msk_ray.config import parse_config
 from msk_ray.errors import storage_failure
 from msk_ray.tune.adapters import METRIC
 from msk_ray.tune.experiment import Experiment
+from msk_ray.tune.gauges import TrialGauges
 from msk_ray.tune.hparams import log_hparams
 from msk_ray.tune.operators import Listed, describe
 from msk_ray.tune.outcomes import write_text
@@ -28,15 +29,6 @@ from msk_ray.tune.space import Space
 from msk_ray.tune.stopping import Evaluation
 from msk_ray.tune.trial_run import HANG_FILE, Hooks, TrainerLike, run_trial
 from msk_ray.tune.trials import Trial, make_trial, overlay
-
-_GAUGES = {
-    "score": "eval/score",
-    "best_score": "eval/best_score",
-    "epoch": "epoch",
-    "env_steps_per_s": "env_steps_per_s",
-    "episode_return": "train/episode_return",
-}
-"""Gauge name → metric; the dashboard's metrics port serves them as `ray_msk_ray_<name>`."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +91,7 @@ def make_trainable(job: Job) -> Callable[[dict[str, Any]], None]:
         _limit_threads(job.threads)
         _record_device(folder / "device.json")
         log_hparams(folder, trial)
-        gauges = _Gauges(job.experiment.name, trial)
+        gauges = TrialGauges(job.experiment.name, trial)
         with tempfile.TemporaryDirectory() as scratch, _watchdog(folder, job.space.file.resources.hang_s) as alive:
 
             def on_epoch(row: Mapping[str, float]) -> None:
@@ -220,27 +212,9 @@ def _record_device(path: Path) -> None:
     facts = {
         "host": platform.node(),
         "pid": os.getpid(),
+        "began": time.time(),
         "visible": os.environ.get("CUDA_VISIBLE_DEVICES", ""),
         "count": torch.cuda.device_count() if cuda else 0,
         "name": torch.cuda.get_device_name(0) if cuda else "cpu",
     }
     write_text(path, json.dumps(facts) + "\n")
-
-
-class _Gauges:
-    """The trial's newest figures as gauges on Ray's metrics port."""
-
-    def __init__(self, experiment: str, trial: Trial) -> None:
-        # Ray takes no other characters in tags.
-        variant = trial.variant.replace("→", "->").encode("ascii", "backslashreplace").decode()
-        tags = {"experiment": experiment, "trial": trial.id, "variant": variant, "seed": str(trial.seed)}
-        self._gauges = {}
-        for name, metric in _GAUGES.items():
-            gauge = Gauge(f"msk_ray_{name}", description=metric, tag_keys=tuple(tags))
-            gauge.set_default_tags(tags)
-            self._gauges[metric] = gauge
-
-    def show(self, row: Mapping[str, float]) -> None:
-        for metric, gauge in self._gauges.items():
-            if metric in row:
-                gauge.set(row[metric])

@@ -1,5 +1,6 @@
 """Real Ray, a trainer of milliseconds: stopping, faults, pausing and resuming."""
 
+import contextlib
 import json
 import os
 import signal
@@ -17,7 +18,7 @@ from stub_trainer import BUG, FULL_DISK, HANG, KILL, MEMORY, NAN, SIMULATION_ERR
 from msk_ray.config import read_yaml
 from msk_ray.errors import StorageFailure
 from msk_ray.tune import experiment as experiments
-from msk_ray.tune import runner
+from msk_ray.tune import runner, standby
 from msk_ray.tune.devices import Placement
 from msk_ray.tune.records import TrialRecord, read_records, read_rows
 from msk_ray.tune.report import finish
@@ -39,7 +40,7 @@ def session() -> Iterator[None]:
 def go(space: Space, path: Path, resume: bool = False) -> tuple[bool, list[TrialRecord]]:
     trials = [] if space.file.search == "optuna" else resolve_trials(space)
     experiment = experiments.reopen(path, trials) if resume else experiments.create(path, space, trials, {})
-    plan = runner.Plan(experiment, space, trials, Placement(0.0, 1), None, StubTrainer, precompile=None)
+    plan = runner.Plan(experiment, space, trials, Placement(0.0, 1), None, StubTrainer, precompile=None, standby=False)
     completed = runner.run_trials(plan)
     finish(experiment)
     return completed, read_records(experiment)
@@ -145,6 +146,63 @@ def test_optuna_trials_enter_the_manifest(make_space: Any, tmp_path: Path) -> No
     assert completed
     assert len(records) >= 2
     assert set(outcomes(records)) == {"finished"}
+
+
+def test_no_more_at_once_than_asked_for_and_the_next_process_waits(make_space: Any, tmp_path: Path) -> None:
+    go_on = tmp_path / "go_on"
+
+    class Patient(StubTrainer):
+        """Its first trial does not end before a process for the next one waits."""
+
+        def run_epoch(self) -> dict[str, float]:
+            row = super().run_epoch()
+            if self.config.trial.seed == 0 and self.finished:
+                deadline = time.monotonic() + 120
+                while not go_on.exists():
+                    assert time.monotonic() < deadline
+                    time.sleep(0.05)
+            return row
+
+    seen: set[int] = set()
+
+    def watch() -> None:
+        deadline = time.monotonic() + 100
+        # The first trial's process, the one asked for the environment of trials, and the one that waits.
+        while len(seen) < 3 and time.monotonic() < deadline:
+            seen.update(_processes_of_trials())
+            time.sleep(0.1)
+        go_on.touch()
+
+    space = make_space(parameters={}, seeds="0-1", overrides={"trial.epochs": 400})
+    path = tmp_path / "runs" / "patient"
+    trials = resolve_trials(space)
+    experiment = experiments.create(path, space, trials, {})
+    thread = threading.Thread(target=watch)
+    thread.start()
+    assert runner.run_trials(runner.Plan(experiment, space, trials, Placement(0.0, 1), 1, Patient, precompile=None))
+    thread.join()
+    first, second = sorted(read_records(experiment), key=lambda record: record.trial.seed)
+    assert outcomes([first, second]) == ["finished", "finished"]
+    began = [json.loads((record.folder / "device.json").read_text()) for record in (first, second)]
+    assert began[1]["began"] >= (first.folder / "outcome.json").stat().st_mtime
+    assert began[0]["pid"] != began[1]["pid"]
+    assert began[1]["pid"] in seen  # it was there before the trial before it had ended
+
+
+def _processes_of_trials() -> list[int]:
+    """Processes of this Ray that have the environment of trials."""
+
+    def parent(pid: int) -> int:
+        return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
+
+    found = []
+    for path in Path("/proc").glob("[0-9]*/environ"):
+        with contextlib.suppress(OSError):  # gone since it was listed
+            text = path.read_bytes()
+            pid = int(path.parent.name)
+            if b"PL_DISABLE_FORK" in text and standby.HOOK.encode() in text and parent(parent(pid)) == os.getpid():
+                found.append(pid)
+    return found
 
 
 def _terminate_when(path: Path) -> None:

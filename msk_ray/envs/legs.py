@@ -1,0 +1,218 @@
+"""What muscle-driven legs share: excitation, observation of muscles, reward, falls and outcomes.
+
+Axes: W worlds, U muscles, N hinges of the legs.
+"""
+
+import math
+from abc import abstractmethod
+from typing import Generic, NamedTuple, TypeVar
+
+import torch
+from torch import Tensor
+
+from msk_ray.config import PhysicsConfig
+from msk_ray.config.schema import CONTACT_FIELDS, LegEnvSettings
+from msk_ray.envs.base import Env
+from msk_ray.envs.muscles import MuscleCurves
+from msk_ray.simulation import StepState
+from msk_ray.simulation.tendons import Tendons
+
+LegSettings = TypeVar("LegSettings", bound=LegEnvSettings)
+
+_GRAVITY = 9.81
+_TRUNK_LEVER = 0.18
+"""How far the centre of mass moves with the trunk's up axis [m]: 34 kg of 75 kg, 0.4 m above the pelvis."""
+_LIMIT_MARGIN = 0.05
+"""Joints pay from this far inside their limits on [rad]."""
+_LIMIT_UNIT = 0.1
+_VELOCITY_SCALE = 0.1
+"""Of joint velocities in the observation [s/rad]."""
+_REWARD_FIELDS = (
+    *("forward_vel", "speed_scale", "progress", "upright", "heading", "height", "alive", "effort", "joint_limit"),
+    *("smoothness", "capture", "sway", "symmetry"),
+)
+
+
+class Root(NamedTuple):
+    """The pelvis in the world, each (W,) or (W, k), world frame: x forward, y left, z up."""
+
+    height: Tensor
+    """Above the ground [m]."""
+    up: Tensor
+    """The trunk's up axis, (W, 3)."""
+    heading: Tensor
+    """Cosine between the pelvis's forward axis and +x."""
+    place: Tensor
+    """Forward and to the left of the start [m], (W, 2)."""
+    pose: Tensor
+    """What the observation tells of place and orientation (W, k)."""
+    velocity: Tensor
+    """[m/s], (W, 3)."""
+    spin: Tensor
+    """Angular velocity [rad/s], (W, 3)."""
+
+
+class LegEnv(Env[LegSettings], Generic[LegSettings]):
+    """Observation, in this order, for U muscles and N leg hinges:
+
+    ======= ===================================================================
+    1       pelvis height above the ground, less the standing height [m]
+    k       pose of the pelvis, as the model's class says
+    3, 3    its velocity [m/s] and angular velocity [rad/s], world frame
+    N, N    hinge angles [rad] and velocities × 0.1 [rad/s]
+    U       activations
+    U       fibre lengths [optimal lengths]
+    U       fibre rates [largest shortening speeds]
+    U       muscle forces [peak isometric forces]
+    U       last action
+    1       speed asked for [m/s]
+    ======= ===================================================================
+
+    All of it is attached: lengths and rates have exact gradients, forces follow from them.
+
+    Actions are squashed into excitations by the logistic curve that takes action 0 to the excitation of standing
+    (`rest_excitation` at least) and ±1 to 0 and 1, with a slope that is nowhere zero.
+    """
+
+    reward_names = (
+        *("forward_vel", "progress", "upright", "heading", "height", "alive", "effort", "joint_limit"),
+        *("smoothness", "capture", "sway", "symmetry"),
+    )
+    stand_height: float
+    """Pelvis height of the standing pose [m]."""
+
+    def prepare(self) -> None:
+        self.curves = MuscleCurves(self.model, self.device)
+        self.action_size = len(self.curves.actuators)
+        self._tendons = Tendons(self.sim.batch)
+        self.prepare_model()
+        held = torch.tensor(self.model.key("stand").ctrl, dtype=torch.float32, device=self.device)
+        rest = held[self.curves.actuators].clamp_min(self.config.rest_excitation)
+        self._odds = (1.0 - rest) / rest
+        self._hinge_qpos = self._index(self.model.jnt_qposadr[self.hinges])
+        self._hinge_dofs = self._index(self.model.jnt_dofadr[self.hinges])
+        with torch.no_grad():
+            stand = torch.tensor(self.model.key("stand").qpos, dtype=torch.float32, device=self.device)[None]
+            still = torch.zeros((1, self.model.nv), device=self.device)
+            self._upright = self.root(StepState(stand, still, still[:, :0])).up[0]
+        self._pendulum_time = math.sqrt(self.stand_height / _GRAVITY)
+        ranges = torch.tensor(self.model.jnt_range[self.hinges], dtype=torch.float32, device=self.device)
+        self._limits = ranges[:, 0] + _LIMIT_MARGIN, ranges[:, 1] - _LIMIT_MARGIN
+        self._flexion_dofs = self._index([self.model.joint(f"hip_flexion_{s}").dofadr[0] for s in "rl"])
+        with torch.no_grad():
+            state = self.draw_physics(self.nworld)
+            self.obs_size = self.observe(state, torch.zeros((self.nworld, self.action_size), device=self.device)).shape[
+                -1
+            ]
+
+    @abstractmethod
+    def prepare_model(self) -> None:
+        """Set `hinges` (joint ids of the legs), `stand_height` and what `root` needs."""
+
+    @abstractmethod
+    def root(self, state: StepState) -> Root:
+        """The pelvis in the world."""
+
+    hinges: list[int]
+
+    def _index(self, values: object) -> Tensor:
+        return torch.as_tensor(values, dtype=torch.long, device=self.device)
+
+    def excitation(self, action: Tensor) -> Tensor:
+        """Excitations (W, U) in [0, 1] of actions (W, U) in [-1, 1]: s/(s + k(1 - s)), s = (1 + a)/2.
+
+        An action is tanh x, so this is the logistic function of 2x - log k.
+        """
+        share = 0.5 + 0.5 * action
+        return share / (share + self._odds * (1.0 - share))
+
+    def control(self, action: Tensor) -> Tensor:
+        return self.excitation(action)
+
+    def observe(self, state: StepState, action: Tensor) -> Tensor:
+        root = self.root(state)
+        length, rate = self._tendons(state.qpos, state.qvel)
+        length, rate = self.curves.normalised(length[:, self.curves.tendons], rate[:, self.curves.tendons])
+        force = self.curves.force(state.act, length, rate)
+        speed = torch.full_like(root.height, self.config.target_speed)
+        return torch.cat(
+            (
+                (root.height - self.stand_height)[:, None],
+                root.pose,
+                root.velocity,
+                root.spin,
+                state.qpos[:, self._hinge_qpos],
+                _VELOCITY_SCALE * state.qvel[:, self._hinge_dofs],
+                state.act,
+                length,
+                rate,
+                force,
+                action,
+                speed[:, None],
+            ),
+            dim=-1,
+        )
+
+    def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+        c = self.config
+        root = self.root(state)
+        speed = root.velocity[:, 0]
+        low, high = self._limits
+        angles = state.qpos[:, self._hinge_qpos]
+        overshoot = (torch.relu(low - angles) + torch.relu(angles - high)) / _LIMIT_UNIT
+        change = action - self.state.action
+        # The trunk is half of the body: where it leans, the centre of mass goes with it.
+        place = root.place + _TRUNK_LEVER * (root.up[:, :2] - self._upright[:2])
+        velocity = root.velocity + _TRUNK_LEVER * torch.linalg.cross(root.spin, root.up)
+        place = place + velocity[:, :2] * self._pendulum_time
+        capture = place[:, 1].square() + (place[:, 0].square() if c.target_speed == 0.0 else 0.0)
+        flexion = state.qvel[:, self._flexion_dofs].sum(-1)
+        terms = (
+            c.forward_vel * torch.exp(-((speed - c.target_speed) / c.speed_scale).square()),
+            c.progress * speed.clamp_max(c.target_speed),
+            c.upright * root.up[:, 2],
+            c.heading * root.heading,
+            -c.height * torch.relu(self.stand_height - root.height).square(),
+            torch.full_like(speed, c.alive),
+            -c.effort * state.act.square().mean(-1),
+            -c.joint_limit * overshoot.square().sum(-1),
+            -c.smoothness * change.square().mean(-1),
+            -c.capture * capture,
+            -c.sway * root.spin.square().sum(-1),
+            -c.symmetry * flexion.square(),
+        )
+        return torch.stack(terms, dim=-1)
+
+    def fell(self, state: StepState) -> Tensor:
+        if not self.config.early_termination:
+            return super().fell(state)
+        root = self.root(state)
+        return (root.height < self.config.min_height * self.stand_height) | (root.up[:, 2] < self.config.min_upright)
+
+    def outcome_terms(self, state: StepState) -> dict[str, Tensor]:
+        root = self.root(state)
+        return {
+            "vx": root.velocity[:, 0],
+            "upright": root.up[:, 2],
+            "activation": state.act.square().mean(-1),
+            "distance": root.place[:, 0],
+        }
+
+    def success(self, tail: dict[str, Tensor]) -> Tensor | None:
+        """Still on its feet at the end; where it was to walk, at `success_speed` or more over the whole episode."""
+        standing = tail["upright"][-1] > self.config.min_upright
+        if self.config.target_speed == 0.0:
+            return standing
+        seconds = self.config.episode_length * self.config.control_timestep
+        return standing & (tail["distance"][-1] >= self.config.success_speed * seconds)
+
+    @classmethod
+    def reference_settings(cls, config: LegSettings) -> LegSettings:
+        fields = {name: type(config).model_fields[name].default for name in _REWARD_FIELDS}
+        changed: LegSettings = config.model_copy(update=fields)
+        return changed
+
+    @classmethod
+    def reference_physics(cls, physics: PhysicsConfig, variant: str | None) -> PhysicsConfig:
+        """`physics` with the model's own contacts and limits."""
+        return physics.model_copy(update=dict.fromkeys(CONTACT_FIELDS))

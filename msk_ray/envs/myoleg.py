@@ -1,0 +1,109 @@
+"""`myoleg` standing or walking the way its toes point."""
+
+import logging
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from msk_ray.config import MyoLegEnvConfig, PhysicsConfig
+from msk_ray.envs.legs import LegEnv, Root
+from msk_ray.envs.models.myoleg import Couplings, build_myoleg, find_model, ground_height
+from msk_ray.simulation import StepState
+from msk_ray.simulation.tangent import quat_rotate
+
+_START_ACTIVATION = 0.05
+_log = logging.getLogger(__name__)
+
+
+class MyoLeg(LegEnv[MyoLegEnvConfig]):
+    """The pose of the pelvis in the observation (7): its place to the left of its line [m], its forward axis and its up
+    axis (3 each) in the world.
+
+    Forward, left and up are the frame in which the model stands: these models walk along -y of MuJoCo's world. The
+    forward axis is found from heel to toes, the up axis from gravity.
+    """
+
+    @staticmethod
+    def build_model(config: MyoLegEnvConfig, physics: PhysicsConfig) -> mujoco.MjModel:
+        _log.info(find_model(config.model, config.source).describe())
+        return build_myoleg(config, physics)
+
+    def prepare_model(self) -> None:
+        model = self.model
+        couplings = Couplings(model)
+        hinge = mujoco.mjtJoint.mjJNT_HINGE
+        self.hinges = [
+            j
+            for j in range(model.njnt)
+            if model.jnt_type[j] == hinge and model.jnt_limited[j] and j not in couplings.joints
+        ]
+        stand = model.key("stand").qpos
+        self._ground = ground_height(model)
+        self.stand_height = float(stand[2]) - self._ground
+        axes = world_axes(model)
+        start = np.zeros(9)
+        mujoco.mju_quat2Mat(start, stand[3:7])
+        # The same axes in the frame of the root, in which they are fixed.
+        local = axes @ start.reshape(3, 3)
+
+        def tensor(values: object) -> Tensor:
+            return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=self.device)
+
+        self._axes, self._local = tensor(axes), tensor(local)
+        self._stand = tensor(stand)
+        self._ranges = tuple(tensor(bound) for bound in model.jnt_range[self.hinges].T)
+        self._dependent, self._driving = self._index(couplings.dependent), self._index(couplings.driving)
+        self._dependent_dofs = self._index(couplings.dependent_dofs)
+        self._driving_dofs = self._index(couplings.driving_dofs)
+        self._reference, self._driving_reference = tensor(couplings.reference), tensor(couplings.driving_reference)
+        self._coefficients = tensor(couplings.coefficients)
+
+    def draw_physics(self, count: int) -> StepState:
+        noise = self.config.reset_noise
+        qpos = self._stand.repeat(count, 1)
+        qvel = torch.zeros((count, self.model.nv), device=self.device)
+        angles = qpos[:, self._hinge_qpos] + noise * self.uniform(count, len(self.hinges))
+        qpos[:, self._hinge_qpos] = angles.clamp(*self._ranges)
+        qpos[:, 2] += 0.2 * noise * (1.0 + self.uniform(count, 1)[:, 0])
+        qvel[:, self._hinge_dofs] = 10.0 * noise * self.uniform(count, len(self.hinges))
+        # Coupled joints follow those they are coupled to, in place and velocity.
+        offset = qpos[:, self._driving] - self._driving_reference
+        c = self._coefficients
+        powers = torch.stack([offset**k for k in range(5)], dim=-1)
+        slopes = torch.stack([k * offset ** max(k - 1, 0) for k in range(5)], dim=-1)
+        qpos[:, self._dependent] = self._reference + (c * powers).sum(-1)
+        qvel[:, self._dependent_dofs] = (c * slopes).sum(-1) * qvel[:, self._driving_dofs]
+        act = torch.full((count, self.model.na), _START_ACTIVATION, device=self.device)
+        return StepState(qpos, qvel, act)
+
+    def root(self, state: StepState) -> Root:
+        q, v = state.qpos, state.qvel
+        orientation = q[:, 3:7]
+        # Rows of `_axes` are forward, left and up of the world.
+        forward = quat_rotate(orientation, self._local[0].expand(len(q), 3)) @ self._axes.T
+        up = quat_rotate(orientation, self._local[2].expand(len(q), 3)) @ self._axes.T
+        spin = quat_rotate(orientation, v[:, 3:6]) @ self._axes.T  # MuJoCo's is in the body frame
+        place = q[:, :3] @ self._axes.T
+        return Root(
+            height=q[:, 2] - self._ground,
+            up=up,
+            heading=forward[:, 0],
+            place=place[:, :2],
+            pose=torch.cat((place[:, 1:2], forward, up), dim=-1),
+            velocity=v[:, :3] @ self._axes.T,
+            spin=spin,
+        )
+
+
+def world_axes(model: mujoco.MjModel) -> np.ndarray:
+    """Forward (heel to toes of the standing pose, level), left and up (against gravity), rows in the world, (3, 3)."""
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.key("stand").id)
+    mujoco.mj_kinematics(model, data)
+    up = -model.opt.gravity / np.linalg.norm(model.opt.gravity)
+    feet = sum(data.body(f"toes_{side}").xpos - data.body(f"calcn_{side}").xpos for side in "rl")
+    forward = feet - (feet @ up) * up
+    forward = forward / np.linalg.norm(forward)
+    return np.stack((forward, np.cross(up, forward), up))

@@ -1,0 +1,120 @@
+"""`myoleg26` standing or walking along +x."""
+
+import math
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from msk_ray.config import AssistConfig, MyoLeg26EnvConfig, PhysicsConfig
+from msk_ray.envs.legs import LegEnv, Root
+from msk_ray.envs.models.myoleg26 import SIDES, build_myoleg26
+from msk_ray.envs.models.myoleg26_tables import JOINTS
+from msk_ray.envs.models.terrain import Terrain
+from msk_ray.simulation import StepState
+
+_ROTATING_INERTIA = 10.0
+"""Rough inertia of the body about its pelvis [kg m²], for the assistance's dampers."""
+_GRAVITY = 9.81
+
+
+class MyoLeg26(LegEnv[MyoLeg26EnvConfig]):
+    """The pose of the pelvis in the observation (4): its place to the right of its line [m], its tilt, list and
+    rotation [rad].
+
+    The pelvis is three slides and three hinges, so that tilt and list are coordinates and no quaternion is needed.
+    """
+
+    @staticmethod
+    def build_model(config: MyoLeg26EnvConfig, physics: PhysicsConfig) -> mujoco.MjModel:
+        return build_myoleg26(config, physics)
+
+    @classmethod
+    def reference_settings(cls, config: MyoLeg26EnvConfig) -> MyoLeg26EnvConfig:
+        return super().reference_settings(config).model_copy(update={"assist": AssistConfig(epochs=0)})
+
+    def prepare_model(self) -> None:
+        model = self.model
+        self.hinges = [model.joint(f"{hinge.name}_{side}").id for side in SIDES for hinge in JOINTS]
+        self.stand_height = float(model.key("stand").qpos[1])
+        terrain = Terrain(self.config.terrain)
+        self._slope = terrain.slope
+        self._plane = not len(terrain.edges)
+        self._edges = self._tensor(terrain.edges)
+        self._levels = self._tensor(terrain.levels)
+        self._ranges = tuple(self._tensor(bound) for bound in model.jnt_range[self.hinges].T)
+        names = {"stand": ["stand"], "walk": ["walk_left", "walk_right"]}
+        names["mixed"] = names["stand"] + names["walk"]
+        keys = [model.key(name) for name in names[self.config.reset]]
+        self._starts = StepState(
+            *(self._tensor([getattr(key, part) for key in keys]) for part in ("qpos", "qvel", "act"))
+        )
+        self._assist_share = self.config.assist.share if self.config.assist.epochs else 0.0
+        mass = float(model.body_subtreemass[0])
+        a = self.config.assist
+        # Critical damping: c = 2 √(k m).
+        lateral, balance = 2.0 * math.sqrt(a.lateral * mass), 2.0 * math.sqrt(a.balance * _ROTATING_INERTIA)
+        self._springs = self._tensor([0.0, 0.0, a.lateral, a.balance, a.balance, a.balance])
+        self._dampers = self._tensor([0.0, 0.0, lateral, balance, balance, balance])
+        self._lift = self._tensor([0.0, a.support * mass * _GRAVITY, 0.0, 0.0, 0.0, 0.0])
+        self._upright_pose = self._tensor(model.key("stand").qpos[:6])
+
+    def _tensor(self, values: object) -> Tensor:
+        return torch.as_tensor(np.array(values), dtype=torch.float32, device=self.device)
+
+    def begin_epoch(self, epoch: int) -> None:
+        a = self.config.assist
+        self._assist_share = a.share * max(0.0, 1.0 - epoch / a.epochs) if a.epochs else 0.0
+
+    def control(self, action: Tensor) -> Tensor:
+        excitation = super().control(action)
+        if not self.config.assist.epochs:
+            return excitation
+        qpos, qvel, _ = self.state.physics
+        force = self._lift - self._springs * (qpos[:, :6] - self._upright_pose) - self._dampers * qvel[:, :6]
+        return torch.cat((excitation, self._assist_share * force), dim=-1)
+
+    def draw_physics(self, count: int) -> StepState:
+        noise = self.config.reset_noise
+        if len(self._starts.qpos) > 1 and self.config.stochastic_reset:
+            source = self.generator.device
+            pick = torch.randint(len(self._starts.qpos), (count,), generator=self.generator, device=source)
+            pick = pick.to(self.device)
+        else:
+            pick = torch.zeros(count, dtype=torch.long, device=self.device)
+        qpos, qvel, act = (part[pick].clone() for part in self._starts)
+        # Places stay: a foot must not start inside the ground. Hinges, the pelvis's among them, are shaken.
+        qpos[:, 3:] += noise * self.uniform(count, self.model.nq - 3)
+        qpos[:, 6:] = qpos[:, 6:].clamp(*self._ranges)
+        qpos[:, 1] += 0.2 * noise * (1.0 + self.uniform(count, 1)[:, 0])
+        qvel += 10.0 * noise * self.uniform(count, self.model.nv)
+        return StepState(qpos, qvel, act)
+
+    def ground_height(self, x: Tensor) -> Tensor:
+        """Height of the ground [m] at x (W,) [m]; flat between its edges, so without a slope of its own there."""
+        if self._plane:
+            return self._slope * x
+        return self._levels[torch.bucketize(x.detach(), self._edges)]
+
+    def root(self, state: StepState) -> Root:
+        q, v = state.qpos, state.qvel
+        tilt, lean, turn = q[:, 3], q[:, 4], q[:, 5]
+        sin_tilt, cos_tilt = torch.sin(tilt), torch.cos(tilt)
+        sin_lean, cos_lean = torch.sin(lean), torch.cos(lean)
+        # R = Rz(tilt) Rx(list) Ry(rotation) in axes x forward, y up, z right.
+        up = torch.stack((-sin_tilt * cos_lean, -sin_lean, cos_tilt * cos_lean), dim=-1)
+        heading = cos_tilt * torch.cos(turn) - sin_tilt * sin_lean * torch.sin(turn)
+        # ω = ẑ tilt' + Rz x̂ list' + Rz Rx ŷ rotation', in the same axes; the world's are x, -z, y.
+        spin_x = cos_tilt * v[:, 4] - sin_tilt * cos_lean * v[:, 5]
+        spin_y = sin_tilt * v[:, 4] + up[:, 2] * v[:, 5]
+        spin_z = v[:, 3] + sin_lean * v[:, 5]
+        return Root(
+            height=q[:, 1] - self.ground_height(q[:, 0]),
+            up=up,
+            heading=heading,
+            place=torch.stack((q[:, 0], -q[:, 2]), dim=-1),
+            pose=q[:, 2:6],
+            velocity=torch.stack((v[:, 0], -v[:, 2], v[:, 1]), dim=-1),
+            spin=torch.stack((spin_x, -spin_z, spin_y), dim=-1),
+        )

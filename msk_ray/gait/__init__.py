@@ -1,0 +1,1 @@
+"""How does a policy walk? Outcome measures of gait analysis, beside those of people."""

@@ -1,0 +1,107 @@
+"""Time series of an episode that gait analysis needs, from its states by C MuJoCo in float64.
+
+Axes: T samples, U muscles.
+"""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from msk_ray.envs.myoleg import world_axes
+from msk_ray.errors import ConfigError
+
+Array = NDArray[np.float64]
+SIDES = ("r", "l")
+CURVES = ("hip_flexion", "knee_flexion", "ankle_dorsiflexion", "vertical_force", "forward_force")
+"""Curves over a gait cycle: angles [°], forces [body weights]."""
+_JOINTS = {"hip_flexion": "hip_flexion", "knee_flexion": "knee_angle", "ankle_dorsiflexion": "ankle_angle"}
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One episode; by side `r` and `l` where it says so."""
+
+    timestep: float
+    """Between samples [s]."""
+    weight: float
+    """Of the body [N]."""
+    forward: Array
+    """Place of the pelvis along the way [m], shape (T,)."""
+    feet: dict[str, Array]
+    """Place of each heel along the way [m], by side (T,)."""
+    curves: dict[str, dict[str, Array]]
+    """`CURVES` by name and side, each (T,)."""
+    activation: Array
+    """Activations, shape (T, U)."""
+    muscle_power: Array
+    """Power that muscles give [W], what they absorb left out, shape (T,)."""
+
+
+def analyse(model: mujoco.MjModel, qpos: Array, qvel: Array, act: Array, timestep: float) -> Episode:
+    """Time series of states (T, nq), (T, nv), (T, na) that are `timestep` [s] apart.
+
+    Raises:
+        ConfigError: the model has no legs of the names that the leg environments use.
+    """
+    try:
+        axes = world_axes(model)
+        angles = {name: _angles(model, joint, qpos) for name, joint in _JOINTS.items()}
+        owners = {side: _carried_by(model, model.body(f"talus_{side}").id) for side in SIDES}
+    except KeyError as error:
+        raise ConfigError(f"gait needs a model of two legs (myoleg26, myoleg): {error.args[0]}") from None
+    weight = float(np.linalg.norm(model.opt.gravity) * model.body_subtreemass[0])
+    muscles = np.flatnonzero(model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_MUSCLE))
+    data = mujoco.MjData(model)
+    count = len(qpos)
+    feet = {side: np.zeros(count) for side in SIDES}
+    forces = {side: np.zeros((count, 3)) for side in SIDES}
+    forward, power = np.zeros(count), np.zeros(count)
+    for t in range(count):
+        data.qpos[:], data.qvel[:], data.act[:] = qpos[t], qvel[t], act[t]
+        mujoco.mj_forward(model, data)
+        forward[t] = data.body("pelvis").xpos @ axes[0]
+        for side in SIDES:
+            feet[side][t] = data.body(f"calcn_{side}").xpos @ axes[0]
+            forces[side][t] = axes @ ground_reaction(model, data, owners[side]) / weight
+        # A muscle's force is negative where it pulls, its velocity where it shortens.
+        given = data.actuator_force[muscles] * data.actuator_velocity[muscles]
+        power[t] = np.maximum(given, 0.0).sum()
+    curves = dict(angles)
+    curves["vertical_force"] = {side: forces[side][:, 2] for side in SIDES}
+    curves["forward_force"] = {side: forces[side][:, 0] for side in SIDES}
+    return Episode(timestep, weight, forward, feet, curves, act, power)
+
+
+def ground_reaction(model: mujoco.MjModel, data: mujoco.MjData, bodies: frozenset[int]) -> Array:
+    """Force of the world on a set of bodies [N], in the world, shape (3,)."""
+    total, wrench = np.zeros(3), np.zeros(6)
+    for k in range(data.ncon):
+        first, second = (int(model.geom_bodyid[g]) for g in data.contact.geom[k])
+        sign = 1.0 if first == 0 and second in bodies else -1.0 if second == 0 and first in bodies else 0.0
+        if sign != 0.0:
+            mujoco.mj_contactForce(model, data, k, wrench)
+            # The force in the contact's frame acts on the second geom.
+            total += sign * data.contact.frame[k].reshape(3, 3).T @ wrench[:3]
+    return total
+
+
+def _carried_by(model: mujoco.MjModel, body: int) -> frozenset[int]:
+    """A body and everything it carries."""
+    found = {body}
+    for other in range(body + 1, model.nbody):
+        if int(model.body_parentid[other]) in found:
+            found.add(other)
+    return frozenset(found)
+
+
+def _angles(model: mujoco.MjModel, joint: str, qpos: Array) -> dict[str, Array]:
+    """Angles [°] of a joint by side (T,), positive in flexion: knees flex towards the longer end of their range."""
+    found = {}
+    for side in SIDES:
+        entry = model.joint(f"{joint}_{side}")
+        lower, upper = entry.range
+        sign = -1.0 if joint == "knee_angle" and abs(lower) > abs(upper) else 1.0
+        found[side] = sign * np.rad2deg(qpos[:, entry.qposadr[0]])
+    return found

@@ -1,0 +1,180 @@
+"""Installed leg models: which is taken, what is said when there is none, and gradients of what `myo_sim` ships."""
+
+import importlib.util
+from importlib.machinery import ModuleSpec
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from msk_ray.config import MyoLegEnvConfig, PhysicsConfig
+from msk_ray.envs import MyoLeg, make_env
+from msk_ray.envs.models.myoleg import Couplings, build_myoleg, find_model
+from msk_ray.envs.myoleg import world_axes
+from msk_ray.errors import ConfigError
+from msk_ray.gradcheck import check_chain, check_gradients, make_states
+from msk_ray.simulation import Simulation, TapePerSubstep
+
+needs_myo_sim = pytest.mark.skipif(
+    importlib.util.find_spec("myo_sim") is None, reason="myo_sim is not installed: pip install msk_ray[myo]"
+)
+
+TOY = """<mujoco><worldbody><geom type="plane" size="1 1 1"/><body name="root" pos="0 0 .8">{root}
+<geom size=".1" mass="1"/>
+<body><joint name="hip_flexion_r" range="-1 1" limited="true"/><geom size=".1" mass="1"/></body>
+<body><joint name="hip_flexion_l"/><joint name="coupled" axis="0 1 0"/><geom size=".1" mass="1"/></body></body>
+</worldbody>
+<equality><joint joint1="coupled" joint2="hip_flexion_l" polycoef="0.1 2 0.5 0 0"/></equality></mujoco>"""
+
+
+@pytest.fixture
+def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Pretend that only the packages installed by calling this are there, each with the given files."""
+    folders: dict[str, Path] = {}
+
+    def find_spec(name: str) -> ModuleSpec | None:
+        if name not in folders:
+            return None
+        spec = ModuleSpec(name, None, is_package=True)
+        spec.submodule_search_locations = [str(folders[name])]
+        return spec
+
+    def add(package: str, *files: str) -> None:
+        folders[package] = tmp_path / package
+        for file in files:
+            path = folders[package] / file
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(TOY.format(root="<freejoint/>"))
+
+    monkeypatch.setattr(importlib.util, "find_spec", find_spec)
+    return add
+
+
+def test_without_any_package_the_line_says_what_to_install(install) -> None:
+    with pytest.raises(
+        ConfigError, match=r"none of myosuite 2, myosuite 3 and myo_sim has.*pip install msk_ray\[myo\]"
+    ):
+        find_model(None)
+    with pytest.raises(ConfigError, match="myosuite3 is missing or lacks a model myolegs; install"):
+        find_model("myolegs", "myosuite3")
+
+
+def test_packages_are_tried_in_order_and_named(install) -> None:
+    install("myo_sim")
+    assert find_model(None).package == "myo_sim"
+    install("myosuite", "envs/myo/assets/leg/myolegs_with_torso_plane.xml")
+    assert find_model(None).package == "myosuite3"
+    assert find_model("myolegs26").package == "myo_sim", "myosuite 3 has no 26-muscle legs"
+    assert find_model(None, "myo_sim").package == "myo_sim"
+    install("myosuite", "simhive/myo_sim/leg/myolegs.xml")
+    found = find_model(None)
+    assert found.package == "myosuite2"
+    assert found.describe().startswith("myoleg: myolegs from myosuite2")
+    assert found.load().compile().nq == 10
+
+
+def test_a_file_of_ones_own_is_taken_before_any_package(install, tmp_path: Path) -> None:
+    install("myo_sim")
+    path = tmp_path / "mine.xml"
+    path.write_text(TOY.format(root="<freejoint/>"))
+    assert find_model(str(path)).package == "file"
+    model = build_myoleg(MyoLegEnvConfig(name="myoleg", model=str(path)), PhysicsConfig())
+    assert model.opt.timestep == pytest.approx(0.002)
+    stand = model.key("stand").qpos
+    assert stand[2] == pytest.approx(0.1 - 5e-4, abs=1e-5), "let down until it touches"
+    assert stand[-1] == pytest.approx(0.1), "the equality holds"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "no file .*gone.xml; write a path, myolegs or myolegs26"),
+        ("<mujoco", "MuJoCo cannot load"),
+        (TOY.format(root=""), "no free joint first"),
+        (TOY.format(root="<freejoint/>").replace('<geom type="plane" size="1 1 1"/>', ""), "meets no ground"),
+    ],
+)
+def test_a_file_that_does_not_fit_is_refused_on_one_line(tmp_path: Path, text: str | None, message: str) -> None:
+    path = tmp_path / ("gone.xml" if text is None else "model.xml")
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(ConfigError, match=message) as caught:
+        build_myoleg(MyoLegEnvConfig(name="myoleg", model=str(path)), PhysicsConfig())
+    assert "\n" not in str(caught.value)
+
+
+@pytest.fixture(scope="module")
+def legs26() -> mujoco.MjModel:
+    return build_myoleg(MyoLegEnvConfig(name="myoleg", model="myolegs26", source="myo_sim"), PhysicsConfig())
+
+
+@needs_myo_sim
+@pytest.mark.parametrize("name", ["myolegs26", "myolegs"])
+@pytest.mark.parametrize("substeps", [1, 8])
+def test_gradients_of_a_step(name: str, substeps: int) -> None:
+    model = build_myoleg(MyoLegEnvConfig(name="myoleg", model=name, source="myo_sim"), PhysicsConfig())
+    if name == "myolegs":
+        assert np.isin(model.wrap_type, int(mujoco.mjtWrap.mjWRAP_CYLINDER)).any()
+    report = check_gradients(
+        model, TapePerSubstep(), substeps=substeps, states=("standing", "policy"), worlds=2, solver_tolerance=1e-9
+    )
+    assert report.checked >= 1
+    assert report.max_rel_error <= 1e-3
+
+
+@needs_myo_sim
+def test_gradients_through_eight_control_steps(legs26: mujoco.MjModel) -> None:
+    points = make_states(legs26, "policy", 3, 0)[1:2]
+    for result in check_chain(legs26, TapePerSubstep(), points, (8,), substeps=2):
+        assert result.rel_error <= 1e-3
+
+
+@needs_myo_sim
+def test_forward_agrees_with_c_mujoco_over_100_steps(legs26: mujoco.MjModel) -> None:
+    sim = Simulation(legs26, 1, 1, None, "cpu", tolerance=1e-9)
+    data = mujoco.MjData(legs26)
+    mujoco.mj_resetDataKeyframe(legs26, data, 0)
+    data.ctrl[:] = 0.1
+    state = [torch.tensor(part[None], dtype=torch.float32) for part in (data.qpos, data.qvel, data.act)]
+    for _ in range(100):
+        mujoco.mj_step(legs26, data)
+        state = sim.step(torch.full((1, legs26.nu), 0.1), *state)
+    for found, exact in zip(state, (data.qpos, data.qvel, data.act), strict=True):
+        assert np.linalg.norm(found[0].numpy() - exact) <= 1e-3 * np.linalg.norm(exact)
+
+
+@needs_myo_sim
+def test_environment_resets_walks_and_measures_as_its_body_does(legs26: mujoco.MjModel) -> None:
+    config = MyoLegEnvConfig(name="myoleg", model="myolegs26", reset_noise=0.1)
+    env: MyoLeg = make_env(config, PhysicsConfig(), 8, "cpu", 0, differentiable=False)
+    axes = world_axes(env.model)
+    assert axes[0] == pytest.approx([0.0, -1.0, 0.0], abs=0.02), "these legs walk along -y"
+    data, couplings = mujoco.MjData(env.model), Couplings(env.model)
+    qpos, qvel, _ = env.state.physics
+    assert len(couplings.joints) == 28
+    for place, speed in zip(qpos.numpy(), qvel.numpy(), strict=True):
+        # Fault: reset noise that breaks equality-coupled joints.
+        np.testing.assert_allclose(couplings.satisfied(place.astype(float)), place, atol=1e-5)
+        data.qpos[:], data.qvel[:] = place, speed
+        mujoco.mj_forward(env.model, data)
+        assert np.abs(data.efc_pos[: data.ne]).max() < 1e-5
+        assert np.abs(data.efc_vel[: data.ne]).max() < 1e-4
+    # Fault: a reward along an axis the model does not walk along, and "up" along the wrong one.
+    state = env.state.physics
+    moving = state._replace(qvel=torch.zeros_like(qvel).index_fill_(1, torch.tensor([1]), -1.25))
+    root = env.root(moving)
+    assert root.velocity[0, 0].item() == pytest.approx(1.25, rel=1e-3)
+    assert root.up[:, 2].min() > 0.999
+    for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)):
+        tipped = state.qpos.clone()
+        quat = np.zeros(4)
+        mujoco.mju_axisAngle2Quat(quat, np.array(axis), 0.8)
+        mujoco.mju_mulQuat(quat, quat, np.array(tipped[0, 3:7].tolist()))
+        tipped[:, 3:7] = torch.tensor(quat, dtype=torch.float32)
+        assert env.root(state._replace(qpos=tipped)).up[0, 2].item() == pytest.approx(np.cos(0.8), abs=1e-3)
+    assert env.action_size == 26
+    transition = env.step(torch.zeros(8, 26))
+    assert transition.obs.shape == (8, env.obs_size)
+    assert transition.reward.isfinite().all()

@@ -1,0 +1,94 @@
+"""From states to series: forces, angles and power of the 26-muscle model; and the command."""
+
+import json
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from msk_ray.config import Config, MyoLeg26EnvConfig, PhysicsConfig, parse_config
+from msk_ray.envs.models.myoleg26 import build_myoleg26
+from msk_ray.errors import ConfigError
+from msk_ray.gait.__main__ import main
+from msk_ray.gait.body import analyse
+from msk_ray.training import Trainer
+
+
+@pytest.fixture(scope="module")
+def model() -> mujoco.MjModel:
+    return build_myoleg26(MyoLeg26EnvConfig(name="myoleg26"), PhysicsConfig())
+
+
+def test_series_of_quiet_standing(model: mujoco.MjModel) -> None:
+    key, data = model.key("stand"), mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, key.id)
+    for _ in range(60):
+        mujoco.mj_step(model, data)
+    episode = analyse(model, data.qpos[None], data.qvel[None], data.act[None], 0.02)
+    weight = 9.81 * model.body_subtreemass[0]
+    assert episode.weight == pytest.approx(weight)
+    mujoco.mj_forward(model, data)
+    mujoco.mj_subtreeVel(model, data)
+    # Newton: what the ground gives is the weight and what the centre of mass accelerates with.
+    acceleration = np.zeros(3)
+    for body in range(1, model.nbody):
+        out = np.zeros(6)
+        mujoco.mj_rnePostConstraint(model, data)
+        mujoco.mj_objectAcceleration(model, data, mujoco.mjtObj.mjOBJ_BODY, body, out, 0)
+        # mj_objectAcceleration gives the body's centre of mass and counts gravity as upward acceleration.
+        acceleration += model.body_mass[body] * out[3:]
+    total = sum(episode.curves["vertical_force"][side][0] for side in "rl")
+    assert total == pytest.approx(acceleration[2] / weight, rel=1e-3)
+    assert 0.7 < total < 1.3
+    assert episode.curves["vertical_force"]["r"][0] == pytest.approx(episode.curves["vertical_force"]["l"][0], rel=1e-3)
+    assert episode.curves["knee_flexion"]["r"][0] == pytest.approx(-np.rad2deg(data.qpos[9]))
+    assert episode.curves["hip_flexion"]["l"][0] == pytest.approx(np.rad2deg(data.qpos[12]))
+
+
+def test_a_leading_foot_is_ahead(model: mujoco.MjModel) -> None:
+    key = model.key("walk_right")
+    episode = analyse(model, key.qpos[None], key.qvel[None], key.act[None], 0.02)
+    assert episode.feet["r"][0] - episode.feet["l"][0] > 0.4
+
+
+def test_a_model_without_legs_is_refused() -> None:
+    other = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
+    )
+    with pytest.raises(ConfigError, match="gait needs a model of two legs"):
+        analyse(other, np.zeros((1, 7)), np.zeros((1, 6)), np.zeros((1, 0)), 0.02)
+
+
+def test_the_command_writes_json_and_a_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = parse_config(
+        {
+            "env": {"name": "myoleg26", "nworld": 4, "target_speed": 0.0},
+            "shac": {"horizon": 2, "critic_iterations": 1, "critic_batches": 1},
+            "actor": {"hidden": [8]},
+            "critic": {"hidden": [8]},
+            "evaluation": {"nworld": 2, "steps": 5, "interval": 1},
+            "trial": {"epochs": 1},
+        }
+    )
+    trainer = Trainer(config, tmp_path / "trial", "cpu")
+    trainer.run_epoch()
+    trainer.close()
+    assert main([str(tmp_path / "trial"), "--worlds", "2", "--steps", "80", "--device", "cpu"]) == 0
+    gait = json.loads((tmp_path / "trial" / "gait.json").read_text())
+    assert gait["episodes"] == 2
+    assert set(gait["measures"]) >= {"speed", "cadence", "step_length", "duty_factor"}
+    assert (tmp_path / "trial" / "gait.png").stat().st_size > 10_000
+    assert "of which ended in a fall" in capsys.readouterr().out
+
+
+def test_another_environment_is_refused(tmp_path: Path, tiny_cartpole: Config) -> None:
+    trainer = Trainer(
+        tiny_cartpole.model_copy(update={"trial": tiny_cartpole.trial.model_copy(update={"epochs": 1})}),
+        tmp_path / "t",
+        "cpu",
+    )
+    trainer.run_epoch()
+    trainer.close()
+    with pytest.raises(ConfigError, match="cartpole has no legs of muscles"):
+        main([str(tmp_path / "t"), "--device", "cpu"])
