@@ -12,6 +12,7 @@ from msk_ray.tune.devices import Placement, choose_placement
 from msk_ray.tune.listing import text_table
 from msk_ray.tune.outcomes import Ending, Outcome, read_ending, write_ending
 from msk_ray.tune.records import best_record, read_record
+from msk_ray.tune.report import write_report
 from msk_ray.tune.space import ResourcesSpec
 from msk_ray.tune.table import markdown, outcome_name, result_rows, summary, table_document, variant_rows
 from msk_ray.tune.trials import resolve_trials
@@ -60,6 +61,19 @@ def test_records_and_tables(experiment: experiments.Experiment, tmp_path: Path) 
     assert f"trials/{records[2].trial.id}/checkpoints/best.pt" in document
     facts = json.loads(json.dumps(summary("e", "Which?", records), allow_nan=False))
     assert facts["best"]["id"] == records[2].trial.id
+
+
+def test_a_sweep_ends_in_its_report(
+    experiment: experiments.Experiment, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    write_report(experiment)
+    page = experiment.path / "report" / "index.html"
+    assert f"report       {page}" in capfd.readouterr().out
+    assert "Which rate?" in page.read_text()
+    # Whatever becomes of it, the sweep's results stand, and the way to try again is named.
+    write_report(experiments.Experiment(tmp_path / "nowhere"))
+    shown = capfd.readouterr()
+    assert "no report (exit code 2); to try again: python -m msk_ray.report" in shown.out
 
 
 def test_an_existing_experiment_is_refused_and_a_changed_space_named(
