@@ -198,6 +198,11 @@ def test_muscle_curves_are_mujocos(env: MyoLeg26) -> None:
             assert found == pytest.approx(-(0.3 * gain + bias) / prm[2], abs=2e-5)
 
 
+def test_a_control_step_lasts_as_long_as_it_says(env: MyoLeg26) -> None:
+    assert env.sim.timestep == pytest.approx(env.config.control_timestep)
+    assert env.sim.substeps == 5
+
+
 def test_a_fall_ends_the_episode(env: MyoLeg26) -> None:
     low = standing(env, pelvis_ty=0.6 * env.stand_height)
     leaning = standing(env, pelvis_list=1.2)
