@@ -150,7 +150,8 @@ def test_reward_by_hand(env: MyoLeg26) -> None:
         {
             "forward_vel": math.exp(-((1.25 / 0.6) ** 2)), "progress": 0.0, "upright": 2.0, "heading": 0.2,
             "height": -5.0 * 0.01, "alive": 0.5, "effort": -0.2 * 0.25,
-            "joint_limit": -0.1 * 1.5**2, "smoothness": -0.02 * 0.25, "capture": -0.3 * (math.hypot(1.0, lateral / 0.1) - 1.0), "sway": -0.02 * 4.0,
+            "joint_limit": -0.1 * 1.5**2, "smoothness": -0.02 * 0.25,
+            "capture": -0.3 * (math.hypot(1.0, lateral / 0.1) - 1.0), "sway": -0.02 * 4.0,
             "symmetry": -0.1 * 9.0,
         },
         rel=1e-4, abs=1e-6,
