@@ -152,7 +152,7 @@ class LegEnvSettings(EnvSettings):
     from the start if asked to stand. That point is where the body would come to rest as a pendulum,
     x + v / √(g / height), with x and v of its centre of mass taken from pelvis and lean of the trunk."""
     capture_scale: PositiveFloat = 0.1
-    """Distance from which the term above grows in proportion [m], so that falling costs no more than living is worth."""
+    """Distance from which the term above grows in proportion [m]: a fall must not cost without bound."""
     sway: NonNegative = 0.02
     """Weight of the squared angular velocity of the pelvis [s²/rad²]."""
     symmetry: NonNegative = 0.0
