@@ -69,9 +69,22 @@ def sweep(tmp_path_factory: pytest.TempPathFactory, tiny_settings: dict[str, Any
 def ant_trial(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of an ant's trial of one epoch. Not to be changed."""
     folder = tmp_path_factory.mktemp("ant")
-    small = ("env.nworld=4", "shac.horizon=4", "trial.epochs=1", "actor.hidden=[16,16]", "critic.hidden=[16,16]")
-    evaluation = ("evaluation.nworld=2", "evaluation.steps=40", "evaluation.interval=1")
-    trainer = Trainer(load_config(ROOT / "configs" / "ant.yaml", [*small, *evaluation]), folder, "cpu")
+    trainer = Trainer(_small_config("ant"), folder, "cpu")
     trainer.run_epoch()
     trainer.close()
     return folder
+
+
+@pytest.fixture(scope="session")
+def myoleg26_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A checkpoint of the leg model before any training."""
+    trainer = Trainer(_small_config("myoleg26_stand"), tmp_path_factory.mktemp("myoleg26"), "cpu")
+    path = trainer.save()
+    trainer.close()
+    return path
+
+
+def _small_config(name: str) -> Config:
+    small = ("env.nworld=4", "shac.horizon=4", "trial.epochs=1", "actor.hidden=[16,16]", "critic.hidden=[16,16]")
+    evaluation = ("evaluation.nworld=2", "evaluation.steps=40", "evaluation.interval=1")
+    return load_config(ROOT / "configs" / f"{name}.yaml", [*small, *evaluation])
