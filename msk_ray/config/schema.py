@@ -147,10 +147,12 @@ class LegEnvSettings(EnvSettings):
     """Weight of the summed squared overshoot past joint limits less a margin of 0.05 rad, in units of 0.1 rad."""
     smoothness: NonNegative = 0.02
     """Weight of the mean squared change of the action."""
-    capture: NonNegative = 5.0
-    """Weight of the squared distance of the capture point from the line walked on, and from the start if asked to stand
-    [1/m²]. That is where the body would come to rest as a pendulum, x + v / √(g / height), with x and v of its centre
-    of mass taken from pelvis and lean of the trunk."""
+    capture: NonNegative = 0.3
+    """Weight of √(1 + (d / capture_scale)²) - 1, d being the distance of the capture point from the line walked on, or
+    from the start if asked to stand. That point is where the body would come to rest as a pendulum,
+    x + v / √(g / height), with x and v of its centre of mass taken from pelvis and lean of the trunk."""
+    capture_scale: PositiveFloat = 0.1
+    """Distance from which the term above grows in proportion [m]: a fall must not cost without bound."""
     sway: NonNegative = 0.02
     """Weight of the squared angular velocity of the pelvis [s²/rad²]."""
     symmetry: NonNegative = 0.0

@@ -84,7 +84,7 @@ class Env(ABC, Generic[Settings]):
         self.sim = Simulation(
             self.model,
             nworld,
-            physics.resolve_substeps(config.control_timestep),
+            round(config.control_timestep / self.model.opt.timestep),
             backward,
             device,
             nconmax=physics.nconmax,

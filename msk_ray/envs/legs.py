@@ -29,7 +29,7 @@ _VELOCITY_SCALE = 0.1
 """Of joint velocities in the observation [s/rad]."""
 _REWARD_FIELDS = (
     *("forward_vel", "speed_scale", "progress", "upright", "heading", "height", "alive", "effort", "joint_limit"),
-    *("smoothness", "capture", "sway", "symmetry"),
+    *("smoothness", "capture", "capture_scale", "sway", "symmetry"),
 )
 
 
@@ -165,7 +165,8 @@ class LegEnv(Env[LegSettings], Generic[LegSettings]):
         place = root.place + _TRUNK_LEVER * (root.up[:, :2] - self._upright[:2])
         velocity = root.velocity + _TRUNK_LEVER * torch.linalg.cross(root.spin, root.up)
         place = place + velocity[:, :2] * self._pendulum_time
-        capture = place[:, 1].square() + (place[:, 0].square() if c.target_speed == 0.0 else 0.0)
+        distance = place if c.target_speed == 0.0 else place[:, 1:]
+        capture = torch.sqrt(1.0 + (distance / c.capture_scale).square().sum(-1)) - 1.0
         flexion = state.qvel[:, self._flexion_dofs].sum(-1)
         terms = (
             c.forward_vel * torch.exp(-((speed - c.target_speed) / c.speed_scale).square()),

@@ -174,6 +174,7 @@ def test_environment_resets_walks_and_measures_as_its_body_does(legs26: mujoco.M
         mujoco.mju_mulQuat(quat, quat, np.array(tipped[0, 3:7].tolist()))
         tipped[:, 3:7] = torch.tensor(quat, dtype=torch.float32)
         assert env.root(state._replace(qpos=tipped)).up[0, 2].item() == pytest.approx(np.cos(0.8), abs=1e-3)
+    assert env.sim.timestep == pytest.approx(config.control_timestep)
     assert env.action_size == 26
     transition = env.step(torch.zeros(8, 26))
     assert transition.obs.shape == (8, env.obs_size)

@@ -150,7 +150,8 @@ def test_reward_by_hand(env: MyoLeg26) -> None:
         {
             "forward_vel": math.exp(-((1.25 / 0.6) ** 2)), "progress": 0.0, "upright": 2.0, "heading": 0.2,
             "height": -5.0 * 0.01, "alive": 0.5, "effort": -0.2 * 0.25,
-            "joint_limit": -0.1 * 1.5**2, "smoothness": -0.02 * 0.25, "capture": -5.0 * lateral**2, "sway": -0.02 * 4.0,
+            "joint_limit": -0.1 * 1.5**2, "smoothness": -0.02 * 0.25,
+            "capture": -0.3 * (math.hypot(1.0, lateral / 0.1) - 1.0), "sway": -0.02 * 4.0,
             "symmetry": -0.1 * 9.0,
         },
         rel=1e-4, abs=1e-6,
@@ -196,6 +197,11 @@ def test_muscle_curves_are_mujocos(env: MyoLeg26) -> None:
             at = torch.full((1, 26), float(length)), torch.full((1, 26), rate)
             found = curves.force(torch.full((1, 26), 0.3), *at)[0, 0].item()
             assert found == pytest.approx(-(0.3 * gain + bias) / prm[2], abs=2e-5)
+
+
+def test_a_control_step_lasts_as_long_as_it_says(env: MyoLeg26) -> None:
+    assert env.sim.timestep == pytest.approx(env.config.control_timestep)
+    assert env.sim.substeps == 5
 
 
 def test_a_fall_ends_the_episode(env: MyoLeg26) -> None:

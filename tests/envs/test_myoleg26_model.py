@@ -112,6 +112,13 @@ def test_moment_arms_lie_in_the_published_ranges(model: mujoco.MjModel, entry) -
     assert arms.max() <= entry.most, f"{entry.source}: {arms}"
 
 
+@pytest.mark.parametrize("entry", PUBLISHED, ids=lambda e: f"{e.muscle}-{e.joint}")
+def test_no_muscle_changes_its_mind_over_a_joint_range(model: mujoco.MjModel, entry) -> None:
+    low, high = model.joint(f"{entry.joint}_r").range
+    arms = moment_arms(model, entry.muscle, entry.joint, np.linspace(low + 1e-3, high - 1e-3, 25))
+    assert np.all(arms * np.sign(entry.most + entry.least) > 0.0)
+
+
 @pytest.mark.parametrize("name", ["stand", "walk_left", "walk_right"])
 def test_keyframes_satisfy_every_constraint(model: mujoco.MjModel, name: str) -> None:
     data = mujoco.MjData(model)

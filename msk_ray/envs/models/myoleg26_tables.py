@@ -86,10 +86,10 @@ ROOT: Final = (
 # Positive is flexion, adduction and inward rotation of the hip, extension of the knee, dorsiflexion of the ankle and
 # extension of the toes.
 JOINTS: Final = (
-    Hinge("hip_flexion", "femur", (0.0, 0.0, 1.0), -0.5236, 1.7453),
+    Hinge("hip_flexion", "femur", (0.0, 0.0, 1.0), -0.5236, 1.5708),
     Hinge("hip_adduction", "femur", (1.0, 0.0, 0.0), -0.6981, 0.3491),
     Hinge("hip_rotation", "femur", (0.0, 1.0, 0.0), -0.5236, 0.5236),
-    Hinge("knee_angle", "tibia", (0.0, 0.0, 1.0), -2.0944, 0.0),
+    Hinge("knee_angle", "tibia", (0.0, 0.0, 1.0), -1.9897, 0.0),
     Hinge("ankle_angle", "talus", (0.0, 0.0, 1.0), -0.8727, 0.4363),
     Hinge("mtp_angle", "toes", (0.0, 0.0, 1.0), -0.5236, 0.7854),
 )

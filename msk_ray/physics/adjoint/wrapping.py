@@ -9,6 +9,9 @@ from mujoco_warp._src.util_misc import wrap
 
 wp.set_module_options({"enable_backward": False})
 
+_LEAST_ARC = wp.constant(1.0e-6)
+"""Arcs up to this long count as a straight path [m]."""
+
 
 @wp.kernel
 def touch_paths(
@@ -48,5 +51,6 @@ def touch_paths(
         wrap_type[place],
         side,
     )
-    if arc >= 0.0:
+    # A path that only just touches has the rates of a straight one; its arc's length, a square root, has no slope.
+    if arc > _LEAST_ARC:
         touch_out[worldid, e] = wp.spatial_vector(point0, point1)

@@ -1,0 +1,150 @@
+"""Control steps a second of the muscle-driven legs: forward, and forward with backward, beside C MuJoCo and myosuite.
+
+A control step is what the environment does for one action: 20 ms of physics, observation, reward and resets.
+"""
+
+import argparse
+import importlib.util
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import torch
+from record import RESULTS, markdown_table, publish
+
+from msk_ray.config import Config, load_config
+from msk_ray.envs import make_env
+from msk_ray.envs.models.myoleg import find_model
+from msk_ray.errors import ConfigError
+
+MODELS = {"myoleg26": ("configs/myoleg26.yaml", "env.assist.epochs=0"), "myolegs": ("configs/myoleg.yaml",)}
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def rate(run: Callable[[], None], steps: int, device: torch.device, seconds: float) -> float:
+    """Steps a second of `run`, which makes `steps` of them, repeated for at least `seconds` after one warm-up."""
+
+    def synchronise() -> None:
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+
+    run()
+    synchronise()
+    started, count = time.perf_counter(), 0
+    while True:
+        run()
+        synchronise()
+        count += 1
+        elapsed = time.perf_counter() - started
+        if elapsed >= seconds:
+            return steps * count / elapsed
+
+
+def measure(config: Config, worlds: int, device: str, horizon: int, seconds: float) -> list[str]:
+    """One row: control steps a second of all worlds together."""
+    env: Any = make_env(config.env, config.physics, worlds, device, 0)
+    generator = torch.Generator(device=env.device).manual_seed(0)
+    shape = (horizon, worlds, env.action_size)
+    actions = 0.3 * torch.randn(shape, generator=generator, device=env.device).clamp(-3, 3)
+
+    def restart() -> None:
+        env.state = env.reset_state()
+        env.stock_resets(horizon)
+
+    def simulate() -> None:
+        state = env.reset_state().physics
+        with torch.no_grad():
+            for action in actions:
+                state = env.sim.step(env.control(action), *state)
+
+    def forward() -> None:
+        restart()
+        with torch.no_grad():
+            for action in actions:
+                env.step(action)
+
+    def both() -> None:
+        restart()
+        inputs = actions.clone().requires_grad_()
+        total = torch.zeros((), device=env.device)
+        for action in inputs:
+            total = total + env.step(action).reward.mean()
+        total.backward()
+
+    rates = [rate(run, horizon * worlds, env.device, seconds) for run in (simulate, forward, both)]
+    env.sim.diagnostics()  # raises if contacts were lost
+    return [str(worlds), *(f"{value:,.0f}" for value in rates), f"{rates[1] / rates[2]:.2f}"]
+
+
+def c_mujoco(model: mujoco.MjModel, substeps: int, seconds: float) -> float:
+    """Control steps a second of C MuJoCo on one thread: physics alone, from the standing pose."""
+    data = mujoco.MjData(model)
+
+    def run() -> None:
+        mujoco.mj_resetDataKeyframe(model, data, model.key("stand").id)
+        for _ in range(32):
+            mujoco.mj_step(model, data, nstep=substeps)
+
+    return rate(run, 32, torch.device("cpu"), seconds)
+
+
+def myosuite(name: str, seconds: float) -> float:
+    """Control steps a second of one of myosuite's own environments, on one thread, under random actions."""
+    from myosuite.utils import gym
+
+    env = gym.make(name)
+    env.reset()
+    env.action_space.seed(0)
+
+    def run() -> None:
+        for _ in range(50):
+            *_, terminated, truncated, _ = env.step(env.action_space.sample())
+            if terminated or truncated:
+                env.reset()
+
+    return rate(run, 50, torch.device("cpu"), seconds)
+
+
+def main() -> None:
+    """Run the benchmark the command line asks for."""
+    p = argparse.ArgumentParser(description=__doc__)
+    p.add_argument("--models", nargs="+", choices=sorted(MODELS), default=sorted(MODELS))
+    p.add_argument("--worlds", type=int, nargs="+", default=[64])
+    p.add_argument("--horizon", type=int, default=16, help="control steps the gradient goes through")
+    p.add_argument("--seconds", type=float, default=1.5, help="each figure is measured for at least this long")
+    p.add_argument("--myosuite", metavar="ENV", default="myoLegWalk-v0", help="of myosuite, if that is installed")
+    p.add_argument("--device", default="cuda:0" if torch.cuda.is_available() else "cpu")
+    p.add_argument("--results", type=Path, default=RESULTS, help="folder the table is appended in")
+    args = p.parse_args()
+    header = ["worlds", "physics", "forward", "forward + backward", "forward / both"]
+    for name in args.models:
+        path, *overrides = MODELS[name]
+        config = load_config(ROOT / path, overrides)
+        try:
+            rows = []
+            for worlds in args.worlds:
+                rows.append(measure(config, worlds, args.device, args.horizon, args.seconds))
+                print(name, rows[-1], flush=True)
+        except ConfigError as error:
+            print(f"{name}: {error}")
+            continue
+        one = make_env(config.env, config.physics, 1, "cpu", 0, differentiable=False)
+        own = c_mujoco(one.model, one.sim.substeps, args.seconds)
+        notes = [f"C MuJoCo, one CPU thread, physics alone: {own:,.0f} control steps/s."]
+        if name == "myolegs":
+            notes.append(find_model(None).describe() + ".")
+            if importlib.util.find_spec("myosuite") is None:
+                notes.append("myosuite is not installed: its own rate was not measured.")
+            else:
+                rate_there = myosuite(args.myosuite, args.seconds)
+                notes.append(f"myosuite's {args.myosuite}, one CPU thread: {rate_there:,.0f} control steps/s.")
+        title = (
+            f"Control steps a second of {name} (nv {one.model.nv}, muscles {one.action_size}), horizon {args.horizon}"
+        )
+        publish("legs", title, args.device, markdown_table(header, rows) + "\n\n" + " ".join(notes), args.results)
+
+
+if __name__ == "__main__":
+    main()
