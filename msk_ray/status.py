@@ -13,6 +13,7 @@ from msk_ray.cli import Parser, run
 from msk_ray.errors import MskRayError, StorageError
 from msk_ray.progress import format_duration
 from msk_ray.tune.experiment import Experiment
+from msk_ray.tune.outcomes import Outcome
 from msk_ray.tune.standing import (
     Observer,
     Standing,
@@ -43,7 +44,7 @@ EXAMPLES = """\
 WIDE = 140
 """Terminals of so many columns show hosts, GPU models and reasons too."""
 _STYLES = {State.RUNNING: "green", State.STALE: "yellow", State.UNREADABLE: "red", State.WAITING: "dim"}
-_FAILED = ("error", "nonfinite", "diverged")
+_FAILED = (Outcome.ERROR, Outcome.NONFINITE, Outcome.DIVERGED, Outcome.OUT_OF_MEMORY)
 
 
 def parser() -> Parser:

@@ -21,13 +21,13 @@ from msk_ray.errors import storage_failure
 from msk_ray.tune.adapters import METRIC
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.gauges import TrialGauges
-from msk_ray.tune.operators import Listed, describe
+from msk_ray.tune.made_up import make_up, write_params
 from msk_ray.tune.outcomes import write_text
 from msk_ray.tune.records import evaluations_of, read_rows
 from msk_ray.tune.space import Space
 from msk_ray.tune.stopping import Evaluation
 from msk_ray.tune.trial_run import HANG_FILE, Hooks, TrainerLike, run_trial
-from msk_ray.tune.trials import Trial, make_trial, overlay
+from msk_ray.tune.trials import Trial, overlay
 
 
 @dataclass(frozen=True)
@@ -55,14 +55,7 @@ class Job:
         """
         params = config.get("params", {})
         if "id" not in config:
-            values, changed = {}, {}
-            for key, op in self.space.sampled.items():
-                level = (
-                    next((lv for lv in op.levels if lv.label == params[key]), None) if isinstance(op, Listed) else None
-                )
-                values[key] = params[key] if level is None else level.value
-                changed[key] = describe(params[key])
-            return make_trial(self.space, self.base, changed, values, self.space.seeds[0], 0)
+            return make_up(self.space, self.base, params)
         trial = self.trials[config["id"]]
         if not params:
             return trial
@@ -75,8 +68,12 @@ def make_trainable(job: Job) -> Callable[[dict[str, Any]], None]:
 
     def trainable(config: dict[str, Any]) -> None:
         trial = job.trial_of(config)
+        folder = job.experiment.trial_folder(trial.id)
         try:
-            attempt(trial, job.experiment.trial_folder(trial.id))
+            folder.mkdir(parents=True, exist_ok=True)
+            if "id" not in config:
+                write_params(folder, config["params"])
+            attempt(trial, folder)
         except Exception as error:
             # Whatever stumbled over a full disk first, a line of output perhaps: the driver must hear of the disk.
             failure = storage_failure(error)
@@ -85,7 +82,6 @@ def make_trainable(job: Job) -> Callable[[dict[str, Any]], None]:
             raise failure from error
 
     def attempt(trial: Trial, folder: Path) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
         _redirect_output(folder / "output.log")
         _limit_threads(job.threads)
         _record_device(folder / "device.json")
