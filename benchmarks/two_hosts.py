@@ -29,7 +29,7 @@ from msk_ray.tune.space import load_space
 from msk_ray.tune.trials import resolve_trials
 
 REPOSITORY = Path(msk_ray.__file__).resolve().parent.parent
-EPOCHS = 60
+EPOCHS = 30
 SPACE = {
     "question": "Does an experiment survive the loss of a host?",
     "base": "configs/cartpole.yaml",
@@ -40,12 +40,12 @@ SPACE = {
         "trial.epochs": EPOCHS,
         "trial.checkpoint_interval": 5,
     },
-    "seeds": "0-3",
+    "seeds": "0-2",
 }
 ADDRESSES = {"msk-a": "10.214.77.1", "msk-b": "10.214.77.2"}
 """Host names, which are their namespaces' too, and addresses."""
 PORT = 6379
-LIMIT_S = 300.0
+LIMIT_S = 900.0
 
 
 class Host:

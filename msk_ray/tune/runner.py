@@ -144,6 +144,7 @@ def run_trials(plan: Plan) -> bool:
         base,
         {trial.id: trial for trial in plan.trials},
         plan.placement.device,
+        plan.placement.gpus,
         plan.placement.cpus,
         plan.trainer_class,
     )

@@ -19,6 +19,7 @@ from ray import tune
 from msk_ray.config import parse_config
 from msk_ray.errors import storage_failure
 from msk_ray.tune.adapters import METRIC
+from msk_ray.tune.devices import wait_for_memory
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.gauges import TrialGauges
 from msk_ray.tune.made_up import make_up, write_params
@@ -28,6 +29,9 @@ from msk_ray.tune.space import Space
 from msk_ray.tune.stopping import Evaluation
 from msk_ray.tune.trial_run import HANG_FILE, Hooks, TrainerLike, run_trial
 from msk_ray.tune.trials import Trial, overlay
+
+MEMORY_LIMIT_S = 60.0
+"""How long a trial waits for the memory of its GPU [s]."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,8 @@ class Job:
     trials: dict[str, Trial]
     """Trials by id; empty when a search makes them up."""
     device: str
+    gpus: float
+    """GPUs of a trial, 0 on CPU."""
     threads: int
     trainer_class: type[TrainerLike]
 
@@ -85,6 +91,8 @@ def make_trainable(job: Job) -> Callable[[dict[str, Any]], None]:
         _redirect_output(folder / "output.log")
         _limit_threads(job.threads)
         _record_device(folder / "device.json")
+        if job.gpus:
+            _wait_for_gpu(job.gpus)
         gauges = TrialGauges(job.experiment.name, trial)
         with tempfile.TemporaryDirectory() as scratch, _watchdog(folder, job.space.file.resources.hang_s) as alive:
 
@@ -196,6 +204,22 @@ def _limit_threads(threads: int) -> None:
     import torch
 
     torch.set_num_threads(threads)
+
+
+def _wait_for_gpu(share: float) -> None:
+    """Wait until a process that had this GPU before has given its memory back."""
+    import torch
+
+    def free_share() -> float:
+        free, total = torch.cuda.mem_get_info(0)
+        return free / total
+
+    left = wait_for_memory(min(share, 1.0), free_share, MEMORY_LIMIT_S)
+    if left is not None:
+        print(
+            f"the GPU has only {left:.0%} of its memory free after {MEMORY_LIMIT_S:.0f} s: who else uses it?",
+            flush=True,
+        )
 
 
 def _record_device(path: Path) -> None:
