@@ -2,7 +2,7 @@
 
 The median epoch of every trial under Tune relative to that in the loop, and the time a trial spends between its epochs,
 which neighbours on the machine touch less (what it pays while it trains); the time from the end of a trial to the first
-epoch of the next one (what it pays between trials; kernels are in Warp's cache from the loop, which runs first); and the
+epoch of the next one (what it pays between trials; kernels are in Warp's cache from the loop, which ran first); and the
 wall time of everything, start-up included.
 """
 

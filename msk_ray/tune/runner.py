@@ -79,6 +79,7 @@ def ray_session(address: str | None, dashboard: bool | None = None) -> Iterator[
         RAY_AIR_NEW_OUTPUT="0",
         RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO="1",  # a trial without GPUs sees none, rather than all
         TUNE_DISABLE_AUTO_CALLBACK_LOGGERS="1",  # trials write their own metrics, at once
+        TUNE_DISABLE_STRICT_METRIC_CHECKING="1",  # a trial asked to stop may not have been evaluated yet
         TUNE_DISABLE_SIGINT_HANDLER="1",  # a request to stop lets trials save themselves first
     )
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")

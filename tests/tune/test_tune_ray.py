@@ -16,7 +16,7 @@ from ray import cloudpickle
 from stub_trainer import BUG, FULL_DISK, HANG, KILL, MEMORY, NAN, SIMULATION_ERROR, StubTrainer
 
 from msk_ray.config import read_yaml
-from msk_ray.errors import StorageError, StorageFailure
+from msk_ray.errors import ClusterLost, StorageError, StorageFailure
 from msk_ray.tune import experiment as experiments
 from msk_ray.tune import runner, standby
 from msk_ray.tune.devices import Placement
@@ -95,6 +95,18 @@ def test_a_full_disk_stops_everything_and_ends_nothing(
     completed, records = go(space, path, resume=True)
     assert completed
     assert outcomes(records) == ["finished", "out_of_memory"]
+
+
+def test_a_dead_node_of_ones_own_ends_the_experiment_resumably(monkeypatch: pytest.MonkeyPatch) -> None:
+    node = runner._OwnNode()
+    monkeypatch.setattr(runner._OwnNode, "INTERVAL_S", 0.0)
+    node.on_step_end(0, [])
+    alive = runner.ray.nodes()
+    monkeypatch.setattr(runner.ray, "nodes", lambda: [{**facts, "Alive": False} for facts in alive])
+    with pytest.raises(ClusterLost, match="has died"):
+        node.on_step_end(1, [])
+    assert node.lost is not None
+    assert node.lost.exit_code == 75
 
 
 def test_asha_stops_the_bad_ones_and_a_stop_request_is_resumable(
