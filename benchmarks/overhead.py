@@ -1,8 +1,9 @@
 """What Ray Tune costs: a sweep of real trials, one after another, against the same trials by `msk_ray.train` in a loop.
 
-Three figures: the median epoch of every trial under Tune relative to that in the loop (what a trial pays while it
-trains); the time from the end of a trial to the first epoch of the next one (what it pays between trials; kernels are
-in Warp's cache from the loop, which runs first); and the wall time of everything, start-up included.
+The median epoch of every trial under Tune relative to that in the loop, and the time a trial spends between its epochs,
+which neighbours on the machine touch less (what it pays while it trains); the time from the end of a trial to the first
+epoch of the next one (what it pays between trials; kernels are in Warp's cache from the loop, which ran first); and the
+wall time of everything, start-up included.
 """
 
 import argparse
@@ -33,18 +34,29 @@ TIMES_FILE = "times.json"
 
 
 class TimedTrainer(Trainer):
-    """Leaves in the trial's folder when its first epoch began and when it ended [s since the epoch]."""
+    """Leaves in the trial's folder when its first epoch began and when it ended [s since the epoch], and the time
+    between its epochs (reports, gauges, watchdog) as a share of that in them."""
 
     _begun: float | None = None
+    _inside = _between = 0.0
+    _left: float | None = None
 
     def run_epoch(self) -> dict[str, float]:
+        entered = time.monotonic()
         if self._begun is None:
             self._begun = time.time()
-        return super().run_epoch()
+        if self._left is not None:
+            self._between += entered - self._left
+        row = super().run_epoch()
+        self._left = time.monotonic()
+        self._inside += self._left - entered
+        return row
 
     def close(self) -> None:
         super().close()
-        (self.logdir / TIMES_FILE).write_text(json.dumps({"begun": self._begun, "ended": time.time()}))
+        share = self._between / self._inside
+        times = {"begun": self._begun, "ended": time.time(), "between_share": share}
+        (self.logdir / TIMES_FILE).write_text(json.dumps(times))
 
 
 def drive(arguments: list[str]) -> int:
@@ -122,11 +134,13 @@ def main() -> None:
         ratios = [epoch_seconds(a) / epoch_seconds(folder / "loop" / t.id) for a, t in zip(tuned, trials, strict=True)]
         between = turnarounds(tuned)
         epochs = [epoch_seconds(path) for path in tuned]
+        shares = [100 * json.loads((path / TIMES_FILE).read_text())["between_share"] for path in tuned]
         text = (folder / "tune.log").read_text()
     header = ["figure", "median", "least", "most"]
     rows = [
         ["epoch under Tune / in the loop", *_spread(ratios, ".3f")],
         ["epoch under Tune [ms]", *_spread([1e3 * e for e in epochs], ".1f")],
+        ["time between epochs, of that in them [%]", *_spread(shares, ".2f")],
         ["end of a trial to first epoch of the next [s]", *_spread(between, ".2f")],
         ["wall time under Tune / in the loop", f"{by_tune / by_loop:.3f}", f"{by_tune:.0f} s", f"{by_loop:.0f} s"],
     ]

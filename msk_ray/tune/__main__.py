@@ -15,6 +15,7 @@ from msk_ray.errors import ConfigError
 from msk_ray.tune import experiment as experiments
 from msk_ray.tune.extension import extended_space, parse_extension
 from msk_ray.tune.listing import text_table, trial_rows
+from msk_ray.tune.made_up import recover
 from msk_ray.tune.outcomes import Outcome
 from msk_ray.tune.smoke import shrink, without_pruning
 from msk_ray.tune.space import Space, find_space, parse_seeds, parse_space
@@ -194,11 +195,14 @@ def _run(args: argparse.Namespace, space: Space, trials: list[Trial], extension:
     path = _experiment_path(args)
     going_on = args.resume or bool(extension)
     if going_on:
-        if space.file.search == "optuna":
-            raise ConfigError("--resume: a search by optuna cannot go on; pass another --name")
-        experiment = experiments.reopen(path, trials, extension)
-        # As recorded: with the ids they began with, and the epochs they were extended to.
-        trials = experiment.trials()
+        searching = space.file.search == "optuna"
+        experiment = experiments.reopen(path, None if searching else trials, extension)
+        if searching:
+            # Else the manifest learns of them only at the end.
+            experiment.set_trials(made.trial for made in recover(experiment, space))
+        else:
+            # As recorded: with the ids they began with, and the epochs they were extended to.
+            trials = experiment.trials()
         experiment.clear_endings(_retried(args))
     # ray and torch take seconds to load; a wrong command line should not wait for them.
     from msk_ray.tune import runner

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import ray
 
 from msk_ray.cli import Parser, run
+from msk_ray.tune.addresses import knock
 
 DESCRIPTION = "Exit code: 0 if at least N nodes are alive, 1 if fewer are or nobody answers at the address."
 EXAMPLES = """\
@@ -29,25 +30,28 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser().parse_args(argv)
     deadline = time.monotonic() + args.wait
     while True:
-        alive = _alive(args.address)
-        if alive is None:
-            print(f"nobody answers at {args.address} yet", flush=True)
+        try:
+            alive = _alive(args.address)
+        except OSError as error:  # ConnectionError too
+            print(f"nobody answers at {args.address} yet: {' '.join(str(error).split())}", flush=True)
         else:
             print(f"{alive} of {args.nodes} node(s) have joined", flush=True)
-        if alive is not None and alive >= args.nodes:
-            return 0
+            if alive >= args.nodes:
+                return 0
         if time.monotonic() + _PAUSE_S > deadline:
             return 1
         time.sleep(_PAUSE_S)
 
 
-def _alive(address: str) -> int | None:
-    """Nodes alive; None if nobody answers."""
-    try:
-        ray.init(address=address, logging_level="ERROR", log_to_driver=False)
-    except ConnectionError:
-        return None
-    alive = sum(node["Alive"] for node in ray.nodes())
+def _alive(address: str) -> int:
+    """Nodes alive.
+
+    Raises:
+        OSError: nobody answers.
+    """
+    knock(address)
+    ray.init(address=address, logging_level="ERROR", log_to_driver=False)
+    alive: int = sum(node["Alive"] for node in ray.nodes())
     ray.shutdown()
     return alive
 

@@ -2,7 +2,6 @@
 
 import logging
 import os
-import socket
 import tempfile
 import time
 import warnings
@@ -16,7 +15,7 @@ import ray
 from ray import tune
 from ray.exceptions import RayTaskError
 from ray.tune import Callback
-from ray.tune.search import BasicVariantGenerator
+from ray.tune.search import BasicVariantGenerator, Searcher
 from ray.tune.stopper import Stopper
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
@@ -28,11 +27,13 @@ from msk_ray.progress import format_duration
 from msk_ray.training import Trainer, precompile
 from msk_ray.tune import standby
 from msk_ray.tune.adapters import METRIC, Population, PruningScheduler, domain, optuna_search
+from msk_ray.tune.addresses import knock
 from msk_ray.tune.devices import Placement
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.gauges import StateGauge
 from msk_ray.tune.journal import JOURNAL_FILE, Journal, replay
 from msk_ray.tune.live import Live
+from msk_ray.tune.made_up import MadeUp, recover
 from msk_ray.tune.operators import Listed
 from msk_ray.tune.outcomes import read_ending, write_ending
 from msk_ray.tune.pruning import make_pruner
@@ -43,7 +44,6 @@ from msk_ray.tune.trainable import Job, make_trainable
 from msk_ray.tune.trial_run import TrainerLike
 from msk_ray.tune.trials import Trial, base_settings, env_steps_budget
 
-_KNOCK_S = 20.0
 Precompile = Callable[[Config, str, Path], None]
 
 
@@ -79,6 +79,7 @@ def ray_session(address: str | None, dashboard: bool | None = None) -> Iterator[
         RAY_AIR_NEW_OUTPUT="0",
         RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO="1",  # a trial without GPUs sees none, rather than all
         TUNE_DISABLE_AUTO_CALLBACK_LOGGERS="1",  # trials write their own metrics, at once
+        TUNE_DISABLE_STRICT_METRIC_CHECKING="1",  # a trial asked to stop may not have been evaluated yet
         TUNE_DISABLE_SIGINT_HANDLER="1",  # a request to stop lets trials save themselves first
     )
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
@@ -97,7 +98,7 @@ def ray_session(address: str | None, dashboard: bool | None = None) -> Iterator[
         context = ray.init("local", include_dashboard=dashboard, dashboard_host="127.0.0.1", **common)
     else:
         try:
-            _knock(address)
+            knock(address)
             context = ray.init(address=address, **common)
         except OSError as error:  # ConnectionError too
             raise DeviceError(
@@ -111,17 +112,6 @@ def ray_session(address: str | None, dashboard: bool | None = None) -> Iterator[
         yield
     finally:
         ray.shutdown()
-
-
-def _knock(address: str) -> None:
-    """See whether anybody listens at HOST:PORT: Ray itself would try for minutes.
-
-    Raises:
-        OSError: nobody does.
-    """
-    host, _, port = address.rpartition(":")
-    if "://" not in address and port.isdigit():
-        socket.create_connection((host, int(port)), timeout=_KNOCK_S).close()
 
 
 def cluster_gpus() -> int:
@@ -142,7 +132,10 @@ def run_trials(plan: Plan) -> bool:
     experiment, space = plan.experiment, plan.space
     _finish_pruning(plan)
     remaining = [t for t in plan.trials if read_record(t, experiment.trial_folder(t.id)).ending is None]
-    if plan.trials and not remaining:
+    made_up = [] if plan.trials else recover(experiment, space)
+    begun = [m for m in made_up if read_record(m.trial, experiment.trial_folder(m.trial.id)).ending is None]
+    missing = space.file.samples - len(made_up) + len(begun)
+    if (plan.trials and not remaining) or (made_up and missing <= 0):
         print("all trials have ended already")
         return True
     base = base_settings(space) if not plan.trials else {}
@@ -152,6 +145,7 @@ def run_trials(plan: Plan) -> bool:
         base,
         {trial.id: trial for trial in plan.trials},
         plan.placement.device,
+        plan.placement.gpus,
         plan.placement.cpus,
         plan.trainer_class,
     )
@@ -160,13 +154,13 @@ def run_trials(plan: Plan) -> bool:
     total = ray.cluster_resources()
     concurrent = plan.placement.concurrent(total.get("GPU", 0.0), total.get("CPU", 1.0), plan.max_concurrent)
     stop = StopRequest()
-    live = Live(experiment, remaining, job.trial_of, concurrent, stop)
+    live = Live(experiment, remaining, job.trial_of, concurrent, stop, [m.trial for m in made_up])
     print(
-        f"{len(remaining) or space.file.samples} trials, {concurrent} at once on "
+        f"{len(remaining) or missing} trials, {concurrent} at once on "
         f"{f'{plan.placement.gpus:g} GPU each' if plan.placement.gpus else 'CPU'}; into {experiment.path}",
         flush=True,
     )
-    _fit(plan, job, live, remaining)
+    _fit(plan, job, live, remaining, made_up)
     if not plan.trials:
         # A search makes trials up as it goes; they enter the manifest once they are known.
         experiment.set_trials(live.started)
@@ -189,7 +183,7 @@ def _finish_pruning(plan: Plan) -> None:
         write_ending(folder, ending)
 
 
-def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial]) -> None:
+def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial], made_up: list[MadeUp]) -> None:
     spec, file = plan.space.file.scheduler, plan.space.file
     budget = _budget(plan.space, plan.trials or [_first_suggestion(job)])
     if spec.kind == "pbt":
@@ -203,8 +197,11 @@ def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial]) -> None:
         )
     resources = {"cpu": plan.placement.cpus} | ({"gpu": plan.placement.gpus} if plan.placement.gpus else {})
     searching = file.search == "optuna"
+    search, samples = _search(plan, made_up) if searching else (_listed(plan), 1)
     node = _OwnNode()
-    spare = [Standby(plan.placement, plan.max_concurrent, live.waiting)] if plan.standby else []
+    spare = [Standby(plan.placement, plan.max_concurrent, live.waiting)] if plan.standby and standby.available() else []
+    if plan.standby and not spare:
+        print("no process on standby, so trials begin seconds later: pip install grpcio to have them", flush=True)
     tuner = tune.Tuner(
         tune.with_resources(make_trainable(job), resources),
         param_space=_param_space(job, remaining),
@@ -212,11 +209,8 @@ def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial]) -> None:
             metric=METRIC,
             mode="max",
             scheduler=scheduler,
-            search_alg=optuna_search(file.sample_seed)
-            if searching
-            # Tune limits a generator it was given no more than this one limits itself.
-            else BasicVariantGenerator(max_concurrent=plan.max_concurrent or 0),
-            num_samples=file.samples if searching else 1,
+            search_alg=search,
+            num_samples=samples,
             max_concurrent_trials=plan.max_concurrent,
             reuse_actors=False,  # a process of its own frees a trial's GPU memory, whatever it did
             trial_dirname_creator=lambda trial: f"{trial.config.get('id', 'trial')}_{trial.trial_id}",
@@ -246,6 +240,26 @@ def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial]) -> None:
         raise _advised(failure) from error
     if live.storage_failure is not None:
         raise _advised(live.storage_failure)
+
+
+def _listed(plan: Plan) -> BasicVariantGenerator:
+    # Tune limits a generator it was given no more than this one limits itself.
+    return BasicVariantGenerator(max_concurrent=plan.max_concurrent or 0)
+
+
+def _search(plan: Plan, made_up: list[MadeUp]) -> tuple[Searcher, int]:
+    """Optuna's search, told what it has done so far, and how many trials are still to be run."""
+    begun, scored, ended = [], [], 0
+    for made in made_up:
+        record = read_record(made.trial, plan.experiment.trial_folder(made.trial.id))
+        if record.ending is None:
+            begun.append(made.params)
+            continue
+        ended += 1
+        if record.best is not None:
+            scored.append((made.params, record.best.score))
+    file = plan.space.file
+    return optuna_search(file.sample_seed, begun, scored), file.samples - ended
 
 
 class _OwnNode(Callback):

@@ -5,6 +5,7 @@ begins in it, on the GPU that trial was given.
 """
 
 import importlib
+import importlib.util
 import os
 import sys
 from collections.abc import Callable
@@ -41,6 +42,11 @@ def import_all() -> None:
 
 HOOK = f"{import_all.__module__}.{import_all.__name__}"
 """For the runtime environment of Ray's session."""
+
+
+def available() -> bool:
+    """Whether raylets can be spoken to from here; grpc comes with ray[default]."""
+    return importlib.util.find_spec("grpc") is not None
 
 
 def nodes_for(placement: Placement) -> list[dict[str, Any]]:

@@ -19,16 +19,20 @@ from ray import tune
 from msk_ray.config import parse_config
 from msk_ray.errors import storage_failure
 from msk_ray.tune.adapters import METRIC
+from msk_ray.tune.devices import wait_for_memory
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.gauges import TrialGauges
 from msk_ray.tune.hparams import log_hparams
-from msk_ray.tune.operators import Listed, describe
+from msk_ray.tune.made_up import make_up, write_params
 from msk_ray.tune.outcomes import write_text
 from msk_ray.tune.records import evaluations_of, read_rows
 from msk_ray.tune.space import Space
 from msk_ray.tune.stopping import Evaluation
 from msk_ray.tune.trial_run import HANG_FILE, Hooks, TrainerLike, run_trial
-from msk_ray.tune.trials import Trial, make_trial, overlay
+from msk_ray.tune.trials import Trial, overlay
+
+MEMORY_LIMIT_S = 60.0
+"""How long a trial waits for the memory of its GPU [s]."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +45,8 @@ class Job:
     trials: dict[str, Trial]
     """Trials by id; empty when a search makes them up."""
     device: str
+    gpus: float
+    """GPUs of a trial, 0 on CPU."""
     threads: int
     trainer_class: type[TrainerLike]
 
@@ -56,14 +62,7 @@ class Job:
         """
         params = config.get("params", {})
         if "id" not in config:
-            values, changed = {}, {}
-            for key, op in self.space.sampled.items():
-                level = (
-                    next((lv for lv in op.levels if lv.label == params[key]), None) if isinstance(op, Listed) else None
-                )
-                values[key] = params[key] if level is None else level.value
-                changed[key] = describe(params[key])
-            return make_trial(self.space, self.base, changed, values, self.space.seeds[0], 0)
+            return make_up(self.space, self.base, params)
         trial = self.trials[config["id"]]
         if not params:
             return trial
@@ -76,8 +75,12 @@ def make_trainable(job: Job) -> Callable[[dict[str, Any]], None]:
 
     def trainable(config: dict[str, Any]) -> None:
         trial = job.trial_of(config)
+        folder = job.experiment.trial_folder(trial.id)
         try:
-            attempt(trial, job.experiment.trial_folder(trial.id))
+            folder.mkdir(parents=True, exist_ok=True)
+            if "id" not in config:
+                write_params(folder, config["params"])
+            attempt(trial, folder)
         except Exception as error:
             # Whatever stumbled over a full disk first, a line of output perhaps: the driver must hear of the disk.
             failure = storage_failure(error)
@@ -86,11 +89,12 @@ def make_trainable(job: Job) -> Callable[[dict[str, Any]], None]:
             raise failure from error
 
     def attempt(trial: Trial, folder: Path) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
         _redirect_output(folder / "output.log")
         _limit_threads(job.threads)
         _record_device(folder / "device.json")
         log_hparams(folder, trial)
+        if job.gpus:
+            _wait_for_gpu(job.gpus)
         gauges = TrialGauges(job.experiment.name, trial)
         with tempfile.TemporaryDirectory() as scratch, _watchdog(folder, job.space.file.resources.hang_s) as alive:
 
@@ -202,6 +206,22 @@ def _limit_threads(threads: int) -> None:
     import torch
 
     torch.set_num_threads(threads)
+
+
+def _wait_for_gpu(share: float) -> None:
+    """Wait until a process that had this GPU before has given its memory back."""
+    import torch
+
+    def free_share() -> float:
+        free, total = torch.cuda.mem_get_info(0)
+        return free / total
+
+    left = wait_for_memory(min(share, 1.0), free_share, MEMORY_LIMIT_S)
+    if left is not None:
+        print(
+            f"the GPU has only {left:.0%} of its memory free after {MEMORY_LIMIT_S:.0f} s: who else uses it?",
+            flush=True,
+        )
 
 
 def _record_device(path: Path) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from msk_ray.errors import ConfigError, DeviceError, StorageError
 from msk_ray.tune import experiment as experiments
-from msk_ray.tune.devices import Placement, choose_placement
+from msk_ray.tune.devices import Placement, choose_placement, wait_for_memory
 from msk_ray.tune.listing import text_table
 from msk_ray.tune.outcomes import Ending, Outcome, read_ending, write_ending
 from msk_ray.tune.records import best_record, read_record
@@ -134,6 +134,18 @@ def test_placement() -> None:
             choose_placement(resources, wrong, cpu=False, gpus=4)
     with pytest.raises(ConfigError, match="exclude"):
         choose_placement(resources, 1.0, cpu=True, gpus=4)
+
+
+def test_the_memory_of_a_dead_trial_is_waited_for() -> None:
+    paused: list[float] = []
+    shares = iter([0.1, 0.1, 0.95])
+    assert wait_for_memory(1.0, lambda: next(shares), 60.0, paused.append) is None
+    assert len(paused) == 2
+    # A quarter of a GPU needs a quarter of its memory.
+    assert wait_for_memory(0.25, lambda: 0.3, 60.0, paused.append) is None
+    assert len(paused) == 2
+    assert wait_for_memory(1.0, lambda: 0.4, 5.0, paused.append) == 0.4
+    assert sum(paused[2:]) == 5.0
 
 
 def test_concurrent_trials() -> None:
