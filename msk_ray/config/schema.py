@@ -112,10 +112,10 @@ class AssistConfig(Section):
     """Epochs until they are gone; 0 has none at all."""
     share: Fraction = 1.0
     """Of the stiffness below, at epoch 0."""
-    balance: NonNegative = 400.0
-    """Righting torque of tilt, list and turn [N m/rad]; its damper is critical for a 10 kg m² body."""
-    lateral: NonNegative = 400.0
-    """Force towards the line walked on [N/m]; its damper is critical for the body's mass."""
+    balance: NonNegative = 800.0
+    """Righting torque of tilt and list [N m/rad]; of the turn as much less as its inertia is. Critically damped."""
+    lateral: NonNegative = 800.0
+    """Force towards the line walked on [N/m]. Critically damped."""
     support: Fraction = 0.0
     """Share of the body's weight that is carried."""
 
