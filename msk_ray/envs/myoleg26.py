@@ -90,7 +90,7 @@ class MyoLeg26(LegEnv[MyoLeg26EnvConfig]):
         qpos[:, 3:] += noise * self.uniform(count, self.model.nq - 3)
         qpos[:, 6:] = qpos[:, 6:].clamp(*self._ranges)
         qpos[:, 1] += 0.2 * noise * (1.0 + self.uniform(count, 1)[:, 0])
-        qvel += 10.0 * noise * self.uniform(count, self.model.nv)
+        qvel += 5.0 * noise * self.uniform(count, self.model.nv)
         return StepState(qpos, qvel, act)
 
     def ground_height(self, x: Tensor) -> Tensor:
