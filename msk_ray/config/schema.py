@@ -400,6 +400,8 @@ class ActorConfig(NetworkConfig):
     """Gaussian with state-independent standard deviation; False is deterministic."""
     log_std: float = -1.0
     """Initial log standard deviation, before tanh."""
+    output_gain: PositiveFloat = 1.0
+    """Gain of the last layer's initial weights; a small one starts from action 0, whatever is observed."""
 
 
 class CriticConfig(NetworkConfig):
