@@ -90,8 +90,8 @@ def c_mujoco(model: mujoco.MjModel, substeps: int, seconds: float) -> float:
     return rate(run, 32, torch.device("cpu"), seconds)
 
 
-def myosuite(name: str, seconds: float) -> float:
-    """Control steps a second of one of myosuite's own environments, on one thread, under random actions."""
+def myosuite(name: str, seconds: float) -> tuple[float, float]:
+    """Control steps a second of one of myosuite's environments, one thread, random actions, and how long one is [s]."""
     from myosuite.utils import gym
 
     env = gym.make(name)
@@ -104,7 +104,7 @@ def myosuite(name: str, seconds: float) -> float:
             if terminated or truncated:
                 env.reset()
 
-    return rate(run, 50, torch.device("cpu"), seconds)
+    return rate(run, 50, torch.device("cpu"), seconds), float(env.unwrapped.dt)
 
 
 def main() -> None:
@@ -138,8 +138,9 @@ def main() -> None:
             if importlib.util.find_spec("myosuite") is None:
                 notes.append("myosuite is not installed: its own rate was not measured.")
             else:
-                rate_there = myosuite(args.myosuite, args.seconds)
-                notes.append(f"myosuite's {args.myosuite}, one CPU thread: {rate_there:,.0f} control steps/s.")
+                there, lasting = myosuite(args.myosuite, args.seconds)
+                what = f"control steps/s of {1e3 * lasting:.0f} ms"
+                notes.append(f"myosuite's {args.myosuite}, one CPU thread: {there:,.0f} {what}.")
         title = (
             f"Control steps a second of {name} (nv {one.model.nv}, muscles {one.action_size}), horizon {args.horizon}"
         )

@@ -112,10 +112,10 @@ class AssistConfig(Section):
     """Epochs until they are gone; 0 has none at all."""
     share: Fraction = 1.0
     """Of the stiffness below, at epoch 0."""
-    balance: NonNegative = 400.0
-    """Righting torque of tilt, list and turn [N m/rad]; its damper is critical for a 10 kg m² body."""
-    lateral: NonNegative = 400.0
-    """Force towards the line walked on [N/m]; its damper is critical for the body's mass."""
+    balance: NonNegative = 800.0
+    """Righting torque of tilt and list [N m/rad]; of the turn as much less as its inertia is. Critically damped."""
+    lateral: NonNegative = 800.0
+    """Force towards the line walked on [N/m]. Critically damped."""
     support: Fraction = 0.0
     """Share of the body's weight that is carried."""
 
@@ -177,8 +177,9 @@ class MyoLeg26EnvConfig(LegEnvSettings):
     assist: AssistConfig = AssistConfig()
     reset: Literal["stand", "walk", "mixed"] = "stand"
     """Initial states about the standing keyframe, the two walking ones, or all three alike."""
-    reset_noise: NonNegative = 0.03
-    """Spread of initial joint angles [rad]; velocities spread ten times that a second."""
+    reset_noise: NonNegative = 0.02
+    """Spread of initial joint angles [rad]; velocities, the pelvis's among them, spread five times that a second, which
+    moves the capture point by 3 cm: feet on the spot can still catch it."""
 
 
 class MyoLegEnvConfig(LegEnvSettings):
@@ -404,6 +405,8 @@ class ActorConfig(NetworkConfig):
     """Gaussian with state-independent standard deviation; False is deterministic."""
     log_std: float = -1.0
     """Initial log standard deviation, before tanh."""
+    output_gain: PositiveFloat = 1.0
+    """Gain of the last layer's initial weights; a small one starts from action 0, whatever is observed."""
 
 
 class CriticConfig(NetworkConfig):

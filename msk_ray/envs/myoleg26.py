@@ -14,8 +14,8 @@ from msk_ray.envs.models.myoleg26_tables import JOINTS
 from msk_ray.envs.models.terrain import Terrain
 from msk_ray.simulation import StepState
 
-_ROTATING_INERTIA = 10.0
-"""Rough inertia of the body about its pelvis [kg m²], for the assistance's dampers."""
+_TRUNK_INERTIA = (7.0, 7.0, 0.85)
+"""Inertia of pelvis and trunk about tilt, list and rotation [kg m²]: what the assistance turns, the legs hanging on."""
 _GRAVITY = 9.81
 
 
@@ -54,9 +54,11 @@ class MyoLeg26(LegEnv[MyoLeg26EnvConfig]):
         mass = float(model.body_subtreemass[0])
         a = self.config.assist
         # Critical damping: c = 2 √(k m).
-        lateral, balance = 2.0 * math.sqrt(a.lateral * mass), 2.0 * math.sqrt(a.balance * _ROTATING_INERTIA)
-        self._springs = self._tensor([0.0, 0.0, a.lateral, a.balance, a.balance, a.balance])
-        self._dampers = self._tensor([0.0, 0.0, lateral, balance, balance, balance])
+        # The same frequency about all three axes, or the light one would ring within a control step.
+        righting = [a.balance * inertia / _TRUNK_INERTIA[0] for inertia in _TRUNK_INERTIA]
+        damping = [2.0 * math.sqrt(k * inertia) for k, inertia in zip(righting, _TRUNK_INERTIA, strict=True)]
+        self._springs = self._tensor([0.0, 0.0, a.lateral, *righting])
+        self._dampers = self._tensor([0.0, 0.0, 2.0 * math.sqrt(a.lateral * mass), *damping])
         self._lift = self._tensor([0.0, a.support * mass * _GRAVITY, 0.0, 0.0, 0.0, 0.0])
         self._upright_pose = self._tensor(model.key("stand").qpos[:6])
 
@@ -88,7 +90,7 @@ class MyoLeg26(LegEnv[MyoLeg26EnvConfig]):
         qpos[:, 3:] += noise * self.uniform(count, self.model.nq - 3)
         qpos[:, 6:] = qpos[:, 6:].clamp(*self._ranges)
         qpos[:, 1] += 0.2 * noise * (1.0 + self.uniform(count, 1)[:, 0])
-        qvel += 10.0 * noise * self.uniform(count, self.model.nv)
+        qvel += 5.0 * noise * self.uniform(count, self.model.nv)
         return StepState(qpos, qvel, act)
 
     def ground_height(self, x: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ class Actor(nn.Module):
 
     def __init__(self, config: ActorConfig, obs_size: int, action_size: int, generator: torch.Generator) -> None:
         super().__init__()
-        self.mean = make_mlp(config, obs_size, action_size, generator)
+        self.mean = make_mlp(config, obs_size, action_size, generator, config.output_gain)
         self.log_std = nn.Parameter(torch.full((action_size,), config.log_std)) if config.stochastic else None
 
     def forward(self, obs: Tensor, noise: Tensor | None = None) -> Tensor:

@@ -10,10 +10,12 @@ from msk_ray.config import NetworkConfig
 _ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "silu": nn.SiLU, "relu": nn.ReLU, "tanh": nn.Tanh}
 
 
-def make_mlp(config: NetworkConfig, inputs: int, outputs: int, generator: torch.Generator) -> nn.Sequential:
+def make_mlp(
+    config: NetworkConfig, inputs: int, outputs: int, generator: torch.Generator, output_gain: float = 1.0
+) -> nn.Sequential:
     """Linear, activation and optional LayerNorm per hidden layer; a linear last layer.
 
-    Weights are orthogonal, with gain √2 in hidden layers and 1 in the last, biases zero, drawn from `generator`.
+    Weights are orthogonal, with gain √2 in hidden layers and `output_gain` in the last, biases zero, drawn from `generator`.
     """
     layers: list[nn.Module] = []
     sizes = (inputs, *config.hidden)
@@ -21,7 +23,7 @@ def make_mlp(config: NetworkConfig, inputs: int, outputs: int, generator: torch.
         layers += [_linear(fan_in, fan_out, 2**0.5, generator), _ACTIVATIONS[config.activation]()]
         if config.layer_norm:
             layers.append(nn.LayerNorm(fan_out))
-    layers.append(_linear(sizes[-1], outputs, 1.0, generator))
+    layers.append(_linear(sizes[-1], outputs, output_gain, generator))
     return nn.Sequential(*layers)
 
 

@@ -230,13 +230,35 @@ def test_assistance_fades_and_the_score_is_free_of_it() -> None:
     for epoch in (0, 5, 10, 11):
         helped.begin_epoch(epoch)
         forces.append(helped.control(torch.zeros(1, 26))[0, 26:])
-    assert forces[0][4].item() == pytest.approx(-40.0, rel=1e-4)
+    assert forces[0][4].item() == pytest.approx(-80.0, rel=1e-4)
     assert forces[0][1].item() == pytest.approx(0.5 * 75.1646 * 9.81, rel=1e-3)
     assert torch.allclose(forces[1], 0.5 * forces[0])
     assert not forces[2].any()
     assert not forces[3].any()
     reference = MyoLeg26.reference_settings(helped.config)
     assert reference.assist.epochs == 0
+
+
+def test_assistance_holds_the_trunk_and_does_not_ring() -> None:
+    env = make(8, assist={"epochs": 10}, reset="mixed")
+    env.begin_epoch(0)
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(60):
+        env.step((torch.rand((8, 26), generator=generator) - 0.5) * 1.6, auto_reset=False)
+        qpos, qvel, _ = env.state.physics
+        assert qvel[:, :6].abs().max() < 8.0
+    assert qpos[:, 3:6].abs().median() < 0.2
+
+
+def test_the_standing_keyframe_is_held_by_its_excitations(env: MyoLeg26) -> None:
+    data = mujoco.MjData(env.model)
+    mujoco.mj_resetDataKeyframe(env.model, data, env.model.key("stand").id)
+    height, tilt = data.qpos[1], data.qpos[3]
+    assert 0.0 <= data.ctrl.min() <= data.ctrl.max() < 0.1, "quiet standing takes little"
+    while data.time < 0.3:
+        mujoco.mj_step(env.model, data)
+    assert data.qpos[1] == pytest.approx(height, abs=0.005)
+    assert data.qpos[3] == pytest.approx(tilt, abs=0.03)
 
 
 def test_scores_use_reference_weights_and_contacts_but_the_same_task() -> None:

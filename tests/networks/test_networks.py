@@ -47,3 +47,12 @@ def test_the_same_seed_gives_the_same_network() -> None:
     make = lambda seed: Actor(ActorConfig(), 4, 2, torch.Generator().manual_seed(seed)).mean[0].weight  # noqa: E731
     assert torch.equal(make(3), make(3))
     assert not torch.equal(make(3), make(4))
+
+
+def test_a_small_output_gain_starts_near_rest() -> None:
+    obs = torch.randn(64, 6)
+    sizes = {}
+    for gain in (1.0, 0.01):
+        actor = Actor(ActorConfig(hidden=(32,), output_gain=gain), 6, 3, torch.Generator().manual_seed(0))
+        sizes[gain] = torch.atanh(actor(obs)).norm().item()
+    assert abs(sizes[0.01] / sizes[1.0] - 0.01) < 1e-4
