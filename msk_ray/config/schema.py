@@ -163,8 +163,8 @@ class LegEnvSettings(EnvSettings):
     """Cosine between the trunk's up axis and +z below which an episode ends."""
     early_termination: bool = True
     """End an episode on a fall."""
-    rest_excitation: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.05
-    """Least excitation of a muscle at action 0; one that the standing keyframe excites more starts from that."""
+    rest_excitation: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.02
+    """Least excitation of a muscle at action 0, where standing keyframes do not ask for more."""
     success_speed: NonNegative = 0.8
     """Mean speed over the episode from which walking counts as a success [m/s]."""
 
