@@ -17,7 +17,7 @@ $(STAMP): pyproject.toml constraints.txt
 	$(RUN) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	touch $@
 
-demo: env            ## a real small Ray Tune sweep (GPU if there is one), ending in its table, curves and best policy
+demo: env            ## a real small Ray Tune sweep (GPU if there is one), ending in its table and report
 	rm -rf runs/demo
 	$(RUN) -m msk_ray.tune --space cartpole_smoke --name demo
 

@@ -37,7 +37,7 @@ from msk_ray.tune.space import load_space
 from msk_ray.tune.trials import Trial, resolve_trials
 
 REPOSITORY = Path(msk_ray.__file__).resolve().parent.parent
-EPOCHS = 20
+EPOCHS = 40
 SPACE = {
     "question": "What does a sweep survive?",
     "base": "configs/cartpole.yaml",
@@ -54,7 +54,7 @@ SPACE = {
     "seeds": "0-1",
     "resources": {"max_failures": 20, "hang_s": 20.0},
 }
-"""Four trials of twenty epochs, checkpointed every second one."""
+"""Four trials of forty epochs, checkpointed every second one."""
 TIMING = ("seconds", "env_steps_per_s", "time/")
 DISK_MIB = 48
 RESUMABLE = 75
@@ -202,6 +202,7 @@ class Sweep:
         self._storage = storage or scratch / "runs"
         self.path = self._storage / name
         self._launches = 0
+        self._rows_at_launch = 0
         self._driver: subprocess.Popen[bytes] | None = None
         self._started = time.monotonic()
         self._family: dict[int, str] = {}
@@ -226,6 +227,7 @@ class Sweep:
         arguments = ["--space", str(self._scratch / "space.yaml"), "--name", self.name, "--storage", str(self._storage)]
         arguments += ["--cpu", "--max-concurrent", "2", *(["--resume"] if self._launches else []), *more]
         self._launches += 1
+        self._rows_at_launch = self.rows()
         paths = [str(REPOSITORY), *filter(None, [os.environ.get("PYTHONPATH")])]
         environment = os.environ | {"RAY_TMPDIR": str(self._scratch), "PYTHONPATH": os.pathsep.join(paths)}
         with (self._scratch / f"{self.name}.log").open("ab") as log:
@@ -254,9 +256,11 @@ class Sweep:
         return sum(len(read_rows(self.path / "trials" / trial.id)) for trial in self.trials)
 
     def wait_for_rows(self, count: int) -> bool:
-        """False if the driver ended before the trials had so many rows."""
+        """Wait for so many rows, one of them new since the launch; False if the driver ended before."""
         assert self._driver is not None
         deadline = time.monotonic() + LAUNCH_LIMIT_S
+        # Trials of a dead raylet train on for a moment, perhaps past the next share already.
+        count = max(count, self._rows_at_launch + 1)
         while self.rows() < count:
             if self._driver.poll() is not None or time.monotonic() > deadline:
                 return False
@@ -408,15 +412,18 @@ def damaged(reference: Reference, scratch: Path, rng: random.Random) -> list[Tal
     def strike() -> int:
         code = sweep.kill(signal.SIGKILL)
         sweep.leftovers()  # else a dying trial may still write a whole one
-        name = waiting.pop(0)
+        # The kinds in turn; a strike before any checkpoint hits nothing, and its kind has its turn again.
+        name = waiting.pop(0) if waiting else min(hit, key=hit.__getitem__)
         for trial in sweep.running():
             found = sorted((sweep.path / "trials" / trial.id / "checkpoints").glob("epoch_*.pt"))
             if found:
                 kinds[name](found[-1])
                 hit[name] += 1
+        if not hit[name]:
+            waiting.insert(0, name)
         return code
 
-    _strike(sweep, rng, len(kinds), strike)
+    _strike(sweep, rng, len(kinds) + 2, strike)
     return [
         _judge(reference, sweep, f"driver SIGKILL and newest checkpoint {name}", hit[name], "--resume")
         for name in kinds

@@ -3,6 +3,7 @@
 import argparse
 import json
 import math
+import os
 import random
 import resource
 import subprocess
@@ -97,6 +98,7 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as scratch:
             experiment = generate(Path(scratch), trials, args.epochs)
             read = sum(path.stat().st_size for path in experiment.path.rglob("metrics.jsonl"))
+            load = os.getloadavg()[0]
             before = resource.getrusage(resource.RUSAGE_CHILDREN)
             started = time.monotonic()
             command = [sys.executable, "-m", "msk_ray.report", str(experiment.path), "--best", "never"]
@@ -106,9 +108,9 @@ def main() -> None:
             cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
             page = experiment.path / "report" / "index.html"
             figures = [f"{read / 1e6:.0f}", f"{wall:.1f}", f"{cpu:.1f}", f"{after.ru_maxrss / 1024:.0f}"]
-            rows.append([f"{trials}", f"{args.epochs}", *figures, f"{page.stat().st_size / 1e6:.2f}"])
+            rows.append([f"{trials}", f"{args.epochs}", *figures, f"{page.stat().st_size / 1e6:.2f}", f"{load:.1f}"])
             print(rows[-1], flush=True)
-    header = ["trials", "rows each", "metrics, MB", "wall, s", "CPU, s", "peak memory, MB", "page, MB"]
+    header = ["trials", "rows each", "metrics, MB", "wall, s", "CPU, s", "peak memory, MB", "page, MB", "load before"]
     publish("report", "Report of a generated experiment", "cpu", markdown_table(header, rows), args.results)
 
 

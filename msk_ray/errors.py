@@ -35,6 +35,12 @@ class StorageFailure(StorageError):
     exit_code = 75  # EX_TEMPFAIL
 
 
+class ClusterLost(MskRayError):
+    """The Ray node this process belongs to has died. Trials go on from what they saved, with another Ray."""
+
+    exit_code = 75  # EX_TEMPFAIL
+
+
 def storage_failure(error: BaseException) -> StorageFailure | None:
     """The failed storage behind an exception, itself or one that it came from; None if it has another cause."""
     seen: BaseException | None = error

@@ -13,6 +13,7 @@ from msk_ray.cli import Parser, run
 from msk_ray.errors import MskRayError, StorageError
 from msk_ray.progress import format_duration
 from msk_ray.tune.experiment import Experiment
+from msk_ray.tune.outcomes import Outcome
 from msk_ray.tune.standing import (
     Observer,
     Standing,
@@ -43,7 +44,7 @@ EXAMPLES = """\
 WIDE = 140
 """Terminals of so many columns show hosts, GPU models and reasons too."""
 _STYLES = {State.RUNNING: "green", State.STALE: "yellow", State.UNREADABLE: "red", State.WAITING: "dim"}
-_FAILED = ("error", "nonfinite", "diverged")
+_FAILED = (Outcome.ERROR, Outcome.NONFINITE, Outcome.DIVERGED, Outcome.OUT_OF_MEMORY)
 
 
 def parser() -> Parser:
@@ -103,7 +104,8 @@ def view(observer: Observer, width: int, rows: int | None = None) -> "Renderable
     if len(shown) < len(standings):
         lines.append(Text(f"... and {len(standings) - len(shown)} more", style="dim"))
     if width < WIDE:  # a wide table has a column for it
-        lines += [Text(f"{s.id}: {s.note}", style="red") for s in shown if s.state is State.UNREADABLE]
+        told = [s for s in shown if s.state is State.UNREADABLE or s.outcome in (Outcome.ERROR, Outcome.OUT_OF_MEMORY)]
+        lines += [Text(f"{s.id}: {s.note}", style="red") for s in told]
     if observer.experiment.stop_file.exists() and any(s.state is not State.ENDED for s in standings):
         lines.append(Text("stopped on request: python -m msk_ray.tune --resume goes on"))
     return Group(*lines)

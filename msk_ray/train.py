@@ -16,7 +16,7 @@ checkpoints/ with the newest two and best.pt, the policy with the highest evalua
 
 EXAMPLES = """\
   python -m msk_ray.train --config configs/cartpole.yaml
-  python -m msk_ray.train --config configs/ant.yaml --device cuda:0 --seed 1 --set shac.horizon=16
+  python -m msk_ray.train --config configs/ant.yaml --device cuda:0 --seed 1 --set shac.horizon=32
   python -m msk_ray.train --config configs/ant.yaml --set 'shac.horizon={start: 8, end: 32, epochs: 100}'
   python -m msk_ray.train --config configs/cartpole.yaml --logdir runs/mine --resume   # after a crash or Ctrl-C
   tensorboard --logdir runs"""

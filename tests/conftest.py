@@ -1,10 +1,18 @@
 """Shared fixtures. Worlds are few and rollouts short: everything here runs on two CPU cores."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from msk_ray.config import Config, parse_config
+from msk_ray.config import Config, dump_yaml, load_config, parse_config
+from msk_ray.training import Trainer
+from msk_ray.tune import experiment as experiments
+from msk_ray.tune.hparams import log_hparams
+from msk_ray.tune.report import finish
+from msk_ray.tune.space import StopSpec, parse_space
+from msk_ray.tune.trial_run import Hooks, run_trial
+from msk_ray.tune.trials import resolve_trials
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -15,16 +23,68 @@ def root() -> Path:
     return ROOT
 
 
+@pytest.fixture(scope="session")
+def tiny_settings() -> dict[str, Any]:
+    """Settings of a CartPole trial of seconds."""
+    return {
+        "env": {"name": "cartpole", "nworld": 8, "episode_length": 40},
+        "shac": {"horizon": 8, "critic_iterations": 2, "critic_batches": 2},
+        "actor": {"hidden": [16, 16]},
+        "critic": {"hidden": [16, 16]},
+        "evaluation": {"interval": 2, "nworld": 4, "steps": 20},
+        "trial": {"epochs": 6, "checkpoint_interval": 2},
+    }
+
+
 @pytest.fixture
-def tiny_cartpole() -> Config:
+def tiny_cartpole(tiny_settings: dict[str, Any]) -> Config:
     """A CartPole trial of seconds."""
-    return parse_config(
-        {
-            "env": {"name": "cartpole", "nworld": 8, "episode_length": 40},
-            "shac": {"horizon": 8, "critic_iterations": 2, "critic_batches": 2},
-            "actor": {"hidden": [16, 16]},
-            "critic": {"hidden": [16, 16]},
-            "evaluation": {"interval": 2, "nworld": 4, "steps": 20},
-            "trial": {"epochs": 6, "checkpoint_interval": 2},
-        }
-    )
+    return parse_config(tiny_settings)
+
+
+@pytest.fixture(scope="session")
+def sweep(tmp_path_factory: pytest.TempPathFactory, tiny_settings: dict[str, Any]) -> experiments.Experiment:
+    """A real small sweep of CartPole, two rates by two seeds, trained here one after the other. Not to be changed."""
+    folder = tmp_path_factory.mktemp("sweep")
+    (folder / "base.yaml").write_text(dump_yaml(tiny_settings))
+    data = {
+        "question": "Which rate?",
+        "base": "base.yaml",
+        "parameters": {"shac.actor_lr": {"grid": [1e-2, 1e-4]}},
+        "seeds": "0-1",
+    }
+    space = parse_space(data, folder / "small.yaml")
+    trials = resolve_trials(space)
+    made = experiments.create(folder / "runs" / "small", space, trials, {})
+    for trial in trials:
+        own = made.trial_folder(trial.id)
+        own.mkdir(parents=True)
+        log_hparams(own, trial)
+        run_trial(trial, own, "cpu", StopSpec(), Trainer, Hooks())
+    assert finish(made) == 0
+    return made
+
+
+@pytest.fixture(scope="session")
+def ant_trial(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of an ant's trial of one epoch. Not to be changed."""
+    folder = tmp_path_factory.mktemp("ant")
+    trainer = Trainer(_small_config("ant"), folder, "cpu")
+    trainer.run_epoch()
+    trainer.close()
+    return folder
+
+
+@pytest.fixture(scope="session")
+def myoleg26_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A checkpoint of the leg model before any training."""
+    trainer = Trainer(_small_config("myoleg26_stand"), tmp_path_factory.mktemp("myoleg26"), "cpu")
+    path = trainer.save()
+    trainer.close()
+    return path
+
+
+def _small_config(name: str) -> Config:
+    small = ("env.nworld=4", "shac.horizon=4", "trial.epochs=1", "actor.hidden=[16,16]", "critic.hidden=[16,16]")
+    evaluation = ("evaluation.nworld=2", "evaluation.steps=40", "evaluation.interval=1")
+    return load_config(ROOT / "configs" / f"{name}.yaml", [*small, *evaluation])

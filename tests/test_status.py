@@ -163,6 +163,21 @@ def test_the_table_fits_the_terminal(
     assert ("number 3 of 3" in text) == (width == 200)
 
 
+def test_a_trial_that_ran_out_of_memory_says_what_to_lower(
+    experiment: experiments.Experiment, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trial = experiment.trials()[0]
+    experiment.trial_folder(trial.id).mkdir(parents=True, exist_ok=True)
+    why = "out_of_memory: cuda:0 has no room for 4096 worlds; lower env.nworld"
+    write_ending(experiment.trial_folder(trial.id), Ending(Outcome.OUT_OF_MEMORY, why))
+    monkeypatch.setenv("COLUMNS", "80")
+    assert run(main, [experiment.name, "--storage", str(experiment.path.parent)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert "lower env.nworld" in " ".join(" ".join(lines).split())
+    assert any(trial.id in line and "out_of_memory" in line for line in lines)
+
+
 def test_an_experiment_by_path_with_a_request_to_stop(
     experiment: experiments.Experiment, capsys: pytest.CaptureFixture[str]
 ) -> None:

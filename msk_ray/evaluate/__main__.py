@@ -73,8 +73,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         best_checkpoint(target)  # torch and Warp take seconds to load; a wrong path should not wait for them
 
     from msk_ray.evaluate.measure import Bench, Request, default_device
+    from msk_ray.simulation.simulation import resolve_device
 
-    bench = Bench(args.device or default_device())
+    device = args.device or default_device()
+    resolve_device(device)  # one that is missing is no trial's fault
+    bench = Bench(device)
     requests = [Request(name, args.worlds, seeds, args.steps) for name in names]
     if target.kind is Kind.EXPERIMENT:
         return evaluate_experiment(Experiment(target.path), bench, requests)
@@ -155,7 +158,8 @@ def evaluate_experiment(experiment: Experiment, bench: "Bench", requests: "Seque
         ranking.sort(key=lambda entry: -entry["score"]["mean"])
         rankings.append(ranking)
     if not any(rankings):
-        raise CheckpointError(f"no policy of {experiment.path} could be evaluated")
+        why = next(iter(failed.values()), "it has no trials")
+        raise CheckpointError(f"no policy of {experiment.path} could be evaluated; the first: {why}")
     missing = [{"trial": trial, "why": why} for trial, why in failed.items()]
     path = experiment.path / EVAL_FILE
     ranked = [{"physics": entries[0]["physics"], "ranking": entries} for entries in rankings if entries]

@@ -15,8 +15,8 @@ def make_mlp(
 ) -> nn.Sequential:
     """Linear, activation and optional LayerNorm per hidden layer; a linear last layer.
 
-    Weights are orthogonal, with gain √2 in hidden layers and `output_gain` in the last, drawn from `generator`; biases
-    are zero.
+    Weights are orthogonal, with gain √2 in hidden layers and `output_gain` in the last; biases are zero. Drawn from
+    `generator`.
     """
     layers: list[nn.Module] = []
     sizes = (inputs, *config.hidden)

@@ -42,13 +42,13 @@ def look_at_best(trial: TrialReading, folder: Path, prefix: str, make: bool, dev
         make: evaluate and draw what is not there yet; else only what is there is shown.
         device: of the simulation; None takes the first GPU, or the CPU.
     """
-    # These load torch, which a report of plain numbers need not wait for.
-    from msk_ray.evaluate.measure import EVAL_FILE, read_evaluations
-    from msk_ray.training.checkpoint import read_manifest
-
     notes: list[str] = []
     try:
         path = best_of_trial(trial.folder)
+        # These load torch, which a report of plain numbers need not wait for.
+        from msk_ray.evaluate.measure import EVAL_FILE, read_evaluations
+        from msk_ray.training.checkpoint import read_manifest
+
         sha = read_manifest(path)["sha256"]
     except (MskRayError, KeyError) as error:
         return Best(trial, notes=(f"There is no policy to look at: {explain(error)}.",))

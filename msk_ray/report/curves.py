@@ -13,6 +13,7 @@ from msk_ray.report.pictures import DASHES, GREY, PALETTE, POINTS, Picture, pict
 from msk_ray.report.reading import Reading, TrialReading
 from msk_ray.tune.outcomes import Outcome
 from msk_ray.tune.pruning import rungs
+from msk_ray.tune.trials import env_steps_budget
 
 NAMED = 8
 """Variants drawn in a colour of their own."""
@@ -69,7 +70,7 @@ def learning_curves(groups: Mapping[str, Sequence[TrialReading]], baseline: str 
             steps, mean, *_ = _mean_and_range(curves[variant])
             axes.plot(steps, mean, color=GREY, linewidth=0.7, alpha=0.6, zorder=1)
         for number, variant in enumerate(named):
-            _draw_variant(axes, curves[variant], number, shorten(variant, 34 if narrow else 60))
+            _draw_variant(axes, curves[variant], number, shorten(variant, 34 if narrow else 44))
             for trial in groups[variant]:
                 if trial.ending is not None and trial.ending.outcome in _STOPPED and len(trial.curve[0]):
                     x, y = trial.curve
@@ -274,7 +275,5 @@ def _rung_steps(reading: Reading) -> list[float]:
     spec = reading.space.scheduler if reading.space is not None else None
     if spec is None or spec.kind != "asha" or spec.time_attr != "env_steps":
         return []
-    from msk_ray.tune.trials import env_steps_budget  # loads torch
-
     budget = max(env_steps_budget(trial.trial.config) for trial in reading.trials)
     return list(rungs(spec.grace * budget, budget, spec.reduction))

@@ -77,11 +77,15 @@ def _draw_ranking(axes: Axes, found: Sequence[Effect], shares: bool) -> None:
     places = range(len(found))
     colours = [GREY if effect.factor == "seed" else PALETTE[0] for effect in found]
     axes.barh(places, values, color=colours, height=0.65)
+    for place, effect in enumerate(found):
+        share = effect.share or 0.0
+        text = f"{effect.spread:.3g}" if not shares else f"{share:.2f}" if share > 0.0 else "≤ 0"
+        axes.text(values[place], place, f" {text}", va="center", fontsize=8)
     axes.set_yticks(places, [shorten(_leaf(e.factor), 18) for e in found], fontsize=8)
     axes.set_ylim(max(len(found), 5) - 0.5, -0.5)
     axes.set_xlabel("share of variance (ω²)" if shares else "spread of mean scores", fontsize=8)
     axes.tick_params(axis="x", labelsize=8)
-    axes.set_xlim(0.0, 1.02 if shares else None)
+    axes.set_xlim(0.0, 1.12 if shares else 1.25 * max(values) or None)
     axes.grid(alpha=0.3, axis="x")
 
 
@@ -184,7 +188,8 @@ def _coordinate(factor: str, trials: Sequence[TrialReading]) -> tuple[np.ndarray
         if numbers.min() > 0.0 and numbers.max() > _DECADES * numbers.min():
             numbers = np.log10(numbers)
         heights = (numbers - numbers.min()) / (numbers.max() - numbers.min())
-        marks = dict(zip(heights.round(6).tolist(), labels, strict=True))
+        texts = [f"{value:.4g}" for value in values]
+        marks = dict(zip(heights.round(6).tolist(), texts, strict=True))
         chosen = sorted(marks)
         if len(chosen) > 6:
             chosen = [chosen[round(share * (len(chosen) - 1))] for share in (0.0, 0.25, 0.5, 0.75, 1.0)]

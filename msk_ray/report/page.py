@@ -93,7 +93,7 @@ class Section:
             start = parts.index("msk_ray") if "msk_ray" in parts else len(parts) - 1
             words = ["python", "-m", ".".join(parts[start:])]
         else:
-            words = [program.name]
+            words = ["python", program.name] if program.suffix == ".py" else [program.name]
         return shlex.join([*words, *map(str, argv[1:])])
 
 

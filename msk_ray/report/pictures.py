@@ -1,7 +1,7 @@
 """Pictures of the page: each drawn twice with matplotlib, for a wide screen or paper and for a phone."""
 
 import io
-import itertools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -59,20 +59,15 @@ def _png(draw: Draw, size: tuple[float, float], narrow: bool) -> bytes:
     return buffer.getvalue()
 
 
-def thin(x: np.ndarray, *curves: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Curves (N,) over `x` with POINTS points at most: the first, the last, and others at equal distances."""
-    if len(x) <= POINTS:
-        return (x, *curves)
-    keep = np.unique(np.round(np.linspace(0, len(x) - 1, POINTS)).astype(int))
-    return (x[keep], *(curve[keep] for curve in curves))
-
-
 def thin_peaks(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """As `thin` for a curve whose peaks matter: of each stretch of points its largest value, at its own place."""
+    """A curve (N,) over `x` with POINTS points at most: of each stretch its largest value, at its own place."""
     if len(x) <= POINTS:
         return x, y
-    edges = np.linspace(0, len(x), POINTS + 1).astype(int)
-    keep = [a + int(np.argmax(np.nan_to_num(y[a:b], nan=-np.inf))) for a, b in itertools.pairwise(edges)]
+    stretch = math.ceil(len(x) / POINTS)
+    padded = np.full(stretch * math.ceil(len(x) / stretch), -np.inf)
+    padded[: len(y)] = np.where(np.isnan(y), -np.inf, y)
+    blocks = padded.reshape(-1, stretch)
+    keep = blocks.argmax(1) + stretch * np.arange(len(blocks))
     return x[keep], y[keep]
 
 

@@ -31,6 +31,19 @@ class CotangentGate:
             return state
         return StepState(*_Gate.apply(self, *state))
 
+    def screen(self, action: Tensor) -> Tensor:
+        """The same actions (W, A); a world's cotangent that is not finite will pass nothing, and be counted.
+
+        Where a step's derivatives overflow inside, the control's cotangent is lost with the state's.
+        """
+        return _Screen.apply(self, action) if action.requires_grad else action
+
+    def pull_screened(self, cotangent: Tensor) -> Tensor:
+        """The cotangent (W, A) let through."""
+        finite = cotangent.isfinite().all(-1)
+        self._nonfinite |= ~finite
+        return torch.where(finite[:, None], cotangent, 0.0)
+
     def pull(self, cotangent: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
         """The cotangents let through, each (W, n)."""
         norm = torch.cat(cotangent, dim=-1).norm(dim=-1)
@@ -45,12 +58,11 @@ class CotangentGate:
 
         Returns scalars still on the device.
         """
-        if not self._norms:
-            return {}
-        norms = torch.cat(self._norms)
+        lost = {"grad/nonfinite_share": self._nonfinite.float().mean()}
+        norms = torch.cat(self._norms) if self._norms else torch.zeros(0)
         finite = norms[norms.isfinite()]
         if not finite.numel():
-            return {"grad/nonfinite_share": self._nonfinite.float().mean()}
+            return lost
         quantiles = torch.quantile(finite, torch.tensor([0.5, 0.9], device=norms.device))
         clipped = (norms > self.bound).float().mean() if self.bound is not None else norms.new_zeros(())
         return {
@@ -58,7 +70,7 @@ class CotangentGate:
             "grad/state_p90": quantiles[1] / unit,
             "grad/state_max": finite.max() / unit,
             "grad/clipped_share": clipped,
-            "grad/nonfinite_share": self._nonfinite.float().mean(),
+            **lost,
         }
 
 
@@ -72,3 +84,15 @@ class _Gate(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *cotangent: Tensor) -> tuple[Tensor | None, ...]:
         return (None, *ctx.gate.pull(cotangent))
+
+
+class _Screen(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, gate: CotangentGate, action: Tensor) -> Tensor:
+        ctx.gate = gate
+        return action.view_as(action)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
+        return None, ctx.gate.pull_screened(cotangent)

@@ -58,7 +58,7 @@ def collect(
             surprise.append(surprising)
         else:
             action = actor(normalize(obs), step_noise)
-        transition = env.step(action)
+        transition = env.step(gate.screen(action))
         raw.append(obs.detach())
         reached.append(normalize(transition.obs))
         rewards.append(transition.reward)

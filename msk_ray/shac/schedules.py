@@ -7,10 +7,7 @@ from msk_ray.config import AdaptiveHorizon, HorizonSchedule
 
 def horizon_at(schedule: int | HorizonSchedule, epoch: int) -> int:
     """Rollout length H in env steps at `epoch`."""
-    if isinstance(schedule, int):
-        return schedule
-    progress = min(1.0, epoch / schedule.epochs)
-    return round(schedule.start + (schedule.end - schedule.start) * progress)
+    return schedule if isinstance(schedule, int) else schedule.at(epoch)
 
 
 def learning_rate_at(initial: float, final: float, schedule: str, epoch: int, epochs: int) -> float:

@@ -83,8 +83,8 @@ class Evaluator:
         Args:
             policy: raw observations (W, O) to actions (W, A).
             seed: of the initial states; None takes `evaluation.seed`.
-            on_step: called with the physical state before each env step and the actions (W, A) taken in it, and once
-                more at the end with the last state and action.
+            on_step: called with the physical state before each env step and the controls (W, nu) of that step, and
+                once more at the end with the last state and the controls that led to it.
 
         Raises:
             SimulationError: contacts or constraint rows were lost to a full buffer.
@@ -99,10 +99,12 @@ class Evaluator:
         terms = torch.zeros((env.nworld, len(env.reward_names)), device=env.device)
         outcomes: dict[str, Tensor] = {}
         tail: list[dict[str, Tensor]] = []
+        control = torch.zeros((env.nworld, env.model.nu), device=env.device)
         for step in range(self.steps):
             action = policy(env.observation())
             if on_step is not None:
-                on_step(env.state.physics, action)
+                control = env.control(action)
+                on_step(env.state.physics, control)
             transition = env.step(action, auto_reset=False)
             outcome = env.outcome_terms(env.state.physics)
             score += torch.where(alive, transition.reward, 0.0)
@@ -117,7 +119,7 @@ class Evaluator:
             if step % _CHECK_EVERY == 0 and not alive.any():
                 break
         if on_step is not None:
-            on_step(env.state.physics, env.state.action)
+            on_step(env.state.physics, control)
         env.sim.diagnostics()  # raises if contacts were lost
         success = None
         if tail and len(tail) == self._tail:

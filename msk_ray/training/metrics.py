@@ -3,19 +3,16 @@
 import json
 import math
 import os
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from torch.utils.tensorboard import SummaryWriter
-from torch.utils.tensorboard.summary import hparams
 
 from msk_ray.errors import StorageFailure
 from msk_ray.metrics_file import METRICS_FILE, read_metrics
 from msk_ray.training.checkpoint import write_atomically
 
-_HPARAM_METRICS = ("eval/best_score", "eval/score", "progress/env_steps")
 _PROGRESS = ("env_steps", "seconds", "env_steps_per_s")
 _SCHEDULED = ("train/horizon", "train/actor_lr")
 _TERM = "eval/term/"
@@ -98,28 +95,5 @@ def log_image(folder: Path, tag: str, image: np.ndarray, epoch: int) -> None:
     try:
         with SummaryWriter(str(folder)) as board:
             board.add_image(tag, image, epoch, dataformats="HWC")
-    except OSError as error:
-        raise StorageFailure(f"cannot write {folder}: {error.strerror or error}") from error
-
-
-def log_hparams(folder: Path, settings: Mapping[str, Any]) -> None:
-    """Name the settings that set a trial apart, for TensorBoard's table of hyperparameters.
-
-    The table takes scores from the trial's own scalars. Written before those, so that TensorBoard, which reads the
-    files of a folder in the order of their age, goes on to follow them.
-
-    Args:
-        settings: name → number, truth value or text.
-
-    Raises:
-        StorageFailure: the disk is full or the folder not writable.
-    """
-    experiment, session, _ = hparams(dict(settings), dict.fromkeys(_HPARAM_METRICS, 0.0))
-    try:
-        with SummaryWriter(str(folder)) as board:
-            writer = board.file_writer
-            assert writer is not None
-            writer.add_summary(experiment)
-            writer.add_summary(session)
     except OSError as error:
         raise StorageFailure(f"cannot write {folder}: {error.strerror or error}") from error

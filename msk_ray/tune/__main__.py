@@ -1,6 +1,7 @@
 """`python -m msk_ray.tune`: an experiment of many trials, one GPU each, with Ray Tune."""
 
 import argparse
+import os
 import shutil
 import sys
 import time
@@ -14,6 +15,7 @@ from msk_ray.errors import ConfigError
 from msk_ray.tune import experiment as experiments
 from msk_ray.tune.extension import extended_space, parse_extension
 from msk_ray.tune.listing import text_table, trial_rows
+from msk_ray.tune.made_up import recover
 from msk_ray.tune.outcomes import Outcome
 from msk_ray.tune.smoke import shrink, without_pruning
 from msk_ray.tune.space import Space, find_space, parse_seeds, parse_space
@@ -23,7 +25,7 @@ DESCRIPTION = """\
 Run a search space: many SHAC trials side by side, one GPU (or CPU core) each, scored by deterministic evaluation,
 the hopeless ones stopped early.
 
-Writes runs/EXPERIMENT/: the trials' folders, and at the end summary.json, table.md and curves.png."""
+Writes runs/EXPERIMENT/: the trials' folders, and at the end summary.json, table.md and report/."""
 
 EXAMPLES = """\
   python -m msk_ray.tune --space cartpole_smoke --cpu               # minutes on two cores
@@ -59,7 +61,13 @@ def parser() -> Parser:
     where.add_argument("--gpus-per-trial", type=float, metavar="G", help="GPUs a trial; below 1, trials share one")
     where.add_argument("--cpu", action="store_true", help="run on CPU cores even if there are GPUs")
     where.add_argument("--max-concurrent", type=int, metavar="N", help="at most N trials at once")
-    where.add_argument("--address", metavar="HOST:PORT", help="use a running Ray cluster; 'auto' finds the local one")
+    where.add_argument(
+        "--address",
+        metavar="HOST:PORT",
+        default=os.environ.get("RAY_ADDRESS") or None,
+        help="use a running Ray cluster, by default the one RAY_ADDRESS names, instead of starting one; 'auto' finds "
+        "what `ray start` began here",
+    )
     where.add_argument("--storage", type=Path, default=Path("runs"), metavar="DIR", help="by default runs/")
     where.add_argument("--name", help="the experiment's name; by default the space's")
     where.add_argument("--resume", action="store_true", help="go on with an experiment that was interrupted")
@@ -187,16 +195,19 @@ def _run(args: argparse.Namespace, space: Space, trials: list[Trial], extension:
     path = _experiment_path(args)
     going_on = args.resume or bool(extension)
     if going_on:
-        if space.file.search == "optuna":
-            raise ConfigError("--resume: a search by optuna cannot go on; pass another --name")
-        experiment = experiments.reopen(path, trials, extension)
-        # As recorded: with the ids they began with, and the epochs they were extended to.
-        trials = experiment.trials()
+        searching = space.file.search == "optuna"
+        experiment = experiments.reopen(path, None if searching else trials, extension)
+        if searching:
+            # Else the manifest learns of them only at the end.
+            experiment.set_trials(made.trial for made in recover(experiment, space))
+        else:
+            # As recorded: with the ids they began with, and the epochs they were extended to.
+            trials = experiment.trials()
         experiment.clear_endings(_retried(args))
     # ray and torch take seconds to load; a wrong command line should not wait for them.
     from msk_ray.tune import runner
     from msk_ray.tune.devices import choose_placement, local_gpus
-    from msk_ray.tune.report import finish
+    from msk_ray.tune.report import finish, write_report
 
     if args.address is None:
         placement = choose_placement(space.file.resources, args.gpus_per_trial, args.cpu, local_gpus())
@@ -214,6 +225,7 @@ def _run(args: argparse.Namespace, space: Space, trials: list[Trial], extension:
     if not completed:
         print(f"stopped on request; go on with --resume --space {args.space} --name {path.name}")
         return RESUMABLE
+    write_report(experiment)
     return 1 if errors else 0
 
 

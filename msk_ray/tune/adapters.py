@@ -1,6 +1,6 @@
 """The rules of `pruning` and the ranges of a space in Ray Tune's terms."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from ray import tune
@@ -100,8 +100,15 @@ def domain(op: Operator) -> Any:
     return (tune.uniform if op.kind == "uniform" else tune.loguniform)(op.low, op.high)
 
 
-def optuna_search(seed: int) -> Searcher:
+def optuna_search(
+    seed: int, begun: Sequence[Mapping[str, Any]] = (), scored: Sequence[tuple[Mapping[str, Any], float]] = ()
+) -> Searcher:
     """Optuna's TPE sampler.
+
+    Args:
+        seed: of its draws.
+        begun: choices it made before that are to be tried first, as they were.
+        scored: choices it made before, and what came of them.
 
     Raises:
         ConfigError: Optuna is not installed.
@@ -112,5 +119,20 @@ def optuna_search(seed: int) -> Searcher:
         raise ConfigError("search: optuna needs the optuna package: pip install 'msk-ray[optuna]'") from None
     from ray.tune.search.optuna import OptunaSearch
 
+    class Informed(OptunaSearch):
+        """Told what came of earlier choices as soon as it knows the space."""
+
+        def set_search_properties(self, *args: Any, **kwargs: Any) -> bool:
+            fresh: bool = super().set_search_properties(*args, **kwargs)
+            for params, score in scored if fresh else ():
+                self.add_evaluated_point(_flat(params), score)
+            return fresh
+
     optuna.logging.set_verbosity(optuna.logging.ERROR)
-    return OptunaSearch(metric=METRIC, mode="max", sampler=optuna.samplers.TPESampler(seed=seed))
+    # Drawing anew with the same seed would repeat the draws of the first time.
+    sampler = optuna.samplers.TPESampler(seed=seed + len(begun) + len(scored))
+    return Informed(metric=METRIC, mode="max", sampler=sampler, points_to_evaluate=[_flat(p) for p in begun] or None)
+
+
+def _flat(params: Mapping[str, Any]) -> dict[str, Any]:
+    return {f"params/{key}": value for key, value in params.items()}

@@ -1,31 +1,59 @@
 """`python -m msk_ray.tune.cluster`: have all nodes of a Ray cluster joined? For scripts that start one."""
 
 import sys
+import time
 from collections.abc import Sequence
 
 import ray
 
 from msk_ray.cli import Parser, run
+from msk_ray.tune.addresses import knock
 
 DESCRIPTION = "Exit code: 0 if at least N nodes are alive, 1 if fewer are or nobody answers at the address."
-EXAMPLES = "  python -m msk_ray.tune.cluster --address 10.0.0.1:6379 --nodes 2"
+EXAMPLES = """\
+  python -m msk_ray.tune.cluster --address 10.0.0.1:6379 --nodes 2
+  python -m msk_ray.tune.cluster --address auto --nodes 3 --wait 900   # up to so many seconds"""
+_PAUSE_S = 5.0
+
+
+def parser() -> Parser:
+    """The command line."""
+    p = Parser("python -m msk_ray.tune.cluster", DESCRIPTION, EXAMPLES)
+    p.add_argument("--address", required=True, metavar="HOST:PORT", help="'auto' for the cluster this machine is in")
+    p.add_argument("--nodes", required=True, type=int, metavar="N")
+    p.add_argument("--wait", type=float, default=0.0, metavar="S", help="wait so long for them [s], by default not")
+    return p
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    p = Parser("python -m msk_ray.tune.cluster", DESCRIPTION, EXAMPLES)
-    p.add_argument("--address", required=True, metavar="HOST:PORT")
-    p.add_argument("--nodes", required=True, type=int, metavar="N")
-    args = p.parse_args(argv)
-    try:
-        ray.init(address=args.address, logging_level="ERROR", log_to_driver=False)
-    except ConnectionError:
-        print(f"nobody answers at {args.address} yet", flush=True)
-        return 1
-    alive = sum(node["Alive"] for node in ray.nodes())
+    args = parser().parse_args(argv)
+    deadline = time.monotonic() + args.wait
+    while True:
+        try:
+            alive = _alive(args.address)
+        except OSError as error:  # ConnectionError too
+            print(f"nobody answers at {args.address} yet: {' '.join(str(error).split())}", flush=True)
+        else:
+            print(f"{alive} of {args.nodes} node(s) have joined", flush=True)
+            if alive >= args.nodes:
+                return 0
+        if time.monotonic() + _PAUSE_S > deadline:
+            return 1
+        time.sleep(_PAUSE_S)
+
+
+def _alive(address: str) -> int:
+    """Nodes alive.
+
+    Raises:
+        OSError: nobody answers.
+    """
+    knock(address)
+    ray.init(address=address, logging_level="ERROR", log_to_driver=False)
+    alive: int = sum(node["Alive"] for node in ray.nodes())
     ray.shutdown()
-    print(f"{alive} of {args.nodes} node(s) have joined", flush=True)
-    return 0 if alive >= args.nodes else 1
+    return alive
 
 
 if __name__ == "__main__":

@@ -1,10 +1,15 @@
 """What a trial runs on: GPUs if there are any and nothing else was asked for."""
 
+import math
 import os
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from msk_ray.errors import ConfigError, DeviceError
 from msk_ray.tune.space import ResourcesSpec
+
+_PAUSE_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -56,6 +61,29 @@ def choose_placement(resources: ResourcesSpec, gpus_per_trial: float | None, cpu
     if wanted > gpus:
         raise DeviceError(f"{wanted:g} GPUs a trial asked for, {gpus} here")
     return Placement(wanted, resources.cpus_per_trial)
+
+
+def wait_for_memory(
+    share: float, free_share: Callable[[], float], limit_s: float, pause: Callable[[float], None] = time.sleep
+) -> float | None:
+    """Wait for the GPU memory of a process that has died: drivers give it back seconds later.
+
+    Args:
+        share: of the GPU's memory that a trial was given.
+        free_share: asks what share is free now.
+        limit_s: patience [s].
+        pause: sleeps for so many seconds.
+
+    Returns:
+        None once nearly all of `share` is free; else what share is free when patience has run out.
+    """
+    for _ in range(math.ceil(limit_s / _PAUSE_S)):
+        # Every process holds some hundred megabytes for its own context.
+        if free_share() >= 0.9 * share:
+            return None
+        pause(_PAUSE_S)
+    free = free_share()
+    return None if free >= 0.9 * share else free
 
 
 def local_gpus() -> int:

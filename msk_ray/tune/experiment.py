@@ -5,8 +5,8 @@ runs/<experiment>/
     space.yaml        the space as it was run
     env.json          versions, devices, commit, command line
     tune/             Ray's own state
-    trials/<id>/      config.yaml, metrics.jsonl, checkpoints/, outcome.json, output.log
-    summary.json, table.md, curves.png
+    trials/<id>/      config.yaml, metrics.jsonl, checkpoints/, outcome.json, output.log, eval.json
+    summary.json, table.md, eval.json, report/
 """
 
 import json

@@ -4,7 +4,7 @@ import math
 import pickle
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -47,6 +47,7 @@ class Live(Callback):
         trial_of: Callable[[dict[str, Any]], Trial],
         concurrent: int,
         stop: StopRequest,
+        started: Iterable[Trial] = (),
     ) -> None:
         self._experiment = experiment
         self._waiting = {trial.id: trial for trial in trials}
@@ -56,7 +57,7 @@ class Live(Callback):
         self._running: dict[str, _Running] = {}
         self._saving: set[str] = set()
         self._ended = 0
-        self.started: list[Trial] = []
+        self.started: list[Trial] = list(started)
         """Trials that were started, in that order, each once, numbered anew."""
         self._best: tuple[float, Trial] | None = None
         self._start = time.monotonic()
@@ -72,6 +73,10 @@ class Live(Callback):
     def __getstate__(self) -> dict[str, Any]:
         # Ray pickles callbacks into its own state, which is never read back: resuming begins from the trials' folders.
         return {key: value for key, value in self.__dict__.items() if key != "_out"}
+
+    def waiting(self) -> int:
+        """How many trials have not started yet, as far as they are known."""
+        return len(self._waiting)
 
     @property
     def stopped(self) -> bool:

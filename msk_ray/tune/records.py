@@ -40,7 +40,7 @@ class TrialRecord:
 
     @property
     def errored(self) -> bool:
-        return self.ending is not None and self.ending.outcome is Outcome.ERROR
+        return self.ending is not None and self.ending.outcome in (Outcome.ERROR, Outcome.OUT_OF_MEMORY)
 
 
 def read_record(trial: Trial, folder: Path) -> TrialRecord:

@@ -1,8 +1,9 @@
-"""What an experiment leaves at its end: a table on the terminal, and summary.json, table.md and curves.png."""
+"""What an experiment leaves at its end: a table on the terminal, summary.json, table.md, and the report."""
 
 import shutil
+import subprocess
+import sys
 
-from msk_ray.tune.curves import draw_curves
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.listing import text_table
 from msk_ray.tune.outcomes import write_json, write_text
@@ -21,7 +22,6 @@ def finish(experiment: Experiment) -> int:
     width = max(100, shutil.get_terminal_size((160, 24)).columns)
     write_json(experiment.path / "summary.json", summary(experiment.name, manifest["question"], records))
     write_text(experiment.path / "table.md", table_document(experiment.name, manifest["question"], records))
-    draw_curves(records, experiment.path / "curves.png", experiment.name)
     print("\n" + text_table(HEADER, result_rows(records), width))
     if len({record.trial.seed for record in records}) > 1:
         header = ("variant", "seeds", "mean score", "std", "min", "max")
@@ -33,6 +33,17 @@ def finish(experiment: Experiment) -> int:
         )
         print(f"best policy  {best.best_checkpoint or 'its checkpoint is missing'}")
     print(f"table        {experiment.path / 'table.md'}")
-    print(f"curves       {experiment.path / 'curves.png'}")
     print(f"trials       {experiment.path / 'trials'}", flush=True)
     return sum(record.errored for record in records)
+
+
+def write_report(experiment: Experiment) -> None:
+    """Have `python -m msk_ray.report` write the experiment's page and print its path.
+
+    In a process of its own: it draws with OpenGL and simulates the best policy, and whatever becomes of that, the
+    results above stand.
+    """
+    command = [sys.executable, "-m", "msk_ray.report", str(experiment.path)]
+    code = subprocess.run(command).returncode
+    if code:
+        print(f"no report (exit code {code}); to try again: python -m msk_ray.report {experiment.path}", flush=True)

@@ -14,26 +14,32 @@ from typing import Any
 import ray
 from ray import tune
 from ray.exceptions import RayTaskError
-from ray.tune.search import BasicVariantGenerator
+from ray.tune import Callback
+from ray.tune.search import BasicVariantGenerator, Searcher
 from ray.tune.stopper import Stopper
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 import msk_ray
 from msk_ray.cli import StopRequest
 from msk_ray.config import Config, read_yaml
-from msk_ray.errors import DeviceError, MskRayError, StorageFailure, storage_failure
+from msk_ray.errors import ClusterLost, DeviceError, MskRayError, StorageFailure, storage_failure
 from msk_ray.progress import format_duration
 from msk_ray.training import Trainer, precompile
+from msk_ray.tune import standby
 from msk_ray.tune.adapters import METRIC, Population, PruningScheduler, domain, optuna_search
+from msk_ray.tune.addresses import knock
 from msk_ray.tune.devices import Placement
 from msk_ray.tune.experiment import Experiment
+from msk_ray.tune.gauges import StateGauge
 from msk_ray.tune.journal import JOURNAL_FILE, Journal, replay
 from msk_ray.tune.live import Live
+from msk_ray.tune.made_up import MadeUp, recover
 from msk_ray.tune.operators import Listed
 from msk_ray.tune.outcomes import read_ending, write_ending
 from msk_ray.tune.pruning import make_pruner
 from msk_ray.tune.records import read_record
 from msk_ray.tune.space import Space
+from msk_ray.tune.standby import Standby, nodes_for
 from msk_ray.tune.trainable import Job, make_trainable
 from msk_ray.tune.trial_run import TrainerLike
 from msk_ray.tune.trials import Trial, base_settings, env_steps_budget
@@ -54,6 +60,8 @@ class Plan:
     trainer_class: type[TrainerLike] = Trainer
     precompile: Precompile | None = precompile
     """Compiles a config's kernels on a node before trials start; None where there is nothing to compile."""
+    standby: bool = True
+    """Whether processes are kept ready for the trials that come next."""
 
 
 @contextmanager
@@ -71,22 +79,31 @@ def ray_session(address: str | None, dashboard: bool | None = None) -> Iterator[
         RAY_AIR_NEW_OUTPUT="0",
         RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO="1",  # a trial without GPUs sees none, rather than all
         TUNE_DISABLE_AUTO_CALLBACK_LOGGERS="1",  # trials write their own metrics, at once
+        TUNE_DISABLE_STRICT_METRIC_CHECKING="1",  # a trial asked to stop may not have been evaluated yet
         TUNE_DISABLE_SIGINT_HANDLER="1",  # a request to stop lets trials save themselves first
     )
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    quiet: dict[str, Any] = {"logging_level": "ERROR", "log_to_driver": False}
+    common: dict[str, Any] = {
+        "logging_level": "ERROR",
+        "log_to_driver": False,
+        "runtime_env": {"worker_process_setup_hook": standby.HOOK},
+    }
     if address is None:
         # Workers must import the package this process runs, wherever it was started from.
         package = str(Path(msk_ray.__file__).resolve().parent.parent)
         paths = [package, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
         os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys(paths))
         # None starts the dashboard where its packages (ray[default]) are installed, and does without elsewhere.
-        context = ray.init(include_dashboard=dashboard, dashboard_host="127.0.0.1", **quiet)
+        # By default Ray would join whatever cluster a `ray start` on this machine once left a note of.
+        context = ray.init("local", include_dashboard=dashboard, dashboard_host="127.0.0.1", **common)
     else:
         try:
-            context = ray.init(address=address, **quiet)
-        except ConnectionError as error:
-            raise DeviceError(f"--address {address}: no Ray cluster there: {str(error).splitlines()[0]}") from error
+            knock(address)
+            context = ray.init(address=address, **common)
+        except OSError as error:  # ConnectionError too
+            raise DeviceError(
+                f"no Ray cluster at {address} (--address or RAY_ADDRESS): {str(error).splitlines()[0]}"
+            ) from error
     try:
         if context.dashboard_url:
             print(f"Ray dashboard: http://{context.dashboard_url}", flush=True)
@@ -115,7 +132,10 @@ def run_trials(plan: Plan) -> bool:
     experiment, space = plan.experiment, plan.space
     _finish_pruning(plan)
     remaining = [t for t in plan.trials if read_record(t, experiment.trial_folder(t.id)).ending is None]
-    if plan.trials and not remaining:
+    made_up = [] if plan.trials else recover(experiment, space)
+    begun = [m for m in made_up if read_record(m.trial, experiment.trial_folder(m.trial.id)).ending is None]
+    missing = space.file.samples - len(made_up) + len(begun)
+    if (plan.trials and not remaining) or (made_up and missing <= 0):
         print("all trials have ended already")
         return True
     base = base_settings(space) if not plan.trials else {}
@@ -125,6 +145,7 @@ def run_trials(plan: Plan) -> bool:
         base,
         {trial.id: trial for trial in plan.trials},
         plan.placement.device,
+        plan.placement.gpus,
         plan.placement.cpus,
         plan.trainer_class,
     )
@@ -133,13 +154,13 @@ def run_trials(plan: Plan) -> bool:
     total = ray.cluster_resources()
     concurrent = plan.placement.concurrent(total.get("GPU", 0.0), total.get("CPU", 1.0), plan.max_concurrent)
     stop = StopRequest()
-    live = Live(experiment, remaining, job.trial_of, concurrent, stop)
+    live = Live(experiment, remaining, job.trial_of, concurrent, stop, [m.trial for m in made_up])
     print(
-        f"{len(remaining) or space.file.samples} trials, {concurrent} at once on "
+        f"{len(remaining) or missing} trials, {concurrent} at once on "
         f"{f'{plan.placement.gpus:g} GPU each' if plan.placement.gpus else 'CPU'}; into {experiment.path}",
         flush=True,
     )
-    _fit(plan, job, live, remaining)
+    _fit(plan, job, live, remaining, made_up)
     if not plan.trials:
         # A search makes trials up as it goes; they enter the manifest once they are known.
         experiment.set_trials(live.started)
@@ -162,7 +183,7 @@ def _finish_pruning(plan: Plan) -> None:
         write_ending(folder, ending)
 
 
-def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial]) -> None:
+def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial], made_up: list[MadeUp]) -> None:
     spec, file = plan.space.file.scheduler, plan.space.file
     budget = _budget(plan.space, plan.trials or [_first_suggestion(job)])
     if spec.kind == "pbt":
@@ -176,6 +197,11 @@ def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial]) -> None:
         )
     resources = {"cpu": plan.placement.cpus} | ({"gpu": plan.placement.gpus} if plan.placement.gpus else {})
     searching = file.search == "optuna"
+    search, samples = _search(plan, made_up) if searching else (_listed(plan), 1)
+    node = _OwnNode()
+    spare = [Standby(plan.placement, plan.max_concurrent, live.waiting)] if plan.standby and standby.available() else []
+    if plan.standby and not spare:
+        print("no process on standby, so trials begin seconds later: pip install grpcio to have them", flush=True)
     tuner = tune.Tuner(
         tune.with_resources(make_trainable(job), resources),
         param_space=_param_space(job, remaining),
@@ -183,8 +209,8 @@ def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial]) -> None:
             metric=METRIC,
             mode="max",
             scheduler=scheduler,
-            search_alg=optuna_search(file.sample_seed) if searching else BasicVariantGenerator(),
-            num_samples=file.samples if searching else 1,
+            search_alg=search,
+            num_samples=samples,
             max_concurrent_trials=plan.max_concurrent,
             reuse_actors=False,  # a process of its own frees a trial's GPU memory, whatever it did
             trial_dirname_creator=lambda trial: f"{trial.config.get('id', 'trial')}_{trial.trial_id}",
@@ -193,7 +219,8 @@ def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial]) -> None:
             name="tune",
             storage_path=str(plan.experiment.path),
             verbose=0,
-            callbacks=[live],
+            # Live first: it writes the endings that only the driver knows.
+            callbacks=[live, StateGauge(plan.experiment, remaining, job.trial_of), node, *spare],
             stop=_StopWhen(live),
             failure_config=tune.FailureConfig(max_failures=file.resources.max_failures),
             # None are deleted: only a population reports them, and another member may be about to take one over.
@@ -204,6 +231,8 @@ def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial]) -> None:
         with _log_to(plan.experiment.path / "ray.log"):
             tuner.fit()
     except Exception as error:
+        if node.lost is not None:
+            raise node.lost from error
         # The driver may meet a full disk before any trial does.
         failure = live.storage_failure or storage_failure(error)
         if failure is None:
@@ -211,6 +240,45 @@ def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial]) -> None:
         raise _advised(failure) from error
     if live.storage_failure is not None:
         raise _advised(live.storage_failure)
+
+
+def _listed(plan: Plan) -> BasicVariantGenerator:
+    # Tune limits a generator it was given no more than this one limits itself.
+    return BasicVariantGenerator(max_concurrent=plan.max_concurrent or 0)
+
+
+def _search(plan: Plan, made_up: list[MadeUp]) -> tuple[Searcher, int]:
+    """Optuna's search, told what it has done so far, and how many trials are still to be run."""
+    begun, scored, ended = [], [], 0
+    for made in made_up:
+        record = read_record(made.trial, plan.experiment.trial_folder(made.trial.id))
+        if record.ending is None:
+            begun.append(made.params)
+            continue
+        ended += 1
+        if record.best is not None:
+            scored.append((made.params, record.best.score))
+    file = plan.space.file
+    return optuna_search(file.sample_seed, begun, scored), file.samples - ended
+
+
+class _OwnNode(Callback):
+    """Ends the experiment when this process's own Ray node has died: Ray itself waits for ever for another one."""
+
+    INTERVAL_S = 2.0
+
+    def __init__(self) -> None:
+        self._id = ray.get_runtime_context().get_node_id()
+        self._checked = time.monotonic()
+        self.lost: ClusterLost | None = None
+
+    def on_step_end(self, iteration: int, trials: list[Any], **info: Any) -> None:
+        if time.monotonic() - self._checked < self.INTERVAL_S:
+            return
+        self._checked = time.monotonic()
+        if any(node["NodeID"] == self._id and not node["Alive"] for node in ray.nodes()):
+            self.lost = ClusterLost("the Ray node of this machine has died (raylet killed?); go on with --resume")
+            raise self.lost
 
 
 def _advised(failure: StorageFailure) -> StorageFailure:
@@ -304,7 +372,7 @@ def _precompile(plan: Plan, trials: Sequence[Trial]) -> None:
     for trial in trials:
         c = trial.config
         models.setdefault(repr((c.env.name, c.physics, c.evaluation.variant)), trial)
-    nodes = [node for node in ray.nodes() if node["Alive"] and _fits(node["Resources"], plan.placement)]
+    nodes = nodes_for(plan.placement)
     started = time.monotonic()
     print(f"compiling kernels of {len(models)} model(s) on {len(nodes)} node(s) ...", flush=True)
     compile_model = plan.precompile
@@ -331,7 +399,3 @@ def _precompile(plan: Plan, trials: Sequence[Trial]) -> None:
             raise error.cause from None
         raise
     print(f"kernels ready after {format_duration(time.monotonic() - started)}", flush=True)
-
-
-def _fits(resources: dict[str, float], placement: Placement) -> bool:
-    return resources.get("CPU", 0.0) >= placement.cpus and resources.get("GPU", 0.0) >= placement.gpus

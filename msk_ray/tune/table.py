@@ -61,7 +61,7 @@ def table_document(name: str, question: str, records: Sequence[TrialRecord]) -> 
     best = best_record(records)
     if best is not None:
         parts.append(f"Best policy: `{_relative(best)}` ({best.trial.variant}, seed {best.trial.seed}).\n")
-    parts.append("![Learning curves](curves.png)\n")
+    parts.append(f"Curves and more: [report](report/index.html), by `python -m msk_ray.report {name}`.\n")
     return "\n".join(part for part in parts if part)
 
 

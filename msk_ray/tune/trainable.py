@@ -7,6 +7,7 @@ import platform
 import shutil
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -14,28 +15,24 @@ from pathlib import Path
 from typing import Any
 
 from ray import tune
-from ray.util.metrics import Gauge
 
 from msk_ray.config import parse_config
 from msk_ray.errors import storage_failure
 from msk_ray.tune.adapters import METRIC
+from msk_ray.tune.devices import wait_for_memory
 from msk_ray.tune.experiment import Experiment
-from msk_ray.tune.operators import Listed, describe
+from msk_ray.tune.gauges import TrialGauges
+from msk_ray.tune.hparams import log_hparams
+from msk_ray.tune.made_up import make_up, write_params
 from msk_ray.tune.outcomes import write_text
 from msk_ray.tune.records import evaluations_of, read_rows
 from msk_ray.tune.space import Space
 from msk_ray.tune.stopping import Evaluation
 from msk_ray.tune.trial_run import HANG_FILE, Hooks, TrainerLike, run_trial
-from msk_ray.tune.trials import Trial, make_trial, overlay
+from msk_ray.tune.trials import Trial, overlay
 
-_GAUGES = {
-    "score": "eval/score",
-    "best_score": "eval/best_score",
-    "epoch": "epoch",
-    "env_steps_per_s": "env_steps_per_s",
-    "episode_return": "train/episode_return",
-}
-"""Gauge name → metric; the dashboard's metrics port serves them as `ray_msk_ray_<name>`."""
+MEMORY_LIMIT_S = 60.0
+"""How long a trial waits for the memory of its GPU [s]."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +45,8 @@ class Job:
     trials: dict[str, Trial]
     """Trials by id; empty when a search makes them up."""
     device: str
+    gpus: float
+    """GPUs of a trial, 0 on CPU."""
     threads: int
     trainer_class: type[TrainerLike]
 
@@ -63,14 +62,7 @@ class Job:
         """
         params = config.get("params", {})
         if "id" not in config:
-            values, changed = {}, {}
-            for key, op in self.space.sampled.items():
-                level = (
-                    next((lv for lv in op.levels if lv.label == params[key]), None) if isinstance(op, Listed) else None
-                )
-                values[key] = params[key] if level is None else level.value
-                changed[key] = describe(params[key])
-            return make_trial(self.space, self.base, changed, values, self.space.seeds[0], 0)
+            return make_up(self.space, self.base, params)
         trial = self.trials[config["id"]]
         if not params:
             return trial
@@ -83,8 +75,12 @@ def make_trainable(job: Job) -> Callable[[dict[str, Any]], None]:
 
     def trainable(config: dict[str, Any]) -> None:
         trial = job.trial_of(config)
+        folder = job.experiment.trial_folder(trial.id)
         try:
-            attempt(trial, job.experiment.trial_folder(trial.id))
+            folder.mkdir(parents=True, exist_ok=True)
+            if "id" not in config:
+                write_params(folder, config["params"])
+            attempt(trial, folder)
         except Exception as error:
             # Whatever stumbled over a full disk first, a line of output perhaps: the driver must hear of the disk.
             failure = storage_failure(error)
@@ -93,11 +89,13 @@ def make_trainable(job: Job) -> Callable[[dict[str, Any]], None]:
             raise failure from error
 
     def attempt(trial: Trial, folder: Path) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
         _redirect_output(folder / "output.log")
         _limit_threads(job.threads)
         _record_device(folder / "device.json")
-        gauges = _Gauges(job.experiment.name, trial)
+        log_hparams(folder, trial)
+        if job.gpus:
+            _wait_for_gpu(job.gpus)
+        gauges = TrialGauges(job.experiment.name, trial)
         with tempfile.TemporaryDirectory() as scratch, _watchdog(folder, job.space.file.resources.hang_s) as alive:
 
             def on_epoch(row: Mapping[str, float]) -> None:
@@ -210,6 +208,22 @@ def _limit_threads(threads: int) -> None:
     torch.set_num_threads(threads)
 
 
+def _wait_for_gpu(share: float) -> None:
+    """Wait until a process that had this GPU before has given its memory back."""
+    import torch
+
+    def free_share() -> float:
+        free, total = torch.cuda.mem_get_info(0)
+        return free / total
+
+    left = wait_for_memory(min(share, 1.0), free_share, MEMORY_LIMIT_S)
+    if left is not None:
+        print(
+            f"the GPU has only {left:.0%} of its memory free after {MEMORY_LIMIT_S:.0f} s: who else uses it?",
+            flush=True,
+        )
+
+
 def _record_device(path: Path) -> None:
     """Keep which host, process and GPUs the trial was given: the evidence that it had them to itself."""
     import torch
@@ -218,27 +232,9 @@ def _record_device(path: Path) -> None:
     facts = {
         "host": platform.node(),
         "pid": os.getpid(),
+        "began": time.time(),
         "visible": os.environ.get("CUDA_VISIBLE_DEVICES", ""),
         "count": torch.cuda.device_count() if cuda else 0,
         "name": torch.cuda.get_device_name(0) if cuda else "cpu",
     }
     write_text(path, json.dumps(facts) + "\n")
-
-
-class _Gauges:
-    """The trial's newest figures as gauges on Ray's metrics port."""
-
-    def __init__(self, experiment: str, trial: Trial) -> None:
-        # Ray takes no other characters in tags.
-        variant = trial.variant.replace("→", "->").encode("ascii", "backslashreplace").decode()
-        tags = {"experiment": experiment, "trial": trial.id, "variant": variant, "seed": str(trial.seed)}
-        self._gauges = {}
-        for name, metric in _GAUGES.items():
-            gauge = Gauge(f"msk_ray_{name}", description=metric, tag_keys=tuple(tags))
-            gauge.set_default_tags(tags)
-            self._gauges[metric] = gauge
-
-    def show(self, row: Mapping[str, float]) -> None:
-        for metric, gauge in self._gauges.items():
-            if metric in row:
-                gauge.set(row[metric])

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from msk_ray.config import AdaptiveHorizon, Config, merge, parse_config, read_config
+from msk_ray.config import AdaptiveHorizon, Config, HorizonSchedule, merge, parse_config, read_config
 from msk_ray.errors import ConfigError
 from msk_ray.tune.operators import Level, Listed, Range, describe
 from msk_ray.tune.space import Space
@@ -201,12 +201,10 @@ def env_steps_budget(config: Config) -> int:
 
     An adaptive horizon is taken to stay where it starts.
     """
-    # msk_ray.shac loads torch, which a dry run need not wait for.
-    from msk_ray.shac.schedules import horizon_at
-
-    horizon = config.shac.horizon
-    fixed = horizon.start if isinstance(horizon, AdaptiveHorizon) else horizon
-    return config.env.nworld * sum(horizon_at(fixed, epoch) for epoch in range(config.trial.epochs))
+    horizon, epochs = config.shac.horizon, config.trial.epochs
+    if isinstance(horizon, HorizonSchedule):
+        return config.env.nworld * sum(horizon.at(epoch) for epoch in range(epochs))
+    return config.env.nworld * epochs * (horizon.start if isinstance(horizon, AdaptiveHorizon) else horizon)
 
 
 def find_trial(trials: list[Trial], text: str) -> Trial:

@@ -25,8 +25,8 @@ class Recording:
     model: Any
     states: StepState
     """Shapes (T + 1, W, ·), on the CPU."""
-    actions: Tensor
-    """Shape (T + 1, W, A); the last one is that of the step before."""
+    controls: Tensor
+    """Shape (T + 1, W, nu); the last ones are those of the step before."""
 
     @property
     def count(self) -> int:
@@ -40,7 +40,7 @@ class Recording:
     def world(self, world: int) -> States:
         """The states of one episode, from its first to the one it ended in."""
         steps = slice(0, self.length(world) + 1)
-        qpos, qvel, act, ctrl = (t[steps, world].double().numpy() for t in (*self.states, self.actions))
+        qpos, qvel, act, ctrl = (t[steps, world].double().numpy() for t in (*self.states, self.controls))
         return States(self.model, qpos, qvel, act, ctrl)
 
     def frames_at(self, world: int, fps: float) -> States:
@@ -63,11 +63,11 @@ def record(bench: Bench, policy: SavedPolicy, request: Request) -> Recording:
     """
     evaluator, physics = bench.evaluator(policy.config, request)
     states: list[StepState] = []
-    actions: list[Tensor] = []
+    controls: list[Tensor] = []
 
-    def keep(state: StepState, action: Tensor) -> None:
+    def keep(state: StepState, control: Tensor) -> None:
         states.append(StepState(*(t.cpu() for t in state)))
-        actions.append(action.cpu())
+        controls.append(control.cpu())
 
     seed = request.seeds[0] if request.seeds else None
     episodes = evaluator.episodes(policy.on(evaluator.env), seed, keep)
@@ -77,5 +77,5 @@ def record(bench: Bench, policy: SavedPolicy, request: Request) -> Recording:
         policy.config.env.control_timestep,
         evaluator.env.model,
         StepState(*(torch.stack(parts) for parts in zip(*states, strict=True))),
-        torch.stack(actions),
+        torch.stack(controls),
     )

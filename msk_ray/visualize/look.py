@@ -7,6 +7,9 @@ RELAXED, ACTIVE = np.array([0.16, 0.35, 0.75]), np.array([0.90, 0.10, 0.08])
 """Colours of a muscle at activation 0 and 1."""
 FORCE = (0.95, 0.15, 0.55, 1.0)
 """Colour of contact forces."""
+_BODY_ALPHA = 0.4
+_TENDON_WIDTH = 0.005
+"""Least radius of a muscle's tendon, in units of the model's extent."""
 _ARROW = 2.0
 """Size of an arrow for a force equal to the whole weight, in units of the model's extent. MuJoCo draws half of it."""
 
@@ -21,6 +24,12 @@ class Look:
         if weight > 0.0:
             # MuJoCo draws map.force / meanmass metres for a newton.
             model.vis.map.force = _ARROW * model.stat.extent * model.stat.meanmass / weight
+        if self._muscles:
+            # Muscles run close to the bones, mostly inside the shapes that stand for them.
+            model.vis.map.alpha = _BODY_ALPHA
+            width = _TENDON_WIDTH * float(model.stat.extent)
+            for tendon in self._muscles:
+                model.tendon_width[tendon] = max(float(model.tendon_width[tendon]), width)
         model.vis.rgba.contactforce = FORCE
         model.vis.scale.forcewidth = 0.1
 
@@ -29,7 +38,8 @@ class Look:
         return bool(self._muscles)
 
     def switch_on(self, option: mujoco.MjvOption) -> None:
-        """Draw contact forces, and tendons where there are any."""
+        """Draw contact forces, and tendons where there are any; bodies with muscles are drawn transparent."""
+        option.flags[mujoco.mjtVisFlag.mjVIS_TRANSPARENT] = self.has_muscles
         option.flags[mujoco.mjtVisFlag.mjVIS_CONTACTFORCE] = True
         option.flags[mujoco.mjtVisFlag.mjVIS_CONTACTPOINT] = True
         option.flags[mujoco.mjtVisFlag.mjVIS_TENDON] = True

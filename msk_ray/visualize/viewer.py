@@ -75,12 +75,13 @@ def watch(bench: Bench, policy: SavedPolicy, request: Request, episodes: int | N
                     return done
                 with torch.no_grad():
                     action = act(env.observation())
+                    control = env.control(action)
                     transition = env.step(action, auto_reset=False)
                 with viewer.lock():
                     state = env.state.physics
                     for name, values in (("qpos", state.qpos), ("qvel", state.qvel), ("act", state.act)):
                         getattr(data, name)[:] = values[0].cpu().numpy()
-                    data.ctrl[:] = action[0].cpu().numpy()
+                    data.ctrl[:] = control[0].cpu().numpy()
                     mujoco.mj_forward(model, data)
                     look.colour(data.act)
                 viewer.sync()

@@ -22,6 +22,7 @@ FAKES = {
         echo "srun $*" >> "$LOG"
         stat -c 'token %a' "$RAY_AUTH_TOKEN_PATH" >> "$LOG"
         echo "mode $RAY_AUTH_MODE, $(wc -c < "$RAY_AUTH_TOKEN_PATH") characters" >> "$LOG"
+        echo "tmp $RAY_TMPDIR" >> "$LOG"
         if [ -n "$STEP_FAILS" ]; then exit 1; fi
         trap 'echo step ended >> "$LOG"; exit 0' TERM
         while true; do /bin/sleep 0.02; done""",
@@ -32,6 +33,7 @@ FAKES = {
             if [ -n "$STEP_FAILS" ] || [ ! -e joined ]; then touch joined; exit 1; fi
             exit 0 ;;
         esac
+        echo "tmp $RAY_TMPDIR" >> "$LOG"
         trap 'echo driver saved >> "$LOG"; exit 75' USR1
         trap 'echo driver told to go >> "$LOG"; exit 75' TERM
         echo driver up >> "$LOG"
@@ -193,6 +195,14 @@ def test_nodes_that_do_not_join_in_time_end_the_job(job: Job) -> None:
     code, output = job.run(MSK_RAY_START_LIMIT="0")
     assert code == 1
     assert "not all nodes joined within 0 s" in output
+
+
+def test_ray_keeps_to_a_folder_of_the_job(job: Job) -> None:
+    job.run(DRIVER_EXITS="0")
+    assert job.lines("tmp") == ["tmp /tmp/msk_ray-123456"] * 3  # two nodes and the driver
+    code, output = job.run(MSK_RAY_TMP="/local/scratch/of/some/department")
+    assert code == 2
+    assert "MSK_RAY_TMP" in output
 
 
 def test_usage(job: Job, root: Path) -> None:

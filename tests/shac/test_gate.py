@@ -34,3 +34,11 @@ def test_a_world_that_is_not_finite_passes_nothing_and_is_counted() -> None:
 def test_nothing_is_bounded_without_a_bound() -> None:
     gate = CotangentGate(None, 1, torch.device("cpu"))
     assert torch.allclose(pulled(gate, torch.tensor([[1e6, 0.0]])), torch.tensor([[1e6, 0.0]]))
+
+
+def test_an_action_whose_cotangent_is_not_finite_loses_its_world_only() -> None:
+    gate = CotangentGate(None, 2, torch.device("cpu"))
+    action = torch.zeros(2, 3, requires_grad=True)
+    gate.screen(action).backward(torch.tensor([[1.0, float("inf"), 2.0], [1.0, 2.0, 3.0]]))
+    assert torch.equal(action.grad, torch.tensor([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]]))
+    assert gate.statistics(unit=1.0) == {"grad/nonfinite_share": 0.5}

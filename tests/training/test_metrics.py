@@ -3,11 +3,13 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from msk_ray.errors import StorageError
 from msk_ray.metrics_file import read_metrics
-from msk_ray.training.metrics import MetricsLog
+from msk_ray.training.metrics import MetricsLog, board_tag, log_image
 
 
 def test_rows_are_on_disk_at_once_and_nan_is_named(tmp_path: Path) -> None:
@@ -45,3 +47,21 @@ def test_rewinding_to_before_the_first_row_drops_a_torn_one(tmp_path: Path) -> N
     log.write({"epoch": 0, "a": 2.0})
     log.close()
     assert [(r["epoch"], r["a"]) for r in read_metrics(path)] == [(0, 2)]
+
+
+def test_tensorboard_groups_by_what_a_figure_is_about(tmp_path: Path) -> None:
+    assert board_tag("eval/score") == "eval/score"
+    log = MetricsLog(tmp_path)
+    log.write({"epoch": 3, "env_steps": 9.0, "train/actor_lr": 1e-3, "train/reward": 1.0, "eval/term/up": 2.0})
+    log.close()
+    events = EventAccumulator(str(tmp_path)).Reload()
+    expected = {"progress/env_steps": 9.0, "schedule/actor_lr": 1e-3, "train/reward": 1.0, "eval_terms/up": 2.0}
+    assert {tag: events.Scalars(tag)[0].value for tag in events.Tags()["scalars"]} == pytest.approx(expected)
+    assert events.Scalars("train/reward")[0].step == 3
+
+
+def test_a_picture_in_tensorboard(tmp_path: Path) -> None:
+    log_image(tmp_path / "film", "film/evaluation", np.zeros((4, 6, 3), np.uint8), 7)
+    events = EventAccumulator(str(tmp_path / "film")).Reload()
+    (image,) = events.Images("film/evaluation")
+    assert (image.height, image.width, image.step) == (4, 6, 7)

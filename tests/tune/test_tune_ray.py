@@ -1,5 +1,6 @@
 """Real Ray, a trainer of milliseconds: stopping, faults, pausing and resuming."""
 
+import contextlib
 import json
 import os
 import signal
@@ -15,10 +16,11 @@ from ray import cloudpickle
 from stub_trainer import BUG, FULL_DISK, HANG, KILL, MEMORY, NAN, SIMULATION_ERROR, StubTrainer
 
 from msk_ray.config import read_yaml
-from msk_ray.errors import StorageFailure
+from msk_ray.errors import ClusterLost, StorageError, StorageFailure
 from msk_ray.tune import experiment as experiments
-from msk_ray.tune import runner
+from msk_ray.tune import runner, standby
 from msk_ray.tune.devices import Placement
+from msk_ray.tune.made_up import recover
 from msk_ray.tune.records import TrialRecord, read_records, read_rows
 from msk_ray.tune.report import finish
 from msk_ray.tune.space import Space
@@ -37,9 +39,14 @@ def session() -> Iterator[None]:
 
 
 def go(space: Space, path: Path, resume: bool = False) -> tuple[bool, list[TrialRecord]]:
-    trials = [] if space.file.search == "optuna" else resolve_trials(space)
-    experiment = experiments.reopen(path, trials) if resume else experiments.create(path, space, trials, {})
-    plan = runner.Plan(experiment, space, trials, Placement(0.0, 1), None, StubTrainer, precompile=None)
+    searching = space.file.search == "optuna"
+    trials = [] if searching else resolve_trials(space)
+    experiment = (
+        experiments.reopen(path, None if searching else trials)
+        if resume
+        else experiments.create(path, space, trials, {})
+    )
+    plan = runner.Plan(experiment, space, trials, Placement(0.0, 1), None, StubTrainer, precompile=None, standby=False)
     completed = runner.run_trials(plan)
     finish(experiment)
     return completed, read_records(experiment)
@@ -73,7 +80,7 @@ def test_faults_are_named_and_killed_or_hung_trials_go_on(
     assert len(scores[0]) == 11
     facts = json.loads((tmp_path / "runs" / "faults" / "summary.json").read_text())
     assert [trial["outcome"] for trial in facts["trials"]] == outcomes(records)
-    for name in ("table.md", "curves.png", "env.json", "manifest.json"):
+    for name in ("table.md", "env.json", "manifest.json"):
         assert (tmp_path / "runs" / "faults" / name).is_file()
 
 
@@ -88,6 +95,18 @@ def test_a_full_disk_stops_everything_and_ends_nothing(
     completed, records = go(space, path, resume=True)
     assert completed
     assert outcomes(records) == ["finished", "out_of_memory"]
+
+
+def test_a_dead_node_of_ones_own_ends_the_experiment_resumably(monkeypatch: pytest.MonkeyPatch) -> None:
+    node = runner._OwnNode()
+    monkeypatch.setattr(runner._OwnNode, "INTERVAL_S", 0.0)
+    node.on_step_end(0, [])
+    alive = runner.ray.nodes()
+    monkeypatch.setattr(runner.ray, "nodes", lambda: [{**facts, "Alive": False} for facts in alive])
+    with pytest.raises(ClusterLost, match="has died"):
+        node.on_step_end(1, [])
+    assert node.lost is not None
+    assert node.lost.exit_code == 75
 
 
 def test_asha_stops_the_bad_ones_and_a_stop_request_is_resumable(
@@ -145,6 +164,117 @@ def test_optuna_trials_enter_the_manifest(make_space: Any, tmp_path: Path) -> No
     assert completed
     assert len(records) >= 2
     assert set(outcomes(records)) == {"finished"}
+
+
+def test_optuna_goes_on_where_it_was(make_space: Any, tmp_path: Path) -> None:
+    pytest.importorskip("optuna")
+    space = make_space(
+        parameters={"shac.actor_lr": {"loguniform": [1e-3, 1e-2]}, "shac.horizon": {"choice": [8, 16]}},
+        samples=3,
+        search="optuna",
+        overrides={"trial.epochs": 100},
+    )
+    path = tmp_path / "runs" / "optuna"
+    timer = threading.Thread(target=_terminate_when, args=(path,))
+    timer.start()
+    completed, before = go(space, path)
+    timer.join()
+    assert not completed
+    assert None in outcomes(before)
+    # As after a driver that was killed: the manifest does not know the trials yet.
+    experiments.Experiment(path).set_trials([])
+    completed, after = go(space, path, resume=True)
+    assert completed
+    assert outcomes(after) == ["finished"] * 3
+    # Those that had begun went on, from their checkpoints, and the others are new.
+    ids = [record.trial.id for record in after]
+    assert ids[: len(before)] == [record.trial.id for record in before]
+    assert len(set(ids)) == 3
+    assert [record.trial.index for record in after] == [0, 1, 2]
+    assert "going on from" in (before[0].folder / "output.log").read_text()
+    assert all([row["epoch"] for row in read_rows(record.folder)] == list(range(101)) for record in after)
+    with pytest.raises(StorageError, match="no longer gives the trial of"):
+        recover(experiments.Experiment(path), make_space(parameters={"shac.actor_lr": {"loguniform": [1e-3, 1e-2]}}))
+
+
+def test_a_population_goes_on_where_it_was(make_space: Any, tmp_path: Path) -> None:
+    space = make_space(
+        parameters={"shac.actor_lr": {"loguniform": [1e-4, 1e-2]}},
+        samples=2,
+        scheduler={"kind": "pbt", "interval": 0.3, "quantile": 0.5},
+        overrides={"evaluation.interval": 20, "trial.epochs": 200},
+    )
+    path = tmp_path / "runs" / "pbt"
+    timer = threading.Thread(target=_terminate_when, args=(path,))
+    timer.start()
+    completed, before = go(space, path)
+    timer.join()
+    assert not completed
+    reached = [record.epochs_done for record in before]
+    completed, after = go(space, path, resume=True)
+    assert completed
+    assert outcomes(after) == ["finished"] * 2
+    assert max(reached) > 0
+    for record in after:
+        assert [row["epoch"] for row in read_rows(record.folder)] == list(range(201))
+        assert 1e-4 <= read_yaml(record.folder / "config.yaml")["shac"]["actor_lr"] <= 1e-2
+
+
+def test_no_more_at_once_than_asked_for_and_the_next_process_waits(make_space: Any, tmp_path: Path) -> None:
+    go_on = tmp_path / "go_on"
+
+    class Patient(StubTrainer):
+        """Its first trial does not end before a process for the next one waits."""
+
+        def run_epoch(self) -> dict[str, float]:
+            row = super().run_epoch()
+            if self.config.trial.seed == 0 and self.finished:
+                deadline = time.monotonic() + 120
+                while not go_on.exists():
+                    assert time.monotonic() < deadline
+                    time.sleep(0.05)
+            return row
+
+    seen: set[int] = set()
+
+    def watch() -> None:
+        deadline = time.monotonic() + 100
+        # The first trial's process, the one asked for the environment of trials, and the one that waits.
+        while len(seen) < 3 and time.monotonic() < deadline:
+            seen.update(_processes_of_trials())
+            time.sleep(0.1)
+        go_on.touch()
+
+    space = make_space(parameters={}, seeds="0-1", overrides={"trial.epochs": 400})
+    path = tmp_path / "runs" / "patient"
+    trials = resolve_trials(space)
+    experiment = experiments.create(path, space, trials, {})
+    thread = threading.Thread(target=watch)
+    thread.start()
+    assert runner.run_trials(runner.Plan(experiment, space, trials, Placement(0.0, 1), 1, Patient, precompile=None))
+    thread.join()
+    first, second = sorted(read_records(experiment), key=lambda record: record.trial.seed)
+    assert outcomes([first, second]) == ["finished", "finished"]
+    began = [json.loads((record.folder / "device.json").read_text()) for record in (first, second)]
+    assert began[1]["began"] >= (first.folder / "outcome.json").stat().st_mtime
+    assert began[0]["pid"] != began[1]["pid"]
+    assert began[1]["pid"] in seen  # it was there before the trial before it had ended
+
+
+def _processes_of_trials() -> list[int]:
+    """Processes of this Ray that have the environment of trials."""
+
+    def parent(pid: int) -> int:
+        return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
+
+    found = []
+    for path in Path("/proc").glob("[0-9]*/environ"):
+        with contextlib.suppress(OSError):  # gone since it was listed
+            text = path.read_bytes()
+            pid = int(path.parent.name)
+            if b"PL_DISABLE_FORK" in text and standby.HOOK.encode() in text and parent(parent(pid)) == os.getpid():
+                found.append(pid)
+    return found
 
 
 def _terminate_when(path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Records, tables, curves and the experiment's folder."""
+"""Records, tables and the experiment's folder."""
 
 import json
 from pathlib import Path
@@ -8,11 +8,11 @@ import pytest
 
 from msk_ray.errors import ConfigError, DeviceError, StorageError
 from msk_ray.tune import experiment as experiments
-from msk_ray.tune.curves import draw_curves
-from msk_ray.tune.devices import Placement, choose_placement
+from msk_ray.tune.devices import Placement, choose_placement, wait_for_memory
 from msk_ray.tune.listing import text_table
 from msk_ray.tune.outcomes import Ending, Outcome, read_ending, write_ending
 from msk_ray.tune.records import best_record, read_record
+from msk_ray.tune.report import write_report
 from msk_ray.tune.space import ResourcesSpec
 from msk_ray.tune.table import markdown, outcome_name, result_rows, summary, table_document, variant_rows
 from msk_ray.tune.trials import resolve_trials
@@ -61,9 +61,19 @@ def test_records_and_tables(experiment: experiments.Experiment, tmp_path: Path) 
     assert f"trials/{records[2].trial.id}/checkpoints/best.pt" in document
     facts = json.loads(json.dumps(summary("e", "Which?", records), allow_nan=False))
     assert facts["best"]["id"] == records[2].trial.id
-    draw_curves(records, tmp_path / "curves.png", "e")
-    assert (tmp_path / "curves.png").stat().st_size > 10_000
-    draw_curves([], tmp_path / "empty.png", "nothing")
+
+
+def test_a_sweep_ends_in_its_report(
+    experiment: experiments.Experiment, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    write_report(experiment)
+    page = experiment.path / "report" / "index.html"
+    assert f"report       {page}" in capfd.readouterr().out
+    assert "Which rate?" in page.read_text()
+    # Whatever becomes of it, the sweep's results stand, and the way to try again is named.
+    write_report(experiments.Experiment(tmp_path / "nowhere"))
+    shown = capfd.readouterr()
+    assert "no report (exit code 2); to try again: python -m msk_ray.report" in shown.out
 
 
 def test_an_existing_experiment_is_refused_and_a_changed_space_named(
@@ -124,6 +134,18 @@ def test_placement() -> None:
             choose_placement(resources, wrong, cpu=False, gpus=4)
     with pytest.raises(ConfigError, match="exclude"):
         choose_placement(resources, 1.0, cpu=True, gpus=4)
+
+
+def test_the_memory_of_a_dead_trial_is_waited_for() -> None:
+    paused: list[float] = []
+    shares = iter([0.1, 0.1, 0.95])
+    assert wait_for_memory(1.0, lambda: next(shares), 60.0, paused.append) is None
+    assert len(paused) == 2
+    # A quarter of a GPU needs a quarter of its memory.
+    assert wait_for_memory(0.25, lambda: 0.3, 60.0, paused.append) is None
+    assert len(paused) == 2
+    assert wait_for_memory(1.0, lambda: 0.4, 5.0, paused.append) == 0.4
+    assert sum(paused[2:]) == 5.0
 
 
 def test_concurrent_trials() -> None:

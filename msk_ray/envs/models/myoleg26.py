@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from msk_ray.config import MyoLeg26EnvConfig, PhysicsConfig
 from msk_ray.envs.models import myoleg26_tables as tables
 from msk_ray.envs.models.myoleg26_poses import add_keyframes
-from msk_ray.envs.models.options import apply_options
+from msk_ray.envs.models.options import add_sky, apply_options
 from msk_ray.envs.models.terrain import Terrain
 
 SIDES = ("r", "l")
@@ -164,6 +164,7 @@ def _body_spec(env: MyoLeg26EnvConfig, p: PhysicsConfig) -> mujoco.MjSpec:
     spec.modelname = "myoleg26"
     spec.compiler.degree = False
     apply_options(spec, p, env.control_timestep)
+    add_sky(spec)
     spec.add_texture(
         name="grid",
         type=mujoco.mjtTexture.mjTEXTURE_2D,

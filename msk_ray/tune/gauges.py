@@ -1,0 +1,92 @@
+"""Where trials stand, as gauges on Ray's metrics port, for Prometheus and the dashboard in `cluster/grafana/`."""
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+from ray.tune import Callback
+from ray.util.metrics import Gauge
+
+from msk_ray.tune.experiment import Experiment
+from msk_ray.tune.outcomes import read_ending
+from msk_ray.tune.trials import Trial
+
+FIGURES = {
+    "msk_ray_score": "eval/score",
+    "msk_ray_best_score": "eval/best_score",
+    "msk_ray_epoch": "epoch",
+    "msk_ray_env_steps_per_s": "env_steps_per_s",
+    "msk_ray_episode_return": "train/episode_return",
+}
+"""Gauge → metric. Ray serves a gauge as `ray_` and its name."""
+STATE = "msk_ray_trial_state"
+"""1 at a trial's present state (`waiting`, `running` or how it ended) and 0 at those it has left."""
+
+
+class TrialGauges:
+    """A trial's newest figures, set by its own process."""
+
+    def __init__(self, experiment: str, trial: Trial) -> None:
+        tags = _tags(experiment, trial)
+        self._gauges = {}
+        for name, metric in FIGURES.items():
+            gauge = Gauge(name, description=metric, tag_keys=tuple(tags))
+            gauge.set_default_tags(tags)
+            self._gauges[metric] = gauge
+
+    def show(self, row: Mapping[str, float]) -> None:
+        """Set what a row of metrics holds."""
+        for metric, gauge in self._gauges.items():
+            if metric in row:
+                gauge.set(row[metric])
+
+
+class StateGauge(Callback):
+    """What each trial is doing, set by the driver: a trial's process cannot say that it has died."""
+
+    def __init__(
+        self, experiment: Experiment, waiting: Iterable[Trial], trial_of: Callable[[dict[str, Any]], Trial]
+    ) -> None:
+        """
+        Args:
+            experiment: where endings are read; whoever writes them has to be called before this is.
+            waiting: trials to be run.
+            trial_of: the trial that a Tune config stands for.
+        """
+        self._experiment = experiment
+        self._trial_of = trial_of
+        self._states: dict[str, str] = {}
+        self._gauge = Gauge(
+            STATE,
+            description="1 at a trial's present state",
+            tag_keys=("experiment", "trial", "variant", "seed", "state"),
+        )
+        for trial in waiting:
+            self._set(trial, "waiting")
+
+    def on_trial_start(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
+        self._set(self._trial_of(trial.config), "running")
+
+    def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
+        self._set(self._trial_of(trial.config), "waiting")
+
+    def on_trial_complete(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
+        mine = self._trial_of(trial.config)
+        ending = read_ending(self._experiment.trial_folder(mine.id))
+        self._set(mine, "waiting" if ending is None else str(ending.outcome))
+
+    def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
+        self.on_trial_complete(iteration, trials, trial)
+
+    def _set(self, trial: Trial, state: str) -> None:
+        tags = _tags(self._experiment.name, trial)
+        before = self._states.get(trial.id)
+        if before is not None:
+            self._gauge.set(0, tags | {"state": before})
+        self._gauge.set(1, tags | {"state": state})
+        self._states[trial.id] = state
+
+
+def _tags(experiment: str, trial: Trial) -> dict[str, str]:
+    # Ray takes no other characters in tags.
+    variant = trial.variant.replace("→", "->").encode("ascii", "backslashreplace").decode()
+    return {"experiment": experiment, "trial": trial.id, "variant": variant, "seed": str(trial.seed)}

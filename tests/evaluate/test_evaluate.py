@@ -1,0 +1,201 @@
+"""Evaluations: the canonical score again, the same twice, every figure by hand, and inputs one may get wrong."""
+
+import json
+import math
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from msk_ray.cli import run
+from msk_ray.errors import CheckpointError
+from msk_ray.evaluate.__main__ import main
+from msk_ray.evaluate.measure import Bench, Request, figures, read_evaluations, store_evaluation
+from msk_ray.training import load_policy, read_metrics
+from msk_ray.training.checkpoint import milestones
+from msk_ray.training.evaluation import Episodes
+from msk_ray.tune.experiment import Experiment
+from msk_ray.tune.records import best_record, read_records
+
+
+@pytest.fixture
+def trial(sweep: Experiment, tmp_path: Path) -> Path:
+    """A copy of the best trial's folder."""
+    best = best_record(read_records(sweep))
+    assert best is not None
+    return Path(shutil.copytree(best.folder, tmp_path / "trial"))
+
+
+def entries(folder: Path) -> list[dict[str, Any]]:
+    return read_evaluations(folder / "eval.json")
+
+
+def test_the_score_is_the_one_trials_are_ranked_by_and_the_same_twice(trial: Path) -> None:
+    assert run(main, [str(trial), "--device", "cpu"]) == 0
+    (first,) = entries(trial)
+    assert run(main, [str(trial / "checkpoints" / "best.pt"), "--device", "cpu"]) == 0
+    (second,) = entries(trial)  # in place of the first: same checkpoint, physics and size
+    timeless = lambda entry: {k: v for k, v in entry.items() if k != "date"}  # noqa: E731
+    assert timeless(first) == timeless(second)
+    rows = [row for row in read_metrics(trial / "metrics.jsonl") if "eval/score" in row]
+    best = max(rows, key=lambda row: row["eval/score"])
+    assert first["canonical"]
+    assert first["score"]["mean"] == best["eval/score"]
+    assert first["score"]["std"] == best["eval/score_std"]
+    assert first["outcomes"]["upright"]["mean"] == best["eval/upright"]
+    assert {f"eval/term/{k}": v["mean"] for k, v in first["terms"].items()} == {
+        k: v for k, v in best.items() if k.startswith("eval/term/")
+    }
+    assert math.isclose(sum(v["mean"] for v in first["terms"].values()), first["score"]["mean"], rel_tol=1e-5)
+
+
+def test_seeds_worlds_and_steps(trial: Path) -> None:
+    assert run(main, [str(trial), "--seeds", "1,2", "--worlds", "3", "--steps", "10", "--device", "cpu"]) == 0
+    (entry,) = entries(trial)
+    assert not entry["canonical"]
+    assert len(entry["scores"]) == 6
+    assert entry["length"] == {"mean": 10.0, "std": 0.0, "min": 10.0, "max": 10.0}
+    by_seed = entry["score_by_seed"]
+    assert by_seed["1"] != by_seed["2"]
+    assert math.isclose((by_seed["1"] + by_seed["2"]) / 2, entry["score"]["mean"], rel_tol=1e-6)
+
+
+def test_an_experiment_is_ranked_and_a_torn_policy_is_named(
+    sweep: Experiment, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = Path(shutil.copytree(sweep.path, tmp_path / "small"))
+    torn = Experiment(folder).trials()[1].id
+    with (folder / "trials" / torn / "checkpoints" / "best.pt").open("ab") as file:
+        file.write(b"x")
+    assert run(main, ["small", "--storage", str(tmp_path), "--device", "cpu"]) == 1
+    data = json.loads((folder / "eval.json").read_text())
+    (ranked,) = data["rankings"]
+    scores = [entry["score"]["mean"] for entry in ranked["ranking"]]
+    assert len(scores) == 3
+    assert scores == sorted(scores, reverse=True)
+    recorded = {record.trial.id: record.best.score for record in read_records(sweep) if record.best is not None}
+    assert {e["trial"]: e["score"]["mean"] for e in ranked["ranking"]} == {
+        k: v for k, v in recorded.items() if k != torn
+    }
+    assert [entry["trial"] for entry in data["failed"]] == [torn]
+    assert "is torn" in data["failed"][0]["why"]
+    assert "under own physics" in capsys.readouterr().out
+
+
+def test_physics_by_name(ant_trial: Path) -> None:
+    policy = load_policy(ant_trial / "checkpoints" / "best.pt")
+    bench = Bench("cpu")
+    reference, published, own = (
+        bench.evaluate(policy, Request(name, steps=20)) for name in ("reference", "published", "own")
+    )
+    assert [e["physics"] for e in (reference, published, own)] == ["matched", "published", "own"]
+    assert reference["score"]["mean"] != published["score"]["mean"]
+    assert reference["score"] == own["score"]  # this trial trains on the reference physics as it stands
+    assert set(reference["terms"]) == {"forward_vel", "up", "heading", "height", "action"}
+    assert "vx" in reference["outcomes"]
+
+
+def test_figures_by_hand() -> None:
+    flags = torch.tensor([True, False])
+    run_a = Episodes(
+        score=torch.tensor([1.0, 3.0]),
+        length=torch.tensor([10.0, 30.0]),
+        fell=flags,
+        diverged=~flags,
+        terms=torch.tensor([[1.0, 0.0], [2.0, 1.0]]),
+        outcomes={"vx": torch.tensor([10.0, 60.0])},
+        success=flags,
+    )
+    run_b = run_a._replace(score=torch.tensor([5.0, 7.0]), fell=torch.tensor([False, False]))
+    found = figures([run_a, run_b], ("a", "b"))
+    assert found["score"] == {"mean": 4.0, "std": pytest.approx(math.sqrt(20 / 3)), "min": 1.0, "max": 7.0}
+    assert found["fall_rate"] == 0.25
+    assert found["diverged_rate"] == 0.5
+    assert found["success_rate"] == 0.5
+    assert found["terms"]["a"]["mean"] == 1.5
+    # 140 metres in 80 steps; the episodes' own speeds are 1 and 2.
+    assert found["outcomes"]["vx"]["mean"] == 1.75
+    assert (found["outcomes"]["vx"]["min"], found["outcomes"]["vx"]["max"]) == (1.0, 2.0)
+
+
+def test_policies_along_the_way_are_those_that_were_evaluated(trial: Path) -> None:
+    rows = {row["epoch"]: row for row in read_metrics(trial / "metrics.jsonl")}
+    kept = milestones(trial / "checkpoints")
+    assert [epoch for epoch, _ in kept] == [0, 2, 4, 6]
+    bench = Bench("cpu")
+    for epoch, path in kept:
+        assert bench.evaluate(load_policy(path), Request())["score"]["mean"] == rows[epoch]["eval/score"]
+    shutil.rmtree(trial / "checkpoints" / "nothing", ignore_errors=True)
+    with pytest.raises(CheckpointError, match="no such checkpoint"):
+        load_policy(trial / "checkpoints" / "policy_000001.pt")
+
+
+def test_a_broken_eval_file_is_not_overwritten(trial: Path) -> None:
+    (trial / "eval.json").write_text("{")
+    assert run(main, [str(trial), "--device", "cpu", "--steps", "2"]) == 2
+    assert (trial / "eval.json").read_text() == "{"
+    (trial / "eval.json").unlink()
+    store_evaluation(trial / "eval.json", {"checkpoint": "a", "physics": "own"})
+    store_evaluation(trial / "eval.json", {"checkpoint": "b", "physics": "own"})
+    assert [entry["checkpoint"] for entry in entries(trial)] == ["a", "b"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["smal"], "did you mean 'small'?"),
+        (["nothing"], "no checkpoint, trial or experiment 'nothing'"),
+        (["small", "--physics", "published"], "env cartpole has no such physics"),
+        (["small", "--seeds", "x"], "write whole numbers"),
+        (["small", "--device", "cuda:9"], "write --device cpu"),
+        (["small/manifest.json"], "is no checkpoint"),
+        (["small/trials/nothing"], "give a .pt file"),
+    ],
+)
+def test_bad_input_is_one_line(
+    sweep: Experiment, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    storage = ["--storage", str(sweep.path.parent)]
+    code = run(main, [*arguments, *storage])
+    error = capsys.readouterr().err
+    assert code == 2
+    lines = [line for line in error.splitlines() if not line.startswith("Warp ")]
+    assert len(lines) == 1
+    assert message in lines[0]
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", ["cartpole", "ant"])
+def test_cpu_and_gpu_agree_over_the_first_hundred_steps(name: str, sweep: Experiment, ant_trial: Path) -> None:
+    """Same initial states to the bit. After 100 steps of float32, whose rounding differs and contact amplifies, the
+    median world's positions differ by less than 1e-3 (CartPole) and 2e-2 (ant) [m, rad], mean scores by 1 %."""
+    best = best_record(read_records(sweep))
+    assert best is not None
+    folder = ant_trial if name == "ant" else best.folder
+    policy = load_policy(folder / "checkpoints" / "best.pt")
+    tolerance = 2e-2 if name == "ant" else 1e-3
+    paths, scores = [], []
+    for device in ("cpu", "cuda:0"):
+        evaluator, _ = Bench(device).evaluator(policy.config, Request(worlds=16, steps=100))
+        states: list[torch.Tensor] = []
+        episodes = evaluator.episodes(
+            policy.on(evaluator.env), None, lambda s, a, kept=states: kept.append(s.qpos.cpu())
+        )
+        paths.append(torch.stack(states))
+        scores.append(episodes.score.cpu())
+    steps = min(len(path) for path in paths)
+    cpu, gpu = (path[:steps] for path in paths)
+    assert torch.equal(cpu[0], gpu[0])
+    assert (cpu - gpu).abs().amax((0, 2)).median() < tolerance
+    assert (scores[0].mean() - scores[1].mean()).abs() < 0.01 * scores[0].abs().mean()
+
+
+@pytest.mark.gpu
+def test_a_gpu_gives_the_same_numbers_twice(sweep: Experiment) -> None:
+    best = best_record(read_records(sweep))
+    assert best is not None
+    policy = load_policy(best.folder / "checkpoints" / "best.pt")
+    first, second = (Bench("cuda:0").evaluate(policy, Request()) for _ in range(2))
+    assert first["scores"] == second["scores"]

@@ -1,0 +1,132 @@
+"""The report of a real sweep in a real browser: wide, narrow, by keyboard and on paper."""
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, urlparse
+
+import pytest
+from needs import need_drawing, need_program
+from playwright.sync_api import Page, sync_playwright
+
+from msk_ray.cli import run
+from msk_ray.report.__main__ import main
+from msk_ray.report.best import strip_text
+from msk_ray.tune.experiment import Experiment
+from msk_ray.tune.records import best_record, read_records
+
+
+@pytest.fixture(scope="module")
+def reported(sweep: Experiment, tmp_path_factory: pytest.TempPathFactory) -> Experiment:
+    """A copy of the sweep with its report, the best policy's evaluation and strip included."""
+    need_drawing()
+    copy = Experiment(Path(shutil.copytree(sweep.path, tmp_path_factory.mktemp("reported") / "small")))
+    assert run(main, [str(copy.path), "--device", "cpu"]) == 0
+    return copy
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """Headless Chromium."""
+    program = need_program("chromium", "chromium-browser", "google-chrome", package="chromium")
+    with sync_playwright() as playwright:
+        # Its sandbox needs rights that a container, or root, does not have.
+        chromium = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture(params=[1280, 375], ids=["wide", "narrow"])
+def page(reported: Experiment, browser: Any, request: pytest.FixtureRequest) -> Iterator[Page]:
+    """The page, and everything the browser complains of in `page.complaints`."""
+    context = browser.new_context(viewport={"width": request.param, "height": 800})
+    opened = context.new_page()
+    complaints: list[str] = []
+    opened.on("console", lambda message: complaints.append(message.text))
+    opened.on("pageerror", lambda error: complaints.append(str(error)))
+    opened.on("requestfailed", lambda failed: complaints.append(failed.url))
+    requests: list[str] = []
+    opened.on("request", lambda made: requests.append(made.url))
+    opened.goto((reported.path / "report" / "index.html").as_uri())
+    opened.complaints, opened.requests = complaints, requests  # type: ignore[attr-defined]
+    yield opened
+    context.close()
+
+
+def test_all_is_drawn_without_complaints_and_fits(page: Page, reported: Experiment) -> None:
+    assert page.complaints == []  # type: ignore[attr-defined]
+    fetched = [url for url in page.requests if not url.startswith("data:")]  # type: ignore[attr-defined]
+    assert fetched == [(reported.path / "report" / "index.html").as_uri()]
+    images = page.evaluate("[...document.images].map(i => [i.complete && i.naturalWidth, i.alt.length, i.clientWidth])")
+    assert len(images) == 6, "strip, curves, effects, parallel coordinates, stops, gradients"
+    assert all(width > 200 and alt > 30 for width, alt, _ in images)
+    inner, scroll = page.evaluate("[window.innerWidth, document.documentElement.scrollWidth]")
+    assert scroll <= inner
+    # Phones get pictures drawn for them, with letters of a size one can read.
+    ratio = page.evaluate("document.images[1].naturalWidth / document.images[1].naturalHeight")
+    assert (ratio < 1.2) == (inner == 375)
+
+
+def test_links_resolve(page: Page, reported: Experiment) -> None:
+    links = page.evaluate("[...document.querySelectorAll('a')].map(a => a.href)")
+    assert len(links) > 20
+    base = (reported.path / "report" / "index.html").as_uri()
+    for link in links:
+        target, _, anchor = link.partition("#")
+        if target == base:
+            assert page.evaluate("id => document.getElementById(id) !== null", anchor), link
+        else:
+            assert Path(unquote(urlparse(target).path)).is_file(), link
+
+
+def test_tables_are_sorted_by_keyboard(page: Page) -> None:
+    heading = page.locator("table[data-sortable] th", has_text="score").first
+    heading.locator("button").focus()
+    column = heading.evaluate("th => th.cellIndex")
+    rows = "[...document.querySelector('table[data-sortable]').tBodies[0].rows]"
+    cells = f"{rows}.map(row => +row.cells[{column}].dataset.value)"
+    page.keyboard.press("Enter")
+    assert heading.get_attribute("aria-sort") == "descending"
+    falling = page.evaluate(cells)
+    assert falling == sorted(falling, reverse=True)
+    page.keyboard.press("Enter")
+    assert heading.get_attribute("aria-sort") == "ascending"
+    assert page.evaluate(cells) == falling[::-1]
+    # The first Tab of the page reaches the link past the navigation.
+    page.evaluate("document.activeElement.blur(); window.scrollTo(0, 0)")
+    page.reload()
+    page.keyboard.press("Tab")
+    assert page.evaluate("document.activeElement.className") == "skip"
+    assert page.locator("h1").count() == 1
+    assert page.evaluate("[...document.querySelectorAll('h1,h2,h3')].map(h => +h.tagName[1])")[:3] == [1, 2, 2]
+
+
+def test_paper_shows_everything(page: Page) -> None:
+    page.emulate_media(media="print")
+    page.evaluate("dispatchEvent(new Event('beforeprint'))")
+    assert not page.locator("nav").is_visible()
+    assert page.evaluate("[...document.querySelectorAll('details')].every(d => d.open)")
+    cut = "d => getComputedStyle(d).overflowX !== 'visible'"
+    hidden = page.evaluate(f"[...document.querySelectorAll('.scroll')].filter({cut}).length")
+    assert hidden == 0
+
+
+def test_the_best_policy_is_shown_and_not_made_twice(reported: Experiment, capsys: pytest.CaptureFixture[str]) -> None:
+    best = best_record(read_records(reported))
+    assert best is not None
+    assert best.best is not None
+    text = (reported.path / "report" / "index.html").read_text()
+    assert f"{best.trial.id}" in text
+    assert f"{best.best.score:.5g}".replace("-", "−") in text
+    assert "the score trials are ranked by" in text
+    assert "reward: pole_angle" in text
+    assert len(text) < 3e6
+    strip = reported.path / "report" / "strip.png"
+    before = strip.stat().st_mtime_ns
+    assert run(main, [str(reported.path), "--device", "cpu"]) == 0
+    assert strip.stat().st_mtime_ns == before
+    assert "evaluating" not in capsys.readouterr().out
+    # A strip of another policy, or a torn one, is not taken for this one's.
+    assert strip_text(strip, "another") is None
+    assert list((best.folder / "film").glob("events*"))

@@ -1,0 +1,253 @@
+"""The report of experiments in every condition, and what its tables and curves say."""
+
+import json
+import os
+import shutil
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from msk_ray.cli import run
+from msk_ray.config import dump_yaml
+from msk_ray.report.__main__ import main
+from msk_ray.report.page import make_section
+from msk_ray.report.reading import Condition, read_experiment
+from msk_ray.report.tables import failures, variant_rows
+from msk_ray.tune import experiment as experiments
+from msk_ray.tune.outcomes import Ending, Outcome, write_ending
+from msk_ray.tune.space import parse_space
+from msk_ray.tune.trials import resolve_trials
+
+
+def row(epoch: int, score: float | None = None) -> dict[str, Any]:
+    base = {"epoch": epoch, "env_steps": 100 * epoch, "seconds": 2.0 * epoch, "env_steps_per_s": 50.0}
+    grad = {"grad/actor_norm": 1.0 + epoch, "grad/nonfinite_share": 0.0} if epoch else {}
+    return base | grad | ({} if score is None else {"eval/score": score, "eval/vx": score / 10, "eval/length": 7.0})
+
+
+def fill(folder: Path, scores: list[float], ending: Ending | None = None) -> None:
+    """A trial's folder with an evaluation every second epoch."""
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = [row(epoch, scores[epoch // 2] if epoch % 2 == 0 else None) for epoch in range(2 * len(scores) - 1)]
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(r) + "\n" for r in rows))
+    if ending is not None:
+        write_ending(folder, ending)
+
+
+@pytest.fixture
+def experiment(tmp_path: Path) -> experiments.Experiment:
+    """A baseline and two variants, two seeds each, all finished but the last, which failed."""
+    (tmp_path / "base.yaml").write_text(dump_yaml({"env": {"name": "cartpole"}, "trial": {"epochs": 4}}))
+    data = {
+        "question": "Does <b>it</b> matter?",
+        "base": "base.yaml",
+        "ablate": {"variants": {"fast": {"shac.actor_lr": 0.1}, "deep": {"actor.hidden": [9, 9]}}},
+        "seeds": "0-1",
+    }
+    space = parse_space(data, tmp_path / "small.yaml")
+    trials = resolve_trials(space)
+    made = experiments.create(tmp_path / "runs" / "e", space, trials, {})
+    scores = {("baseline", 0): 10.0, ("baseline", 1): 12.0, ("fast", 0): 30.0, ("fast", 1): 34.0, ("deep", 0): 11.0}
+    for trial in trials:
+        score = scores.get((trial.changed["variant"], trial.seed))
+        folder = made.trial_folder(trial.id)
+        if score is None:
+            fill(folder, [1.0, 2.0], Ending(Outcome.NONFINITE, "train/actor_loss is nan <i>at</i> epoch 3"))
+            (folder / "output.log").write_text("line\n" * 30 + "the last words\n")
+        else:
+            fill(folder, [0.0, score, score - 1], Ending(Outcome.FINISHED, "all 4 epochs done"))
+    return made
+
+
+def page_of(experiment: experiments.Experiment, *arguments: str) -> str:
+    assert run(main, [str(experiment.path), *arguments]) == 0
+    return (experiment.path / "report" / "index.html").read_text()
+
+
+def test_tables_by_hand(experiment: experiments.Experiment) -> None:
+    reading = read_experiment(experiment, time.time())
+    assert reading.condition is Condition.FINISHED
+    assert reading.notes == ()
+    rows = variant_rows(reading, "baseline")
+    assert [(r.variant, r.mean, r.difference, r.verdict) for r in rows] == [
+        ("fast", 32.0, 21.0, "better"),
+        ("baseline", 11.0, None, "baseline"),
+        ("deep", 6.5, -4.5, "unclear"),
+    ]
+    assert rows[0].figures == {"vx": 3.2}
+    (failure,) = failures(reading)
+    assert (failure[0], len(failure[2])) == ("nonfinite", 1)
+    assert failure[2][0].tail().splitlines()[-1] == "the last words"
+    best = reading.best
+    assert best is not None
+    assert (best.score, best.best_row["epoch"]) == (34.0, 2.0)
+
+
+def test_the_page_says_it_all_and_takes_nothing_for_markup(experiment: experiments.Experiment) -> None:
+    page = page_of(experiment)
+    assert "Does &lt;b&gt;it&lt;/b&gt; matter?" in page
+    assert "nan &lt;i&gt;at&lt;/i&gt; epoch 3" in page
+    for words in ("6 trials: 5 finished, 1 nonfinite", "Differences are from: baseline", "the last words", "better"):
+        assert words in page
+    assert "There is no policy to look at" in page  # these trials have no checkpoints
+    assert "http" not in page.replace("http-equiv", ""), "nothing is fetched"
+    for name in ("curves", "effects", "parallel", "stops", "health"):
+        assert (experiment.path / "report" / f"{name}.png").stat().st_size > 5000
+
+
+def test_the_baseline_can_be_chosen(experiment: experiments.Experiment, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "Differences are from: fast" in page_of(experiment, "--baseline", "fas")
+    assert run(main, [str(experiment.path), "--baseline", "slow"]) == 2
+    assert "no variant of e is called so; write one of: baseline; fast; deep" in capsys.readouterr().err
+
+
+def test_command_and_files(experiment: experiments.Experiment) -> None:
+    env = {"command": ["/x/y/msk_ray/tune/__main__.py", "--space", "a b"], "commit": "abc+", "packages": {"torch": "1"}}
+    (experiment.path / "env.json").write_text(json.dumps(env))
+    page = page_of(experiment)
+    assert "git checkout abc\npython -m msk_ray.tune --space &#39;a b&#39;" in page
+    assert "changes that were not committed" in page
+    section = make_section(read_experiment(experiment, 0.0), experiment.path / "report", "", None, None)
+    links = [link for trial in section.reading.trials for _, link in section.files(trial)]
+    assert len(links) == 7  # six metrics and an output
+    assert all((experiment.path / "report" / link).is_file() for link in links)
+
+
+def _empty(e: experiments.Experiment) -> None:
+    shutil.rmtree(e.path)
+    e.path.mkdir()
+
+
+def _half_written(e: experiments.Experiment) -> None:
+    (e.path / "manifest.json").unlink()
+    shutil.rmtree(e.path / "trials")
+
+
+def _torn_manifest(e: experiments.Experiment) -> None:
+    path = e.path / "manifest.json"
+    path.write_text(path.read_text()[:200])
+    # What trials wrote themselves is still found.
+    for trial_folder in (e.path / "trials").iterdir():
+        (trial_folder / "config.yaml").write_text(dump_yaml({"env": {"name": "cartpole"}}))
+
+
+def _nothing_else(e: experiments.Experiment) -> None:
+    (e.path / "env.json").unlink()
+    (e.path / "space.yaml").write_text("question: [")
+
+
+def _not_begun(e: experiments.Experiment) -> None:
+    for folder in (e.path / "trials").iterdir():
+        shutil.rmtree(folder)
+
+
+def _folders(e: experiments.Experiment) -> list[Path]:
+    return [e.trial_folder(trial.id) for trial in e.trials()]
+
+
+def _broken_trials(e: experiments.Experiment) -> None:
+    folders = _folders(e)
+    (folders[0] / "metrics.jsonl").write_text('{"epoch": 0, "ev\n{"epoch": 1}\n')
+    (folders[1] / "outcome.json").write_text('{"outcome": "fin')
+    (folders[2] / "metrics.jsonl").write_text('{"epoch": 0, "env_steps": 0}\n{"epoch": 1, "env')
+    (folders[3] / "metrics.jsonl").write_text("")
+    (folders[4] / "outcome.json").write_text('{"outcome": "unheard_of", "why": ""}')
+
+
+def _crashed(e: experiments.Experiment) -> None:
+    for folder in _folders(e)[:3]:
+        (folder / "outcome.json").unlink()
+        os.utime(folder / "metrics.jsonl", (1e9, 1e9))
+
+
+def _running(e: experiments.Experiment) -> None:
+    (_folders(e)[0] / "outcome.json").unlink()
+
+
+def _never_evaluated(e: experiments.Experiment) -> None:
+    for folder in _folders(e):
+        rows = [row(1), row(2)]
+        (folder / "metrics.jsonl").write_text("".join(json.dumps(r) + "\n" for r in rows))
+
+
+def _nothing_finite(e: experiments.Experiment) -> None:
+    bad = {"epoch": 1, "env_steps": 5, "seconds": 1.0, "eval/score": None, "grad/actor_norm": None}
+    for folder in _folders(e):
+        (folder / "metrics.jsonl").write_text(json.dumps(bad | {"nonfinite": ["eval/score", "grad/actor_norm"]}) + "\n")
+
+
+def _best_without_policy(e: experiments.Experiment) -> None:
+    for folder in _folders(e):
+        (folder / "checkpoints").mkdir()
+        (folder / "checkpoints" / "best.pt").write_bytes(b"torn")
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (_empty, ["The folder is empty.", "empty"]),
+        (_half_written, ["Which trials were planned is not known", "manifest.json is missing", "It has no trials"]),
+        (_torn_manifest, ["Which trials were planned is not known", "6 trials"]),
+        (_nothing_else, ["env.json is missing", "space.yaml cannot be read", "Versions and command were not recorded"]),
+        (_not_begun, ["not started", "No trial has begun yet", "No trial was evaluated yet"]),
+        (
+            _broken_trials,
+            ["3 unreadable", "is not JSON", "JSONDecodeError", "unheard_of", "the trial&#39;s files make no sense"],
+        ),
+        (_crashed, ["interrupted", "--resume goes on", "3 interrupted"]),
+        (_running, ["Trials are still running", "1 running"]),
+        (_never_evaluated, ["No trial was evaluated yet", "Too few evaluated trials"]),
+        (_nothing_finite, ["No trial was evaluated yet", "No trial has recorded a gradient yet"]),
+        (_best_without_policy, ["There is no policy to look at: no such checkpoint"]),
+    ],
+)
+def test_every_condition_is_named_and_never_a_traceback(
+    experiment: experiments.Experiment, damage: Any, words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    damage(experiment)
+    page = page_of(experiment)
+    for expected in words:
+        assert expected in page
+    assert "Traceback" not in page
+    assert capsys.readouterr().err == ""
+
+
+def test_several_side_by_side(experiment: experiments.Experiment, tmp_path: Path) -> None:
+    other = experiments.Experiment(Path(shutil.copytree(experiment.path, tmp_path / "runs" / "other")))
+    _crashed(other)
+    out = tmp_path / "both"
+    assert run(main, ["e", "other", "--storage", str(tmp_path / "runs"), "--out", str(out)]) == 0
+    page = (out / "index.html").read_text()
+    assert "Side by side" in page
+    assert page.count('<section id="') == 3
+    assert (out / "together.png").is_file()
+    assert (out / "1_curves.png").is_file()
+    assert (out / "2_curves.png").is_file()
+    assert not (experiment.path / "report").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["e", "e"], "the same experiment twice"),
+        (["x"], "did you mean 'e'?"),
+        (["../base.yaml"], "is no checkpoint"),
+        (["../elsewhere"], "holds no experiment"),
+    ],
+)
+def test_bad_input_is_one_line(
+    experiment: experiments.Experiment,
+    tmp_path: Path,
+    arguments: list[str],
+    message: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "letter.txt").touch()
+    if message == "did you mean 'e'?":
+        arguments = ["ee"]
+    assert run(main, [*arguments, "--storage", str(experiment.path.parent)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert message in line

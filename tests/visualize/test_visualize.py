@@ -1,0 +1,239 @@
+"""Pictures without a display, for CartPole and the ant, on the CPU; the viewer under a virtual display."""
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import av
+import mujoco
+import numpy as np
+import pytest
+from needs import need_drawing, need_program
+from PIL import Image
+
+from msk_ray.cli import run
+from msk_ray.errors import DeviceError
+from msk_ray.evaluate.measure import Bench, Request
+from msk_ray.training import load_policy
+from msk_ray.tune.experiment import Experiment
+from msk_ray.visualize import render
+from msk_ray.visualize.__main__ import main
+from msk_ray.visualize.episodes import record
+from msk_ray.visualize.look import ACTIVE, RELAXED, Look, muscle_tendons
+from msk_ray.visualize.render import States, View, frames, headless_backend
+
+MUSCLE = """
+<mujoco>
+  <option gravity="0 0 0"/>
+  <worldbody>
+    <light pos="0 -2 2" dir="0 1 -1"/>
+    <camera name="front" pos="0 -1 0" xyaxes="1 0 0 0 0 1"/>
+    <site name="a" pos="-.3 0 0"/>
+    <body><joint type="slide" axis="1 0 0"/><geom size=".02"/><site name="b" pos=".3 0 0"/></body>
+  </worldbody>
+  <tendon><spatial name="t" width=".05"><site site="a"/><site site="b"/></spatial></tendon>
+  <actuator><muscle name="m" tendon="t" lengthrange=".1 1"/></actuator>
+</mujoco>
+"""
+RESTING = """
+<mujoco>
+  <worldbody>
+    <light pos="0 -2 2" dir="0 1 -1"/>
+    <camera name="front" pos="0 -2 .3" xyaxes="1 0 0 0 0 1"/>
+    <geom type="plane" size="2 2 .1"/>
+    <body pos="0 0 .048"><freejoint/><geom type="box" size=".05 .05 .05" mass="1"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.fixture
+def drawing() -> str:
+    """The OpenGL platform that works here."""
+    return need_drawing()
+
+
+@pytest.fixture(params=["cartpole", "ant", "myoleg26"])
+def target(request: pytest.FixtureRequest, sweep: Experiment) -> Path:
+    """A trial's folder, or a checkpoint, of each environment."""
+    if request.param == "cartpole":
+        return sweep.trial_folder(sweep.trials()[0].id)
+    path: Path = request.getfixturevalue("ant_trial" if request.param == "ant" else "myoleg26_checkpoint")
+    return path
+
+
+def decode(path: Path) -> list[np.ndarray]:
+    with av.open(str(path)) as container:
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+
+
+def test_video_and_strip(target: Path, tmp_path: Path, drawing: str, capsys: pytest.CaptureFixture[str]) -> None:
+    video, strip = tmp_path / "deep" / "out.mp4", tmp_path / "out.png"
+    options = ["--steps", "20", "--size", "160x120", "--device", "cpu", "--fps", "30", "--frames", "3"]
+    assert run(main, [str(target), "--video", str(video), "--strip", str(strip), *options]) == 0
+    shots = decode(video)
+    # 20 steps of 1/60 s, or 1/50 with muscles, fewer if it fell; at 30 frames a second with both ends.
+    assert 2 <= len(shots) <= 13
+    assert shots[0].shape == (120, 160, 3)
+    assert np.ptp(shots[0]) > 50
+    assert np.abs(shots[0].astype(int) - shots[-1].astype(int)).max() > 20, "something moved"
+    with Image.open(strip) as image:
+        assert image.size[0] == 3 * 160 + 2 * 4
+        left, right = (np.asarray(image)[:120, x : x + 160] for x in (0, 328))
+    assert np.ptp(left) > 50
+    assert not np.array_equal(left, right)
+    assert "frames in" in capsys.readouterr().out
+
+
+def test_frames_progression_and_tensorboard(sweep: Experiment, tmp_path: Path, drawing: str) -> None:
+    folder = Path(shutil.copytree(sweep.trial_folder(sweep.trials()[0].id), tmp_path / "trial"))
+    small = ["--size", "64x48", "--device", "cpu", "--frames", "3"]
+    assert run(main, [str(folder), "--save-frames", str(tmp_path / "f"), "--fps", "6", "--episodes", "2", *small]) == 0
+    # Two episodes of 20 steps, a third of a second: frames at 0, 1/6 and 2/6 s.
+    assert len(list((tmp_path / "f").glob("frame_*.png"))) == 6
+    grid = tmp_path / "grid.png"
+    assert run(main, ["--progression", str(folder), "--strip", str(grid), *small]) == 0
+    with Image.open(grid) as image:
+        # Four policies along the way and the best, each row of a title, frames, times and a gap.
+        assert image.size == (3 * 64 + 2 * 4, 5 * (16 + 48 + 16 + 4) - 4)
+    assert run(main, [str(folder), "--strip", str(tmp_path / "s.png"), "--tensorboard", *small]) == 0
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(folder / "film")).Reload()
+    assert events.Tags()["images"] == ["film/evaluation"]
+    (shown,) = events.Images("film/evaluation")
+    assert (shown.width, shown.height) == (3 * 64 + 2 * 4, Image.open(tmp_path / "s.png").height)
+
+
+def test_statistics_without_pictures(sweep: Experiment, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = sweep.trial_folder(sweep.trials()[0].id)
+    assert run(main, [str(folder), "--no-render", "--episodes", "3", "--device", "cpu"]) == 0
+    table = capsys.readouterr().out.splitlines()
+    policy = load_policy(folder / "checkpoints" / "best.pt")
+    scores = Bench("cpu").evaluate(policy, Request(worlds=3))["scores"]
+    shown = [float(line.split()[1]) for line in table if line[:1].isdigit()]
+    assert shown == [float(f"{score:.5g}") for score in scores]
+    assert "mean ± std" in table[-1]
+
+
+def test_a_recording_ends_where_its_episode_does(ant_trial: Path) -> None:
+    recording = record(Bench("cpu"), load_policy(ant_trial / "checkpoints" / "best.pt"), Request(worlds=2, steps=12))
+    assert recording.length(0) == 12
+    assert len(recording.world(0)) == 13
+    assert recording.ending(0) == "time"
+    # At 30 a second, of 12 steps of 1/60 s: every second one.
+    assert np.array_equal(recording.frames_at(0, 30.0).qpos, recording.world(0).qpos[::2])
+    state = recording.world(1)
+    assert (state.qvel.shape, state.act.shape, state.ctrl.shape) == ((13, 14), (13, 0), (13, 8))
+
+
+def test_muscles_are_coloured_by_activation(drawing: str) -> None:
+    model = mujoco.MjModel.from_xml_string(MUSCLE)
+    assert muscle_tendons(model) == {0: [0]}
+    Look(model).colour(np.array([0.25]))
+    assert np.allclose(model.tendon_rgba[0, :3], 0.75 * RELAXED + 0.25 * ACTIVE, atol=1e-6)
+    one = np.zeros((2, 1))
+    states = States(model, one, one, np.array([[0.0], [1.0]]), one)
+    relaxed, active = frames(states, View(96, 64))
+    # In the middle of the picture runs the tendon: blue, then red.
+    blue, red = relaxed[32, 30].astype(int), active[32, 30].astype(int)
+    assert blue[2] > blue[0] + 30
+    assert red[0] > red[2] + 30
+
+
+def test_contact_forces_are_drawn(drawing: str) -> None:
+    model = mujoco.MjModel.from_xml_string(RESTING)
+    qpos = np.array([[0, 0, 0.048, 1, 0, 0, 0], [0, 0, 0.5, 1, 0, 0, 0]], dtype=float)
+    states = States(model, qpos, np.zeros((2, 6)), np.zeros((2, 0)), np.zeros((2, 0)))
+    resting, flying = (frame.astype(int) for frame in frames(states, View(160, 120)))
+    arrows = [((f[..., 0] > f[..., 1] + 60) & (f[..., 2] > f[..., 1] + 20)).sum() for f in (resting, flying)]
+    assert arrows[0] > 10
+    assert arrows[1] == 0
+
+
+def test_without_opengl_the_packages_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    fault = render.probe("nonsense")  # a real process, which MuJoCo refuses to draw in
+    assert fault is not None
+    assert "nonsense" in fault
+    monkeypatch.setattr(render, "probe", lambda backend: f"no {backend} here")
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    headless_backend.cache_clear()
+    try:
+        with pytest.raises(DeviceError, match=r"egl: no egl here; osmesa: no osmesa here.*apt install libosmesa6"):
+            headless_backend()
+    finally:
+        headless_backend.cache_clear()
+
+
+def test_a_drawing_process_that_dies_is_reported(drawing: str) -> None:
+    model = mujoco.MjModel.from_xml_string(RESTING)
+    wrong = States(model, np.zeros((1, 3)), np.zeros((1, 6)), np.zeros((1, 0)), np.zeros((1, 0)))
+    with pytest.raises(DeviceError, match="failed at frame 0: ValueError"):
+        list(frames(wrong, View(32, 32)))
+    with pytest.raises(DeviceError, match="--camera 'top': the model has front"):
+        list(frames(wrong, View(32, 32, "top")))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "name one thing to watch"),
+        (["small"], "no display here: add --video"),
+        (["small", "--no-render", "--video", "a.mp4"], "--no-render draws nothing"),
+        (["small", "--video", "a.gif"], "ends in .mp4"),
+        (["small", "--tensorboard", "--no-render"], "goes with --strip"),
+        (["small", "--no-render", "--fps", "0"], "must be above 0"),
+        (["small", "--progression", "small"], "name one thing to watch"),
+        (["smal", "--no-render"], "did you mean 'small'?"),
+    ],
+)
+def test_bad_input_is_one_line(
+    sweep: Experiment,
+    arguments: list[str],
+    message: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    assert run(main, [*arguments, "--storage", str(sweep.path.parent)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert message in line
+
+
+@pytest.fixture
+def display() -> Iterator[str]:
+    """A virtual display."""
+    program = need_program("Xvfb", package="xvfb")
+    ours, theirs = os.pipe()
+    command = [program, "-displayfd", str(theirs), "-screen", "0", "640x480x24"]
+    process = subprocess.Popen(command, pass_fds=[theirs], stderr=subprocess.DEVNULL)
+    os.close(theirs)
+    try:
+        # It writes the display's number once it can be used.
+        with os.fdopen(ours) as pipe:
+            number = pipe.readline().strip()
+        assert number, "Xvfb ended at once"
+        yield f":{number}"
+    finally:
+        process.terminate()
+        process.wait()
+
+
+def test_the_viewer_shows_episodes_and_ends(sweep: Experiment, root: Path, display: str) -> None:
+    folder = sweep.trial_folder(sweep.trials()[0].id)
+    environment = os.environ | {"DISPLAY": display, "PYTHONPATH": str(root), "LIBGL_ALWAYS_SOFTWARE": "1"}
+    for name in ("WAYLAND_DISPLAY", "MUJOCO_GL"):
+        environment.pop(name, None)
+    done = subprocess.run(
+        [sys.executable, "-m", "msk_ray.visualize", str(folder), "--episodes", "2", "--steps", "10", "--device", "cpu"],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "2 episodes"
