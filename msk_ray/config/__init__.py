@@ -1,5 +1,6 @@
 """What a trial is: one frozen, checked tree of settings, read from YAML."""
 
+from msk_ray.config.legs import AssistConfig, LegEnvSettings, MyoLeg26EnvConfig, MyoLegEnvConfig, TerrainConfig
 from msk_ray.config.load import (
     apply_overrides,
     describe_fault,
@@ -14,7 +15,6 @@ from msk_ray.config.load import (
 from msk_ray.config.schema import (
     AdaptiveHorizon,
     AntEnvConfig,
-    AssistConfig,
     CartPoleEnvConfig,
     Config,
     ContactCurriculum,
@@ -24,15 +24,12 @@ from msk_ray.config.schema import (
     EvaluationConfig,
     FdConfig,
     HorizonSchedule,
-    LegEnvSettings,
-    MyoLeg26EnvConfig,
-    MyoLegEnvConfig,
     NetworkConfig,
     PhysicsConfig,
     ShacConfig,
-    TerrainConfig,
     TrialConfig,
 )
+from msk_ray.config.sections import EnvSettings
 
 __all__ = [
     "AdaptiveHorizon",
@@ -44,6 +41,7 @@ __all__ = [
     "ContactStart",
     "EntropyConfig",
     "EnvConfig",
+    "EnvSettings",
     "EvaluationConfig",
     "FdConfig",
     "HorizonSchedule",

@@ -11,8 +11,7 @@ import mujoco
 import torch
 from torch import Tensor
 
-from msk_ray.config import PhysicsConfig
-from msk_ray.config.schema import EnvSettings
+from msk_ray.config import EnvSettings, PhysicsConfig
 from msk_ray.simulation import Backward, Simulation, StepState
 
 Settings = TypeVar("Settings", bound=EnvSettings)

@@ -10,8 +10,8 @@ from typing import Generic, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from msk_ray.config import PhysicsConfig
-from msk_ray.config.schema import CONTACT_FIELDS, LegEnvSettings
+from msk_ray.config import LegEnvSettings, PhysicsConfig
+from msk_ray.config.schema import CONTACT_FIELDS
 from msk_ray.envs.base import Env
 from msk_ray.envs.muscles import MuscleCurves
 from msk_ray.simulation import StepState

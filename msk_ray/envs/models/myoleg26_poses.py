@@ -14,9 +14,9 @@ from msk_ray.envs.models.myoleg26_tables import OUTLINE
 
 WALKING_SPEED: Final = 1.25
 """Of the walking keyframes [m/s]."""
-REST_ACTIVATION: Final = 0.05
-"""Of every muscle in the walking keyframes."""
-_LEAST_EFFORT: Final = 1e-6
+REST_ACTIVATION: Final = 0.02
+"""Of every muscle in the walking keyframes, and at least in standing: a little tension makes joints stiff."""
+_LEAST_EFFORT: Final = 1e-4
 _SOLVER_STEPS: Final = 3000
 _PRESSED: Final = 5e-4
 """Depth to which the lowest point of a sole enters the ground [m], so that contact is there from the first step."""
@@ -48,14 +48,14 @@ def add_keyframes(spec: mujoco.MjSpec) -> None:
 
 
 def holding_activations(model: mujoco.MjModel, qpos: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Least activations (na,) that hold a pose still, its contacts pushing upward without friction.
+    """Activations (na,), `REST_ACTIVATION` at least, that hold a pose still, its contacts pushing upward.
 
-    Solves min |A x - b|² + ε |a|², x = (a, f) ≥ 0, by accelerated projected gradients: A takes activations and contact
-    forces [body weights] to generalised forces, b is what gravity and passive muscles ask for.
+    Solves min |A x - b|² + ε |x|², x = (a - rest, f) ≥ 0, by accelerated projected gradients: A takes activations and
+    contact forces without friction [body weights] to generalised forces, b is what gravity and muscles at rest ask for.
     """
     data = mujoco.MjData(model)
     forces = []
-    for activation in (0.0, 1.0):
+    for activation in (REST_ACTIVATION, 1.0 + REST_ACTIVATION):
         data.qpos[:] = qpos
         data.act[:] = activation
         mujoco.mj_forward(model, data)
@@ -88,7 +88,7 @@ def holding_activations(model: mujoco.MjModel, qpos: NDArray[np.float64]) -> NDA
         faster = (1.0 + np.sqrt(1.0 + 4.0 * speed**2)) / 2.0
         momentum = new + (speed - 1.0) / faster * (new - x)
         x, speed = new, faster
-    return x[: model.na]
+    return REST_ACTIVATION + x[: model.na]
 
 
 def _address(model: mujoco.MjModel, joint: str) -> int:
