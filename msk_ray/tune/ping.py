@@ -20,7 +20,7 @@ def _versions() -> dict[str, str]:
 
 def main() -> None:
     """Print {"worker": versions, "cpus", "gpus"} as the last line."""
-    with ray_session(None, dashboard=False):
+    with ray_session(None, dashboard=False, trials=False):
         worker = ray.get(ray.remote(_versions).options(num_cpus=1).remote())
         total = ray.cluster_resources()
     print(json.dumps({"worker": worker, "cpus": total.get("CPU", 0), "gpus": total.get("GPU", 0)}))

@@ -65,12 +65,13 @@ class Plan:
 
 
 @contextmanager
-def ray_session(address: str | None, dashboard: bool | None = None) -> Iterator[None]:
+def ray_session(address: str | None, dashboard: bool | None = None, trials: bool = True) -> Iterator[None]:
     """A Ray of our own on this machine, or the one at `address`.
 
     Args:
         address: of a running cluster.
         dashboard: whether to start one; None starts it where its packages (ray[default]) are installed.
+        trials: whether trials are to run; then every process imports what they need as soon as it is there.
 
     Raises:
         DeviceError: the cluster at `address` cannot be reached.
@@ -83,10 +84,12 @@ def ray_session(address: str | None, dashboard: bool | None = None) -> Iterator[
         TUNE_DISABLE_SIGINT_HANDLER="1",  # a request to stop lets trials save themselves first
     )
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    # Ray would have trials give way to everything else on the machine.
+    os.environ.setdefault("RAY_worker_niceness", "0")
     common: dict[str, Any] = {
         "logging_level": "ERROR",
         "log_to_driver": False,
-        "runtime_env": {"worker_process_setup_hook": standby.HOOK},
+        "runtime_env": {"worker_process_setup_hook": standby.HOOK} if trials else None,
     }
     if address is None:
         # Workers must import the package this process runs, wherever it was started from.
