@@ -58,7 +58,7 @@ SPACE = {
 TIMING = ("seconds", "env_steps_per_s", "time/")
 DISK_MIB = 48
 RESUMABLE = 75
-LAUNCH_LIMIT_S = 300.0
+LAUNCH_LIMIT_S = 900.0
 
 
 class FaultyTrainer(Trainer):
