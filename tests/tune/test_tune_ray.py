@@ -220,7 +220,9 @@ def test_a_population_goes_on_where_it_was(make_space: Any, tmp_path: Path) -> N
         assert 1e-4 <= read_yaml(record.folder / "config.yaml")["shac"]["actor_lr"] <= 1e-2
 
 
-def test_no_more_at_once_than_asked_for_and_the_next_process_waits(make_space: Any, tmp_path: Path) -> None:
+def test_no_more_at_once_than_asked_for_and_the_next_process_waits(
+    make_space: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     go_on = tmp_path / "go_on"
 
     class Patient(StubTrainer):
