@@ -67,8 +67,8 @@ def main(argv: Sequence[str] | None = None) -> int:
                 f"env {subject.config.env.name} has no physics named {name!r}; "
                 + (f"write {', '.join(known)}" if known else "leave --variants out")
             )
-    states = args.states or (("reset", "standing") if subject.modules is None else ("reset", "standing", "gait"))
-    name = args.subject.stem if subject.modules is None else f"{args.subject.parent.parent.name}_{args.subject.stem}"
+    states = args.states or (("reset", "standing") if subject.saved is None else ("reset", "standing", "gait"))
+    name = args.subject.stem if subject.saved is None else f"{args.subject.parent.parent.name}_{args.subject.stem}"
     output = args.output or Path("runs") / "diagnose" / name
     try:
         output.mkdir(parents=True, exist_ok=True)

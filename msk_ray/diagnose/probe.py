@@ -17,11 +17,11 @@ from torch import Tensor, nn
 
 from msk_ray.config import Config, PhysicsConfig, load_config
 from msk_ray.envs import Env, EnvState, make_env
-from msk_ray.errors import CheckpointError, ConfigError, SimulationError
+from msk_ray.errors import ConfigError, SimulationError
 from msk_ray.gradcheck import Oracle, Point
-from msk_ray.networks import Actor, RunningMeanStd
+from msk_ray.networks import Actor
 from msk_ray.simulation import StepState
-from msk_ray.training import load_policy
+from msk_ray.training import PolicyNetwork, SavedPolicy, load_policy
 
 STATE_KINDS = ("reset", "standing", "gait")
 """Where trajectories start: fresh resets; settled under zero action; the policy's own motion after a while."""
@@ -34,27 +34,13 @@ _STEP = 1e-6
 Step = Callable[[Tensor, StepState], StepState]
 
 
-class PolicyNetwork(nn.Module):
-    """Raw observations (W, O) to deterministic actions (W, A)."""
-
-    def __init__(self, actor: Actor, normalizer: RunningMeanStd | None) -> None:
-        super().__init__()
-        self.actor = actor
-        self.normalizer = normalizer
-
-    def forward(self, obs: Tensor) -> Tensor:
-        action: Tensor = self.actor(obs if self.normalizer is None else self.normalizer.normalize(obs))
-        return action
-
-
 @dataclass(frozen=True)
 class Subject:
     """What is diagnosed: a trial's settings and a policy for it, trained or fresh."""
 
-    name: str
     config: Config
-    modules: dict[str, Any] | None
-    """State of the actor and the normalizer; None for a fresh policy."""
+    saved: SavedPolicy | None
+    """The trained policy; None for a fresh one."""
 
     def network(self, env: Env[Any]) -> PolicyNetwork:
         """The policy's network for an environment, on its device.
@@ -62,18 +48,11 @@ class Subject:
         Raises:
             CheckpointError: it was trained on other observations or actions.
         """
+        if self.saved is not None:
+            return self.saved.network(env)
         generator = torch.Generator().manual_seed(self.config.trial.seed)
         actor = Actor(self.config.actor, env.obs_size, env.action_size, generator)
-        trained = self.modules is not None and self.config.shac.normalize_obs
-        normalizer = RunningMeanStd((env.obs_size,)) if trained else None
-        if self.modules is not None:
-            try:
-                actor.load_state_dict(self.modules["actor"])
-                if normalizer is not None:
-                    normalizer.load_state_dict(self.modules["normalizer"])
-            except (KeyError, RuntimeError) as error:
-                raise CheckpointError(f"{self.name} does not fit its environment: {error}") from error
-        return PolicyNetwork(actor, normalizer).to(env.device)
+        return PolicyNetwork(actor, None).to(env.device)
 
 
 def read_subject(path: Path, overrides: Sequence[str] = ()) -> Subject:
@@ -86,8 +65,8 @@ def read_subject(path: Path, overrides: Sequence[str] = ()) -> Subject:
         if overrides:
             raise ConfigError("--set works with a config; a checkpoint comes with its own settings")
         saved = load_policy(path)
-        return Subject(str(path), saved.config, saved.modules)
-    return Subject(str(path), load_config(path, overrides), None)
+        return Subject(saved.config, saved)
+    return Subject(load_config(path, overrides), None)
 
 
 @dataclass(frozen=True)
@@ -135,7 +114,7 @@ def probe(
         ConfigError: "gait" asked of a fresh policy.
         SimulationError: the policy falls everywhere before its gait state.
     """
-    if "gait" in states and subject.modules is None:
+    if "gait" in states and subject.saved is None:
         raise ConfigError("--states gait needs a trained policy: give a checkpoint instead of a config")
     for variant in variants:
         physics = subject.config.physics if variant is None else PhysicsConfig(variant=variant)

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from msk_ray.config import Config, parse_config
 from msk_ray.envs import Env
@@ -13,6 +13,19 @@ from msk_ray.errors import CheckpointError
 from msk_ray.networks import Actor, RunningMeanStd
 from msk_ray.training.checkpoint import read_checkpoint, read_manifest
 from msk_ray.training.evaluation import Policy
+
+
+class PolicyNetwork(nn.Module):
+    """Raw observations (W, O) to deterministic actions (W, A), differentiable."""
+
+    def __init__(self, actor: Actor, normalizer: RunningMeanStd | None) -> None:
+        super().__init__()
+        self.actor = actor
+        self.normalizer = normalizer
+
+    def forward(self, obs: Tensor) -> Tensor:
+        action: Tensor = self.actor(obs if self.normalizer is None else self.normalizer.normalize(obs))
+        return action
 
 
 @dataclass(frozen=True)
@@ -28,28 +41,39 @@ class SavedPolicy:
     modules: dict[str, Any]
     """State of the actor and, if observations are normalised, of the normalizer."""
 
-    def on(self, env: Env[Any]) -> Policy:
-        """The policy on an environment's device: raw observations (W, O) to actions (W, A).
+    def network(self, env: Env[Any]) -> PolicyNetwork:
+        """The policy's network on an environment's device.
 
         Raises:
             CheckpointError: it was trained on other observations or actions.
         """
-        actor = Actor(self.config.actor, env.obs_size, env.action_size, torch.Generator()).to(env.device)
-        normalizer = RunningMeanStd((env.obs_size,)).to(env.device) if self.config.shac.normalize_obs else None
+        network = PolicyNetwork(
+            Actor(self.config.actor, env.obs_size, env.action_size, torch.Generator()),
+            RunningMeanStd((env.obs_size,)) if self.config.shac.normalize_obs else None,
+        )
         try:
-            actor.load_state_dict(self.modules["actor"])
-            if normalizer is not None:
-                normalizer.load_state_dict(self.modules["normalizer"])
+            network.actor.load_state_dict(self.modules["actor"])
+            if network.normalizer is not None:
+                network.normalizer.load_state_dict(self.modules["normalizer"])
         except (KeyError, RuntimeError) as error:
             what = str(error).splitlines()[-1].strip()
             raise CheckpointError(
                 f"{self.path} does not fit env {self.config.env.name} as it is now ({what}): use the commit it was "
                 "written with"
             ) from error
+        return network.to(env.device)
+
+    def on(self, env: Env[Any]) -> Policy:
+        """The policy on an environment's device: raw observations (W, O) to actions (W, A), without gradients.
+
+        Raises:
+            CheckpointError: it was trained on other observations or actions.
+        """
+        network = self.network(env)
 
         @torch.no_grad()
         def policy(obs: Tensor) -> Tensor:
-            action: Tensor = actor(obs if normalizer is None else normalizer.normalize(obs))
+            action: Tensor = network(obs)
             return action
 
         return policy
