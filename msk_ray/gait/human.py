@@ -1,7 +1,7 @@
 """How people walk: published ranges of healthy adults at free speed on level ground.
 
-Textbook figures, meant to place a gait at a glance; the printed tables were not at hand when they were entered, so check
-the source before quoting one.
+Textbook figures, meant to place a gait at a glance; the printed tables were not at hand when they were entered, so
+check the source before quoting one.
 """
 
 from typing import Final, NamedTuple
