@@ -146,7 +146,7 @@ def _returns(env: Env[Any], network: nn.Module, step: Step, start: EnvState, hor
     found = []
     for t in range(1, horizons[-1] + 1):
         action = network(env.observe(physics, action))
-        physics = step(action, physics)
+        physics = step(env.control(action), physics)
         total = total + env.reward_terms(physics, action, env.observe(physics, action)).sum(-1)
         if t in horizons:
             found.append(total)

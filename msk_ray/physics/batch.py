@@ -169,7 +169,7 @@ class WorldBatch:
         for name, value in fields.items():
             array = getattr(self.model, f"pair_{name}")
             # In place: a recorded graph reads this memory.
-            array.assign(np.asarray(value, np.float32).reshape(array.shape[0], array.shape[1], -1).squeeze())
+            array.assign(np.asarray(value, np.float32).reshape(*array.shape, -1))
 
     def check_overflow(self) -> float:
         """Share of worlds whose solver met an iteration limit since the last call.
