@@ -81,6 +81,14 @@ class LegEnvSettings(EnvSettings):
     """Weight of the squared angular velocity of the pelvis [s²/rad²]."""
     symmetry: NonNegative = 0.0
     """Weight of the squared sum of both hips' flexion rates [s²/rad²]: legs in antiphase, without a reference gait."""
+    stride: NonNegative = 0.0
+    """Weight of (r - 1)² with r² = (d / stride_angle)² + (d' / (stride_angle ω))², d being the angle between both hips'
+    flexions, d' its rate, ω = 2π cadence / 120 s. Nothing is paid where the legs swing against each other as a pendulum
+    of that angle and cadence, in whatever phase; quick small steps pay at each of their turning points."""
+    stride_angle: PositiveFloat = 0.75
+    """Largest angle between the hips' flexions [rad]: 2 asin(step length / (2 leg length)) for 0.67 m and 0.9 m."""
+    cadence: PositiveFloat = 112.0
+    """Steps a minute; at 1.25 m/s people take about as many [1/min]."""
     min_height: float = 0.65
     """Pelvis height above the ground, as a share of standing, below which an episode ends."""
     min_upright: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.5

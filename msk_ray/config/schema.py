@@ -352,6 +352,9 @@ class TrialConfig(Section):
 
     epochs: PositiveInt = 500
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    start_from: str | None = None
+    """Checkpoint of another trial whose networks and observation statistics this one starts from, such as a best.pt;
+    null starts from random ones. Optimisers and worlds are new either way."""
     checkpoint_interval: PositiveInt = 10
     """Epochs between checkpoints."""
     keep_checkpoints: Annotated[int, Field(ge=2)] = 2

@@ -29,7 +29,7 @@ _VELOCITY_SCALE = 0.1
 """Of joint velocities in the observation [s/rad]."""
 _REWARD_FIELDS = (
     *("forward_vel", "speed_scale", "progress", "upright", "heading", "height", "alive", "effort", "joint_limit"),
-    *("smoothness", "capture", "capture_scale", "sway", "symmetry"),
+    *("smoothness", "capture", "capture_scale", "sway", "symmetry", "stride", "stride_angle", "cadence"),
 )
 
 
@@ -50,6 +50,21 @@ class Root(NamedTuple):
     """[m/s], (W, 3)."""
     spin: Tensor
     """Angular velocity [rad/s], (W, 3)."""
+
+
+def stride_error(angles: Tensor, rates: Tensor, amplitude: float, rate: float) -> Tensor:
+    """(r - 1)², shape (W,), of the angle d between both hips as a pendulum: r² = (d/A)² + (d'/(Aω))².
+
+    Args:
+        angles: right and left hip flexion [rad], (W, 2).
+        rates: their velocities [rad/s], (W, 2).
+        amplitude: A [rad].
+        rate: ω [rad/s].
+    """
+    swing = torch.stack((angles[:, 0] - angles[:, 1], (rates[:, 0] - rates[:, 1]) / rate), dim=-1) / amplitude
+    # The square root has no slope where the legs stand still together.
+    radius = torch.sqrt(swing.square().sum(-1) + 1e-4)
+    return (radius - 1.0).square()
 
 
 class LegEnv(Env[LegSettings], Generic[LegSettings]):
@@ -76,7 +91,7 @@ class LegEnv(Env[LegSettings], Generic[LegSettings]):
 
     reward_names = (
         *("forward_vel", "progress", "upright", "heading", "height", "alive", "effort", "joint_limit"),
-        *("smoothness", "capture", "sway", "symmetry"),
+        *("smoothness", "capture", "sway", "symmetry", "stride"),
     )
     stand_height: float
     """Pelvis height of the standing pose [m]."""
@@ -98,7 +113,9 @@ class LegEnv(Env[LegSettings], Generic[LegSettings]):
         self._pendulum_time = math.sqrt(self.stand_height / _GRAVITY)
         ranges = torch.tensor(self.model.jnt_range[self.hinges], dtype=torch.float32, device=self.device)
         self._limits = ranges[:, 0] + _LIMIT_MARGIN, ranges[:, 1] - _LIMIT_MARGIN
-        self._flexion_dofs = self._index([self.model.joint(f"hip_flexion_{s}").dofadr[0] for s in "rl"])
+        flexions = [self.model.joint(f"hip_flexion_{s}") for s in "rl"]
+        self._flexion_dofs = self._index([joint.dofadr[0] for joint in flexions])
+        self._flexion_qpos = self._index([joint.qposadr[0] for joint in flexions])
         with torch.no_grad():
             state = self.draw_physics(self.nworld)
             self.obs_size = self.observe(state, torch.zeros((self.nworld, self.action_size), device=self.device)).shape[
@@ -167,7 +184,8 @@ class LegEnv(Env[LegSettings], Generic[LegSettings]):
         place = place + velocity[:, :2] * self._pendulum_time
         distance = place if c.target_speed == 0.0 else place[:, 1:]
         capture = torch.sqrt(1.0 + (distance / c.capture_scale).square().sum(-1)) - 1.0
-        flexion = state.qvel[:, self._flexion_dofs].sum(-1)
+        flexion_rates = state.qvel[:, self._flexion_dofs]
+        flexions = state.qpos[:, self._flexion_qpos]
         terms = (
             c.forward_vel * torch.exp(-((speed - c.target_speed) / c.speed_scale).square()),
             c.progress * speed.clamp_max(c.target_speed),
@@ -180,7 +198,8 @@ class LegEnv(Env[LegSettings], Generic[LegSettings]):
             -c.smoothness * change.square().mean(-1),
             -c.capture * capture,
             -c.sway * root.spin.square().sum(-1),
-            -c.symmetry * flexion.square(),
+            -c.symmetry * flexion_rates.sum(-1).square(),
+            -c.stride * stride_error(flexions, flexion_rates, c.stride_angle, math.tau * c.cadence / 120.0),
         )
         return torch.stack(terms, dim=-1)
 

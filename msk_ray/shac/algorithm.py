@@ -3,6 +3,7 @@
 import copy
 import math
 import time
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -168,6 +169,20 @@ class Shac:
             self._entropy.coefficient = state["entropy_coefficient"]
         if self._contacts is not None:
             self._contacts.set_progress(state["curriculum"])
+
+    def start_from(self, modules: Mapping[str, Any]) -> None:
+        """Take networks and statistics from another trial's states, by module name; the actor has to be among them.
+
+        What is not there, such as the critic of a policy saved alone, stays as it is.
+
+        Raises:
+            KeyError: there is no actor, or no statistics of the observations that it expects normalised.
+            RuntimeError: a network has another shape.
+        """
+        needed = {"actor"} | ({"normalizer"} if self.normalizer is not None else set())
+        for name, module in self._modules().items():
+            if name in modules or name in needed:
+                module.load_state_dict(modules[name])
 
     def _horizon_now(self, epoch: int) -> int:
         configured = self.config.shac.horizon

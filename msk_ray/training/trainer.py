@@ -88,12 +88,14 @@ class Trainer:
         Raises:
             SimulationError: the gradient or the physics failed, or the device ran out of memory; the last checkpoint
                 stays as it is.
+            CheckpointError: the first epoch, and the checkpoint to start from is missing, torn, or does not fit.
         """
         with named_out_of_memory(self._device, self.env.nworld):
             return self._run_epoch()
 
     def _run_epoch(self) -> dict[str, float]:
         if self.epoch == 0:
+            self._start_from(self.config.trial.start_from)
             self._evaluate_initial()
         started = time.perf_counter()
         metrics = self.shac.update(self.epoch)
@@ -154,6 +156,19 @@ class Trainer:
         """Flush the logs."""
         self._log.close()
 
+    def _start_from(self, path: str | None) -> None:
+        if path is None:
+            return
+        state = read_checkpoint(Path(path))
+        try:
+            self.shac.start_from(_to_device(state["shac"]["modules"], self.env.device))
+        except (KeyError, TypeError, RuntimeError) as error:
+            what = str(error).splitlines()[-1].strip()
+            raise CheckpointError(
+                f"trial.start_from: {path} does not fit this trial ({what}): give a checkpoint of the same env and "
+                "networks"
+            ) from error
+
     def _evaluate_initial(self) -> None:
         self._log.write(self._row(self._evaluate()))
 
@@ -207,7 +222,7 @@ def precompile(config: Config, device: str, logdir: Path) -> None:
     tiny = config.as_dict()
     tiny["shac"] |= {"horizon": 2, "critic_iterations": 1, "critic_batches": 1}
     tiny["evaluation"] |= {"steps": 1}
-    tiny["trial"] |= {"epochs": 1}
+    tiny["trial"] |= {"epochs": 1, "start_from": None}
     trainer = Trainer(Config.model_validate(tiny), logdir, device)
     trainer.run_epoch()
     trainer.close()

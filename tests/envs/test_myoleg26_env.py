@@ -9,6 +9,7 @@ import torch
 
 from msk_ray.config import MyoLeg26EnvConfig, PhysicsConfig, parse_config
 from msk_ray.envs import MyoLeg26, make_env
+from msk_ray.envs.legs import stride_error
 from msk_ray.envs.muscles import MuscleCurves
 from msk_ray.errors import ConfigError
 from msk_ray.simulation import StepState
@@ -135,11 +136,12 @@ def test_reward_by_hand(env: MyoLeg26) -> None:
     env.state = env.reset_state()
     state = standing(
         env, pelvis_tilt=0.0, pelvis_ty=env.stand_height - 0.1, knee_angle_r=0.1, knee_angle_l=-0.5,
+        hip_flexion_r=0.3, hip_flexion_l=0.0,
         v_pelvis_tz=0.5, v_pelvis_list=2.0, v_hip_flexion_r=1.0, v_hip_flexion_l=2.0,
     )  # fmt: skip
     state.act.fill_(0.5)
     config = env.config
-    env.config = config.model_copy(update={"symmetry": 0.1, "progress": 0.5})
+    env.config = config.model_copy(update={"symmetry": 0.1, "progress": 0.5, "stride": 0.5})
     try:
         found = terms(env, state, torch.full((2, 26), 0.5))
     finally:
@@ -153,9 +155,23 @@ def test_reward_by_hand(env: MyoLeg26) -> None:
             "joint_limit": -0.1 * 1.5**2, "smoothness": -0.02 * 0.25,
             "capture": -0.3 * (math.hypot(1.0, lateral / 0.1) - 1.0), "sway": -0.02 * 4.0,
             "symmetry": -0.1 * 9.0,
+            # d = 0.3 of 0.75 rad; d' = -1 of 0.75 * 2π * 112 / 120 rad/s
+            "stride": -0.5 * (math.hypot(0.4, 0.2274, 0.01) - 1.0) ** 2,
         },
         rel=1e-4, abs=1e-6,
     )  # fmt: skip
+
+
+def test_legs_that_swing_as_a_pendulum_pay_nothing_for_their_stride(env: MyoLeg26) -> None:
+    time = torch.linspace(0.0, 1.2, 60)
+    rate = math.tau * 112 / 120
+    swing, speed = 0.375 * torch.sin(rate * time), 0.375 * rate * torch.cos(rate * time)
+    walking = stride_error(torch.stack((swing, -swing), -1), torch.stack((speed, -speed), -1), 0.75, rate)
+    assert walking.max() < 1e-6
+    # Four times as quick and as small: as fast in the middle, all but still where it turns.
+    quick = stride_error(torch.stack((swing, -swing), -1) / 4, torch.stack((speed, -speed), -1), 0.75, rate)
+    assert quick.min() < 1e-3
+    assert quick.max() > 0.5
 
 
 def test_observation_is_in_the_documented_order(env: MyoLeg26) -> None:

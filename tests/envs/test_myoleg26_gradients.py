@@ -49,7 +49,7 @@ def test_forward_agrees_with_c_mujoco_over_100_steps(model: mujoco.MjModel, name
 
 def test_reward_and_observation_have_the_gradient_of_their_own_values() -> None:
     """Through muscle lengths, rates and forces, joint limits and the pelvis, by central differences of the value."""
-    config = MyoLeg26EnvConfig(name="myoleg26", symmetry=0.3, progress=0.2, stochastic_reset=False)
+    config = MyoLeg26EnvConfig(name="myoleg26", symmetry=0.3, stride=0.4, progress=0.2, stochastic_reset=False)
     env = make_env(config, PhysicsConfig(), 1, "cpu", 0, differentiable=False)
     rng = np.random.default_rng(3)
     parts = [part[0].numpy().astype(float) for part in env.state.physics]

@@ -169,8 +169,9 @@ def test_bad_input_is_one_line(
 @pytest.mark.gpu
 @pytest.mark.parametrize("name", ["cartpole", "ant"])
 def test_cpu_and_gpu_agree_over_the_first_hundred_steps(name: str, sweep: Experiment, ant_trial: Path) -> None:
-    """Same initial states to the bit. After 100 steps of float32, whose rounding differs and contact amplifies, the
-    median world's positions differ by less than 1e-3 (CartPole) and 2e-2 (ant) [m, rad], mean scores by 1 %."""
+    """Same initial states, but for the last bits of an orientation. After 100 steps of float32, whose rounding differs
+    and contact amplifies, the median world's positions differ by less than 1e-3 (CartPole) and 2e-2 (ant) [m, rad],
+    mean scores by 1 %."""
     best = best_record(read_records(sweep))
     assert best is not None
     folder = ant_trial if name == "ant" else best.folder
@@ -187,7 +188,7 @@ def test_cpu_and_gpu_agree_over_the_first_hundred_steps(name: str, sweep: Experi
         scores.append(episodes.score.cpu())
     steps = min(len(path) for path in paths)
     cpu, gpu = (path[:steps] for path in paths)
-    assert torch.equal(cpu[0], gpu[0])
+    torch.testing.assert_close(cpu[0], gpu[0], rtol=0.0, atol=1e-6)
     assert (cpu - gpu).abs().amax((0, 2)).median() < tolerance
     assert (scores[0].mean() - scores[1].mean()).abs() < 0.01 * scores[0].abs().mean()
 

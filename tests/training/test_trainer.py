@@ -1,6 +1,7 @@
 """The trainer: learns, resumes exactly, refuses what does not fit."""
 
 import json
+import math
 import os
 import signal
 import subprocess
@@ -14,7 +15,7 @@ import yaml
 from msk_ray.config import Config
 from msk_ray.errors import CheckpointError
 from msk_ray.training import Trainer, read_metrics
-from msk_ray.training.checkpoint import epoch_checkpoints
+from msk_ray.training.checkpoint import epoch_checkpoints, milestones
 
 
 def comparable(rows: list[dict]) -> list[dict]:
@@ -41,6 +42,46 @@ def test_a_trial_leaves_its_record(tiny_cartpole: Config, tmp_path: Path) -> Non
     assert (tmp_path / "checkpoints" / "best.pt").is_file()
     assert list(tmp_path.glob("events*"))
     assert yaml.safe_load((tmp_path / "config.yaml").read_text()) == tiny_cartpole.as_dict()
+
+
+def test_a_trial_can_start_from_another_ones_networks(tiny_cartpole: Config, tmp_path: Path) -> None:
+    train(tiny_cartpole, tmp_path / "first")
+    best = tmp_path / "first" / "checkpoints" / "best.pt"
+    score = max(row.get("eval/score", -math.inf) for row in read_metrics(tmp_path / "first" / "metrics.jsonl"))
+    settings = tiny_cartpole.as_dict()
+    settings["trial"]["start_from"] = str(best)
+    second = Trainer(Config.model_validate(settings), tmp_path / "second", "cpu")
+    second.run_epoch()
+    second.close()
+    initial = read_metrics(tmp_path / "second" / "metrics.jsonl")[0]
+    assert initial["epoch"] == 0
+    assert initial["env_steps"] == 0
+    assert initial["eval/score"] == pytest.approx(score)
+
+
+def test_a_policy_saved_alone_is_enough_to_start_from(tiny_cartpole: Config, tmp_path: Path) -> None:
+    train(tiny_cartpole, tmp_path / "first")
+    _, policy = milestones(tmp_path / "first" / "checkpoints")[-1]
+    settings = tiny_cartpole.as_dict()
+    settings["trial"]["start_from"] = str(policy)
+    second = Trainer(Config.model_validate(settings), tmp_path / "second", "cpu")
+    second.run_epoch()
+    second.close()
+    last = read_metrics(tmp_path / "first" / "metrics.jsonl")[-1]
+    assert read_metrics(tmp_path / "second" / "metrics.jsonl")[0]["eval/score"] == pytest.approx(last["eval/score"])
+
+
+@pytest.mark.parametrize("missing", [True, False])
+def test_a_checkpoint_that_does_not_fit_is_no_start(tiny_cartpole: Config, tmp_path: Path, missing: bool) -> None:
+    settings = tiny_cartpole.as_dict()
+    settings["trial"]["start_from"] = str(tmp_path / "first" / "checkpoints" / "best.pt")
+    if not missing:
+        train(tiny_cartpole, tmp_path / "first")
+        settings["actor"]["hidden"] = [9]
+    trainer = Trainer(Config.model_validate(settings), tmp_path / "second", "cpu")
+    with pytest.raises(CheckpointError, match="no such checkpoint" if missing else "does not fit this trial"):
+        trainer.run_epoch()
+    trainer.close()
 
 
 def test_resuming_gives_the_metrics_of_an_uninterrupted_run(tiny_cartpole: Config, tmp_path: Path) -> None:
