@@ -7,13 +7,14 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
 
 from msk_ray.config import Config
 from msk_ray.errors import CheckpointError
-from msk_ray.training import Trainer, read_metrics
+from msk_ray.training import Trainer, precompile, read_metrics
 from msk_ray.training.checkpoint import epoch_checkpoints
 
 
@@ -129,3 +130,9 @@ def test_a_torn_checkpoint_falls_back_to_the_one_before(tiny_cartpole: Config, t
         trainer.run_epoch()
     trainer.close()
     assert comparable(read_metrics(tmp_path / "metrics.jsonl")) == comparable(whole)
+
+
+def test_kernels_are_compiled_in_few_worlds(tiny_settings: dict[str, Any], tmp_path: Path) -> None:
+    huge = tiny_settings | {"env": tiny_settings["env"] | {"nworld": 10**12}}
+    huge["evaluation"] = tiny_settings["evaluation"] | {"nworld": 10**12}
+    precompile(Config.model_validate(huge), "cpu", tmp_path)  # no machine has room for so many
