@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from msk_ray.cli import RESUMABLE, Parser, run
+from msk_ray.cli import RESUMABLE, TERMINAL_LOG, Parser, outliving, run
 from msk_ray.config import dump_yaml, parse_override, read_yaml
 from msk_ray.errors import ConfigError
 from msk_ray.tune import experiment as experiments
@@ -228,19 +228,19 @@ def _run(args: argparse.Namespace, space: Space, trials: list[Trial], extension:
         placement = choose_placement(space.file.resources, args.gpus_per_trial, args.cpu, local_gpus())
     if not going_on:
         experiment = experiments.create(path, space, trials, _options(args))
-
-    with runner.ray_session(args.address):
-        if args.address is not None:
-            placement = choose_placement(space.file.resources, args.gpus_per_trial, args.cpu, runner.cluster_gpus())
-        if not placement.gpus and not args.cpu:
-            print("no GPU here: trials run on CPU cores")
-        limit = args.max_concurrent or space.file.resources.max_concurrent
-        completed = runner.run_trials(runner.Plan(experiment, space, trials, placement, limit))
-    errors = finish(experiment)
-    if not completed:
-        print(f"stopped on request; go on with --resume --space {args.space} --name {path.name}")
-        return RESUMABLE
-    write_report(experiment)
+    with outliving(path / TERMINAL_LOG):
+        with runner.ray_session(args.address):
+            if args.address is not None:
+                placement = choose_placement(space.file.resources, args.gpus_per_trial, args.cpu, runner.cluster_gpus())
+            if not placement.gpus and not args.cpu:
+                print("no GPU here: trials run on CPU cores")
+            limit = args.max_concurrent or space.file.resources.max_concurrent
+            completed = runner.run_trials(runner.Plan(experiment, space, trials, placement, limit))
+        errors = finish(experiment)
+        if not completed:
+            print(f"stopped on request; go on with --resume --space {args.space} --name {path.name}")
+            return RESUMABLE
+        write_report(experiment)
     return 1 if errors else 0
 
 

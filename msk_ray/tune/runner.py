@@ -2,6 +2,7 @@
 
 import logging
 import os
+import signal
 import tempfile
 import time
 import warnings
@@ -98,7 +99,8 @@ def ray_session(address: str | None, dashboard: bool | None = None, trials: bool
         os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys(paths))
         # None starts the dashboard where its packages (ray[default]) are installed, and does without elsewhere.
         # By default Ray would join whatever cluster a `ray start` on this machine once left a note of.
-        context = ray.init("local", include_dashboard=dashboard, dashboard_host="127.0.0.1", **common)
+        with _hangup_kept_from_children():
+            context = ray.init("local", include_dashboard=dashboard, dashboard_host="127.0.0.1", **common)
     else:
         try:
             knock(address)
@@ -115,6 +117,18 @@ def ray_session(address: str | None, dashboard: bool | None = None, trials: bool
         yield
     finally:
         ray.shutdown()
+
+
+@contextmanager
+def _hangup_kept_from_children() -> Iterator[None]:
+    """A terminal that closes sends SIGHUP to all processes in its foreground: Ray's must live on for trials to save
+    themselves. Blocked signals are inherited; in this process one that comes meanwhile is heard afterwards. Ray does
+    the same about SIGINT."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def cluster_gpus() -> int:

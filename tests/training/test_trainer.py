@@ -84,7 +84,10 @@ def test_killing_the_train_command_loses_nothing(root: Path, tiny_cartpole: Conf
     assert comparable(read_metrics(metrics)) == comparable(whole)
 
 
-def test_sigterm_saves_and_says_resumable(root: Path, tiny_cartpole: Config, tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_saves_and_says_resumable(
+    number: signal.Signals, root: Path, tiny_cartpole: Config, tmp_path: Path
+) -> None:
     config = tiny_cartpole.as_dict()
     config["trial"] |= {"epochs": 100000, "checkpoint_interval": 100000}
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(config))
@@ -99,10 +102,16 @@ def test_sigterm_saves_and_says_resumable(root: Path, tiny_cartpole: Config, tmp
         assert process.poll() is None
         assert time.monotonic() < deadline
         time.sleep(0.01)
-    process.terminate()
-    output, _ = process.communicate(timeout=60)
-    assert process.returncode == 75
-    assert "stopped by SIGTERM" in output
+    if number is signal.SIGHUP:
+        process.stdout.close()  # with the terminal goes whoever reads from it
+        process.send_signal(number)
+        assert process.wait(60) == 75
+        output = (tmp_path / "run" / "terminal.log").read_text()
+    else:
+        process.send_signal(number)
+        output, _ = process.communicate(timeout=60)
+        assert process.returncode == 75
+    assert f"stopped by {number.name}" in output
     assert len(epoch_checkpoints(tmp_path / "run" / "checkpoints")) == 1
     rows = [json.loads(line) for line in metrics.read_text().splitlines()]
     assert f"epoch_{rows[-1]['epoch']:06d}.pt" == epoch_checkpoints(tmp_path / "run" / "checkpoints")[0].name

@@ -47,7 +47,9 @@ from msk_ray.tune.trials import resolve_trials
 def session() -> Iterator[None]:
     """One Ray for all tests here."""
     cloudpickle.register_pickle_by_value(stub_trainer)
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)}
+    handlers = {
+        number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP)
+    }
     with runner.ray_session(None, dashboard=False, trials=False):  # stubs need none of what trials import
         yield
     for number, handler in handlers.items():
