@@ -32,6 +32,7 @@ from msk_ray.tune.addresses import knock
 from msk_ray.tune.devices import Placement
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.gauges import StateGauge
+from msk_ray.tune.halved import read_halved
 from msk_ray.tune.journal import JOURNAL_FILE, Journal, replay
 from msk_ray.tune.live import Live
 from msk_ray.tune.made_up import MadeUp, recover
@@ -196,7 +197,10 @@ def _finish_pruning(plan: Plan) -> None:
         return
     ending = replay(make_pruner(spec, _budget(plan.space, plan.trials)), spec.time_attr, reports)
     folder = plan.experiment.trial_folder(reports[-1].trial)
-    if ending is not None and read_ending(folder) is None:
+    if ending is None or read_ending(folder) is not None:
+        return
+    # What a trial scored with all its worlds does not end it when it has half of them.
+    if reports[-1].halved or read_halved(folder) is None:
         write_ending(folder, ending)
 
 

@@ -17,8 +17,9 @@ from msk_ray.training import Trainer, read_checkpoint
 from msk_ray.tune import experiment as experiments
 from msk_ray.tune import halved, runner, trial_run
 from msk_ray.tune.__main__ import main
+from msk_ray.tune.devices import Placement
 from msk_ray.tune.halved import ABANDONED, Halved, StartAnew, read_halved, write_halved
-from msk_ray.tune.journal import Report, replay
+from msk_ray.tune.journal import JOURNAL_FILE, Journal, Report, replay
 from msk_ray.tune.outcomes import Ending, Outcome, read_ending, write_ending
 from msk_ray.tune.pruning import make_pruner
 from msk_ray.tune.records import read_records, read_rows
@@ -187,6 +188,24 @@ def test_early_stopping_forgets_the_attempt_with_all_worlds(kind: Any) -> None:
     without = replay(make_pruner(spec, 1000), "env_steps", [*others, *halves])
     assert with_all is not None
     assert with_all == without
+
+
+@pytest.mark.parametrize("halved_after", [False, True])
+def test_a_stop_that_was_not_carried_out_is_void_once_the_worlds_are_halved(
+    halved_after: bool, make_space: Any, tmp_path: Path
+) -> None:
+    space = make_space(scheduler={"kind": "asha", "grace": 0.5, "reduction": 2.0, "min_trials": 2})
+    trials = resolve_trials(space)
+    experiment = experiments.create(tmp_path / "e", space, trials, {})
+    good, bad = (trial.id for trial in trials)
+    experiment.trial_folder(bad).mkdir()
+    for name, score in ((good, 2.0), (bad, 1.0)):  # at the rung, half of 20 epochs × 64 env steps
+        Journal(experiment.path / JOURNAL_FILE).append(Report(name, 10, 640, 1.0, score, False))
+    if halved_after:
+        write_halved(experiment.trial_folder(bad), Halved(8, 4, "no room"))
+    runner._finish_pruning(runner.Plan(experiment, space, trials, Placement(0.0, 1), None))
+    ending = read_ending(experiment.trial_folder(bad))
+    assert (ending and ending.outcome) == (None if halved_after else Outcome.STOPPED_ASHA)
 
 
 def test_a_population_cannot(make_space: Any) -> None:
