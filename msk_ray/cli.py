@@ -1,14 +1,26 @@
 """What the command-line entry points share."""
 
 import argparse
+import contextlib
+import errno
+import io
+import os
 import signal
 import sys
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 
-from msk_ray.errors import MskRayError
+from msk_ray.errors import MskRayError, StorageFailure
 
 RESUMABLE = 75
 """Exit code of a run that was asked to stop and saved its state (EX_TEMPFAIL)."""
+
+
+TERMINAL_LOG = "terminal.log"
+"""In the folder of what runs: what the terminal would have shown, from when it was closed."""
+_UNREAD = (errno.EPIPE, errno.EIO)
+"""A pipe whose reader has left, and a terminal that is gone."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -39,10 +51,84 @@ def run(main: Callable[[Sequence[str] | None], int], argv: Sequence[str] | None 
         return 0
 
 
-class StopRequest:
-    """Set by SIGINT, SIGTERM or SIGUSR1; the loop that owns it stops at its next safe point.
+class _Outliving(io.TextIOBase):
+    """A standard stream, written to without a buffer, that moves to a file once nobody reads it."""
 
-    A second SIGINT interrupts at once.
+    def __init__(self, descriptor: int, log: Path, descriptors: Sequence[int]) -> None:
+        self._descriptor = descriptor
+        self._log = log
+        self._descriptors = descriptors
+
+    def write(self, text: str) -> int:
+        data = text.encode("utf-8", errors="replace")
+        while data:
+            try:
+                data = data[os.write(self._descriptor, data) :]
+            except OSError as error:
+                if error.errno not in _UNREAD:
+                    raise
+                self._move(error)
+        return len(text)
+
+    def fileno(self) -> int:
+        return self._descriptor
+
+    def isatty(self) -> bool:
+        return os.isatty(self._descriptor)
+
+    def _move(self, error: OSError) -> None:
+        """Point this stream, and the other if it is the same pipe or terminal, to the file."""
+        try:
+            self._log.parent.mkdir(parents=True, exist_ok=True)
+            file = os.open(self._log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+        except OSError as fault:
+            raise StorageFailure(f"cannot write {self._log}: {fault.strerror}") from fault
+        when = time.strftime("%Y-%m-%d %H:%M:%S")
+        os.write(file, f"--- {when}: nobody reads the output any more ({error.strerror}); it goes on here\n".encode())
+        lost = os.fstat(self._descriptor)
+        for descriptor in self._descriptors:
+            if os.path.samestat(os.fstat(descriptor), lost):
+                os.dup2(file, descriptor)
+        os.close(file)
+
+
+@contextlib.contextmanager
+def outliving(log: Path) -> Iterator[None]:
+    """Let what runs go on when nobody reads its output any more: from then on, lines go into a file.
+
+    Standard output and error stay there when this returns, whoever writes to them: children, or Python at its exit.
+
+    Args:
+        log: the file; made only then.
+
+    Raises:
+        StorageFailure: while it is entered: the file cannot be written.
+    """
+    descriptors = [_descriptor(stream) for stream in (sys.stdout, sys.stderr)]
+    known = [descriptor for descriptor in descriptors if descriptor is not None]
+    out, err = (None if descriptor is None else _Outliving(descriptor, log, known) for descriptor in descriptors)
+    for stream in (sys.stdout, sys.stderr):
+        if stream is not None:
+            stream.flush()
+    with contextlib.redirect_stdout(out or sys.stdout), contextlib.redirect_stderr(err or sys.stderr):
+        yield
+
+
+def _descriptor(stream: object) -> int | None:
+    """Of a standard stream; None if it has none, as under a test runner, or with one that was closed from the start."""
+    if stream is None:
+        return None
+    try:
+        descriptor: int = stream.fileno()  # type: ignore[attr-defined]
+    except io.UnsupportedOperation:
+        return None
+    return descriptor
+
+
+class StopRequest:
+    """Set by SIGINT, SIGTERM, SIGUSR1 or SIGHUP; the loop that owns it stops at its next safe point.
+
+    A second SIGINT interrupts at once. SIGHUP, which comes when the terminal closes, stays ignored where it is: nohup.
     """
 
     def __init__(self) -> None:
@@ -53,6 +139,8 @@ class StopRequest:
         """Take over the signals, again if a library has taken them meanwhile."""
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1):
             signal.signal(number, self._handle)
+        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+            signal.signal(signal.SIGHUP, self._handle)
 
     def _handle(self, number: int, frame: object) -> None:
         if self.signal is not None and number == signal.SIGINT:

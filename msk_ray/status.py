@@ -124,7 +124,7 @@ def headline(experiment: Experiment, standings: Sequence[Standing]) -> str:
 
 
 def trial_table(standings: Sequence[Standing], width: int) -> "Table":
-    """One row a trial. Only what was changed may wrap; in a wide table hosts and reasons are shown too."""
+    """One row a trial. Only what was changed, half the worlds too, may wrap; a wide table shows hosts and reasons."""
     from rich import box
     from rich.table import Table
 
@@ -154,7 +154,9 @@ def _cells(standing: Standing, wide: bool, seeds: bool) -> list[str]:
     gpu = f"{device.host}:{device.gpu} {device.name}".strip() if wide and device.host else device.gpu
     cells = [
         standing.id,
-        standing.variant + (f", seed {standing.seed}" if seeds else ""),
+        standing.variant
+        + (f", seed {standing.seed}" if seeds else "")
+        + (f" ({standing.halved})" if standing.halved is not None else ""),
         state,
         f"{progress.epoch}/{standing.epochs}",
         "-" if progress.best is None else f"{progress.best:.4g}",

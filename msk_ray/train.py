@@ -4,7 +4,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from msk_ray.cli import RESUMABLE, Parser, StopRequest, run
+from msk_ray.cli import RESUMABLE, TERMINAL_LOG, Parser, StopRequest, outliving, run
 from msk_ray.config import Config, load_config
 from msk_ray.errors import StorageError
 
@@ -43,7 +43,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     config = load_config(args.config, overrides)
     logdir = args.logdir or Path("runs") / "train" / f"{args.config.stem}_seed{config.trial.seed}"
     _check_logdir(logdir, args.resume)
-    return _train(config, logdir.resolve(), args.device, args.resume)
+    logdir = logdir.resolve()
+    with outliving(logdir / TERMINAL_LOG):
+        return _train(config, logdir, args.device, args.resume)
 
 
 def _check_logdir(logdir: Path, resume: bool) -> None:

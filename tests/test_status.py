@@ -14,6 +14,7 @@ from msk_ray.cli import run
 from msk_ray.config import dump_yaml
 from msk_ray.status import main, short_number
 from msk_ray.tune import experiment as experiments
+from msk_ray.tune.halved import Halved, write_halved
 from msk_ray.tune.outcomes import Ending, Outcome, write_ending
 from msk_ray.tune.space import parse_space
 from msk_ray.tune.standing import Observer, State, best_of, progress_of, remaining
@@ -176,6 +177,23 @@ def test_a_trial_that_ran_out_of_memory_says_what_to_lower(
     assert max(map(len, lines)) <= 80
     assert "lower env.nworld" in " ".join(" ".join(lines).split())
     assert any(trial.id in line and "out_of_memory" in line for line in lines)
+
+
+@pytest.mark.parametrize("width", [80, 200])
+def test_a_trial_with_half_its_worlds_says_so(
+    experiment: experiments.Experiment,
+    width: int,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    write_halved(experiment.trial_folder(experiment.trials()[0].id), Halved(64, 32, "no room", cleared=True))
+    monkeypatch.setenv("COLUMNS", str(width))
+    assert run(main, [experiment.name, "--storage", str(experiment.path.parent)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= width
+    text = " ".join(" ".join(lines).split())
+    assert text.count("(half the") == 1
+    assert "32 of 64" in text
 
 
 def test_an_experiment_by_path_with_a_request_to_stop(

@@ -11,6 +11,7 @@ from msk_ray.cli import Parser, run
 from msk_ray.errors import CheckpointError, MskRayError
 from msk_ray.evaluate.targets import Kind, Target, best_checkpoint, best_of_trial, find_target
 from msk_ray.tune.experiment import Experiment
+from msk_ray.tune.halved import read_halved
 from msk_ray.tune.listing import text_table
 from msk_ray.tune.outcomes import write_json
 from msk_ray.tune.space import parse_seeds
@@ -153,7 +154,9 @@ def evaluate_experiment(experiment: Experiment, bench: "Bench", requests: "Seque
                 failed[trial.id] = str(error)
                 print(f"{number}/{len(trials)}  {trial.id}  {error}", flush=True)
                 continue
-            ranking.append({"trial": trial.id, "variant": trial.variant, "seed": trial.seed, **entry})
+            halved = read_halved(experiment.trial_folder(trial.id))
+            name = trial.variant + (f" ({halved})" if halved is not None else "")
+            ranking.append({"trial": trial.id, "variant": name, "seed": trial.seed, **entry})
             print(f"{number}/{len(trials)}  {trial.id}  {entry['score']['mean']:.5g}", flush=True)
         ranking.sort(key=lambda entry: -entry["score"]["mean"])
         rankings.append(ranking)

@@ -19,6 +19,7 @@ from msk_ray.config import describe_fault, parse_config, read_yaml
 from msk_ray.errors import MskRayError, StorageError
 from msk_ray.metrics_file import METRICS_FILE, read_metrics
 from msk_ray.tune.experiment import Experiment
+from msk_ray.tune.halved import Halved, read_halved
 from msk_ray.tune.operators import describe
 from msk_ray.tune.outcomes import Ending, Outcome, read_ending
 from msk_ray.tune.space import SpaceFile
@@ -58,6 +59,8 @@ class TrialReading:
     """What is wrong with its files."""
     device: str = ""
     """GPU model, or cpu; empty if it was not recorded."""
+    halved: Halved | None = None
+    """Set if it runs with half its worlds: then its scores do not compare with the others'."""
 
     @property
     def epochs_done(self) -> int:
@@ -97,7 +100,8 @@ class TrialReading:
 
     @property
     def why(self) -> str:
-        return self.note or (self.ending.why if self.ending is not None else "")
+        parts = (self.halved, self.note or (self.ending and self.ending.why))
+        return "; ".join(str(part) for part in parts if part)
 
     @property
     def failed(self) -> bool:
@@ -162,6 +166,11 @@ class Reading:
         return groups
 
     @property
+    def halved(self) -> list[TrialReading]:
+        """Trials that run with half their worlds."""
+        return [trial for trial in self.trials if trial.halved is not None]
+
+    @property
     def seeds(self) -> set[int]:
         return {trial.trial.seed for trial in self.trials}
 
@@ -211,6 +220,7 @@ def _read_trial(trial: Trial, folder: Path, now: float) -> TrialReading:
         ending = read_ending(folder)
         progress = progress_of([_numbers(row) for row in rows[-12:]])
         device = _device(folder / DEVICE_FILE)
+        halved = read_halved(folder)
     except _UNREADABLE as error:
         return TrialReading(trial, folder, {}, State.UNREADABLE, note=explain(error))
     age = heartbeat_age(folder, now)
@@ -220,7 +230,7 @@ def _read_trial(trial: Trial, folder: Path, now: float) -> TrialReading:
         state = State.WAITING
     else:
         state = State.STALE if age > patience(folder, progress) else State.RUNNING
-    return TrialReading(trial, folder, columns, state, ending, device=device)
+    return TrialReading(trial, folder, columns, state, ending, device=device, halved=halved)
 
 
 def _device(path: Path) -> str:

@@ -38,6 +38,8 @@ class VariantRow:
     is_baseline: bool
     figures: dict[str, float]
     """Mean over seeds of further evaluation figures at the best evaluation, such as the speed."""
+    halved: int = 0
+    """How many of the scores are of trials with half their worlds."""
 
     @property
     def verdict(self) -> str:
@@ -109,6 +111,7 @@ def variant_rows(reading: Reading, baseline: str | None) -> list[VariantRow]:
                 difference_interval(scores, reference) if compared else None,
                 own,
                 figures,
+                sum(trial.halved is not None and trial.score is not None for trial in trials),
             )
         )
     return sorted(rows, key=lambda row: (row.mean is None, -(row.mean or 0.0)))

@@ -218,10 +218,14 @@ class Trainer:
 
 
 def precompile(config: Config, device: str, logdir: Path) -> None:
-    """Compile every kernel this configuration needs into Warp's cache, by one epoch of a two-step horizon."""
+    """Compile every kernel this configuration needs into Warp's cache, by one epoch of a two-step horizon.
+
+    In few worlds: kernels are the same in many, and a device too small for those is the trial's to name.
+    """
     tiny = config.as_dict()
+    tiny["env"] |= {"nworld": 2}
     tiny["shac"] |= {"horizon": 2, "critic_iterations": 1, "critic_batches": 1}
-    tiny["evaluation"] |= {"steps": 1}
+    tiny["evaluation"] |= {"steps": 1, "nworld": 2}
     tiny["trial"] |= {"epochs": 1, "start_from": None}
     trainer = Trainer(Config.model_validate(tiny), logdir, device)
     trainer.run_epoch()

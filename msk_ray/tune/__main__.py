@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from msk_ray.cli import RESUMABLE, Parser, run
+from msk_ray.cli import RESUMABLE, TERMINAL_LOG, Parser, outliving, run
 from msk_ray.config import dump_yaml, parse_override, read_yaml
 from msk_ray.errors import ConfigError
 from msk_ray.tune import experiment as experiments
@@ -59,6 +59,12 @@ def parser() -> Parser:
     p.add_argument("--debug-trial", metavar="K", help="run trial K (number or id of --dry-run) here, without Ray")
     where = p.add_argument_group("where and how")
     where.add_argument("--gpus-per-trial", type=float, metavar="G", help="GPUs a trial; below 1, trials share one")
+    where.add_argument(
+        "--halve-worlds",
+        action=argparse.BooleanOptionalAction,
+        help="start a trial that runs out of memory anew, once, with half of its env.nworld, and say so in all tables; "
+        "by default as the space says (resources.halve_worlds_on_oom), with --resume as before",
+    )
     where.add_argument("--cpu", action="store_true", help="run on CPU cores even if there are GPUs")
     where.add_argument("--max-concurrent", type=int, metavar="N", help="at most N trials at once")
     where.add_argument(
@@ -101,7 +107,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     extension = parse_extension(args.extend)
     if extension and args.smoke:
         raise ConfigError("--extend: a smoke run has nothing to extend; leave --smoke out")
-    space = _read_space(args, _recorded_extension(args) | extension)
+    recorded = _recorded(args)
+    if args.halve_worlds is None and recorded is not None:
+        args.halve_worlds = recorded.halve_worlds()
+    space = _read_space(args, (recorded.extension() if recorded is not None else {}) | extension)
     if extension and (space.file.search == "optuna" or space.file.scheduler.kind == "pbt"):
         raise ConfigError("--extend: optuna and pbt cannot go on from a recorded experiment; pass another --name")
     trials = [] if space.file.search == "optuna" else resolve_trials(space)
@@ -132,11 +141,11 @@ def _experiment_path(args: argparse.Namespace) -> Path:
     return (storage / experiments.check_name(name)).resolve()
 
 
-def _recorded_extension(args: argparse.Namespace) -> dict[str, Any]:
-    """How the experiment to go on with was extended before; its space file knows nothing of that."""
+def _recorded(args: argparse.Namespace) -> experiments.Experiment | None:
+    """The experiment to go on with: what was said on its command lines before, its space file does not know."""
     experiment = experiments.Experiment(_experiment_path(args))
     going_on = (args.resume or args.extend) and (experiment.path / "manifest.json").is_file()
-    return experiment.extension() if going_on else {}
+    return experiment if going_on else None
 
 
 def _read_space(args: argparse.Namespace, extension: Mapping[str, Any]) -> Space:
@@ -150,6 +159,10 @@ def _read_space(args: argparse.Namespace, extension: Mapping[str, Any]) -> Space
             raise ConfigError(f"--set {key}: the space varies it; edit {path.name}, or set another key")
     if changes:
         data["overrides"] = {**(data.get("overrides") or {}), **changes}
+    if args.halve_worlds is not None:
+        resources = data.get("resources") or {}
+        if isinstance(resources, dict):  # else the space is refused for that
+            data["resources"] = {**resources, "halve_worlds_on_oom": args.halve_worlds}
     if args.seeds is not None:
         parse_seeds(args.seeds)
         data["seeds"] = args.seeds
@@ -204,6 +217,8 @@ def _run(args: argparse.Namespace, space: Space, trials: list[Trial], extension:
             # As recorded: with the ids they began with, and the epochs they were extended to.
             trials = experiment.trials()
         experiment.clear_endings(_retried(args))
+        if args.halve_worlds is not None:
+            experiment.set_halve_worlds(args.halve_worlds)
     # ray and torch take seconds to load; a wrong command line should not wait for them.
     from msk_ray.tune import runner
     from msk_ray.tune.devices import choose_placement, local_gpus
@@ -213,19 +228,19 @@ def _run(args: argparse.Namespace, space: Space, trials: list[Trial], extension:
         placement = choose_placement(space.file.resources, args.gpus_per_trial, args.cpu, local_gpus())
     if not going_on:
         experiment = experiments.create(path, space, trials, _options(args))
-
-    with runner.ray_session(args.address):
-        if args.address is not None:
-            placement = choose_placement(space.file.resources, args.gpus_per_trial, args.cpu, runner.cluster_gpus())
-        if not placement.gpus and not args.cpu:
-            print("no GPU here: trials run on CPU cores")
-        limit = args.max_concurrent or space.file.resources.max_concurrent
-        completed = runner.run_trials(runner.Plan(experiment, space, trials, placement, limit))
-    errors = finish(experiment)
-    if not completed:
-        print(f"stopped on request; go on with --resume --space {args.space} --name {path.name}")
-        return RESUMABLE
-    write_report(experiment)
+    with outliving(path / TERMINAL_LOG):
+        with runner.ray_session(args.address):
+            if args.address is not None:
+                placement = choose_placement(space.file.resources, args.gpus_per_trial, args.cpu, runner.cluster_gpus())
+            if not placement.gpus and not args.cpu:
+                print("no GPU here: trials run on CPU cores")
+            limit = args.max_concurrent or space.file.resources.max_concurrent
+            completed = runner.run_trials(runner.Plan(experiment, space, trials, placement, limit))
+        errors = finish(experiment)
+        if not completed:
+            print(f"stopped on request; go on with --resume --space {args.space} --name {path.name}")
+            return RESUMABLE
+        write_report(experiment)
     return 1 if errors else 0
 
 

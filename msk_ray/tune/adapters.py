@@ -16,6 +16,8 @@ from msk_ray.tune.space import SchedulerSpec
 
 METRIC = "score"
 """What trials report to Tune; `eval/score` under a name Tune does not take for a nested key."""
+STARTS_ANEW = "starts_anew"
+"""What a trial reports, alone, right before it fails in order to be started anew: with how many worlds."""
 
 
 class PruningScheduler(FIFOScheduler):
@@ -44,7 +46,8 @@ class PruningScheduler(FIFOScheduler):
         self._pruner = pruner
         self._time_attr = time_attr
         self._journal = journal
-        self._heard = {report.trial: report.epoch for report in journal.read()}
+        # The first report with half the worlds is new, whatever was heard of the attempt with all of them.
+        self._heard = {report.trial: (report.halved, report.epoch) for report in journal.read()}
         self._identify = identify
         self._on_stop = on_stop
 
@@ -53,12 +56,21 @@ class PruningScheduler(FIFOScheduler):
             return TrialScheduler.CONTINUE
         trial_id = self._identify(trial)
         report = Report(
-            trial_id, result["epoch"], result["env_steps"], result["seconds"], result[METRIC], result["ended"]
+            trial_id,
+            result["epoch"],
+            result["env_steps"],
+            result["seconds"],
+            result[METRIC],
+            result["ended"],
+            result["halved"],
         )
-        if report.epoch <= self._heard.get(trial_id, -1):
+        heard = self._heard.get(trial_id, (False, -1))
+        if (report.halved, report.epoch) <= heard:
             return TrialScheduler.CONTINUE
-        self._heard[trial_id] = report.epoch
+        self._heard[trial_id] = report.halved, report.epoch
         self._journal.append(report)
+        if report.halved and not heard[0]:
+            self._pruner.forget(trial_id)
         ending = self._pruner.report(trial_id, report.time(self._time_attr), report.score)
         # A trial that has ended by itself still counts for the others, but has its own outcome.
         if ending is None or result["ended"]:
@@ -120,7 +132,11 @@ def optuna_search(
     from ray.tune.search.optuna import OptunaSearch
 
     class Informed(OptunaSearch):
-        """Told what came of earlier choices as soon as it knows the space."""
+        """Told what came of earlier choices as soon as it knows the space; takes reports without a score, too."""
+
+        def on_trial_result(self, trial_id: str, result: dict[str, Any]) -> None:
+            if METRIC in result:
+                super().on_trial_result(trial_id, result)
 
         def set_search_properties(self, *args: Any, **kwargs: Any) -> bool:
             fresh: bool = super().set_search_properties(*args, **kwargs)

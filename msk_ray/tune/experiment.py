@@ -5,7 +5,8 @@ runs/<experiment>/
     space.yaml        the space as it was run
     env.json          versions, devices, commit, command line
     tune/             Ray's own state
-    trials/<id>/      config.yaml, metrics.jsonl, checkpoints/, outcome.json, output.log, eval.json
+    trials/<id>/      config.yaml, metrics.jsonl, checkpoints/, outcome.json, output.log, eval.json; halved.json and
+                      abandoned/ if it was started anew with half its worlds
     summary.json, table.md, eval.json, report/
 """
 
@@ -101,6 +102,17 @@ class Experiment:
             ending = read_ending(folder)
             if ending is not None and ending.outcome in outcomes:
                 (folder / OUTCOME_FILE).unlink()
+
+    def halve_worlds(self) -> bool | None:
+        """What was said of it on the command line; None if nothing was, so that the space decides."""
+        said: bool | None = self.manifest().get("options", {}).get("halve_worlds")
+        return said
+
+    def set_halve_worlds(self, said: bool) -> None:
+        """Keep what is said of it now, for the next time."""
+        manifest = self.manifest()
+        options = manifest.get("options", {}) | {"halve_worlds": said}
+        write_json(self.path / "manifest.json", manifest | {"options": options})
 
     def extension(self) -> dict[str, Any]:
         """How the experiment was extended since it was made: epochs, samples, seeds."""

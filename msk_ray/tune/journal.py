@@ -28,6 +28,8 @@ class Report:
     score: float
     ended: bool
     """Whether the trial had ended by itself."""
+    halved: bool = False
+    """Whether it ran with half its worlds; what it reported with all of them no longer counts then."""
 
     def time(self, attribute: str) -> float:
         """Progress as `env_steps`, `epoch` or `seconds`."""
@@ -70,6 +72,10 @@ def replay(pruner: Pruner, time_attr: str, reports: Sequence[Report]) -> Ending 
         What it answered to the last one, which the driver may not have lived to carry out.
     """
     ending = None
+    halved: set[str] = set()
     for report in reports:
+        if report.halved and report.trial not in halved:
+            halved.add(report.trial)
+            pruner.forget(report.trial)
         ending = pruner.report(report.trial, report.time(time_attr), report.score)
     return None if not reports or reports[-1].ended else ending

@@ -15,8 +15,9 @@ from ray.tune import Callback
 from msk_ray.cli import StopRequest
 from msk_ray.errors import StorageFailure, storage_failure
 from msk_ray.progress import format_duration
-from msk_ray.tune.adapters import METRIC
+from msk_ray.tune.adapters import METRIC, STARTS_ANEW
 from msk_ray.tune.experiment import Experiment
+from msk_ray.tune.halved import Halved, read_halved
 from msk_ray.tune.outcomes import Ending, Outcome, read_ending, write_ending
 from msk_ray.tune.time_left import time_left
 from msk_ray.tune.trial_run import ERROR_FILE, HANG_FILE
@@ -59,7 +60,12 @@ class Live(Callback):
         self._ended = 0
         self.started: list[Trial] = list(started)
         """Trials that were started, in that order, each once, numbered anew."""
-        self._best: tuple[float, Trial] | None = None
+        self._bests: dict[str, tuple[float, Trial]] = {}
+        """The best score of each trial that has reported one, and the trial."""
+        self._halved: dict[str, Halved] = {}
+        """Those of the trials seen here that run with half their worlds."""
+        self._starting_anew: dict[str, bool] = {}
+        """Trials halved in this driver's life, and whether the failure that leads to it is still to come."""
         self._start = time.monotonic()
         # Kept, because what Ray itself prints is sent elsewhere while trials run.
         self._out = sys.stdout
@@ -99,6 +105,7 @@ class Live(Callback):
     def on_trial_start(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         mine = self._trial_of(trial.config)
         self._waiting.pop(mine.id, None)
+        self._look_up_halved(mine)
         again = mine.id in self._running
         if all(mine.id != trial.id for trial in self.started):
             self.started.append(replace(mine, index=len(self.started)))
@@ -109,9 +116,13 @@ class Live(Callback):
     def on_trial_result(
         self, iteration: int, trials: list[Any], trial: Any, result: dict[str, Any], **info: Any
     ) -> None:
+        mine = self._trial_of(trial.config)
+        if STARTS_ANEW in result:
+            # The failure by which it gets a fresh process is not one of those that `max_failures` counts.
+            trial.max_failures += 1
+            self._starting_anew[mine.id] = True
         if METRIC not in result:
             return
-        mine = self._trial_of(trial.config)
         run = self._running.setdefault(mine.id, _Running(mine, time.monotonic()))
         run.epoch, run.score = result["epoch"], result[METRIC]
         if run.first_epoch is None:
@@ -120,15 +131,27 @@ class Live(Callback):
         elif run.epoch > run.first_epoch:
             self._seconds_per_epoch[mine.id] = (time.monotonic() - run.since) / (run.epoch - run.first_epoch)
         run.best = max(run.best, run.score)
-        if self._best is None or run.score > self._best[0]:
-            self._best = run.score, mine
-            self._say(f"{mine.id} best so far: score {run.score:.5g} at epoch {run.epoch}/{mine.epochs}")
+        best = self._best
+        if mine.id not in self._bests or run.score > self._bests[mine.id][0]:
+            self._bests[mine.id] = run.score, mine
+        if best is None or run.score > best[0]:
+            half = self._in_brackets(mine)
+            self._say(f"{mine.id} best so far: score {run.score:.5g} at epoch {run.epoch}/{mine.epochs}{half}")
 
     def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         if self._meet_storage_failure(trial):
             return
         mine = self._trial_of(trial.config)
-        why = _reason(self._experiment.trial_folder(mine.id), trial)
+        if self._starting_anew.get(mine.id):
+            self._starting_anew[mine.id] = False
+            self._look_up_halved(mine)
+            halved = self._halved[mine.id]
+            # What it scored with all its worlds is set aside.
+            self._bests.pop(mine.id, None)
+            self._seconds_per_epoch.pop(mine.id, None)
+            self._say(f"{mine.id} ran out of memory with {halved.asked} worlds; starting anew with {halved.worlds}")
+            return
+        why = self._reason(mine, trial)
         self._say(f"{mine.id} {why}; trying again from its newest checkpoint")
 
     def on_trial_complete(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
@@ -141,7 +164,7 @@ class Live(Callback):
         self._ended += 1
         compared = ending.outcome in (Outcome.STOPPED_ASHA, Outcome.STOPPED_MEDIAN)  # their reason names the score
         score = "" if run is None or compared or run.best == float("-inf") else f"; best score {run.best:.5g}"
-        self._say(f"{mine.id} {ending.outcome}: {ending.why}{score}")
+        self._say(f"{mine.id} {ending.outcome}: {ending.why}{score}{self._in_brackets(mine)}")
 
     def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         if self._meet_storage_failure(trial):
@@ -151,9 +174,9 @@ class Live(Callback):
         self._saving.discard(mine.id)
         self._running.pop(mine.id, None)
         self._ended += 1
-        ending = Ending(Outcome.ERROR, _reason(folder, trial))
+        ending = Ending(Outcome.ERROR, self._reason(mine, trial))
         write_ending(folder, ending)
-        self._say(f"{mine.id} error: {ending.why}; see {folder}")
+        self._say(f"{mine.id} error: {ending.why}; see {folder}{self._in_brackets(mine)}")
 
     def pruned(self, trial_id: str, ending: Ending) -> None:
         """A scheduler stops a trial: its process will not live to write its ending."""
@@ -162,8 +185,9 @@ class Live(Callback):
     def status(self) -> str:
         """One line on where everything stands."""
         parts = [f"{len(self._running)} running", f"{len(self._waiting)} waiting", f"{self._ended} ended"]
-        if self._best is not None:
-            parts.append(f"best {self._best[0]:.5g} ({self._best[1].id})")
+        best = self._best
+        if best is not None:
+            parts.append(f"best {best[0]:.5g} ({best[1].id})")
         running = [
             (run.trial.epochs - run.epoch, self._seconds_per_epoch.get(run.trial.id)) for run in self._running.values()
         ]
@@ -177,6 +201,15 @@ class Live(Callback):
                 f"    {run.trial.id}  epoch {run.epoch:>4}/{run.trial.epochs}  {score}  {self._name(run.trial)}"
             )
         return "\n".join(lines)
+
+    @property
+    def _best(self) -> tuple[float, Trial] | None:
+        return max(self._bests.values(), key=lambda best: best[0], default=None)
+
+    def _look_up_halved(self, trial: Trial) -> None:
+        halved = read_halved(self._experiment.trial_folder(trial.id))
+        if halved is not None:
+            self._halved[trial.id] = halved
 
     def _meet_storage_failure(self, trial: Any) -> bool:
         """Whether the disk failed a trial; then all are stopped, and none has ended by that."""
@@ -211,9 +244,18 @@ class Live(Callback):
     def _say(self, text: str) -> None:
         print(f"[{format_duration(time.monotonic() - self._start):>6}] {text}", file=self._out, flush=True)
 
-    @staticmethod
-    def _name(trial: Trial) -> str:
-        return f"{trial.variant} seed={trial.seed}"
+    def _name(self, trial: Trial) -> str:
+        return f"{trial.variant} seed={trial.seed}{self._in_brackets(trial)}"
+
+    def _in_brackets(self, trial: Trial) -> str:
+        """That a trial runs with half its worlds, if it does."""
+        halved = self._halved.get(trial.id)
+        return "" if halved is None else f" ({halved})"
+
+    def _reason(self, mine: Trial, trial: Any) -> str:
+        """Why a trial's process ended before its time, on one line."""
+        counted = trial.num_failures - (mine.id in self._starting_anew)
+        return _reason(self._experiment.trial_folder(mine.id), trial, counted)
 
 
 def _error_of(trial: Any) -> Exception | None:
@@ -228,8 +270,7 @@ def _error_of(trial: Any) -> Exception | None:
     return error
 
 
-def _reason(folder: Path, trial: Any) -> str:
-    """Why a trial's process ended before its time, on one line."""
+def _reason(folder: Path, trial: Any, failures: int) -> str:
     hang_file, error_file = folder / HANG_FILE, folder / ERROR_FILE
     if hang_file.is_file() and hang_file.stat().st_size:
         return f"it hung; where is in {hang_file}"
@@ -237,6 +278,6 @@ def _reason(folder: Path, trial: Any) -> str:
         return error_file.read_text(encoding="utf-8").strip().splitlines()[-1]
     error = _error_of(trial)
     if error is None or isinstance(error, RayActorError):
-        times = "" if trial.num_failures < 2 else f", {trial.num_failures} times now"
+        times = "" if failures < 2 else f", {failures} times now"
         return f"its process died (killed, or out of memory){times}"
     return str(error).strip().splitlines()[-1]

@@ -21,11 +21,17 @@ class Pruner(Protocol):
     def report(self, trial: str, time: float, score: float) -> Ending | None:
         """Take in one evaluation; answer why the trial should end now, or None."""
 
+    def forget(self, trial: str) -> None:
+        """Drop what a trial has reported: it starts anew."""
+
 
 class NeverPrune:
     """Lets every trial run."""
 
     def report(self, trial: str, time: float, score: float) -> Ending | None:
+        return None
+
+    def forget(self, trial: str) -> None:
         return None
 
 
@@ -62,6 +68,11 @@ class SuccessiveHalving:
         if newest is None or time >= self._rungs[newest] * math.sqrt(self._reduction):
             return None
         return self._judge(trial, newest)
+
+    def forget(self, trial: str) -> None:
+        self._best.pop(trial, None)
+        for scores in self._scores:
+            scores.pop(trial, None)
 
     def _judge(self, trial: str, index: int) -> Ending | None:
         scores = self._scores[index]
@@ -107,6 +118,9 @@ class MedianStopping:
             if len(means) >= self._min_trials:
                 return self._judge(own, moment, means)
         return None
+
+    def forget(self, trial: str) -> None:
+        self._history.pop(trial, None)
 
     def _judge(self, own: dict[float, float], moment: float, means: list[float]) -> Ending | None:
         best = max(s for t, s in own.items() if t <= moment)

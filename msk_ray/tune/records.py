@@ -8,6 +8,7 @@ from typing import Any
 
 from msk_ray.metrics_file import METRICS_FILE, read_metrics
 from msk_ray.tune.experiment import Experiment
+from msk_ray.tune.halved import Halved, read_halved
 from msk_ray.tune.outcomes import Ending, Outcome, read_ending
 from msk_ray.tune.stopping import Evaluation
 from msk_ray.tune.trials import Trial
@@ -25,6 +26,8 @@ class TrialRecord:
     evaluations: tuple[Evaluation, ...]
     ending: Ending | None
     """None: not ended, whether running, waiting or interrupted."""
+    halved: Halved | None = None
+    """Set if it runs with half its worlds: then its scores do not compare with the others'."""
 
     @property
     def best(self) -> Evaluation | None:
@@ -48,7 +51,13 @@ def read_record(trial: Trial, folder: Path) -> TrialRecord:
     rows = read_rows(folder)
     last = rows[-1] if rows else {"epoch": 0, "seconds": 0.0}
     return TrialRecord(
-        trial, folder, int(last["epoch"]), float(last["seconds"]), tuple(evaluations_of(rows)), read_ending(folder)
+        trial,
+        folder,
+        int(last["epoch"]),
+        float(last["seconds"]),
+        tuple(evaluations_of(rows)),
+        read_ending(folder),
+        read_halved(folder),
     )
 
 

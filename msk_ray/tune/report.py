@@ -8,7 +8,7 @@ from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.listing import text_table
 from msk_ray.tune.outcomes import write_json, write_text
 from msk_ray.tune.records import best_record, read_records
-from msk_ray.tune.table import HEADER, result_rows, summary, table_document, variant_rows
+from msk_ray.tune.table import HEADER, halved_note, result_rows, summary, table_document, variant_rows
 
 
 def finish(experiment: Experiment) -> int:
@@ -26,11 +26,13 @@ def finish(experiment: Experiment) -> int:
     if len({record.trial.seed for record in records}) > 1:
         header = ("variant", "seeds", "mean score", "std", "min", "max")
         print("\n" + text_table(header, variant_rows(records), width))
+    if (note := halved_note(records)) is not None:
+        print(f"\n{note}")
     best = best_record(records)
     if best is not None and best.best is not None:
-        print(
-            f"\nbest trial   {best.trial.id}: {best.trial.variant} seed={best.trial.seed}, score {best.best.score:.5g}"
-        )
+        half = f" ({best.halved})" if best.halved is not None else ""
+        name = f"{best.trial.variant} seed={best.trial.seed}{half}"
+        print(f"\nbest trial   {best.trial.id}: {name}, score {best.best.score:.5g}")
         print(f"best policy  {best.best_checkpoint or 'its checkpoint is missing'}")
     print(f"table        {experiment.path / 'table.md'}")
     print(f"trials       {experiment.path / 'trials'}", flush=True)

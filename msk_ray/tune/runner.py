@@ -2,6 +2,7 @@
 
 import logging
 import os
+import signal
 import tempfile
 import time
 import warnings
@@ -31,6 +32,7 @@ from msk_ray.tune.addresses import knock
 from msk_ray.tune.devices import Placement
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.gauges import StateGauge
+from msk_ray.tune.halved import read_halved
 from msk_ray.tune.journal import JOURNAL_FILE, Journal, replay
 from msk_ray.tune.live import Live
 from msk_ray.tune.made_up import MadeUp, recover
@@ -98,7 +100,8 @@ def ray_session(address: str | None, dashboard: bool | None = None, trials: bool
         os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys(paths))
         # None starts the dashboard where its packages (ray[default]) are installed, and does without elsewhere.
         # By default Ray would join whatever cluster a `ray start` on this machine once left a note of.
-        context = ray.init("local", include_dashboard=dashboard, dashboard_host="127.0.0.1", **common)
+        with _hangup_kept_from_children():
+            context = ray.init("local", include_dashboard=dashboard, dashboard_host="127.0.0.1", **common)
     else:
         try:
             knock(address)
@@ -115,6 +118,18 @@ def ray_session(address: str | None, dashboard: bool | None = None, trials: bool
         yield
     finally:
         ray.shutdown()
+
+
+@contextmanager
+def _hangup_kept_from_children() -> Iterator[None]:
+    """A terminal that closes sends SIGHUP to all processes in its foreground: Ray's must live on for trials to save
+    themselves. Blocked signals are inherited; in this process one that comes meanwhile is heard afterwards. Ray does
+    the same about SIGINT."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def cluster_gpus() -> int:
@@ -182,7 +197,10 @@ def _finish_pruning(plan: Plan) -> None:
         return
     ending = replay(make_pruner(spec, _budget(plan.space, plan.trials)), spec.time_attr, reports)
     folder = plan.experiment.trial_folder(reports[-1].trial)
-    if ending is not None and read_ending(folder) is None:
+    if ending is None or read_ending(folder) is not None:
+        return
+    # What a trial scored with all its worlds does not end it when it has half of them.
+    if reports[-1].halved or read_halved(folder) is None:
         write_ending(folder, ending)
 
 

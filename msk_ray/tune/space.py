@@ -85,6 +85,8 @@ class ResourcesSpec(Part):
     """How often a trial whose process or node died goes on from its checkpoint."""
     hang_s: Annotated[float, Field(gt=0.0)] | None = 1800.0
     """Seconds without an epoch after which a trial's process is ended and tried again; null waits for ever."""
+    halve_worlds_on_oom: bool = False
+    """Start a trial that runs out of memory anew, once, with half its worlds."""
 
 
 class SmokeSpec(Part):
@@ -232,6 +234,11 @@ def _check_combination(file: SpaceFile, parameters: Mapping[str, Operator], seed
     if file.scheduler.kind == "pbt":
         if not any(isinstance(parameters[key], Range) for key in sampled):
             raise ConfigError("scheduler.kind: pbt needs a parameter with a range to move in (uniform, loguniform)")
+        if file.resources.halve_worlds_on_oom:
+            raise ConfigError(
+                "resources.halve_worlds_on_oom (--halve-worlds): pbt hands the states of all worlds from one trial to "
+                "another, so all need as many; write false"
+            )
         if file.search == "optuna":
             raise ConfigError("scheduler.kind: pbt chooses values itself; write search: random")
 

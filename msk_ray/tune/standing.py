@@ -13,6 +13,7 @@ from msk_ray.config import parse_config, read_yaml
 from msk_ray.errors import MskRayError
 from msk_ray.metrics_file import METRICS_FILE
 from msk_ray.tune.experiment import Experiment
+from msk_ray.tune.halved import Halved, read_halved
 from msk_ray.tune.operators import describe
 from msk_ray.tune.outcomes import read_ending
 from msk_ray.tune.records import evaluations_of, read_rows
@@ -84,6 +85,8 @@ class Standing:
     """Name of its ending, if it has one."""
     note: str = ""
     """Why it ended, or what is wrong with its files."""
+    halved: Halved | None = None
+    """Set if it runs with half its worlds."""
 
     @property
     def seconds_left(self) -> float | None:
@@ -142,6 +145,7 @@ class Observer:
             ending = read_ending(folder)
             progress = self._progress(folder)
             device = _device(folder / DEVICE_FILE)
+            halved = read_halved(folder)
         except (MskRayError, OSError, ValueError, KeyError, TypeError) as error:
             # One trial's broken file must not hide the others; what is wrong with it is shown in its row.
             return _unreadable(trial.id, trial.variant, trial.seed, trial.epochs, error)
@@ -163,6 +167,7 @@ class Observer:
             age,
             "" if ending is None else str(ending.outcome),
             "" if ending is None else ending.why,
+            halved,
         )
 
     def _progress(self, folder: Path) -> Progress:

@@ -19,10 +19,12 @@ def result_rows(records: Sequence[TrialRecord]) -> list[tuple[str, ...]]:
 def variant_rows(records: Sequence[TrialRecord]) -> list[tuple[str, ...]]:
     """One row a variant: seeds, mean, standard deviation and range of the best scores. The highest mean first."""
     groups: dict[str, list[float]] = {}
+    halved: dict[str, int] = {}
     for record in records:
         scores = groups.setdefault(record.trial.variant, [])
         if record.best is not None:
             scores.append(record.best.score)
+            halved[record.trial.variant] = halved.get(record.trial.variant, 0) + (record.halved is not None)
     rows = []
     for variant, scores in groups.items():
         if not scores:
@@ -30,7 +32,8 @@ def variant_rows(records: Sequence[TrialRecord]) -> list[tuple[str, ...]]:
             continue
         mean = statistics.fmean(scores)
         deviation = f"{statistics.stdev(scores):.4g}" if len(scores) > 1 else "-"
-        texts = (variant, str(len(scores)), f"{mean:.5g}", deviation, f"{min(scores):.5g}", f"{max(scores):.5g}")
+        seeds = f"{len(scores)} ({halved[variant]} with half the worlds)" if halved[variant] else str(len(scores))
+        texts = (variant, seeds, f"{mean:.5g}", deviation, f"{min(scores):.5g}", f"{max(scores):.5g}")
         rows.append((mean, texts))
     return [texts for _, texts in sorted(rows, key=lambda row: -row[0])]
 
@@ -60,7 +63,10 @@ def table_document(name: str, question: str, records: Sequence[TrialRecord]) -> 
         parts += ["By variant, over seeds:\n", markdown(header, variant_rows(records))]
     best = best_record(records)
     if best is not None:
-        parts.append(f"Best policy: `{_relative(best)}` ({best.trial.variant}, seed {best.trial.seed}).\n")
+        half = f", {best.halved}" if best.halved is not None else ""
+        parts.append(f"Best policy: `{_relative(best)}` ({best.trial.variant}, seed {best.trial.seed}{half}).\n")
+    if (note := halved_note(records)) is not None:
+        parts.append(f"{note}\n")
     parts.append(f"Curves and more: [report](report/index.html), by `python -m msk_ray.report {name}`.\n")
     return "\n".join(part for part in parts if part)
 
@@ -72,6 +78,18 @@ def outcome_name(record: TrialRecord) -> str:
     return "interrupted" if record.epochs_done else "waiting"
 
 
+def halved_note(records: Sequence[TrialRecord]) -> str | None:
+    """What the reader of a table must know of trials with half their worlds; None if there are none."""
+    count = sum(record.halved is not None for record in records)
+    if not count:
+        return None
+    trials = "1 trial" if count == 1 else f"{count} trials"
+    return (
+        f"{trials} ran with half the worlds asked for, after running out of memory with all of them: "
+        "not comparable with the others."
+    )
+
+
 def _row(record: TrialRecord) -> tuple[str, ...]:
     trial, best = record.trial, record.best
     return (
@@ -81,9 +99,10 @@ def _row(record: TrialRecord) -> tuple[str, ...]:
         "-" if best is None else f"{best.score:.5g}",
         "-" if best is None else str(best.epoch),
         f"{record.epochs_done}/{trial.epochs}",
-        outcome_name(record),
+        # Here, not with the reason: a terminal may cut that.
+        outcome_name(record) + (", half the worlds" if record.halved is not None else ""),
         f"trials/{trial.id}",
-        record.ending.why if record.ending is not None else "",
+        "; ".join(str(part) for part in (record.halved, record.ending and record.ending.why) if part),
     )
 
 
@@ -101,6 +120,7 @@ def _facts(record: TrialRecord) -> dict[str, Any]:
         "seconds": record.seconds,
         "outcome": outcome_name(record),
         "why": record.ending.why if record.ending is not None else "",
+        "halved": None if record.halved is None else {"asked": record.halved.asked, "worlds": record.halved.worlds},
         "folder": f"trials/{record.trial.id}",
         "best_checkpoint": str(_relative(record)) if record.best_checkpoint else None,
     }

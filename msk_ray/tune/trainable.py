@@ -18,10 +18,11 @@ from ray import tune
 
 from msk_ray.config import parse_config
 from msk_ray.errors import storage_failure
-from msk_ray.tune.adapters import METRIC
+from msk_ray.tune.adapters import METRIC, STARTS_ANEW
 from msk_ray.tune.devices import wait_for_memory
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.gauges import TrialGauges
+from msk_ray.tune.halved import StartAnew, read_halved
 from msk_ray.tune.hparams import log_hparams
 from msk_ray.tune.made_up import make_up, write_params
 from msk_ray.tune.outcomes import write_text
@@ -92,7 +93,8 @@ def make_trainable(job: Job) -> Callable[[dict[str, Any]], None]:
         _redirect_output(folder / "output.log")
         _limit_threads(job.threads)
         _record_device(folder / "device.json")
-        log_hparams(folder, trial)
+        halved = read_halved(folder)
+        log_hparams(folder, trial if halved is None else halved.of(trial))
         if job.gpus:
             _wait_for_gpu(job.gpus)
         gauges = TrialGauges(job.experiment.name, trial)
@@ -104,26 +106,37 @@ def make_trainable(job: Job) -> Callable[[dict[str, Any]], None]:
 
             hooks = Hooks(
                 on_epoch=on_epoch,
-                on_evaluation=_report_with_checkpoint if job.population else _report,
+                on_evaluation=_report_with_checkpoint if job.population else _reporter(halved is not None),
                 pause=job.experiment.stop_file.exists,
             )
-            run_trial(
-                trial,
-                folder,
-                job.device,
-                job.space.file.stop,
-                _exchanging(job, folder) if job.population else job.trainer_class,
-                hooks,
-                _handed_checkpoint(Path(scratch)) if job.population else None,
-            )
+            try:
+                run_trial(
+                    trial,
+                    folder,
+                    job.device,
+                    job.space.file.stop,
+                    _exchanging(job, folder) if job.population else job.trainer_class,
+                    hooks,
+                    _handed_checkpoint(Path(scratch)) if job.population else None,
+                    job.space.file.resources.halve_worlds_on_oom,
+                )
+            except StartAnew as again:
+                # Tune starts a trial in a fresh process only after a failure. The driver hears of this one before it
+                # happens, and does not count it.
+                tune.report({STARTS_ANEW: again.halved.worlds})
+                raise
 
     return trainable
 
 
-def _report(evaluation: Evaluation, ended: bool, trainer: TrainerLike) -> None:
-    """Report to Tune. State stays out of it: a retried trial goes on from its own folder, where a torn newest
+def _reporter(halved: bool) -> Callable[[Evaluation, bool, TrainerLike], None]:
+    """Reports to Tune. State stays out of it: a retried trial goes on from its own folder, where a torn newest
     checkpoint is passed over; Ray would insist on it at every retry."""
-    tune.report(_figures(evaluation, ended))
+
+    def report(evaluation: Evaluation, ended: bool, trainer: TrainerLike) -> None:
+        tune.report(_figures(evaluation, ended, halved))
+
+    return report
 
 
 def _report_with_checkpoint(evaluation: Evaluation, ended: bool, trainer: TrainerLike) -> None:
@@ -132,16 +145,17 @@ def _report_with_checkpoint(evaluation: Evaluation, ended: bool, trainer: Traine
     with tempfile.TemporaryDirectory() as folder:
         for file in (path, path.with_suffix(".json")):
             shutil.copy(file, folder)
-        tune.report(_figures(evaluation, ended), checkpoint=tune.Checkpoint.from_directory(folder))
+        tune.report(_figures(evaluation, ended, False), checkpoint=tune.Checkpoint.from_directory(folder))
 
 
-def _figures(evaluation: Evaluation, ended: bool) -> dict[str, Any]:
+def _figures(evaluation: Evaluation, ended: bool, halved: bool) -> dict[str, Any]:
     return {
         METRIC: evaluation.score,
         "epoch": evaluation.epoch,
         "env_steps": evaluation.env_steps,
         "seconds": evaluation.seconds,
         "ended": ended,
+        "halved": halved,
     }
 
 

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Protocol
 
 from msk_ray.config import Config
-from msk_ray.errors import MskRayError, SimulationError, StorageFailure
+from msk_ray.errors import ConfigError, Failure, MskRayError, SimulationError, StorageFailure
+from msk_ray.tune.halved import ABANDONED, Halved, StartAnew, halve, read_halved, set_aside, write_halved
 from msk_ray.tune.outcomes import Ending, Outcome, read_ending, write_ending, write_text
 from msk_ray.tune.records import evaluations_of, read_rows
 from msk_ray.tune.space import StopSpec
@@ -59,16 +60,23 @@ def run_trial(
     trainer_class: type[TrainerLike],
     hooks: Hooks,
     checkpoint: Path | None = None,
+    may_halve: bool = False,
 ) -> Ending | None:
     """Train until the trial ends, by its last epoch or by one of its own rules.
 
     Goes on from the newest whole checkpoint in `folder`, or from `checkpoint` if one is given. The ending is written
     to `folder`.
 
+    Args:
+        may_halve: whether the trial may start anew with half its worlds when it runs out of memory, once. One that
+            has half of them already keeps to that, whatever is said here.
+
     Returns:
         How it ended; None if it was paused before.
 
     Raises:
+        StartAnew: it ran out of memory and is to be run again, by a fresh process, with half its worlds. That is kept
+            in `folder`.
         StorageFailure: the disk is full or gone; the trial can go on once it is back.
         Exception: anything that is neither a failed simulation nor a fault the user can mend. Its traceback is kept in
             `error.txt`, and the trial may be tried again.
@@ -79,10 +87,19 @@ def run_trial(
     folder.mkdir(parents=True, exist_ok=True)
     # What an earlier attempt stumbled over stays in the trial's output; this file is about the latest one.
     (folder / ERROR_FILE).unlink(missing_ok=True)
+    halved = read_halved(folder)
+    if halved is not None:
+        # The process that decided it may not have lived to do this.
+        halved = set_aside(folder, halved)
+        print(halved, flush=True)
     try:
-        ending = _train(trial, folder, device, stop, trainer_class, hooks, checkpoint)
+        as_run = trial if halved is None else halved.of(trial)
+        ending = _train(as_run, folder, device, stop, trainer_class, hooks, checkpoint, halved)
     except SimulationError as error:
-        ending = Ending(Outcome(error.failure.value), str(error))
+        if error.failure is Failure.OUT_OF_MEMORY:
+            ending = _out_of_memory(trial, folder, str(error), halved, may_halve)
+        else:
+            ending = Ending(Outcome(error.failure.value), str(error))
     except StorageFailure:
         # The disk's fault, not the trial's: it has not ended, and goes on once there is room.
         raise
@@ -97,6 +114,24 @@ def run_trial(
     return ending
 
 
+def _out_of_memory(trial: Trial, folder: Path, why: str, halved: Halved | None, may_halve: bool) -> Ending:
+    """How a trial ends whose device has no room for it, unless it is to start anew."""
+    if halved is not None:
+        why += f"; {halved.asked} worlds were asked for, and half of them has been tried"
+    elif may_halve:
+        try:
+            decided = halve(trial, why)
+        except ConfigError as fault:
+            why += f"; half of them could not be tried: {fault}"
+        else:
+            write_halved(folder, decided)
+            set_aside(folder, decided)
+            again = StartAnew(decided)
+            print(f"{why}\n{again}; what was done so far is in {ABANDONED}/", flush=True)
+            raise again
+    return Ending(Outcome.OUT_OF_MEMORY, why)
+
+
 def _train(
     trial: Trial,
     folder: Path,
@@ -105,9 +140,14 @@ def _train(
     trainer_class: type[TrainerLike],
     hooks: Hooks,
     checkpoint: Path | None,
+    halved: Halved | None,
 ) -> Ending | None:
     trainer = trainer_class(trial.config, folder, device)
     try:
+        if halved is not None:
+            # For whoever reads these settings alone.
+            settings = folder / "config.yaml"
+            write_text(settings, f"# {halved} asked for\n{settings.read_text(encoding='utf-8')}")
         if checkpoint is not None:
             trainer.restore(checkpoint)
         else:

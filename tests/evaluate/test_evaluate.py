@@ -17,6 +17,7 @@ from msk_ray.training import load_policy, read_metrics
 from msk_ray.training.checkpoint import milestones
 from msk_ray.training.evaluation import Episodes
 from msk_ray.tune.experiment import Experiment
+from msk_ray.tune.halved import Halved, write_halved
 from msk_ray.tune.records import best_record, read_records
 
 
@@ -69,6 +70,7 @@ def test_an_experiment_is_ranked_and_a_torn_policy_is_named(
     torn = Experiment(folder).trials()[1].id
     with (folder / "trials" / torn / "checkpoints" / "best.pt").open("ab") as file:
         file.write(b"x")
+    write_halved(folder / "trials" / Experiment(folder).trials()[0].id, Halved(16, 8, "no room", cleared=True))
     assert run(main, ["small", "--storage", str(tmp_path), "--device", "cpu"]) == 1
     data = json.loads((folder / "eval.json").read_text())
     (ranked,) = data["rankings"]
@@ -81,7 +83,9 @@ def test_an_experiment_is_ranked_and_a_torn_policy_is_named(
     }
     assert [entry["trial"] for entry in data["failed"]] == [torn]
     assert "is torn" in data["failed"][0]["why"]
-    assert "under own physics" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "under own physics" in shown
+    assert shown.count("(half the worlds: 8 of 16)") == 1
 
 
 def test_physics_by_name(ant_trial: Path) -> None:

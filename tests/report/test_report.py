@@ -16,6 +16,7 @@ from msk_ray.report.page import make_section
 from msk_ray.report.reading import Condition, read_experiment
 from msk_ray.report.tables import failures, variant_rows
 from msk_ray.tune import experiment as experiments
+from msk_ray.tune.halved import Halved, write_halved
 from msk_ray.tune.outcomes import Ending, Outcome, write_ending
 from msk_ray.tune.space import parse_space
 from msk_ray.tune.trials import resolve_trials
@@ -95,6 +96,20 @@ def test_the_page_says_it_all_and_takes_nothing_for_markup(experiment: experimen
     assert "http" not in page.replace("http-equiv", ""), "nothing is fetched"
     for name in ("curves", "effects", "parallel", "stops", "health"):
         assert (experiment.path / "report" / f"{name}.png").stat().st_size > 5000
+
+
+def test_half_the_worlds_are_said_wherever_a_score_is(experiment: experiments.Experiment) -> None:
+    assert "half the worlds" not in page_of(experiment)
+    best = read_experiment(experiment, time.time()).best
+    assert best is not None
+    write_halved(best.folder, Halved(64, 32, "no room", cleared=True))
+    page = " ".join(page_of(experiment).split())
+    note = f"with half the worlds asked for, after running out of memory with all of them (<code>{best.trial.id}<"
+    assert note in page
+    assert "fast, seed 1, half the worlds: 32 of 64</dd>" in page
+    assert ">2 of 2 (1 with half the worlds)</td>" in page
+    assert "<td>finished, half the worlds</td>" in page
+    assert "half the worlds: 32 of 64; all 4 epochs done</td>" in page
 
 
 def test_the_baseline_can_be_chosen(experiment: experiments.Experiment, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,13 +8,14 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
 
 from msk_ray.config import Config
 from msk_ray.errors import CheckpointError
-from msk_ray.training import Trainer, read_metrics
+from msk_ray.training import Trainer, precompile, read_metrics
 from msk_ray.training.checkpoint import epoch_checkpoints, milestones
 
 
@@ -124,7 +125,10 @@ def test_killing_the_train_command_loses_nothing(root: Path, tiny_cartpole: Conf
     assert comparable(read_metrics(metrics)) == comparable(whole)
 
 
-def test_sigterm_saves_and_says_resumable(root: Path, tiny_cartpole: Config, tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_saves_and_says_resumable(
+    number: signal.Signals, root: Path, tiny_cartpole: Config, tmp_path: Path
+) -> None:
     config = tiny_cartpole.as_dict()
     config["trial"] |= {"epochs": 100000, "checkpoint_interval": 100000}
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(config))
@@ -139,10 +143,16 @@ def test_sigterm_saves_and_says_resumable(root: Path, tiny_cartpole: Config, tmp
         assert process.poll() is None
         assert time.monotonic() < deadline
         time.sleep(0.01)
-    process.terminate()
-    output, _ = process.communicate(timeout=60)
-    assert process.returncode == 75
-    assert "stopped by SIGTERM" in output
+    if number is signal.SIGHUP:
+        process.stdout.close()  # with the terminal goes whoever reads from it
+        process.send_signal(number)
+        assert process.wait(60) == 75
+        output = (tmp_path / "run" / "terminal.log").read_text()
+    else:
+        process.send_signal(number)
+        output, _ = process.communicate(timeout=60)
+        assert process.returncode == 75
+    assert f"stopped by {number.name}" in output
     assert len(epoch_checkpoints(tmp_path / "run" / "checkpoints")) == 1
     rows = [json.loads(line) for line in metrics.read_text().splitlines()]
     assert f"epoch_{rows[-1]['epoch']:06d}.pt" == epoch_checkpoints(tmp_path / "run" / "checkpoints")[0].name
@@ -170,3 +180,9 @@ def test_a_torn_checkpoint_falls_back_to_the_one_before(tiny_cartpole: Config, t
         trainer.run_epoch()
     trainer.close()
     assert comparable(read_metrics(tmp_path / "metrics.jsonl")) == comparable(whole)
+
+
+def test_kernels_are_compiled_in_few_worlds(tiny_settings: dict[str, Any], tmp_path: Path) -> None:
+    huge = tiny_settings | {"env": tiny_settings["env"] | {"nworld": 10**12}}
+    huge["evaluation"] = tiny_settings["evaluation"] | {"nworld": 10**12}
+    precompile(Config.model_validate(huge), "cpu", tmp_path)  # no machine has room for so many

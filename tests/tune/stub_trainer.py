@@ -2,7 +2,8 @@
 
 Which way is chosen by `env.cart_position_penalty`: 1 kills its own process once, 2 gives NaN, 3 raises
 SimulationError, 4 raises an unforeseen error every time, 5 hangs once, 6 finds the disk full once, 7 runs out of
-memory. Anything else trains.
+memory, 8 does so with more than `ROOM` worlds, 9 does so before its first epoch, 10 too, and kills its own process once
+when it has begun with fewer. Anything else trains.
 """
 
 import errno
@@ -16,10 +17,13 @@ from collections.abc import Collection
 from pathlib import Path
 
 from msk_ray.config import Config, dump_yaml
-from msk_ray.errors import Failure, SimulationError
+from msk_ray.errors import CheckpointError, Failure, SimulationError
 
 KILL, NAN, SIMULATION_ERROR, BUG, HANG, FULL_DISK, MEMORY = 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0
+LATE_CROWD, CROWD, DOOMED_CROWD = 8.0, 9.0, 10.0
 MISBEHAVE_AT = 5
+ROOM = 4
+"""Worlds that fit."""
 
 
 class StubTrainer:
@@ -34,6 +38,13 @@ class StubTrainer:
         (logdir / "checkpoints").mkdir(parents=True, exist_ok=True)
         (logdir / "config.yaml").write_text(dump_yaml(config.as_dict()))
         self.behaviour = getattr(config.env, "cart_position_penalty", None)
+        with (logdir / "processes").open("a") as file:
+            file.write(f"{os.getpid()}\n")
+        if self.behaviour in (CROWD, DOOMED_CROWD) and config.env.nworld > ROOM:
+            raise SimulationError("out_of_memory: made up at once", Failure.OUT_OF_MEMORY)
+        if self.behaviour == DOOMED_CROWD and not (logdir / "died_once").exists():
+            (logdir / "died_once").touch()
+            os.kill(os.getpid(), signal.SIGKILL)
 
     @property
     def finished(self) -> bool:
@@ -79,7 +90,7 @@ class StubTrainer:
         if self.behaviour == FULL_DISK and not marker.exists():
             marker.touch()
             raise OSError(errno.ENOSPC, "No space left on device")
-        if self.behaviour == MEMORY:
+        if self.behaviour == MEMORY or (self.behaviour == LATE_CROWD and self.config.env.nworld > ROOM):
             raise SimulationError("out_of_memory: made up", Failure.OUT_OF_MEMORY)
         if self.behaviour == NAN:
             row["train/actor_loss"] = math.nan
@@ -96,13 +107,16 @@ class StubTrainer:
 
     def save(self) -> Path:
         path = self.logdir / "checkpoints" / f"epoch_{self.epoch:06d}.pt"
-        payload = json.dumps({"epoch": self.epoch, "best_score": self.best_score}).encode()
+        state = {"epoch": self.epoch, "best_score": self.best_score, "nworld": self.config.env.nworld}
+        payload = json.dumps(state).encode()
         path.write_bytes(payload)
         path.with_suffix(".json").write_text(json.dumps({"sha256": hashlib.sha256(payload).hexdigest()}))
         return path
 
     def restore(self, path: Path, changed: Collection[str] = ()) -> None:
         state = json.loads(path.read_bytes())
+        if state["nworld"] != self.config.env.nworld:
+            raise CheckpointError(f"{path} was written under other settings")
         self.epoch, self.best_score = state["epoch"], state["best_score"]
 
     def restore_latest(self) -> tuple[Path | None, list[str]]:

@@ -37,7 +37,8 @@ class Driver:
         self._epoch = epoch
         start, slope = CURVES[trial]
         result = {METRIC: start + slope * epoch, "epoch": epoch, "env_steps": 100 * epoch, "seconds": 0.1 * epoch}
-        self._scheduler.on_trial_result(None, SimpleNamespace(id=trial), result | {"ended": epoch == EPOCHS})
+        result |= {"ended": epoch == EPOCHS, "halved": False}
+        self._scheduler.on_trial_result(None, SimpleNamespace(id=trial), result)
 
 
 def order() -> list[tuple[str, int]]:

@@ -13,17 +13,33 @@ from typing import Any
 import pytest
 import stub_trainer
 from ray import cloudpickle
-from stub_trainer import BUG, FULL_DISK, HANG, KILL, MEMORY, NAN, SIMULATION_ERROR, StubTrainer
+from stub_trainer import (
+    BUG,
+    CROWD,
+    DOOMED_CROWD,
+    FULL_DISK,
+    HANG,
+    KILL,
+    LATE_CROWD,
+    MEMORY,
+    NAN,
+    ROOM,
+    SIMULATION_ERROR,
+    StubTrainer,
+)
 
 from msk_ray.config import read_yaml
 from msk_ray.errors import ClusterLost, StorageError, StorageFailure
 from msk_ray.tune import experiment as experiments
 from msk_ray.tune import runner, standby
 from msk_ray.tune.devices import Placement
+from msk_ray.tune.halved import Halved, StartAnew, read_halved
 from msk_ray.tune.made_up import recover
+from msk_ray.tune.outcomes import Outcome
 from msk_ray.tune.records import TrialRecord, read_records, read_rows
 from msk_ray.tune.report import finish
-from msk_ray.tune.space import Space
+from msk_ray.tune.space import Space, StopSpec
+from msk_ray.tune.trial_run import Hooks, run_trial
 from msk_ray.tune.trials import resolve_trials
 
 
@@ -31,7 +47,9 @@ from msk_ray.tune.trials import resolve_trials
 def session() -> Iterator[None]:
     """One Ray for all tests here."""
     cloudpickle.register_pickle_by_value(stub_trainer)
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)}
+    handlers = {
+        number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP)
+    }
     with runner.ray_session(None, dashboard=False, trials=False):  # stubs need none of what trials import
         yield
     for number, handler in handlers.items():
@@ -95,6 +113,77 @@ def test_a_full_disk_stops_everything_and_ends_nothing(
     completed, records = go(space, path, resume=True)
     assert completed
     assert outcomes(records) == ["finished", "out_of_memory"]
+
+
+def test_out_of_memory_starts_anew_with_half_the_worlds_in_a_fresh_process(
+    make_space: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    space = make_space(
+        parameters={"env.cart_position_penalty": {"grid": [0.0, CROWD, LATE_CROWD, MEMORY, DOOMED_CROWD]}},
+        # No death is forgiven, and being started anew is none.
+        resources={"max_failures": 0, "halve_worlds_on_oom": True},
+        scheduler={"kind": "asha", "grace": 0.9},
+    )
+    path = tmp_path / "runs" / "crowded"
+    completed, records = go(space, path)
+    shown = capsys.readouterr().out
+    assert completed
+    assert outcomes(records) == ["finished", "finished", "finished", "out_of_memory", "error"]
+    assert [record.halved and record.halved.worlds for record in records] == [None, ROOM, ROOM, ROOM, ROOM]
+    assert all("8 worlds were asked for, and half" in r.ending.why for r in records[3:4])  # type: ignore[union-attr]
+    assert records[4].ending.why == "its process died (killed, or out of memory)"  # type: ignore[union-attr]
+    for record in records[1:]:
+        processes = (record.folder / "processes").read_text().split()
+        assert len(processes) == len(set(processes)) == 2
+        assert f"{record.trial.id} ran out of memory with 8 worlds; starting anew with 4" in shown
+        assert f"{record.trial.id} again  {record.trial.variant} seed=0 (half the worlds: 4 of 8)" in shown
+    for record in records[:3]:
+        assert [row["epoch"] for row in read_rows(record.folder)] == list(range(21))
+    # What the rule heard of the attempt with all worlds is heard again with half of them.
+    heard = [json.loads(line) for line in (path / "reports.jsonl").read_text().splitlines()]
+    late = [(report["halved"], report["epoch"]) for report in heard if report["trial"] == records[2].trial.id]
+    assert late == [(False, 2), (False, 4), *((True, epoch) for epoch in range(2, 21, 2))]
+    assert "4 trials ran with half the worlds asked for" in shown
+    assert shown.count("finished, half the worlds") == 2
+    # The one whose process was killed between the decision and its first epoch goes on with its half.
+    experiments.Experiment(path).clear_endings({Outcome.ERROR})
+    completed, records = go(space, path, resume=True)
+    assert outcomes(records)[4] == "finished"
+    assert records[4].halved is not None
+    assert (records[4].halved.asked, records[4].halved.worlds) == (8, 4)
+    assert "(half the worlds: 4 of 8)" in capsys.readouterr().out
+
+
+def test_a_search_goes_on_with_half_the_worlds(make_space: Any, tmp_path: Path) -> None:
+    pytest.importorskip("optuna")
+    space = make_space(
+        parameters={"shac.actor_lr": {"loguniform": [1e-3, 1e-2]}},
+        search="optuna",
+        overrides={"trial.epochs": 6, "env.cart_position_penalty": LATE_CROWD},
+        resources={"max_failures": 0, "halve_worlds_on_oom": True},
+    )
+    completed, (record,) = go(space, tmp_path / "runs" / "optuna")
+    assert completed
+    assert outcomes([record]) == ["finished"]
+    assert record.halved is not None
+    assert [row["epoch"] for row in read_rows(record.folder)] == list(range(7))
+
+
+def test_a_driver_killed_after_the_decision_goes_on_with_half_the_worlds(make_space: Any, tmp_path: Path) -> None:
+    space = make_space(
+        parameters={"env.cart_position_penalty": {"grid": [LATE_CROWD]}}, resources={"halve_worlds_on_oom": True}
+    )
+    path = tmp_path / "runs" / "killed"
+    (trial,) = resolve_trials(space)
+    folder = experiments.create(path, space, [trial], {}).trial_folder(trial.id)
+    with pytest.raises(StartAnew):  # as far as a driver came that was killed there
+        run_trial(trial, folder, "cpu", StopSpec(), StubTrainer, Hooks(), may_halve=True)
+    # Whoever goes on may not halve, and need not: it has been decided.
+    completed, (record,) = go(make_space(parameters={"env.cart_position_penalty": {"grid": [LATE_CROWD]}}), path, True)
+    assert completed
+    assert outcomes([record]) == ["finished"]
+    assert record.halved == Halved(8, 4, "out_of_memory: made up", cleared=True) == read_halved(folder)
+    assert [row["epoch"] for row in read_rows(folder)] == list(range(21))
 
 
 def test_a_dead_node_of_ones_own_ends_the_experiment_resumably(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,207 @@
+"""The faults, a function each, and what became of the sweeps they struck."""
+
+import contextlib
+import os
+import random
+import signal
+import subprocess
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from fault_campaign.reference import Reference
+from fault_campaign.space import EPOCHS
+from fault_campaign.sweep import Sweep
+from msk_ray.tune.outcomes import read_ending
+from msk_ray.tune.trials import Trial
+
+DISK_MIB = 48
+RESUMABLE = 75
+
+
+@dataclass
+class Tally:
+    """One line of the table."""
+
+    fault: str
+    injected: int
+    ended_by: str
+    lost_rows: int = 0
+    lost_trials: int = 0
+    seconds: float = 0.0
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def survived(self) -> int:
+        return 0 if self.lost_rows or self.lost_trials else self.injected
+
+
+def inside_workers(reference: Reference, scratch: Path, rng: random.Random) -> list[Tally]:
+    """Deaths and hangs of trial processes; Ray tries them again by itself."""
+    sweep = Sweep("workers", scratch, reference.trials)
+    kinds = {
+        "worker SIGKILL before an epoch": ("kill", sorted(rng.sample(range(2, EPOCHS + 1), 4))),
+        # The first one strikes before there is any checkpoint.
+        "worker SIGKILL in the middle of a row": ("torn_row", [1, *sorted(rng.sample(range(2, EPOCHS), 3))]),
+        "worker SIGKILL in the middle of a checkpoint": (
+            "torn_checkpoint",
+            [*sorted(rng.sample(range(2, EPOCHS, 2), 3)), EPOCHS],
+        ),
+        "hang": ("hang", sorted(rng.sample(range(2, EPOCHS + 1), 2))),
+    }
+    for trial, (kind, epochs) in zip(sweep.trials, kinds.values(), strict=True):
+        sweep.plant(trial, dict.fromkeys(epochs, kind))
+    sweep.launch()
+    code = sweep.wait()
+    tallies = []
+    for trial, name in zip(sweep.trials, kinds, strict=True):
+        tallies.append(_judge(reference, sweep, name, sweep.struck(trial), "nothing", [trial]))
+        if code != 0:
+            tallies[-1].notes.append(f"exit code {code}")
+    return tallies
+
+
+def nan(reference: Reference, scratch: Path, rng: random.Random) -> list[Tally]:
+    """A policy turns to NaN: the trial ends there by name, and goes on from its checkpoint when asked to."""
+    sweep = Sweep("nan", scratch, reference.trials)
+    for trial in sweep.trials:
+        sweep.plant(trial, {rng.randrange(2, EPOCHS + 1): "nan"})
+    sweep.launch()
+    sweep.wait()
+    endings = [read_ending(sweep.path / "trials" / trial.id) for trial in sweep.trials]
+    named = sum(ending is not None and ending.outcome == "nonfinite" for ending in endings)
+    sweep.launch("--retry", "nonfinite")
+    sweep.wait()
+    injected = sum(map(sweep.struck, sweep.trials))
+    tally = _judge(reference, sweep, "NaN in the policy", injected, "--resume --retry nonfinite")
+    if named != injected:
+        tally.notes.append(f"{injected - named} of them were not named nonfinite: {endings}")
+    return [tally]
+
+
+def killed(
+    reference: Reference,
+    scratch: Path,
+    rng: random.Random,
+    name: str,
+    times: int,
+    number: signal.Signals,
+    raylet: bool = False,
+) -> list[Tally]:
+    """The driver or its raylet dies several times in one sweep."""
+    sweep = Sweep(name.replace(" ", "_"), scratch, reference.trials)
+    injected, codes = _strike(sweep, rng, times, lambda: sweep.kill(number, raylet))
+    tally = _judge(reference, sweep, name, injected, "--resume")
+    if number == signal.SIGTERM and set(codes) != {RESUMABLE}:
+        tally.notes.append(f"exit codes {codes} instead of {RESUMABLE}")
+    return [tally]
+
+
+def damaged(reference: Reference, scratch: Path, rng: random.Random) -> list[Tally]:
+    """The driver dies, and with it the newest checkpoint of every trial that ran."""
+
+    def truncate(path: Path) -> None:
+        os.truncate(path, path.stat().st_size // 3)
+
+    def zero(path: Path) -> None:
+        path.write_bytes(bytes(path.stat().st_size))
+
+    def lose(path: Path) -> None:
+        path.unlink()
+
+    kinds = {"truncated": truncate, "zeroed": zero, "missing": lose}
+    waiting = list(kinds)
+    hit = dict.fromkeys(kinds, 0)
+    sweep = Sweep("damaged_checkpoints", scratch, reference.trials)
+
+    def strike() -> int:
+        code = sweep.kill(signal.SIGKILL)
+        sweep.leftovers()  # else a dying trial may still write a whole one
+        # The kinds in turn; a strike before any checkpoint hits nothing, and its kind has its turn again.
+        name = waiting.pop(0) if waiting else min(hit, key=hit.__getitem__)
+        for trial in sweep.running():
+            found = sorted((sweep.path / "trials" / trial.id / "checkpoints").glob("epoch_*.pt"))
+            if found:
+                kinds[name](found[-1])
+                hit[name] += 1
+        if not hit[name]:
+            waiting.insert(0, name)
+        return code
+
+    _strike(sweep, rng, len(kinds) + 2, strike)
+    return [
+        _judge(reference, sweep, f"driver SIGKILL and newest checkpoint {name}", hit[name], "--resume")
+        for name in kinds
+    ]
+
+
+def full_disk(reference: Reference, scratch: Path, rng: random.Random) -> list[Tally]:
+    """The storage has no byte left (a small tmpfs, filled up) until the driver has ended."""
+    disk = scratch / "disk"
+    disk.mkdir()
+    mount = subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={DISK_MIB}m", "tmpfs", str(disk)])
+    if mount.returncode:
+        return [Tally("full disk", 0, "not run: mounting a tmpfs needs root")]
+    try:
+        sweep = Sweep("full_disk", scratch, reference.trials, storage=disk)
+        ballast = disk / "ballast"
+
+        def strike() -> int:
+            with contextlib.suppress(OSError), ballast.open("wb", buffering=0) as file:
+                while True:  # until it raises: no space left
+                    file.write(bytes(4096))
+            code = sweep.wait()
+            ballast.unlink()
+            return code
+
+        injected, codes = _strike(sweep, rng, 2, strike)
+        tally = _judge(reference, sweep, "full disk", injected, "--resume")
+        if set(codes) != {RESUMABLE}:
+            tally.notes.append(f"exit codes {codes} instead of {RESUMABLE}")
+        return [tally]
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
+
+
+def _strike(sweep: Sweep, rng: random.Random, times: int, strike: Callable[[], int]) -> tuple[int, list[int]]:
+    """Launch, strike once some rows have been written, and again; at last let it end.
+
+    Returns:
+        How often it was struck before it had ended, and the exit codes of the drivers struck.
+    """
+    total = len(sweep.trials) * (EPOCHS + 1)
+    codes: list[int] = []
+    for index in range(times):
+        sweep.launch()
+        # Spread over the sweep, each share of it drawn on; rows not yet checkpointed are written again.
+        share = total * (index + rng.uniform(0.3, 0.9)) / (times + 0.5)
+        if not sweep.wait_for_rows(round(share)):
+            break
+        codes.append(strike())
+        print(f"  {sweep.name}: struck at about {share:.0f} of {total} rows, exit code {codes[-1]}", flush=True)
+    sweep.launch()
+    code = sweep.wait()
+    if code:
+        print(f"  {sweep.name}: the last resume ended with {code}", flush=True)
+    return len(codes), codes
+
+
+def _judge(
+    reference: Reference, sweep: Sweep, fault: str, injected: int, ended_by: str, trials: list[Trial] | None = None
+) -> Tally:
+    rows, lost, notes = reference.compare(sweep.path, trials or sweep.trials)
+    left = sweep.leftovers()
+    if left:
+        notes.append(f"{left} processes of killed drivers were still there 30 s later")
+    return Tally(fault, injected, ended_by, rows, lost, sweep.seconds, notes)
+
+
+CAMPAIGNS: dict[str, Callable[[Reference, Path, random.Random], list[Tally]]] = {
+    "disk": full_disk,
+    "raylet": lambda *a: killed(*a, "raylet SIGKILL", 3, signal.SIGKILL, True),
+    "nan": nan,
+    "workers": inside_workers,
+    "checkpoints": damaged,
+    "sigterm": lambda *a: killed(*a, "driver SIGTERM", 3, signal.SIGTERM),
+    "driver": lambda *a: killed(*a, "driver SIGKILL", 3, signal.SIGKILL),
+}

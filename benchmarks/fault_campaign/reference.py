@@ -1,0 +1,71 @@
+"""What sweeps are compared with: every trial trained alone."""
+
+from pathlib import Path
+from typing import Any
+
+from fault_campaign.space import EPOCHS, TIMING
+from msk_ray.training import Trainer, read_checkpoint
+from msk_ray.tune.outcomes import read_ending
+from msk_ray.tune.records import read_rows
+from msk_ray.tune.trials import Trial
+
+
+class Reference:
+    """Every trial of the space, trained without Ray and without faults."""
+
+    def __init__(self, trials: list[Trial], folder: Path) -> None:
+        import torch
+
+        torch.set_num_threads(1)  # what a trial of one core gets
+        self.trials = trials
+        self._folder = folder
+        for trial in trials:
+            trainer = Trainer(trial.config, folder / trial.id, "cpu")
+            while not trainer.finished:
+                trainer.run_epoch()
+            trainer.close()
+
+    def compare(self, experiment: Path, trials: list[Trial]) -> tuple[int, int, list[str]]:
+        """Rows and trials of an experiment that are missing or differ, and what is wrong with them."""
+        lost_rows = lost_trials = 0
+        notes = []
+        for trial in trials:
+            folder = experiment / "trials" / trial.id
+            expected, found = read_rows(self._folder / trial.id), read_rows(folder)
+            assert len(expected) == EPOCHS + 1
+            by_epoch = {row["epoch"]: _without_timing(row) for row in found}
+            wrong = [row["epoch"] for row in expected if by_epoch.get(row["epoch"]) != _without_timing(row)]
+            wrong += [row["epoch"] for row in found if row["epoch"] > EPOCHS]
+            lost_rows += len(wrong)
+            ending = read_ending(folder)
+            whole = (
+                ending is not None
+                and ending.outcome == "finished"
+                and _same(_last_state(self._folder / trial.id), _last_state(folder))
+            )
+            lost_trials += not whole
+            if wrong or not whole:
+                notes.append(f"{trial.id}: rows {wrong} missing or different, ended {ending}")
+        return lost_rows, lost_trials, notes
+
+
+def _without_timing(row: dict[str, float]) -> dict[str, Any]:
+    return {key: repr(value) for key, value in row.items() if not key.startswith(TIMING)}
+
+
+def _last_state(folder: Path) -> dict[str, Any] | None:
+    path = folder / "checkpoints" / f"epoch_{EPOCHS:06d}.pt"
+    return {k: v for k, v in read_checkpoint(path).items() if k not in TIMING} if path.is_file() else None
+
+
+def _same(a: Any, b: Any) -> bool:
+    """Whether nested containers hold the same structure and bit-equal tensors."""
+    import torch
+
+    if isinstance(a, torch.Tensor):
+        return isinstance(b, torch.Tensor) and torch.equal(a, b)
+    if isinstance(a, dict):
+        return isinstance(b, dict) and a.keys() == b.keys() and all(_same(a[key], b[key]) for key in a)
+    if isinstance(a, (list, tuple)):
+        return isinstance(b, (list, tuple)) and len(a) == len(b) and all(map(_same, a, b))
+    return bool(a == b)

@@ -1,0 +1,21 @@
+"""What is shot at: four small CartPole trials."""
+
+EPOCHS = 40
+SPACE = {
+    "question": "What does a sweep survive?",
+    "base": "configs/cartpole.yaml",
+    "overrides": {
+        "env.nworld": 8,
+        "shac.horizon": 8,
+        "evaluation.nworld": 8,
+        "evaluation.steps": 32,
+        "evaluation.interval": 2,
+        "trial.epochs": EPOCHS,
+        "trial.checkpoint_interval": 2,
+    },
+    "parameters": {"shac.actor_lr": {"grid": [5.0e-3, 1.0e-3]}},
+    "seeds": "0-1",
+    "resources": {"max_failures": 20, "hang_s": 20.0},
+}
+"""Four trials of forty epochs, checkpointed every second one."""
+TIMING = ("seconds", "env_steps_per_s", "time/")

@@ -1,0 +1,65 @@
+"""A trainer whose process can be shot at from the inside, and the driver of a sweep of such trials."""
+
+import functools
+import json
+import math
+import os
+import signal
+import sys
+import time
+
+from msk_ray.training import Trainer
+
+
+class FaultyTrainer(Trainer):
+    """A trainer that does to its own process what it finds in `EXPERIMENT/faults/TRIAL/EPOCH`, once each."""
+
+    def _take(self) -> str | None:
+        path = self.logdir.parent.parent / "faults" / self.logdir.name / str(self.epoch + 1)
+        if not path.is_file():
+            return None
+        kind = path.read_text()
+        path.rename(path.with_suffix(".done"))
+        return kind
+
+    def run_epoch(self) -> dict[str, float]:
+        kind = self._take()
+        match kind:
+            case "kill":
+                _kill_self()
+            case "hang":
+                time.sleep(3600)
+            case "nan":
+                next(self.shac.actor.parameters()).data.fill_(math.nan)
+        row = super().run_epoch()
+        match kind:
+            case "torn_row":
+                with (self.logdir / "metrics.jsonl").open("a") as file:
+                    file.write(json.dumps({"epoch": self.epoch + 1, "env_steps": 1})[:17])
+                _kill_self()
+            case "torn_checkpoint":
+                # What lies there after a death between a checkpoint's two files, on a disk that lost half of it.
+                path = self.save()
+                path.with_suffix(".json").unlink()
+                os.truncate(path, path.stat().st_size // 2)
+                _kill_self()
+        return row
+
+
+def _kill_self() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def drive(arguments: list[str]) -> int:
+    """`python -m msk_ray.tune` with trials that can be shot at, and without the dashboard's share of the cores."""
+    from ray import cloudpickle
+
+    from msk_ray.cli import run
+    from msk_ray.tune import runner
+    from msk_ray.tune.__main__ import main as tune_main
+
+    # Trials' processes need not find this module.
+    cloudpickle.register_pickle_by_value(sys.modules[__name__])
+    runner.Plan = functools.partial(runner.Plan, trainer_class=FaultyTrainer)  # type: ignore[assignment,misc]
+    runner.ray_session = functools.partial(runner.ray_session, dashboard=False)
+    return run(tune_main, arguments)
