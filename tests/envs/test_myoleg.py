@@ -11,7 +11,7 @@ import torch
 
 from msk_ray.config import MyoLegEnvConfig, PhysicsConfig
 from msk_ray.envs import MyoLeg, make_env
-from msk_ray.envs.models.myoleg import Couplings, build_myoleg, find_model
+from msk_ray.envs.models.myoleg import SUBSTEPS, Couplings, build_myoleg, find_model
 from msk_ray.envs.myoleg import world_axes
 from msk_ray.errors import ConfigError
 from msk_ray.gradcheck import check_chain, check_gradients, make_states
@@ -126,8 +126,8 @@ def test_gradients_of_a_step(name: str, substeps: int) -> None:
 
 @needs_myo_sim
 def test_gradients_through_eight_control_steps(legs26: mujoco.MjModel) -> None:
-    points = make_states(legs26, "policy", 3, 0)[1:2]
-    for result in check_chain(legs26, TapePerSubstep(), points, (8,), substeps=2):
+    points = [*make_states(legs26, "standing", 1, 0), *make_states(legs26, "policy", 4, 0)[:1]]
+    for result in check_chain(legs26, TapePerSubstep(), points, (8,), substeps=SUBSTEPS):
         assert result.rel_error <= 1e-3
 
 
