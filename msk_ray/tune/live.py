@@ -15,7 +15,7 @@ from ray.tune import Callback
 from msk_ray.cli import StopRequest
 from msk_ray.errors import StorageFailure, storage_failure
 from msk_ray.progress import format_duration
-from msk_ray.tune.adapters import METRIC, STARTS_ANEW
+from msk_ray.tune.adapters import BEST, METRIC, STARTS_ANEW
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.halved import Halved, read_halved
 from msk_ray.tune.outcomes import Ending, Outcome, read_ending, write_ending
@@ -130,13 +130,13 @@ class Live(Callback):
             run.first_epoch, run.since = run.epoch, time.monotonic()
         elif run.epoch > run.first_epoch:
             self._seconds_per_epoch[mine.id] = (time.monotonic() - run.since) / (run.epoch - run.first_epoch)
-        run.best = max(run.best, run.score)
+        run.best = max(run.best, result[BEST])
         best = self._best
-        if mine.id not in self._bests or run.score > self._bests[mine.id][0]:
-            self._bests[mine.id] = run.score, mine
-        if best is None or run.score > best[0]:
-            half = self._in_brackets(mine)
-            self._say(f"{mine.id} best so far: score {run.score:.5g} at epoch {run.epoch}/{mine.epochs}{half}")
+        if mine.id not in self._bests or run.best > self._bests[mine.id][0]:
+            self._bests[mine.id] = run.best, mine
+        if best is None or run.best > best[0]:
+            when = f" at epoch {run.epoch}/{mine.epochs}" if run.score == run.best else ""
+            self._say(f"{mine.id} best so far: score {run.best:.5g}{when}{self._in_brackets(mine)}")
 
     def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         if self._meet_storage_failure(trial):

@@ -18,7 +18,7 @@ from ray import tune
 
 from msk_ray.config import parse_config
 from msk_ray.errors import storage_failure
-from msk_ray.tune.adapters import METRIC, STARTS_ANEW
+from msk_ray.tune.adapters import BEST, METRIC, STARTS_ANEW
 from msk_ray.tune.devices import wait_for_memory
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.gauges import TrialGauges
@@ -134,7 +134,7 @@ def _reporter(halved: bool) -> Callable[[Evaluation, bool, TrainerLike], None]:
     checkpoint is passed over; Ray would insist on it at every retry."""
 
     def report(evaluation: Evaluation, ended: bool, trainer: TrainerLike) -> None:
-        tune.report(_figures(evaluation, ended, halved))
+        tune.report(_figures(evaluation, ended, trainer.best_score, halved))
 
     return report
 
@@ -145,12 +145,14 @@ def _report_with_checkpoint(evaluation: Evaluation, ended: bool, trainer: Traine
     with tempfile.TemporaryDirectory() as folder:
         for file in (path, path.with_suffix(".json")):
             shutil.copy(file, folder)
-        tune.report(_figures(evaluation, ended, False), checkpoint=tune.Checkpoint.from_directory(folder))
+        figures = _figures(evaluation, ended, trainer.best_score, False)
+        tune.report(figures, checkpoint=tune.Checkpoint.from_directory(folder))
 
 
-def _figures(evaluation: Evaluation, ended: bool, halved: bool) -> dict[str, Any]:
+def _figures(evaluation: Evaluation, ended: bool, best: float, halved: bool) -> dict[str, Any]:
     return {
         METRIC: evaluation.score,
+        BEST: best,
         "epoch": evaluation.epoch,
         "env_steps": evaluation.env_steps,
         "seconds": evaluation.seconds,

@@ -23,6 +23,7 @@ class TrainerLike(Protocol):
     """What a trial needs of `msk_ray.training.Trainer`."""
 
     epoch: int
+    best_score: float
 
     def __init__(self, config: Config, logdir: Path, device: str) -> None: ...
 
