@@ -17,6 +17,8 @@ from msk_ray.report.statistics import Effect, effects, mean_interval
 
 PANELS = 4
 """Parameters whose levels are drawn one by one."""
+LEVELS = 16
+"""Levels of a parameter that are drawn; of more, the best and the worst ones."""
 AXES = 8
 """Parameters of the parallel coordinates."""
 _DECADES = 30.0
@@ -91,10 +93,12 @@ def _draw_ranking(axes: Axes, found: Sequence[Effect], shares: bool) -> None:
 
 def _draw_levels(axes: Axes, effect: Effect) -> None:
     levels = list(effect.levels.items())
-    if len(levels) > 10:
-        # Too many to tell apart: the best and the worst ones.
+    title = _leaf(effect.factor)
+    if len(levels) > LEVELS:
+        # Too many to tell apart.
         ordered = sorted(levels, key=lambda level: -float(np.mean(level[1])))
-        levels = [*ordered[:5], *ordered[-5:]]
+        title += f" (best and worst of {len(levels)})"
+        levels = [*ordered[: LEVELS // 2], *ordered[-LEVELS // 2 :]]
     jitter = np.random.default_rng(0)
     for place, (_, scores) in enumerate(levels):
         spots = place + 0.16 * (jitter.random(len(scores)) - 0.5)
@@ -108,7 +112,7 @@ def _draw_levels(axes: Axes, effect: Effect) -> None:
     turned: dict[str, Any] = {"rotation": 40, "ha": "right", "rotation_mode": "anchor"} if slanted else {}
     axes.set_xticks(range(len(levels)), [shorten(label, 18) for label, _ in levels], fontsize=7, **turned)
     axes.tick_params(axis="y", labelsize=7)
-    axes.set_title(_leaf(effect.factor), fontsize=9)
+    axes.set_title(title, fontsize=9)
     axes.set_ylabel("best score", fontsize=8)
     axes.grid(alpha=0.3, axis="y")
 
