@@ -1,9 +1,10 @@
 """What Ray Tune costs: a sweep of real trials, one after another, against the same trials by `msk_ray.train` in a loop.
 
-The median epoch of every trial under Tune relative to that in the loop, and the time a trial spends between its epochs,
-which neighbours on the machine touch less (what it pays while it trains); the time from the end of a trial to the first
-epoch of the next one (what it pays between trials; kernels are in Warp's cache from the loop, which ran first); and the
-wall time of everything, start-up included.
+The median epoch of every trial under Tune relative to that in the loop, which is run before and after it, so that a
+machine that grows slower or faster cancels out and shows how far it can be trusted. The time a trial spends between its
+epochs, which neighbours on the machine touch less (what it pays while it trains). The time from the end of a trial to
+the first epoch of the next one (what it pays between trials; kernels are in Warp's cache from the loop, which ran
+first). The wall time of everything, start-up included.
 """
 
 import argparse
@@ -126,12 +127,15 @@ def main() -> None:
         }
         (folder / "space.yaml").write_text(dump_yaml(space))
         trials = resolve_trials(load_space(folder / "space.yaml"))
-        by_loop = loop(trials, folder / "loop", args.device)
+        before, after = folder / "before", folder / "after"
+        by_loop = loop(trials, before, args.device)
         command = [sys.executable, __file__, "drive", "--space", str(folder / "space.yaml"), "--name", "tune"]
         command += ["--storage", str(folder), "--max-concurrent", "1", *(["--cpu"] if args.device == "cpu" else [])]
         by_tune = _run(command, folder / "tune.log")
         tuned = [folder / "tune" / "trials" / trial.id for trial in trials]
-        ratios = [epoch_seconds(a) / epoch_seconds(folder / "loop" / t.id) for a, t in zip(tuned, trials, strict=True)]
+        by_loop = (by_loop + loop(trials, after, args.device)) / 2
+        looped = [(epoch_seconds(before / trial.id), epoch_seconds(after / trial.id)) for trial in trials]
+        ratios = [epoch_seconds(a) / statistics.mean(b) for a, b in zip(tuned, looped, strict=True)]
         between = turnarounds(tuned)
         epochs = [epoch_seconds(path) for path in tuned]
         shares = [100 * json.loads((path / TIMES_FILE).read_text())["between_share"] for path in tuned]
@@ -139,6 +143,7 @@ def main() -> None:
     header = ["figure", "median", "least", "most"]
     rows = [
         ["epoch under Tune / in the loop", *_spread(ratios, ".3f")],
+        ["epoch in the loop, afterwards / before", *_spread([b / a for a, b in looped], ".3f")],
         ["epoch under Tune [ms]", *_spread([1e3 * e for e in epochs], ".1f")],
         ["time between epochs, of that in them [%]", *_spread(shares, ".2f")],
         ["end of a trial to first epoch of the next [s]", *_spread(between, ".2f")],
