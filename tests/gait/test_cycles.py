@@ -132,6 +132,14 @@ def test_what_no_episode_showed_is_null() -> None:
     assert found["curves"]["knee_flexion"] == {"r": None, "l": None}
 
 
+@pytest.mark.parametrize(("speed", "step_length"), [(1.54, 0.79), (1.31, 0.66)])
+def test_measured_means_lie_in_the_human_ranges(speed: float, step_length: float) -> None:
+    """Means of men (Murray, Drought & Kory 1964) and women (Murray, Kory & Sepic 1970), both at 117 steps a minute."""
+    assert speed == pytest.approx(step_length * 117.0 / 60.0, rel=0.02), "the three belong together"
+    for name, value in (("speed", speed), ("cadence", 117.0), ("step_length", step_length)):
+        assert MEASURES[name].least < value < MEASURES[name].most
+
+
 def test_every_human_range_has_a_source_and_a_curve() -> None:
     for limits in (*MEASURES.values(), *(landmark.range for landmark in LANDMARKS.values())):
         assert limits.least < limits.most
