@@ -1,8 +1,9 @@
 """How people walk: published ranges of healthy adults at free speed on level ground.
 
-Textbook figures, meant to place a gait at a glance. The printed tables were not at hand when they were entered, so check
-the source before quoting a limit. What they were checked against: the means that Murray, Drought & Kory (1964, men) and
-Murray, Kory & Sepic (1970, women) measured lie inside them (1.54 and 1.31 m/s, 117 steps/min, steps of 0.79 and 0.66 m).
+Textbook figures, meant to place a gait at a glance. The printed tables were not at hand when they were entered, so
+check the source before quoting a limit. What they were checked against: the means that Murray, Drought & Kory (1964,
+men) and Murray, Kory & Sepic (1970, women) measured lie inside them (1.54 and 1.31 m/s, 117 steps a minute, steps of
+0.79 and 0.66 m).
 """
 
 from typing import Final, NamedTuple

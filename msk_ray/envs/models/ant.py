@@ -122,14 +122,14 @@ def build_ant(env: AntEnvConfig, physics: PhysicsConfig) -> mujoco.MjModel:
     )
     material = spec.add_material(name="grid", texrepeat=[1, 1], texuniform=True)
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "grid"
-    world.add_light(pos=[0, 0, 6], dir=[0, 0, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
     ground = {"contype": 0, "conaffinity": 0}
     world.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], material="grid", **ground)
 
     torso = world.add_body(name="torso", pos=[0, 0, STAND_HEIGHT])
-    torso.add_camera(
-        name="track", mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, pos=[0, -4, 1.2], xyaxes=[1, 0, 0, 0, 0.3, 1]
-    )
+    # Camera and light go along: shadows are cast within a few metres of the light's place only.
+    along = mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM
+    torso.add_camera(name="track", mode=along, pos=[0, -4, 1.2], xyaxes=[1, 0, 0, 0, 0.3, 1])
+    torso.add_light(mode=along, pos=[0, 0, 6], dir=[0, 0, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
     torso.add_freejoint(name="root")
     body_look = {"density": p.density, "rgba": [0.8, 0.6, 0.3, 1], **ground}
     limb_look = {"type": mujoco.mjtGeom.mjGEOM_CAPSULE, "size": [0.08, 0, 0], **body_look}

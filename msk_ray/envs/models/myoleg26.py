@@ -177,15 +177,15 @@ def _body_spec(env: MyoLeg26EnvConfig, p: PhysicsConfig) -> mujoco.MjSpec:
     material = spec.add_material(name="grid", texrepeat=[1, 1], texuniform=True)
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "grid"
     world = spec.worldbody
-    world.add_light(pos=[0, 0, 6], dir=[0, 0, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
     ground = Terrain(env.terrain).add_to(spec, "grid")
 
     # x forward, y up, z right in the body; x forward, z up in the world.
     half = float(np.sqrt(0.5))
     pelvis = world.add_body(name="pelvis", quat=[half, half, 0.0, 0.0])
-    pelvis.add_camera(
-        name="track", mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, pos=[0.3, 0.2, 3.2], xyaxes=[1, 0, 0, 0, 1, 0]
-    )
+    # Camera and light go along: shadows are cast within a few metres of the light's place only.
+    along = mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM
+    pelvis.add_camera(name="track", mode=along, pos=[0.3, 0.2, 3.2], xyaxes=[1, 0, 0, 0, 1, 0])
+    pelvis.add_light(mode=along, pos=[0, 6, 0], dir=[0, -1, 0], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
     for name, kind, axis in tables.ROOT:
         joint_type = mujoco.mjtJoint.mjJNT_SLIDE if kind == "slide" else mujoco.mjtJoint.mjJNT_HINGE
         pelvis.add_joint(name=name, type=joint_type, axis=list(axis))
