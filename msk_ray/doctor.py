@@ -18,6 +18,7 @@ from pathlib import Path
 import msk_ray
 from msk_ray.cli import Parser, run
 from msk_ray.errors import MskRayError, StorageError
+from msk_ray.nvidia_smi import ask_driver
 from msk_ray.tune.experiment import check_writable
 
 DESCRIPTION = """\
@@ -295,10 +296,10 @@ def _gpu_facts() -> GpuFacts:
     import msk_ray.physics  # noqa: F401
 
     wp.init()
-    driver, count = _driver()
+    view = ask_driver()
     return GpuFacts(
-        driver,
-        count,
+        view.driver,
+        len(view.gpus),
         wp.get_cuda_driver_version() if wp.is_cuda_available() else None,
         torch.version.cuda,
         torch.cuda.device_count() if torch.cuda.is_available() else 0,
@@ -306,19 +307,6 @@ def _gpu_facts() -> GpuFacts:
         wp.get_cuda_device_count(),
         os.environ.get("CUDA_VISIBLE_DEVICES"),
     )
-
-
-def _driver() -> tuple[str | None, int]:
-    """Driver version and number of GPUs by nvidia-smi; (None, 0) without a driver that works."""
-    if shutil.which("nvidia-smi") is None:
-        return None, 0
-    query = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
-    try:
-        result = subprocess.run(query, capture_output=True, text=True, timeout=30)
-    except subprocess.TimeoutExpired:
-        return "that does not answer", 0
-    versions = result.stdout.split() if result.returncode == 0 else []
-    return (versions[0], len(versions)) if versions else (None, 0)
 
 
 def _no_gpu(who: str, built_for: str, facts: GpuFacts) -> str:

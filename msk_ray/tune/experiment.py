@@ -26,6 +26,7 @@ from typing import Any
 import msk_ray
 from msk_ray.config import dump_yaml, parse_config
 from msk_ray.errors import StorageError
+from msk_ray.nvidia_smi import ask_driver
 from msk_ray.tune.extension import extend_trials
 from msk_ray.tune.outcomes import OUTCOME_FILE, Outcome, read_ending, write_json, write_text
 from msk_ray.tune.space import Space
@@ -248,13 +249,16 @@ def check_name(name: str) -> str:
 
 
 def environment() -> dict[str, Any]:
-    """What the experiment ran with."""
+    """What the experiment ran with: versions, command, and the machine it was started on."""
+    driver = ask_driver()
     return {
         "command": sys.argv,
         "python": platform.python_version(),
         "platform": platform.platform(),
         "host": platform.node(),
         "cpus": os.cpu_count(),
+        "gpus": list(driver.gpus),
+        "driver": driver.driver,
         "packages": {name: version for name in _PACKAGES if (version := _version(name))},
         "commit": _commit(),
     }

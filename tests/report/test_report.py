@@ -120,10 +120,12 @@ def test_the_baseline_can_be_chosen(experiment: experiments.Experiment, capsys: 
 
 def test_command_and_files(experiment: experiments.Experiment) -> None:
     env = {"command": ["/x/y/msk_ray/tune/__main__.py", "--space", "a b"], "commit": "abc+", "packages": {"torch": "1"}}
+    env |= {"gpus": ["A", "B"], "driver": "570"}
     (experiment.path / "env.json").write_text(json.dumps(env))
     page = page_of(experiment)
     assert "git checkout abc\npython -m msk_ray.tune --space &#39;a b&#39;" in page
     assert "changes that were not committed" in page
+    assert "<dt>GPUs there</dt><dd>A, B (driver 570)</dd>" in page
     section = make_section(read_experiment(experiment, 0.0), experiment.path / "report", "", None, None)
     links = [link for trial in section.reading.trials for _, link in section.files(trial)]
     assert len(links) == 7  # six metrics and an output

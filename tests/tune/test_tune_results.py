@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from msk_ray.errors import ConfigError, DeviceError, StorageError
+from msk_ray.nvidia_smi import ask_driver
 from msk_ray.tune import experiment as experiments
 from msk_ray.tune.devices import Placement, choose_placement, wait_for_memory
 from msk_ray.tune.listing import text_table
@@ -103,6 +104,7 @@ def test_space_is_kept_as_written(experiment: experiments.Experiment) -> None:
     assert "actor_lr" in (experiment.path / "space.yaml").read_text()
     environment = json.loads((experiment.path / "env.json").read_text())
     assert environment["packages"]["ray"]
+    assert environment["gpus"] == list(ask_driver().gpus)
 
 
 def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:

@@ -1,0 +1,138 @@
+"""What would early stopping have done? A sweep that ran without it, judged afterwards by a space's rule.
+
+The recorded evaluations are told to the rule in the order in which so many trials at once would have reached them; a
+trial it names ends there, and the next one begins. The table says what that saves, and what it costs: the best score
+kept beside the best of all. A sweep that was itself stopped early cannot be judged: what its trials would have become
+is not known.
+"""
+
+import argparse
+import heapq
+import sys
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from record import RESULTS, markdown_table, publish
+
+from msk_ray.cli import run
+from msk_ray.errors import ConfigError
+from msk_ray.tune.experiment import Experiment
+from msk_ray.tune.outcomes import Outcome
+from msk_ray.tune.pruning import Pruner, make_pruner
+from msk_ray.tune.records import TrialRecord, read_records
+from msk_ray.tune.space import SchedulerSpec
+from msk_ray.tune.standing import Observer
+from msk_ray.tune.stopping import Evaluation
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A trial as early stopping would have left it."""
+
+    record: TrialRecord
+    last: Evaluation
+    """Where it ended."""
+    stopped: bool
+
+    @property
+    def best(self) -> float:
+        """Its best score up to there."""
+        return max(e.score for e in self.record.evaluations if e.epoch <= self.last.epoch)
+
+
+def judge(records: Sequence[TrialRecord], pruner: Pruner, time_attr: str, slots: int) -> list[Judged]:
+    """Tell a rule what trials reported, as if `slots` of them ran at once, each as fast as it did.
+
+    Args:
+        records: finished trials, in the order they begin; the untrained policy's evaluation is not reported.
+        pruner: the rule, knowing nothing yet.
+        time_attr: what it compares trials at.
+        slots: trials at once.
+    """
+    waiting = deque(range(len(records)))
+    reports = [[e for e in record.evaluations if e.epoch > 0] for record in records]
+    judged: dict[int, Judged] = {}
+    # Next report of each running trial: when, which trial, its how manieth, when the trial began.
+    running: list[tuple[float, int, int, float]] = []
+
+    def begin(now: float) -> None:
+        if waiting:
+            trial = waiting.popleft()
+            heapq.heappush(running, (now + reports[trial][0].seconds, trial, 0, now))
+
+    for _ in range(slots):
+        begin(0.0)
+    while running:
+        now, trial, count, began = heapq.heappop(running)
+        report, ended = reports[trial][count], count + 1 == len(reports[trial])
+        stop = pruner.report(records[trial].trial.id, report.time(time_attr), report.score) is not None and not ended
+        if stop or ended:
+            judged[trial] = Judged(records[trial], report, stop)
+            begin(now)
+        else:
+            heapq.heappush(running, (began + reports[trial][count + 1].seconds, trial, count + 1, began))
+    return [judged[trial] for trial in range(len(records))]
+
+
+def table(judged: Sequence[Judged]) -> str:
+    """A row a trial, the best first, and what was saved."""
+    rows = []
+    for one in sorted(judged, key=lambda j: -_whole(j)):
+        trial = one.record.trial
+        end = f"stopped at {one.last.epoch} of {trial.config.trial.epochs}" if one.stopped else "kept"
+        rows.append([trial.variant, str(trial.seed), f"{_whole(one):.5g}", f"{one.best:.5g}", end])
+    used, whole = (sum(f(j) for j in judged) for f in (lambda j: j.last.env_steps, _env_steps))
+    epochs_used = sum(j.last.epoch for j in judged)
+    epochs = sum(j.record.epochs_done for j in judged)
+    best, kept = max(map(_whole, judged)), max(j.best for j in judged)
+    verdict = "kept" if kept == best else f"LOST, {kept:.5g} instead"
+    header = ["trial", "seed", "score without stopping", "score with it", "end"]
+    return (
+        markdown_table(header, rows)
+        + f"\n\nSaved: {1 - used / whole:.0%} of the env steps, {1 - epochs_used / epochs:.0%} of the epochs. "
+        + f"Best of all, {best:.5g}: {verdict}."
+    )
+
+
+def _whole(one: Judged) -> float:
+    return max(e.score for e in one.record.evaluations)
+
+
+def _env_steps(one: Judged) -> int:
+    return one.record.evaluations[-1].env_steps
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the benchmark the command line asks for."""
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("experiment", type=Path, help="folder of a finished sweep without a scheduler")
+    p.add_argument("--kind", choices=("asha", "median"), default="asha")
+    p.add_argument("--grace", type=float, default=0.25, help="share of the budget that no trial is stopped within")
+    p.add_argument("--reduction", type=float, default=3.0, help="asha: one in so many goes on")
+    p.add_argument("--slots", type=int, default=4, help="trials at once")
+    p.add_argument("--results", type=Path, default=RESULTS, help="folder the table is appended in")
+    args = p.parse_args(argv)
+    experiment = Experiment(args.experiment.resolve())
+    records = read_records(experiment)
+    unfinished = [r.trial.id for r in records if r.ending is None or r.ending.outcome is not Outcome.FINISHED]
+    if unfinished or not records:
+        raise ConfigError(
+            f"{args.experiment}: {len(unfinished)} of {len(records)} trials did not run to their end, the first is "
+            f"{unfinished[0] if unfinished else '-'}; judge a finished sweep with scheduler: {{kind: none}}"
+        )
+    spec = SchedulerSpec(kind=args.kind, grace=args.grace, reduction=args.reduction)
+    budget = max(record.evaluations[-1].time(spec.time_attr) for record in records)
+    judged = judge(records, make_pruner(spec, budget), spec.time_attr, args.slots)
+    rule = f"{args.kind}, grace {args.grace:g}" + (f", reduction {args.reduction:g}" if args.kind == "asha" else "")
+    title = f"Early stopping of {args.experiment.name}, {rule}, {args.slots} trials at once"
+    ran_on = sorted({standing.device.name for standing in Observer(experiment).look(time.time())} - {""})
+    text = f"{table(judged)} The sweep ran on: {', '.join(ran_on) or 'CPU'}; it is judged on the machine above."
+    publish("early_stopping", title, "cpu", text, args.results)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(run(main, sys.argv[1:]))

@@ -1,0 +1,72 @@
+"""A sweep without early stopping, judged afterwards: three trials small enough to follow by hand."""
+
+import runpy
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from msk_ray.tune.pruning import SuccessiveHalving
+from msk_ray.tune.records import TrialRecord
+from msk_ray.tune.stopping import Evaluation
+
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+
+
+@pytest.fixture
+def benchmark(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    return runpy.run_path(str(BENCHMARKS / "early_stopping.py"))
+
+
+def record(name: str, *scores: float) -> TrialRecord:
+    """Evaluated untrained, and after 100, 120 and 200 env steps, which take as many seconds."""
+    times = (0, 100, 120, 200)
+    seen = tuple(Evaluation(t // 10, t, float(t), s) for t, s in zip(times, (0.0, *scores), strict=True))
+    settings = SimpleNamespace(trial=SimpleNamespace(epochs=20))
+    trial: Any = SimpleNamespace(id=name, variant=name, seed=0, config=settings)
+    return TrialRecord(trial, Path(name), 20, 200.0, seen, None)
+
+
+RECORDS = [record("late", 1.0, 1.0, 9.0), record("middle", 2.0, 2.0, 3.0), record("early", 3.0, 3.0, 4.0)]
+
+
+def test_side_by_side_the_late_one_is_stopped(benchmark: dict[str, Any]) -> None:
+    """At 100 it is first and alone; at 120 it is third of three, of which two go on."""
+    judged = benchmark["judge"](RECORDS, SuccessiveHalving([100.0], 2.0), "env_steps", 3)
+    assert [(j.record.trial.id, j.last.env_steps, j.stopped, j.best) for j in judged] == [
+        ("late", 120, True, 1.0),
+        ("middle", 200, False, 3.0),
+        ("early", 200, False, 4.0),
+    ]
+    text = benchmark["table"](judged)
+    assert "| late | 0 | 9 | 1 | stopped at 12 of 20 |" in text
+    # 80 of 600 env steps, 8 of 60 epochs.
+    assert "Saved: 13% of the env steps, 13% of the epochs. Best of all, 9: LOST, 4 instead." in text
+
+
+def test_one_after_another_it_meets_nobody_at_the_rung(benchmark: dict[str, Any]) -> None:
+    judged = benchmark["judge"](RECORDS, SuccessiveHalving([100.0], 2.0), "env_steps", 1)
+    assert not any(j.stopped for j in judged)
+    assert "Saved: 0% of the env steps, 0% of the epochs. Best of all, 9: kept." in benchmark["table"](judged)
+
+
+def test_a_freed_slot_is_taken_at_once(benchmark: dict[str, Any]) -> None:
+    """Two at once: `late` is stopped at 120 s only if `early` and `middle` have been at the rung by then."""
+    order = [RECORDS[2], RECORDS[1], RECORDS[0]]
+    judged = benchmark["judge"](order, SuccessiveHalving([100.0], 2.0), "env_steps", 2)
+    # `early` and `middle` are at the rung at 100 s: one of two goes on, so `middle` stops and `late` takes its place.
+    assert [(j.record.trial.id, j.stopped, j.last.env_steps) for j in judged] == [
+        ("early", False, 200),
+        ("middle", True, 100),
+        ("late", True, 100),
+    ]
+
+
+def test_a_sweep_that_was_stopped_early_is_refused(
+    benchmark: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "manifest.json").write_text('{"format": 1, "name": "x", "question": "", "trials": []}')
+    assert benchmark["run"](benchmark["main"], [str(tmp_path)]) != 0
+    assert "judge a finished sweep with scheduler: {kind: none}" in capsys.readouterr().err
