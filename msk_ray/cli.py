@@ -5,6 +5,7 @@ import contextlib
 import errno
 import io
 import os
+import shlex
 import signal
 import sys
 import time
@@ -33,6 +34,21 @@ class Parser(argparse.ArgumentParser):
             epilog=f"examples:\n{examples}",
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
+
+
+def typed_command(argv: Sequence[str], *more: str) -> str:
+    """A process's arguments as one would type them, and `more` options that are not among them yet."""
+    program = Path(argv[0])
+    if program.name == "__main__.py":
+        # `python -m msk_ray.tune` shows up as the path of the file it runs.
+        parts = program.parent.parts
+        start = parts.index("msk_ray") if "msk_ray" in parts else len(parts) - 1
+        words = ["python", "-m", ".".join(parts[start:])]
+    elif program.parent.name == "msk_ray" and program.suffix == ".py":
+        words = ["python", "-m", f"msk_ray.{program.stem}"]
+    else:
+        words = ["python", program.name] if program.suffix == ".py" else [program.name]
+    return shlex.join([*words, *argv[1:], *(option for option in more if option not in argv)])
 
 
 def run(main: Callable[[Sequence[str] | None], int], argv: Sequence[str] | None = None) -> int:

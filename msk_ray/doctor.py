@@ -1,5 +1,6 @@
 """`python -m msk_ray.doctor`: can this machine run trials? If not, what is to be mended?"""
 
+import importlib.util
 import json
 import os
 import platform
@@ -69,6 +70,10 @@ class GpuFacts:
     """CUDA_VISIBLE_DEVICES."""
 
 
+_NEEDED = ("torch", "warp", "mujoco", "mujoco_warp", "ray")
+"""Modules without which nothing more can be checked."""
+
+
 def parser() -> Parser:
     """The command line."""
     p = Parser("python -m msk_ray.doctor", DESCRIPTION, EXAMPLES)
@@ -90,6 +95,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     ]
     broken = 0
     for check in checks:
+        missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
+        if missing and check is not check_python and check is not check_packages:
+            print(f"{'MEND':5} {'packages':9} {', '.join(missing)} cannot be imported: the rest was not checked")
+            broken += 1
+            break
         # Each line as soon as it is known: kernels may take a minute to compile.
         for finding in check():
             print(f"{'MEND' if finding.broken else 'ok':5} {finding.subject:9} {finding.text}", flush=True)

@@ -107,7 +107,7 @@ def view(observer: Observer, width: int, rows: int | None = None) -> "Renderable
         told = [s for s in shown if s.state is State.UNREADABLE or s.outcome in (Outcome.ERROR, Outcome.OUT_OF_MEMORY)]
         lines += [Text(f"{s.id}: {s.note}", style="red") for s in told]
     if observer.experiment.stop_file.exists() and any(s.state is not State.ENDED for s in standings):
-        lines.append(Text("stopped on request: python -m msk_ray.tune --resume goes on"))
+        lines.append(Text(f"stopped on request; go on with: {observer.experiment.resume_command()}"))
     return Group(*lines)
 
 

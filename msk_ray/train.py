@@ -4,9 +4,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from msk_ray.cli import RESUMABLE, TERMINAL_LOG, Parser, StopRequest, outliving, run
+from msk_ray.cli import RESUMABLE, TERMINAL_LOG, Parser, StopRequest, outliving, run, typed_command
 from msk_ray.config import Config, load_config
-from msk_ray.errors import StorageError
+from msk_ray.errors import CheckpointError, StorageError
+from msk_ray.tune.experiment import check_writable
 
 DESCRIPTION = """\
 Train one policy with SHAC: one trial, in this process, without Ray.
@@ -45,7 +46,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     _check_logdir(logdir, args.resume)
     logdir = logdir.resolve()
     with outliving(logdir / TERMINAL_LOG):
-        return _train(config, logdir, args.device, args.resume)
+        command = typed_command(sys.argv if argv is None else [__file__, *argv], "--resume")
+        return _train(config, logdir, args.device, args.resume, command)
 
 
 def _check_logdir(logdir: Path, resume: bool) -> None:
@@ -54,15 +56,23 @@ def _check_logdir(logdir: Path, resume: bool) -> None:
         raise StorageError(f"{logdir} holds a trial already: add --resume to go on with it, or name another --logdir")
     if resume and not (logdir / "checkpoints").is_dir():
         raise StorageError(f"--resume: no trial in {logdir}; leave --resume out to start one")
+    check_writable(logdir)
 
 
-def _train(config: Config, logdir: Path, device: str | None, resume: bool) -> int:
+def _train(config: Config, logdir: Path, device: str | None, resume: bool, resume_command: str) -> int:
     # torch and Warp take seconds to load; a wrong command line should not wait for them.
     import torch
 
     from msk_ray.progress import Progress
     from msk_ray.training import Trainer
+    from msk_ray.training.checkpoint import newest_valid_checkpoint
 
+    if resume:
+        newest, faults = newest_valid_checkpoint(logdir / "checkpoints")
+        if newest is None and faults:
+            raise CheckpointError(
+                f"--resume: no checkpoint in {logdir} is whole ({faults[0]}); name another --logdir to start anew"
+            )
     stop = StopRequest()
     device = device or ("cuda:0" if torch.cuda.is_available() else "cpu")
     print(f"{config.env.name}: {config.trial.epochs} epochs, {config.env.nworld} worlds, on {device}; into {logdir}")
@@ -81,7 +91,7 @@ def _train(config: Config, logdir: Path, device: str | None, resume: bool) -> in
         trainer.save()
         trainer.close()
         assert stop.signal is not None
-        print(f"stopped by {stop.signal.name} after epoch {trainer.epoch}; go on with --resume --logdir {logdir}")
+        print(f"stopped by {stop.signal.name} after epoch {trainer.epoch}; go on with: {resume_command}")
         return RESUMABLE
     trainer.close()
     print(f"best evaluation score {trainer.best_score:.1f}: {trainer.best_checkpoint}")

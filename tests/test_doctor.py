@@ -65,7 +65,7 @@ def test_storage_is_left_as_it_was(tmp_path: Path) -> None:
     assert not finding.broken, finding
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "file").touch()
-    assert "choose another --storage" in check_storage(tmp_path / "file" / "runs").text
+    assert "choose another folder" in check_storage(tmp_path / "file" / "runs").text
 
 
 def test_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -102,6 +102,18 @@ def test_stale_after_a_minute_at_four_seconds_an_epoch(
     assert next(s for s in Observer(experiment).look(NOW) if s.id == folder.name).state is state
 
 
+@pytest.mark.parametrize(("age", "state"), [(4.0, State.STALE), (6.0, State.RUNNING)])
+def test_a_trial_whose_driver_has_left_is_not_running(
+    experiment: experiments.Experiment, age: float, state: State
+) -> None:
+    """The running one was heard of 5 s ago: before the driver wrote its summary, or, resumed since, after."""
+    summary = experiment.path / "summary.json"
+    summary.write_text("{}")
+    os.utime(summary, (NOW - age, NOW - age))
+    trial = experiment.trials()[0].id
+    assert next(s for s in Observer(experiment).look(NOW) if s.id == trial).state is state
+
+
 def test_a_process_that_has_just_started_may_take_minutes_to_compile(experiment: experiments.Experiment) -> None:
     folder = experiment.trial_folder(experiment.trials()[1].id)
     for age, state in ((500.0, State.RUNNING), (700.0, State.STALE)):
@@ -201,7 +213,10 @@ def test_an_experiment_by_path_with_a_request_to_stop(
 ) -> None:
     experiment.stop_file.touch()
     assert run(main, [str(experiment.path)]) == 0
-    assert "stopped on request" in capsys.readouterr().out
+    command = experiment.resume_command()
+    assert command.endswith(" --resume")
+    said = "".join(capsys.readouterr().out.split())
+    assert "stoppedonrequest;goonwith:" + "".join(command.split()) in said
 
 
 def test_list_of_experiments(experiment: experiments.Experiment, capsys: pytest.CaptureFixture[str]) -> None:

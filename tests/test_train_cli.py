@@ -26,7 +26,7 @@ def train(root: Path, cwd: Path, *arguments: str) -> subprocess.CompletedProcess
         (["--device", "cuda:7"], "cuda:7"),
         (["--device", "tpu"], "write cpu, cuda or cuda:0"),
         (["--resume", "--logdir", "nowhere"], "no trial in nowhere"),
-        (["--logdir", "/proc/nowhere"], "cannot create"),
+        (["--logdir", "/proc/nowhere"], "cannot write to /proc/nowhere"),
     ],
 )
 def test_bad_input_is_one_line(root: Path, tmp_path: Path, arguments: list[str], message: str) -> None:
@@ -47,6 +47,19 @@ def test_a_folder_that_holds_a_trial_is_left_alone(root: Path, tmp_path: Path) -
     assert result.returncode == 2
     assert "add --resume" in result.stderr
     assert (tmp_path / "metrics.jsonl").read_text() == '{"epoch": 0}\n'
+
+
+def test_a_trial_without_a_whole_checkpoint_is_not_begun_anew(root: Path, tmp_path: Path) -> None:
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / "epoch_000004.pt").write_bytes(b"torn")
+    (tmp_path / "metrics.jsonl").write_text('{"epoch": 0}\n{"epoch": 1}\n')
+    config = str(root / "configs" / "cartpole.yaml")
+    result = train(root, tmp_path, "--config", config, "--logdir", str(tmp_path), "--resume")
+    assert result.returncode == 2
+    assert "is whole" in result.stderr
+    assert "name another --logdir to start anew" in result.stderr
+    assert (tmp_path / "metrics.jsonl").read_text() == '{"epoch": 0}\n{"epoch": 1}\n'
+    assert not (tmp_path / "config.yaml").exists()
 
 
 def test_help_teaches_by_example(root: Path, tmp_path: Path) -> None:

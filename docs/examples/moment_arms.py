@@ -66,4 +66,6 @@ def main(path: Path) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit("python docs/examples/moment_arms.py FILE.png")
     main(Path(sys.argv[1]))

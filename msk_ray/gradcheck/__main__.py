@@ -71,8 +71,8 @@ def parser() -> Parser:
         "--states",
         default="standing,random",
         metavar="KINDS",
-        help="comma-separated: standing, random, contact (in touch, under random controls), policy (along a smooth "
-        "rollout); default %(default)s",
+        help="comma-separated: standing, random, contact (in touch, under random controls; anywhere along them if "
+        "nothing ever touches), policy (along a smooth rollout); default %(default)s",
     )
     p.add_argument("--worlds", type=_positive(int), default=8, metavar="W", help="states of each kind (default 8)")
     p.add_argument(

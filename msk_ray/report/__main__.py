@@ -12,6 +12,7 @@ from msk_ray.evaluate.targets import find_experiment
 from msk_ray.report.best import Best, look_at_best
 from msk_ray.report.page import compare, make_section, write_page
 from msk_ray.report.reading import Condition, Reading, check_folder, read_experiment
+from msk_ray.tune.experiment import check_writable
 
 DESCRIPTION = """\
 Write one self-contained page about an experiment, or several side by side: learning curves, the ablation table with
@@ -60,6 +61,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     folder = (args.out or experiments[0].path / "report").resolve()
     now = time.time()
     readings = [read_experiment(experiment, now) for experiment in experiments]
+    check_writable(folder)
     sections = []
     for number, reading in enumerate(readings):
         prefix = f"{number + 1}_" if len(readings) > 1 else ""

@@ -2,7 +2,6 @@
 
 import base64
 import os
-import shlex
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from msk_ray import __version__
+from msk_ray.cli import typed_command
 from msk_ray.errors import StorageFailure
 from msk_ray.progress import format_duration
 from msk_ray.report.best import Best
@@ -27,7 +27,7 @@ _FILES = ("config.yaml", "metrics.jsonl", "output.log", "error.txt", "eval.json"
 _WORDS = {
     Condition.RUNNING: "Trials are still running: this is the state at the time above.",
     Condition.INTERRUPTED: "It is not at its end, and no trial shows a sign of life: it was stopped or has crashed. "
-    "python -m msk_ray.tune --resume goes on.",
+    "The command under Repeat it, with --resume, goes on.",
     Condition.WAITING: "No trial has begun yet.",
     Condition.EMPTY: "It has no trials: it was interrupted before its first file was whole, or has not begun.",
     Condition.FINISHED: "",
@@ -86,15 +86,7 @@ class Section:
         argv = self.reading.environment.get("command")
         if not isinstance(argv, list) or not argv:
             return ""
-        program = Path(str(argv[0]))
-        if program.name == "__main__.py":
-            # `python -m msk_ray.tune` shows up as the path of the file it runs.
-            parts = program.parent.parts
-            start = parts.index("msk_ray") if "msk_ray" in parts else len(parts) - 1
-            words = ["python", "-m", ".".join(parts[start:])]
-        else:
-            words = ["python", program.name] if program.suffix == ".py" else [program.name]
-        return shlex.join([*words, *map(str, argv[1:])])
+        return typed_command([str(word) for word in argv])
 
 
 def make_section(reading: Reading, folder: Path, prefix: str, baseline: str | None, best: Best | None) -> Section:

@@ -23,7 +23,7 @@ from msk_ray.tune.halved import Halved, read_halved
 from msk_ray.tune.operators import describe
 from msk_ray.tune.outcomes import Ending, Outcome, read_ending
 from msk_ray.tune.space import SpaceFile
-from msk_ray.tune.standing import DEVICE_FILE, OUTPUT_FILE, State, heartbeat_age, patience, progress_of
+from msk_ray.tune.standing import DEVICE_FILE, OUTPUT_FILE, State, heartbeat_age, is_silent, progress_of
 from msk_ray.tune.stopping import SCORE
 from msk_ray.tune.trials import Trial
 
@@ -229,7 +229,7 @@ def _read_trial(trial: Trial, folder: Path, now: float) -> TrialReading:
     elif age is None:
         state = State.WAITING
     else:
-        state = State.STALE if age > patience(folder, progress) else State.RUNNING
+        state = State.STALE if is_silent(folder, progress, age) else State.RUNNING
     return TrialReading(trial, folder, columns, state, ending, device=device, halved=halved)
 
 

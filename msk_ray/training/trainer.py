@@ -11,6 +11,7 @@ from msk_ray.envs import make_env
 from msk_ray.errors import CheckpointError, StorageError
 from msk_ray.shac import Shac
 from msk_ray.training.checkpoint import (
+    epoch_checkpoints,
     milestone_path,
     newest_valid_checkpoint,
     prune_checkpoints,
@@ -55,7 +56,9 @@ class Trainer:
             self.checkpoints.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise StorageError(f"cannot create {self.checkpoints}: {error.strerror or error}") from error
-        write_atomically(logdir / "config.yaml", dump_yaml(config.as_dict()).encode())
+        if not epoch_checkpoints(self.checkpoints):
+            # Else the file says what those were trained under, until one of them is gone on from.
+            self._write_config()
         self._device = device
         with named_out_of_memory(device, config.env.nworld):
             self.env = make_env(config.env, config.physics, config.env.nworld, device, config.trial.seed)
@@ -132,7 +135,15 @@ class Trainer:
         state = read_checkpoint(path)
         difference = _first_difference(state["config"], self.config.as_dict(), changed)
         if difference:
-            raise CheckpointError(f"{path} was written under other settings: {difference}")
+            raise CheckpointError(
+                f"{path} was written under other settings: {difference}; say what was said then, or start another trial"
+            )
+        if state["epoch"] > self.config.trial.epochs:
+            raise CheckpointError(
+                f"{path} has {state['epoch']} epochs already: set trial.epochs to the new total, not "
+                f"{self.config.trial.epochs}"
+            )
+        self._write_config()
         self.shac.load_state_dict(_to_device(state["shac"], self.env.device))
         self.epoch, self.env_steps = state["epoch"], state["env_steps"]
         self.best_score, self._seconds = state["best_score"], state["seconds"]
@@ -148,9 +159,13 @@ class Trainer:
         if path is not None:
             self.restore(path)
         else:
+            self._write_config()
             # An attempt that died before its first checkpoint may have left rows, the last of them torn.
             self._log.rewind(-1)
         return path, faults
+
+    def _write_config(self) -> None:
+        write_atomically(self.logdir / "config.yaml", dump_yaml(self.config.as_dict()).encode())
 
     def close(self) -> None:
         """Flush the logs."""

@@ -238,7 +238,7 @@ def _run(args: argparse.Namespace, space: Space, trials: list[Trial], extension:
             completed = runner.run_trials(runner.Plan(experiment, space, trials, placement, limit))
         errors = finish(experiment)
         if not completed:
-            print(f"stopped on request; go on with --resume --space {args.space} --name {path.name}")
+            print(f"stopped on request; go on with: {experiment.resume_command()}")
             return RESUMABLE
         write_report(experiment)
     return 1 if errors else 0

@@ -130,7 +130,7 @@ def optuna_search(
     try:
         import optuna
     except ImportError:
-        raise ConfigError("search: optuna needs the optuna package: pip install 'msk-ray[optuna]'") from None
+        raise ConfigError("search: optuna needs the optuna package: pip install optuna") from None
     from ray.tune.search.optuna import OptunaSearch
 
     class Informed(OptunaSearch):

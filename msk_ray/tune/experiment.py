@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import msk_ray
+from msk_ray.cli import typed_command
 from msk_ray.config import dump_yaml, parse_config
 from msk_ray.errors import StorageError
 from msk_ray.nvidia_smi import ask_driver
@@ -48,6 +49,15 @@ class Experiment:
     @property
     def name(self) -> str:
         return self.path.name
+
+    def resume_command(self) -> str:
+        """The command that goes on with it: the one it was begun with, and --resume."""
+        try:
+            argv = json.loads((self.path / "env.json").read_text(encoding="utf-8"))["command"]
+            return typed_command([str(word) for word in argv], "--resume")
+        except (OSError, ValueError, KeyError, TypeError, IndexError):
+            # What was typed is lost, or was never whole; its options are in nobody else's hands.
+            return "python -m msk_ray.tune --resume, with the options it was begun with,"
 
     @property
     def tune(self) -> Path:
@@ -187,7 +197,7 @@ def reopen(path: Path, trials: list[Trial] | None, extension: Mapping[str, Any] 
     """
     experiment = Experiment(path)
     if not path.is_dir():
-        raise StorageError(f"--resume: no experiment at {path}; leave --resume out to start one")
+        raise StorageError(f"no experiment at {path} to go on with; leave --resume and --extend out to start one")
     recorded = experiment.trials()
     check_writable(path)
     if extension:
@@ -198,7 +208,8 @@ def reopen(path: Path, trials: list[Trial] | None, extension: Mapping[str, Any] 
     if difference:
         raise StorageError(
             f"--resume: the space no longer gives the trials of {path}: {difference}; undo that, or pass another "
-            "--name (--extend adds samples, seeds or epochs)"
+            f"--name (--extend adds samples, seeds or epochs). It was begun so that this goes on: "
+            f"{experiment.resume_command()}"
         )
     # Also without a new extension: an earlier one may have been interrupted right after its manifest.
     experiment.clear_outgrown()
@@ -234,7 +245,7 @@ def check_writable(path: Path) -> None:
         probe.write_bytes(b"0" * 4096)
         probe.unlink()
     except OSError as error:
-        raise StorageError(f"cannot write to {path}: {error.strerror or error}; choose another --storage") from error
+        raise StorageError(f"cannot write to {path}: {error.strerror or error}; choose another folder") from error
 
 
 def check_name(name: str) -> str:

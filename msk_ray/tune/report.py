@@ -8,6 +8,7 @@ from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.listing import text_table
 from msk_ray.tune.outcomes import write_json, write_text
 from msk_ray.tune.records import best_record, read_records
+from msk_ray.tune.standing import SUMMARY_FILE
 from msk_ray.tune.table import HEADER, halved_note, result_rows, summary, table_document, variant_rows
 
 
@@ -20,7 +21,7 @@ def finish(experiment: Experiment) -> int:
     manifest = experiment.manifest()
     records = read_records(experiment)
     width = max(100, shutil.get_terminal_size((160, 24)).columns)
-    write_json(experiment.path / "summary.json", summary(experiment.name, manifest["question"], records))
+    write_json(experiment.path / SUMMARY_FILE, summary(experiment.name, manifest["question"], records))
     write_text(experiment.path / "table.md", table_document(experiment.name, manifest["question"], records))
     print("\n" + text_table(HEADER, result_rows(records), width))
     if len({record.trial.seed for record in records}) > 1:

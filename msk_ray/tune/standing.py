@@ -22,6 +22,10 @@ from msk_ray.tune.trials import Trial
 
 DEVICE_FILE = "device.json"
 OUTPUT_FILE = "output.log"
+SUMMARY_FILE = "summary.json"
+"""What a driver writes, with the table, when it ends by itself."""
+_BEATS = (METRICS_FILE, DEVICE_FILE, OUTPUT_FILE)
+"""Files that a trial's process writes to as long as it lives."""
 RECENT = 10
 """Newest rows that speed is taken from."""
 STALE_EPOCHS = 10
@@ -155,7 +159,7 @@ class Observer:
         elif age is None:
             state = State.WAITING
         else:
-            state = State.STALE if age > patience(folder, progress) else State.RUNNING
+            state = State.STALE if is_silent(folder, progress, age) else State.RUNNING
         return Standing(
             trial.id,
             trial.variant,
@@ -203,10 +207,17 @@ def heartbeat_age(folder: Path, now: float) -> float | None:
 
     Clocks of machines that share a storage differ: a heartbeat from the future is a fresh one.
     """
-    beats = [
-        beat for name in (METRICS_FILE, DEVICE_FILE, OUTPUT_FILE) if (beat := _modified(folder / name)) is not None
-    ]
+    beats = [beat for name in _BEATS if (beat := _modified(folder / name)) is not None]
     return max(0.0, now - max(beats)) if beats else None
+
+
+def is_silent(folder: Path, progress: Progress, age: float) -> bool:
+    """Whether a trial that has not ended shows no sign of life: it was silent for too long, or its driver, which writes
+    the summary last of all, has left since."""
+    summary = _modified(folder.parent.parent / SUMMARY_FILE)
+    beats = [_modified(folder / name) for name in _BEATS]
+    left = summary is not None and all(beat is None or beat < summary for beat in beats)
+    return left or age > patience(folder, progress)
 
 
 def patience(folder: Path, progress: Progress) -> float:

@@ -18,7 +18,7 @@ from msk_ray.gradcheck import check_chain, check_gradients, make_states
 from msk_ray.simulation import Simulation, TapePerSubstep
 
 needs_myo_sim = pytest.mark.skipif(
-    importlib.util.find_spec("myo_sim") is None, reason="myo_sim is not installed: pip install msk_ray[myo]"
+    importlib.util.find_spec("myo_sim") is None, reason="myo_sim is not installed: pip install myo-sim"
 )
 
 TOY = """<mujoco><worldbody><geom type="plane" size="1 1 1"/><body name="root" pos="0 0 .8">{root}
@@ -53,9 +53,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 
 def test_without_any_package_the_line_says_what_to_install(install) -> None:
-    with pytest.raises(
-        ConfigError, match=r"none of myosuite 2, myosuite 3 and myo_sim has.*pip install msk_ray\[myo\]"
-    ):
+    with pytest.raises(ConfigError, match=r"none of myosuite 2, myosuite 3 and myo_sim has.*pip install myo-sim"):
         find_model(None)
     with pytest.raises(ConfigError, match="myosuite3 is missing or lacks a model myolegs; install"):
         find_model("myolegs", "myosuite3")

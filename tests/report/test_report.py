@@ -213,7 +213,7 @@ def _best_without_policy(e: experiments.Experiment) -> None:
             _broken_trials,
             ["3 unreadable", "is not JSON", "JSONDecodeError", "unheard_of", "the trial&#39;s files make no sense"],
         ),
-        (_crashed, ["interrupted", "--resume goes on", "3 interrupted"]),
+        (_crashed, ["interrupted", "with --resume, goes on", "3 interrupted"]),
         (_running, ["Trials are still running", "1 running"]),
         (_never_evaluated, ["No trial was evaluated yet", "Too few evaluated trials"]),
         (_nothing_finite, ["No trial was evaluated yet", "No trial has recorded a gradient yet"]),

@@ -153,6 +153,8 @@ def test_a_signal_saves_and_says_resumable(
         output, _ = process.communicate(timeout=60)
         assert process.returncode == 75
     assert f"stopped by {number.name}" in output
+    assert f"go on with: python -m msk_ray.train --config {tmp_path / 'config.yaml'}" in output
+    assert output.rstrip().endswith("--resume")
     assert len(epoch_checkpoints(tmp_path / "run" / "checkpoints")) == 1
     rows = [json.loads(line) for line in metrics.read_text().splitlines()]
     assert f"epoch_{rows[-1]['epoch']:06d}.pt" == epoch_checkpoints(tmp_path / "run" / "checkpoints")[0].name
@@ -165,6 +167,36 @@ def test_a_checkpoint_of_other_settings_is_refused(tiny_cartpole: Config, tmp_pa
     trainer = Trainer(Config.model_validate(other), tmp_path / "b", "cpu")
     with pytest.raises(CheckpointError, match=r"shac\.gamma was 0\.99, now 0\.9"):
         trainer.restore(tmp_path / "a" / "checkpoints" / "best.pt")
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "value", "message"),
+    [("trial", "epochs", 3, "has 6 epochs already: set trial.epochs to the new total, not 3"),
+     ("env", "nworld", 16, r"env\.nworld was \d+, now 16")],
+)  # fmt: skip
+def test_a_refused_resume_leaves_the_record_as_it_was(
+    section: str, key: str, value: int, message: str, tiny_cartpole: Config, tmp_path: Path
+) -> None:
+    train(tiny_cartpole, tmp_path)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    other = tiny_cartpole.as_dict()
+    other[section][key] = value
+    trainer = Trainer(Config.model_validate(other), tmp_path, "cpu")
+    with pytest.raises(CheckpointError, match=message):
+        trainer.restore_latest()
+    assert {path: path.read_bytes() for path in before if "tfevents" not in path.name} == {
+        path: data for path, data in before.items() if "tfevents" not in path.name
+    }
+
+
+def test_a_resume_with_more_epochs_is_recorded(tiny_cartpole: Config, tmp_path: Path) -> None:
+    train(tiny_cartpole, tmp_path)
+    more = tiny_cartpole.as_dict()
+    more["trial"]["epochs"] = 8
+    trainer = Trainer(Config.model_validate(more), tmp_path, "cpu")
+    trainer.restore_latest()
+    trainer.close()
+    assert yaml.safe_load((tmp_path / "config.yaml").read_text())["trial"]["epochs"] == 8
 
 
 def test_a_torn_checkpoint_falls_back_to_the_one_before(tiny_cartpole: Config, tmp_path: Path) -> None:

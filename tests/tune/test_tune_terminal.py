@@ -4,6 +4,7 @@ import json
 import os
 import pty
 import select
+import shlex
 import signal
 import subprocess
 import sys
@@ -80,7 +81,7 @@ def test_a_terminal_that_closes_lets_trials_save_themselves(command: list[str], 
     log = (experiment.path / "terminal.log").read_text()
     assert "nobody reads the output any more (Input/output error); it goes on here" in log
     assert "SIGHUP: 2 trials save themselves" in log or "SIGHUP: 1 trials save themselves" in log
-    assert log.rstrip().endswith(f"go on with --resume --space {command[3]} --name small")
+    assert log.rstrip().endswith(f"go on with: python stub_driver.py {shlex.join(command[2:])} --resume")
     for record in read_records(experiment):
         if record.epochs_done and record.ending is None:
             # They saved themselves: the newest checkpoint is of the last epoch done, due or not.

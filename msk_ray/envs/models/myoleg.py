@@ -19,7 +19,7 @@ from msk_ray.envs.models.options import apply_options
 from msk_ray.errors import ConfigError
 
 NAMES: Final = ("myolegs", "myolegs26")
-INSTALL: Final = "install one with `pip install msk_ray[myo]` (myo_sim), or set env.model to the path of an MJCF file"
+INSTALL: Final = "install one with `pip install myo-sim`, or set env.model to the path of an MJCF file"
 SUBSTEPS: Final = 10
 """Physics steps of a control step of 20 ms: 2 ms each, as the models' own."""
 SMOOTHING: Final = 0.2

@@ -395,7 +395,8 @@ def check_supported(model: mujoco.MjModel, mode: str) -> None:
     if found:
         lines = [f"{name} ({', '.join(e[:5])}{' …' if len(e) > 5 else ''})" for name, e in found.items()]
         raise UnsupportedModelError(
-            f"{mode} does not differentiate {'; '.join(lines)}. The mode fd_jacobian does: physics.backward=fd_jacobian"
+            f"{mode} does not differentiate {'; '.join(lines)}. Finite differences do: physics.backward=fd_jacobian in "
+            "a config, --mode fd_jacobian of gradcheck, backward=FdJacobian() in Python"
         )
 
 
