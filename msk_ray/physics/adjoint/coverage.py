@@ -1,5 +1,6 @@
 """Which model features the adjoint differentiates: one table for the check before the first step and for the docs."""
 
+import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
@@ -390,14 +391,25 @@ def unsupported(model: mujoco.MjModel) -> dict[str, list[str]]:
 
 
 def check_supported(model: mujoco.MjModel, mode: str) -> None:
-    """Raise UnsupportedModelError naming every element that `mode` cannot differentiate."""
+    """Raise UnsupportedModelError naming every element that `mode` cannot differentiate, and warn of each one whose
+    gradient it only approximates.
+    """
     found = unsupported(model)
     if found:
-        lines = [f"{name} ({', '.join(e[:5])}{' …' if len(e) > 5 else ''})" for name, e in found.items()]
+        lines = [f"{name} ({_few(elements)})" for name, elements in found.items()]
         raise UnsupportedModelError(
             f"{mode} does not differentiate {'; '.join(lines)}. Finite differences do: physics.backward=fd_jacobian in "
             "a config, --mode fd_jacobian of gradcheck, backward=FdJacobian() in Python"
         )
+    for feature in FEATURES:
+        if feature.partly and (elements := feature.find(model)):
+            warnings.warn(
+                f"{mode} is only partly exact for {feature.name} ({_few(elements)}): {feature.note}", stacklevel=3
+            )
+
+
+def _few(elements: list[str]) -> str:
+    return ", ".join(elements[:5]) + (" …" if len(elements) > 5 else "")
 
 
 def table() -> str:
