@@ -33,7 +33,8 @@ def resolve_device(device: str) -> torch.device:
     if (resolved.index or 0) >= count:
         seen = f"{count} CUDA device(s)" if count else "no CUDA device"
         raise DeviceError(
-            f"device {device!r} asked for, but torch sees {seen}: write --device cpu (in Python device='cpu'), or mend the driver"
+            f"device {device!r} asked for, but torch sees {seen}: write --device cpu (in Python device='cpu'), "
+            "or mend the driver"
         )
     if not wp.is_cuda_available():
         raise DeviceError("torch sees a CUDA device but Warp does not: check that driver and warp-lang fit")
