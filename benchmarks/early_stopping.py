@@ -84,8 +84,8 @@ def table(judged: Sequence[Judged]) -> str:
         trial = one.record.trial
         end = f"stopped at {one.last.epoch} of {trial.config.trial.epochs}" if one.stopped else "kept"
         rows.append([trial.variant, str(trial.seed), f"{_whole(one):.5g}", f"{one.best:.5g}", end])
-    used, whole = (sum(f(j) for j in judged) for f in (lambda j: j.last.env_steps, _env_steps))
-    epochs_used = sum(j.last.epoch for j in judged)
+    used, epochs_used = sum(j.last.env_steps for j in judged), sum(j.last.epoch for j in judged)
+    whole = sum(j.record.evaluations[-1].env_steps for j in judged)
     epochs = sum(j.record.epochs_done for j in judged)
     best, kept = max(map(_whole, judged)), max(j.best for j in judged)
     verdict = "kept" if kept == best else f"LOST, {kept:.5g} instead"
@@ -99,10 +99,6 @@ def table(judged: Sequence[Judged]) -> str:
 
 def _whole(one: Judged) -> float:
     return max(e.score for e in one.record.evaluations)
-
-
-def _env_steps(one: Judged) -> int:
-    return one.record.evaluations[-1].env_steps
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -88,6 +88,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     checks: list[Callable[[], list[Finding]]] = [
         check_python,
         check_packages,
+        check_imports,
         lambda: check_gpus(args.device),
         lambda: [check_gradient(args.device)],
         lambda: [check_ray()],
@@ -95,15 +96,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     ]
     broken = 0
     for check in checks:
-        missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
-        if missing and check is not check_python and check is not check_packages:
-            print(f"{'MEND':5} {'packages':9} {', '.join(missing)} cannot be imported: the rest was not checked")
-            broken += 1
-            break
         # Each line as soon as it is known: kernels may take a minute to compile.
-        for finding in check():
+        findings = check()
+        for finding in findings:
             print(f"{'MEND' if finding.broken else 'ok':5} {finding.subject:9} {finding.text}", flush=True)
             broken += finding.broken
+        if check is check_imports and findings:
+            break
     print("all is well" if not broken else f"{broken} thing(s) to mend")
     return 1 if broken else 0
 
@@ -129,6 +128,14 @@ def check_packages() -> list[Finding]:
         {r.name: str(r.specifier) for r in wanted if r.marker is None or r.marker.evaluate({"extra": ""})},
         {distribution.name.lower(): distribution.version for distribution in metadata.distributions()},
     )
+
+
+def check_imports() -> list[Finding]:
+    """Whether what all further checks need can be imported at all; nothing to say if it can."""
+    missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
+    if not missing:
+        return []
+    return [Finding("packages", f"{', '.join(missing)} cannot be imported: the rest was not checked", True)]
 
 
 def package_findings(wanted: dict[str, str], installed: dict[str, str]) -> list[Finding]:

@@ -127,3 +127,15 @@ def test_something_broken_gives_exit_1(
     for line in ("MEND  gpu", "MEND  gradient", "MEND  ray       does not start: exit code 9", "MEND  storage"):
         assert line in text
     assert "4 thing(s) to mend" in text
+
+
+def test_without_its_packages_it_says_so_and_stops(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(doctor, "_NEEDED", ("json", "no_such_module_here"))
+    assert run(main, ["--storage", str(tmp_path / "runs")]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-2:] == [
+        "MEND  packages  no_such_module_here cannot be imported: the rest was not checked",
+        "1 thing(s) to mend",
+    ]

@@ -18,7 +18,7 @@ NONE = DriverView(None, ())
         ),
         ("echo 'NVIDIA-SMI has failed because it could not talk to the driver'; exit 9", NONE),
         ("echo 'No devices were found'", NONE),
-        ("exec /bin/sleep 5", DriverView("that does not answer", ())),
+        ("exec /bin/sleep 20", DriverView("that does not answer", ())),
     ],
 )
 def test_what_the_driver_says(
@@ -28,7 +28,7 @@ def test_what_the_driver_says(
     program.write_text(f"#!/bin/sh\n{script}\n")
     program.chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert ask_driver(timeout_s=1.0) == expected
+    assert ask_driver(timeout_s=3.0) == expected
 
 
 def test_no_driver(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

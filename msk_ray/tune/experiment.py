@@ -57,7 +57,7 @@ class Experiment:
             return typed_command([str(word) for word in argv], "--resume")
         except (OSError, ValueError, KeyError, TypeError, IndexError):
             # What was typed is lost, or was never whole; its options are in nobody else's hands.
-            return "python -m msk_ray.tune --resume, with the options it was begun with,"
+            return "python -m msk_ray.tune --resume, with the options it was begun with"
 
     @property
     def tune(self) -> Path:
@@ -208,7 +208,7 @@ def reopen(path: Path, trials: list[Trial] | None, extension: Mapping[str, Any] 
     if difference:
         raise StorageError(
             f"--resume: the space no longer gives the trials of {path}: {difference}; undo that, or pass another "
-            f"--name (--extend adds samples, seeds or epochs). It was begun so that this goes on: "
+            f"--name (--extend adds samples, seeds or epochs). As it was begun, it goes on with: "
             f"{experiment.resume_command()}"
         )
     # Also without a new extension: an earlier one may have been interrupted right after its manifest.

@@ -207,16 +207,19 @@ def heartbeat_age(folder: Path, now: float) -> float | None:
 
     Clocks of machines that share a storage differ: a heartbeat from the future is a fresh one.
     """
-    beats = [beat for name in _BEATS if (beat := _modified(folder / name)) is not None]
-    return max(0.0, now - max(beats)) if beats else None
+    beat = _last_beat(folder)
+    return None if beat is None else max(0.0, now - beat)
+
+
+def _last_beat(folder: Path) -> float | None:
+    return max((beat for name in _BEATS if (beat := _modified(folder / name)) is not None), default=None)
 
 
 def is_silent(folder: Path, progress: Progress, age: float) -> bool:
     """Whether a trial that has not ended shows no sign of life: it was silent for too long, or its driver, which writes
     the summary last of all, has left since."""
-    summary = _modified(folder.parent.parent / SUMMARY_FILE)
-    beats = [_modified(folder / name) for name in _BEATS]
-    left = summary is not None and all(beat is None or beat < summary for beat in beats)
+    summary, beat = _modified(folder.parent.parent / SUMMARY_FILE), _last_beat(folder)
+    left = summary is not None and (beat is None or beat < summary)
     return left or age > patience(folder, progress)
 
 
