@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from msk_ray.report.pictures import GREY, PALETTE, Picture, picture, shorten
 from msk_ray.report.reading import Reading, TrialReading
-from msk_ray.report.statistics import Effect, effects, mean_interval
+from msk_ray.report.statistics import Effect, Scored, effects, mean_interval
 
 PANELS = 4
 """Parameters whose levels are drawn one by one."""
@@ -21,6 +21,10 @@ LEVELS = 16
 """Levels of a parameter that are drawn; of more, the best and the worst ones."""
 AXES = 8
 """Parameters of the parallel coordinates."""
+_CUT_WORDS = (
+    "Open circles are trials stopped before their time, or still running, with the best score they had: they might "
+    "have risen further, so effects beside them are of the sweep as it was run, not of whole runs. "
+)
 _DECADES = 30.0
 """Numbers whose largest is so many times the smallest are drawn on a logarithmic axis."""
 
@@ -28,7 +32,11 @@ _DECADES = 30.0
 def ranked_effects(reading: Reading) -> list[Effect]:
     """Effects of the experiment's parameters on the best score, the largest first."""
     return effects(
-        [(t.trial.changed, t.trial.values, t.trial.seed, t.score) for t in reading.trials if t.score is not None]
+        [
+            Scored(t.trial.changed, t.trial.values, t.trial.seed, t.score, t.cut)
+            for t in reading.trials
+            if t.score is not None
+        ]
     )
 
 
@@ -67,7 +75,7 @@ def parameter_effects(found: Sequence[Effect], name: str) -> Picture | None:
             else "First: between the mean scores of a parameter's best and worst level; with one trial a level that "
             "cannot be told from chance. Then: the scores. "
         )
-        + "Trials stopped early count with the best score they had.",
+        + (_CUT_WORDS if any(trial.cut for level in first.trials.values() for trial in level) else ""),
         draw,
         (9.0, 5.4),
         (4.2, 1.2 + 0.3 * len(found) + 2.2 * len(panels)),
@@ -92,17 +100,19 @@ def _draw_ranking(axes: Axes, found: Sequence[Effect], shares: bool) -> None:
 
 
 def _draw_levels(axes: Axes, effect: Effect) -> None:
-    levels = list(effect.levels.items())
+    levels = list(effect.trials.items())
     title = _leaf(effect.factor)
     if len(levels) > LEVELS:
         # Too many to tell apart.
-        ordered = sorted(levels, key=lambda level: -float(np.mean(level[1])))
+        ordered = sorted(levels, key=lambda level: -float(np.mean([t.score for t in level[1]])))
         title += f" (best and worst of {len(levels)})"
         levels = [*ordered[: LEVELS // 2], *ordered[-LEVELS // 2 :]]
     jitter = np.random.default_rng(0)
-    for place, (_, scores) in enumerate(levels):
-        spots = place + 0.16 * (jitter.random(len(scores)) - 0.5)
-        axes.plot(spots, scores, "o", color=GREY, markersize=3, alpha=0.7)
+    for place, (_, trials) in enumerate(levels):
+        scores = [trial.score for trial in trials]
+        for trial, spot in zip(trials, place + 0.16 * (jitter.random(len(trials)) - 0.5), strict=True):
+            inside = "none" if trial.cut else GREY
+            axes.plot(spot, trial.score, "o", color=GREY, markerfacecolor=inside, markersize=3.5, alpha=0.8)
         mean, interval = float(np.mean(scores)), mean_interval(scores)
         axes.plot([place - 0.3, place + 0.3], [mean, mean], color=PALETTE[1], linewidth=2)
         if interval is not None:

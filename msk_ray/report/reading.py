@@ -81,6 +81,20 @@ class TrialReading:
         scores = self.curve[1]
         return float(scores.max()) if len(scores) else None
 
+    def score_within(self, env_steps: float) -> float | None:
+        """Highest finite score of the evaluations in the first `env_steps`; None if there is none."""
+        steps, scores = self.curve
+        within = scores[steps <= env_steps]
+        return float(within.max()) if len(within) else None
+
+    @property
+    def cut(self) -> bool:
+        """Whether it stands before its end without having failed: stopped, interrupted or running. Given more, its
+        score might have risen."""
+        if self.state is State.ENDED:
+            return self.ending is not None and self.ending.outcome not in {*FAILURES, Outcome.FINISHED}
+        return self.state in (State.RUNNING, State.STALE)
+
     @property
     def best_row(self) -> dict[str, float]:
         """The evaluation with the highest score: its epoch, env steps, and every `eval/` figure that is a number."""

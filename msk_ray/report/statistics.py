@@ -3,9 +3,11 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+
+T = TypeVar("T")
 
 DRAWS = 10_000
 CONFIDENCE = 0.95
@@ -58,14 +60,33 @@ def _interval(statistic: np.ndarray) -> Interval:
 
 
 @dataclass(frozen=True)
+class Scored:
+    """A trial's best score, and what led to it."""
+
+    changed: Mapping[str, str]
+    """Its parameters as text."""
+    values: Mapping[str, Any]
+    """The same as data."""
+    seed: int
+    score: float
+    cut: bool = False
+    """It ended before its time: given more, the score might have risen."""
+
+
+@dataclass(frozen=True)
 class Effect:
     """How the score depends on one parameter, whatever the others are."""
 
     factor: str
-    levels: dict[str, list[float]]
-    """Scores of the trials at each level, in order of the level."""
+    trials: dict[str, list[Scored]]
+    """Trials at each level, in order of the level."""
     share: float | None
     """Of the variance of the scores, ω²; None if every trial has a level of its own."""
+
+    @property
+    def levels(self) -> dict[str, list[float]]:
+        """Scores at each level."""
+        return {level: [trial.score for trial in trials] for level, trials in self.trials.items()}
 
     @property
     def spread(self) -> float:
@@ -74,47 +95,47 @@ class Effect:
         return max(means) - min(means)
 
 
-def effects(trials: Sequence[tuple[Mapping[str, str], Mapping[str, Any], int, float]]) -> list[Effect]:
+def effects(trials: Sequence[Scored]) -> list[Effect]:
     """Parameters ranked by the share of the scores' variance that they explain, the largest first.
-
-    Args:
-        trials: each one's parameters as text and as data, its seed, and its score.
 
     Returns:
         An effect for each parameter with at least two levels, and one called `seed` for comparison if there are
         several seeds.
     """
-    factors = list(dict.fromkeys(key for changed, *_ in trials for key in changed))
+    factors = list(dict.fromkeys(key for trial in trials for key in trial.changed))
     found = []
     for factor in factors:
-        rows = [
-            (changed[factor], values.get(factor), score) for changed, values, _, score in trials if factor in changed
-        ]
+        rows = [(trial.changed[factor], trial.values.get(factor), trial) for trial in trials if factor in trial.changed]
         found.append(_effect(factor, levels_of(rows)))
-    by_seed: dict[str, list[float]] = {}
-    for _, _, seed, score in sorted(trials, key=lambda trial: trial[2]):
-        by_seed.setdefault(str(seed), []).append(score)
+    by_seed: dict[str, list[Scored]] = {}
+    for trial in sorted(trials, key=lambda trial: trial.seed):
+        by_seed.setdefault(str(trial.seed), []).append(trial)
     found.append(_effect("seed", by_seed))
-    kept = [effect for effect in found if len(effect.levels) > 1]
+    kept = [effect for effect in found if len(effect.trials) > 1]
     return sorted(kept, key=lambda e: (-math.inf if e.share is None else -e.share, -e.spread))
 
 
-def levels_of(rows: Sequence[tuple[str, Any, float]]) -> dict[str, list[float]]:
-    """Scores by level. Of numbers with many values, as drawn ones have, the levels are quarters of equal size."""
+def levels_of(rows: Sequence[tuple[str, Any, T]]) -> dict[str, list[T]]:
+    """Trials, or their scores, by level. Of numbers with many values, as drawn ones have, the levels are quarters of
+    equal size.
+
+    Args:
+        rows: the level as text and as data, and what is to be sorted by it.
+    """
     numbers = [value for _, value, _ in rows if isinstance(value, int | float) and not isinstance(value, bool)]
-    levels: dict[str, list[float]] = {}
+    levels: dict[str, list[T]] = {}
     if len(numbers) == len(rows) and len(set(numbers)) > 2 * BINS:
         edges = np.quantile(numbers, np.linspace(0.0, 1.0, BINS + 1))
         bins = np.clip(np.searchsorted(edges, numbers, side="right") - 1, 0, BINS - 1)
         for place in range(BINS):
             label = f"{edges[place]:.3g} … {edges[place + 1]:.3g}"
-            scores = [score for (_, _, score), own in zip(rows, bins, strict=True) if own == place]
-            if scores:
-                levels[label] = scores
+            inside = [item for (_, _, item), own in zip(rows, bins, strict=True) if own == place]
+            if inside:
+                levels[label] = inside
         return levels
     numeric = len(numbers) == len(rows)
-    for label, _, score in sorted(rows, key=lambda row: row[1]) if numeric else rows:
-        levels.setdefault(label, []).append(score)
+    for label, _, item in sorted(rows, key=lambda row: row[1]) if numeric else rows:
+        levels.setdefault(label, []).append(item)
     return levels
 
 
@@ -137,5 +158,6 @@ def variance_share(groups: Sequence[Sequence[float]]) -> float | None:
     return float((between - (k - 1) * within) / (total + within))
 
 
-def _effect(factor: str, levels: dict[str, list[float]]) -> Effect:
-    return Effect(factor, levels, variance_share(list(levels.values())) if len(levels) > 1 else None)
+def _effect(factor: str, trials: dict[str, list[Scored]]) -> Effect:
+    scores = [[trial.score for trial in level] for level in trials.values()]
+    return Effect(factor, trials, variance_share(scores) if len(scores) > 1 else None)

@@ -1,5 +1,6 @@
 """The page's tables as plain data."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -33,13 +34,19 @@ class VariantRow:
     mean: float | None
     interval: Interval | None
     difference: float | None
-    """Of the mean from the baseline's; None for the baseline itself, or without scores."""
+    """Of the mean from the baseline's, over the env steps of `compared_at`; None for the baseline itself, or without
+    scores."""
     difference_interval: Interval | None
+    compared_at: float | None
+    """If trials of this variant or of the baseline were cut short: the env steps that all of both have reached, which
+    is where they are compared. None if all ran to their end."""
     is_baseline: bool
     figures: dict[str, float]
     """Mean over seeds of further evaluation figures at the best evaluation, such as the speed."""
     halved: int = 0
     """How many of the scores are of trials with half their worlds."""
+    cut: int = 0
+    """How many are of trials stopped before their time, or still running."""
 
     @property
     def verdict(self) -> str:
@@ -87,14 +94,15 @@ def outcome_figures(trials: Sequence[TrialReading]) -> list[str]:
 def variant_rows(reading: Reading, baseline: str | None) -> list[VariantRow]:
     """A row a variant, the highest mean first, those without a score last."""
     groups = reading.variants
-    reference = _scores(groups[baseline]) if baseline is not None else []
+    reference = groups[baseline] if baseline is not None else []
     names = outcome_figures(reading.trials)
     rows = []
     for variant, trials in groups.items():
         scores = _scores(trials)
-        mean = sum(scores) / len(scores) if scores else None
+        mean = _mean(scores) if scores else None
         own = variant == baseline
-        compared = mean is not None and bool(reference) and not own
+        at, pair = _on_equal_terms(trials, reference)
+        compared = not own and all(pair)
         figures = {}
         for name in names:
             found = [trial.best_row[f"eval/{name}"] for trial in trials if f"eval/{name}" in trial.best_row]
@@ -107,14 +115,36 @@ def variant_rows(reading: Reading, baseline: str | None) -> list[VariantRow]:
                 len(trials),
                 mean,
                 mean_interval(scores),
-                mean - sum(reference) / len(reference) if compared and mean is not None else None,
-                difference_interval(scores, reference) if compared else None,
+                _mean(pair[0]) - _mean(pair[1]) if compared else None,
+                difference_interval(*pair) if compared else None,
+                at if compared else None,
                 own,
                 figures,
                 sum(trial.halved is not None and trial.score is not None for trial in trials),
+                sum(trial.cut and trial.score is not None for trial in trials),
             )
         )
     return sorted(rows, key=lambda row: (row.mean is None, -(row.mean or 0.0)))
+
+
+def _on_equal_terms(
+    trials: Sequence[TrialReading], reference: Sequence[TrialReading]
+) -> tuple[float | None, tuple[list[float], list[float]]]:
+    """The env steps that all trials cut short have reached, None if there are none; and the best scores up to there.
+
+    A stopped trial's score says what it had, and beside a whole run's it always looks worse.
+    """
+    ends = [float(t.curve[0][-1]) for t in (*trials, *reference) if t.cut and t.score is not None]
+    limit = min(ends, default=math.inf)
+
+    def within(group: Sequence[TrialReading]) -> list[float]:
+        return [score for score in (trial.score_within(limit) for trial in group) if score is not None]
+
+    return (limit if ends else None), (within(trials), within(reference))
+
+
+def _mean(scores: Sequence[float]) -> float:
+    return sum(scores) / len(scores)
 
 
 def failures(reading: Reading) -> list[tuple[str, str, list[TrialReading]]]:

@@ -86,12 +86,36 @@ def test_tables_by_hand(experiment: experiments.Experiment) -> None:
     assert (best.score, best.best_row["epoch"]) == (34.0, 2.0)
 
 
+def test_stopped_trials_are_compared_where_they_stopped(experiment: experiments.Experiment) -> None:
+    """`fast` is far behind whole runs because it was stopped; where it was stopped it was ahead."""
+    rising = {0: [0.0, 4.0, 50.0], 1: [0.0, 6.0, 70.0]}
+    for trial in experiment.trials():
+        if trial.changed["variant"] == "baseline":
+            fill(experiment.trial_folder(trial.id), rising[trial.seed])
+        elif trial.changed["variant"] == "fast":
+            fill(experiment.trial_folder(trial.id), [0.0, 7.0 + trial.seed], Ending(Outcome.STOPPED_ASHA, "behind"))
+    reading = read_experiment(experiment, time.time())
+    rows = {row.variant: row for row in variant_rows(reading, "baseline")}
+    fast, deep = rows["fast"], rows["deep"]
+    assert (fast.mean, fast.cut, rows["baseline"].mean) == (7.5, 2, 60.0)
+    # At 200 env steps: (7 + 8)/2 against (4 + 6)/2; the bootstrap's extremes are 7 - 6 and 8 - 4.
+    assert (fast.compared_at, fast.difference, fast.verdict) == (200.0, 2.5, "better")
+    # All of `deep` ended by itself, finished or failed: whole runs are compared.
+    assert (deep.compared_at, deep.difference) == (None, 6.5 - 60.0)
+    page = page_of(experiment)
+    assert "2 of 2 (2 cut short)" in page
+    assert "compared at" in page
+    assert "Open circles are trials stopped before their time" in page
+
+
 def test_the_page_says_it_all_and_takes_nothing_for_markup(experiment: experiments.Experiment) -> None:
     page = page_of(experiment)
     assert "Does &lt;b&gt;it&lt;/b&gt; matter?" in page
     assert "nan &lt;i&gt;at&lt;/i&gt; epoch 3" in page
     for words in ("6 trials: 5 finished, 1 nonfinite", "Differences are from: baseline", "the last words", "better"):
         assert words in page
+    assert "compared at" not in page, "nothing was cut short"
+    assert "Open circles" not in page
     assert "There is no policy to look at" in page  # these trials have no checkpoints
     assert "http" not in page.replace("http-equiv", ""), "nothing is fetched"
     for name in ("curves", "effects", "parallel", "stops", "health"):
