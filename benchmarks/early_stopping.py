@@ -2,12 +2,14 @@
 
 The recorded evaluations are told to the rule in the order in which so many trials at once would have reached them; a
 trial it names ends there, and the next one begins. The table says what that saves, and what it costs: the best score
-kept beside the best of all. A sweep that was itself stopped early cannot be judged: what its trials would have become
-is not known.
+kept beside the best of all. Which trial meets which others at a rung hangs on the order they begin in, so the rule is
+also judged over random orders. A sweep that was itself stopped early cannot be judged: what its trials would have
+become is not known.
 """
 
 import argparse
 import heapq
+import random
 import sys
 import time
 from collections import deque
@@ -41,6 +43,18 @@ class Judged:
     def best(self) -> float:
         """Its best score up to there."""
         return max(e.score for e in self.record.evaluations if e.epoch <= self.last.epoch)
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What a space's scheduler asks for, over trials whose longest takes `budget` of its time."""
+
+    spec: SchedulerSpec
+    budget: float
+
+    def fresh(self) -> Pruner:
+        """The rule, knowing nothing yet."""
+        return make_pruner(self.spec, self.budget)
 
 
 def judge(records: Sequence[TrialRecord], pruner: Pruner, time_attr: str, slots: int) -> list[Judged]:
@@ -97,6 +111,33 @@ def table(judged: Sequence[Judged]) -> str:
     )
 
 
+@dataclass(frozen=True)
+class Chances:
+    """A rule over random orders of the trials."""
+
+    orders: int
+    kept: int
+    """Orders in which the best of all went to its end."""
+    mean_best: float
+    """Best score that was left, mean over orders."""
+    saved: tuple[float, float, float]
+    """Share of the env steps saved: least, mean, most."""
+
+
+def chances(records: Sequence[TrialRecord], rule: Rule, slots: int, orders: int) -> Chances:
+    """Judge a rule over so many random orders of the trials, the same ones in every call."""
+    draw = random.Random(0)
+    best = max(e.score for record in records for e in record.evaluations)
+    whole = sum(record.evaluations[-1].env_steps for record in records)
+    lefts, saved = [], []
+    for _ in range(orders):
+        judged = judge(draw.sample(records, len(records)), rule.fresh(), rule.spec.time_attr, slots)
+        lefts.append(max(one.best for one in judged))
+        saved.append(1 - sum(one.last.env_steps for one in judged) / whole)
+    kept = sum(left == best for left in lefts)
+    return Chances(orders, kept, sum(lefts) / orders, (min(saved), sum(saved) / orders, max(saved)))
+
+
 def _whole(one: Judged) -> float:
     return max(e.score for e in one.record.evaluations)
 
@@ -109,23 +150,39 @@ def main(argv: Sequence[str] | None = None) -> int:
     p.add_argument("--grace", type=float, default=0.25, help="share of the budget that no trial is stopped within")
     p.add_argument("--reduction", type=float, default=3.0, help="asha: one in so many goes on")
     p.add_argument("--slots", type=int, default=4, help="trials at once")
+    p.add_argument("--orders", type=int, default=1000, help="random orders of the trials to judge besides")
+    p.add_argument("--leave-out-unfinished", action="store_true", help="judge the others, and name what is left out")
     p.add_argument("--results", type=Path, default=RESULTS, help="folder the table is appended in")
     args = p.parse_args(argv)
     experiment = Experiment(args.experiment.resolve())
     records = read_records(experiment)
-    unfinished = [r.trial.id for r in records if r.ending is None or r.ending.outcome is not Outcome.FINISHED]
-    if unfinished or not records:
+    whole = [r for r in records if r.ending is not None and r.ending.outcome is Outcome.FINISHED]
+    unfinished = [r for r in records if r not in whole]
+    if not whole or (unfinished and not args.leave_out_unfinished):
         raise ConfigError(
             f"{args.experiment}: {len(unfinished)} of {len(records)} trials did not run to their end, the first is "
-            f"{unfinished[0] if unfinished else '-'}; judge a finished sweep with scheduler: {{kind: none}}"
+            f"{unfinished[0].trial.id if unfinished else '-'}; judge a finished sweep with scheduler: {{kind: none}}"
+            + (", or --leave-out-unfinished" if whole else "")
         )
     spec = SchedulerSpec(kind=args.kind, grace=args.grace, reduction=args.reduction)
-    budget = max(record.evaluations[-1].time(spec.time_attr) for record in records)
-    judged = judge(records, make_pruner(spec, budget), spec.time_attr, args.slots)
-    rule = f"{args.kind}, grace {args.grace:g}" + (f", reduction {args.reduction:g}" if args.kind == "asha" else "")
-    title = f"Early stopping of {args.experiment.name}, {rule}, {args.slots} trials at once"
+    rule = Rule(spec, max(record.evaluations[-1].time(spec.time_attr) for record in whole))
+    judged = judge(whole, rule.fresh(), spec.time_attr, args.slots)
+    odds = chances(whole, rule, args.slots, args.orders)
+    named = f"{args.kind}, grace {args.grace:g}" + (f", reduction {args.reduction:g}" if args.kind == "asha" else "")
+    title = f"Early stopping of {args.experiment.name}, {named}, {args.slots} trials at once"
     ran_on = sorted({standing.device.name for standing in Observer(experiment).look(time.time())} - {""})
-    text = f"{table(judged)} The sweep ran on: {', '.join(ran_on) or 'CPU'}; it is judged on the machine above."
+    text = (
+        f"{table(judged)}\n\nOver {odds.orders} random orders of the trials the best of all was kept in "
+        f"{odds.kept / odds.orders:.0%}; the best that was left has a mean of {odds.mean_best:.5g}; "
+        f"{odds.saved[0]:.0%} to {odds.saved[2]:.0%} of the env steps were saved, {odds.saved[1]:.0%} on average.\n\n"
+    )
+    for record in unfinished:
+        best = max((e.score for e in record.evaluations), default=float("nan"))
+        text += (
+            f"Left out: {record.trial.variant}, seed {record.trial.seed}, cut off at epoch {record.epochs_done} of "
+            f"{record.trial.config.trial.epochs} with a best score of {best:.5g}. "
+        )
+    text += f"The sweep ran on: {', '.join(ran_on) or 'CPU'}; it is judged on the machine above."
     publish("early_stopping", title, "cpu", text, args.results)
     return 0
 

@@ -9,6 +9,7 @@ import pytest
 
 from msk_ray.tune.pruning import SuccessiveHalving
 from msk_ray.tune.records import TrialRecord
+from msk_ray.tune.space import SchedulerSpec
 from msk_ray.tune.stopping import Evaluation
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
@@ -62,6 +63,18 @@ def test_a_freed_slot_is_taken_at_once(benchmark: dict[str, Any]) -> None:
         ("middle", True, 100),
         ("late", True, 100),
     ]
+
+
+def test_over_all_orders(benchmark: dict[str, Any]) -> None:
+    """One after another, a rung at 100 that the better half passes: `late`, the worst there, goes on only if it comes
+    first and meets nobody. `early` goes on in any order."""
+    rule = benchmark["Rule"](SchedulerSpec(kind="asha", grace=0.5, reduction=2), 200.0)
+    odds = benchmark["chances"](RECORDS, rule, 1, 600)
+    kept = odds.kept / odds.orders
+    assert kept == pytest.approx(1 / 3, abs=0.06)
+    assert odds.mean_best == pytest.approx(kept * 9 + (1 - kept) * 4)
+    # Least is saved by late, middle, early, where each is the best so far; most by early, late, middle.
+    assert (odds.saved[0], odds.saved[2]) == pytest.approx((0.0, 200 / 600))
 
 
 def test_a_sweep_that_was_stopped_early_is_refused(
