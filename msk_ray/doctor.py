@@ -19,8 +19,8 @@ from pathlib import Path
 import msk_ray
 from msk_ray.cli import Parser, run
 from msk_ray.errors import MskRayError, StorageError
+from msk_ray.files import check_writable
 from msk_ray.nvidia_smi import ask_driver
-from msk_ray.tune.experiment import check_writable
 
 DESCRIPTION = """\
 Check that this machine can run trials: versions, GPU and driver, gradients of one step, Ray, the storage folder.

@@ -7,7 +7,7 @@ from pathlib import Path
 from msk_ray.cli import RESUMABLE, TERMINAL_LOG, Parser, StopRequest, outliving, run, typed_command
 from msk_ray.config import Config, load_config
 from msk_ray.errors import CheckpointError, StorageError
-from msk_ray.tune.experiment import check_writable
+from msk_ray.files import check_writable
 
 DESCRIPTION = """\
 Train one policy with SHAC: one trial, in this process, without Ray.

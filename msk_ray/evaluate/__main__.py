@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 from msk_ray.cli import Parser, run
 from msk_ray.errors import CheckpointError, MskRayError
 from msk_ray.evaluate.targets import Kind, Target, best_checkpoint, best_of_trial, find_target
+from msk_ray.files import write_json
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.halved import read_halved
 from msk_ray.tune.listing import text_table
-from msk_ray.tune.outcomes import write_json
 from msk_ray.tune.space import parse_seeds
 
 if TYPE_CHECKING:

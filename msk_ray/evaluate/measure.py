@@ -16,10 +16,10 @@ from msk_ray.config import Config, PhysicsConfig
 from msk_ray.envs import env_class
 from msk_ray.errors import ConfigError, StorageError
 from msk_ray.evaluate.targets import trial_folder_of
+from msk_ray.files import write_json
 from msk_ray.training import Evaluator, SavedPolicy
 from msk_ray.training.evaluation import Episodes
 from msk_ray.training.memory import named_out_of_memory
-from msk_ray.tune.outcomes import write_json
 
 FORMAT = 1
 EVAL_FILE = "eval.json"

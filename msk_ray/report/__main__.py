@@ -9,10 +9,10 @@ from pathlib import Path
 from msk_ray.cli import Parser, run
 from msk_ray.errors import ConfigError
 from msk_ray.evaluate.targets import find_experiment
+from msk_ray.files import check_writable
 from msk_ray.report.best import Best, look_at_best
 from msk_ray.report.page import compare, make_section, write_page
 from msk_ray.report.reading import Condition, Reading, check_folder, read_experiment
-from msk_ray.tune.experiment import check_writable
 
 DESCRIPTION = """\
 Write one self-contained page about an experiment, or several side by side: learning curves, the ablation table with

@@ -10,6 +10,7 @@ from PIL import Image, PngImagePlugin
 
 from msk_ray.errors import CheckpointError, MskRayError
 from msk_ray.evaluate.targets import best_of_trial
+from msk_ray.files import write_bytes
 from msk_ray.report.reading import TrialReading, explain
 
 STRIP = "strip"
@@ -140,8 +141,6 @@ def _draw(path: Path, out: Path, sha: str, device: str | None) -> None:
 
 
 def _save(image: Image.Image, path: Path, facts: PngImagePlugin.PngInfo) -> None:
-    from msk_ray.training.checkpoint import write_atomically
-
     buffer = io.BytesIO()
     image.save(buffer, "png", pnginfo=facts)
-    write_atomically(path, buffer.getvalue())
+    write_bytes(path, buffer.getvalue())

@@ -13,6 +13,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from msk_ray import __version__
 from msk_ray.cli import typed_command
 from msk_ray.errors import StorageFailure
+from msk_ray.files import write_text
 from msk_ray.progress import format_duration
 from msk_ray.report.best import Best
 from msk_ray.report.curves import gradient_health, learning_curves, stopping_map
@@ -20,7 +21,6 @@ from msk_ray.report.influence import parallel_coordinates, parameter_effects, ra
 from msk_ray.report.pictures import Picture, format_steps
 from msk_ray.report.reading import Condition, Reading, TrialReading
 from msk_ray.report.tables import baseline_of, failures, outcome_counts, outcome_figures, variant_rows
-from msk_ray.tune.outcomes import write_text
 
 PAGE = "index.html"
 _FILES = ("config.yaml", "metrics.jsonl", "output.log", "error.txt", "eval.json", "checkpoints/best.pt")

@@ -7,36 +7,18 @@ is torn. Both are written to a temporary name, flushed to disk and renamed.
 import hashlib
 import io
 import json
-import os
 import re
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from msk_ray.errors import CheckpointError, StorageFailure
+from msk_ray.errors import CheckpointError
+from msk_ray.files import write_bytes
 
 FORMAT = 1
 _EPOCH_NAME = re.compile(r"epoch_(\d+)\.pt")
 _POLICY_NAME = re.compile(r"policy_(\d+)\.pt")
-
-
-def write_atomically(path: Path, payload: bytes) -> None:
-    """Replace `path` by `payload` in one step that survives a crash.
-
-    Raises:
-        StorageFailure: the disk is full or the folder not writable; what was there before is untouched.
-    """
-    temporary = path.with_name(f".{path.name}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            file.write(payload)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise StorageFailure(f"cannot write {path}: {error.strerror or error}") from error
 
 
 def write_checkpoint(path: Path, state: dict[str, Any], facts: dict[str, Any]) -> Path:
@@ -46,9 +28,9 @@ def write_checkpoint(path: Path, state: dict[str, Any], facts: dict[str, Any]) -
     payload = buffer.getvalue()
     # A manifest left from before would vouch for the wrong payload if a crash came between the two writes.
     manifest_path(path).unlink(missing_ok=True)
-    write_atomically(path, payload)
+    write_bytes(path, payload)
     manifest = {"format": FORMAT, "sha256": hashlib.sha256(payload).hexdigest(), "bytes": len(payload), **facts}
-    write_atomically(manifest_path(path), json.dumps(manifest, indent=1).encode())
+    write_bytes(manifest_path(path), json.dumps(manifest, indent=1).encode())
     return path
 
 
@@ -133,7 +115,9 @@ def newest_valid_checkpoint(folder: Path) -> tuple[Path | None, list[str]]:
 
 
 def prune_checkpoints(folder: Path, keep: int) -> None:
-    """Delete all but the `keep` newest numbered checkpoints."""
+    """Delete all but the `keep` newest numbered checkpoints, and what a process killed while writing has left."""
+    for path in folder.glob(".*.pt.*"):
+        path.unlink()
     for path in epoch_checkpoints(folder)[keep:]:
         path.unlink()
         manifest_path(path).unlink(missing_ok=True)

@@ -10,8 +10,8 @@ import numpy as np
 from torch.utils.tensorboard import SummaryWriter
 
 from msk_ray.errors import StorageFailure
+from msk_ray.files import write_bytes
 from msk_ray.metrics_file import METRICS_FILE, read_metrics
-from msk_ray.training.checkpoint import write_atomically
 
 _PROGRESS = ("env_steps", "seconds", "env_steps_per_s")
 _SCHEDULED = ("train/horizon", "train/actor_lr")
@@ -47,7 +47,7 @@ class MetricsLog:
         if not self._path.is_file():
             return
         rows = [row for row in read_metrics(self._path) if row["epoch"] <= epoch]
-        write_atomically(self._path, "".join(json.dumps(row) + "\n" for row in rows).encode())
+        write_bytes(self._path, "".join(json.dumps(row) + "\n" for row in rows).encode())
         self.close()
         self._board = SummaryWriter(str(self._folder), purge_step=epoch + 1)
 

@@ -9,6 +9,7 @@ from typing import Any
 from msk_ray.config import Config, dump_yaml
 from msk_ray.envs import make_env
 from msk_ray.errors import CheckpointError, StorageError
+from msk_ray.files import write_bytes
 from msk_ray.shac import Shac
 from msk_ray.training.checkpoint import (
     epoch_checkpoints,
@@ -16,7 +17,6 @@ from msk_ray.training.checkpoint import (
     newest_valid_checkpoint,
     prune_checkpoints,
     read_checkpoint,
-    write_atomically,
     write_checkpoint,
 )
 from msk_ray.training.evaluation import Evaluator
@@ -165,7 +165,7 @@ class Trainer:
         return path, faults
 
     def _write_config(self) -> None:
-        write_atomically(self.logdir / "config.yaml", dump_yaml(self.config.as_dict()).encode())
+        write_bytes(self.logdir / "config.yaml", dump_yaml(self.config.as_dict()).encode())
 
     def close(self) -> None:
         """Flush the logs."""

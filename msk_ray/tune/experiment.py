@@ -27,9 +27,10 @@ import msk_ray
 from msk_ray.cli import typed_command
 from msk_ray.config import dump_yaml, parse_config
 from msk_ray.errors import StorageError
+from msk_ray.files import check_writable, write_json, write_text
 from msk_ray.nvidia_smi import ask_driver
 from msk_ray.tune.extension import extend_trials
-from msk_ray.tune.outcomes import OUTCOME_FILE, Outcome, read_ending, write_json, write_text
+from msk_ray.tune.outcomes import OUTCOME_FILE, Outcome, read_ending
 from msk_ray.tune.space import Space
 from msk_ray.tune.trials import Trial, describe_changes
 
@@ -231,21 +232,6 @@ def difference_of(recorded: list[Trial], now: list[Trial]) -> str | None:
     parts = [f"{len(gone)} gone ({_few(gone)})"] if gone else []
     parts += [f"{len(added)} new ({_few(added)})"] if added else []
     return ", ".join(parts)
-
-
-def check_writable(path: Path) -> None:
-    """Make the folder and write a file into it: permissions alone do not tell (full disks, read-only mounts).
-
-    Raises:
-        StorageError: it did not work.
-    """
-    probe = path / f".probe.{os.getpid()}"
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-        probe.write_bytes(b"0" * 4096)
-        probe.unlink()
-    except OSError as error:
-        raise StorageError(f"cannot write to {path}: {error.strerror or error}; choose another folder") from error
 
 
 def check_name(name: str) -> str:

@@ -10,7 +10,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from msk_ray.errors import StorageFailure
-from msk_ray.tune.outcomes import Ending, write_text
+from msk_ray.files import write_text
+from msk_ray.tune.outcomes import Ending
 from msk_ray.tune.pruning import Pruner
 from msk_ray.tune.stopping import Evaluation
 

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from msk_ray.errors import ConfigError, StorageError
+from msk_ray.files import write_json
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.operators import Listed, describe
-from msk_ray.tune.outcomes import write_json
 from msk_ray.tune.space import Space
 from msk_ray.tune.trials import Trial, base_settings, make_trial
 

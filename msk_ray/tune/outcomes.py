@@ -1,13 +1,11 @@
 """How a trial ended: a name, and why, kept in the trial's own folder."""
 
 import json
-import os
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
 
-from msk_ray.errors import StorageFailure
+from msk_ray.files import write_json
 
 OUTCOME_FILE = "outcome.json"
 
@@ -57,27 +55,3 @@ def read_ending(folder: Path) -> Ending | None:
         return None
     data = json.loads(path.read_text(encoding="utf-8"))
     return Ending(Outcome(data["outcome"]), data["why"])
-
-
-def write_json(path: Path, data: Any) -> None:
-    """Write plain data so that a reader never sees half a file, and the file survives a crash right after."""
-    write_text(path, json.dumps(data, indent=2, allow_nan=False) + "\n")
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write text so that a reader never sees half a file, and the file survives a crash right after.
-
-    Raises:
-        StorageFailure: the disk is full or the folder not writable; what was there before is untouched.
-    """
-    # Another process may write the same file: each has its own temporary.
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        with temporary.open("w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise StorageFailure(f"cannot write {path}: {error.strerror or error}") from error

@@ -4,9 +4,9 @@ import shutil
 import subprocess
 import sys
 
+from msk_ray.files import write_json, write_text
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.listing import text_table
-from msk_ray.tune.outcomes import write_json, write_text
 from msk_ray.tune.records import best_record, read_records
 from msk_ray.tune.standing import SUMMARY_FILE
 from msk_ray.tune.table import HEADER, halved_note, result_rows, summary, table_document, variant_rows

@@ -18,6 +18,7 @@ from ray import tune
 
 from msk_ray.config import parse_config
 from msk_ray.errors import storage_failure
+from msk_ray.files import write_text
 from msk_ray.tune.adapters import BEST, METRIC, STARTS_ANEW
 from msk_ray.tune.devices import wait_for_memory
 from msk_ray.tune.experiment import Experiment
@@ -25,7 +26,6 @@ from msk_ray.tune.gauges import TrialGauges
 from msk_ray.tune.halved import StartAnew, read_halved
 from msk_ray.tune.hparams import log_hparams
 from msk_ray.tune.made_up import make_up, write_params
-from msk_ray.tune.outcomes import write_text
 from msk_ray.tune.records import evaluations_of, read_rows
 from msk_ray.tune.space import Space
 from msk_ray.tune.stopping import Evaluation

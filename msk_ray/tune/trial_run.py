@@ -8,8 +8,9 @@ from typing import Protocol
 
 from msk_ray.config import Config
 from msk_ray.errors import ConfigError, Failure, MskRayError, SimulationError, StorageFailure
+from msk_ray.files import write_text
 from msk_ray.tune.halved import ABANDONED, Halved, StartAnew, halve, read_halved, set_aside, write_halved
-from msk_ray.tune.outcomes import Ending, Outcome, read_ending, write_ending, write_text
+from msk_ray.tune.outcomes import Ending, Outcome, read_ending, write_ending
 from msk_ray.tune.records import evaluations_of, read_rows
 from msk_ray.tune.space import StopSpec
 from msk_ray.tune.stopping import Evaluation, ending_of

@@ -1,0 +1,52 @@
+"""Files that are whole or not there at all, and folders that take them."""
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from msk_ray.errors import StorageError, StorageFailure
+
+
+def check_writable(path: Path) -> None:
+    """Make the folder and write a file into it: permissions alone do not tell (full disks, read-only mounts).
+
+    Raises:
+        StorageError: it did not work.
+    """
+    probe = path / f".probe.{os.getpid()}"
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        probe.write_bytes(b"0" * 4096)
+        probe.unlink()
+    except OSError as error:
+        raise StorageError(f"cannot write to {path}: {error.strerror or error}; choose another folder") from error
+
+
+def write_bytes(path: Path, payload: bytes) -> None:
+    """Put `payload` at `path` so that a reader never sees half a file, and the file survives a crash right after.
+
+    Raises:
+        StorageFailure: the disk is full or the folder not writable; what was there before is untouched.
+    """
+    # Another process may write the same file: each has its own temporary.
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with temporary.open("wb") as file:
+            file.write(payload)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise StorageFailure(f"cannot write {path}: {error.strerror or error}") from error
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write text as `write_bytes` does."""
+    write_bytes(path, text.encode())
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Write plain data as `write_bytes` does."""
+    write_text(path, json.dumps(data, indent=2, allow_nan=False) + "\n")
