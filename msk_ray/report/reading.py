@@ -21,14 +21,13 @@ from msk_ray.metrics_file import METRICS_FILE, read_metrics
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.halved import Halved, read_halved
 from msk_ray.tune.operators import describe
-from msk_ray.tune.outcomes import Ending, Outcome, read_ending
+from msk_ray.tune.outcomes import Ending, read_ending
 from msk_ray.tune.space import SpaceFile
 from msk_ray.tune.standing import DEVICE_FILE, OUTPUT_FILE, State, heartbeat_age, is_silent, progress_of
 from msk_ray.tune.stopping import SCORE
 from msk_ray.tune.trials import Trial
 
 ERROR_FILE = "error.txt"
-FAILURES = {Outcome.NONFINITE, Outcome.DIVERGED, Outcome.OUT_OF_MEMORY, Outcome.ERROR}
 _TAIL_LINES = 12
 _UNREADABLE = (MskRayError, OSError, ValueError, KeyError, TypeError)
 
@@ -92,7 +91,7 @@ class TrialReading:
         """Whether it stands before its end without having failed: stopped, interrupted or running. Given more, its
         score might have risen."""
         if self.state is State.ENDED:
-            return self.ending is not None and self.ending.outcome not in {*FAILURES, Outcome.FINISHED}
+            return self.ending is not None and self.ending.cut
         return self.state in (State.RUNNING, State.STALE)
 
     @property
@@ -119,7 +118,7 @@ class TrialReading:
 
     @property
     def failed(self) -> bool:
-        return self.state is State.UNREADABLE or (self.ending is not None and self.ending.outcome in FAILURES)
+        return self.state is State.UNREADABLE or (self.ending is not None and self.ending.failed)
 
     @property
     def best_checkpoint(self) -> Path | None:

@@ -35,12 +35,24 @@ class Outcome(StrEnum):
     """An exception, or its process died too often."""
 
 
+FAILURES = {Outcome.NONFINITE, Outcome.DIVERGED, Outcome.OUT_OF_MEMORY, Outcome.ERROR}
+
+
 @dataclass(frozen=True)
 class Ending:
     """A trial's outcome and the reason in words."""
 
     outcome: Outcome
     why: str
+
+    @property
+    def failed(self) -> bool:
+        return self.outcome in FAILURES
+
+    @property
+    def cut(self) -> bool:
+        """Whether it came before the last epoch and was no failure: given more, the score might have risen."""
+        return not self.failed and self.outcome is not Outcome.FINISHED
 
 
 def write_ending(folder: Path, ending: Ending) -> None:

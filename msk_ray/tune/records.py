@@ -42,6 +42,11 @@ class TrialRecord:
         return path if path.is_file() else None
 
     @property
+    def cut(self) -> bool:
+        """Whether it stands before its last epoch without having failed: given more, its score might have risen."""
+        return self.ending.cut if self.ending is not None else self.epochs_done > 0
+
+    @property
     def errored(self) -> bool:
         return self.ending is not None and self.ending.outcome in (Outcome.ERROR, Outcome.OUT_OF_MEMORY)
 

@@ -36,8 +36,8 @@ class SchedulerSpec(Part):
     kind: Literal["asha", "median", "pbt", "none"] = "none"
     time_attr: Literal["env_steps", "epoch", "seconds"] = "env_steps"
     """What trials are compared at. Env steps is fair between horizons, and trials need not run in lockstep."""
-    grace: Share = 0.1
-    """Share of the longest trial's budget that no trial is stopped within."""
+    grace: Share = 0.25
+    """Share of the longest trial's budget that no trial is stopped within. Too small a one loses slow starters."""
     reduction: Annotated[float, Field(ge=1.5, le=16)] = 3.0
     """asha: one in this many goes on past each rung; rungs are grace × reductionⁿ."""
     min_trials: PositiveInt | None = None

@@ -18,21 +18,24 @@ def result_rows(records: Sequence[TrialRecord]) -> list[tuple[str, ...]]:
 
 def variant_rows(records: Sequence[TrialRecord]) -> list[tuple[str, ...]]:
     """One row a variant: seeds, mean, standard deviation and range of the best scores. The highest mean first."""
-    groups: dict[str, list[float]] = {}
-    halved: dict[str, int] = {}
+    groups: dict[str, list[TrialRecord]] = {}
     for record in records:
-        scores = groups.setdefault(record.trial.variant, [])
-        if record.best is not None:
-            scores.append(record.best.score)
-            halved[record.trial.variant] = halved.get(record.trial.variant, 0) + (record.halved is not None)
+        groups.setdefault(record.trial.variant, []).append(record)
     rows = []
-    for variant, scores in groups.items():
+    for variant, group in groups.items():
+        scored = [record for record in group if record.best is not None]
+        scores = [record.best.score for record in scored if record.best is not None]
         if not scores:
             rows.append((float("-inf"), (variant, "0", "-", "-", "-", "-")))
             continue
+        counts = {
+            "cut short": sum(record.cut for record in scored),
+            "with half the worlds": sum(record.halved is not None for record in scored),
+        }
+        remarks = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
+        seeds = f"{len(scores)} ({remarks})" if remarks else str(len(scores))
         mean = statistics.fmean(scores)
         deviation = f"{statistics.stdev(scores):.4g}" if len(scores) > 1 else "-"
-        seeds = f"{len(scores)} ({halved[variant]} with half the worlds)" if halved[variant] else str(len(scores))
         texts = (variant, seeds, f"{mean:.5g}", deviation, f"{min(scores):.5g}", f"{max(scores):.5g}")
         rows.append((mean, texts))
     return [texts for _, texts in sorted(rows, key=lambda row: -row[0])]
@@ -61,6 +64,11 @@ def table_document(name: str, question: str, records: Sequence[TrialRecord]) -> 
     if len({record.trial.seed for record in records}) > 1:
         header = ("variant", "seeds", "mean score", "std", "min", "max")
         parts += ["By variant, over seeds:\n", markdown(header, variant_rows(records))]
+        if any(record.cut for record in records):
+            parts.append(
+                "Trials cut short count with the best score they had, which might have risen further: the report "
+                "compares variants at equal env steps.\n"
+            )
     best = best_record(records)
     if best is not None:
         half = f", {best.halved}" if best.halved is not None else ""
