@@ -161,7 +161,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not whole or (unfinished and not args.leave_out_unfinished):
         raise ConfigError(
             f"{args.experiment}: {len(unfinished)} of {len(records)} trials did not run to their end, the first is "
-            f"{unfinished[0].trial.id if unfinished else '-'}; judge a finished sweep with scheduler: {{kind: none}}"
+            f"{unfinished[0].trial.id if unfinished else '-'}; judge a finished sweep that ran with --no-early-stopping"
             + (", or --leave-out-unfinished" if whole else "")
         )
     spec = SchedulerSpec(kind=args.kind, grace=args.grace, reduction=args.reduction)

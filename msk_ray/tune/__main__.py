@@ -18,7 +18,7 @@ from msk_ray.tune.extension import extended_space, parse_extension
 from msk_ray.tune.listing import text_table, trial_rows
 from msk_ray.tune.made_up import recover
 from msk_ray.tune.outcomes import Outcome
-from msk_ray.tune.smoke import shrink, without_pruning
+from msk_ray.tune.smoke import shrink, without_early_stopping
 from msk_ray.tune.space import Space, find_space, parse_seeds, parse_space
 from msk_ray.tune.trials import Trial, find_trial, resolve_trials
 
@@ -34,12 +34,16 @@ EXAMPLES = """\
   python -m msk_ray.tune --space ant_ablate --smoke --cpu           # does all of it run at all?
   python -m msk_ray.tune --space ant_lr --seeds 0-4 --gpus-per-trial 0.5
   python -m msk_ray.tune --space ant_lr --set trial.epochs=100 --name ant_lr_short
+  python -m msk_ray.tune --space ant_ablate --no-early-stopping --name ant_ablate_whole   # to rank what is varied
   python -m msk_ray.tune --space ant_lr --resume                    # after Ctrl-C, a crash or a lost node
   python -m msk_ray.tune --space ant_lr --extend epochs=600         # it has ended; go on to more epochs
   python -m msk_ray.tune --space ant_lr --debug-trial 3             # that trial alone, here, without Ray
 
 exit codes: 0 all trials ended, 1 some ended in an error, 2 refused before any work began, 75 stopped on request and
 resumable."""
+
+REMEMBERED = ("halve_worlds", "early_stopping")
+"""Options that --resume goes on with unless it says otherwise."""
 
 
 def parser() -> Parser:
@@ -55,6 +59,12 @@ def parser() -> Parser:
         help="override a setting of all trials",
     )
     p.add_argument("--seeds", metavar="LIST", help="seeds instead of the space's, such as 0-4 or 0,3,7")
+    p.add_argument(
+        "--early-stopping",
+        action=argparse.BooleanOptionalAction,
+        help="whether scores end trials (asha, median, stop.plateau, stop.target) as the space says, or all run to "
+        "their end; with --resume as before",
+    )
     p.add_argument("--smoke", action="store_true", help="shrink to minutes: every value of every factor, few epochs")
     p.add_argument("--dry-run", action="store_true", help="print the resolved trials and stop")
     p.add_argument("--debug-trial", metavar="K", help="run trial K (number or id of --dry-run) here, without Ray")
@@ -109,15 +119,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     if extension and args.smoke:
         raise ConfigError("--extend: a smoke run has nothing to extend; leave --smoke out")
     recorded = _recorded(args)
-    if args.halve_worlds is None and recorded is not None:
-        args.halve_worlds = recorded.halve_worlds()
+    if recorded is not None:
+        for option in REMEMBERED:
+            if getattr(args, option) is None:
+                setattr(args, option, recorded.said(option))
     space = _read_space(args, (recorded.extension() if recorded is not None else {}) | extension)
     if extension and (space.file.search == "optuna" or space.file.scheduler.kind == "pbt"):
         raise ConfigError("--extend: optuna and pbt cannot go on from a recorded experiment; pass another --name")
     trials = [] if space.file.search == "optuna" else resolve_trials(space)
     if args.smoke:
         trials = shrink(space, trials) if trials else []
-        space = without_pruning(space)
+        space = without_early_stopping(space)
     if args.dry_run:
         _print_trials(space, trials)
         return 0
@@ -167,7 +179,12 @@ def _read_space(args: argparse.Namespace, extension: Mapping[str, Any]) -> Space
     if args.seeds is not None:
         parse_seeds(args.seeds)
         data["seeds"] = args.seeds
-    return parse_space(extended_space(data, extension), path)
+    space = parse_space(extended_space(data, extension), path)
+    if args.early_stopping is False:
+        if space.file.scheduler.kind == "pbt":
+            raise ConfigError(f"--no-early-stopping: in {path.name} trials go on from each other (pbt); leave it out")
+        space = without_early_stopping(space)
+    return space
 
 
 def _print_trials(space: Space, trials: list[Trial]) -> None:
@@ -218,8 +235,7 @@ def _run(args: argparse.Namespace, space: Space, trials: list[Trial], extension:
             # As recorded: with the ids they began with, and the epochs they were extended to.
             trials = experiment.trials()
         experiment.clear_endings(_retried(args))
-        if args.halve_worlds is not None:
-            experiment.set_halve_worlds(args.halve_worlds)
+        experiment.say(**{option: getattr(args, option) for option in REMEMBERED})
     # ray and torch take seconds to load; a wrong command line should not wait for them.
     from msk_ray.tune import runner
     from msk_ray.tune.devices import choose_placement, local_gpus

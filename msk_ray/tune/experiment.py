@@ -115,16 +115,17 @@ class Experiment:
             if ending is not None and ending.outcome in outcomes:
                 (folder / OUTCOME_FILE).unlink()
 
-    def halve_worlds(self) -> bool | None:
-        """What was said of it on the command line; None if nothing was, so that the space decides."""
-        said: bool | None = self.manifest().get("options", {}).get("halve_worlds")
+    def said(self, option: str) -> bool | None:
+        """What was said of `halve_worlds` or `early_stopping` on a command line; None if nothing was, so that the space
+        decides."""
+        said: bool | None = self.manifest().get("options", {}).get(option)
         return said
 
-    def set_halve_worlds(self, said: bool) -> None:
-        """Keep what is said of it now, for the next time."""
+    def say(self, **options: bool | None) -> None:
+        """Keep what is said of such options now, for the next time; None says nothing."""
         manifest = self.manifest()
-        options = manifest.get("options", {}) | {"halve_worlds": said}
-        write_json(self.path / "manifest.json", manifest | {"options": options})
+        said = {option: value for option, value in options.items() if value is not None}
+        write_json(self.path / "manifest.json", manifest | {"options": manifest.get("options", {}) | said})
 
     def extension(self) -> dict[str, Any]:
         """How the experiment was extended since it was made: epochs, samples, seeds."""

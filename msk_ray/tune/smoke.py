@@ -12,12 +12,14 @@ EVALUATION_WORLDS = 4
 EVALUATION_STEPS = 32
 
 
-def without_pruning(space: Space) -> Space:
-    """The space with no trial stopped because others do better: each is to show that it runs to its end."""
-    if space.file.scheduler.kind not in ("asha", "median"):
-        return space
-    scheduler = space.file.scheduler.model_copy(update={"kind": "none"})
-    return space.model_copy(update={"file": space.file.model_copy(update={"scheduler": scheduler})})
+def without_early_stopping(space: Space) -> Space:
+    """The space with no trial ended because of its score or the others': each runs to its end. pbt stays, which ends
+    none."""
+    file = space.file
+    changes: dict[str, Any] = {"stop": file.stop.model_copy(update={"plateau": None, "target": None})}
+    if file.scheduler.kind in ("asha", "median"):
+        changes["scheduler"] = file.scheduler.model_copy(update={"kind": "none"})
+    return space.model_copy(update={"file": file.model_copy(update=changes)})
 
 
 def shrink(space: Space, trials: list[Trial]) -> list[Trial]:

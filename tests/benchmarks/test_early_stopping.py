@@ -82,4 +82,4 @@ def test_a_sweep_that_was_stopped_early_is_refused(
 ) -> None:
     (tmp_path / "manifest.json").write_text('{"format": 1, "name": "x", "question": "", "trials": []}')
     assert benchmark["run"](benchmark["main"], [str(tmp_path)]) != 0
-    assert "judge a finished sweep with scheduler: {kind: none}" in capsys.readouterr().err
+    assert "judge a finished sweep that ran with --no-early-stopping" in capsys.readouterr().err

@@ -1,5 +1,6 @@
 """The command line without Ray: dry runs, and refusals that cost one line and no work."""
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -8,8 +9,9 @@ from typing import Any
 
 import pytest
 
-from msk_ray.cli import run
+from msk_ray.cli import RESUMABLE, run
 from msk_ray.config import dump_yaml
+from msk_ray.tune import runner
 from msk_ray.tune.__main__ import main
 
 
@@ -97,3 +99,38 @@ def test_help_teaches_with_examples(capsys: pytest.CaptureFixture[str]) -> None:
     text = capsys.readouterr().out
     assert text.count("python -m msk_ray.tune --space") >= 6
     assert "exit codes" in text
+
+
+def test_every_trial_to_its_end_on_request(
+    space_data: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What ends trials by score is left out, what ends broken ones is not; --resume remembers."""
+    space = tmp_path / "small.yaml"
+    stop = {"target": 9.0, "plateau": {"patience": 2}, "wall_time_s": 60.0}
+    space.write_text(dump_yaml(space_data | {"scheduler": {"kind": "asha"}, "stop": stop}))
+    plans: list[runner.Plan] = []
+    monkeypatch.setattr(runner, "ray_session", lambda *args: contextlib.nullcontext())
+    monkeypatch.setattr(runner, "run_trials", lambda plan: bool(plans.append(plan)))
+
+    def early(*arguments: str) -> bool:
+        code = run(main, ["--space", str(space), "--cpu", "--storage", str(tmp_path / "runs"), *arguments])
+        assert code == RESUMABLE
+        file = plans.pop().space.file
+        assert (file.stop.nonfinite, file.stop.wall_time_s) == (True, 60.0)
+        by_score = {file.scheduler.kind != "none", file.stop.plateau is not None, file.stop.target is not None}
+        assert len(by_score) == 1, "all of them or none"
+        return by_score.pop()
+
+    assert not early("--no-early-stopping")
+    assert not early("--resume")
+    assert early("--resume", "--early-stopping")
+    assert early("--resume")
+    assert early("--name", "other")
+    space.write_text(dump_yaml(space_data | {"scheduler": {"kind": "pbt"}, **drawn_rate()}))
+    assert run(main, ["--space", str(space), "--dry-run", "--no-early-stopping"]) == 2
+    assert "in small.yaml trials go on from each other (pbt)" in capsys.readouterr().err
+
+
+def drawn_rate() -> dict[str, Any]:
+    """What pbt can exchange."""
+    return {"parameters": {"shac.actor_lr": {"loguniform": [1e-4, 1e-2]}}, "samples": 4}
