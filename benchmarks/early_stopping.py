@@ -29,6 +29,9 @@ from msk_ray.tune.space import SchedulerSpec
 from msk_ray.tune.standing import Observer
 from msk_ray.tune.stopping import Evaluation
 
+NEAR = 0.01
+"""What a sweep may lose of its best score and still have found as much, as a share of it."""
+
 
 @dataclass(frozen=True)
 class Judged:
@@ -117,7 +120,9 @@ class Chances:
 
     orders: int
     kept: int
-    """Orders in which the best of all went to its end."""
+    """Orders in which the best of all reached its best score."""
+    near: int
+    """Orders that left a score within NEAR of it: the best trial often has a twin."""
     mean_best: float
     """Best score that was left, mean over orders."""
     saved: tuple[float, float, float]
@@ -135,7 +140,8 @@ def chances(records: Sequence[TrialRecord], rule: Rule, slots: int, orders: int)
         lefts.append(max(one.best for one in judged))
         saved.append(1 - sum(one.last.env_steps for one in judged) / whole)
     kept = sum(left == best for left in lefts)
-    return Chances(orders, kept, sum(lefts) / orders, (min(saved), sum(saved) / orders, max(saved)))
+    near = sum(left >= best - NEAR * abs(best) for left in lefts)
+    return Chances(orders, kept, near, sum(lefts) / orders, (min(saved), sum(saved) / orders, max(saved)))
 
 
 def _whole(one: Judged) -> float:
@@ -173,7 +179,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     ran_on = sorted({standing.device.name for standing in Observer(experiment).look(time.time())} - {""})
     text = (
         f"{table(judged)}\n\nOver {odds.orders} random orders of the trials the best of all was kept in "
-        f"{odds.kept / odds.orders:.0%}; the best that was left has a mean of {odds.mean_best:.5g}; "
+        f"{odds.kept / odds.orders:.0%}, and a score within {NEAR:.0%} of it in {odds.near / odds.orders:.0%}; the best "
+        f"that was left has a mean of {odds.mean_best:.5g}; "
         f"{odds.saved[0]:.0%} to {odds.saved[2]:.0%} of the env steps were saved, {odds.saved[1]:.0%} on average.\n\n"
     )
     for record in unfinished:

@@ -71,10 +71,20 @@ def test_over_all_orders(benchmark: dict[str, Any]) -> None:
     rule = benchmark["Rule"](SchedulerSpec(kind="asha", grace=0.5, reduction=2), 200.0)
     odds = benchmark["chances"](RECORDS, rule, 1, 600)
     kept = odds.kept / odds.orders
+    assert odds.near == odds.kept, "nothing else comes near"
     assert kept == pytest.approx(1 / 3, abs=0.06)
     assert odds.mean_best == pytest.approx(kept * 9 + (1 - kept) * 4)
     # Least is saved by late, middle, early, where each is the best so far; most by early, late, middle.
     assert (odds.saved[0], odds.saved[2]) == pytest.approx((0.0, 200 / 600))
+
+
+def test_a_twin_is_as_good(benchmark: dict[str, Any]) -> None:
+    twins = [RECORDS[0], record("twin", 2.0, 2.0, 8.95), record("early", 3.0, 3.0, 4.0)]
+    rule = benchmark["Rule"](SchedulerSpec(kind="asha", grace=0.5, reduction=2), 200.0)
+    odds = benchmark["chances"](twins, rule, 1, 600)
+    # `late` goes on if it is first, the twin if it comes before `early`: 1/3 and 1/2, both in `late, twin, early` (1/6).
+    assert odds.kept / 600 == pytest.approx(1 / 3, abs=0.06)
+    assert odds.near / 600 == pytest.approx(1 / 3 + 1 / 2 - 1 / 6, abs=0.06)
 
 
 def test_a_sweep_that_was_stopped_early_is_refused(
