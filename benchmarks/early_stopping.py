@@ -17,9 +17,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from pydantic import ValidationError
 from record import RESULTS, markdown_table, publish
 
 from msk_ray.cli import run
+from msk_ray.config import describe_fault
 from msk_ray.errors import ConfigError
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.outcomes import Outcome
@@ -28,6 +30,7 @@ from msk_ray.tune.records import TrialRecord, read_records
 from msk_ray.tune.space import SchedulerSpec
 from msk_ray.tune.standing import Observer
 from msk_ray.tune.stopping import Evaluation
+from msk_ray.tune.table import outcome_name
 
 NEAR = 0.01
 """What a sweep may lose of its best score and still have found as much, as a share of it."""
@@ -120,7 +123,7 @@ class Chances:
 
     orders: int
     kept: int
-    """Orders in which the best of all reached its best score."""
+    """Orders in which the best of all got as far as its best score."""
     near: int
     """Orders that left a score within NEAR of it: the best trial often has a twin."""
     mean_best: float
@@ -144,6 +147,27 @@ def chances(records: Sequence[TrialRecord], rule: Rule, slots: int, orders: int)
     return Chances(orders, kept, near, sum(lefts) / orders, (min(saved), sum(saved) / orders, max(saved)))
 
 
+def choose(
+    records: Sequence[TrialRecord], experiment: Path, leave_out: bool
+) -> tuple[list[TrialRecord], list[TrialRecord]]:
+    """Trials that ran to their end, and the others.
+
+    Raises:
+        ConfigError: there are others, and they are not to be left out or were themselves stopped early: to judge the
+            ones that survived a rule would flatter any rule.
+    """
+    whole = [r for r in records if r.ending is not None and r.ending.outcome is Outcome.FINISHED]
+    others = [r for r in records if r not in whole]
+    stopped = [r for r in others if r.ending is not None and r.ending.cut]
+    if whole and not stopped and (leave_out or not others):
+        return whole, others
+    example = "".join(f", {r.trial.id} for one ({outcome_name(r)})" for r in [*stopped, *others][:1])
+    raise ConfigError(
+        f"{experiment}: {len(others)} of {len(records)} trials did not run to their end{example}; judge a finished sweep "
+        "that ran with --no-early-stopping" + (", or --leave-out-unfinished" if whole and not stopped else "")
+    )
+
+
 def _whole(one: Judged) -> float:
     return max(e.score for e in one.record.evaluations)
 
@@ -151,7 +175,7 @@ def _whole(one: Judged) -> float:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the benchmark the command line asks for."""
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("experiment", type=Path, help="folder of a finished sweep without a scheduler")
+    p.add_argument("experiment", type=Path, help="folder of a sweep that ran with --no-early-stopping")
     p.add_argument("--kind", choices=("asha", "median"), default="asha")
     p.add_argument("--grace", type=float, default=0.25, help="share of the budget that no trial is stopped within")
     p.add_argument("--reduction", type=float, default=3.0, help="asha: one in so many goes on")
@@ -160,17 +184,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     p.add_argument("--leave-out-unfinished", action="store_true", help="judge the others, and name what is left out")
     p.add_argument("--results", type=Path, default=RESULTS, help="folder the table is appended in")
     args = p.parse_args(argv)
+    if args.slots < 1 or args.orders < 1:
+        raise ConfigError(f"--slots {args.slots} --orders {args.orders}: at least 1 of each")
+    try:
+        spec = SchedulerSpec(kind=args.kind, grace=args.grace, reduction=args.reduction)
+    except ValidationError as error:
+        raise ConfigError(f"--{describe_fault(error, SchedulerSpec)}") from error
     experiment = Experiment(args.experiment.resolve())
     records = read_records(experiment)
-    whole = [r for r in records if r.ending is not None and r.ending.outcome is Outcome.FINISHED]
-    unfinished = [r for r in records if r not in whole]
-    if not whole or (unfinished and not args.leave_out_unfinished):
-        raise ConfigError(
-            f"{args.experiment}: {len(unfinished)} of {len(records)} trials did not run to their end, the first is "
-            f"{unfinished[0].trial.id if unfinished else '-'}; judge a finished sweep that ran with --no-early-stopping"
-            + (", or --leave-out-unfinished" if whole else "")
-        )
-    spec = SchedulerSpec(kind=args.kind, grace=args.grace, reduction=args.reduction)
+    whole, others = choose(records, args.experiment, args.leave_out_unfinished)
     rule = Rule(spec, max(record.evaluations[-1].time(spec.time_attr) for record in whole))
     judged = judge(whole, rule.fresh(), spec.time_attr, args.slots)
     odds = chances(whole, rule, args.slots, args.orders)
@@ -179,15 +201,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     ran_on = sorted({standing.device.name for standing in Observer(experiment).look(time.time())} - {""})
     text = (
         f"{table(judged)}\n\nOver {odds.orders} random orders of the trials the best of all was kept in "
-        f"{odds.kept / odds.orders:.0%}, and a score within {NEAR:.0%} of it in {odds.near / odds.orders:.0%}; the best "
-        f"that was left has a mean of {odds.mean_best:.5g}; "
+        f"{odds.kept / odds.orders:.0%}, and a score within {NEAR:.0%} of it in {odds.near / odds.orders:.0%}; the "
+        f"best that was left has a mean of {odds.mean_best:.5g}; "
         f"{odds.saved[0]:.0%} to {odds.saved[2]:.0%} of the env steps were saved, {odds.saved[1]:.0%} on average.\n\n"
     )
-    for record in unfinished:
-        best = max((e.score for e in record.evaluations), default=float("nan"))
+    for record in others:
+        best = "no score" if record.best is None else f"a best score of {record.best.score:.5g}"
         text += (
-            f"Left out: {record.trial.variant}, seed {record.trial.seed}, cut off at epoch {record.epochs_done} of "
-            f"{record.trial.config.trial.epochs} with a best score of {best:.5g}. "
+            f"Left out: {record.trial.variant}, seed {record.trial.seed}, {outcome_name(record)} at epoch "
+            f"{record.epochs_done} of {record.trial.config.trial.epochs} with {best}. "
         )
     text += f"The sweep ran on: {', '.join(ran_on) or 'CPU'}; it is judged on the machine above."
     publish("early_stopping", title, "cpu", text, args.results)

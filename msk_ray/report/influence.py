@@ -22,7 +22,7 @@ LEVELS = 16
 AXES = 8
 """Parameters of the parallel coordinates."""
 _CUT_WORDS = (
-    "Open circles are trials stopped before their time, or still running, with the best score they had: they might "
+    "Open circles are trials stopped before their end, or still running, with the best score they had: they might "
     "have risen further, so effects beside them are of the sweep as it was run, not of whole runs. "
 )
 _DECADES = 30.0

@@ -80,6 +80,12 @@ class TrialReading:
         scores = self.curve[1]
         return float(scores.max()) if len(scores) else None
 
+    def last_within(self, env_steps: float) -> float | None:
+        """Env steps of the last evaluation of a trained policy within so many; None if there is none."""
+        steps = self.curve[0]
+        within = steps[(steps > 0) & (steps <= env_steps)]
+        return float(within[-1]) if len(within) else None
+
     def score_within(self, env_steps: float) -> float | None:
         """Highest finite score of the evaluations in the first `env_steps`; None if there is none."""
         steps, scores = self.curve

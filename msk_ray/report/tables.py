@@ -38,22 +38,24 @@ class VariantRow:
     scores."""
     difference_interval: Interval | None
     compared_at: float | None
-    """If trials of this variant or of the baseline were cut short: the env steps that all of both have reached, which
-    is where they are compared. None if all ran to their end."""
+    """If trials of this variant or of the baseline stand before their end: the env steps they are compared at. None if
+    all ran to their end."""
     is_baseline: bool
     figures: dict[str, float]
     """Mean over seeds of further evaluation figures at the best evaluation, such as the speed."""
     halved: int = 0
     """How many of the scores are of trials with half their worlds."""
     cut: int = 0
-    """How many are of trials stopped before their time, or still running."""
+    """How many are of trials that ended, or stand, before their end without having failed."""
 
     @property
     def verdict(self) -> str:
         if self.is_baseline:
             return "baseline"
-        if self.difference is None:
+        if self.mean is None:
             return "no score"
+        if self.difference is None:
+            return "not comparable"
         if self.difference_interval is None:
             return "one seed"
         if not self.difference_interval.excludes(0.0):
@@ -101,8 +103,7 @@ def variant_rows(reading: Reading, baseline: str | None) -> list[VariantRow]:
         scores = _scores(trials)
         mean = _mean(scores) if scores else None
         own = variant == baseline
-        at, pair = _on_equal_terms(trials, reference)
-        compared = not own and all(pair)
+        at, pair = (None, None) if own else _on_equal_terms(trials, reference)
         figures = {}
         for name in names:
             found = [trial.best_row[f"eval/{name}"] for trial in trials if f"eval/{name}" in trial.best_row]
@@ -115,9 +116,9 @@ def variant_rows(reading: Reading, baseline: str | None) -> list[VariantRow]:
                 len(trials),
                 mean,
                 mean_interval(scores),
-                _mean(pair[0]) - _mean(pair[1]) if compared else None,
-                difference_interval(*pair) if compared else None,
-                at if compared else None,
+                _mean(pair[0]) - _mean(pair[1]) if pair else None,
+                difference_interval(*pair) if pair else None,
+                at if pair else None,
                 own,
                 figures,
                 sum(trial.halved is not None and trial.score is not None for trial in trials),
@@ -129,18 +130,31 @@ def variant_rows(reading: Reading, baseline: str | None) -> list[VariantRow]:
 
 def _on_equal_terms(
     trials: Sequence[TrialReading], reference: Sequence[TrialReading]
-) -> tuple[float | None, tuple[list[float], list[float]]]:
-    """The env steps that all trials cut short have reached, None if there are none; and the best scores up to there.
+) -> tuple[float | None, tuple[list[float], list[float]] | None]:
+    """Where two groups are compared, and their best scores up to there.
 
-    A stopped trial's score says what it had, and beside a whole run's it always looks worse.
+    A stopped trial's score says what it had; beside a whole run's it looks worse than it is. So if any stands before
+    its end, all count up to the newest evaluation that none is behind at; failed ones count with what they had, those
+    not evaluated since they began do not count.
+
+    Returns:
+        Env steps, None if all ran to their end; and the scores of either group, None if one has none.
     """
-    ends = [float(t.curve[0][-1]) for t in (*trials, *reference) if t.cut and t.score is not None]
-    limit = min(ends, default=math.inf)
+    begun = [t for t in (*trials, *reference) if not t.cut or t.last_within(math.inf) is not None]
+    counted = {id(t) for t in begun}
+    limit = math.inf
+    if any(t.cut for t in begun):
+        going = [t for t in begun if t.score is not None and not t.failed]
+        limit = min(t.last_within(math.inf) or 0.0 for t in going if t.cut)
+        # Whoever is evaluated at other env steps would else be ahead or behind by what lies between.
+        limit = min(t.last_within(limit) or 0.0 for t in going)
 
     def within(group: Sequence[TrialReading]) -> list[float]:
-        return [score for score in (trial.score_within(limit) for trial in group) if score is not None]
+        found = [trial.score_within(limit) for trial in group if id(trial) in counted]
+        return [score for score in found if score is not None]
 
-    return (limit if ends else None), (within(trials), within(reference))
+    pair = (within(trials), within(reference))
+    return (limit if limit < math.inf else None), (pair if limit > 0.0 and all(pair) else None)
 
 
 def _mean(scores: Sequence[float]) -> float:

@@ -51,8 +51,8 @@ class Ending:
 
     @property
     def cut(self) -> bool:
-        """Whether it came before the last epoch and was no failure: given more, the score might have risen."""
-        return not self.failed and self.outcome is not Outcome.FINISHED
+        """Whether the trial ended before it had used what it was given, without failing: its score might have risen."""
+        return not self.failed and self.outcome not in (Outcome.FINISHED, Outcome.WALL_TIME)
 
 
 def write_ending(folder: Path, ending: Ending) -> None:

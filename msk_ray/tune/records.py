@@ -43,8 +43,8 @@ class TrialRecord:
 
     @property
     def cut(self) -> bool:
-        """Whether it stands before its last epoch without having failed: given more, its score might have risen."""
-        return self.ending.cut if self.ending is not None else self.epochs_done > 0
+        """Whether it stands before its end without having failed: given more, its score might have risen."""
+        return self.ending.cut if self.ending is not None else bool(self.evaluations)
 
     @property
     def errored(self) -> bool:

@@ -29,7 +29,7 @@ def variant_rows(records: Sequence[TrialRecord]) -> list[tuple[str, ...]]:
             rows.append((float("-inf"), (variant, "0", "-", "-", "-", "-")))
             continue
         counts = {
-            "cut short": sum(record.cut for record in scored),
+            "before the end": sum(record.cut for record in scored),
             "with half the worlds": sum(record.halved is not None for record in scored),
         }
         remarks = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
@@ -66,8 +66,8 @@ def table_document(name: str, question: str, records: Sequence[TrialRecord]) -> 
         parts += ["By variant, over seeds:\n", markdown(header, variant_rows(records))]
         if any(record.cut for record in records):
             parts.append(
-                "Trials cut short count with the best score they had, which might have risen further: the report "
-                "compares variants at equal env steps.\n"
+                "Trials that stand or were stopped before their end count with the best score they had, which might "
+                "have risen further: the report compares variants at equal env steps.\n"
             )
     best = best_record(records)
     if best is not None:

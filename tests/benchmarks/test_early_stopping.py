@@ -1,12 +1,14 @@
 """A sweep without early stopping, judged afterwards: three trials small enough to follow by hand."""
 
 import runpy
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from msk_ray.tune.outcomes import Ending, Outcome
 from msk_ray.tune.pruning import SuccessiveHalving
 from msk_ray.tune.records import TrialRecord
 from msk_ray.tune.space import SchedulerSpec
@@ -82,9 +84,27 @@ def test_a_twin_is_as_good(benchmark: dict[str, Any]) -> None:
     twins = [RECORDS[0], record("twin", 2.0, 2.0, 8.95), record("early", 3.0, 3.0, 4.0)]
     rule = benchmark["Rule"](SchedulerSpec(kind="asha", grace=0.5, reduction=2), 200.0)
     odds = benchmark["chances"](twins, rule, 1, 600)
-    # `late` goes on if it is first, the twin if it comes before `early`: 1/3 and 1/2, both in `late, twin, early` (1/6).
+    # `late` goes on only if it is first; the twin in all orders but `early, twin, late`, where it is worse of two.
     assert odds.kept / 600 == pytest.approx(1 / 3, abs=0.06)
-    assert odds.near / 600 == pytest.approx(1 / 3 + 1 / 2 - 1 / 6, abs=0.06)
+    assert odds.near / 600 == pytest.approx(5 / 6, abs=0.06)
+
+
+def ended(name: str, outcome: Outcome | None) -> TrialRecord:
+    return replace(record(name, 1.0, 2.0, 3.0), ending=None if outcome is None else Ending(outcome, "so"))
+
+
+def test_only_whole_runs_are_judged(benchmark: dict[str, Any]) -> None:
+    """Those cut off by the clock may be left out; what a rule has stopped may not."""
+    choose, error, folder = benchmark["choose"], benchmark["ConfigError"], Path("runs/x")
+    whole, cut_off, broken = ended("a", Outcome.FINISHED), ended("b", None), ended("c", Outcome.NONFINITE)
+    assert choose([whole], folder, False) == ([whole], [])
+    assert choose([whole, cut_off, broken], folder, True) == ([whole], [cut_off, broken])
+    with pytest.raises(error, match=r"2 of 3 .* b for one \(interrupted\); .* or --leave-out-unfinished"):
+        choose([whole, cut_off, broken], folder, False)
+    with pytest.raises(error, match=r"2 of 3 .* s for one \(stopped_asha\); .*--no-early-stopping$"):
+        choose([whole, cut_off, ended("s", Outcome.STOPPED_ASHA)], folder, True)
+    with pytest.raises(error, match=r"1 of 1 .*--no-early-stopping$"):
+        choose([cut_off], folder, True)
 
 
 def test_a_sweep_that_was_stopped_early_is_refused(

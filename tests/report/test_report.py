@@ -103,9 +103,49 @@ def test_stopped_trials_are_compared_where_they_stopped(experiment: experiments.
     # All of `deep` ended by itself, finished or failed: whole runs are compared.
     assert (deep.compared_at, deep.difference) == (None, 6.5 - 60.0)
     page = page_of(experiment)
-    assert "2 of 2 (2 cut short)" in page
+    assert "2 of 2 (2 before the end)" in page
     assert "compared at" in page
-    assert "Open circles are trials stopped before their time" in page
+    assert "Open circles are trials stopped before their end" in page
+
+
+def compared(made: experiments.Experiment, curves: dict[str, list[tuple[int, float]]], outcome: Outcome) -> Any:
+    """The row of `fast`, stopped with this outcome, beside whole runs of the baseline: one seed counts of each."""
+    for trial in made.trials():
+        name = trial.changed["variant"]
+        if name not in curves or trial.seed:
+            (made.trial_folder(trial.id) / "metrics.jsonl").unlink(missing_ok=True)
+            continue
+        rows = [row(epoch, score) for epoch, score in curves[name]]
+        (made.trial_folder(trial.id) / "metrics.jsonl").write_text("".join(json.dumps(r) + "\n" for r in rows))
+        if name == "fast":
+            write_ending(made.trial_folder(trial.id), Ending(outcome, "so"))
+    rows_now = variant_rows(read_experiment(made, time.time()), "baseline")
+    return next(r for r in rows_now if r.variant == "fast")
+
+
+def test_nobody_is_compared_with_an_untrained_policy(experiment: experiments.Experiment) -> None:
+    """At its first evaluation the baseline was elsewhere: at epoch 6, where `fast` no longer was."""
+    stopped = Outcome.STOPPED_ASHA
+    fast = compared(experiment, {"baseline": [(0, 0.0), (6, 90.0)], "fast": [(0, 0.0), (4, 50.0)]}, stopped)
+    assert (fast.mean, fast.difference, fast.verdict) == (50.0, None, "not comparable")
+    fast = compared(experiment, {"baseline": [(0, 0.0), (6, 90.0)], "fast": [(0, 50.0)]}, stopped)
+    assert (fast.mean, fast.cut, fast.verdict) == (50.0, 1, "not comparable")
+    assert "compared at" not in page_of(experiment)
+
+
+def test_evaluations_at_other_env_steps_are_compared_at_the_newest_common_ones(
+    experiment: experiments.Experiment,
+) -> None:
+    """`fast` was stopped at epoch 5; the baseline was evaluated at 4 before that, where `fast` had been at 3."""
+    baseline, fast = [(0, 0.0), (4, 40.0), (8, 80.0)], [(0, 0.0), (3, 35.0), (5, 55.0)]
+    found = compared(experiment, {"baseline": baseline, "fast": fast}, Outcome.STOPPED_ASHA)
+    assert (found.compared_at, found.difference) == (400.0, 35.0 - 40.0)
+
+
+def test_what_used_up_its_time_is_a_whole_run(experiment: experiments.Experiment) -> None:
+    curves = {"baseline": [(0, 0.0), (4, 40.0), (8, 80.0)], "fast": [(0, 0.0), (4, 50.0)]}
+    found = compared(experiment, curves, Outcome.WALL_TIME)
+    assert (found.compared_at, found.difference, found.cut) == (None, 50.0 - 80.0, 0)
 
 
 def test_the_page_says_it_all_and_takes_nothing_for_markup(experiment: experiments.Experiment) -> None:

@@ -58,13 +58,13 @@ def test_records_and_tables(experiment: experiments.Experiment, tmp_path: Path) 
     assert rows[1][1:7] == ("actor_lr=0.01", "0", "5", "2", "4/20", "finished")
     # Rate 0.01: best scores 5 and 7, mean 6, deviation √2.
     assert variant_rows(records)[0] == ("actor_lr=0.01", "2", "6", "1.414", "5", "7")
-    assert [row[1] for row in variant_rows(records)] == ["2", "1 (1 cut short)"]
+    assert [row[1] for row in variant_rows(records)] == ["2", "1 (1 before the end)"]
     document = table_document("e", "Which?", records)
     assert "number 2 of 2 \\| rung" in document
     assert f"trials/{records[2].trial.id}/checkpoints/best.pt" in document
-    assert "Trials cut short count with the best score they had" in document
+    assert "count with the best score they had" in document
     whole = table_document("e", "Which?", [records[0], records[2]])
-    assert "cut short" not in whole
+    assert "before the" not in whole
     facts = json.loads(json.dumps(summary("e", "Which?", records), allow_nan=False))
     assert facts["best"]["id"] == records[2].trial.id
 
