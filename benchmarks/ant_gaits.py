@@ -24,6 +24,8 @@ SETTLED = 2.5
 """Seconds after which the gait counts."""
 SLOWEST = 0.5
 """Strides a second below which an oscillation is no stride."""
+LOCKED = 0.75
+"""Share of the time at an end of its range from which a joint is named."""
 MARGIN = 0.05
 """A joint so near an end of its range is at it [rad]: the limits of these models are soft."""
 
@@ -60,7 +62,7 @@ def gait(states: States, timestep: float) -> Gait:
     power = (np.abs(np.fft.rfft(joints - joints.mean(0), axis=0)) ** 2).sum(1)
     rates = np.fft.rfftfreq(len(joints), timestep)
     fast = rates >= SLOWEST
-    low, high = model.jnt_range[1:].T
+    low, high = np.where(model.jnt_limited[1:, None], model.jnt_range[1:], [-np.inf, np.inf]).T
     return Gait(
         vx=float(qpos[-1, 0] - qpos[0, 0]) / ((len(qpos) - 1) * timestep),
         flight=1.0 - touching / len(qpos),
@@ -79,11 +81,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     p.add_argument("--results", type=Path, default=RESULTS, help="folder the table is appended in")
     args = p.parse_args(argv)
     rows = []
+    if args.worlds < 1:
+        raise ConfigError(f"--worlds {args.worlds}: at least 1")
     for checkpoint in args.checkpoints:
         recording = record(
             Bench(args.device), load_policy(checkpoint), Request("reference", args.worlds, None, args.steps)
         )
         enough = round(2 * SETTLED / recording.timestep)
+        if args.steps < enough:
+            raise ConfigError(f"--steps {args.steps}: a gait is told from {enough} env steps or more")
+        joints = recording.model.jnt_type
+        if recording.model.nv < 7 or joints[0] != mujoco.mjtJoint.mjJNT_FREE or recording.model.nq != len(joints) + 6:
+            raise ConfigError(f"{checkpoint}: its model is no free root with hinges; ant is")
         whole = [w for w in range(recording.count) if recording.length(w) >= enough]
         if not whole:
             raise ConfigError(f"{checkpoint}: all episodes ended within {2 * SETTLED:g} s; name a policy that goes on")
@@ -93,10 +102,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         locked = [
             f"{mujoco.mj_id2name(recording.model, mujoco.mjtObj.mjOBJ_JOINT, j + 1)} {share:.0%}"
             for j, share in enumerate(shares)
-            if share > 0.75
+            if share > LOCKED
         ]
         figures = [f"{vx:.2f}", f"{flight:.0%}", f"{rate:.2f}", f"{vx / rate:.2f}", ", ".join(locked) or "none"]
-        rows.append([checkpoint.stem, *figures, f"{len(whole)} of {recording.count}"])
+        rows.append([str(checkpoint), *figures, f"{len(whole)} of {recording.count}"])
         print(" | ".join(rows[-1]), flush=True)
     header = [
         "policy",

@@ -163,8 +163,8 @@ def choose(
         return whole, others
     example = "".join(f", {r.trial.id} for one ({outcome_name(r)})" for r in [*stopped, *others][:1])
     raise ConfigError(
-        f"{experiment}: {len(others)} of {len(records)} trials did not run to their end{example}; judge a finished sweep "
-        "that ran with --no-early-stopping" + (", or --leave-out-unfinished" if whole and not stopped else "")
+        f"{experiment}: {len(others)} of {len(records)} trials did not run to their end{example}; judge a finished "
+        "sweep that ran with --no-early-stopping" + (", or --leave-out-unfinished" if whole and not stopped else "")
     )
 
 

@@ -1,11 +1,18 @@
 """Files that are whole or not there at all, and folders that take them."""
 
+import contextlib
 import json
 import os
+import socket
+import time
 from pathlib import Path
 from typing import Any
 
 from msk_ray.errors import StorageError, StorageFailure
+
+STALE_S = 3600.0
+"""Age after which a temporary file has lost its writer."""
+_PART = ".part"
 
 
 def check_writable(path: Path) -> None:
@@ -29,8 +36,8 @@ def write_bytes(path: Path, payload: bytes) -> None:
     Raises:
         StorageFailure: the disk is full or the folder not writable; what was there before is untouched.
     """
-    # Another process may write the same file: each has its own temporary.
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    # Another process, perhaps of another host, may write the same file: each has its own temporary.
+    temporary = path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}{_PART}")
     try:
         with temporary.open("wb") as file:
             file.write(payload)
@@ -40,6 +47,14 @@ def write_bytes(path: Path, payload: bytes) -> None:
     except OSError as error:
         temporary.unlink(missing_ok=True)
         raise StorageFailure(f"cannot write {path}: {error.strerror or error}") from error
+
+
+def sweep(folder: Path) -> None:
+    """Remove temporaries that processes killed while writing have left here: none takes `STALE_S` to write."""
+    for path in folder.glob(f".*{_PART}"):
+        with contextlib.suppress(FileNotFoundError):  # its writer, or another sweep, was faster
+            if time.time() - path.stat().st_mtime > STALE_S:
+                path.unlink()
 
 
 def write_text(path: Path, text: str) -> None:

@@ -115,9 +115,7 @@ def newest_valid_checkpoint(folder: Path) -> tuple[Path | None, list[str]]:
 
 
 def prune_checkpoints(folder: Path, keep: int) -> None:
-    """Delete all but the `keep` newest numbered checkpoints, and what a process killed while writing has left."""
-    for path in folder.glob(".*.pt.*"):
-        path.unlink()
+    """Delete all but the `keep` newest numbered checkpoints."""
     for path in epoch_checkpoints(folder)[keep:]:
         path.unlink()
         manifest_path(path).unlink(missing_ok=True)

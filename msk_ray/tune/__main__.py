@@ -17,7 +17,7 @@ from msk_ray.tune import experiment as experiments
 from msk_ray.tune.extension import extended_space, parse_extension
 from msk_ray.tune.listing import text_table, trial_rows
 from msk_ray.tune.made_up import recover
-from msk_ray.tune.outcomes import Outcome
+from msk_ray.tune.outcomes import Outcome, read_ending
 from msk_ray.tune.smoke import shrink, without_early_stopping
 from msk_ray.tune.space import Space, find_space, parse_seeds, parse_space
 from msk_ray.tune.trials import Trial, find_trial, resolve_trials
@@ -42,9 +42,6 @@ EXAMPLES = """\
 exit codes: 0 all trials ended, 1 some ended in an error, 2 refused before any work began, 75 stopped on request and
 resumable."""
 
-REMEMBERED = ("halve_worlds", "early_stopping")
-"""Options that --resume goes on with unless it says otherwise."""
-
 
 def parser() -> Parser:
     """The command line."""
@@ -65,7 +62,11 @@ def parser() -> Parser:
         help="whether scores end trials (asha, median, stop.plateau, stop.target) as the space says, or all run to "
         "their end; with --resume as before",
     )
-    p.add_argument("--smoke", action="store_true", help="shrink to minutes: every value of every factor, few epochs")
+    p.add_argument(
+        "--smoke",
+        action="store_true",
+        help="shrink to minutes: every value of every factor, few epochs, no early stopping",
+    )
     p.add_argument("--dry-run", action="store_true", help="print the resolved trials and stop")
     p.add_argument("--debug-trial", metavar="K", help="run trial K (number or id of --dry-run) here, without Ray")
     where = p.add_argument_group("where and how")
@@ -115,12 +116,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     retried = _retried(args)
     if retried and not args.resume:
         raise ConfigError(f"--retry{'-errored' if args.retry_errored else ''} goes with --resume")
+    if args.smoke and args.early_stopping:
+        raise ConfigError("--early-stopping: a smoke run ends no trial by its score; leave one of them out")
     extension = parse_extension(args.extend)
     if extension and args.smoke:
         raise ConfigError("--extend: a smoke run has nothing to extend; leave --smoke out")
     recorded = _recorded(args)
     if recorded is not None:
-        for option in REMEMBERED:
+        for option in experiments.REMEMBERED:
             if getattr(args, option) is None:
                 setattr(args, option, recorded.said(option))
     space = _read_space(args, (recorded.extension() if recorded is not None else {}) | extension)
@@ -182,7 +185,10 @@ def _read_space(args: argparse.Namespace, extension: Mapping[str, Any]) -> Space
     space = parse_space(extended_space(data, extension), path)
     if args.early_stopping is False:
         if space.file.scheduler.kind == "pbt":
-            raise ConfigError(f"--no-early-stopping: in {path.name} trials go on from each other (pbt); leave it out")
+            raise ConfigError(
+                f"--no-early-stopping: in {path.name} trials go on from each other (pbt); leave it out, or say "
+                "--early-stopping if the experiment remembers it"
+            )
         space = without_early_stopping(space)
     return space
 
@@ -227,6 +233,10 @@ def _run(args: argparse.Namespace, space: Space, trials: list[Trial], extension:
     going_on = args.resume or bool(extension)
     if going_on:
         searching = space.file.search == "optuna"
+        recorded = _recorded(args)
+        another_rule = recorded is not None and args.early_stopping != recorded.said("early_stopping")
+        if recorded is not None and not another_rule:
+            recorded.check_scheduler(space)
         experiment = experiments.reopen(path, None if searching else trials, extension)
         if searching:
             # Else the manifest learns of them only at the end.
@@ -235,7 +245,11 @@ def _run(args: argparse.Namespace, space: Space, trials: list[Trial], extension:
             # As recorded: with the ids they began with, and the epochs they were extended to.
             trials = experiment.trials()
         experiment.clear_endings(_retried(args))
-        experiment.say(**{option: getattr(args, option) for option in REMEMBERED})
+        if another_rule:
+            experiment.write_space(space)
+        if args.early_stopping is False:
+            _name_stopped(experiment)
+        experiment.say(**{option: getattr(args, option) for option in experiments.REMEMBERED})
     # ray and torch take seconds to load; a wrong command line should not wait for them.
     from msk_ray.tune import runner
     from msk_ray.tune.devices import choose_placement, local_gpus
@@ -259,6 +273,15 @@ def _run(args: argparse.Namespace, space: Space, trials: list[Trial], extension:
             return RESUMABLE
         write_report(experiment)
     return 1 if errors else 0
+
+
+def _name_stopped(experiment: experiments.Experiment) -> None:
+    """Say that trials stopped before --no-early-stopping was said stay stopped, and what lets them go on."""
+    endings = [read_ending(experiment.trial_folder(trial.id)) for trial in experiment.trials()]
+    stopped = [ending.outcome for ending in endings if ending is not None and ending.cut]
+    if stopped:
+        names = ",".join(sorted(set(stopped)))
+        print(f"stopped early before, and left so: {len(stopped)} trials; --retry {names} lets them go on")
 
 
 def _options(args: argparse.Namespace) -> dict[str, Any]:

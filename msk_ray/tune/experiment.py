@@ -23,18 +23,23 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
+
 import msk_ray
 from msk_ray.cli import typed_command
-from msk_ray.config import dump_yaml, parse_config
-from msk_ray.errors import StorageError
+from msk_ray.config import dump_yaml, parse_config, read_yaml
+from msk_ray.errors import MskRayError, StorageError
 from msk_ray.files import check_writable, write_json, write_text
 from msk_ray.nvidia_smi import ask_driver
 from msk_ray.tune.extension import extend_trials
 from msk_ray.tune.outcomes import OUTCOME_FILE, Outcome, read_ending
-from msk_ray.tune.space import Space
+from msk_ray.tune.space import Space, SpaceFile
 from msk_ray.tune.trials import Trial, describe_changes
 
 FORMAT = 1
+SPACE_FILE = "space.yaml"
+REMEMBERED = ("halve_worlds", "early_stopping")
+"""Options that --resume goes on with unless it says otherwise."""
 STOP_FILE = "stop"
 """While this file lies in the experiment's folder, trials save themselves and end at their next epoch."""
 _PACKAGES = ("msk-ray", "torch", "warp-lang", "mujoco", "mujoco-warp", "ray", "numpy")
@@ -52,10 +57,12 @@ class Experiment:
         return self.path.name
 
     def resume_command(self) -> str:
-        """The command that goes on with it: the one it was begun with, and --resume."""
+        """The command that goes on with it: the one it was begun with, and --resume, which remembers the last word on
+        `REMEMBERED`."""
+        flags = {f"--{no}{option.replace('_', '-')}" for option in REMEMBERED for no in ("", "no-")}
         try:
             argv = json.loads((self.path / "env.json").read_text(encoding="utf-8"))["command"]
-            return typed_command([str(word) for word in argv], "--resume")
+            return typed_command([str(word) for word in argv if word not in flags], "--resume")
         except (OSError, ValueError, KeyError, TypeError, IndexError):
             # What was typed is lost, or was never whole; its options are in nobody else's hands.
             return "python -m msk_ray.tune --resume, with the options it was begun with"
@@ -116,16 +123,39 @@ class Experiment:
                 (folder / OUTCOME_FILE).unlink()
 
     def said(self, option: str) -> bool | None:
-        """What was said of `halve_worlds` or `early_stopping` on a command line; None if nothing was, so that the space
-        decides."""
-        said: bool | None = self.manifest().get("options", {}).get(option)
+        """What was said of one of `REMEMBERED` on a command line; None if nothing was, so that the space decides."""
+        said: bool | None = (self.manifest().get("options") or {}).get(option)
         return said
 
     def say(self, **options: bool | None) -> None:
         """Keep what is said of such options now, for the next time; None says nothing."""
         manifest = self.manifest()
         said = {option: value for option, value in options.items() if value is not None}
-        write_json(self.path / "manifest.json", manifest | {"options": manifest.get("options", {}) | said})
+        write_json(self.path / "manifest.json", manifest | {"options": (manifest.get("options") or {}) | said})
+
+    def write_space(self, space: Space) -> None:
+        """Record the space as it is run, its scheduler in full: a default may change, and the rungs with it."""
+        written = space.file.model_dump(mode="json", exclude_unset=True)
+        written["scheduler"] = space.file.scheduler.model_dump(mode="json")
+        write_text(self.path / SPACE_FILE, dump_yaml(written))
+
+    def check_scheduler(self, space: Space) -> None:
+        """Refuse to go on by another rule than trials have been stopped by so far.
+
+        Raises:
+            StorageError: the space's scheduler is not the recorded one.
+        """
+        try:
+            recorded = SpaceFile.model_validate(read_yaml(self.path / SPACE_FILE)).scheduler.model_dump()
+        except (MskRayError, ValidationError):
+            return  # lost or torn: nothing hangs on it but this check and the report
+        now = space.file.scheduler.model_dump()
+        changes = [f"{key} {recorded[key]} → {now[key]}" for key in now if now[key] != recorded[key]]
+        if changes:
+            raise StorageError(
+                f"--resume: the space's scheduler is not the one of {self.path}: {', '.join(changes)}; undo that, or "
+                "pass another --name"
+            )
 
     def extension(self) -> dict[str, Any]:
         """How the experiment was extended since it was made: epochs, samples, seeds."""
@@ -168,8 +198,7 @@ def create(path: Path, space: Space, trials: list[Trial], options: dict[str, Any
         raise StorageError(f"{path} holds an experiment already: add --resume to go on with it, or pass another --name")
     check_writable(path)
     (path / "trials").mkdir(exist_ok=True)
-    written = space.file.model_dump(mode="json", exclude_unset=True)
-    write_text(path / "space.yaml", dump_yaml(written))
+    experiment.write_space(space)
     write_json(path / "env.json", environment())
     manifest = {
         "format": FORMAT,

@@ -1,6 +1,7 @@
 """The command line without Ray: dry runs, and refusals that cost one line and no work."""
 
 import contextlib
+import json
 import os
 import subprocess
 import sys
@@ -10,9 +11,11 @@ from typing import Any
 import pytest
 
 from msk_ray.cli import RESUMABLE, run
-from msk_ray.config import dump_yaml
+from msk_ray.config import dump_yaml, read_yaml
 from msk_ray.tune import runner
 from msk_ray.tune.__main__ import main
+from msk_ray.tune.experiment import Experiment
+from msk_ray.tune.outcomes import Ending, Outcome, write_ending
 
 
 @pytest.fixture
@@ -121,14 +124,52 @@ def test_every_trial_to_its_end_on_request(
         assert len(by_score) == 1, "all of them or none"
         return by_score.pop()
 
+    def recorded() -> Any:
+        return read_yaml(tmp_path / "runs" / "small" / "space.yaml")["scheduler"]["kind"]
+
     assert not early("--no-early-stopping")
+    assert recorded() == "none"
     assert not early("--resume")
+    made = Experiment(tmp_path / "runs" / "small")
+    made.trial_folder(made.trials()[0].id).mkdir()
+    write_ending(made.trial_folder(made.trials()[0].id), Ending(Outcome.STOPPED_ASHA, "behind"))
     assert early("--resume", "--early-stopping")
+    assert recorded() == "asha"
     assert early("--resume")
+    capsys.readouterr()
+    assert not early("--resume", "--no-early-stopping")
+    assert "left so: 1 trials; --retry stopped_asha lets them go on" in capsys.readouterr().out
+    facts = json.loads((made.path / "env.json").read_text())
+    (made.path / "env.json").write_text(json.dumps(facts | {"command": ["msk-ray", "tune", "--no-early-stopping"]}))
+    assert made.resume_command() == "msk-ray tune --resume", "not what would undo a later word"
+    assert early("--resume", "--early-stopping")
     assert early("--name", "other")
+    assert run(main, ["--space", str(space), "--cpu", "--smoke", "--early-stopping"]) == 2
+    assert "a smoke run ends no trial by its score" in capsys.readouterr().err
     space.write_text(dump_yaml(space_data | {"scheduler": {"kind": "pbt"}, **drawn_rate()}))
     assert run(main, ["--space", str(space), "--dry-run", "--no-early-stopping"]) == 2
     assert "in small.yaml trials go on from each other (pbt)" in capsys.readouterr().err
+
+
+def test_another_rule_is_refused(
+    space_data: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Trials that one rule has stopped do not go on beside others under another; a new default is no new rule."""
+    space = tmp_path / "small.yaml"
+    space.write_text(dump_yaml(space_data | {"scheduler": {"kind": "asha"}}))
+    monkeypatch.setattr(runner, "ray_session", lambda *args: contextlib.nullcontext())
+    monkeypatch.setattr(runner, "run_trials", lambda plan: False)
+    arguments = ["--space", str(space), "--cpu", "--storage", str(tmp_path / "runs")]
+    assert run(main, arguments) == RESUMABLE
+    kept = read_yaml(tmp_path / "runs" / "small" / "space.yaml")["scheduler"]
+    assert (kept["grace"], kept["reduction"]) == (0.25, 3.0), "in full"
+    space.write_text(dump_yaml(space_data | {"scheduler": {"kind": "asha", "grace": 0.1}}))
+    manifest = (tmp_path / "runs" / "small" / "manifest.json").read_text()
+    assert run(main, [*arguments, "--resume"]) != 0
+    assert "grace 0.25 → 0.1" in capsys.readouterr().err
+    assert (tmp_path / "runs" / "small" / "manifest.json").read_text() == manifest
+    space.write_text(dump_yaml(space_data | {"scheduler": {"kind": "asha", "grace": 0.25}}))
+    assert run(main, [*arguments, "--resume"]) == RESUMABLE
 
 
 def drawn_rate() -> dict[str, Any]:
