@@ -42,6 +42,8 @@ class Gait:
     """Strides a second: where the joints' power spectrum, summed, has its peak."""
     at_end: np.ndarray
     """Share of the time that each hinge is at an end of its range, (J,)."""
+    past: np.ndarray
+    """How far each is past the nearer end [rad], mean over time, (J,); negative inside the range."""
 
 
 def gait(states: States, timestep: float) -> Gait:
@@ -67,6 +69,7 @@ def gait(states: States, timestep: float) -> Gait:
         vx=float(qpos[-1, 0] - qpos[0, 0]) / ((len(qpos) - 1) * timestep),
         flight=1.0 - touching / len(qpos),
         rate=float(rates[fast][power[fast].argmax()]),
+        past=np.maximum(low - joints, joints - high).mean(0),
         at_end=((joints < low + MARGIN) | (joints > high - MARGIN)).mean(0),
     )
 
@@ -98,13 +101,14 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise ConfigError(f"{checkpoint}: all episodes ended within {2 * SETTLED:g} s; name a policy that goes on")
         gaits = [gait(recording.world(w), recording.timestep) for w in whole]
         vx, flight, rate = (float(np.median([getattr(g, key) for g in gaits])) for key in ("vx", "flight", "rate"))
-        shares = np.mean([g.at_end for g in gaits], axis=0)
+        shares, past = (np.mean([getattr(g, key) for g in gaits], axis=0) for key in ("at_end", "past"))
         locked = [
-            f"{mujoco.mj_id2name(recording.model, mujoco.mjtObj.mjOBJ_JOINT, j + 1)} {share:.0%}"
+            f"{mujoco.mj_id2name(recording.model, mujoco.mjtObj.mjOBJ_JOINT, j + 1)} {share:.0%}, "
+            f"{np.degrees(past[j]):.0f}° past it"
             for j, share in enumerate(shares)
             if share > LOCKED
         ]
-        figures = [f"{vx:.2f}", f"{flight:.0%}", f"{rate:.2f}", f"{vx / rate:.2f}", ", ".join(locked) or "none"]
+        figures = [f"{vx:.2f}", f"{flight:.0%}", f"{rate:.2f}", f"{vx / rate:.2f}", "; ".join(locked) or "none"]
         rows.append([str(checkpoint), *figures, f"{len(whole)} of {recording.count}"])
         print(" | ".join(rows[-1]), flush=True)
     header = [

@@ -51,3 +51,5 @@ def test_figures_of_a_made_gait(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found.flight == pytest.approx(0.5, abs=0.01)
     assert found.rate == pytest.approx(3.0, abs=0.03)
     assert found.at_end == pytest.approx([0.0, 1.0])
+    # Mean of |0.5 sin| is 1/π.
+    assert found.past == pytest.approx([1 / np.pi - 1.0, -0.02], abs=2e-3)
