@@ -28,20 +28,21 @@ def device_name(device: str) -> str:
 
 
 def commit() -> str:
-    """Short git commit of the working tree; outside a clone what MSK_RAY_COMMIT says, or "unknown"."""
+    """Short git commit of the working tree, with -dirty if anything but results differs from it; outside a clone what
+    MSK_RAY_COMMIT says, or "unknown"."""
     if "MSK_RAY_COMMIT" in os.environ:
         return os.environ["MSK_RAY_COMMIT"]
     try:
-        answer = subprocess.run(
-            ["git", "describe", "--always", "--dirty"],
-            capture_output=True,
-            text=True,
-            cwd=Path(__file__).parent,
-            check=True,
-        )
+        # The tables themselves, of which one run appends several, are no change of what is measured.
+        changed = _git("diff", "HEAD", "--name-only", "--", ".", ":!benchmarks/results")
+        return _git("rev-parse", "--short", "HEAD") + ("-dirty" if changed else "")
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
-    return answer.stdout.strip()
+
+
+def _git(*arguments: str) -> str:
+    root = Path(__file__).parents[1]
+    return subprocess.run(["git", *arguments], capture_output=True, text=True, cwd=root, check=True).stdout.strip()
 
 
 def markdown_table(header: list[str], rows: list[list[str]]) -> str:
