@@ -60,7 +60,8 @@ class VariantRow:
             return "one seed"
         if not self.difference_interval.excludes(0.0):
             return "unclear"
-        return "better" if self.difference > 0 else "worse"
+        word = "better" if self.difference > 0 else "worse"
+        return word if self.compared_at is None else f"{word} so far"
 
 
 def baseline_of(reading: Reading, asked: str | None) -> str | None:

@@ -99,7 +99,7 @@ def test_stopped_trials_are_compared_where_they_stopped(experiment: experiments.
     fast, deep = rows["fast"], rows["deep"]
     assert (fast.mean, fast.cut, rows["baseline"].mean) == (7.5, 2, 60.0)
     # At 200 env steps: (7 + 8)/2 against (4 + 6)/2; the bootstrap's extremes are 7 - 6 and 8 - 4.
-    assert (fast.compared_at, fast.difference, fast.verdict) == (200.0, 2.5, "better")
+    assert (fast.compared_at, fast.difference, fast.verdict) == (200.0, 2.5, "better so far")
     # All of `deep` ended by itself, finished or failed: whole runs are compared.
     assert (deep.compared_at, deep.difference) == (None, 6.5 - 60.0)
     page = page_of(experiment)
