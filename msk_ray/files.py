@@ -49,10 +49,10 @@ def write_bytes(path: Path, payload: bytes) -> None:
         raise StorageFailure(f"cannot write {path}: {error.strerror or error}") from error
 
 
-def sweep(folder: Path) -> None:
+def remove_stale(folder: Path) -> None:
     """Remove temporaries that processes killed while writing have left here: none takes `STALE_S` to write."""
     for path in folder.glob(f".*{_PART}"):
-        with contextlib.suppress(FileNotFoundError):  # its writer, or another sweep, was faster
+        with contextlib.suppress(FileNotFoundError):  # its writer, or another process here, was faster
             if time.time() - path.stat().st_mtime > STALE_S:
                 path.unlink()
 

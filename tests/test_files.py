@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from msk_ray.errors import StorageError
-from msk_ray.files import STALE_S, sweep, write_bytes
+from msk_ray.files import STALE_S, remove_stale, write_bytes
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -37,5 +37,5 @@ def test_what_a_killed_writer_left_goes_and_what_is_being_written_stays(
     then = time.time() - STALE_S - 1.0
     os.utime(killed, (then, then))
     os.utime(tmp_path / "best.pt", (then, then))
-    sweep(tmp_path)
+    remove_stale(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"best.pt", going.name}

@@ -9,7 +9,7 @@ from typing import Any
 from msk_ray.config import Config, dump_yaml
 from msk_ray.envs import make_env
 from msk_ray.errors import CheckpointError, StorageError
-from msk_ray.files import sweep, write_bytes
+from msk_ray.files import remove_stale, write_bytes
 from msk_ray.shac import Shac
 from msk_ray.training.checkpoint import (
     epoch_checkpoints,
@@ -57,7 +57,7 @@ class Trainer:
         except OSError as error:
             raise StorageError(f"cannot create {self.checkpoints}: {error.strerror or error}") from error
         for folder in (logdir, self.checkpoints):
-            sweep(folder)
+            remove_stale(folder)
         if not epoch_checkpoints(self.checkpoints):
             # Else the file says what those were trained under, until one of them is gone on from.
             self._write_config()
