@@ -83,16 +83,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     p.add_argument("--device", default="cpu")
     p.add_argument("--results", type=Path, default=RESULTS, help="folder the table is appended in")
     args = p.parse_args(argv)
-    rows = []
     if args.worlds < 1:
         raise ConfigError(f"--worlds {args.worlds}: at least 1")
+    bench, request = Bench(args.device), Request("reference", args.worlds, None, args.steps)
+    rows = []
     for checkpoint in args.checkpoints:
-        recording = record(
-            Bench(args.device), load_policy(checkpoint), Request("reference", args.worlds, None, args.steps)
-        )
-        enough = round(2 * SETTLED / recording.timestep)
+        policy = load_policy(checkpoint)
+        enough = round(2 * SETTLED / policy.config.env.control_timestep)
         if args.steps < enough:
             raise ConfigError(f"--steps {args.steps}: a gait is told from {enough} env steps or more")
+        recording = record(bench, policy, request)
         joints = recording.model.jnt_type
         if recording.model.nv < 7 or joints[0] != mujoco.mjtJoint.mjJNT_FREE or recording.model.nq != len(joints) + 6:
             raise ConfigError(f"{checkpoint}: its model is no free root with hinges; ant is")

@@ -6,7 +6,7 @@ from enum import StrEnum
 from pathlib import Path
 
 from msk_ray.errors import CheckpointError, StorageError
-from msk_ray.tune.experiment import Experiment
+from msk_ray.tune.experiment import SPACE_FILE, Experiment
 from msk_ray.tune.records import best_record, read_records
 from msk_ray.tune.standing import find_experiments
 
@@ -109,7 +109,7 @@ def trial_folder_of(checkpoint: Path) -> Path:
 
 
 def _kind_of(path: Path) -> Kind:
-    if any((path / part).exists() for part in ("manifest.json", "space.yaml", "trials")):
+    if any((path / part).exists() for part in ("manifest.json", SPACE_FILE, "trials")):
         return Kind.EXPERIMENT
     if any((path / part).exists() for part in ("checkpoints", "config.yaml", "metrics.jsonl")):
         return Kind.TRIAL

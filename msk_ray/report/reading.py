@@ -18,7 +18,7 @@ from pydantic import ValidationError
 from msk_ray.config import describe_fault, parse_config, read_yaml
 from msk_ray.errors import MskRayError, StorageError
 from msk_ray.metrics_file import METRICS_FILE, read_metrics
-from msk_ray.tune.experiment import Experiment
+from msk_ray.tune.experiment import SPACE_FILE, Experiment
 from msk_ray.tune.halved import Halved, read_halved
 from msk_ray.tune.operators import describe
 from msk_ray.tune.outcomes import Ending, read_ending
@@ -211,7 +211,7 @@ def read_experiment(experiment: Experiment, now: float) -> Reading:
             trials = experiment.trials()
         except _UNREADABLE as error:
             notes.append(f"Which trials were planned is not known: {explain(error)}.")
-    text, space = _read_space(experiment.path / "space.yaml", notes)
+    text, space = _read_space(experiment.path / SPACE_FILE, notes)
     readings = [_read_trial(trial, experiment.trial_folder(trial.id), now) for trial in trials]
     readings += _unlisted(experiment, {trial.id for trial in trials}, space, notes, now)
     return Reading(
@@ -336,5 +336,5 @@ def check_folder(experiment: Experiment) -> None:
         StorageError: it holds files, and none that an experiment begins with.
     """
     names = [path.name for path in experiment.path.iterdir()]
-    if names and not {"manifest.json", "space.yaml", "env.json", "trials"} & set(names):
+    if names and not {"manifest.json", SPACE_FILE, "env.json", "trials"} & set(names):
         raise StorageError(f"{experiment.path} holds no experiment (nor the beginning of one)")

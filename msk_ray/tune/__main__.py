@@ -138,7 +138,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     if args.debug_trial is not None:
         return _debug(args, space, find_trial(trials, args.debug_trial))
-    return _run(args, space, trials, extension)
+    return _run(args, space, trials, extension, recorded)
 
 
 def _retried(args: argparse.Namespace) -> set[Outcome]:
@@ -228,12 +228,17 @@ def _debug(args: argparse.Namespace, space: Space, trial: Trial) -> int:
     return 1 if read_record(trial, folder).errored else 0
 
 
-def _run(args: argparse.Namespace, space: Space, trials: list[Trial], extension: Mapping[str, Any]) -> int:
+def _run(
+    args: argparse.Namespace,
+    space: Space,
+    trials: list[Trial],
+    extension: Mapping[str, Any],
+    recorded: experiments.Experiment | None,
+) -> int:
     path = _experiment_path(args)
     going_on = args.resume or bool(extension)
     if going_on:
         searching = space.file.search == "optuna"
-        recorded = _recorded(args)
         another_rule = recorded is not None and args.early_stopping != recorded.said("early_stopping")
         if recorded is not None and not another_rule:
             recorded.check_scheduler(space)

@@ -147,8 +147,11 @@ class Experiment:
         """
         try:
             recorded = SpaceFile.model_validate(read_yaml(self.path / SPACE_FILE)).scheduler.model_dump()
-        except (MskRayError, ValidationError):
-            return  # lost or torn: nothing hangs on it but this check and the report
+        except (MskRayError, ValidationError) as error:
+            # Nothing hangs on it but this check and the report.
+            text = " ".join(str(error).split())
+            print(f"whether the space's scheduler is still the one trials were stopped by is not known: {text}")
+            return
         now = space.file.scheduler.model_dump()
         changes = [f"{key} {recorded[key]} → {now[key]}" for key in now if now[key] != recorded[key]]
         if changes:

@@ -12,7 +12,7 @@ from typing import Any
 from msk_ray.config import parse_config, read_yaml
 from msk_ray.errors import MskRayError
 from msk_ray.metrics_file import METRICS_FILE
-from msk_ray.tune.experiment import Experiment
+from msk_ray.tune.experiment import SPACE_FILE, Experiment
 from msk_ray.tune.halved import Halved, read_halved
 from msk_ray.tune.operators import describe
 from msk_ray.tune.outcomes import read_ending
@@ -131,7 +131,7 @@ class Observer:
         folders = sorted(path for path in _subfolders(self.experiment.path / "trials") if path.name not in listed)
         if not folders:
             return []
-        varied = read_yaml(self.experiment.path / "space.yaml").get("parameters") or {}
+        varied = read_yaml(self.experiment.path / SPACE_FILE).get("parameters") or {}
         return [self._made_up(folder, varied, now) for folder in folders]
 
     def _made_up(self, folder: Path, varied: Mapping[str, Any], now: float) -> Standing:
@@ -260,7 +260,7 @@ def find_experiments(storage: Path) -> list[Path]:
     found = [
         path
         for path in _subfolders(storage)
-        if any((path / part).exists() for part in ("manifest.json", "space.yaml", "env.json"))
+        if any((path / part).exists() for part in ("manifest.json", SPACE_FILE, "env.json"))
     ]
     return sorted(found, key=lambda path: (path.stat().st_mtime, path.name))
 

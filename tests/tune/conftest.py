@@ -1,5 +1,6 @@
 """A small space over CartPole, and how to vary it."""
 
+import contextlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import pytest
 
 from msk_ray.config import dump_yaml
+from msk_ray.tune import runner
 from msk_ray.tune.space import Space, parse_space
 
 MakeSpace = Callable[..., Space]
@@ -38,3 +40,12 @@ def make_space(tmp_path: Path, space_data: dict[str, Any]) -> MakeSpace:
         return parse_space(space_data | changes, tmp_path / "small.yaml")
 
     return make
+
+
+@pytest.fixture
+def plans(monkeypatch: pytest.MonkeyPatch) -> list[runner.Plan]:
+    """What a driver would run: it gets as far as its plan, and ends as if it had been stopped there."""
+    made: list[runner.Plan] = []
+    monkeypatch.setattr(runner, "ray_session", lambda *args: contextlib.nullcontext())
+    monkeypatch.setattr(runner, "run_trials", lambda plan: bool(made.append(plan)))
+    return made

@@ -1,6 +1,5 @@
 """The command line without Ray: dry runs, and refusals that cost one line and no work."""
 
-import contextlib
 import json
 import os
 import subprocess
@@ -105,15 +104,12 @@ def test_help_teaches_with_examples(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_every_trial_to_its_end_on_request(
-    space_data: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    space_data: dict[str, Any], tmp_path: Path, plans: list[runner.Plan], capsys: pytest.CaptureFixture[str]
 ) -> None:
     """What ends trials by score is left out, what ends broken ones is not; --resume remembers."""
     space = tmp_path / "small.yaml"
     stop = {"target": 9.0, "plateau": {"patience": 2}, "wall_time_s": 60.0}
     space.write_text(dump_yaml(space_data | {"scheduler": {"kind": "asha"}, "stop": stop}))
-    plans: list[runner.Plan] = []
-    monkeypatch.setattr(runner, "ray_session", lambda *args: contextlib.nullcontext())
-    monkeypatch.setattr(runner, "run_trials", lambda plan: bool(plans.append(plan)))
 
     def early(*arguments: str) -> bool:
         code = run(main, ["--space", str(space), "--cpu", "--storage", str(tmp_path / "runs"), *arguments])
@@ -152,13 +148,11 @@ def test_every_trial_to_its_end_on_request(
 
 
 def test_another_rule_is_refused(
-    space_data: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    space_data: dict[str, Any], tmp_path: Path, plans: list[runner.Plan], capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Trials that one rule has stopped do not go on beside others under another; a new default is no new rule."""
     space = tmp_path / "small.yaml"
     space.write_text(dump_yaml(space_data | {"scheduler": {"kind": "asha"}}))
-    monkeypatch.setattr(runner, "ray_session", lambda *args: contextlib.nullcontext())
-    monkeypatch.setattr(runner, "run_trials", lambda plan: False)
     arguments = ["--space", str(space), "--cpu", "--storage", str(tmp_path / "runs")]
     assert run(main, arguments) == RESUMABLE
     kept = read_yaml(tmp_path / "runs" / "small" / "space.yaml")["scheduler"]
@@ -170,6 +164,11 @@ def test_another_rule_is_refused(
     assert (tmp_path / "runs" / "small" / "manifest.json").read_text() == manifest
     space.write_text(dump_yaml(space_data | {"scheduler": {"kind": "asha", "grace": 0.25}}))
     assert run(main, [*arguments, "--resume"]) == RESUMABLE
+    assert "is not known" not in capsys.readouterr().out
+    assert len(plans) == 2
+    (tmp_path / "runs" / "small" / "space.yaml").unlink()
+    assert run(main, [*arguments, "--resume"]) == RESUMABLE
+    assert "the one trials were stopped by is not known" in capsys.readouterr().out
 
 
 def drawn_rate() -> dict[str, Any]:

@@ -1,6 +1,5 @@
 """A trial that runs out of memory starts anew with half its worlds, once; whoever dies when, and nobody is misled."""
 
-import contextlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -218,13 +217,10 @@ def test_a_population_cannot(make_space: Any) -> None:
 
 
 def test_what_the_command_line_said_is_kept_until_it_says_otherwise(
-    space_data: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    space_data: dict[str, Any], tmp_path: Path, plans: list[runner.Plan]
 ) -> None:
     space = tmp_path / "small.yaml"
     space.write_text(dump_yaml(space_data))
-    plans: list[runner.Plan] = []
-    monkeypatch.setattr(runner, "ray_session", lambda *args: contextlib.nullcontext())
-    monkeypatch.setattr(runner, "run_trials", lambda plan: bool(plans.append(plan)))
 
     def halves(*arguments: str) -> bool:
         code = run(main, ["--space", str(space), "--cpu", "--storage", str(tmp_path / "runs"), *arguments])
