@@ -38,9 +38,8 @@ class FaultyTrainer(Trainer):
                     file.write(json.dumps({"epoch": self.epoch + 1, "env_steps": 1})[:17])
                 _kill_self()
             case "torn_checkpoint":
-                # What lies there after a death between a checkpoint's two files, on a disk that lost half of it.
+                # What lies there after a death on a disk that lost half of it.
                 path = self.save()
-                path.with_suffix(".json").unlink()
                 os.truncate(path, path.stat().st_size // 2)
                 _kill_self()
         return row

@@ -10,6 +10,7 @@ from PIL import Image, PngImagePlugin
 
 from msk_ray.errors import CheckpointError, MskRayError
 from msk_ray.evaluate.targets import best_of_trial
+from msk_ray.experiment.checkpoint_file import read_facts
 from msk_ray.files import write_bytes
 from msk_ray.report.reading import TrialReading, explain
 
@@ -46,11 +47,10 @@ def look_at_best(trial: TrialReading, folder: Path, prefix: str, make: bool, dev
     notes: list[str] = []
     try:
         path = best_of_trial(trial.folder)
-        # These load torch, which a report of plain numbers need not wait for.
+        # Loads torch, which a report of plain numbers need not wait for.
         from msk_ray.evaluate.measure import EVAL_FILE, read_evaluations
-        from msk_ray.training.checkpoint import read_manifest
 
-        sha = read_manifest(path)["sha256"]
+        sha = read_facts(path)["sha256"]
     except (MskRayError, KeyError) as error:
         return Best(trial, notes=(f"There is no policy to look at: {explain(error)}.",))
     entries: list[dict[str, Any]] = []

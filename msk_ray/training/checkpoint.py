@@ -1,12 +1,6 @@
-"""Checkpoints that are either whole or not there.
+"""Checkpoints that are either whole or not there: PyTorch states in files that vouch for themselves."""
 
-A checkpoint is `<name>.pt` and, written after it, `<name>.json` with its SHA-256: a file without a matching manifest
-is torn. Both are written to a temporary name, flushed to disk and renamed.
-"""
-
-import hashlib
 import io
-import json
 import re
 from pathlib import Path
 from typing import Any
@@ -14,70 +8,53 @@ from typing import Any
 import torch
 
 from msk_ray.errors import CheckpointError
-from msk_ray.files import write_bytes
+from msk_ray.experiment.checkpoint_file import read_checkpoint_file, remove_checkpoint_file, write_checkpoint_file
 
-FORMAT = 1
 _EPOCH_NAME = re.compile(r"epoch_(\d+)\.pt")
 _POLICY_NAME = re.compile(r"policy_(\d+)\.pt")
 
 
 def write_checkpoint(path: Path, state: dict[str, Any], facts: dict[str, Any]) -> Path:
-    """Write `state` to `path` and its manifest, with `facts` such as the epoch, beside it."""
-    buffer = io.BytesIO()
-    torch.save(state, buffer)
-    payload = buffer.getvalue()
-    # A manifest left from before would vouch for the wrong payload if a crash came between the two writes.
-    manifest_path(path).unlink(missing_ok=True)
-    write_bytes(path, payload)
-    manifest = {"format": FORMAT, "sha256": hashlib.sha256(payload).hexdigest(), "bytes": len(payload), **facts}
-    write_bytes(manifest_path(path), json.dumps(manifest, indent=1).encode())
-    return path
-
-
-def manifest_path(path: Path) -> Path:
-    """Where the manifest of a checkpoint lies."""
-    return path.with_suffix(".json")
-
-
-def read_manifest(path: Path) -> dict[str, Any]:
-    """The manifest of the checkpoint at `path`: format, sha256, bytes, and facts such as the epoch.
+    """Write `state` to `path`, with `facts` such as the epoch to be read without it; what was there is replaced whole.
 
     Raises:
-        CheckpointError: it is missing, unreadable, or of another format.
+        StorageFailure: the disk is full or gone; what was there before is untouched.
     """
-    try:
-        manifest = json.loads(manifest_path(path).read_text())
-    except FileNotFoundError as error:
-        raise CheckpointError(f"no such checkpoint: {error.filename}") from None
-    except (OSError, ValueError) as error:
-        raise CheckpointError(f"cannot read checkpoint {path}: {error}") from error
-    found = manifest.get("format") if isinstance(manifest, dict) else None
-    if found != FORMAT:
-        raise CheckpointError(f"{path} has checkpoint format {found}, this version reads {FORMAT}")
-    facts: dict[str, Any] = manifest
-    return facts
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    write_checkpoint_file(path, buffer.getvalue(), facts)
+    return path
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
     """The state in a checkpoint, on CPU.
 
     Raises:
-        CheckpointError: it is missing, torn, or of another format.
+        CheckpointError: it is missing, torn, of another format, or holds no state.
     """
+    return load_checkpoint(path)[1]
+
+
+def load_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The facts and the state in a checkpoint, on CPU.
+
+    Raises:
+        CheckpointError: as `read_checkpoint`.
+    """
+    facts, payload = read_checkpoint_file(path)
     try:
-        payload = path.read_bytes()
-    except FileNotFoundError as error:
-        raise CheckpointError(f"no such checkpoint: {error.filename}") from None
-    except OSError as error:
-        raise CheckpointError(f"cannot read checkpoint {path}: {error}") from error
-    manifest = read_manifest(path)
-    if hashlib.sha256(payload).hexdigest() != manifest.get("sha256"):
+        state = torch.load(io.BytesIO(payload), map_location="cpu", weights_only=True)
+    except Exception as error:  # of whatever type: what the bytes mean decides what the unpickler raises
+        why = str(error).strip().splitlines()[:1] or [""]
         raise CheckpointError(
-            f"{path} is torn: {len(payload)} bytes of {manifest.get('bytes')}, checksum differs; use an older one of "
+            f"{path} holds no state of a trial ({type(error).__name__}: {why[0]:.120}); use an older one of "
             f"{path.parent}"
+        ) from error
+    if not isinstance(state, dict):
+        raise CheckpointError(
+            f"{path} holds no state of a trial (a {type(state).__name__}); use an older one of {path.parent}"
         )
-    state: dict[str, Any] = torch.load(io.BytesIO(payload), map_location="cpu", weights_only=True)
-    return state
+    return facts, state
 
 
 def epoch_checkpoints(folder: Path) -> list[Path]:
@@ -117,5 +94,4 @@ def newest_valid_checkpoint(folder: Path) -> tuple[Path | None, list[str]]:
 def prune_checkpoints(folder: Path, keep: int) -> None:
     """Delete all but the `keep` newest numbered checkpoints."""
     for path in epoch_checkpoints(folder)[keep:]:
-        path.unlink()
-        manifest_path(path).unlink(missing_ok=True)
+        remove_checkpoint_file(path)

@@ -11,7 +11,7 @@ from msk_ray.config import Config, parse_config
 from msk_ray.envs import Env
 from msk_ray.errors import CheckpointError
 from msk_ray.networks import Actor, RunningMeanStd
-from msk_ray.training.checkpoint import read_checkpoint, read_manifest
+from msk_ray.training.checkpoint import load_checkpoint
 from msk_ray.training.evaluation import Policy
 
 
@@ -37,7 +37,7 @@ class SavedPolicy:
     epoch: int
     env_steps: int
     sha256: str
-    """Of the checkpoint's file."""
+    """Of what the checkpoint holds; evaluations and pictures are known by it."""
     modules: dict[str, Any]
     """State of the actor and, if observations are normalised, of the normalizer."""
 
@@ -86,7 +86,7 @@ def load_policy(path: Path) -> SavedPolicy:
         CheckpointError: the checkpoint is missing, torn, of another format, or holds no policy.
         ConfigError: its settings are not known to this version.
     """
-    state = read_checkpoint(path)
+    facts, state = load_checkpoint(path)
     try:
         config, epoch, env_steps, modules = (
             state["config"],
@@ -96,6 +96,4 @@ def load_policy(path: Path) -> SavedPolicy:
         )
     except (KeyError, TypeError) as error:
         raise CheckpointError(f"{path} holds no policy: {error} is missing") from error
-    return SavedPolicy(
-        path, parse_config(config, f"{path}: its settings"), epoch, env_steps, read_manifest(path)["sha256"], modules
-    )
+    return SavedPolicy(path, parse_config(config, f"{path}: its settings"), epoch, env_steps, facts["sha256"], modules)

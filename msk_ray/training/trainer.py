@@ -134,7 +134,7 @@ class Trainer:
         Raises:
             CheckpointError: it is missing, torn, or was written under other settings.
         """
-        state = read_checkpoint(path)
+        state = _expect(path, read_checkpoint(path))
         difference = _first_difference(state["config"], self.config.as_dict(), changed)
         if difference:
             raise CheckpointError(
@@ -217,7 +217,8 @@ class Trainer:
             "env_steps": self.env_steps,
             "shac": {"modules": self.shac.policy_state_dict()},
         }
-        write_checkpoint(milestone_path(self.checkpoints, self.epoch), state, {"epoch": self.epoch, "score": score})
+        facts = {"epoch": self.epoch, "score": _finite(score)}
+        write_checkpoint(milestone_path(self.checkpoints, self.epoch), state, facts)
 
     def _row(self, metrics: dict[str, float]) -> dict[str, float]:
         return {"epoch": self.epoch, "env_steps": self.env_steps, "seconds": self._seconds, **metrics}
@@ -231,7 +232,7 @@ class Trainer:
             "best_score": self.best_score,
             "shac": self.shac.state_dict(),
         }
-        write_checkpoint(path, state, {"epoch": self.epoch, "best_score": self.best_score})
+        write_checkpoint(path, state, {"epoch": self.epoch, "best_score": _finite(self.best_score)})
 
 
 def precompile(config: Config, device: str, logdir: Path) -> None:
@@ -247,6 +248,19 @@ def precompile(config: Config, device: str, logdir: Path) -> None:
     trainer = Trainer(Config.model_validate(tiny), logdir, device)
     trainer.run_epoch()
     trainer.close()
+
+
+def _expect(path: Path, state: dict[str, Any]) -> dict[str, Any]:
+    """The state of a trial, with everything that going on needs."""
+    missing = [key for key in ("config", "epoch", "env_steps", "seconds", "best_score", "shac") if key not in state]
+    if missing:
+        raise CheckpointError(f"{path} holds no trial to go on with: {', '.join(missing)} missing")
+    return state
+
+
+def _finite(score: float) -> float | None:
+    """A score for a checkpoint's facts, which know no infinity: None before the first evaluation."""
+    return score if math.isfinite(score) else None
 
 
 def _first_difference(

@@ -143,8 +143,7 @@ def _report_with_checkpoint(evaluation: Evaluation, ended: bool, trainer: Traine
     """Report with state, which Ray hands on to another member of the population."""
     path = trainer.save()
     with tempfile.TemporaryDirectory() as folder:
-        for file in (path, path.with_suffix(".json")):
-            shutil.copy(file, folder)
+        shutil.copy(path, folder)
         figures = _figures(evaluation, ended, trainer.best_score, False)
         tune.report(figures, checkpoint=tune.Checkpoint.from_directory(folder))
 

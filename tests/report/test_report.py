@@ -281,7 +281,7 @@ def _best_without_policy(e: experiments.Experiment) -> None:
         (_running, ["Trials are still running", "1 running"]),
         (_never_evaluated, ["No trial was evaluated yet", "Too few evaluated trials"]),
         (_nothing_finite, ["No trial was evaluated yet", "No trial has recorded a gradient yet"]),
-        (_best_without_policy, ["There is no policy to look at: no such checkpoint"]),
+        (_best_without_policy, ["is torn: it has neither a head nor a manifest"]),
     ],
 )
 def test_every_condition_is_named_and_never_a_traceback(
