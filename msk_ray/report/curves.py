@@ -9,11 +9,15 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from msk_ray.config import read_yaml
+from msk_ray.errors import ConfigError
 from msk_ray.report.pictures import DASHES, GREY, PALETTE, POINTS, Picture, picture, shorten, steps_axis, thin_peaks
 from msk_ray.report.reading import Reading, TrialReading
+from msk_ray.tune.budget import extreme_configs, longest_budget
+from msk_ray.tune.experiment import SPACE_FILE
 from msk_ray.tune.outcomes import Outcome
 from msk_ray.tune.pruning import rungs
-from msk_ray.tune.trials import env_steps_budget
+from msk_ray.tune.space import parse_space
 
 NAMED = 8
 """Variants drawn in a colour of their own."""
@@ -223,7 +227,7 @@ def stopping_map(reading: Reading, name: str) -> Picture | None:
         return None
     ordered = sorted(begun, key=lambda t: (t.score is None, -(t.score or 0.0), t.trial.index))
     seeds = len(reading.seeds) > 1
-    lines = _rung_steps(reading)
+    lines, unknown = rung_steps(reading)
 
     def draw(figure: Figure, narrow: bool) -> None:
         axes = figure.add_subplot()
@@ -263,17 +267,30 @@ def stopping_map(reading: Reading, name: str) -> Picture | None:
         f"{len(ordered)} trials as bars of env steps, the best score on top: "
         + ", ".join(f"{n} {outcome}" for outcome, n in counts.items())
         + ".",
-        "The best score on top. Why each one stopped is in the table of trials.",
+        f"The best score on top. {unknown}Why each one stopped is in the table of trials.",
         draw,
         (9.0, height),
         (4.2, max(3.0, height)),
     )
 
 
-def _rung_steps(reading: Reading) -> list[float]:
-    """Env steps at which asha compares trials; none for other rules, or if they are compared at something else."""
-    spec = reading.space.scheduler if reading.space is not None else None
-    if spec is None or spec.kind != "asha" or spec.time_attr != "env_steps":
-        return []
-    budget = max(env_steps_budget(trial.trial.config) for trial in reading.trials)
-    return list(rungs(spec.grace * budget, budget, spec.reduction))
+def rung_steps(reading: Reading) -> tuple[list[float], str]:
+    """Env steps at which asha compares trials, and why they are not known if they are not.
+
+    None for other rules, or if trials are compared at something else.
+    """
+    if reading.space is None:
+        return [], ""
+    spec = reading.space.scheduler
+    if spec.kind != "asha" or spec.time_attr != "env_steps":
+        return [], ""
+    configs = [trial.trial.config for trial in reading.trials]
+    if reading.space.search == "optuna":
+        # The rungs of a search come from what it may suggest, whatever it has suggested so far.
+        path = reading.experiment.path / SPACE_FILE
+        try:
+            configs = extreme_configs(parse_space(read_yaml(path), path))
+        except ConfigError as error:
+            return [], f"Where the rungs of asha lie is not known: {error}. "
+    budget = longest_budget(reading.space, configs)
+    return list(rungs(spec.grace * budget, budget, spec.reduction)), ""

@@ -14,6 +14,7 @@ from msk_ray.config import dump_yaml, parse_override, read_yaml
 from msk_ray.errors import ConfigError
 from msk_ray.files import check_writable
 from msk_ray.tune import experiment as experiments
+from msk_ray.tune.budget import extreme_configs
 from msk_ray.tune.extension import extended_space, parse_extension
 from msk_ray.tune.listing import text_table, trial_rows
 from msk_ray.tune.made_up import recover
@@ -129,7 +130,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     space = _read_space(args, (recorded.extension() if recorded is not None else {}) | extension)
     if extension and (space.file.search == "optuna" or space.file.scheduler.kind == "pbt"):
         raise ConfigError("--extend: optuna and pbt cannot go on from a recorded experiment; pass another --name")
-    trials = [] if space.file.search == "optuna" else resolve_trials(space)
+    trials = _resolve(space)
     if args.smoke:
         trials = shrink(space, trials) if trials else []
         space = without_early_stopping(space)
@@ -139,6 +140,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     if args.debug_trial is not None:
         return _debug(args, space, find_trial(trials, args.debug_trial))
     return _run(args, space, trials, extension, recorded)
+
+
+def _resolve(space: Space) -> list[Trial]:
+    """The space's trials; none of a search, whose settings are checked as far as they are known."""
+    if space.file.search != "optuna":
+        return resolve_trials(space)
+    extreme_configs(space)
+    return []
 
 
 def _retried(args: argparse.Namespace) -> set[Outcome]:

@@ -29,6 +29,7 @@ from msk_ray.training import Trainer, precompile
 from msk_ray.tune import standby
 from msk_ray.tune.adapters import METRIC, Population, PruningScheduler, domain, optuna_search
 from msk_ray.tune.addresses import knock
+from msk_ray.tune.budget import extreme_configs, longest_budget
 from msk_ray.tune.devices import Placement
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.gauges import StateGauge
@@ -44,7 +45,7 @@ from msk_ray.tune.space import Space
 from msk_ray.tune.standby import Standby, nodes_for
 from msk_ray.tune.trainable import Job, make_trainable
 from msk_ray.tune.trial_run import TrainerLike
-from msk_ray.tune.trials import Trial, base_settings, env_steps_budget
+from msk_ray.tune.trials import Trial, base_settings
 
 Precompile = Callable[[Config, str, Path], None]
 
@@ -195,7 +196,7 @@ def _finish_pruning(plan: Plan) -> None:
     reports = _journal(plan).read()
     if not reports or not plan.trials or spec.kind == "pbt":
         return
-    ending = replay(make_pruner(spec, _budget(plan.space, plan.trials)), spec.time_attr, reports)
+    ending = replay(make_pruner(spec, _budget(plan)), spec.time_attr, reports)
     folder = plan.experiment.trial_folder(reports[-1].trial)
     if ending is None or read_ending(folder) is not None:
         return
@@ -206,7 +207,7 @@ def _finish_pruning(plan: Plan) -> None:
 
 def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial], made_up: list[MadeUp]) -> None:
     spec, file = plan.space.file.scheduler, plan.space.file
-    budget = _budget(plan.space, plan.trials or [_first_suggestion(job)])
+    budget = _budget(plan)
     if spec.kind == "pbt":
         scheduler: Any = Population(spec, budget, plan.space.sampled)
     else:
@@ -368,18 +369,14 @@ def _current_params(job: Job, trial: Trial) -> dict[str, Any]:
     return params
 
 
-def _budget(space: Space, trials: Sequence[Trial]) -> float:
-    """What the longest trial takes, in the scheduler's unit of time."""
-    attribute = space.file.scheduler.time_attr
-    if attribute == "env_steps":
-        return max(env_steps_budget(trial.config) for trial in trials)
-    if attribute == "epoch":
-        return max(trial.epochs for trial in trials)
-    return space.file.stop.wall_time_s or 0.0
+def _budget(plan: Plan) -> float:
+    """What the longest trial can take, in the scheduler's unit of time."""
+    configs = [trial.config for trial in plan.trials] or extreme_configs(plan.space)
+    return longest_budget(plan.space.file, configs)
 
 
 def _first_suggestion(job: Job) -> Trial:
-    """A stand-in for the trials a search will make up: same model, same length."""
+    """A stand-in for the trials a search will make up, of the same model."""
     params = {
         key: op.levels[0].label if isinstance(op, Listed) else op.ends()[0].value
         for key, op in job.space.sampled.items()

@@ -37,7 +37,8 @@ class SchedulerSpec(Part):
     time_attr: Literal["env_steps", "epoch", "seconds"] = "env_steps"
     """What trials are compared at. Env steps is fair between horizons, and trials need not run in lockstep."""
     grace: Share = 0.25
-    """Share of the longest trial's budget that no trial is stopped within. Too small a one loses slow starters."""
+    """Share of the longest trial's budget that no trial is stopped within: of the longest one that a search may
+    suggest, an adaptive horizon counted with its `longest`. Too small a one loses slow starters."""
     reduction: Annotated[float, Field(ge=1.5, le=16)] = 3.0
     """asha: one in this many goes on past each rung; rungs are grace × reductionⁿ."""
     min_trials: PositiveInt | None = None

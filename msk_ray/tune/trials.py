@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from msk_ray.config import AdaptiveHorizon, Config, HorizonSchedule, merge, parse_config, read_config
+from msk_ray.config import Config, merge, parse_config, read_config
 from msk_ray.errors import ConfigError
 from msk_ray.tune.operators import Level, Listed, Range, describe
 from msk_ray.tune.space import Space
@@ -182,29 +182,19 @@ def _check_collisions(space: Space) -> None:
     owner: dict[str, str] = {}
     for key, op in space.parameters.items():
         levels: Iterable[Level] = op.levels if isinstance(op, Listed) else op.ends()
-        for leaf in sorted({leaf for level in levels for leaf in _leaves(key, level.value)}):
+        for leaf in sorted({leaf for level in levels for leaf in leaves(key, level.value)}):
             other = owner.setdefault(leaf, key)
             if other != key:
                 raise ConfigError(f"{space.name}: parameters {other!r} and {key!r} both set {leaf}")
 
 
-def _leaves(key: str, value: Any) -> Iterator[str]:
+def leaves(key: str, value: Any) -> Iterator[str]:
+    """The dotted keys that a value sets: `key` itself, or those of all settings in a section."""
     if isinstance(value, Mapping) and value:
         for name, item in value.items():
-            yield from _leaves(f"{key}.{name}", item)
+            yield from leaves(f"{key}.{name}", item)
     else:
         yield key
-
-
-def env_steps_budget(config: Config) -> int:
-    """Env steps a trial takes when it runs to its last epoch: the sum over epochs of horizon × worlds.
-
-    An adaptive horizon is taken to stay where it starts.
-    """
-    horizon, epochs = config.shac.horizon, config.trial.epochs
-    if isinstance(horizon, HorizonSchedule):
-        return config.env.nworld * sum(horizon.at(epoch) for epoch in range(epochs))
-    return config.env.nworld * epochs * (horizon.start if isinstance(horizon, AdaptiveHorizon) else horizon)
 
 
 def find_trial(trials: list[Trial], text: str) -> Trial:

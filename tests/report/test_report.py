@@ -12,6 +12,7 @@ import pytest
 from msk_ray.cli import run
 from msk_ray.config import dump_yaml
 from msk_ray.report.__main__ import main
+from msk_ray.report.curves import rung_steps
 from msk_ray.report.page import make_section
 from msk_ray.report.reading import Condition, read_experiment
 from msk_ray.report.tables import failures, variant_rows
@@ -19,7 +20,7 @@ from msk_ray.tune import experiment as experiments
 from msk_ray.tune.halved import Halved, write_halved
 from msk_ray.tune.outcomes import Ending, Outcome, write_ending
 from msk_ray.tune.space import parse_space
-from msk_ray.tune.trials import resolve_trials
+from msk_ray.tune.trials import base_settings, make_trial, resolve_trials
 
 
 def row(epoch: int, score: float | None = None) -> dict[str, Any]:
@@ -332,3 +333,24 @@ def test_bad_input_is_one_line(
     assert run(main, [*arguments, "--storage", str(experiment.path.parent)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert message in line
+
+
+def test_rungs_of_a_search_are_drawn_where_trials_were_judged(tmp_path: Path) -> None:
+    """Whatever it has suggested so far: here only its shortest trial."""
+    (tmp_path / "base.yaml").write_text(dump_yaml({"env": {"name": "cartpole", "nworld": 8}, "trial": {"epochs": 20}}))
+    data = {
+        "question": "?",
+        "base": str(tmp_path / "base.yaml"),
+        "search": "optuna",
+        "parameters": {"shac.horizon": {"choice": [4, 32]}},
+        "scheduler": {"kind": "asha", "grace": 0.25, "reduction": 2},
+    }
+    space = parse_space(data, tmp_path / "search.yaml")
+    made = experiments.create(tmp_path / "runs" / "search", space, [], {})
+    made.set_trials([make_trial(space, base_settings(space), {"shac.horizon": "4"}, {"shac.horizon": 4}, 0, 0)])
+    assert rung_steps(read_experiment(made, time.time())) == ([1280.0, 2560.0], "")
+    (tmp_path / "base.yaml").unlink()
+    steps, unknown = rung_steps(read_experiment(made, time.time()))
+    assert steps == []
+    assert "is not known" in unknown
+    assert "no such config file" in unknown

@@ -7,7 +7,7 @@ import pytest
 from msk_ray.errors import ConfigError
 from msk_ray.tune.smoke import cover, shrink
 from msk_ray.tune.space import find_space, load_space, parse_seeds
-from msk_ray.tune.trials import env_steps_budget, find_trial, overlay, resolve_trials
+from msk_ray.tune.trials import find_trial, overlay, resolve_trials
 
 
 def test_grid_is_a_product_with_seeds_outermost(make_space: Any) -> None:
@@ -58,13 +58,6 @@ def test_a_mapping_is_laid_over_a_section_and_replaces_a_number() -> None:
     assert overlay(settings, {"shac.horizon": schedule})["shac"] == {"horizon": schedule, "gamma": 0.9}
     with pytest.raises(ConfigError, match="gamma is a value"):
         overlay(settings, {"shac.gamma.x": 1})
-
-
-def test_env_steps_budget_of_a_growing_horizon(make_space: Any) -> None:
-    # Epochs 0..19 with horizons 4, 6, 8, 8, ...: (4 + 6 + 18 × 8) × 8 worlds = 1232.
-    grow = {"start": 4, "end": 8, "epochs": 2}
-    (trial,) = resolve_trials(make_space(parameters={"shac.horizon": {"grid": [grow]}}))
-    assert env_steps_budget(trial.config) == 1232
 
 
 @pytest.mark.parametrize(
