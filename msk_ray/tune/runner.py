@@ -36,6 +36,7 @@ from msk_ray.tune.gauges import StateGauge
 from msk_ray.tune.halved import read_halved
 from msk_ray.tune.journal import JOURNAL_FILE, Journal, replay
 from msk_ray.tune.live import Live
+from msk_ray.tune.local_ray import loopback_only, make_token_private, way_in
 from msk_ray.tune.made_up import MadeUp, recover
 from msk_ray.tune.operators import Listed
 from msk_ray.tune.outcomes import read_ending, write_ending
@@ -101,7 +102,8 @@ def ray_session(address: str | None, dashboard: bool | None = None, trials: bool
         os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys(paths))
         # None starts the dashboard where its packages (ray[default]) are installed, and does without elsewhere.
         # By default Ray would join whatever cluster a `ray start` on this machine once left a note of.
-        with _hangup_kept_from_children():
+        make_token_private()
+        with _hangup_kept_from_children(), loopback_only():
             context = ray.init("local", include_dashboard=dashboard, dashboard_host="127.0.0.1", **common)
     else:
         try:
@@ -113,7 +115,7 @@ def ray_session(address: str | None, dashboard: bool | None = None, trials: bool
             ) from error
     try:
         if context.dashboard_url:
-            print(f"Ray dashboard: http://{context.dashboard_url}", flush=True)
+            print(f"Ray dashboard: http://{context.dashboard_url}{way_in()}", flush=True)
         elif dashboard is None:
             print("no Ray dashboard: pip install 'ray[default]' to have one", flush=True)
         yield

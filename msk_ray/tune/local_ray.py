@@ -1,0 +1,90 @@
+"""What a Ray of our own on this machine shows to others: its ports, its token, and its dashboard."""
+
+import os
+import secrets
+import stat
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from ray._private import ray_constants
+
+from msk_ray.errors import StorageError
+
+TOKEN_FILE = Path(".ray") / "auth_token"
+"""Where Ray keeps the token of local sessions, below the home folder."""
+
+
+@contextmanager
+def loopback_only() -> Iterator[None]:
+    """A Ray started meanwhile listens on the loopback interface alone.
+
+    Ray gives every server the address of its node, and takes the machine's own address for it even where it is told
+    127.0.0.1; with the switch below, its default on macOS and Windows, it takes the loopback address. The switch is
+    read from the environment when Ray is imported, so it is set here instead.
+    """
+    before = ray_constants.ENABLE_RAY_CLUSTER
+    ray_constants.ENABLE_RAY_CLUSTER = False
+    try:
+        yield
+    finally:
+        ray_constants.ENABLE_RAY_CLUSTER = before
+
+
+def make_token_private() -> None:
+    """Make the token file of local sessions, or tighten the one there is, so that nobody else can read it.
+
+    Whoever has the token can run programs as this user, and Ray writes it with the permissions of an ordinary file.
+
+    Raises:
+        StorageError: the file cannot be written, or belongs to somebody else.
+    """
+    mode = os.environ.get("RAY_AUTH_MODE")
+    if (mode is not None and mode.lower() != "token") or _own_token():
+        return
+    path = Path.home() / TOKEN_FILE
+    try:
+        _make(path)
+        if stat.S_IMODE(path.stat().st_mode) & 0o077:
+            path.chmod(0o600)
+            print(
+                f"{path} could be read by other users of this machine until now. To replace it: remove it while no Ray "
+                "runs, and the next session makes another",
+                flush=True,
+            )
+    except OSError as error:
+        raise StorageError(
+            f"cannot keep Ray's token in {path}: {error.strerror or error}; "
+            "point RAY_AUTH_TOKEN_PATH to a file of your own that holds a token"
+        ) from error
+
+
+def way_in() -> str:
+    """How to get into the dashboard of the Ray this process has joined, to be printed behind its address."""
+    if os.environ.get("RAY_AUTH_MODE", "").lower() != "token":
+        return ""
+    if os.environ.get("RAY_AUTH_TOKEN"):
+        return " (asks once for the token: the one in RAY_AUTH_TOKEN)"
+    path = os.environ.get("RAY_AUTH_TOKEN_PATH") or Path.home() / TOKEN_FILE
+    return f" (asks once for the token: cat {path})"
+
+
+def _own_token() -> bool:
+    return bool(os.environ.get("RAY_AUTH_TOKEN") or os.environ.get("RAY_AUTH_TOKEN_PATH"))
+
+
+def _make(path: Path) -> None:
+    """Make the token unless there is one. It is whole from the start: another session may read it at any time."""
+    if path.exists():
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    descriptor, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)  # mode 0600
+    try:
+        with os.fdopen(descriptor, "w") as file:
+            file.write(secrets.token_hex(32))
+        # Another session may have been faster: its token holds.
+        with suppress(FileExistsError):
+            os.link(temporary, path)
+    finally:
+        os.unlink(temporary)

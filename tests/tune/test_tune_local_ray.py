@@ -1,0 +1,140 @@
+"""A Ray of our own on this machine: what it shows to the network and to other users of the machine."""
+
+import json
+import os
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from msk_ray.errors import StorageError
+from msk_ray.tune import local_ray
+
+SESSION = """
+import ipaddress, json, os, sys
+import ray, psutil
+from msk_ray.tune.runner import ray_session
+
+@ray.remote
+def token_file():
+    path = os.path.expanduser("~/.ray/auth_token")
+    return os.stat(path).st_mode & 0o777
+
+with ray_session(None, trials=False):
+    mode = ray.get(token_file.remote())
+    open_to_others = []
+    listening = 0
+    me = psutil.Process()
+    for process in [me, *me.children(recursive=True)]:
+        for socket in process.net_connections("inet"):
+            if socket.status != psutil.CONN_LISTEN:
+                continue
+            listening += 1
+            address = ipaddress.ip_address(socket.laddr.ip)
+            if not (getattr(address, "ipv4_mapped", None) or address).is_loopback:
+                open_to_others.append([" ".join(process.cmdline())[:80], socket.laddr.ip, socket.laddr.port])
+    print("FACTS", json.dumps({"mode": mode, "listening": listening, "open": open_to_others}))
+"""
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A home folder without a token, and an environment that names none."""
+    for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    return tmp_path
+
+
+def permissions(path: Path) -> int:
+    return path.stat().st_mode & 0o777
+
+
+def test_a_session_is_closed_to_the_network_and_its_token_to_other_users(home: Path) -> None:
+    result = subprocess.run([sys.executable, "-c", SESSION], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    first, *_, last = result.stdout.strip().splitlines()
+    facts = json.loads(last.removeprefix("FACTS "))
+    assert facts["listening"] >= 8  # gcs_server, raylet, dashboard, agents, workers
+    assert facts["open"] == []
+    assert facts["mode"] == 0o600
+    # The terminal says how to get in, without the token itself.
+    token = home / ".ray" / "auth_token"
+    assert first.startswith("Ray dashboard: http://127.0.0.1:")
+    assert first.endswith(f" (asks once for the token: cat {token})")
+    assert token.read_text() not in result.stdout + result.stderr
+
+
+def test_a_token_is_made_once_by_all_who_start_together(home: Path) -> None:
+    barrier = threading.Barrier(8)
+
+    def make() -> None:
+        barrier.wait()
+        local_ray.make_token_private()
+        seen.append((home / ".ray" / "auth_token").read_text())
+
+    seen: list[str] = []
+    threads = [threading.Thread(target=make) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(seen) == 8
+    assert len(set(seen)) == 1
+    assert len(seen[0]) == 64
+    assert permissions(home / ".ray" / "auth_token") == 0o600
+    assert [path.name for path in (home / ".ray").iterdir()] == ["auth_token"]
+
+
+def test_a_token_that_others_could_read_is_tightened_and_kept(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = home / ".ray" / "auth_token"
+    path.parent.mkdir()
+    path.write_text("known")
+    path.chmod(0o644)
+    local_ray.make_token_private()
+    assert permissions(path) == 0o600
+    assert path.read_text() == "known"  # another session may be using it
+    assert "could be read by other users of this machine until now" in capsys.readouterr().out
+    local_ray.make_token_private()
+    assert capsys.readouterr().out == ""
+
+
+def test_a_token_that_cannot_be_kept_is_refused_in_one_line(home: Path) -> None:
+    (home / ".ray").write_text("a file where the folder should be")
+    with pytest.raises(StorageError, match=r"cannot keep Ray's token in .*; point RAY_AUTH_TOKEN_PATH to a file"):
+        local_ray.make_token_private()
+
+
+@pytest.mark.parametrize(
+    "variables",
+    [{"RAY_AUTH_MODE": "disabled"}, {"RAY_AUTH_TOKEN": "t"}, {"RAY_AUTH_TOKEN_PATH": "/elsewhere"}],
+    ids=["disabled", "in the environment", "in a file of one's own"],
+)
+def test_no_token_is_made_where_it_is_not_used(
+    home: Path, monkeypatch: pytest.MonkeyPatch, variables: dict[str, str]
+) -> None:
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    local_ray.make_token_private()
+    assert os.listdir(home) == []
+
+
+@pytest.mark.parametrize(
+    ("variables", "line"),
+    [
+        ({}, ""),
+        ({"RAY_AUTH_MODE": "disabled"}, ""),
+        ({"RAY_AUTH_MODE": "token"}, " (asks once for the token: cat HOME/.ray/auth_token)"),
+        ({"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": "/a/b"}, " (asks once for the token: cat /a/b)"),
+        (
+            {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "t", "RAY_AUTH_TOKEN_PATH": "/a/b"},
+            " (asks once for the token: the one in RAY_AUTH_TOKEN)",
+        ),
+    ],
+)
+def test_the_way_in(home: Path, monkeypatch: pytest.MonkeyPatch, variables: dict[str, str], line: str) -> None:
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    assert local_ray.way_in() == line.replace("HOME", str(home))
