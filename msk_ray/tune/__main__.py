@@ -91,6 +91,11 @@ def parser() -> Parser:
     where.add_argument("--name", help="the experiment's name; by default the space's")
     where.add_argument("--resume", action="store_true", help="go on with an experiment that was interrupted")
     where.add_argument(
+        "--start-or-resume",
+        action="store_true",
+        help="--resume if the experiment has begun, start it if not: for schedulers that run the same command again",
+    )
+    where.add_argument(
         "--extend",
         action="append",
         default=[],
@@ -112,6 +117,8 @@ def parser() -> Parser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
+    if args.start_or_resume:
+        args.resume = args.resume or experiments.has_begun(_experiment_path(args))
     if args.max_concurrent is not None and args.max_concurrent < 1:
         raise ConfigError(f"--max-concurrent {args.max_concurrent}: at least 1")
     retried = _retried(args)
@@ -169,7 +176,7 @@ def _experiment_path(args: argparse.Namespace) -> Path:
 def _recorded(args: argparse.Namespace) -> experiments.Experiment | None:
     """The experiment to go on with: what was said on its command lines before, its space file does not know."""
     experiment = experiments.Experiment(_experiment_path(args))
-    going_on = (args.resume or args.extend) and (experiment.path / "manifest.json").is_file()
+    going_on = (args.resume or args.extend) and experiments.has_begun(experiment.path)
     return experiment if going_on else None
 
 

@@ -190,6 +190,11 @@ class Experiment:
         write_json(self.path / "manifest.json", self.manifest() | {"trials": [_entry(trial) for trial in trials]})
 
 
+def has_begun(path: Path) -> bool:
+    """Whether the folder holds a whole experiment, which --resume goes on with."""
+    return (path / "manifest.json").is_file()
+
+
 def create(path: Path, space: Space, trials: list[Trial], options: dict[str, Any]) -> Experiment:
     """Make a new experiment's folder and say in it what it is.
 

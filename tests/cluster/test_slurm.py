@@ -1,45 +1,83 @@
-"""The SLURM script run for real, with fakes for SLURM, Ray and Python that write down how they were called."""
+"""The SLURM scripts run for real, with fakes for SLURM, Ray and Python that write down how they were called."""
 
 import contextlib
+import fcntl
 import os
+import re
+import shutil
 import signal
 import stat
 import subprocess
+import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
+PAUSE = """
+        if [ "$PAUSE_AT" = {name} ]; then
+            echo "paused" >> "$LOG"
+            while [ ! -e "$GO" ]; do /bin/sleep 0.02; done
+        fi"""
+"""A fake that takes its time."""
 FAKES = {
     "scontrol": """
         echo "scontrol $*" >> "$LOG"
-        if [ "$1" = show ]; then printf 'node1\\nnode2\\n'; fi""",
+        if [ "$1" = requeue ]; then exit "${REQUEUE_FAILS:-0}"; fi"""
+    + PAUSE.format(name="scontrol")
+    + """
+        printf 'node1\\nnode2\\n'""",
     "sleep": "exec /bin/sleep 0.02",
-    "hostname": "echo '10.0.0.1 192.168.0.1'",
-    # A step stays until it is told to go, as `ray start --block` does.
+    "hostname": PAUSE.format(name="hostname") + "\necho '10.0.0.1 192.168.0.1'",
+    # Both nodes are this machine: the second has its folder beside the first's.
     "srun": """
         echo "srun $*" >> "$LOG"
-        stat -c 'token %a' "$RAY_AUTH_TOKEN_PATH" >> "$LOG"
-        echo "mode $RAY_AUTH_MODE, $(wc -c < "$RAY_AUTH_TOKEN_PATH") characters" >> "$LOG"
-        echo "tmp $RAY_TMPDIR" >> "$LOG"
         if [ -n "$STEP_FAILS" ]; then exit 1; fi
+        case "$*" in *--nodelist=node1*) place= ;; *) place=-node2 ;; esac
+        while [ "${1#--}" != "$1" ]; do shift; done
+        script=$1 folder=$2
+        shift 2
+        export JOBS_TMPDIR=$folder RAY_TMPDIR=$folder$place RAY_AUTH_TOKEN_PATH=$folder$place/token
+        exec "$script" "$folder$place" "$@" """,
+    "ray": """
+        echo "ray $*" >> "$LOG"
+        stat -c 'token %a' "$RAY_AUTH_TOKEN_PATH" >> "$LOG"
+        stat -c 'folder %a' "$RAY_TMPDIR" >> "$LOG"
+        echo "mode $RAY_AUTH_MODE, $(wc -c < "$RAY_AUTH_TOKEN_PATH") characters" >> "$LOG"
+        echo "tmp $JOBS_TMPDIR" >> "$LOG"
         trap 'echo step ended >> "$LOG"; exit 0' TERM
         while true; do /bin/sleep 0.02; done""",
+    # Without a trap, as Python is until its first lines have run.
     "python": """
         echo "python $*" >> "$LOG"
         case "$*" in
-        *msk_ray.tune.cluster*)
+        *msk_ray.tune.cluster*)"""
+    + PAUSE.format(name="joining")
+    + """
             if [ -n "$STEP_FAILS" ] || [ ! -e joined ]; then touch joined; exit 1; fi
+            while [ "$(grep -cx "tmp $RAY_TMPDIR" "$LOG")" -lt 2 ]; do /bin/sleep 0.02; done
             exit 0 ;;
         esac
         echo "tmp $RAY_TMPDIR" >> "$LOG"
-        trap 'echo driver saved >> "$LOG"; exit 75' USR1
-        trap 'echo driver told to go >> "$LOG"; exit 75' TERM
+        if [ "$PAUSE_AT" = imports ]; then
+            echo paused >> "$LOG"
+            while true; do /bin/sleep 0.02; done
+        fi
+        trap 'echo driver saved >> "$LOG"; exit 75' USR1 TERM
         echo driver up >> "$LOG"
         if [ -n "$DRIVER_EXITS" ]; then exit "$DRIVER_EXITS"; fi
         while true; do /bin/sleep 0.02; done""",
 }
+LIMIT_S = 120.0
+"""Far more than anything here takes on a busy machine."""
+
+
+def until(condition: Callable[[], object], what: str) -> None:
+    deadline = time.monotonic() + LIMIT_S
+    while not condition():
+        assert time.monotonic() < deadline, what
+        time.sleep(0.02)
 
 
 @pytest.fixture
@@ -52,33 +90,37 @@ def job(tmp_path: Path, root: Path) -> Iterator["Job"]:
     project = tmp_path / "project"
     project.mkdir()
     (project / "cluster").symlink_to(root / "cluster")
-    made = Job(tmp_path, root / "cluster" / "slurm.sbatch")
+    # Sockets need a short path.
+    made = Job(tmp_path, root / "cluster", Path(tempfile.mkdtemp(dir="/tmp", prefix="")))
     yield made
     for process in made.started:
         with contextlib.suppress(ProcessLookupError):  # all of it has ended
             os.killpg(process.pid, signal.SIGKILL)
         process.communicate()
+    shutil.rmtree(made.disk)
 
 
 class Job:
     """A submitted job."""
 
-    def __init__(self, folder: Path, script: Path) -> None:
-        self.folder, self.script, self.log = folder, script, folder / "log"
+    def __init__(self, folder: Path, scripts: Path, disk: Path) -> None:
+        self.folder, self.scripts, self.disk, self.log = folder, scripts, disk, folder / "log"
         self.started: list[subprocess.Popen[str]] = []
         self.environment = {
             "PATH": f"{folder / 'bin'}:{os.environ['PATH']}",
             "LOG": str(self.log),
+            "GO": str(folder / "go"),
             "SLURM_SUBMIT_DIR": str(folder / "project"),
             "SLURM_JOB_ID": "123456",
             "SLURM_JOB_NODELIST": "node[1-2]",
             "SLURM_CPUS_PER_TASK": "16",
             "MSK_RAY_BIN": str(folder / "bin"),
+            "MSK_RAY_TMP": str(disk),
         }
 
-    def start(self, *options: str, **environment: str) -> "subprocess.Popen[str]":
+    def start(self, *options: str, script: str = "slurm.sbatch", **environment: str) -> "subprocess.Popen[str]":
         process = subprocess.Popen(
-            ["bash", str(self.script), "ant_lr", str(self.folder / "runs"), *options],
+            ["bash", str(self.scripts / script), "ant_lr", str(self.folder / "runs"), *options],
             env=self.environment | environment,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -90,30 +132,34 @@ class Job:
 
     def run(self, *options: str, **environment: str) -> tuple[int, str]:
         """Exit code and output."""
-        process = self.start(*options, **environment)
-        output, _ = process.communicate(timeout=30)
+        return self.end(self.start(*options, **environment))
+
+    def end(self, process: "subprocess.Popen[str]") -> tuple[int, str]:
+        """Exit code and output of one that is about to end."""
+        output, _ = process.communicate(timeout=LIMIT_S)
         return process.returncode, output
 
     def lines(self, beginning: str) -> list[str]:
         text = self.log.read_text() if self.log.exists() else ""
         return [line for line in text.splitlines() if line.startswith(beginning)]
 
-    def wait_for(self, line: str) -> None:
-        for _ in range(400):
-            if self.lines(line):
-                return
-            time.sleep(0.05)
-        raise AssertionError(f"no {line!r} in {self.log.read_text()}")
+    def wait_for(self, line: str, count: int = 1) -> None:
+        until(lambda: len(self.lines(line)) >= count, f"no {line!r}")
 
     def left_over(self) -> list[str]:
         """What the job left in the project's folder."""
         return sorted(path.name for path in (self.folder / "project").iterdir())
 
+    def tokens(self) -> list[Path]:
+        """On the nodes' disk."""
+        return sorted(path for path in self.disk.rglob("*") if path.is_file())
+
 
 @pytest.mark.parametrize("code", [0, 1, 2, 130])
 def test_the_drivers_exit_code_is_the_jobs(job: Job, code: int) -> None:
     assert job.run(DRIVER_EXITS=str(code))[0] == code
-    assert job.left_over() == ["cluster", "joined"]  # no token
+    assert job.left_over() == ["cluster", "joined"]
+    assert not job.tokens()
 
 
 def test_head_workers_and_driver(job: Job) -> None:
@@ -135,35 +181,113 @@ def test_head_workers_and_driver(job: Job) -> None:
         checks == ["python -m msk_ray.tune.cluster --address 10.0.0.1:33824 --nodes 2"] * 2
     )  # the second time all are
     storage = job.folder / "runs"
-    expected = f"--space ant_lr --name ant_lr --storage {storage} --seeds 0-4 --address 10.0.0.1:33824"
+    expected = f"--space ant_lr --storage {storage} --start-or-resume --seeds 0-4 --address 10.0.0.1:33824"
     assert driver == f"python -m msk_ray.tune {expected}"
 
 
 def test_the_token_is_for_its_owner_alone_and_goes_with_the_job(job: Job) -> None:
     process = job.start()
     job.wait_for("driver up")
-    (token,) = (job.folder / "project").glob(".ray-token-*")
-    assert stat.S_IMODE(token.stat().st_mode) == 0o600
-    assert len(token.read_text()) == 64
+    first, second = job.tokens()
+    assert first.read_text() == second.read_text()
+    assert re.fullmatch("[0-9a-f]{64}", first.read_text())
+    for token in (first, second):
+        assert stat.S_IMODE(token.stat().st_mode) == 0o600
+        assert stat.S_IMODE(token.parent.stat().st_mode) == 0o700
+    assert first.read_text() not in job.log.read_text()  # no command line shows it
     process.send_signal(signal.SIGTERM)
-    process.communicate(timeout=30)
-    assert not token.exists()
+    job.end(process)
+    assert not job.tokens()
     assert set(job.lines("token")) == {"token 600"}
+    assert set(job.lines("folder")) == {"folder 700"}
     assert set(job.lines("mode")) == {"mode token, 64 characters"}
 
 
-@pytest.mark.parametrize(
-    ("number", "answer"), [(signal.SIGUSR1, "driver saved"), (signal.SIGTERM, "driver told to go")]
-)
-def test_signals_reach_the_driver_and_the_job_is_resumable(job: Job, number: signal.Signals, answer: str) -> None:
+def test_a_killed_jobs_token_goes_when_the_next_one_starts_and_a_living_ones_stays(job: Job) -> None:
+    process = job.start()
+    job.wait_for("driver up")
+    killed = job.tokens()
+    os.killpg(process.pid, signal.SIGKILL)
+    job.end(process)
+    assert job.left_over() == ["cluster", "joined"]
+    assert all(token.exists() for token in killed)
+    elsewhere = job.folder / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "precious").touch()
+    (job.disk / "msk_ray-1-abcdef").symlink_to(elsewhere)
+    living = job.disk / "msk_ray-2-abcdef"
+    living.mkdir()
+    held = os.open(living, os.O_RDONLY)
+    fcntl.flock(held, fcntl.LOCK_EX)
+    job.run(DRIVER_EXITS="0")
+    os.close(held)
+    assert not any(token.exists() for token in killed)
+    assert (elsewhere / "precious").exists()
+    assert living.exists()
+
+
+def test_a_node_takes_no_folder_that_is_there_already(job: Job) -> None:
+    folder = job.disk / "msk_ray-1-abcdef"
+    (job.disk / "new-msk_ray-1-abcdef").mkdir(mode=0o777)
+    result = subprocess.run(
+        ["bash", job.scripts / "slurm_node.sh", folder, "true"], input="secret", capture_output=True, text=True
+    )
+    assert result.returncode != 0
+    assert "File exists" in result.stderr
+    assert not job.tokens()
+
+
+@pytest.mark.parametrize("number", [signal.SIGUSR1, signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_signals_reach_the_driver_and_the_job_is_resumable(job: Job, number: signal.Signals) -> None:
     process = job.start()
     job.wait_for("driver up")
     process.send_signal(number)
-    process.communicate(timeout=30)
-    assert process.returncode == 75
-    assert job.lines(answer)
+    assert job.end(process)[0] == 75
+    assert job.lines("driver saved")
     assert not job.lines("scontrol requeue")
-    job.wait_for("step ended")
+    assert len(job.lines("step ended")) == 2
+
+
+@pytest.mark.parametrize("number", [signal.SIGUSR1, signal.SIGTERM])
+@pytest.mark.parametrize("place", ["scontrol", "hostname", "joining", "imports"])
+def test_a_signal_before_the_driver_can_save_leaves_the_job_resumable(
+    job: Job, place: str, number: signal.Signals
+) -> None:
+    process = job.start(PAUSE_AT=place, MSK_RAY_REQUEUE="1")
+    job.wait_for("paused")
+    process.send_signal(number)
+    (job.folder / "go").touch()
+    assert job.end(process)[0] == 75
+    assert not job.lines("driver up")
+    # TERM: it was cancelled, or SLURM itself puts it back.
+    assert job.lines("scontrol requeue") == (["scontrol requeue 123456"] if number == signal.SIGUSR1 else [])
+    assert not job.tokens()
+
+
+@pytest.mark.parametrize("script", ["slurm.sbatch", "start_or_resume.sh"])
+@pytest.mark.parametrize("place", ["imports", "nowhere"])
+def test_a_signal_to_the_whole_group(job: Job, script: str, place: str) -> None:
+    process = job.start(script=script, PAUSE_AT=place, MSK_RAY_PYTHON=str(job.folder / "bin" / "python"))
+    job.wait_for("paused" if place == "imports" else "driver up")
+    os.killpg(process.pid, signal.SIGUSR1)
+    assert job.end(process)[0] == 75
+
+
+@pytest.mark.parametrize("number", [signal.SIGUSR1, signal.SIGTERM, signal.SIGHUP])
+def test_start_or_resume_ends_resumably_before_python_is_up(job: Job, number: signal.Signals) -> None:
+    python = str(job.folder / "bin" / "python")
+    process = job.start(script="start_or_resume.sh", PAUSE_AT="imports", MSK_RAY_PYTHON=python)
+    job.wait_for("paused")
+    process.send_signal(number)
+    assert job.end(process)[0] == 75
+
+
+def test_a_driver_that_somebody_else_kills_has_failed(job: Job) -> None:
+    process = job.start(script="start_or_resume.sh", MSK_RAY_PYTHON=str(job.folder / "bin" / "python"))
+    job.wait_for("driver up")
+    (driver,) = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()[:1]
+    os.kill(int(driver), signal.SIGKILL)
+    assert job.end(process)[0] == 128 + signal.SIGKILL
 
 
 def test_a_job_out_of_time_goes_back_into_the_queue_if_asked(job: Job) -> None:
@@ -171,17 +295,24 @@ def test_a_job_out_of_time_goes_back_into_the_queue_if_asked(job: Job) -> None:
     assert job.lines("scontrol requeue") == ["scontrol requeue 123456"]
 
 
-def test_a_job_that_failed_does_not(job: Job) -> None:
-    assert job.run(DRIVER_EXITS="1", MSK_RAY_REQUEUE="1")[0] == 1
+def test_a_queue_that_does_not_take_it_back_leaves_it_resumable(job: Job) -> None:
+    code, output = job.run(DRIVER_EXITS="75", MSK_RAY_REQUEUE="1", REQUEUE_FAILS="1")
+    assert code == 75
+    assert "error: scontrol requeue failed; submit the job again" in output
+
+
+def test_a_job_that_is_cancelled_does_not_go_back(job: Job) -> None:
+    process = job.start(MSK_RAY_REQUEUE="1")
+    job.wait_for("driver up")
+    process.send_signal(signal.SIGTERM)
+    assert job.end(process)[0] == 75
+    assert job.lines("driver saved")
     assert not job.lines("scontrol requeue")
 
 
-def test_a_job_started_again_goes_on(job: Job) -> None:
-    manifest = job.folder / "runs" / "ant_lr" / "manifest.json"
-    manifest.parent.mkdir(parents=True)
-    manifest.touch()
-    job.run(DRIVER_EXITS="0")
-    assert "--resume" in job.lines("python -m msk_ray.tune --")[0]
+def test_a_job_that_failed_does_not(job: Job) -> None:
+    assert job.run(DRIVER_EXITS="1", MSK_RAY_REQUEUE="1")[0] == 1
+    assert not job.lines("scontrol requeue")
 
 
 def test_a_node_whose_ray_does_not_start_ends_the_job(job: Job) -> None:
@@ -199,7 +330,11 @@ def test_nodes_that_do_not_join_in_time_end_the_job(job: Job) -> None:
 
 def test_ray_keeps_to_a_folder_of_the_job(job: Job) -> None:
     job.run(DRIVER_EXITS="0")
-    assert job.lines("tmp") == ["tmp /tmp/msk_ray-123456"] * 3  # two nodes and the driver
+    job.run(DRIVER_EXITS="0")  # put back into the queue, a job keeps its number
+    used = job.lines("tmp")
+    assert len(used) == 6  # two nodes and the driver, twice
+    assert len(set(used)) == 2
+    assert all(re.fullmatch(rf"tmp {job.disk}/msk_ray-123456-[0-9a-f]{{6}}", line) for line in used)
     code, output = job.run(MSK_RAY_TMP="/local/scratch/of/some/department")
     assert code == 2
     assert "MSK_RAY_TMP" in output

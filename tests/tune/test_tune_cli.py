@@ -147,6 +147,22 @@ def test_every_trial_to_its_end_on_request(
     assert "in small.yaml trials go on from each other (pbt)" in capsys.readouterr().err
 
 
+def test_start_or_resume_asks_the_experiment_by_the_name_it_has(
+    space_file: Path, tmp_path: Path, plans: list[runner.Plan], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As a scheduler does that knows nothing of what it started before."""
+    command = ["--space", str(space_file), "--cpu", "--storage", str(tmp_path / "runs"), "--start-or-resume"]
+    for name in (["--name", "other"], ["--na=third"], ["--smoke"], []):
+        made = []
+        for _ in range(2):
+            assert run(main, [*command, *name]) == RESUMABLE
+            made.append((plans[-1].experiment.path / "manifest.json").read_text())
+        assert json.loads(made[0])["created"] == json.loads(made[1])["created"]
+    assert sorted(path.name for path in (tmp_path / "runs").iterdir()) == ["other", "small", "small-smoke", "third"]
+    (tmp_path / "runs" / "small" / "manifest.json").unlink()  # killed before it was whole
+    assert run(main, command) == RESUMABLE
+
+
 def test_another_rule_is_refused(
     space_data: dict[str, Any], tmp_path: Path, plans: list[runner.Plan], capsys: pytest.CaptureFixture[str]
 ) -> None:
