@@ -95,7 +95,6 @@ class _Outliving(io.TextIOBase):
     def _move(self, error: OSError) -> None:
         """Point this stream, and the other if it is the same pipe or terminal, to the file."""
         try:
-            self._log.parent.mkdir(parents=True, exist_ok=True)
             file = os.open(self._log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
         except OSError as fault:
             raise StorageFailure(f"cannot write {self._log}: {fault.strerror}") from fault

@@ -19,7 +19,7 @@ from pathlib import Path
 import msk_ray
 from msk_ray.cli import Parser, run
 from msk_ray.errors import MskRayError, StorageError
-from msk_ray.files import check_writable
+from msk_ray.files import make_folder
 from msk_ray.nvidia_smi import ask_driver
 
 DESCRIPTION = """\
@@ -267,7 +267,7 @@ def check_storage(storage: Path) -> Finding:
     folder = storage.resolve()
     try:
         with _made(folder):
-            check_writable(folder)
+            make_folder(folder)
             seconds = _write_as_a_trial_does(folder)
             free = shutil.disk_usage(folder).free / 1e9
     except StorageError as error:

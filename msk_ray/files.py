@@ -15,19 +15,35 @@ STALE_S = 3600.0
 _PART = ".part"
 
 
-def check_writable(path: Path) -> None:
-    """Make the folder and write a file into it: permissions alone do not tell (full disks, read-only mounts).
+def make_folder(path: Path) -> None:
+    """Make a folder that files can be written to, with those above it, or find it there.
 
     Raises:
         StorageError: it did not work.
     """
-    probe = path / f".probe.{os.getpid()}"
     try:
         path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _cannot_write(path, error) from error
+    check_writable(path)
+
+
+def check_writable(path: Path) -> None:
+    """Write a file into a folder: permissions alone do not tell (full disks, read-only mounts).
+
+    Raises:
+        StorageError: it did not work, or there is no such folder.
+    """
+    probe = path / f".probe.{socket.gethostname()}.{os.getpid()}"
+    try:
         probe.write_bytes(b"0" * 4096)
         probe.unlink()
     except OSError as error:
-        raise StorageError(f"cannot write to {path}: {error.strerror or error}; choose another folder") from error
+        raise _cannot_write(path, error) from error
+
+
+def _cannot_write(path: Path, error: OSError) -> StorageError:
+    return StorageError(f"cannot write to {path}: {error.strerror or error}; choose another folder")
 
 
 def write_bytes(path: Path, payload: bytes) -> None:

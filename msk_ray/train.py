@@ -7,7 +7,7 @@ from pathlib import Path
 from msk_ray.cli import RESUMABLE, TERMINAL_LOG, Parser, StopRequest, outliving, run, typed_command
 from msk_ray.config import Config, load_config
 from msk_ray.errors import CheckpointError, StorageError
-from msk_ray.files import check_writable
+from msk_ray.files import check_writable, make_folder
 
 DESCRIPTION = """\
 Train one policy with SHAC: one trial, in this process, without Ray.
@@ -56,7 +56,10 @@ def _check_logdir(logdir: Path, resume: bool) -> None:
         raise StorageError(f"{logdir} holds a trial already: add --resume to go on with it, or name another --logdir")
     if resume and not (logdir / "checkpoints").is_dir():
         raise StorageError(f"--resume: no trial in {logdir}; leave --resume out to start one")
-    check_writable(logdir)
+    if resume:
+        check_writable(logdir)
+    else:
+        make_folder(logdir)
 
 
 def _train(config: Config, logdir: Path, device: str | None, resume: bool, resume_command: str) -> int:

@@ -9,7 +9,7 @@ from pathlib import Path
 from msk_ray.cli import Parser, run
 from msk_ray.errors import ConfigError
 from msk_ray.evaluate.targets import find_experiment
-from msk_ray.files import check_writable
+from msk_ray.files import make_folder
 from msk_ray.report.best import Best, look_at_best
 from msk_ray.report.page import compare, make_section, write_page
 from msk_ray.report.reading import Condition, Reading, check_folder, read_experiment
@@ -61,7 +61,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     folder = (args.out or experiments[0].path / "report").resolve()
     now = time.time()
     readings = [read_experiment(experiment, now) for experiment in experiments]
-    check_writable(folder)
+    make_folder(folder)
     sections = []
     for number, reading in enumerate(readings):
         prefix = f"{number + 1}_" if len(readings) > 1 else ""

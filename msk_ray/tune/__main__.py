@@ -12,7 +12,7 @@ from typing import Any
 from msk_ray.cli import RESUMABLE, TERMINAL_LOG, Parser, outliving, run
 from msk_ray.config import dump_yaml, parse_override, read_yaml
 from msk_ray.errors import ConfigError
-from msk_ray.files import check_writable
+from msk_ray.files import make_folder
 from msk_ray.tune import experiment as experiments
 from msk_ray.tune.budget import extreme_configs
 from msk_ray.tune.extension import extended_space, parse_extension
@@ -230,7 +230,7 @@ def _debug(args: argparse.Namespace, space: Space, trial: Trial) -> int:
     from msk_ray.tune.trial_run import Hooks, run_trial
 
     folder = (args.storage / "debug" / f"{space.name}_{trial.id}_{time.strftime('%Y%m%d_%H%M%S')}").resolve()
-    check_writable(folder)
+    make_folder(folder)
     device = "cpu" if args.cpu or local_gpus() == 0 else "cuda:0"
     print(f"trial {trial.index} ({trial.id}): {trial.variant} seed={trial.seed} on {device}; into {folder}", flush=True)
     hooks = Hooks(

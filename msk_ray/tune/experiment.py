@@ -28,8 +28,8 @@ from pydantic import ValidationError
 import msk_ray
 from msk_ray.cli import typed_command
 from msk_ray.config import dump_yaml, parse_config, read_yaml
-from msk_ray.errors import MskRayError, StorageError
-from msk_ray.files import check_writable, write_json, write_text
+from msk_ray.errors import MskRayError, StorageError, StorageFailure
+from msk_ray.files import check_writable, make_folder, write_json, write_text
 from msk_ray.nvidia_smi import ask_driver
 from msk_ray.tune.extension import extend_trials
 from msk_ray.tune.outcomes import OUTCOME_FILE, Outcome, read_ending
@@ -79,6 +79,51 @@ class Experiment:
     def trial_folder(self, trial_id: str) -> Path:
         """Where a trial keeps everything."""
         return self.path / "trials" / trial_id
+
+    def make_trial_folder(self, trial_id: str) -> Path:
+        """Make a trial's folder, once, before it first starts.
+
+        Raises:
+            StorageFailure: the disk is full or gone, or the experiment has.
+        """
+        folder = self.trial_folder(trial_id)
+        self.check_there()
+        try:
+            folder.mkdir(exist_ok=True)  # without those above it: an experiment that was moved is not begun again
+        except OSError as error:
+            raise StorageFailure(f"cannot write {folder}: {error.strerror or error}") from error
+        return folder
+
+    def check_there(self, trial_id: str | None = None) -> None:
+        """Notice that the experiment, or a trial's folder, has gone since it was opened.
+
+        Raises:
+            StorageFailure: it has.
+        """
+        for path in (self.path / "manifest.json", *([] if trial_id is None else [self.trial_folder(trial_id)])):
+            try:
+                path.stat()
+            except OSError as error:
+                raise StorageFailure(f"{path} has gone: moved, removed or not mounted ({error.strerror})") from error
+
+    def lost(self, trial_id: str | None = None) -> StorageFailure | None:
+        """What `check_there` raises, if anything."""
+        try:
+            self.check_there(trial_id)
+        except StorageFailure as failure:
+            return failure
+        return None
+
+    def asked_to_stop(self) -> bool:
+        """Whether trials are to save themselves and end.
+
+        Raises:
+            StorageFailure: the experiment has gone, and with it any such request.
+        """
+        if self.stop_file.exists():
+            return True
+        self.check_there()
+        return False
 
     def manifest(self) -> dict[str, Any]:
         """The manifest as plain data.
@@ -204,8 +249,8 @@ def create(path: Path, space: Space, trials: list[Trial], options: dict[str, Any
     experiment = Experiment(path)
     if (path / "manifest.json").exists():
         raise StorageError(f"{path} holds an experiment already: add --resume to go on with it, or pass another --name")
-    check_writable(path)
-    (path / "trials").mkdir(exist_ok=True)
+    make_folder(path)
+    make_folder(path / "trials")
     experiment.write_space(space)
     write_json(path / "env.json", environment())
     manifest = {

@@ -17,7 +17,11 @@ def finish(experiment: Experiment) -> int:
 
     Returns:
         How many trials ended in an error.
+
+    Raises:
+        StorageFailure: the disk is full or gone, or the experiment is.
     """
+    experiment.check_there()
     manifest = experiment.manifest()
     records = read_records(experiment)
     width = max(100, shutil.get_terminal_size((160, 24)).columns)

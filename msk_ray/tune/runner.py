@@ -40,6 +40,7 @@ from msk_ray.tune.local_ray import loopback_only, make_token_private, way_in
 from msk_ray.tune.made_up import MadeUp, recover
 from msk_ray.tune.operators import Listed
 from msk_ray.tune.outcomes import read_ending, write_ending
+from msk_ray.tune.presence import Presence, remove_remains
 from msk_ray.tune.pruning import make_pruner
 from msk_ray.tune.records import read_record
 from msk_ray.tune.space import Space
@@ -172,6 +173,8 @@ def run_trials(plan: Plan) -> bool:
     )
     if plan.precompile is not None:
         _precompile(plan, remaining or [_first_suggestion(job)])
+    for trial in remaining:
+        experiment.make_trial_folder(trial.id)
     total = ray.cluster_resources()
     concurrent = plan.placement.concurrent(total.get("GPU", 0.0), total.get("CPU", 1.0), plan.max_concurrent)
     stop = StopRequest()
@@ -244,7 +247,13 @@ def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial], made_up: list
             storage_path=str(plan.experiment.path),
             verbose=0,
             # Live first: it writes the endings that only the driver knows.
-            callbacks=[live, StateGauge(plan.experiment, remaining, job.trial_of), node, *spare],
+            callbacks=[
+                live,
+                StateGauge(plan.experiment, remaining, job.trial_of),
+                node,
+                Presence(plan.experiment),
+                *spare,
+            ],
             stop=_StopWhen(live),
             failure_config=tune.FailureConfig(max_failures=file.resources.max_failures),
             # None are deleted: only a population reports them, and another member may be about to take one over.
@@ -255,14 +264,16 @@ def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial], made_up: list
         with _log_to(plan.experiment.path / "ray.log"):
             tuner.fit()
     except Exception as error:
+        remove_remains(plan.experiment)
         if node.lost is not None:
             raise node.lost from error
         # The driver may meet a full disk before any trial does.
-        failure = live.storage_failure or storage_failure(error)
+        failure = live.storage_failure or storage_failure(error) or plan.experiment.lost()
         if failure is None:
             raise
         raise _advised(failure) from error
     if live.storage_failure is not None:
+        remove_remains(plan.experiment)
         raise _advised(live.storage_failure)
 
 

@@ -78,13 +78,16 @@ def make_trainable(job: Job) -> Callable[[dict[str, Any]], None]:
         trial = job.trial_of(config)
         folder = job.experiment.trial_folder(trial.id)
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-            if "id" not in config:
+            if "id" in config:
+                job.experiment.check_there(trial.id)
+            else:
+                job.experiment.make_trial_folder(trial.id)
                 write_params(folder, config["params"])
             attempt(trial, folder)
         except Exception as error:
             # Whatever stumbled over a full disk first, a line of output perhaps: the driver must hear of the disk.
-            failure = storage_failure(error)
+            # Or over a file that is no longer there, as nothing is.
+            failure = storage_failure(error) or job.experiment.lost(trial.id)
             if failure is None or failure is error:
                 raise
             raise failure from error
@@ -107,7 +110,7 @@ def make_trainable(job: Job) -> Callable[[dict[str, Any]], None]:
             hooks = Hooks(
                 on_epoch=on_epoch,
                 on_evaluation=_report_with_checkpoint if job.population else _reporter(halved is not None),
-                pause=job.experiment.stop_file.exists,
+                pause=job.experiment.asked_to_stop,
             )
             try:
                 run_trial(

@@ -67,7 +67,7 @@ def run_trial(
     """Train until the trial ends, by its last epoch or by one of its own rules.
 
     Goes on from the newest whole checkpoint in `folder`, or from `checkpoint` if one is given. The ending is written
-    to `folder`.
+    to `folder`, which is there: a trial whose folder was moved does not begin again.
 
     Args:
         may_halve: whether the trial may start anew with half its worlds when it runs out of memory, once. One that
@@ -79,14 +79,15 @@ def run_trial(
     Raises:
         StartAnew: it ran out of memory and is to be run again, by a fresh process, with half its worlds. That is kept
             in `folder`.
-        StorageFailure: the disk is full or gone; the trial can go on once it is back.
+        StorageFailure: the disk is full or gone, or the folder is; the trial can go on once it is back.
         Exception: anything that is neither a failed simulation nor a fault the user can mend. Its traceback is kept in
             `error.txt`, and the trial may be tried again.
     """
-    done = read_ending(folder) if folder.is_dir() else None
+    if not folder.is_dir():
+        raise StorageFailure(f"{folder} has gone: moved, removed or not mounted")
+    done = read_ending(folder)
     if done is not None:
         return done
-    folder.mkdir(parents=True, exist_ok=True)
     # What an earlier attempt stumbled over stays in the trial's output; this file is about the latest one.
     (folder / ERROR_FILE).unlink(missing_ok=True)
     halved = read_halved(folder)

@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from msk_ray.config import Config
-from msk_ray.errors import CheckpointError
+from msk_ray.errors import CheckpointError, StorageFailure
 from msk_ray.training import Trainer, precompile, read_metrics
 from msk_ray.training.checkpoint import epoch_checkpoints, milestones
 
@@ -158,6 +158,29 @@ def test_a_signal_saves_and_says_resumable(
     assert len(epoch_checkpoints(tmp_path / "run" / "checkpoints")) == 1
     rows = [json.loads(line) for line in metrics.read_text().splitlines()]
     assert f"epoch_{rows[-1]['epoch']:06d}.pt" == epoch_checkpoints(tmp_path / "run" / "checkpoints")[0].name
+
+
+def test_a_folder_that_was_moved_stops_training_resumably_and_is_not_made_again(
+    tiny_cartpole: Config, tmp_path: Path
+) -> None:
+    whole = train(tiny_cartpole, tmp_path / "whole")
+    folder = tmp_path / "run"
+    first = Trainer(tiny_cartpole, folder, "cpu")
+    for _ in range(3):
+        first.run_epoch()
+    folder.rename(tmp_path / "elsewhere")
+    with pytest.raises(StorageFailure, match="No such file or directory") as caught:
+        first.run_epoch()
+    assert caught.value.exit_code == 75
+    first.close()
+    assert not folder.exists()
+    (tmp_path / "elsewhere").rename(folder)
+    second = Trainer(tiny_cartpole, folder, "cpu")
+    assert second.restore_latest()[0] == folder / "checkpoints" / "epoch_000002.pt"
+    while not second.finished:
+        second.run_epoch()
+    second.close()
+    assert comparable(read_metrics(folder / "metrics.jsonl")) == comparable(whole)
 
 
 def test_a_checkpoint_of_other_settings_is_refused(tiny_cartpole: Config, tmp_path: Path) -> None:

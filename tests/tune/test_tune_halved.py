@@ -40,6 +40,7 @@ def crowded(make_space: Any) -> Callable[..., Trial]:
 
 
 def attempt(trial: Trial, folder: Path, may_halve: bool = True, trainer: Any = StubTrainer) -> Ending | None:
+    folder.mkdir(parents=True, exist_ok=True)
     return trial_run.run_trial(trial, folder, "cpu", StopSpec(), trainer, Hooks(), may_halve=may_halve)
 
 

@@ -127,6 +127,52 @@ def test_a_full_disk_stops_everything_and_ends_nothing(
     assert outcomes(records) == ["finished", "out_of_memory"]
 
 
+def gone(path: Path, what: str, before: threading.Event) -> None:
+    """Once a trial has written some rows, move the experiment's folder, its manifest, or the trial's folder away."""
+    while True:
+        written = [file for file in path.glob("trials/*/metrics.jsonl") if len(file.read_bytes().splitlines()) > 8]
+        if written or before.wait(0.05):
+            break
+    source = {"experiment": path, "manifest": path / "manifest.json", "trial": written[0].parent}[what]
+    source.rename(path.parent / "elsewhere")
+
+
+@pytest.mark.parametrize("what", ["experiment", "manifest", "trial"])
+def test_what_has_gone_stops_the_sweep_and_is_not_made_again(
+    what: str, make_space: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Fails where a trial makes its folder: it begins again at epoch 0, and the sweep ends as if it had finished."""
+    monkeypatch.setattr(StubTrainer, "seconds_per_epoch", 0.2)
+    space = make_space(overrides={"trial.epochs": 60}, resources={"max_failures": 3})
+    path = tmp_path / "runs" / "gone"
+    ended = threading.Event()
+    mover = threading.Thread(target=gone, args=(path, what, ended))
+    mover.start()
+    with pytest.raises(StorageFailure, match=r"has gone|cannot write") as caught:
+        go(space, path)
+    ended.set()
+    mover.join()
+    assert caught.value.exit_code == 75
+    assert "go on with --resume" in str(caught.value)
+    elsewhere = path.parent / "elsewhere"
+    lost = {"experiment": path, "manifest": path / "manifest.json"}.get(what)
+    if lost is None:
+        (lost,) = [path / "trials" / t.id for t in resolve_trials(space) if not (path / "trials" / t.id).exists()]
+    assert not lost.exists()
+    elsewhere.rename(lost)
+    rows = {t.id: read_rows(path / "trials" / t.id) for t in resolve_trials(space)}
+    completed, records = go(space, path, resume=True)
+    assert completed
+    assert outcomes(records) == ["finished", "finished"]
+    for record in records:
+        found = read_rows(record.folder)
+        assert [row["epoch"] for row in found] == list(range(61))
+        kept = rows[record.trial.id]
+        assert [row["eval/score"] for row in kept[::2]] == [row["eval/score"] for row in found[: len(kept) : 2]]
+        # One process before and one after: it went on from its checkpoint rather than from nothing.
+        assert len((record.folder / "processes").read_text().splitlines()) == 2
+
+
 def test_out_of_memory_starts_anew_with_half_the_worlds_in_a_fresh_process(
     make_space: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

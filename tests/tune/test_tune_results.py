@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from msk_ray.errors import ConfigError, DeviceError, StorageError
-from msk_ray.files import check_writable
+from msk_ray.files import make_folder
 from msk_ray.nvidia_smi import ask_driver
 from msk_ray.tune import experiment as experiments
 from msk_ray.tune.devices import Placement, choose_placement, wait_for_memory
@@ -115,7 +115,7 @@ def test_space_is_kept_as_written(experiment: experiments.Experiment) -> None:
 def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(StorageError, match="cannot write to"):
-        check_writable(tmp_path / "file" / "runs")
+        make_folder(tmp_path / "file" / "runs")
     with pytest.raises(StorageError, match="letters, digits"):
         experiments.check_name("../x")
 

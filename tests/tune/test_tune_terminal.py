@@ -112,7 +112,7 @@ def test_a_pipe_that_nobody_reads_does_not_matter(command: list[str], experiment
 def test_no_line_is_lost_and_the_exit_code_is_its_own(redirection: str, tmp_path: Path) -> None:
     code = (
         "import sys, time; from pathlib import Path; from msk_ray.cli import outliving\n"
-        "with outliving(Path('deep/log')):\n"
+        "with outliving(Path('log')):\n"
         "    time.sleep(0.5)\n"
         "    print('a' * 100_000); print('ü', flush=True); print('to stderr', file=sys.stderr)\n"
         "print('after'); sys.exit(75)"
@@ -123,10 +123,10 @@ def test_no_line_is_lost_and_the_exit_code_is_its_own(redirection: str, tmp_path
     )
     assert (done.returncode, done.stderr) == (75, "to stderr\n")
     if redirection == "| true":
-        lines = (tmp_path / "deep" / "log").read_text(encoding="utf-8").splitlines()
+        lines = (tmp_path / "log").read_text(encoding="utf-8").splitlines()
         assert lines[1:] == ["a" * 100_000, "ü", "after"]
     else:
-        assert not (tmp_path / "deep").exists()
+        assert not (tmp_path / "log").exists()
 
 
 def test_nohup_keeps_its_word(command: list[str], experiment: Experiment) -> None:

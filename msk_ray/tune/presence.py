@@ -1,0 +1,34 @@
+"""Ends a sweep whose experiment's folder has gone: moved, removed, or no longer mounted."""
+
+import shutil
+import time
+from typing import Any
+
+from ray.tune import Callback
+
+from msk_ray.tune.experiment import Experiment
+
+
+def remove_remains(experiment: Experiment) -> None:
+    """Remove what Ray has written at the place of an experiment that has gone: it makes the folders it writes to, and
+    an experiment that is moved back would land inside them."""
+    path = experiment.path
+    if not path.is_dir() or experiment.lost() is None:
+        return
+    if {child.name for child in path.iterdir()} <= {experiment.tune.name}:
+        shutil.rmtree(path)
+
+
+class Presence(Callback):
+    """Looks for the experiment's manifest now and then; without it, trials have nowhere to save themselves."""
+
+    INTERVAL_S = 2.0
+
+    def __init__(self, experiment: Experiment) -> None:
+        self._experiment = experiment
+        self._checked = time.monotonic()
+
+    def on_step_end(self, iteration: int, trials: list[Any], **info: Any) -> None:
+        if time.monotonic() - self._checked >= self.INTERVAL_S:
+            self._checked = time.monotonic()
+            self._experiment.check_there()
