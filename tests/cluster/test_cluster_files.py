@@ -8,6 +8,7 @@ machines, Grafana), `schemas/` holds a strict one of the fields that are set, an
 import copy
 import functools
 import json
+import os
 import re
 import shlex
 import shutil
@@ -233,6 +234,40 @@ def test_commands_that_nodes_run(name: str, tmp_path: Path) -> None:
     assert "0.0.0.0" not in text
     with pytest.raises(ray_commands.click.NoSuchOption):
         check_start(starts[0].replace("--port", "--prot"))
+
+
+METADATA = {
+    "http://169.254.169.254/latest/api/token": "secret",
+    "http://169.254.169.254/latest/meta-data/mac": "02:29:96:8f:6a:2d",
+    "http://169.254.169.254/latest/meta-data/network/interfaces/macs/02:29:96:8f:6a:2d/vpc-ipv4-cidr-blocks": (
+        "172.31.0.0/16\n10.7.0.0/20"
+    ),
+    "http://metadata.google.internal/computeMetadata/v1/instance/network-interfaces/0/ip": "10.128.3.9",
+    "http://metadata.google.internal/computeMetadata/v1/instance/network-interfaces/0/subnetmask": "255.255.240.0",
+}
+"""What machines are told about themselves on AWS (instance metadata, version 2) and Google Cloud."""
+
+
+@pytest.mark.parametrize(("name", "networks"), [("aws", ["172.31.0.0/16", "10.7.0.0/20"]), ("gcp", ["10.128.0.0/20"])])
+def test_the_storage_is_shared_with_the_clusters_network_alone(name: str, networks: list[str], tmp_path: Path) -> None:
+    commands = yaml.safe_load((FOLDER / f"{name}.yaml").read_text())["head_setup_commands"]
+    (command,) = [command for command in commands if "exportfs" in command]
+    exports = tmp_path / "exports"
+    answers = "\n".join(f"{url}) printf '{text}' ;;" for url, text in METADATA.items())
+    fakes = {
+        "curl": f'case "${{!#}}" in\n{answers}\n*) exit 22 ;;\nesac',
+        "sudo": f'case "$1" in tee) cat > {exports} ;; exportfs) ;; *) exit 1 ;; esac',
+    }
+    for fake, body in fakes.items():
+        (tmp_path / fake).write_text(f"#!/bin/bash\n{body}\n")
+        (tmp_path / fake).chmod(0o755)
+    environment = {"PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    subprocess.run(["bash", "-c", command], env=environment, check=True)
+    assert exports.read_text().splitlines() == [f"/shared {net}(rw,sync,no_subtree_check)" for net in networks]
+    exports.unlink()
+    (tmp_path / "curl").write_text("#!/bin/bash\nexit 22\n")  # no answer
+    assert subprocess.run(["bash", "-c", command], env=environment).returncode != 0
+    assert not exports.exists()
 
 
 def test_commands_that_start_experiments() -> None:
