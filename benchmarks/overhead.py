@@ -158,9 +158,9 @@ def main() -> None:
 
 
 def _parsed(overrides: list[str]) -> dict[str, object]:
-    from msk_ray.config import parse_override
+    from msk_ray.config import parse_overrides
 
-    return dict(parse_override(text) for text in overrides)
+    return parse_overrides(overrides)
 
 
 def _spread(values: list[float], form: str) -> list[str]:

@@ -18,7 +18,7 @@ from pathlib import Path
 from record import RESULTS, markdown_table, publish
 
 import msk_ray
-from msk_ray.config import dump_yaml, parse_override
+from msk_ray.config import dump_yaml, parse_overrides
 from msk_ray.tune.devices import local_gpus
 from msk_ray.tune.outcomes import read_ending
 from msk_ray.tune.records import read_rows
@@ -128,7 +128,7 @@ def main(argv: list[str] | None = None) -> None:
     args = p.parse_args(argv)
     if not args.cpu and local_gpus() == 0:
         sys.exit("no GPU here: pass --cpu, with a small --config")
-    overrides = {"env.nworld": args.worlds} | dict(parse_override(text) for text in args.overrides)
+    overrides = {"env.nworld": args.worlds} | parse_overrides(args.overrides)
     device = ["--cpu"] if args.cpu else []
     with tempfile.TemporaryDirectory(prefix="thr_") as scratch:
         folder = Path(scratch)

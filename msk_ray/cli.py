@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from msk_ray.errors import MskRayError, StorageFailure
+from msk_ray.errors import MskRayError, StorageFailure, brief
 
 RESUMABLE = 75
 """Exit code of a run that was asked to stop and saved its state (EX_TEMPFAIL)."""
@@ -65,6 +65,11 @@ def run(main: Callable[[Sequence[str] | None], int], argv: Sequence[str] | None 
         # The reader of our output, such as `head`, has left.
         sys.stderr.close()
         return 0
+    except OSError as error:
+        if error.errno != errno.ENAMETOOLONG:
+            raise
+        print(f"error: {brief(error.filename)}: too long for the name of a file; write a shorter one", file=sys.stderr)
+        return MskRayError.exit_code
 
 
 class _Outliving(io.TextIOBase):

@@ -1,9 +1,24 @@
 """Errors a user can mend. Each message is one line that says what to write or do instead."""
 
 import errno
+import reprlib
 from enum import StrEnum
 
 _STORAGE_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS, errno.ESTALE}
+
+
+def shortened(text: str, limit: int = 80) -> str:
+    """The first `limit` characters of a text, with dots where more is left out."""
+    return text if len(text) <= limit else f"{text[: limit - 3]}..."
+
+
+_BRIEF = reprlib.Repr()
+_BRIEF.maxstring = _BRIEF.maxother = _BRIEF.maxlong = 60
+
+
+def brief(value: object) -> str:
+    """The `repr` of a value for an error message, short however large the value is."""
+    return shortened(_BRIEF.repr(value), 160)
 
 
 class MskRayError(Exception):

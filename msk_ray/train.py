@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from msk_ray.cli import RESUMABLE, TERMINAL_LOG, Parser, StopRequest, outliving, run, typed_command
-from msk_ray.config import Config, load_config
+from msk_ray.config import SET_HELP, Config, load_config
 from msk_ray.errors import CheckpointError, StorageError
 from msk_ray.files import check_writable, make_folder
 
@@ -27,9 +27,7 @@ def parser() -> Parser:
     """The command line."""
     p = Parser("python -m msk_ray.train", DESCRIPTION, EXAMPLES)
     p.add_argument("--config", type=Path, required=True, metavar="FILE", help="a file of configs/")
-    p.add_argument(
-        "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help="override a setting"
-    )
+    p.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help=SET_HELP)
     p.add_argument("--seed", type=int, help="same as --set trial.seed=N")
     p.add_argument("--device", help="cpu or cuda:N; by default the first GPU, or the CPU if there is none")
     p.add_argument("--logdir", type=Path, metavar="DIR", help="by default runs/train/CONFIG_seedN")

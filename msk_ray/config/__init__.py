@@ -1,17 +1,8 @@
 """What a trial is: one frozen, checked tree of settings, read from YAML."""
 
 from msk_ray.config.legs import AssistConfig, LegEnvSettings, MyoLeg26EnvConfig, MyoLegEnvConfig, TerrainConfig
-from msk_ray.config.load import (
-    apply_overrides,
-    describe_fault,
-    dump_yaml,
-    load_config,
-    merge,
-    parse_config,
-    parse_override,
-    read_config,
-    read_yaml,
-)
+from msk_ray.config.load import describe_fault, load_config, parse_config, read_config
+from msk_ray.config.overlay import SET_HELP, combine, merge, overlay, parse_override, parse_overrides
 from msk_ray.config.schema import (
     AdaptiveHorizon,
     AntEnvConfig,
@@ -30,8 +21,10 @@ from msk_ray.config.schema import (
     TrialConfig,
 )
 from msk_ray.config.sections import EnvSettings
+from msk_ray.config.yaml_text import dump_yaml, parse_yaml, read_yaml
 
 __all__ = [
+    "SET_HELP",
     "AdaptiveHorizon",
     "AntEnvConfig",
     "AssistConfig",
@@ -53,13 +46,16 @@ __all__ = [
     "ShacConfig",
     "TerrainConfig",
     "TrialConfig",
-    "apply_overrides",
+    "combine",
     "describe_fault",
     "dump_yaml",
     "load_config",
     "merge",
+    "overlay",
     "parse_config",
     "parse_override",
+    "parse_overrides",
+    "parse_yaml",
     "read_config",
     "read_yaml",
 ]

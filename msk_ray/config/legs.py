@@ -2,9 +2,9 @@
 
 from typing import Annotated, Literal
 
-from pydantic import Field, PositiveFloat, PositiveInt
+from pydantic import Field, PositiveFloat
 
-from msk_ray.config.sections import EnvSettings, Fraction, NonNegative, Section
+from msk_ray.config.sections import Count, EnvSettings, Fraction, NonNegative, Section, Text, Whole
 
 
 class TerrainConfig(Section):
@@ -22,7 +22,7 @@ class TerrainConfig(Section):
     """Largest height of `rough` strips and `height_field` [m]."""
     start: NonNegative = 0.8
     """Where the ground stops being flat [m]; a slope starts at the origin."""
-    seed: Annotated[int, Field(ge=0)] = 0
+    seed: Whole = 0
     """Of the heights of `rough` and `height_field`."""
 
 
@@ -32,7 +32,7 @@ class AssistConfig(Section):
     Evaluation never has them.
     """
 
-    epochs: Annotated[int, Field(ge=0)] = 0
+    epochs: Whole = 0
     """Epochs until they are gone; 0 has none at all."""
     share: Fraction = 1.0
     """Of the stiffness below, at epoch 0."""
@@ -47,7 +47,7 @@ class AssistConfig(Section):
 class LegEnvSettings(EnvSettings):
     """What the muscle-driven legs share. Reward weights are per control step."""
 
-    episode_length: PositiveInt = 500
+    episode_length: Count = 500
     control_timestep: PositiveFloat = 0.02
     target_speed: NonNegative = 1.25
     """Forward speed asked for [m/s]; 0 asks to stand."""
@@ -118,7 +118,7 @@ class MyoLegEnvConfig(LegEnvSettings):
     """Legs of an installed myosuite or myo_sim, or of a model file."""
 
     name: Literal["myoleg"]
-    model: str | None = None
+    model: Text | None = None
     """Path of an MJCF file, or `myolegs` (80 muscles) or `myolegs26`; null takes `myolegs`."""
     source: Literal["auto", "myosuite2", "myosuite3", "myo_sim"] = "auto"
     """Package to take it from; `auto` takes the first that is installed, in this order."""

@@ -1,73 +1,16 @@
 """Reading configurations: YAML in, a checked `Config` out, or one line saying what to write instead."""
 
-import copy
 import difflib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, get_args, get_origin
 
-import yaml
 from pydantic import BaseModel, Tag, ValidationError
 
+from msk_ray.config.overlay import merge, overlay, parse_overrides
 from msk_ray.config.schema import VARIANTS, Config
-from msk_ray.errors import ConfigError
-
-
-def read_yaml(path: Path) -> dict[str, Any]:
-    """The mapping in a YAML file.
-
-    Raises:
-        ConfigError: the file is missing, unreadable, not YAML, or not a mapping.
-    """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        siblings = sorted(p.stem for p in path.parent.glob("*.yaml")) if path.parent.is_dir() else []
-        hint = f"; {path.parent} holds: {', '.join(siblings)}" if siblings else ""
-        raise ConfigError(f"no such file: {path}{hint}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"cannot read {path}: {error}") from error
-    try:
-        data = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from error
-    if not isinstance(data, dict):
-        raise ConfigError(f"{path} must hold a mapping of settings at its top level")
-    return data
-
-
-def parse_override(text: str) -> tuple[str, Any]:
-    """Split "a.b=value" into its dotted key and its value, read as YAML.
-
-    Raises:
-        ConfigError: no "=" in it, or the value is not YAML.
-    """
-    key, separator, value = text.partition("=")
-    if not separator or not key.strip():
-        raise ConfigError(f"--set {text!r}: write key=value, such as shac.horizon=16")
-    try:
-        return key.strip(), yaml.safe_load(value)
-    except yaml.YAMLError:
-        raise ConfigError(f"--set {text!r}: the value is not valid YAML") from None
-
-
-def apply_overrides(data: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """A copy of nested `data` with each dotted key of `overrides` set.
-
-    Raises:
-        ConfigError: a key goes through something that is not a section.
-    """
-    result = copy.deepcopy(dict(data))
-    for dotted, value in overrides.items():
-        *sections, leaf = dotted.split(".")
-        node = result
-        for section in sections:
-            child = node.setdefault(section, {})
-            if not isinstance(child, dict):
-                raise ConfigError(f"{dotted}: {section} is a value, not a section of settings")
-            node = child
-        node[leaf] = copy.deepcopy(value)
-    return result
+from msk_ray.config.yaml_text import read_yaml
+from msk_ray.errors import ConfigError, brief, shortened
 
 
 def parse_config(data: Mapping[str, Any], source: str = "config") -> Config:
@@ -107,22 +50,7 @@ def load_config(path: Path, overrides: Iterable[str] = ()) -> Config:
     Raises:
         ConfigError: as `read_config`, `parse_override` and `parse_config`.
     """
-    data = apply_overrides(read_config(path), dict(parse_override(text) for text in overrides))
-    return parse_config(data, str(path))
-
-
-def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """`over` laid over `base`, section by section."""
-    merged = copy.deepcopy(dict(base))
-    for key, value in over.items():
-        old = merged.get(key)
-        merged[key] = merge(old, value) if isinstance(old, dict) and isinstance(value, dict) else copy.deepcopy(value)
-    return merged
-
-
-def dump_yaml(data: Mapping[str, Any]) -> str:
-    """YAML text of plain data, in the order given."""
-    return yaml.safe_dump(dict(data), sort_keys=False, allow_unicode=True, width=100)
+    return parse_config(overlay(read_config(path), parse_overrides(overrides)), str(path))
 
 
 def describe_fault(error: ValidationError, root: type[BaseModel] = Config) -> str:
@@ -131,7 +59,7 @@ def describe_fault(error: ValidationError, root: type[BaseModel] = Config) -> st
     # A misspelt key is often missing under its right name too; the misspelling is what to mend.
     first = min(faults, key=lambda fault: fault["type"] != "extra_forbidden")
     # Discriminated unions put the tag into the location; it is no key of the file.
-    location = [str(part) for part in first["loc"] if part not in _TAGS]
+    location = [shortened(str(part)) for part in first["loc"] if part not in _TAGS]
     where = ".".join(location)
     if first["type"] == "extra_forbidden":
         known = _keys_at(root, location[:-1], first["loc"])
@@ -145,9 +73,13 @@ def describe_fault(error: ValidationError, root: type[BaseModel] = Config) -> st
     elif first["type"].startswith("union_tag"):
         text = f"{where or 'env'}: {first['msg']}; write env.name: {' or '.join(VARIANTS)}"
     else:
-        text = f"{where}: {first['msg']}, not {first['input']!r}"
+        text = f"{where}: {first['msg']}, not {brief(first['input'])}"
     more = len(faults) - 1
+    text = shortened(" ".join(text.split()), _MAX_MESSAGE)
     return text + (f" (and {more} more fault{'s' if more > 1 else ''})" if more else "")
+
+
+_MAX_MESSAGE = 400
 
 
 _TAGS = (*VARIANTS, "constant", "schedule", "adaptive")

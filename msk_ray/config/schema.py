@@ -6,10 +6,10 @@ arXiv:2204.07137) and the hyperparameters published with it.
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Discriminator, Field, PositiveFloat, PositiveInt, Tag, model_validator
+from pydantic import Discriminator, Field, PositiveFloat, Tag, model_validator
 
 from msk_ray.config.legs import MyoLeg26EnvConfig, MyoLegEnvConfig
-from msk_ray.config.sections import EnvSettings, Fraction, NonNegative, Section
+from msk_ray.config.sections import Count, EnvSettings, Fraction, NonNegative, Section, Text, Whole
 
 Vec2 = tuple[float, float]
 Vec5 = tuple[float, float, float, float, float]
@@ -31,7 +31,7 @@ class CartPoleEnvConfig(EnvSettings):
     """Swing up a pole on a cart and keep it there. Angle 0 is upright."""
 
     name: Literal["cartpole"]
-    episode_length: PositiveInt = 240
+    episode_length: Count = 240
     pole_angle_penalty: NonNegative = 1.0
     """Weight of angle² [1/rad²], with the angle wrapped to ±π."""
     pole_velocity_penalty: NonNegative = 0.1
@@ -48,7 +48,7 @@ class AntEnvConfig(EnvSettings):
     """A four-legged walker whose reward asks for forward velocity."""
 
     name: Literal["ant"]
-    episode_length: PositiveInt = 1000
+    episode_length: Count = 1000
     forward_vel: float = 1.0
     """Weight of the torso's velocity along +x [s/m]."""
     heading: float = 1.0
@@ -81,14 +81,14 @@ class FdConfig(Section):
     """Perturbation of qvel [m/s, rad/s]."""
     eps_act: PositiveFloat = 5e-4
     """Perturbation of act [its own unit]."""
-    max_worlds: PositiveInt = 131072
+    max_worlds: Count = 131072
     """Perturbed copies run at once; more are done in chunks."""
 
 
 class PhysicsConfig(Section):
     """How the model is built, stepped and differentiated. Fields left null keep the variant's value."""
 
-    variant: str | None = None
+    variant: Text | None = None
     """Named physics of the environment: for ant `published`, `matched` or `matched_hard_friction`."""
     backward: Literal["tape_per_substep", "tape_all", "fd_jacobian", "hybrid"] = "tape_per_substep"
     """Backward mode of the step. `tape_*` are exact; `fd_jacobian` differentiates any model by finite differences;
@@ -96,15 +96,15 @@ class PhysicsConfig(Section):
     substep_grad_clip: PositiveFloat | None = None
     """Bound on each world's state cotangent between substeps, in the loss's own units; null leaves it. Tapes only."""
     fd: FdConfig = FdConfig()
-    substeps: PositiveInt | None = None
+    substeps: Count | None = None
     """Physics steps an env step. Set this or `timestep`; 4 if neither is set."""
     timestep: PositiveFloat | None = None
     """Duration of a physics step [s]; must divide the env's control_timestep."""
     tolerance: PositiveFloat | None = None
     """Constraint solver tolerance; mujoco_warp's default is 1e-6."""
-    iterations: PositiveInt | None = None
+    iterations: Count | None = None
     """Constraint solver iteration limit."""
-    ls_iterations: PositiveInt | None = None
+    ls_iterations: Count | None = None
     """Line search iteration limit."""
     integrator: Literal["Euler", "implicitfast", "RK4"] | None = None
     cone: Literal["pyramidal", "elliptic"] | None = None
@@ -132,9 +132,9 @@ class PhysicsConfig(Section):
     """Impedance of joint limits."""
     gear: PositiveFloat | None = None
     """Force or torque of a motor at full control [N, N m]."""
-    nconmax: PositiveInt | None = None
+    nconmax: Count | None = None
     """Contacts a world; null takes a bound from the geometry."""
-    njmax: PositiveInt | None = None
+    njmax: Count | None = None
     """Constraint rows a world; null takes a bound from the geometry."""
 
     @model_validator(mode="after")
@@ -170,9 +170,9 @@ class PhysicsConfig(Section):
 class HorizonSchedule(Section):
     """Rollout length by epoch: `start` at epoch 0, `end` from epoch `epochs` on, linear between."""
 
-    start: PositiveInt
-    end: PositiveInt
-    epochs: PositiveInt
+    start: Count
+    end: Count
+    epochs: Count
 
     def at(self, epoch: int) -> int:
         """Env steps at `epoch`, counted from 0."""
@@ -188,9 +188,9 @@ class AdaptiveHorizon(Section):
     follows a constraint on contact forces; this one follows the cotangents themselves.
     """
 
-    start: PositiveInt
-    shortest: PositiveInt = 4
-    longest: PositiveInt = 64
+    start: Count
+    shortest: Count = 4
+    longest: Count = 64
     target: PositiveFloat
     """Wanted 90th percentile of the cotangent norms, before any bound [reward]."""
     rate: Annotated[float, Field(gt=0.0, le=1.0)] = 0.1
@@ -214,7 +214,7 @@ def _kind_of_horizon(value: Any) -> str:
 
 
 Horizon = Annotated[
-    Annotated[PositiveInt, Tag("constant")]
+    Annotated[Count, Tag("constant")]
     | Annotated[HorizonSchedule, Tag("schedule")]
     | Annotated[AdaptiveHorizon, Tag("adaptive")],
     Discriminator(_kind_of_horizon),
@@ -254,7 +254,7 @@ class ContactCurriculum(Section):
     """Train first in softer contacts, and go over to those of `physics` step by step."""
 
     start: ContactStart
-    epochs: PositiveInt
+    epochs: Count
     """Steps from `start` to the trial's physics, one an epoch."""
     reward: float | None = None
     """Mean reward per env step an epoch must reach for a step to be taken; null takes one every epoch."""
@@ -263,7 +263,7 @@ class ContactCurriculum(Section):
 class NetworkConfig(Section):
     """A multilayer perceptron."""
 
-    hidden: tuple[PositiveInt, ...] = (64, 64)
+    hidden: Annotated[tuple[Annotated[int, Field(gt=0, le=65536)], ...], Field(max_length=64)] = (64, 64)
     activation: Literal["elu", "silu", "relu", "tanh"] = "elu"
     layer_norm: bool = True
     """Normalise each hidden layer."""
@@ -299,9 +299,9 @@ class ShacConfig(Section):
     """λ of the TD(λ) targets."""
     critic_method: Literal["td-lambda", "one-step"] = "td-lambda"
     """Targets of the critic."""
-    critic_iterations: PositiveInt = 16
+    critic_iterations: Count = 16
     """Passes over the rollout an epoch."""
-    critic_batches: PositiveInt = 4
+    critic_batches: Count = 4
     """Minibatches a pass."""
     target_critic_alpha: Fraction = 0.2
     """target ← α·target + (1 − α)·critic after each epoch."""
@@ -337,25 +337,25 @@ class ShacConfig(Section):
 class EvaluationConfig(Section):
     """Deterministic evaluation on fixed seeds: the only thing policies are ranked by."""
 
-    interval: PositiveInt = 10
+    interval: Count = 10
     """Epochs between evaluations."""
-    nworld: PositiveInt = 64
-    steps: PositiveInt | None = None
+    nworld: Count = 64
+    steps: Count | None = None
     """Env steps; null takes the env's episode length."""
-    seed: Annotated[int, Field(ge=0)] = 1234
-    variant: str | None = None
+    seed: Whole = 1234
+    variant: Text | None = None
     """Physics the score is taken under; null takes the env's reference physics."""
 
 
 class TrialConfig(Section):
     """How long, from which seed, and how often to save."""
 
-    epochs: PositiveInt = 500
+    epochs: Count = 500
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
-    start_from: str | None = None
+    start_from: Text | None = None
     """Checkpoint of another trial whose networks and observation statistics this one starts from, such as a best.pt;
     null starts from random ones. Optimisers and worlds are new either way."""
-    checkpoint_interval: PositiveInt = 10
+    checkpoint_interval: Count = 10
     """Epochs between checkpoints."""
     keep_checkpoints: Annotated[int, Field(ge=2)] = 2
     """Newest checkpoints kept, beside the best."""

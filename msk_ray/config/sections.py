@@ -1,25 +1,68 @@
 """What all groups of settings are made of."""
 
-from typing import Annotated
+from functools import cache
+from typing import Annotated, Any, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validator
 
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 NonNegative = Annotated[float, Field(ge=0.0)]
+Count = Annotated[int, Field(gt=0, lt=2**31)]
+"""A number of things, at least one; what Warp and CUDA can count."""
+Whole = Annotated[int, Field(ge=0, lt=2**31)]
+"""A whole number from 0 on."""
+Text = Annotated[str, Field(max_length=4096)]
 
 
 class Section(BaseModel):
-    """A frozen group of settings that refuses unknown keys."""
+    """A frozen group of settings that refuses unknown keys, numbers that are not finite, and `true` for a number."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _no_truth_for_numbers(cls, data: Any) -> Any:
+        # Python takes True for 1. Here, before anything is converted, it is made something that no number is.
+        if not isinstance(data, dict):
+            return data
+        numeric = _without_truth(cls)
+        return {key: _no_number(value) if key in numeric else value for key, value in data.items()}
+
+
+class _NotANumber:
+    """Stands for a `true` or `false` where neither is meant, until it is refused."""
+
+    def __init__(self, value: bool) -> None:
+        self._value = value
+
+    def __repr__(self) -> str:
+        return str(self._value).lower()
+
+
+def _no_number(value: Any) -> Any:
+    if isinstance(value, bool):
+        return _NotANumber(value)
+    if isinstance(value, list | tuple) and any(isinstance(item, bool) for item in value):
+        return [_no_number(item) for item in value]
+    return value
+
+
+@cache
+def _without_truth(section: type[Section]) -> frozenset[str]:
+    """Fields that take neither true nor false."""
+    return frozenset(name for name, field in section.model_fields.items() if not _takes_truth(field.annotation))
+
+
+def _takes_truth(annotation: Any) -> bool:
+    return annotation in (bool, Any) or any(_takes_truth(part) for part in get_args(annotation))
 
 
 class EnvSettings(Section):
     """What every environment has."""
 
-    nworld: PositiveInt = 64
+    nworld: Count = 64
     """Worlds W simulated at once."""
-    episode_length: PositiveInt
+    episode_length: Count
     """Env steps after which an episode is truncated."""
     control_timestep: PositiveFloat = 1.0 / 60.0
     """Duration of an env step [s]."""

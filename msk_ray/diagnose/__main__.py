@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from msk_ray.cli import Parser, run
+from msk_ray.config import SET_HELP
 from msk_ray.config.schema import VARIANTS
 from msk_ray.errors import ConfigError, StorageError
 
@@ -34,7 +35,9 @@ def parser() -> Parser:
     """The command line."""
     p = Parser("python -m msk_ray.diagnose", DESCRIPTION, EXAMPLES)
     p.add_argument("subject", type=Path, metavar="CHECKPOINT_OR_CONFIG")
-    p.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help="for a config")
+    p.add_argument(
+        "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help=f"for a config: {SET_HELP}"
+    )
     p.add_argument("--variants", nargs="+", metavar="NAME", help="named physics; by default all of the environment")
     p.add_argument("--states", nargs="+", choices=("reset", "standing", "gait"), help="by default all that apply")
     p.add_argument("--horizons", nargs="+", type=int, default=[1, 4, 8, 16, 32], metavar="H", help="env steps")

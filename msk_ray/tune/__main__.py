@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from msk_ray.cli import RESUMABLE, TERMINAL_LOG, Parser, outliving, run
-from msk_ray.config import dump_yaml, parse_override, read_yaml
+from msk_ray.config import SET_HELP, combine, dump_yaml, parse_overrides, read_yaml
 from msk_ray.errors import ConfigError
 from msk_ray.files import make_folder
 from msk_ray.tune import experiment as experiments
@@ -54,7 +54,7 @@ def parser() -> Parser:
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="override a setting of all trials",
+        help=f"of all trials: {SET_HELP}",
     )
     p.add_argument("--seeds", metavar="LIST", help="seeds instead of the space's, such as 0-4 or 0,3,7")
     p.add_argument(
@@ -184,13 +184,15 @@ def _read_space(args: argparse.Namespace, extension: Mapping[str, Any]) -> Space
     """The space with the command line's changes laid over it, checked again as a whole."""
     path = find_space(args.space)
     data: dict[str, Any] = read_yaml(path)
-    changes = dict(parse_override(text) for text in args.overrides)
+    changes = parse_overrides(args.overrides)
     parameters = data.get("parameters")
     for key in changes:
         if isinstance(parameters, dict) and key in parameters:
             raise ConfigError(f"--set {key}: the space varies it; edit {path.name}, or set another key")
     if changes:
-        data["overrides"] = {**(data.get("overrides") or {}), **changes}
+        overrides = data.get("overrides") or {}
+        if isinstance(overrides, dict):  # else the space is refused for that
+            data["overrides"] = combine(overrides, changes.items())
     if args.halve_worlds is not None:
         resources = data.get("resources") or {}
         if isinstance(resources, dict):  # else the space is refused for that

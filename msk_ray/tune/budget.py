@@ -4,10 +4,10 @@ import itertools
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-from msk_ray.config import AdaptiveHorizon, Config, HorizonSchedule, parse_config
+from msk_ray.config import AdaptiveHorizon, Config, HorizonSchedule, overlay, parse_config
 from msk_ray.tune.operators import Level, Listed, Operator
 from msk_ray.tune.space import Space, SpaceFile
-from msk_ray.tune.trials import base_settings, check_ranges, leaves, overlay
+from msk_ray.tune.trials import base_settings, check_ranges, leaves
 
 _DECIDING = ("shac.horizon", "trial.epochs", "env.nworld")
 """Settings, and sections of settings, that decide how many env steps a trial takes."""

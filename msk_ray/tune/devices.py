@@ -51,7 +51,7 @@ def choose_placement(resources: ResourcesSpec, gpus_per_trial: float | None, cpu
     if gpus_per_trial is not None:
         if cpu:
             raise ConfigError("--cpu and --gpus-per-trial exclude each other")
-        if gpus_per_trial <= 0 or (gpus_per_trial > 1 and gpus_per_trial % 1):
+        if not (0 < gpus_per_trial <= 1 or gpus_per_trial % 1 == 0 < gpus_per_trial):  # NaN is neither
             raise ConfigError(f"--gpus-per-trial {gpus_per_trial:g}: write 1, 2, ... or a share such as 0.5")
         if gpus == 0:
             raise DeviceError(f"--gpus-per-trial {gpus_per_trial:g}: no GPU here; pass --cpu to run on CPUs")

@@ -28,7 +28,7 @@ from pydantic import ValidationError
 import msk_ray
 from msk_ray.cli import typed_command
 from msk_ray.config import dump_yaml, parse_config, read_yaml
-from msk_ray.errors import MskRayError, StorageError, StorageFailure
+from msk_ray.errors import MskRayError, StorageError, StorageFailure, brief
 from msk_ray.files import check_writable, make_folder, write_json, write_text
 from msk_ray.nvidia_smi import ask_driver
 from msk_ray.tune.extension import extend_trials
@@ -323,8 +323,8 @@ def check_name(name: str) -> str:
     Raises:
         StorageError: it would not be a plain folder name.
     """
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name):
-        raise StorageError(f"--name {name!r}: use letters, digits, '.', '_' and '-'")
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}", name):
+        raise StorageError(f"--name {brief(name)}: use at most 128 letters, digits, '.', '_' and '-'")
     return name
 
 

@@ -9,11 +9,11 @@ import json
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from msk_ray.config import parse_config
+from msk_ray.config import overlay, parse_config
 from msk_ray.errors import ConfigError, StorageFailure
 from msk_ray.files import write_json, write_text
 from msk_ray.metrics_file import METRICS_FILE
-from msk_ray.tune.trials import Trial, overlay
+from msk_ray.tune.trials import Trial
 
 HALVED_FILE = "halved.json"
 ABANDONED = "abandoned"

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from msk_ray.errors import ConfigError
+from msk_ray.errors import ConfigError, brief
 
 ListKind = Literal["grid", "choice"]
 RangeKind = Literal["uniform", "loguniform", "randint"]
@@ -70,14 +70,16 @@ def parse_operator(key: str, data: Any) -> Operator:
         ConfigError: unknown operator, empty list, or a range that is none.
     """
     if not isinstance(data, Mapping) or len(data) != 1:
-        raise ConfigError(f"parameters.{key}: write one of {', '.join(KINDS)}, such as {{grid: [1, 2]}}, not {data!r}")
+        raise ConfigError(
+            f"parameters.{key}: write one of {', '.join(KINDS)}, such as {{grid: [1, 2]}}, not {brief(data)}"
+        )
     kind, values = next(iter(data.items()))
     if kind not in KINDS:
         near = difflib.get_close_matches(str(kind), KINDS, n=1)
         hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(KINDS)}"
-        raise ConfigError(f"parameters.{key}: unknown operator {kind!r}; {hint}")
+        raise ConfigError(f"parameters.{key}: unknown operator {brief(kind)}; {hint}")
     if not isinstance(values, list) or not values:
-        raise ConfigError(f"parameters.{key}.{kind}: must be a list, not {values!r}")
+        raise ConfigError(f"parameters.{key}.{kind}: must be a list, not {brief(values)}")
     if kind in ("grid", "choice"):
         return Listed(kind, tuple(_level(value) for value in values))
     return _range(key, kind, values)
@@ -106,25 +108,26 @@ def _range(key: str, kind: RangeKind, values: list[Any]) -> Range:
     where = f"parameters.{key}.{kind}"
     numbers = [number for number in map(_number, values) if number is not None]
     if len(values) != 2 or len(numbers) != 2:
-        raise ConfigError(f"{where}: write [low, high], two numbers, not {values!r}")
+        raise ConfigError(f"{where}: write [low, high], two numbers, not {brief(values)}")
     low, high = numbers
     if not low < high:
         raise ConfigError(f"{where}: low {low:g} must be below high {high:g}")
     if kind == "loguniform" and low <= 0:
         raise ConfigError(f"{where}: low {low:g} must be above 0")
     if kind == "randint" and not (isinstance(low, int) and isinstance(high, int)):
-        raise ConfigError(f"{where}: both ends must be whole numbers, not {values!r}")
+        raise ConfigError(f"{where}: both ends must be whole numbers, not {brief(values)}")
     return Range(kind, low, high)
 
 
 def _number(value: Any) -> int | float | None:
-    """`value` as a finite number, or None. YAML reads 1e-3 as text (it wants 1.0e-3), so text is tried too."""
+    """`value` as a number below 2^53 in size, or None. YAML reads 1e-3 as text (it wants 1.0e-3), so text is tried
+    too."""
     if isinstance(value, str):
         try:
             value = float(value)
         except ValueError:
             return None
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 2**53:
         return None
     return value
 

@@ -1,36 +1,31 @@
 """The search space file: a question, a base config, and what is varied in it."""
 
+import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError
+from pydantic import ConfigDict, Field, ValidationError
 
 import msk_ray
 from msk_ray.config import describe_fault, read_yaml
-from msk_ray.errors import ConfigError
+from msk_ray.config.sections import Count, Section, Text, Whole
+from msk_ray.errors import ConfigError, brief
 from msk_ray.tune.operators import Listed, Operator, Range, parse_operator
 
 Share = Annotated[float, Field(gt=0.0, lt=1.0)]
-
-MAX_SEEDS = 1000
-
-
-class Part(BaseModel):
-    """A frozen group of settings that refuses unknown keys."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+MAX_SEEDS = 100_000
 
 
-class AblateSpec(Part):
+class AblateSpec(Section):
     """One factor at a time: the baseline, and each variant laid over it. Keys are dotted config keys."""
 
-    baseline: dict[str, Any] = {}
+    baseline: dict[str, Any] = Field(default_factory=dict)
     variants: Annotated[dict[str, dict[str, Any]], Field(min_length=1)]
 
 
-class SchedulerSpec(Part):
+class SchedulerSpec(Section):
     """Which trials are stopped early because others do better."""
 
     kind: Literal["asha", "median", "pbt", "none"] = "none"
@@ -41,7 +36,7 @@ class SchedulerSpec(Part):
     suggest, an adaptive horizon counted with its `longest`. Too small a one loses slow starters."""
     reduction: Annotated[float, Field(ge=1.5, le=16)] = 3.0
     """asha: one in this many goes on past each rung; rungs are grace × reductionⁿ."""
-    min_trials: PositiveInt | None = None
+    min_trials: Count | None = None
     """Trials that must have come as far before one is stopped; null is `reduction` rounded up (asha), 3 (median)."""
     interval: Share = 0.1
     """pbt: share of the budget between two exchanges."""
@@ -51,10 +46,10 @@ class SchedulerSpec(Part):
     """pbt: probability that an exchanged value is drawn anew instead of being moved by a fifth."""
 
 
-class PlateauSpec(Part):
+class PlateauSpec(Section):
     """Stop a trial whose best score no longer rises."""
 
-    patience: PositiveInt
+    patience: Count
     """Evaluations without a rise."""
     min_delta: Annotated[float, Field(ge=0.0)] = 0.0
     """What counts as a rise [score]."""
@@ -62,7 +57,7 @@ class PlateauSpec(Part):
     """Share of the trial's epochs before which it is not stopped."""
 
 
-class StopSpec(Part):
+class StopSpec(Section):
     """When a trial ends by itself before its last epoch."""
 
     nonfinite: bool = True
@@ -74,15 +69,15 @@ class StopSpec(Part):
     """Score at which a trial has done its work."""
 
 
-class ResourcesSpec(Part):
+class ResourcesSpec(Section):
     """What a trial gets, and how often it is tried again."""
 
     gpus_per_trial: Annotated[float, Field(gt=0.0)] = 1.0
     """GPUs of a trial where there are any; below 1, trials share one."""
-    cpus_per_trial: PositiveInt = 1
+    cpus_per_trial: Count = 1
     """CPU cores, and threads, of a trial."""
-    max_concurrent: PositiveInt | None = None
-    max_failures: Annotated[int, Field(ge=0)] = 3
+    max_concurrent: Count | None = None
+    max_failures: Whole = 3
     """How often a trial whose process or node died goes on from its checkpoint."""
     hang_s: Annotated[float, Field(gt=0.0)] | None = 1800.0
     """Seconds without an epoch after which a trial's process is ended and tried again; null waits for ever."""
@@ -90,30 +85,32 @@ class ResourcesSpec(Part):
     """Start a trial that runs out of memory anew, once, with half its worlds."""
 
 
-class SmokeSpec(Part):
+class SmokeSpec(Section):
     """What `--smoke` changes beyond the general rule."""
 
-    overrides: dict[str, Any] = {}
-    max_trials: PositiveInt = 8
+    overrides: dict[str, Any] = Field(default_factory=dict)
+    max_trials: Count = 8
 
 
-class SpaceFile(Part):
+class SpaceFile(Section):
     """A search space as written."""
 
-    question: str
+    question: Text
     """What the experiment is to answer."""
-    base: str
+    base: Text
     """Config file, relative to the space file, the working directory, or the folder that holds `configs/`."""
-    overrides: dict[str, Any] = {}
+    overrides: dict[str, Any] = Field(default_factory=dict)
     """Dotted config keys set in every trial."""
-    parameters: dict[str, Any] = {}
+    parameters: dict[str, Any] = Field(default_factory=dict)
     """Dotted config keys that are varied, each with one operator."""
     ablate: AblateSpec | None = None
     seeds: str | int | list[int] = "0"
     """Seeds every trial is run with: "0-4", "0,3", 7 or [0, 3]."""
-    samples: PositiveInt = 1
+    max_trials: Count = 2000
+    """Most trials the space may make; more are refused before any is made."""
+    samples: Count = 1
     """Draws of the sampled parameters (choice, uniform, loguniform, randint), for each point of the grid."""
-    sample_seed: Annotated[int, Field(ge=0)] = 0
+    sample_seed: Whole = 0
     """Seed of those draws."""
     search: Literal["random", "optuna"] = "random"
     scheduler: SchedulerSpec = SchedulerSpec()
@@ -122,7 +119,7 @@ class SpaceFile(Part):
     smoke: SmokeSpec = SmokeSpec()
 
 
-class Space(Part):
+class Space(Section):
     """A checked search space, with its operators and seeds read."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
@@ -184,6 +181,7 @@ def parse_space(data: Mapping[str, Any], path: Path) -> Space:
         raise ConfigError(f"{path}: {describe_fault(error, SpaceFile)}") from None
     try:
         parameters = {key: parse_operator(key, value) for key, value in file.parameters.items()}
+        _check_count(file, parameters)
         seeds = parse_seeds(file.seeds)
         _check_combination(file, parameters, seeds)
         base_path = _find_base(file.base, path)
@@ -198,19 +196,40 @@ def parse_seeds(text: str | int | list[int]) -> tuple[int, ...]:
     Raises:
         ConfigError: not such a list.
     """
-    pieces = [str(piece) for piece in text] if isinstance(text, list) else str(text).split(",")
     seeds: dict[int, None] = {}
-    for piece in pieces:
-        match = re.fullmatch(r"\s*(\d+)(?:\s*-\s*(\d+))?\s*", piece)
-        if match is None:
-            raise ConfigError(f"seeds {text!r}: write whole numbers such as 0-4 or 0,3,7")
-        first, last = int(match[1]), int(match[2] or match[1])
-        if last < first:
-            raise ConfigError(f"seeds {text!r}: {first}-{last} runs backwards; write {last}-{first}")
-        if last - first >= MAX_SEEDS:
-            raise ConfigError(f"seeds {text!r}: more than {MAX_SEEDS} seeds")
+    ranges = _seed_ranges(text)
+    if (count := sum(last - first + 1 for first, last in ranges)) > MAX_SEEDS:
+        raise ConfigError(f"seeds {brief(text)}: {count} seeds, more than {MAX_SEEDS}")
+    for first, last in ranges:
         seeds.update(dict.fromkeys(range(first, last + 1)))
     return tuple(seeds)
+
+
+def _seed_ranges(text: str | int | list[int]) -> list[tuple[int, int]]:
+    """(first, last) of each piece of a list of seeds; nothing is written out."""
+    pieces = [str(piece) for piece in text] if isinstance(text, list) else str(text).split(",")
+    ranges = []
+    for piece in pieces:
+        match = re.fullmatch(r"\s*(\d{1,10})(?:\s*-\s*(\d{1,10}))?\s*", piece)
+        if match is None or max(int(match[1]), int(match[2] or 0)) >= 2**31:
+            raise ConfigError(f"seeds {brief(text)}: write whole numbers such as 0-4 or 0,3,7, below 2^31")
+        first, last = int(match[1]), int(match[2] or match[1])
+        if last < first:
+            raise ConfigError(f"seeds {brief(text)}: {first}-{last} runs backwards; write {last}-{first}")
+        ranges.append((first, last))
+    return ranges
+
+
+def _check_count(file: SpaceFile, parameters: Mapping[str, Operator]) -> None:
+    """Refuse a space of more than `max_trials`, counted before a single one is made."""
+    seeds = sum(last - first + 1 for first, last in _seed_ranges(file.seeds))
+    grids = [len(op.levels) for op in parameters.values() if isinstance(op, Listed) and op.kind == "grid"]
+    variants = len(file.ablate.variants) + 1 if file.ablate is not None else file.samples * math.prod(grids)
+    if variants * seeds > file.max_trials:
+        raise ConfigError(
+            f"{variants} variants × {seeds} seeds are {variants * seeds} trials, more than max_trials "
+            f"{file.max_trials}: take some away, or write a larger max_trials in the space"
+        )
 
 
 def _check_combination(file: SpaceFile, parameters: Mapping[str, Operator], seeds: tuple[int, ...]) -> None:

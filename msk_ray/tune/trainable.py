@@ -16,7 +16,7 @@ from typing import Any
 
 from ray import tune
 
-from msk_ray.config import parse_config
+from msk_ray.config import overlay, parse_config
 from msk_ray.errors import storage_failure
 from msk_ray.files import write_text
 from msk_ray.tune.adapters import BEST, METRIC, STARTS_ANEW
@@ -30,7 +30,7 @@ from msk_ray.tune.records import evaluations_of, read_rows
 from msk_ray.tune.space import Space
 from msk_ray.tune.stopping import Evaluation
 from msk_ray.tune.trial_run import HANG_FILE, Hooks, TrainerLike, run_trial
-from msk_ray.tune.trials import Trial, overlay
+from msk_ray.tune.trials import Trial
 
 MEMORY_LIMIT_S = 60.0
 """How long a trial waits for the memory of its GPU [s]."""

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from msk_ray.config import Config, merge, parse_config, read_config
+from msk_ray.config import Config, overlay, parse_config, read_config
 from msk_ray.errors import ConfigError
 from msk_ray.tune.operators import Level, Listed, Range, describe
 from msk_ray.tune.space import Space
@@ -105,27 +105,6 @@ def trial_id(config: Config) -> str:
     """First digits of the SHA-256 of a config's content. Equal configs have equal ids wherever they are resolved."""
     text = json.dumps(config.as_dict(), sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()[:ID_DIGITS]
-
-
-def overlay(settings: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """A copy of nested `settings` with each dotted key of `values` set; a mapping is laid over the section it names.
-
-    Raises:
-        ConfigError: a key goes through something that is not a section.
-    """
-    result = dict(settings)
-    for dotted, value in values.items():
-        *sections, leaf = dotted.split(".")
-        node: Any = result
-        for section in sections:
-            node = node.get(section, {})
-            if not isinstance(node, Mapping):
-                raise ConfigError(f"{dotted}: {section} is a value, not a section of settings")
-        nested = {leaf: value}
-        for section in reversed(sections):
-            nested = {section: nested}
-        result = merge(result, nested)
-    return result
 
 
 def check_ranges(space: Space, base: Mapping[str, Any]) -> None:

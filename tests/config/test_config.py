@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from msk_ray.config import apply_overrides, load_config, parse_config, parse_override
+from msk_ray.config import load_config, overlay, parse_config, parse_override, parse_overrides
 from msk_ray.errors import ConfigError
 
 CARTPOLE = {"env": {"name": "cartpole"}}
@@ -48,7 +48,7 @@ def test_a_fault_is_named_on_one_line(data: dict, message: str) -> None:
 
 def test_overrides_reach_nested_settings() -> None:
     key, value = parse_override("shac.horizon={start: 4, end: 8, epochs: 2}")
-    data = apply_overrides(CARTPOLE, {key: value, "env.nworld": 16})
+    data = overlay(CARTPOLE, {key: value, "env.nworld": 16})
     config = parse_config(data)
     assert config.env.nworld == 16
     assert config.shac.horizon.end == 8
@@ -107,6 +107,6 @@ def test_substeps_follow_from_either_setting() -> None:
 )
 def test_faults_in_what_adapts_are_named(override, message):
     with pytest.raises(ConfigError) as caught:
-        parse_config(apply_overrides({"env": {"name": "cartpole"}}, dict([parse_override(override)])))
+        parse_config(overlay(CARTPOLE, parse_overrides([override])))
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)

@@ -4,10 +4,11 @@ from typing import Any
 
 import pytest
 
+from msk_ray.config import overlay
 from msk_ray.errors import ConfigError
 from msk_ray.tune.smoke import cover, shrink
 from msk_ray.tune.space import find_space, load_space, parse_seeds
-from msk_ray.tune.trials import find_trial, overlay, resolve_trials
+from msk_ray.tune.trials import find_trial, resolve_trials
 
 
 def test_grid_is_a_product_with_seeds_outermost(make_space: Any) -> None:

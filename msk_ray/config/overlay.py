@@ -1,0 +1,103 @@
+"""Laying settings over settings: the one rule that `--set`, `extends` and search spaces follow.
+
+A mapping is laid over the section that stands there, key by key; anything else replaces what stands there. Where a
+setting takes mappings of several kinds (`shac.horizon`, `env` by its `name`), a mapping of another kind replaces the
+old one, so that kinds never mix. `null` takes a section away.
+"""
+
+import copy
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from msk_ray.config.schema import AdaptiveHorizon, HorizonSchedule
+from msk_ray.config.yaml_text import MAX_DEPTH, parse_yaml
+from msk_ray.errors import ConfigError, brief, shortened
+
+SET_HELP = (
+    "override a setting, KEY being dotted and VALUE YAML; a mapping is laid over the section KEY names, keeping the "
+    "section's other settings (shac.entropy={target: 0.5} keeps coefficient), unless it is of another kind; null takes "
+    "the section away"
+)
+
+
+def parse_override(text: str) -> tuple[str, Any]:
+    """Split "a.b=value" into its dotted key and its value, read as YAML.
+
+    Raises:
+        ConfigError: no "=" in it, or the value is not YAML.
+    """
+    key, separator, value = text.partition("=")
+    if not separator or not key.strip():
+        raise ConfigError(f"--set {brief(text)}: write key=value, such as shac.horizon=16")
+    return key.strip(), parse_yaml(value, f"--set {shortened(text)}: the value")
+
+
+def parse_overrides(texts: Iterable[str]) -> dict[str, Any]:
+    """What several "a.b=value" say together, in order, for `overlay`.
+
+    Raises:
+        ConfigError: as `parse_override`.
+    """
+    return combine({}, [parse_override(text) for text in texts])
+
+
+def combine(first: Mapping[str, Any], then: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    """Dotted keys and values that say what `first` and afterwards `then` say.
+
+    A key said twice comes in its last place, mappings laid over each other.
+    """
+    combined = dict(first)
+    for key, value in then:
+        old = combined.pop(key, None)
+        combined[key] = _laid_over(key.split("."), old, value)
+    return combined
+
+
+def overlay(settings: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """A copy of nested `settings` with each dotted key of `values` set, by the rule above.
+
+    Raises:
+        ConfigError: a key goes through something that is not a section.
+    """
+    result = copy.deepcopy(dict(settings))
+    for dotted, value in values.items():
+        path = dotted.split(".")
+        if len(path) > MAX_DEPTH:
+            raise ConfigError(f"{shortened(dotted)}: no setting lies {len(path)} sections deep")
+        node = result
+        for section in path[:-1]:
+            if node.get(section) is None:
+                node[section] = {}
+            child = node[section]
+            if not isinstance(child, dict):
+                raise ConfigError(f"{shortened(dotted)}: {section} is a value, not a section of settings")
+            node = child
+        node[path[-1]] = _laid_over(path, node.get(path[-1]), value)
+    return result
+
+
+def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """`over` laid over `base`, section by section."""
+    merged: dict[str, Any] = _laid_over([], dict(base), over)
+    return merged
+
+
+def _laid_over(path: list[str], old: Any, new: Any) -> Any:
+    if not (isinstance(old, Mapping) and isinstance(new, Mapping)) or _another_kind(path, old, new):
+        return copy.deepcopy(new)
+    result = {key: copy.deepcopy(value) for key, value in old.items() if key not in new}
+    return result | {key: _laid_over([*path, str(key)], old.get(key), value) for key, value in new.items()}
+
+
+_HORIZONS = (set(HorizonSchedule.model_fields), set(AdaptiveHorizon.model_fields))
+
+
+def _another_kind(path: list[str], old: Mapping[str, Any], new: Mapping[str, Any]) -> bool:
+    """Whether two mappings for the same setting describe different things."""
+    if path == ["env"]:
+        return "name" in new and "name" in old and new["name"] != old["name"]
+    if path == ["shac", "horizon"]:
+        schedule, adaptive = _HORIZONS
+        own, other = (adaptive, schedule) if "target" in old else (schedule, adaptive)
+        return bool(set(new) & (other - own))
+    return False

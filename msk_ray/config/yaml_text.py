@@ -1,0 +1,142 @@
+"""The one reader of YAML: plain data only, within limits, so that no file can hang or exhaust the program."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from msk_ray.errors import ConfigError, brief, shortened
+
+MAX_BYTES = 1 << 20
+"""Largest file or value [B]: a space of thousands of variants is a tenth of it."""
+MAX_DEPTH = 32
+"""Mappings and lists inside each other."""
+MAX_NODES = 200_000
+"""Values after aliases (`*name`) are written out."""
+MAX_INTEGER = 1 << 63
+
+
+class _NotSettings(yaml.YAMLError):
+    """A document is more than settings may be."""
+
+
+class _Loader(yaml.SafeLoader):
+    """PyYAML's safe loader, with limits on what a document expands to, and without keys that are written twice."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self._depth = 0
+        self._extent: dict[yaml.Node, tuple[int, int]] = {}
+        """Values in and depth below each node that has been read, its aliases written out."""
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        alias = self.check_event(yaml.AliasEvent)
+        tag = getattr(self.peek_event(), "tag", None)
+        if tag not in (None, "!"):
+            raise _NotSettings(f"settings are plain data; leave the tag {brief(tag)} out")
+        self._depth += 1
+        if self._depth > MAX_DEPTH:
+            raise _NotSettings(f"more than {MAX_DEPTH} mappings and lists inside each other")
+        node: yaml.Node | None = super().compose_node(parent, index)
+        self._depth -= 1
+        if node is None:
+            return node
+        if alias and node not in self._extent:
+            raise _NotSettings("an alias refers to a value that contains it")
+        if node not in self._extent:
+            if isinstance(node, yaml.ScalarNode) and not node.value.isascii():
+                node.value.encode()  # half a character, written as an escape, could never be printed
+            children: list[yaml.Node] = []
+            if isinstance(node, yaml.SequenceNode):
+                children = node.value
+            elif isinstance(node, yaml.MappingNode):
+                _check_keys(node)
+                children = [part for pair in node.value for part in pair]
+            below = [self._extent[child] for child in children]
+            size = 1 + sum(count for count, _ in below)
+            depth = 1 + max((levels for _, levels in below), default=0)
+            if size > MAX_NODES:
+                raise _NotSettings(f"more than {MAX_NODES} values once its aliases are written out")
+            if depth > MAX_DEPTH:
+                raise _NotSettings(f"more than {MAX_DEPTH} mappings and lists inside each other")
+            self._extent[node] = size, depth
+        return node
+
+    def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
+        number: int = super().construct_yaml_int(node)
+        if abs(number) >= MAX_INTEGER:
+            raise _NotSettings(f"whole numbers must be below 2^63, not {shortened(node.value, 40)}")
+        return number
+
+
+_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
+# A date is text: no setting is one, and one that does not exist could not be read.
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in resolvers if tag != "tag:yaml.org,2002:timestamp"]
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+
+
+def _check_keys(node: yaml.MappingNode) -> None:
+    """Refuse a key that is written twice, of which YAML would take the last."""
+    seen: set[tuple[str, str]] = set()
+    for key, _ in node.value:
+        if not isinstance(key, yaml.ScalarNode):
+            raise _NotSettings("a key must be a name, not a list or a mapping")
+        if (key.tag, key.value) in seen:
+            raise _NotSettings(f"key {brief(key.value)} is written twice; leave one of them out")
+        seen.add((key.tag, key.value))
+
+
+def parse_yaml(text: str, source: str) -> Any:
+    """Plain data from YAML text. `source` names it in errors.
+
+    Raises:
+        ConfigError: it is no YAML, holds something else than plain data, a key twice, or exceeds the limits.
+    """
+    if len(text) > MAX_BYTES:
+        raise ConfigError(f"{source} is larger than {MAX_BYTES} bytes: too large for settings")
+    try:
+        loader = _Loader(text)
+        try:
+            return loader.get_single_data()
+        finally:
+            loader.dispose()
+    except _NotSettings as error:
+        raise ConfigError(f"{source}: {error}") from error
+    except (yaml.YAMLError, ValueError) as error:
+        # ValueError: an integer of thousands of digits.
+        reason = shortened(" ".join(str(error).split()), 300)
+        raise ConfigError(f"{source} is not valid YAML: {reason}") from error
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """The mapping in a YAML file.
+
+    Raises:
+        ConfigError: the file is missing, unreadable, not YAML, too large, or not a mapping.
+    """
+    try:
+        # One byte more than allowed shows that there is more.
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+        if len(data) > MAX_BYTES:
+            raise ConfigError(f"{path} is larger than {MAX_BYTES} bytes: too large for settings")
+        text = data.decode("utf-8")
+    except FileNotFoundError:
+        siblings = sorted(p.stem for p in path.parent.glob("*.yaml")) if path.parent.is_dir() else []
+        hint = shortened(f"; {path.parent} holds: {', '.join(siblings)}", 500) if siblings else ""
+        raise ConfigError(f"no such file: {path}{hint}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8"
+        raise ConfigError(f"cannot read {path}: {reason or error}") from error
+    settings = parse_yaml(text, str(path))
+    if not isinstance(settings, dict):
+        raise ConfigError(f"{path} must hold a mapping of settings at its top level")
+    return settings
+
+
+def dump_yaml(data: Mapping[str, Any]) -> str:
+    """YAML text of plain data, in the order given."""
+    return yaml.safe_dump(dict(data), sort_keys=False, allow_unicode=True, width=100)
