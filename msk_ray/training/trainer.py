@@ -6,11 +6,11 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
+from msk_ray.algorithms import Shac
 from msk_ray.config import Config, dump_yaml
 from msk_ray.envs import make_env
 from msk_ray.errors import CheckpointError, StorageError
 from msk_ray.files import remove_stale, write_bytes
-from msk_ray.shac import Shac
 from msk_ray.training.checkpoint import (
     epoch_checkpoints,
     milestone_path,
@@ -103,15 +103,15 @@ class Trainer:
             self._start_from(self.config.trial.start_from)
             self._evaluate_initial()
         started = time.perf_counter()
-        metrics = self.shac.update(self.epoch)
+        result = self.shac.update(self.epoch)
         self.epoch += 1
-        steps = int(metrics["train/horizon"]) * self.env.nworld
-        self.env_steps += steps
+        self.env_steps += result.env_steps
         elapsed = time.perf_counter() - started
+        metrics = dict(result.metrics)
         if self.epoch % self.config.evaluation.interval == 0 or self.finished:
             metrics |= self._evaluate()
         self._seconds += time.perf_counter() - started
-        row = self._row(metrics | {"env_steps_per_s": steps / elapsed})
+        row = self._row(metrics | {"env_steps_per_s": result.env_steps / elapsed})
         self._log.write(row)
         if self.epoch % self.config.trial.checkpoint_interval == 0 or self.finished:
             self.save()

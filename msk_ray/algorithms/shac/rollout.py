@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from msk_ray.algorithms.shac.gate import CotangentGate
 from msk_ray.envs import Env
 from msk_ray.networks import Actor, RunningMeanStd
-from msk_ray.shac.gate import CotangentGate
 
 
 @dataclass
@@ -26,7 +26,7 @@ class Rollout:
     """Terminated or truncated, shape (H, W) bool."""
     diverged: Tensor
     """Shape (H, W) bool."""
-    surprise: Tensor | None
+    neg_log_prob: Tensor | None
     """−log π of the actions taken [nat], attached, shape (H, W); None if it was not asked for."""
 
 
@@ -38,7 +38,7 @@ def collect(
     gate: CotangentGate,
     *,
     state_bptt: bool,
-    with_surprise: bool = False,
+    with_neg_log_prob: bool = False,
 ) -> Rollout:
     """Roll the policy out for as many steps as `noise` (H, W, A) has, from where the worlds are.
 
@@ -48,14 +48,14 @@ def collect(
     env.state = env.state.detach()
     env.stock_resets(len(noise))
     raw, reached, rewards, terminated, done, diverged = [], [], [], [], [], []
-    surprise = []
+    neg_log_probs = []
     normalize = normalizer.normalize if normalizer is not None else lambda x: x
     for step_noise in noise:
         env.state = env.state._replace(physics=gate(env.state.physics)) if state_bptt else env.state.detach()
         obs = env.observation()
-        if with_surprise:
-            action, surprising = actor.sample(normalize(obs), step_noise)
-            surprise.append(surprising)
+        if with_neg_log_prob:
+            action, neg_log_prob = actor.sample(normalize(obs), step_noise)
+            neg_log_probs.append(neg_log_prob)
         else:
             action = actor(normalize(obs), step_noise)
         transition = env.step(gate.screen(action))
@@ -72,5 +72,5 @@ def collect(
         torch.stack(terminated),
         torch.stack(done),
         torch.stack(diverged),
-        torch.stack(surprise) if surprise else None,
+        torch.stack(neg_log_probs) if neg_log_probs else None,
     )

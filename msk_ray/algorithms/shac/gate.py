@@ -1,12 +1,45 @@
 """What passes between env steps on the way back: each world's state cotangent, bounded and watched."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from msk_ray.simulation import StepState
+
+
+class Norms(NamedTuple):
+    """Norms of the state cotangents that were finite; scalars, still on the device."""
+
+    median: Tensor
+    p90: Tensor
+    """90th percentile."""
+    maximum: Tensor
+    clipped_share: Tensor
+    """Share of all cotangents that were longer than the bound."""
+
+
+class CotangentStatistics(NamedTuple):
+    """What passed a gate in one backward pass."""
+
+    nonfinite_share: Tensor
+    """Share of worlds with a cotangent that was not finite, a scalar on the device."""
+    norms: Norms | None
+    """None where no finite cotangent passed."""
+
+    def metrics(self) -> dict[str, Tensor]:
+        """The same by metric name."""
+        found = {"grad/nonfinite_share": self.nonfinite_share}
+        if self.norms is None:
+            return found
+        return {
+            "grad/state_median": self.norms.median,
+            "grad/state_p90": self.norms.p90,
+            "grad/state_max": self.norms.maximum,
+            "grad/clipped_share": self.norms.clipped_share,
+            **found,
+        }
 
 
 class CotangentGate:
@@ -53,25 +86,18 @@ class CotangentGate:
         scale = torch.ones_like(norm) if self.bound is None else (self.bound / norm).clamp(max=1.0)
         return tuple(torch.where(finite[:, None], scale[:, None] * g, 0.0) for g in cotangent)
 
-    def statistics(self, unit: float) -> dict[str, Tensor]:
-        """Median, 90th percentile and maximum of finite norms over worlds and steps in units of `unit`, and shares.
-
-        Returns scalars still on the device.
-        """
-        lost = {"grad/nonfinite_share": self._nonfinite.float().mean()}
+    def statistics(self, unit: float) -> "CotangentStatistics":
+        """Norms in units of `unit`, over worlds and steps."""
+        lost = self._nonfinite.float().mean()
         norms = torch.cat(self._norms) if self._norms else torch.zeros(0)
         finite = norms[norms.isfinite()]
         if not finite.numel():
-            return lost
+            return CotangentStatistics(lost, None)
         quantiles = torch.quantile(finite, torch.tensor([0.5, 0.9], device=norms.device))
         clipped = (norms > self.bound).float().mean() if self.bound is not None else norms.new_zeros(())
-        return {
-            "grad/state_median": quantiles[0] / unit,
-            "grad/state_p90": quantiles[1] / unit,
-            "grad/state_max": finite.max() / unit,
-            "grad/clipped_share": clipped,
-            **lost,
-        }
+        return CotangentStatistics(
+            lost, Norms(quantiles[0] / unit, quantiles[1] / unit, finite.max() / unit, clipped_share=clipped)
+        )
 
 
 class _Gate(torch.autograd.Function):

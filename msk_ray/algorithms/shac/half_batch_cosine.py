@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 
-class HalvesWatch:
+class HalfBatchCosine:
     """Splits the gradient of one backward pass into the parts of the two halves of the worlds.
 
     A linear layer's weight gradient is the sum over steps and worlds of (output cotangent) ⊗ (input). Both are at hand

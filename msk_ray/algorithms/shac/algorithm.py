@@ -9,19 +9,20 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from msk_ray.algorithms.base import EpochResult
+from msk_ray.algorithms.shac import returns
+from msk_ray.algorithms.shac.critic_fit import CriticFit
+from msk_ray.algorithms.shac.curriculum import ContactSchedule
+from msk_ray.algorithms.shac.entropy import EntropyBonus
+from msk_ray.algorithms.shac.episodes import EpisodeTracker
+from msk_ray.algorithms.shac.gate import CotangentGate, Norms
+from msk_ray.algorithms.shac.half_batch_cosine import HalfBatchCosine
+from msk_ray.algorithms.shac.rollout import Rollout, collect
+from msk_ray.algorithms.shac.schedules import adapted_horizon, horizon_at, learning_rate_at
 from msk_ray.config import AdaptiveHorizon, Config
 from msk_ray.envs import Env
 from msk_ray.errors import Failure, SimulationError
 from msk_ray.networks import Actor, Critic, RunningMeanStd
-from msk_ray.shac import returns
-from msk_ray.shac.critic_fit import CriticFit
-from msk_ray.shac.curriculum import ContactSchedule
-from msk_ray.shac.entropy import EntropyBonus
-from msk_ray.shac.episodes import EpisodeTracker
-from msk_ray.shac.gate import CotangentGate
-from msk_ray.shac.gradient_noise import HalvesWatch
-from msk_ray.shac.rollout import Rollout, collect
-from msk_ray.shac.schedules import adapted_horizon, horizon_at, learning_rate_at
 
 
 class Shac:
@@ -52,11 +53,11 @@ class Shac:
         self._entropy = EntropyBonus(c.entropy, env.action_size) if c.entropy is not None else None
         self._contacts = ContactSchedule(config.curriculum, env) if config.curriculum is not None else None
 
-    def update(self, epoch: int) -> dict[str, float]:
+    def update(self, epoch: int) -> EpochResult:
         """Train one epoch, counted from 0.
 
         Returns:
-            Metrics, with seconds spent in rollout, backward and critic.
+            Env steps, and metrics with seconds spent in rollout, backward and critic.
 
         Raises:
             SimulationError: too many worlds had a non-finite gradient, the policy's gradient is not finite, or the
@@ -78,15 +79,15 @@ class Shac:
         gate = CotangentGate(
             None if c.state_grad_clip is None else c.state_grad_clip * unit, self.env.nworld, self.env.device
         )
-        halves = HalvesWatch(self.actor)
+        halves = HalfBatchCosine(self.actor)
         with halves.watching():
             rollout, loss, next_values, scaled_rewards = self._forward(horizon, gate)
         rollout_s = clock.lap()
 
         self.actor_optimizer.zero_grad()
         loss.backward()
-        gate_statistics = gate.statistics(unit)
-        gradient_norm = self._step_actor(float(gate_statistics.get("grad/nonfinite_share", 0.0)))
+        cotangents = gate.statistics(unit)
+        gradient_norm = self._step_actor(float(cotangents.nonfinite_share))
         backward_s = clock.lap()
 
         critic_loss = self._train_critic(rollout, next_values.detach(), scaled_rewards)
@@ -94,32 +95,31 @@ class Shac:
             self.normalizer.update(rollout.obs.flatten(0, 1))
         critic_s = clock.lap()
 
+        reward = rollout.rewards.detach().mean()
         metrics = {
             "train/actor_loss": loss.detach(),
             "train/critic_loss": critic_loss,
-            "train/reward": rollout.rewards.detach().mean(),
+            "train/reward": reward,
             "train/value": next_values.detach().mean(),
             "train/diverged": rollout.diverged.sum(),
             "grad/actor_norm": gradient_norm,
             "grad/halves_cosine": halves.cosine(),
-            **gate_statistics,
+            **cotangents.metrics(),
             **self.episodes.update(rollout.rewards.detach(), rollout.done),
         }
         if self.actor.log_std is not None:
             metrics["train/std"] = self.actor.log_std.detach().exp().mean()
         numbers = {name: float(value) for name, value in metrics.items()}
-        return (
-            numbers
-            | self._adapt(numbers, rollout)
-            | {
-                "train/horizon": float(horizon),
-                "train/actor_lr": actor_lr,
-                "time/rollout_s": rollout_s,
-                "time/backward_s": backward_s,
-                "time/critic_s": critic_s,
-                **{f"physics/{name}": value for name, value in self.env.sim.diagnostics().items()},
-            }
-        )
+        numbers |= self._adapt(rollout, float(reward), cotangents.norms)
+        numbers |= {
+            "train/horizon": float(horizon),
+            "train/actor_lr": actor_lr,
+            "time/rollout_s": rollout_s,
+            "time/backward_s": backward_s,
+            "time/critic_s": critic_s,
+            **{f"physics/{name}": value for name, value in self.env.sim.diagnostics().items()},
+        }
+        return EpochResult(horizon * self.env.nworld, numbers)
 
     @torch.no_grad()
     def policy(self, obs: Tensor) -> Tensor:
@@ -191,21 +191,30 @@ class Shac:
             return round(self._horizon)
         return horizon_at(configured, epoch)
 
-    def _adapt(self, metrics: dict[str, float], rollout: Rollout) -> dict[str, float]:
-        """Move horizon, entropy bonus and contacts on after an epoch with these metrics; returns where they stood."""
+    def _adapt(self, rollout: Rollout, reward: float, norms: Norms | None) -> dict[str, float]:
+        """Move horizon, entropy bonus and contacts on after an epoch.
+
+        Args:
+            rollout: the epoch's.
+            reward: its mean reward per env step.
+            norms: of its state cotangents.
+
+        Returns:
+            Where they stood, by metric name.
+        """
         stood: dict[str, float] = {}
         if isinstance(self.config.shac.horizon, AdaptiveHorizon):
             assert self._horizon is not None
-            p90 = metrics.get("grad/state_p90", math.nan)
+            p90 = math.nan if norms is None else float(norms.p90)
             self._horizon = adapted_horizon(self.config.shac.horizon, self._horizon, p90)
         if self._entropy is not None:
-            assert rollout.surprise is not None
-            entropy = float(rollout.surprise.detach().mean())
+            assert rollout.neg_log_prob is not None
+            entropy = float(rollout.neg_log_prob.detach().mean())
             stood |= {"train/entropy": entropy, "train/entropy_coefficient": self._entropy.coefficient}
             self._entropy.adapt(entropy)
         if self._contacts is not None:
             stood["train/curriculum"] = self._contacts.progress
-            self._contacts.advance(metrics["train/reward"])
+            self._contacts.advance(reward)
         return stood
 
     def _modules(self) -> dict[str, nn.Module]:
@@ -231,12 +240,12 @@ class Shac:
             noise,
             gate,
             state_bptt=c.state_bptt,
-            with_surprise=self._entropy is not None,
+            with_neg_log_prob=self._entropy is not None,
         )
         rewards = c.reward_scale * rollout.rewards
         if self._entropy is not None:
-            assert rollout.surprise is not None
-            rewards = rewards + self._entropy.coefficient * rollout.surprise
+            assert rollout.neg_log_prob is not None
+            rewards = rewards + self._entropy.coefficient * rollout.neg_log_prob
         std: Tensor | float = 1.0
         if self.return_statistics is not None:
             std = torch.sqrt(self.return_statistics.var + 1e-6)

@@ -1,6 +1,6 @@
 import torch
 
-from msk_ray.shac.gradient_noise import HalvesWatch
+from msk_ray.algorithms.shac.half_batch_cosine import HalfBatchCosine
 
 
 def network() -> torch.nn.Sequential:
@@ -21,7 +21,7 @@ def test_the_cosine_is_that_of_two_separate_backward_passes() -> None:
     ]
     expected = torch.nn.functional.cosine_similarity(*halves, dim=0)
 
-    watch = HalvesWatch(net)
+    watch = HalfBatchCosine(net)
     with watch.watching():
         loss = loss_of(slice(0, 8))
     loss.backward()
@@ -31,7 +31,7 @@ def test_the_cosine_is_that_of_two_separate_backward_passes() -> None:
 def test_equal_worlds_agree_and_opposite_ones_do_not() -> None:
     net = network()
     for sign, cosine in ((1.0, 1.0), (-1.0, -1.0)):
-        watch = HalvesWatch(net)
+        watch = HalfBatchCosine(net)
         with watch.watching():
             out = net(torch.ones(4, 3))
         (out * torch.tensor([1.0, 1.0, sign, sign])[:, None]).sum().backward()

@@ -4,8 +4,8 @@ import math
 
 import pytest
 
+from msk_ray.algorithms.shac.schedules import adapted_horizon, horizon_at, learning_rate_at
 from msk_ray.config import AdaptiveHorizon, HorizonSchedule
-from msk_ray.shac.schedules import adapted_horizon, horizon_at, learning_rate_at
 
 
 def test_horizon_grows_linearly_then_stays() -> None:

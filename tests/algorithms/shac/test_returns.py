@@ -2,7 +2,7 @@
 
 import torch
 
-from msk_ray.shac.returns import actor_loss, discounts, one_step_targets, td_lambda_targets
+from msk_ray.algorithms.shac.returns import actor_loss, discounts, one_step_targets, td_lambda_targets
 
 
 def column(*values: float | bool) -> torch.Tensor:

@@ -2,9 +2,9 @@
 
 import torch
 
+from msk_ray.algorithms.shac.critic_fit import CriticFit
 from msk_ray.config.schema import CriticConfig
 from msk_ray.networks import Critic
-from msk_ray.shac.critic_fit import CriticFit
 
 
 def fit(passes: int, grad_norm: float | None = 1.0) -> tuple[Critic, float]:

@@ -3,29 +3,29 @@ import math
 import pytest
 import torch
 
+from msk_ray.algorithms.shac.entropy import EntropyBonus
 from msk_ray.config import EntropyConfig
 from msk_ray.config.schema import ActorConfig
 from msk_ray.networks import Actor
-from msk_ray.shac.entropy import EntropyBonus
 
 
-def test_surprise_is_the_negative_log_density_of_the_squashed_gaussian() -> None:
+def test_neg_log_prob_is_the_negative_log_density_of_the_squashed_gaussian() -> None:
     actor = Actor(ActorConfig(hidden=(4,), log_std=math.log(0.5)), 3, 2, torch.Generator().manual_seed(0))
     obs, noise = torch.randn(6, 3), torch.randn(6, 2)
-    action, surprise = actor.sample(obs, noise)
+    action, neg_log_prob = actor.sample(obs, noise)
     torch.testing.assert_close(action, actor(obs, noise))
     # Independently: torch's own transformed distribution.
     base = torch.distributions.Normal(actor.mean(obs), 0.5)
     squashed = torch.distributions.TransformedDistribution(base, [torch.distributions.transforms.TanhTransform()])
-    torch.testing.assert_close(surprise, -squashed.log_prob(action).sum(-1), rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(neg_log_prob, -squashed.log_prob(action).sum(-1), rtol=1e-3, atol=1e-4)
 
 
-def test_surprise_is_finite_where_the_action_saturates() -> None:
+def test_neg_log_prob_is_finite_where_the_action_saturates() -> None:
     actor = Actor(ActorConfig(hidden=(4,), log_std=3.0), 3, 2, torch.Generator().manual_seed(0))
-    _action, surprise = actor.sample(torch.zeros(1, 3), torch.full((1, 2), 4.0))
+    _action, neg_log_prob = actor.sample(torch.zeros(1, 3), torch.full((1, 2), 4.0))
     # u = 4 e³ = 80.3: log(1 − tanh² u) ≈ log 4 − 2u
     expected = 2 * (8.0 + 3.0 + 0.5 * math.log(2 * math.pi) + math.log(4.0) - 2 * 4 * math.exp(3.0))
-    assert float(surprise.detach()) == pytest.approx(expected, rel=1e-3)
+    assert float(neg_log_prob.detach()) == pytest.approx(expected, rel=1e-3)
 
 
 def test_the_bonus_is_constant_without_a_target_and_rises_while_entropy_is_missing() -> None:
