@@ -76,10 +76,18 @@ class MetricsLog:
             raise StorageFailure(f"cannot write {self._path}: {error.strerror or error}") from error
 
     def close(self) -> None:
-        """Flush and close TensorBoard's file."""
-        if self._board is not None:
-            self._board.close()
-            self._board = None
+        """Flush and close TensorBoard's file.
+
+        Raises:
+            StorageFailure: its last events could not be written; the rows are in `metrics.jsonl` all the same.
+        """
+        board, self._board = self._board, None
+        if board is None:
+            return
+        try:
+            board.close()
+        except OSError as error:
+            raise StorageFailure(f"cannot write TensorBoard's events: {error.strerror or error}") from error
 
 
 def log_image(folder: Path, tag: str, image: np.ndarray, epoch: int) -> None:

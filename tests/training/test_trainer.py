@@ -1,5 +1,6 @@
 """The trainer: learns, resumes exactly, refuses what does not fit."""
 
+import contextlib
 import json
 import math
 import os
@@ -172,7 +173,8 @@ def test_a_folder_that_was_moved_stops_training_resumably_and_is_not_made_again(
     with pytest.raises(StorageFailure, match="No such file or directory") as caught:
         first.run_epoch()
     assert caught.value.exit_code == 75
-    first.close()
+    with contextlib.suppress(StorageFailure):  # TensorBoard's thread may have events left to write, or none
+        first.close()
     assert not folder.exists()
     (tmp_path / "elsewhere").rename(folder)
     second = Trainer(tiny_cartpole, folder, "cpu")
@@ -238,6 +240,6 @@ def test_a_torn_checkpoint_falls_back_to_the_one_before(tiny_cartpole: Config, t
 
 
 def test_kernels_are_compiled_in_few_worlds(tiny_settings: dict[str, Any], tmp_path: Path) -> None:
-    huge = tiny_settings | {"env": tiny_settings["env"] | {"nworld": 10**12}}
-    huge["evaluation"] = tiny_settings["evaluation"] | {"nworld": 10**12}
+    huge = tiny_settings | {"env": tiny_settings["env"] | {"nworld": 2**31 - 1}}
+    huge["evaluation"] = tiny_settings["evaluation"] | {"nworld": 2**31 - 1}
     precompile(Config.model_validate(huge), "cpu", tmp_path)  # no machine has room for so many
