@@ -67,13 +67,13 @@ def judge(records: Sequence[TrialRecord], pruner: Pruner, time_attr: str, slots:
     """Tell a rule what trials reported, as if `slots` of them ran at once, each as fast as it did.
 
     Args:
-        records: finished trials, in the order they begin; the untrained policy's evaluation is not reported.
+        records: finished trials, in the order they begin.
         pruner: the rule, knowing nothing yet.
         time_attr: what it compares trials at.
         slots: trials at once.
     """
     waiting = deque(range(len(records)))
-    reports = [[e for e in record.evaluations if e.epoch > 0] for record in records]
+    reports = [record.evaluations for record in records]
     judged: dict[int, Judged] = {}
     # Next report of each running trial: when, which trial, its how manieth, when the trial began.
     running: list[tuple[float, int, int, float]] = []

@@ -21,7 +21,8 @@ class Progress:
         now = time.monotonic()
         left = (now - self._start) / max(1, epoch - self._first) * (self._epochs - epoch)
         if "eval/score" in row:
-            self._score = f"  eval {row['eval/score']:.1f} (best {row['eval/best_score']:.1f})"
+            best = f" (best {row['eval/best_score']:.1f})" if "eval/best_score" in row else ""
+            self._score = f"  eval {row['eval/score']:.1f}{best}"
         text = (
             f"epoch {epoch}/{self._epochs}  {row['env_steps_per_s']:,.0f} env steps/s  "
             f"reward {row['train/reward']:.3f}{self._score}  {format_duration(left)} left"

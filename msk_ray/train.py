@@ -1,5 +1,6 @@
 """`python -m msk_ray.train`: one trial in this process, without Ray. The thing to debug."""
 
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +14,8 @@ DESCRIPTION = """\
 Train one policy with SHAC: one trial, in this process, without Ray.
 
 Writes into the log folder: config.yaml (every setting), metrics.jsonl (one row an epoch), TensorBoard events and
-checkpoints/ with the newest two and best.pt, the policy with the highest evaluation score."""
+checkpoints/ with the newest two and best.pt, the trained policy with the highest evaluation score (until the first
+evaluation the untrained one)."""
 
 EXAMPLES = """\
   python -m msk_ray.train --config configs/cartpole.yaml
@@ -95,7 +97,10 @@ def _train(config: Config, logdir: Path, device: str | None, resume: bool, resum
         print(f"stopped by {stop.signal.name} after epoch {trainer.epoch}; go on with: {resume_command}")
         return RESUMABLE
     trainer.close()
-    print(f"best evaluation score {trainer.best_score:.1f}: {trainer.best_checkpoint}")
+    if math.isfinite(trainer.best_score):
+        print(f"best evaluation score {trainer.best_score:.1f}: {trainer.best_checkpoint}")
+    else:
+        print(f"no evaluation gave a score; {trainer.best_checkpoint} is the untrained policy")
     print(f"metrics: {logdir / 'metrics.jsonl'}; curves: tensorboard --logdir {logdir}")
     return 0
 

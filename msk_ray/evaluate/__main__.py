@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from msk_ray.cli import Parser, run
 from msk_ray.errors import CheckpointError, MskRayError
 from msk_ray.evaluate.targets import Kind, Target, best_checkpoint, best_of_trial, find_target
+from msk_ray.experiment.checkpoint_file import read_facts
 from msk_ray.files import write_json
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.halved import read_halved
@@ -107,8 +108,9 @@ def policy_text(entry: dict[str, Any]) -> str:
         for name, values in figure_rows(entry)
     ]
     shares = [f"{name} {entry[key]:.1%}" for key, name in SHARES.items() if key in entry]
+    epoch = f"epoch {entry['epoch']}" + (" (untrained)" if entry["epoch"] == 0 else "")
     return (
-        f"{entry['checkpoint']}, epoch {entry['epoch']}, under {entry['physics']} physics: {entry['worlds']} worlds, "
+        f"{entry['checkpoint']}, {epoch}, under {entry['physics']} physics: {entry['worlds']} worlds, "
         f"seeds {seeds}, {entry['steps']} steps, on {entry['device']}\n"
         + text_table(("per episode", "mean", "std", "min", "max"), rows, 120)
         + "\n"
@@ -132,7 +134,8 @@ def figure_rows(entry: dict[str, Any]) -> list[tuple[str, dict[str, float]]]:
 def evaluate_experiment(experiment: Experiment, bench: "Bench", requests: "Sequence[Request]") -> int:
     """Evaluate the best policy of each trial, keep the figures beside it, and rank them.
 
-    A trial whose policy cannot be evaluated is named and does not hold up the others.
+    A trial whose policy cannot be evaluated is named and does not hold up the others. One that has only its untrained
+    policy is named too, and has no rank.
 
     Returns:
         The exit code: 1 if there was such a trial.
@@ -142,12 +145,17 @@ def evaluate_experiment(experiment: Experiment, bench: "Bench", requests: "Seque
 
     trials = experiment.trials()
     rankings: list[list[dict[str, Any]]] = []
-    failed = {}
+    failed: dict[str, str] = {}
+    untrained: dict[str, str] = {}
     for request in requests:
         ranking = []
         for number, trial in enumerate(trials, start=1):
             try:
                 path = best_of_trial(experiment.trial_folder(trial.id))
+                if read_facts(path).get("epoch") == 0:
+                    untrained[trial.id] = f"{path} is the untrained policy; it has no rank"
+                    print(f"{number}/{len(trials)}  {trial.id}  {untrained[trial.id]}", flush=True)
+                    continue
                 entry = bench.evaluate(load_policy(path), request)
                 store_evaluation(eval_file_of(path), entry)
             except MskRayError as error:
@@ -161,12 +169,13 @@ def evaluate_experiment(experiment: Experiment, bench: "Bench", requests: "Seque
         ranking.sort(key=lambda entry: -entry["score"]["mean"])
         rankings.append(ranking)
     if not any(rankings):
-        why = next(iter(failed.values()), "it has no trials")
+        why = next(iter([*failed.values(), *untrained.values()]), "it has no trials")
         raise CheckpointError(f"no policy of {experiment.path} could be evaluated; the first: {why}")
     missing = [{"trial": trial, "why": why} for trial, why in failed.items()]
     path = experiment.path / EVAL_FILE
     ranked = [{"physics": entries[0]["physics"], "ranking": entries} for entries in rankings if entries]
-    write_json(path, {"format": FORMAT, "experiment": experiment.name, "rankings": ranked, "failed": missing})
+    left_out = {"failed": missing, "untrained": sorted(untrained)}
+    write_json(path, {"format": FORMAT, "experiment": experiment.name, "rankings": ranked, **left_out})
     width = max(100, shutil.get_terminal_size((160, 24)).columns)
     for entries in filter(None, rankings):
         print(f"\nunder {entries[0]['physics']} physics\n{ranking_text(entries, width)}")

@@ -79,7 +79,7 @@ def best_trial_folder(target: Target) -> Path:
     """The folder of the one trial a target stands for.
 
     Raises:
-        CheckpointError: no trial of the experiment was evaluated yet.
+        CheckpointError: no trial of the experiment has a score yet.
     """
     if target.kind is Kind.CHECKPOINT:
         return trial_folder_of(target.path)
@@ -87,7 +87,10 @@ def best_trial_folder(target: Target) -> Path:
         return target.path
     best = best_record(read_records(Experiment(target.path)))
     if best is None:
-        raise CheckpointError(f"no trial of {target.path} was evaluated yet; come back after its first evaluation")
+        raise CheckpointError(
+            f"no trained policy of {target.path} has a score yet; come back after the first evaluation of one, or name "
+            "a trial to look at its untrained policy"
+        )
     return best.folder
 
 

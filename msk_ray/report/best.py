@@ -50,9 +50,15 @@ def look_at_best(trial: TrialReading, folder: Path, prefix: str, make: bool, dev
         # Loads torch, which a report of plain numbers need not wait for.
         from msk_ray.evaluate.measure import EVAL_FILE, read_evaluations
 
-        sha = read_facts(path)["sha256"]
+        facts = read_facts(path)
+        sha = facts["sha256"]
     except (MskRayError, KeyError) as error:
         return Best(trial, notes=(f"There is no policy to look at: {explain(error)}.",))
+    if facts.get("epoch") == 0:
+        notes.append(
+            "Its best.pt is the untrained policy, which an older version kept because no trained one scored higher: "
+            "what follows is that policy's."
+        )
     entries: list[dict[str, Any]] = []
     try:
         entries = _own(read_evaluations(trial.folder / EVAL_FILE), sha)

@@ -60,9 +60,10 @@ Curve = tuple[np.ndarray, np.ndarray]
 
 
 def learning_curves(groups: Mapping[str, Sequence[TrialReading]], baseline: str | None, name: str) -> Picture | None:
-    """Score over env steps, a line a variant and a band over its seeds; None if nothing was evaluated."""
-    curves = {v: [t.curve for t in trials if len(t.curve[0])] for v, trials in groups.items()}
-    ranked = sorted((v for v in curves if curves[v]), key=lambda v: -_mean_best(curves[v]))
+    """Score over env steps, a line a variant and a band over its seeds; None if no trained policy has a score."""
+    means = {v: float(np.mean(scores)) for v, trials in groups.items() if (scores := _best_scores(trials))}
+    curves = {v: [t.curve for t in groups[v] if len(t.curve[0])] for v in means}
+    ranked = sorted(curves, key=lambda v: -means[v])
     if not ranked:
         return None
     named = ranked[:NAMED] + ([baseline] if baseline in ranked[NAMED:] else [])
@@ -91,7 +92,7 @@ def learning_curves(groups: Mapping[str, Sequence[TrialReading]], baseline: str 
         figure.legend(handles, labels, fontsize=8, title="best first", title_fontsize=8, **place)
 
     seeds = max(len(own) for own in curves.values())
-    best = _mean_best(curves[ranked[0]])
+    best = means[ranked[0]]
     return picture(
         name,
         "Learning curves",
@@ -130,8 +131,8 @@ def _limit_below(axes: Axes, curves: Sequence[Curve]) -> None:
         axes.set_ylim(bottom=bottom)
 
 
-def _mean_best(curves: Sequence[Curve]) -> float:
-    return float(np.mean([y.max() for _, y in curves]))
+def _best_scores(trials: Sequence[TrialReading]) -> list[float]:
+    return [trial.score for trial in trials if trial.score is not None]
 
 
 def _colour(number: int) -> str:

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from msk_ray.report.pictures import GREY, PALETTE, Picture, picture, shorten
 from msk_ray.report.reading import Reading, TrialReading
-from msk_ray.report.statistics import Effect, Scored, effects, mean_interval
+from msk_ray.report.statistics import LEAST, Effect, Scored, effects, mean_interval
 
 PANELS = 4
 """Parameters whose levels are drawn one by one."""
@@ -31,65 +31,72 @@ _DECADES = 30.0
 
 def ranked_effects(reading: Reading) -> list[Effect]:
     """Effects of the experiment's parameters on the best score, the largest first."""
-    return effects(
-        [
-            Scored(t.trial.changed, t.trial.values, t.trial.seed, t.score, t.cut)
-            for t in reading.trials
-            if t.score is not None
-        ]
-    )
+    return effects([Scored(t.trial.changed, t.trial.values, t.trial.seed, t.score, t.cut) for t in reading.trials])
 
 
 def parameter_effects(found: Sequence[Effect], name: str) -> Picture | None:
-    """Parameters ranked, and the scores at each level of the first ones; None without a parameter."""
-    if not found:
+    """Parameters ranked, and the scores at each level of the first ones; None if no two levels have a score."""
+    drawn = [effect for effect in found if effect.spread is not None]
+    if not drawn:
         return None
-    panels = list(found[:PANELS])
-    shares = any(effect.share is not None for effect in found)
+    panels = drawn[:PANELS]
+    shares = any(effect.share is not None for effect in drawn)
 
     def draw(figure: Figure, narrow: bool) -> None:
         rows = 2 if len(panels) > 2 else 1
         if narrow:
-            parts: Any = figure.subfigures(2, 1, height_ratios=(0.6 + 0.3 * len(found), 2.0 * len(panels)))
+            parts: Any = figure.subfigures(2, 1, height_ratios=(0.6 + 0.3 * len(drawn), 2.0 * len(panels)))
             grid = parts[1].subplots(len(panels), 1, squeeze=False).ravel()
         else:
             parts = figure.subfigures(1, 2, width_ratios=(1.0, 1.6))
             grid = parts[1].subplots(rows, math.ceil(len(panels) / rows), squeeze=False).ravel()
             for axes in grid[len(panels) :]:
                 axes.set_axis_off()
-        _draw_ranking(parts[0].add_subplot(), found, shares)
+        _draw_ranking(parts[0].add_subplot(), drawn, shares)
         for axes, effect in zip(grid, panels, strict=False):
             _draw_levels(axes, effect)
 
-    first = found[0]
+    first = drawn[0]
     share = "" if first.share is None else f", {max(0.0, first.share):.0%} of the variance"
     return picture(
         name,
         "What the parameters do",
-        f"{len(found)} parameters ranked by their effect on the best score. First: {first.factor}{share}, "
+        f"{len(drawn)} parameters ranked by their effect on the best score. First: {first.factor}{share}, "
         f"{first.spread:.4g} between its best and its worst level.",
         (
             "First: share of the scores' variance that a parameter explains alone, less what chance would (ω²; "
             "Hays 1963). Then: best scores at each level, with their mean and its 95 % bootstrap interval. "
             if shares
-            else "First: between the mean scores of a parameter's best and worst level; with one trial a level that "
-            "cannot be told from chance. Then: the scores. "
+            else "First: between the mean scores of a parameter's best and worst level, which cannot be told from "
+            "chance. Then: the scores. "
         )
+        + _too_few_words(found)
         + (_CUT_WORDS if any(trial.cut for level in first.trials.values() for trial in level) else ""),
         draw,
         (9.0, 5.4),
-        (4.2, 1.2 + 0.3 * len(found) + 2.2 * len(panels)),
+        (4.2, 1.2 + 0.3 * len(drawn) + 2.2 * len(panels)),
+    )
+
+
+def _too_few_words(found: Sequence[Effect]) -> str:
+    """Which parameters have too few trained trials for a share of the variance, and where."""
+    short = [f"{_leaf(effect.factor)} ({effect.too_few})" for effect in found if effect.too_few]
+    if not short:
+        return ""
+    more = f" and {len(short) - AXES} more parameters" if len(short) > AXES else ""
+    return (
+        f"Too few trials with a score of a trained policy for the share of the variance, which needs {LEAST} at each "
+        f"level: {', '.join(short[:AXES])}{more}. "
     )
 
 
 def _draw_ranking(axes: Axes, found: Sequence[Effect], shares: bool) -> None:
-    values = [(max(0.0, e.share) if e.share is not None else 0.0) if shares else e.spread for e in found]
+    values = [max(0.0, e.share or 0.0) if shares else e.spread or 0.0 for e in found]
     places = range(len(found))
     colours = [GREY if effect.factor == "seed" else PALETTE[0] for effect in found]
     axes.barh(places, values, color=colours, height=0.65)
     for place, effect in enumerate(found):
-        share = effect.share or 0.0
-        text = f"{effect.spread:.3g}" if not shares else f"{share:.2f}" if share > 0.0 else "≤ 0"
+        text = f"{effect.spread:.3g}" if not shares else _share_text(effect)
         axes.text(values[place], place, f" {text}", va="center", fontsize=8)
     axes.set_yticks(places, [shorten(_leaf(e.factor), 18) for e in found], fontsize=8)
     axes.set_ylim(max(len(found), 5) - 0.5, -0.5)
@@ -99,20 +106,27 @@ def _draw_ranking(axes: Axes, found: Sequence[Effect], shares: bool) -> None:
     axes.grid(alpha=0.3, axis="x")
 
 
+def _share_text(effect: Effect) -> str:
+    if effect.share is None:
+        return "too few trials"
+    return f"{effect.share:.2f}" if effect.share > 0.0 else "≤ 0"
+
+
 def _draw_levels(axes: Axes, effect: Effect) -> None:
-    levels = list(effect.trials.items())
+    levels = [(level, effect.scored(level)) for level in effect.levels]
     title = _leaf(effect.factor)
     if len(levels) > LEVELS:
         # Too many to tell apart.
-        ordered = sorted(levels, key=lambda level: -float(np.mean([t.score for t in level[1]])))
+        ordered = sorted(levels, key=lambda level: -float(np.mean(effect.levels[level[0]])))
         title += f" (best and worst of {len(levels)})"
         levels = [*ordered[: LEVELS // 2], *ordered[-LEVELS // 2 :]]
     jitter = np.random.default_rng(0)
-    for place, (_, trials) in enumerate(levels):
-        scores = [trial.score for trial in trials]
-        for trial, spot in zip(trials, place + 0.16 * (jitter.random(len(trials)) - 0.5), strict=True):
+    for place, (label, trials) in enumerate(levels):
+        scores = effect.levels[label]
+        spots = place + 0.16 * (jitter.random(len(trials)) - 0.5)
+        for trial, score, spot in zip(trials, scores, spots, strict=True):
             inside = "none" if trial.cut else GREY
-            axes.plot(spot, trial.score, "o", color=GREY, markerfacecolor=inside, markersize=3.5, alpha=0.8)
+            axes.plot(spot, score, "o", color=GREY, markerfacecolor=inside, markersize=3.5, alpha=0.8)
         mean, interval = float(np.mean(scores)), mean_interval(scores)
         axes.plot([place - 0.3, place + 0.3], [mean, mean], color=PALETTE[1], linewidth=2)
         if interval is not None:
@@ -129,7 +143,7 @@ def _draw_levels(axes: Axes, effect: Effect) -> None:
 
 def parallel_coordinates(reading: Reading, found: Sequence[Effect], name: str) -> Picture | None:
     """A line a trial through its parameters to its score; None with fewer than two trials or no parameter."""
-    factors = [effect.factor for effect in found if effect.factor != "seed"][:AXES]
+    factors = [effect.factor for effect in found if effect.factor != "seed" and effect.spread is not None][:AXES]
     trials = [t for t in reading.trials if t.score is not None and all(f in t.trial.changed for f in factors)]
     if len(trials) < 2 or not factors:
         return None

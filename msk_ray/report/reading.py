@@ -68,27 +68,36 @@ class TrialReading:
 
     @cached_property
     def curve(self) -> tuple[np.ndarray, np.ndarray]:
-        """Env steps and scores of the evaluations with a finite score, both (N,)."""
+        """Env steps and scores of the evaluations with a finite score, both (N,); that of the untrained policy, from
+        which a curve begins, is among them."""
         if SCORE not in self.columns:
             return np.zeros(0), np.zeros(0)
         keep = np.isfinite(self.columns[SCORE])
         return self.columns["env_steps"][keep], self.columns[SCORE][keep]
 
+    @cached_property
+    def trained(self) -> tuple[np.ndarray, np.ndarray]:
+        """The same of the trained policy alone, both (N,): what counts as its score."""
+        if SCORE not in self.columns:
+            return np.zeros(0), np.zeros(0)
+        keep = np.isfinite(self.columns[SCORE]) & (self.columns["epoch"] > 0)
+        return self.columns["env_steps"][keep], self.columns[SCORE][keep]
+
     @property
     def score(self) -> float | None:
-        """Highest finite evaluation score; None before the first."""
-        scores = self.curve[1]
+        """Highest finite evaluation score of the trained policy; None before the first."""
+        scores = self.trained[1]
         return float(scores.max()) if len(scores) else None
 
     def last_within(self, env_steps: float) -> float | None:
-        """Env steps of the last evaluation of a trained policy within so many; None if there is none."""
-        steps = self.curve[0]
-        within = steps[(steps > 0) & (steps <= env_steps)]
+        """Env steps of the last evaluation of a trained policy within `env_steps`; None if there is none."""
+        steps = self.trained[0]
+        within = steps[steps <= env_steps]
         return float(within[-1]) if len(within) else None
 
     def score_within(self, env_steps: float) -> float | None:
-        """Highest finite score of the evaluations in the first `env_steps`; None if there is none."""
-        steps, scores = self.curve
+        """Highest finite score of the trained policy in the first `env_steps`; None if there is none."""
+        steps, scores = self.trained
         within = scores[steps <= env_steps]
         return float(within.max()) if len(within) else None
 
@@ -105,7 +114,8 @@ class TrialReading:
         """The evaluation with the highest score: its epoch, env steps, and every `eval/` figure that is a number."""
         if self.score is None:
             return {}
-        row = int(np.nanargmax(self.columns[SCORE]))
+        trained = (self.columns["epoch"] > 0) & np.isfinite(self.columns[SCORE])
+        row = int(np.argmax(np.where(trained, self.columns[SCORE], -np.inf)))
         kept = ("epoch", "env_steps", "seconds")
         found = {name: float(v[row]) for name, v in self.columns.items() if name.startswith("eval/") or name in kept}
         return {name: value for name, value in found.items() if math.isfinite(value)}
@@ -172,7 +182,7 @@ class Reading:
 
     @property
     def best(self) -> TrialReading | None:
-        """The trial with the highest score at any evaluation; None if none was evaluated."""
+        """The trial with the highest score at any evaluation; None if none has a score."""
         scored = [trial for trial in self.trials if trial.score is not None]
         return max(scored, key=lambda t: (t.score or 0.0, -t.trial.index)) if scored else None
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
@@ -11,6 +12,8 @@ T = TypeVar("T")
 
 DRAWS = 10_000
 CONFIDENCE = 0.95
+LEAST = 2
+"""Scores that each level needs for the share of the variance that a parameter explains."""
 BINS = 4
 """Groups of equal size that a drawn number is sorted into."""
 
@@ -61,14 +64,14 @@ def _interval(statistic: np.ndarray) -> Interval:
 
 @dataclass(frozen=True)
 class Scored:
-    """A trial's best score, and what led to it."""
+    """A trial's best score, if its trained policy has one, and what led to it."""
 
     changed: Mapping[str, str]
     """Its parameters as text."""
     values: Mapping[str, Any]
     """The same as data."""
     seed: int
-    score: float
+    score: float | None
     cut: bool = False
     """It ended before its time: given more, the score might have risen."""
 
@@ -79,24 +82,48 @@ class Effect:
 
     factor: str
     trials: dict[str, list[Scored]]
-    """Trials at each level, in order of the level."""
-    share: float | None
-    """Of the variance of the scores, ω²; None if every trial has a level of its own."""
+    """Trials at each level, in order of the level; those without a score too."""
 
     @property
     def levels(self) -> dict[str, list[float]]:
-        """Scores at each level."""
-        return {level: [trial.score for trial in trials] for level, trials in self.trials.items()}
+        """Scores at each level that has any."""
+        found = {level: [t.score for t in trials if t.score is not None] for level, trials in self.trials.items()}
+        return {level: scores for level, scores in found.items() if scores}
+
+    def scored(self, level: str) -> list[Scored]:
+        """Trials at a level that have a score."""
+        return [trial for trial in self.trials[level] if trial.score is not None]
 
     @property
-    def spread(self) -> float:
-        """Between the best and the worst level's mean score."""
+    def too_few(self) -> str:
+        """At which level there are fewer than LEAST scores; empty if at none."""
+        levels = self.levels
+        counts = {level: len(levels.get(level, ())) for level in self.trials}
+        short = {level: count for level, count in counts.items() if count < LEAST}
+        if not short:
+            return ""
+        level, count = min(short.items(), key=lambda item: item[1])
+        more = f", and {len(short) - 1} more" if len(short) > 1 else ""
+        return f"{level} has {count or 'none'}{more}"
+
+    @cached_property
+    def share(self) -> float | None:
+        """Of the variance of the scores, ω²; None if there are too few at any level."""
+        return None if self.too_few else variance_share(list(self.levels.values()))
+
+    @property
+    def spread(self) -> float | None:
+        """Between the best and the worst level's mean score; None unless two levels have one."""
         means = [sum(scores) / len(scores) for scores in self.levels.values()]
-        return max(means) - min(means)
+        return max(means) - min(means) if len(means) > 1 else None
 
 
 def effects(trials: Sequence[Scored]) -> list[Effect]:
-    """Parameters ranked by the share of the scores' variance that they explain, the largest first.
+    """Parameters ranked by the share of the scores' variance that they explain, the largest first; then those with too
+    few scores for that, by their spread.
+
+    Args:
+        trials: all that were planned, those without a score too: an effect is not told from the levels that have one.
 
     Returns:
         An effect for each parameter with at least two levels, and one called `seed` for comparison if there are
@@ -106,13 +133,13 @@ def effects(trials: Sequence[Scored]) -> list[Effect]:
     found = []
     for factor in factors:
         rows = [(trial.changed[factor], trial.values.get(factor), trial) for trial in trials if factor in trial.changed]
-        found.append(_effect(factor, levels_of(rows)))
+        found.append(Effect(factor, levels_of(rows)))
     by_seed: dict[str, list[Scored]] = {}
     for trial in sorted(trials, key=lambda trial: trial.seed):
         by_seed.setdefault(str(trial.seed), []).append(trial)
-    found.append(_effect("seed", by_seed))
+    found.append(Effect("seed", by_seed))
     kept = [effect for effect in found if len(effect.trials) > 1]
-    return sorted(kept, key=lambda e: (-math.inf if e.share is None else -e.share, -e.spread))
+    return sorted(kept, key=lambda e: (math.inf if e.share is None else -e.share, -(e.spread or 0.0)))
 
 
 def levels_of(rows: Sequence[tuple[str, Any, T]]) -> dict[str, list[T]]:
@@ -156,8 +183,3 @@ def variance_share(groups: Sequence[Sequence[float]]) -> float | None:
         return 0.0
     within = (total - between) / (n - k)
     return float((between - (k - 1) * within) / (total + within))
-
-
-def _effect(factor: str, trials: dict[str, list[Scored]]) -> Effect:
-    scores = [[trial.score for trial in level] for level in trials.values()]
-    return Effect(factor, trials, variance_share(scores) if len(scores) > 1 else None)

@@ -57,7 +57,7 @@ class VariantRow:
         if self.difference is None:
             return "not comparable"
         if self.difference_interval is None:
-            return "one seed"
+            return "one seed" if self.planned == 1 else "too few seeds"
         if not self.difference_interval.excludes(0.0):
             return "unclear"
         word = "better" if self.difference > 0 else "worse"

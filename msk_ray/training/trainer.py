@@ -11,6 +11,7 @@ from msk_ray.config import Config, dump_yaml
 from msk_ray.envs import make_env
 from msk_ray.errors import CheckpointError, StorageError
 from msk_ray.files import remove_stale, write_bytes
+from msk_ray.metrics_file import METRICS_FILE, read_metrics
 from msk_ray.training.checkpoint import (
     epoch_checkpoints,
     milestone_path,
@@ -33,13 +34,13 @@ class Trainer:
     """One trial in this process.
 
     Writes `config.yaml`, `metrics.jsonl`, TensorBoard events and `checkpoints/` under `logdir`; there the newest whole
-    states, `best.pt`, and the policies alone (`policy_*.pt`) of about every eighth of the way. Call `run_epoch` until
-    `finished`; or `restore_latest` first to go on from the newest whole checkpoint, which on CPU gives exactly the
-    metrics of an uninterrupted run.
+    states, `best.pt` (until the first evaluation the untrained policy), and the policies alone (`policy_*.pt`) of about
+    every eighth of the way. Call `run_epoch` until `finished`; or `restore_latest` first to go on from the newest whole
+    checkpoint, which on CPU gives exactly the metrics of an uninterrupted run.
 
     Attributes:
         epoch: epochs done.
-        best_score: highest evaluation score so far, -inf before the first.
+        best_score: highest evaluation score of the trained policy so far, -inf before the first; that of `best.pt`.
 
     Raises:
         DeviceError, UnsupportedModelError, StorageError, SimulationError: as their messages say.
@@ -148,8 +149,19 @@ class Trainer:
         self._write_config()
         self.shac.load_state_dict(_to_device(state["shac"], self.env.device))
         self.epoch, self.env_steps = state["epoch"], state["env_steps"]
-        self.best_score, self._seconds = state["best_score"], state["seconds"]
+        self._seconds = state["seconds"]
         self._log.rewind(self.epoch)
+        self.best_score = self._trained_best(state["best_score"])
+
+    def _trained_best(self, recorded: float) -> float:
+        """A checkpoint's best score; -inf if it is what the policy scored untrained, which older versions counted.
+
+        Then `best.pt` is the untrained policy, and the next evaluation replaces it.
+        """
+        rows = read_metrics(self.logdir / METRICS_FILE)
+        untrained = [row.get("eval/score") for row in rows if row["epoch"] == 0]
+        trained = [row.get("eval/score") for row in rows if row["epoch"] > 0]
+        return -math.inf if recorded in untrained and recorded not in trained else recorded
 
     def restore_latest(self) -> tuple[Path | None, list[str]]:
         """Go on from the newest whole checkpoint, or from the start if there is none.
@@ -192,15 +204,18 @@ class Trainer:
     def _evaluate(self) -> dict[str, float]:
         started = time.perf_counter()
         figures = self.evaluator.run(self.shac.policy)
-        if figures["score"] > self.best_score:
+        if self.epoch == 0:
+            # For whoever wants to look at it; it has no score, so that any trained policy replaces it.
+            self._write(self.best_checkpoint)
+        elif figures["score"] > self.best_score:
             self.best_score = figures["score"]
             self._write(self.best_checkpoint)
         if self._at_milestone():
             self._write_policy(figures["score"])
-        return {f"eval/{name}": value for name, value in figures.items()} | {
-            "eval/best_score": self.best_score,
-            "time/evaluation_s": time.perf_counter() - started,
-        }
+        row = {f"eval/{name}": value for name, value in figures.items()}
+        if math.isfinite(self.best_score):
+            row["eval/best_score"] = self.best_score
+        return row | {"time/evaluation_s": time.perf_counter() - started}
 
     def _at_milestone(self) -> bool:
         """Whether this evaluation is the first one past another eighth of the trial, or the one before training.

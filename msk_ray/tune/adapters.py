@@ -17,7 +17,7 @@ from msk_ray.tune.space import SchedulerSpec
 METRIC = "score"
 """What trials report to Tune; `eval/score` under a name Tune does not take for a nested key."""
 BEST = "best"
-"""The highest score so far, that of the untrained policy at epoch 0 included, which is not reported by itself."""
+"""The highest score so far; no trial reports what its policy scored untrained."""
 STARTS_ANEW = "starts_anew"
 """What a trial reports, alone, right before it fails in order to be started anew: with how many worlds."""
 

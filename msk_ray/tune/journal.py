@@ -67,7 +67,7 @@ class Journal:
 
 
 def replay(pruner: Pruner, time_attr: str, reports: Sequence[Report]) -> Ending | None:
-    """Feed a rule with recorded reports.
+    """Feed a rule with recorded reports, but for those of untrained policies, which older versions recorded.
 
     Returns:
         What it answered to the last one, which the driver may not have lived to carry out.
@@ -78,5 +78,5 @@ def replay(pruner: Pruner, time_attr: str, reports: Sequence[Report]) -> Ending 
         if report.halved and report.trial not in halved:
             halved.add(report.trial)
             pruner.forget(report.trial)
-        ending = pruner.report(report.trial, report.time(time_attr), report.score)
+        ending = pruner.report(report.trial, report.time(time_attr), report.score) if report.epoch > 0 else None
     return None if not reports or reports[-1].ended else ending

@@ -131,6 +131,8 @@ class Live(Callback):
         elif run.epoch > run.first_epoch:
             self._seconds_per_epoch[mine.id] = (time.monotonic() - run.since) / (run.epoch - run.first_epoch)
         run.best = max(run.best, result[BEST])
+        if not math.isfinite(run.best):
+            return  # no score has been a number yet
         best = self._best
         if mine.id not in self._bests or run.best > self._bests[mine.id][0]:
             self._bests[mine.id] = run.best, mine

@@ -31,15 +31,15 @@ class TrialRecord:
 
     @property
     def best(self) -> Evaluation | None:
-        """The evaluation with the highest score; None if there was none with a score."""
+        """The evaluation of the trained policy with the highest score; None if there was none with a score."""
         finite = [evaluation for evaluation in self.evaluations if math.isfinite(evaluation.score)]
         return max(finite, key=lambda evaluation: evaluation.score) if finite else None
 
     @property
     def best_checkpoint(self) -> Path | None:
-        """Checkpoint of the best evaluation's policy."""
+        """Checkpoint of the best evaluation's policy; None if it is missing, or no trained policy has a score."""
         path = self.folder / "checkpoints" / "best.pt"
-        return path if path.is_file() else None
+        return path if self.best is not None and path.is_file() else None
 
     @property
     def cut(self) -> bool:
@@ -77,13 +77,13 @@ def read_rows(folder: Path) -> list[dict[str, float]]:
 
 
 def evaluations_of(rows: Sequence[Mapping[str, float]]) -> list[Evaluation]:
-    """The evaluations among rows of metrics."""
+    """The evaluations of trained policies among rows of metrics."""
     found = (Evaluation.from_row(row) for row in rows)
     return [evaluation for evaluation in found if evaluation is not None]
 
 
 def best_record(records: Sequence[TrialRecord]) -> TrialRecord | None:
-    """The trial with the highest score at any evaluation; None if none was evaluated."""
+    """The trial with the highest score at any evaluation; None if none has a score."""
     scored = [(record.best.score, -record.trial.index, record) for record in records if record.best is not None]
     return max(scored, key=lambda item: item[:2])[2] if scored else None
 

@@ -54,7 +54,7 @@ class Progress:
 
     epoch: int = 0
     best: float | None = None
-    """Highest finite evaluation score."""
+    """Highest finite evaluation score of the trained policy."""
     env_steps_per_s: float | None = None
     """Median over the newest rows."""
     seconds_per_epoch: float | None = None
@@ -250,7 +250,7 @@ def remaining(standings: Sequence[Standing]) -> float | None:
 
 
 def best_of(standings: Sequence[Standing]) -> Standing | None:
-    """The trial with the highest score; None if none was evaluated."""
+    """The trial with the highest score; None if none has one."""
     scored = [s for s in standings if s.progress.best is not None]
     return max(scored, key=lambda s: s.progress.best or -math.inf) if scored else None
 

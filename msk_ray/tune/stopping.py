@@ -13,7 +13,10 @@ SCORE = "eval/score"
 
 @dataclass(frozen=True)
 class Evaluation:
-    """One deterministic evaluation of a trial's policy."""
+    """One deterministic evaluation of a trial's policy after it was trained for an epoch or more.
+
+    What the policy scores before training is drawn in curves and counts nowhere: no trial has earned it.
+    """
 
     epoch: int
     env_steps: int
@@ -22,8 +25,8 @@ class Evaluation:
 
     @classmethod
     def from_row(cls, row: Mapping[str, float]) -> "Evaluation | None":
-        """The evaluation in a row of metrics; None when the epoch had none."""
-        if SCORE not in row:
+        """The evaluation in a row of metrics; None when the epoch had none, or the policy was not trained yet."""
+        if SCORE not in row or row["epoch"] <= 0:
             return None
         return cls(int(row["epoch"]), int(row["env_steps"]), float(row["seconds"]), float(row[SCORE]))
 

@@ -2,6 +2,7 @@
 
 import faulthandler
 import json
+import math
 import os
 import platform
 import shutil
@@ -180,8 +181,8 @@ def _exchanging(job: Job, folder: Path) -> type[TrainerLike]:
         def restore(self, path: Path) -> None:
             super().restore(path, changed=moving)
             # best.pt is this trial's own; a better member's best score would keep it from ever being replaced.
-            own = [evaluation.score for evaluation in evaluations_of(read_rows(folder))]
-            self.best_score = max(own, default=float("-inf"))
+            own = [e.score for e in evaluations_of(read_rows(folder)) if math.isfinite(e.score)]
+            self.best_score = max(own, default=-math.inf)
 
     return Exchanging
 

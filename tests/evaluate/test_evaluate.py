@@ -40,7 +40,7 @@ def test_the_score_is_the_one_trials_are_ranked_by_and_the_same_twice(trial: Pat
     (second,) = entries(trial)  # in place of the first: same checkpoint, physics and size
     timeless = lambda entry: {k: v for k, v in entry.items() if k != "date"}  # noqa: E731
     assert timeless(first) == timeless(second)
-    rows = [row for row in read_metrics(trial / "metrics.jsonl") if "eval/score" in row]
+    rows = [row for row in read_metrics(trial / "metrics.jsonl") if "eval/score" in row and row["epoch"] > 0]
     best = max(rows, key=lambda row: row["eval/score"])
     assert first["canonical"]
     assert first["score"]["mean"] == best["eval/score"]
@@ -61,6 +61,19 @@ def test_seeds_worlds_and_steps(trial: Path) -> None:
     by_seed = entry["score_by_seed"]
     assert by_seed["1"] != by_seed["2"]
     assert math.isclose((by_seed["1"] + by_seed["2"]) / 2, entry["score"]["mean"], rel_tol=1e-6)
+
+
+def test_an_untrained_policy_has_no_rank(sweep: Experiment, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = Path(shutil.copytree(sweep.path, tmp_path / "small"))
+    untrained = folder / "trials" / sweep.trials()[1].id / "checkpoints"
+    shutil.copy(untrained / "policy_000000.pt", untrained / "best.pt")
+    assert run(main, ["small", "--storage", str(tmp_path), "--device", "cpu"]) == 0
+    data = json.loads((folder / "eval.json").read_text())
+    assert data["untrained"] == [sweep.trials()[1].id]
+    assert len(data["rankings"][0]["ranking"]) == 3
+    assert "is the untrained policy; it has no rank" in capsys.readouterr().out
+    assert run(main, [str(untrained.parent), "--device", "cpu"]) == 0
+    assert "epoch 0 (untrained), under" in capsys.readouterr().out
 
 
 def test_an_experiment_is_ranked_and_a_torn_policy_is_named(

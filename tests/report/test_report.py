@@ -11,8 +11,10 @@ import pytest
 
 from msk_ray.cli import run
 from msk_ray.config import dump_yaml
+from msk_ray.experiment.checkpoint_file import write_checkpoint_file
 from msk_ray.report.__main__ import main
 from msk_ray.report.curves import rung_steps
+from msk_ray.report.influence import ranked_effects
 from msk_ray.report.page import make_section
 from msk_ray.report.reading import Condition, read_experiment
 from msk_ray.report.tables import failures, variant_rows
@@ -130,8 +132,36 @@ def test_nobody_is_compared_with_an_untrained_policy(experiment: experiments.Exp
     fast = compared(experiment, {"baseline": [(0, 0.0), (6, 90.0)], "fast": [(0, 0.0), (4, 50.0)]}, stopped)
     assert (fast.mean, fast.difference, fast.verdict) == (50.0, None, "not comparable")
     fast = compared(experiment, {"baseline": [(0, 0.0), (6, 90.0)], "fast": [(0, 50.0)]}, stopped)
-    assert (fast.mean, fast.cut, fast.verdict) == (50.0, 1, "not comparable")
+    assert (fast.mean, fast.cut, fast.verdict) == (None, 0, "no score")
     assert "compared at" not in page_of(experiment)
+
+
+def test_nothing_is_told_from_untrained_policies(experiment: experiments.Experiment) -> None:
+    """Two variants were stopped before they were evaluated: from their untrained scores ω² would be 1."""
+    for trial in experiment.trials():
+        if trial.changed["variant"] != "baseline":
+            fill(experiment.trial_folder(trial.id), [-9145.6], Ending(Outcome.STOPPED_ASHA, "behind"))
+    reading = read_experiment(experiment, time.time())
+    assert [trial.score for trial in reading.trials if trial.ending and trial.ending.cut] == [None] * 4
+    effects = {effect.factor: effect for effect in ranked_effects(reading)}
+    variant = effects["variant"]
+    assert (variant.share, variant.spread, variant.too_few) == (None, None, "fast has none, and 1 more")
+    rows = {row.variant: row for row in variant_rows(reading, "baseline")}
+    assert [(rows[v].mean, rows[v].difference, rows[v].verdict) for v in ("fast", "deep")] == [
+        (None, None, "no score")
+    ] * 2
+    page = page_of(experiment)
+    assert "9145" not in page.replace("\N{MINUS SIGN}", "-")
+    assert "needs 2 at each level: seed (0 has 1, and 1 more), variant (fast has none, and 1 more)." in page
+
+
+def test_a_best_policy_that_was_never_trained_is_called_so(experiment: experiments.Experiment) -> None:
+    """Older versions kept the untrained policy where no trained one scored higher."""
+    best = read_experiment(experiment, time.time()).best
+    assert best is not None
+    (best.folder / "checkpoints").mkdir()
+    write_checkpoint_file(best.folder / "checkpoints" / "best.pt", b"policy", {"epoch": 0})
+    assert "Its best.pt is the untrained policy" in page_of(experiment, "--best", "never")
 
 
 def test_evaluations_at_other_env_steps_are_compared_at_the_newest_common_ones(
@@ -273,15 +303,15 @@ def _best_without_policy(e: experiments.Experiment) -> None:
         (_half_written, ["Which trials were planned is not known", "manifest.json is missing", "It has no trials"]),
         (_torn_manifest, ["Which trials were planned is not known", "6 trials"]),
         (_nothing_else, ["env.json is missing", "space.yaml cannot be read", "Versions and command were not recorded"]),
-        (_not_begun, ["not started", "No trial has begun yet", "No trial was evaluated yet"]),
+        (_not_begun, ["not started", "No trial has begun yet", "No trained policy has a score yet"]),
         (
             _broken_trials,
             ["3 unreadable", "is not JSON", "JSONDecodeError", "unheard_of", "the trial&#39;s files make no sense"],
         ),
         (_crashed, ["interrupted", "with --resume, goes on", "3 interrupted"]),
         (_running, ["Trials are still running", "1 running"]),
-        (_never_evaluated, ["No trial was evaluated yet", "Too few evaluated trials"]),
-        (_nothing_finite, ["No trial was evaluated yet", "No trial has recorded a gradient yet"]),
+        (_never_evaluated, ["No trained policy has a score yet", "Too few trials with a score of a trained policy"]),
+        (_nothing_finite, ["No trained policy has a score yet", "No trial has recorded a gradient yet"]),
         (_best_without_policy, ["is torn: it has neither a head nor a manifest"]),
     ],
 )

@@ -77,6 +77,23 @@ def test_the_parameter_that_matters_comes_first() -> None:
     assert effects([Scored({"lr": "1"}, {"lr": 1}, 0, 5.0)]) == []
 
 
+def scored(level: float, *scores: float | None) -> list[Scored]:
+    return [Scored({"lr": f"{level}"}, {"lr": level}, 0, score) for score in scores]
+
+
+def test_too_few_scores_give_no_share_and_say_where() -> None:
+    enough = [*scored(0.1, 0.5, 1.5), *scored(0.2, 3.5, 4.5)]
+    (effect,) = effects(enough)
+    assert (effect.share, effect.too_few) == (pytest.approx(8.5 / 10.5), "")
+    # One more level nobody was trained at, or once: what lies between the others is not the parameter's effect.
+    (effect,) = effects([*enough, *scored(0.3, None, None)])
+    assert (effect.share, effect.too_few, effect.spread) == (None, "0.3 has none", 3.0)
+    (effect,) = effects([*scored(0.1, 1.0, 2.0), *scored(0.2, 3.0, None)])
+    assert (effect.share, effect.too_few, effect.spread) == (None, "0.2 has 1", 1.5)
+    (effect,) = effects([*scored(0.1, 1.0, 2.0), *scored(0.2, None), *scored(0.3, None)])
+    assert (effect.share, effect.too_few, effect.spread) == (None, "0.2 has none, and 1 more", None)
+
+
 def test_thinning_keeps_every_peak() -> None:
     y = np.zeros(10 * POINTS)
     peaks = np.random.default_rng(1).choice(len(y), 20, replace=False)

@@ -16,8 +16,10 @@ import yaml
 
 from msk_ray.config import Config
 from msk_ray.errors import CheckpointError, StorageFailure
+from msk_ray.experiment.checkpoint_file import read_facts
 from msk_ray.training import Trainer, precompile, read_metrics
-from msk_ray.training.checkpoint import epoch_checkpoints, milestones
+from msk_ray.training.checkpoint import epoch_checkpoints, milestones, read_checkpoint, write_checkpoint
+from msk_ray.training.evaluation import Evaluator
 
 
 def comparable(rows: list[dict]) -> list[dict]:
@@ -39,11 +41,52 @@ def test_a_trial_leaves_its_record(tiny_cartpole: Config, tmp_path: Path) -> Non
     assert [row["epoch"] for row in rows] == list(range(7))
     assert [row["epoch"] for row in rows if "eval/score" in row] == [0, 2, 4, 6]
     assert rows[-1]["env_steps"] == 6 * 8 * 8
-    assert rows[-1]["eval/best_score"] == max(row["eval/score"] for row in rows if "eval/score" in row)
+    assert rows[-1]["eval/best_score"] == max(row["eval/score"] for row in rows[1:] if "eval/score" in row)
     assert [p.name for p in epoch_checkpoints(tmp_path / "checkpoints")] == ["epoch_000006.pt", "epoch_000004.pt"]
     assert (tmp_path / "checkpoints" / "best.pt").is_file()
     assert list(tmp_path.glob("events*"))
     assert yaml.safe_load((tmp_path / "config.yaml").read_text()) == tiny_cartpole.as_dict()
+
+
+def test_the_untrained_policy_is_kept_without_a_score_until_a_trained_one_has_one(
+    tiny_cartpole: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Here training makes it worse: 0 untrained, then -2, -4 and -6."""
+    monkeypatch.setattr(Evaluator, "run", lambda self, policy: {"score": -float(trainer.epoch)})
+    trainer = Trainer(tiny_cartpole, tmp_path, "cpu")
+    trainer.run_epoch()
+    assert trainer.best_score == -math.inf
+    facts = read_facts(trainer.best_checkpoint)
+    assert (facts["epoch"], facts["best_score"]) == (0, None)
+    while not trainer.finished:
+        trainer.run_epoch()
+    trainer.close()
+    facts = read_facts(trainer.best_checkpoint)
+    assert (facts["epoch"], facts["best_score"]) == (2, -2.0)
+    rows = read_metrics(tmp_path / "metrics.jsonl")
+    assert [row.get("eval/best_score") for row in rows] == [None, None, -2.0, None, -2.0, None, -2.0]
+
+
+def test_a_checkpoint_that_counts_the_untrained_policy_goes_on_without_it(
+    tiny_cartpole: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As older versions wrote it: the best score is the untrained policy's, which no trained one has reached."""
+    monkeypatch.setattr(Evaluator, "run", lambda self, policy: {"score": -float(trainer.epoch)})
+    trainer = Trainer(tiny_cartpole, tmp_path, "cpu")
+    for _ in range(4):
+        trainer.run_epoch()
+    newest = trainer.checkpoints / "epoch_000004.pt"
+    trainer.close()
+    for path in (newest, trainer.best_checkpoint):
+        state = read_checkpoint(newest) | {"best_score": 0.0}
+        write_checkpoint(path, state, {"epoch": 4 if path == newest else 0, "best_score": 0.0})
+    trainer = Trainer(tiny_cartpole, tmp_path, "cpu")
+    trainer.restore_latest()
+    assert trainer.best_score == -math.inf
+    while not trainer.finished:
+        trainer.run_epoch()
+    trainer.close()
+    assert read_facts(trainer.best_checkpoint)["epoch"] == 6
 
 
 def test_a_trial_can_start_from_another_ones_networks(tiny_cartpole: Config, tmp_path: Path) -> None:

@@ -57,9 +57,8 @@ class StubTrainer:
     def run_epoch(self) -> dict[str, float]:
         time.sleep(self.seconds_per_epoch)
         if self.epoch == 0:
-            self.best_score = 0.0
-            (self.logdir / "checkpoints" / "best.pt").write_text(str(self.best_score))
-            self._write({**self._row(), "eval/score": 0.0, "eval/best_score": 0.0})
+            (self.logdir / "checkpoints" / "best.pt").write_text("untrained")
+            self._write({**self._row(), "eval/score": 0.0})
         self.epoch += 1
         row = self._row()
         if self.epoch == MISBEHAVE_AT:

@@ -105,13 +105,15 @@ def test_faults_are_named_and_killed_or_hung_trials_go_on(
 def test_a_trial_that_training_makes_worse_is_shown_with_the_score_it_is_ranked_by(
     make_space: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Where no later policy is better than the untrained one, its score of 0 is the best."""
+    """Where no later policy is better than the untrained one, which scores 0, the best of the trained ones counts."""
     _, records = go(make_space(parameters={"shac.actor_lr": {"grid": [1e-5]}}), tmp_path / "runs" / "worse")
     assert records[0].best is not None
-    assert (records[0].best.score, records[0].best.epoch) == (0.0, 0)
+    # −50 (1 − e^(−epoch/10)) falls from its first evaluation on.
+    assert (records[0].best.score, records[0].best.epoch) == (pytest.approx(-9.0635, abs=1e-4), 2)
     shown = capsys.readouterr().out
-    assert "finished: all 20 epochs done; best score 0" in shown
-    assert "best so far: score 0\n" in shown
+    assert "finished: all 20 epochs done; best score -9.0635" in shown
+    assert "best so far: score -9.0635 at epoch 2/20" in shown
+    assert "score 0" not in shown
 
 
 def test_a_full_disk_stops_everything_and_ends_nothing(

@@ -1,6 +1,8 @@
 """Records, tables and the experiment's folder."""
 
 import json
+import shutil
+import time
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,7 @@ from msk_ray.tune.outcomes import Ending, Outcome, read_ending, write_ending
 from msk_ray.tune.records import best_record, read_record
 from msk_ray.tune.report import write_report
 from msk_ray.tune.space import ResourcesSpec
+from msk_ray.tune.standing import Observer
 from msk_ray.tune.table import markdown, outcome_name, result_rows, summary, table_document, variant_rows
 from msk_ray.tune.trials import resolve_trials
 
@@ -49,7 +52,7 @@ def experiment(make_space: Any, tmp_path: Path) -> experiments.Experiment:
 
 def test_records_and_tables(experiment: experiments.Experiment, tmp_path: Path) -> None:
     records = [read_record(t, experiment.trial_folder(t.id)) for t in experiment.trials()]
-    assert [len(r.evaluations) for r in records] == [3, 2, 3, 0]
+    assert [len(r.evaluations) for r in records] == [2, 1, 2, 0], "the untrained policy's does not count"
     assert [outcome_name(r) for r in records] == ["finished", "stopped_asha", "nonfinite", "waiting"]
     best = best_record(records)
     assert best is records[2]
@@ -67,6 +70,34 @@ def test_records_and_tables(experiment: experiments.Experiment, tmp_path: Path) 
     assert "before the" not in whole
     facts = json.loads(json.dumps(summary("e", "Which?", records), allow_nan=False))
     assert facts["best"]["id"] == records[2].trial.id
+
+
+def test_an_untrained_policy_has_no_score(experiment: experiments.Experiment, make_space: Any) -> None:
+    """It scores higher than anything that was trained, and is all that two stopped trials have."""
+    trials = experiment.trials()
+    for number, scores in enumerate([[90.0, 5.0, 4.0], [90.0], [90.0, 7.0, None], [90.0]]):
+        folder = experiment.trial_folder(trials[number].id)
+        shutil.rmtree(folder, ignore_errors=True)
+        fill(experiment, trials[number].id, scores, Ending(Outcome.STOPPED_ASHA, "behind"))
+    records = [read_record(t, experiment.trial_folder(t.id)) for t in trials]
+    assert [None if r.best is None else (r.best.score, r.best.epoch) for r in records] == [
+        (5.0, 2),
+        None,
+        (7.0, 2),
+        None,
+    ]
+    assert best_record(records) is records[2]
+    assert [row[3:5] for row in result_rows(records)] == [("7", "2"), ("5", "2"), ("-", "-"), ("-", "-")]
+    assert [row[1] for row in variant_rows(records)] == ["2 (2 before the end)", "0"]
+    facts = summary("e", "Which?", records)["trials"]
+    assert [(f["score"], f["score_epoch"], f["best_checkpoint"] is None) for f in facts] == [
+        (5.0, 2, False),
+        (None, None, True),
+        (7.0, 2, False),
+        (None, None, True),
+    ]
+    shown = {standing.id: standing.progress.best for standing in Observer(experiment).look(time.time())}
+    assert [shown[trial.id] for trial in trials] == [5.0, None, 7.0, None]
 
 
 def test_a_sweep_ends_in_its_report(

@@ -4,8 +4,10 @@ import math
 
 import pytest
 
+from msk_ray.tune.journal import Report, replay
 from msk_ray.tune.outcomes import Outcome
 from msk_ray.tune.pruning import MedianStopping, SuccessiveHalving, make_pruner, rungs
+from msk_ray.tune.records import evaluations_of
 from msk_ray.tune.space import PlateauSpec, SchedulerSpec, StopSpec
 from msk_ray.tune.stopping import Evaluation, ending_of, plateau
 
@@ -142,3 +144,25 @@ def test_last_epoch_and_wall_time() -> None:
     late = ending_of(StopSpec(wall_time_s=5.0), row(10), evaluations(1.0), epochs=100, elapsed_s=5.0)
     assert late is not None
     assert late.outcome is Outcome.WALL_TIME
+
+
+def test_the_untrained_policy_counts_in_no_rule() -> None:
+    """It reaches the target and is never surpassed; the trial goes on."""
+    rows = [row(epoch, **{"eval/score": score}) for epoch, score in enumerate([100.0, 1.0, 2.0, 3.0])]
+    seen = evaluations_of(rows)
+    assert [evaluation.epoch for evaluation in seen] == [1, 2, 3]
+    assert ending_of(StopSpec(target=50.0), row(1), evaluations_of(rows[:1]), 20, 1.0) is None
+    rule = StopSpec(target=50.0, plateau=PlateauSpec(patience=2, grace=0.0))
+    assert ending_of(rule, rows[3], seen, 20, 3.0) is None
+
+
+def test_a_journal_of_an_older_version_has_untrained_policies_in_it() -> None:
+    spec = SchedulerSpec(kind="asha", grace=0.25, reduction=2)
+    old = [
+        Report("a", 0, 0, 0.0, 100.0, False),
+        Report("a", 3, 300, 3.0, 1.0, False),
+        Report("b", 3, 300, 3.0, 2.0, False),
+    ]
+    pruner = make_pruner(spec, 1000)
+    assert replay(pruner, "env_steps", old) is None, "b is the better of the two"
+    assert pruner.report("a", 310, 1.0) is not None
