@@ -30,16 +30,26 @@ mv -T -- "${folder%/*}/new-${folder##*/}" "$folder"
 cat >"$folder/token.new"
 mv -- "$folder/token.new" "$folder/token"
 
-code=0
-if ((!ended)); then
-    "$@" </dev/null &
-    ray=$!
-    while kill -0 "$ray" 2>/dev/null; do
-        # Again: the first may have come before there was anything to end.
-        ((!ended)) || kill "$ray" 2>/dev/null || true
-        sleep 0.5 || true
-    done
-    wait "$ray" || code=$?
-fi
-rm -f -- "$folder/token"
-exit "$code"
+# In braces: bash reads them whole, so that a change of this file does not reach a node that runs.
+{
+    code=0
+    if ((!ended)); then
+        # SLURM signals all processes of a step; this one alone ends Ray at USR2, in order.
+        (
+            trap '' USR2
+            exec "$@" </dev/null
+        ) &
+        ray=$!
+        while kill -0 "$ray" 2>/dev/null; do
+            # Again: the first may have come before there was anything to end.
+            ((!ended)) || kill "$ray" 2>/dev/null || true
+            { sleep 0.5 || true; } 2>/dev/null # bash says so when the signal ends it too
+        done
+        wait "$ray" || code=$?
+    fi
+    rm -f -- "$folder/token"
+    if ((ended)); then
+        exit 0
+    fi
+    exit "$code"
+}

@@ -15,6 +15,9 @@ fi
 # shellcheck source-path=SCRIPTDIR
 source "$(dirname "${BASH_SOURCE[0]}")/stop_signals.sh"
 
-"${MSK_RAY_PYTHON:-python}" -m msk_ray.tune --space "$1" --storage "$2" --start-or-resume "${@:3}" &
-await "$!"
-exit "$code"
+# In braces: bash reads them whole, so that a change of this file does not reach a driver that runs.
+{
+    "${MSK_RAY_PYTHON:-python}" -m msk_ray.tune --space "$1" --storage "$2" --start-or-resume "${@:3}" &
+    await "$!"
+    exit "$code"
+}

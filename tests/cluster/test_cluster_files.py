@@ -319,6 +319,7 @@ def test_scripts(name: str, variable: str, tmp_path: Path) -> None:
 SBATCH = {
     "job-name",
     "output",
+    "open-mode",
     "nodes",
     "ntasks-per-node",
     "cpus-per-task",

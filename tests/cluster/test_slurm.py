@@ -237,6 +237,40 @@ def test_a_node_takes_no_folder_that_is_there_already(job: Job) -> None:
     assert not job.tokens()
 
 
+@pytest.mark.parametrize("number", [signal.SIGUSR2, signal.SIGTERM])
+def test_a_node_ends_in_order_when_all_of_its_step_is_signalled(job: Job, number: signal.Signals) -> None:
+    """As SLURM signals steps. What asks the driver to stop does not end the Ray that the driver still needs."""
+    folder = job.disk / "msk_ray-1-abcdef"
+    process = subprocess.Popen(
+        ["bash", job.scripts / "slurm_node.sh", folder, "ray"],
+        env=job.environment | {"RAY_TMPDIR": str(folder), "RAY_AUTH_TOKEN_PATH": str(folder / "token")},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+    job.started.append(process)
+    assert process.stdin is not None
+    process.stdin.close()
+    process.stdin = None
+    job.wait_for("tmp")
+    for ignored in (signal.SIGUSR1, signal.SIGHUP, signal.SIGINT):
+        os.killpg(process.pid, ignored)
+    assert folder.exists()
+    assert process.poll() is None
+    os.killpg(process.pid, number)
+    assert job.end(process)[0] == 0
+    assert job.lines("step ended")
+    assert not job.tokens()
+
+
+def test_a_node_whose_ray_ends_by_itself_has_failed(job: Job) -> None:
+    folder = job.disk / "msk_ray-1-abcdef"
+    assert subprocess.run(["bash", job.scripts / "slurm_node.sh", folder, "false"], input=b"secret").returncode == 1
+    assert not job.tokens()
+
+
 @pytest.mark.parametrize("number", [signal.SIGUSR1, signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_signals_reach_the_driver_and_the_job_is_resumable(job: Job, number: signal.Signals) -> None:
     process = job.start()
