@@ -7,7 +7,6 @@ second is killed at once. Then the experiment must end by itself, with every tri
 
 import argparse
 import json
-import os
 import secrets
 import shutil
 import signal
@@ -19,16 +18,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from hosts import Host, check_possible, network
 from record import RESULTS, markdown_table, publish
 
-import msk_ray
 from msk_ray.config import dump_yaml
 from msk_ray.tune.outcomes import read_ending
 from msk_ray.tune.records import read_rows
 from msk_ray.tune.space import load_space
 from msk_ray.tune.trials import resolve_trials
 
-REPOSITORY = Path(msk_ray.__file__).resolve().parent.parent
 EPOCHS = 30
 SPACE = {
     "question": "Does an experiment survive the loss of a host?",
@@ -48,78 +46,28 @@ PORT = 6379
 LIMIT_S = 900.0
 
 
-class Host:
-    """A host: namespaces of its own, and the processes in them. Its folder for Ray is nobody else's."""
-
-    def __init__(self, name: str, scratch: Path) -> None:
-        self.name, self.address = name, ADDRESSES[name]
-        self._scratch = scratch
-        for folder in (name, "local"):
-            (scratch / folder).mkdir(exist_ok=True)
-        boot = f"hostname {name} && mount --bind {scratch / name} {scratch / 'local'} && touch {scratch / name / 'up'}"
-        spaces = ["unshare", "--uts", "--mount", "--pid", "--fork", "--kill-child", "--mount-proc"]
-        self._outside = subprocess.Popen(
-            ["ip", "netns", "exec", name, *spaces, "sh", "-c", f"{boot} && exec sleep infinity"]
-        )
-        while not (scratch / name / "up").exists():
-            if self._outside.poll() is not None:
-                sys.exit(f"cannot make the host {name}")
-            time.sleep(0.05)
-        children = Path(f"/proc/{self._outside.pid}/task/{self._outside.pid}/children").read_text().split()
-        self._first = children[0]
-
-    def start(self, command: list[str], log: str) -> "subprocess.Popen[bytes]":
-        """Run a command there."""
-        environment = os.environ | {
-            "RAY_TMPDIR": str(self._scratch / "local"),
-            "RAY_AUTH_MODE": "token",
-            "RAY_AUTH_TOKEN_PATH": str(self._scratch / "token"),
-            "PYTHONPATH": os.pathsep.join([str(REPOSITORY), *filter(None, [os.environ.get("PYTHONPATH")])]),
-        }
-        environment.pop("RAY_ADDRESS", None)
-        into = ["nsenter", "--target", self._first, "--net", "--uts", "--mount", "--pid", f"--wd={REPOSITORY}"]
-        with (self._scratch / log).open("ab") as file:
-            return subprocess.Popen([*into, *command], stdout=file, stderr=file, env=environment)
-
-    def start_ray(self, head: bool) -> None:
-        """Its raylet, of one core."""
-        ray = [str(Path(sys.executable).with_name("ray")), "start", "--block", "--num-cpus=1", "--disable-usage-stats"]
-        ray += [f"--node-ip-address={self.address}", "--object-store-memory=100000000"]
-        where = ["--head", f"--port={PORT}", "--include-dashboard=false"]
-        self.start([*ray, *(where if head else [f"--address={ADDRESSES['msk-a']}:{PORT}"])], f"{self.name}.log")
-
-    def kill(self) -> None:
-        """Every process there, at once: the first takes all others of its namespace along."""
-        self._outside.kill()
-        self._outside.wait()
+def _start_ray(host: Host, log: Path, *where: str) -> None:
+    """Its raylet, of one core."""
+    ray = [str(Path(sys.executable).with_name("ray")), "start", "--block", "--num-cpus=1", "--disable-usage-stats"]
+    host.start([*ray, f"--node-ip-address={host.address}", "--object-store-memory=100000000", *where], log)
 
 
 @contextmanager
 def _hosts(scratch: Path) -> Iterator[list[Host]]:
-    names = list(ADDRESSES)
-    for name in names:
-        _ip("netns", "add", name)
-    try:
-        _ip("link", "add", "veth", "netns", names[0], "type", "veth", "peer", "name", "veth", "netns", names[1])
-        for name, address in ADDRESSES.items():
-            _ip("-n", name, "address", "add", f"{address}/24", "dev", "veth")
-            for device in ("lo", "veth"):
-                _ip("-n", name, "link", "set", device, "up")
+    environment = {
+        "RAY_TMPDIR": str(scratch / "local"),
+        "RAY_AUTH_MODE": "token",
+        "RAY_AUTH_TOKEN_PATH": str(scratch / "token"),
+    }
+    with network(ADDRESSES):
         hosts: list[Host] = []
         try:
-            for name in names:
-                hosts.append(Host(name, scratch))
+            for name, address in ADDRESSES.items():
+                hosts.append(Host(name, address, scratch / "local", scratch / name, environment))
             yield hosts
         finally:
             for host in hosts:
                 host.kill()
-    finally:
-        for name in names:
-            _ip("netns", "delete", name)
-
-
-def _ip(*words: str) -> None:
-    subprocess.run(["ip", *words], check=True)
 
 
 def _wait(what: str, condition: object, driver: "subprocess.Popen[bytes]", log: Path) -> None:
@@ -145,8 +93,7 @@ def main() -> int:
     p.add_argument("--results", type=Path, default=RESULTS, help="folder the table is appended in")
     p.add_argument("--keep", action="store_true", help="keep the experiment and logs")
     args = p.parse_args()
-    if os.geteuid() or shutil.which("ip") is None:
-        sys.exit("network namespaces need root and the ip command (apt-get install iproute2)")
+    check_possible()
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(number))
     # Ray's sockets lie below, and their paths may have 107 bytes.
     scratch = Path(tempfile.mkdtemp(prefix="hosts_", dir="/tmp"))
@@ -159,19 +106,18 @@ def main() -> int:
     folder = scratch / "runs" / "hosts" / "trials"
     python = [sys.executable, "-m"]
     with _hosts(scratch) as (first, second):
-        first.start_ray(head=True)
-        second.start_ray(head=False)
         address = f"{first.address}:{PORT}"
+        _start_ray(first, scratch / f"{first.name}.log", "--head", f"--port={PORT}", "--include-dashboard=false")
+        _start_ray(second, scratch / f"{second.name}.log", f"--address={address}")
         joined = first.start(
-            [*python, "msk_ray.tune.cluster", "--address", address, "--nodes", "2", "--wait", "60"], "joined.log"
+            [*python, "msk_ray.tune.cluster", "--address", address, "--nodes", "2", "--wait", "60"],
+            scratch / "joined.log",
         )
         if joined.wait():
             sys.exit("the hosts did not find each other:\n" + (scratch / "joined.log").read_text()[-3000:])
-        command = ["msk_ray.tune", "--space", str(scratch / "space.yaml"), "--name", "hosts", "--cpu"]
-        driver = first.start(
-            [*python, *command, "--storage", str(scratch / "runs"), "--address", address], "driver.log"
-        )
         log = scratch / "driver.log"
+        command = ["msk_ray.tune", "--space", str(scratch / "space.yaml"), "--name", "hosts", "--cpu"]
+        driver = first.start([*python, *command, "--storage", str(scratch / "runs"), "--address", address], log)
         _wait("trials on both hosts", lambda: all(_running(folder).values()), driver, log)
         lost = _running(folder)[second.name]
         print(f"at {time.monotonic() - started:.0f} s: trials on both hosts; killing {second.name}", flush=True)
