@@ -19,7 +19,8 @@ shift
 for left in "${folder%/*}"/msk_ray-*; do
     if [[ -d $left && ! -L $left && -O $left ]]; then
         # shellcheck disable=SC2094 # a lock is neither read nor written
-        (if flock --nonblock 8; then rm -rf -- "$left"; fi) 8<"$left"
+        # The other way out: another job that starts here was faster.
+        (if flock --nonblock 8; then rm -rf -- "$left"; fi) 8<"$left" || [[ ! -e $left ]]
     fi
 done
 # Under another name until it is locked, so that no other job takes it for left over. mkdir refuses what exists.
