@@ -2,6 +2,7 @@
 
 from msk_ray.gradcheck.chain import ChainComparison, check_chain
 from msk_ray.gradcheck.check import Comparison, GradientReport, Limits, check_gradients
+from msk_ray.gradcheck.nonfinite import NonFinite
 from msk_ray.gradcheck.oracle import Linearization, Oracle, Point
 from msk_ray.gradcheck.states import STATE_KINDS, make_states
 
@@ -12,6 +13,7 @@ __all__ = [
     "GradientReport",
     "Limits",
     "Linearization",
+    "NonFinite",
     "Oracle",
     "Point",
     "check_chain",

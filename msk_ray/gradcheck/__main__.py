@@ -5,6 +5,7 @@ import json
 import math
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +27,8 @@ forward pass itself differs from C MuJoCo, are left out and counted.
   rel_error   |g - g_ref| / |g_ref|    0 is right
   cosine      between g and g_ref      1 is right; tells direction from magnitude
   norm_ratio  |g| / |g_ref|            1 is right; far above 1 means exploding gradients
+
+A step or a gradient that is not finite, at any state, fails the check; its elements are named.
 
 Exit code: 0 within the tolerance, 1 past it, 2 for a model that is not supported or a wrong command line."""
 
@@ -150,7 +153,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(json.dumps(as_json(report, str(args.model), args.tolerance, [])))
     else:
         print_table(report, str(args.model), args.tolerance)
-    if not report.checked:
+    if not report.checked and not report.nonfinite:
         raise ConfigError(
             f"nothing could be compared: {_excluded(report)}; take other --states, more --worlds or --forward-tolerance"
         )
@@ -184,12 +187,17 @@ def as_json(report: "GradientReport", model: str, tolerance: float, unsupported:
             }
             for r in report.results
         ],
+        "nonfinite": [asdict(lost) for lost in report.nonfinite],
         "max_rel_error": _finite(report.max_rel_error),
         "tolerance": tolerance,
         "diagnostics": {name: _finite(figure) for name, figure in report.diagnostics.items()},
         "ok": not unsupported and report.max_rel_error <= tolerance,
         "unsupported": unsupported,
     }
+
+
+def _figure(error: float) -> str:
+    return f"{error:.1e}" if math.isfinite(error) else "non-finite"
 
 
 def _excluded(report: "GradientReport") -> str:
@@ -219,8 +227,8 @@ def print_table(report: "GradientReport", model: str, tolerance: float) -> None:
             state,
             name,
             str(len(rows)),
-            f"{np.median(errors):.1e}",
-            f"{max(errors):.1e}",
+            _figure(float(np.median(errors))),
+            _figure(max(errors)),
             f"{min(cosines):.6f}" if cosines else "-",
             f"{min(ratios):.4f} … {max(ratios):.4f}" if ratios else "-",
             style=style,
@@ -231,8 +239,10 @@ def print_table(report: "GradientReport", model: str, tolerance: float) -> None:
     console.print(_excluded(report))
     if report.checked and report.excluded > MANY_EXCLUDED * (report.checked + report.excluded):
         console.print("note: many states were left out, so this speaks for the others only")
+    for lost in report.nonfinite:
+        console.print(f"non-finite: {lost}", markup=False)
     verdict = "ok" if report.max_rel_error <= tolerance else "past the tolerance"
-    console.print(f"largest relative error {report.max_rel_error:.1e}, tolerance {tolerance:.1e}: {verdict}")
+    console.print(f"largest relative error {_figure(report.max_rel_error)}, tolerance {tolerance:.1e}: {verdict}")
 
 
 if __name__ == "__main__":

@@ -9,14 +9,13 @@ from dataclasses import dataclass, field
 
 import mujoco
 import numpy as np
-import torch
-from torch import Tensor
 
 from msk_ray.errors import ConfigError
-from msk_ray.gradcheck.oracle import INPUTS, Array, Linearization, Oracle, Point
+from msk_ray.gradcheck.nonfinite import NonFinite, find_nonfinite
+from msk_ray.gradcheck.oracle import Array, Linearization, Oracle, Point
+from msk_ray.gradcheck.pullback import simulated_gradients
 from msk_ray.gradcheck.states import STATE_KINDS, make_states
 from msk_ray.simulation import Backward, Simulation
-from msk_ray.simulation.backward import StepState
 
 _VANISHING = 1e-9
 """A reference gradient below this share of its cotangent is zero up to the rounding of the differences."""
@@ -73,6 +72,8 @@ class GradientReport:
     """States compared."""
     diagnostics: dict[str, float] = field(default_factory=dict)
     """What the simulation and its backward mode report of themselves, the largest over the kinds of state."""
+    nonfinite: list[NonFinite] = field(default_factory=list)
+    """States, compared or left out, at which the step or its gradient is not finite."""
 
     @property
     def excluded(self) -> int:
@@ -81,7 +82,9 @@ class GradientReport:
 
     @property
     def max_rel_error(self) -> float:
-        """The largest relative error; infinite where nothing could be compared, so that it never passes."""
+        """The largest relative error; infinite where anything is not finite or nothing could be compared: a failure."""
+        if self.nonfinite:
+            return math.inf
         return max((r.rel_error for r in self.results), default=math.inf)
 
     def of(self, name: str, state: str | None = None) -> list[Comparison]:
@@ -121,39 +124,6 @@ def forward_mismatch(oracle: Oracle, start: Point, expected: Point, actual: Poin
         float(np.linalg.norm(error[nv : 2 * nv])) / speed,
         float(np.max(np.abs(error[2 * nv :]), initial=0.0)),
     )
-
-
-def _stack(sim: Simulation, points: Sequence[Point], name: str) -> Tensor:
-    rows = np.stack([getattr(point, name) for point in points])
-    return torch.as_tensor(rows, dtype=torch.float32, device=sim.device).requires_grad_()
-
-
-def _numpy(tensor: Tensor) -> Array:
-    return tensor.detach().cpu().numpy().astype(np.float64)
-
-
-def simulated_gradients(
-    sim: Simulation, points: Sequence[Point], cotangents: Array
-) -> tuple[list[Point], dict[str, Array]]:
-    """Results of one env step of `sim` from W points, and gradients of ⟨cotangent, results⟩ in tangent coordinates.
-
-    Args:
-        points: one a world.
-        cotangents: tangent cotangents of (qpos', qvel', act'), shape (W, R).
-
-    Returns:
-        The results, and by input the gradients, shape (W, columns of that input).
-    """
-    inputs = {name: _stack(sim, points, name) for name in INPUTS}
-    end = sim.step(**inputs)
-    weights = torch.as_tensor(cotangents, dtype=torch.float32, device=sim.device)
-    on_qpos, on_qvel, on_act = weights.split([sim.model.nv, sim.model.nv, sim.model.na], dim=1)
-    raw = StepState(sim.tangent.lift(end.qpos.detach(), on_qpos), on_qvel, on_act)
-    gradients = dict(zip(inputs, torch.autograd.grad(end, list(inputs.values()), list(raw)), strict=True))
-    gradients["qpos"] = sim.tangent.project(inputs["qpos"].detach(), gradients["qpos"])
-    arrays = [_numpy(value) for value in end]
-    ends = [Point(point.ctrl, *(array[w] for array in arrays)) for w, point in enumerate(points)]
-    return ends, {name: _numpy(value) for name, value in gradients.items()}
 
 
 def check_gradients(
@@ -208,6 +178,10 @@ def check_gradients(
         for name, figure in sim.diagnostics().items():  # raises if contacts were lost
             report.diagnostics[name] = max(report.diagnostics.get(name, -math.inf), figure)
         for world, (point, end) in enumerate(zip(points, ends, strict=True)):
+            own = {name: gradient[world] for name, gradient in gradients.items()}
+            lost = find_nonfinite(sim, kind, world, point, end, own)
+            if lost is not None:
+                report.nonfinite.append(lost)
             reference = oracle.linearize(point)
             if forward_mismatch(oracle, point, reference.end, end) > limits.forward_mismatch:
                 report.forward_mismatches += 1
@@ -215,7 +189,7 @@ def check_gradients(
                 report.kinks += 1
             else:
                 report.checked += 1
-                report.results += _comparisons(kind, world, reference, cotangents[world], gradients)
+                report.results += _comparisons(kind, world, reference, cotangents[world], own)
     return report
 
 
@@ -224,6 +198,6 @@ def _comparisons(
 ) -> list[Comparison]:
     norm = float(np.linalg.norm(cotangent))
     return [
-        Comparison(kind, world, name, *compare(gradients[name][world], expected, norm))
+        Comparison(kind, world, name, *compare(gradients[name], expected, norm))
         for name, expected in reference.pull_back(cotangent).items()
     ]

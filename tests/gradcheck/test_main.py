@@ -8,12 +8,38 @@ import pytest
 
 from msk_ray.cli import run
 from msk_ray.gradcheck.__main__ import main
+from msk_ray.simulation import Simulation, TapePerSubstep
+from msk_ray.simulation.modes import BACKWARD_MODES
 
 FAST = ["--worlds", "2", "--states", "random"]
 UNSUPPORTED = """
 <mujoco><worldbody>
   <body mocap="true"/><body><joint/><geom size=".1"/></body>
 </worldbody></mujoco>"""
+
+
+class NanSlope(TapePerSubstep):
+    """The gradient by the second velocity is NaN where the first velocity of the first state has a cotangent."""
+
+    def record(self, ctrl, start, end):
+        if not hasattr(self, "_first"):
+            self._first = start.qpos[0].clone()
+        return (*super().record(ctrl, start, end), (start.qpos == self._first).all(-1))
+
+    def vjp(self, saved, cotangent, needs):
+        *own, first = saved
+        gradients = super().vjp(tuple(own), cotangent, needs)
+        gradients.qvel[first & (cotangent.qvel[:, 0] != 0), 1] = float("nan")
+        return gradients
+
+
+_ADVANCE = Simulation.advance
+
+
+def _nan_velocity(sim, ctrl, start):
+    end = _ADVANCE(sim, ctrl, start)
+    end.qvel[1, 1] = float("nan")
+    return end
 
 
 def test_table_and_success(cartpole_file, capsys):
@@ -36,6 +62,29 @@ def test_a_config_stands_for_its_model(root, capsys):
 def test_past_tolerance(cartpole_file, capsys):
     assert run(main, [str(cartpole_file), *FAST, "--tolerance", "1e-12"]) == 1
     assert "past the tolerance" in capsys.readouterr().out
+
+
+def test_nonfinite_elements_are_named(cartpole_file, capsys, monkeypatch):
+    """The gradient by the pole's velocity is NaN wherever the cart's velocity counts, at one of two states."""
+    monkeypatch.setitem(BACKWARD_MODES, "tape_per_substep", NanSlope)
+    assert run(main, [str(cartpole_file), *FAST]) == 1
+    out = capsys.readouterr().out
+    assert "non-finite: state 0 of random: the slope of qvel of joint slide by qvel of joint hinge\n" in out
+    assert "largest relative error non-finite, tolerance 1.0e-02: past the tolerance" in out
+    assert "inf" not in out.replace("non-finite", "")
+    assert run(main, [str(cartpole_file), *FAST, "--json"]) == 1
+    report = json.loads(capsys.readouterr().out)
+    assert report["nonfinite"] == [
+        {"state": "random", "world": 0, "results": ["qvel of joint slide"], "inputs": ["qvel of joint hinge"]}
+    ]
+    assert report["ok"] is False
+
+
+def test_a_step_that_is_not_finite_fails_though_no_state_can_be_compared(cartpole_file, capsys, monkeypatch):
+    monkeypatch.setattr(Simulation, "advance", _nan_velocity)
+    assert run(main, [str(cartpole_file), *FAST]) == 1
+    out = capsys.readouterr().out
+    assert "non-finite: state 1 of random: the step's qvel of joint hinge\n" in out
 
 
 def test_json(cartpole_file):
