@@ -6,7 +6,8 @@ only that law is differentiated. Local axes (e, f) are signed unit vectors of a 
 """
 
 import warp as wp
-from mujoco_warp._src.collision_primitive_core import sphere_box
+
+from msk_ray.physics.adjoint.pair_laws import sphere_box_contact
 
 wp.set_module_options({"enable_backward": False})
 
@@ -164,7 +165,7 @@ def capsule_contact(
 ) -> tuple[wp.float32, wp.vec3, wp.vec3]:
     """Contact of the capsule's sphere at the law's place with the box."""
     centre = pos + axis * axis_place(pos, axis, box_pos, box_mat, law)
-    dist, point, normal = sphere_box(centre, radius, box_pos, box_mat, box_size)
+    dist, point, normal = sphere_box_contact(centre, radius, box_pos, box_mat, box_size)
     return dist, point, normal
 
 

@@ -1,8 +1,9 @@
 """How a contact's distance, point and frame move with the two bodies, by pair of geometries.
 
 Plane against sphere, capsule, box or mesh: the core of the other geom that is nearest the plane (centre, end, corner,
-vertex) is fixed to its body. Sphere against sphere, capsule, cylinder or box, capsule against capsule, and plane
-against cylinder or ellipsoid: the collision function itself is differentiated. Boxes against boxes and capsules: the
+vertex) is fixed to its body; against a cylinder it also runs around the rim. Sphere against sphere, capsule, cylinder
+or box, capsule against capsule, and plane against ellipsoid: the collision function itself is differentiated
+(`pair_laws`). Boxes against boxes and capsules: the
 law of the features that touch (`box_laws`). Any other pair: the distance moves by n·(relative velocity at the point),
 exactly; the point and the frame are taken to follow the mean of both bodies.
 """
@@ -12,19 +13,18 @@ from typing import Any, NamedTuple
 
 import mujoco
 import warp as wp
-from mujoco_warp._src.collision_primitive_core import (
-    capsule_capsule,
-    plane_cylinder,
-    plane_ellipsoid,
-    sphere_box,
-    sphere_capsule,
-    sphere_cylinder,
-    sphere_sphere,
-)
 from mujoco_warp._src.math import make_frame
 from mujoco_warp._src.types import GeomType
 
 from msk_ray.physics.adjoint.box_pairs import box_box_wrenches, capsule_box_wrenches
+from msk_ray.physics.adjoint.pair_laws import (
+    SCORED_PAIRS,
+    ParallelLaw,
+    is_scored,
+    pair_score,
+    parallel_law,
+    rim_torque,
+)
 from msk_ray.physics.adjoint.spatial import column, turning_torque, wrench
 
 wp.set_module_options({"enable_backward": False})
@@ -44,62 +44,6 @@ def frame_score(normal: wp.vec3, axis: wp.vec3, along_axis: wp.int32, weight: wp
         frame = make_frame(normal)
         score = wp.dot(weight[0], frame[0]) + wp.dot(weight[1], frame[1]) + wp.dot(weight[2], frame[2])
     return score
-
-
-@wp.func
-def pair_score(
-    type1: wp.int32,
-    type2: wp.int32,
-    index: wp.int32,
-    pos1: wp.vec3,
-    mat1: wp.mat33,
-    size1: wp.vec3,
-    pos2: wp.vec3,
-    mat2: wp.mat33,
-    size2: wp.vec3,
-    dist_weight: wp.float32,
-    pos_weight: wp.vec3,
-    normal_weight: wp.vec3,
-) -> wp.float32:
-    """Weighted sum of (dist, pos, normal) of contact `index` of a pair, by mujoco_warp's own collision functions."""
-    axis1 = column(mat1, 2)
-    axis2 = column(mat2, 2)
-    score = wp.float32(0.0)
-    if type1 == GeomType.SPHERE and type2 == GeomType.SPHERE:
-        dist_a, pos_a, normal_a = sphere_sphere(pos1, size1[0], pos2, size2[0])
-        score = dist_weight * dist_a + wp.dot(pos_weight, pos_a) + wp.dot(normal_weight, normal_a)
-    elif type1 == GeomType.SPHERE and type2 == GeomType.CAPSULE:
-        dist_b, pos_b, normal_b = sphere_capsule(pos1, size1[0], pos2, axis2, size2[0], size2[1])
-        score = dist_weight * dist_b + wp.dot(pos_weight, pos_b) + wp.dot(normal_weight, normal_b)
-    elif type1 == GeomType.SPHERE and type2 == GeomType.CYLINDER:
-        dist_c, pos_c, normal_c = sphere_cylinder(pos1, size1[0], pos2, axis2, size2[0], size2[1])
-        score = dist_weight * dist_c + wp.dot(pos_weight, pos_c) + wp.dot(normal_weight, normal_c)
-    elif type1 == GeomType.SPHERE and type2 == GeomType.BOX:
-        dist_d, pos_d, normal_d = sphere_box(pos1, size1[0], pos2, mat2, size2)
-        score = dist_weight * dist_d + wp.dot(pos_weight, pos_d) + wp.dot(normal_weight, normal_d)
-    elif type1 == GeomType.CAPSULE and type2 == GeomType.CAPSULE:
-        dist_e, pos_e, normal_e = capsule_capsule(pos1, axis1, size1[0], size1[1], pos2, axis2, size2[0], size2[1])
-        score = dist_weight * dist_e[index]
-        score += wp.dot(pos_weight, pos_e[index]) + wp.dot(normal_weight, normal_e[index])
-    elif type1 == GeomType.PLANE and type2 == GeomType.CYLINDER:
-        dist_f, pos_f, normal_f = plane_cylinder(axis1, pos1, pos2, axis2, size2[0], size2[1])
-        score = dist_weight * dist_f[index] + wp.dot(pos_weight, pos_f[index]) + wp.dot(normal_weight, normal_f)
-    elif type1 == GeomType.PLANE and type2 == GeomType.ELLIPSOID:
-        dist_g, pos_g, normal_g = plane_ellipsoid(axis1, pos1, pos2, mat2, size2)
-        score = dist_weight * dist_g + wp.dot(pos_weight, pos_g) + wp.dot(normal_weight, normal_g)
-    return score
-
-
-@wp.func
-def is_scored(type1: int, type2: int) -> bool:
-    """Whether `pair_score` knows the pair."""
-    if type1 == GeomType.SPHERE:
-        return (
-            type2 == GeomType.SPHERE or type2 == GeomType.CAPSULE or type2 == GeomType.CYLINDER or type2 == GeomType.BOX
-        )
-    if type1 == GeomType.CAPSULE:
-        return type2 == GeomType.CAPSULE
-    return type1 == GeomType.PLANE and (type2 == GeomType.CYLINDER or type2 == GeomType.ELLIPSOID)
 
 
 class PairKinds(NamedTuple):
@@ -200,16 +144,21 @@ def pull_geometry_kernel(kinds: PairKinds) -> Any:
             if known:
                 size1 = geom_size[worldid % geom_size.shape[0], geoms[0]]
                 size2 = geom_size[worldid % geom_size.shape[0], geoms[1]]
-                _t1, _t2, _i, pos1_bar, mat1_bar, _s1, pos2_bar, mat2_bar, _s2, _d, _p, _n = wp.grad(pair_score)(
+                law = ParallelLaw()
+                if type1 == GeomType.CAPSULE:
+                    law = parallel_law(
+                        contact_index_in[con], pos1, column(mat1, 2), size1[1], pos2, column(mat2, 2), size2[1]
+                    )
+                _t1, _t2, pos1_bar, mat1_bar, _s1, pos2_bar, mat2_bar, _s2, _l, _d, _p, _n = wp.grad(pair_score)(
                     type1,
                     type2,
-                    contact_index_in[con],
                     pos1,
                     mat1,
                     size1,
                     pos2,
                     mat2,
                     size2,
+                    law,
                     dist_bar,
                     pos_bar,
                     normal_bar,
@@ -257,7 +206,7 @@ def pull_geometry_kernel(kinds: PairKinds) -> Any:
                     )
         if not known and type1 == GeomType.PLANE:
             # The core of the other geom that is nearest the plane is fixed to its body: a sphere's centre, a capsule's
-            # end, a box's corner, a mesh's vertex.
+            # end, a box's corner, a mesh's vertex; a cylinder's rim point also runs around the rim.
             radius = float(0.0)
             if type2 == GeomType.SPHERE or type2 == GeomType.CAPSULE:
                 radius = geom_size[worldid % geom_size.shape[0], geoms[1]][0]
@@ -272,6 +221,10 @@ def pull_geometry_kernel(kinds: PairKinds) -> Any:
             # n turns with the plane: dn = ω × n  ⇒  torque n × n̄
             force1 = -reach * normal
             torque1 = wp.cross(normal, turned)
+            if type2 == GeomType.CYLINDER:
+                around = rim_torque(normal, column(mat2, 2), core - pos2, force2)
+                torque2 += around
+                torque1 -= around
         if not known and type1 != GeomType.PLANE:
             # dist moves with n·(u₂ - u₁) at the point; point and frame with the mean of both bodies.
             spin = wp.cross(frame[0], weight[0]) + wp.cross(frame[1], weight[1]) + wp.cross(frame[2], weight[2])
@@ -288,15 +241,6 @@ def pull_geometry_kernel(kinds: PairKinds) -> Any:
 
     return pull_geometry
 
-
-SCORED_PAIRS = frozenset(
-    {
-        *((int(GeomType.SPHERE), int(t)) for t in (GeomType.SPHERE, GeomType.CAPSULE, GeomType.CYLINDER, GeomType.BOX)),
-        (int(GeomType.CAPSULE), int(GeomType.CAPSULE)),
-        *((int(GeomType.PLANE), int(t)) for t in (GeomType.CYLINDER, GeomType.ELLIPSOID)),
-    }
-)
-"""Geometry types, ascending, that `pair_score` knows."""
 
 BOX_PAIRS = frozenset({(int(GeomType.BOX), int(GeomType.BOX)), (int(GeomType.CAPSULE), int(GeomType.BOX))})
 """Those that `box_laws` knows."""

@@ -173,7 +173,9 @@ def pull_rows(
                 a = qacc_in[worldid, dof + i]
                 axis_bar[i] = -(bars[2] * lam_in[worldid, dof + i] + vel_bar * v + y * a)
             across = axis_bar - axis * wp.dot(axis, axis_bar)
-            moved = -pos_bar * axis + 0.5 / wp.tan(0.5 * turn[3]) * across + 0.5 * wp.cross(axis_bar, axis)
+            moved = -pos_bar * axis + 0.5 * wp.cross(axis_bar, axis)
+            if turn[3] > 0.0:  # without a rotation there is no axis, and mujoco_warp's row is zero
+                moved += 0.5 / wp.tan(0.5 * turn[3]) * across
             for i in range(3):
                 wp.atomic_add(phi_qpos_out, worldid, dof + i, moved[i])
                 wp.atomic_add(phi_qvel_out, worldid, dof + i, -vel_bar * axis[i])

@@ -107,7 +107,8 @@ def start_tendons(
             x = length - rest[1]
         elif length < rest[0]:
             x = length - rest[0]
-        if x != 0.0:
+        # A spring without a dead band has its stiffness at rest too.
+        if x != 0.0 or rest[0] == rest[1]:
             lam_bar += x * (stiffness + poly[0] * x + poly[1] * x * x)
             length_bar += rate_l * _poly_force_deriv(stiffness, poly, x, 0)
     if damper_on:
@@ -211,9 +212,14 @@ def weigh(rates: Rates, fields: Fields) -> wp.spatial_vector:
 
 @wp.func
 def segment_turn(start: wp.vec3, end: wp.vec3, slide: wp.vec3) -> wp.vec3:
-    """Cotangent of the segment's end (minus that of its start): n̄ = Σ ρ̄ Δu ,  dn = (1 - n nᵀ) dp / |p|."""
+    """Cotangent of the segment's end (minus that of its start): n̄ = Σ ρ̄ Δu ,  dn = (1 - n nᵀ) dp / |p|.
+
+    Zero for a segment without length, which has no direction that could turn.
+    """
     dif = end - start
     length = wp.length(dif)
+    if length == 0.0:
+        return wp.vec3(0.0)
     n = dif / length
     return (slide - n * wp.dot(n, slide)) / length
 
