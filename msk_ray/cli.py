@@ -11,8 +11,10 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import NoReturn
 
 from msk_ray.errors import MskRayError, StorageFailure, brief
+from msk_ray.text import printable
 
 RESUMABLE = 75
 """Exit code of a run that was asked to stop and saved its state (EX_TEMPFAIL)."""
@@ -35,20 +37,37 @@ class Parser(argparse.ArgumentParser):
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
 
+    def error(self, message: str) -> NoReturn:
+        """Say what is wrong with the command line on one line that is safe for a terminal, and exit with 2."""
+        super().error(printable(message))
+
 
 def typed_command(argv: Sequence[str], *more: str) -> str:
     """A process's arguments as one would type them, and `more` options that are not among them yet."""
     program = Path(argv[0])
-    if program.name == "__main__.py":
-        # `python -m msk_ray.tune` shows up as the path of the file it runs.
-        parts = program.parent.parts
-        start = parts.index("msk_ray") if "msk_ray" in parts else len(parts) - 1
-        words = ["python", "-m", ".".join(parts[start:])]
-    elif program.parent.name == "msk_ray" and program.suffix == ".py":
-        words = ["python", "-m", f"msk_ray.{program.stem}"]
+    # `python -m msk_ray.tune` shows up as the path of the file it runs.
+    module = _module_of(program)
+    if module is None and program.name == "__main__.py":
+        module = program.parent.name
+    if module is not None:
+        words = ["python", "-m", module]
     else:
         words = ["python", program.name] if program.suffix == ".py" else [program.name]
     return shlex.join([*words, *argv[1:], *(option for option in more if option not in argv)])
+
+
+def _module_of(program: Path) -> str | None:
+    """The module of this package that a file is, in this checkout or another one; None if it is none.
+
+    Told by what this package holds: the checkout's folder, or any other on the way, may be called msk_ray too.
+    """
+    package = Path(__file__).resolve().parent
+    for place, part in enumerate(program.parts):
+        inside = Path(*program.parts[place + 1 :])
+        if part == package.name and inside.suffix == ".py" and (package / inside).is_file():
+            names = inside.with_suffix("").parts
+            return ".".join([package.name, *(names[:-1] if names[-1] == "__main__" else names)])
+    return None
 
 
 def run(main: Callable[[Sequence[str] | None], int], argv: Sequence[str] | None = None) -> int:
@@ -56,7 +75,7 @@ def run(main: Callable[[Sequence[str] | None], int], argv: Sequence[str] | None 
     try:
         return main(argv)
     except MskRayError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {printable(str(error))}", file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
@@ -68,7 +87,10 @@ def run(main: Callable[[Sequence[str] | None], int], argv: Sequence[str] | None 
     except OSError as error:
         if error.errno != errno.ENAMETOOLONG:
             raise
-        print(f"error: {brief(error.filename)}: too long for the name of a file; write a shorter one", file=sys.stderr)
+        print(
+            f"error: {printable(brief(error.filename))}: too long for the name of a file; write a shorter one",
+            file=sys.stderr,
+        )
         return MskRayError.exit_code
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from msk_ray.cli import Parser, run
 from msk_ray.errors import MskRayError, StorageError
 from msk_ray.progress import format_duration
+from msk_ray.text import printable
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.outcomes import Outcome
 from msk_ray.tune.standing import (
@@ -96,7 +97,7 @@ def view(observer: Observer, width: int, rows: int | None = None) -> "Renderable
     from rich.text import Text
 
     standings = observer.look(time.time())
-    lines: list[RenderableType] = [Text(headline(observer.experiment, standings))]
+    lines: list[RenderableType] = [Text(printable(headline(observer.experiment, standings)))]
     if not standings:
         return Group(*lines, Text("no trial has started yet"))
     shown = standings if rows is None else standings[: max(1, rows)]
@@ -105,9 +106,10 @@ def view(observer: Observer, width: int, rows: int | None = None) -> "Renderable
         lines.append(Text(f"... and {len(standings) - len(shown)} more", style="dim"))
     if width < WIDE:  # a wide table has a column for it
         told = [s for s in shown if s.state is State.UNREADABLE or s.outcome in (Outcome.ERROR, Outcome.OUT_OF_MEMORY)]
-        lines += [Text(f"{s.id}: {s.note}", style="red") for s in told]
+        lines += [Text(printable(f"{s.id}: {s.note}"), style="red") for s in told]
     if observer.experiment.stop_file.exists() and any(s.state is not State.ENDED for s in standings):
-        lines.append(Text(f"stopped on request; go on with: {observer.experiment.resume_command()}"))
+        command = printable(observer.experiment.resume_command())
+        lines.append(Text(f"stopped on request; go on with: {command}"))
     return Group(*lines)
 
 
@@ -127,6 +129,7 @@ def trial_table(standings: Sequence[Standing], width: int) -> "Table":
     """One row a trial. Only what was changed, half the worlds too, may wrap; a wide table shows hosts and reasons."""
     from rich import box
     from rich.table import Table
+    from rich.text import Text
 
     wide = width >= WIDE
     table = Table(box=box.SIMPLE_HEAD, width=width, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
@@ -143,7 +146,8 @@ def trial_table(standings: Sequence[Standing], width: int) -> "Table":
     seeds = len({standing.seed for standing in standings}) > 1
     for standing in standings:
         style = "red" if standing.outcome in _FAILED else _STYLES.get(standing.state, "")
-        table.add_row(*_cells(standing, wide, seeds), style=style)
+        # As Text: rich would take brackets and colons in a label for markup and emoji.
+        table.add_row(*(Text(printable(cell)) for cell in _cells(standing, wide, seeds)), style=style)
     return table
 
 
@@ -215,6 +219,7 @@ def _over(observer: Observer) -> bool:
 def _list(storage: Path) -> int:
     from rich import box
     from rich.table import Table
+    from rich.text import Text
 
     paths = find_experiments(storage)
     if not paths:
@@ -225,7 +230,7 @@ def _list(storage: Path) -> int:
     table.add_column("state", ratio=2, overflow="fold")
     table.add_column("question", ratio=3, no_wrap=True, overflow="ellipsis")
     for path in paths:
-        table.add_row(path.name, *_summary(Experiment(path)))
+        table.add_row(*(Text(printable(cell)) for cell in (path.name, *_summary(Experiment(path)))))
     _console().print(table)
     return 0
 

@@ -9,6 +9,7 @@ from msk_ray.cli import RESUMABLE, TERMINAL_LOG, Parser, StopRequest, outliving,
 from msk_ray.config import SET_HELP, Config, load_config
 from msk_ray.errors import CheckpointError, StorageError
 from msk_ray.files import check_writable, make_folder
+from msk_ray.text import printable
 
 DESCRIPTION = """\
 Train one policy with SHAC: one trial, in this process, without Ray.
@@ -84,7 +85,7 @@ def _train(config: Config, logdir: Path, device: str | None, resume: bool, resum
     if resume:
         path, faults = trainer.restore_latest()
         for fault in faults:
-            print(f"skipped: {fault}")
+            print(f"skipped: {printable(fault)}")
         print(f"resumed from {path}" if path else "no whole checkpoint yet: starting anew")
     progress = Progress(config.trial.epochs, trainer.epoch)
     while not trainer.finished and not stop:
@@ -94,7 +95,7 @@ def _train(config: Config, logdir: Path, device: str | None, resume: bool, resum
         trainer.save()
         trainer.close()
         assert stop.signal is not None
-        print(f"stopped by {stop.signal.name} after epoch {trainer.epoch}; go on with: {resume_command}")
+        print(f"stopped by {stop.signal.name} after epoch {trainer.epoch}; go on with: {printable(resume_command)}")
         return RESUMABLE
     trainer.close()
     if math.isfinite(trainer.best_score):

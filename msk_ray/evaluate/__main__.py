@@ -12,6 +12,7 @@ from msk_ray.errors import CheckpointError, MskRayError
 from msk_ray.evaluate.targets import Kind, Target, best_checkpoint, best_of_trial, find_target
 from msk_ray.experiment.checkpoint_file import read_facts
 from msk_ray.files import write_json
+from msk_ray.text import printable
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.halved import read_halved
 from msk_ray.tune.listing import text_table
@@ -160,7 +161,7 @@ def evaluate_experiment(experiment: Experiment, bench: "Bench", requests: "Seque
                 store_evaluation(eval_file_of(path), entry)
             except MskRayError as error:
                 failed[trial.id] = str(error)
-                print(f"{number}/{len(trials)}  {trial.id}  {error}", flush=True)
+                print(f"{number}/{len(trials)}  {trial.id}  {printable(str(error))}", flush=True)
                 continue
             halved = read_halved(experiment.trial_folder(trial.id))
             name = trial.variant + (f" ({halved})" if halved is not None else "")

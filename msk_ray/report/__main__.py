@@ -13,6 +13,7 @@ from msk_ray.files import make_folder
 from msk_ray.report.best import Best, look_at_best
 from msk_ray.report.page import compare, make_section, write_page
 from msk_ray.report.reading import Condition, Reading, check_folder, read_experiment
+from msk_ray.text import printable
 
 DESCRIPTION = """\
 Write one self-contained page about an experiment, or several side by side: learning curves, the ablation table with
@@ -76,8 +77,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     page = write_page(sections, together, folder, now, command)
     for reading in readings:
         for note in reading.notes:
-            print(f"{reading.name}: {note}")
-    print(f"report       {page}")
+            print(printable(f"{reading.name}: {note}"))
+    print(printable(f"report       {page}"))
     return 0
 
 

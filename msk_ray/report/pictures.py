@@ -10,6 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
+from msk_ray.text import printable
+
 Draw = Callable[[Figure, bool], None]
 """Draws into an empty figure; told whether it is the narrow one."""
 
@@ -79,8 +81,9 @@ def steps_axis(axes: Axes) -> None:
 
 
 def shorten(text: str, length: int) -> str:
-    """`text`, cut to `length` characters."""
-    return text if len(text) <= length else text[: length - 1] + "…"
+    """`text` on one line, cut to `length` characters, for a picture: a dollar sign begins no formula there."""
+    line = printable(text)
+    return (line if len(line) <= length else line[: length - 1] + "…").replace("$", "\\$")
 
 
 def format_steps(steps: float) -> str:

@@ -13,6 +13,7 @@ from msk_ray.cli import RESUMABLE, TERMINAL_LOG, Parser, outliving, run
 from msk_ray.config import SET_HELP, combine, dump_yaml, parse_overrides, read_yaml
 from msk_ray.errors import ConfigError
 from msk_ray.files import make_folder
+from msk_ray.text import printable, printable_lines
 from msk_ray.tune import experiment as experiments
 from msk_ray.tune.budget import extreme_configs
 from msk_ray.tune.extension import extended_space, parse_extension
@@ -213,14 +214,15 @@ def _read_space(args: argparse.Namespace, extension: Mapping[str, Any]) -> Space
 
 def _print_trials(space: Space, trials: list[Trial]) -> None:
     width = shutil.get_terminal_size((120, 24)).columns
-    print(space.file.question.strip() + "\n")
+    print(printable_lines(space.file.question.strip()) + "\n")
     if space.file.search == "optuna":
         print(f"{space.file.samples} trials, chosen by optuna as results come in, over:")
         print(dump_yaml(space.file.parameters), end="")
     else:
         print(text_table(("#", "id", "changed", "seed", "epochs"), trial_rows(trials), width))
     print(
-        f"\n{len(trials) or space.file.samples} trials · scheduler {space.file.scheduler.kind} · base {space.file.base}"
+        f"\n{len(trials) or space.file.samples} trials · scheduler {space.file.scheduler.kind} · "
+        f"base {printable(space.file.base)}"
     )
 
 
@@ -234,7 +236,8 @@ def _debug(args: argparse.Namespace, space: Space, trial: Trial) -> int:
     folder = (args.storage / "debug" / f"{space.name}_{trial.id}_{time.strftime('%Y%m%d_%H%M%S')}").resolve()
     make_folder(folder)
     device = "cpu" if args.cpu or local_gpus() == 0 else "cuda:0"
-    print(f"trial {trial.index} ({trial.id}): {trial.variant} seed={trial.seed} on {device}; into {folder}", flush=True)
+    where = printable(f"{trial.variant} seed={trial.seed} on {device}; into {folder}")
+    print(f"trial {trial.index} ({trial.id}): {where}", flush=True)
     hooks = Hooks(
         on_evaluation=lambda e, ended, trainer: print(
             f"epoch {e.epoch}/{trial.epochs}  score {e.score:.5g}", flush=True
@@ -242,7 +245,7 @@ def _debug(args: argparse.Namespace, space: Space, trial: Trial) -> int:
     )
     ending = run_trial(trial, folder, device, space.file.stop, Trainer, hooks)
     assert ending is not None  # nobody pauses it
-    print(f"{ending.outcome}: {ending.why}")
+    print(f"{ending.outcome}: {printable(ending.why)}")
     return 1 if read_record(trial, folder).errored else 0
 
 
@@ -292,7 +295,7 @@ def _run(
             completed = runner.run_trials(runner.Plan(experiment, space, trials, placement, limit))
         errors = finish(experiment)
         if not completed:
-            print(f"stopped on request; go on with: {experiment.resume_command()}")
+            print(f"stopped on request; go on with: {printable(experiment.resume_command())}")
             return RESUMABLE
         write_report(experiment)
     return 1 if errors else 0

@@ -31,6 +31,7 @@ from msk_ray.config import dump_yaml, parse_config, read_yaml
 from msk_ray.errors import MskRayError, StorageError, StorageFailure, brief
 from msk_ray.files import check_writable, make_folder, write_json, write_text
 from msk_ray.nvidia_smi import ask_driver
+from msk_ray.text import printable
 from msk_ray.tune.extension import extend_trials
 from msk_ray.tune.outcomes import OUTCOME_FILE, Outcome, read_ending
 from msk_ray.tune.space import Space, SpaceFile
@@ -195,7 +196,9 @@ class Experiment:
         except (MskRayError, ValidationError) as error:
             # Nothing hangs on it but this check and the report.
             text = " ".join(str(error).split())
-            print(f"whether the space's scheduler is still the one trials were stopped by is not known: {text}")
+            print(
+                f"whether the space's scheduler is still the one trials were stopped by is not known: {printable(text)}"
+            )
             return
         now = space.file.scheduler.model_dump()
         changes = [f"{key} {recorded[key]} → {now[key]}" for key in now if now[key] != recorded[key]]

@@ -2,12 +2,14 @@
 
 from collections.abc import Sequence
 
+from msk_ray.text import printable
 from msk_ray.tune.trials import Trial
 
 
 def text_table(header: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> str:
-    """A table for a terminal of `width` columns; the last column is cut, never the others."""
-    body = [list(header), *[list(row) for row in rows]]
+    """A table for a terminal of `width` columns; the last column is cut, never the others. Control characters in a cell
+    are shown, not obeyed."""
+    body = [[printable(cell) for cell in row] for row in (header, *rows)]
     widths = [max(len(line[column]) for line in body) for column in range(len(header))]
     lines = []
     for number, line in enumerate(body):

@@ -15,6 +15,7 @@ from ray.tune import Callback
 from msk_ray.cli import StopRequest
 from msk_ray.errors import StorageFailure, storage_failure
 from msk_ray.progress import format_duration
+from msk_ray.text import printable, printable_lines
 from msk_ray.tune.adapters import BEST, METRIC, STARTS_ANEW
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.halved import Halved, read_halved
@@ -166,7 +167,7 @@ class Live(Callback):
         self._ended += 1
         compared = ending.outcome in (Outcome.STOPPED_ASHA, Outcome.STOPPED_MEDIAN)  # their reason names the score
         score = "" if run is None or compared or run.best == float("-inf") else f"; best score {run.best:.5g}"
-        self._say(f"{mine.id} {ending.outcome}: {ending.why}{score}{self._in_brackets(mine)}")
+        self._say(f"{mine.id} {ending.outcome}: {printable(ending.why)}{score}{self._in_brackets(mine)}")
 
     def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         if self._meet_storage_failure(trial):
@@ -223,7 +224,7 @@ class Live(Callback):
         self._running.pop(trial_id, None)
         if self.storage_failure is None:
             self.storage_failure = failure
-            self._say(f"{trial_id} {failure}; stopping all trials ...")
+            self._say(f"{trial_id} {printable(str(failure))}; stopping all trials ...")
         if self._stopping_since is None:
             self._stop_trials()
         self._saving.discard(trial_id)
@@ -244,10 +245,11 @@ class Live(Callback):
         self._say(f"{self._stop.signal.name}: {len(self._saving)} trials save themselves at the end of their epoch ...")
 
     def _say(self, text: str) -> None:
-        print(f"[{format_duration(time.monotonic() - self._start):>6}] {text}", file=self._out, flush=True)
+        shown = printable_lines(text)
+        print(f"[{format_duration(time.monotonic() - self._start):>6}] {shown}", file=self._out, flush=True)
 
     def _name(self, trial: Trial) -> str:
-        return f"{trial.variant} seed={trial.seed}{self._in_brackets(trial)}"
+        return f"{printable(trial.variant)} seed={trial.seed}{self._in_brackets(trial)}"
 
     def _in_brackets(self, trial: Trial) -> str:
         """That a trial runs with half its worlds, if it does."""
@@ -257,7 +259,7 @@ class Live(Callback):
     def _reason(self, mine: Trial, trial: Any) -> str:
         """Why a trial's process ended before its time, on one line."""
         counted = trial.num_failures - (mine.id in self._starting_anew)
-        return _reason(self._experiment.trial_folder(mine.id), trial, counted)
+        return printable(_reason(self._experiment.trial_folder(mine.id), trial, counted))
 
 
 def _error_of(trial: Any) -> Exception | None:

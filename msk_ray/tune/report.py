@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 from msk_ray.files import write_json, write_text
+from msk_ray.text import printable
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.listing import text_table
 from msk_ray.tune.records import best_record, read_records
@@ -37,10 +38,10 @@ def finish(experiment: Experiment) -> int:
     if best is not None and best.best is not None:
         half = f" ({best.halved})" if best.halved is not None else ""
         name = f"{best.trial.variant} seed={best.trial.seed}{half}"
-        print(f"\nbest trial   {best.trial.id}: {name}, score {best.best.score:.5g}")
-        print(f"best policy  {best.best_checkpoint or 'its checkpoint is missing'}")
-    print(f"table        {experiment.path / 'table.md'}")
-    print(f"trials       {experiment.path / 'trials'}", flush=True)
+        print(f"\nbest trial   {best.trial.id}: {printable(name)}, score {best.best.score:.5g}")
+        print(f"best policy  {printable(str(best.best_checkpoint or 'its checkpoint is missing'))}")
+    print(printable(f"table        {experiment.path / 'table.md'}"))
+    print(printable(f"trials       {experiment.path / 'trials'}"), flush=True)
     return sum(record.errored for record in records)
 
 

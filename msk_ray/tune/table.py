@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from msk_ray.text import markdown_cell, markdown_text, printable
 from msk_ray.tune.records import TrialRecord, best_record
 
 HEADER = ("trial", "changed", "seed", "score", "at epoch", "epochs", "stopped", "path", "why")
@@ -42,9 +43,9 @@ def variant_rows(records: Sequence[TrialRecord]) -> list[tuple[str, ...]]:
 
 
 def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table."""
+    """A Markdown table that shows its cells as they are, whatever is in them."""
     lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines) + "\n"
+    return "\n".join("| " + " | ".join(markdown_cell(cell) for cell in line) + " |" for line in lines) + "\n"
 
 
 def summary(name: str, question: str, records: Sequence[TrialRecord]) -> dict[str, Any]:
@@ -60,7 +61,11 @@ def summary(name: str, question: str, records: Sequence[TrialRecord]) -> dict[st
 
 def table_document(name: str, question: str, records: Sequence[TrialRecord]) -> str:
     """The Markdown report of an experiment."""
-    parts = [f"# {name}\n", f"{question}\n" if question else "", markdown(HEADER, result_rows(records))]
+    parts = [
+        f"# {markdown_text(name)}\n",
+        f"{markdown_text(question)}\n" if question else "",
+        markdown(HEADER, result_rows(records)),
+    ]
     if len({record.trial.seed for record in records}) > 1:
         header = ("variant", "seeds", "mean score", "std", "min", "max")
         parts += ["By variant, over seeds:\n", markdown(header, variant_rows(records))]
@@ -72,7 +77,8 @@ def table_document(name: str, question: str, records: Sequence[TrialRecord]) -> 
     best = best_record(records)
     if best is not None:
         half = f", {best.halved}" if best.halved is not None else ""
-        parts.append(f"Best policy: `{_relative(best)}` ({best.trial.variant}, seed {best.trial.seed}{half}).\n")
+        variant = markdown_text(printable(best.trial.variant))
+        parts.append(f"Best policy: `{_relative(best)}` ({variant}, seed {best.trial.seed}{half}).\n")
     if (note := halved_note(records)) is not None:
         parts.append(f"{note}\n")
     parts.append(f"Curves and more: [report](report/index.html), by `python -m msk_ray.report {name}`.\n")

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from matplotlib.figure import Figure
 
 from msk_ray.cli import run
 from msk_ray.config import dump_yaml
@@ -16,6 +17,7 @@ from msk_ray.report.__main__ import main
 from msk_ray.report.curves import rung_steps
 from msk_ray.report.influence import ranked_effects
 from msk_ray.report.page import make_section
+from msk_ray.report.pictures import picture, shorten
 from msk_ray.report.reading import Condition, read_experiment
 from msk_ray.report.tables import failures, variant_rows
 from msk_ray.tune import experiment as experiments
@@ -384,3 +386,13 @@ def test_rungs_of_a_search_are_drawn_where_trials_were_judged(tmp_path: Path) ->
     assert steps == []
     assert "is not known" in unknown
     assert "no such config file" in unknown
+
+
+def test_a_dollar_in_a_label_is_no_formula() -> None:
+    """Between two of them, matplotlib would read TeX, and fail where it is none."""
+
+    def draw(figure: Figure, narrow: bool) -> None:
+        figure.suptitle(shorten("cost $\\frac$ \x1b[1m", 40))
+
+    assert picture("x", "", "", "", draw).wide
+    assert shorten("a$b\n", 40) == "a\\$b\\n"

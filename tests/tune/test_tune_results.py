@@ -1,6 +1,7 @@
 """Records, tables and the experiment's folder."""
 
 import json
+import re
 import shutil
 import time
 from pathlib import Path
@@ -8,15 +9,19 @@ from typing import Any
 
 import pytest
 
+from msk_ray.cli import run
+from msk_ray.config import dump_yaml
 from msk_ray.errors import ConfigError, DeviceError, StorageError
 from msk_ray.files import make_folder
 from msk_ray.nvidia_smi import ask_driver
+from msk_ray.status import main as status
 from msk_ray.tune import experiment as experiments
+from msk_ray.tune.__main__ import main as tune
 from msk_ray.tune.devices import Placement, choose_placement, wait_for_memory
 from msk_ray.tune.listing import text_table
 from msk_ray.tune.outcomes import Ending, Outcome, read_ending, write_ending
 from msk_ray.tune.records import best_record, read_record
-from msk_ray.tune.report import write_report
+from msk_ray.tune.report import finish, write_report
 from msk_ray.tune.space import ResourcesSpec
 from msk_ray.tune.standing import Observer
 from msk_ray.tune.table import markdown, outcome_name, result_rows, summary, table_document, variant_rows
@@ -197,3 +202,30 @@ def test_text_table_cuts_the_end_only() -> None:
     text = text_table(("id", "why"), [("a1", "x" * 50)], width=20)
     assert text.splitlines()[2] == "a1  " + "x" * 15 + "…"
     assert markdown(("a",), [("1|2",)]) == "| a |\n| --- |\n| 1\\|2 |\n"
+
+
+def test_labels_and_reasons_reach_neither_terminal_nor_markdown_as_they_are(
+    make_space: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    evil = "\x1b[2J\n| <script>alert(1)</script>"
+    levels = [{"label": f"a{evil}", "value": 0.01}, {"label": "b [bold]:smile:", "value": 0.001}]
+    space = make_space(parameters={"shac.actor_lr": {"grid": levels}}, question=f"Which?{evil}")
+    made = experiments.create(tmp_path / "runs" / "e", space, resolve_trials(space), {})
+    for trial in made.trials():
+        fill(made, trial.id, [0.0, 5.0], Ending(Outcome.ERROR, f"because{evil}"))
+    finish(made)
+    assert run(status, ["e", "--storage", str(tmp_path / "runs")]) == 0
+    assert run(status, ["--storage", str(tmp_path / "runs")]) == 0
+    file = tmp_path / "space.yaml"
+    file.write_text(dump_yaml({**space.file.model_dump(exclude_unset=True), "base": str(tmp_path / "base.yaml")}))
+    assert run(tune, ["--space", str(file), "--dry-run"]) == 0
+    shown = capsys.readouterr().out
+    assert "\x1b" not in shown
+    assert "\\x1b[2J" in shown
+    assert "[bold]:smile:" in shown
+    table = (made.path / "table.md").read_text()
+    assert "\x1b" not in table
+    assert "<script>" not in table
+    rows = [line for line in table.splitlines() if line.startswith("| ") and "trials/" in line]
+    # Nine columns: what is not escaped begins another.
+    assert [len(re.findall(r"(?<!\\)\|", row)) for row in rows] == [10, 10]

@@ -1,0 +1,45 @@
+"""Text from files and users made safe for where it is shown: a terminal's line, a Markdown page.
+
+A label or an error may hold anything. Written to a terminal as it is, an escape sequence could clear the screen, rename
+the window or overwrite what was said before, and a newline could pass for a line of our own.
+"""
+
+import html
+import unicodedata
+
+_HIDDEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}
+"""Unicode categories without a shape of their own: controls, format (direction of writing), surrogates, separators."""
+
+
+def printable(text: str) -> str:
+    r"""`text` on one line, every control character written as Python would write it: `\n`, `\x1b`, `\u202e`."""
+    if text.isprintable():
+        return text
+    return "".join(_visible(character) for character in text)
+
+
+def printable_lines(text: str) -> str:
+    """The same for text of several lines, which stay lines."""
+    return "\n".join(printable(line) for line in text.split("\n"))
+
+
+def markdown_text(text: str) -> str:
+    """Text for a paragraph of Markdown, shown as it is: no HTML, links or pictures, and nothing hidden."""
+    return "\n".join(_markdown(line) for line in text.split("\n"))
+
+
+def markdown_cell(text: str) -> str:
+    """The same for one cell of a Markdown table."""
+    return _markdown(text).replace("|", "\\|")
+
+
+def _markdown(line: str) -> str:
+    escaped = html.escape(printable(line).replace("\\", "\\\\"), quote=False)
+    # A closing bracket before a parenthesis or another bracket is what makes a link or a picture.
+    return escaped.replace("](", "]\\(").replace("][", "]\\[").replace("`", "\\`")
+
+
+def _visible(character: str) -> str:
+    if unicodedata.category(character) not in _HIDDEN:
+        return character
+    return character.encode("unicode_escape", "surrogatepass").decode()
