@@ -1,34 +1,42 @@
 """What a trial is: one frozen, checked tree of settings, read from YAML."""
 
-from msk_ray.config.legs import AssistConfig, LegEnvSettings, MyoLeg26EnvConfig, MyoLegEnvConfig, TerrainConfig
-from msk_ray.config.load import describe_fault, load_config, parse_config, read_config
+from msk_ray.config.environments import AntEnvConfig, AntReward, CartPoleEnvConfig, CartPoleReward
+from msk_ray.config.legs import (
+    AssistConfig,
+    LegEnvSettings,
+    LegReward,
+    MyoLeg26EnvConfig,
+    MyoLegEnvConfig,
+    TerrainConfig,
+)
+from msk_ray.config.load import describe_fault, load_config, parse_config, parse_recorded, read_config
 from msk_ray.config.overlay import SET_HELP, combine, merge, overlay, parse_override, parse_overrides
+from msk_ray.config.physics import FdConfig, PhysicsConfig
+from msk_ray.config.recorded import current_key, current_values, env_name, first_spelling
 from msk_ray.config.schema import (
     AdaptiveHorizon,
-    AntEnvConfig,
-    CartPoleEnvConfig,
     Config,
     ContactCurriculum,
     ContactStart,
     EntropyConfig,
     EnvConfig,
     EvaluationConfig,
-    FdConfig,
     HorizonSchedule,
     NetworkConfig,
-    PhysicsConfig,
     ShacConfig,
     TrialConfig,
 )
-from msk_ray.config.sections import EnvSettings
+from msk_ray.config.sections import EnvSettings, Reward
 from msk_ray.config.yaml_text import dump_yaml, parse_yaml, read_yaml
 
 __all__ = [
     "SET_HELP",
     "AdaptiveHorizon",
     "AntEnvConfig",
+    "AntReward",
     "AssistConfig",
     "CartPoleEnvConfig",
+    "CartPoleReward",
     "Config",
     "ContactCurriculum",
     "ContactStart",
@@ -39,22 +47,29 @@ __all__ = [
     "FdConfig",
     "HorizonSchedule",
     "LegEnvSettings",
+    "LegReward",
     "MyoLeg26EnvConfig",
     "MyoLegEnvConfig",
     "NetworkConfig",
     "PhysicsConfig",
+    "Reward",
     "ShacConfig",
     "TerrainConfig",
     "TrialConfig",
     "combine",
+    "current_key",
+    "current_values",
     "describe_fault",
     "dump_yaml",
+    "env_name",
+    "first_spelling",
     "load_config",
     "merge",
     "overlay",
     "parse_config",
     "parse_override",
     "parse_overrides",
+    "parse_recorded",
     "parse_yaml",
     "read_config",
     "read_yaml",

@@ -4,7 +4,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, PositiveFloat
 
-from msk_ray.config.sections import Count, EnvSettings, Fraction, NonNegative, Section, Text, Whole
+from msk_ray.config.physics import ACTIVATION, CONTACTS, JOINTS, LIMITS, SOLVING, STEPPING
+from msk_ray.config.sections import Count, EnvSettings, Fraction, NonNegative, Reward, Section, Text, Whole
 
 
 class TerrainConfig(Section):
@@ -26,6 +27,16 @@ class TerrainConfig(Section):
     """Of the heights of `rough` and `height_field`."""
 
 
+_TERRAIN_READS: dict[str, tuple[str, ...]] = {
+    "flat": (),
+    "slope": ("slope",),
+    "steps": ("step_height", "step_depth", "start"),
+    "rough": ("step_depth", "roughness", "start", "seed"),
+    "height_field": ("roughness", "start", "seed"),
+}
+"""What each kind of ground is made by."""
+
+
 class AssistConfig(Section):
     """Springs and dampers that hold the pelvis up during training, annealed linearly to nothing.
 
@@ -44,19 +55,15 @@ class AssistConfig(Section):
     """Share of the body's weight that is carried."""
 
 
-class LegEnvSettings(EnvSettings):
-    """What the muscle-driven legs share. Reward weights are per control step."""
+class LegReward(Reward):
+    """Weights per control step."""
 
-    episode_length: Count = 500
-    control_timestep: PositiveFloat = 0.02
-    target_speed: NonNegative = 1.25
-    """Forward speed asked for [m/s]; 0 asks to stand."""
     forward_vel: float = 1.0
-    """Weight of exp(-((v - target_speed) / speed_scale)²)."""
+    """Weight of exp(-((v - env.target_speed) / speed_scale)²)."""
     speed_scale: PositiveFloat = 0.6
     """Speed error at which the term above has fallen to 1/e [m/s]."""
     progress: float = 0.0
-    """Weight of the forward speed, up to target_speed [s/m]: a slope where the term above is flat."""
+    """Weight of the forward speed, up to env.target_speed [s/m]: a slope where the term above is flat."""
     upright: float = 2.0
     """Weight of the cosine between the trunk's up axis and +z."""
     heading: float = 0.2
@@ -89,6 +96,15 @@ class LegEnvSettings(EnvSettings):
     """Largest angle between the hips' flexions [rad]: 2 asin(step length / (2 leg length)) for 0.67 m and 0.9 m."""
     cadence: PositiveFloat = 112.0
     """Steps a minute; at 1.25 m/s people take about as many [1/min]."""
+
+
+class LegEnvSettings(EnvSettings):
+    """What the muscle-driven legs share."""
+
+    episode_length: Count = 500
+    control_timestep: PositiveFloat = 0.02
+    target_speed: NonNegative = 1.25
+    """Forward speed asked for [m/s]; 0 asks to stand."""
     min_height: float = 0.65
     """Pelvis height above the ground, as a share of standing, below which an episode ends."""
     min_upright: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.5
@@ -99,10 +115,21 @@ class LegEnvSettings(EnvSettings):
     """Least excitation of a muscle at action 0, where standing keyframes do not ask for more."""
     success_speed: NonNegative = 0.8
     """Mean speed over the episode from which walking counts as a success [m/s]."""
+    reward: LegReward = LegReward()
+
+    def unread(self) -> dict[str, str]:
+        unread = {}
+        if not self.early_termination:
+            unread["min_height"] = "env.early_termination is false"
+        if self.target_speed == 0.0:
+            unread["success_speed"] = "env.target_speed 0 asks to stand"
+        return unread
 
 
 class MyoLeg26EnvConfig(LegEnvSettings):
     """Two legs under one trunk, 13 Hill-type muscles each."""
+
+    reads_physics = STEPPING | SOLVING | CONTACTS | LIMITS | JOINTS | ACTIVATION
 
     name: Literal["myoleg26"]
     terrain: TerrainConfig = TerrainConfig()
@@ -113,9 +140,22 @@ class MyoLeg26EnvConfig(LegEnvSettings):
     """Spread of initial joint angles [rad]; velocities, the pelvis's among them, spread five times that a second, which
     moves the capture point by 3 cm: feet on the spot can still catch it."""
 
+    def unread(self) -> dict[str, str]:
+        unread = super().unread()
+        reads = _TERRAIN_READS[self.terrain.kind]
+        for name in TerrainConfig.model_fields:
+            if name != "kind" and name not in reads:
+                unread[f"terrain.{name}"] = f"env.terrain.kind is {self.terrain.kind}"
+        if not self.assist.epochs:
+            for name in ("share", "balance", "lateral", "support"):
+                unread[f"assist.{name}"] = "env.assist.epochs is 0"
+        return unread
+
 
 class MyoLegEnvConfig(LegEnvSettings):
-    """Legs of an installed myosuite or myo_sim, or of a model file."""
+    """Legs of an installed myosuite or myo_sim, or of a model file: its contacts, limits and joints are its own."""
+
+    reads_physics = STEPPING | SOLVING | ACTIVATION
 
     name: Literal["myoleg"]
     model: Text | None = None
@@ -124,3 +164,13 @@ class MyoLegEnvConfig(LegEnvSettings):
     """Package to take it from; `auto` takes the first that is installed, in this order."""
     reset_noise: NonNegative = 0.01
     """Spread of initial joint angles [rad]; coupled joints follow those they are coupled to."""
+
+    def unread(self) -> dict[str, str]:
+        unread = super().unread()
+        if self.model not in (None, *PACKAGED_MODELS):
+            unread["source"] = "env.model is the path of a file"
+        return unread
+
+
+PACKAGED_MODELS = ("myolegs", "myolegs26")
+"""Models that installed packages have, the default first."""

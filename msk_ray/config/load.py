@@ -8,7 +8,9 @@ from typing import Annotated, Any, get_args, get_origin
 from pydantic import BaseModel, Tag, ValidationError
 
 from msk_ray.config.overlay import merge, overlay, parse_overrides
-from msk_ray.config.schema import VARIANTS, Config
+from msk_ray.config.recorded import current_settings, env_name
+from msk_ray.config.schema import ENVIRONMENTS, RECORDED, Config
+from msk_ray.config.unread import unread_settings
 from msk_ray.config.yaml_text import read_yaml
 from msk_ray.errors import ConfigError, brief, shortened
 
@@ -25,8 +27,25 @@ def parse_config(data: Mapping[str, Any], source: str = "config") -> Config:
         raise ConfigError(f"{source}: {describe_fault(error)}") from None
 
 
+def parse_recorded(data: Mapping[str, Any], source: str) -> Config:
+    """The configuration that a trial's files hold, written by this version or an earlier one.
+
+    Settings that nothing read then, and that are refused now, come back at their defaults.
+
+    Raises:
+        ConfigError: as `parse_config`.
+    """
+    settings = current_settings(data, env_name(data)) if isinstance(data, Mapping) else data
+    try:
+        config = Config.model_validate(settings, context=RECORDED)
+        unread = {key: default for key, _, default in unread_settings(config)}
+        return Config.model_validate(overlay(config.as_dict(), unread)) if unread else config
+    except ValidationError as error:
+        raise ConfigError(f"{source}: {describe_fault(error)}") from None
+
+
 def read_config(path: Path) -> dict[str, Any]:
-    """The settings of a config file laid over those of the file its `extends` names, if any.
+    """The settings of a config file laid over those of the file its `extends` names, if any, in today's spelling.
 
     `extends` is a path relative to the file, and goes one level deep: what is extended may not extend another.
 
@@ -36,12 +55,13 @@ def read_config(path: Path) -> dict[str, Any]:
     data = read_yaml(path)
     base_name = data.pop("extends", None)
     if base_name is None:
-        return data
+        return current_settings(data, env_name(data))
     base_path = path.parent / str(base_name)
     base = read_yaml(base_path)
     if "extends" in base:
         raise ConfigError(f"{path} extends {base_path}, which extends another file: extend that one directly")
-    return merge(base, data)
+    name = env_name(data) or env_name(base)
+    return merge(current_settings(base, name), current_settings(data, name))
 
 
 def load_config(path: Path, overrides: Iterable[str] = ()) -> Config:
@@ -64,14 +84,18 @@ def describe_fault(error: ValidationError, root: type[BaseModel] = Config) -> st
     if first["type"] == "extra_forbidden":
         known = _keys_at(root, location[:-1], first["loc"])
         near = difflib.get_close_matches(location[-1], known, n=1)
-        hint = f"did you mean {near[0]!r}?" if near else f"known keys: {', '.join(known)}"
+        below = _section_with(root, location, first["loc"])
+        if below is not None:
+            hint = f"write {'.'.join([*location[:-1], below, location[-1]])}"
+        else:
+            hint = f"did you mean {near[0]!r}?" if near else f"known keys: {', '.join(known)}"
         text = f"{where}: unknown key; {hint}"
     elif first["type"] == "value_error":
         text = str(first["ctx"]["error"]) if "ctx" in first else first["msg"]
     elif first["type"] == "missing":
         text = f"{where}: missing"
     elif first["type"].startswith("union_tag"):
-        text = f"{where or 'env'}: {first['msg']}; write env.name: {' or '.join(VARIANTS)}"
+        text = f"{where or 'env'}: {first['msg']}; write env.name: {' or '.join(ENVIRONMENTS)}"
     else:
         text = f"{where}: {first['msg']}, not {brief(first['input'])}"
     more = len(faults) - 1
@@ -82,7 +106,7 @@ def describe_fault(error: ValidationError, root: type[BaseModel] = Config) -> st
 _MAX_MESSAGE = 400
 
 
-_TAGS = (*VARIANTS, "constant", "schedule", "adaptive")
+_TAGS = (*ENVIRONMENTS, "constant", "schedule", "adaptive")
 """Tags of discriminated unions, which pydantic puts into a fault's location."""
 
 
@@ -97,6 +121,19 @@ def _own_name(model: type[BaseModel]) -> tuple[Any, ...]:
 
 def _keys_at(root: type[BaseModel], sections: list[str], location: tuple[Any, ...]) -> list[str]:
     """Known keys of the section of `root` a fault lies in."""
+    return list(_model_at(root, sections, location).model_fields)
+
+
+def _section_with(root: type[BaseModel], location: list[str], tagged: tuple[Any, ...]) -> str | None:
+    """The section beside a misplaced key that has a setting of its name."""
+    for name, field in _model_at(root, location[:-1], tagged).model_fields.items():
+        if _is_model(field.annotation) and location[-1] in field.annotation.model_fields:  # type: ignore[union-attr]
+            return name
+    return None
+
+
+def _model_at(root: type[BaseModel], sections: list[str], location: tuple[Any, ...]) -> type[BaseModel]:
+    """The section of `root` a fault lies in."""
     model: Any = root
     for section in sections:
         annotation = model.model_fields[section].annotation
@@ -105,4 +142,5 @@ def _keys_at(root: type[BaseModel], sections: list[str], location: tuple[Any, ..
         models = [(o[0], [m.tag for m in o[1:] if isinstance(m, Tag)]) for o in options if _is_model(o[0])]
         named = [(m, [*tags, *_own_name(m)]) for m, tags in models]
         model = next((m for m, tags in named if any(tag in location for tag in tags)), named[0][0])
-    return list(model.model_fields)
+    found: type[BaseModel] = model
+    return found

@@ -6,165 +6,26 @@ arXiv:2204.07137) and the hyperparameters published with it.
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Discriminator, Field, PositiveFloat, Tag, model_validator
+from pydantic import Discriminator, Field, PositiveFloat, Tag, ValidationInfo, model_validator
 
+from msk_ray.config.environments import AntEnvConfig, CartPoleEnvConfig
 from msk_ray.config.legs import MyoLeg26EnvConfig, MyoLegEnvConfig
-from msk_ray.config.sections import Count, EnvSettings, Fraction, NonNegative, Section, Text, Whole
-
-Vec2 = tuple[float, float]
-Vec5 = tuple[float, float, float, float, float]
-
-
-VARIANTS: dict[str, tuple[str, ...]] = {
-    "cartpole": (),
-    "ant": ("matched", "matched_hard_friction", "published"),
-    "myoleg26": (),
-    "myoleg": (),
-}
-"""Named physics of each environment, the one that policies are scored under first."""
-
-CONTACT_FIELDS = ("cone", "impratio", "solref", "solimp", "friction", "solreffriction", "solref_limit", "solimp_limit")
-"""Fields of the physics section that mean something only in a model with contacts and joint limits."""
-
-
-class CartPoleEnvConfig(EnvSettings):
-    """Swing up a pole on a cart and keep it there. Angle 0 is upright."""
-
-    name: Literal["cartpole"]
-    episode_length: Count = 240
-    pole_angle_penalty: NonNegative = 1.0
-    """Weight of angle² [1/rad²], with the angle wrapped to ±π."""
-    pole_velocity_penalty: NonNegative = 0.1
-    """Weight of angular velocity² [s²/rad²]."""
-    cart_position_penalty: NonNegative = 0.05
-    """Weight of position² [1/m²]."""
-    cart_velocity_penalty: NonNegative = 0.1
-    """Weight of velocity² [s²/m²]."""
-    cart_action_penalty: NonNegative = 0.0
-    """Weight of action²."""
-
-
-class AntEnvConfig(EnvSettings):
-    """A four-legged walker whose reward asks for forward velocity."""
-
-    name: Literal["ant"]
-    episode_length: Count = 1000
-    forward_vel: float = 1.0
-    """Weight of the torso's velocity along +x [s/m]."""
-    heading: float = 1.0
-    """Weight of the cosine between the torso's forward axis and +x."""
-    up: float = 0.1
-    """Weight of the cosine between the torso's up axis and +z."""
-    height: float = 1.0
-    """Weight of the torso's height above `termination_height` [1/m]."""
-    action_penalty: NonNegative = 0.0
-    """Weight of the summed squared action."""
-    termination_height: float = 0.27
-    """Torso height below which an episode ends [m]."""
-    early_termination: bool = True
-    """End an episode on falling below `termination_height`."""
-
+from msk_ray.config.physics import PhysicsConfig, Vec5
+from msk_ray.config.sections import Count, EnvSettings, Fraction, Section, Text, Whole
+from msk_ray.config.unread import unread_settings
+from msk_ray.errors import brief
 
 EnvConfig = Annotated[
     CartPoleEnvConfig | AntEnvConfig | MyoLeg26EnvConfig | MyoLegEnvConfig, Field(discriminator="name")
 ]
 
-
-class FdConfig(Section):
-    """Central differences of backward mode `fd_jacobian`."""
-
-    eps_ctrl: PositiveFloat = 5e-3
-    """Perturbation of ctrl [its own unit]."""
-    eps_qpos: PositiveFloat = 5e-4
-    """Perturbation of qpos along a tangent direction [m, rad]."""
-    eps_qvel: PositiveFloat = 2e-3
-    """Perturbation of qvel [m/s, rad/s]."""
-    eps_act: PositiveFloat = 5e-4
-    """Perturbation of act [its own unit]."""
-    max_worlds: Count = 131072
-    """Perturbed copies run at once; more are done in chunks."""
-
-
-class PhysicsConfig(Section):
-    """How the model is built, stepped and differentiated. Fields left null keep the variant's value."""
-
-    variant: Text | None = None
-    """Named physics of the environment: for ant `published`, `matched` or `matched_hard_friction`."""
-    backward: Literal["tape_per_substep", "tape_all", "fd_jacobian", "hybrid"] = "tape_per_substep"
-    """Backward mode of the step. `tape_*` are exact; `fd_jacobian` differentiates any model by finite differences;
-    `hybrid` takes the state's gradient from the tape and the control's from finite differences, for diagnosis."""
-    substep_grad_clip: PositiveFloat | None = None
-    """Bound on each world's state cotangent between substeps, in the loss's own units; null leaves it. Tapes only."""
-    fd: FdConfig = FdConfig()
-    substeps: Count | None = None
-    """Physics steps an env step. Set this or `timestep`; 4 if neither is set."""
-    timestep: PositiveFloat | None = None
-    """Duration of a physics step [s]; must divide the env's control_timestep."""
-    tolerance: PositiveFloat | None = None
-    """Constraint solver tolerance; mujoco_warp's default is 1e-6."""
-    iterations: Count | None = None
-    """Constraint solver iteration limit."""
-    ls_iterations: Count | None = None
-    """Line search iteration limit."""
-    integrator: Literal["Euler", "implicitfast", "RK4"] | None = None
-    cone: Literal["pyramidal", "elliptic"] | None = None
-    """Friction cone. The pyramid's edges make contact gradients explode over long horizons; the ellipse has none."""
-    impratio: PositiveFloat | None = None
-    """Ratio of frictional to normal constraint impedance."""
-    solref: Vec2 | None = None
-    """Contact time constant [s] and damping ratio."""
-    solimp: Vec5 | None = None
-    """Contact impedance d0, dwidth, width [m], midpoint, power."""
-    friction: PositiveFloat | None = None
-    """Sliding friction coefficient."""
-    solreffriction: Vec2 | None = None
-    """Solver reference of the friction directions alone [s, ratio], set on contact pairs; needs the elliptic cone.
-
-    Friction acts like a damper with this time constant: (0.02, 1) sticks, (1, 1) is viscous. `(0, 0)` uses solref.
-    """
-    joint_damping: NonNegative | None = None
-    """Damping of every actuated joint [N m s/rad]."""
-    armature: NonNegative | None = None
-    """Rotor inertia of every actuated joint [kg m²]."""
-    solref_limit: Vec2 | None = None
-    """Solver reference of joint limits; two negative values are -stiffness and -damping."""
-    solimp_limit: Vec5 | None = None
-    """Impedance of joint limits."""
-    gear: PositiveFloat | None = None
-    """Force or torque of a motor at full control [N, N m]."""
-    nconmax: Count | None = None
-    """Contacts a world; null takes a bound from the geometry."""
-    njmax: Count | None = None
-    """Constraint rows a world; null takes a bound from the geometry."""
-
-    @model_validator(mode="after")
-    def _friction_direction_needs_ellipse(self) -> "PhysicsConfig":
-        if self.solreffriction is not None and self.cone == "pyramidal":
-            raise ValueError("solreffriction acts with the elliptic cone only: write cone: elliptic")
-        return self
-
-    def resolve_substeps(self, control_timestep: float) -> int:
-        """Physics steps an env step of `control_timestep` [s].
-
-        Raises:
-            ValueError: `timestep` does not divide it, or `substeps` and `timestep` disagree.
-        """
-        if self.timestep is None:
-            return self.substeps or 4
-        ratio = control_timestep / self.timestep
-        whole = round(ratio)
-        if whole < 1 or abs(ratio - whole) > 1e-4 * whole:
-            nearest = control_timestep / max(1, whole)
-            raise ValueError(
-                f"physics.timestep {self.timestep:g} s does not divide env.control_timestep {control_timestep:g} s: "
-                f"write {nearest:.8g} ({max(1, whole)} substeps)"
-            )
-        if self.substeps is not None and self.substeps != whole:
-            raise ValueError(
-                f"physics.substeps {self.substeps} and physics.timestep {self.timestep:g} s disagree: "
-                f"an env step of {control_timestep:g} s has {whole} such substeps; write one of the two"
-            )
-        return whole
+ENVIRONMENTS: dict[str, type[EnvSettings]] = {
+    "cartpole": CartPoleEnvConfig,
+    "ant": AntEnvConfig,
+    "myoleg26": MyoLeg26EnvConfig,
+    "myoleg": MyoLegEnvConfig,
+}
+"""The settings of each environment by its name."""
 
 
 class HorizonSchedule(Section):
@@ -361,6 +222,10 @@ class TrialConfig(Section):
     """Newest checkpoints kept, beside the best."""
 
 
+RECORDED = "recorded"
+"""Context of validation in which settings that nothing reads are let through: earlier versions let them be written."""
+
+
 class Config(Section):
     """One trial."""
 
@@ -376,15 +241,11 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _physics_fits_env(self) -> "Config":
-        variants = VARIANTS[self.env.name]
+        variants = self.env.variants
         for field, name in (("physics.variant", self.physics.variant), ("evaluation.variant", self.evaluation.variant)):
             if name is not None and name not in variants:
                 known = f"write one of {', '.join(variants)}" if variants else "leave it out"
-                raise ValueError(f"{field}: env {self.env.name} has no physics named {name!r}; {known}")
-        if self.env.name == "cartpole":
-            set_ = [name for name in CONTACT_FIELDS if getattr(self.physics, name) is not None]
-            if set_:
-                raise ValueError(f"physics.{set_[0]}: cartpole has no contacts or joint limits; leave it out")
+                raise ValueError(f"{field}: env {self.env.name} has no physics named {brief(name)}; {known}")
         return self
 
     @model_validator(mode="after")
@@ -407,10 +268,17 @@ class Config(Section):
         return self
 
     def _check_curriculum(self) -> None:
-        if self.env.name == "cartpole":
-            raise ValueError("curriculum: cartpole has no contacts; leave it out")
+        if "cone" not in self.env.reads_physics:
+            raise ValueError(f"curriculum: {self.env.name} has no contacts; leave it out")
         if self.physics.backward not in ("tape_per_substep", "tape_all"):
             raise ValueError("curriculum needs physics.backward: tape_per_substep or tape_all")
+
+    @model_validator(mode="after")
+    def _everything_is_read(self, info: ValidationInfo) -> "Config":
+        if info.context != RECORDED:
+            for key, why, _ in unread_settings(self):
+                raise ValueError(f"{key}: {why} leave it out")
+        return self
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data that `parse_config` reads back."""

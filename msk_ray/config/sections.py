@@ -1,7 +1,7 @@
 """What all groups of settings are made of."""
 
 from functools import cache
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, ClassVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validator
 
@@ -57,8 +57,21 @@ def _takes_truth(annotation: Any) -> bool:
     return annotation in (bool, Any) or any(_takes_truth(part) for part in get_args(annotation))
 
 
+class Reward(Section):
+    """The weights and shapes of an environment's reward. Their defaults are the reference reward: what policies are
+    scored under, whatever they were trained on."""
+
+
 class EnvSettings(Section):
-    """What every environment has."""
+    """What every environment has, and what it declares of itself."""
+
+    variants: ClassVar[tuple[str, ...]] = ()
+    """Named physics of the environment, the one that policies are scored under first."""
+    pyramidal_variants: ClassVar[frozenset[str]] = frozenset()
+    """Those of them whose friction cone is a pyramid unless `physics.cone` says otherwise."""
+    reads_physics: ClassVar[frozenset[str]]
+    """Settings of the physics section that do something here, `fd.eps_act` for one within a section; others are
+    refused."""
 
     nworld: Count = 64
     """Worlds W simulated at once."""
@@ -68,3 +81,8 @@ class EnvSettings(Section):
     """Duration of an env step [s]."""
     stochastic_reset: bool = True
     """Draw the initial state at random; False starts every episode in the same state."""
+    reward: Reward = Reward()
+
+    def unread(self) -> dict[str, str]:
+        """Settings of this section, dotted, that nothing reads because of others, and what makes it so."""
+        return {}

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 from msk_ray.cli import Parser, run
 from msk_ray.config import SET_HELP
-from msk_ray.config.schema import VARIANTS
 from msk_ray.errors import ConfigError, StorageError
 
 if TYPE_CHECKING:
@@ -63,7 +62,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     from msk_ray.diagnose.probe import probe, read_subject
 
     subject = read_subject(args.subject, args.overrides)
-    known = VARIANTS[subject.config.env.name]
+    known = subject.config.env.variants
     for name in args.variants or ():
         if name not in known:
             raise ConfigError(

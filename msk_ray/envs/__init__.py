@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from msk_ray.config import EnvConfig, PhysicsConfig
+from msk_ray.config import EnvConfig, EnvSettings, PhysicsConfig
 from msk_ray.envs.ant import Ant
 from msk_ray.envs.base import Env, EnvState, Transition
 from msk_ray.envs.cartpole import CartPole
@@ -13,12 +13,12 @@ from msk_ray.simulation.modes import configured_backward
 __all__ = ["Ant", "CartPole", "Env", "EnvState", "MyoLeg", "MyoLeg26", "Transition", "env_class", "make_env"]
 
 
-_ENVS: dict[str, type[Env[Any]]] = {"cartpole": CartPole, "ant": Ant, "myoleg26": MyoLeg26, "myoleg": MyoLeg}
+_ENVS: dict[type[EnvSettings], type[Env[Any]]] = {env.settings: env for env in (CartPole, Ant, MyoLeg26, MyoLeg)}
 
 
 def env_class(config: EnvConfig) -> type[Env[Any]]:
     """The environment that settings of this type describe."""
-    return _ENVS[config.name]
+    return _ENVS[type(config)]
 
 
 def make_env(

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from msk_ray.config import AntEnvConfig, PhysicsConfig
-from msk_ray.config.schema import VARIANTS
 from msk_ray.envs.base import Env
 from msk_ray.envs.models.ant import STAND_HEIGHT, STAND_JOINTS, build_ant
 from msk_ray.simulation import StepState
@@ -33,8 +32,7 @@ class Ant(Env[AntEnvConfig]):
     """
 
     obs_size = 37
-    variants = VARIANTS["ant"]
-
+    settings = AntEnvConfig
     reward_names = ("forward_vel", "up", "heading", "height", "action")
 
     @staticmethod
@@ -42,14 +40,14 @@ class Ant(Env[AntEnvConfig]):
         return build_ant(config, physics)
 
     def prepare(self) -> None:
-        c = self.config
+        r = self.config.reward
         # World z of the torso's z axis and world x of its x axis are w² - x² - y² + z² and w² + x² - y² - z².
         self._axes = torch.tensor(((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)), device=self.device)
         # All terms but the action penalty are linear in the observation.
         linear = torch.zeros(self.obs_size, len(self.reward_names))
-        for term, (entry, weight) in enumerate(((5, c.forward_vel), (27, c.up), (28, c.heading), (0, c.height))):
+        for term, (entry, weight) in enumerate(((5, r.forward_vel), (27, r.up), (28, r.heading), (0, r.height))):
             linear[entry, term] = weight
-        offset = torch.tensor((0.0, 0.0, 0.0, -c.height * c.termination_height, 0.0))
+        offset = torch.tensor((0.0, 0.0, 0.0, -r.height * self.config.termination_height, 0.0))
         self._linear, self._offset = linear.to(self.device), offset.to(self.device)
         self._stand = torch.tensor((0.0, 0.0, STAND_HEIGHT, 1.0, 0.0, 0.0, 0.0, *STAND_JOINTS), device=self.device)
 
@@ -79,9 +77,9 @@ class Ant(Env[AntEnvConfig]):
 
     def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
         terms = torch.addmm(self._offset, obs, self._linear)
-        if self.config.action_penalty == 0.0:
+        if self.config.reward.action_penalty == 0.0:
             return terms
-        effort = -self.config.action_penalty * action.square().sum(-1, keepdim=True)
+        effort = -self.config.reward.action_penalty * action.square().sum(-1, keepdim=True)
         return torch.cat((terms[:, :-1], effort), dim=-1)
 
     def fell(self, state: StepState) -> Tensor:

@@ -65,8 +65,8 @@ class Env(ABC, Generic[Settings]):
     obs_size: int
     reward_names: ClassVar[tuple[str, ...]]
     """Names of the T parts of the reward."""
-    variants: ClassVar[tuple[str, ...]] = ()
-    """Named physics of this environment."""
+    settings: ClassVar[type[EnvSettings]]
+    """Its section of the configuration, which also says what physics has a name here, and what physics is read."""
 
     def __init__(
         self,
@@ -104,17 +104,16 @@ class Env(ABC, Generic[Settings]):
 
     @classmethod
     def reference_settings(cls, config: Settings) -> Settings:
-        """`config` with the reward weights that policies are scored under."""
-        weights = {n: f.default for n, f in type(config).model_fields.items() if n not in EnvSettings.model_fields}
-        keep = {"name", "early_termination", "termination_height"}
-        return config.model_copy(update={n: d for n, d in weights.items() if n not in keep})
+        """`config` with the reward that policies are scored under, the section's defaults; all else stays."""
+        return config.model_copy(update={"reward": type(config.reward)()})
 
     @classmethod
     def reference_physics(cls, physics: PhysicsConfig, variant: str | None) -> PhysicsConfig:
         """The physics that policies are scored under: a named variant as it stands, or `physics` if there is none."""
-        if not cls.variants:
+        variants = cls.settings.variants
+        if not variants:
             return physics
-        return PhysicsConfig(variant=variant or cls.variants[0], nconmax=physics.nconmax, njmax=physics.njmax)
+        return PhysicsConfig(variant=variant or variants[0], nconmax=physics.nconmax, njmax=physics.njmax)
 
     def prepare(self) -> None:
         """Put constants on the device: copying one there in every step would make the host wait for the GPU."""

@@ -21,6 +21,7 @@ class CartPole(Env[CartPoleEnvConfig]):
     Starts hanging down, ± π/2 rad, with small velocities. Never terminates; truncated after `episode_length`.
     """
 
+    settings = CartPoleEnvConfig
     obs_size = 5
     reward_names = ("pole_angle", "pole_velocity", "cart_position", "cart_velocity", "action")
 
@@ -29,13 +30,13 @@ class CartPole(Env[CartPoleEnvConfig]):
         return build_cartpole(config, physics)
 
     def prepare(self) -> None:
-        c = self.config
+        r = self.config.reward
         penalties = (
-            c.pole_angle_penalty,
-            c.pole_velocity_penalty,
-            c.cart_position_penalty,
-            c.cart_velocity_penalty,
-            c.cart_action_penalty,
+            r.pole_angle_penalty,
+            r.pole_velocity_penalty,
+            r.cart_position_penalty,
+            r.cart_velocity_penalty,
+            r.cart_action_penalty,
         )
         self._weights = -torch.tensor(penalties, device=self.device)
         self._hanging = torch.tensor((0.0, math.pi), device=self.device)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from msk_ray.config import LegEnvSettings, PhysicsConfig
-from msk_ray.config.schema import CONTACT_FIELDS
+from msk_ray.config.physics import CONTACTS, LIMITS
 from msk_ray.envs.base import Env
 from msk_ray.envs.muscles import MuscleCurves
 from msk_ray.simulation import StepState
@@ -27,10 +27,6 @@ _LIMIT_MARGIN = 0.05
 _LIMIT_UNIT = 0.1
 _VELOCITY_SCALE = 0.1
 """Of joint velocities in the observation [s/rad]."""
-_REWARD_FIELDS = (
-    *("forward_vel", "speed_scale", "progress", "upright", "heading", "height", "alive", "effort", "joint_limit"),
-    *("smoothness", "capture", "capture_scale", "sway", "symmetry", "stride", "stride_angle", "cadence"),
-)
 
 
 class Root(NamedTuple):
@@ -171,7 +167,7 @@ class LegEnv(Env[LegSettings], Generic[LegSettings]):
         )
 
     def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
-        c = self.config
+        c, r = self.config, self.config.reward
         root = self.root(state)
         speed = root.velocity[:, 0]
         low, high = self._limits
@@ -183,23 +179,23 @@ class LegEnv(Env[LegSettings], Generic[LegSettings]):
         velocity = root.velocity + _TRUNK_LEVER * torch.linalg.cross(root.spin, root.up)
         place = place + velocity[:, :2] * self._pendulum_time
         distance = place if c.target_speed == 0.0 else place[:, 1:]
-        capture = torch.sqrt(1.0 + (distance / c.capture_scale).square().sum(-1)) - 1.0
+        capture = torch.sqrt(1.0 + (distance / r.capture_scale).square().sum(-1)) - 1.0
         flexion_rates = state.qvel[:, self._flexion_dofs]
         flexions = state.qpos[:, self._flexion_qpos]
         terms = (
-            c.forward_vel * torch.exp(-((speed - c.target_speed) / c.speed_scale).square()),
-            c.progress * speed.clamp_max(c.target_speed),
-            c.upright * root.up[:, 2],
-            c.heading * root.heading,
-            -c.height * torch.relu(self.stand_height - root.height).square(),
-            torch.full_like(speed, c.alive),
-            -c.effort * state.act.square().mean(-1),
-            -c.joint_limit * overshoot.square().sum(-1),
-            -c.smoothness * change.square().mean(-1),
-            -c.capture * capture,
-            -c.sway * root.spin.square().sum(-1),
-            -c.symmetry * flexion_rates.sum(-1).square(),
-            -c.stride * stride_error(flexions, flexion_rates, c.stride_angle, math.tau * c.cadence / 120.0),
+            r.forward_vel * torch.exp(-((speed - c.target_speed) / r.speed_scale).square()),
+            r.progress * speed.clamp_max(c.target_speed),
+            r.upright * root.up[:, 2],
+            r.heading * root.heading,
+            -r.height * torch.relu(self.stand_height - root.height).square(),
+            torch.full_like(speed, r.alive),
+            -r.effort * state.act.square().mean(-1),
+            -r.joint_limit * overshoot.square().sum(-1),
+            -r.smoothness * change.square().mean(-1),
+            -r.capture * capture,
+            -r.sway * root.spin.square().sum(-1),
+            -r.symmetry * flexion_rates.sum(-1).square(),
+            -r.stride * stride_error(flexions, flexion_rates, r.stride_angle, math.tau * r.cadence / 120.0),
         )
         return torch.stack(terms, dim=-1)
 
@@ -227,12 +223,6 @@ class LegEnv(Env[LegSettings], Generic[LegSettings]):
         return standing & (tail["distance"][-1] >= self.config.success_speed * seconds)
 
     @classmethod
-    def reference_settings(cls, config: LegSettings) -> LegSettings:
-        fields = {name: type(config).model_fields[name].default for name in _REWARD_FIELDS}
-        changed: LegSettings = config.model_copy(update=fields)
-        return changed
-
-    @classmethod
     def reference_physics(cls, physics: PhysicsConfig, variant: str | None) -> PhysicsConfig:
         """`physics` with the model's own contacts and limits."""
-        return physics.model_copy(update=dict.fromkeys(CONTACT_FIELDS))
+        return physics.model_copy(update=dict.fromkeys({"cone", "impratio"} | CONTACTS | LIMITS))

@@ -25,6 +25,8 @@ class MyoLeg(LegEnv[MyoLegEnvConfig]):
     forward axis is found from heel to toes, the up axis from gravity.
     """
 
+    settings = MyoLegEnvConfig
+
     @staticmethod
     def build_model(config: MyoLegEnvConfig, physics: PhysicsConfig) -> mujoco.MjModel:
         _log.info(find_model(config.model, config.source).describe())

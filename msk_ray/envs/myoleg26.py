@@ -26,6 +26,8 @@ class MyoLeg26(LegEnv[MyoLeg26EnvConfig]):
     The pelvis is three slides and three hinges, so that tilt and list are coordinates and no quaternion is needed.
     """
 
+    settings = MyoLeg26EnvConfig
+
     @staticmethod
     def build_model(config: MyoLeg26EnvConfig, physics: PhysicsConfig) -> mujoco.MjModel:
         return build_myoleg26(config, physics)

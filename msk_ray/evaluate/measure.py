@@ -45,13 +45,14 @@ def named_physics(config: Config, name: str) -> tuple[str, PhysicsConfig]:
         ConfigError: its environment has no such physics.
     """
     env_type = env_class(config.env)
+    variants = env_type.settings.variants
     if name == REFERENCE:
-        variant = config.evaluation.variant or (env_type.variants[0] if env_type.variants else OWN)
+        variant = config.evaluation.variant or (variants[0] if variants else OWN)
         return variant, env_type.reference_physics(config.physics, config.evaluation.variant)
     if name == OWN:
         return OWN, config.physics
-    if name not in env_type.variants:
-        known = ", ".join((REFERENCE, OWN, *env_type.variants))
+    if name not in variants:
+        known = ", ".join((REFERENCE, OWN, *variants))
         raise ConfigError(f"--physics {name!r}: env {config.env.name} has no such physics; write one of {known}")
     return name, env_type.reference_physics(config.physics, name)
 

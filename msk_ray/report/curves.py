@@ -9,7 +9,6 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from msk_ray.config import read_yaml
 from msk_ray.errors import ConfigError
 from msk_ray.report.pictures import DASHES, GREY, PALETTE, POINTS, Picture, picture, shorten, steps_axis, thin_peaks
 from msk_ray.report.reading import Reading, TrialReading
@@ -17,7 +16,7 @@ from msk_ray.tune.budget import extreme_configs, longest_budget
 from msk_ray.tune.experiment import SPACE_FILE
 from msk_ray.tune.outcomes import Outcome
 from msk_ray.tune.pruning import rungs
-from msk_ray.tune.space import parse_space
+from msk_ray.tune.space import load_space
 
 NAMED = 8
 """Variants drawn in a colour of their own."""
@@ -290,7 +289,7 @@ def rung_steps(reading: Reading) -> tuple[list[float], str]:
         # The rungs of a search come from what it may suggest, whatever it has suggested so far.
         path = reading.experiment.path / SPACE_FILE
         try:
-            configs = extreme_configs(parse_space(read_yaml(path), path))
+            configs = extreme_configs(load_space(path))
         except ConfigError as error:
             return [], f"Where the rungs of asha lie is not known: {error}. "
     budget = longest_budget(reading.space, configs)

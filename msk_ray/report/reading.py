@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from msk_ray.config import describe_fault, parse_config, read_yaml
+from msk_ray.config import current_key, describe_fault, parse_recorded, read_yaml
 from msk_ray.errors import MskRayError, StorageError
 from msk_ray.metrics_file import METRICS_FILE, read_metrics
 from msk_ray.tune.experiment import SPACE_FILE, Experiment
@@ -293,9 +293,10 @@ def _unlisted(
         if not path.is_file():
             continue  # made, but nothing was written into it
         try:
-            config = parse_config(read_yaml(path), str(path))
+            config = parse_recorded(read_yaml(path), str(path))
             settings = config.as_dict()
-            values = {key: _at(settings, key) for key in (space.parameters if space else {})}
+            varied = [current_key(key, config.env.name) for key in (space.parameters if space else {})]
+            values = {key: _at(settings, key) for key in varied}
         except _UNREADABLE as error:
             notes.append(f"trials/{folder.name} is left out, its settings cannot be read: {explain(error)}.")
             continue

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from msk_ray.config import Config, parse_config
+from msk_ray.config import Config, parse_recorded
 from msk_ray.envs import Env
 from msk_ray.errors import CheckpointError
 from msk_ray.networks import Actor, RunningMeanStd
@@ -96,4 +96,5 @@ def load_policy(path: Path) -> SavedPolicy:
         )
     except (KeyError, TypeError) as error:
         raise CheckpointError(f"{path} holds no policy: {error} is missing") from error
-    return SavedPolicy(path, parse_config(config, f"{path}: its settings"), epoch, env_steps, facts["sha256"], modules)
+    settings = parse_recorded(config, f"{path}: its settings")
+    return SavedPolicy(path, settings, epoch, env_steps, facts["sha256"], modules)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from msk_ray.algorithms import Shac
-from msk_ray.config import Config, dump_yaml
+from msk_ray.config import Config, dump_yaml, parse_recorded
 from msk_ray.envs import make_env
 from msk_ray.errors import CheckpointError, StorageError
 from msk_ray.files import remove_stale, write_bytes
@@ -136,7 +136,9 @@ class Trainer:
             CheckpointError: it is missing, torn, or was written under other settings.
         """
         state = _expect(path, read_checkpoint(path))
-        difference = _first_difference(state["config"], self.config.as_dict(), changed)
+        difference = _first_difference(
+            parse_recorded(state["config"], f"{path}: its settings").as_dict(), self.config.as_dict(), changed
+        )
         if difference:
             raise CheckpointError(
                 f"{path} was written under other settings: {difference}; say what was said then, or start another trial"

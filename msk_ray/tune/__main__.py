@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from msk_ray.cli import RESUMABLE, TERMINAL_LOG, Parser, outliving, run
-from msk_ray.config import SET_HELP, combine, dump_yaml, parse_overrides, read_yaml
+from msk_ray.config import SET_HELP, combine, dump_yaml, parse_overrides
 from msk_ray.errors import ConfigError
 from msk_ray.files import make_folder
 from msk_ray.text import printable, printable_lines
@@ -21,7 +21,7 @@ from msk_ray.tune.listing import text_table, trial_rows
 from msk_ray.tune.made_up import recover
 from msk_ray.tune.outcomes import Outcome, read_ending
 from msk_ray.tune.smoke import shrink, without_early_stopping
-from msk_ray.tune.space import Space, find_space, parse_seeds, parse_space
+from msk_ray.tune.space import Space, find_space, parse_seeds, parse_space, read_space
 from msk_ray.tune.trials import Trial, find_trial, resolve_trials
 
 DESCRIPTION = """\
@@ -184,7 +184,7 @@ def _recorded(args: argparse.Namespace) -> experiments.Experiment | None:
 def _read_space(args: argparse.Namespace, extension: Mapping[str, Any]) -> Space:
     """The space with the command line's changes laid over it, checked again as a whole."""
     path = find_space(args.space)
-    data: dict[str, Any] = read_yaml(path)
+    data = read_space(path)
     changes = parse_overrides(args.overrides)
     parameters = data.get("parameters")
     for key in changes:

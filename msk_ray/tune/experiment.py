@@ -27,7 +27,7 @@ from pydantic import ValidationError
 
 import msk_ray
 from msk_ray.cli import typed_command
-from msk_ray.config import dump_yaml, parse_config, read_yaml
+from msk_ray.config import current_values, dump_yaml, parse_recorded, read_yaml
 from msk_ray.errors import MskRayError, StorageError, StorageFailure, brief
 from msk_ray.files import check_writable, make_folder, write_json, write_text
 from msk_ray.nvidia_smi import ask_driver
@@ -35,7 +35,7 @@ from msk_ray.text import printable
 from msk_ray.tune.extension import extend_trials
 from msk_ray.tune.outcomes import OUTCOME_FILE, Outcome, read_ending
 from msk_ray.tune.space import Space, SpaceFile
-from msk_ray.tune.trials import Trial, describe_changes
+from msk_ray.tune.trials import Trial, describe_changes, with_recorded_ids
 
 FORMAT = 1
 SPACE_FILE = "space.yaml"
@@ -149,16 +149,12 @@ class Experiment:
 
     def trials(self) -> list[Trial]:
         """The trials of the manifest."""
-        return [
-            Trial(
-                entry["index"],
-                entry["id"],
-                entry["changed"],
-                entry["values"],
-                parse_config(entry["config"], f"{self.path / 'manifest.json'}: trial {entry['id']}"),
-            )
-            for entry in self.manifest()["trials"]
-        ]
+        trials = []
+        for entry in self.manifest()["trials"]:
+            config = parse_recorded(entry["config"], f"{self.path / 'manifest.json'}: trial {entry['id']}")
+            changed, values = (current_values(entry[part], config.env.name) for part in ("changed", "values"))
+            trials.append(Trial(entry["index"], entry["id"], changed, values, config))
+        return trials
 
     def clear_endings(self, outcomes: Collection[Outcome]) -> None:
         """Take back the endings of trials that ended in one of these ways, so that they go on."""
@@ -287,6 +283,8 @@ def reopen(path: Path, trials: list[Trial] | None, extension: Mapping[str, Any] 
         raise StorageError(f"no experiment at {path} to go on with; leave --resume and --extend out to start one")
     recorded = experiment.trials()
     check_writable(path)
+    if trials is not None:
+        trials = with_recorded_ids(trials, recorded)
     if extension:
         assert trials is not None
         recorded = extend_trials(recorded, trials, extension.get("epochs"))

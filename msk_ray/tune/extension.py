@@ -10,7 +10,7 @@ from typing import Any
 
 from msk_ray.errors import ConfigError
 from msk_ray.tune.space import parse_seeds
-from msk_ray.tune.trials import Trial, variant_text
+from msk_ray.tune.trials import Trial, variant_text, with_epochs
 
 KINDS = ("epochs", "samples", "seeds")
 
@@ -71,9 +71,4 @@ def extend_trials(recorded: Sequence[Trial], planned: Sequence[Trial], epochs: i
         longest = max(trial.epochs for trial in recorded)
         raise ConfigError(f"--extend epochs={epochs}: trials have {longest} epochs already; write the new total")
     trials = [*recorded, *(replace(trial, index=len(recorded) + place) for place, trial in enumerate(new))]
-    return trials if epochs is None else [_with_epochs(trial, epochs) for trial in trials]
-
-
-def _with_epochs(trial: Trial, epochs: int) -> Trial:
-    longer = trial.config.trial.model_copy(update={"epochs": epochs})
-    return replace(trial, config=trial.config.model_copy(update={"trial": longer}))
+    return trials if epochs is None else [with_epochs(trial, epochs) for trial in trials]

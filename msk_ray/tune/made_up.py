@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from msk_ray.config import current_values, env_name
 from msk_ray.errors import ConfigError, StorageError
 from msk_ray.files import write_json
 from msk_ray.tune.experiment import Experiment
@@ -50,7 +51,7 @@ def recover(experiment: Experiment, space: Space) -> list[MadeUp]:
     files = sorted(experiment.path.glob(f"trials/*/{PARAMS_FILE}"), key=lambda path: (path.stat().st_mtime, path))
     found: list[MadeUp] = []
     for file in files:
-        params = json.loads(file.read_text(encoding="utf-8"))
+        params = current_values(json.loads(file.read_text(encoding="utf-8")), env_name(base))
         try:
             trial = make_up(space, base, params)
         except (ConfigError, KeyError) as error:

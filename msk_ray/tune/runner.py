@@ -22,7 +22,7 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 import msk_ray
 from msk_ray.cli import StopRequest
-from msk_ray.config import Config, read_yaml
+from msk_ray.config import Config, parse_recorded, read_yaml
 from msk_ray.errors import ClusterLost, DeviceError, MskRayError, StorageFailure, storage_failure
 from msk_ray.progress import format_duration
 from msk_ray.training import Trainer, precompile
@@ -373,7 +373,7 @@ def _current_params(job: Job, trial: Trial) -> dict[str, Any]:
     written = job.experiment.trial_folder(trial.id) / "config.yaml"
     if not written.is_file():
         return params
-    settings = read_yaml(written)
+    settings = parse_recorded(read_yaml(written), str(written)).as_dict()
     for key in params:
         node: Any = settings
         for part in key.split("."):

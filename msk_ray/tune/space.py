@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import ConfigDict, Field, ValidationError
 
 import msk_ray
-from msk_ray.config import describe_fault, read_yaml
+from msk_ray.config import current_values, describe_fault, env_name, read_config, read_yaml
 from msk_ray.config.sections import Count, Section, Text, Whole
 from msk_ray.errors import ConfigError, brief
 from msk_ray.tune.operators import Listed, Operator, Range, parse_operator
@@ -166,7 +166,35 @@ def load_space(path: Path) -> Space:
     Raises:
         ConfigError: as `parse_space`, or the file cannot be read.
     """
-    return parse_space(read_yaml(path), path)
+    return parse_space(read_space(path), path)
+
+
+def read_space(path: Path) -> dict[str, Any]:
+    """The plain data of a space file, in today's spelling.
+
+    Raises:
+        ConfigError: it or its base cannot be read.
+    """
+    data = read_yaml(path)
+    if not isinstance(data.get("base"), str):
+        return data  # and is refused for that
+    try:
+        name = env_name(read_config(_find_base(data["base"], path)))
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+
+    def current(values: Any) -> Any:
+        return current_values(values, name) if isinstance(values, dict) else values
+
+    data |= {part: current(data[part]) for part in ("overrides", "parameters") if part in data}
+    ablate, smoke = data.get("ablate"), data.get("smoke")
+    if isinstance(smoke, dict) and "overrides" in smoke:
+        data["smoke"] = smoke | {"overrides": current(smoke["overrides"])}
+    if isinstance(ablate, dict):
+        data["ablate"] = ablate = {part: current(values) for part, values in ablate.items()}
+        if isinstance(variants := ablate.get("variants"), dict):
+            ablate["variants"] = {label: current(values) for label, values in variants.items()}
+    return data
 
 
 def parse_space(data: Mapping[str, Any], path: Path) -> Space:

@@ -9,7 +9,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from msk_ray.config import parse_config, read_yaml
+from msk_ray.config import current_key, parse_recorded, read_yaml
 from msk_ray.errors import MskRayError
 from msk_ray.metrics_file import METRICS_FILE
 from msk_ray.tune.experiment import SPACE_FILE, Experiment
@@ -137,10 +137,11 @@ class Observer:
     def _made_up(self, folder: Path, varied: Mapping[str, Any], now: float) -> Standing:
         path = folder / "config.yaml"
         try:
-            config = parse_config(read_yaml(path), str(path))
+            config = parse_recorded(read_yaml(path), str(path))
         except MskRayError as error:
             return _unreadable(folder.name, "?", 0, 0, error)
-        values = {key: _at(config.as_dict(), key) for key in varied}
+        settings = config.as_dict()
+        values = {key: _at(settings, key) for key in (current_key(key, config.env.name) for key in varied)}
         return self._standing(Trial(0, folder.name, {k: describe(v) for k, v in values.items()}, values, config), now)
 
     def _standing(self, trial: Trial, now: float) -> Standing:

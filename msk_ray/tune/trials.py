@@ -5,11 +5,11 @@ import hashlib
 import itertools
 import json
 import random
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
-from msk_ray.config import Config, overlay, parse_config, read_config
+from msk_ray.config import Config, first_spelling, overlay, parse_config, read_config
 from msk_ray.errors import ConfigError
 from msk_ray.tune.operators import Level, Listed, Range, describe
 from msk_ray.tune.space import Space
@@ -102,9 +102,34 @@ def make_trial(
 
 
 def trial_id(config: Config) -> str:
-    """First digits of the SHA-256 of a config's content. Equal configs have equal ids wherever they are resolved."""
-    text = json.dumps(config.as_dict(), sort_keys=True, separators=(",", ":"))
+    """First digits of the SHA-256 of a config's content. Equal configs have equal ids wherever they are resolved, and
+    by whatever version."""
+    text = json.dumps(first_spelling(config.as_dict()), sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()[:ID_DIGITS]
+
+
+def with_recorded_ids(planned: Sequence[Trial], recorded: Sequence[Trial]) -> list[Trial]:
+    """Planned trials under the ids that the same trials are recorded under.
+
+    Ids differ where an earlier version accepted, and hashed, settings that nothing reads; and after an extension,
+    which leaves ids but not epochs as they were.
+    """
+    one_length = len({trial.epochs for trial in recorded}) == 1 == len({trial.epochs for trial in planned})
+
+    def content(trial: Trial) -> str:
+        return trial_id(with_epochs(trial, 1).config if one_length else trial.config)
+
+    ids = {trial.id for trial in recorded}
+    by_content = {content(trial): trial.id for trial in recorded}
+    return [
+        trial if trial.id in ids else replace(trial, id=by_content.get(content(trial), trial.id)) for trial in planned
+    ]
+
+
+def with_epochs(trial: Trial, epochs: int) -> Trial:
+    """The same trial, id included, of another length."""
+    longer = trial.config.trial.model_copy(update={"epochs": epochs})
+    return replace(trial, config=trial.config.model_copy(update={"trial": longer}))
 
 
 def check_ranges(space: Space, base: Mapping[str, Any]) -> None:

@@ -27,12 +27,14 @@ def test_a_config_survives_a_round_trip() -> None:
     [
         ({**CARTPOLE, "shac": {"horizn": 3}}, "shac.horizn: unknown key; did you mean 'horizon'?"),
         ({**CARTPOLE, "phsics": {}}, "did you mean 'physics'?"),
-        ({"env": {"name": "ant", "uup": 1.0}}, "env.uup: unknown key; did you mean 'up'?"),
+        ({"env": {"name": "ant", "reward": {"uup": 1.0}}}, "env.reward.uup: unknown key; did you mean 'up'?"),
+        ({"env": {"name": "ant", "up": 1.0}}, "env.up: unknown key; write env.reward.up"),
+        ({**CARTPOLE, "horizon": 4}, "horizon: unknown key; write shac.horizon"),
         ({**CARTPOLE, "shac": {"gamma": 3}}, "shac.gamma: Input should be less than or equal to 1, not 3"),
         ({**CARTPOLE, "physics": {"timestep": 0.003}}, "does not divide env.control_timestep"),
         ({**CARTPOLE, "physics": {"timestep": 1 / 240, "substeps": 3}}, "disagree"),
         ({"env": {"name": "ant"}, "physics": {"variant": "soft"}}, "write one of matched,"),
-        ({**CARTPOLE, "physics": {"friction": 0.5}}, "cartpole has no contacts"),
+        ({**CARTPOLE, "physics": {"friction": 0.5}}, "physics.friction: env cartpole does not read it; leave it out"),
         ({"env": {"name": "ant"}, "physics": {"cone": "pyramidal", "solreffriction": [1, 1]}}, "cone: elliptic"),
         ({"env": {"name": "hopper"}}, "write env.name: cartpole or ant or myoleg26 or myoleg"),
         ({**CARTPOLE, "shac": {"critic_batches": 7}}, "critic_batches 7 must divide"),
@@ -61,10 +63,10 @@ def test_an_override_without_a_value_is_refused() -> None:
 
 
 def test_extends_lays_one_file_over_another(tmp_path: Path) -> None:
-    (tmp_path / "base.yaml").write_text("env: {name: ant, nworld: 32, up: 0.5}\n")
-    (tmp_path / "child.yaml").write_text("extends: base.yaml\nenv: {up: 0.2}\n")
+    (tmp_path / "base.yaml").write_text("env: {name: ant, nworld: 32, reward: {up: 0.5}}\n")
+    (tmp_path / "child.yaml").write_text("extends: base.yaml\nenv: {reward: {up: 0.2}}\n")
     config = load_config(tmp_path / "child.yaml")
-    assert (config.env.nworld, config.env.up) == (32, 0.2)
+    assert (config.env.nworld, config.env.reward.up) == (32, 0.2)
     (tmp_path / "grandchild.yaml").write_text("extends: child.yaml\n")
     with pytest.raises(ConfigError, match="extends another file"):
         load_config(tmp_path / "grandchild.yaml")

@@ -6,7 +6,7 @@ import mujoco
 import pytest
 import torch
 
-from msk_ray.config import AntEnvConfig, CartPoleEnvConfig, PhysicsConfig
+from msk_ray.config import AntEnvConfig, AntReward, CartPoleEnvConfig, PhysicsConfig
 from msk_ray.envs import Ant, CartPole, make_env
 from msk_ray.envs.models.ant import VARIANTS, build_ant
 from msk_ray.simulation import StepState
@@ -91,7 +91,9 @@ def test_ant_standing_reward_by_hand(ant: Ant) -> None:
 
 
 def test_ant_reward_terms_follow_their_weights() -> None:
-    config = AntEnvConfig(name="ant", forward_vel=3.0, up=2.0, heading=0.5, height=4.0, action_penalty=0.25)
+    config = AntEnvConfig(
+        name="ant", reward=AntReward(forward_vel=3.0, up=2.0, heading=0.5, height=4.0, action_penalty=0.25)
+    )
     env = make_env(config, PhysicsConfig(), 1, "cpu", 0, differentiable=False)
     state = StepState(torch.tensor([[0.0, 0, 0.77, 1, 0, 0, 0, *[0.0] * 8]]), torch.zeros(1, 14), torch.zeros(1, 0))
     state.qvel[0, 0] = 1.5
@@ -168,8 +170,8 @@ def test_a_pyramid_drops_the_softened_friction_it_cannot_have() -> None:
 
 
 def test_scores_are_taken_under_reference_weights_and_physics() -> None:
-    trained = AntEnvConfig(name="ant", forward_vel=5.0, up=0.0, nworld=7)
+    trained = AntEnvConfig(name="ant", reward=AntReward(forward_vel=5.0, up=0.0), nworld=7)
     reference = Ant.reference_settings(trained)
-    assert (reference.forward_vel, reference.up, reference.nworld) == (1.0, 0.1, 7)
+    assert (reference.reward.forward_vel, reference.reward.up, reference.nworld) == (1.0, 0.1, 7)
     physics = Ant.reference_physics(PhysicsConfig(variant="published", friction=0.1), None)
     assert physics == PhysicsConfig(variant="matched")

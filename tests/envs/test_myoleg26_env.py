@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from msk_ray.config import MyoLeg26EnvConfig, PhysicsConfig, parse_config
+from msk_ray.config import LegReward, MyoLeg26EnvConfig, PhysicsConfig, parse_config
 from msk_ray.envs import MyoLeg26, make_env
 from msk_ray.envs.legs import stride_error
 from msk_ray.envs.muscles import MuscleCurves
@@ -48,8 +48,8 @@ def test_toppling_to_any_side_costs_uprightness(env: MyoLeg26, coordinate: str, 
     """Fault: "up" measured along a body axis that rewards toppling sideways."""
     upright = terms(env, standing(env, pelvis_tilt=0.0))["upright"]
     toppled = terms(env, standing(env, **{"pelvis_tilt": 0.0, coordinate: angle}))["upright"]
-    assert upright == pytest.approx(env.config.upright)
-    assert toppled == pytest.approx(env.config.upright * math.cos(angle), rel=1e-5)
+    assert upright == pytest.approx(env.config.reward.upright)
+    assert toppled == pytest.approx(env.config.reward.upright * math.cos(angle), rel=1e-5)
 
 
 def test_up_heading_and_spin_agree_with_the_body_in_c_mujoco(env: MyoLeg26) -> None:
@@ -76,7 +76,7 @@ def test_effort_grows_with_activation_from_rest(env: MyoLeg26) -> None:
     for activation in (0.0, 0.2, 0.5, 1.0):
         state = standing(env)
         found.append(terms(env, state._replace(act=torch.full_like(state.act, activation)))["effort"])
-    weight = env.config.effort
+    weight = env.config.reward.effort
     assert found == pytest.approx([0.0, -0.04 * weight, -0.25 * weight, -weight])
 
 
@@ -94,7 +94,7 @@ def test_forward_is_where_the_toes_point(env: MyoLeg26) -> None:
     mujoco.mj_forward(env.model, data)
     assert data.body("talus_r").xpos[0] < before - 0.2
     target = env.config.target_speed
-    assert terms(env, standing(env, v_pelvis_tx=target))["forward_vel"] == pytest.approx(env.config.forward_vel)
+    assert terms(env, standing(env, v_pelvis_tx=target))["forward_vel"] == pytest.approx(env.config.reward.forward_vel)
     sideways, backward = standing(env, v_pelvis_tz=target), standing(env, v_pelvis_tx=-target)
     still = terms(env, standing(env))["forward_vel"]
     assert terms(env, sideways)["forward_vel"] == pytest.approx(still)
@@ -141,7 +141,7 @@ def test_reward_by_hand(env: MyoLeg26) -> None:
     )  # fmt: skip
     state.act.fill_(0.5)
     config = env.config
-    env.config = config.model_copy(update={"symmetry": 0.1, "progress": 0.5, "stride": 0.5})
+    env.config = config.model_copy(update={"reward": LegReward(symmetry=0.1, progress=0.5, stride=0.5)})
     try:
         found = terms(env, state, torch.full((2, 26), 0.5))
     finally:
@@ -278,9 +278,10 @@ def test_the_standing_keyframe_is_held_by_its_excitations(env: MyoLeg26) -> None
 
 
 def test_scores_use_reference_weights_and_contacts_but_the_same_task() -> None:
-    trained = MyoLeg26EnvConfig(name="myoleg26", forward_vel=5.0, effort=0.0, target_speed=0.7, reset="walk")
+    reward = LegReward(forward_vel=5.0, effort=0.0)
+    trained = MyoLeg26EnvConfig(name="myoleg26", reward=reward, target_speed=0.7, reset="walk")
     reference = MyoLeg26.reference_settings(trained)
-    assert (reference.forward_vel, reference.effort) == (1.0, 0.2)
+    assert (reference.reward.forward_vel, reference.reward.effort) == (1.0, 0.2)
     assert (reference.target_speed, reference.reset) == (0.7, "walk")
     physics = MyoLeg26.reference_physics(PhysicsConfig(friction=0.1, substeps=4), None)
     assert physics == PhysicsConfig(substeps=4)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from msk_ray.config import MyoLeg26EnvConfig, PhysicsConfig
+from msk_ray.config import LegReward, MyoLeg26EnvConfig, PhysicsConfig
 from msk_ray.envs import make_env
 from msk_ray.envs.models.myoleg26 import SUBSTEPS, build_myoleg26
 from msk_ray.gradcheck import check_chain, check_gradients, make_states
@@ -49,7 +49,9 @@ def test_forward_agrees_with_c_mujoco_over_100_steps(model: mujoco.MjModel, name
 
 def test_reward_and_observation_have_the_gradient_of_their_own_values() -> None:
     """Through muscle lengths, rates and forces, joint limits and the pelvis, by central differences of the value."""
-    config = MyoLeg26EnvConfig(name="myoleg26", symmetry=0.3, stride=0.4, progress=0.2, stochastic_reset=False)
+    config = MyoLeg26EnvConfig(
+        name="myoleg26", reward=LegReward(symmetry=0.3, stride=0.4, progress=0.2), stochastic_reset=False
+    )
     env = make_env(config, PhysicsConfig(), 1, "cpu", 0, differentiable=False)
     rng = np.random.default_rng(3)
     parts = [part[0].numpy().astype(float) for part in env.state.physics]

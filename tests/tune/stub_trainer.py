@@ -1,6 +1,6 @@
 """A trainer of milliseconds: its score rises towards a height set by the learning rate; some settings misbehave.
 
-Which way is chosen by `env.cart_position_penalty`: 1 kills its own process once, 2 gives NaN, 3 raises
+Which way is chosen by `env.reward.cart_position_penalty`: 1 kills its own process once, 2 gives NaN, 3 raises
 SimulationError, 4 raises an unforeseen error every time, 5 hangs once, 6 finds the disk full once, 7 runs out of
 memory, 8 does so with more than `ROOM` worlds, 9 does so before its first epoch, 10 too, and kills its own process once
 when it has begun with fewer. Anything else trains.
@@ -18,6 +18,7 @@ from pathlib import Path
 from msk_ray.config import Config, dump_yaml
 from msk_ray.errors import CheckpointError, Failure, SimulationError
 
+BEHAVIOUR = "env.reward.cart_position_penalty"
 KILL, NAN, SIMULATION_ERROR, BUG, HANG, FULL_DISK, MEMORY = 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0
 LATE_CROWD, CROWD, DOOMED_CROWD = 8.0, 9.0, 10.0
 MISBEHAVE_AT = 5
@@ -36,7 +37,7 @@ class StubTrainer:
         self.best_score = -math.inf
         (logdir / "checkpoints").mkdir(parents=True, exist_ok=True)
         (logdir / "config.yaml").write_text(dump_yaml(config.as_dict()))
-        self.behaviour = getattr(config.env, "cart_position_penalty", None)
+        self.behaviour = getattr(config.env.reward, "cart_position_penalty", None)
         with (logdir / "processes").open("a") as file:
             file.write(f"{os.getpid()}\n")
         if self.behaviour in (CROWD, DOOMED_CROWD) and config.env.nworld > ROOM:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from stub_trainer import CROWD, LATE_CROWD, MEMORY, StubTrainer
+from stub_trainer import BEHAVIOUR, CROWD, LATE_CROWD, MEMORY, StubTrainer
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from msk_ray.cli import RESUMABLE, run
@@ -33,7 +33,7 @@ def crowded(make_space: Any) -> Callable[..., Trial]:
     """A trial of 8 worlds that misbehaves in some way."""
 
     def make(behaviour: float, **overrides: Any) -> Trial:
-        changes = {"env.cart_position_penalty": behaviour} | {k.replace("__", "."): v for k, v in overrides.items()}
+        changes = {BEHAVIOUR: behaviour} | {k.replace("__", "."): v for k, v in overrides.items()}
         return resolve_trials(make_space(parameters={}, overrides=changes))[0]
 
     return make

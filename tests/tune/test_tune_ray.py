@@ -14,6 +14,7 @@ import pytest
 import stub_trainer
 from ray import cloudpickle
 from stub_trainer import (
+    BEHAVIOUR,
     BUG,
     CROWD,
     DOOMED_CROWD,
@@ -79,7 +80,8 @@ def test_faults_are_named_and_killed_or_hung_trials_go_on(
 ) -> None:
     behaviours = [0.0, KILL, NAN, SIMULATION_ERROR, BUG, HANG]
     space = make_space(
-        parameters={"env.cart_position_penalty": {"grid": behaviours}}, resources={"max_failures": 1, "hang_s": 3.0}
+        parameters={BEHAVIOUR: {"grid": behaviours}},
+        resources={"max_failures": 1, "hang_s": 3.0},
     )
     completed, records = go(space, tmp_path / "runs" / "faults")
     assert completed
@@ -119,7 +121,7 @@ def test_a_trial_that_training_makes_worse_is_shown_with_the_score_it_is_ranked_
 def test_a_full_disk_stops_everything_and_ends_nothing(
     make_space: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    space = make_space(parameters={"env.cart_position_penalty": {"grid": [FULL_DISK, MEMORY]}})
+    space = make_space(parameters={BEHAVIOUR: {"grid": [FULL_DISK, MEMORY]}})
     path = tmp_path / "runs" / "disk"
     with pytest.raises(StorageFailure, match="No space left on device; mend that and go on with --resume"):
         go(space, path)
@@ -179,7 +181,7 @@ def test_out_of_memory_starts_anew_with_half_the_worlds_in_a_fresh_process(
     make_space: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     space = make_space(
-        parameters={"env.cart_position_penalty": {"grid": [0.0, CROWD, LATE_CROWD, MEMORY, DOOMED_CROWD]}},
+        parameters={BEHAVIOUR: {"grid": [0.0, CROWD, LATE_CROWD, MEMORY, DOOMED_CROWD]}},
         # No death is forgiven, and being started anew is none.
         resources={"max_failures": 0, "halve_worlds_on_oom": True},
         scheduler={"kind": "asha", "grace": 0.9},
@@ -219,7 +221,7 @@ def test_a_search_goes_on_with_half_the_worlds(make_space: Any, tmp_path: Path) 
     space = make_space(
         parameters={"shac.actor_lr": {"loguniform": [1e-3, 1e-2]}},
         search="optuna",
-        overrides={"trial.epochs": 6, "env.cart_position_penalty": LATE_CROWD},
+        overrides={"trial.epochs": 6, BEHAVIOUR: LATE_CROWD},
         resources={"max_failures": 0, "halve_worlds_on_oom": True},
     )
     completed, (record,) = go(space, tmp_path / "runs" / "optuna")
@@ -230,16 +232,14 @@ def test_a_search_goes_on_with_half_the_worlds(make_space: Any, tmp_path: Path) 
 
 
 def test_a_driver_killed_after_the_decision_goes_on_with_half_the_worlds(make_space: Any, tmp_path: Path) -> None:
-    space = make_space(
-        parameters={"env.cart_position_penalty": {"grid": [LATE_CROWD]}}, resources={"halve_worlds_on_oom": True}
-    )
+    space = make_space(parameters={BEHAVIOUR: {"grid": [LATE_CROWD]}}, resources={"halve_worlds_on_oom": True})
     path = tmp_path / "runs" / "killed"
     (trial,) = resolve_trials(space)
     folder = experiments.create(path, space, [trial], {}).trial_folder(trial.id)
     with pytest.raises(StartAnew):  # as far as a driver came that was killed there
         run_trial(trial, folder, "cpu", StopSpec(), StubTrainer, Hooks(), may_halve=True)
     # Whoever goes on may not halve, and need not: it has been decided.
-    completed, (record,) = go(make_space(parameters={"env.cart_position_penalty": {"grid": [LATE_CROWD]}}), path, True)
+    completed, (record,) = go(make_space(parameters={BEHAVIOUR: {"grid": [LATE_CROWD]}}), path, True)
     assert completed
     assert outcomes([record]) == ["finished"]
     assert record.halved == Halved(8, 4, "out_of_memory: made up", cleared=True) == read_halved(folder)

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msk_ray.config import MyoLegEnvConfig, PhysicsConfig
+from msk_ray.config.legs import PACKAGED_MODELS
 from msk_ray.envs.models.options import apply_options
 from msk_ray.errors import ConfigError
 
-NAMES: Final = ("myolegs", "myolegs26")
 INSTALL: Final = "install one with `pip install myo-sim`, or set env.model to the path of an MJCF file"
 SUBSTEPS: Final = 10
 """Physics steps of a control step of 20 ms: 2 ms each, as the models' own."""
@@ -52,12 +52,12 @@ def find_model(model: str | None, source: str = "auto") -> Source:
     Raises:
         ConfigError: there is no such file, name or package.
     """
-    if model is not None and model not in NAMES:
+    if model is not None and model not in PACKAGED_MODELS:
         path = Path(model)
         if not path.is_file():
-            raise ConfigError(f"env.model: no file {model}; write a path, {' or '.join(NAMES)}")
+            raise ConfigError(f"env.model: no file {model}; write a path, {' or '.join(PACKAGED_MODELS)}")
         return Source("file", "", model, lambda: _spec_of(path))
-    name = model or NAMES[0]
+    name = model or PACKAGED_MODELS[0]
     finders = {"myosuite2": _myosuite2, "myosuite3": _myosuite3, "myo_sim": _myo_sim}
     asked = list(finders) if source == "auto" else [source]
     for package in asked:

@@ -1,0 +1,125 @@
+"""How a model is built, stepped and differentiated, and which environments read which of these settings."""
+
+from typing import Literal
+
+from pydantic import PositiveFloat, model_validator
+
+from msk_ray.config.sections import Count, NonNegative, Section, Text
+
+Vec2 = tuple[float, float]
+Vec5 = tuple[float, float, float, float, float]
+
+STEPPING = frozenset(
+    (
+        *("backward", "substep_grad_clip", "substeps", "timestep", "integrator"),
+        *("fd.eps_ctrl", "fd.eps_qpos", "fd.eps_qvel", "fd.max_worlds"),
+    )
+)
+"""Settings that every environment reads."""
+SOLVING = frozenset(("tolerance", "iterations", "ls_iterations", "cone", "impratio", "nconmax", "njmax"))
+"""Those of the constraint solver, which a model without contacts and limits does without."""
+CONTACTS = frozenset(("solref", "solimp", "friction", "solreffriction"))
+"""Those of contacts, in models that declare their own."""
+LIMITS = frozenset(("solref_limit", "solimp_limit"))
+"""Those of joint limits."""
+JOINTS = frozenset(("joint_damping", "armature"))
+"""Those of joints."""
+ACTIVATION = frozenset(("fd.eps_act",))
+"""Those of models whose actuators have a state."""
+
+
+class FdConfig(Section):
+    """Central differences of backward mode `fd_jacobian`."""
+
+    eps_ctrl: PositiveFloat = 5e-3
+    """Perturbation of ctrl [its own unit]."""
+    eps_qpos: PositiveFloat = 5e-4
+    """Perturbation of qpos along a tangent direction [m, rad]."""
+    eps_qvel: PositiveFloat = 2e-3
+    """Perturbation of qvel [m/s, rad/s]."""
+    eps_act: PositiveFloat = 5e-4
+    """Perturbation of act [its own unit]."""
+    max_worlds: Count = 131072
+    """Perturbed copies run at once; more are done in chunks."""
+
+
+class PhysicsConfig(Section):
+    """How the model is built, stepped and differentiated. Fields left null keep the variant's value."""
+
+    variant: Text | None = None
+    """Named physics of the environment: for ant `published`, `matched` or `matched_hard_friction`."""
+    backward: Literal["tape_per_substep", "tape_all", "fd_jacobian", "hybrid"] = "tape_per_substep"
+    """Backward mode of the step. `tape_*` are exact; `fd_jacobian` differentiates any model by finite differences;
+    `hybrid` takes the state's gradient from the tape and the control's from finite differences, for diagnosis."""
+    substep_grad_clip: PositiveFloat | None = None
+    """Bound on each world's state cotangent between substeps, in the loss's own units; null leaves it. Tapes only."""
+    fd: FdConfig = FdConfig()
+    substeps: Count | None = None
+    """Physics steps an env step. Set this or `timestep`; 4 if neither is set."""
+    timestep: PositiveFloat | None = None
+    """Duration of a physics step [s]; must divide the env's control_timestep."""
+    tolerance: PositiveFloat | None = None
+    """Constraint solver tolerance; mujoco_warp's default is 1e-6."""
+    iterations: Count | None = None
+    """Constraint solver iteration limit."""
+    ls_iterations: Count | None = None
+    """Line search iteration limit."""
+    integrator: Literal["Euler", "implicitfast", "RK4"] | None = None
+    cone: Literal["pyramidal", "elliptic"] | None = None
+    """Friction cone. The pyramid's edges make contact gradients explode over long horizons; the ellipse has none."""
+    impratio: PositiveFloat | None = None
+    """Ratio of frictional to normal constraint impedance."""
+    solref: Vec2 | None = None
+    """Contact time constant [s] and damping ratio."""
+    solimp: Vec5 | None = None
+    """Contact impedance d0, dwidth, width [m], midpoint, power."""
+    friction: PositiveFloat | None = None
+    """Sliding friction coefficient."""
+    solreffriction: Vec2 | None = None
+    """Solver reference of the friction directions alone [s, ratio], set on contact pairs; needs the elliptic cone.
+
+    Friction acts like a damper with this time constant: (0.02, 1) sticks, (1, 1) is viscous. `(0, 0)` uses solref.
+    """
+    joint_damping: NonNegative | None = None
+    """Damping of every actuated joint [N m s/rad]."""
+    armature: NonNegative | None = None
+    """Rotor inertia of every actuated joint [kg m²]."""
+    solref_limit: Vec2 | None = None
+    """Solver reference of joint limits; two negative values are -stiffness and -damping."""
+    solimp_limit: Vec5 | None = None
+    """Impedance of joint limits."""
+    gear: PositiveFloat | None = None
+    """Force or torque of a motor at full control [N, N m]."""
+    nconmax: Count | None = None
+    """Contacts a world; null takes a bound from the geometry."""
+    njmax: Count | None = None
+    """Constraint rows a world; null takes a bound from the geometry."""
+
+    @model_validator(mode="after")
+    def _friction_direction_needs_ellipse(self) -> "PhysicsConfig":
+        if self.solreffriction is not None and self.cone == "pyramidal":
+            raise ValueError("solreffriction acts with the elliptic cone only: write cone: elliptic")
+        return self
+
+    def resolve_substeps(self, control_timestep: float) -> int:
+        """Physics steps an env step of `control_timestep` [s].
+
+        Raises:
+            ValueError: `timestep` does not divide it, or `substeps` and `timestep` disagree.
+        """
+        if self.timestep is None:
+            return self.substeps or 4
+        ratio = control_timestep / self.timestep
+        whole = round(ratio)
+        if whole < 1 or abs(ratio - whole) > 1e-4 * whole:
+            nearest = control_timestep / max(1, whole)
+            raise ValueError(
+                f"physics.timestep {self.timestep:g} s does not divide env.control_timestep {control_timestep:g} s: "
+                f"write {nearest:.8g} ({max(1, whole)} substeps)"
+            )
+        if self.substeps is not None and self.substeps != whole:
+            raise ValueError(
+                f"physics.substeps {self.substeps} and physics.timestep {self.timestep:g} s disagree: "
+                f"an env step of {control_timestep:g} s has {whole} such substeps; write one of the two"
+            )
+        return whole

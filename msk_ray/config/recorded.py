@@ -1,0 +1,74 @@
+"""Settings as earlier versions wrote them: the one place that turns old spellings into today's.
+
+Until November 2026 the weights of the reward stood among the other settings of `env`; now they are `env.reward`. Files
+are read in either spelling; what is typed is refused in the old one.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+_LEGS = (
+    *("forward_vel", "speed_scale", "progress", "upright", "heading", "height", "alive", "effort", "joint_limit"),
+    *("smoothness", "capture", "capture_scale", "sway", "symmetry", "stride", "stride_angle", "cadence"),
+)
+_ONCE_FLAT: dict[str, tuple[str, ...]] = {
+    "cartpole": (
+        *("pole_angle_penalty", "pole_velocity_penalty", "cart_position_penalty", "cart_velocity_penalty"),
+        "cart_action_penalty",
+    ),
+    "ant": ("forward_vel", "heading", "up", "height", "action_penalty"),
+    "myoleg26": _LEGS,
+    "myoleg": _LEGS,
+}
+"""Settings of `env` that have moved into `env.reward`, by the environment's name."""
+
+
+def env_name(settings: Mapping[str, Any]) -> str | None:
+    """The environment that nested settings name, if they do."""
+    env = settings.get("env")
+    name = env.get("name") if isinstance(env, Mapping) else None
+    return name if isinstance(name, str) else None
+
+
+def current_settings(settings: Mapping[str, Any], name: str | None) -> dict[str, Any]:
+    """Nested settings of environment `name` in today's spelling."""
+    moved = _ONCE_FLAT.get(name or "", ())
+    env = settings.get("env")
+    if not isinstance(env, Mapping) or "reward" in env or not any(key in env for key in moved):
+        return dict(settings)
+    rest = {key: value for key, value in env.items() if key not in moved}
+    reward = {key: value for key, value in env.items() if key in moved}
+    return {**settings, "env": {**rest, "reward": reward}}
+
+
+def current_key(dotted: str, name: str | None) -> str:
+    """A dotted key of environment `name` in today's spelling."""
+    section, _, key = dotted.partition(".")
+    return f"env.reward.{key}" if section == "env" and key in _ONCE_FLAT.get(name or "", ()) else dotted
+
+
+def current_values(values: Mapping[str, Any], name: str | None) -> dict[str, Any]:
+    """Dotted keys and what they are set to, for environment `name`, in today's spelling."""
+    return {
+        current_key(key, name): current_settings({"env": value}, name)["env"] if key == "env" else value
+        for key, value in values.items()
+    }
+
+
+def first_spelling(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """A complete configuration's plain data as the first version wrote it, which trials' ids are hashes of.
+
+    So a trial keeps its id from version to version. A setting that comes later belongs in `_LATER`.
+    """
+    env = dict(settings["env"])
+    if env["name"] in _ONCE_FLAT:
+        env |= env.pop("reward")
+    spelt = {**settings, "env": env}
+    for (section, key), default in _LATER.items():
+        if spelt[section].get(key) == default:
+            spelt[section] = {name: value for name, value in spelt[section].items() if name != key}
+    return spelt
+
+
+_LATER: dict[tuple[str, str], Any] = {}
+"""Settings that the first version did not have, (section, name), with the default at which they leave ids alone."""

@@ -1,0 +1,68 @@
+"""Settings that do nothing in a trial, because its environment or another setting leaves them unread.
+
+They are refused: a sweep over one would be many names for one trial.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+from msk_ray.config.physics import FdConfig, PhysicsConfig
+
+if TYPE_CHECKING:
+    from msk_ray.config.schema import Config
+
+
+def unread_settings(config: Config) -> Iterator[tuple[str, str, Any]]:
+    """(dotted key, why nothing reads it, its default) of each such setting that is not at its default."""
+    for key, why in _unread(config).items():
+        *sections, name = key.split(".")
+        owner: Any = config
+        for section in sections:
+            owner = getattr(owner, section)
+        default = type(owner).model_fields[name].default
+        if getattr(owner, name) != default:
+            yield key, why, default
+
+
+def _unread(config: Config) -> dict[str, str]:
+    env, physics, shac = config.env, config.physics, config.shac
+    fields = [name for name in PhysicsConfig.model_fields if name != "fd"]
+    fields += [f"fd.{name}" for name in FdConfig.model_fields]
+    unread = {f"physics.{name}": _while("physics.backward", physics.backward) for name in _unread_by_backward(config)}
+    if (physics.cone or ("pyramidal" if physics.variant in env.pyramidal_variants else "elliptic")) == "pyramidal":
+        why = "nothing reads it while friction cones are pyramids; write physics.cone: elliptic, or"
+        unread["physics.solreffriction"] = why
+        if config.curriculum is not None:
+            unread["curriculum.start.solreffriction"] = why
+    alien = [name for name in fields if name not in env.reads_physics]
+    unread |= {f"physics.{name}": f"env {env.name} does not read it;" for name in alien}
+    unread |= {f"env.{name}": f"nothing reads it while {why};" for name, why in env.unread().items()}
+    if shac.lr_schedule == "constant":
+        unread["shac.final_lr"] = _while("shac.lr_schedule", "constant")
+    if shac.critic_method == "one-step":
+        unread["shac.lam"] = _while("shac.critic_method", "one-step")
+    if not shac.state_bptt:
+        unread["shac.state_grad_clip"] = _while("shac.state_bptt", "false")
+    if shac.entropy is not None and shac.entropy.target is None:
+        unread["shac.entropy.rate"] = _while("shac.entropy.target", "null")
+    if not config.actor.stochastic:
+        unread["actor.log_std"] = _while("actor.stochastic", "false")
+    return unread
+
+
+def _unread_by_backward(config: Config) -> list[str]:
+    """Fields of the physics section that the backward mode leaves unread."""
+    state = ["fd.eps_qpos", "fd.eps_qvel", "fd.eps_act"]
+    match config.physics.backward:
+        case "fd_jacobian":
+            return ["substep_grad_clip"]
+        case "hybrid":
+            return state
+        case _:
+            return [*state, "fd.eps_ctrl", "fd.max_worlds"]
+
+
+def _while(key: str, value: str) -> str:
+    return f"nothing reads it while {key} is {value};"

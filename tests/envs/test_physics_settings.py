@@ -1,0 +1,176 @@
+"""A setting of the physics section does something, or is refused: in every environment, with every backward mode."""
+
+from functools import cache
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from msk_ray.config import Config, PhysicsConfig, overlay, parse_config
+from msk_ray.config.physics import FdConfig
+from msk_ray.config.schema import ENVIRONMENTS
+from msk_ray.envs import env_class, make_env
+from msk_ray.errors import ConfigError
+from msk_ray.simulation.modes import BACKWARD_MODES, configured_backward
+
+VALUES: dict[str, Any] = {
+    "variant": "matched_hard_friction",
+    "substep_grad_clip": 5.0,
+    "substeps": 7,
+    "timestep": 0.0025,
+    "tolerance": 1e-9,
+    "iterations": 7,
+    "ls_iterations": 3,
+    "integrator": "RK4",
+    "cone": "pyramidal",
+    "impratio": 3.0,
+    "solref": [0.03, 0.9],
+    "solimp": [0.8, 0.9, 0.02, 0.5, 2.0],
+    "friction": 0.33,
+    "solreffriction": [0.5, 1.0],
+    "joint_damping": 3.3,
+    "armature": 0.77,
+    "solref_limit": [0.03, 0.9],
+    "solimp_limit": [0.8, 0.9, 0.02, 0.5, 2.0],
+    "gear": 33.0,
+    "nconmax": 9,
+    "njmax": 61,
+    "fd.eps_ctrl": 0.01,
+    "fd.eps_qpos": 0.01,
+    "fd.eps_qvel": 0.01,
+    "fd.eps_act": 0.01,
+    "fd.max_worlds": 64,
+}
+REFUSED = {
+    "cartpole": {"variant", "tolerance", "iterations", "ls_iterations", "cone", "impratio", "solref", "solimp"}
+    | {"friction", "solreffriction", "solref_limit", "solimp_limit", "nconmax", "njmax", "fd.eps_act"},
+    "ant": {"fd.eps_act"},
+    "myoleg26": {"variant", "gear"},
+    "myoleg": {"variant", "gear", "solref", "solimp", "friction", "solreffriction", "solref_limit", "solimp_limit"}
+    | {"joint_damping", "armature"},
+}
+"""What each environment does not read whatever the backward mode."""
+STATE_EPS = {"fd.eps_qpos", "fd.eps_qvel", "fd.eps_act"}
+UNREAD_BY = {
+    "tape_per_substep": {"fd.eps_ctrl", "fd.max_worlds"} | STATE_EPS,
+    "tape_all": {"fd.eps_ctrl", "fd.max_worlds"} | STATE_EPS,
+    "fd_jacobian": {"substep_grad_clip"},
+    "hybrid": STATE_EPS,
+}
+
+
+LEGS = """<mujoco><worldbody><geom type="plane" size="1 1 1"/><body name="root" pos="0 0 .8"><freejoint/>
+<geom size=".1" mass="1"/>
+<body><joint name="hip_flexion_r"/><geom size=".1" mass="1"/></body>
+<body><joint name="hip_flexion_l"/><geom size=".1" mass="1"/></body></body></worldbody></mujoco>"""
+
+
+@pytest.fixture(scope="module")
+def legs(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The path of a small model for `myoleg`."""
+    path = tmp_path_factory.mktemp("legs") / "legs.xml"
+    path.write_text(LEGS)
+    return str(path)
+
+
+def _settings(env: str, backward: str, legs: str) -> dict[str, Any]:
+    settings: dict[str, Any] = {"env": {"name": env, "control_timestep": 0.02}, "physics": {"backward": backward}}
+    if env == "myoleg":
+        settings["env"] |= {"model": legs}
+    return settings
+
+
+@cache
+def _model(env: str, field: str | None, legs: str) -> bytes:
+    """The compiled model of an environment with one setting of its physics changed."""
+    settings = _settings(env, "fd_jacobian", legs)
+    config = parse_config(settings if field is None else overlay(settings, {f"physics.{field}": _value(env, field)}))
+    model = env_class(config.env).build_model(config.env, config.physics)
+    buffer = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return buffer.tobytes()
+
+
+def _value(env: str, field: str) -> Any:
+    # This model has MuJoCo's default cone.
+    return "elliptic" if (env, field) == ("myoleg", "cone") else VALUES[field]
+
+
+def _backward(config: Config) -> list[tuple[Any, ...]]:
+    """What the backward mode, and those it is made of, are told."""
+    whole = vars(configured_backward(config.physics))
+    parts = [whole, *(vars(whole[name]) for name in ("state", "ctrl") if name in whole)]
+    return [(part.get("substep_grad_clip"), part.get("eps"), part.get("max_worlds")) for part in parts]
+
+
+def test_every_field_is_tried() -> None:
+    fields = {name for name in PhysicsConfig.model_fields if name not in ("fd", "backward")}
+    assert set(VALUES) == fields | {f"fd.{name}" for name in FdConfig.model_fields}
+    for settings in ENVIRONMENTS.values():
+        assert settings.reads_physics <= set(VALUES) | {"backward"}
+    assert set(UNREAD_BY) == set(BACKWARD_MODES)
+
+
+@pytest.mark.parametrize("backward", sorted(UNREAD_BY))
+@pytest.mark.parametrize("env", sorted(REFUSED))
+def test_a_setting_does_something_or_is_refused(env: str, backward: str, legs: str) -> None:
+    base = _settings(env, backward, legs)
+    plain = _backward(parse_config(base))
+    for field in VALUES:
+        settings = overlay(base, {f"physics.{field}": _value(env, field)})
+        if field in REFUSED[env] | UNREAD_BY[backward]:
+            with pytest.raises(ConfigError) as caught:
+                parse_config(settings)
+            assert f"physics.{field}:" in str(caught.value)
+            assert "leave it out" in str(caught.value)
+        elif field in ("nconmax", "njmax"):
+            parse_config(settings)  # sizes of buffers: the next test
+        elif field == "substep_grad_clip" or field.startswith("fd."):
+            assert _backward(parse_config(settings)) != plain, f"{field} does nothing"
+        else:
+            parse_config(settings)
+            assert _model(env, field, legs) != _model(env, None, legs), f"{field} does nothing"
+
+
+@pytest.mark.parametrize("env", ["ant", "myoleg26"])
+@pytest.mark.parametrize("field", ["nconmax", "njmax"])
+def test_buffers_are_as_large_as_asked_for(env: str, field: str) -> None:
+    config = parse_config(overlay(_settings(env, "tape_all", ""), {f"physics.{field}": 61}))
+    batch = make_env(config.env, config.physics, 1, "cpu", 0, differentiable=False).sim.batch
+    assert 61 in (batch.data.naconmax, batch.data.njmax)
+
+
+UNREAD: list[tuple[dict[str, Any], str, Any, dict[str, Any]]] = [
+    ({"shac.lr_schedule": "constant"}, "shac.final_lr", 1e-4, {"shac.lr_schedule": "linear"}),
+    ({"shac.critic_method": "one-step"}, "shac.lam", 0.5, {"shac.critic_method": "td-lambda"}),
+    ({"shac.state_bptt": False}, "shac.state_grad_clip", 10.0, {"shac.state_bptt": True}),
+    ({"shac.entropy": {}}, "shac.entropy.rate", 0.1, {"shac.entropy.target": 0.5}),
+    ({"actor.stochastic": False}, "actor.log_std", 0.0, {"actor.stochastic": True}),
+    ({"physics.variant": "published"}, "physics.solreffriction", [1.0, 1.0], {"physics.cone": "elliptic"}),
+    (
+        {"physics.variant": "published", "curriculum": {"start": {"friction": 2.0}, "epochs": 3}},
+        "curriculum.start.solreffriction",
+        [1.0, 1.0],
+        {"physics.cone": "elliptic"},
+    ),
+    ({"env": {"name": "myoleg26", "terrain": {"kind": "slope"}}}, "env.terrain.seed", 3, {"env.terrain.kind": "rough"}),
+    ({"env": {"name": "myoleg26"}}, "env.terrain.slope", 0.2, {"env.terrain.kind": "slope"}),
+    ({"env": {"name": "myoleg26"}}, "env.assist.balance", 100.0, {"env.assist.epochs": 10}),
+    ({"env": {"name": "myoleg26", "target_speed": 0.0}}, "env.success_speed", 0.5, {"env.target_speed": 1.0}),
+    ({"env": {"name": "myoleg", "early_termination": False}}, "env.min_height", 0.5, {"env.early_termination": True}),
+    ({"env": {"name": "myoleg", "model": "legs.xml"}}, "env.source", "myo_sim", {"env.model": "myolegs26"}),
+]
+
+
+@pytest.mark.parametrize(("changes", "key", "value", "remedy"), UNREAD, ids=[case[1] for case in UNREAD])
+def test_a_setting_that_another_leaves_unread_is_refused(
+    changes: dict[str, Any], key: str, value: Any, remedy: dict[str, Any]
+) -> None:
+    settings = overlay({"env": {"name": "ant"}}, changes)
+    parse_config(parse_config(settings).as_dict())  # a trial's config.yaml holds every field, at its default
+    with pytest.raises(ConfigError) as caught:
+        parse_config(overlay(settings, {key: value}))
+    assert str(caught.value).startswith(f"config: {key}: nothing reads it while ")
+    assert "leave it out" in str(caught.value)
+    parse_config(overlay(overlay(settings, {key: value}), remedy))

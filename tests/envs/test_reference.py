@@ -1,0 +1,64 @@
+"""Scores are taken under the reference reward, and under nothing else that differs from the trial."""
+
+from typing import Any
+
+import pytest
+
+from msk_ray.config import EnvSettings, LegReward, MyoLegEnvConfig, Reward, parse_config
+from msk_ray.config.physics import STEPPING
+from msk_ray.config.sections import Section
+from msk_ray.envs import Ant, CartPole, MyoLeg, MyoLeg26
+from msk_ray.envs.base import Env
+
+ENVS: tuple[type[Env[Any]], ...] = (CartPole, Ant, MyoLeg26, MyoLeg)
+
+
+class _HopperReward(Reward):
+    speed: float = 2.0
+
+
+class _HopperSettings(EnvSettings):
+    reads_physics = STEPPING
+
+    episode_length: int = 10
+    model: str = "hopper.xml"
+    height: float = 0.5
+    reward: _HopperReward = _HopperReward()
+
+
+def test_a_model_path_survives_scoring() -> None:
+    """Of an environment that says nothing about it: the base class must be right."""
+    trained = _HopperSettings(model="own.xml", height=0.7, nworld=3, reward=_HopperReward(speed=9.0))
+    reference = Env.reference_settings(trained)
+    assert reference == _HopperSettings(model="own.xml", height=0.7, nworld=3)
+    legs = MyoLegEnvConfig(name="myoleg", model="own.xml", target_speed=0.5, reward=LegReward(sway=1.0))
+    assert Env.reference_settings(legs) == MyoLegEnvConfig(name="myoleg", model="own.xml", target_speed=0.5)
+
+
+def _other(value: Any) -> Any:
+    """Another value of the same type."""
+    match value:
+        case bool():
+            return not value
+        case int() | float():
+            return value / 2 if value else 0.25
+        case None:
+            return "own.xml"
+    return value
+
+
+@pytest.mark.parametrize("env", ENVS, ids=lambda env: env.settings.model_fields["name"].annotation.__args__[0])
+def test_only_the_reward_is_reset(env: type[Env[Any]]) -> None:
+    name = env.settings.model_fields["name"].annotation.__args__[0]  # type: ignore[union-attr]
+    default = parse_config({"env": {"name": name}}).env
+    changes = {
+        field: _other(getattr(default, field))
+        for field in env.settings.model_fields
+        if not isinstance(getattr(default, field), str | Section)
+    }
+    weights = {weight: _other(value) for weight, value in default.reward.model_dump().items()}
+    changes |= {"name": name, "nworld": 3, "episode_length": 7, "reward": weights}
+    trained = env.settings.model_validate(changes)
+    reference = env.reference_settings(trained)
+    assert reference.reward == default.reward != trained.reward
+    assert reference.model_dump(exclude={"reward", "assist"}) == trained.model_dump(exclude={"reward", "assist"})
