@@ -23,13 +23,13 @@ from record import RESULTS, markdown_table, publish
 from msk_ray.cli import run
 from msk_ray.config import describe_fault
 from msk_ray.errors import ConfigError
+from msk_ray.experiment.metrics import Evaluation
+from msk_ray.experiment.outcomes import Outcome
 from msk_ray.tune.experiment import Experiment
-from msk_ray.tune.outcomes import Outcome
 from msk_ray.tune.pruning import Pruner, make_pruner
 from msk_ray.tune.records import TrialRecord, read_records
 from msk_ray.tune.space import SchedulerSpec
 from msk_ray.tune.standing import Observer
-from msk_ray.tune.stopping import Evaluation
 from msk_ray.tune.table import outcome_name
 
 NEAR = 0.01

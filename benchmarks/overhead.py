@@ -23,8 +23,8 @@ from record import RESULTS, markdown_table, publish
 
 import msk_ray
 from msk_ray.config import dump_yaml
+from msk_ray.experiment.metrics import read_rows
 from msk_ray.training import Trainer
-from msk_ray.tune.records import read_rows
 from msk_ray.tune.space import load_space
 from msk_ray.tune.trials import Trial, resolve_trials
 

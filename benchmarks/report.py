@@ -16,8 +16,8 @@ from typing import Any
 from record import RESULTS, markdown_table, publish
 
 from msk_ray.config import dump_yaml
+from msk_ray.experiment.outcomes import Ending, Outcome, write_ending
 from msk_ray.tune import experiment as experiments
-from msk_ray.tune.outcomes import Ending, Outcome, write_ending
 from msk_ray.tune.space import parse_space
 from msk_ray.tune.trials import resolve_trials
 

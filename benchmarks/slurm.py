@@ -24,9 +24,9 @@ from hosts import Host, check_possible, network
 from record import RESULTS, markdown_table, publish
 
 from msk_ray.config import dump_yaml
+from msk_ray.experiment.metrics import read_rows
+from msk_ray.experiment.outcomes import read_ending
 from msk_ray.tune.experiment import Experiment
-from msk_ray.tune.outcomes import read_ending
-from msk_ray.tune.records import read_rows
 
 SPACE = {
     "question": "Does an experiment survive what SLURM does to jobs?",

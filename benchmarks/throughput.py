@@ -19,9 +19,9 @@ from record import RESULTS, markdown_table, publish
 
 import msk_ray
 from msk_ray.config import dump_yaml, parse_overrides
+from msk_ray.experiment.metrics import read_rows
+from msk_ray.experiment.outcomes import read_ending
 from msk_ray.tune.devices import local_gpus
-from msk_ray.tune.outcomes import read_ending
-from msk_ray.tune.records import read_rows
 
 REPOSITORY = Path(msk_ray.__file__).resolve().parent.parent
 WARM_UP = 5

@@ -11,14 +11,15 @@ from typing import TYPE_CHECKING
 
 from msk_ray.cli import Parser, run
 from msk_ray.errors import MskRayError, StorageError
+from msk_ray.experiment.damage import count_damages
+from msk_ray.experiment.outcomes import Outcome
+from msk_ray.experiment.snapshot import State
 from msk_ray.progress import format_duration
 from msk_ray.text import printable
 from msk_ray.tune.experiment import Experiment
-from msk_ray.tune.outcomes import Outcome
 from msk_ray.tune.standing import (
     Observer,
     Standing,
-    State,
     best_of,
     counts,
     find_experiments,
@@ -105,8 +106,12 @@ def view(observer: Observer, width: int, rows: int | None = None) -> "Renderable
     if len(shown) < len(standings):
         lines.append(Text(f"... and {len(standings) - len(shown)} more", style="dim"))
     if width < WIDE:  # a wide table has a column for it
-        told = [s for s in shown if s.state is State.UNREADABLE or s.outcome in (Outcome.ERROR, Outcome.OUT_OF_MEMORY)]
+        bad = (Outcome.ERROR, Outcome.OUT_OF_MEMORY)
+        told = [s for s in shown if s.damages or s.state is State.UNREADABLE or s.outcome in bad]
         lines += [Text(printable(f"{s.id}: {s.note}"), style="red") for s in told]
+    damages = [damage for standing in standings for damage in standing.damages]
+    if damages:
+        lines.append(Text(f"skipped: {count_damages(damages)}", style="red"))
     if observer.experiment.stop_file.exists() and any(s.state is not State.ENDED for s in standings):
         command = printable(observer.experiment.resume_command())
         lines.append(Text(f"stopped on request; go on with: {command}"))
@@ -155,7 +160,8 @@ def _cells(standing: Standing, wide: bool, seeds: bool) -> list[str]:
     progress, device = standing.progress, standing.device
     # "stopped_asha" is an outcome's name; in a narrow column "asha" says the same.
     state = (standing.outcome if wide else standing.outcome.removeprefix("stopped_")) or str(standing.state)
-    gpu = f"{device.host}:{device.gpu} {device.name}".strip() if wide and device.host else device.gpu
+    model = "" if device.gpu == "cpu" else device.name
+    gpu = f"{device.host}:{device.gpu} {model}".strip() if wide and device.host else device.gpu
     cells = [
         standing.id,
         standing.variant
@@ -238,7 +244,7 @@ def _list(storage: Path) -> int:
 def _summary(experiment: Experiment) -> tuple[str, str, str, str]:
     try:
         standings = Observer(experiment).look(time.time())
-        question = experiment.manifest()["question"]
+        question = experiment.manifest().get("question") or ""
     except MskRayError as error:
         return "-", "-", str(error), ""
     best = best_of(standings)

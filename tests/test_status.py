@@ -12,12 +12,14 @@ import pytest
 
 from msk_ray.cli import run
 from msk_ray.config import dump_yaml
+from msk_ray.experiment.halved import Halved, write_halved
+from msk_ray.experiment.metrics import progress_of
+from msk_ray.experiment.outcomes import Ending, Outcome, write_ending
+from msk_ray.experiment.snapshot import State
 from msk_ray.status import main, short_number
 from msk_ray.tune import experiment as experiments
-from msk_ray.tune.halved import Halved, write_halved
-from msk_ray.tune.outcomes import Ending, Outcome, write_ending
 from msk_ray.tune.space import parse_space
-from msk_ray.tune.standing import Observer, State, best_of, progress_of, remaining
+from msk_ray.tune.standing import Observer, best_of, remaining
 from msk_ray.tune.trials import resolve_trials
 
 NOW = time.time()
@@ -65,7 +67,7 @@ def experiment(now: None, tmp_path: Path) -> experiments.Experiment:
     write_ending(folders[2], Ending(Outcome.FINISHED, "all done"))
     fill(folders[3], [row(0), row(4, 2.0)], age=999.0)
     write_ending(folders[3], Ending(Outcome.STOPPED_ASHA, "number 3 of 3"))
-    fill(folders[5], [row(1)], age=1.0)
+    fill(folders[5], [row(1)], age=999.0)
     (folders[5] / "outcome.json").write_text('{"outc')
     return made
 
@@ -75,7 +77,7 @@ def test_states_from_files(experiment: experiments.Experiment) -> None:
     assert [s.state for s in standings] == [
         State.RUNNING,
         State.STALE,
-        State.UNREADABLE,
+        State.STALE,
         State.ENDED,
         State.ENDED,
         State.WAITING,
@@ -88,8 +90,8 @@ def test_states_from_files(experiment: experiments.Experiment) -> None:
     assert [s.outcome for s in standings[3:5]] == ["finished", "stopped_asha"]  # the higher score first
     best = best_of(standings)
     assert best is standings[3]
-    # One trial at a time and 4 s an epoch: 12 epochs of the running one, 16 of the silent, 20 of the waiting.
-    assert remaining(standings) == (12 + 16 + 20) * 4.0
+    # One trial at a time and 4 s an epoch: 12 epochs of the running one, 16 and 19 of the silent, 20 of the waiting.
+    assert remaining(standings) == (12 + 16 + 19 + 20) * 4.0
 
 
 @pytest.mark.parametrize(("age", "state"), [(59.0, State.RUNNING), (61.0, State.STALE), (-50.0, State.RUNNING)])
@@ -125,11 +127,11 @@ def test_a_process_that_has_just_started_may_take_minutes_to_compile(experiment:
 def test_a_changed_file_is_read_again_and_another_is_not(
     experiment: experiments.Experiment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from msk_ray.tune import standing
+    from msk_ray.experiment import snapshot
 
     read: list[str] = []
-    original = standing.read_rows
-    monkeypatch.setattr(standing, "read_rows", lambda folder: (read.append(folder.name), original(folder))[1])
+    original = snapshot.load_metrics
+    monkeypatch.setattr(snapshot, "load_metrics", lambda path: (read.append(path.parent.name), original(path))[1])
     observer = Observer(experiment)
     observer.look(NOW)
     read.clear()
@@ -166,12 +168,13 @@ def test_the_table_fits_the_terminal(
     text = capsys.readouterr().out
     lines = text.splitlines()
     assert max(map(len, lines)) <= width
-    assert lines[0].startswith("rates · 1 running · 1 stale · 1 waiting · 2 ended · 1 unreadable · best 9")
+    assert lines[0].startswith("rates · 1 running · 2 stale · 1 waiting · 2 ended · best 9")
     running = next(line.split() for line in lines if "running" in line and "8/20" in line)
     for cell in ("actor_lr=0.01", "8/20", "7", "12.3k", "48s"):
         assert cell in running, running
     assert "asha" in text
-    assert "JSONDecodeError" in text  # what is wrong with the broken file
+    assert "outcome.json: not JSON" in " ".join(text.split())  # what is wrong with the broken file
+    assert "skipped: 1 damaged file" in text
     assert ("node7:3 NVIDIA H200" in text) == (width == 200)
     assert ("number 3 of 3" in text) == (width == 200)
 
@@ -204,7 +207,7 @@ def test_a_trial_with_half_its_worlds_says_so(
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= width
     text = " ".join(" ".join(lines).split())
-    assert text.count("(half the") == 1
+    assert text.count("(half") == 1
     assert "32 of 64" in text
 
 
@@ -231,7 +234,7 @@ def test_list_of_experiments(experiment: experiments.Experiment, capsys: pytest.
     assert "Which rate?" in text
     assert "1 running" in text
     assert "manifest.json is" in text
-    assert "cannot read" in text
+    assert "not JSON" in text
     assert "debug" not in text
 
 
@@ -241,8 +244,8 @@ def test_list_of_experiments(experiment: experiments.Experiment, capsys: pytest.
         (["rate"], "did you mean 'rates'?"),
         (["nothing"], "there are rates"),
         (["torn"], "holds no experiment: manifest.json is missing"),
-        (["garbled"], "cannot read"),
-        (["odd"], "has no trials"),
+        (["garbled"], "manifest.json: not JSON"),
+        (["odd"], "manifest.json: trials is missing; restore it"),
         (["--watch"], "which experiment? there are"),
     ],
 )

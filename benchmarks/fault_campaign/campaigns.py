@@ -12,7 +12,7 @@ from pathlib import Path
 from fault_campaign.reference import Reference
 from fault_campaign.space import EPOCHS
 from fault_campaign.sweep import Sweep
-from msk_ray.tune.outcomes import read_ending
+from msk_ray.experiment.outcomes import read_ending
 from msk_ray.tune.trials import Trial
 
 DISK_MIB = 48

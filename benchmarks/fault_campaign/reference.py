@@ -4,9 +4,9 @@ from pathlib import Path
 from typing import Any
 
 from fault_campaign.space import EPOCHS, TIMING
+from msk_ray.experiment.metrics import read_rows
+from msk_ray.experiment.outcomes import read_ending
 from msk_ray.training import Trainer, read_checkpoint
-from msk_ray.tune.outcomes import read_ending
-from msk_ray.tune.records import read_rows
 from msk_ray.tune.trials import Trial
 
 

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import msk_ray
 from fault_campaign.processes import birth_of, descendants_of, name_of
-from msk_ray.tune.outcomes import read_ending
-from msk_ray.tune.records import read_rows
+from msk_ray.experiment.metrics import read_rows
+from msk_ray.experiment.outcomes import read_ending
 from msk_ray.tune.trials import Trial
 
 REPOSITORY = Path(msk_ray.__file__).resolve().parent.parent

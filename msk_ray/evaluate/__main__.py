@@ -11,10 +11,10 @@ from msk_ray.cli import Parser, run
 from msk_ray.errors import CheckpointError, MskRayError
 from msk_ray.evaluate.targets import Kind, Target, best_checkpoint, best_of_trial, find_target
 from msk_ray.experiment.checkpoint_file import read_facts
+from msk_ray.experiment.snapshot import read_trial
 from msk_ray.files import write_json
 from msk_ray.text import printable
 from msk_ray.tune.experiment import Experiment
-from msk_ray.tune.halved import read_halved
 from msk_ray.tune.listing import text_table
 from msk_ray.tune.space import parse_seeds
 
@@ -163,7 +163,7 @@ def evaluate_experiment(experiment: Experiment, bench: "Bench", requests: "Seque
                 failed[trial.id] = str(error)
                 print(f"{number}/{len(trials)}  {trial.id}  {printable(str(error))}", flush=True)
                 continue
-            halved = read_halved(experiment.trial_folder(trial.id))
+            halved = read_trial(experiment.trial_folder(trial.id)).halved
             name = trial.variant + (f" ({halved})" if halved is not None else "")
             ranking.append({"trial": trial.id, "variant": name, "seed": trial.seed, **entry})
             print(f"{number}/{len(trials)}  {trial.id}  {entry['score']['mean']:.5g}", flush=True)

@@ -1,7 +1,6 @@
 """Evaluations of one policy under one physics: figures with their spread over episodes."""
 
 import datetime
-import json
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,15 +13,16 @@ from torch import Tensor
 
 from msk_ray.config import Config, PhysicsConfig
 from msk_ray.envs import env_class
-from msk_ray.errors import ConfigError, StorageError
+from msk_ray.errors import ConfigError
 from msk_ray.evaluate.targets import trial_folder_of
+from msk_ray.experiment.damage import DamagedFile, field, is_number, number, read_object
+from msk_ray.experiment.layout import EVAL_FILE
 from msk_ray.files import write_json
 from msk_ray.training import Evaluator, SavedPolicy
 from msk_ray.training.evaluation import Episodes
 from msk_ray.training.memory import named_out_of_memory
 
 FORMAT = 1
-EVAL_FILE = "eval.json"
 REFERENCE, OWN = "reference", "own"
 _PACKAGES = ("msk-ray", "torch", "warp-lang", "mujoco", "mujoco-warp")
 
@@ -178,15 +178,44 @@ def read_evaluations(path: Path) -> list[dict[str, Any]]:
         StorageError: it is not such a file.
     """
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return []
-    except (OSError, ValueError) as error:
-        raise StorageError(f"cannot read {path}: {error}; remove it to have it written anew") from error
-    entries = data.get("evaluations") if isinstance(data, dict) and data.get("format") == FORMAT else None
-    if not isinstance(entries, list):
-        raise StorageError(f"{path} holds no evaluations of format {FORMAT}; remove it to have it written anew")
+        return read_object(path, _evaluations) or []
+    except DamagedFile as error:
+        raise DamagedFile(error.damage, "remove it to have it written again") from None
+
+
+def _evaluations(data: dict[str, Any]) -> list[dict[str, Any]]:
+    if data.get("format") != FORMAT:
+        raise ValueError(f"it holds no evaluations of format {FORMAT}")
+    entries: list[dict[str, Any]] = field(data, "evaluations", list)
+    for place, entry in enumerate(entries):
+        if not isinstance(entry, dict):
+            raise ValueError(f"evaluation {place} is no object")
+        try:
+            _check_evaluation(entry)
+        except ValueError as error:
+            raise ValueError(f"evaluation {place}: {error}") from None
     return entries
+
+
+def _check_evaluation(entry: dict[str, Any]) -> None:
+    for name in ("checkpoint", "physics", "sha256", "device"):
+        field(entry, name, str)
+    for name in ("worlds", "steps", "epoch"):
+        field(entry, name, int)
+    field(entry, "canonical", bool)
+    for name in ("fall_rate", "diverged_rate", *(["success_rate"] if "success_rate" in entry else [])):
+        number(entry, name)
+    if not all(map(is_number, field(entry, "seeds", list))):
+        raise ValueError("seeds are no numbers")
+    groups = [
+        {name: entry.get(name) for name in ("score", "length")},
+        *(field(entry, n, dict) for n in ("outcomes", "terms")),
+    ]
+    for group in groups:
+        for name in group:
+            spread_of = field(group, name, dict)
+            for part in ("mean", "std", "min", "max"):
+                number(spread_of, part)
 
 
 def store_evaluation(path: Path, entry: Mapping[str, Any]) -> None:

@@ -6,11 +6,10 @@ from enum import StrEnum
 from pathlib import Path
 
 from msk_ray.errors import CheckpointError, StorageError
-from msk_ray.tune.experiment import SPACE_FILE, Experiment
+from msk_ray.experiment import layout
+from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.records import best_record, read_records
 from msk_ray.tune.standing import find_experiments
-
-BEST = "best.pt"
 
 
 class Kind(StrEnum):
@@ -100,9 +99,9 @@ def best_of_trial(folder: Path) -> Path:
     Raises:
         CheckpointError: there is none yet.
     """
-    path = folder / "checkpoints" / BEST
+    path = layout.best_checkpoint(folder)
     if not path.is_file():
-        raise CheckpointError(f"{folder} has no checkpoints/{BEST}: the trial was not evaluated yet, or lost it")
+        raise CheckpointError(f"{folder} has no checkpoints/{path.name}: the trial was not evaluated yet, or lost it")
     return path
 
 
@@ -112,9 +111,9 @@ def trial_folder_of(checkpoint: Path) -> Path:
 
 
 def _kind_of(path: Path) -> Kind:
-    if any((path / part).exists() for part in ("manifest.json", SPACE_FILE, "trials")):
+    if any((path / part).exists() for part in (layout.MANIFEST_FILE, layout.SPACE_FILE, "trials")):
         return Kind.EXPERIMENT
-    if any((path / part).exists() for part in ("checkpoints", "config.yaml", "metrics.jsonl")):
+    if any((path / part).exists() for part in ("checkpoints", "config.yaml", layout.METRICS_FILE)):
         return Kind.TRIAL
     if path.name == "checkpoints":
         raise StorageError(f"{path}: give one of its .pt files, or the trial's folder above it")

@@ -10,11 +10,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from msk_ray.errors import ConfigError
+from msk_ray.experiment.outcomes import Outcome
 from msk_ray.report.pictures import DASHES, GREY, PALETTE, POINTS, Picture, picture, shorten, steps_axis, thin_peaks
 from msk_ray.report.reading import Reading, TrialReading
 from msk_ray.tune.budget import extreme_configs, longest_budget
 from msk_ray.tune.experiment import SPACE_FILE
-from msk_ray.tune.outcomes import Outcome
 from msk_ray.tune.pruning import rungs
 from msk_ray.tune.space import load_space
 

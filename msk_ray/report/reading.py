@@ -3,7 +3,6 @@
 What cannot be read is named in `notes`, or in the trial it belongs to; it never hides the rest.
 """
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,21 +14,29 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from msk_ray.config import current_key, describe_fault, parse_recorded, read_yaml
+from msk_ray.config import describe_fault, read_yaml
 from msk_ray.errors import MskRayError, StorageError
-from msk_ray.metrics_file import METRICS_FILE, read_metrics
-from msk_ray.tune.experiment import SPACE_FILE, Experiment
-from msk_ray.tune.halved import Halved, read_halved
-from msk_ray.tune.operators import describe
-from msk_ray.tune.outcomes import Ending, read_ending
+from msk_ray.experiment.damage import Damage, count_damages, describe_damages
+from msk_ray.experiment.halved import Halved
+from msk_ray.experiment.layout import (
+    ENVIRONMENT_FILE,
+    ERROR_FILE,
+    MANIFEST_FILE,
+    OUTPUT_FILE,
+    SPACE_FILE,
+    best_checkpoint,
+)
+from msk_ray.experiment.metrics import SCORE
+from msk_ray.experiment.outcomes import Ending
+from msk_ray.experiment.snapshot import State, TrialReader
+from msk_ray.tune.experiment import Experiment, read_environment
+from msk_ray.tune.records import unlisted_trials
 from msk_ray.tune.space import SpaceFile
-from msk_ray.tune.standing import DEVICE_FILE, OUTPUT_FILE, State, heartbeat_age, is_silent, progress_of
-from msk_ray.tune.stopping import SCORE
 from msk_ray.tune.trials import Trial
 
-ERROR_FILE = "error.txt"
 _TAIL_LINES = 12
-_UNREADABLE = (MskRayError, OSError, ValueError, KeyError, TypeError)
+_NOTED = 10
+"""Damaged files that are named; of more, the number is said."""
 
 
 class Condition(StrEnum):
@@ -129,7 +136,7 @@ class TrialReading:
 
     @property
     def why(self) -> str:
-        parts = (self.halved, self.note or (self.ending and self.ending.why))
+        parts = (self.halved, self.ending and self.ending.why, self.note)
         return "; ".join(str(part) for part in parts if part)
 
     @property
@@ -138,7 +145,7 @@ class TrialReading:
 
     @property
     def best_checkpoint(self) -> Path | None:
-        path = self.folder / "checkpoints" / "best.pt"
+        path = best_checkpoint(self.folder)
         return path if path.is_file() else None
 
     def tail(self) -> str:
@@ -219,17 +226,29 @@ def read_experiment(experiment: Experiment, now: float) -> Reading:
         try:
             manifest = experiment.manifest()
             trials = experiment.trials()
-        except _UNREADABLE as error:
+        except MskRayError as error:
             notes.append(f"Which trials were planned is not known: {explain(error)}.")
     text, space = _read_space(experiment.path / SPACE_FILE, notes)
-    readings = [_read_trial(trial, experiment.trial_folder(trial.id), now) for trial in trials]
-    readings += _unlisted(experiment, {trial.id for trial in trials}, space, notes, now)
+    environment, damages = _read_environment(experiment.path, notes)
+    listed = {trial.id for trial in trials}
+    unlisted, unreadable = unlisted_trials(experiment, listed, list(space.parameters) if space else [])
+    notes += [f"A trial is left out: {line}." for line in describe_damages(unreadable, experiment.path)]
+    reader = TrialReader()
+    readings = []
+    for trial in [*trials, *unlisted]:
+        reading, found = _read_trial(reader, trial, experiment.trial_folder(trial.id), now)
+        readings.append(reading)
+        damages += found
+    if damages:
+        lines = describe_damages(damages, experiment.path)
+        more = f"; and {len(lines) - _NOTED} more files" if len(lines) > _NOTED else ""
+        notes.append(f"Skipped: {count_damages(damages)}. {'; '.join(lines[:_NOTED])}{more}.")
     return Reading(
         experiment,
         str(manifest.get("question") or (space.question.strip() if space else "")),
         str(manifest.get("created", "")),
         tuple(readings),
-        _read_environment(experiment.path / "env.json", notes),
+        environment,
         space,
         text,
         tuple(notes),
@@ -242,76 +261,23 @@ def explain(error: Exception) -> str:
     return text if isinstance(error, MskRayError) else f"{type(error).__name__}: {text}"
 
 
-def _read_trial(trial: Trial, folder: Path, now: float) -> TrialReading:
-    try:
-        rows = read_metrics(folder / METRICS_FILE)
-        columns = columns_of(rows)
-        ending = read_ending(folder)
-        progress = progress_of([_numbers(row) for row in rows[-12:]])
-        device = _device(folder / DEVICE_FILE)
-        halved = read_halved(folder)
-    except _UNREADABLE as error:
-        return TrialReading(trial, folder, {}, State.UNREADABLE, note=explain(error))
-    age = heartbeat_age(folder, now)
-    if ending is not None:
-        state = State.ENDED
-    elif age is None:
-        state = State.WAITING
-    else:
-        state = State.STALE if is_silent(folder, progress, age) else State.RUNNING
-    return TrialReading(trial, folder, columns, state, ending, device=device, halved=halved)
-
-
-def _device(path: Path) -> str:
-    return str(json.loads(path.read_text(encoding="utf-8"))["name"]) if path.is_file() else ""
+def _read_trial(reader: TrialReader, trial: Trial, folder: Path, now: float) -> tuple[TrialReading, tuple[Damage, ...]]:
+    seen = reader.read(folder, now)
+    note = "; ".join(describe_damages(seen.damages, folder))
+    columns = columns_of(seen.rows)
+    return TrialReading(
+        trial, folder, columns, seen.state, seen.ending, note, seen.device.name, seen.halved
+    ), seen.damages
 
 
 def columns_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
-    """Rows of metrics as arrays (E,) by name; what a row lacks, or has as null, is NaN."""
-    names: dict[str, None] = {}
+    """Rows of metrics as arrays (E,) by name; what a row lacks is NaN."""
+    if not rows:
+        return {}
+    names: dict[str, None] = dict.fromkeys(("epoch", "env_steps", "seconds"))
     for row in rows:
         names.update(dict.fromkeys(row))
-    names.pop("nonfinite", None)
-    return {name: np.array([row.get(name) for row in rows], dtype=float) for name in names}
-
-
-def _numbers(row: Mapping[str, Any]) -> dict[str, float]:
-    return {k: math.nan if v is None else v for k, v in row.items() if k != "nonfinite"}
-
-
-def _unlisted(
-    experiment: Experiment, listed: set[str], space: SpaceFile | None, notes: list[str], now: float
-) -> list[TrialReading]:
-    """Trials that the manifest does not know: those a search has made up, or all if it is lost."""
-    root = experiment.path / "trials"
-    folders = (
-        sorted(path for path in root.iterdir() if path.is_dir() and path.name not in listed) if root.is_dir() else []
-    )
-    found: list[TrialReading] = []
-    for folder in folders:
-        path = folder / "config.yaml"
-        if not path.is_file():
-            continue  # made, but nothing was written into it
-        try:
-            config = parse_recorded(read_yaml(path), str(path))
-            settings = config.as_dict()
-            varied = [current_key(key, config.env.name) for key in (space.parameters if space else {})]
-            values = {key: _at(settings, key) for key in varied}
-        except _UNREADABLE as error:
-            notes.append(f"trials/{folder.name} is left out, its settings cannot be read: {explain(error)}.")
-            continue
-        trial = Trial(
-            len(listed) + len(found), folder.name, {k: describe(v) for k, v in values.items()}, values, config
-        )
-        found.append(_read_trial(trial, folder, now))
-    return found
-
-
-def _at(settings: Mapping[str, Any], dotted: str) -> Any:
-    node: Any = settings
-    for part in dotted.split("."):
-        node = node[part]
-    return node
+    return {name: np.array([row.get(name, math.nan) for row in rows], dtype=float) for name in names}
 
 
 def _read_space(path: Path, notes: list[str]) -> tuple[str, SpaceFile | None]:
@@ -323,21 +289,16 @@ def _read_space(path: Path, notes: list[str]) -> tuple[str, SpaceFile | None]:
         return text, SpaceFile.model_validate(read_yaml(path))
     except ValidationError as error:
         notes.append(f"space.yaml cannot be read: {describe_fault(error, SpaceFile)}.")
-    except _UNREADABLE as error:
+    except (MskRayError, OSError, ValueError) as error:
         notes.append(f"space.yaml cannot be read: {explain(error)}.")
     return "", None
 
 
-def _read_environment(path: Path, notes: list[str]) -> dict[str, Any]:
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+def _read_environment(folder: Path, notes: list[str]) -> tuple[dict[str, Any], list[Damage]]:
+    if not (folder / ENVIRONMENT_FILE).is_file():
         notes.append("env.json is missing: versions and command are not known.")
-        return {}
-    except (OSError, ValueError) as error:
-        notes.append(f"env.json cannot be read: {explain(error)}.")
-        return {}
-    return data if isinstance(data, dict) else {}
+        return {}, []
+    return read_environment(folder / ENVIRONMENT_FILE)
 
 
 def check_folder(experiment: Experiment) -> None:
@@ -347,5 +308,5 @@ def check_folder(experiment: Experiment) -> None:
         StorageError: it holds files, and none that an experiment begins with.
     """
     names = [path.name for path in experiment.path.iterdir()]
-    if names and not {"manifest.json", SPACE_FILE, "env.json", "trials"} & set(names):
+    if names and not {MANIFEST_FILE, SPACE_FILE, ENVIRONMENT_FILE, "trials"} & set(names):
         raise StorageError(f"{experiment.path} holds no experiment (nor the beginning of one)")

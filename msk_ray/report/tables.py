@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from msk_ray.errors import ConfigError
+from msk_ray.experiment.outcomes import Outcome
 from msk_ray.report.reading import Reading, TrialReading
 from msk_ray.report.statistics import Interval, difference_interval, mean_interval
-from msk_ray.tune.outcomes import Outcome
 from msk_ray.tune.standing import State
 
 _PLAIN_FIGURES = ("score", "score_std", "length", "fall_rate", "diverged_rate", "best_score")

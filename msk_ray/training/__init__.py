@@ -1,6 +1,6 @@
 """One trial: train, evaluate, log, checkpoint, resume. Knows nothing of Ray."""
 
-from msk_ray.metrics_file import read_metrics
+from msk_ray.experiment.metrics import read_metrics
 from msk_ray.training.checkpoint import newest_valid_checkpoint, read_checkpoint
 from msk_ray.training.evaluation import Evaluator
 from msk_ray.training.policy import PolicyNetwork, SavedPolicy, load_policy

@@ -10,8 +10,10 @@ import numpy as np
 from torch.utils.tensorboard import SummaryWriter
 
 from msk_ray.errors import StorageFailure
+from msk_ray.experiment.damage import Damage
+from msk_ray.experiment.layout import METRICS_FILE
+from msk_ray.experiment.metrics import load_metrics
 from msk_ray.files import write_bytes
-from msk_ray.metrics_file import METRICS_FILE, read_metrics
 
 _PROGRESS = ("env_steps", "seconds", "env_steps_per_s")
 _SCHEDULED = ("train/horizon", "train/actor_lr")
@@ -42,14 +44,23 @@ class MetricsLog:
         self._board: SummaryWriter | None = None
         self._folder = folder
 
-    def rewind(self, epoch: int) -> None:
-        """Drop rows after `epoch`, which a resumed trial will write again, and with them a torn last line."""
+    def rewind(self, epoch: int) -> tuple[Damage, ...]:
+        """Drop rows after `epoch`, which a resumed trial will write again, and with them what is damaged.
+
+        Returns:
+            The damaged lines.
+
+        Raises:
+            StorageFailure: the rows cannot be read or written.
+        """
         if not self._path.is_file():
-            return
-        rows = [row for row in read_metrics(self._path) if row["epoch"] <= epoch]
+            return ()
+        metrics = load_metrics(self._path)
+        rows = [row for row in metrics.rows if row["epoch"] <= epoch]
         write_bytes(self._path, "".join(json.dumps(row) + "\n" for row in rows).encode())
         self.close()
         self._board = SummaryWriter(str(self._folder), purge_step=epoch + 1)
+        return metrics.damages
 
     def write(self, row: dict[str, float]) -> None:
         """Append one row; it is on its way to disk when this returns.

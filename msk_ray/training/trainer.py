@@ -10,8 +10,10 @@ from msk_ray.algorithms import Shac
 from msk_ray.config import Config, dump_yaml, parse_recorded
 from msk_ray.envs import make_env
 from msk_ray.errors import CheckpointError, StorageError
+from msk_ray.experiment.damage import Damage, describe_damages
+from msk_ray.experiment.layout import METRICS_FILE
+from msk_ray.experiment.metrics import SCORE, read_metrics
 from msk_ray.files import remove_stale, write_bytes
-from msk_ray.metrics_file import METRICS_FILE, read_metrics
 from msk_ray.training.checkpoint import (
     epoch_checkpoints,
     milestone_path,
@@ -68,6 +70,7 @@ class Trainer:
             self.shac = Shac(config, self.env)
             self.evaluator = Evaluator(config, device)
         self._log = MetricsLog(logdir)
+        self._damages: tuple[Damage, ...] = ()
 
     @property
     def checkpoints(self) -> Path:
@@ -152,7 +155,7 @@ class Trainer:
         self.shac.load_state_dict(_to_device(state["shac"], self.env.device))
         self.epoch, self.env_steps = state["epoch"], state["env_steps"]
         self._seconds = state["seconds"]
-        self._log.rewind(self.epoch)
+        self._damages = self._log.rewind(self.epoch)
         self.best_score = self._trained_best(state["best_score"])
 
     def _trained_best(self, recorded: float) -> float:
@@ -161,15 +164,15 @@ class Trainer:
         Then `best.pt` is the untrained policy, and the next evaluation replaces it.
         """
         rows = read_metrics(self.logdir / METRICS_FILE)
-        untrained = [row.get("eval/score") for row in rows if row["epoch"] == 0]
-        trained = [row.get("eval/score") for row in rows if row["epoch"] > 0]
+        untrained = [row.get(SCORE) for row in rows if row["epoch"] == 0]
+        trained = [row.get(SCORE) for row in rows if row["epoch"] > 0]
         return -math.inf if recorded in untrained and recorded not in trained else recorded
 
     def restore_latest(self) -> tuple[Path | None, list[str]]:
         """Go on from the newest whole checkpoint, or from the start if there is none.
 
         Returns:
-            Its path or None, and a line on each newer checkpoint that was torn.
+            Its path or None, and a line on each newer checkpoint that was torn and on damaged metrics.
         """
         path, faults = newest_valid_checkpoint(self.checkpoints)
         if path is not None:
@@ -177,8 +180,8 @@ class Trainer:
         else:
             self._write_config()
             # An attempt that died before its first checkpoint may have left rows, the last of them torn.
-            self._log.rewind(-1)
-        return path, faults
+            self._damages = self._log.rewind(-1)
+        return path, [*faults, *describe_damages(self._damages, self.logdir)]
 
     def _write_config(self) -> None:
         write_bytes(self.logdir / "config.yaml", dump_yaml(self.config.as_dict()).encode())

@@ -12,6 +12,7 @@ from typing import Any
 from msk_ray.cli import RESUMABLE, TERMINAL_LOG, Parser, outliving, run
 from msk_ray.config import SET_HELP, combine, dump_yaml, parse_overrides
 from msk_ray.errors import ConfigError
+from msk_ray.experiment.outcomes import Outcome, read_ending
 from msk_ray.files import make_folder
 from msk_ray.text import printable, printable_lines
 from msk_ray.tune import experiment as experiments
@@ -19,7 +20,6 @@ from msk_ray.tune.budget import extreme_configs
 from msk_ray.tune.extension import extended_space, parse_extension
 from msk_ray.tune.listing import text_table, trial_rows
 from msk_ray.tune.made_up import recover
-from msk_ray.tune.outcomes import Outcome, read_ending
 from msk_ray.tune.smoke import shrink, without_early_stopping
 from msk_ray.tune.space import Space, find_space, parse_seeds, parse_space, read_space
 from msk_ray.tune.trials import Trial, find_trial, resolve_trials

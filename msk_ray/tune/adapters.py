@@ -8,9 +8,9 @@ from ray.tune.schedulers import FIFOScheduler, PopulationBasedTraining, TrialSch
 from ray.tune.search import Searcher
 
 from msk_ray.errors import ConfigError
-from msk_ray.tune.journal import Journal, Report
+from msk_ray.experiment.journal import Journal, Report
+from msk_ray.experiment.outcomes import Ending
 from msk_ray.tune.operators import Listed, Operator, Range
-from msk_ray.tune.outcomes import Ending
 from msk_ray.tune.pruning import Pruner
 from msk_ray.tune.space import SchedulerSpec
 
@@ -49,7 +49,7 @@ class PruningScheduler(FIFOScheduler):
         self._time_attr = time_attr
         self._journal = journal
         # The first report with half the worlds is new, whatever was heard of the attempt with all of them.
-        self._heard = {report.trial: (report.halved, report.epoch) for report in journal.read()}
+        self._heard = {report.trial: (report.halved, report.epoch) for report in journal.read()[0]}
         self._identify = identify
         self._on_stop = on_stop
 

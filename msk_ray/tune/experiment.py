@@ -10,7 +10,6 @@ runs/<experiment>/
     summary.json, table.md, eval.json, report/
 """
 
-import json
 import os
 import platform
 import re
@@ -29,20 +28,20 @@ import msk_ray
 from msk_ray.cli import typed_command
 from msk_ray.config import current_values, dump_yaml, parse_recorded, read_yaml
 from msk_ray.errors import MskRayError, StorageError, StorageFailure, brief
+from msk_ray.experiment.damage import Damage, DamagedFile, cut, field, read_object, texts
+from msk_ray.experiment.layout import ENVIRONMENT_FILE, MANIFEST_FILE, METRICS_FILE, OUTCOME_FILE, SPACE_FILE, STOP_FILE
+from msk_ray.experiment.metrics import read_metrics
+from msk_ray.experiment.outcomes import Outcome, read_ending
 from msk_ray.files import check_writable, make_folder, write_json, write_text
 from msk_ray.nvidia_smi import ask_driver
 from msk_ray.text import printable
 from msk_ray.tune.extension import extend_trials
-from msk_ray.tune.outcomes import OUTCOME_FILE, Outcome, read_ending
 from msk_ray.tune.space import Space, SpaceFile
 from msk_ray.tune.trials import Trial, describe_changes, with_recorded_ids
 
 FORMAT = 1
-SPACE_FILE = "space.yaml"
 REMEMBERED = ("halve_worlds", "early_stopping")
 """Options that --resume goes on with unless it says otherwise."""
-STOP_FILE = "stop"
-"""While this file lies in the experiment's folder, trials save themselves and end at their next epoch."""
 _PACKAGES = ("msk-ray", "torch", "warp-lang", "mujoco", "mujoco-warp", "ray", "numpy")
 
 
@@ -61,12 +60,11 @@ class Experiment:
         """The command that goes on with it: the one it was begun with, and --resume, which remembers the last word on
         `REMEMBERED`."""
         flags = {f"--{no}{option.replace('_', '-')}" for option in REMEMBERED for no in ("", "no-")}
-        try:
-            argv = json.loads((self.path / "env.json").read_text(encoding="utf-8"))["command"]
-            return typed_command([str(word) for word in argv if word not in flags], "--resume")
-        except (OSError, ValueError, KeyError, TypeError, IndexError):
+        argv = read_environment(self.path / ENVIRONMENT_FILE)[0].get("command")
+        if not argv:
             # What was typed is lost, or was never whole; its options are in nobody else's hands.
             return "python -m msk_ray.tune --resume, with the options it was begun with"
+        return typed_command([word for word in argv if word not in flags], "--resume")
 
     @property
     def tune(self) -> Path:
@@ -101,7 +99,7 @@ class Experiment:
         Raises:
             StorageFailure: it has.
         """
-        for path in (self.path / "manifest.json", *([] if trial_id is None else [self.trial_folder(trial_id)])):
+        for path in (self.path / MANIFEST_FILE, *([] if trial_id is None else [self.trial_folder(trial_id)])):
             try:
                 path.stat()
             except OSError as error:
@@ -132,26 +130,19 @@ class Experiment:
         Raises:
             StorageError: missing, unreadable, or of another format.
         """
-        path = self.path / "manifest.json"
         try:
-            data = json.loads(path.read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            raise StorageError(f"{self.path} holds no experiment: manifest.json is missing") from None
-        except (OSError, ValueError) as error:
-            raise StorageError(f"cannot read {path}: {error}") from error
-        if not isinstance(data, dict) or data.get("format") != FORMAT:
-            found = data.get("format") if isinstance(data, dict) else None
-            raise StorageError(f"{path} has format {found}, this version reads {FORMAT}")
-        if not isinstance(data.get("trials"), list):
-            raise StorageError(f"{path} has no trials")
-        manifest: dict[str, Any] = data
+            manifest = read_object(self.path / MANIFEST_FILE, _manifest)
+        except DamagedFile as error:
+            raise DamagedFile(error.damage, "restore it, or start again under another --name") from None
+        if manifest is None:
+            raise StorageError(f"{self.path} holds no experiment: {MANIFEST_FILE} is missing")
         return manifest
 
     def trials(self) -> list[Trial]:
         """The trials of the manifest."""
         trials = []
         for entry in self.manifest()["trials"]:
-            config = parse_recorded(entry["config"], f"{self.path / 'manifest.json'}: trial {entry['id']}")
+            config = parse_recorded(entry["config"], f"{self.path / MANIFEST_FILE}: trial {entry['id']}")
             changed, values = (current_values(entry[part], config.env.name) for part in ("changed", "values"))
             trials.append(Trial(entry["index"], entry["id"], changed, values, config))
         return trials
@@ -173,7 +164,7 @@ class Experiment:
         """Keep what is said of such options now, for the next time; None says nothing."""
         manifest = self.manifest()
         said = {option: value for option, value in options.items() if value is not None}
-        write_json(self.path / "manifest.json", manifest | {"options": (manifest.get("options") or {}) | said})
+        write_json(self.path / MANIFEST_FILE, manifest | {"options": (manifest.get("options") or {}) | said})
 
     def write_space(self, space: Space) -> None:
         """Record the space as it is run, its scheduler in full: a default may change, and the rungs with it."""
@@ -213,30 +204,28 @@ class Experiment:
         """Replace the manifest's list of trials by a longer one, and say in it what was asked for."""
         extended = {"extended": self.extension() | dict(extension)}
         write_json(
-            self.path / "manifest.json", self.manifest() | extended | {"trials": [_entry(trial) for trial in trials]}
+            self.path / MANIFEST_FILE, self.manifest() | extended | {"trials": [_entry(trial) for trial in trials]}
         )
 
     def clear_outgrown(self) -> None:
         """Take back the endings of trials that finished before their epochs were extended."""
-        from msk_ray.training import read_metrics  # loads torch, which a dry run need not wait for
-
         for trial in self.trials():
             folder = self.trial_folder(trial.id)
             ending = read_ending(folder)
             if ending is None or ending.outcome is not Outcome.FINISHED:
                 continue
-            rows = read_metrics(folder / "metrics.jsonl")
+            rows = read_metrics(folder / METRICS_FILE)
             if rows and rows[-1]["epoch"] < trial.epochs:
                 (folder / OUTCOME_FILE).unlink()
 
     def set_trials(self, trials: Iterable[Trial]) -> None:
         """Replace the manifest's list of trials."""
-        write_json(self.path / "manifest.json", self.manifest() | {"trials": [_entry(trial) for trial in trials]})
+        write_json(self.path / MANIFEST_FILE, self.manifest() | {"trials": [_entry(trial) for trial in trials]})
 
 
 def has_begun(path: Path) -> bool:
     """Whether the folder holds a whole experiment, which --resume goes on with."""
-    return (path / "manifest.json").is_file()
+    return (path / MANIFEST_FILE).is_file()
 
 
 def create(path: Path, space: Space, trials: list[Trial], options: dict[str, Any]) -> Experiment:
@@ -246,12 +235,12 @@ def create(path: Path, space: Space, trials: list[Trial], options: dict[str, Any
         StorageError: the folder cannot be written, or holds an experiment already.
     """
     experiment = Experiment(path)
-    if (path / "manifest.json").exists():
+    if (path / MANIFEST_FILE).exists():
         raise StorageError(f"{path} holds an experiment already: add --resume to go on with it, or pass another --name")
     make_folder(path)
     make_folder(path / "trials")
     experiment.write_space(space)
-    write_json(path / "env.json", environment())
+    write_json(path / ENVIRONMENT_FILE, environment())
     manifest = {
         "format": FORMAT,
         "name": path.name,
@@ -262,7 +251,7 @@ def create(path: Path, space: Space, trials: list[Trial], options: dict[str, Any
         "trials": [_entry(trial) for trial in trials],
     }
     # Last: a folder with a manifest is a whole experiment.
-    write_json(path / "manifest.json", manifest)
+    write_json(path / MANIFEST_FILE, manifest)
     return experiment
 
 
@@ -327,6 +316,75 @@ def check_name(name: str) -> str:
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}", name):
         raise StorageError(f"--name {brief(name)}: use at most 128 letters, digits, '.', '_' and '-'")
     return name
+
+
+def _manifest(data: dict[str, Any]) -> dict[str, Any]:
+    """A manifest as it is.
+
+    Raises:
+        ValueError: it is none that this version reads.
+    """
+    if data.get("format") != FORMAT:
+        raise ValueError(f"it has format {data.get('format')!r:.40}, this version reads {FORMAT}")
+    for number, entry in enumerate(field(data, "trials", list)):
+        if not isinstance(entry, dict):
+            raise ValueError(f"trial {number} is no object")
+        try:
+            field(entry, "index", int)
+            if not re.fullmatch(r"[A-Za-z0-9_-]+", field(entry, "id", str)):
+                raise ValueError("id is no trial's")
+            if not texts(field(entry, "changed", dict).values()):
+                raise ValueError("changed holds something else than texts")
+            field(entry, "values", dict)
+            field(entry, "config", dict)
+        except ValueError as error:
+            raise ValueError(f"trial {number}: {error}") from None
+    for name, kind in (("question", str), ("options", dict), ("extended", dict)):
+        if data.get(name) is not None:
+            field(data, name, kind)
+    return data
+
+
+_ENVIRONMENT = {
+    "command": list,
+    "python": str,
+    "platform": str,
+    "host": str,
+    "cpus": int,
+    "gpus": list,
+    "driver": str,
+    "packages": dict,
+    "commit": str,
+}
+
+
+def read_environment(path: Path) -> tuple[dict[str, Any], list[Damage]]:
+    """What an experiment ran with, as far as its file says, and what of it cannot be used.
+
+    Raises:
+        StorageFailure: the storage does not give it.
+    """
+    damages: list[Damage] = []
+
+    def usable(data: dict[str, Any]) -> dict[str, Any]:
+        found = {}
+        for name in data.keys() & _ENVIRONMENT.keys():
+            if data[name] is None:
+                continue  # not known, which null says
+            try:
+                value: Any = field(data, name, _ENVIRONMENT[name])
+                inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+                if not texts(inner):
+                    raise ValueError(f"{name} holds something else than texts")
+                found[name] = value
+            except ValueError as error:
+                damages.append(Damage(path, cut(error)))
+        return {name: found[name] for name in _ENVIRONMENT if name in found}
+
+    try:
+        return read_object(path, usable) or {}, damages
+    except DamagedFile as error:
+        return {}, [error.damage]
 
 
 def environment() -> dict[str, Any]:

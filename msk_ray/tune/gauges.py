@@ -6,8 +6,8 @@ from typing import Any
 from ray.tune import Callback
 from ray.util.metrics import Gauge
 
+from msk_ray.experiment.outcomes import read_ending
 from msk_ray.tune.experiment import Experiment
-from msk_ray.tune.outcomes import read_ending
 from msk_ray.tune.trials import Trial
 
 FIGURES = {

@@ -14,14 +14,15 @@ from ray.tune import Callback
 
 from msk_ray.cli import StopRequest
 from msk_ray.errors import StorageFailure, storage_failure
+from msk_ray.experiment.damage import DamagedFile
+from msk_ray.experiment.halved import Halved, read_halved
+from msk_ray.experiment.layout import ERROR_FILE, HANG_FILE
+from msk_ray.experiment.outcomes import Ending, Outcome, read_ending, write_ending
 from msk_ray.progress import format_duration
 from msk_ray.text import printable, printable_lines
 from msk_ray.tune.adapters import BEST, METRIC, STARTS_ANEW
 from msk_ray.tune.experiment import Experiment
-from msk_ray.tune.halved import Halved, read_halved
-from msk_ray.tune.outcomes import Ending, Outcome, read_ending, write_ending
 from msk_ray.tune.time_left import time_left
-from msk_ray.tune.trial_run import ERROR_FILE, HANG_FILE
 from msk_ray.tune.trials import Trial
 
 STATUS_INTERVAL_S = 30.0
@@ -210,7 +211,10 @@ class Live(Callback):
         return max(self._bests.values(), key=lambda best: best[0], default=None)
 
     def _look_up_halved(self, trial: Trial) -> None:
-        halved = read_halved(self._experiment.trial_folder(trial.id))
+        try:
+            halved = read_halved(self._experiment.trial_folder(trial.id))
+        except DamagedFile:
+            halved = None  # the trial ends by that, and says so
         if halved is not None:
             self._halved[trial.id] = halved
 
@@ -279,7 +283,7 @@ def _reason(folder: Path, trial: Any, failures: int) -> str:
     if hang_file.is_file() and hang_file.stat().st_size:
         return f"it hung; where is in {hang_file}"
     if error_file.is_file():
-        return error_file.read_text(encoding="utf-8").strip().splitlines()[-1]
+        return error_file.read_text(encoding="utf-8", errors="replace").strip().splitlines()[-1]
     error = _error_of(trial)
     if error is None or isinstance(error, RayActorError):
         times = "" if failures < 2 else f", {failures} times now"

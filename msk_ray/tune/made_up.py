@@ -1,6 +1,5 @@
 """Trials that a search makes up as it goes: what it chose for each is kept in the trial's folder, to go on from."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -8,13 +7,13 @@ from typing import Any
 
 from msk_ray.config import current_values, env_name
 from msk_ray.errors import ConfigError, StorageError
+from msk_ray.experiment.damage import DamagedFile, read_object
+from msk_ray.experiment.layout import PARAMS_FILE
 from msk_ray.files import write_json
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.operators import Listed, describe
 from msk_ray.tune.space import Space
 from msk_ray.tune.trials import Trial, base_settings, make_trial
-
-PARAMS_FILE = "params.json"
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,14 @@ def recover(experiment: Experiment, space: Space) -> list[MadeUp]:
     files = sorted(experiment.path.glob(f"trials/*/{PARAMS_FILE}"), key=lambda path: (path.stat().st_mtime, path))
     found: list[MadeUp] = []
     for file in files:
-        params = current_values(json.loads(file.read_text(encoding="utf-8")), env_name(base))
+        try:
+            recorded = read_object(file, dict)
+        except DamagedFile as error:
+            advice = f"what the search chose is not known: remove {file.parent}, and the search makes up another trial"
+            raise DamagedFile(error.damage, advice) from None
+        if recorded is None:
+            continue  # removed since it was found
+        params = current_values(recorded, env_name(base))
         try:
             trial = make_up(space, base, params)
         except (ConfigError, KeyError) as error:

@@ -11,7 +11,7 @@ import statistics
 from collections.abc import Sequence
 from typing import Protocol
 
-from msk_ray.tune.outcomes import Ending, Outcome
+from msk_ray.experiment.outcomes import Ending, Outcome
 from msk_ray.tune.space import SchedulerSpec
 
 

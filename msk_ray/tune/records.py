@@ -1,33 +1,57 @@
-"""What a trial left on disk, read back: metrics, evaluations, outcome."""
+"""The trials of an experiment with what their folders hold: for tables, and to go on from."""
 
 import math
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from msk_ray.metrics_file import METRICS_FILE, read_metrics
+from msk_ray.config import current_key, parse_recorded, read_yaml
+from msk_ray.errors import MskRayError
+from msk_ray.experiment.damage import Damage, cut
+from msk_ray.experiment.halved import Halved
+from msk_ray.experiment.metrics import Evaluation
+from msk_ray.experiment.outcomes import Ending
+from msk_ray.experiment.snapshot import TrialReader, TrialSnapshot, read_trial
 from msk_ray.tune.experiment import Experiment
-from msk_ray.tune.halved import Halved, read_halved
-from msk_ray.tune.outcomes import Ending, Outcome, read_ending
-from msk_ray.tune.stopping import Evaluation
+from msk_ray.tune.operators import describe
 from msk_ray.tune.trials import Trial
 
 
 @dataclass(frozen=True)
 class TrialRecord:
-    """One trial as its folder shows it."""
+    """One trial and what its folder holds."""
 
     trial: Trial
-    folder: Path
-    epochs_done: int
-    seconds: float
-    """Training time [s]."""
-    evaluations: tuple[Evaluation, ...]
-    ending: Ending | None
-    """None: not ended, whether running, waiting or interrupted."""
-    halved: Halved | None = None
-    """Set if it runs with half its worlds: then its scores do not compare with the others'."""
+    snapshot: TrialSnapshot
+
+    @property
+    def folder(self) -> Path:
+        return self.snapshot.folder
+
+    @property
+    def epochs_done(self) -> int:
+        return self.snapshot.epochs_done
+
+    @property
+    def seconds(self) -> float:
+        """Training time [s]."""
+        return self.snapshot.seconds
+
+    @property
+    def evaluations(self) -> tuple[Evaluation, ...]:
+        return self.snapshot.evaluations
+
+    @property
+    def ending(self) -> Ending | None:
+        """None: not ended, whether running, waiting or interrupted."""
+        return self.snapshot.ending
+
+    @property
+    def halved(self) -> Halved | None:
+        """Set if it runs with half its worlds: then its scores do not compare with the others'."""
+        return self.snapshot.halved
 
     @property
     def best(self) -> Evaluation | None:
@@ -38,8 +62,7 @@ class TrialRecord:
     @property
     def best_checkpoint(self) -> Path | None:
         """Checkpoint of the best evaluation's policy; None if it is missing, or no trained policy has a score."""
-        path = self.folder / "checkpoints" / "best.pt"
-        return path if self.best is not None and path.is_file() else None
+        return self.snapshot.best_checkpoint if self.best is not None else None
 
     @property
     def cut(self) -> bool:
@@ -48,38 +71,18 @@ class TrialRecord:
 
     @property
     def errored(self) -> bool:
-        return self.ending is not None and self.ending.outcome in (Outcome.ERROR, Outcome.OUT_OF_MEMORY)
+        return self.snapshot.errored
 
 
 def read_record(trial: Trial, folder: Path) -> TrialRecord:
     """A trial's record; an empty one if it never started."""
-    rows = read_rows(folder)
-    last = rows[-1] if rows else {"epoch": 0, "seconds": 0.0}
-    return TrialRecord(
-        trial,
-        folder,
-        int(last["epoch"]),
-        float(last["seconds"]),
-        tuple(evaluations_of(rows)),
-        read_ending(folder),
-        read_halved(folder),
-    )
+    return TrialRecord(trial, read_trial(folder, time.time()))
 
 
 def read_records(experiment: Experiment) -> list[TrialRecord]:
     """Records of all trials of an experiment, in order."""
-    return [read_record(trial, experiment.trial_folder(trial.id)) for trial in experiment.trials()]
-
-
-def read_rows(folder: Path) -> list[dict[str, float]]:
-    """A trial's metrics, each epoch once. Values the file marks as not finite are NaN."""
-    return [_with_nan(row) for row in read_metrics(folder / METRICS_FILE)]
-
-
-def evaluations_of(rows: Sequence[Mapping[str, float]]) -> list[Evaluation]:
-    """The evaluations of trained policies among rows of metrics."""
-    found = (Evaluation.from_row(row) for row in rows)
-    return [evaluation for evaluation in found if evaluation is not None]
+    reader, now = TrialReader(), time.time()
+    return [TrialRecord(trial, reader.read(experiment.trial_folder(trial.id), now)) for trial in experiment.trials()]
 
 
 def best_record(records: Sequence[TrialRecord]) -> TrialRecord | None:
@@ -88,6 +91,40 @@ def best_record(records: Sequence[TrialRecord]) -> TrialRecord | None:
     return max(scored, key=lambda item: item[:2])[2] if scored else None
 
 
-def _with_nan(row: Mapping[str, Any]) -> dict[str, float]:
-    bad = row.get("nonfinite", [])
-    return {key: math.nan if key in bad else value for key, value in row.items() if key != "nonfinite"}
+def unlisted_trials(
+    experiment: Experiment, listed: set[str], parameters: Sequence[str]
+) -> tuple[list[Trial], list[Damage]]:
+    """Trials that the manifest does not know: those a search has made up, or all if it is lost.
+
+    Args:
+        listed: ids of those it knows.
+        parameters: dotted keys that the space varies.
+
+    Returns:
+        The trials, as their folders' `config.yaml` has them, and those of these files that cannot be used.
+    """
+    root = experiment.path / "trials"
+    folders = [path for path in root.iterdir() if path.name not in listed and path.is_dir()] if root.is_dir() else []
+    found: list[Trial] = []
+    damages = []
+    for folder in sorted(folders):
+        path = folder / "config.yaml"
+        if not path.is_file():
+            continue  # made, but nothing was written into it
+        try:
+            config = parse_recorded(read_yaml(path), str(path))
+            settings = config.as_dict()
+            values = {key: _at(settings, key) for key in (current_key(key, config.env.name) for key in parameters)}
+        except (MskRayError, KeyError, TypeError) as error:
+            damages.append(Damage(path, cut(f"no settings of a trial: {error}")))
+            continue
+        changed = {key: describe(value) for key, value in values.items()}
+        found.append(Trial(len(listed) + len(found), folder.name, changed, values, config))
+    return found, damages
+
+
+def _at(settings: Mapping[str, Any], dotted: str) -> Any:
+    node: Any = settings
+    for part in dotted.split("."):
+        node = node[part]
+    return node

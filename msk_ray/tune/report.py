@@ -4,12 +4,13 @@ import shutil
 import subprocess
 import sys
 
+from msk_ray.experiment.damage import count_damages, describe_damages
+from msk_ray.experiment.layout import SUMMARY_FILE
 from msk_ray.files import write_json, write_text
 from msk_ray.text import printable
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.listing import text_table
 from msk_ray.tune.records import best_record, read_records
-from msk_ray.tune.standing import SUMMARY_FILE
 from msk_ray.tune.table import HEADER, halved_note, result_rows, summary, table_document, variant_rows
 
 
@@ -26,12 +27,16 @@ def finish(experiment: Experiment) -> int:
     manifest = experiment.manifest()
     records = read_records(experiment)
     width = max(100, shutil.get_terminal_size((160, 24)).columns)
-    write_json(experiment.path / SUMMARY_FILE, summary(experiment.name, manifest["question"], records))
-    write_text(experiment.path / "table.md", table_document(experiment.name, manifest["question"], records))
+    write_json(experiment.path / SUMMARY_FILE, summary(experiment.name, manifest.get("question") or "", records))
+    write_text(experiment.path / "table.md", table_document(experiment.name, manifest.get("question") or "", records))
     print("\n" + text_table(HEADER, result_rows(records), width))
     if len({record.trial.seed for record in records}) > 1:
         header = ("variant", "seeds", "mean score", "std", "min", "max")
         print("\n" + text_table(header, variant_rows(records), width))
+    damages = [damage for record in records for damage in record.snapshot.damages]
+    if damages:
+        print(f"\nskipped {count_damages(damages)}:")
+        print("\n".join(describe_damages(damages, experiment.path)))
     if (note := halved_note(records)) is not None:
         print(f"\n{note}")
     best = best_record(records)

@@ -24,6 +24,10 @@ import msk_ray
 from msk_ray.cli import StopRequest
 from msk_ray.config import Config, parse_recorded, read_yaml
 from msk_ray.errors import ClusterLost, DeviceError, MskRayError, StorageFailure, storage_failure
+from msk_ray.experiment.damage import describe_damages
+from msk_ray.experiment.journal import Journal
+from msk_ray.experiment.layout import HALVED_FILE, JOURNAL_FILE
+from msk_ray.experiment.outcomes import read_ending, write_ending
 from msk_ray.progress import format_duration
 from msk_ray.training import Trainer, precompile
 from msk_ray.tune import standby
@@ -33,13 +37,11 @@ from msk_ray.tune.budget import extreme_configs, longest_budget
 from msk_ray.tune.devices import Placement
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.gauges import StateGauge
-from msk_ray.tune.halved import read_halved
-from msk_ray.tune.journal import JOURNAL_FILE, Journal, replay
+from msk_ray.tune.journal import replay
 from msk_ray.tune.live import Live
 from msk_ray.tune.local_ray import loopback_only, make_token_private, way_in
 from msk_ray.tune.made_up import MadeUp, recover
 from msk_ray.tune.operators import Listed
-from msk_ray.tune.outcomes import read_ending, write_ending
 from msk_ray.tune.presence import Presence, remove_remains
 from msk_ray.tune.pruning import make_pruner
 from msk_ray.tune.records import read_record
@@ -198,7 +200,9 @@ def _journal(plan: Plan) -> Journal:
 def _finish_pruning(plan: Plan) -> None:
     """Write the ending of a trial that the rule had just stopped when the driver died."""
     spec = plan.space.file.scheduler
-    reports = _journal(plan).read()
+    reports, damages = _journal(plan).read()
+    for line in describe_damages(damages, plan.experiment.path):
+        print(f"skipped: {line}", flush=True)
     if not reports or not plan.trials or spec.kind == "pbt":
         return
     ending = replay(make_pruner(spec, _budget(plan)), spec.time_attr, reports)
@@ -206,7 +210,7 @@ def _finish_pruning(plan: Plan) -> None:
     if ending is None or read_ending(folder) is not None:
         return
     # What a trial scored with all its worlds does not end it when it has half of them.
-    if reports[-1].halved or read_halved(folder) is None:
+    if reports[-1].halved or not (folder / HALVED_FILE).exists():
         write_ending(folder, ending)
 
 
@@ -218,7 +222,7 @@ def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial], made_up: list
     else:
         pruner = make_pruner(spec, budget)
         journal = _journal(plan)
-        replay(pruner, spec.time_attr, journal.read())
+        replay(pruner, spec.time_attr, journal.read()[0])
         scheduler = PruningScheduler(
             pruner, spec.time_attr, journal, lambda trial: job.trial_of(trial.config).id, live.pruned
         )

@@ -2,37 +2,10 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
-from msk_ray.tune.outcomes import Ending, Outcome
+from msk_ray.experiment.metrics import SCORE, Evaluation
+from msk_ray.experiment.outcomes import Ending, Outcome
 from msk_ray.tune.space import PlateauSpec, StopSpec
-
-SCORE = "eval/score"
-"""The canonical evaluation metric trials are ranked by; higher is better."""
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """One deterministic evaluation of a trial's policy after it was trained for an epoch or more.
-
-    What the policy scores before training is drawn in curves and counts nowhere: no trial has earned it.
-    """
-
-    epoch: int
-    env_steps: int
-    seconds: float
-    score: float
-
-    @classmethod
-    def from_row(cls, row: Mapping[str, float]) -> "Evaluation | None":
-        """The evaluation in a row of metrics; None when the epoch had none, or the policy was not trained yet."""
-        if SCORE not in row or row["epoch"] <= 0:
-            return None
-        return cls(int(row["epoch"]), int(row["env_steps"]), float(row["seconds"]), float(row[SCORE]))
-
-    def time(self, attribute: str) -> float:
-        """Progress as `env_steps`, `epoch` or `seconds`."""
-        return float({"env_steps": self.env_steps, "epoch": self.epoch, "seconds": self.seconds}[attribute])
 
 
 def ending_of(

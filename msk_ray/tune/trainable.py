@@ -19,18 +19,20 @@ from ray import tune
 
 from msk_ray.config import overlay, parse_config
 from msk_ray.errors import storage_failure
+from msk_ray.experiment.damage import DamagedFile
+from msk_ray.experiment.halved import Halved, read_halved
+from msk_ray.experiment.layout import DEVICE_FILE, HANG_FILE, OUTPUT_FILE
+from msk_ray.experiment.metrics import Evaluation, evaluations_of, read_rows
 from msk_ray.files import write_text
 from msk_ray.tune.adapters import BEST, METRIC, STARTS_ANEW
 from msk_ray.tune.devices import wait_for_memory
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.gauges import TrialGauges
-from msk_ray.tune.halved import StartAnew, read_halved
+from msk_ray.tune.halved import StartAnew, as_run
 from msk_ray.tune.hparams import log_hparams
 from msk_ray.tune.made_up import make_up, write_params
-from msk_ray.tune.records import evaluations_of, read_rows
 from msk_ray.tune.space import Space
-from msk_ray.tune.stopping import Evaluation
-from msk_ray.tune.trial_run import HANG_FILE, Hooks, TrainerLike, run_trial
+from msk_ray.tune.trial_run import Hooks, TrainerLike, run_trial
 from msk_ray.tune.trials import Trial
 
 MEMORY_LIMIT_S = 60.0
@@ -94,11 +96,11 @@ def make_trainable(job: Job) -> Callable[[dict[str, Any]], None]:
             raise failure from error
 
     def attempt(trial: Trial, folder: Path) -> None:
-        _redirect_output(folder / "output.log")
+        _redirect_output(folder / OUTPUT_FILE)
         _limit_threads(job.threads)
-        _record_device(folder / "device.json")
-        halved = read_halved(folder)
-        log_hparams(folder, trial if halved is None else halved.of(trial))
+        _record_device(folder / DEVICE_FILE)
+        halved = _halved(folder)
+        log_hparams(folder, as_run(trial, halved))
         if job.gpus:
             _wait_for_gpu(job.gpus)
         gauges = TrialGauges(job.experiment.name, trial)
@@ -131,6 +133,13 @@ def make_trainable(job: Job) -> Callable[[dict[str, Any]], None]:
                 raise
 
     return trainable
+
+
+def _halved(folder: Path) -> Halved | None:
+    try:
+        return read_halved(folder)
+    except DamagedFile:
+        return None  # the trial ends by that in a moment, and says so
 
 
 def _reporter(halved: bool) -> Callable[[Evaluation, bool, TrainerLike], None]:

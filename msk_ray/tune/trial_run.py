@@ -8,16 +8,16 @@ from typing import Protocol
 
 from msk_ray.config import Config
 from msk_ray.errors import ConfigError, Failure, MskRayError, SimulationError, StorageFailure
+from msk_ray.experiment.damage import DamagedFile
+from msk_ray.experiment.halved import Halved, read_halved, set_aside, write_halved
+from msk_ray.experiment.layout import ABANDONED, ERROR_FILE
+from msk_ray.experiment.metrics import Evaluation, evaluations_of, read_rows
+from msk_ray.experiment.outcomes import Ending, Outcome, load_ending, write_ending
 from msk_ray.files import write_text
-from msk_ray.tune.halved import ABANDONED, Halved, StartAnew, halve, read_halved, set_aside, write_halved
-from msk_ray.tune.outcomes import Ending, Outcome, read_ending, write_ending
-from msk_ray.tune.records import evaluations_of, read_rows
+from msk_ray.tune.halved import StartAnew, as_run, halve
 from msk_ray.tune.space import StopSpec
-from msk_ray.tune.stopping import Evaluation, ending_of
+from msk_ray.tune.stopping import ending_of
 from msk_ray.tune.trials import Trial
-
-ERROR_FILE = "error.txt"
-HANG_FILE = "hang.txt"
 
 
 class TrainerLike(Protocol):
@@ -85,19 +85,23 @@ def run_trial(
     """
     if not folder.is_dir():
         raise StorageFailure(f"{folder} has gone: moved, removed or not mounted")
-    done = read_ending(folder)
+    try:
+        done = load_ending(folder)
+    except DamagedFile as error:
+        print(f"{error}; going on as if it had not ended", flush=True)
+        done = None
     if done is not None:
         return done
     # What an earlier attempt stumbled over stays in the trial's output; this file is about the latest one.
     (folder / ERROR_FILE).unlink(missing_ok=True)
-    halved = read_halved(folder)
-    if halved is not None:
-        # The process that decided it may not have lived to do this.
-        halved = set_aside(folder, halved)
-        print(halved, flush=True)
+    halved = None
     try:
-        as_run = trial if halved is None else halved.of(trial)
-        ending = _train(as_run, folder, device, stop, trainer_class, hooks, checkpoint, halved)
+        halved = _read_halved(folder)
+        if halved is not None:
+            # The process that decided it may not have lived to do this.
+            halved = set_aside(folder, halved)
+            print(halved, flush=True)
+        ending = _train(as_run(trial, halved), folder, device, stop, trainer_class, hooks, checkpoint, halved)
     except SimulationError as error:
         if error.failure is Failure.OUT_OF_MEMORY:
             ending = _out_of_memory(trial, folder, str(error), halved, may_halve)
@@ -115,6 +119,17 @@ def run_trial(
     if ending is not None:
         write_ending(folder, ending)
     return ending
+
+
+def _read_halved(folder: Path) -> Halved | None:
+    try:
+        return read_halved(folder)
+    except DamagedFile as error:
+        advice = (
+            'how many worlds the trial has is not known: write {"asked": N, "worlds": HALF, "why": "", "cleared": '
+            "true} into it and add --resume --retry error"
+        )
+        raise DamagedFile(error.damage, advice) from None
 
 
 def _out_of_memory(trial: Trial, folder: Path, why: str, halved: Halved | None, may_halve: bool) -> Ending:
@@ -156,7 +171,7 @@ def _train(
         else:
             path, faults = trainer.restore_latest()
             for fault in faults:
-                print(f"checkpoint skipped: {fault}", flush=True)
+                print(f"skipped: {fault}", flush=True)
             print(f"going on from {path}" if path else "starting", flush=True)
         return _loop(trial, folder, stop, trainer, hooks)
     finally:

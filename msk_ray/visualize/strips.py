@@ -7,7 +7,7 @@ from PIL import Image
 
 from msk_ray.errors import CheckpointError
 from msk_ray.evaluate.measure import Bench, Request
-from msk_ray.evaluate.targets import BEST
+from msk_ray.experiment.layout import best_checkpoint
 from msk_ray.training import load_policy
 from msk_ray.training.checkpoint import milestones
 from msk_ray.training.metrics import log_image
@@ -48,7 +48,7 @@ def progression(
     paths = [path for _, path in milestones(folder)]
     if not paths:
         return None, []
-    best = folder / BEST
+    best = best_checkpoint(trial)
     policies = [load_policy(path) for path in paths]
     if best.is_file():
         policies.append(load_policy(best))

@@ -8,11 +8,12 @@ from typing import Any
 
 import pytest
 
-from msk_ray.tune.outcomes import Ending, Outcome
+from msk_ray.experiment.metrics import SCORE, Evaluation, progress_of
+from msk_ray.experiment.outcomes import Ending, Outcome
+from msk_ray.experiment.snapshot import Device, State, TrialSnapshot
 from msk_ray.tune.pruning import SuccessiveHalving
 from msk_ray.tune.records import TrialRecord
 from msk_ray.tune.space import SchedulerSpec
-from msk_ray.tune.stopping import Evaluation
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 
@@ -29,7 +30,9 @@ def record(name: str, *scores: float) -> TrialRecord:
     seen = tuple(Evaluation(t // 10, t, float(t), s) for t, s in zip(times, scores, strict=True))
     settings = SimpleNamespace(trial=SimpleNamespace(epochs=20))
     trial: Any = SimpleNamespace(id=name, variant=name, seed=0, config=settings)
-    return TrialRecord(trial, Path(name), 20, 200.0, seen, None)
+    rows = tuple({"epoch": e.epoch, "env_steps": e.env_steps, "seconds": e.seconds, SCORE: e.score} for e in seen)
+    snapshot = TrialSnapshot(Path(name), rows, progress_of(rows), None, None, Device(), State.STALE, None, ())
+    return TrialRecord(trial, snapshot)
 
 
 RECORDS = [record("late", 1.0, 1.0, 9.0), record("middle", 2.0, 2.0, 3.0), record("early", 3.0, 3.0, 4.0)]
@@ -90,7 +93,9 @@ def test_a_twin_is_as_good(benchmark: dict[str, Any]) -> None:
 
 
 def ended(name: str, outcome: Outcome | None) -> TrialRecord:
-    return replace(record(name, 1.0, 2.0, 3.0), ending=None if outcome is None else Ending(outcome, "so"))
+    found = record(name, 1.0, 2.0, 3.0)
+    ending = None if outcome is None else Ending(outcome, "so")
+    return replace(found, snapshot=replace(found.snapshot, ending=ending))
 
 
 def test_only_whole_runs_are_judged(benchmark: dict[str, Any]) -> None:

@@ -13,6 +13,8 @@ from matplotlib.figure import Figure
 from msk_ray.cli import run
 from msk_ray.config import dump_yaml
 from msk_ray.experiment.checkpoint_file import write_checkpoint_file
+from msk_ray.experiment.halved import Halved, write_halved
+from msk_ray.experiment.outcomes import Ending, Outcome, write_ending
 from msk_ray.report.__main__ import main
 from msk_ray.report.curves import rung_steps
 from msk_ray.report.influence import ranked_effects
@@ -21,8 +23,6 @@ from msk_ray.report.pictures import picture, shorten
 from msk_ray.report.reading import Condition, read_experiment
 from msk_ray.report.tables import failures, variant_rows
 from msk_ray.tune import experiment as experiments
-from msk_ray.tune.halved import Halved, write_halved
-from msk_ray.tune.outcomes import Ending, Outcome, write_ending
 from msk_ray.tune.space import parse_space
 from msk_ray.tune.trials import base_settings, make_trial, resolve_trials
 
@@ -308,7 +308,7 @@ def _best_without_policy(e: experiments.Experiment) -> None:
         (_not_begun, ["not started", "No trial has begun yet", "No trained policy has a score yet"]),
         (
             _broken_trials,
-            ["3 unreadable", "is not JSON", "JSONDecodeError", "unheard_of", "the trial&#39;s files make no sense"],
+            ["Skipped: 1 damaged line and 2 damaged files.", "line 1: not JSON", "unheard_of", "3 finished"],
         ),
         (_crashed, ["interrupted", "with --resume, goes on", "3 interrupted"]),
         (_running, ["Trials are still running", "1 running"]),

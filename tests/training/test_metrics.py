@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from msk_ray.errors import StorageError
-from msk_ray.metrics_file import read_metrics
+from msk_ray.experiment.metrics import read_metrics
 from msk_ray.training.metrics import MetricsLog, board_tag, log_image
 
 
@@ -35,8 +34,18 @@ def test_reading_keeps_the_latest_row_of_an_epoch_and_forgives_a_torn_end(tmp_pa
     path.write_text('{"epoch": 1, "a": 1}\n{"epoch": 2, "a": 2}\n{"epoch": 1, "a": 3}\n{"epoch": 3, "a')
     assert [(r["epoch"], r["a"]) for r in read_metrics(path)] == [(1, 3), (2, 2)]
     path.write_text('{"epo\n{"epoch": 2}\n')
-    with pytest.raises(StorageError, match="line 1 is not JSON"):
-        read_metrics(path)
+    assert [r["epoch"] for r in read_metrics(path)] == [2]
+
+
+def test_rewinding_past_a_damaged_line_keeps_the_others_and_names_it(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.jsonl"
+    path.write_bytes(b'{"epoch": 0, "a": 1}\n\xff\xff\n{"epoch": 2, "a": 3}\n{"epoch": 3, "a": 4}\n{"epoch": 4')
+    log = MetricsLog(tmp_path)
+    (damage,) = log.rewind(2)
+    log.close()
+    assert str(damage) == f"{path}, line 2: not UTF-8 text: byte 0 is 0xff"
+    assert [(r["epoch"], r["a"]) for r in read_metrics(path)] == [(0, 1), (2, 3)]
+    assert path.read_bytes().count(b"\n") == 2
 
 
 def test_rewinding_to_before_the_first_row_drops_a_torn_one(tmp_path: Path) -> None:

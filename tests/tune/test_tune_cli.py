@@ -11,10 +11,10 @@ import pytest
 
 from msk_ray.cli import RESUMABLE, run
 from msk_ray.config import dump_yaml, read_yaml
+from msk_ray.experiment.outcomes import Ending, Outcome, write_ending
 from msk_ray.tune import runner
 from msk_ray.tune.__main__ import main
 from msk_ray.tune.experiment import Experiment
-from msk_ray.tune.outcomes import Ending, Outcome, write_ending
 
 
 @pytest.fixture

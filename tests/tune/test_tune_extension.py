@@ -6,9 +6,9 @@ from typing import Any
 import pytest
 
 from msk_ray.errors import ConfigError, StorageError
+from msk_ray.experiment.outcomes import Ending, Outcome, read_ending, write_ending
 from msk_ray.tune import experiment as experiments
 from msk_ray.tune.extension import extended_space, parse_extension
-from msk_ray.tune.outcomes import Ending, Outcome, read_ending, write_ending
 from msk_ray.tune.trials import resolve_trials
 
 DRAWN = {"shac.actor_lr": {"loguniform": [1e-4, 1e-2]}}

@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
+from msk_ray.experiment.outcomes import Ending, Outcome, write_ending
 from msk_ray.tune import experiment as experiments
 from msk_ray.tune import gauges
-from msk_ray.tune.outcomes import Ending, Outcome, write_ending
 from msk_ray.tune.trials import resolve_trials
 
 

@@ -12,16 +12,21 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from msk_ray.cli import RESUMABLE, run
 from msk_ray.config import dump_yaml, read_yaml
 from msk_ray.errors import ConfigError
+from msk_ray.experiment import halved
+from msk_ray.experiment.halved import Halved, read_halved, write_halved
+from msk_ray.experiment.journal import Journal, Report
+from msk_ray.experiment.layout import ABANDONED, JOURNAL_FILE
+from msk_ray.experiment.metrics import read_rows
+from msk_ray.experiment.outcomes import Ending, Outcome, read_ending, write_ending
 from msk_ray.training import Trainer, read_checkpoint
 from msk_ray.tune import experiment as experiments
-from msk_ray.tune import halved, runner, trial_run
+from msk_ray.tune import runner, trial_run
 from msk_ray.tune.__main__ import main
 from msk_ray.tune.devices import Placement
-from msk_ray.tune.halved import ABANDONED, Halved, StartAnew, read_halved, write_halved
-from msk_ray.tune.journal import JOURNAL_FILE, Journal, Report, replay
-from msk_ray.tune.outcomes import Ending, Outcome, read_ending, write_ending
+from msk_ray.tune.halved import StartAnew
+from msk_ray.tune.journal import replay
 from msk_ray.tune.pruning import make_pruner
-from msk_ray.tune.records import read_records, read_rows
+from msk_ray.tune.records import read_records
 from msk_ray.tune.space import SchedulerSpec, StopSpec
 from msk_ray.tune.table import halved_note, result_rows, summary, table_document, variant_rows
 from msk_ray.tune.trial_run import Hooks
@@ -81,6 +86,32 @@ def test_half_the_worlds_from_the_beginning(
     assert capsys.readouterr().out.splitlines()[:2] == ["half the worlds: 4 of 8", "starting"]
     assert read_yaml(tmp_path / "config.yaml")["env"]["nworld"] == 4
     assert (tmp_path / "config.yaml").read_text().startswith("# half the worlds: 4 of 8 asked for\n")
+
+
+def test_a_damaged_outcome_is_said_and_the_trial_goes_on(
+    crowded: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trial = crowded(0.0)
+    assert attempt(trial, tmp_path) == Ending(Outcome.FINISHED, "all 20 epochs done")
+    (tmp_path / "outcome.json").write_bytes(b"\xff\xfe")
+    assert attempt(trial, tmp_path) == Ending(Outcome.FINISHED, "all 20 epochs done")
+    assert "outcome.json: not UTF-8 text" in capsys.readouterr().out
+    assert [row["epoch"] for row in read_rows(tmp_path)] == list(range(21))
+    assert read_ending(tmp_path) == Ending(Outcome.FINISHED, "all 20 epochs done")
+
+
+def test_a_trial_whose_number_of_worlds_is_damaged_ends_and_says_what_to_write(crowded: Any, tmp_path: Path) -> None:
+    trial = crowded(LATE_CROWD)
+    with pytest.raises(StartAnew):
+        attempt(trial, tmp_path)
+    (tmp_path / "halved.json").write_text("null")
+    before = sorted(path.name for path in tmp_path.rglob("*"))
+    ending = attempt(trial, tmp_path)
+    assert ending is not None
+    assert ending.outcome is Outcome.ERROR
+    assert "halved.json: null instead of a JSON object" in ending.why
+    assert "--resume --retry error" in ending.why
+    assert sorted({path.name for path in tmp_path.rglob("*")} - {"outcome.json"}) == sorted(set(before))
 
 
 @pytest.mark.parametrize("where", ["before anything is set aside", "after the first file", "after the last one"])

@@ -7,9 +7,10 @@ from typing import Any
 
 import pytest
 
+from msk_ray.experiment.journal import Journal, Report
+from msk_ray.experiment.outcomes import Ending
 from msk_ray.tune.adapters import METRIC, PruningScheduler
-from msk_ray.tune.journal import Journal, Report, replay
-from msk_ray.tune.outcomes import Ending
+from msk_ray.tune.journal import replay
 from msk_ray.tune.pruning import make_pruner
 from msk_ray.tune.space import SchedulerSpec
 
@@ -25,7 +26,7 @@ class Driver:
     def __init__(self, spec: SchedulerSpec, path: Path) -> None:
         journal = Journal(path)
         pruner = make_pruner(spec, 100 * EPOCHS)
-        replay(pruner, spec.time_attr, journal.read())
+        replay(pruner, spec.time_attr, journal.read()[0])
         self.stopped: dict[str, tuple[int, str]] = {}
         self._epoch = 0
         self._scheduler = PruningScheduler(pruner, spec.time_attr, journal, lambda trial: trial.id, self._stop)
@@ -93,6 +94,6 @@ def test_a_torn_end_is_cut_off(tmp_path: Path) -> None:
     journal.append(report)
     with (tmp_path / "j").open("a") as file:
         file.write('{"trial"')
-    assert journal.read() == [report]
+    assert journal.read() == ([report], ())
     journal.append(report)
     assert [json.loads(line)["trial"] for line in (tmp_path / "j").read_text().splitlines()] == ["a", "a"]

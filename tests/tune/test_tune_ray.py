@@ -31,13 +31,15 @@ from stub_trainer import (
 
 from msk_ray.config import read_yaml
 from msk_ray.errors import ClusterLost, StorageError, StorageFailure
+from msk_ray.experiment.halved import Halved, read_halved
+from msk_ray.experiment.metrics import read_rows
+from msk_ray.experiment.outcomes import Outcome
 from msk_ray.tune import experiment as experiments
 from msk_ray.tune import runner, standby
 from msk_ray.tune.devices import Placement
-from msk_ray.tune.halved import Halved, StartAnew, read_halved
+from msk_ray.tune.halved import StartAnew
 from msk_ray.tune.made_up import recover
-from msk_ray.tune.outcomes import Outcome
-from msk_ray.tune.records import TrialRecord, read_records, read_rows
+from msk_ray.tune.records import TrialRecord, read_records
 from msk_ray.tune.report import finish
 from msk_ray.tune.space import Space, StopSpec
 from msk_ray.tune.trial_run import Hooks, run_trial

@@ -22,7 +22,8 @@ from msk_ray.config import (
 from msk_ray.config.recorded import current_settings
 from msk_ray.errors import ConfigError
 from msk_ray.evaluate import __main__ as evaluate
-from msk_ray.metrics_file import read_metrics
+from msk_ray.experiment.metrics import read_metrics
+from msk_ray.experiment.outcomes import Outcome
 from msk_ray.report import __main__ as report
 from msk_ray.training import Trainer
 from msk_ray.training.policy import load_policy
@@ -30,7 +31,6 @@ from msk_ray.tune import __main__ as tune
 from msk_ray.tune import runner
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.made_up import recover
-from msk_ray.tune.outcomes import Outcome
 from msk_ray.tune.space import StopSpec, load_space
 from msk_ray.tune.trial_run import Hooks, run_trial
 from msk_ray.tune.trials import resolve_trials, trial_id, with_recorded_ids

@@ -12,6 +12,7 @@ import pytest
 from msk_ray.cli import run
 from msk_ray.config import dump_yaml
 from msk_ray.errors import ConfigError, DeviceError, StorageError
+from msk_ray.experiment.outcomes import Ending, Outcome, read_ending, write_ending
 from msk_ray.files import make_folder
 from msk_ray.nvidia_smi import ask_driver
 from msk_ray.status import main as status
@@ -19,7 +20,6 @@ from msk_ray.tune import experiment as experiments
 from msk_ray.tune.__main__ import main as tune
 from msk_ray.tune.devices import Placement, choose_placement, wait_for_memory
 from msk_ray.tune.listing import text_table
-from msk_ray.tune.outcomes import Ending, Outcome, read_ending, write_ending
 from msk_ray.tune.records import best_record, read_record
 from msk_ray.tune.report import finish, write_report
 from msk_ray.tune.space import ResourcesSpec

@@ -4,12 +4,13 @@ import math
 
 import pytest
 
-from msk_ray.tune.journal import Report, replay
-from msk_ray.tune.outcomes import Outcome
+from msk_ray.experiment.journal import Report
+from msk_ray.experiment.metrics import Evaluation, evaluations_of
+from msk_ray.experiment.outcomes import Outcome
+from msk_ray.tune.journal import replay
 from msk_ray.tune.pruning import MedianStopping, SuccessiveHalving, make_pruner, rungs
-from msk_ray.tune.records import evaluations_of
 from msk_ray.tune.space import PlateauSpec, SchedulerSpec, StopSpec
-from msk_ray.tune.stopping import Evaluation, ending_of, plateau
+from msk_ray.tune.stopping import ending_of, plateau
 
 
 def evaluations(*scores: float) -> list[Evaluation]:

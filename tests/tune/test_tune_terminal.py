@@ -17,8 +17,9 @@ import pytest
 
 from msk_ray.cli import RESUMABLE, StopRequest
 from msk_ray.config import dump_yaml
+from msk_ray.experiment.metrics import read_rows
 from msk_ray.tune.experiment import Experiment
-from msk_ray.tune.records import read_records, read_rows
+from msk_ray.tune.records import read_records
 
 LIMIT_S = 120
 EPOCHS = 150

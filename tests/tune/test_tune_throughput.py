@@ -8,7 +8,7 @@ from types import ModuleType
 
 import pytest
 
-from msk_ray.tune.outcomes import Ending, Outcome, write_ending
+from msk_ray.experiment.outcomes import Ending, Outcome, write_ending
 from msk_ray.tune.space import parse_space
 from msk_ray.tune.trials import resolve_trials
 

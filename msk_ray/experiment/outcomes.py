@@ -1,13 +1,13 @@
 """How a trial ended: a name, and why, kept in the trial's own folder."""
 
-import json
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from pathlib import Path
+from typing import Any
 
+from msk_ray.experiment.damage import DamagedFile, field, read_object
+from msk_ray.experiment.layout import OUTCOME_FILE
 from msk_ray.files import write_json
-
-OUTCOME_FILE = "outcome.json"
 
 
 class Outcome(StrEnum):
@@ -60,10 +60,27 @@ def write_ending(folder: Path, ending: Ending) -> None:
     write_json(folder / OUTCOME_FILE, asdict(ending))
 
 
+def load_ending(folder: Path) -> Ending | None:
+    """The ending in a trial's folder; None while it has none.
+
+    Raises:
+        DamagedFile: its file cannot be used.
+        StorageFailure: the storage does not give it.
+    """
+    return read_object(folder / OUTCOME_FILE, _ending)
+
+
 def read_ending(folder: Path) -> Ending | None:
-    """The ending in a trial's folder; None while it has none."""
-    path = folder / OUTCOME_FILE
-    if not path.is_file():
+    """The same, for who goes on with trials: one whose ending cannot be used has not ended. `TrialSnapshot` names the
+    damage."""
+    try:
+        return load_ending(folder)
+    except DamagedFile:
         return None
-    data = json.loads(path.read_text(encoding="utf-8"))
-    return Ending(Outcome(data["outcome"]), data["why"])
+
+
+def _ending(data: dict[str, Any]) -> Ending:
+    name = field(data, "outcome", str)
+    if name not in list(Outcome):
+        raise ValueError(f"outcome {name!r:.40} is none that this version knows")
+    return Ending(Outcome(name), field(data, "why", str))

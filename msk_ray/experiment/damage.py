@@ -1,0 +1,224 @@
+"""Reading JSON files that may be damaged: what cannot be used is named by file and line, and never hides the rest.
+
+What follows from a damaged file, by its kind:
+
+| file | what is damaged | what is done |
+|---|---|---|
+| `metrics.jsonl` | a line | the line is skipped and counted; a trial that goes on writes the others again without it |
+| `reports.jsonl` | a line | the line is skipped and counted; the stopping rule is told the others |
+| both | the last line, cut short | what a killed writer leaves: dropped without a word |
+| `outcome.json` | the file | the trial has not ended: it goes on from its newest checkpoint and ends again |
+| `device.json` | the file | the device is not known |
+| `halved.json` | the file | the trial ends in an error until it is repaired: how many worlds it has is not known |
+| `params.json` | the file | `--resume` is refused: what the search chose is not known; remove the trial's folder |
+| `manifest.json` | the file | refused, except by `report`, which shows what the trials' folders hold |
+| `env.json` | the file, a field | versions and command are not known |
+| `eval.json` | the file, an entry | refused: remove it to have it written again |
+| a checkpoint | the file | passed over for the one before; `best.pt` is refused by who asks for it |
+
+`summary.json`, `table.md` and the report are written and never read.
+"""
+
+import contextlib
+import json
+import math
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from msk_ray.errors import StorageError, StorageFailure
+
+T = TypeVar("T")
+_TEXT_LIMIT = 100
+
+
+@dataclass(frozen=True)
+class Damage:
+    """A part of a file that cannot be used."""
+
+    path: Path
+    what: str
+    line: int | None = None
+    """From 1; None if it is about the whole file."""
+
+    def __str__(self) -> str:
+        return f"{self.path}{'' if self.line is None else f', line {self.line}'}: {self.what}"
+
+
+class DamagedFile(StorageError):
+    """A file holds something else than it should."""
+
+    def __init__(self, damage: Damage, advice: str = "") -> None:
+        super().__init__(damage, advice)  # both, so that the error survives pickling between processes
+        self.damage = damage
+        self.advice = advice
+
+    def __str__(self) -> str:
+        return f"{self.damage}{f'; {self.advice}' if self.advice else ''}"
+
+
+def describe_damages(damages: Sequence[Damage], root: Path) -> list[str]:
+    """A line for each damaged file, its path from `root` on: how many lines of it were skipped, and what is wrong with
+    the first."""
+    files: dict[Path, list[Damage]] = {}
+    for damage in damages:
+        files.setdefault(damage.path, []).append(damage)
+    lines = []
+    for path, found in files.items():
+        first = found[0]
+        name = Path(os.path.relpath(path, root)).as_posix()
+        if first.line is None:
+            lines.append(f"{name}: {first.what}")
+        else:
+            count = "1 line" if len(found) == 1 else f"{len(found)} lines"
+            lines.append(f"{name}: {count} skipped; line {first.line}: {first.what}")
+    return lines
+
+
+def count_damages(damages: Sequence[Damage]) -> str:
+    """`3 damaged lines and 1 damaged file`; empty for none."""
+    lines = sum(damage.line is not None for damage in damages)
+    counts = ((lines, "line"), (len(damages) - lines, "file"))
+    return " and ".join(f"{n} damaged {what}{'' if n == 1 else 's'}" for n, what in counts if n)
+
+
+def read_bytes(path: Path) -> bytes | None:
+    """What a file holds; None if there is no such file.
+
+    Raises:
+        StorageFailure: the storage does not give it.
+    """
+    try:
+        return path.read_bytes()
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError as error:
+        raise StorageFailure(f"cannot read {path}: {error.strerror or error}") from error
+
+
+def read_object(path: Path, build: Callable[[dict[str, Any]], T]) -> T | None:
+    """What a file with one JSON object stands for; None if there is no such file.
+
+    Args:
+        build: makes it of the object; raises ValueError with what is wrong with it.
+
+    Raises:
+        DamagedFile: it cannot be used.
+        StorageFailure: the storage does not give it.
+    """
+    data = read_bytes(path)
+    if data is None:
+        return None
+    try:
+        return build(parse_object(data))
+    except ValueError as error:
+        raise DamagedFile(Damage(path, cut(error))) from error
+
+
+def read_lines(path: Path, build: Callable[[dict[str, Any]], T]) -> tuple[list[T], tuple[Damage, ...]]:
+    """What the lines of a file, a JSON object each, stand for, and those that cannot be used.
+
+    A last line without its end that cannot be used is what a writer leaves that is not done, or was killed: it counts
+    as not written.
+
+    Args:
+        build: makes it of a line's object; raises ValueError with what is wrong with it.
+
+    Raises:
+        StorageFailure: the storage does not give it.
+    """
+    lines = (read_bytes(path) or b"").split(b"\n")
+    unfinished = lines.pop()
+    found: list[T] = []
+    damages = []
+    for number, line in enumerate(lines, start=1):
+        try:
+            found.append(build(parse_object(line)))
+        except ValueError as error:
+            damages.append(Damage(path, cut(error), number))
+    if unfinished:
+        with contextlib.suppress(ValueError):  # not written, as said above
+            found.append(build(parse_object(unfinished)))
+    return found, tuple(damages)
+
+
+def parse_object(data: bytes) -> dict[str, Any]:
+    """A JSON object. NaN and infinity, which JSON does not know, are numbers here, and none that is finite.
+
+    Raises:
+        ValueError: it is none, with the reason.
+    """
+    try:
+        value = json.loads(data.decode("utf-8"))
+    except UnicodeDecodeError as error:
+        raise ValueError(f"not UTF-8 text: byte {error.start} is {data[error.start]:#04x}") from None
+    except json.JSONDecodeError as error:
+        raise ValueError(f"not JSON: {error}") from None
+    except RecursionError:
+        raise ValueError("not JSON of ours: nested too deep") from None
+    if not isinstance(value, dict):
+        raise ValueError(f"{_kind(value)} instead of a JSON object")
+    return value
+
+
+def field(data: Mapping[str, Any], name: str, kind: type[T]) -> T:
+    """A field of an object; true and false are no numbers.
+
+    Raises:
+        ValueError: it is missing or of another kind.
+    """
+    if name not in data:
+        raise ValueError(f"{name} is missing")
+    value = data[name]
+    if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
+        raise ValueError(f"{name} is {_kind(value)} instead of {_KINDS[kind]}")
+    return value
+
+
+def number(data: Mapping[str, Any], name: str) -> float:
+    """A field that is a finite number.
+
+    Raises:
+        ValueError: it is missing, or none.
+    """
+    if name not in data:
+        raise ValueError(f"{name} is missing")
+    value = data[name]
+    if not is_number(value):
+        raise ValueError(f"{name} is {_kind(value)} instead of a finite number")
+    return float(value)
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value is a finite number, as a float can hold it; true and false are none."""
+    if type(value) is float:
+        return math.isfinite(value)
+    return type(value) is int and -(10**300) < value < 10**300
+
+
+def texts(values: Iterable[Any]) -> bool:
+    """Whether all values are texts."""
+    return all(isinstance(value, str) for value in values)
+
+
+def cut(error: object) -> str:
+    """A message on one short line."""
+    text = " ".join(str(error).split())
+    return text if len(text) <= _TEXT_LIMIT else text[: _TEXT_LIMIT - 1] + "…"
+
+
+_KINDS: dict[Any, str] = {
+    str: "text",
+    int: "a whole number",
+    float: "a number",
+    bool: "true or false",
+    list: "a list",
+    dict: "an object",
+    type(None): "null",
+}
+
+
+def _kind(value: Any) -> str:
+    return _KINDS[type(value)]

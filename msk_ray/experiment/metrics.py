@@ -1,0 +1,140 @@
+"""Reading a trial's `metrics.jsonl`, apart from writing it: who only looks need not load torch."""
+
+import math
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from msk_ray.experiment.damage import Damage, field, is_number, number, read_lines, texts
+from msk_ray.experiment.layout import METRICS_FILE
+
+SCORE = "eval/score"
+"""The canonical evaluation metric trials are ranked by; higher is better."""
+EPOCH_LIMIT = 10**9
+"""No trial has this many epochs."""
+RECENT = 10
+"""Newest rows that speed is taken from."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """One deterministic evaluation of a trial's policy after it was trained for an epoch or more.
+
+    What the policy scores before training is drawn in curves and counts nowhere: no trial has earned it.
+    """
+
+    epoch: int
+    env_steps: int
+    seconds: float
+    score: float
+
+    @classmethod
+    def from_row(cls, row: Mapping[str, float]) -> "Evaluation | None":
+        """The evaluation in a row of metrics; None when the epoch had none, or the policy was not trained yet."""
+        if SCORE not in row or row["epoch"] <= 0:
+            return None
+        return cls(int(row["epoch"]), int(row["env_steps"]), float(row["seconds"]), float(row[SCORE]))
+
+    def time(self, attribute: str) -> float:
+        """Progress as `env_steps`, `epoch` or `seconds`."""
+        return float({"env_steps": self.env_steps, "epoch": self.epoch, "seconds": self.seconds}[attribute])
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """A trial's metrics."""
+
+    rows: tuple[dict[str, Any], ...] = ()
+    """In order of epoch, each epoch once: its latest row. As in the file: what is not finite is None, and named in the
+    row's `nonfinite`."""
+    damages: tuple[Damage, ...] = ()
+
+
+def load_metrics(path: Path) -> Metrics:
+    """A trial's metrics, without the lines that are damaged; none if there is no such file.
+
+    Raises:
+        StorageFailure: the storage does not give it.
+    """
+    found, damages = read_lines(path, _row)
+    rows = {row["epoch"]: row for row in found}
+    return Metrics(tuple(rows[epoch] for epoch in sorted(rows)), damages)
+
+
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """The rows of `load_metrics`."""
+    return list(load_metrics(path).rows)
+
+
+def _row(row: dict[str, Any]) -> dict[str, Any]:
+    """A row as it is.
+
+    Raises:
+        ValueError: it is none of a trial's.
+    """
+    epoch = field(row, "epoch", int)
+    if not 0 <= epoch < EPOCH_LIMIT:
+        raise ValueError(f"epoch {epoch:.3g} cannot be" if abs(epoch) < 10**300 else "an epoch that cannot be")
+    for name, value in row.items():
+        if name == "nonfinite":
+            if not isinstance(value, list) or not texts(value):
+                raise ValueError("nonfinite is no list of names")
+        elif value is not None and not is_number(value):  # None was not finite when it was written
+            raise ValueError(f"{name:.40} is no finite number")
+    if SCORE in row:
+        number(row, "env_steps")
+        number(row, "seconds")
+    return row
+
+
+def with_nan(row: Mapping[str, Any]) -> dict[str, float]:
+    """A row of metrics whose missing values are NaN."""
+    return {key: math.nan if value is None else value for key, value in row.items() if key != "nonfinite"}
+
+
+def read_rows(folder: Path) -> list[dict[str, float]]:
+    """A trial's metrics, each epoch once. Values the file marks as not finite are NaN.
+
+    Raises:
+        StorageFailure: the storage does not give them.
+    """
+    return [with_nan(row) for row in load_metrics(folder / METRICS_FILE).rows]
+
+
+def evaluations_of(rows: Sequence[Mapping[str, float]]) -> list[Evaluation]:
+    """The evaluations of trained policies among rows of metrics."""
+    found = (Evaluation.from_row(row) for row in rows)
+    return [evaluation for evaluation in found if evaluation is not None]
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a trial's rows of metrics say."""
+
+    epoch: int = 0
+    best: float | None = None
+    """Highest finite evaluation score of the trained policy."""
+    env_steps_per_s: float | None = None
+    """Median over the newest rows."""
+    seconds_per_epoch: float | None = None
+    """Mean over the newest rows [s]."""
+
+
+def progress_of(rows: Sequence[Mapping[str, float]]) -> Progress:
+    """What rows of metrics, in order of epoch, say."""
+    if not rows:
+        return Progress()
+    scores = [e.score for e in evaluations_of(rows) if math.isfinite(e.score)]
+    recent = [row for row in rows[-RECENT - 1 :] if row["epoch"] > 0]
+    speeds = [row["env_steps_per_s"] for row in recent if math.isfinite(row.get("env_steps_per_s", math.nan))]
+    first, last = rows[-RECENT - 1 :][0], rows[-1]
+    epochs = last["epoch"] - first["epoch"]
+    seconds = last.get("seconds", math.nan) - first.get("seconds", math.nan)
+    return Progress(
+        int(last["epoch"]),
+        max(scores, default=None),
+        statistics.median(speeds) if speeds else None,
+        seconds / epochs if epochs and math.isfinite(seconds) else None,
+    )

@@ -1,0 +1,211 @@
+"""The one reader of a trial's folder: what its files say at one moment, in whatever condition they are."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, TypeVar
+
+from msk_ray.errors import StorageFailure
+from msk_ray.experiment.damage import Damage, DamagedFile, cut, field, read_object
+from msk_ray.experiment.halved import Halved, read_halved
+from msk_ray.experiment.layout import DEVICE_FILE, METRICS_FILE, OUTPUT_FILE, SUMMARY_FILE, best_checkpoint
+from msk_ray.experiment.metrics import (
+    Evaluation,
+    Metrics,
+    Progress,
+    evaluations_of,
+    load_metrics,
+    progress_of,
+    with_nan,
+)
+from msk_ray.experiment.outcomes import Ending, Outcome, load_ending
+
+T = TypeVar("T")
+_BEATS = (METRICS_FILE, DEVICE_FILE, OUTPUT_FILE)
+"""Files that a trial's process writes to as long as it lives."""
+STALE_EPOCHS = 10
+"""A trial is stale when it was silent for this many of its own epochs ..."""
+STALE_S = 60.0
+"""... and for at least this long [s]."""
+STALE_STARTING_S = 600.0
+"""The same for a process that has not done an epoch yet: it may be compiling."""
+
+
+class State(StrEnum):
+    """What a trial seems to be doing."""
+
+    RUNNING = "running"
+    STALE = "stale"
+    """No sign of life for too long: its process, its machine or the whole experiment has died, or was stopped."""
+    WAITING = "waiting"
+    ENDED = "ended"
+    UNREADABLE = "unreadable"
+    """Which trial it is cannot be read."""
+
+
+@dataclass(frozen=True)
+class Device:
+    """What a trial's process was given."""
+
+    host: str = ""
+    gpu: str = "-"
+    """Index on its host, or `cpu`."""
+    name: str = ""
+    """Model of the GPU, or `cpu`; empty if it is not known."""
+
+
+@dataclass(frozen=True)
+class TrialSnapshot:
+    """What a trial's folder holds at one moment."""
+
+    folder: Path
+    rows: tuple[dict[str, float], ...]
+    """Metrics in order of epoch, each epoch once; NaN for what is not finite. Empty if they were not asked for."""
+    progress: Progress
+    ending: Ending | None
+    """None: not ended, whether running, waiting or interrupted."""
+    halved: Halved | None
+    """Set if it runs with half its worlds: then its scores do not compare with the others'."""
+    device: Device
+    state: State
+    age: float | None
+    """Time since its process last wrote something [s]; None if it never did."""
+    damages: tuple[Damage, ...]
+    """What was skipped."""
+
+    @property
+    def evaluations(self) -> tuple[Evaluation, ...]:
+        return tuple(evaluations_of(self.rows))
+
+    @property
+    def epochs_done(self) -> int:
+        return self.progress.epoch
+
+    @property
+    def seconds(self) -> float:
+        """Training time [s]."""
+        seconds = self.rows[-1].get("seconds", math.nan) if self.rows else 0.0
+        return seconds if math.isfinite(seconds) else 0.0
+
+    @property
+    def best_checkpoint(self) -> Path | None:
+        """Checkpoint of the best evaluation's policy."""
+        path = best_checkpoint(self.folder)
+        return path if path.is_file() else None
+
+    @property
+    def errored(self) -> bool:
+        return self.ending is not None and self.ending.outcome in (Outcome.ERROR, Outcome.OUT_OF_MEMORY)
+
+
+class TrialReader:
+    """Reads trials' folders, again and again; metrics that have not changed are not read twice."""
+
+    def __init__(self, keep_rows: bool = True) -> None:
+        """
+        Args:
+            keep_rows: whether snapshots hold all rows of metrics, or only what they say.
+        """
+        self._keep_rows = keep_rows
+        self._seen: dict[Path, tuple[tuple[int, int], tuple[tuple[dict[str, float], ...], Progress, Metrics]]] = {}
+
+    def read(self, folder: Path, now: float) -> TrialSnapshot:
+        """A trial's folder at `now` [s since the epoch]; nothing in it makes this fail."""
+        damages: list[Damage] = []
+        rows, progress, metrics = self._metrics(folder / METRICS_FILE, damages)
+        damages += metrics.damages
+        ending = _attempt(lambda: load_ending(folder), None, folder, damages)
+        halved = _attempt(lambda: read_halved(folder), None, folder, damages)
+        device = _attempt(lambda: read_object(folder / DEVICE_FILE, _device), None, folder, damages) or Device()
+        age = _heartbeat_age(folder, now)
+        if ending is not None:
+            state = State.ENDED
+        elif age is None:
+            state = State.WAITING
+        else:
+            state = State.STALE if _is_silent(folder, progress, age) else State.RUNNING
+        return TrialSnapshot(folder, rows, progress, ending, halved, device, state, age, tuple(damages))
+
+    def _metrics(self, path: Path, damages: list[Damage]) -> tuple[tuple[dict[str, float], ...], Progress, Metrics]:
+        stamp = _stamp(path)
+        if stamp is None:
+            return (), Progress(), Metrics()
+        seen = self._seen.get(path)
+        if seen is not None and seen[0] == stamp:
+            return seen[1]
+        metrics = _attempt(lambda: load_metrics(path), Metrics(), path, damages)
+        rows = tuple(with_nan(row) for row in metrics.rows)
+        found = rows if self._keep_rows else (), progress_of(rows), Metrics((), metrics.damages)
+        if not damages:
+            self._seen[path] = stamp, found
+        return found
+
+
+def read_trial(folder: Path, now: float = 0.0) -> TrialSnapshot:
+    """A trial's folder at `now` [s since the epoch], which only tells running trials from silent ones."""
+    return TrialReader().read(folder, now)
+
+
+def _attempt(read: Callable[[], T], otherwise: T, path: Path, damages: list[Damage]) -> T:
+    try:
+        return read()
+    except DamagedFile as error:
+        damages.append(error.damage)
+    except StorageFailure as error:
+        damages.append(Damage(path, cut(error)))
+    return otherwise
+
+
+def _device(facts: dict[str, Any]) -> Device:
+    host = field(facts, "host", str)
+    if not field(facts, "count", int):
+        return Device(host, "cpu", "cpu")
+    # Without CUDA_VISIBLE_DEVICES a process sees all GPUs and takes the first.
+    return Device(host, field(facts, "visible", str) or "0", field(facts, "name", str))
+
+
+def _heartbeat_age(folder: Path, now: float) -> float | None:
+    """Seconds since a trial's process last wrote; None if it never did.
+
+    Clocks of machines that share a storage differ: a heartbeat from the future is a fresh one.
+    """
+    beat = _last_beat(folder)
+    return None if beat is None else max(0.0, now - beat)
+
+
+def _last_beat(folder: Path) -> float | None:
+    return max((beat for name in _BEATS if (beat := _modified(folder / name)) is not None), default=None)
+
+
+def _is_silent(folder: Path, progress: Progress, age: float) -> bool:
+    """Whether a trial that has not ended shows no sign of life: it was silent for too long, or its driver, which writes
+    the summary last of all, has left since."""
+    summary, beat = _modified(folder.parent.parent / SUMMARY_FILE), _last_beat(folder)
+    left = summary is not None and (beat is None or beat < summary)
+    return left or age > _patience(folder, progress)
+
+
+def _patience(folder: Path, progress: Progress) -> float:
+    """How long a trial may be silent before it counts as stale [s]."""
+    started, metrics = _modified(folder / DEVICE_FILE), _modified(folder / METRICS_FILE)
+    # A process younger than the metrics, as after a retry, has not done an epoch of its own.
+    starting = metrics is None or (started is not None and started >= metrics)
+    if starting or progress.seconds_per_epoch is None:
+        return STALE_STARTING_S
+    return max(STALE_S, STALE_EPOCHS * progress.seconds_per_epoch)
+
+
+def _stamp(path: Path) -> tuple[int, int] | None:
+    """Modification time [ns] and size; None if there is no such file."""
+    try:
+        facts = path.stat()
+    except OSError:
+        return None
+    return facts.st_mtime_ns, facts.st_size
+
+
+def _modified(path: Path) -> float | None:
+    stamp = _stamp(path)
+    return None if stamp is None else stamp[0] * 1e-9
