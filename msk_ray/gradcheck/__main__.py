@@ -187,6 +187,7 @@ def as_json(report: "GradientReport", model: str, tolerance: float, unsupported:
             }
             for r in report.results
         ],
+        "approximated": report.approximated,
         "nonfinite": [asdict(lost) for lost in report.nonfinite],
         "max_rel_error": _finite(report.max_rel_error),
         "tolerance": tolerance,
@@ -239,6 +240,13 @@ def print_table(report: "GradientReport", model: str, tolerance: float) -> None:
     console.print(_excluded(report))
     if report.checked and report.excluded > MANY_EXCLUDED * (report.checked + report.excluded):
         console.print("note: many states were left out, so this speaks for the others only")
+    if report.approximated:
+        share, count = report.diagnostics["approximated_share"], len(report.approximated)
+        console.print(
+            f"contacts only partly exact: {', '.join(report.approximated[:3])}{' …' if count > 3 else ''} ({count} "
+            f"pair(s) may touch); one touched in {share:.1%} of the substeps",
+            markup=False,
+        )
     for lost in report.nonfinite:
         console.print(f"non-finite: {lost}", markup=False)
     verdict = "ok" if report.max_rel_error <= tolerance else "past the tolerance"

@@ -15,6 +15,7 @@ from msk_ray.gradcheck.nonfinite import NonFinite, find_nonfinite
 from msk_ray.gradcheck.oracle import Array, Linearization, Oracle, Point
 from msk_ray.gradcheck.pullback import simulated_gradients
 from msk_ray.gradcheck.states import STATE_KINDS, make_states
+from msk_ray.physics.adjoint.coverage import partly_exact
 from msk_ray.simulation import Backward, Simulation
 
 _VANISHING = 1e-9
@@ -72,6 +73,9 @@ class GradientReport:
     """States compared."""
     diagnostics: dict[str, float] = field(default_factory=dict)
     """What the simulation and its backward mode report of themselves, the largest over the kinds of state."""
+    approximated: list[str] = field(default_factory=list)
+    """Pairs of geoms whose contacts the mode differentiates only in part; `approximated_share` of the diagnostics tells
+    in which share of the substeps one touched."""
     nonfinite: list[NonFinite] = field(default_factory=list)
     """States, compared or left out, at which the step or its gradient is not finite."""
 
@@ -190,6 +194,8 @@ def check_gradients(
             else:
                 report.checked += 1
                 report.results += _comparisons(kind, world, reference, cotangents[world], own)
+    if "approximated_share" in report.diagnostics:
+        report.approximated = partly_exact(model)
     return report
 
 

@@ -50,6 +50,7 @@ HEALTH = {
     "grad/state_p90": ("state cotangent, 90th percentile [rewards]", True),
     "grad/clipped_share": ("share of cotangents clipped", False),
     "grad/nonfinite_share": ("share of worlds without a gradient", False),
+    "grad/approximated_share": ("share of substeps with an approximate gradient", False),
     "physics/solver_limit_share": ("share of worlds at the solver's limit", False),
     "train/diverged": ("worlds diverged an epoch", False),
 }

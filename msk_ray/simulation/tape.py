@@ -5,6 +5,7 @@ Both tapes checkpoint each substep's state and acceleration, in one buffer that 
 nothing is solved); `tape_all` keeps them.
 """
 
+import warnings
 from abc import abstractmethod
 from typing import Any
 
@@ -55,6 +56,7 @@ class _Tape(Backward):
         self._batch = batch
         self._device = torch.device(str(batch.device))
         self._pulled = 0
+        self._warned = False
         with wp.ScopedDevice(batch.device):
             self._adjoint = StepAdjoint(mjm, batch.model, batch.data)
             pool = Pool(batch.device)
@@ -95,6 +97,7 @@ class _Tape(Backward):
         if self._graph is None:
             self._graph = Graph(self.launch_backward, self._batch.device)
             self._clipped.zero_()
+            self._adjoint.touch_counter.clear()
         self._ctrl.copy_(ctrl)
         self._saved.copy_(kept)
         for view, value in zip(self.cotangent, cotangent, strict=True):
@@ -124,8 +127,26 @@ class _Tape(Backward):
             between = max(1, self._pulled * (self._batch.substeps - 1)) * self._batch.nworld
             figures["substep_clip_share"] = float(self._clipped.numpy().sum()) / between
             self._clipped.zero_()
+        if self._adjoint.touch_counter.present:
+            figures["approximated_share"] = self._approximated_share()
         self._pulled = 0
         return figures
+
+    def _approximated_share(self) -> float:
+        """Share of the worlds' substeps pulled back whose gradient went through a contact that is approximated.
+
+        Warns when it is above zero for the first time.
+        """
+        count, pairs = self._adjoint.touch_counter.read()
+        share = count / (max(1, self._pulled) * self._batch.substeps * self._batch.nworld)
+        if count and not self._warned:
+            self._warned = True
+            warnings.warn(
+                f"the gradient is approximate in {share:.1%} of the substeps (grad/approximated_share), where it goes "
+                f"through contacts of {', '.join(pairs)}",
+                stacklevel=4,
+            )
+        return share
 
 
 class TapePerSubstep(_Tape):

@@ -24,6 +24,9 @@ from msk_ray.envs import Env
 from msk_ray.errors import Failure, SimulationError
 from msk_ray.networks import Actor, Critic, RunningMeanStd
 
+_OF_GRADIENTS = frozenset({"approximated_share"})
+"""Figures of the simulation that speak of its gradients; the others speak of its physics."""
+
 
 class Shac:
     """Actor, critic, their optimisers and the statistics they need, trained on one environment.
@@ -117,7 +120,10 @@ class Shac:
             "time/rollout_s": rollout_s,
             "time/backward_s": backward_s,
             "time/critic_s": critic_s,
-            **{f"physics/{name}": value for name, value in self.env.sim.diagnostics().items()},
+            **{
+                f"{'grad' if name in _OF_GRADIENTS else 'physics'}/{name}": value
+                for name, value in self.env.sim.diagnostics().items()
+            },
         }
         return EpochResult(horizon * self.env.nworld, numbers)
 

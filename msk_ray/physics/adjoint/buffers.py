@@ -8,6 +8,7 @@ import warp as wp
 from mujoco_warp._src.types import MJ_MAXVAL
 
 from msk_ray.physics.adjoint import geometry
+from msk_ray.physics.adjoint.approximated import TouchCounter
 from msk_ray.physics.adjoint.coverage import colliding_pairs
 from msk_ray.physics.adjoint.tables import build_tables
 
@@ -47,6 +48,7 @@ class StepBuffers:
 
         with wp.ScopedDevice(self.device):
             self._tables = build_tables(mjm, model)
+            self.touch_counter = TouchCounter(mjm, worlds)
             self.live = wp.ones(worlds, dtype=int)
             self.grad_qpos, self.grad_qvel = floats(worlds, nv), floats(worlds, nv)
             self.grad_act, self.grad_ctrl = floats(worlds, mjm.na), floats(worlds, mjm.nu)

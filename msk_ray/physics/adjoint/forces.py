@@ -306,6 +306,7 @@ class ForcePullbacks(StepBuffers):
                 m.geom_bodyid,
                 m.geom_type,
                 m.geom_size,
+                self.touch_counter.substep,
                 d.nacon,
                 d.contact.dist,
                 d.contact.pos,
@@ -321,7 +322,7 @@ class ForcePullbacks(StepBuffers):
                 self._phi_pos,
                 self._phi_frame,
             ],
-            outputs=[self._moved_bar],
+            outputs=[self._moved_bar, self.touch_counter.touches],
         )
 
     def _pull_actuators(self, d: Any) -> None:

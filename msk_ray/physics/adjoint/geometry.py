@@ -16,7 +16,9 @@ import warp as wp
 from mujoco_warp._src.math import make_frame
 from mujoco_warp._src.types import GeomType
 
+from msk_ray.physics.adjoint.approximated import Touches, count_touch
 from msk_ray.physics.adjoint.box_pairs import box_box_wrenches, capsule_box_wrenches
+from msk_ray.physics.adjoint.coverage import approximated_types
 from msk_ray.physics.adjoint.pair_laws import (
     SCORED_PAIRS,
     ParallelLaw,
@@ -55,18 +57,22 @@ class PairKinds(NamedTuple):
     """Box with box or capsule."""
     native_ccd: bool
     """Whether boxes collide by MuJoCo's native convex collision."""
+    approximated: bool
+    """A pair whose point and frame are taken to follow the mean of both bodies."""
 
     @classmethod
     def of(cls, mjm: mujoco.MjModel, types: set[tuple[int, int]]) -> "PairKinds":
         """Those of a model whose colliding geometry types (ascending) are `types`."""
         native = not mjm.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_NATIVECCD
-        return cls(bool(types & SCORED_PAIRS), bool(types & BOX_PAIRS), bool(native))
+        approximated = bool(approximated_types(mjm))
+        return cls(bool(types & SCORED_PAIRS), bool(types & BOX_PAIRS), bool(native), approximated)
 
 
 @cache
 def pull_geometry_kernel(kinds: PairKinds) -> Any:
     """The kernel for models with these kinds of pairs."""
     scored, boxes, native_ccd = kinds.scored, kinds.boxes, int(kinds.native_ccd)
+    approximated = kinds.approximated
 
     @wp.kernel(module="unique", enable_backward=False)
     def pull_geometry(
@@ -75,6 +81,7 @@ def pull_geometry_kernel(kinds: PairKinds) -> Any:
         geom_bodyid: wp.array[int],
         geom_type: wp.array[int],
         geom_size: wp.array2d[wp.vec3],
+        substep: int,
         # In:
         nacon_in: wp.array[int],
         contact_dist_in: wp.array[float],
@@ -92,6 +99,7 @@ def pull_geometry_kernel(kinds: PairKinds) -> Any:
         phi_frame_in: wp.array[wp.mat33],
         # Out:
         moved_bar_out: wp.array2d[wp.spatial_vector],
+        touches_out: Touches,
     ):
         """Cotangents of (dist, pos, frame) to wrenches on the two bodies whose displacement moves them."""
         con = wp.tid()
@@ -225,15 +233,19 @@ def pull_geometry_kernel(kinds: PairKinds) -> Any:
                 around = rim_torque(normal, column(mat2, 2), core - pos2, force2)
                 torque2 += around
                 torque1 -= around
-        if not known and type1 != GeomType.PLANE:
-            # dist moves with n·(u₂ - u₁) at the point; point and frame with the mean of both bodies.
-            spin = wp.cross(frame[0], weight[0]) + wp.cross(frame[1], weight[1]) + wp.cross(frame[2], weight[2])
-            force1 = 0.5 * pos_bar - dist_bar * normal
-            force2 = 0.5 * pos_bar + dist_bar * normal
-            torque1 = 0.5 * spin
-            torque2 = 0.5 * spin
-            place1 = point
-            place2 = point
+        if wp.static(approximated):
+            if not known and type1 != GeomType.PLANE:
+                # dist moves with n·(u₂ - u₁) at the point; point and frame with the mean of both bodies.
+                spin = wp.cross(frame[0], weight[0]) + wp.cross(frame[1], weight[1]) + wp.cross(frame[2], weight[2])
+                force1 = 0.5 * pos_bar - dist_bar * normal
+                force2 = 0.5 * pos_bar + dist_bar * normal
+                torque1 = 0.5 * spin
+                torque2 = 0.5 * spin
+                place1 = point
+                place2 = point
+                # A contact that pushes nothing, or whose world has no cotangent, has none either.
+                if dist_bar != 0.0 or wp.dot(pos_bar, pos_bar) != 0.0:
+                    count_touch(touches_out, worldid, substep, geom_type.shape[0], geoms[0], geoms[1], type1, type2)
         if body1 > 0:
             wp.atomic_add(moved_bar_out, worldid, body1, wrench(force1, torque1, place1 - com1))
         if body2 > 0:

@@ -31,6 +31,7 @@ class StepAdjoint(ForcePullbacks):
         grad_qvel: shape (W, nv).
         grad_act: shape (W, na).
         grad_ctrl: shape (W, nu); every substep adds to it.
+        touch_counter: how many substeps' gradients went through a contact that is approximated.
         live: worlds whose gradient is wanted; the others get exact zeros. Shape (W,), int.
     """
 
@@ -58,6 +59,7 @@ class StepAdjoint(ForcePullbacks):
             outputs=[self.live],
         )
         self.grad_ctrl.zero_()
+        self.touch_counter.start()
 
     def finish(self, qpos: wp.array, raw_qpos: wp.array) -> None:
         """Launch the change of the tangent gradient at `qpos` to raw coordinates (W, nq)."""
@@ -80,6 +82,7 @@ class StepAdjoint(ForcePullbacks):
 
     def pull_back(self, data: Any, qvel_next: wp.array) -> None:
         """Launch the pullback of one substep; `qvel_next` (W, nv) is the velocity after it."""
+        self.touch_counter.substep += 1
         self._pull_integrator(data, qvel_next)
         jacobian = self._constraint_laws(data)
         self._solve(data, jacobian)
