@@ -94,3 +94,34 @@ def random_weights(model: mujoco.MjModel, count: int, seed: int) -> dict[str, np
     """Cotangents of (qpos tangent, qvel, act) for `count` worlds."""
     rng = np.random.default_rng(seed)
     return {n: rng.normal(size=(count, k)) for n, k in (("qpos", model.nv), ("qvel", model.nv), ("act", model.na))}
+
+
+def studded_plate() -> mujoco.MjModel:
+    """A free plate with 64 spheres below, on which it lands, and 256 above: more contacts than a bound is taken for.
+
+    It starts 20 cm above the ground, where nothing touches. mujoco_warp's own guess is room for 48 contacts and 64
+    rows; lying, it makes 64 and 256.
+    """
+
+    def studs(side: int, height: float) -> str:
+        places = np.linspace(-0.4, 0.4, side)
+        return "".join(f'<geom size=".02" pos="{x} {y} {height}"/>' for x in places for y in places)
+
+    return tighten(
+        mujoco.MjModel.from_xml_string(
+            f"""
+<mujoco>
+  <option timestep=".004"/>
+  <default><geom contype="0" conaffinity="1" mass=".02" solref=".05 1"/></default>
+  <worldbody>
+    <geom type="plane" size="5 5 1" contype="1" conaffinity="0"/>
+    <body pos="0 0 .25">
+      <freejoint/>
+      {studs(8, -0.03)}{studs(16, 0.03)}
+      <site name="middle"/>
+    </body>
+  </worldbody>
+  <actuator><motor site="middle" gear="0 0 1 0 0 0"/></actuator>
+</mujoco>"""
+        )
+    )

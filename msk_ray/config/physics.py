@@ -91,9 +91,10 @@ class PhysicsConfig(Section):
     gear: PositiveFloat | None = None
     """Force or torque of a motor at full control [N, N m]."""
     nconmax: Count | None = None
-    """Contacts a world; null takes a bound from the geometry."""
+    """Contacts a world; null takes a bound from the geometry or, where that is large, tries the model out and lets the
+    room grow with use. What is given does not grow."""
     njmax: Count | None = None
-    """Constraint rows a world; null takes a bound from the geometry."""
+    """Constraint rows a world; null as for nconmax."""
 
     @model_validator(mode="after")
     def _friction_direction_needs_ellipse(self) -> "PhysicsConfig":

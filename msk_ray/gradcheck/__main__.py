@@ -92,6 +92,12 @@ def parser() -> Parser:
         metavar="T",
         help="forward mismatch from which a state is left out, relative to its motion (default 3e-5)",
     )
+    p.add_argument(
+        "--nconmax", type=_positive(int), metavar="N", help="room for contacts a world; by default tried out, and grows"
+    )
+    p.add_argument(
+        "--njmax", type=_positive(int), metavar="N", help="room for constraint rows a world; by default the same"
+    )
     p.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
     return p
 
@@ -143,6 +149,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             device=args.device,
             solver_tolerance=args.solver_tolerance,
             limits=limits,
+            room=(args.nconmax, args.njmax),
         )
     except UnsupportedModelError as error:
         if args.json:

@@ -141,6 +141,7 @@ def check_gradients(
     device: str = "cpu",
     solver_tolerance: float | None = None,
     limits: Limits | None = None,
+    room: tuple[int | None, int | None] = (None, None),
 ) -> GradientReport:
     """Compare gradients of one env step by `backward` with float64 central differences of C MuJoCo.
 
@@ -156,6 +157,7 @@ def check_gradients(
         device: where Warp runs.
         solver_tolerance: Warp's solver tolerance, below mujoco_warp's floor of 1e-6 if wanted.
         limits: what counts as a kink and as a forward mismatch.
+        room: `nconmax` and `njmax` of the Simulation.
 
     Returns:
         The comparisons; none where every state was excluded, which `max_rel_error` does not let pass.
@@ -163,14 +165,17 @@ def check_gradients(
     Raises:
         UnsupportedModelError: `backward` or mujoco_warp cannot treat the model.
         ConfigError: unknown kind of state, or a model without degrees of freedom.
-        SimulationError: the model diverges in C MuJoCo.
+        SimulationError: the model diverges in C MuJoCo, or Warp had too little room for its contacts.
     """
     unknown = [kind for kind in states if kind not in STATE_KINDS]
     if unknown or not states:
         raise ConfigError(f"unknown kinds of state {unknown}: write some of {', '.join(STATE_KINDS)}")
     if model.nv == 0:
         raise ConfigError("the model has no degrees of freedom, so there is no gradient to check")
-    sim = Simulation(model, worlds, substeps, backward, device, tolerance=solver_tolerance)
+    nconmax, njmax = room
+    sim = Simulation(
+        model, worlds, substeps, backward, device, nconmax=nconmax, njmax=njmax, tolerance=solver_tolerance
+    )
     oracle, limits = Oracle(model, substeps), limits or Limits()
     report = GradientReport(backward.name, substeps, worlds)
     for kind in dict.fromkeys(states):
@@ -179,7 +184,7 @@ def check_gradients(
         # Rounded, so that both sides pull the same numbers back.
         cotangents = rng.standard_normal((worlds, 2 * model.nv + model.na)).astype(np.float32).astype(np.float64)
         ends, gradients = simulated_gradients(sim, points, cotangents)
-        for name, figure in sim.diagnostics().items():  # raises if contacts were lost
+        for name, figure in sim.diagnostics().items():
             report.diagnostics[name] = max(report.diagnostics.get(name, -math.inf), figure)
         for world, (point, end) in enumerate(zip(points, ends, strict=True)):
             own = {name: gradient[world] for name, gradient in gradients.items()}

@@ -1,65 +1,18 @@
 """`nworld` copies of one model, stepped together by an unmodified mujoco_warp."""
 
+import copy
 from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import warp as wp
-from mujoco_warp import OverflowType
 from numpy.typing import NDArray
 
-from msk_ray.errors import SimulationError, UnsupportedModelError
-
-# Contacts mujoco_warp can return for one pair of geoms, by the less common of the two types.
-_CONTACTS_PER_PAIR = {
-    mujoco.mjtGeom.mjGEOM_SPHERE: 1,
-    mujoco.mjtGeom.mjGEOM_ELLIPSOID: 1,
-    mujoco.mjtGeom.mjGEOM_CAPSULE: 2,
-    mujoco.mjtGeom.mjGEOM_CYLINDER: 4,
-    mujoco.mjtGeom.mjGEOM_BOX: 8,
-    mujoco.mjtGeom.mjGEOM_MESH: 8,
-}
-# Largest bound worth allocating per world; above it mujoco_warp's own guess is used instead.
-_MAX_BOUNDED_CONTACTS = 256
-# Bits that tell of lost contacts or constraint rows, as against an iteration limit that only costs accuracy.
-_ITERATION_BITS = OverflowType.ITERATIONS | OverflowType.LS_ITERATIONS
-
-
-def contact_capacity(model: mujoco.MjModel) -> tuple[int, int] | None:
-    """Upper bound (contacts, constraint rows) of one world, or None where no small bound is known.
-
-    Counts every pair of geoms that the collision masks or explicit pairs let through; the parent filter is not
-    applied, so the bound errs upwards.
-    """
-    pairs = {(int(a), int(b)) for a, b in zip(model.pair_geom1, model.pair_geom2, strict=True)}
-    dims = {
-        (int(a), int(b)): int(d) for a, b, d in zip(model.pair_geom1, model.pair_geom2, model.pair_dim, strict=True)
-    }
-    for a in range(model.ngeom):
-        for b in range(a + 1, model.ngeom):
-            if model.geom_bodyid[a] == model.geom_bodyid[b]:
-                continue
-            if (model.geom_contype[a] & model.geom_conaffinity[b]) or (
-                model.geom_contype[b] & model.geom_conaffinity[a]
-            ):
-                pairs.add((a, b))
-    contacts = rows = 0
-    pyramidal = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
-    for a, b in pairs:
-        types = {mujoco.mjtGeom(model.geom_type[g]) for g in (a, b)} - {mujoco.mjtGeom.mjGEOM_PLANE}
-        if not types <= _CONTACTS_PER_PAIR.keys():
-            return None
-        count = min((_CONTACTS_PER_PAIR[t] for t in types), default=0)
-        dim = dims.get((a, b), max(int(model.geom_condim[a]), int(model.geom_condim[b])))
-        contacts += count
-        rows += count * (1 if dim == 1 else 2 * (dim - 1) if pyramidal else dim)
-    if contacts > _MAX_BOUNDED_CONTACTS:
-        return None
-    limits = int(np.sum(model.jnt_limited)) + 2 * int(np.sum(model.tendon_limited))
-    friction = int(np.sum(model.dof_frictionloss > 0)) + int(np.sum(model.tendon_frictionloss > 0))
-    # A hinge or slide limit can be active on both sides at once inside its margin.
-    return max(contacts, 1), max(rows + 2 * limits + friction + 6 * model.neq, 1)
+from msk_ray.errors import UnsupportedModelError
+from msk_ray.physics.capacity import Capacity, default_capacity
+from msk_ray.physics.overflow import LossWatch, cured, loss_error, needed
+from msk_ray.physics.sealed import ModelWatch, seal
 
 
 def check_state(model: mujoco.MjModel) -> None:
@@ -96,12 +49,21 @@ class WorldBatch:
     An env step is `substeps` calls of `mujoco_warp.step` under one control. It is a pure function of
     (ctrl, qpos, qvel, act): the solver starts cold at its first substep and warm at the others.
 
+    Args:
+        mjm: the C MuJoCo model, which must not change while the batch lives.
+        nconmax, njmax: contacts and constraint rows a world. By default a bound from the geometry where that is small,
+            else what a short probe in C MuJoCo needed and half as much again.
+        tolerance: solver tolerance, below mujoco_warp's floor of 1e-6 if wanted.
+
     Attributes:
         mjm: the C MuJoCo model.
-        model, data: mujoco_warp's copies on the device.
+        model, data: mujoco_warp's copies on the device. The model's arrays cannot be replaced, as recorded graphs
+            would not follow.
         nworld: number of worlds W.
         substeps: physics steps an env step.
         device: the Warp device.
+        capacity: contacts and rows a world that `data` has room for.
+        losses: what steps lost for want of room; ask it between steps.
 
     Raises:
         UnsupportedModelError: mujoco_warp cannot load the model, or it has state outside (qpos, qvel, act).
@@ -120,28 +82,74 @@ class WorldBatch:
     ) -> None:
         check_state(mjm)
         self.mjm = mjm
-        self.nworld = nworld
         self.substeps = substeps
         self.device = wp.get_device(device)
-        self._options: dict[str, Any] = {"nconmax": nconmax, "njmax": njmax, "tolerance": tolerance}
-        bound = contact_capacity(mjm)
-        if bound is not None:
-            nconmax = nconmax or bound[0]
-            njmax = njmax or bound[1]
         with wp.ScopedDevice(self.device):
             try:
-                self.model = mjw.put_model(mjm)
+                model = mjw.put_model(mjm)
             except (NotImplementedError, ValueError) as error:
                 raise UnsupportedModelError(f"mujoco_warp cannot load the model: {error}") from error
             if tolerance is not None:
                 # put_model clamps to 1e-6; the adjoint holds at the optimum only, so it may ask for less.
-                self.model.opt.tolerance = wp.array([tolerance], dtype=float)
-            self.model.opt.warn_overflow = 0  # read back by `check_overflow`, not printed from kernels
-            self.data = mjw.make_data(mjm, nworld=nworld, nconmax=nconmax, njmax=njmax)
+                model.opt.tolerance = wp.array([tolerance], dtype=float)
+            model.opt.warn_overflow = 0  # read back by `losses`, not printed from kernels
+        seal(model, "batch.model")
+        self._model = model
+        self._watch = ModelWatch(mjm)
+        self._given = Capacity(nconmax or 0, njmax or 0)
+        start, self._bound = default_capacity(mjm) if not all(self._given) else (self._given, None)
+        self._allocate(nworld, Capacity(nconmax or start.contacts, njmax or start.rows))
 
-    def resized(self, nworld: int) -> "WorldBatch":
-        """Another batch of the same model and settings with `nworld` worlds."""
-        return WorldBatch(self.mjm, nworld, self.substeps, str(self.device), **self._options)
+    @property
+    def model(self) -> Any:
+        """mujoco_warp's model."""
+        return self._model
+
+    def _allocate(self, nworld: int, capacity: Capacity) -> None:
+        self.nworld = nworld
+        self.capacity = capacity
+        with wp.ScopedDevice(self.device):
+            self.data = mjw.make_data(self.mjm, nworld=nworld, nconmax=capacity.contacts, njmax=capacity.rows)
+        self.losses = LossWatch(self.data, self.device)
+
+    def resized(self, nworld: int, capacity: Capacity | None = None) -> "WorldBatch":
+        """Another batch of the same model, which both share, with `nworld` worlds."""
+        self.check_model()
+        other = copy.copy(self)
+        other._allocate(nworld, capacity or self.capacity)
+        return other
+
+    def check_model(self, thorough: bool = False) -> None:
+        """Raise ConfigError if the MjModel was edited since; meshes and height fields are compared if `thorough`."""
+        self._watch.check(thorough)
+
+    def growth(self, wanted: Capacity) -> Capacity:
+        """The part of `wanted` that may be allocated: sizes that were given stay, and so do bounds of the geometry."""
+        if self._bound is not None:
+            wanted = wanted.at_most(self._bound)
+        return Capacity(
+            self.capacity.contacts if self._given.contacts else max(wanted.contacts, self.capacity.contacts),
+            self.capacity.rows if self._given.rows else max(wanted.rows, self.capacity.rows),
+        )
+
+    def larger(self) -> "WorldBatch":
+        """The batch to repeat a step with that lost something here; waits for the device.
+
+        Raises:
+            SimulationError: the room was given by the user, or more of it would not help.
+        """
+        lost, _, peak = self.losses.read()
+        wanted = needed(lost, self.capacity, peak)
+        allowed = self.growth(wanted)
+        if not cured(lost, self.capacity, allowed):
+            raise loss_error(lost, self.capacity, wanted)
+        return self.resized(self.nworld, allowed)
+
+    def raise_losses(self) -> None:
+        """Raise SimulationError if a step that the device has finished lost contacts or constraint rows."""
+        if self.losses.heard():
+            lost, _, peak = self.losses.read()
+            raise loss_error(lost, self.capacity, needed(lost, self.capacity, peak))
 
     def begin_step(self) -> None:
         """Launch what makes an env step independent of the one before."""
@@ -153,6 +161,14 @@ class WorldBatch:
         self.begin_step()
         for _ in range(self.substeps):
             self.launch_substep(self.data)
+        self.end_step(self.data)
+
+    def end_step(self, data: Any) -> None:
+        """Launch the look for losses of an env step whose last substep was made in `data`: its last launch.
+
+        Worlds that lost contacts or rows get NaN for (qpos, qvel, act), so that nothing can take them for states.
+        """
+        self.losses.launch(data)
 
     def launch_substep(self, data: Any) -> None:
         """Launch one physics step on `data`, this batch's own or another of the same model and size."""
@@ -162,6 +178,8 @@ class WorldBatch:
     def set_contact_pairs(self, fields: dict[str, NDArray[np.float64]]) -> None:
         """Change what contact pairs are made of, from the next step on; recorded graphs follow.
 
+        The MjModel keeps what it was compiled with.
+
         Args:
             fields: of solref (P, 2), solreffriction (P, 2), solimp (P, 5), friction (P, 5), those that change, for the
                 P pairs in the model's order.
@@ -170,21 +188,3 @@ class WorldBatch:
             array = getattr(self.model, f"pair_{name}")
             # In place: a recorded graph reads this memory.
             array.assign(np.asarray(value, np.float32).reshape(*array.shape, -1))
-
-    def check_overflow(self) -> float:
-        """Share of worlds whose solver met an iteration limit since the last call.
-
-        Raises:
-            SimulationError: contacts or constraint rows were lost because a buffer was too small.
-        """
-        bits = self.data.overflow.numpy().copy()  # on CPU numpy() is a view, and the next line clears it
-        self.data.overflow.zero_()
-        lost = np.bitwise_or.reduce(bits) & ~int(_ITERATION_BITS)
-        if lost:
-            names = OverflowType(int(lost)).name
-            raise SimulationError(
-                f"mujoco_warp ran out of {names} space in {int(np.count_nonzero(bits & lost))} of {self.nworld} "
-                f"worlds; raise physics.nconmax (now {self.data.naconmax // self.nworld}) or physics.njmax "
-                f"(now {self.data.njmax})"
-            )
-        return float(np.mean(bits != 0))

@@ -39,6 +39,8 @@ class TapedStep:
 
     Raises:
         UnsupportedModelError: the adjoint does not cover the model.
+        SimulationError: by a step or its pullback, a step lost contacts or constraint rows.
+        ConfigError: by either, the MjModel was edited.
     """
 
     def __init__(self, batch: WorldBatch) -> None:
@@ -51,6 +53,8 @@ class TapedStep:
     def __call__(self, ctrl: wp.array, state: WarpState, tape: wp.Tape | None = None) -> WarpState:
         """The state after one env step under `ctrl` (W, nu), in new arrays; inputs that need a gradient keep theirs."""
         batch, data = self._batch, self._batch.data
+        batch.check_model()
+        batch.raise_losses()
         kept: list[dict[str, wp.array]] = []
         with wp.ScopedDevice(batch.device):
             wp.copy(data.ctrl, ctrl)
@@ -62,7 +66,10 @@ class TapedStep:
                 batch.launch_substep(data)
                 saved["qacc"] = wp.clone(data.qacc, requires_grad=False)
                 kept.append(saved)
+            batch.end_step(data)
             end = WarpState(*(wp.clone(getattr(data, n), requires_grad=tape is not None) for n in WarpState._fields))
+        if not batch.device.is_cuda:
+            batch.raise_losses()
         if tape is not None:
             held = wp.clone(ctrl, requires_grad=False)
             arrays = [array for array in (ctrl, *state, *end) if array.requires_grad]
@@ -73,6 +80,9 @@ class TapedStep:
         self, held: wp.array, ctrl: wp.array, start: WarpState, end: WarpState, kept: list[dict[str, wp.array]]
     ) -> None:
         batch, data, adjoint = self._batch, self._batch.data, self._adjoint
+        batch.check_model()
+        wp.synchronize_device(batch.device)
+        batch.raise_losses()
         with wp.ScopedDevice(batch.device):
             wp.copy(data.ctrl, held)
             wp.copy(adjoint.grad_qvel, end.qvel.grad)

@@ -3,8 +3,9 @@
 Axes: W worlds. `nq, nv, na, nu` as in MuJoCo.
 """
 
+import copy
 from abc import ABC, abstractmethod
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 from torch import Tensor
 
@@ -61,8 +62,15 @@ class Backward(ABC):
             UnsupportedModelError: the model has a feature this mode cannot differentiate.
         """
 
+    def fresh(self) -> Self:
+        """A mode with the same settings, to attach to another batch. `attach` has to set all that is not a setting."""
+        return copy.copy(self)
+
     def launch_step(self, batch: WorldBatch) -> None:
-        """Launch one env step. A mode that keeps per-substep data overrides this; it is captured as a graph."""
+        """Launch one env step. A mode that keeps per-substep data overrides this; it is captured as a graph.
+
+        It begins with `batch.begin_step()` and ends with `batch.end_step(data)`.
+        """
         batch.launch_step()
 
     @abstractmethod

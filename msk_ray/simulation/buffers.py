@@ -8,6 +8,17 @@ from msk_ray.physics import WorldBatch
 from msk_ray.simulation.backward import StepState
 
 
+def device_of(batch: WorldBatch) -> torch.device:
+    """The batch's device, as torch names it."""
+    return torch.device(str(batch.device))
+
+
+def wait_for(device: torch.device) -> None:
+    """Wait until torch's current stream on `device` has done what was asked of it."""
+    if device.type == "cuda":
+        torch.cuda.current_stream(device).synchronize()
+
+
 def stream_of(device: torch.device) -> wp.Stream | None:
     """The Warp view of torch's current stream, so that both libraries' work stays in one order."""
     if device.type != "cuda":

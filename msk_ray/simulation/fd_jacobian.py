@@ -3,9 +3,10 @@
 import torch
 from torch import Tensor
 
-from msk_ray.physics import Graph, WorldBatch
+from msk_ray.physics import WorldBatch
 from msk_ray.simulation.backward import Backward, InputGradients, Needs, StepState
-from msk_ray.simulation.buffers import BatchTensors, stream_of
+from msk_ray.simulation.buffers import device_of
+from msk_ray.simulation.stepper import Stepper
 from msk_ray.simulation.tangent import Tangent
 
 
@@ -40,12 +41,12 @@ class FdJacobian(Backward):
     ) -> None:
         self.eps = {"ctrl": eps_ctrl, "qpos": eps_qpos, "qvel": eps_qvel, "act": eps_act}
         self.max_worlds = max_worlds
-        self._copies: dict[int, _Copies] = {}
 
     def attach(self, batch: WorldBatch) -> None:
+        self._copies: dict[int, Stepper] = {}
         self._batch = batch
         self._sizes = {"ctrl": batch.mjm.nu, "qpos": batch.mjm.nv, "qvel": batch.mjm.nv, "act": batch.mjm.na}
-        self._device = torch.device(str(batch.device))
+        self._device = device_of(batch)
         self._tangent = Tangent(batch.mjm, self._device)
 
     def record(self, ctrl: Tensor, start: StepState, end: StepState) -> tuple[Tensor, ...]:
@@ -75,12 +76,9 @@ class FdJacobian(Backward):
         )
 
     def diagnostics(self) -> dict[str, float]:
-        """Share of perturbed copies whose solver met an iteration limit since the last call.
-
-        Raises:
-            SimulationError: a copy lost contacts or constraint rows, so that its differences are not slopes.
-        """
-        return {"fd_solver_limit_share": max((c.check_overflow() for c in self._copies.values()), default=0.0)}
+        """Share of perturbed copies whose solver met an iteration limit since the last call."""
+        shares = [copies.diagnostics()["solver_limit_share"] for copies in self._copies.values()]
+        return {"fd_solver_limit_share": max(shares, default=0.0)}
 
     def _slopes(
         self, chunk: list[tuple[str, int]], width: int, ctrl: Tensor, start: StepState, weights: StepState
@@ -88,7 +86,7 @@ class FdJacobian(Backward):
         """Directional derivatives of ⟨weights, end⟩, shape (len(chunk), W), along each column of `chunk`."""
         copies = self._copies.get(width)
         if copies is None:
-            copies = self._copies[width] = _Copies(self._batch, 2 * width)
+            copies = self._copies[width] = Stepper(self._batch.resized(2 * width * self._batch.nworld))
         shape = (2, width, self._batch.nworld)
         inputs = {"ctrl": ctrl, **start._asdict()}
         spread = {name: value.expand(*shape, -1).clone() for name, value in inputs.items()}
@@ -101,28 +99,12 @@ class FdJacobian(Backward):
             steps[k] = 2.0 * self.eps[name]
         if any(name == "qpos" for name, _ in chunk):
             spread["qpos"] = self._tangent.integrate(spread["qpos"], deltas)
-        end = copies.advance({name: value.flatten(0, 2) for name, value in spread.items()})
+        inputs = {name: value.flatten(0, 2) for name, value in spread.items()}
+        end = copies.advance(inputs.pop("ctrl"), StepState(**inputs))
+        copies.engine.settle()
         plus_q, minus_q = end.qpos.view(*shape, -1)[:, : len(chunk)]
         change = (self._tangent.difference(minus_q, plus_q) * weights.qpos).sum(-1)
         for value, weight in ((end.qvel, weights.qvel), (end.act, weights.act)):
             plus, minus = value.view(*shape, -1)[:, : len(chunk)]
             change = change + ((plus - minus) * weight).sum(-1)
         return change / steps
-
-
-class _Copies:
-    """A batch that holds `count` copies of every world of `batch`."""
-
-    def __init__(self, batch: WorldBatch, count: int) -> None:
-        self._batch = batch.resized(count * batch.nworld)
-        self._buffers = BatchTensors(self._batch)
-        self._graph = Graph(self._batch.launch_step, self._batch.device)
-        self._device = torch.device(str(batch.device))
-
-    def check_overflow(self) -> float:
-        return self._batch.check_overflow()
-
-    def advance(self, inputs: dict[str, Tensor]) -> StepState:
-        self._buffers.load(inputs["ctrl"], StepState(inputs["qpos"], inputs["qvel"], inputs["act"]))
-        self._graph.replay(stream_of(self._device))
-        return self._buffers.read()

@@ -9,9 +9,10 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from msk_ray.errors import ConfigError, DeviceError
-from msk_ray.physics import Graph, WorldBatch
+from msk_ray.physics import WorldBatch
+from msk_ray.physics.capacity import Capacity
 from msk_ray.simulation.backward import Backward, Needs, StepState
-from msk_ray.simulation.buffers import BatchTensors, stream_of
+from msk_ray.simulation.stepper import Engine, Stepper
 from msk_ray.simulation.tangent import Tangent
 
 
@@ -50,7 +51,8 @@ class WarpSimStep(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, Tensor]:
         start = StepState(qpos, qvel, act)
         end = sim.advance(ctrl, start)
-        ctx.sim = sim
+        # The one that made this step: the simulation may go on with another.
+        ctx.engine = sim.engine
         ctx.save_for_backward(*sim.require_backward().record(ctrl, start, end))
         return end
 
@@ -59,7 +61,9 @@ class WarpSimStep(torch.autograd.Function):
     def backward(ctx: Any, qpos: Tensor, qvel: Tensor, act: Tensor) -> tuple[Tensor | None, ...]:
         needs = Needs(*ctx.needs_input_grad[1:])
         cotangent = StepState(qpos, qvel, act)
-        gradients = ctx.sim.require_backward().vjp(ctx.saved_tensors, cotangent, needs)
+        ctx.engine.batch.check_model()
+        ctx.engine.settle()
+        gradients = ctx.engine.backward.vjp(ctx.saved_tensors, cotangent, needs)
         # A linear map takes zero to zero, also in a world whose Jacobian is not finite: 0 × NaN must not leak out.
         used = torch.cat(cotangent, dim=-1).ne(0).any(-1, keepdim=True)
         return (None, *(None if g is None else torch.where(used, g, 0.0) for g in gradients))
@@ -74,8 +78,11 @@ class Simulation:
         substeps: physics steps per call of `step`.
         backward: how to differentiate; None for forward only.
         device: "cpu", "cuda" or "cuda:N".
-        nconmax, njmax: contacts and constraint rows per world; by default a bound from the geometry.
+        nconmax, njmax: contacts and constraint rows a world. By default a bound from the geometry where that is small,
+            else what a short probe in C MuJoCo needed and half as much again, which grows with use.
         tolerance: solver tolerance, below mujoco_warp's floor of 1e-6 if wanted.
+
+    The model must not be edited while the simulation lives; the next step or backward refuses to go on if it was.
 
     Raises:
         UnsupportedModelError: the model cannot be stepped, or not differentiated by `backward`.
@@ -100,19 +107,26 @@ class Simulation:
         self.model = model
         self.nworld = nworld
         self.substeps = substeps
-        self.backward = backward
         self.tangent = Tangent(model, self.device)
-        self.batch = WorldBatch(
-            model, nworld, substeps, str(self.device), nconmax=nconmax, njmax=njmax, tolerance=tolerance
+        self._stepper = Stepper(
+            WorldBatch(model, nworld, substeps, str(self.device), nconmax=nconmax, njmax=njmax, tolerance=tolerance),
+            backward,
         )
-        if backward is not None:
-            backward.attach(self.batch)
-            launches = lambda: backward.launch_step(self.batch)  # noqa: E731
-        else:
-            launches = self.batch.launch_step
-        self._buffers = BatchTensors(self.batch)
-        self._graph = Graph(launches, self.batch.device)
-        self.batch.check_overflow()
+
+    @property
+    def engine(self) -> Engine:
+        """What made the last step."""
+        return self._stepper.engine
+
+    @property
+    def batch(self) -> WorldBatch:
+        """The worlds. A step or `diagnostics` that makes more room replaces it, so ask for it where it is used."""
+        return self.engine.batch
+
+    @property
+    def backward(self) -> Backward | None:
+        """The backward mode, attached to `batch`."""
+        return self.engine.backward
 
     @property
     def timestep(self) -> float:
@@ -139,6 +153,11 @@ class Simulation:
 
         Returns:
             New tensors (qpos, qvel, act).
+
+        Raises:
+            SimulationError: a step lost contacts or constraint rows, and more room was not allowed or would not help.
+                On CUDA it may be an earlier step, whose results are NaN in the worlds concerned.
+            ConfigError: the MjModel was edited since the simulation was made.
         """
         if torch.is_grad_enabled() and any(t.requires_grad for t in (ctrl, qpos, qvel, act)):
             return StepState(*WarpSimStep.apply(self, ctrl, qpos, qvel, act))
@@ -146,15 +165,22 @@ class Simulation:
 
     def advance(self, ctrl: Tensor, start: StepState) -> StepState:
         """The forward pass alone, outside autograd."""
-        self._buffers.load(ctrl, start)
-        self._graph.replay(stream_of(self.device))
-        return self._buffers.read()
+        return self._stepper.advance(ctrl, start)
+
+    @property
+    def capacity(self) -> Capacity:
+        """Contacts and constraint rows a world that there is room for now."""
+        return self.batch.capacity
+
+    def reserve(self, capacity: Capacity) -> None:
+        """Make room for at least `capacity` a world, as far as it is not fixed by `nconmax` and `njmax`."""
+        self._stepper.reserve(capacity)
 
     def diagnostics(self) -> dict[str, float]:
-        """Figures since the last call: share of worlds at a solver limit, and those of the backward mode.
+        """Figures since the last call: share of worlds at a solver limit, largest shares of the room for contacts and
+        rows that a step ended with, and those of the backward mode. Buffers that are nearly full grow.
 
         Raises:
             SimulationError: contacts or constraint rows were lost to a full buffer.
         """
-        figures = {"solver_limit_share": self.batch.check_overflow()}
-        return figures | (self.backward.diagnostics() if self.backward is not None else {})
+        return self._stepper.diagnostics()

@@ -18,7 +18,7 @@ from msk_ray.physics.adjoint import StepAdjoint
 from msk_ray.physics.adjoint.coverage import check_supported
 from msk_ray.physics.adjoint.stages import recompute_stages
 from msk_ray.simulation.backward import Backward, InputGradients, Needs, StepState
-from msk_ray.simulation.buffers import stream_of
+from msk_ray.simulation.buffers import device_of, stream_of
 from msk_ray.simulation.pool import Pool
 from msk_ray.simulation.residual import ResidualGauge
 
@@ -54,7 +54,7 @@ class _Tape(Backward):
         mjm, worlds = batch.mjm, batch.nworld
         check_supported(mjm, self.name)
         self._batch = batch
-        self._device = torch.device(str(batch.device))
+        self._device = device_of(batch)
         self._pulled = 0
         self._warned = False
         with wp.ScopedDevice(batch.device):
@@ -165,6 +165,7 @@ class TapePerSubstep(_Tape):
             self._gauge.launch(data)
         for name, array in self._last.items():
             wp.copy(array, getattr(data, name))
+        batch.end_step(data)
 
     def _stages(self, k: int) -> Any:
         data = self._batch.data
@@ -207,6 +208,7 @@ class TapeAll(_Tape):
             wp.copy(getattr(batch.data, name), getattr(before, name))
         for name, array in self._last.items():
             wp.copy(array, getattr(before, name))
+        batch.end_step(before)
 
     def _stages(self, k: int) -> Any:
         data = self._datas[k]
@@ -228,6 +230,9 @@ class Hybrid(Backward):
     def __init__(self, state: Backward, ctrl: Backward) -> None:
         self.state = state
         self.ctrl = ctrl
+
+    def fresh(self) -> "Hybrid":
+        return Hybrid(self.state.fresh(), self.ctrl.fresh())
 
     def attach(self, batch: WorldBatch) -> None:
         self.state.attach(batch)

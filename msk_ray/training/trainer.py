@@ -27,7 +27,10 @@ from msk_ray.training.memory import named_out_of_memory
 from msk_ray.training.metrics import MetricsLog
 
 # Settings that may differ between a checkpoint and the trial that goes on from it.
-_EXTENDABLE = {"trial": {"epochs", "checkpoint_interval", "keep_checkpoints"}}
+_EXTENDABLE = {
+    "trial": {"epochs", "checkpoint_interval", "keep_checkpoints"},
+    "physics": {"nconmax", "njmax"},  # room, which an error may ask for; results do not depend on it
+}
 _MILESTONES = 8
 """Policies kept along the way beside the first; they are what `visualize --progression` shows."""
 

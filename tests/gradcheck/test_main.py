@@ -153,6 +153,21 @@ def test_bad_input_is_one_line(cartpole_file, capsys, arguments, named):
     assert err.count("\n") == 1
 
 
+def test_room_is_taken_and_an_error_says_how_much_it_takes(tmp_path, capsys):
+    path = tmp_path / "plate.xml"
+    studs = "".join(f'<geom size=".02" pos="{x / 10} {y / 10} 0"/>' for x in range(4) for y in range(4))
+    path.write_text(f"""<mujoco><worldbody><geom type="plane" size="5 5 1"/>
+        <body pos="0 0 .019"><freejoint/>{studs}</body></worldbody></mujoco>""")
+    command = [str(path), "--states", "standing", "--worlds", "2"]
+    assert run(main, [*command, "--nconmax", "20", "--njmax", "16"]) == 2
+    err = capsys.readouterr().err
+    assert "njmax: 80 (now 16 constraint rows a world)" in err
+    assert err.count("\n") == 1
+    assert run(main, [*command, "--nconmax", "20", "--njmax", "80"]) == 0
+    with pytest.raises(SystemExit):
+        main([*command, "--njmax", "0"])
+
+
 def test_bad_files(tmp_path, capsys):
     assert run(main, [str(tmp_path / "none.xml")]) == 2
     assert "no model file" in capsys.readouterr().err

@@ -4,11 +4,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from scenes import studded_plate
 
 from msk_ray.config import AntEnvConfig, Config, PhysicsConfig, parse_config
 from msk_ray.envs import make_env
 from msk_ray.envs.models.ant import build_ant
+from msk_ray.errors import SimulationError
 from msk_ray.gradcheck import check_gradients
+from msk_ray.simulation import Simulation, TapePerSubstep
 from msk_ray.simulation.modes import make_backward
 from msk_ray.training import Trainer, read_metrics
 
@@ -70,3 +73,47 @@ def test_a_trial_trains_and_resumes(tmp_path: Path) -> None:
         second.run_epoch()
     second.close()
     assert [row["epoch"] for row in read_metrics(tmp_path / "metrics.jsonl")] == list(range(5))
+
+
+def lying(sim: Simulation) -> dict[str, torch.Tensor]:
+    """The plate on the ground in world 0, in the air in the others; its control wants a gradient."""
+    qpos, qvel, act = sim.initial_state()
+    qpos[0, 2] = 0.0495
+    ctrl = torch.zeros(sim.nworld, sim.model.nu, device=sim.device, requires_grad=True)
+    return {"ctrl": ctrl, "qpos": qpos, "qvel": qvel, "act": act}
+
+
+def test_lost_rows_are_nan_at_once_and_an_error_in_backward() -> None:
+    sim = Simulation(studded_plate(), 3, 2, TapePerSubstep(), "cuda", nconmax=200, njmax=64)
+    end = sim.step(**lying(sim))
+    assert end.qvel[0].isnan().all()
+    assert end.qvel[1:].isfinite().all()
+    with pytest.raises(SimulationError, match="njmax"):
+        end.qvel.sum().backward()
+
+
+def test_lost_rows_are_an_error_at_the_next_step_that_comes_after_them() -> None:
+    sim = Simulation(studded_plate(), 3, 2, None, "cuda", nconmax=200, njmax=64)
+    start = {name: value.detach() for name, value in lying(sim).items()}
+    sim.step(**start)
+    torch.cuda.synchronize()
+    with pytest.raises(SimulationError, match="njmax"):
+        sim.step(**start)
+    sim.step(**start)
+    with pytest.raises(SimulationError, match="njmax"):
+        sim.diagnostics()
+
+
+def test_default_room_is_enough_on_a_gpu_and_grows_between_epochs() -> None:
+    sim = Simulation(studded_plate(), 64, 2, TapePerSubstep(), "cuda")
+    start = lying(sim)
+    start["qpos"][:, 2] = 0.0495
+    end = sim.step(**start)
+    end.qvel.sum().backward()
+    assert end.qvel.isfinite().all()
+    before = sim.capacity
+    assert 0.4 < sim.diagnostics()["rows_share"] <= 1.0
+    sim.reserve(before._replace(rows=2 * before.rows))
+    again = sim.step(**start)
+    assert torch.allclose(again.qvel, end.qvel, atol=1e-5)
+    again.qvel.sum().backward()

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 import yaml
 
-from msk_ray.config import Config
+from msk_ray.config import Config, parse_config
 from msk_ray.errors import CheckpointError, StorageFailure
 from msk_ray.experiment.checkpoint_file import read_facts
 from msk_ray.training import Trainer, precompile, read_metrics
@@ -280,6 +280,28 @@ def test_a_torn_checkpoint_falls_back_to_the_one_before(tiny_cartpole: Config, t
         trainer.run_epoch()
     trainer.close()
     assert comparable(read_metrics(tmp_path / "metrics.jsonl")) == comparable(whole)
+
+
+def test_room_may_change_and_is_kept_in_checkpoints(tiny_settings: dict[str, Any], tmp_path: Path) -> None:
+    """An error that asks for physics.njmax can be followed; room that grew is there from the first step on."""
+    tiny_settings["env"] = {"name": "ant", "nworld": 2, "episode_length": 4}
+    tiny_settings["shac"] |= {"horizon": 2}
+    tiny_settings["physics"] = {"nconmax": 30}
+    first = Trainer(parse_config(tiny_settings), tmp_path, "cpu")
+    first.run_epoch()
+    path = first.save()
+    first.close()
+    tiny_settings["physics"] |= {"nconmax": None, "njmax": 100}
+    second = Trainer(parse_config(tiny_settings), tmp_path, "cpu")
+    second.env.sim.reserve = (asked := []).append
+    second.restore(path)
+    second.close()
+    assert asked == [(30, first.env.sim.capacity.rows)]
+    tiny_settings["physics"] |= {"tolerance": 1e-5}
+    third = Trainer(parse_config(tiny_settings), tmp_path, "cpu")
+    with pytest.raises(CheckpointError, match=r"physics\.tolerance"):
+        third.restore(path)
+    third.close()
 
 
 def test_kernels_are_compiled_in_few_worlds(tiny_settings: dict[str, Any], tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from msk_ray.config import AdaptiveHorizon, Config
 from msk_ray.envs import Env
 from msk_ray.errors import Failure, SimulationError
 from msk_ray.networks import Actor, Critic, RunningMeanStd
+from msk_ray.physics.capacity import Capacity
 
 _OF_GRADIENTS = frozenset({"approximated_share"})
 """Figures of the simulation that speak of its gradients; the others speak of its physics."""
@@ -154,6 +155,7 @@ class Shac:
             "horizon": self._horizon,
             "entropy_coefficient": None if self._entropy is None else self._entropy.coefficient,
             "curriculum": None if self._contacts is None else self._contacts.progress,
+            "capacity": tuple(self.env.sim.capacity),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -175,6 +177,9 @@ class Shac:
             self._entropy.coefficient = state["entropy_coefficient"]
         if self._contacts is not None:
             self._contacts.set_progress(state["curriculum"])
+        if "capacity" in state:
+            # Room that the trial grew to: what comes next may need it at once.
+            self.env.sim.reserve(Capacity(*state["capacity"]))
 
     def start_from(self, modules: Mapping[str, Any]) -> None:
         """Take networks and statistics from another trial's states, by module name; the actor has to be among them.

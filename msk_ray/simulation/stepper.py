@@ -1,0 +1,125 @@
+"""Env steps of tensors, on recorded graphs whose buffers grow where a step needs more room."""
+
+from torch import Tensor
+
+from msk_ray.physics import Graph, WorldBatch
+from msk_ray.physics.capacity import Capacity
+from msk_ray.simulation.backward import Backward, StepState
+from msk_ray.simulation.buffers import BatchTensors, device_of, stream_of, wait_for
+
+_NEARLY_FULL = 0.75
+"""Share of a buffer in use from which it grows between epochs, before a step that it is too small for."""
+
+
+class Engine:
+    """One batch, the graph of its step and the backward mode attached to it: everything whose size is fixed.
+
+    A recorded env step is pulled back by the engine that made it, whatever others came after.
+    """
+
+    def __init__(self, batch: WorldBatch, backward: Backward | None) -> None:
+        self.batch = batch
+        self.backward = backward
+        self.device = device_of(batch)
+        if backward is not None:
+            backward.attach(batch)
+        self._buffers = BatchTensors(batch)
+        launches = batch.launch_step if backward is None else lambda: backward.launch_step(batch)
+        self._graph = Graph(launches, batch.device)
+        batch.losses.read()  # of the start-up, whose state is nobody's
+        self._unseen = False
+
+    def advance(self, ctrl: Tensor, start: StepState) -> StepState:
+        """One env step, whatever it lost."""
+        self._buffers.load(ctrl, start)
+        self._graph.replay(stream_of(self.device))
+        self._unseen = True
+        return self._buffers.read()
+
+    def settle(self) -> None:
+        """Raise SimulationError if a step made so far lost something. Waits for the device, once after each step."""
+        if self._unseen:
+            wait_for(self.device)
+            self._unseen = False
+        self.batch.raise_losses()
+
+    def diagnostics(self) -> tuple[dict[str, float], Capacity]:
+        """Figures since the last call, and the most room a world used.
+
+        Raises:
+            SimulationError: a step lost contacts or constraint rows.
+        """
+        self.settle()
+        _, limited, used = self.batch.losses.read()
+        room = self.batch.capacity
+        figures = {
+            "solver_limit_share": limited,
+            "contacts_share": used.contacts / room.contacts,
+            "rows_share": used.rows / room.rows,
+        }
+        return figures | (self.backward.diagnostics() if self.backward is not None else {}), used
+
+
+class Stepper:
+    """Steps a batch; on CPU, where a loss is known at once, a step that lost something is repeated with more room.
+
+    On CUDA the results of such a step are NaN, and an error follows at the first call after the device got there: at
+    the latest when it is pulled back.
+
+    Attributes:
+        engine: what made the last step.
+    """
+
+    def __init__(self, batch: WorldBatch, backward: Backward | None = None) -> None:
+        self.engine = Engine(batch, backward)
+        self._retired: list[Engine] = []
+
+    def advance(self, ctrl: Tensor, start: StepState) -> StepState:
+        """The state after one env step under `ctrl` (W, nu).
+
+        Raises:
+            SimulationError: a step lost contacts or constraint rows, on CUDA perhaps an earlier one.
+            ConfigError: the MjModel was edited.
+        """
+        self.engine.batch.check_model()
+        self.engine.batch.raise_losses()
+        end = self.engine.advance(ctrl, start)
+        # On CUDA what is heard of here may be the loss of an earlier step, which this one started from.
+        while self.engine.device.type == "cpu" and self.engine.batch.losses.heard():
+            self._replace(self.engine.batch.larger())
+            end = self.engine.advance(ctrl, start)
+        return end
+
+    def reserve(self, wanted: Capacity) -> None:
+        """Make room for at least `wanted` a world, as far as it may grow."""
+        batch = self.engine.batch
+        allowed = batch.growth(wanted)
+        if allowed != batch.capacity:
+            self._replace(batch.resized(batch.nworld, allowed))
+
+    def diagnostics(self) -> dict[str, float]:
+        """Figures since the last call, the largest where there were several engines; makes room where it runs short.
+
+        Raises:
+            SimulationError: a step lost contacts or constraint rows.
+        """
+        batch = self.engine.batch
+        batch.check_model(thorough=True)
+        figures, used = self.engine.diagnostics()
+        for engine in self._retired:
+            earlier, _ = engine.diagnostics()
+            figures = {name: max(value, earlier[name]) for name, value in figures.items()}
+        self._retired.clear()
+        now = batch.capacity
+        self.reserve(
+            Capacity(
+                2 * now.contacts if used.contacts > _NEARLY_FULL * now.contacts else now.contacts,
+                2 * now.rows if used.rows > _NEARLY_FULL * now.rows else now.rows,
+            )
+        )
+        return figures
+
+    def _replace(self, batch: WorldBatch) -> None:
+        old = self.engine
+        self.engine = Engine(batch, None if old.backward is None else old.backward.fresh())
+        self._retired.append(old)
