@@ -178,10 +178,10 @@ class Slurm:
     def wait_for_trials(self, job: str, name: str) -> None:
         self.wait("trials on both nodes", lambda: all(self.running(name).values()), job)
 
-    def left_over(self) -> list[str]:
+    def left_over(self, tokens: bool) -> list[str]:
         """Processes of jobs on the nodes, and tokens."""
         own = {"sleep", "slurmctld", "slurmd", "slurmscriptd", "ps"}
-        found = [str(path) for path in self.scratch.glob("slurm-?/msk_ray-*/token")]
+        found = [str(path) for path in self.scratch.glob("slurm-?/msk_ray-*/token")] if tokens else []
         for node in self.nodes:
             for line in node.ask(["ps", "-eo", "pid=,stat=,comm="]).splitlines():
                 pid, state, name = line.split(maxsplit=2)
@@ -238,7 +238,7 @@ def cancelled(slurm: Slurm, name: str) -> str:
     slurm.wait_for_trials(job, name)
     slurm.first.ask(["scancel", job])
     slurm.wait_for_state(job, "CANCELLED")
-    gone(slurm)
+    gone(slurm, tokens=False)
     if slurm.job(job)["Restarts"] != "0":
         raise RuntimeError("a cancelled job went back into the queue")
     slurm.wait_for_state(slurm.submit(name, requeue=False), "COMPLETED")
@@ -273,14 +273,17 @@ def node_lost(slurm: Slurm, name: str) -> str:
 SCENARIOS: tuple[Scenario, ...] = (undisturbed, time_limit, before_trials, cancelled, asked_to_save, node_lost)
 
 
-def gone(slurm: Slurm) -> None:
+def gone(slurm: Slurm, tokens: bool = True) -> None:
     """Wait until nothing of any job is left.
+
+    Args:
+        tokens: whether that holds for tokens too; those of jobs that were killed go with the next job.
 
     Raises:
         RuntimeError: something stays.
     """
     deadline = time.monotonic() + LIMIT_S / 10
-    while left := slurm.left_over():
+    while left := slurm.left_over(tokens):
         if time.monotonic() > deadline:
             raise RuntimeError(f"left over: {left}")
         time.sleep(0.5)

@@ -41,12 +41,12 @@ FAKES = {
         export JOBS_TMPDIR=$folder RAY_TMPDIR=$folder$place RAY_AUTH_TOKEN_PATH=$folder$place/token
         exec "$script" "$folder$place" "$@" """,
     "ray": """
+        trap 'echo step ended >> "$LOG"; exit 0' TERM
         echo "ray $*" >> "$LOG"
         stat -c 'token %a' "$RAY_AUTH_TOKEN_PATH" >> "$LOG"
         stat -c 'folder %a' "$RAY_TMPDIR" >> "$LOG"
         echo "mode $RAY_AUTH_MODE, $(wc -c < "$RAY_AUTH_TOKEN_PATH") characters" >> "$LOG"
         echo "tmp $JOBS_TMPDIR" >> "$LOG"
-        trap 'echo step ended >> "$LOG"; exit 0' TERM
         while true; do /bin/sleep 0.02; done""",
     # Without a trap, as Python is until its first lines have run.
     "python": """
