@@ -1,3 +1,51 @@
-"""Policy learning through differentiable MuJoCo Warp, swept with Ray Tune."""
+"""Policy learning through differentiable MuJoCo Warp, swept with Ray Tune.
+
+What libraries and notebooks use stands here by one name each, and is loaded when it is first asked for: importing
+`msk_ray` loads neither torch nor Warp.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from msk_ray.config import Config as Config
+    from msk_ray.config import load_config as load_config
+    from msk_ray.envs import Env as Env
+    from msk_ray.gradcheck import check_gradients as check_gradients
+    from msk_ray.simulation import Backward as Backward
+    from msk_ray.simulation import FdJacobian as FdJacobian
+    from msk_ray.simulation import Hybrid as Hybrid
+    from msk_ray.simulation import Simulation as Simulation
+    from msk_ray.simulation import TapeAll as TapeAll
+    from msk_ray.simulation import TapePerSubstep as TapePerSubstep
+    from msk_ray.training.policy import load_policy as load_policy
 
 __version__ = "0.1.0"
+
+_HOMES = {
+    "Backward": "msk_ray.simulation",
+    "Config": "msk_ray.config",
+    "Env": "msk_ray.envs",
+    "FdJacobian": "msk_ray.simulation",
+    "Hybrid": "msk_ray.simulation",
+    "Simulation": "msk_ray.simulation",
+    "TapeAll": "msk_ray.simulation",
+    "TapePerSubstep": "msk_ray.simulation",
+    "check_gradients": "msk_ray.gradcheck",
+    "load_config": "msk_ray.config",
+    "load_policy": "msk_ray.training.policy",
+}
+
+__all__ = sorted([*_HOMES, "__version__"])
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'msk_ray' has no attribute {name!r}; it has {', '.join(sorted(_HOMES))}")
+    found = getattr(import_module(_HOMES[name]), name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOMES})

@@ -12,8 +12,10 @@ from msk_ray.errors import ConfigError, DeviceError
 from msk_ray.physics import WorldBatch
 from msk_ray.physics.capacity import Capacity
 from msk_ray.simulation.backward import Backward, Needs, StepState
+from msk_ray.simulation.modes import make_backward
 from msk_ray.simulation.stepper import Engine, Stepper
 from msk_ray.simulation.tangent import Tangent
+from msk_ray.simulation.tape import TapePerSubstep
 
 
 def resolve_device(device: str) -> torch.device:
@@ -76,7 +78,8 @@ class Simulation:
         model: the compiled MuJoCo model; its timestep is the substep's.
         nworld: number of worlds W.
         substeps: physics steps per call of `step`.
-        backward: how to differentiate; None for forward only.
+        backward: how to differentiate: a mode or its name (tape_per_substep, tape_all, fd_jacobian, hybrid); None for
+            forward only.
         device: "cpu", "cuda" or "cuda:N".
         nconmax, njmax: contacts and constraint rows a world. By default a bound from the geometry where that is small,
             else what a short probe in C MuJoCo needed and half as much again, which grows with use.
@@ -94,8 +97,8 @@ class Simulation:
         model: mujoco.MjModel,
         nworld: int,
         substeps: int,
-        backward: Backward | None,
-        device: str | torch.device,
+        backward: Backward | str | None = TapePerSubstep.name,
+        device: str | torch.device = "cpu",
         *,
         nconmax: int | None = None,
         njmax: int | None = None,
@@ -103,14 +106,20 @@ class Simulation:
     ) -> None:
         if nworld < 1 or substeps < 1:
             raise ConfigError(f"nworld and substeps must be at least 1, not {nworld} and {substeps}")
+        if not isinstance(model, mujoco.MjModel):
+            raise ConfigError(
+                f"model must be a mujoco.MjModel, not {type(model).__name__}: write mujoco.MjModel.from_xml_path(...)"
+            )
         self.device = resolve_device(str(device))
         self.model = model
         self.nworld = nworld
         self.substeps = substeps
         self.tangent = Tangent(model, self.device)
+        self._widths = (("ctrl", model.nu), ("qpos", model.nq), ("qvel", model.nv), ("act", model.na))
+        self._place = torch.empty(0, device=self.device).device
         self._stepper = Stepper(
             WorldBatch(model, nworld, substeps, str(self.device), nconmax=nconmax, njmax=njmax, tolerance=tolerance),
-            backward,
+            make_backward(backward) if isinstance(backward, str) else backward,
         )
 
     @property
@@ -155,13 +164,31 @@ class Simulation:
             New tensors (qpos, qvel, act).
 
         Raises:
+            ConfigError: an argument has another shape, dtype or device.
             SimulationError: a step lost contacts or constraint rows, and more room was not allowed or would not help.
                 On CUDA it may be an earlier step, whose results are NaN in the worlds concerned.
             ConfigError: the MjModel was edited since the simulation was made.
         """
+        self._check_inputs(ctrl, qpos, qvel, act)
         if torch.is_grad_enabled() and any(t.requires_grad for t in (ctrl, qpos, qvel, act)):
             return StepState(*WarpSimStep.apply(self, ctrl, qpos, qvel, act))
         return self.advance(ctrl, StepState(qpos, qvel, act))
+
+    def _check_inputs(self, *inputs: Tensor) -> None:
+        # Copying into the batch's buffers would broadcast one world to all, and convert dtypes and devices silently.
+        for (name, width), value in zip(self._widths, inputs, strict=True):
+            if value.shape != (self.nworld, width):
+                raise ConfigError(
+                    f"step: {name} has shape {tuple(value.shape)}, but {self.nworld} worlds of this model take "
+                    f"({self.nworld}, {width})"
+                )
+            if value.dtype != torch.float32:
+                raise ConfigError(f"step: {name} is {value.dtype}: write {name}.float()")
+            if value.device != self._place:
+                raise ConfigError(
+                    f"step: {name} is on {value.device}, the simulation on {self._place}: write "
+                    f"{name}.to({str(self._place)!r})"
+                )
 
     def advance(self, ctrl: Tensor, start: StepState) -> StepState:
         """The forward pass alone, outside autograd."""
