@@ -4,6 +4,7 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
+from msk_ray import signals
 from msk_ray.cli import run
 
 COMMANDS = {
@@ -18,6 +19,9 @@ COMMANDS = {
     "diagnose": ("msk_ray.diagnose.__main__", "compare a policy's gradients with float64 differences, by horizon"),
     "gradcheck": ("msk_ray.gradcheck.__main__", "check a model's gradients against float64 finite differences"),
 }
+
+SAVING = ("train", "tune")
+"""Those that save what they have when they are asked to stop."""
 
 
 def usage() -> str:
@@ -36,6 +40,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name not in COMMANDS:
         print(f"error: no command {name!r}; write one of {', '.join(COMMANDS)}", file=sys.stderr)
         return 2
+    if name in SAVING:
+        # Before what takes time to load.
+        signals.listen()
     return run(import_module(COMMANDS[name][0]).main, rest)
 
 

@@ -6,19 +6,15 @@ import errno
 import io
 import os
 import shlex
-import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NoReturn
 
+from msk_ray import signals
 from msk_ray.errors import MskRayError, StorageFailure, brief
 from msk_ray.text import printable
-
-RESUMABLE = 75
-"""Exit code of a run that was asked to stop and saved its state (EX_TEMPFAIL)."""
-
 
 TERMINAL_LOG = "terminal.log"
 """In the folder of what runs: what the terminal would have shown, from when it was closed."""
@@ -71,13 +67,22 @@ def _module_of(program: Path) -> str | None:
 
 
 def run(main: Callable[[Sequence[str] | None], int], argv: Sequence[str] | None = None) -> int:
-    """Run an entry point: a fault the user can mend becomes one line on stderr and a non-zero exit code."""
+    """Run an entry point: a fault the user can mend becomes one line on stderr and a non-zero exit code.
+
+    In a program that listens to `signals`, a request to stop that `main` had nothing to save for ends it with 75.
+    """
+    stop = signals.current()
     try:
+        if stop is not None:
+            stop.loading = False
         return main(argv)
     except MskRayError as error:
         print(f"error: {printable(str(error))}", file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
+        if stop is not None and stop.signal is not None and not stop.insisted:
+            print(f"stopped by {stop.signal.name}", file=sys.stderr)
+            return signals.RESUMABLE
         print("interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:
@@ -92,6 +97,9 @@ def run(main: Callable[[Sequence[str] | None], int], argv: Sequence[str] | None 
             file=sys.stderr,
         )
         return MskRayError.exit_code
+    finally:
+        if stop is not None:
+            stop.settle()
 
 
 class _Outliving(io.TextIOBase):
@@ -165,29 +173,3 @@ def _descriptor(stream: object) -> int | None:
     except io.UnsupportedOperation:
         return None
     return descriptor
-
-
-class StopRequest:
-    """Set by SIGINT, SIGTERM, SIGUSR1 or SIGHUP; the loop that owns it stops at its next safe point.
-
-    A second SIGINT interrupts at once. SIGHUP, which comes when the terminal closes, stays ignored where it is: nohup.
-    """
-
-    def __init__(self) -> None:
-        self.signal: signal.Signals | None = None
-        self.install()
-
-    def install(self) -> None:
-        """Take over the signals, again if a library has taken them meanwhile."""
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1):
-            signal.signal(number, self._handle)
-        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
-            signal.signal(signal.SIGHUP, self._handle)
-
-    def _handle(self, number: int, frame: object) -> None:
-        if self.signal is not None and number == signal.SIGINT:
-            raise KeyboardInterrupt
-        self.signal = signal.Signals(number)
-
-    def __bool__(self) -> bool:
-        return self.signal is not None

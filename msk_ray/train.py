@@ -1,14 +1,21 @@
 """`python -m msk_ray.train`: one trial in this process, without Ray. The thing to debug."""
 
+if __name__ == "__main__":
+    # Before whatever takes time to load.
+    from msk_ray import signals
+
+    signals.listen()
+
 import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from msk_ray.cli import RESUMABLE, TERMINAL_LOG, Parser, StopRequest, outliving, run, typed_command
+from msk_ray.cli import TERMINAL_LOG, Parser, outliving, run, typed_command
 from msk_ray.config import SET_HELP, Config, load_config
 from msk_ray.errors import CheckpointError, StorageError
 from msk_ray.files import check_writable, make_folder
+from msk_ray.signals import RESUMABLE, StopRequest, listening
 from msk_ray.text import printable
 
 DESCRIPTION = """\
@@ -46,9 +53,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     logdir = args.logdir or Path("runs") / "train" / f"{args.config.stem}_seed{config.trial.seed}"
     _check_logdir(logdir, args.resume)
     logdir = logdir.resolve()
-    with outliving(logdir / TERMINAL_LOG):
-        command = typed_command(sys.argv if argv is None else [__file__, *argv], "--resume")
-        return _train(config, logdir, args.device, args.resume, command)
+    words = sys.argv if argv is None else [__file__, *argv]
+    with outliving(logdir / TERMINAL_LOG), listening() as stop:
+        try:
+            return _train(config, logdir, args.device, args.resume, stop, typed_command(words, "--resume"))
+        except KeyboardInterrupt:
+            if stop.signal is None or stop.insisted:
+                raise
+            # Not between two epochs: the kernels are not there yet, or the disk is slow.
+            begun = (logdir / "checkpoints").is_dir()
+            command = typed_command(words, *(["--resume"] if begun else []))
+            print(f"stopped by {stop.signal.name}; go on with: {printable(command)}")
+            return RESUMABLE
 
 
 def _check_logdir(logdir: Path, resume: bool) -> None:
@@ -63,7 +79,9 @@ def _check_logdir(logdir: Path, resume: bool) -> None:
         make_folder(logdir)
 
 
-def _train(config: Config, logdir: Path, device: str | None, resume: bool, resume_command: str) -> int:
+def _train(
+    config: Config, logdir: Path, device: str | None, resume: bool, stop: StopRequest, resume_command: str
+) -> int:
     # torch and Warp take seconds to load; a wrong command line should not wait for them.
     import torch
 
@@ -77,7 +95,6 @@ def _train(config: Config, logdir: Path, device: str | None, resume: bool, resum
             raise CheckpointError(
                 f"--resume: no checkpoint in {logdir} is whole ({faults[0]}); name another --logdir to start anew"
             )
-    stop = StopRequest()
     device = device or ("cuda:0" if torch.cuda.is_available() else "cpu")
     print(f"{config.env.name}: {config.trial.epochs} epochs, {config.env.nworld} worlds, on {device}; into {logdir}")
     print("preparing kernels (a first run compiles them, up to a minute) ...", flush=True)
@@ -88,16 +105,17 @@ def _train(config: Config, logdir: Path, device: str | None, resume: bool, resum
             print(f"skipped: {printable(fault)}")
         print(f"resumed from {path}" if path else "no whole checkpoint yet: starting anew")
     progress = Progress(config.trial.epochs, trainer.epoch)
-    while not trainer.finished and not stop:
-        progress.show(trainer.run_epoch())
-    progress.close()
-    if not trainer.finished:
-        trainer.save()
+    with stop.deferred():
+        while not trainer.finished and not stop:
+            progress.show(trainer.run_epoch())
+        progress.close()
+        if not trainer.finished:
+            trainer.save()
+            trainer.close()
+            assert stop.signal is not None
+            print(f"stopped by {stop.signal.name} after epoch {trainer.epoch}; go on with: {printable(resume_command)}")
+            return RESUMABLE
         trainer.close()
-        assert stop.signal is not None
-        print(f"stopped by {stop.signal.name} after epoch {trainer.epoch}; go on with: {printable(resume_command)}")
-        return RESUMABLE
-    trainer.close()
     if math.isfinite(trainer.best_score):
         print(f"best evaluation score {trainer.best_score:.1f}: {trainer.best_checkpoint}")
     else:

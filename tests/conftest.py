@@ -1,9 +1,11 @@
 """Shared fixtures. Worlds are few and rollouts short: everything here runs on two CPU cores."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from processes import Launcher
 
 from msk_ray.config import Config, dump_yaml, load_config, parse_config
 from msk_ray.training import Trainer
@@ -21,6 +23,14 @@ ROOT = Path(__file__).resolve().parent.parent
 def root() -> Path:
     """Top folder of the repository."""
     return ROOT
+
+
+@pytest.fixture
+def launcher() -> Iterator[Launcher]:
+    """Starts programs of which nothing is left after the test."""
+    made = Launcher()
+    yield made
+    made.end()
 
 
 @pytest.fixture(scope="session")

@@ -1,5 +1,11 @@
 """`python -m msk_ray.tune`: an experiment of many trials, one GPU each, with Ray Tune."""
 
+if __name__ == "__main__":
+    # Before whatever takes time to load.
+    from msk_ray import signals
+
+    signals.listen()
+
 import argparse
 import os
 import shutil
@@ -9,11 +15,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from msk_ray.cli import RESUMABLE, TERMINAL_LOG, Parser, outliving, run
+from msk_ray.cli import TERMINAL_LOG, Parser, outliving, run
 from msk_ray.config import SET_HELP, combine, dump_yaml, parse_overrides
 from msk_ray.errors import ConfigError
 from msk_ray.experiment.outcomes import Outcome, read_ending
 from msk_ray.files import make_folder
+from msk_ray.signals import RESUMABLE, StopRequest, listening
 from msk_ray.text import printable, printable_lines
 from msk_ray.tune import experiment as experiments
 from msk_ray.tune.budget import extreme_configs
@@ -285,20 +292,33 @@ def _run(
         placement = choose_placement(space.file.resources, args.gpus_per_trial, args.cpu, local_gpus())
     if not going_on:
         experiment = experiments.create(path, space, trials, _options(args))
-    with outliving(path / TERMINAL_LOG):
-        with runner.ray_session(args.address):
-            if args.address is not None:
-                placement = choose_placement(space.file.resources, args.gpus_per_trial, args.cpu, runner.cluster_gpus())
-            if not placement.gpus and not args.cpu:
-                print("no GPU here: trials run on CPU cores")
-            limit = args.max_concurrent or space.file.resources.max_concurrent
-            completed = runner.run_trials(runner.Plan(experiment, space, trials, placement, limit))
-        errors = finish(experiment)
-        if not completed:
-            print(f"stopped on request; go on with: {printable(experiment.resume_command())}")
-            return RESUMABLE
-        write_report(experiment)
+    with outliving(path / TERMINAL_LOG), listening() as stop:
+        try:
+            with runner.ray_session(args.address):
+                if args.address is not None:
+                    placement = choose_placement(
+                        space.file.resources, args.gpus_per_trial, args.cpu, runner.cluster_gpus()
+                    )
+                if not placement.gpus and not args.cpu:
+                    print("no GPU here: trials run on CPU cores")
+                limit = args.max_concurrent or space.file.resources.max_concurrent
+                completed = runner.run_trials(runner.Plan(experiment, space, trials, placement, limit))
+            errors = finish(experiment)
+            if not completed:
+                return _stopped(stop, experiment)
+            write_report(experiment)
+        except KeyboardInterrupt:
+            # Where there is nothing to save: Ray starts, kernels are compiled, the report is written.
+            if stop.signal is None or stop.insisted:
+                raise
+            return _stopped(stop, experiment)
     return 1 if errors else 0
+
+
+def _stopped(stop: StopRequest, experiment: experiments.Experiment) -> int:
+    by = "on request" if stop.signal is None else f"by {stop.signal.name}"
+    print(f"stopped {by}; go on with: {printable(experiment.resume_command())}")
+    return RESUMABLE
 
 
 def _name_stopped(experiment: experiments.Experiment) -> None:

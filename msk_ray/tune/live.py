@@ -12,13 +12,13 @@ from typing import Any
 from ray.exceptions import RayActorError
 from ray.tune import Callback
 
-from msk_ray.cli import StopRequest
 from msk_ray.errors import StorageFailure, storage_failure
 from msk_ray.experiment.damage import DamagedFile
 from msk_ray.experiment.halved import Halved, read_halved
 from msk_ray.experiment.layout import ERROR_FILE, HANG_FILE
 from msk_ray.experiment.outcomes import Ending, Outcome, read_ending, write_ending
 from msk_ray.progress import format_duration
+from msk_ray.signals import StopRequest
 from msk_ray.text import printable, printable_lines
 from msk_ray.tune.adapters import BEST, METRIC, STARTS_ANEW
 from msk_ray.tune.experiment import Experiment
@@ -76,7 +76,6 @@ class Live(Callback):
         self._stopping_since: float | None = None
         self.storage_failure: StorageFailure | None = None
         """What a trial met when it wrote; then everything is stopped, as every trial would meet it."""
-        self._armed = False
 
     def __getstate__(self) -> dict[str, Any]:
         # Ray pickles callbacks into its own state, which is never read back: resuming begins from the trials' folders.
@@ -94,10 +93,6 @@ class Live(Callback):
         return not self._saving or time.monotonic() - self._stopping_since > SHUTDOWN_GRACE_S
 
     def on_step_end(self, iteration: int, trials: list[Any], **info: Any) -> None:
-        if not self._armed:
-            # Tune takes SIGUSR1 for itself when it starts.
-            self._stop.install()
-            self._armed = True
         if self._stop and self._stopping_since is None:
             self._begin_stop()
         if time.monotonic() - self._last_status >= STATUS_INTERVAL_S:

@@ -2,7 +2,6 @@
 
 import logging
 import os
-import signal
 import tempfile
 import time
 import warnings
@@ -21,7 +20,6 @@ from ray.tune.stopper import Stopper
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 import msk_ray
-from msk_ray.cli import StopRequest
 from msk_ray.config import Config, parse_recorded, read_yaml
 from msk_ray.errors import ClusterLost, DeviceError, MskRayError, StorageFailure, storage_failure
 from msk_ray.experiment.damage import describe_damages
@@ -29,6 +27,7 @@ from msk_ray.experiment.journal import Journal
 from msk_ray.experiment.layout import HALVED_FILE, JOURNAL_FILE
 from msk_ray.experiment.outcomes import read_ending, write_ending
 from msk_ray.progress import format_duration
+from msk_ray.signals import StopRequest, listening
 from msk_ray.training import Trainer, precompile
 from msk_ray.tune import standby
 from msk_ray.tune.adapters import METRIC, Population, PruningScheduler, domain, optuna_search
@@ -37,6 +36,7 @@ from msk_ray.tune.budget import extreme_configs, longest_budget
 from msk_ray.tune.devices import Placement
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.gauges import StateGauge
+from msk_ray.tune.interrupts import end_ray, run_in_thread, starting_ray
 from msk_ray.tune.journal import replay
 from msk_ray.tune.live import Live
 from msk_ray.tune.local_ray import loopback_only, make_token_private, way_in
@@ -91,6 +91,8 @@ def ray_session(address: str | None, dashboard: bool | None = None, trials: bool
         TUNE_DISABLE_SIGINT_HANDLER="1",  # a request to stop lets trials save themselves first
     )
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    # Ray starts a cluster by itself for whoever asks it something after `ray.shutdown`.
+    os.environ["RAY_ENABLE_AUTO_CONNECT"] = "0"
     # Ray would have trials give way to everything else on the machine.
     os.environ.setdefault("RAY_worker_niceness", "0")
     common: dict[str, Any] = {
@@ -103,39 +105,32 @@ def ray_session(address: str | None, dashboard: bool | None = None, trials: bool
         package = str(Path(msk_ray.__file__).resolve().parent.parent)
         paths = [package, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
         os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys(paths))
-        # None starts the dashboard where its packages (ray[default]) are installed, and does without elsewhere.
-        # By default Ray would join whatever cluster a `ray start` on this machine once left a note of.
-        make_token_private()
-        with _hangup_kept_from_children(), loopback_only():
-            context = ray.init("local", include_dashboard=dashboard, dashboard_host="127.0.0.1", **common)
-    else:
-        try:
-            knock(address)
-            context = ray.init(address=address, **common)
-        except OSError as error:  # ConnectionError too
-            raise DeviceError(
-                f"no Ray cluster at {address} (--address or RAY_ADDRESS): {str(error).splitlines()[0]}"
-            ) from error
     try:
+        with starting_ray():
+            context = _init(address, dashboard, common)
         if context.dashboard_url:
             print(f"Ray dashboard: http://{context.dashboard_url}{way_in()}", flush=True)
         elif dashboard is None:
             print("no Ray dashboard: pip install 'ray[default]' to have one", flush=True)
         yield
     finally:
-        ray.shutdown()
+        end_ray()
 
 
-@contextmanager
-def _hangup_kept_from_children() -> Iterator[None]:
-    """A terminal that closes sends SIGHUP to all processes in its foreground: Ray's must live on for trials to save
-    themselves. Blocked signals are inherited; in this process one that comes meanwhile is heard afterwards. Ray does
-    the same about SIGINT."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP})
+def _init(address: str | None, dashboard: bool | None, common: dict[str, Any]) -> Any:
+    if address is None:
+        # None starts the dashboard where its packages (ray[default]) are installed, and does without elsewhere.
+        # By default Ray would join whatever cluster a `ray start` on this machine once left a note of.
+        make_token_private()
+        with loopback_only():
+            return ray.init("local", include_dashboard=dashboard, dashboard_host="127.0.0.1", **common)
     try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        knock(address)
+        return ray.init(address=address, **common)
+    except OSError as error:  # ConnectionError too
+        raise DeviceError(
+            f"no Ray cluster at {address} (--address or RAY_ADDRESS): {str(error).splitlines()[0]}"
+        ) from error
 
 
 def cluster_gpus() -> int:
@@ -179,18 +174,18 @@ def run_trials(plan: Plan) -> bool:
         experiment.make_trial_folder(trial.id)
     total = ray.cluster_resources()
     concurrent = plan.placement.concurrent(total.get("GPU", 0.0), total.get("CPU", 1.0), plan.max_concurrent)
-    stop = StopRequest()
-    live = Live(experiment, remaining, job.trial_of, concurrent, stop, [m.trial for m in made_up])
     print(
         f"{len(remaining) or missing} trials, {concurrent} at once on "
         f"{f'{plan.placement.gpus:g} GPU each' if plan.placement.gpus else 'CPU'}; into {experiment.path}",
         flush=True,
     )
-    _fit(plan, job, live, remaining, made_up)
-    if not plan.trials:
-        # A search makes trials up as it goes; they enter the manifest once they are known.
-        experiment.set_trials(live.started)
-    return not stop
+    with listening() as stop, stop.deferred():
+        live = Live(experiment, remaining, job.trial_of, concurrent, stop, [m.trial for m in made_up])
+        _fit(plan, job, live, stop, remaining, made_up)
+        if not plan.trials:
+            # A search makes trials up as it goes; they enter the manifest once they are known.
+            experiment.set_trials(live.started)
+        return not stop
 
 
 def _journal(plan: Plan) -> Journal:
@@ -214,7 +209,7 @@ def _finish_pruning(plan: Plan) -> None:
         write_ending(folder, ending)
 
 
-def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial], made_up: list[MadeUp]) -> None:
+def _fit(plan: Plan, job: Job, live: Live, stop: StopRequest, remaining: list[Trial], made_up: list[MadeUp]) -> None:
     spec, file = plan.space.file.scheduler, plan.space.file
     budget = _budget(plan)
     if spec.kind == "pbt":
@@ -266,7 +261,7 @@ def _fit(plan: Plan, job: Job, live: Live, remaining: list[Trial], made_up: list
     )
     try:
         with _log_to(plan.experiment.path / "ray.log"):
-            tuner.fit()
+            run_in_thread(tuner.fit, stop)
     except Exception as error:
         remove_remains(plan.experiment)
         if node.lost is not None:

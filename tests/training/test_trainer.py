@@ -7,12 +7,12 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
+from processes import Launcher, catches, wait_until
 
 from msk_ray.config import Config, parse_config
 from msk_ray.errors import CheckpointError, StorageFailure
@@ -146,22 +146,29 @@ def test_resuming_gives_the_metrics_of_an_uninterrupted_run(tiny_cartpole: Confi
     assert comparable(read_metrics(tmp_path / "cut" / "metrics.jsonl")) == comparable(whole)
 
 
-def test_killing_the_train_command_loses_nothing(root: Path, tiny_cartpole: Config, tmp_path: Path) -> None:
+def command_of(config: dict[str, Any], tmp_path: Path, logdir: str) -> list[str]:
+    """`python -m msk_ray.train` of a config, on the CPU."""
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(config))
+    return [
+        sys.executable, "-m", "msk_ray.train", "--config", str(tmp_path / "config.yaml"), "--device", "cpu",
+        "--logdir", str(tmp_path / logdir),
+    ]  # fmt: skip
+
+
+def rows_in(metrics: Path) -> int:
+    return len(metrics.read_text().splitlines()) if metrics.exists() else 0
+
+
+def test_killing_the_train_command_loses_nothing(
+    root: Path, tiny_cartpole: Config, tmp_path: Path, launcher: Launcher
+) -> None:
     config = tiny_cartpole.as_dict()
     config["trial"] |= {"epochs": 40}
-    (tmp_path / "config.yaml").write_text(yaml.safe_dump(config))
     whole = train(Config.model_validate(config), tmp_path / "whole")
-    command = [
-        sys.executable, "-m", "msk_ray.train", "--config", str(tmp_path / "config.yaml"), "--device", "cpu",
-        "--logdir", str(tmp_path / "killed"),
-    ]  # fmt: skip
-    process = subprocess.Popen(command, cwd=root, stdout=subprocess.DEVNULL)
+    command = command_of(config, tmp_path, "killed")
+    process = launcher.start(command, cwd=root, stdout=subprocess.DEVNULL)
     metrics = tmp_path / "killed" / "metrics.jsonl"
-    deadline = time.monotonic() + 120
-    while not (metrics.exists() and len(metrics.read_text().splitlines()) > 12):
-        assert process.poll() is None, "the run ended before it could be killed"
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    wait_until(lambda: rows_in(metrics) > 12, process)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     assert len(read_metrics(metrics)) < 41
@@ -169,32 +176,23 @@ def test_killing_the_train_command_loses_nothing(root: Path, tiny_cartpole: Conf
     assert comparable(read_metrics(metrics)) == comparable(whole)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP])
 def test_a_signal_saves_and_says_resumable(
-    number: signal.Signals, root: Path, tiny_cartpole: Config, tmp_path: Path
+    number: signal.Signals, root: Path, tiny_cartpole: Config, tmp_path: Path, launcher: Launcher
 ) -> None:
     config = tiny_cartpole.as_dict()
     config["trial"] |= {"epochs": 100000, "checkpoint_interval": 100000}
-    (tmp_path / "config.yaml").write_text(yaml.safe_dump(config))
-    process = subprocess.Popen(
-        [sys.executable, "-m", "msk_ray.train", "--config", str(tmp_path / "config.yaml"), "--device", "cpu",
-         "--logdir", str(tmp_path / "run")],
-        cwd=root, stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
+    process = launcher.start(command_of(config, tmp_path, "run"), cwd=root, stdout=subprocess.PIPE)
     metrics = tmp_path / "run" / "metrics.jsonl"
-    deadline = time.monotonic() + 120
-    while not (metrics.exists() and len(metrics.read_text().splitlines()) > 3):
-        assert process.poll() is None
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    wait_until(lambda: rows_in(metrics) > 3, process)
     if number is signal.SIGHUP:
         process.stdout.close()  # with the terminal goes whoever reads from it
         process.send_signal(number)
-        assert process.wait(60) == 75
+        assert process.wait() == 75
         output = (tmp_path / "run" / "terminal.log").read_text()
     else:
         process.send_signal(number)
-        output, _ = process.communicate(timeout=60)
+        output, _ = process.communicate()
         assert process.returncode == 75
     assert f"stopped by {number.name}" in output
     assert f"go on with: python -m msk_ray.train --config {tmp_path / 'config.yaml'}" in output
@@ -226,6 +224,19 @@ def test_a_folder_that_was_moved_stops_training_resumably_and_is_not_made_again(
         second.run_epoch()
     second.close()
     assert comparable(read_metrics(folder / "metrics.jsonl")) == comparable(whole)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP])
+def test_a_signal_before_training_is_a_request_to_stop_too(
+    number: signal.Signals, root: Path, tiny_cartpole: Config, tmp_path: Path, launcher: Launcher
+) -> None:
+    command = command_of(tiny_cartpole.as_dict(), tmp_path, "run")
+    process = launcher.start(command, cwd=root, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    wait_until(lambda: catches(process.pid, signal.SIGHUP), process)  # the last one it listens to
+    process.send_signal(number)
+    _, errors = process.communicate()
+    assert process.returncode == 75
+    assert errors.startswith(f"stopped by {number.name}")
 
 
 def test_a_checkpoint_of_other_settings_is_refused(tiny_cartpole: Config, tmp_path: Path) -> None:

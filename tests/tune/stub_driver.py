@@ -1,7 +1,16 @@
 """`python -m msk_ray.tune` whose trials take milliseconds; for a process of its own."""
 
+from msk_ray import signals
+
+if __name__ == "__main__":
+    signals.listen()
+
 import functools
+import os
 import sys
+import time
+from pathlib import Path
+from typing import Any
 
 import stub_trainer
 from ray import cloudpickle
@@ -11,10 +20,18 @@ from msk_ray.cli import run
 from msk_ray.tune import runner
 from msk_ray.tune.__main__ import main
 
+
+def compile_for_ever(*of_trial: Any) -> None:
+    """Kernels that take their time; says that it has begun."""
+    Path(os.environ["STUB_COMPILES"]).touch()
+    time.sleep(3600)
+
+
 if __name__ == "__main__":
     cloudpickle.register_pickle_by_value(stub_trainer)
+    precompile = compile_for_ever if "STUB_COMPILES" in os.environ else None
     runner.Plan = functools.partial(  # type: ignore[assignment,misc]
-        runner.Plan, trainer_class=StubTrainer, precompile=None, standby=False
+        runner.Plan, trainer_class=StubTrainer, precompile=precompile, standby=False
     )
     runner.ray_session = functools.partial(runner.ray_session, dashboard=False, trials=False)
     sys.exit(run(main))

@@ -4,6 +4,9 @@ Which way is chosen by `env.reward.cart_position_penalty`: 1 kills its own proce
 SimulationError, 4 raises an unforeseen error every time, 5 hangs once, 6 finds the disk full once, 7 runs out of
 memory, 8 does so with more than `ROOM` worlds, 9 does so before its first epoch, 10 too, and kills its own process once
 when it has begun with fewer. Anything else trains.
+
+While the file named by the environment variable `STUB_HOLD` exists, no trial gets past epoch `HELD_AT`, unless its
+experiment is asked to stop.
 """
 
 import errno
@@ -22,6 +25,7 @@ BEHAVIOUR = "env.reward.cart_position_penalty"
 KILL, NAN, SIMULATION_ERROR, BUG, HANG, FULL_DISK, MEMORY = 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0
 LATE_CROWD, CROWD, DOOMED_CROWD = 8.0, 9.0, 10.0
 MISBEHAVE_AT = 5
+HELD_AT = 10
 ROOM = 4
 """Worlds that fit."""
 
@@ -57,6 +61,9 @@ class StubTrainer:
 
     def run_epoch(self) -> dict[str, float]:
         time.sleep(self.seconds_per_epoch)
+        hold, stop = Path(os.environ.get("STUB_HOLD", "/nowhere")), self.logdir.parent.parent / "stop"
+        while self.epoch >= HELD_AT and hold.exists() and not stop.exists():
+            time.sleep(0.01)
         if self.epoch == 0:
             (self.logdir / "checkpoints" / "best.pt").write_text("untrained")
             self._write({**self._row(), "eval/score": 0.0})

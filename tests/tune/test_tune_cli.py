@@ -9,9 +9,10 @@ from typing import Any
 
 import pytest
 
-from msk_ray.cli import RESUMABLE, run
+from msk_ray.cli import run
 from msk_ray.config import dump_yaml, read_yaml
 from msk_ray.experiment.outcomes import Ending, Outcome, write_ending
+from msk_ray.signals import RESUMABLE
 from msk_ray.tune import runner
 from msk_ray.tune.__main__ import main
 from msk_ray.tune.experiment import Experiment

@@ -9,7 +9,7 @@ import pytest
 from stub_trainer import BEHAVIOUR, CROWD, LATE_CROWD, MEMORY, StubTrainer
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from msk_ray.cli import RESUMABLE, run
+from msk_ray.cli import run
 from msk_ray.config import dump_yaml, read_yaml
 from msk_ray.errors import ConfigError
 from msk_ray.experiment import halved
@@ -18,6 +18,7 @@ from msk_ray.experiment.journal import Journal, Report
 from msk_ray.experiment.layout import ABANDONED, JOURNAL_FILE
 from msk_ray.experiment.metrics import read_rows
 from msk_ray.experiment.outcomes import Ending, Outcome, read_ending, write_ending
+from msk_ray.signals import RESUMABLE
 from msk_ray.training import Trainer, read_checkpoint
 from msk_ray.tune import experiment as experiments
 from msk_ray.tune import runner, trial_run

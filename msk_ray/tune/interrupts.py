@@ -1,0 +1,112 @@
+"""Signals and Ray: the driver alone hears that it is asked to stop, whatever Ray does in the same process.
+
+Ray's daemons and the trials' processes hear none of these signals, also where one goes to the whole process group or
+control group (`timeout`, systemd, `kill -- -PGID`): trials are asked to save themselves, and Ray ends when they have.
+"""
+
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import ray
+
+from msk_ray.errors import ClusterLost
+from msk_ray.signals import StopRequest, current
+
+KEPT_FROM_CHILDREN = {signal.SIGHUP, signal.SIGTERM, signal.SIGUSR1, signal.SIGTSTP}
+"""Blocked in Ray's processes, which inherit that; Ray itself does the same with SIGINT. SIGTSTP (Ctrl-Z) stops the
+driver alone: a trial that is stopped cannot be told from one that hangs."""
+_TICK_S = 1.0
+_POLL_S = 0.05
+_LAST_WORD_S = 180.0
+"""How long Ray may take to end, after a request to stop [s]; more than trials get to save themselves."""
+
+
+@contextmanager
+def starting_ray() -> Iterator[None]:
+    """For `ray.init`: what it starts does not hear the signals above, and afterwards the handlers are this program's.
+
+    Raises:
+        KeyboardInterrupt: this program was asked to stop meanwhile.
+    """
+    stop = current()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, KEPT_FROM_CHILDREN)
+    try:
+        yield
+    except SystemExit as error:
+        # Ray's own handler, in place from the beginning of `ray.init` on, exits so.
+        if stop is None or error.code != signal.SIGTERM:
+            raise
+        stop.receive(signal.SIGTERM)
+    finally:
+        if stop is not None:
+            stop.install()
+        # One that came meanwhile is heard now.
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def end_ray() -> None:
+    """`ray.shutdown`, and an end to the daemons that `starting_ray` has let start: they do not hear that they are asked
+    to go, for which Ray gives each of them a second."""
+    done = threading.Event()
+
+    def end_daemons() -> None:
+        while not done.wait(_POLL_S):
+            if not ray.is_initialized():  # while it is, this process needs them
+                for pid in _deaf_children():
+                    with suppress(ProcessLookupError):  # Ray was faster
+                        os.kill(pid, signal.SIGKILL)
+
+    thread = threading.Thread(target=end_daemons)
+    thread.start()
+    try:
+        ray.shutdown()
+    finally:
+        done.set()
+        thread.join()
+
+
+def _deaf_children() -> Iterator[int]:
+    """Children of this process that have SIGTERM blocked."""
+    for entry in Path("/proc").iterdir():
+        if not entry.name.isdigit():
+            continue
+        try:
+            lines = (entry / "status").read_text().splitlines()
+        except OSError:
+            continue  # it has ended meanwhile
+        facts = dict(line.split(":", 1) for line in lines if ":" in line)
+        if int(facts["PPid"]) == os.getpid() and int(facts["SigBlk"], 16) >> (signal.SIGTERM - 1) & 1:
+            yield int(entry.name)
+
+
+def run_in_thread(work: Callable[[], object], stop: StopRequest) -> None:
+    """Run Tune's loop in a thread, where it takes no signal for itself and cannot keep this thread from hearing one.
+
+    Raises:
+        ClusterLost: the loop did not end when it was asked to: Ray does not answer.
+        Exception: whatever the loop raised.
+    """
+    failure: list[BaseException] = []
+
+    def body() -> None:
+        try:
+            work()
+        except BaseException as error:
+            failure.append(error)
+
+    # A daemon: one that waits for a dead cluster must not keep the process.
+    thread = threading.Thread(target=body, name="tune", daemon=True)
+    thread.start()
+    # Ticks rather than a clock: time in which this process itself is stopped does not count.
+    waited = 0.0
+    while thread.is_alive():
+        thread.join(_TICK_S)
+        waited += _TICK_S if stop else 0.0
+        if waited > _LAST_WORD_S:
+            raise ClusterLost("asked to stop, Ray did not answer; trials go on from what they saved, with --resume")
+    if failure:
+        raise failure[0]

@@ -1,0 +1,138 @@
+"""Whatever signal asks a sweep to stop, at whatever moment, to whichever process: all is saved, 75, nothing is left."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from processes import Launcher, catches, members_of, wait_until
+from stub_trainer import HELD_AT
+
+from msk_ray.config import dump_yaml
+from msk_ray.errors import ClusterLost
+from msk_ray.signals import NUMBERS, RESUMABLE, listening
+from msk_ray.tune import interrupts
+from msk_ray.tune.experiment import Experiment
+from msk_ray.tune.records import read_records
+
+Start = Callable[..., "subprocess.Popen[str]"]
+
+
+@pytest.fixture
+def experiment(tmp_path: Path) -> Experiment:
+    return Experiment(tmp_path / "runs" / "small")
+
+
+@pytest.fixture
+def start(space_data: dict[str, Any], tmp_path: Path, root: Path, launcher: Launcher) -> Start:
+    """Starts the driver of two trials, held at an epoch while a file exists."""
+    space = tmp_path / "small.yaml"
+    space.write_text(dump_yaml(space_data))
+    here = Path(__file__).parent
+    command = [sys.executable, str(here / "stub_driver.py"), "--space", str(space), "--cpu"]
+    (tmp_path / "hold").touch()
+
+    def made(*more: str, **environment: str) -> "subprocess.Popen[str]":
+        paths = {"PYTHONPATH": os.pathsep.join([str(root), str(here)]), "STUB_HOLD": str(tmp_path / "hold")}
+        return launcher.start(
+            [*command, "--storage", str(tmp_path / "runs"), *more],
+            env=os.environ | paths | environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+        )
+
+    return made
+
+
+def held(experiment: Experiment) -> bool:
+    return len(list(experiment.path.glob(f"trials/*/checkpoints/epoch_{HELD_AT:06d}.pt"))) == 2
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGUSR1])
+def test_a_signal_to_the_whole_group_lets_trials_save_themselves(
+    number: signal.Signals, start: Start, experiment: Experiment, tmp_path: Path
+) -> None:
+    driver = start()
+    wait_until(lambda: held(experiment), driver)
+    os.killpg(driver.pid, number)
+    output, _ = driver.communicate()
+    assert driver.returncode == RESUMABLE, output
+    assert f"{number.name}: 2 trials save themselves" in output
+    for record in read_records(experiment):
+        newest = sorted((record.folder / "checkpoints").glob("epoch_*.pt"))[-1]
+        assert json.loads(newest.read_text())["epoch"] == record.epochs_done >= HELD_AT
+    wait_until(lambda: not members_of(driver.pid))
+    (tmp_path / "hold").unlink()
+    again = start("--resume")
+    output, _ = again.communicate()
+    assert again.returncode == 0, output
+    assert [str(record.ending and record.ending.outcome) for record in read_records(experiment)] == ["finished"] * 2
+
+
+def modules_load(driver: "subprocess.Popen[str]", tmp_path: Path) -> bool:
+    return catches(driver.pid, signal.SIGHUP)  # the last one it listens to
+
+
+def ray_starts(driver: "subprocess.Popen[str]", tmp_path: Path) -> bool:
+    return "gcs_server" in members_of(driver.pid).values()
+
+
+def kernels_are_compiled(driver: "subprocess.Popen[str]", tmp_path: Path) -> bool:
+    return (tmp_path / "compiles").exists()
+
+
+@pytest.mark.parametrize(
+    ("moment", "number"),
+    [(modules_load, signal.SIGTERM), (ray_starts, signal.SIGTERM), (kernels_are_compiled, signal.SIGUSR1)],
+)
+def test_a_signal_before_the_first_trial_is_a_request_to_stop_too(
+    moment: Callable[..., bool], number: signal.Signals, start: Start, tmp_path: Path
+) -> None:
+    driver = start(STUB_COMPILES=str(tmp_path / "compiles"))
+    wait_until(lambda: moment(driver, tmp_path), driver)
+    os.killpg(driver.pid, number)
+    output, _ = driver.communicate()
+    assert driver.returncode == RESUMABLE, output
+    assert f"stopped by {number.name}" in output
+    if moment is not modules_load:
+        assert "go on with: python stub_driver.py" in output
+    wait_until(lambda: not members_of(driver.pid))
+
+
+def test_tune_takes_no_signal() -> None:
+    from ray.tune.tune import _setup_signal_catching
+
+    with listening() as stop:
+        interrupts.run_in_thread(_setup_signal_catching, stop)
+        assert [signal.getsignal(number) for number in NUMBERS] == [stop.receive] * len(NUMBERS)
+
+
+def test_what_the_loop_raises_is_raised() -> None:
+    def fail() -> None:
+        raise ZeroDivisionError
+
+    with listening() as stop, pytest.raises(ZeroDivisionError):
+        interrupts.run_in_thread(fail, stop)
+
+
+def test_a_loop_that_does_not_end_when_it_should_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(interrupts, "_TICK_S", 0.01)
+    monkeypatch.setattr(interrupts, "_LAST_WORD_S", 0.05)
+    released = threading.Event()
+    with listening() as stop, stop.deferred():
+        stop.receive(signal.SIGTERM)
+        with pytest.raises(ClusterLost, match="did not answer"):
+            interrupts.run_in_thread(released.wait, stop)
+    released.set()
+
+
+def test_rays_own_handler_is_heard_as_a_request() -> None:
+    with listening() as stop, pytest.raises(KeyboardInterrupt), interrupts.starting_ray():
+        sys.exit(signal.SIGTERM)
+    assert stop.signal is signal.SIGTERM
