@@ -14,7 +14,8 @@ import sys
 import time
 from pathlib import Path
 
-from fault_campaign.campaigns import CAMPAIGNS, Tally
+from fault_campaign import campaigns, drivers
+from fault_campaign.campaigns import Tally
 from fault_campaign.reference import Reference
 from fault_campaign.space import EPOCHS, SPACE
 from fault_campaign.sweep import scratch_folder
@@ -24,6 +25,8 @@ from record import RESULTS, markdown_table, publish
 from msk_ray.config import dump_yaml
 from msk_ray.tune.space import load_space
 from msk_ray.tune.trials import resolve_trials
+
+CAMPAIGNS = campaigns.CAMPAIGNS | drivers.CAMPAIGNS
 
 
 def main() -> int:

@@ -50,6 +50,10 @@ class StorageFailure(StorageError):
     exit_code = 75  # EX_TEMPFAIL
 
 
+class OwnershipLost(StorageFailure):
+    """Another process has become the owner of a folder that this one was writing to, or the folder has gone."""
+
+
 class ClusterLost(MskRayError):
     """The Ray node this process belongs to has died. Trials go on from what they saved, with another Ray."""
 

@@ -6,7 +6,9 @@ if __name__ == "__main__":
 
     signals.listen()
 
+import argparse
 import math
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,6 +17,7 @@ from msk_ray.cli import TERMINAL_LOG, Parser, outliving, run, typed_command
 from msk_ray.config import SET_HELP, Config, load_config
 from msk_ray.errors import CheckpointError, StorageError
 from msk_ray.files import check_writable, make_folder
+from msk_ray.ownership import Ownership, owned
 from msk_ray.signals import RESUMABLE, StopRequest, listening
 from msk_ray.text import printable
 
@@ -42,6 +45,11 @@ def parser() -> Parser:
     p.add_argument("--device", help="cpu or cuda:N; by default the first GPU, or the CPU if there is none")
     p.add_argument("--logdir", type=Path, metavar="DIR", help="by default runs/train/CONFIG_seedN")
     p.add_argument("--resume", action="store_true", help="go on from the newest whole checkpoint in the log folder")
+    p.add_argument(
+        "--force",
+        action="store_true",
+        help="take the log folder over from a process that looks alive, after looking: the other one stops by itself",
+    )
     return p
 
 
@@ -54,9 +62,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     _check_logdir(logdir, args.resume)
     logdir = logdir.resolve()
     words = sys.argv if argv is None else [__file__, *argv]
-    with outliving(logdir / TERMINAL_LOG), listening() as stop:
+    with listening() as stop, owned(logdir, args.force) as ownership, outliving(logdir / TERMINAL_LOG):
         try:
-            return _train(config, logdir, args.device, args.resume, stop, typed_command(words, "--resume"))
+            return _train(config, args, ownership, stop, typed_command(words, "--resume"))
         except KeyboardInterrupt:
             if stop.signal is None or stop.insisted:
                 raise
@@ -80,8 +88,10 @@ def _check_logdir(logdir: Path, resume: bool) -> None:
 
 
 def _train(
-    config: Config, logdir: Path, device: str | None, resume: bool, stop: StopRequest, resume_command: str
+    config: Config, args: argparse.Namespace, ownership: Ownership, stop: StopRequest, resume_command: str
 ) -> int:
+    # Read when torch is imported: threads that wait for work are to sleep, not to spin.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     # torch and Warp take seconds to load; a wrong command line should not wait for them.
     import torch
 
@@ -89,17 +99,18 @@ def _train(
     from msk_ray.training import Trainer
     from msk_ray.training.checkpoint import newest_valid_checkpoint
 
-    if resume:
+    logdir = ownership.folder
+    if args.resume:
         newest, faults = newest_valid_checkpoint(logdir / "checkpoints")
         if newest is None and faults:
             raise CheckpointError(
                 f"--resume: no checkpoint in {logdir} is whole ({faults[0]}); name another --logdir to start anew"
             )
-    device = device or ("cuda:0" if torch.cuda.is_available() else "cpu")
+    device = args.device or ("cuda:0" if torch.cuda.is_available() else "cpu")
     print(f"{config.env.name}: {config.trial.epochs} epochs, {config.env.nworld} worlds, on {device}; into {logdir}")
     print("preparing kernels (a first run compiles them, up to a minute) ...", flush=True)
     trainer = Trainer(config, logdir, device)
-    if resume:
+    if args.resume:
         path, faults = trainer.restore_latest()
         for fault in faults:
             print(f"skipped: {printable(fault)}")
@@ -107,9 +118,11 @@ def _train(
     progress = Progress(config.trial.epochs, trainer.epoch)
     with stop.deferred():
         while not trainer.finished and not stop:
+            ownership.check()
             progress.show(trainer.run_epoch())
         progress.close()
         if not trainer.finished:
+            ownership.check()
             trainer.save()
             trainer.close()
             assert stop.signal is not None

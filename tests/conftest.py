@@ -1,5 +1,6 @@
 """Shared fixtures. Worlds are few and rollouts short: everything here runs on two CPU cores."""
 
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,14 @@ ROOT = Path(__file__).resolve().parent.parent
 def root() -> Path:
     """Top folder of the repository."""
     return ROOT
+
+
+@pytest.fixture(autouse=True, scope="session")
+def hangup() -> Iterator[None]:
+    """SIGHUP does what it does by default, also where the tests themselves run under `nohup`."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
 
 
 @pytest.fixture

@@ -55,7 +55,7 @@ def inside_workers(reference: Reference, scratch: Path, rng: random.Random) -> l
     code = sweep.wait()
     tallies = []
     for trial, name in zip(sweep.trials, kinds, strict=True):
-        tallies.append(_judge(reference, sweep, name, sweep.struck(trial), "nothing", [trial]))
+        tallies.append(judge(reference, sweep, name, sweep.struck(trial), "nothing", [trial]))
         if code != 0:
             tallies[-1].notes.append(f"exit code {code}")
     return tallies
@@ -73,7 +73,7 @@ def nan(reference: Reference, scratch: Path, rng: random.Random) -> list[Tally]:
     sweep.launch("--retry", "nonfinite")
     sweep.wait()
     injected = sum(map(sweep.struck, sweep.trials))
-    tally = _judge(reference, sweep, "NaN in the policy", injected, "--resume --retry nonfinite")
+    tally = judge(reference, sweep, "NaN in the policy", injected, "--resume --retry nonfinite")
     if named != injected:
         tally.notes.append(f"{injected - named} of them were not named nonfinite: {endings}")
     return [tally]
@@ -90,8 +90,8 @@ def killed(
 ) -> list[Tally]:
     """The driver or its raylet dies several times in one sweep."""
     sweep = Sweep(name.replace(" ", "_"), scratch, reference.trials)
-    injected, codes = _strike(sweep, rng, times, lambda: sweep.kill(number, raylet))
-    tally = _judge(reference, sweep, name, injected, "--resume")
+    injected, codes = strike(sweep, rng, times, lambda: sweep.kill(number, raylet))
+    tally = judge(reference, sweep, name, injected, "--resume")
     if number == signal.SIGTERM and set(codes) != {RESUMABLE}:
         tally.notes.append(f"exit codes {codes} instead of {RESUMABLE}")
     return [tally]
@@ -114,7 +114,7 @@ def damaged(reference: Reference, scratch: Path, rng: random.Random) -> list[Tal
     hit = dict.fromkeys(kinds, 0)
     sweep = Sweep("damaged_checkpoints", scratch, reference.trials)
 
-    def strike() -> int:
+    def blow() -> int:
         code = sweep.kill(signal.SIGKILL)
         sweep.leftovers()  # else a dying trial may still write a whole one
         # The kinds in turn; a strike before any checkpoint hits nothing, and its kind has its turn again.
@@ -128,10 +128,9 @@ def damaged(reference: Reference, scratch: Path, rng: random.Random) -> list[Tal
             waiting.insert(0, name)
         return code
 
-    _strike(sweep, rng, len(kinds) + 2, strike)
+    strike(sweep, rng, len(kinds) + 2, blow)
     return [
-        _judge(reference, sweep, f"driver SIGKILL and newest checkpoint {name}", hit[name], "--resume")
-        for name in kinds
+        judge(reference, sweep, f"driver SIGKILL and newest checkpoint {name}", hit[name], "--resume") for name in kinds
     ]
 
 
@@ -146,7 +145,7 @@ def full_disk(reference: Reference, scratch: Path, rng: random.Random) -> list[T
         sweep = Sweep("full_disk", scratch, reference.trials, storage=disk)
         ballast = disk / "ballast"
 
-        def strike() -> int:
+        def blow() -> int:
             with contextlib.suppress(OSError), ballast.open("wb", buffering=0) as file:
                 while True:  # until it raises: no space left
                     file.write(bytes(4096))
@@ -154,8 +153,8 @@ def full_disk(reference: Reference, scratch: Path, rng: random.Random) -> list[T
             ballast.unlink()
             return code
 
-        injected, codes = _strike(sweep, rng, 2, strike)
-        tally = _judge(reference, sweep, "full disk", injected, "--resume")
+        injected, codes = strike(sweep, rng, 2, blow)
+        tally = judge(reference, sweep, "full disk", injected, "--resume")
         if set(codes) != {RESUMABLE}:
             tally.notes.append(f"exit codes {codes} instead of {RESUMABLE}")
         return [tally]
@@ -163,7 +162,7 @@ def full_disk(reference: Reference, scratch: Path, rng: random.Random) -> list[T
         subprocess.run(["umount", str(disk)], check=True)
 
 
-def _strike(sweep: Sweep, rng: random.Random, times: int, strike: Callable[[], int]) -> tuple[int, list[int]]:
+def strike(sweep: Sweep, rng: random.Random, times: int, blow: Callable[[], int]) -> tuple[int, list[int]]:
     """Launch, strike once some rows have been written, and again; at last let it end.
 
     Returns:
@@ -177,7 +176,7 @@ def _strike(sweep: Sweep, rng: random.Random, times: int, strike: Callable[[], i
         share = total * (index + rng.uniform(0.3, 0.9)) / (times + 0.5)
         if not sweep.wait_for_rows(round(share)):
             break
-        codes.append(strike())
+        codes.append(blow())
         print(f"  {sweep.name}: struck at about {share:.0f} of {total} rows, exit code {codes[-1]}", flush=True)
     sweep.launch()
     code = sweep.wait()
@@ -186,7 +185,7 @@ def _strike(sweep: Sweep, rng: random.Random, times: int, strike: Callable[[], i
     return len(codes), codes
 
 
-def _judge(
+def judge(
     reference: Reference, sweep: Sweep, fault: str, injected: int, ended_by: str, trials: list[Trial] | None = None
 ) -> Tally:
     rows, lost, notes = reference.compare(sweep.path, trials or sweep.trials)

@@ -14,9 +14,6 @@ class Reference:
     """Every trial of the space, trained without Ray and without faults."""
 
     def __init__(self, trials: list[Trial], folder: Path) -> None:
-        import torch
-
-        torch.set_num_threads(1)  # what a trial of one core gets
         self.trials = trials
         self._folder = folder
         for trial in trials:

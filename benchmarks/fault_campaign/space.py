@@ -1,6 +1,7 @@
 """What is shot at: four small CartPole trials."""
 
 EPOCHS = 40
+HANG_S = 20.0
 SPACE = {
     "question": "What does a sweep survive?",
     "base": "configs/cartpole.yaml",
@@ -15,7 +16,7 @@ SPACE = {
     },
     "parameters": {"shac.actor_lr": {"grid": [5.0e-3, 1.0e-3]}},
     "seeds": "0-1",
-    "resources": {"max_failures": 20, "hang_s": 20.0},
+    "resources": {"max_failures": 20, "hang_s": HANG_S},
 }
 """Four trials of forty epochs, checkpointed every second one."""
 TIMING = ("seconds", "env_steps_per_s", "time/")

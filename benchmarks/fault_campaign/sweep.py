@@ -57,21 +57,37 @@ class Sweep:
 
     def launch(self, *more: str) -> None:
         """Start the driver: afresh the first time, with --resume from then on."""
-        arguments = ["--space", str(self._scratch / "space.yaml"), "--name", self.name, "--storage", str(self._storage)]
-        arguments += ["--cpu", "--max-concurrent", "2", *(["--resume"] if self._launches else []), *more]
+        self._driver = self._start([*(["--resume"] if self._launches else []), *more])
         self._launches += 1
         self._rows_at_launch = self.rows()
+
+    def beside(self) -> int:
+        """Try to go on with the experiment while its driver is at work; the exit code of the second one."""
+        second = self._start(["--resume"])
+        return second.wait()
+
+    def hand_over(self) -> int:
+        """Have a second driver take the experiment over; the exit code of the first one."""
+        assert self._driver is not None
+        self._remember()
+        first, self._driver = self._driver, self._start(["--resume", "--force"])
+        return first.wait()
+
+    def _start(self, more: list[str]) -> subprocess.Popen[bytes]:
+        arguments = ["--space", str(self._scratch / "space.yaml"), "--name", self.name, "--storage", str(self._storage)]
+        arguments += ["--cpu", "--max-concurrent", "2", *more]
         paths = [str(REPOSITORY), *filter(None, [os.environ.get("PYTHONPATH")])]
         environment = os.environ | {"RAY_TMPDIR": str(self._scratch), "PYTHONPATH": os.pathsep.join(paths)}
         with (self._scratch / f"{self.name}.log").open("ab") as log:
-            self._driver = subprocess.Popen(
+            driver = subprocess.Popen(
                 [sys.executable, str(COMMAND), "drive", *arguments],
                 stdout=log,
                 stderr=log,
                 env=environment,
                 start_new_session=True,
             )
-        _drivers.append(self._driver)
+        _drivers.append(driver)
+        return driver
 
     def wait(self) -> int:
         """Exit code of the driver; ended after a limit, which then counts as a loss."""
@@ -100,14 +116,24 @@ class Sweep:
             time.sleep(0.02)
         return True
 
-    def kill(self, number: signal.Signals, raylet: bool = False) -> int:
-        """Send a signal to the driver, or to its raylet; the driver's exit code."""
+    def send(self, number: signal.Signals) -> None:
+        """Send a signal to the driver."""
+        assert self._driver is not None
+        os.kill(self._driver.pid, number)
+
+    def ending(self, trial: Trial) -> str | None:
+        """How a trial ended."""
+        ending = read_ending(self.path / "trials" / trial.id)
+        return None if ending is None else str(ending.outcome)
+
+    def kill(self, number: signal.Signals, raylet: bool = False, group: bool = False) -> int:
+        """Send a signal to the driver, to its raylet, or to every process of the sweep; the driver's exit code."""
         assert self._driver is not None
         self._remember()
         target = self._driver.pid
         if raylet:
             (target,) = [pid for pid in descendants_of(self._driver.pid) if name_of(pid) == "raylet"]
-        os.kill(target, number)
+        (os.killpg if group else os.kill)(target, number)
         return self.wait()
 
     def running(self) -> list[Trial]:

@@ -4,9 +4,14 @@ import functools
 import json
 import math
 import os
+import resource
 import signal
 import sys
 import time
+from pathlib import Path
+from typing import Any
+
+import torch
 
 from msk_ray.training import Trainer
 
@@ -29,6 +34,8 @@ class FaultyTrainer(Trainer):
                 _kill_self()
             case "hang":
                 time.sleep(3600)
+            case "memory":
+                self._crowd()
             case "nan":
                 next(self.shac.actor.parameters()).data.fill_(math.nan)
         row = super().run_epoch()
@@ -43,6 +50,19 @@ class FaultyTrainer(Trainer):
                 os.truncate(path, path.stat().st_size // 2)
                 _kill_self()
         return row
+
+    def _crowd(self) -> None:
+        """Let this process have hardly more memory than it has, and its next update ask for much more."""
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+        limit = pages * resource.getpagesize() + 2**28
+        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+        update = self.shac.update
+
+        def crowded(epoch: int) -> Any:
+            torch.empty(2**30)
+            return update(epoch)
+
+        self.shac.update = crowded  # type: ignore[method-assign]
 
 
 def _kill_self() -> None:

@@ -70,5 +70,5 @@ def first_spelling(settings: Mapping[str, Any]) -> dict[str, Any]:
     return spelt
 
 
-_LATER: dict[tuple[str, str], Any] = {}
+_LATER: dict[tuple[str, str], Any] = {("trial", "threads"): 1}
 """Settings that the first version did not have, (section, name), with the default at which they leave ids alone."""

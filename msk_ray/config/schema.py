@@ -220,6 +220,9 @@ class TrialConfig(Section):
     """Epochs between checkpoints."""
     keep_checkpoints: Annotated[int, Field(ge=2)] = 2
     """Newest checkpoints kept, beside the best."""
+    threads: Count = 1
+    """Threads that torch computes with on the CPU. Sums depend on their number, and so do the figures of a trial: it is
+    this setting's, never the machine's. Networks of a few hundred units gain nothing by more than one."""
 
 
 RECORDED = "recorded"

@@ -21,6 +21,7 @@ from msk_ray.files import write_json
 from msk_ray.training import Evaluator, SavedPolicy
 from msk_ray.training.evaluation import Episodes
 from msk_ray.training.memory import named_out_of_memory
+from msk_ray.training.threads import use_threads
 
 FORMAT = 1
 REFERENCE, OWN = "reference", "own"
@@ -87,6 +88,7 @@ class Bench:
         Raises:
             MskRayError: as `evaluator`, or the checkpoint does not fit its environment.
         """
+        use_threads(policy.config)
         evaluator, physics = self.evaluator(policy.config, request)
         own = policy.config.evaluation
         seeds = request.seeds or (own.seed,)

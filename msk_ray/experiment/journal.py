@@ -5,6 +5,7 @@ died; and a rule that is told an evaluation twice judges it twice, the second ti
 """
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -37,8 +38,14 @@ class Report:
 class Journal:
     """The reports of an experiment, one JSON object a line."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, guard: Callable[[], None] = lambda: None) -> None:
+        """
+        Args:
+            path: of the file.
+            guard: called before it is written; raises if the experiment is another driver's by now.
+        """
         self._path = path
+        self._guard = guard
 
     def read(self) -> tuple[list[Report], tuple[Damage, ...]]:
         """All reports, and the lines that cannot be used; a last line torn by the driver's death is cut off.
@@ -56,8 +63,9 @@ class Journal:
         """Add one report; it outlives this process when this returns.
 
         Raises:
-            StorageFailure: the disk is full or gone.
+            StorageFailure: the disk is full or gone, or as the guard says.
         """
+        self._guard()
         try:
             with self._path.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(asdict(report)) + "\n")

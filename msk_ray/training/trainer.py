@@ -25,6 +25,7 @@ from msk_ray.training.checkpoint import (
 from msk_ray.training.evaluation import Evaluator
 from msk_ray.training.memory import named_out_of_memory
 from msk_ray.training.metrics import MetricsLog
+from msk_ray.training.threads import use_threads
 
 # Settings that may differ between a checkpoint and the trial that goes on from it.
 _EXTENDABLE = {
@@ -68,6 +69,7 @@ class Trainer:
             # Else the file says what those were trained under, until one of them is gone on from.
             self._write_config()
         self._device = device
+        use_threads(config)
         with named_out_of_memory(device, config.env.nworld):
             self.env = make_env(config.env, config.physics, config.env.nworld, device, config.trial.seed)
             self.shac = Shac(config, self.env)

@@ -7,6 +7,7 @@ if __name__ == "__main__":
     signals.listen()
 
 import argparse
+import contextlib
 import os
 import shutil
 import sys
@@ -24,9 +25,11 @@ from msk_ray.signals import RESUMABLE, StopRequest, listening
 from msk_ray.text import printable, printable_lines
 from msk_ray.tune import experiment as experiments
 from msk_ray.tune.budget import extreme_configs
+from msk_ray.tune.devices import check_threads
 from msk_ray.tune.extension import extended_space, parse_extension
 from msk_ray.tune.listing import text_table, trial_rows
 from msk_ray.tune.made_up import recover
+from msk_ray.tune.one_driver import own
 from msk_ray.tune.smoke import shrink, without_early_stopping
 from msk_ray.tune.space import Space, find_space, parse_seeds, parse_space, read_space
 from msk_ray.tune.trials import Trial, find_trial, resolve_trials
@@ -104,6 +107,11 @@ def parser() -> Parser:
         help="--resume if the experiment has begun, start it if not: for schedulers that run the same command again",
     )
     where.add_argument(
+        "--force",
+        action="store_true",
+        help="take the experiment over from a driver that looks alive, after looking: the other one stops by itself",
+    )
+    where.add_argument(
         "--extend",
         action="append",
         default=[],
@@ -159,10 +167,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _resolve(space: Space) -> list[Trial]:
     """The space's trials; none of a search, whose settings are checked as far as they are known."""
-    if space.file.search != "optuna":
-        return resolve_trials(space)
-    extreme_configs(space)
-    return []
+    if space.file.search == "optuna":
+        check_threads(extreme_configs(space), space.file.resources)
+        return []
+    trials = resolve_trials(space)
+    check_threads((trial.config for trial in trials), space.file.resources)
+    return trials
 
 
 def _retried(args: argparse.Namespace) -> set[Outcome]:
@@ -265,34 +275,21 @@ def _run(
 ) -> int:
     path = _experiment_path(args)
     going_on = args.resume or bool(extension)
-    if going_on:
-        searching = space.file.search == "optuna"
-        another_rule = recorded is not None and args.early_stopping != recorded.said("early_stopping")
-        if recorded is not None and not another_rule:
-            recorded.check_scheduler(space)
-        experiment = experiments.reopen(path, None if searching else trials, extension)
-        if searching:
-            # Else the manifest learns of them only at the end.
-            experiment.set_trials(made.trial for made in recover(experiment, space))
-        else:
-            # As recorded: with the ids they began with, and the epochs they were extended to.
-            trials = experiment.trials()
-        experiment.clear_endings(_retried(args))
-        if another_rule:
-            experiment.write_space(space)
-        if args.early_stopping is False:
-            _name_stopped(experiment)
-        experiment.say(**{option: getattr(args, option) for option in experiments.REMEMBERED})
-    # ray and torch take seconds to load; a wrong command line should not wait for them.
-    from msk_ray.tune import runner
-    from msk_ray.tune.devices import choose_placement, local_gpus
-    from msk_ray.tune.report import finish, write_report
+    with contextlib.ExitStack() as stack, listening() as stop:
+        if going_on:
+            ownership = stack.enter_context(own(path, new=False, force=args.force))
+            experiment, trials = _go_on(args, space, trials, extension, recorded)
+        # ray and torch take seconds to load; a wrong command line should not wait for them.
+        from msk_ray.tune import runner
+        from msk_ray.tune.devices import choose_placement, local_gpus
+        from msk_ray.tune.report import finish, write_report
 
-    if args.address is None:
-        placement = choose_placement(space.file.resources, args.gpus_per_trial, args.cpu, local_gpus())
-    if not going_on:
-        experiment = experiments.create(path, space, trials, _options(args))
-    with outliving(path / TERMINAL_LOG), listening() as stop:
+        if args.address is None:
+            placement = choose_placement(space.file.resources, args.gpus_per_trial, args.cpu, local_gpus())
+        if not going_on:
+            ownership = stack.enter_context(own(path, new=True, force=args.force))
+            experiment = experiments.create(path, space, trials, _options(args))
+        stack.enter_context(outliving(path / TERMINAL_LOG))
         try:
             with runner.ray_session(args.address):
                 if args.address is not None:
@@ -302,7 +299,9 @@ def _run(
                 if not placement.gpus and not args.cpu:
                     print("no GPU here: trials run on CPU cores")
                 limit = args.max_concurrent or space.file.resources.max_concurrent
-                completed = runner.run_trials(runner.Plan(experiment, space, trials, placement, limit))
+                plan = runner.Plan(experiment, space, trials, placement, limit, ownership=ownership)
+                completed = runner.run_trials(plan)
+            ownership.check(now=True)
             errors = finish(experiment)
             if not completed:
                 return _stopped(stop, experiment)
@@ -313,6 +312,34 @@ def _run(
                 raise
             return _stopped(stop, experiment)
     return 1 if errors else 0
+
+
+def _go_on(
+    args: argparse.Namespace,
+    space: Space,
+    trials: list[Trial],
+    extension: Mapping[str, Any],
+    recorded: experiments.Experiment | None,
+) -> tuple[experiments.Experiment, list[Trial]]:
+    """The experiment to go on with, and its trials as recorded; none where a search makes them up."""
+    searching = space.file.search == "optuna"
+    another_rule = recorded is not None and args.early_stopping != recorded.said("early_stopping")
+    if recorded is not None and not another_rule:
+        recorded.check_scheduler(space)
+    experiment = experiments.reopen(_experiment_path(args), None if searching else trials, extension)
+    if searching:
+        # Else the manifest learns of them only at the end.
+        experiment.set_trials(made.trial for made in recover(experiment, space))
+    else:
+        # As recorded: with the ids they began with, and the epochs they were extended to.
+        trials = experiment.trials()
+    experiment.clear_endings(_retried(args))
+    if another_rule:
+        experiment.write_space(space)
+    if args.early_stopping is False:
+        _name_stopped(experiment)
+    experiment.say(**{option: getattr(args, option) for option in experiments.REMEMBERED})
+    return experiment, trials
 
 
 def _stopped(stop: StopRequest, experiment: experiments.Experiment) -> int:

@@ -3,9 +3,10 @@
 import math
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
+from msk_ray.config import Config
 from msk_ray.errors import ConfigError, DeviceError
 from msk_ray.tune.space import ResourcesSpec
 
@@ -61,6 +62,19 @@ def choose_placement(resources: ResourcesSpec, gpus_per_trial: float | None, cpu
     if wanted > gpus:
         raise DeviceError(f"{wanted:g} GPUs a trial asked for, {gpus} here")
     return Placement(wanted, resources.cpus_per_trial)
+
+
+def check_threads(configs: Iterable[Config], resources: ResourcesSpec) -> None:
+    """Refuse trials that compute with more threads than they are given cores.
+
+    Raises:
+        ConfigError: saying what to write.
+    """
+    most = max((config.trial.threads for config in configs), default=1)
+    if most > resources.cpus_per_trial:
+        raise ConfigError(
+            f"trial.threads {most}, {resources.cpus_per_trial} cores a trial: write resources.cpus_per_trial: {most}"
+        )
 
 
 def wait_for_memory(

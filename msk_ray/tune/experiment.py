@@ -4,6 +4,7 @@ runs/<experiment>/
     manifest.json     the trials: ids, changed parameters, full configs
     space.yaml        the space as it was run
     env.json          versions, devices, commit, command line
+    owner.json        the driver at work, if there is one
     tune/             Ray's own state
     trials/<id>/      config.yaml, metrics.jsonl, checkpoints/, outcome.json, output.log, eval.json; halved.json and
                       abandoned/ if it was started anew with half its worlds
@@ -228,6 +229,12 @@ def has_begun(path: Path) -> bool:
     return (path / MANIFEST_FILE).is_file()
 
 
+def refuse_old(path: Path) -> None:
+    """Raise StorageError where there is an experiment already."""
+    if has_begun(path):
+        raise StorageError(f"{path} holds an experiment already: add --resume to go on with it, or pass another --name")
+
+
 def create(path: Path, space: Space, trials: list[Trial], options: dict[str, Any]) -> Experiment:
     """Make a new experiment's folder and say in it what it is.
 
@@ -235,8 +242,7 @@ def create(path: Path, space: Space, trials: list[Trial], options: dict[str, Any
         StorageError: the folder cannot be written, or holds an experiment already.
     """
     experiment = Experiment(path)
-    if (path / MANIFEST_FILE).exists():
-        raise StorageError(f"{path} holds an experiment already: add --resume to go on with it, or pass another --name")
+    refuse_old(path)
     make_folder(path)
     make_folder(path / "trials")
     experiment.write_space(space)

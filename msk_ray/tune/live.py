@@ -28,6 +28,8 @@ from msk_ray.tune.trials import Trial
 STATUS_INTERVAL_S = 30.0
 SHUTDOWN_GRACE_S = 120.0
 """How long trials may take to reach the end of their epoch and save, after a request to stop."""
+LONGEST_STEP_S = 5.0
+"""What a step of Tune's loop counts for at most: in the rest this process was itself stopped or asleep [s]."""
 
 
 @dataclass
@@ -50,8 +52,20 @@ class Live(Callback):
         trial_of: Callable[[dict[str, Any]], Trial],
         concurrent: int,
         stop: StopRequest,
+        guard: Callable[[], None],
         started: Iterable[Trial] = (),
     ) -> None:
+        """
+        Args:
+            experiment: whose trials they are.
+            trials: those to be run, as far as they are known.
+            trial_of: the trial that a Tune config stands for.
+            concurrent: trials at once.
+            stop: asked between any two events.
+            guard: called before anything is written; raises if the experiment is another driver's by now.
+            started: trials started before, in that order.
+        """
+        self._guard = guard
         self._experiment = experiment
         self._waiting = {trial.id: trial for trial in trials}
         self._trial_of = trial_of
@@ -73,13 +87,15 @@ class Live(Callback):
         self._out = sys.stdout
         self._last_status = self._start
         self._seconds_per_epoch: dict[str, float] = {}
-        self._stopping_since: float | None = None
+        self._stopping = False
+        self._stopping_s = 0.0
+        self._last_step = self._start
         self.storage_failure: StorageFailure | None = None
         """What a trial met when it wrote; then everything is stopped, as every trial would meet it."""
 
     def __getstate__(self) -> dict[str, Any]:
         # Ray pickles callbacks into its own state, which is never read back: resuming begins from the trials' folders.
-        return {key: value for key, value in self.__dict__.items() if key != "_out"}
+        return {key: value for key, value in self.__dict__.items() if key not in ("_out", "_guard")}
 
     def waiting(self) -> int:
         """How many trials have not started yet, as far as they are known."""
@@ -88,12 +104,14 @@ class Live(Callback):
     @property
     def stopped(self) -> bool:
         """Whether a request to stop has been carried out: every trial that ran has saved itself, or time is up."""
-        if self._stopping_since is None:
-            return False
-        return not self._saving or time.monotonic() - self._stopping_since > SHUTDOWN_GRACE_S
+        return self._stopping and (not self._saving or self._stopping_s > SHUTDOWN_GRACE_S)
 
     def on_step_end(self, iteration: int, trials: list[Any], **info: Any) -> None:
-        if self._stop and self._stopping_since is None:
+        now = time.monotonic()
+        if self._stopping:
+            self._stopping_s += min(now - self._last_step, LONGEST_STEP_S)
+        self._last_step = now
+        if self._stop and not self._stopping:
             self._begin_stop()
         if time.monotonic() - self._last_status >= STATUS_INTERVAL_S:
             self._last_status = time.monotonic()
@@ -107,7 +125,7 @@ class Live(Callback):
         if all(mine.id != trial.id for trial in self.started):
             self.started.append(replace(mine, index=len(self.started)))
         self._running[mine.id] = _Running(mine, time.monotonic())
-        if self._stopping_since is None:
+        if not self._stopping:
             self._say(f"{mine.id} {'again' if again else 'start'}  {self._name(mine)}")
 
     def on_trial_result(
@@ -168,6 +186,7 @@ class Live(Callback):
     def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         if self._meet_storage_failure(trial):
             return
+        self._guard()
         mine = self._trial_of(trial.config)
         folder = self._experiment.trial_folder(mine.id)
         self._saving.discard(mine.id)
@@ -179,6 +198,7 @@ class Live(Callback):
 
     def pruned(self, trial_id: str, ending: Ending) -> None:
         """A scheduler stops a trial: its process will not live to write its ending."""
+        self._guard()
         write_ending(self._experiment.trial_folder(trial_id), ending)
 
     def status(self) -> str:
@@ -224,13 +244,14 @@ class Live(Callback):
         if self.storage_failure is None:
             self.storage_failure = failure
             self._say(f"{trial_id} {printable(str(failure))}; stopping all trials ...")
-        if self._stopping_since is None:
+        if not self._stopping:
             self._stop_trials()
         self._saving.discard(trial_id)
         return True
 
     def _stop_trials(self) -> None:
-        self._stopping_since = time.monotonic()
+        self._guard()
+        self._stopping = True
         self._saving = set(self._running)
         try:
             self._experiment.stop_file.touch()

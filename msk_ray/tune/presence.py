@@ -1,7 +1,8 @@
-"""Ends a sweep whose experiment's folder has gone: moved, removed, or no longer mounted."""
+"""Ends a sweep whose experiment's folder has gone (moved, removed, or no longer mounted) or has another owner."""
 
 import shutil
 import time
+from collections.abc import Callable
 from typing import Any
 
 from ray.tune import Callback
@@ -20,13 +21,24 @@ def remove_remains(experiment: Experiment) -> None:
 
 
 class Presence(Callback):
-    """Looks for the experiment's manifest now and then; without it, trials have nowhere to save themselves."""
+    """Looks for the experiment's manifest now and then; without it, trials have nowhere to save themselves.
+
+    Also makes sure that the experiment is still this driver's.
+    """
 
     INTERVAL_S = 2.0
 
-    def __init__(self, experiment: Experiment) -> None:
+    def __init__(self, experiment: Experiment, guard: Callable[[], None]) -> None:
         self._experiment = experiment
+        self._guard = guard
         self._checked = time.monotonic()
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Ray pickles callbacks into its own state, which is never read back.
+        return {}
+
+    def on_step_begin(self, iteration: int, trials: list[Any], **info: Any) -> None:
+        self._guard()
 
     def on_step_end(self, iteration: int, trials: list[Any], **info: Any) -> None:
         if time.monotonic() - self._checked >= self.INTERVAL_S:

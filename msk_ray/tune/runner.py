@@ -21,11 +21,12 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 import msk_ray
 from msk_ray.config import Config, parse_recorded, read_yaml
-from msk_ray.errors import ClusterLost, DeviceError, MskRayError, StorageFailure, storage_failure
+from msk_ray.errors import ClusterLost, DeviceError, MskRayError, OwnershipLost, StorageFailure, storage_failure
 from msk_ray.experiment.damage import describe_damages
 from msk_ray.experiment.journal import Journal
 from msk_ray.experiment.layout import HALVED_FILE, JOURNAL_FILE
 from msk_ray.experiment.outcomes import read_ending, write_ending
+from msk_ray.ownership import Ownership
 from msk_ray.progress import format_duration
 from msk_ray.signals import StopRequest, listening
 from msk_ray.training import Trainer, precompile
@@ -69,6 +70,17 @@ class Plan:
     """Compiles a config's kernels on a node before trials start; None where there is nothing to compile."""
     standby: bool = True
     """Whether processes are kept ready for the trials that come next."""
+    ownership: Ownership | None = None
+    """Of the experiment; None where nobody else can know of it."""
+
+    def guard(self) -> None:
+        """Make sure that the experiment is still this driver's.
+
+        Raises:
+            OwnershipLost: it is not.
+        """
+        if self.ownership is not None:
+            self.ownership.check()
 
 
 @contextmanager
@@ -165,8 +177,8 @@ def run_trials(plan: Plan) -> bool:
         {trial.id: trial for trial in plan.trials},
         plan.placement.device,
         plan.placement.gpus,
-        plan.placement.cpus,
         plan.trainer_class,
+        None if plan.ownership is None else plan.ownership.owner.token,
     )
     if plan.precompile is not None:
         _precompile(plan, remaining or [_first_suggestion(job)])
@@ -180,7 +192,7 @@ def run_trials(plan: Plan) -> bool:
         flush=True,
     )
     with listening() as stop, stop.deferred():
-        live = Live(experiment, remaining, job.trial_of, concurrent, stop, [m.trial for m in made_up])
+        live = Live(experiment, remaining, job.trial_of, concurrent, stop, plan.guard, [m.trial for m in made_up])
         _fit(plan, job, live, stop, remaining, made_up)
         if not plan.trials:
             # A search makes trials up as it goes; they enter the manifest once they are known.
@@ -189,7 +201,7 @@ def run_trials(plan: Plan) -> bool:
 
 
 def _journal(plan: Plan) -> Journal:
-    return Journal(plan.experiment.path / JOURNAL_FILE)
+    return Journal(plan.experiment.path / JOURNAL_FILE, plan.guard)
 
 
 def _finish_pruning(plan: Plan) -> None:
@@ -250,7 +262,7 @@ def _fit(plan: Plan, job: Job, live: Live, stop: StopRequest, remaining: list[Tr
                 live,
                 StateGauge(plan.experiment, remaining, job.trial_of),
                 node,
-                Presence(plan.experiment),
+                Presence(plan.experiment, plan.guard),
                 *spare,
             ],
             stop=_StopWhen(live),
@@ -316,6 +328,8 @@ class _OwnNode(Callback):
 
 
 def _advised(failure: StorageFailure) -> StorageFailure:
+    if isinstance(failure, OwnershipLost):
+        return failure
     return StorageFailure(f"{failure}; mend that and go on with --resume")
 
 

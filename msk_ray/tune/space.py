@@ -75,7 +75,7 @@ class ResourcesSpec(Section):
     gpus_per_trial: Annotated[float, Field(gt=0.0)] = 1.0
     """GPUs of a trial where there are any; below 1, trials share one."""
     cpus_per_trial: Count = 1
-    """CPU cores, and threads, of a trial."""
+    """CPU cores of a trial; at least its `trial.threads`."""
     max_concurrent: Count | None = None
     max_failures: Whole = 3
     """How often a trial whose process or node died goes on from its checkpoint."""

@@ -26,8 +26,9 @@ _CALL_LIMIT_S = 10.0
 
 def import_all() -> None:
     """Run by every process of a trial as soon as it is there; what cannot be imported, the trial will say."""
-    # Numerical libraries read it when they are imported; a trial sets its own number of threads for what it computes.
+    # Numerical libraries read it when they are imported; a trial sets its own number of threads (`trial.threads`).
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # threads that wait for work sleep rather than spin
     # CUDA reads it once, when it is initialised. Should an import do that, the trial is to fail without a GPU, not to
     # run on another trial's.
     visible = os.environ.get("CUDA_VISIBLE_DEVICES")

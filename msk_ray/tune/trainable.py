@@ -13,17 +13,18 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from ray import tune
 
 from msk_ray.config import overlay, parse_config
-from msk_ray.errors import storage_failure
+from msk_ray.errors import OwnershipLost, storage_failure
 from msk_ray.experiment.damage import DamagedFile
 from msk_ray.experiment.halved import Halved, read_halved
 from msk_ray.experiment.layout import DEVICE_FILE, HANG_FILE, OUTPUT_FILE
 from msk_ray.experiment.metrics import Evaluation, evaluations_of, read_rows
 from msk_ray.files import write_text
+from msk_ray.ownership import acquire_for
 from msk_ray.tune.adapters import BEST, METRIC, STARTS_ANEW
 from msk_ray.tune.devices import wait_for_memory
 from msk_ray.tune.experiment import Experiment
@@ -51,8 +52,9 @@ class Job:
     device: str
     gpus: float
     """GPUs of a trial, 0 on CPU."""
-    threads: int
     trainer_class: type[TrainerLike]
+    owner: str | None = None
+    """Token of the experiment's owner; None where it has none."""
 
     @property
     def population(self) -> bool:
@@ -86,7 +88,8 @@ def make_trainable(job: Job) -> Callable[[dict[str, Any]], None]:
             else:
                 job.experiment.make_trial_folder(trial.id)
                 write_params(folder, config["params"])
-            attempt(trial, folder)
+            with _owned(folder, job):
+                attempt(trial, folder)
         except Exception as error:
             # Whatever stumbled over a full disk first, a line of output perhaps: the driver must hear of the disk.
             # Or over a file that is no longer there, as nothing is.
@@ -97,22 +100,27 @@ def make_trainable(job: Job) -> Callable[[dict[str, Any]], None]:
 
     def attempt(trial: Trial, folder: Path) -> None:
         _redirect_output(folder / OUTPUT_FILE)
-        _limit_threads(job.threads)
         _record_device(folder / DEVICE_FILE)
         halved = _halved(folder)
         log_hparams(folder, as_run(trial, halved))
         if job.gpus:
             _wait_for_gpu(job.gpus)
         gauges = TrialGauges(job.experiment.name, trial)
-        with tempfile.TemporaryDirectory() as scratch, _watchdog(folder, job.space.file.resources.hang_s) as alive:
+        with tempfile.TemporaryDirectory() as scratch, _watchdog(folder, job.space.file.resources.hang_s) as watch:
 
             def on_epoch(row: Mapping[str, float]) -> None:
-                alive()
+                watch.alive()
                 gauges.show(row)
+
+            report = _report_with_checkpoint if job.population else _reporter(halved is not None)
+
+            def on_evaluation(evaluation: Evaluation, ended: bool, trainer: TrainerLike) -> None:
+                with watch.suspended():
+                    report(evaluation, ended, trainer)
 
             hooks = Hooks(
                 on_epoch=on_epoch,
-                on_evaluation=_report_with_checkpoint if job.population else _reporter(halved is not None),
+                on_evaluation=on_evaluation,
                 pause=job.experiment.asked_to_stop,
             )
             try:
@@ -129,7 +137,8 @@ def make_trainable(job: Job) -> Callable[[dict[str, Any]], None]:
             except StartAnew as again:
                 # Tune starts a trial in a fresh process only after a failure. The driver hears of this one before it
                 # happens, and does not count it.
-                tune.report({STARTS_ANEW: again.halved.worlds})
+                with watch.suspended():
+                    tune.report({STARTS_ANEW: again.halved.worlds})
                 raise
 
     return trainable
@@ -140,6 +149,29 @@ def _halved(folder: Path) -> Halved | None:
         return read_halved(folder)
     except DamagedFile:
         return None  # the trial ends by that in a moment, and says so
+
+
+@contextmanager
+def _owned(folder: Path, job: Job) -> Iterator[None]:
+    """Own a trial's folder on behalf of the driver that started this process.
+
+    A process left over from an earlier driver, or from a node that Ray gave up, holds it until it notices: the one that
+    serves the experiment's present owner wins, and waits for it.
+    """
+    if job.owner is None:
+        yield
+        return
+    ownership = acquire_for(folder, job.experiment.path, job.owner, _leave)
+    try:
+        yield
+    finally:
+        ownership.release()
+
+
+def _leave(lost: OwnershipLost) -> None:
+    """End this process where it stands: another one may be writing to the same files already."""
+    os.write(2, f"{lost}; this process ends\n".encode())
+    os._exit(lost.exit_code)
 
 
 def _reporter(halved: bool) -> Callable[[Evaluation, bool, TrainerLike], None]:
@@ -206,34 +238,46 @@ def _redirect_output(path: Path) -> None:
     os.close(file)
 
 
-@contextmanager
-def _watchdog(folder: Path, limit_s: float | None) -> Iterator[Callable[[], None]]:
-    """End this process if the function given is not called for `limit_s`, and leave its stacks in `hang.txt`.
+class _Watch:
+    """Ends this process if it is not heard of for `limit_s`, and leaves its stacks in a file.
 
     faulthandler counts in a thread of its own below Python, so that a call that hangs in a driver is caught too.
     """
+
+    def __init__(self, limit_s: float | None, file: TextIO | None) -> None:
+        self._limit_s = limit_s
+        self._file = file
+        self.alive()
+
+    def alive(self) -> None:
+        """Count from the beginning."""
+        if self._limit_s is not None and self._file is not None:
+            faulthandler.dump_traceback_later(self._limit_s, exit=True, file=self._file)
+
+    @contextmanager
+    def suspended(self) -> Iterator[None]:
+        """Not to count in a block: a report waits for the driver, which may be stopped, asleep or busy."""
+        faulthandler.cancel_dump_traceback_later()
+        try:
+            yield
+        finally:
+            self.alive()
+
+
+@contextmanager
+def _watchdog(folder: Path, limit_s: float | None) -> Iterator[_Watch]:
+    """Watch over this process for a block; the stacks of one that hung are left in `hang.txt`."""
     path = folder / HANG_FILE
     path.unlink(missing_ok=True)
     if limit_s is None:
-        yield lambda: None
+        yield _Watch(None, None)
         return
     with path.open("w", encoding="utf-8") as file:
-
-        def alive() -> None:
-            faulthandler.dump_traceback_later(limit_s, exit=True, file=file)
-
-        alive()
         try:
-            yield alive
+            yield _Watch(limit_s, file)
         finally:
             faulthandler.cancel_dump_traceback_later()
     path.unlink()
-
-
-def _limit_threads(threads: int) -> None:
-    import torch
-
-    torch.set_num_threads(threads)
 
 
 def _wait_for_gpu(share: float) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from msk_ray import status, train
-from msk_ray.cli import RESUMABLE, run
+from msk_ray.cli import run
 from msk_ray.config import (
     current_key,
     dump_yaml,
@@ -25,6 +25,7 @@ from msk_ray.evaluate import __main__ as evaluate
 from msk_ray.experiment.metrics import read_metrics
 from msk_ray.experiment.outcomes import Outcome
 from msk_ray.report import __main__ as report
+from msk_ray.signals import RESUMABLE
 from msk_ray.training import Trainer
 from msk_ray.training.policy import load_policy
 from msk_ray.tune import __main__ as tune

@@ -1,0 +1,103 @@
+"""Faults around processes: two drivers, one that is frozen, signals to the whole group, memory that has a limit."""
+
+import random
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from fault_campaign.campaigns import RESUMABLE, Tally, judge, strike
+from fault_campaign.reference import Reference
+from fault_campaign.space import EPOCHS, HANG_S
+from fault_campaign.sweep import Sweep
+
+REFUSED = 2
+
+
+def two_drivers(reference: Reference, scratch: Path, rng: random.Random) -> list[Tally]:
+    """`--resume` beside a driver at work is refused, and `--resume --force` takes the experiment over."""
+    sweep = Sweep("two_drivers", scratch, reference.trials)
+    refused = Tally("second driver beside the first", 0, "nothing: refused")
+    taken = Tally("experiment taken over from a driver at work", 0, "nothing: the new driver ends it")
+    sweep.launch()
+    total = len(sweep.trials) * (EPOCHS + 1)
+    for share in (0.2, 0.4):
+        if not sweep.wait_for_rows(round(total * (share + rng.uniform(0.0, 0.1)))):
+            break
+        code = sweep.beside()
+        refused.injected += 1
+        if code != REFUSED:
+            refused.notes.append(f"exit code {code} instead of {REFUSED}")
+    if sweep.wait_for_rows(round(total * 0.6)):
+        first = sweep.hand_over()
+        taken.injected += 1
+        if first != RESUMABLE:
+            taken.notes.append(f"the first driver ended with {first} instead of {RESUMABLE}")
+    code = sweep.wait()
+    if code:
+        taken.notes.append(f"the second driver ended with {code}")
+    for tally in (refused, taken):
+        verdict = judge(reference, sweep, tally.fault, tally.injected, tally.ended_by)
+        verdict.notes += tally.notes
+        tally.__dict__.update(verdict.__dict__)
+    return [refused, taken]
+
+
+def frozen_driver(reference: Reference, scratch: Path, rng: random.Random) -> list[Tally]:
+    """The driver stands still for longer than a trial may be silent (a laptop asleep, SIGSTOP), and goes on."""
+    sweep = Sweep("frozen_driver", scratch, reference.trials)
+    total = len(sweep.trials) * (EPOCHS + 1)
+    tally = Tally("driver frozen for twice hang_s", 0, "nothing")
+    sweep.launch()
+    for share in (0.1, 0.5):
+        if not sweep.wait_for_rows(round(total * (share + rng.uniform(0.0, 0.2)))):
+            break
+        sweep.send(signal.SIGSTOP)
+        time.sleep(2 * HANG_S)
+        sweep.send(signal.SIGCONT)
+        tally.injected += 1
+    code = sweep.wait()
+    hung = [str(path) for path in sweep.path.glob("trials/*/hang.txt")]
+    verdict = judge(reference, sweep, tally.fault, tally.injected, tally.ended_by)
+    if code or hung:
+        verdict.notes.append(f"exit code {code}; counted as hung: {hung or 'none'}")
+    return [verdict]
+
+
+def group_signal(reference: Reference, scratch: Path, rng: random.Random, number: signal.Signals) -> list[Tally]:
+    """A signal reaches the driver, Ray's daemons and every trial, as from `timeout`, systemd or `kill -- -PGID`."""
+    sweep = Sweep(f"group_{number.name}", scratch, reference.trials)
+    injected, codes = strike(sweep, rng, 3, lambda: sweep.kill(number, group=True))
+    tally = judge(reference, sweep, f"{number.name} to the whole group", injected, "--resume")
+    if set(codes) != {RESUMABLE}:
+        tally.notes.append(f"exit codes {codes} instead of {RESUMABLE}")
+    return [tally]
+
+
+def memory_limit(reference: Reference, scratch: Path, rng: random.Random) -> list[Tally]:
+    """A trial's process may have no more memory than it has (RLIMIT_AS): the next large allocation fails.
+
+    The trial starts anew with half its worlds; the others are untouched. What it computes with half of them is not what
+    the reference computes, so that it is judged by its ending alone.
+    """
+    sweep = Sweep("memory_limit", scratch, reference.trials)
+    struck = sweep.trials[rng.randrange(len(sweep.trials))]
+    sweep.plant(struck, {rng.randrange(4, EPOCHS): "memory"})
+    sweep.launch("--halve-worlds")
+    code = sweep.wait()
+    others = [trial for trial in sweep.trials if trial is not struck]
+    tally = judge(reference, sweep, "process at its memory limit", sweep.struck(struck), "half the worlds", others)
+    halved = (sweep.path / "trials" / struck.id / "halved.json").is_file()
+    ended = sweep.ending(struck)
+    if code or not halved or ended != "finished":
+        tally.notes.append(f"exit code {code}; halved: {halved}; {struck.id} ended {ended}")
+    return [tally]
+
+
+CAMPAIGNS: dict[str, Callable[[Reference, Path, random.Random], list[Tally]]] = {
+    "two_drivers": two_drivers,
+    "frozen": frozen_driver,
+    "group_sigterm": lambda *a: group_signal(*a, signal.SIGTERM),
+    "group_sigusr1": lambda *a: group_signal(*a, signal.SIGUSR1),
+    "memory": memory_limit,
+}

@@ -1,0 +1,342 @@
+"""One owner at a time for a folder: whoever writes an experiment, a trial or a training run holds the lock in it.
+
+The lock is a file, `owner.json`, that names its owner and that the owner touches every `BEAT_S`. It holds on shared
+storage and outlives no owner:
+
+- It appears whole and once: written aside, then linked to its name, which fails if the name is taken. No `flock`, which
+  shared file systems do not all have.
+- An owner of this machine is looked up among its processes by number and birth, so that one that was killed is known
+  at once. An owner of another machine is judged by the age of the lock's last touch: stale after `STALE_S`. The two
+  times that this takes, the touch and now, are stamped by the file server; the hosts' clocks do not matter.
+- Whoever finds a stale lock renames it away, looks whether that was the one it judged, and links its own. An owner that
+  was taken for dead, frozen for a while perhaps, finds another name in the file, or none, and must stop
+  (`Ownership.check`) without touching anything.
+"""
+
+import contextlib
+import json
+import os
+import platform
+import threading
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from msk_ray.errors import OwnershipLost, StorageError, StorageFailure
+
+LOCK_FILE = "owner.json"
+BEAT_S = 5.0
+"""Between two touches of a lock [s]."""
+STALE_S = 60.0
+"""Age of the last touch after which an owner on another machine counts as dead [s]."""
+_WAIT_S = 0.5
+_CHECKED_S = 1.0
+"""For so long one look at the lock is good enough [s]."""
+
+
+@dataclass(frozen=True)
+class Owner:
+    """Who holds a lock."""
+
+    host: str
+    pid: int
+    birth: str
+    """When the process was started, in the kernel's ticks since boot: its number alone may be used again."""
+    machine: str
+    """Boot and process-number namespace: where `pid` means something."""
+    token: str
+    """Drawn when the lock was taken."""
+    began: str
+    """Date and time, for people."""
+    serves: str | None = None
+    """Of a trial's process: the token of the experiment's owner that started it."""
+
+    def alive_here(self) -> bool | None:
+        """Whether the process lives; None if it is one of another machine, or of another container."""
+        return _birth_of(self.pid) == self.birth if self.machine == _machine() else None
+
+
+@dataclass(frozen=True)
+class _Found:
+    """A lock as it lies there."""
+
+    owner: Owner | None
+    """None if the file is damaged: then its age alone tells."""
+    age_s: float
+
+    @property
+    def stale(self) -> bool:
+        alive = None if self.owner is None else self.owner.alive_here()
+        return self.age_s > STALE_S if alive is None else not alive
+
+    def __str__(self) -> str:
+        if self.owner is None:
+            return f"{LOCK_FILE} is damaged, touched {self.age_s:.0f} s ago"
+        who = f"process {self.owner.pid} on {self.owner.host}"
+        return f"{who}, at work since {self.owner.began}, seen {self.age_s:.0f} s ago"
+
+
+class Ownership:
+    """A lock that is held: touched by a thread of its own until `release`."""
+
+    def __init__(
+        self, folder: Path, owner: Owner, above: Path | None, on_loss: Callable[[OwnershipLost], None] | None
+    ) -> None:
+        """
+        Args:
+            folder: what is owned.
+            owner: as it stands in the file.
+            above: the folder whose owner this one serves, if it serves one.
+            on_loss: called once from the thread when the lock is found lost.
+        """
+        self.folder = folder
+        self.owner = owner
+        self._above = above
+        self._on_loss = on_loss
+        # Touching the file that was made, not whatever has its name: another's lock is never kept alive.
+        self._file = os.open(folder / LOCK_FILE, os.O_RDONLY)
+        self._lost: OwnershipLost | None = None
+        self._seen = time.monotonic()
+        self._done = threading.Event()
+        self._thread = threading.Thread(target=self._beat, name="owner", daemon=True)
+        self._thread.start()
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Ray pickles whatever its callbacks refer to into its own state, which is never read back.
+        return {"folder": self.folder, "owner": self.owner}
+
+    def check(self, now: bool = False) -> None:
+        """Make sure that the lock is still held; cheap enough for every step of a loop.
+
+        Args:
+            now: even if that was seen a moment ago.
+
+        Raises:
+            OwnershipLost: another has taken it over, it is gone, or it cannot be read for so long that it may be.
+        """
+        if self._lost is None and (now or time.monotonic() - self._seen > _CHECKED_S):
+            self._look()
+        if self._lost is not None:
+            raise self._lost
+
+    def release(self) -> None:
+        """Give the lock back, if it is still held."""
+        self._done.set()
+        self._thread.join()
+        os.close(self._file)
+        with contextlib.suppress(OSError):  # an unreachable lock becomes stale by itself
+            if _token_in(self.folder / LOCK_FILE) == self.owner.token:
+                (self.folder / LOCK_FILE).unlink()
+
+    def _beat(self) -> None:
+        while not self._done.wait(BEAT_S):
+            self._look()
+            if self._lost is not None:
+                if self._on_loss is not None:
+                    self._on_loss(self._lost)
+                return
+
+    def _look(self) -> None:
+        """See whether the lock is still held, and touch it if so."""
+        try:
+            if _token_in(self.folder / LOCK_FILE) != self.owner.token:
+                self._lost = OwnershipLost(f"{self.folder} has been taken over by {_find(self.folder) or 'another'}")
+            elif self._above is not None and _token_in(self._above / LOCK_FILE) != self.owner.serves:
+                self._lost = OwnershipLost(
+                    f"the driver of {self._above} that this process serves is no longer its owner"
+                )
+            else:
+                os.utime(self._file)
+                self._seen = time.monotonic()
+        except FileNotFoundError as error:
+            self._lost = OwnershipLost(f"{error.filename} has gone: moved, removed or taken over")
+        except OSError as error:
+            # A storage that does not answer for a moment. Where it is longer, others may have taken this for dead.
+            if time.monotonic() - self._seen > STALE_S / 2:
+                self._lost = OwnershipLost(f"cannot keep the lock {self.folder / LOCK_FILE}: {error.strerror}")
+
+
+def acquire(folder: Path, *, force: bool = False) -> Ownership:
+    """Become a folder's owner.
+
+    Args:
+        folder: there already.
+        force: take it from whoever has it.
+
+    Raises:
+        StorageError: another one lives, or may.
+        StorageFailure: the folder cannot be written.
+    """
+    owner = _this_process(None)
+    _take(folder, owner, force, 0.0)
+    return Ownership(folder, owner, None, None)
+
+
+def acquire_for(
+    folder: Path, above: Path, serves: str, on_loss: Callable[[OwnershipLost], None], patience_s: float = 2 * STALE_S
+) -> Ownership:
+    """Become the owner of a folder on behalf of the owner of one above it, for as long as that one stays its owner.
+
+    A process that holds it and lives is waited for: one that serves an earlier owner finds that out, and stops.
+
+    Args:
+        folder: of a trial.
+        above: of its experiment.
+        serves: the token of the experiment's owner.
+        on_loss: called once, from another thread, when the lock is lost, or the experiment has another owner.
+        patience_s: how long to wait [s].
+
+    Raises:
+        StorageError: it is still held after that.
+        StorageFailure: the folder cannot be written.
+        OwnershipLost: the experiment has another owner by now.
+    """
+    owner = _this_process(serves)
+    _take(folder, owner, False, patience_s)
+    ownership = Ownership(folder, owner, above, on_loss)
+    try:
+        ownership.check(now=True)
+    except OwnershipLost:
+        ownership.release()
+        raise
+    return ownership
+
+
+def _this_process(serves: str | None) -> Owner:
+    return Owner(
+        platform.node(),
+        os.getpid(),
+        _birth_of(os.getpid()),
+        _machine(),
+        uuid.uuid4().hex,
+        time.strftime("%Y-%m-%d %H:%M:%S"),
+        serves,
+    )
+
+
+def _take(folder: Path, owner: Owner, force: bool, patience_s: float) -> None:
+    waited = 0.0
+    try:
+        while not _link(folder, owner):
+            found = _find(folder)
+            if found is None:
+                continue  # released, or taken over, this moment
+            if found.stale or force:
+                _remove(folder, found)
+            elif waited >= patience_s:
+                raise StorageError(_refusal(folder, found))
+            else:
+                time.sleep(_WAIT_S)
+                waited += _WAIT_S  # ticks: time in which this process is stopped does not count
+    except OSError as error:
+        raise StorageFailure(f"cannot write {folder / LOCK_FILE}: {error.strerror or error}") from error
+
+
+@contextlib.contextmanager
+def owned(folder: Path, force: bool = False) -> Iterator[Ownership]:
+    """Own a folder for a block, as `acquire` says."""
+    ownership = acquire(folder, force=force)
+    try:
+        yield ownership
+    finally:
+        ownership.release()
+
+
+def _refusal(folder: Path, found: _Found) -> str:
+    known_alive = found.owner is not None and found.owner.alive_here()
+    left = "" if known_alive else f"if it is dead, wait {max(1.0, STALE_S - found.age_s):.0f} s; "
+    return f"{folder} is in use by {found}: stop that first; {left}--force takes it over"
+
+
+def _link(folder: Path, owner: Owner) -> bool:
+    """Put a lock in place; False if there is one."""
+    path = folder / LOCK_FILE
+    temporary = folder / f".{LOCK_FILE}.{owner.token}.part"
+    data = (json.dumps(asdict(owner)) + "\n").encode()
+    try:
+        with temporary.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        try:
+            os.link(temporary, path)
+        except FileExistsError:
+            return False
+        except OSError:
+            # A file system without links. Whoever reads it before it is written takes it for damaged, and young.
+            try:
+                descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
+            except FileExistsError:
+                return False
+            with os.fdopen(descriptor, "wb") as file:
+                file.write(data)
+        return True
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _find(folder: Path) -> _Found | None:
+    """The lock as it lies there, and how long ago it was touched; None if there is none."""
+    path = folder / LOCK_FILE
+    probe = folder / f".{LOCK_FILE}.{uuid.uuid4().hex}.part"
+    try:
+        with path.open("rb") as file:  # opening asks the file server anew
+            data = file.read()
+            touched = os.fstat(file.fileno()).st_mtime
+    except FileNotFoundError:
+        return None
+    try:
+        probe.touch()
+        now = probe.stat().st_mtime
+    finally:
+        probe.unlink(missing_ok=True)
+    try:
+        owner: Owner | None = Owner(**json.loads(data))
+    except (ValueError, TypeError):
+        owner = None
+    return _Found(owner, max(0.0, now - touched))
+
+
+def _remove(folder: Path, found: _Found) -> None:
+    """Take a lock away, if it is still the one that was found."""
+    judged = None if found.owner is None else found.owner.token
+    aside = folder / f".{LOCK_FILE}.{uuid.uuid4().hex}.part"
+    try:
+        if _token_in(folder / LOCK_FILE) != judged:
+            return  # another was faster
+        os.rename(folder / LOCK_FILE, aside)
+    except FileNotFoundError:
+        return  # likewise
+    if _token_in(aside) != judged:
+        # It changed hands in between: back with it. If a third one has linked its own meanwhile, the second will see.
+        with contextlib.suppress(FileExistsError):
+            os.link(aside, folder / LOCK_FILE)
+    aside.unlink(missing_ok=True)
+
+
+def _token_in(lock: Path) -> str | None:
+    """None if it is damaged."""
+    data = lock.read_bytes()
+    try:
+        token: str = json.loads(data)["token"]
+    except (ValueError, TypeError, KeyError):
+        return None
+    return token
+
+
+def _birth_of(pid: int) -> str:
+    """When a process of this machine was started, in the kernel's ticks; empty if there is none, or a dead one."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return ""
+    return "" if fields[0] == "Z" else fields[19]
+
+
+def _machine() -> str:
+    """What tells this run of this machine, and this container, from others."""
+    boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+    return f"{boot} {os.readlink('/proc/self/ns/pid')}"
