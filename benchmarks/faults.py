@@ -15,10 +15,10 @@ import time
 from pathlib import Path
 
 from fault_campaign import campaigns, drivers
-from fault_campaign.campaigns import Tally
 from fault_campaign.reference import Reference
 from fault_campaign.space import EPOCHS, SPACE
 from fault_campaign.sweep import scratch_folder
+from fault_campaign.tally import Tally
 from fault_campaign.trainer import drive
 from record import RESULTS, markdown_table, publish
 

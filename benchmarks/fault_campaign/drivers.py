@@ -6,10 +6,10 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from fault_campaign.campaigns import RESUMABLE, Tally, judge, strike
 from fault_campaign.reference import Reference
 from fault_campaign.space import EPOCHS, HANG_S
 from fault_campaign.sweep import Sweep
+from fault_campaign.tally import RESUMABLE, Tally, judge, strike
 
 REFUSED = 2
 

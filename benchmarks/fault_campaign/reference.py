@@ -22,6 +22,10 @@ class Reference:
                 trainer.run_epoch()
             trainer.close()
 
+    def folder_of(self, trial: Trial) -> Path:
+        """Of a trial that was left alone."""
+        return self._folder / trial.id
+
     def compare(self, experiment: Path, trials: list[Trial]) -> tuple[int, int, list[str]]:
         """Rows and trials of an experiment that are missing or differ, and what is wrong with them."""
         lost_rows = lost_trials = 0

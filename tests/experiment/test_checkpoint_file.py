@@ -6,7 +6,7 @@ import random
 from pathlib import Path
 
 import pytest
-from killed import die_within
+from fault_campaign.killed import die_within
 
 from msk_ray.errors import CheckpointError, StorageFailure
 from msk_ray.experiment.checkpoint_file import (

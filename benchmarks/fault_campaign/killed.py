@@ -7,6 +7,17 @@ from collections.abc import Callable
 from typing import Any
 
 
+def calls_of(work: Callable[[], object]) -> int:
+    """How many C functions `work` calls in a forked process."""
+    low, high = 0, 1
+    while die_within(work, high):
+        low, high = high, 2 * high
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if die_within(work, middle) else (low, middle)
+    return low
+
+
 def die_within(work: Callable[[], object], calls: int) -> bool:
     """Run `work` in a forked process that kills itself (SIGKILL) right before its `calls`-th call of a C function, such
     as those that open, write, flush and rename files.
