@@ -16,7 +16,7 @@ from record import RESULTS, markdown_table, publish
 
 from msk_ray.config import Config, load_config
 from msk_ray.envs import make_env
-from msk_ray.envs.models.myoleg import find_model
+from msk_ray.envs.myoleg.model import find_model
 from msk_ray.errors import ConfigError
 
 MODELS = {"myoleg26": ("configs/myoleg26.yaml", "env.assist.epochs=0"), "myolegs": ("configs/myoleg.yaml",)}

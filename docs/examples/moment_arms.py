@@ -16,9 +16,9 @@ import numpy as np
 from matplotlib.patches import Rectangle
 
 from msk_ray.config import MyoLeg26EnvConfig, PhysicsConfig
-from msk_ray.envs.models.moment_arms import PUBLISHED, moment_arms
-from msk_ray.envs.models.myoleg26 import WINDOW, build_myoleg26
-from msk_ray.envs.models.myoleg26_tables import MUSCLES
+from msk_ray.envs.myoleg26.model import WINDOW, build_myoleg26
+from msk_ray.envs.myoleg26.moment_arms import PUBLISHED, moment_arms
+from msk_ray.envs.myoleg26.tables import MUSCLES
 
 AXES = ("hip_flexion", "hip_adduction", "knee_angle", "ankle_angle")
 

@@ -1,34 +1,32 @@
-"""Environments: observation and reward as torch functions of (qpos, qvel, act), so that both stay in the graph."""
+"""Environments: observation and reward as torch functions of (qpos, qvel, act), so that both stay in the graph.
 
-from typing import Any
+Names are loaded when they are first asked for, so that an environment's settings can be read without torch and Warp.
+"""
 
-from msk_ray.config import EnvConfig, EnvSettings, PhysicsConfig
-from msk_ray.envs.ant import Ant
-from msk_ray.envs.base import Env, EnvState, Transition
-from msk_ray.envs.cartpole import CartPole
-from msk_ray.envs.myoleg import MyoLeg
-from msk_ray.envs.myoleg26 import MyoLeg26
-from msk_ray.simulation.modes import configured_backward
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
-__all__ = ["Ant", "CartPole", "Env", "EnvState", "MyoLeg", "MyoLeg26", "Transition", "env_class", "make_env"]
+if TYPE_CHECKING:
+    from msk_ray.envs.base import Env as Env
+    from msk_ray.envs.base import EnvState as EnvState
+    from msk_ray.envs.base import Transition as Transition
+    from msk_ray.envs.make import env_class as env_class
+    from msk_ray.envs.make import make_env as make_env
+
+_HOMES = {
+    "Env": "msk_ray.envs.base",
+    "EnvState": "msk_ray.envs.base",
+    "Transition": "msk_ray.envs.base",
+    "env_class": "msk_ray.envs.make",
+    "make_env": "msk_ray.envs.make",
+}
+
+__all__ = sorted(_HOMES)
 
 
-_ENVS: dict[type[EnvSettings], type[Env[Any]]] = {env.settings: env for env in (CartPole, Ant, MyoLeg26, MyoLeg)}
-
-
-def env_class(config: EnvConfig) -> type[Env[Any]]:
-    """The environment that settings of this type describe."""
-    return _ENVS[type(config)]
-
-
-def make_env(
-    config: EnvConfig, physics: PhysicsConfig, nworld: int, device: str, seed: int, *, differentiable: bool = True
-) -> Env[Any]:
-    """Build the environment of a config section.
-
-    Raises:
-        UnsupportedModelError: the model cannot be stepped, or not differentiated by `physics.backward`.
-        DeviceError: no such device.
-    """
-    backward = configured_backward(physics) if differentiable else None
-    return env_class(config)(config, physics, nworld, device, seed, backward)
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'msk_ray.envs' has no attribute {name!r}; it has {', '.join(__all__)}")
+    found = getattr(import_module(_HOMES[name]), name)
+    globals()[name] = found
+    return found

@@ -41,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser().parse_args(argv)
     path = best_checkpoint(find_target(args.target, args.storage))
 
-    from msk_ray.envs.legs import LegEnv
+    from msk_ray.envs.legs.env import LegEnv
     from msk_ray.evaluate.measure import Bench, Request, default_device
     from msk_ray.gait.body import analyse
     from msk_ray.gait.measure import measure

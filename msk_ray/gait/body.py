@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from msk_ray.envs.myoleg import world_axes
+from msk_ray.envs.myoleg.env import world_axes
 from msk_ray.errors import ConfigError
 
 Array = NDArray[np.float64]

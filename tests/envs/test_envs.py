@@ -7,8 +7,10 @@ import pytest
 import torch
 
 from msk_ray.config import AntEnvConfig, AntReward, CartPoleEnvConfig, PhysicsConfig
-from msk_ray.envs import Ant, CartPole, make_env
-from msk_ray.envs.models.ant import VARIANTS, build_ant
+from msk_ray.envs import make_env
+from msk_ray.envs.ant.env import Ant
+from msk_ray.envs.ant.model import VARIANTS, build_ant
+from msk_ray.envs.cartpole.env import CartPole
 from msk_ray.simulation import StepState
 
 

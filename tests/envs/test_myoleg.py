@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from msk_ray.config import MyoLegEnvConfig, PhysicsConfig
-from msk_ray.envs import MyoLeg, make_env
-from msk_ray.envs.models.myoleg import SUBSTEPS, Couplings, build_myoleg, find_model
-from msk_ray.envs.myoleg import world_axes
+from msk_ray.envs import make_env
+from msk_ray.envs.myoleg.env import MyoLeg, world_axes
+from msk_ray.envs.myoleg.model import SUBSTEPS, Couplings, build_myoleg, find_model
 from msk_ray.errors import ConfigError
 from msk_ray.gradcheck import check_chain, check_gradients, make_states
 from msk_ray.simulation import Simulation, TapePerSubstep

@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from msk_ray.config import LegReward, MyoLeg26EnvConfig, PhysicsConfig, parse_config
-from msk_ray.envs import MyoLeg26, make_env
-from msk_ray.envs.legs import stride_error
-from msk_ray.envs.muscles import MuscleCurves
+from msk_ray.envs import make_env
+from msk_ray.envs.legs.env import stride_error
+from msk_ray.envs.legs.muscles import MuscleCurves
+from msk_ray.envs.myoleg26.env import MyoLeg26
 from msk_ray.errors import ConfigError
 from msk_ray.simulation import StepState
 

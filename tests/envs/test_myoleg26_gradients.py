@@ -7,7 +7,7 @@ import torch
 
 from msk_ray.config import LegReward, MyoLeg26EnvConfig, PhysicsConfig
 from msk_ray.envs import make_env
-from msk_ray.envs.models.myoleg26 import SUBSTEPS, build_myoleg26
+from msk_ray.envs.myoleg26.model import SUBSTEPS, build_myoleg26
 from msk_ray.gradcheck import check_chain, check_gradients, make_states
 from msk_ray.simulation import Simulation, TapePerSubstep
 

@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from msk_ray.config import MyoLeg26EnvConfig, PhysicsConfig
-from msk_ray.envs.models import myoleg26_tables as tables
-from msk_ray.envs.models.moment_arms import PUBLISHED, moment_arms
-from msk_ray.envs.models.myoleg26 import CURVE, WINDOW, build_myoleg26
-from msk_ray.envs.models.terrain import Terrain
+from msk_ray.envs.myoleg26 import tables
+from msk_ray.envs.myoleg26.model import CURVE, WINDOW, build_myoleg26
+from msk_ray.envs.myoleg26.moment_arms import PUBLISHED, moment_arms
+from msk_ray.envs.myoleg26.terrain import Terrain
 from msk_ray.errors import UnsupportedModelError
 from msk_ray.physics.adjoint.coverage import check_supported
 from msk_ray.simulation import Simulation

@@ -7,8 +7,11 @@ import pytest
 from msk_ray.config import EnvSettings, LegReward, MyoLegEnvConfig, Reward, parse_config
 from msk_ray.config.physics import STEPPING
 from msk_ray.config.sections import Section
-from msk_ray.envs import Ant, CartPole, MyoLeg, MyoLeg26
+from msk_ray.envs.ant.env import Ant
 from msk_ray.envs.base import Env
+from msk_ray.envs.cartpole.env import CartPole
+from msk_ray.envs.myoleg.env import MyoLeg
+from msk_ray.envs.myoleg26.env import MyoLeg26
 
 ENVS: tuple[type[Env[Any]], ...] = (CartPole, Ant, MyoLeg26, MyoLeg)
 

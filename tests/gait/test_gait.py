@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from msk_ray.config import Config, MyoLeg26EnvConfig, PhysicsConfig, parse_config
-from msk_ray.envs.models.myoleg26 import build_myoleg26
+from msk_ray.envs.myoleg26.model import build_myoleg26
 from msk_ray.errors import ConfigError
 from msk_ray.gait.__main__ import main
 from msk_ray.gait.body import analyse

@@ -3,8 +3,8 @@
 import numpy as np
 
 from msk_ray.config import AntEnvConfig, CartPoleEnvConfig, PhysicsConfig
-from msk_ray.envs.models.ant import build_ant
-from msk_ray.envs.models.cartpole import build_cartpole
+from msk_ray.envs.ant.model import build_ant
+from msk_ray.envs.cartpole.model import build_cartpole
 from msk_ray.gradcheck import Point, check_chain, make_states
 from msk_ray.simulation import TapePerSubstep
 

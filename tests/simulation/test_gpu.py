@@ -8,7 +8,7 @@ from scenes import studded_plate
 
 from msk_ray.config import AntEnvConfig, Config, PhysicsConfig, parse_config
 from msk_ray.envs import make_env
-from msk_ray.envs.models.ant import build_ant
+from msk_ray.envs.ant.model import build_ant
 from msk_ray.errors import SimulationError
 from msk_ray.gradcheck import check_gradients
 from msk_ray.simulation import Simulation, TapePerSubstep

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from msk_ray.config import MyoLeg26EnvConfig, PhysicsConfig
-from msk_ray.envs.models.myoleg26 import build_myoleg26
+from msk_ray.envs.myoleg26.model import build_myoleg26
 from msk_ray.errors import ConfigError
 from msk_ray.physics import WorldBatch
 from msk_ray.simulation.kinematics import Frames, Kinematics

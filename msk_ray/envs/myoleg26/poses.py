@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from msk_ray.envs.models.myoleg26_tables import OUTLINE
+from msk_ray.envs.myoleg26.tables import OUTLINE
 
 WALKING_SPEED: Final = 1.25
 """Of the walking keyframes [m/s]."""

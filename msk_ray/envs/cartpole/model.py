@@ -3,7 +3,7 @@
 import mujoco
 
 from msk_ray.config import CartPoleEnvConfig, PhysicsConfig
-from msk_ray.envs.models.options import add_sky, apply_options
+from msk_ray.envs.options import add_sky, apply_options
 
 CART_MASS = 1.0
 POLE_MASS = 0.25

@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msk_ray.config import MyoLeg26EnvConfig, PhysicsConfig
-from msk_ray.envs.models import myoleg26_tables as tables
-from msk_ray.envs.models.myoleg26_poses import add_keyframes
-from msk_ray.envs.models.options import add_sky, apply_options
-from msk_ray.envs.models.terrain import Terrain
+from msk_ray.envs.myoleg26 import tables
+from msk_ray.envs.myoleg26.poses import add_keyframes
+from msk_ray.envs.myoleg26.terrain import Terrain
+from msk_ray.envs.options import add_sky, apply_options
 
 SIDES = ("r", "l")
 CURVE = (0.0, 2.0)

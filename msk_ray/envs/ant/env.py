@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from msk_ray.config import AntEnvConfig, PhysicsConfig
+from msk_ray.envs.ant.model import STAND_HEIGHT, STAND_JOINTS, build_ant
 from msk_ray.envs.base import Env
-from msk_ray.envs.models.ant import STAND_HEIGHT, STAND_JOINTS, build_ant
 from msk_ray.simulation import StepState
 from msk_ray.simulation.tangent import quat_exp, quat_multiply, quat_rotate
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from msk_ray.config import LegEnvSettings, PhysicsConfig
 from msk_ray.config.physics import CONTACTS, LIMITS
 from msk_ray.envs.base import Env
-from msk_ray.envs.muscles import MuscleCurves
+from msk_ray.envs.legs.muscles import MuscleCurves
 from msk_ray.simulation import StepState
 from msk_ray.simulation.tendons import Tendons
 

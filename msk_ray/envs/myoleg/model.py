@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from msk_ray.config import MyoLegEnvConfig, PhysicsConfig
 from msk_ray.config.legs import PACKAGED_MODELS
-from msk_ray.envs.models.options import apply_options
+from msk_ray.envs.options import apply_options
 from msk_ray.errors import ConfigError
 
 INSTALL: Final = "install one with `pip install myo-sim`, or set env.model to the path of an MJCF file"

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from msk_ray.config import AntEnvConfig, PhysicsConfig
-from msk_ray.envs.models.options import add_sky, apply_options
+from msk_ray.envs.options import add_sky, apply_options
 
 STAND_HEIGHT = 0.75
 STAND_JOINTS = (0.0, 1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0)

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from msk_ray.config import MyoLegEnvConfig, PhysicsConfig
-from msk_ray.envs.legs import LegEnv, Root
-from msk_ray.envs.models.myoleg import Couplings, build_myoleg, find_model, ground_height
+from msk_ray.envs.legs.env import LegEnv, Root
+from msk_ray.envs.myoleg.model import Couplings, build_myoleg, find_model, ground_height
 from msk_ray.simulation import StepState
 from msk_ray.simulation.tangent import quat_rotate
 

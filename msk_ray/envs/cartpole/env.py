@@ -8,7 +8,7 @@ from torch import Tensor
 
 from msk_ray.config import CartPoleEnvConfig, PhysicsConfig
 from msk_ray.envs.base import Env, wrap_angle
-from msk_ray.envs.models.cartpole import build_cartpole
+from msk_ray.envs.cartpole.model import build_cartpole
 from msk_ray.simulation import StepState
 
 UPRIGHT_ANGLE = 0.3

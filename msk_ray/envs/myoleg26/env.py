@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from msk_ray.config import AssistConfig, MyoLeg26EnvConfig, PhysicsConfig
-from msk_ray.envs.legs import LegEnv, Root
-from msk_ray.envs.models.myoleg26 import SIDES, build_myoleg26
-from msk_ray.envs.models.myoleg26_tables import JOINTS
-from msk_ray.envs.models.terrain import Terrain
+from msk_ray.envs.legs.env import LegEnv, Root
+from msk_ray.envs.myoleg26.model import SIDES, build_myoleg26
+from msk_ray.envs.myoleg26.tables import JOINTS
+from msk_ray.envs.myoleg26.terrain import Terrain
 from msk_ray.simulation import StepState
 
 _TRUNK_INERTIA = (7.0, 7.0, 0.85)

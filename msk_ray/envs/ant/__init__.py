@@ -1,0 +1,1 @@
+"""A four-legged walker with motors, in three named physics."""

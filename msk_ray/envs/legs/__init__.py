@@ -1,0 +1,1 @@
+"""What environments of muscle-driven legs share."""

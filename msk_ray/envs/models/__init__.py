@@ -1,1 +1,0 @@
-"""Model builders: settings in, a compiled MjModel out."""

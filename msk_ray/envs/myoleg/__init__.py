@@ -1,0 +1,1 @@
+"""Muscle-driven legs of an installed package or of a model file."""

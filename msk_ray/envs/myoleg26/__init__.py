@@ -1,0 +1,1 @@
+"""Two legs of 26 muscles under one trunk, built here."""
