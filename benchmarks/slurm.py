@@ -26,8 +26,9 @@ from record import RESULTS, markdown_table, publish
 from msk_ray.config import dump_yaml
 from msk_ray.experiment.metrics import read_rows
 from msk_ray.experiment.outcomes import read_ending
-from msk_ray.tune.experiment import Experiment
+from msk_ray.tune.experiment import Experiment, has_begun
 
+TRIALS = 3
 SPACE = {
     "question": "Does an experiment survive what SLURM does to jobs?",
     "base": "configs/cartpole.yaml",
@@ -37,7 +38,7 @@ SPACE = {
         "evaluation.steps": 32,
         "trial.checkpoint_interval": 5,
     },
-    "seeds": "0-2",
+    "seeds": f"0-{TRIALS - 1}",
 }
 ADDRESSES = {"slurm-a": "10.214.78.1", "slurm-b": "10.214.78.2"}
 """Node names and addresses."""
@@ -347,6 +348,8 @@ def _wait_until_idle(slurm: Slurm) -> None:
 
 def _losses(experiment: Experiment, epochs: int) -> tuple[int, int, int]:
     """Trials that have not finished, rows missing, and rows that are there twice."""
+    if not has_begun(experiment.path):
+        return TRIALS, TRIALS * (epochs + 1), 0
     unfinished = missing = doubled = 0
     for trial in experiment.trials():
         path = experiment.trial_folder(trial.id)
@@ -396,7 +399,7 @@ def main() -> int:
             print(f"  {result}; unfinished, missing, doubled: {losses}; {seconds:.0f} s", flush=True)
             rows.append([what, result, *map(str, losses), f"{seconds:.0f} s"])
     header = ["scenario", "job", "trials unfinished", "rows missing", "rows doubled", "time"]
-    title = f"{version}, two nodes, 3 CartPole trials of {args.epochs} epochs in each scenario"
+    title = f"{version}, two nodes, {TRIALS} CartPole trials of {args.epochs} epochs in each scenario"
     publish("slurm", title, "cpu", markdown_table(header, rows), args.results)
     if args.keep or failed:
         print(f"kept: {scratch}")
