@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from needs import need_program
+from playwright.sync_api import sync_playwright
 from processes import Launcher
 
 from msk_ray.config import Config, dump_yaml, load_config, parse_config
@@ -107,3 +109,14 @@ def _small_config(name: str) -> Config:
     small = ("env.nworld=4", "shac.horizon=4", "trial.epochs=1", "actor.hidden=[16,16]", "critic.hidden=[16,16]")
     evaluation = ("evaluation.nworld=2", "evaluation.steps=40", "evaluation.interval=1")
     return load_config(ROOT / "configs" / f"{name}.yaml", [*small, *evaluation])
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """Headless Chromium."""
+    program = need_program("chromium", "chromium-browser", "google-chrome", package="chromium")
+    with sync_playwright() as playwright:
+        # Its sandbox needs rights that a container, or root, does not have.
+        chromium = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        yield chromium
+        chromium.close()

@@ -105,6 +105,8 @@ def ray_session(address: str | None, dashboard: bool | None = None, trials: bool
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     # Ray starts a cluster by itself for whoever asks it something after `ray.shutdown`.
     os.environ["RAY_ENABLE_AUTO_CONNECT"] = "0"
+    # Off by default because it runs a program in the cluster; so can everybody who has the token it asks for.
+    os.environ.setdefault("RAY_DASHBOARD_ENABLE_PROFILING", "1")
     # Ray would have trials give way to everything else on the machine.
     os.environ.setdefault("RAY_worker_niceness", "0")
     common: dict[str, Any] = {
@@ -241,7 +243,7 @@ def _fit(plan: Plan, job: Job, live: Live, stop: StopRequest, remaining: list[Tr
     if plan.standby and not spare:
         print("no process on standby, so trials begin seconds later: pip install grpcio to have them", flush=True)
     tuner = tune.Tuner(
-        tune.with_resources(make_trainable(job), resources),
+        make_trainable(job, resources),
         param_space=_param_space(job, remaining),
         tune_config=tune.TuneConfig(
             metric=METRIC,

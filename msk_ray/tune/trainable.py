@@ -1,4 +1,4 @@
-"""The function Ray Tune runs in a trial's process: `run_trial` with reports, gauges and its output in a file."""
+"""What Ray Tune runs in a trial's process: `run_trial` with reports, gauges and its output in a file."""
 
 import faulthandler
 import json
@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from ray import tune
+from ray.tune.trainable import wrap_function
 
 from msk_ray.config import overlay, parse_config
 from msk_ray.errors import OwnershipLost, storage_failure
@@ -76,10 +77,10 @@ class Job:
         return replace(trial, config=settings)
 
 
-def make_trainable(job: Job) -> Callable[[dict[str, Any]], None]:
-    """The function a Tune trial runs."""
+def make_trainable(job: Job, resources: dict[str, float]) -> type[tune.Trainable]:
+    """The class whose actors run the trials, each with these resources of a node."""
 
-    def trainable(config: dict[str, Any]) -> None:
+    def train(config: dict[str, Any]) -> None:
         trial = job.trial_of(config)
         folder = job.experiment.trial_folder(trial.id)
         try:
@@ -89,7 +90,7 @@ def make_trainable(job: Job) -> Callable[[dict[str, Any]], None]:
                 job.experiment.make_trial_folder(trial.id)
                 write_params(folder, config["params"])
             with _owned(folder, job):
-                attempt(trial, folder)
+                in_frame_named(trial.label, lambda: attempt(trial, folder))
         except Exception as error:
             # Whatever stumbled over a full disk first, a line of output perhaps: the driver must hear of the disk.
             # Or over a file that is no longer there, as nothing is.
@@ -141,7 +142,24 @@ def make_trainable(job: Job) -> Callable[[dict[str, Any]], None]:
                     tune.report({STARTS_ANEW: again.halved.worlds})
                 raise
 
-    return trainable
+    # Given the function alone, Tune makes a class `ImplicitFunc` of it whose actors all look alike.
+    class TrialActor(wrap_function(tune.with_resources(train, resources))):  # type: ignore[misc]
+        def __repr__(self) -> str:
+            """Names the actor in Ray's dashboard, in its lists, and in front of its lines of output."""
+            return job.trial_of(self.config).label
+
+    TrialActor.__qualname__ = TrialActor.__name__
+    return TrialActor
+
+
+def in_frame_named(name: str, call: Callable[[], None]) -> None:
+    """Call a function from a frame of this name: profilers and tracebacks show which trial it was."""
+
+    def frame() -> None:
+        call()
+
+    frame.__code__ = frame.__code__.replace(co_name=name, co_qualname=name)
+    frame()
 
 
 def _halved(folder: Path) -> Halved | None:

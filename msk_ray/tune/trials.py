@@ -44,6 +44,13 @@ class Trial:
         """The changed parameters on one line; equal for all seeds of a variant."""
         return variant_text(self.changed)
 
+    @property
+    def label(self) -> str:
+        """Id, changed parameters and seed on one line of printable characters, for Ray's lists and profiles."""
+        text = f"{self.id} {self.variant} seed={self.seed}"
+        # A profile separates its frames by semicolons.
+        return "".join(c if c.isprintable() else " " for c in text).replace(";", ",")
+
 
 def variant_text(changed: Mapping[str, str]) -> str:
     """`actor_lr=0.002, horizon=16, hard friction`: keys without their sections, and whole sections by label alone."""

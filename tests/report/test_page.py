@@ -7,8 +7,8 @@ from typing import Any
 from urllib.parse import unquote, urlparse
 
 import pytest
-from needs import need_drawing, need_program
-from playwright.sync_api import Page, sync_playwright
+from needs import need_drawing
+from playwright.sync_api import Page
 
 from msk_ray.cli import run
 from msk_ray.report.__main__ import main
@@ -24,17 +24,6 @@ def reported(sweep: Experiment, tmp_path_factory: pytest.TempPathFactory) -> Exp
     copy = Experiment(Path(shutil.copytree(sweep.path, tmp_path_factory.mktemp("reported") / "small")))
     assert run(main, [str(copy.path), "--device", "cpu"]) == 0
     return copy
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    """Headless Chromium."""
-    program = need_program("chromium", "chromium-browser", "google-chrome", package="chromium")
-    with sync_playwright() as playwright:
-        # Its sandbox needs rights that a container, or root, does not have.
-        chromium = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
-        yield chromium
-        chromium.close()
 
 
 @pytest.fixture(params=[1280, 375], ids=["wide", "narrow"])

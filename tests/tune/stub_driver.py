@@ -1,4 +1,7 @@
-"""`python -m msk_ray.tune` whose trials take milliseconds; for a process of its own."""
+"""`python -m msk_ray.tune` whose trials take milliseconds; for a process of its own.
+
+It starts a dashboard if STUB_DASHBOARD is set.
+"""
 
 from msk_ray import signals
 
@@ -33,5 +36,7 @@ if __name__ == "__main__":
     runner.Plan = functools.partial(  # type: ignore[assignment,misc]
         runner.Plan, trainer_class=StubTrainer, precompile=precompile, standby=False
     )
-    runner.ray_session = functools.partial(runner.ray_session, dashboard=False, trials=False)
+    runner.ray_session = functools.partial(
+        runner.ray_session, dashboard=None if os.environ.get("STUB_DASHBOARD") else False, trials=False
+    )
     sys.exit(run(main))
