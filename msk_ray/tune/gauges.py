@@ -1,5 +1,6 @@
 """Where trials stand, as gauges on Ray's metrics port, for Prometheus and the dashboard in `cluster/grafana/`."""
 
+import threading
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
@@ -7,6 +8,7 @@ from ray.tune import Callback
 from ray.util.metrics import Gauge
 
 from msk_ray.experiment.outcomes import read_ending
+from msk_ray.text import printable
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.trials import Trial
 
@@ -19,7 +21,55 @@ FIGURES = {
 }
 """Gauge → metric. Ray serves a gauge as `ray_` and its name."""
 STATE = "msk_ray_trial_state"
-"""1 at a trial's present state (`waiting`, `running` or how it ended) and 0 at those it has left."""
+"""1 at a trial's present state (`waiting`, `running` or how it ended); one that it has left goes to 0 and then away."""
+
+
+REPEAT_S = 5.0
+"""Time after which a value is set once more [s]."""
+
+
+class Kept:
+    """Values of gauges that stay until they are dropped.
+
+    Ray hands a value on once after it was set, and after 20 s it no longer serves one that was not set since: a state
+    that lasts, or a score between two evaluations, would be gone. So a thread sets every value again and again.
+    """
+
+    def __init__(self) -> None:
+        self._values: dict[tuple[int, tuple[tuple[str, str], ...]], Callable[[], None]] = {}
+        self._lock = threading.Lock()
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._repeat, name="gauges", daemon=True)
+        self._thread.start()
+
+    def set(self, gauge: Gauge, value: float, tags: Mapping[str, str] | None = None) -> None:
+        """Show a value from now on."""
+        given = dict(tags or {})
+        with self._lock:
+            self._values[_key(gauge, given)] = lambda: gauge.set(value, given)
+            gauge.set(value, given)
+
+    def drop(self, gauge: Gauge, tags: Mapping[str, str]) -> None:
+        """Set to 0, and no longer show."""
+        given = dict(tags)
+        with self._lock:
+            del self._values[_key(gauge, given)]
+            gauge.set(0, given)
+
+    def close(self) -> None:
+        """Let go of all values."""
+        self._closed.set()
+        self._thread.join()
+
+    def _repeat(self) -> None:
+        while not self._closed.wait(REPEAT_S):
+            with self._lock:
+                for set_again in self._values.values():
+                    set_again()
+
+
+def _key(gauge: Gauge, tags: Mapping[str, str]) -> tuple[int, tuple[tuple[str, str], ...]]:
+    return id(gauge), tuple(sorted(tags.items()))
 
 
 class TrialGauges:
@@ -27,6 +77,7 @@ class TrialGauges:
 
     def __init__(self, experiment: str, trial: Trial) -> None:
         tags = _tags(experiment, trial)
+        self._kept = Kept()
         self._gauges = {}
         for name, metric in FIGURES.items():
             gauge = Gauge(name, description=metric, tag_keys=tuple(tags))
@@ -37,7 +88,11 @@ class TrialGauges:
         """Set what a row of metrics holds."""
         for metric, gauge in self._gauges.items():
             if metric in row:
-                gauge.set(row[metric])
+                self._kept.set(gauge, row[metric])
+
+    def close(self) -> None:
+        """No longer show anything."""
+        self._kept.close()
 
 
 class StateGauge(Callback):
@@ -55,6 +110,7 @@ class StateGauge(Callback):
         self._experiment = experiment
         self._trial_of = trial_of
         self._states: dict[str, str] = {}
+        self._kept = Kept()
         self._gauge = Gauge(
             STATE,
             description="1 at a trial's present state",
@@ -62,6 +118,14 @@ class StateGauge(Callback):
         )
         for trial in waiting:
             self._set(trial, "waiting")
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Ray pickles callbacks into its own state, which is never read back.
+        return {}
+
+    def close(self) -> None:
+        """No longer show anything."""
+        self._kept.close()
 
     def on_trial_start(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         self._set(self._trial_of(trial.config), "running")
@@ -81,12 +145,12 @@ class StateGauge(Callback):
         tags = _tags(self._experiment.name, trial)
         before = self._states.get(trial.id)
         if before is not None:
-            self._gauge.set(0, tags | {"state": before})
-        self._gauge.set(1, tags | {"state": state})
+            self._kept.drop(self._gauge, tags | {"state": before})
+        self._kept.set(self._gauge, 1, tags | {"state": state})
         self._states[trial.id] = state
 
 
 def _tags(experiment: str, trial: Trial) -> dict[str, str]:
     # Ray takes no other characters in tags.
-    variant = trial.variant.replace("→", "->").encode("ascii", "backslashreplace").decode()
+    variant = printable(trial.variant).replace("→", "->").encode("ascii", "backslashreplace").decode()
     return {"experiment": experiment, "trial": trial.id, "variant": variant, "seed": str(trial.seed)}

@@ -3,17 +3,47 @@
 import os
 import secrets
 import stat
+import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
+import ray
 from ray._private import ray_constants
 
+import msk_ray
 from msk_ray.errors import StorageError
 
 TOKEN_FILE = Path(".ray") / "auth_token"
 """Where Ray keeps the token of local sessions, below the home folder."""
+
+
+def start_local(dashboard: bool | None, options: Mapping[str, Any]) -> Any:
+    """Start a Ray for this process alone, and join it.
+
+    Args:
+        dashboard: whether to start one; None starts it where its packages (ray[default]) are installed.
+        options: for `ray.init`.
+
+    Returns:
+        What `ray.init` does.
+
+    Raises:
+        StorageError: there is no place for its token.
+    """
+    # Workers must import the package this process runs, wherever it was started from.
+    package = str(Path(msk_ray.__file__).resolve().parent.parent)
+    paths = [package, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
+    os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys(paths))
+    # The dashboard finds its profiler where programs of this environment are, activated or not.
+    programs = [*os.environ.get("PATH", os.defpath).split(os.pathsep), str(Path(sys.executable).parent)]
+    os.environ["PATH"] = os.pathsep.join(dict.fromkeys(programs))
+    make_token_private()
+    with loopback_only():
+        # By default Ray would join whatever cluster a `ray start` on this machine once left a note of.
+        return ray.init("local", include_dashboard=dashboard, dashboard_host="127.0.0.1", **options)
 
 
 @contextmanager

@@ -6,7 +6,7 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import closing, contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,6 @@ from ray.tune.search import BasicVariantGenerator, Searcher
 from ray.tune.stopper import Stopper
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-import msk_ray
 from msk_ray.config import Config, parse_recorded, read_yaml
 from msk_ray.errors import ClusterLost, DeviceError, MskRayError, OwnershipLost, StorageFailure, storage_failure
 from msk_ray.experiment.damage import describe_damages
@@ -40,7 +39,7 @@ from msk_ray.tune.gauges import StateGauge
 from msk_ray.tune.interrupts import end_ray, run_in_thread, starting_ray
 from msk_ray.tune.journal import replay
 from msk_ray.tune.live import Live
-from msk_ray.tune.local_ray import loopback_only, make_token_private, way_in
+from msk_ray.tune.local_ray import start_local, way_in
 from msk_ray.tune.made_up import MadeUp, recover
 from msk_ray.tune.operators import Listed
 from msk_ray.tune.presence import Presence, remove_remains
@@ -114,11 +113,6 @@ def ray_session(address: str | None, dashboard: bool | None = None, trials: bool
         "log_to_driver": False,
         "runtime_env": {"worker_process_setup_hook": standby.HOOK} if trials else None,
     }
-    if address is None:
-        # Workers must import the package this process runs, wherever it was started from.
-        package = str(Path(msk_ray.__file__).resolve().parent.parent)
-        paths = [package, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
-        os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys(paths))
     try:
         with starting_ray():
             context = _init(address, dashboard, common)
@@ -133,11 +127,7 @@ def ray_session(address: str | None, dashboard: bool | None = None, trials: bool
 
 def _init(address: str | None, dashboard: bool | None, common: dict[str, Any]) -> Any:
     if address is None:
-        # None starts the dashboard where its packages (ray[default]) are installed, and does without elsewhere.
-        # By default Ray would join whatever cluster a `ray start` on this machine once left a note of.
-        make_token_private()
-        with loopback_only():
-            return ray.init("local", include_dashboard=dashboard, dashboard_host="127.0.0.1", **common)
+        return start_local(dashboard, common)
     try:
         knock(address)
         return ray.init(address=address, **common)
@@ -242,6 +232,7 @@ def _fit(plan: Plan, job: Job, live: Live, stop: StopRequest, remaining: list[Tr
     spare = [Standby(plan.placement, plan.max_concurrent, live.waiting)] if plan.standby and standby.available() else []
     if plan.standby and not spare:
         print("no process on standby, so trials begin seconds later: pip install grpcio to have them", flush=True)
+    states = StateGauge(plan.experiment, remaining, job.trial_of)
     tuner = tune.Tuner(
         make_trainable(job, resources),
         param_space=_param_space(job, remaining),
@@ -262,7 +253,7 @@ def _fit(plan: Plan, job: Job, live: Live, stop: StopRequest, remaining: list[Tr
             # Live first: it writes the endings that only the driver knows.
             callbacks=[
                 live,
-                StateGauge(plan.experiment, remaining, job.trial_of),
+                states,
                 node,
                 Presence(plan.experiment, plan.guard),
                 *spare,
@@ -274,7 +265,7 @@ def _fit(plan: Plan, job: Job, live: Live, stop: StopRequest, remaining: list[Tr
         ),
     )
     try:
-        with _log_to(plan.experiment.path / "ray.log"):
+        with closing(states), _log_to(plan.experiment.path / "ray.log"):
             run_in_thread(tuner.fit, stop)
     except Exception as error:
         remove_remains(plan.experiment)

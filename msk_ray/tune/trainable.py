@@ -10,7 +10,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TextIO
@@ -106,8 +106,11 @@ def make_trainable(job: Job, resources: dict[str, float]) -> type[tune.Trainable
         log_hparams(folder, as_run(trial, halved))
         if job.gpus:
             _wait_for_gpu(job.gpus)
-        gauges = TrialGauges(job.experiment.name, trial)
-        with tempfile.TemporaryDirectory() as scratch, _watchdog(folder, job.space.file.resources.hang_s) as watch:
+        with (
+            tempfile.TemporaryDirectory() as scratch,
+            closing(TrialGauges(job.experiment.name, trial)) as gauges,
+            _watchdog(folder, job.space.file.resources.hang_s) as watch,
+        ):
 
             def on_epoch(row: Mapping[str, float]) -> None:
                 watch.alive()

@@ -11,6 +11,7 @@ from typing import Any
 
 from msk_ray.config import Config, first_spelling, overlay, parse_config, read_config
 from msk_ray.errors import ConfigError
+from msk_ray.text import printable
 from msk_ray.tune.operators import Level, Listed, Range, describe
 from msk_ray.tune.space import Space
 
@@ -47,9 +48,8 @@ class Trial:
     @property
     def label(self) -> str:
         """Id, changed parameters and seed on one line of printable characters, for Ray's lists and profiles."""
-        text = f"{self.id} {self.variant} seed={self.seed}"
         # A profile separates its frames by semicolons.
-        return "".join(c if c.isprintable() else " " for c in text).replace(";", ",")
+        return printable(f"{self.id} {self.variant} seed={self.seed}").replace(";", ",")
 
 
 def variant_text(changed: Mapping[str, str]) -> str:

@@ -2,7 +2,7 @@
 
 Without a cloud: Ray's check of cluster YAML, EC2's RunInstances from botocore, Kubernetes' schema of pods and
 claims, shellcheck, hadolint. Where whoever reads a file publishes no schema that can be had offline (KubeRay, Google's
-machines, Grafana), `schemas/` holds a strict one of the fields that are set, and no other field passes.
+machines, Grafana, Prometheus), `schemas/` holds a strict one of the fields that are set, and no other field passes.
 """
 
 import copy
@@ -24,6 +24,8 @@ import kubernetes_validate
 import pytest
 import yaml
 from botocore.validate import ParamValidator
+from ray._common.utils import get_default_ray_temp_dir
+from ray._private.ray_constants import PROMETHEUS_SERVICE_DISCOVERY_FILE
 from ray.autoscaler._private.util import prepare_config, validate_config
 from ray.scripts import scripts as ray_commands
 
@@ -119,6 +121,7 @@ def documents() -> Iterator[tuple[str, Any, Check]]:
     yield "dashboard", json.loads((grafana / "dashboards" / "msk_ray.json").read_text()), check_json("dashboard")
     for part, name in (("dashboards", "provider"), ("datasources", "prometheus")):
         yield name, yaml.safe_load((grafana / part / f"{name}.yaml").read_text()), check_json(f"grafana_{part}")
+    yield "scraping", yaml.safe_load((FOLDER / "prometheus.yml").read_text()), check_json("prometheus")
 
 
 DOCUMENTS = list(documents())
@@ -205,6 +208,14 @@ def test_the_dashboard_asks_for_gauges_there_are() -> None:
     asked += [variable["query"] for variable in dashboard["templating"]["list"]]
     used = {name for text in asked for name in re.findall(r"ray_\w+", text)}
     assert used == {f"ray_{name}" for name in (*FIGURES, STATE)}
+
+
+def test_prometheus_finds_the_nodes_where_ray_lists_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("RAY_TMPDIR", "TMPDIR"):
+        monkeypatch.delenv(name, raising=False)
+    (job,) = yaml.safe_load((FOLDER / "prometheus.yml").read_text())["scrape_configs"]
+    (found,) = job["file_sd_configs"]
+    assert found["files"] == [str(Path(get_default_ray_temp_dir()) / PROMETHEUS_SERVICE_DISCOVERY_FILE)]
 
 
 def shell_of(config: Any) -> str:
@@ -359,4 +370,4 @@ def test_dockerfile() -> None:
 def test_every_file_is_checked_here() -> None:
     found = {path.name for path in FOLDER.rglob("*") if path.is_file()}
     checked = {"aws.yaml", "gcp.yaml", "raycluster.yaml", "rayjob.yaml", "Dockerfile", *SCRIPTS}
-    assert found == checked | {"msk_ray.json", "provider.yaml", "prometheus.yaml", "README.md"}
+    assert found == checked | {"msk_ray.json", "provider.yaml", "prometheus.yaml", "prometheus.yml", "README.md"}

@@ -6,15 +6,15 @@ import shlex
 import subprocess
 import sys
 import traceback
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from playwright.sync_api import Page, expect
+from processes import Launcher
 
-from msk_ray.cli import RESUMABLE
 from msk_ray.config import dump_yaml
+from msk_ray.signals import RESUMABLE
 from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.records import read_records
 from msk_ray.tune.trainable import in_frame_named
@@ -26,8 +26,8 @@ LIMIT_MS = 300_000
 
 @pytest.fixture
 def driver(
-    space_data: dict[str, Any], tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch
-) -> Iterator["subprocess.Popen[str]"]:
+    space_data: dict[str, Any], tmp_path: Path, root: Path, launcher: Launcher, monkeypatch: pytest.MonkeyPatch
+) -> "subprocess.Popen[str]":
     """A sweep that runs until it is stopped, in a home folder without a token."""
     for name in ("RAY_ADDRESS", "RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"):
         monkeypatch.delenv(name, raising=False)
@@ -40,10 +40,7 @@ def driver(
     space.write_text(dump_yaml(space_data | {"parameters": rates, "overrides": {"trial.epochs": 1_000_000}}))
     program = str(Path(__file__).with_name("stub_driver.py"))
     command = [sys.executable, program, "--space", str(space), "--cpu", "--storage", str(tmp_path / "runs")]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        yield process
-        if process.poll() is None:
-            process.kill()  # its Ray ends with it
+    return launcher.start(command, stdout=subprocess.PIPE)
 
 
 def line_with(driver: "subprocess.Popen[str]", text: str) -> str:
@@ -103,4 +100,4 @@ def test_a_profile_shows_which_trial_it_is_of() -> None:
 def test_a_label_is_one_line_that_profiles_can_hold(make_space: Any) -> None:
     rates = {"shac.actor_lr": {"grid": [{"label": "a;b\n\x1b[2Jc → d", "value": 0.01}]}}
     (trial,) = resolve_trials(make_space(parameters=rates))
-    assert trial.label == f"{trial.id} actor_lr=a,b  [2Jc → d seed=0"
+    assert trial.label == f"{trial.id} actor_lr=a,b\\n\\x1b[2Jc → d seed=0"

@@ -1,5 +1,6 @@
 """Gauges of trials: what is set, under which names and tags."""
 
+import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -46,6 +47,31 @@ def test_figures_of_a_trial(fake: dict[str, FakeGauge], make_space: Any) -> None
         "msk_ray_score": [7.5],
     }
     assert set(fake) == set(gauges.FIGURES)
+
+
+def test_a_value_is_set_again_and_again_until_it_is_dropped(
+    fake: dict[str, FakeGauge], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ray serves a value for 20 s after it was set and no longer."""
+    monkeypatch.setattr(gauges, "REPEAT_S", 0.01)
+    gauge: Any = FakeGauge("g", "", ("trial",))
+    kept = gauges.Kept()
+    kept.set(gauge, 1, {"trial": "a"})
+    kept.set(gauge, 2, {"trial": "a"})
+    kept.set(gauge, 3, {"trial": "b"})
+    for _ in range(2):
+        gauge.values.clear()
+        while gauge.values != {("a",): 2, ("b",): 3}:
+            time.sleep(0.01)
+    kept.drop(gauge, {"trial": "b"})
+    assert gauge.values["b",] == 0
+    gauge.values.clear()
+    while gauge.values != {("a",): 2}:
+        time.sleep(0.01)
+    kept.close()
+    gauge.values.clear()
+    time.sleep(0.05)
+    assert gauge.values == {}
 
 
 def test_the_state_of_a_trial_is_the_only_one_at_1(fake: dict[str, FakeGauge], make_space: Any, tmp_path: Path) -> None:

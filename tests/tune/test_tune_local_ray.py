@@ -13,7 +13,7 @@ from msk_ray.errors import StorageError
 from msk_ray.tune import local_ray
 
 SESSION = """
-import ipaddress, json, os, sys
+import ipaddress, json, os, shutil, sys
 import ray, psutil
 from msk_ray.tune.runner import ray_session
 
@@ -22,8 +22,13 @@ def token_file():
     path = os.path.expanduser("~/.ray/auth_token")
     return os.stat(path).st_mode & 0o777
 
+@ray.remote
+def profiler():
+    return shutil.which("py-spy")
+
 with ray_session(None, trials=False):
     mode = ray.get(token_file.remote())
+    profiler_found = ray.get(profiler.remote()) is not None
     open_to_others = []
     listening = 0
     me = psutil.Process()
@@ -35,7 +40,17 @@ with ray_session(None, trials=False):
             address = ipaddress.ip_address(socket.laddr.ip)
             if not (getattr(address, "ipv4_mapped", None) or address).is_loopback:
                 open_to_others.append([" ".join(process.cmdline())[:80], socket.laddr.ip, socket.laddr.port])
-    print("FACTS", json.dumps({"mode": mode, "listening": listening, "open": open_to_others}))
+    facts = {"mode": mode, "listening": listening, "open": open_to_others, "profiler": profiler_found}
+    print("FACTS", json.dumps(facts))
+"""
+
+WITHOUT_DASHBOARD = """
+import sys
+sys.modules["aiohttp_cors"] = None  # as if ray[default] were not installed
+from msk_ray.tune.runner import ray_session
+
+with ray_session(None, trials=False):
+    pass
 """
 
 
@@ -52,7 +67,10 @@ def permissions(path: Path) -> int:
     return path.stat().st_mode & 0o777
 
 
-def test_a_session_is_closed_to_the_network_and_its_token_to_other_users(home: Path) -> None:
+def test_a_session_is_closed_to_the_network_and_its_token_to_other_users(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", os.defpath)  # as in an environment that was not activated
     result = subprocess.run([sys.executable, "-c", SESSION], capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
     first, *_, last = result.stdout.strip().splitlines()
@@ -60,11 +78,18 @@ def test_a_session_is_closed_to_the_network_and_its_token_to_other_users(home: P
     assert facts["listening"] >= 8  # gcs_server, raylet, dashboard, agents, workers
     assert facts["open"] == []
     assert facts["mode"] == 0o600
+    assert facts["profiler"]
     # The terminal says how to get in, without the token itself.
     token = home / ".ray" / "auth_token"
     assert first.startswith("Ray dashboard: http://127.0.0.1:")
     assert first.endswith(f" (asks once for the token: cat {token})")
     assert token.read_text() not in result.stdout + result.stderr
+
+
+def test_one_line_says_that_there_is_no_dashboard(home: Path) -> None:
+    result = subprocess.run([sys.executable, "-c", WITHOUT_DASHBOARD], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout == "no Ray dashboard: pip install 'ray[default]' to have one\n"
 
 
 def test_a_token_is_made_once_by_all_who_start_together(home: Path) -> None:

@@ -238,6 +238,7 @@ def test_a_driver_killed_after_the_decision_goes_on_with_half_the_worlds(make_sp
     path = tmp_path / "runs" / "killed"
     (trial,) = resolve_trials(space)
     folder = experiments.create(path, space, [trial], {}).trial_folder(trial.id)
+    folder.mkdir(parents=True)
     with pytest.raises(StartAnew):  # as far as a driver came that was killed there
         run_trial(trial, folder, "cpu", StopSpec(), StubTrainer, Hooks(), may_halve=True)
     # Whoever goes on may not halve, and need not: it has been decided.
