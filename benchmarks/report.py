@@ -1,4 +1,4 @@
-"""How long the report of a large experiment takes, and how large its page is: generated trials of realistic rows."""
+"""How long status and report of a large experiment take, and how large its page is: generated trials."""
 
 import argparse
 import json
@@ -86,6 +86,14 @@ def row(epoch: int, rng: random.Random) -> dict[str, Any]:
     return found
 
 
+def timed(module: str, *arguments: str) -> tuple[float, float]:
+    """Seconds that a command takes, and of them on a CPU."""
+    before, started = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
+    subprocess.run([sys.executable, "-m", module, *arguments], check=True, stdout=subprocess.DEVNULL)
+    wall, after = time.monotonic() - started, resource.getrusage(resource.RUSAGE_CHILDREN)
+    return wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
 def main() -> None:
     """Run the benchmark the command line asks for."""
     p = argparse.ArgumentParser(description=__doc__)
@@ -99,18 +107,27 @@ def main() -> None:
             experiment = generate(Path(scratch), trials, args.epochs)
             read = sum(path.stat().st_size for path in experiment.path.rglob("metrics.jsonl"))
             load = os.getloadavg()[0]
-            before = resource.getrusage(resource.RUSAGE_CHILDREN)
-            started = time.monotonic()
-            command = [sys.executable, "-m", "msk_ray.report", str(experiment.path), "--best", "never"]
-            subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-            wall = time.monotonic() - started
-            after = resource.getrusage(resource.RUSAGE_CHILDREN)
-            cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+            status = [f"{seconds:.1f}" for seconds in timed("msk_ray.status", str(experiment.path))]
+            wall, cpu = timed("msk_ray.report", str(experiment.path), "--best", "never")
+            memory = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
             page = experiment.path / "report" / "index.html"
-            figures = [f"{read / 1e6:.0f}", f"{wall:.1f}", f"{cpu:.1f}", f"{after.ru_maxrss / 1024:.0f}"]
-            rows.append([f"{trials}", f"{args.epochs}", *figures, f"{page.stat().st_size / 1e6:.2f}", f"{load:.1f}"])
+            figures = [f"{read / 1e6:.0f}", f"{wall:.1f}", f"{cpu:.1f}", f"{memory / 1024:.0f}"]
+            rows.append(
+                [f"{trials}", f"{args.epochs}", *status, *figures, f"{page.stat().st_size / 1e6:.2f}", f"{load:.1f}"]
+            )
             print(rows[-1], flush=True)
-    header = ["trials", "rows each", "metrics, MB", "wall, s", "CPU, s", "peak memory, MB", "page, MB", "load before"]
+    header = [
+        "trials",
+        "rows each",
+        "status, s",
+        "its CPU, s",
+        "metrics, MB",
+        "report, s",
+        "its CPU, s",
+        "peak memory, MB",
+        "page, MB",
+        "load before",
+    ]
     publish("report", "Report of a generated experiment", "cpu", markdown_table(header, rows), args.results)
 
 

@@ -77,7 +77,7 @@ def _row(row: dict[str, Any]) -> dict[str, Any]:
     epoch = field(row, "epoch", int)
     if not 0 <= epoch < EPOCH_LIMIT:
         raise ValueError(f"epoch {epoch:.3g} cannot be" if abs(epoch) < 10**300 else "an epoch that cannot be")
-    for name, value in row.items():
+    for name, value in row.items() if "nonfinite" in row or not _all_finite(row) else ():
         if name == "nonfinite":
             if not isinstance(value, list) or not texts(value):
                 raise ValueError("nonfinite is no list of names")
@@ -89,8 +89,18 @@ def _row(row: dict[str, Any]) -> dict[str, Any]:
     return row
 
 
+def _all_finite(row: Mapping[str, Any]) -> bool:
+    """Whether all values are finite numbers, found out fast: most rows are such. False also where it is not certain."""
+    try:
+        return set(map(type, row.values())) <= {int, float} and math.isfinite(sum(row.values()))
+    except OverflowError:
+        return False
+
+
 def with_nan(row: Mapping[str, Any]) -> dict[str, float]:
     """A row of metrics whose missing values are NaN."""
+    if "nonfinite" not in row and None not in row.values():
+        return dict(row)
     return {key: math.nan if value is None else value for key, value in row.items() if key != "nonfinite"}
 
 
