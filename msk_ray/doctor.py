@@ -207,13 +207,14 @@ def check_gradient(device: str | None) -> Finding:
     """Gradients of one step of CartPole by the analytic backward pass, against float64 differences of C MuJoCo."""
     import torch
 
-    from msk_ray.config import CartPoleEnvConfig, PhysicsConfig
+    from msk_ray.config import PhysicsConfig
     from msk_ray.envs import env_class
+    from msk_ray.envs.cartpole.config import CartPoleSettings
     from msk_ray.gradcheck import check_gradients
     from msk_ray.simulation import TapePerSubstep
 
     where = device or ("cuda:0" if torch.cuda.is_available() else "cpu")
-    env = CartPoleEnvConfig(name="cartpole")
+    env = CartPoleSettings(name="cartpole")
     started = time.monotonic()
     try:
         model = env_class(env).build_model(env, PhysicsConfig())

@@ -15,7 +15,8 @@ import mujoco
 import numpy as np
 from matplotlib.patches import Rectangle
 
-from msk_ray.config import MyoLeg26EnvConfig, PhysicsConfig
+from msk_ray.config import PhysicsConfig
+from msk_ray.envs.myoleg26.config import MyoLeg26Settings
 from msk_ray.envs.myoleg26.model import WINDOW, build_myoleg26
 from msk_ray.envs.myoleg26.moment_arms import PUBLISHED, moment_arms
 from msk_ray.envs.myoleg26.tables import MUSCLES
@@ -40,7 +41,7 @@ def fibre_spans(model: mujoco.MjModel) -> dict[str, tuple[float, float, float]]:
 
 def main(path: Path) -> None:
     """Write the picture."""
-    model = build_myoleg26(MyoLeg26EnvConfig(name="myoleg26"), PhysicsConfig())
+    model = build_myoleg26(MyoLeg26Settings(name="myoleg26"), PhysicsConfig())
     figure, panels = plt.subplots(1, len(AXES) + 1, figsize=(20, 4.2), constrained_layout=True)
     for panel, joint in zip(panels, AXES, strict=False):
         low, high = model.joint(f"{joint}_r").range

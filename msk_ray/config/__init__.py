@@ -1,25 +1,17 @@
 """What a trial is: one frozen, checked tree of settings, read from YAML."""
 
-from msk_ray.config.environments import AntEnvConfig, AntReward, CartPoleEnvConfig, CartPoleReward
-from msk_ray.config.legs import (
-    AssistConfig,
-    LegEnvSettings,
-    LegReward,
-    MyoLeg26EnvConfig,
-    MyoLegEnvConfig,
-    TerrainConfig,
-)
+from msk_ray.config.environments import ENVIRONMENTS, settings_class
 from msk_ray.config.load import describe_fault, load_config, parse_config, parse_recorded, read_config
 from msk_ray.config.overlay import SET_HELP, combine, merge, overlay, parse_override, parse_overrides
 from msk_ray.config.physics import FdConfig, PhysicsConfig
 from msk_ray.config.recorded import current_key, current_values, env_name, first_spelling
+from msk_ray.config.resolve import Registry, resolve, resolve_class
 from msk_ray.config.schema import (
     AdaptiveHorizon,
     Config,
     ContactCurriculum,
     ContactStart,
     EntropyConfig,
-    EnvConfig,
     EvaluationConfig,
     HorizonSchedule,
     NetworkConfig,
@@ -30,31 +22,22 @@ from msk_ray.config.sections import EnvSettings, Reward
 from msk_ray.config.yaml_text import dump_yaml, parse_yaml, read_yaml
 
 __all__ = [
+    "ENVIRONMENTS",
     "SET_HELP",
     "AdaptiveHorizon",
-    "AntEnvConfig",
-    "AntReward",
-    "AssistConfig",
-    "CartPoleEnvConfig",
-    "CartPoleReward",
     "Config",
     "ContactCurriculum",
     "ContactStart",
     "EntropyConfig",
-    "EnvConfig",
     "EnvSettings",
     "EvaluationConfig",
     "FdConfig",
     "HorizonSchedule",
-    "LegEnvSettings",
-    "LegReward",
-    "MyoLeg26EnvConfig",
-    "MyoLegEnvConfig",
     "NetworkConfig",
     "PhysicsConfig",
+    "Registry",
     "Reward",
     "ShacConfig",
-    "TerrainConfig",
     "TrialConfig",
     "combine",
     "current_key",
@@ -73,4 +56,7 @@ __all__ = [
     "parse_yaml",
     "read_config",
     "read_yaml",
+    "resolve",
+    "resolve_class",
+    "settings_class",
 ]

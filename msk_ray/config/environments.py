@@ -1,62 +1,72 @@
-"""The settings of CartPole and the ant."""
+"""The environments that `env.name` can take, and the settings that each declares."""
 
-from typing import Literal
+import difflib
+from typing import Any
 
-from msk_ray.config.physics import CONTACTS, JOINTS, LIMITS, SOLVING, STEPPING
-from msk_ray.config.sections import Count, EnvSettings, NonNegative, Reward
+from msk_ray.config.physics import PhysicsConfig
+from msk_ray.config.resolve import Registry, resolve, resolve_class
+from msk_ray.config.sections import EnvSettings
+from msk_ray.errors import ConfigError
 
-
-class CartPoleReward(Reward):
-    """Penalties per env step."""
-
-    pole_angle_penalty: NonNegative = 1.0
-    """Weight of angle² [1/rad²], with the angle wrapped to ±π."""
-    pole_velocity_penalty: NonNegative = 0.1
-    """Weight of angular velocity² [s²/rad²]."""
-    cart_position_penalty: NonNegative = 0.05
-    """Weight of position² [1/m²]."""
-    cart_velocity_penalty: NonNegative = 0.1
-    """Weight of velocity² [s²/m²]."""
-    cart_action_penalty: NonNegative = 0.0
-    """Weight of action²."""
-
-
-class CartPoleEnvConfig(EnvSettings):
-    """Swing up a pole on a cart and keep it there. Angle 0 is upright."""
-
-    reads_physics = STEPPING | JOINTS | {"gear"}
-
-    name: Literal["cartpole"]
-    episode_length: Count = 240
-    reward: CartPoleReward = CartPoleReward()
-
-
-class AntReward(Reward):
-    """Weights per env step."""
-
-    forward_vel: float = 1.0
-    """Weight of the torso's velocity along +x [s/m]."""
-    heading: float = 1.0
-    """Weight of the cosine between the torso's forward axis and +x."""
-    up: float = 0.1
-    """Weight of the cosine between the torso's up axis and +z."""
-    height: float = 1.0
-    """Weight of the torso's height above `env.termination_height` [1/m]."""
-    action_penalty: NonNegative = 0.0
-    """Weight of the summed squared action."""
+ENVIRONMENTS = Registry(
+    "env.name",
+    "msk_ray.envs",
+    {
+        "cartpole": "msk_ray.envs.cartpole.env:CartPole",
+        "ant": "msk_ray.envs.ant.env:Ant",
+        "myoleg26": "msk_ray.envs.myoleg26.env:MyoLeg26",
+        "myoleg": "msk_ray.envs.myoleg.env:MyoLeg",
+    },
+)
+"""Classes of environments."""
+SETTINGS = Registry(
+    "env.name",
+    "msk_ray.env_settings",
+    {
+        "cartpole": "msk_ray.envs.cartpole.config:CartPoleSettings",
+        "ant": "msk_ray.envs.ant.config:AntSettings",
+        "myoleg26": "msk_ray.envs.myoleg26.config:MyoLeg26Settings",
+        "myoleg": "msk_ray.envs.myoleg.config:MyoLegSettings",
+    },
+)
+"""Settings that can be imported without their environment, which loads torch. A name that is only in `ENVIRONMENTS` has
+those of its class."""
 
 
-class AntEnvConfig(EnvSettings):
-    """A four-legged walker whose reward asks for forward velocity."""
+def settings_class(name: Any) -> type[EnvSettings]:
+    """The settings that the environment of this name, or at this import path, declares.
 
-    variants = ("matched", "matched_hard_friction", "published")
-    pyramidal_variants = frozenset(("published",))
-    reads_physics = STEPPING | SOLVING | CONTACTS | LIMITS | JOINTS | {"variant", "gear"}
+    Raises:
+        ConfigError: there is no such environment, or its declaration lacks something.
+    """
+    path = ENVIRONMENTS.path(name)
+    light = SETTINGS.find(name)
+    if light is not None:
+        settings = resolve_class(light, ENVIRONMENTS.key, EnvSettings)
+    else:
+        declared = getattr(resolve(path, ENVIRONMENTS.key), "Settings", None)
+        if not (isinstance(declared, type) and issubclass(declared, EnvSettings)):
+            raise ConfigError(f"env.name: {path} declares no settings: write `class Settings(EnvSettings)` in it")
+        settings = declared
+    _check_declared(settings, path)
+    return settings
 
-    name: Literal["ant"]
-    episode_length: Count = 1000
-    reward: AntReward = AntReward()
-    termination_height: float = 0.27
-    """Torso height below which an episode ends [m]."""
-    early_termination: bool = True
-    """End an episode on falling below `termination_height`."""
+
+def _check_declared(settings: type[EnvSettings], path: str) -> None:
+    reads = getattr(settings, "reads_physics", None)
+    if reads is None:
+        raise ConfigError(
+            f"env.name: the settings of {path} do not declare which physics settings they read: write "
+            "`reads_physics = STEPPING | SOLVING` (msk_ray.config.physics)"
+        )
+    known = PhysicsConfig.names()
+    for name in sorted(set(reads) - set(known)):
+        near = difflib.get_close_matches(name, known, n=1)
+        hint = f"did you mean {near[0]!r}?" if near else f"write some of {', '.join(known)}"
+        raise ConfigError(f"env.name: the settings of {path} read physics.{name}, which does not exist; {hint}")
+    reward = settings.model_fields["reward"].annotation
+    needed = [name for name, field in getattr(reward, "model_fields", {}).items() if field.is_required()]
+    if needed:
+        raise ConfigError(
+            f"env.name: reward.{needed[0]} of {path} has no default: policies are scored under the reward's defaults"
+        )

@@ -7,9 +7,10 @@ from typing import Annotated, Any, get_args, get_origin
 
 from pydantic import BaseModel, Tag, ValidationError
 
+from msk_ray.config.environments import settings_class
 from msk_ray.config.overlay import merge, overlay, parse_overrides
 from msk_ray.config.recorded import current_settings, env_name
-from msk_ray.config.schema import ENVIRONMENTS, RECORDED, Config
+from msk_ray.config.schema import RECORDED, Config
 from msk_ray.config.unread import unread_settings
 from msk_ray.config.yaml_text import read_yaml
 from msk_ray.errors import ConfigError, brief, shortened
@@ -24,7 +25,7 @@ def parse_config(data: Mapping[str, Any], source: str = "config") -> Config:
     try:
         return Config.model_validate(data)
     except ValidationError as error:
-        raise ConfigError(f"{source}: {describe_fault(error)}") from None
+        raise ConfigError(f"{source}: {describe_fault(error, named=_named(data))}") from None
 
 
 def parse_recorded(data: Mapping[str, Any], source: str) -> Config:
@@ -41,7 +42,7 @@ def parse_recorded(data: Mapping[str, Any], source: str) -> Config:
         unread = {key: default for key, _, default in unread_settings(config)}
         return Config.model_validate(overlay(config.as_dict(), unread)) if unread else config
     except ValidationError as error:
-        raise ConfigError(f"{source}: {describe_fault(error)}") from None
+        raise ConfigError(f"{source}: {describe_fault(error, named=_named(settings))}") from None
 
 
 def read_config(path: Path) -> dict[str, Any]:
@@ -73,8 +74,24 @@ def load_config(path: Path, overrides: Iterable[str] = ()) -> Config:
     return parse_config(overlay(read_config(path), parse_overrides(overrides)), str(path))
 
 
-def describe_fault(error: ValidationError, root: type[BaseModel] = Config) -> str:
-    """The first fault found while validating a `root`, and how many more there are, on one line."""
+def _named(data: Any) -> dict[str, type[BaseModel]]:
+    """Sections whose settings are declared by what the section names, as far as it is found."""
+    try:
+        return {"env": settings_class(env_name(data))} if isinstance(data, Mapping) else {}
+    except ConfigError:
+        return {}  # the fault described is this one
+
+
+def describe_fault(
+    error: ValidationError, root: type[BaseModel] = Config, *, named: Mapping[str, type[BaseModel]] | None = None
+) -> str:
+    """The first fault found while validating a `root`, and how many more there are, on one line.
+
+    Args:
+        error: what validating raised.
+        root: the class validated.
+        named: of sections of `root` that are open, the class that was taken.
+    """
     faults = error.errors()
     # A misspelt key is often missing under its right name too; the misspelling is what to mend.
     first = min(faults, key=lambda fault: fault["type"] != "extra_forbidden")
@@ -82,9 +99,10 @@ def describe_fault(error: ValidationError, root: type[BaseModel] = Config) -> st
     location = [shortened(str(part)) for part in first["loc"] if part not in _TAGS]
     where = ".".join(location)
     if first["type"] == "extra_forbidden":
-        known = _keys_at(root, location[:-1], first["loc"])
+        section = _model_at(root, location[:-1], first["loc"], named or {})
+        known = list(section.model_fields)
         near = difflib.get_close_matches(location[-1], known, n=1)
-        below = _section_with(root, location, first["loc"])
+        below = _subsection_with(section, location[-1], (named or {}) if section is root else {})
         if below is not None:
             hint = f"write {'.'.join([*location[:-1], below, location[-1]])}"
         else:
@@ -94,8 +112,6 @@ def describe_fault(error: ValidationError, root: type[BaseModel] = Config) -> st
         text = str(first["ctx"]["error"]) if "ctx" in first else first["msg"]
     elif first["type"] == "missing":
         text = f"{where}: missing"
-    elif first["type"].startswith("union_tag"):
-        text = f"{where or 'env'}: {first['msg']}; write env.name: {' or '.join(ENVIRONMENTS)}"
     else:
         text = f"{where}: {first['msg']}, not {brief(first['input'])}"
     more = len(faults) - 1
@@ -106,7 +122,7 @@ def describe_fault(error: ValidationError, root: type[BaseModel] = Config) -> st
 _MAX_MESSAGE = 400
 
 
-_TAGS = (*ENVIRONMENTS, "constant", "schedule", "adaptive")
+_TAGS = ("constant", "schedule", "adaptive")
 """Tags of discriminated unions, which pydantic puts into a fault's location."""
 
 
@@ -114,33 +130,28 @@ def _is_model(kind: Any) -> bool:
     return isinstance(kind, type) and issubclass(kind, BaseModel)
 
 
-def _own_name(model: type[BaseModel]) -> tuple[Any, ...]:
-    field = model.model_fields.get("name")
-    return get_args(field.annotation) if field is not None else ()
-
-
-def _keys_at(root: type[BaseModel], sections: list[str], location: tuple[Any, ...]) -> list[str]:
-    """Known keys of the section of `root` a fault lies in."""
-    return list(_model_at(root, sections, location).model_fields)
-
-
-def _section_with(root: type[BaseModel], location: list[str], tagged: tuple[Any, ...]) -> str | None:
-    """The section beside a misplaced key that has a setting of its name."""
-    for name, field in _model_at(root, location[:-1], tagged).model_fields.items():
-        if _is_model(field.annotation) and location[-1] in field.annotation.model_fields:  # type: ignore[union-attr]
+def _subsection_with(section: type[BaseModel], key: str, named: Mapping[str, type[BaseModel]]) -> str | None:
+    """The section within `section` that has a setting of this name."""
+    for name, field in section.model_fields.items():
+        kind = named.get(name, field.annotation)
+        if _is_model(kind) and key in kind.model_fields:  # type: ignore[union-attr]
             return name
     return None
 
 
-def _model_at(root: type[BaseModel], sections: list[str], location: tuple[Any, ...]) -> type[BaseModel]:
+def _model_at(
+    root: type[BaseModel], sections: list[str], location: tuple[Any, ...], named: Mapping[str, type[BaseModel]]
+) -> type[BaseModel]:
     """The section of `root` a fault lies in."""
     model: Any = root
-    for section in sections:
+    for depth, section in enumerate(sections):
+        if depth == 0 and section in named:
+            model = named[section]
+            continue
         annotation = model.model_fields[section].annotation
-        # A member of a union is Annotated with its tag, or names itself in its field `name`.
+        # A member of a union is Annotated with its tag.
         options = [get_args(a) if get_origin(a) is Annotated else (a,) for a in get_args(annotation) or (annotation,)]
         models = [(o[0], [m.tag for m in o[1:] if isinstance(m, Tag)]) for o in options if _is_model(o[0])]
-        named = [(m, [*tags, *_own_name(m)]) for m, tags in models]
-        model = next((m for m, tags in named if any(tag in location for tag in tags)), named[0][0])
+        model = next((m for m, tags in models if any(tag in location for tag in tags)), models[0][0])
     found: type[BaseModel] = model
     return found

@@ -102,6 +102,11 @@ class PhysicsConfig(Section):
             raise ValueError("solreffriction acts with the elliptic cone only: write cone: elliptic")
         return self
 
+    @classmethod
+    def names(cls) -> list[str]:
+        """Every setting of the section, dotted within it."""
+        return [*(name for name in cls.model_fields if name != "fd"), *(f"fd.{name}" for name in FdConfig.model_fields)]
+
     def resolve_substeps(self, control_timestep: float) -> int:
         """Physics steps an env step of `control_timestep` [s].
 

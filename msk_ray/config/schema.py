@@ -4,28 +4,36 @@ Sources of the defaults: SHAC (Xu et al. 2022, "Accelerated Policy Learning with
 arXiv:2204.07137) and the hyperparameters published with it.
 """
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import Discriminator, Field, PositiveFloat, Tag, ValidationInfo, model_validator
+from pydantic import (
+    BeforeValidator,
+    Discriminator,
+    Field,
+    PositiveFloat,
+    SerializeAsAny,
+    Tag,
+    ValidationInfo,
+    model_validator,
+)
 
-from msk_ray.config.environments import AntEnvConfig, CartPoleEnvConfig
-from msk_ray.config.legs import MyoLeg26EnvConfig, MyoLegEnvConfig
+from msk_ray.config.environments import settings_class
 from msk_ray.config.physics import PhysicsConfig, Vec5
 from msk_ray.config.sections import Count, EnvSettings, Fraction, Section, Text, Whole
 from msk_ray.config.unread import unread_settings
-from msk_ray.errors import brief
+from msk_ray.errors import ConfigError, brief
 
-EnvConfig = Annotated[
-    CartPoleEnvConfig | AntEnvConfig | MyoLeg26EnvConfig | MyoLegEnvConfig, Field(discriminator="name")
-]
 
-ENVIRONMENTS: dict[str, type[EnvSettings]] = {
-    "cartpole": CartPoleEnvConfig,
-    "ant": AntEnvConfig,
-    "myoleg26": MyoLeg26EnvConfig,
-    "myoleg": MyoLegEnvConfig,
-}
-"""The settings of each environment by its name."""
+def _declared_settings(value: Any, info: ValidationInfo) -> Any:
+    """The `env` section as the settings that the environment it names declares."""
+    if isinstance(value, EnvSettings) or not isinstance(value, Mapping):
+        return value
+    try:
+        settings = settings_class(value.get("name"))
+    except ConfigError as error:
+        raise ValueError(str(error)) from error
+    return settings.model_validate(value, context=info.context)
 
 
 class HorizonSchedule(Section):
@@ -232,7 +240,7 @@ RECORDED = "recorded"
 class Config(Section):
     """One trial."""
 
-    env: EnvConfig
+    env: Annotated[SerializeAsAny[EnvSettings], BeforeValidator(_declared_settings)]
     physics: PhysicsConfig = PhysicsConfig()
     curriculum: ContactCurriculum | None = None
     """Softer contacts to begin with; null trains in `physics` from the start."""

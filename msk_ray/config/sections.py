@@ -73,6 +73,8 @@ class EnvSettings(Section):
     """Settings of the physics section that do something here, `fd.eps_act` for one within a section; others are
     refused."""
 
+    name: Text
+    """Of the environment: a short name, or package.module:Class."""
     nworld: Count = 64
     """Worlds W simulated at once."""
     episode_length: Count

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from msk_ray.config.physics import FdConfig, PhysicsConfig
+from msk_ray.config.physics import PhysicsConfig
 
 if TYPE_CHECKING:
     from msk_ray.config.schema import Config
@@ -28,15 +28,13 @@ def unread_settings(config: Config) -> Iterator[tuple[str, str, Any]]:
 
 def _unread(config: Config) -> dict[str, str]:
     env, physics, shac = config.env, config.physics, config.shac
-    fields = [name for name in PhysicsConfig.model_fields if name != "fd"]
-    fields += [f"fd.{name}" for name in FdConfig.model_fields]
     unread = {f"physics.{name}": _while("physics.backward", physics.backward) for name in _unread_by_backward(config)}
     if (physics.cone or ("pyramidal" if physics.variant in env.pyramidal_variants else "elliptic")) == "pyramidal":
         why = "nothing reads it while friction cones are pyramids; write physics.cone: elliptic, or"
         unread["physics.solreffriction"] = why
         if config.curriculum is not None:
             unread["curriculum.start.solreffriction"] = why
-    alien = [name for name in fields if name not in env.reads_physics]
+    alien = [name for name in PhysicsConfig.names() if name not in env.reads_physics]
     unread |= {f"physics.{name}": f"env {env.name} does not read it;" for name in alien}
     unread |= {f"env.{name}": f"nothing reads it while {why};" for name, why in env.unread().items()}
     if shac.lr_schedule == "constant":

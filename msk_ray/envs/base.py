@@ -14,7 +14,7 @@ from torch import Tensor
 from msk_ray.config import EnvSettings, PhysicsConfig
 from msk_ray.simulation import Backward, Simulation, StepState
 
-Settings = TypeVar("Settings", bound=EnvSettings)
+SettingsT = TypeVar("SettingsT", bound=EnvSettings)
 
 # A world whose state leaves this bound has diverged: no model here reaches it while the solver works.
 _ABSURD = 1e6
@@ -52,7 +52,7 @@ class Transition(NamedTuple):
     """The physics left all bounds, shape (W,) bool; counted in `terminated`."""
 
 
-class Env(ABC, Generic[Settings]):
+class Env(ABC, Generic[SettingsT]):
     """Batched environment over a `Simulation`.
 
     Attributes:
@@ -65,12 +65,12 @@ class Env(ABC, Generic[Settings]):
     obs_size: int
     reward_names: ClassVar[tuple[str, ...]]
     """Names of the T parts of the reward."""
-    settings: ClassVar[type[EnvSettings]]
+    Settings: ClassVar[type[EnvSettings]]
     """Its section of the configuration, which also says what physics has a name here, and what physics is read."""
 
     def __init__(
         self,
-        config: Settings,
+        config: SettingsT,
         physics: PhysicsConfig,
         nworld: int,
         device: str,
@@ -97,20 +97,20 @@ class Env(ABC, Generic[Settings]):
         self.prepare()
         self.state = self.reset_state()
 
-    @staticmethod
+    @classmethod
     @abstractmethod
-    def build_model(config: Settings, physics: PhysicsConfig) -> mujoco.MjModel:
+    def build_model(cls, config: SettingsT, physics: PhysicsConfig) -> mujoco.MjModel:
         """Compile the model these settings describe."""
 
     @classmethod
-    def reference_settings(cls, config: Settings) -> Settings:
+    def reference_settings(cls, config: SettingsT) -> SettingsT:
         """`config` with the reward that policies are scored under, the section's defaults; all else stays."""
         return config.model_copy(update={"reward": type(config.reward)()})
 
     @classmethod
     def reference_physics(cls, physics: PhysicsConfig, variant: str | None) -> PhysicsConfig:
         """The physics that policies are scored under: a named variant as it stands, or `physics` if there is none."""
-        variants = cls.settings.variants
+        variants = cls.Settings.variants
         if not variants:
             return physics
         return PhysicsConfig(variant=variant or variants[0], nconmax=physics.nconmax, njmax=physics.njmax)

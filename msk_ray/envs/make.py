@@ -2,28 +2,36 @@
 
 from typing import Any
 
-from msk_ray.config import EnvConfig, EnvSettings, PhysicsConfig
-from msk_ray.envs.ant.env import Ant
+from msk_ray.config import ENVIRONMENTS, EnvSettings, PhysicsConfig, resolve_class
 from msk_ray.envs.base import Env
-from msk_ray.envs.cartpole.env import CartPole
-from msk_ray.envs.myoleg.env import MyoLeg
-from msk_ray.envs.myoleg26.env import MyoLeg26
+from msk_ray.errors import ConfigError
 from msk_ray.simulation.modes import configured_backward
 
-_ENVS: dict[type[EnvSettings], type[Env[Any]]] = {env.settings: env for env in (CartPole, Ant, MyoLeg26, MyoLeg)}
 
+def env_class(config: EnvSettings) -> type[Env[Any]]:
+    """The environment that these settings name.
 
-def env_class(config: EnvConfig) -> type[Env[Any]]:
-    """The environment that settings of this type describe."""
-    return _ENVS[type(config)]
+    Raises:
+        ConfigError: there is none of that name, or it has settings of another type.
+    """
+    path = ENVIRONMENTS.path(config.name)
+    found: type[Env[Any]] = resolve_class(path, ENVIRONMENTS.key, Env)  # type: ignore[type-abstract]
+    lacking = sorted(found.__abstractmethods__)
+    if lacking:
+        raise ConfigError(f"env.name: {path} lacks {', '.join(lacking)}: write them as msk_ray.envs.Env describes")
+    if not isinstance(config, found.Settings):
+        wanted = f"{found.Settings.__module__}.{found.Settings.__qualname__}"
+        raise ConfigError(f"env.name: {path} takes settings of type {wanted}, not {type(config).__qualname__}")
+    return found
 
 
 def make_env(
-    config: EnvConfig, physics: PhysicsConfig, nworld: int, device: str, seed: int, *, differentiable: bool = True
+    config: EnvSettings, physics: PhysicsConfig, nworld: int, device: str, seed: int, *, differentiable: bool = True
 ) -> Env[Any]:
     """Build the environment of a config section.
 
     Raises:
+        ConfigError: as `env_class`.
         UnsupportedModelError: the model cannot be stepped, or not differentiated by `physics.backward`.
         DeviceError: no such device.
     """

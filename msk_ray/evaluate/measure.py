@@ -46,7 +46,7 @@ def named_physics(config: Config, name: str) -> tuple[str, PhysicsConfig]:
         ConfigError: its environment has no such physics.
     """
     env_type = env_class(config.env)
-    variants = env_type.settings.variants
+    variants = config.env.variants
     if name == REFERENCE:
         variant = config.evaluation.variant or (variants[0] if variants else OWN)
         return variant, env_type.reference_physics(config.physics, config.evaluation.variant)

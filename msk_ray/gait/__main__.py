@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from msk_ray.cli import Parser, run
-from msk_ray.errors import ConfigError
 from msk_ray.evaluate.__main__ import positive
 from msk_ray.evaluate.targets import best_checkpoint, find_target, trial_folder_of
 from msk_ray.files import write_json
@@ -41,9 +40,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser().parse_args(argv)
     path = best_checkpoint(find_target(args.target, args.storage))
 
-    from msk_ray.envs.legs.env import LegEnv
     from msk_ray.evaluate.measure import Bench, Request, default_device
-    from msk_ray.gait.body import analyse
+    from msk_ray.gait.body import analyse, check_legs
     from msk_ray.gait.measure import measure
     from msk_ray.gait.picture import draw
     from msk_ray.training import load_policy
@@ -52,10 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     policy = load_policy(path)
     bench = Bench(args.device or default_device())
     request = Request(worlds=args.worlds, steps=args.steps)
-    if not isinstance(bench.evaluator(policy.config, request)[0].env, LegEnv):
-        raise ConfigError(
-            f"{path}: env {policy.config.env.name} has no legs of muscles; gait measures myoleg26, myoleg"
-        )
+    check_legs(bench.evaluator(policy.config, request)[0].env.model)
     recording = record(bench, policy, request)
     episodes = []
     for world in range(recording.count):

@@ -45,12 +45,10 @@ def analyse(model: mujoco.MjModel, qpos: Array, qvel: Array, act: Array, timeste
     Raises:
         ConfigError: the model has no legs of the names that the leg environments use.
     """
-    try:
-        axes = world_axes(model)
-        angles = {name: _angles(model, joint, qpos) for name, joint in _JOINTS.items()}
-        owners = {side: _carried_by(model, model.body(f"talus_{side}").id) for side in SIDES}
-    except KeyError as error:
-        raise ConfigError(f"gait needs a model of two legs (myoleg26, myoleg): {error.args[0]}") from None
+    check_legs(model)
+    axes = world_axes(model)
+    angles = {name: _angles(model, joint, qpos) for name, joint in _JOINTS.items()}
+    owners = {side: _carried_by(model, model.body(f"talus_{side}").id) for side in SIDES}
     weight = float(np.linalg.norm(model.opt.gravity) * model.body_subtreemass[0])
     muscles = np.flatnonzero(model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_MUSCLE))
     data = mujoco.MjData(model)
@@ -72,6 +70,20 @@ def analyse(model: mujoco.MjModel, qpos: Array, qvel: Array, act: Array, timeste
     curves["vertical_force"] = {side: forces[side][:, 2] for side in SIDES}
     curves["forward_force"] = {side: forces[side][:, 0] for side in SIDES}
     return Episode(timestep, weight, forward, feet, curves, act, power)
+
+
+def check_legs(model: mujoco.MjModel) -> None:
+    """Raise ConfigError unless a model has the bodies, joints and standing keyframe that gait is measured by."""
+    try:
+        model.key("stand")
+        for side in SIDES:
+            for body in ("calcn", "toes", "talus"):
+                model.body(f"{body}_{side}")
+            for joint in _JOINTS.values():
+                model.joint(f"{joint}_{side}")
+        model.body("pelvis")
+    except KeyError as error:
+        raise ConfigError(f"gait needs a model of two legs, as myoleg26 has: {error.args[0]}") from None
 
 
 def ground_reaction(model: mujoco.MjModel, data: mujoco.MjData, bodies: frozenset[int]) -> Array:

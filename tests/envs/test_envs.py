@@ -6,22 +6,24 @@ import mujoco
 import pytest
 import torch
 
-from msk_ray.config import AntEnvConfig, AntReward, CartPoleEnvConfig, PhysicsConfig
+from msk_ray.config import PhysicsConfig
 from msk_ray.envs import make_env
+from msk_ray.envs.ant.config import AntReward, AntSettings
 from msk_ray.envs.ant.env import Ant
 from msk_ray.envs.ant.model import VARIANTS, build_ant
+from msk_ray.envs.cartpole.config import CartPoleSettings
 from msk_ray.envs.cartpole.env import CartPole
 from msk_ray.simulation import StepState
 
 
 @pytest.fixture(scope="module")
 def cartpole() -> CartPole:
-    return make_env(CartPoleEnvConfig(name="cartpole", episode_length=3), PhysicsConfig(), 4, "cpu", 0)
+    return make_env(CartPoleSettings(name="cartpole", episode_length=3), PhysicsConfig(), 4, "cpu", 0)
 
 
 @pytest.fixture(scope="module")
 def ant() -> Ant:
-    config = AntEnvConfig(name="ant", episode_length=50)
+    config = AntSettings(name="ant", episode_length=50)
     return make_env(config, PhysicsConfig(), 4, "cpu", 0, differentiable=False)
 
 
@@ -93,7 +95,7 @@ def test_ant_standing_reward_by_hand(ant: Ant) -> None:
 
 
 def test_ant_reward_terms_follow_their_weights() -> None:
-    config = AntEnvConfig(
+    config = AntSettings(
         name="ant", reward=AntReward(forward_vel=3.0, up=2.0, heading=0.5, height=4.0, action_penalty=0.25)
     )
     env = make_env(config, PhysicsConfig(), 1, "cpu", 0, differentiable=False)
@@ -114,7 +116,7 @@ def test_an_ant_that_falls_terminates_and_restarts(ant: Ant) -> None:
 
 
 def test_a_diverged_world_is_reset_counted_and_kept_out_of_the_gradient() -> None:
-    env = make_env(CartPoleEnvConfig(name="cartpole"), PhysicsConfig(), 3, "cpu", 0)
+    env = make_env(CartPoleSettings(name="cartpole"), PhysicsConfig(), 3, "cpu", 0)
     qvel = env.state.physics.qvel.clone()
     qvel[1, 0] = float("nan")
     env.state = env.state._replace(physics=env.state.physics._replace(qvel=qvel))
@@ -131,7 +133,7 @@ def test_a_diverged_world_is_reset_counted_and_kept_out_of_the_gradient() -> Non
 
 
 def test_resets_are_the_same_for_the_same_seed_and_differ_between_worlds() -> None:
-    make = lambda seed: make_env(AntEnvConfig(name="ant"), PhysicsConfig(), 4, "cpu", seed, differentiable=False)  # noqa: E731
+    make = lambda seed: make_env(AntSettings(name="ant"), PhysicsConfig(), 4, "cpu", seed, differentiable=False)  # noqa: E731
     first, again, other = make(5).state.physics.qpos, make(5).state.physics.qpos, make(6).state.physics.qpos
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
@@ -141,7 +143,7 @@ def test_resets_are_the_same_for_the_same_seed_and_differ_between_worlds() -> No
 
 @pytest.mark.parametrize("variant", sorted(VARIANTS))
 def test_every_ant_variant_has_the_documented_layout(variant: str) -> None:
-    model = build_ant(AntEnvConfig(name="ant"), PhysicsConfig(variant=variant))
+    model = build_ant(AntSettings(name="ant"), PhysicsConfig(variant=variant))
     assert (model.nq, model.nv, model.nu, model.npair) == (15, 14, 8, 13)
     assert model.opt.timestep == pytest.approx(1 / 240)
     assert [model.joint(i).name for i in range(1, 9)] == [f"{j}_{k}" for k in range(1, 5) for j in ("hip", "ankle")]
@@ -153,7 +155,7 @@ def test_physics_knobs_reach_the_model() -> None:
         variant="published", cone="elliptic", solref=(0.05, 1.0), friction=0.4, solreffriction=(0.33, 1.0),
         joint_damping=3.0, armature=0.2, gear=77.0, substeps=8, impratio=2.0,
     )  # fmt: skip
-    model = build_ant(AntEnvConfig(name="ant"), knobs)
+    model = build_ant(AntSettings(name="ant"), knobs)
     assert model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
     assert model.opt.timestep == pytest.approx(1 / 480)
     assert model.opt.impratio == 2.0
@@ -167,12 +169,12 @@ def test_physics_knobs_reach_the_model() -> None:
 
 
 def test_a_pyramid_drops_the_softened_friction_it_cannot_have() -> None:
-    model = build_ant(AntEnvConfig(name="ant"), PhysicsConfig(variant="matched", cone="pyramidal"))
+    model = build_ant(AntSettings(name="ant"), PhysicsConfig(variant="matched", cone="pyramidal"))
     assert (model.pair_solreffriction == 0).all()
 
 
 def test_scores_are_taken_under_reference_weights_and_physics() -> None:
-    trained = AntEnvConfig(name="ant", reward=AntReward(forward_vel=5.0, up=0.0), nworld=7)
+    trained = AntSettings(name="ant", reward=AntReward(forward_vel=5.0, up=0.0), nworld=7)
     reference = Ant.reference_settings(trained)
     assert (reference.reward.forward_vel, reference.reward.up, reference.nworld) == (1.0, 0.1, 7)
     physics = Ant.reference_physics(PhysicsConfig(variant="published", friction=0.1), None)

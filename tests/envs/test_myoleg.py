@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from msk_ray.config import MyoLegEnvConfig, PhysicsConfig
+from msk_ray.config import PhysicsConfig
 from msk_ray.envs import make_env
+from msk_ray.envs.myoleg.config import MyoLegSettings
 from msk_ray.envs.myoleg.env import MyoLeg, world_axes
 from msk_ray.envs.myoleg.model import SUBSTEPS, Couplings, build_myoleg, find_model
 from msk_ray.errors import ConfigError
@@ -78,7 +79,7 @@ def test_a_file_of_ones_own_is_taken_before_any_package(install, tmp_path: Path)
     path = tmp_path / "mine.xml"
     path.write_text(TOY.format(root="<freejoint/>"))
     assert find_model(str(path)).package == "file"
-    model = build_myoleg(MyoLegEnvConfig(name="myoleg", model=str(path)), PhysicsConfig())
+    model = build_myoleg(MyoLegSettings(name="myoleg", model=str(path)), PhysicsConfig())
     assert model.opt.timestep == pytest.approx(0.002)
     stand = model.key("stand").qpos
     assert stand[2] == pytest.approx(0.1 - 5e-4, abs=1e-5), "let down until it touches"
@@ -99,20 +100,20 @@ def test_a_file_that_does_not_fit_is_refused_on_one_line(tmp_path: Path, text: s
     if text is not None:
         path.write_text(text)
     with pytest.raises(ConfigError, match=message) as caught:
-        build_myoleg(MyoLegEnvConfig(name="myoleg", model=str(path)), PhysicsConfig())
+        build_myoleg(MyoLegSettings(name="myoleg", model=str(path)), PhysicsConfig())
     assert "\n" not in str(caught.value)
 
 
 @pytest.fixture(scope="module")
 def legs26() -> mujoco.MjModel:
-    return build_myoleg(MyoLegEnvConfig(name="myoleg", model="myolegs26", source="myo_sim"), PhysicsConfig())
+    return build_myoleg(MyoLegSettings(name="myoleg", model="myolegs26", source="myo_sim"), PhysicsConfig())
 
 
 @needs_myo_sim
 @pytest.mark.parametrize("name", ["myolegs26", "myolegs"])
 @pytest.mark.parametrize("substeps", [1, 8])
 def test_gradients_of_a_step(name: str, substeps: int) -> None:
-    model = build_myoleg(MyoLegEnvConfig(name="myoleg", model=name, source="myo_sim"), PhysicsConfig())
+    model = build_myoleg(MyoLegSettings(name="myoleg", model=name, source="myo_sim"), PhysicsConfig())
     if name == "myolegs":
         assert np.isin(model.wrap_type, int(mujoco.mjtWrap.mjWRAP_CYLINDER)).any()
     report = check_gradients(
@@ -145,7 +146,7 @@ def test_forward_agrees_with_c_mujoco_over_100_steps(legs26: mujoco.MjModel) -> 
 
 @needs_myo_sim
 def test_environment_resets_walks_and_measures_as_its_body_does(legs26: mujoco.MjModel) -> None:
-    config = MyoLegEnvConfig(name="myoleg", model="myolegs26", reset_noise=0.1)
+    config = MyoLegSettings(name="myoleg", model="myolegs26", reset_noise=0.1)
     env: MyoLeg = make_env(config, PhysicsConfig(), 8, "cpu", 0, differentiable=False)
     axes = world_axes(env.model)
     assert axes[0] == pytest.approx([0.0, -1.0, 0.0], abs=0.02), "these legs walk along -y"

@@ -7,17 +7,19 @@ import numpy as np
 import pytest
 import torch
 
-from msk_ray.config import LegReward, MyoLeg26EnvConfig, PhysicsConfig, parse_config
+from msk_ray.config import PhysicsConfig, parse_config
 from msk_ray.envs import make_env
+from msk_ray.envs.legs.config import LegReward
 from msk_ray.envs.legs.env import stride_error
 from msk_ray.envs.legs.muscles import MuscleCurves
+from msk_ray.envs.myoleg26.config import MyoLeg26Settings
 from msk_ray.envs.myoleg26.env import MyoLeg26
 from msk_ray.errors import ConfigError
 from msk_ray.simulation import StepState
 
 
 def make(nworld: int = 2, *, differentiable: bool = False, **settings: object) -> MyoLeg26:
-    config = MyoLeg26EnvConfig.model_validate({"name": "myoleg26", **settings})
+    config = MyoLeg26Settings.model_validate({"name": "myoleg26", **settings})
     return make_env(config, PhysicsConfig(), nworld, "cpu", 0, differentiable=differentiable)
 
 
@@ -280,7 +282,7 @@ def test_the_standing_keyframe_is_held_by_its_excitations(env: MyoLeg26) -> None
 
 def test_scores_use_reference_weights_and_contacts_but_the_same_task() -> None:
     reward = LegReward(forward_vel=5.0, effort=0.0)
-    trained = MyoLeg26EnvConfig(name="myoleg26", reward=reward, target_speed=0.7, reset="walk")
+    trained = MyoLeg26Settings(name="myoleg26", reward=reward, target_speed=0.7, reset="walk")
     reference = MyoLeg26.reference_settings(trained)
     assert (reference.reward.forward_vel, reference.reward.effort) == (1.0, 0.2)
     assert (reference.target_speed, reference.reset) == (0.7, "walk")

@@ -5,8 +5,10 @@ import numpy as np
 import pytest
 import torch
 
-from msk_ray.config import LegReward, MyoLeg26EnvConfig, PhysicsConfig
+from msk_ray.config import PhysicsConfig
 from msk_ray.envs import make_env
+from msk_ray.envs.legs.config import LegReward
+from msk_ray.envs.myoleg26.config import MyoLeg26Settings
 from msk_ray.envs.myoleg26.model import SUBSTEPS, build_myoleg26
 from msk_ray.gradcheck import check_chain, check_gradients, make_states
 from msk_ray.simulation import Simulation, TapePerSubstep
@@ -14,7 +16,7 @@ from msk_ray.simulation import Simulation, TapePerSubstep
 
 @pytest.fixture(scope="module")
 def model() -> mujoco.MjModel:
-    return build_myoleg26(MyoLeg26EnvConfig(name="myoleg26"), PhysicsConfig())
+    return build_myoleg26(MyoLeg26Settings(name="myoleg26"), PhysicsConfig())
 
 
 @pytest.mark.parametrize("substeps", [1, 8])
@@ -49,7 +51,7 @@ def test_forward_agrees_with_c_mujoco_over_100_steps(model: mujoco.MjModel, name
 
 def test_reward_and_observation_have_the_gradient_of_their_own_values() -> None:
     """Through muscle lengths, rates and forces, joint limits and the pelvis, by central differences of the value."""
-    config = MyoLeg26EnvConfig(
+    config = MyoLeg26Settings(
         name="myoleg26", reward=LegReward(symmetry=0.3, stride=0.4, progress=0.2), stochastic_reset=False
     )
     env = make_env(config, PhysicsConfig(), 1, "cpu", 0, differentiable=False)
@@ -82,7 +84,7 @@ def test_reward_and_observation_have_the_gradient_of_their_own_values() -> None:
 
 def test_activation_carries_most_of_the_gradient_across_control_steps() -> None:
     """Fault: an activation that is cut between control steps loses most of what an excitation does later."""
-    config = MyoLeg26EnvConfig(name="myoleg26", stochastic_reset=False)
+    config = MyoLeg26Settings(name="myoleg26", stochastic_reset=False)
     env = make_env(config, PhysicsConfig(), 1, "cpu", 0)
     norms = []
     for cut in (False, True):

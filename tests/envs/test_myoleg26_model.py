@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 import torch
 
-from msk_ray.config import MyoLeg26EnvConfig, PhysicsConfig
+from msk_ray.config import PhysicsConfig
 from msk_ray.envs.myoleg26 import tables
+from msk_ray.envs.myoleg26.config import MyoLeg26Settings
 from msk_ray.envs.myoleg26.model import CURVE, WINDOW, build_myoleg26
 from msk_ray.envs.myoleg26.moment_arms import PUBLISHED, moment_arms
 from msk_ray.envs.myoleg26.terrain import Terrain
@@ -21,7 +22,7 @@ MIRROR = np.array([1, 1, -1, 1, -1, -1], dtype=float)
 
 @pytest.fixture(scope="module")
 def model() -> mujoco.MjModel:
-    return build_myoleg26(MyoLeg26EnvConfig(name="myoleg26"), PhysicsConfig())
+    return build_myoleg26(MyoLeg26Settings(name="myoleg26"), PhysicsConfig())
 
 
 def fibre_lengths(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
@@ -160,7 +161,7 @@ def test_it_stays_bounded_under_any_constant_excitation(model: mujoco.MjModel) -
 
 @pytest.mark.parametrize("kind", ["slope", "steps", "rough"])
 def test_ground_from_primitives_is_differentiable_and_where_it_says(kind: str) -> None:
-    config = MyoLeg26EnvConfig.model_validate({"name": "myoleg26", "terrain": {"kind": kind, "start": 0.5}})
+    config = MyoLeg26Settings.model_validate({"name": "myoleg26", "terrain": {"kind": kind, "start": 0.5}})
     model = build_myoleg26(config, PhysicsConfig())
     check_supported(model, "tape_per_substep")
     data = mujoco.MjData(model)
@@ -177,7 +178,7 @@ def test_ground_from_primitives_is_differentiable_and_where_it_says(kind: str) -
 
 
 def test_a_height_field_raises_by_name_and_works_by_finite_differences() -> None:
-    config = MyoLeg26EnvConfig.model_validate({"name": "myoleg26", "terrain": {"kind": "height_field"}})
+    config = MyoLeg26Settings.model_validate({"name": "myoleg26", "terrain": {"kind": "height_field"}})
     model = build_myoleg26(config, PhysicsConfig())
     with pytest.raises(UnsupportedModelError, match=r"height fields.*floor.*fd_jacobian"):
         check_supported(model, "tape_per_substep")

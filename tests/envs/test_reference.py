@@ -4,16 +4,12 @@ from typing import Any
 
 import pytest
 
-from msk_ray.config import EnvSettings, LegReward, MyoLegEnvConfig, Reward, parse_config
+from msk_ray.config import EnvSettings, Reward, parse_config
 from msk_ray.config.physics import STEPPING
 from msk_ray.config.sections import Section
-from msk_ray.envs.ant.env import Ant
-from msk_ray.envs.base import Env
-from msk_ray.envs.cartpole.env import CartPole
-from msk_ray.envs.myoleg.env import MyoLeg
-from msk_ray.envs.myoleg26.env import MyoLeg26
-
-ENVS: tuple[type[Env[Any]], ...] = (CartPole, Ant, MyoLeg26, MyoLeg)
+from msk_ray.envs import Env, env_class
+from msk_ray.envs.legs.config import LegReward
+from msk_ray.envs.myoleg.config import MyoLegSettings
 
 
 class _HopperReward(Reward):
@@ -31,11 +27,11 @@ class _HopperSettings(EnvSettings):
 
 def test_a_model_path_survives_scoring() -> None:
     """Of an environment that says nothing about it: the base class must be right."""
-    trained = _HopperSettings(model="own.xml", height=0.7, nworld=3, reward=_HopperReward(speed=9.0))
+    trained = _HopperSettings(name="hopper", model="own.xml", height=0.7, nworld=3, reward=_HopperReward(speed=9.0))
     reference = Env.reference_settings(trained)
-    assert reference == _HopperSettings(model="own.xml", height=0.7, nworld=3)
-    legs = MyoLegEnvConfig(name="myoleg", model="own.xml", target_speed=0.5, reward=LegReward(sway=1.0))
-    assert Env.reference_settings(legs) == MyoLegEnvConfig(name="myoleg", model="own.xml", target_speed=0.5)
+    assert reference == _HopperSettings(name="hopper", model="own.xml", height=0.7, nworld=3)
+    legs = MyoLegSettings(name="myoleg", model="own.xml", target_speed=0.5, reward=LegReward(sway=1.0))
+    assert Env.reference_settings(legs) == MyoLegSettings(name="myoleg", model="own.xml", target_speed=0.5)
 
 
 def _other(value: Any) -> Any:
@@ -50,18 +46,18 @@ def _other(value: Any) -> Any:
     return value
 
 
-@pytest.mark.parametrize("env", ENVS, ids=lambda env: env.settings.model_fields["name"].annotation.__args__[0])
-def test_only_the_reward_is_reset(env: type[Env[Any]]) -> None:
-    name = env.settings.model_fields["name"].annotation.__args__[0]  # type: ignore[union-attr]
+@pytest.mark.parametrize("name", ["cartpole", "ant", "myoleg26", "myoleg"])
+def test_only_the_reward_is_reset(name: str) -> None:
     default = parse_config({"env": {"name": name}}).env
+    env = env_class(default)
     changes = {
         field: _other(getattr(default, field))
-        for field in env.settings.model_fields
+        for field in env.Settings.model_fields
         if not isinstance(getattr(default, field), str | Section)
     }
     weights = {weight: _other(value) for weight, value in default.reward.model_dump().items()}
     changes |= {"name": name, "nworld": 3, "episode_length": 7, "reward": weights}
-    trained = env.settings.model_validate(changes)
+    trained = env.Settings.model_validate(changes)
     reference = env.reference_settings(trained)
     assert reference.reward == default.reward != trained.reward
     assert reference.model_dump(exclude={"reward", "assist"}) == trained.model_dump(exclude={"reward", "assist"})

@@ -7,7 +7,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from msk_ray.config import Config, MyoLeg26EnvConfig, PhysicsConfig, parse_config
+from msk_ray.config import Config, PhysicsConfig, parse_config
+from msk_ray.envs.myoleg26.config import MyoLeg26Settings
 from msk_ray.envs.myoleg26.model import build_myoleg26
 from msk_ray.errors import ConfigError
 from msk_ray.gait.__main__ import main
@@ -17,7 +18,7 @@ from msk_ray.training import Trainer
 
 @pytest.fixture(scope="module")
 def model() -> mujoco.MjModel:
-    return build_myoleg26(MyoLeg26EnvConfig(name="myoleg26"), PhysicsConfig())
+    return build_myoleg26(MyoLeg26Settings(name="myoleg26"), PhysicsConfig())
 
 
 def test_series_of_quiet_standing(model: mujoco.MjModel) -> None:
@@ -90,5 +91,5 @@ def test_another_environment_is_refused(tmp_path: Path, tiny_cartpole: Config) -
     )
     trainer.run_epoch()
     trainer.close()
-    with pytest.raises(ConfigError, match="cartpole has no legs of muscles"):
+    with pytest.raises(ConfigError, match="gait needs a model of two legs"):
         main([str(tmp_path / "t"), "--device", "cpu"])

@@ -6,8 +6,9 @@ import pytest
 import torch
 from scenes import studded_plate
 
-from msk_ray.config import AntEnvConfig, Config, PhysicsConfig, parse_config
+from msk_ray.config import Config, PhysicsConfig, parse_config
 from msk_ray.envs import make_env
+from msk_ray.envs.ant.config import AntSettings
 from msk_ray.envs.ant.model import build_ant
 from msk_ray.errors import SimulationError
 from msk_ray.gradcheck import check_gradients
@@ -21,7 +22,7 @@ pytestmark = pytest.mark.gpu
 @pytest.mark.parametrize("variant", ["matched", "matched_hard_friction"])
 @pytest.mark.parametrize("mode", ["tape_per_substep", "tape_all"])
 def test_gradients_of_an_ant_are_those_of_float64(mode: str, variant: str) -> None:
-    model = build_ant(AntEnvConfig(name="ant"), PhysicsConfig(variant=variant))
+    model = build_ant(AntSettings(name="ant"), PhysicsConfig(variant=variant))
     report = check_gradients(
         model, make_backward(mode), substeps=4, states=("standing", "contact"), worlds=8, device="cuda"
     )
@@ -31,7 +32,7 @@ def test_gradients_of_an_ant_are_those_of_float64(mode: str, variant: str) -> No
 
 def rollout(backward: str) -> tuple[torch.Tensor, torch.Tensor]:
     """Total reward of three env steps and its gradient with respect to a constant action."""
-    env = make_env(AntEnvConfig(name="ant", stochastic_reset=False), PhysicsConfig(backward=backward), 6, "cuda", 0)
+    env = make_env(AntSettings(name="ant", stochastic_reset=False), PhysicsConfig(backward=backward), 6, "cuda", 0)
     generator = torch.Generator().manual_seed(1)
     qvel = 0.3 * torch.randn(6, 14, generator=generator)
     env.state = env.state._replace(physics=env.state.physics._replace(qvel=qvel.cuda()))

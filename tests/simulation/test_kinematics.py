@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from msk_ray.config import MyoLeg26EnvConfig, PhysicsConfig
+from msk_ray.config import PhysicsConfig
+from msk_ray.envs.myoleg26.config import MyoLeg26Settings
 from msk_ray.envs.myoleg26.model import build_myoleg26
 from msk_ray.errors import ConfigError
 from msk_ray.physics import WorldBatch
@@ -28,7 +29,7 @@ WORLDS = 3
 def models() -> dict[str, mujoco.MjModel]:
     return {
         "every joint": mujoco.MjModel.from_xml_string(EVERY_JOINT),
-        "myoleg26": build_myoleg26(MyoLeg26EnvConfig(name="myoleg26"), PhysicsConfig()),
+        "myoleg26": build_myoleg26(MyoLeg26Settings(name="myoleg26"), PhysicsConfig()),
     }
 
 

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from msk_ray.config import MyoLeg26EnvConfig, PhysicsConfig
+from msk_ray.config import PhysicsConfig
+from msk_ray.envs.myoleg26.config import MyoLeg26Settings
 from msk_ray.envs.myoleg26.model import build_myoleg26
 from msk_ray.errors import UnsupportedModelError
 from msk_ray.physics import WorldBatch
@@ -28,7 +29,7 @@ def lengths_and_rates(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray)
 @pytest.mark.parametrize("which", ["myoleg26", "free and ball joints"])
 def test_lengths_rates_and_their_gradients(which: str) -> None:
     if which == "myoleg26":
-        model = build_myoleg26(MyoLeg26EnvConfig(name="myoleg26"), PhysicsConfig())
+        model = build_myoleg26(MyoLeg26Settings(name="myoleg26"), PhysicsConfig())
     else:
         model = mujoco.MjModel.from_xml_string(FREE_ARM)
     rng = np.random.default_rng(1)

@@ -6,7 +6,8 @@ import mujoco
 import torch
 from torch import Tensor
 
-from msk_ray.config import AntEnvConfig, PhysicsConfig
+from msk_ray.config import PhysicsConfig
+from msk_ray.envs.ant.config import AntSettings
 from msk_ray.envs.ant.model import STAND_HEIGHT, STAND_JOINTS, build_ant
 from msk_ray.envs.base import Env
 from msk_ray.simulation import StepState
@@ -15,7 +16,7 @@ from msk_ray.simulation.tangent import quat_exp, quat_multiply, quat_rotate
 _JOINT_VELOCITY_SCALE = 0.1
 
 
-class Ant(Env[AntEnvConfig]):
+class Ant(Env[AntSettings]):
     """Observation (37), in this order:
 
     ====== ===========================================================
@@ -32,11 +33,11 @@ class Ant(Env[AntEnvConfig]):
     """
 
     obs_size = 37
-    settings = AntEnvConfig
+    Settings = AntSettings
     reward_names = ("forward_vel", "up", "heading", "height", "action")
 
-    @staticmethod
-    def build_model(config: AntEnvConfig, physics: PhysicsConfig) -> mujoco.MjModel:
+    @classmethod
+    def build_model(cls, config: AntSettings, physics: PhysicsConfig) -> mujoco.MjModel:
         return build_ant(config, physics)
 
     def prepare(self) -> None:

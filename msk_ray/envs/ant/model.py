@@ -10,7 +10,8 @@ from itertools import product
 import mujoco
 import numpy as np
 
-from msk_ray.config import AntEnvConfig, PhysicsConfig
+from msk_ray.config import PhysicsConfig
+from msk_ray.envs.ant.config import AntSettings
 from msk_ray.envs.options import add_sky, apply_options
 
 STAND_HEIGHT = 0.75
@@ -99,7 +100,7 @@ def resolve_ant_physics(physics: PhysicsConfig) -> AntPhysics:
     return replace(base, **changes)
 
 
-def build_ant(env: AntEnvConfig, physics: PhysicsConfig) -> mujoco.MjModel:
+def build_ant(env: AntSettings, physics: PhysicsConfig) -> mujoco.MjModel:
     """Free torso and 8 hinges (hip, ankle of the legs at +x+y, -x+y, -x-y, +x-y), 8 motors in the same order.
 
     All contacts are explicit pairs of a geom with the floor, so that friction can be softened by itself.

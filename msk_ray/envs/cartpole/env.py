@@ -6,8 +6,9 @@ import mujoco
 import torch
 from torch import Tensor
 
-from msk_ray.config import CartPoleEnvConfig, PhysicsConfig
+from msk_ray.config import PhysicsConfig
 from msk_ray.envs.base import Env, wrap_angle
+from msk_ray.envs.cartpole.config import CartPoleSettings
 from msk_ray.envs.cartpole.model import build_cartpole
 from msk_ray.simulation import StepState
 
@@ -15,18 +16,18 @@ UPRIGHT_ANGLE = 0.3
 """A pole within this angle of upright counts as held [rad]."""
 
 
-class CartPole(Env[CartPoleEnvConfig]):
+class CartPole(Env[CartPoleSettings]):
     """Observation (5): cart position [m], cart velocity [m/s], sin and cos of the pole angle, its rate [rad/s].
 
     Starts hanging down, ± π/2 rad, with small velocities. Never terminates; truncated after `episode_length`.
     """
 
-    settings = CartPoleEnvConfig
+    Settings = CartPoleSettings
     obs_size = 5
     reward_names = ("pole_angle", "pole_velocity", "cart_position", "cart_velocity", "action")
 
-    @staticmethod
-    def build_model(config: CartPoleEnvConfig, physics: PhysicsConfig) -> mujoco.MjModel:
+    @classmethod
+    def build_model(cls, config: CartPoleSettings, physics: PhysicsConfig) -> mujoco.MjModel:
         return build_cartpole(config, physics)
 
     def prepare(self) -> None:

@@ -2,7 +2,8 @@
 
 import mujoco
 
-from msk_ray.config import CartPoleEnvConfig, PhysicsConfig
+from msk_ray.config import PhysicsConfig
+from msk_ray.envs.cartpole.config import CartPoleSettings
 from msk_ray.envs.options import add_sky, apply_options
 
 CART_MASS = 1.0
@@ -11,7 +12,7 @@ POLE_LENGTH = 1.0
 GEAR = 20.0
 
 
-def build_cartpole(env: CartPoleEnvConfig, physics: PhysicsConfig) -> mujoco.MjModel:
+def build_cartpole(env: CartPoleSettings, physics: PhysicsConfig) -> mujoco.MjModel:
     """Cart of 1 kg, pole of 0.25 kg and 1 m, force of ±20 N at full control, no contacts.
 
     qpos is (cart position [m], pole angle [rad], 0 upright); qvel their rates; ctrl in [-1, 1].

@@ -10,14 +10,15 @@ from typing import Generic, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from msk_ray.config import LegEnvSettings, PhysicsConfig
+from msk_ray.config import PhysicsConfig
 from msk_ray.config.physics import CONTACTS, LIMITS
 from msk_ray.envs.base import Env
+from msk_ray.envs.legs.config import LegSettings
 from msk_ray.envs.legs.muscles import MuscleCurves
 from msk_ray.simulation import StepState
 from msk_ray.simulation.tendons import Tendons
 
-LegSettings = TypeVar("LegSettings", bound=LegEnvSettings)
+AnyLegSettings = TypeVar("AnyLegSettings", bound=LegSettings)
 
 _GRAVITY = 9.81
 _TRUNK_LEVER = 0.18
@@ -63,7 +64,7 @@ def stride_error(angles: Tensor, rates: Tensor, amplitude: float, rate: float) -
     return (radius - 1.0).square()
 
 
-class LegEnv(Env[LegSettings], Generic[LegSettings]):
+class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
     """Observation, in this order, for U muscles and N leg hinges:
 
     ======= ===================================================================

@@ -7,8 +7,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from msk_ray.config import MyoLegEnvConfig, PhysicsConfig
+from msk_ray.config import PhysicsConfig
 from msk_ray.envs.legs.env import LegEnv, Root
+from msk_ray.envs.myoleg.config import MyoLegSettings
 from msk_ray.envs.myoleg.model import Couplings, build_myoleg, find_model, ground_height
 from msk_ray.simulation import StepState
 from msk_ray.simulation.tangent import quat_rotate
@@ -17,7 +18,7 @@ _START_ACTIVATION = 0.05
 _log = logging.getLogger(__name__)
 
 
-class MyoLeg(LegEnv[MyoLegEnvConfig]):
+class MyoLeg(LegEnv[MyoLegSettings]):
     """The pose of the pelvis in the observation (7): its place to the left of its line [m], its forward axis and its up
     axis (3 each) in the world.
 
@@ -25,10 +26,10 @@ class MyoLeg(LegEnv[MyoLegEnvConfig]):
     forward axis is found from heel to toes, the up axis from gravity.
     """
 
-    settings = MyoLegEnvConfig
+    Settings = MyoLegSettings
 
-    @staticmethod
-    def build_model(config: MyoLegEnvConfig, physics: PhysicsConfig) -> mujoco.MjModel:
+    @classmethod
+    def build_model(cls, config: MyoLegSettings, physics: PhysicsConfig) -> mujoco.MjModel:
         _log.info(find_model(config.model, config.source).describe())
         return build_myoleg(config, physics)
 

@@ -14,8 +14,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from msk_ray.config import MyoLegEnvConfig, PhysicsConfig
-from msk_ray.config.legs import PACKAGED_MODELS
+from msk_ray.config import PhysicsConfig
+from msk_ray.envs.myoleg.config import PACKAGED_MODELS, MyoLegSettings
 from msk_ray.envs.options import apply_options
 from msk_ray.errors import ConfigError
 
@@ -125,7 +125,7 @@ def _myo_sim(name: str) -> Source | None:
     return Source("myo_sim", package[1], name, load)
 
 
-def build_myoleg(env: MyoLegEnvConfig, physics: PhysicsConfig) -> mujoco.MjModel:
+def build_myoleg(env: MyoLegSettings, physics: PhysicsConfig) -> mujoco.MjModel:
     """Compile the model found, with this trial's solver settings and, as keyframe `stand`, its standing pose.
 
     Changed are the smoothing of every muscle's activation and, in the packages' models, what is touched: scenery but

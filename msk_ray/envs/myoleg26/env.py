@@ -7,8 +7,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from msk_ray.config import AssistConfig, MyoLeg26EnvConfig, PhysicsConfig
+from msk_ray.config import PhysicsConfig
 from msk_ray.envs.legs.env import LegEnv, Root
+from msk_ray.envs.myoleg26.config import AssistConfig, MyoLeg26Settings
 from msk_ray.envs.myoleg26.model import SIDES, build_myoleg26
 from msk_ray.envs.myoleg26.tables import JOINTS
 from msk_ray.envs.myoleg26.terrain import Terrain
@@ -19,21 +20,21 @@ _TRUNK_INERTIA = (7.0, 7.0, 0.85)
 _GRAVITY = 9.81
 
 
-class MyoLeg26(LegEnv[MyoLeg26EnvConfig]):
+class MyoLeg26(LegEnv[MyoLeg26Settings]):
     """The pose of the pelvis in the observation (4): its place to the right of its line [m], its tilt, list and
     rotation [rad].
 
     The pelvis is three slides and three hinges, so that tilt and list are coordinates and no quaternion is needed.
     """
 
-    settings = MyoLeg26EnvConfig
+    Settings = MyoLeg26Settings
 
-    @staticmethod
-    def build_model(config: MyoLeg26EnvConfig, physics: PhysicsConfig) -> mujoco.MjModel:
+    @classmethod
+    def build_model(cls, config: MyoLeg26Settings, physics: PhysicsConfig) -> mujoco.MjModel:
         return build_myoleg26(config, physics)
 
     @classmethod
-    def reference_settings(cls, config: MyoLeg26EnvConfig) -> MyoLeg26EnvConfig:
+    def reference_settings(cls, config: MyoLeg26Settings) -> MyoLeg26Settings:
         return super().reference_settings(config).model_copy(update={"assist": AssistConfig(epochs=0)})
 
     def prepare_model(self) -> None:

@@ -20,8 +20,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from msk_ray.config import MyoLeg26EnvConfig, PhysicsConfig
+from msk_ray.config import PhysicsConfig
 from msk_ray.envs.myoleg26 import tables
+from msk_ray.envs.myoleg26.config import MyoLeg26Settings
 from msk_ray.envs.myoleg26.poses import add_keyframes
 from msk_ray.envs.myoleg26.terrain import Terrain
 from msk_ray.envs.options import add_sky, apply_options
@@ -76,7 +77,7 @@ SUBSTEPS = 5
 """Physics steps of a control step of 20 ms: 4 ms each."""
 
 
-def build_myoleg26(env: MyoLeg26EnvConfig, physics: PhysicsConfig) -> mujoco.MjModel:
+def build_myoleg26(env: MyoLeg26Settings, physics: PhysicsConfig) -> mujoco.MjModel:
     """Compile the model. ctrl is the excitation of 26 muscles in [0, 1], right leg first, then any assistance."""
     p = resolve_physics(physics)
     spec = _body_spec(env, p)
@@ -158,7 +159,7 @@ def _mirrored_axis(axis: tuple[float, float, float], side: str) -> list[float]:
     return list(axis) if side == "r" else [-x, -y, z]
 
 
-def _body_spec(env: MyoLeg26EnvConfig, p: PhysicsConfig) -> mujoco.MjSpec:
+def _body_spec(env: MyoLeg26Settings, p: PhysicsConfig) -> mujoco.MjSpec:
     """Everything but muscles and keyframes."""
     spec = mujoco.MjSpec()
     spec.modelname = "myoleg26"

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from msk_ray.config import TerrainConfig
+from msk_ray.envs.myoleg26.config import TerrainConfig
 
 _PIECES = 20
 """Boxes of stepped and rough ground; more would raise the number of contact pairs beyond what is bounded tightly."""

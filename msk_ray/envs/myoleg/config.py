@@ -1,0 +1,30 @@
+"""The settings of installed legs."""
+
+from typing import Literal
+
+from msk_ray.config.physics import ACTIVATION, SOLVING, STEPPING
+from msk_ray.config.sections import NonNegative, Text
+from msk_ray.envs.legs.config import LegSettings
+
+
+class MyoLegSettings(LegSettings):
+    """Legs of an installed myosuite or myo_sim, or of a model file: its contacts, limits and joints are its own."""
+
+    reads_physics = STEPPING | SOLVING | ACTIVATION
+
+    model: Text | None = None
+    """Path of an MJCF file, or `myolegs` (80 muscles) or `myolegs26`; null takes `myolegs`."""
+    source: Literal["auto", "myosuite2", "myosuite3", "myo_sim"] = "auto"
+    """Package to take it from; `auto` takes the first that is installed, in this order."""
+    reset_noise: NonNegative = 0.01
+    """Spread of initial joint angles [rad]; coupled joints follow those they are coupled to."""
+
+    def unread(self) -> dict[str, str]:
+        unread = super().unread()
+        if self.model not in (None, *PACKAGED_MODELS):
+            unread["source"] = "env.model is the path of a file"
+        return unread
+
+
+PACKAGED_MODELS = ("myolegs", "myolegs26")
+"""Models that installed packages have, the default first."""

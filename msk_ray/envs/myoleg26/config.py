@@ -1,0 +1,81 @@
+"""The settings of the two legs of 26 muscles."""
+
+from typing import Literal
+
+from pydantic import PositiveFloat
+
+from msk_ray.config.physics import ACTIVATION, CONTACTS, JOINTS, LIMITS, SOLVING, STEPPING
+from msk_ray.config.sections import Fraction, NonNegative, Section, Whole
+from msk_ray.envs.legs.config import LegSettings
+
+
+class TerrainConfig(Section):
+    """Ground of a leg model, made of primitives along +x."""
+
+    kind: Literal["flat", "slope", "steps", "rough", "height_field"] = "flat"
+    """`height_field` has no exact gradient: it needs physics.backward=fd_jacobian."""
+    slope: float = 0.1
+    """Rise over run of `slope`; negative goes down."""
+    step_height: NonNegative = 0.05
+    """Rise of each of the `steps` [m]."""
+    step_depth: PositiveFloat = 0.6
+    """Length along x of each step or rough strip [m]."""
+    roughness: NonNegative = 0.03
+    """Largest height of `rough` strips and `height_field` [m]."""
+    start: NonNegative = 0.8
+    """Where the ground stops being flat [m]; a slope starts at the origin."""
+    seed: Whole = 0
+    """Of the heights of `rough` and `height_field`."""
+
+
+_TERRAIN_READS: dict[str, tuple[str, ...]] = {
+    "flat": (),
+    "slope": ("slope",),
+    "steps": ("step_height", "step_depth", "start"),
+    "rough": ("step_depth", "roughness", "start", "seed"),
+    "height_field": ("roughness", "start", "seed"),
+}
+"""What each kind of ground is made by."""
+
+
+class AssistConfig(Section):
+    """Springs and dampers that hold the pelvis up during training, annealed linearly to nothing.
+
+    Evaluation never has them.
+    """
+
+    epochs: Whole = 0
+    """Epochs until they are gone; 0 has none at all."""
+    share: Fraction = 1.0
+    """Of the stiffness below, at epoch 0."""
+    balance: NonNegative = 800.0
+    """Righting torque of tilt and list [N m/rad]; of the turn as much less as its inertia is. Critically damped."""
+    lateral: NonNegative = 800.0
+    """Force towards the line walked on [N/m]. Critically damped."""
+    support: Fraction = 0.0
+    """Share of the body's weight that is carried."""
+
+
+class MyoLeg26Settings(LegSettings):
+    """Two legs under one trunk, 13 Hill-type muscles each."""
+
+    reads_physics = STEPPING | SOLVING | CONTACTS | LIMITS | JOINTS | ACTIVATION
+
+    terrain: TerrainConfig = TerrainConfig()
+    assist: AssistConfig = AssistConfig()
+    reset: Literal["stand", "walk", "mixed"] = "stand"
+    """Initial states about the standing keyframe, the two walking ones, or all three alike."""
+    reset_noise: NonNegative = 0.02
+    """Spread of initial joint angles [rad]; velocities, the pelvis's among them, spread five times that a second, which
+    moves the capture point by 3 cm: feet on the spot can still catch it."""
+
+    def unread(self) -> dict[str, str]:
+        unread = super().unread()
+        reads = _TERRAIN_READS[self.terrain.kind]
+        for name in TerrainConfig.model_fields:
+            if name != "kind" and name not in reads:
+                unread[f"terrain.{name}"] = f"env.terrain.kind is {self.terrain.kind}"
+        if not self.assist.epochs:
+            for name in ("share", "balance", "lateral", "support"):
+                unread[f"assist.{name}"] = "env.assist.epochs is 0"
+        return unread
