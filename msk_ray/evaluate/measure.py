@@ -4,7 +4,6 @@ import datetime
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from msk_ray.errors import ConfigError
 from msk_ray.evaluate.targets import trial_folder_of
 from msk_ray.experiment.damage import DamagedFile, field, is_number, number, read_object
 from msk_ray.experiment.layout import EVAL_FILE
+from msk_ray.experiment.versions import installed_versions
 from msk_ray.files import write_json
 from msk_ray.training import Evaluator, SavedPolicy
 from msk_ray.training.evaluation import Episodes
@@ -115,7 +115,7 @@ class Bench:
             "scores": [round(float(s), 6) for run in runs for s in run.score],
             "score_by_seed": {str(seed): float(run.score.mean()) for seed, run in zip(seeds, runs, strict=True)},
             "device": device_name(self._device),
-            "packages": {name: metadata.version(name) for name in _PACKAGES},
+            "packages": installed_versions(_PACKAGES),
             "python": platform.python_version(),
             "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         }

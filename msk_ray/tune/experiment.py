@@ -19,7 +19,6 @@ import sys
 import time
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +32,7 @@ from msk_ray.experiment.damage import Damage, DamagedFile, cut, field, read_obje
 from msk_ray.experiment.layout import ENVIRONMENT_FILE, MANIFEST_FILE, METRICS_FILE, OUTCOME_FILE, SPACE_FILE, STOP_FILE
 from msk_ray.experiment.metrics import read_metrics
 from msk_ray.experiment.outcomes import Outcome, read_ending
+from msk_ray.experiment.versions import installed_versions
 from msk_ray.files import check_writable, make_folder, write_json, write_text
 from msk_ray.nvidia_smi import ask_driver
 from msk_ray.text import printable
@@ -404,16 +404,9 @@ def environment() -> dict[str, Any]:
         "cpus": os.cpu_count(),
         "gpus": list(driver.gpus),
         "driver": driver.driver,
-        "packages": {name: version for name in _PACKAGES if (version := _version(name))},
+        "packages": installed_versions(_PACKAGES),
         "commit": _commit(),
     }
-
-
-def _version(package: str) -> str | None:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return None
 
 
 def _commit() -> str | None:
