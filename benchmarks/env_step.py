@@ -53,9 +53,9 @@ def measure(name: str, args: argparse.Namespace) -> list[float]:
 def elsewhere(tree: Path, arguments: list[str]) -> dict[str, list[float]]:
     """The same measurement by this script in another process, of the package in `tree`."""
     command = [sys.executable, __file__, *arguments, "--json"]
-    done = subprocess.run(
-        command, env={**os.environ, "PYTHONPATH": str(tree)}, capture_output=True, text=True, check=True
-    )
+    # First, so that it wins over a package that is installed or on the path already.
+    path = os.pathsep.join(filter(None, (str(tree), os.environ.get("PYTHONPATH"))))
+    done = subprocess.run(command, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, check=True)
     return json.loads(done.stdout.splitlines()[-1])
 
 
