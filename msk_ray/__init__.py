@@ -9,13 +9,18 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from msk_ray.config import Config as Config
+    from msk_ray.config import EnvSettings as EnvSettings
+    from msk_ray.config import Reward as Reward
     from msk_ray.config import load_config as load_config
     from msk_ray.envs import Env as Env
+    from msk_ray.envs import MjcfEnv as MjcfEnv
+    from msk_ray.envs import MjcfSettings as MjcfSettings
     from msk_ray.gradcheck import check_gradients as check_gradients
     from msk_ray.simulation import Backward as Backward
     from msk_ray.simulation import FdJacobian as FdJacobian
     from msk_ray.simulation import Hybrid as Hybrid
     from msk_ray.simulation import Simulation as Simulation
+    from msk_ray.simulation import StepState as StepState
     from msk_ray.simulation import TapeAll as TapeAll
     from msk_ray.simulation import TapePerSubstep as TapePerSubstep
     from msk_ray.training.policy import load_policy as load_policy
@@ -26,9 +31,14 @@ _HOMES = {
     "Backward": "msk_ray.simulation",
     "Config": "msk_ray.config",
     "Env": "msk_ray.envs",
+    "EnvSettings": "msk_ray.config",
     "FdJacobian": "msk_ray.simulation",
     "Hybrid": "msk_ray.simulation",
+    "MjcfEnv": "msk_ray.envs",
+    "MjcfSettings": "msk_ray.envs",
+    "Reward": "msk_ray.config",
     "Simulation": "msk_ray.simulation",
+    "StepState": "msk_ray.simulation",
     "TapeAll": "msk_ray.simulation",
     "TapePerSubstep": "msk_ray.simulation",
     "check_gradients": "msk_ray.gradcheck",

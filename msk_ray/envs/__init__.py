@@ -12,10 +12,14 @@ if TYPE_CHECKING:
     from msk_ray.envs.base import Transition as Transition
     from msk_ray.envs.make import env_class as env_class
     from msk_ray.envs.make import make_env as make_env
+    from msk_ray.envs.mjcf.config import MjcfSettings as MjcfSettings
+    from msk_ray.envs.mjcf.env import MjcfEnv as MjcfEnv
 
 _HOMES = {
     "Env": "msk_ray.envs.base",
     "EnvState": "msk_ray.envs.base",
+    "MjcfEnv": "msk_ray.envs.mjcf.env",
+    "MjcfSettings": "msk_ray.envs.mjcf.config",
     "Transition": "msk_ray.envs.base",
     "env_class": "msk_ray.envs.make",
     "make_env": "msk_ray.envs.make",

@@ -5,14 +5,19 @@ Axes: W worlds, O observation, A action.
 
 import math
 from abc import ABC, abstractmethod
-from typing import ClassVar, Generic, NamedTuple, TypeVar
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import mujoco
 import torch
 from torch import Tensor
 
 from msk_ray.config import EnvSettings, PhysicsConfig
+from msk_ray.errors import ConfigError
 from msk_ray.simulation import Backward, Simulation, StepState
+from msk_ray.simulation.kinematics import Frames, Kinematics, Names
+from msk_ray.simulation.tendons import Tendons
 
 SettingsT = TypeVar("SettingsT", bound=EnvSettings)
 
@@ -94,6 +99,8 @@ class Env(ABC, Generic[SettingsT]):
         self.action_size = self.model.nu
         self.generator = torch.Generator(device=self.device).manual_seed(seed)
         self._fresh: list[StepState] = []
+        self._reached: StepState | None = None
+        self._measured: dict[str, tuple[StepState, bool, Any]] = {}
         self.prepare()
         self.state = self.reset_state()
 
@@ -177,8 +184,14 @@ class Env(ABC, Generic[SettingsT]):
         diverged = ~self._sound(after)
         # `where` sends no cotangent into a diverged world's step, so its gradient cannot reach the batch.
         after = StepState(*(torch.where(diverged[:, None], b.detach(), a) for b, a in zip(before, after, strict=True)))
+        self._reached, self._diverged = after, diverged
         obs = self.observe(after, action)
         terms = self.reward_terms(after, action, obs)
+        if terms.shape != (self.nworld, len(self.reward_names)):
+            raise ConfigError(
+                f"reward_terms of {type(self).__qualname__} has shape {tuple(terms.shape)}, but reward_names has "
+                f"{len(self.reward_names)} names for {self.nworld} worlds: return torch.stack(terms, dim=-1)"
+            )
         reward = torch.where(diverged, 0.0, terms.sum(-1))
         age = self.state.age + 1
         terminated = diverged | self.fell(after)
@@ -186,6 +199,58 @@ class Env(ABC, Generic[SettingsT]):
         reached = EnvState(after, action, age)
         self.state = self._reset_where(terminated | truncated, reached) if auto_reset else reached
         return Transition(reward, terms.detach(), obs, terminated, truncated, diverged)
+
+    def frames(self, state: StepState) -> Frames:
+        """Bodies, sites, geoms and centres of mass in `state` (W worlds): where they are and how they move.
+
+        All of it carries gradients. What several functions ask for of one state is computed once.
+        """
+        frames: Frames = self._once("frames", state, lambda: self._kinematics(state.qpos, state.qvel))
+        return frames
+
+    def tendons(self, state: StepState) -> tuple[Tensor, Tensor]:
+        """Lengths [m] and rates [m/s] of all tendons in `state`, each (W, ntendon); both carry gradients.
+
+        Raises:
+            UnsupportedModelError: the model has no tendons.
+        """
+        found: tuple[Tensor, Tensor] = self._once("tendons", state, lambda: self._tendons(state.qpos, state.qvel))
+        return found
+
+    def contact_forces(self, state: StepState, geom: Names) -> Tensor:
+        """Force of all contacts on geoms [N], world coordinates: (W, 3) of one name or id, (W, n, 3) of several.
+
+        Values only: no gradient flows through them. They are those of the last substep of the step that led to
+        `state`, and 0 in a world that diverged in it. So only `reward_terms`, `fell` and `outcome_terms` can ask: an
+        observation is also taken of states that no step has led to.
+
+        Raises:
+            ConfigError: no step has just led to `state`, or there is no such geom.
+        """
+        if state is not self._reached:
+            raise ConfigError(
+                f"{type(self).__qualname__}: contact forces belong to a step, not to a state: ask for them in "
+                "reward_terms, fell or outcome_terms, not in observe"
+            )
+        force = self._once("contact_forces", state, self.sim.contact_forces)
+        chosen = force[:, self._kinematics.indices("geom", geom)]
+        return torch.where(self._diverged.view(-1, *[1] * (chosen.dim() - 1)), 0.0, chosen)
+
+    def _once(self, what: str, state: StepState, measure: Callable[[], Any]) -> Any:
+        """What `measure` gives for `state`, computed once for as long as it is the newest one asked about."""
+        grad = torch.is_grad_enabled()
+        kept = self._measured.get(what)
+        if kept is None or kept[0] is not state or kept[1] != grad:
+            kept = self._measured[what] = (state, grad, measure())
+        return kept[2]
+
+    @cached_property
+    def _kinematics(self) -> Kinematics:
+        return Kinematics(self.sim.batch)
+
+    @cached_property
+    def _tendons(self) -> Tendons:
+        return Tendons(self.sim.batch)
 
     def uniform(self, *shape: int) -> Tensor:
         """Uniform numbers in [-1, 1) from the environment's generator; zeros if resets are not stochastic."""

@@ -26,12 +26,20 @@ def add_sky(spec: mujoco.MjSpec) -> None:
 
 
 def apply_options(spec: mujoco.MjSpec, physics: PhysicsConfig, control_timestep: float) -> None:
-    """Set timestep, solver and cone of `spec`: Newton and dense Jacobians, Euler unless told otherwise."""
+    """Set timestep, solver and cone of `spec`: Newton, dense Jacobians and Euler, then what `physics` says."""
     option = spec.option
     option.timestep = control_timestep / physics.resolve_substeps(control_timestep)
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-    option.integrator = _INTEGRATORS[physics.integrator or "Euler"]
+    option.integrator = _INTEGRATORS["Euler"]
+    override_options(spec, physics)
+
+
+def override_options(spec: mujoco.MjSpec, physics: PhysicsConfig) -> None:
+    """Set what `physics` says of solver and integrator; what it leaves null stays."""
+    option = spec.option
+    if physics.integrator is not None:
+        option.integrator = _INTEGRATORS[physics.integrator]
     if physics.cone is not None:
         option.cone = _CONES[physics.cone]
     if physics.impratio is not None:

@@ -5,7 +5,7 @@ Axes: W worlds. `nq, nv, na, nu` as in MuJoCo.
 
 import copy
 from abc import ABC, abstractmethod
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 from torch import Tensor
 
@@ -72,6 +72,10 @@ class Backward(ABC):
         It begins with `batch.begin_step()` and ends with `batch.end_step(data)`.
         """
         batch.launch_step()
+
+    def last_data(self, batch: WorldBatch) -> Any:
+        """The mujoco_warp.Data in which the last substep of an env step was made."""
+        return batch.data
 
     @abstractmethod
     def record(self, ctrl: Tensor, start: StepState, end: StepState) -> tuple[Tensor, ...]:

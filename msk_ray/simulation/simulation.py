@@ -174,6 +174,14 @@ class Simulation:
             return StepState(*WarpSimStep.apply(self, ctrl, qpos, qvel, act))
         return self.advance(ctrl, StepState(qpos, qvel, act))
 
+    def contact_forces(self) -> Tensor:
+        """Force of all contacts on every geom in world coordinates [N], shape (W, G, 3).
+
+        Values only, without a gradient, of the last substep of the last `step`: ask before the next one, and before a
+        backward pass, which goes through the same buffers.
+        """
+        return self.engine.contact_forces()
+
     def _check_inputs(self, *inputs: Tensor) -> None:
         # Copying into the batch's buffers would broadcast one world to all, and convert dtypes and devices silently.
         for (name, width), value in zip(self._widths, inputs, strict=True):

@@ -1,9 +1,11 @@
 """Env steps of tensors, on recorded graphs whose buffers grow where a step needs more room."""
 
+import warp as wp
 from torch import Tensor
 
 from msk_ray.physics import Graph, WorldBatch
 from msk_ray.physics.capacity import Capacity
+from msk_ray.physics.touch import ContactForces
 from msk_ray.simulation.backward import Backward, StepState
 from msk_ray.simulation.buffers import BatchTensors, device_of, stream_of, wait_for
 
@@ -28,6 +30,17 @@ class Engine:
         self._graph = Graph(launches, batch.device)
         batch.losses.read()  # of the start-up, whose state is nobody's
         self._unseen = False
+        self._touch: ContactForces | None = None
+
+    def contact_forces(self) -> Tensor:
+        """Force of the contacts on every geom [N] in the last substep of the last step, (W, G, 3)."""
+        if self._touch is None:
+            data = self.batch.data if self.backward is None else self.backward.last_data(self.batch)
+            self._touch = ContactForces(self.batch.model, data)
+            self._touch_graph = Graph(self._touch.launch, self.batch.device)
+        self._touch_graph.replay(stream_of(self.device))
+        force: Tensor = wp.to_torch(self._touch.force, requires_grad=False)
+        return force.clone()
 
     def advance(self, ctrl: Tensor, start: StepState) -> StepState:
         """One env step, whatever it lost."""

@@ -210,6 +210,9 @@ class TapeAll(_Tape):
             wp.copy(array, getattr(before, name))
         batch.end_step(before)
 
+    def last_data(self, batch: WorldBatch) -> Any:
+        return self._datas[-1]
+
     def _stages(self, k: int) -> Any:
         data = self._datas[k]
         for name, array in self._states[k].items():
@@ -239,9 +242,16 @@ class Hybrid(Backward):
         self.ctrl.attach(batch)
 
     def launch_step(self, batch: WorldBatch) -> None:
+        self._stepping().launch_step(batch)
+
+    def last_data(self, batch: WorldBatch) -> Any:
+        return self._stepping().last_data(batch)
+
+    def _stepping(self) -> Backward:
+        """The mode whose launches make the step."""
         own = [m for m in (self.state, self.ctrl) if type(m).launch_step is not Backward.launch_step]
         assert len(own) <= 1, "two modes that each launch the step their own way cannot be mixed"
-        (own[0] if own else self.state).launch_step(batch)
+        return own[0] if own else self.state
 
     def record(self, ctrl: Tensor, start: StepState, end: StepState) -> tuple[Tensor, ...]:
         first = self.state.record(ctrl, start, end)

@@ -16,7 +16,6 @@ from msk_ray.envs.base import Env
 from msk_ray.envs.legs.config import LegSettings
 from msk_ray.envs.legs.muscles import MuscleCurves
 from msk_ray.simulation import StepState
-from msk_ray.simulation.tendons import Tendons
 
 AnyLegSettings = TypeVar("AnyLegSettings", bound=LegSettings)
 
@@ -96,7 +95,6 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
     def prepare(self) -> None:
         self.curves = MuscleCurves(self.model, self.device)
         self.action_size = len(self.curves.actuators)
-        self._tendons = Tendons(self.sim.batch)
         self.prepare_model()
         held = torch.tensor(self.model.key("stand").ctrl, dtype=torch.float32, device=self.device)
         rest = held[self.curves.actuators].clamp_min(self.config.rest_excitation)
@@ -145,7 +143,7 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
 
     def observe(self, state: StepState, action: Tensor) -> Tensor:
         root = self.root(state)
-        length, rate = self._tendons(state.qpos, state.qvel)
+        length, rate = self.tendons(state)
         length, rate = self.curves.normalised(length[:, self.curves.tendons], rate[:, self.curves.tendons])
         force = self.curves.force(state.act, length, rate)
         speed = torch.full_like(root.height, self.config.target_speed)

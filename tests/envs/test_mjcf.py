@@ -1,0 +1,234 @@
+"""Environments from an MJCF file: model, start, controls, what can be measured, and what is refused."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from msk_ray.config import overlay, parse_config
+from msk_ray.envs import Env, env_class, make_env
+from msk_ray.errors import ConfigError, MskRayError, UnsupportedModelError
+from msk_ray.simulation import Simulation
+from msk_ray.simulation.modes import BACKWARD_MODES
+
+MODEL = """<mujoco><option timestep="0.004" integrator="implicitfast" iterations="33"/>
+  <worldbody><geom name="floor" type="plane" size="5 5 1"/>
+    <body name="ball" pos="0 0 .5"><freejoint/><geom name="ball" size=".1" mass="2"/>
+      <body name="arm" pos="0 0 .1"><joint name="hinge" axis="0 1 0" range="-10 10"/>
+        <geom type="capsule" fromto="0 0 .1 0 0 .4" size=".02" contype="0" conaffinity="0"/></body></body></worldbody>
+  <actuator><position name="aim" joint="hinge" kp="5" ctrlrange="0.1 0.5"/></actuator>
+  <keyframe><key name="high" qpos="0 0 2 1 0 0 0 0.1" qvel="1 0 0 0 0 0 0"/>
+    <key name="low" qpos="0 0 .099 .6 .8 0 0 0"/></keyframe></mujoco>"""
+
+BALL = """
+import torch
+from msk_ray import MjcfEnv, Reward
+
+class BallReward(Reward):
+    height: float = 2.0
+
+class Ball(MjcfEnv):
+    class Settings(MjcfEnv.Settings):
+        reward: BallReward = BallReward()
+
+    mjcf = "models/ball.xml"
+    reward_names = ("height", "touch")
+
+    def observe(self, state, action):
+        return torch.cat((self.frames(state).position("ball"), state.qvel, action), -1)
+
+    def reward_terms(self, state, action, obs):
+        height = self.config.reward.height * self.frames(state).center_of_mass("ball")[:, 2]
+        return torch.stack((height, self.contact_forces(state, "ball")[:, 2]), -1)
+
+class Feeling(Ball):
+    def observe(self, state, action):
+        return self.contact_forces(state, "ball")
+
+class Short(Ball):
+    def reward_terms(self, state, action, obs):
+        return super().reward_terms(state, action, obs)[:, 0]
+
+class Flat(Ball):
+    def observe(self, state, action):
+        return state.qpos[:, 0]
+
+class Strung(Ball):
+    def observe(self, state, action):
+        return self.tendons(state)[0]
+
+class Homeless(MjcfEnv):
+    reward_names = ()
+    observe = Ball.observe
+    reward_terms = Ball.reward_terms
+
+class Unfinished(MjcfEnv):
+    mjcf = "models/ball.xml"
+    reward_names = ()
+
+class Free(Ball):
+    mjcf = "models/free.xml"
+
+class Edited(Ball):
+    @classmethod
+    def edit(cls, spec, config, physics):
+        spec.geom("ball").mass = 7.0
+"""
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of a module `ball` and its models; what runs here is started elsewhere."""
+    home = tmp_path / "home"
+    (home / "models").mkdir(parents=True)
+    (home / "ball.py").write_text(BALL)
+    (home / "models" / "ball.xml").write_text(MODEL)
+    (home / "models" / "free.xml").write_text(MODEL.replace(' ctrlrange="0.1 0.5"', ""))
+    (home / "models" / "torn.xml").write_text(MODEL[:100])
+    monkeypatch.syspath_prepend(home)
+    monkeypatch.chdir(tmp_path)
+    yield home
+    sys.modules.pop("ball", None)
+
+
+def _make(name: str = "Ball", nworld: int = 4, differentiable: bool = False, **values: Any) -> Env[Any]:
+    settings = {"env": {"name": f"ball:{name}", "nworld": nworld}}
+    config = parse_config(overlay(settings, {key.replace("__", "."): value for key, value in values.items()}))
+    return make_env(config.env, config.physics, nworld, "cpu", 0, differentiable=differentiable)
+
+
+def _model(name: str = "Ball", **values: Any) -> mujoco.MjModel:
+    settings = {"env": {"name": f"ball:{name}"}}
+    config = parse_config(overlay(settings, {key.replace("__", "."): value for key, value in values.items()}))
+    return env_class(config.env).build_model(config.env, config.physics)
+
+
+def test_options_are_the_files_unless_the_physics_section_says_otherwise(home: Path) -> None:
+    model = _model()
+    assert (model.opt.timestep, model.opt.iterations) == (pytest.approx(0.004), 33)
+    assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    changed = _model(physics__substeps=2, physics__integrator="Euler", physics__cone="elliptic", physics__impratio=3.0)
+    assert (changed.opt.timestep, changed.opt.impratio) == (pytest.approx(0.01), 3.0)
+    assert changed.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+    assert changed.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+    assert _model("Edited").body("ball").mass[0] == 7.0
+
+
+def test_episodes_start_about_a_keyframe(home: Path) -> None:
+    still = _make(env__stochastic_reset=False)
+    np.testing.assert_allclose(still.state.physics.qpos[0], [0, 0, 2, 1, 0, 0, 0, 0.1], atol=1e-6)
+    np.testing.assert_allclose(still.state.physics.qvel[0], [1, 0, 0, 0, 0, 0, 0], atol=1e-6)
+    noisy = _make(nworld=256, env__keyframe="low", env__reset_noise=0.5, env__reset_velocity_noise=0.25)
+    qpos, qvel, _ = noisy.state.physics
+    np.testing.assert_allclose(qpos[:, 3:7].norm(dim=-1), 1.0, atol=1e-6)
+    tangent = noisy.sim.tangent.difference(torch.tensor([0, 0, 0.099, 0.6, 0.8, 0, 0, 0]).expand(256, 8), qpos)
+    assert tangent[:, :6].abs().max() <= 0.5 + 1e-5
+    assert tangent[:, :6].abs().amax(0).min() > 0.45, "some degree of freedom is not moved"
+    assert qpos[:, 7].abs().max() == pytest.approx(np.deg2rad(10.0)), "a start outside of the joint's range"
+    assert 0.2 < qvel.abs().max() <= 0.25
+
+
+def test_actions_span_the_control_ranges(home: Path) -> None:
+    env = _make(nworld=3)
+    controls = env.control(torch.tensor([[-1.0], [0.0], [1.0]]))
+    np.testing.assert_allclose(controls[:, 0], [0.1, 0.3, 0.5], atol=1e-6)
+
+
+def test_a_reward_of_frames_has_a_gradient_and_one_of_forces_a_value(home: Path) -> None:
+    env = _make(nworld=2, differentiable=True, env__keyframe="low", env__stochastic_reset=False)
+    for _ in range(10):
+        transition = env.step(torch.zeros(2, 1), auto_reset=False)
+    assert (transition.terms[:, 1] > 5.0).all()
+    assert not env.contact_forces(env.state.physics, "ball").requires_grad
+    env.state = env.state.detach()
+    qpos = env.state.physics.qpos.clone().requires_grad_()
+    env.state = env.state._replace(physics=env.state.physics._replace(qpos=qpos))
+    env.step(torch.zeros(2, 1)).reward.sum().backward()
+    assert qpos.grad is not None
+    assert qpos.grad.abs().sum() > 0.1
+
+
+def test_what_is_measured_of_a_state_is_computed_once_and_with_gradients_where_asked(home: Path) -> None:
+    env = _make(nworld=2)
+    state = env.state.physics._replace(qpos=env.state.physics.qpos.clone().requires_grad_())
+    with torch.no_grad():
+        assert not env.frames(state).position("ball").requires_grad
+    assert env.frames(state).position("ball").requires_grad
+    assert env.frames(state) is env.frames(state)
+    assert env.frames(state) is not env.frames(state._replace())
+
+
+def test_a_world_that_diverged_has_no_forces(home: Path) -> None:
+    env = _make(nworld=2, env__keyframe="low")
+    physics = env.state.physics
+    env.state = env.state._replace(
+        physics=physics._replace(qvel=physics.qvel.clone().index_fill_(0, torch.tensor(1), 1e9))
+    )
+    transition = env.step(torch.zeros(2, 1))
+    assert transition.diverged.tolist() == [False, True]
+    assert torch.isfinite(transition.terms).all()
+    assert transition.terms[1, 1] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "message"),
+    [
+        ("Ball", {"env__model": "gone.xml"}, "env.model: no file .*/home/gone.xml; write a path relative to"),
+        ("Ball", {"env__model": "models/torn.xml"}, "models/torn.xml: "),
+        ("Ball", {"env__keyframe": "middle"}, "env.keyframe: the model has no keyframe 'middle'; it has high, low"),
+        ("Ball", {"env__control_timestep": 0.03}, "write physics.substeps: 8, or env.control_timestep: 0.032"),
+        ("Ball", {"physics__solref": [0.1, 1.0]}, "physics.solref: env ball:Ball does not read it; leave it out"),
+        ("Ball", {"env__stochastic_reset": False, "env__reset_noise": 0.1}, "env.reset_noise: nothing reads it while"),
+        ("Ball", {"env__reward__heigt": 1.0}, "env.reward.heigt: unknown key; did you mean 'height'"),
+        ("Free", {}, "actuator aim has no ctrlrange, so no control for actions of -1 and 1: write a ctrlrange"),
+        ("Feeling", {}, "ask for them in reward_terms, fell or outcome_terms, not in observe"),
+        ("Flat", {}, r"observe of Flat has shape \(4,\), not \(worlds, entries\) with 4 worlds"),
+        ("Strung", {}, "the model has no tendons"),
+        ("Homeless", {}, "Homeless has no model: write `mjcf = 'model.xml'` in the class"),
+        ("Unfinished", {}, "ball:Unfinished lacks observe, reward_terms"),
+    ],
+)
+def test_what_does_not_fit_is_refused_before_the_first_step(
+    home: Path, name: str, values: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(MskRayError, match=message) as caught:
+        _make(name, **values)
+    assert isinstance(caught.value, ConfigError | UnsupportedModelError)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_reward_of_another_shape_than_its_names_is_refused(home: Path) -> None:
+    env = _make("Short")
+    with pytest.raises(ConfigError, match=r"reward_terms of Short has shape \(4,\), but reward_names has 2 names"):
+        env.step(torch.zeros(4, 1))
+
+
+def test_forces_are_those_of_the_last_substep_in_every_backward_mode() -> None:
+    model = mujoco.MjModel.from_xml_string(MODEL)
+    found = {}
+    for mode in (None, *BACKWARD_MODES):
+        sim = Simulation(model, 2, 5, mode)
+        qpos, qvel, act = sim.initial_state()
+        qpos[:, 2] = 0.11
+        for _ in range(8):
+            ctrl = torch.zeros(2, 1, requires_grad=mode is not None)
+            qpos, qvel, act = sim.step(ctrl, qpos.detach(), qvel.detach(), act)
+        found[mode] = sim.contact_forces()
+    data = mujoco.MjData(model)
+    data.qpos[2] = 0.11
+    wrench = np.zeros(6)
+    for step in range(40):
+        # As in an env step, whose first substep starts the solver from nothing.
+        if step % 5 == 0:
+            data.qacc_warmstart[:] = 0.0
+        mujoco.mj_step(model, data)
+    assert data.ncon == 1
+    mujoco.mj_contactForce(model, data, 0, wrench)
+    assert wrench[0] > 1.0
+    for mode, force in found.items():
+        np.testing.assert_allclose(force[:, model.geom("ball").id, 2], wrench[0], rtol=5e-3, err_msg=str(mode))
+        np.testing.assert_allclose(force[:, model.geom("floor").id, 2], -wrench[0], rtol=5e-3, err_msg=str(mode))
