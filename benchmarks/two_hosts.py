@@ -52,6 +52,12 @@ def _start_ray(host: Host, log: Path, *where: str) -> None:
     host.start([*ray, f"--node-ip-address={host.address}", "--object-store-memory=100000000", *where], log)
 
 
+def _wait_for_nodes(host: Host, address: str, count: int, log: Path) -> None:
+    command = ["msk_ray.tune.cluster", "--address", address, "--nodes", str(count), "--wait", str(LIMIT_S)]
+    if host.start([sys.executable, "-m", *command], log).wait():
+        sys.exit("the hosts did not find each other:\n" + log.read_text()[-3000:])
+
+
 @contextmanager
 def _hosts(scratch: Path) -> Iterator[list[Host]]:
     environment = {
@@ -108,13 +114,10 @@ def main() -> int:
     with _hosts(scratch) as (first, second):
         address = f"{first.address}:{PORT}"
         _start_ray(first, scratch / f"{first.name}.log", "--head", f"--port={PORT}", "--include-dashboard=false")
+        _wait_for_nodes(first, address, 1, scratch / "joined.log")
+        # A raylet that comes before the head is up gives up soon.
         _start_ray(second, scratch / f"{second.name}.log", f"--address={address}")
-        joined = first.start(
-            [*python, "msk_ray.tune.cluster", "--address", address, "--nodes", "2", "--wait", "60"],
-            scratch / "joined.log",
-        )
-        if joined.wait():
-            sys.exit("the hosts did not find each other:\n" + (scratch / "joined.log").read_text()[-3000:])
+        _wait_for_nodes(first, address, 2, scratch / "joined.log")
         log = scratch / "driver.log"
         command = ["msk_ray.tune", "--space", str(scratch / "space.yaml"), "--name", "hosts", "--cpu"]
         driver = first.start([*python, *command, "--storage", str(scratch / "runs"), "--address", address], log)
