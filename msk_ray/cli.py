@@ -71,6 +71,10 @@ def run(main: Callable[[Sequence[str] | None], int], argv: Sequence[str] | None 
 
     In a program that listens to `signals`, a request to stop that `main` had nothing to save for ends it with 75.
     """
+    # `python -m` looks for modules in the current folder, a console script does not: a class that a configuration names
+    # by import path is to be found either way.
+    if "" not in sys.path:
+        sys.path.append("")
     stop = signals.current()
     try:
         if stop is not None:

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from msk_ray.config import Config, PhysicsConfig, load_config
+from msk_ray.diagnose.exact import ExactKinematics, ExactTendons
 from msk_ray.envs import Env, EnvState, make_env
 from msk_ray.errors import ConfigError, SimulationError
 from msk_ray.gradcheck import Oracle, Point
@@ -119,6 +120,8 @@ def probe(
     for variant in variants:
         physics = subject.config.physics if variant is None else PhysicsConfig(variant=variant)
         env = make_env(subject.config.env, physics, worlds, device, seed)
+        # Finite differences would see forces that the gradient does not: both leave them out.
+        env.ignore_contact_forces = True
         network = subject.network(env)
         for state in states:
             start = _starting_state(env, network, state)
@@ -226,7 +229,20 @@ def _double(env: Env[Any]) -> Env[Any]:
     """The environment with its constants in float64 on the CPU: for observations and rewards, not for steps."""
     ideal = copy.copy(env)
     for name, value in vars(env).items():
-        if isinstance(value, Tensor):
-            setattr(ideal, name, value.cpu().double() if value.is_floating_point() else value.cpu())
+        setattr(ideal, name, _in_double(value))
     ideal.device = torch.device("cpu")
+    ideal.measure_by(ExactKinematics(env.model), ExactTendons(env.model))
     return ideal
+
+
+def _in_double(value: Any) -> Any:
+    """Tensors, also within tuples, lists and dicts, in float64 on the CPU; anything else as it is."""
+    match value:
+        case Tensor():
+            return value.cpu().double() if value.is_floating_point() else value.cpu()
+        case tuple() | list():
+            parts = [_in_double(part) for part in value]
+            return type(value)(*parts) if hasattr(value, "_fields") else type(value)(parts)
+        case dict():
+            return {key: _in_double(part) for key, part in value.items()}
+    return value

@@ -64,6 +64,7 @@ class Env(ABC, Generic[SettingsT]):
         state: current state of all worlds; `detach` it to start a new graph.
         generator: source of reset states, on the environment's device; one on the CPU may be put in its place, which
             draws the same states for every device.
+        ignore_contact_forces: whether they are read as 0, in a comparison of gradients, which they have none of.
     """
 
     action_size: int
@@ -99,6 +100,7 @@ class Env(ABC, Generic[SettingsT]):
         self.action_size = self.model.nu
         self.generator = torch.Generator(device=self.device).manual_seed(seed)
         self._fresh: list[StepState] = []
+        self.ignore_contact_forces = False
         self._reached: StepState | None = None
         self._measured: dict[str, tuple[StepState, bool, Any]] = {}
         self.prepare()
@@ -227,6 +229,8 @@ class Env(ABC, Generic[SettingsT]):
         Raises:
             ConfigError: no step has just led to `state`, or there is no such geom.
         """
+        if self.ignore_contact_forces:
+            return torch.zeros_like(self.frames(state).geom_position(geom))
         if state is not self._reached:
             raise ConfigError(
                 f"{type(self).__qualname__}: contact forces belong to a step, not to a state: ask for them in "
@@ -243,6 +247,11 @@ class Env(ABC, Generic[SettingsT]):
         if kept is None or kept[0] is not state or kept[1] != grad:
             kept = self._measured[what] = (state, grad, measure())
         return kept[2]
+
+    def measure_by(self, kinematics: Kinematics, tendons: Tendons) -> None:
+        """Take `frames` and `tendons` from these: those of a simulation in float64, for example."""
+        self._kinematics, self._tendons = kinematics, tendons
+        self._measured = {}
 
     @cached_property
     def _kinematics(self) -> Kinematics:

@@ -206,7 +206,7 @@ class Frames:
     def axis(self, body: Names, axis: int) -> Tensor:
         """Where axis 0, 1 or 2 (x, y, z) of bodies points, unit vectors (W, 3) or (W, n, 3)."""
         quat = self.orientation(body)
-        unit = torch.zeros(3, device=quat.device)
+        unit = torch.zeros(3, dtype=quat.dtype, device=quat.device)
         unit[axis] = 1.0
         return quat_rotate(quat, unit.expand(*quat.shape[:-1], 3))
 

@@ -29,7 +29,7 @@ class MjcfEnv(Env[AnyMjcfSettings], Generic[AnyMjcfSettings]):
     It has to have `mjcf`, `reward_names`, `observe` and `reward_terms`, and settings with its own reward:
 
         class Settings(MjcfEnv.Settings):
-            reward: HopperReward = HopperReward()
+            reward: WalkerReward = WalkerReward()
 
     Actions in [-1, 1] become controls over each actuator's ctrlrange (`control`), episodes start about a keyframe
     (`draw_physics`) and end at the time limit or where `fell` says so. `edit` may change the model before it is

@@ -1,0 +1,145 @@
+"""An environment from outside: one file that the package does not know goes through every command, as ours do.
+
+The commands run as the console script does, in a folder of the user's.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from needs import need_drawing
+from processes import Launcher
+
+from msk_ray.config import dump_yaml
+
+HERE = Path(__file__).resolve().parent
+SCRIPT = """
+import sys
+from msk_ray.__main__ import main
+if __name__ == "__main__":
+    sys.exit(main())
+"""
+SETTINGS = {
+    "env": {"name": "hopper:Hopper", "nworld": 8, "episode_length": 40, "reward": {"forward": 2.0}},
+    "shac": {"horizon": 4, "critic_iterations": 2, "critic_batches": 2},
+    "actor": {"hidden": [16]},
+    "critic": {"hidden": [16]},
+    "evaluation": {"interval": 1, "nworld": 4, "steps": 20},
+    "trial": {"epochs": 2, "checkpoint_interval": 1},
+}
+SPACE = {
+    "question": "Which rate?",
+    "base": "hopper.yaml",
+    "parameters": {"env.reward.upright": {"grid": [0.5, 1.0]}},
+    "seeds": "0-1",
+}
+
+pytestmark = pytest.mark.timeout(3600)  # a dozen programs one after the other
+
+Command = Callable[..., "subprocess.CompletedProcess[str]"]
+
+
+def _user(place: Path, root: Path, launcher: Launcher, *paths: Path) -> Command:
+    """What runs `msk-ray ARGUMENTS` in the folder `place`, with `paths` installed."""
+    script = place / "bin" / "msk-ray"
+    script.parent.mkdir(parents=True)
+    script.write_text(SCRIPT)
+    (place / "hopper.yaml").write_text(dump_yaml(SETTINGS))
+    (place / "hopper_rates.yaml").write_text(dump_yaml(SPACE))
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (root, *paths)))}
+
+    def command(*arguments: str) -> "subprocess.CompletedProcess[str]":
+        process = launcher.start(
+            [sys.executable, str(script), *arguments],
+            cwd=place,
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+        )
+        output, _ = process.communicate()
+        return subprocess.CompletedProcess(arguments, process.returncode, output, "")
+
+    return command
+
+
+@pytest.fixture
+def user(tmp_path: Path, root: Path, launcher: Launcher) -> Command:
+    """Commands in a folder that holds the hopper."""
+    (tmp_path / "user").mkdir()
+    (tmp_path / "user" / "hopper.py").write_text((HERE / "hopper.py").read_text())
+    return _user(tmp_path / "user", root, launcher)
+
+
+def _done(result: "subprocess.CompletedProcess[str]") -> str:
+    assert result.returncode == 0, result.stdout
+    return result.stdout
+
+
+def test_it_is_one_short_file_that_the_package_does_not_know(root: Path) -> None:
+    assert len((HERE / "hopper.py").read_text().splitlines()) <= 60
+    for path in (root / "msk_ray").rglob("*.py"):
+        assert "hopper" not in path.read_text().lower(), path
+
+
+def test_by_import_path_it_trains_and_is_shown_measured_and_diagnosed(user: Command, tmp_path: Path) -> None:
+    home = tmp_path / "user"
+    _done(user("train", "--config", "hopper.yaml", "--device", "cpu"))
+    trial = home / "runs" / "train" / "hopper_seed0"
+    assert "no module 'hopper'" not in _done(user("train", "--config", "hopper.yaml", "--device", "cpu", "--resume"))
+    text = _done(user("evaluate", str(trial), "--device", "cpu", "--worlds", "4"))
+    for term in ("forward", "upright", "effort", "impact"):
+        assert term in text
+    quality = ("--horizons", "1", "2", "--worlds", "2", "--directions", "4", "--states", "standing")
+    _done(user("diagnose", str(trial / "checkpoints" / "best.pt"), *quality, "--output", "quality"))
+    assert list((home / "quality").glob("*.png"))
+    refused = user("gait", str(trial), "--device", "cpu")
+    assert (refused.returncode, "gait needs a model of two legs" in refused.stdout) == (2, True), refused.stdout
+    need_drawing()
+    pictures = ("--device", "cpu", "--steps", "10", "--size", "64x48")
+    _done(user("visualize", str(trial), "--video", "hopper.mp4", *pictures))
+    _done(user("visualize", str(trial), "--strip", "hopper.png", *pictures))
+    assert (home / "hopper.mp4").stat().st_size > 500
+    assert (home / "hopper.png").stat().st_size > 500
+
+
+def test_by_import_path_it_is_swept_and_reported(user: Command, tmp_path: Path) -> None:
+    runs = tmp_path / "user" / "runs"
+    assert "4 trials" in _done(user("tune", "--space", "hopper_rates.yaml", "--dry-run"))
+    misspelt = user("tune", "--space", "hopper_rates.yaml", "--dry-run", "--set", "env.reward.efort=1")
+    assert (misspelt.returncode, "did you mean 'effort'?" in misspelt.stdout) == (2, True), misspelt.stdout
+    sweep = ("--space", "hopper_rates.yaml", "--cpu", "--max-concurrent", "1")
+    _done(user("tune", *sweep))
+    trials = [json.loads(path.read_text()) for path in runs.glob("hopper_rates/trials/*/outcome.json")]
+    assert [entry["outcome"] for entry in trials] == ["finished"] * 4, trials
+    assert "4" in _done(user("status", "hopper_rates"))
+    _done(user("report", "hopper_rates", "--device", "cpu"))
+    assert "env.reward.upright" in (runs / "hopper_rates" / "report" / "index.html").read_text()
+
+
+def test_installed_as_a_wheel_it_has_a_short_name(tmp_path: Path, root: Path, launcher: Launcher) -> None:
+    source, site = tmp_path / "source", tmp_path / "site"
+    source.mkdir()
+    (source / "hopper.py").write_text((HERE / "hopper.py").read_text())
+    (source / "pyproject.toml").write_text(
+        '[build-system]\nrequires = ["setuptools"]\nbuild-backend = "setuptools.build_meta"\n'
+        '[project]\nname = "my-hopper"\nversion = "1.0"\n'
+        '[project.entry-points."msk_ray.envs"]\nhopper = "hopper:Hopper"\n'
+        '[tool.setuptools]\npy-modules = ["hopper"]\n'
+    )
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
+    apart = ("--no-index", "--no-deps", "--no-build-isolation")
+    subprocess.run([*pip, "wheel", *apart, "--wheel-dir", str(tmp_path), str(source)], check=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    subprocess.run([*pip, "install", *apart, "--target", str(site), str(wheel)], check=True)
+    (tmp_path / "user").mkdir()
+    command = _user(tmp_path / "user", root, launcher, site)
+    named = ("--config", "hopper.yaml", "--device", "cpu", "--set", "env.name=hopper")
+    misspelt = command("train", "--config", "hopper.yaml", "--set", "env.name=hoper")
+    assert (misspelt.returncode, "did you mean 'hopper'?" in misspelt.stdout) == (2, True), misspelt.stdout
+    _done(command("train", *named))
+    rows = (tmp_path / "user" / "runs" / "train" / "hopper_seed0" / "metrics.jsonl").read_text().splitlines()
+    assert len(rows) == 3  # the untrained policy, and two epochs
