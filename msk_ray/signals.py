@@ -58,8 +58,12 @@ class StopRequest:
             self._deferred = False
 
     def settle(self) -> None:
-        """The work is done and the exit code known: a request changes nothing any more."""
-        self._deferred = True
+        """The work is done and the exit code known: a request changes nothing any more.
+
+        Ignored rather than handled: an interpreter that ends takes handlers away before it has ended.
+        """
+        for number in NUMBERS:
+            signal.signal(number, signal.SIG_IGN)
 
     def receive(self, number: int, frame: FrameType | None = None) -> None:
         """Do what a signal of this number asks for."""

@@ -71,6 +71,13 @@ def test_the_handlers_of_others_come_back() -> None:
         ("os.kill(os.getpid(), signal.SIGTERM); run(lambda argv: 0)", RESUMABLE, "SIGTERM before anything began\n"),
         ("sys.exit(run(lambda argv: os.kill(os.getpid(), signal.SIGUSR1)))", RESUMABLE, "stopped by SIGUSR1\n"),
         ("code = run(lambda argv: 0); os.kill(os.getpid(), signal.SIGTERM); sys.exit(code)", 0, ""),
+        # When modules are taken down, handlers have been.
+        (
+            "class Last:\n  def __del__(self, kill=os.kill, pid=os.getpid()): kill(pid, 15)\n"
+            "last = Last(); sys.exit(run(lambda argv: 75))",
+            RESUMABLE,
+            "",
+        ),
     ],
 )
 def test_from_the_first_line_to_the_last(body: str, code: int, output: str) -> None:
