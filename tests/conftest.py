@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 from needs import need_program
-from playwright.sync_api import sync_playwright
 from processes import Launcher
 
 from msk_ray.config import Config, dump_yaml, load_config, parse_config
@@ -114,6 +113,9 @@ def _small_config(name: str) -> Config:
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
     """Headless Chromium."""
+    # Here, so that a GPU machine without it runs all tests that open no browser.
+    from playwright.sync_api import sync_playwright
+
     program = need_program("chromium", "chromium-browser", "google-chrome", package="chromium")
     with sync_playwright() as playwright:
         # Its sandbox needs rights that a container, or root, does not have.
