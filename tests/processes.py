@@ -9,16 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-
-def stat_of(pid: int) -> list[str]:
-    """Name, then the fields of /proc/PID/stat from the state on; empty if there is no such process, or a dead one."""
-    try:
-        text = Path(f"/proc/{pid}/stat").read_text()
-    except OSError:
-        return []
-    name, _, rest = text[text.index("(") + 1 :].rpartition(")")
-    fields = rest.split()
-    return [] if fields[0] == "Z" else [name, *fields]
+from fault_campaign.processes import stat_of
 
 
 def members_of(session: int) -> dict[int, str]:
