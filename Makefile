@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV   ?= .venv
 RUN    := $(VENV)/bin/python
 STAMP  := $(VENV)/.installed
+WORKERS ?= 4
 
 .PHONY: help env demo test check unit gpu-test bench clean
 
@@ -29,8 +30,8 @@ check: env           ## formatting, lint, layers and types
 	$(VENV)/bin/lint-imports
 	$(VENV)/bin/mypy
 
-unit: env            ## the tests that need no GPU
-	$(RUN) -m pytest
+unit: env            ## the tests that need no GPU, in as many processes as WORKERS says
+	$(RUN) -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 gpu-test: env        ## the tests that need a CUDA device
 	$(RUN) -m pytest -m gpu

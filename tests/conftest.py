@@ -21,6 +21,11 @@ from msk_ray.tune.trials import resolve_trials
 ROOT = Path(__file__).resolve().parent.parent
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files with tests of minutes, which mostly wait, come first: beside them there is room for the many short ones."""
+    items.sort(key=lambda item: item.path.parent.name not in ("plugin", "tune"))
+
+
 @pytest.fixture
 def root() -> Path:
     """Top folder of the repository."""
@@ -35,6 +40,12 @@ def hangup() -> Iterator[None]:
     signal.signal(signal.SIGHUP, before)
 
 
+@pytest.fixture(autouse=True)
+def no_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Output is as wide as into a pipe: processes of pytest-xdist are told the width of the terminal they share."""
+    monkeypatch.delenv("COLUMNS", raising=False)
+
+
 @pytest.fixture
 def launcher() -> Iterator[Launcher]:
     """Starts programs of which nothing is left after the test."""
@@ -43,9 +54,7 @@ def launcher() -> Iterator[Launcher]:
     made.end()
 
 
-@pytest.fixture(scope="session")
-def tiny_settings() -> dict[str, Any]:
-    """Settings of a CartPole trial of seconds."""
+def _tiny_settings() -> dict[str, Any]:
     return {
         "env": {"name": "cartpole", "nworld": 8, "episode_length": 40},
         "shac": {"horizon": 8, "critic_iterations": 2, "critic_batches": 2},
@@ -57,16 +66,22 @@ def tiny_settings() -> dict[str, Any]:
 
 
 @pytest.fixture
+def tiny_settings() -> dict[str, Any]:
+    """Settings of a CartPole trial of seconds, of which each test may change its own copy."""
+    return _tiny_settings()
+
+
+@pytest.fixture
 def tiny_cartpole(tiny_settings: dict[str, Any]) -> Config:
     """A CartPole trial of seconds."""
     return parse_config(tiny_settings)
 
 
 @pytest.fixture(scope="session")
-def sweep(tmp_path_factory: pytest.TempPathFactory, tiny_settings: dict[str, Any]) -> experiments.Experiment:
+def sweep(tmp_path_factory: pytest.TempPathFactory) -> experiments.Experiment:
     """A real small sweep of CartPole, two rates by two seeds, trained here one after the other. Not to be changed."""
     folder = tmp_path_factory.mktemp("sweep")
-    (folder / "base.yaml").write_text(dump_yaml(tiny_settings))
+    (folder / "base.yaml").write_text(dump_yaml(_tiny_settings()))
     data = {
         "question": "Which rate?",
         "base": "base.yaml",

@@ -28,6 +28,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
+import orjson
+
 from msk_ray.errors import StorageError, StorageFailure
 
 T = TypeVar("T")
@@ -144,6 +146,14 @@ def read_lines(path: Path, build: Callable[[dict[str, Any]], T]) -> tuple[list[T
     return found, tuple(damages)
 
 
+def _load(data: bytes) -> Any:
+    try:
+        return orjson.loads(data)
+    except orjson.JSONDecodeError:
+        # It knows no NaN either; and says less about what is wrong.
+        return json.loads(data.decode("utf-8"))
+
+
 def parse_object(data: bytes) -> dict[str, Any]:
     """A JSON object. NaN and infinity, which JSON does not know, are numbers here, and none that is finite.
 
@@ -151,7 +161,7 @@ def parse_object(data: bytes) -> dict[str, Any]:
         ValueError: it is none, with the reason.
     """
     try:
-        value = json.loads(data.decode("utf-8"))
+        value = _load(data)
     except UnicodeDecodeError as error:
         raise ValueError(f"not UTF-8 text: byte {error.start} is {data[error.start]:#04x}") from None
     except json.JSONDecodeError as error:
