@@ -222,7 +222,10 @@ def test_an_experiment_by_path_with_a_request_to_stop(
     assert "stoppedonrequest;goonwith:" + "".join(command.split()) in said
 
 
-def test_list_of_experiments(experiment: experiments.Experiment, capsys: pytest.CaptureFixture[str]) -> None:
+def test_list_of_experiments(
+    experiment: experiments.Experiment, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "300")  # the folder is named, however long its name is
     storage = experiment.path.parent
     (storage / "debug").mkdir()
     (storage / "torn").mkdir()
