@@ -1,8 +1,9 @@
 """Actuators: slopes of force and activation with respect to control, activation, length and velocity."""
 
 import warp as wp
-from mujoco_warp._src.types import BiasType, DynType, GainType, JointType, TrnType, vec10
-from mujoco_warp._src.util_misc import muscle_bias, muscle_dynamics, muscle_gain, muscle_gain_vel_deriv
+from mujoco_warp import BiasType, DynType, GainType, JointType, TrnType
+
+from msk_ray.physics.mjw_private import muscle_bias, muscle_dynamics, muscle_gain, muscle_gain_vel_deriv, vec10
 
 wp.set_module_options({"enable_backward": False})
 

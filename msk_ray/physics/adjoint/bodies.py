@@ -11,11 +11,9 @@ from their own body, so λᵀ(M a + bias) = Σ_b L·(I A + V ×* I V) needs noth
 """
 
 import warp as wp
-from mujoco_warp._src.math import inert_vec, motion_cross_force
-from mujoco_warp._src.types import vec10
-from mujoco_warp._src.util_misc import _poly_force_deriv
 
 from msk_ray.physics.adjoint.spatial import carried, wrench
+from msk_ray.physics.mjw_private import inert_vec, motion_cross_force, poly_force_deriv, vec10
 
 wp.set_module_options({"enable_backward": False})
 
@@ -252,12 +250,12 @@ def sweep_up(
         stiffness = jnt_stiffness[worldid % jnt_stiffness.shape[0], jnt]
         poly = jnt_stiffnesspoly[worldid % jnt_stiffnesspoly.shape[0], jnt]
         # Φ ∋ λ k(x) x with x = q - q₀
-        slope_q += lam_j * _poly_force_deriv(stiffness, poly, stretch, 0)
+        slope_q += lam_j * poly_force_deriv(stiffness, poly, stretch, 0)
     if damper_on:
         c = damping_in[worldid, j]
         v = qvel_in[worldid, j]
         # Φ ∋ λ c(|v|) v
-        slope_v += lam_j * _poly_force_deriv(c[0], wp.vec2(c[1], c[2]), v, 1)
+        slope_v += lam_j * poly_force_deriv(c[0], wp.vec2(c[1], c[2]), v, 1)
         if implicit_damping:
             # Φ ∋ h μ B(v) â with B = d(c v)/dv, hence dB/dv = sign(v) (2 c₁ + 6 c₂ |v|)
             h = opt_timestep[worldid % opt_timestep.shape[0]]

@@ -5,7 +5,6 @@ happens to lie on a clipping plane stays a corner.
 """
 
 import warp as wp
-from mujoco_warp._src.math import safe_div
 
 from msk_ray.physics.adjoint.box_laws import (
     CROSSING,
@@ -22,6 +21,7 @@ from msk_ray.physics.adjoint.box_laws import (
     face_contact,
     point_contact,
 )
+from msk_ray.physics.mjw_private import safe_div
 
 wp.set_module_options({"enable_backward": False})
 

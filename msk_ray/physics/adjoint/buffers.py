@@ -5,12 +5,12 @@ from typing import Any
 import mujoco
 import numpy as np
 import warp as wp
-from mujoco_warp._src.types import MJ_MAXVAL
 
 from msk_ray.physics.adjoint import geometry
 from msk_ray.physics.adjoint.approximated import TouchCounter
 from msk_ray.physics.adjoint.coverage import colliding_pairs
 from msk_ray.physics.adjoint.tables import build_tables
+from msk_ray.physics.mjw_private import MJ_MAXVAL
 
 
 class StepBuffers:

@@ -6,10 +6,10 @@ plain field x, along the frame's axes (k < 3), and the relative spin (k ≥ 3). 
 """
 
 import warp as wp
-from mujoco_warp._src.types import ConstraintType, vec5
 
 from msk_ray.physics.adjoint.rows import cone_law, cone_slope, row_slopes, vec6
 from msk_ray.physics.adjoint.spatial import carried, point_velocity, wrench
+from msk_ray.physics.mjw_private import ConstraintType, vec5
 
 wp.set_module_options({"enable_backward": False})
 

@@ -8,10 +8,11 @@ from both bodies' spins and angular accelerations; `turn_score` holds them and i
 """
 
 import warp as wp
-from mujoco_warp._src.types import ConstraintType, EqType, ObjType, vec5, vec12
+from mujoco_warp import ObjType
 
 from msk_ray.physics.adjoint.rows import row_slopes
 from msk_ray.physics.adjoint.spatial import carried, point_velocity, wrench
+from msk_ray.physics.mjw_private import ConstraintType, EqType, vec5, vec12
 
 wp.set_module_options({"enable_backward": False})
 

@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 
 import mujoco
 import warp as wp
-from mujoco_warp._src.math import make_frame
-from mujoco_warp._src.types import GeomType
+from mujoco_warp import GeomType
 
 from msk_ray.physics.adjoint.approximated import Touches, count_touch
 from msk_ray.physics.adjoint.box_pairs import box_box_wrenches, capsule_box_wrenches
@@ -28,6 +27,7 @@ from msk_ray.physics.adjoint.pair_laws import (
     rim_torque,
 )
 from msk_ray.physics.adjoint.spatial import column, turning_torque, wrench
+from msk_ray.physics.mjw_private import make_frame
 
 wp.set_module_options({"enable_backward": False})
 

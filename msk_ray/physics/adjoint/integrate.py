@@ -4,8 +4,9 @@ Rotations are perturbed on the right (body frame), as MuJoCo's ball and free joi
 """
 
 import warp as wp
-from mujoco_warp._src.types import JointType
-from mujoco_warp._src.util_misc import _poly_force_deriv, dof_damping_total
+from mujoco_warp import JointType
+
+from msk_ray.physics.mjw_private import dof_damping_total, poly_force_deriv
 
 wp.set_module_options({"enable_backward": False})
 
@@ -116,7 +117,7 @@ def pull_position(
         # hB = h d(c(|v|) v)/dv, the damping that the Euler integrator treats implicitly
         step_out[worldid, j] = 0.0
         if implicit_damping:
-            step_out[worldid, j] = h * _poly_force_deriv(linear, poly, qvel_in[worldid, j], 1)
+            step_out[worldid, j] = h * poly_force_deriv(linear, poly, qvel_in[worldid, j], 1)
         phi_qpos_out[worldid, j] = 0.0
         phi_qvel_out[worldid, j] = 0.0
 

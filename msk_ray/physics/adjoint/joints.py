@@ -1,9 +1,9 @@
 """Springs of free and ball joints."""
 
 import warp as wp
-from mujoco_warp._src.math import quat_sub
-from mujoco_warp._src.types import JointType
-from mujoco_warp._src.util_misc import _poly_force
+from mujoco_warp import JointType
+
+from msk_ray.physics.mjw_private import poly_force, quat_sub
 
 wp.set_module_options({"enable_backward": False})
 
@@ -24,7 +24,7 @@ def log_rate_pullback(phi: wp.vec3, g: wp.vec3) -> wp.vec3:
 def spring_slope(stiffness: float, poly: wp.vec2, dif: wp.vec3, lam: wp.vec3) -> wp.vec3:
     """∂/∂d of k(|d|) λ·d, k = k₀ + p₀|d| + p₁|d|²."""
     r = wp.length(dif)
-    out = _poly_force(stiffness, poly, r, 0) * lam
+    out = poly_force(stiffness, poly, r, 0) * lam
     if r > 0.0:
         out += (poly[0] / r + 2.0 * poly[1]) * wp.dot(lam, dif) * dif
     return out

@@ -6,7 +6,10 @@ ends lie side by side.
 """
 
 import warp as wp
-from mujoco_warp._src.collision_primitive_core import (
+from mujoco_warp import GeomType
+
+from msk_ray.physics.adjoint.spatial import column
+from msk_ray.physics.mjw_private import (
     capsule_capsule,
     plane_ellipsoid,
     plane_sphere,
@@ -14,9 +17,6 @@ from mujoco_warp._src.collision_primitive_core import (
     sphere_capsule,
     sphere_sphere,
 )
-from mujoco_warp._src.types import GeomType
-
-from msk_ray.physics.adjoint.spatial import column
 
 wp.set_module_options({"enable_backward": False})
 

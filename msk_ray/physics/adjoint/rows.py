@@ -6,8 +6,8 @@ T = |φᵢ jarᵢ| and are finished in `contacts`.
 """
 
 import warp as wp
-from mujoco_warp._src.constraint import _contact_kbimp
-from mujoco_warp._src.types import ConstraintType, vec5
+
+from msk_ray.physics.mjw_private import ConstraintType, contact_kbimp, vec5
 
 wp.set_module_options({"enable_backward": False})
 
@@ -54,7 +54,7 @@ class RowSlopes:
 @wp.func
 def row_slopes(disableflags: int, timestep: float, solref: wp.vec2, solimp: vec5, pos: float) -> RowSlopes:
     """Slopes of one row. D = imp / ((1 - imp) w)  ⇒  d(log D) = d(imp) / (imp (1 - imp))."""
-    kbi = _contact_kbimp(disableflags, timestep, solref, solimp, pos, False)
+    kbi = contact_kbimp(disableflags, timestep, solref, solimp, pos, False)
     slope = impedance_slope(solimp, pos)
     out = RowSlopes()
     out.damping = kbi[1]

@@ -1,10 +1,11 @@
 """Constraint rows of joints and tendons: limits, friction loss, and joint and tendon equalities."""
 
 import warp as wp
-from mujoco_warp._src.types import ConstraintType, EqType, JointType, vec5, vec12
+from mujoco_warp import JointType
 
 from msk_ray.physics.adjoint.rows import row_slopes
 from msk_ray.physics.adjoint.tendons import tendon_rate
+from msk_ray.physics.mjw_private import ConstraintType, EqType, vec5, vec12
 
 wp.set_module_options({"enable_backward": False})
 

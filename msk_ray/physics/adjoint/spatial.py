@@ -1,7 +1,8 @@
 """Spatial algebra on MuJoCo's com-based vectors: motions [ω; v] and forces [torque; force] about one fixed point."""
 
 import warp as wp
-from mujoco_warp._src.math import motion_cross_force
+
+from msk_ray.physics.mjw_private import motion_cross_force
 
 wp.set_module_options({"enable_backward": False})
 

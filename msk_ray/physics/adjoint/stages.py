@@ -5,7 +5,7 @@ from typing import Any
 import mujoco
 import mujoco_warp as mjw
 import numpy as np
-from mujoco_warp._src.derivative import deriv_smooth_vel
+from mujoco_warp import deriv_smooth_vel
 
 from msk_ray.physics.batch import refresh_velocity
 

@@ -11,10 +11,9 @@ On a wrapping geom the ends are tangent points that move over the surface; the r
 """
 
 import warp as wp
-from mujoco_warp._src.types import MJ_MAXVAL, WrapType
-from mujoco_warp._src.util_misc import _poly_force_deriv, tendon_damping_total, wrap
 
 from msk_ray.physics.adjoint.spatial import carried, point_velocity, wrench
+from msk_ray.physics.mjw_private import MJ_MAXVAL, WrapType, poly_force_deriv, tendon_damping_total, wrap
 
 wp.set_module_options({"enable_backward": False})
 
@@ -110,7 +109,7 @@ def start_tendons(
         # A spring without a dead band has its stiffness at rest too.
         if x != 0.0 or rest[0] == rest[1]:
             lam_bar += x * (stiffness + poly[0] * x + poly[1] * x * x)
-            length_bar += rate_l * _poly_force_deriv(stiffness, poly, x, 0)
+            length_bar += rate_l * poly_force_deriv(stiffness, poly, x, 0)
     if damper_on:
         c, bend = tendon_damping_total(
             tendon_actuatorid,
@@ -125,7 +124,7 @@ def start_tendons(
             t,
         )
         speed = wp.abs(rate_v)
-        slope = _poly_force_deriv(c, bend, rate_v, 1)
+        slope = poly_force_deriv(c, bend, rate_v, 1)
         lam_bar += rate_v * (c + bend[0] * speed + bend[1] * speed * speed)
         qvel_bar += rate_l * slope
         if implicit_all and (c != 0.0 or bend[0] != 0.0 or bend[1] != 0.0):

@@ -1,11 +1,11 @@
 """Actuators whose moment turns with q: at sites, and in the parent's frame of ball and free joints."""
 
 import warp as wp
-from mujoco_warp._src.math import quat_to_vel
-from mujoco_warp._src.types import JointType, TrnType
+from mujoco_warp import JointType, TrnType
 
 from msk_ray.physics.adjoint.joints import log_rate_pullback
 from msk_ray.physics.adjoint.spatial import carried, point_velocity, wrench
+from msk_ray.physics.mjw_private import quat_to_vel
 
 wp.set_module_options({"enable_backward": False})
 

@@ -4,8 +4,8 @@ Kept apart from `tendons`: Warp drops the derivative of a function that another 
 """
 
 import warp as wp
-from mujoco_warp._src.types import MJ_MAXVAL
-from mujoco_warp._src.util_misc import wrap
+
+from msk_ray.physics.mjw_private import MJ_MAXVAL, wrap
 
 wp.set_module_options({"enable_backward": False})
 

@@ -1,0 +1,119 @@
+"""What the adjoint takes from inside mujoco_warp; after an upgrade these tests name what changed."""
+
+import inspect
+import re
+from pathlib import Path
+from typing import get_args, get_origin
+
+import mujoco
+import pytest
+import warp as wp
+
+from msk_ray.physics import mjw_private
+
+DAMPING = (
+    "{}_damping array2d[float32], {}_dampingpoly array2d[vec2f], actuator_trntype array1d[int32], "
+    "actuator_trnid array1d[vec2i], actuator_damping array2d[float32], actuator_dampingpoly array2d[vec2f], "
+    "actuator_gear array2d[spatial_vectorf], worldid int"
+)
+SIGNATURES = {
+    "capsule_capsule": "cap1_pos vec3f, cap1_axis vec3f, cap1_radius float, cap1_half_length float, cap2_pos vec3f, "
+    "cap2_axis vec3f, cap2_radius float, cap2_half_length float -> (vec2f, mat23f, mat23f)",
+    "contact_kbimp": "opt_disableflags int, timestep float, solref vec2f, solimp vec5f, pos_imp float, "
+    "is_discrete bool -> vec3f",
+    "dof_damping_total": "jnt_actuatorid array1d[int32], dof_jntid array1d[int32], "
+    + DAMPING.format("dof", "dof")
+    + ", dofid int -> (float, vec2f)",
+    "inert_vec": "i vec10f, v spatial_vectorf -> spatial_vectorf",
+    "make_frame": "a vec3f -> ?",
+    "motion_cross_force": "v spatial_vectorf, f spatial_vectorf -> spatial_vectorf",
+    "muscle_bias": "len float, lengthrange vec2f, acc0 float, prm vec10f -> float",
+    "muscle_dynamics": "control float, activation float, prm vec10f -> float",
+    "muscle_gain": "len float, vel float, lengthrange vec2f, acc0 float, prm vec10f -> float",
+    "muscle_gain_vel_deriv": "len float, vel float, lengthrange vec2f, acc0 float, prm vec10f -> float",
+    "plane_ellipsoid": "plane_normal vec3f, plane_pos vec3f, ellipsoid_pos vec3f, ellipsoid_rot mat33f, "
+    "ellipsoid_size vec3f -> (float, vec3f, vec3f)",
+    "plane_sphere": "plane_normal vec3f, plane_pos vec3f, sphere_pos vec3f, sphere_radius float -> (float, vec3f)",
+    "poly_force": "linear float, poly vec2f, x float, flg_odd int -> float",
+    "poly_force_deriv": "linear float, poly vec2f, x float, flg_odd int -> float",
+    "quat_sub": "qa quatf, qb quatf -> vec3f",
+    "quat_to_vel": "quat quatf -> vec3f",
+    "safe_div": "x Any, y Any -> Any",
+    "sphere_box": "sphere_pos vec3f, sphere_radius float, box_pos vec3f, box_rot mat33f, box_size vec3f "
+    "-> (float, vec3f, vec3f)",
+    "sphere_capsule": "sphere_pos vec3f, sphere_radius float, capsule_pos vec3f, capsule_axis vec3f, "
+    "capsule_radius float, capsule_half_length float -> (float, vec3f, vec3f)",
+    "sphere_sphere": "pos1 vec3f, radius1 float, pos2 vec3f, radius2 float -> (float, vec3f, vec3f)",
+    "tendon_damping_total": "tendon_actuatorid array1d[int32], "
+    + DAMPING.format("tendon", "tendon")
+    + ", tenid int -> (float, vec2f)",
+    "wrap": "x0 vec3f, x1 vec3f, pos vec3f, mat mat33f, radius float, geomtype int, side vec3f "
+    "-> (float, vec3f, vec3f)",
+}
+MEMBERS = {
+    "ConstraintType": {
+        "EQUALITY": mujoco.mjtConstraint.mjCNSTR_EQUALITY,
+        "FRICTION_DOF": mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF,
+        "FRICTION_TENDON": mujoco.mjtConstraint.mjCNSTR_FRICTION_TENDON,
+        "LIMIT_JOINT": mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT,
+        "LIMIT_TENDON": mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON,
+        "CONTACT_ELLIPTIC": mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC,
+    },
+    "EqType": {
+        "CONNECT": mujoco.mjtEq.mjEQ_CONNECT,
+        "WELD": mujoco.mjtEq.mjEQ_WELD,
+        "JOINT": mujoco.mjtEq.mjEQ_JOINT,
+        "TENDON": mujoco.mjtEq.mjEQ_TENDON,
+    },
+    "WrapType": {"JOINT": mujoco.mjtWrap.mjWRAP_JOINT},
+}
+LENGTHS = {"vec5": 5, "vec10": 10, "vec12": 12}
+
+
+def spelled(kind: object) -> str:
+    """A type as the table above writes it."""
+    if kind is inspect.Parameter.empty:
+        return "?"
+    if get_origin(kind) is tuple:
+        return f"({', '.join(spelled(part) for part in get_args(kind))})"
+    if hasattr(kind, "ndim") and hasattr(kind, "dtype"):
+        return f"array{kind.ndim}d[{spelled(kind.dtype)}]"
+    return kind.__name__
+
+
+@pytest.mark.parametrize("name", sorted(SIGNATURES))
+def test_a_function_takes_and_gives_what_it_did(name: str) -> None:
+    signature = inspect.signature(getattr(mjw_private, name).func)
+    takes = ", ".join(f"{key} {spelled(p.annotation)}" for key, p in signature.parameters.items())
+    assert f"{takes} -> {spelled(signature.return_annotation)}" == SIGNATURES[name]
+
+
+@pytest.mark.parametrize("name", sorted(MEMBERS))
+def test_members_are_those_of_c_mujoco(name: str) -> None:
+    kind = getattr(mjw_private, name)
+    assert {key: int(kind[key]) for key in MEMBERS[name]} == {key: int(v) for key, v in MEMBERS[name].items()}
+
+
+@pytest.mark.parametrize("name", sorted(LENGTHS))
+def test_vectors_are_as_long(name: str) -> None:
+    kind = getattr(mjw_private, name)
+    assert (kind._shape_, kind._wp_scalar_type_) == ((LENGTHS[name],), wp.float32)
+
+
+def test_every_private_name_is_checked() -> None:
+    assert mujoco.mjMAXVAL == mjw_private.MJ_MAXVAL
+    assert sorted([*SIGNATURES, *MEMBERS, *LENGTHS, "MJ_MAXVAL"]) == sorted(mjw_private.__all__)
+
+
+def test_private_names_come_from_one_module(root: Path) -> None:
+    inside = re.compile(r"mujoco_warp\._src|mjw\._src")
+    found = [p.relative_to(root) for p in (root / "msk_ray").rglob("*.py") if inside.search(p.read_text())]
+    assert found == [Path("msk_ray/physics/mjw_private.py")]
+
+
+def test_members_that_kernels_use_are_checked(root: Path) -> None:
+    """A member the table lacks would go unnoticed."""
+    for name, members in MEMBERS.items():
+        uses = re.compile(rf"\b{name}\.([A-Z_]+)")
+        used = {m for p in (root / "msk_ray" / "physics").rglob("*.py") for m in uses.findall(p.read_text())}
+        assert used == set(members), name
