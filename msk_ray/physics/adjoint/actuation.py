@@ -184,7 +184,7 @@ def pull_actuators(
     ten_smooth_bar_out: wp.array2d[float],
     length_bar_out: wp.array2d[float],
     rate_bar_out: wp.array2d[wp.vec4],
-):
+) -> None:
     """Φ ∋ -(m·λ) F(len, m·v, act, ctrl) - h κ dF/dv and ḡ·act': gradients of ctrl and act, and those of len and rates.
 
     With implicit integration κ = Σ m_i m_j μ_i â_j over the pairs that M couples. A tendon's cotangents go to its

@@ -53,7 +53,7 @@ def body_fields(
     mu_bar_out: wp.array2d[wp.spatial_vector],
     excess_bar_out: wp.array2d[wp.spatial_vector],
     moved_bar_out: wp.array2d[wp.spatial_vector],
-):
+) -> None:
     """Fields of λ, a, μ and a - â, the acceleration A, and the cotangents that inertia gives them."""
     worldid, bodyid = wp.tid()
     zero = wp.spatial_vector(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -124,7 +124,7 @@ def close_velocity(
     # Out:
     cacc_sum_out: wp.array2d[wp.spatial_vector],
     qvel_bar_out: wp.array2d[wp.spatial_vector],
-):
+) -> None:
     """Σ of Ā over each subtree, and what δA_j ∋ δV_j × S_j v_j adds to V̄: (S_j v_j) ×* Σ Ā."""
     worldid, bodyid = wp.tid()
     total = wp.spatial_vector(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -184,7 +184,7 @@ def sweep_up(
     # Out:
     grad_qpos_out: wp.array2d[float],
     grad_qvel_out: wp.array2d[float],
-):
+) -> None:
     """Gradient of one dof: q̄ -= ∂Φ/∂q, v̄ -= ∂Φ/∂v, from the bodies it moves and its own spring and damper."""
     worldid, j = wp.tid()
     if live_in[worldid] == 0:

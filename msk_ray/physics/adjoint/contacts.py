@@ -80,7 +80,7 @@ def pull_contacts(
     phi_dist_out: wp.array[float],
     phi_pos_out: wp.array[wp.vec3],
     phi_frame_out: wp.array[wp.mat33],
-):
+) -> None:
     """Φ ∋ -Σ_r ρ_r(λ) f_r(ρ(a) - aref): wrenches on both bodies, and cotangents of (dist, pos, frame)."""
     con = wp.tid()
     if con >= wp.min(nacon_in[0], contact_dist_in.shape[0]):

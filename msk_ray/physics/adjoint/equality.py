@@ -116,7 +116,7 @@ def pull_anchors(
     qvel_bar_out: wp.array2d[wp.spatial_vector],
     cacc_bar_out: wp.array2d[wp.spatial_vector],
     moved_bar_out: wp.array2d[wp.spatial_vector],
-):
+) -> None:
     """Φ ∋ -ρ(λ)·f(jar): one thread a row; that of an equality's first row does all three or six."""
     worldid, row = wp.tid()
     if row + 2 >= wp.min(nefc_in[worldid], slope_in.shape[1]):

@@ -100,7 +100,7 @@ def pull_geometry_kernel(kinds: PairKinds) -> Any:
         # Out:
         moved_bar_out: wp.array2d[wp.spatial_vector],
         touches_out: Touches,
-    ):
+    ) -> None:
         """Cotangents of (dist, pos, frame) to wrenches on the two bodies whose displacement moves them."""
         con = wp.tid()
         if con >= wp.min(nacon_in[0], contact_dist_in.shape[0]):

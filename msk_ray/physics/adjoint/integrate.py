@@ -68,7 +68,7 @@ def pull_position(
     rhs_out: wp.array2d[float],
     phi_qpos_out: wp.array2d[float],
     phi_qvel_out: wp.array2d[float],
-):
+) -> None:
     """Turns cotangents of (q', v') into those of (q, v') in place, and starts this substep's sums.
 
     Also writes each dof's damping coefficients (c₀, c₁, c₂) of the force -v (c₀ + c₁|v| + c₂ v²), and hB.
@@ -133,7 +133,7 @@ def project(
     raw_in: wp.array2d[float],
     # Out:
     tangent_out: wp.array2d[float],
-):
+) -> None:
     """Raw gradient (W, nq) to tangent gradient (W, nv): the vector part of ½ q*⊗g for a quaternion."""
     worldid, jntid = wp.tid()
     kind = jnt_type[jntid]
@@ -168,7 +168,7 @@ def lift(
     tangent_in: wp.array2d[float],
     # Out:
     raw_out: wp.array2d[float],
-):
+) -> None:
     """Tangent gradient (W, nv) to the raw one (W, nq) without a component along q: 2 q⊗[0, g]."""
     worldid, jntid = wp.tid()
     kind = jnt_type[jntid]
@@ -199,7 +199,7 @@ def mark_live(
     act_in: wp.array2d[float],
     # Out:
     live_out: wp.array[int],
-):
+) -> None:
     """1 for a world whose cotangents are not all zero; only such worlds are given a gradient."""
     worldid = wp.tid()
     live = int(0)
@@ -224,7 +224,7 @@ def clip_norm(
     grad_qvel_out: wp.array2d[float],
     grad_act_out: wp.array2d[float],
     clipped_out: wp.array[int],
-):
+) -> None:
     """Scales each world's state cotangent to at most `bound_in` in Euclidean norm, and counts where it did."""
     worldid = wp.tid()
     largest = float(0.0)
@@ -260,7 +260,7 @@ def add_into(
     x_in: wp.array2d[float],
     # Out:
     y_out: wp.array2d[float],
-):
+) -> None:
     """y += x, as gradients add up."""
     i, j = wp.tid()
     y_out[i, j] = y_out[i, j] + x_in[i, j]

@@ -44,7 +44,7 @@ def pull_turning_springs(
     lam_in: wp.array2d[float],
     # Out:
     phi_qpos_out: wp.array2d[float],
-):
+) -> None:
     """Φ ∋ λ·k(|d|) d: d the displacement from rest, for a rotation its logarithm."""
     worldid, jntid = wp.tid()
     kind = jnt_type[jntid]

@@ -24,7 +24,7 @@ def tendon_rates(
     ten_J_in: wp.array2d[float],
     # Out:
     rate_out: wp.array2d[float],
-):
+) -> None:
     """ρ = J v."""
     worldid, t = wp.tid()
     rate_out[worldid, t] = tendon_rate(
@@ -40,7 +40,7 @@ def negated(
     # Out:
     length_out: wp.array2d[float],
     rate_out: wp.array2d[float],
-):
+) -> None:
     """-Φ: the sweep subtracts its slopes."""
     worldid, t = wp.tid()
     length_out[worldid, t] = -length_bar_in[worldid, t]

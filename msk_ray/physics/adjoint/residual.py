@@ -17,7 +17,7 @@ def residual_squares(
     # Out:
     gap_out: wp.array[float],
     size_out: wp.array[float],
-):
+) -> None:
     """Adds one dof's (Ma - τ - Jᵀf)² to its world's gap, and (Ma)² + τ² + (Jᵀf)² to its size."""
     worldid, i = wp.tid()
     product = float(0.0)
@@ -38,7 +38,7 @@ def residual_share(
     gap_out: wp.array[float],
     size_out: wp.array[float],
     worst_out: wp.array[float],
-):
+) -> None:
     """Keeps the largest √(gap/size) of each world and clears both for the next step; NaN stays NaN."""
     worldid = wp.tid()
     share = wp.sqrt(gap_out[worldid] / (size_out[worldid] + 1.0e-12))

@@ -15,7 +15,7 @@ _MINIMP = wp.constant(1.0e-4)
 _MAXIMP = wp.constant(0.9999)
 
 
-class vec6(wp.types.vector(length=6, dtype=wp.float32)):  # type: ignore[misc]
+class vec6(wp.types.vector(length=6, dtype=wp.float32)):
     """One number per contact dimension: normal, two tangents, torsion, two rolls."""
 
 
@@ -74,7 +74,7 @@ def densify_rows(
     sparse_in: wp.array3d[float],
     # Out:
     dense_out: wp.array3d[float],
-):
+) -> None:
     """Sparse constraint Jacobian to (W, njmax, nv)."""
     worldid, row = wp.tid()
     if row >= nefc_in[worldid]:
@@ -103,7 +103,7 @@ def row_laws(
     jar_out: wp.array2d[float],
     force_out: wp.array2d[float],
     slope_out: wp.array2d[float],
-):
+) -> None:
     """jar = J a - aref, the force f of uncoupled rows, and their slope s = -∂f/∂jar. Elliptic rows get f = s = 0."""
     worldid, row = wp.tid()
     if row >= wp.min(nefc_in[worldid], jar_out.shape[1]):
@@ -208,7 +208,7 @@ def scaled_jacobian(
     contact_address_in: wp.array2d[int],
     # Out:
     scaled_out: wp.array3d[float],
-):
+) -> None:
     """S J, one thread a (row, dof); needed for elliptic cones only, whose S couples the rows of a contact."""
     worldid, row, dof = wp.tid()
     if row >= wp.min(nefc_in[worldid], jar_in.shape[1]):

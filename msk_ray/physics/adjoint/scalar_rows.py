@@ -1,5 +1,7 @@
 """Constraint rows of joints and tendons: limits, friction loss, and joint and tendon equalities."""
 
+import math
+
 import warp as wp
 from mujoco_warp import JointType
 
@@ -8,6 +10,8 @@ from msk_ray.physics.adjoint.tendons import tendon_rate
 from msk_ray.physics.mjw_private import ConstraintType, EqType, vec5, vec12
 
 wp.set_module_options({"enable_backward": False})
+
+_PI = wp.constant(math.pi)
 
 
 @wp.func
@@ -52,8 +56,8 @@ def quat_angle_axis(q: wp.vec4) -> wp.vec4:
         return wp.vec4(0.0, 0.0, 0.0, 0.0)
     axis = u / sine
     angle = 2.0 * wp.atan2(sine, q[0])
-    if angle > wp.pi:
-        angle = 2.0 * wp.pi - angle
+    if angle > _PI:
+        angle = 2.0 * _PI - angle
         axis = -axis
     return wp.vec4(axis[0], axis[1], axis[2], angle)
 
@@ -108,7 +112,7 @@ def pull_rows(
     ten_qvel_bar_out: wp.array2d[float],
     ten_lam_bar_out: wp.array2d[float],
     ten_qacc_bar_out: wp.array2d[float],
-):
+) -> None:
     """Φ ∋ -ρ(λ) f(ρ(a) + b ρ(v) + k imp pos) of every row that joints and tendons make; f also moves with D(pos)."""
     worldid, row = wp.tid()
     if row >= wp.min(nefc_in[worldid], slope_in.shape[1]):

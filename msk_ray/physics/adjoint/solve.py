@@ -27,7 +27,7 @@ def build_matrices(
     # Out:
     implicit_out: wp.array3d[float],
     hessian_out: wp.array3d[float],
-):
+) -> None:
     """M + hB and H = M + JᵀSJ as full matrices, one thread an entry of the lower triangle.
 
     `step_in` is the diagonal hB, shape (W, nv), or with `step_dense` all of M + hB in M's sparse layout.
@@ -75,7 +75,7 @@ def solve_tiled(nv: int) -> Any:
         mu_out: wp.array2d[float],
         excess_out: wp.array2d[float],
         lam_out: wp.array2d[float],
-    ):
+    ) -> None:
         worldid = wp.tid()
         rhs = wp.tile_load(rhs_in[worldid], shape=wp.static(nv))
         damping = wp.tile_load(damping_in[worldid], shape=wp.static(nv))
@@ -109,7 +109,7 @@ def solve_two_tiled(nv: int) -> Any:
         # Out:
         first_out: wp.array2d[float],
         second_out: wp.array2d[float],
-    ):
+    ) -> None:
         worldid = wp.tid()
         matrix = wp.tile_load(matrix_in[worldid], shape=(wp.static(nv), wp.static(nv)))
         wp.tile_cholesky_inplace(matrix)
@@ -132,7 +132,7 @@ def solve_two_serial(
     # Out:
     first_out: wp.array2d[float],
     second_out: wp.array2d[float],
-):
+) -> None:
     """The same for any nv, one thread a world; the factor overwrites the matrix."""
     worldid = wp.tid()
     _factor(matrix_in[worldid], nv)
@@ -155,7 +155,7 @@ def damping_product(
     scale_in: float,
     # Out:
     y_out: wp.array2d[float],
-):
+) -> None:
     """hB x, or with a negative scale start + scale · hB x; hB = (M + hB) - M in M's sparse layout."""
     worldid, i = wp.tid()
     total = float(0.0)
@@ -214,7 +214,7 @@ def solve_serial(
     mu_out: wp.array2d[float],
     excess_out: wp.array2d[float],
     lam_out: wp.array2d[float],
-):
+) -> None:
     """The same two solves for any nv, one thread a world; factors overwrite the matrices."""
     worldid = wp.tid()
     _factor(implicit_in[worldid], nv)

@@ -8,19 +8,19 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def point_velocity(motion: wp.spatial_vector, arm: wp.vec3) -> wp.vec3:
+def point_velocity(motion: wp.spatial_vectorf, arm: wp.vec3) -> wp.vec3:
     """Velocity of the point at `arm` from the reference point: v + ω × r."""
     return wp.spatial_bottom(motion) + wp.cross(wp.spatial_top(motion), arm)
 
 
 @wp.func
-def wrench(force: wp.vec3, torque: wp.vec3, arm: wp.vec3) -> wp.spatial_vector:
+def wrench(force: wp.vec3, torque: wp.vec3, arm: wp.vec3) -> wp.spatial_vectorf:
     """Force at `arm` and a free torque, about the reference point: [t + r × f; f]."""
     return wp.spatial_vector(torque + wp.cross(arm, force), force)
 
 
 @wp.func
-def carried(motion: wp.spatial_vector, force: wp.spatial_vector) -> wp.spatial_vector:
+def carried(motion: wp.spatial_vectorf, force: wp.spatial_vectorf) -> wp.spatial_vectorf:
     """Cotangent of a body's displacement w where f·(w × V) is the change of f·V: w·(V ×* f)."""
     return motion_cross_force(motion, force)
 

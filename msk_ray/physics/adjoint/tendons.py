@@ -83,7 +83,7 @@ def start_tendons(
     qacc_bar_out: wp.array2d[float],
     mu_bar_out: wp.array2d[float],
     smooth_bar_out: wp.array2d[float],
-):
+) -> None:
     """Starts each tendon's cotangents with those of its spring and damper: Φ ∋ ρ(λ) (k(x) x + c(|ρ(v)|) ρ(v)).
 
     With implicit integration also Φ ∋ h μᵀ B â where B ∋ d(c ρ)/dρ J Jᵀ on the entries that M has.
@@ -168,7 +168,7 @@ def pull_tendons(
     # Out:
     phi_qpos_out: wp.array2d[float],
     phi_qvel_out: wp.array2d[float],
-):
+) -> None:
     """∂Φ/∂q ∋ J l̄, and for fixed tendons ∂Φ/∂v ∋ J ρ̄(v); spatial ones give that to their bodies."""
     worldid, t, k = wp.tid()
     if k >= ten_J_rownnz[t]:
@@ -195,15 +195,15 @@ class Rates:
 class Fields:
     """Plain fields of one body."""
 
-    lam: wp.spatial_vector
-    qacc: wp.spatial_vector
-    qvel: wp.spatial_vector
-    mu: wp.spatial_vector
-    smooth: wp.spatial_vector
+    lam: wp.spatial_vectorf
+    qacc: wp.spatial_vectorf
+    qvel: wp.spatial_vectorf
+    mu: wp.spatial_vectorf
+    smooth: wp.spatial_vectorf
 
 
 @wp.func
-def weigh(rates: Rates, fields: Fields) -> wp.spatial_vector:
+def weigh(rates: Rates, fields: Fields) -> wp.spatial_vectorf:
     """Σ_x ρ̄(x) V(x): one field that carries all that a direction's cotangent needs."""
     out = rates.lam * fields.lam + rates.qacc * fields.qacc + rates.qvel * fields.qvel
     return out + rates.mu * fields.mu + rates.smooth * fields.smooth
@@ -314,7 +314,7 @@ def pull_paths(
     mu_bar_out: wp.array2d[wp.spatial_vector],
     excess_bar_out: wp.array2d[wp.spatial_vector],
     moved_bar_out: wp.array2d[wp.spatial_vector],
-):
+) -> None:
     """How J x of a spatial tendon turns with q: one thread a stretch of path between two sites, geom or not."""
     worldid, e = wp.tid()
     t = segment_tendon[e]
@@ -351,7 +351,7 @@ def pull_paths(
             side = site_xpos_in[worldid, sidesite]
     touch0 = wp.spatial_top(touch_in[worldid, e])
     touch1 = wp.spatial_bottom(touch_in[worldid, e])
-    if touch0[0] >= MJ_MAXVAL:
+    if touch_in[worldid, e][0] >= MJ_MAXVAL:
         if body0 == body1:
             return
         n = wp.normalize(end - start)

@@ -32,7 +32,7 @@ def pull_turning_joints(
     rate_bar_in: wp.array2d[wp.vec4],
     # Out:
     phi_qpos_out: wp.array2d[float],
-):
+) -> None:
     """len = gear·log(q) of a ball joint; in the parent's frame the moment is m = R(q)ᵀ gear."""
     worldid, uid = wp.tid()
     kind = actuator_trntype[uid]
@@ -93,7 +93,7 @@ def pull_sites(
     mu_bar_out: wp.array2d[wp.spatial_vector],
     excess_bar_out: wp.array2d[wp.spatial_vector],
     moved_bar_out: wp.array2d[wp.spatial_vector],
-):
+) -> None:
     """m·x = F·u(x) + T·ω(x) at the site, with force F and torque T fixed in the site's frame; len = 0."""
     worldid, uid = wp.tid()
     if actuator_trntype[uid] != TrnType.SITE:

@@ -29,7 +29,7 @@ def touch_paths(
     site_xpos_in: wp.array2d[wp.vec3],
     # Out:
     touch_out: wp.array2d[wp.spatial_vector],
-):
+) -> None:
     """Both tangent points of each stretch of path, MJ_MAXVAL where it runs straight."""
     worldid, e = wp.tid()
     far = wp.vec3(MJ_MAXVAL)
