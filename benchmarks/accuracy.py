@@ -9,6 +9,7 @@ from record import RESULTS, markdown_table, publish
 from msk_ray.config import load_config
 from msk_ray.envs import env_class
 from msk_ray.gradcheck import check_gradients
+from msk_ray.simulation import Simulation
 from msk_ray.simulation.modes import configured_backward
 
 
@@ -31,15 +32,15 @@ def main() -> None:
         for mode in args.modes:
             for substeps in args.substeps:
                 for state in args.states:
-                    report = check_gradients(
+                    sim = Simulation(
                         model,
+                        args.worlds,
+                        substeps,
                         configured_backward(config.physics.model_copy(update={"backward": mode})),
-                        substeps=substeps,
-                        states=(state,),
-                        worlds=args.worlds,
-                        device=args.device,
-                        solver_tolerance=args.solver_tolerance,
+                        args.device,
+                        tolerance=args.solver_tolerance,
                     )
+                    report = check_gradients(sim, states=(state,))
                     row = [path.stem, mode, str(substeps), state]
                     for name in ("ctrl", "qpos", "qvel"):
                         errors = [r.rel_error for r in report.of(name)]

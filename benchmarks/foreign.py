@@ -17,7 +17,7 @@ from record import RESULTS, markdown_table, publish
 from msk_ray.errors import MskRayError, UnsupportedModelError
 from msk_ray.gradcheck import GradientReport, check_gradients
 from msk_ray.physics.capacity import default_capacity, geometric_bound
-from msk_ray.simulation.modes import make_backward
+from msk_ray.simulation import Simulation
 
 
 class Model(NamedTuple):
@@ -75,15 +75,8 @@ def measure(model: mujoco.MjModel, args: argparse.Namespace) -> list[str]:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            report = check_gradients(
-                model,
-                make_backward("tape_per_substep"),
-                substeps=args.substeps,
-                states=args.states,
-                worlds=args.worlds,
-                device=args.device,
-                solver_tolerance=args.solver_tolerance,
-            )
+            sim = Simulation(model, args.worlds, args.substeps, device=args.device, tolerance=args.solver_tolerance)
+            report = check_gradients(sim, states=args.states)
         except UnsupportedModelError as error:
             return [*sizes, "refused", "-", "-", "-", str(error).partition(". ")[0]]
         except MskRayError as error:

@@ -211,14 +211,14 @@ def check_gradient(device: str | None) -> Finding:
     from msk_ray.envs import env_class
     from msk_ray.envs.cartpole.config import CartPoleSettings
     from msk_ray.gradcheck import check_gradients
-    from msk_ray.simulation import TapePerSubstep
+    from msk_ray.simulation import Simulation
 
     where = device or ("cuda:0" if torch.cuda.is_available() else "cpu")
     env = CartPoleSettings(name="cartpole")
     started = time.monotonic()
     try:
         model = env_class(env).build_model(env, PhysicsConfig())
-        report = check_gradients(model, TapePerSubstep(), substeps=1, worlds=4, device=where)
+        report = check_gradients(Simulation(model, nworld=4, substeps=1, device=where))
     except (MskRayError, RuntimeError, ValueError, OSError) as error:
         # Compilers, drivers and memory fail with errors of these kinds; whatever it is, it is the finding.
         return Finding("gradient", f"one step on {where} failed: {_one_line(error)}", True)

@@ -1,5 +1,6 @@
 """Rules of the source that no linter here checks."""
 
+import ast
 import tomllib
 from pathlib import Path
 
@@ -9,3 +10,29 @@ def test_mypy_ignores_no_module(root: Path) -> None:
     settings = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["mypy"]
     ignored = [o["module"] for o in settings["overrides"] if o.get("ignore_errors")]
     assert not ignored
+
+
+def test_no_file_is_longer_than_450_lines(root: Path) -> None:
+    long = {p.name: n for p in (root / "msk_ray").rglob("*.py") if (n := len(p.read_text().splitlines())) > 450}
+    assert not long
+
+
+def test_no_function_outside_kernels_has_more_than_8_parameters(root: Path) -> None:
+    found = []
+    for path in (root / "msk_ray").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and not _is_kernel(node):
+                count = len(_parameters(node.args))
+                if count > 8:
+                    found.append(f"{path.relative_to(root)}: {node.name} has {count}")
+    assert not found
+
+
+def _is_kernel(node: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
+    return any(ast.unparse(d).startswith(("wp.kernel", "wp.func")) for d in node.decorator_list)
+
+
+def _parameters(arguments: ast.arguments) -> list[str]:
+    own = [*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs]
+    extra = [a for a in (arguments.vararg, arguments.kwarg) if a is not None]
+    return [a.arg for a in (*own, *extra) if a.arg not in ("self", "cls")]

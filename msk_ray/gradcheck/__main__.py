@@ -132,25 +132,27 @@ def main(argv: Sequence[str] | None = None) -> int:
     if args.seed < 0:
         raise ConfigError(f"--seed must not be negative, not {args.seed}")
     # torch and Warp take seconds to load; a wrong command line should not wait for them.
-    from msk_ray.gradcheck.check import GradientReport, Limits, check_gradients
+    from msk_ray.gradcheck.check import GradientReport, Limits, check_gradients, check_request
+    from msk_ray.simulation import Simulation
     from msk_ray.simulation.modes import make_backward
 
     backward = make_backward(args.mode)
     model = load_model(args.model)
+    states = [kind.strip() for kind in args.states.split(",") if kind.strip()]
+    check_request(model, states)
     limits = Limits() if args.forward_tolerance is None else Limits(forward_mismatch=args.forward_tolerance)
     try:
-        report = check_gradients(
+        sim = Simulation(
             model,
+            args.worlds,
+            args.substeps,
             backward,
-            substeps=args.substeps,
-            states=[kind.strip() for kind in args.states.split(",") if kind.strip()],
-            worlds=args.worlds,
-            seed=args.seed,
-            device=args.device,
-            solver_tolerance=args.solver_tolerance,
-            limits=limits,
-            room=(args.nconmax, args.njmax),
+            args.device,
+            nconmax=args.nconmax,
+            njmax=args.njmax,
+            tolerance=args.solver_tolerance,
         )
+        report = check_gradients(sim, states=states, seed=args.seed, limits=limits)
     except UnsupportedModelError as error:
         if args.json:
             empty = GradientReport(args.mode, args.substeps, args.worlds)

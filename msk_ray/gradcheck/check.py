@@ -16,7 +16,7 @@ from msk_ray.gradcheck.oracle import Array, Linearization, Oracle, Point
 from msk_ray.gradcheck.pullback import simulated_gradients
 from msk_ray.gradcheck.states import STATE_KINDS, make_states
 from msk_ray.physics.adjoint.coverage import partly_exact
-from msk_ray.simulation import Backward, Simulation
+from msk_ray.simulation import Simulation
 
 _VANISHING = 1e-9
 """A reference gradient below this share of its cotangent is zero up to the rounding of the differences."""
@@ -130,54 +130,45 @@ def forward_mismatch(oracle: Oracle, start: Point, expected: Point, actual: Poin
     )
 
 
-def check_gradients(
-    model: mujoco.MjModel,
-    backward: Backward,
-    *,
-    substeps: int = 1,
-    states: Sequence[str] = ("standing", "random"),
-    worlds: int = 4,
-    seed: int = 0,
-    device: str = "cpu",
-    solver_tolerance: float | None = None,
-    limits: Limits | None = None,
-    room: tuple[int | None, int | None] = (None, None),
-) -> GradientReport:
-    """Compare gradients of one env step by `backward` with float64 central differences of C MuJoCo.
-
-    Every state gets its own random normal cotangent on all of (qpos', qvel', act').
-
-    Args:
-        model: the compiled model.
-        backward: a mode that no Simulation uses yet.
-        substeps: physics steps an env step.
-        states: kinds of state, of `STATE_KINDS`.
-        worlds: states of each kind, W.
-        seed: of the states and cotangents.
-        device: where Warp runs.
-        solver_tolerance: Warp's solver tolerance, below mujoco_warp's floor of 1e-6 if wanted.
-        limits: what counts as a kink and as a forward mismatch.
-        room: `nconmax` and `njmax` of the Simulation.
-
-    Returns:
-        The comparisons; none where every state was excluded, which `max_rel_error` does not let pass.
-
-    Raises:
-        UnsupportedModelError: `backward` or mujoco_warp cannot treat the model.
-        ConfigError: unknown kind of state, or a model without degrees of freedom.
-        SimulationError: the model diverges in C MuJoCo, or Warp had too little room for its contacts.
-    """
+def check_request(model: mujoco.MjModel, states: Sequence[str]) -> None:
+    """Raise ConfigError for an unknown kind of state, or a model without degrees of freedom."""
     unknown = [kind for kind in states if kind not in STATE_KINDS]
     if unknown or not states:
         raise ConfigError(f"unknown kinds of state {unknown}: write some of {', '.join(STATE_KINDS)}")
     if model.nv == 0:
         raise ConfigError("the model has no degrees of freedom, so there is no gradient to check")
-    nconmax, njmax = room
-    sim = Simulation(
-        model, worlds, substeps, backward, device, nconmax=nconmax, njmax=njmax, tolerance=solver_tolerance
-    )
+
+
+def check_gradients(
+    sim: Simulation,
+    *,
+    states: Sequence[str] = ("standing", "random"),
+    seed: int = 0,
+    limits: Limits | None = None,
+) -> GradientReport:
+    """Compare gradients of one env step of `sim` with float64 central differences of C MuJoCo.
+
+    Every state gets its own random normal cotangent on all of (qpos', qvel', act').
+
+    Args:
+        sim: the simulation, with a backward mode; its number of worlds W is that of states of each kind.
+        states: kinds of state, of `STATE_KINDS`.
+        seed: of the states and cotangents.
+        limits: what counts as a kink and as a forward mismatch.
+
+    Returns:
+        The comparisons; none where every state was excluded, which `max_rel_error` does not let pass.
+
+    Raises:
+        ConfigError: unknown kind of state, a model without degrees of freedom, or a simulation that is forward only.
+        SimulationError: the model diverges in C MuJoCo, or Warp had too little room for its contacts.
+    """
+    model, worlds, substeps = sim.model, sim.nworld, sim.substeps
+    check_request(model, states)
+    if sim.backward is None:
+        raise ConfigError("this Simulation has no gradient to check: make it with a backward mode")
     oracle, limits = Oracle(model, substeps), limits or Limits()
-    report = GradientReport(backward.name, substeps, worlds)
+    report = GradientReport(sim.backward.name, substeps, worlds)
     for kind in dict.fromkeys(states):
         points = make_states(model, kind, worlds, seed)
         rng = np.random.default_rng([seed, list(STATE_KINDS).index(kind), 1])

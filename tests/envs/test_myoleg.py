@@ -116,9 +116,7 @@ def test_gradients_of_a_step(name: str, substeps: int) -> None:
     model = build_myoleg(MyoLegSettings(name="myoleg", model=name, source="myo_sim"), PhysicsConfig())
     if name == "myolegs":
         assert np.isin(model.wrap_type, int(mujoco.mjtWrap.mjWRAP_CYLINDER)).any()
-    report = check_gradients(
-        model, TapePerSubstep(), substeps=substeps, states=("standing", "policy"), worlds=2, solver_tolerance=1e-9
-    )
+    report = check_gradients(Simulation(model, 2, substeps, tolerance=1e-9), states=("standing", "policy"))
     assert report.checked >= 1
     assert report.max_rel_error <= 1e-3
 

@@ -22,7 +22,7 @@ def model() -> mujoco.MjModel:
 @pytest.mark.parametrize("substeps", [1, 8])
 def test_gradients_of_a_step(model: mujoco.MjModel, substeps: int) -> None:
     kinds = ("standing", "contact", "policy") if substeps == 1 else ("standing", "contact")
-    report = check_gradients(model, TapePerSubstep(), substeps=substeps, states=kinds, worlds=2, solver_tolerance=1e-9)
+    report = check_gradients(Simulation(model, 2, substeps, tolerance=1e-9), states=kinds)
     assert report.checked >= 3
     assert {r.input for r in report.results} == {"ctrl", "qpos", "qvel", "act"}
     assert report.max_rel_error <= 1e-3

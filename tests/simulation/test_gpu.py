@@ -13,7 +13,6 @@ from msk_ray.envs.ant.model import build_ant
 from msk_ray.errors import SimulationError
 from msk_ray.gradcheck import check_gradients
 from msk_ray.simulation import Simulation, TapePerSubstep
-from msk_ray.simulation.modes import make_backward
 from msk_ray.training import Trainer, read_metrics
 
 pytestmark = pytest.mark.gpu
@@ -23,9 +22,7 @@ pytestmark = pytest.mark.gpu
 @pytest.mark.parametrize("mode", ["tape_per_substep", "tape_all"])
 def test_gradients_of_an_ant_are_those_of_float64(mode: str, variant: str) -> None:
     model = build_ant(AntSettings(name="ant"), PhysicsConfig(variant=variant))
-    report = check_gradients(
-        model, make_backward(mode), substeps=4, states=("standing", "contact"), worlds=8, device="cuda"
-    )
+    report = check_gradients(Simulation(model, 8, 4, mode, "cuda"), states=("standing", "contact"))
     assert report.checked >= 12
     assert report.max_rel_error <= 1e-2
 
