@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from msk_ray.simulation import StepState as StepState
     from msk_ray.simulation import TapeAll as TapeAll
     from msk_ray.simulation import TapePerSubstep as TapePerSubstep
+    from msk_ray.train import train as train
     from msk_ray.training.policy import load_policy as load_policy
 
 __version__ = "0.1.0"
@@ -44,6 +45,7 @@ _HOMES = {
     "check_gradients": "msk_ray.gradcheck",
     "load_config": "msk_ray.config",
     "load_policy": "msk_ray.training.policy",
+    "train": "msk_ray.train",
 }
 
 __all__ = sorted([*_HOMES, "__version__"])
@@ -52,7 +54,9 @@ __all__ = sorted([*_HOMES, "__version__"])
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module 'msk_ray' has no attribute {name!r}; it has {', '.join(sorted(_HOMES))}")
-    found = getattr(import_module(_HOMES[name]), name)
+    home = import_module(_HOMES[name])
+    # `train` stays the module, which can be called: who imports it must find its other names.
+    found = home if _HOMES[name] == f"msk_ray.{name}" else getattr(home, name)
     globals()[name] = found
     return found
 

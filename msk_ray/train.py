@@ -1,4 +1,8 @@
-"""`python -m msk_ray.train`: one trial in this process, without Ray. The thing to debug."""
+"""`python -m msk_ray.train`, and `msk_ray.train(config, ...)`: one trial in this process, without Ray.
+
+The module can be called, because `msk_ray.train` names both: the module once it is imported, and for a library the
+function.
+"""
 
 if __name__ == "__main__":
     # Before whatever takes time to load.
@@ -10,16 +14,23 @@ import argparse
 import math
 import os
 import sys
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING
 
 from msk_ray.cli import TERMINAL_LOG, Parser, outliving, run, typed_command
 from msk_ray.config import SET_HELP, Config, load_config
-from msk_ray.errors import CheckpointError, StorageError
+from msk_ray.errors import CheckpointError, ConfigError, StorageError
 from msk_ray.files import check_writable, make_folder
 from msk_ray.ownership import Ownership, owned
 from msk_ray.signals import RESUMABLE, StopRequest, listening
 from msk_ray.text import printable
+
+if TYPE_CHECKING:
+    from msk_ray.training import Trainer
 
 DESCRIPTION = """\
 Train one policy with SHAC: one trial, in this process, without Ray.
@@ -78,7 +89,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _check_logdir(logdir: Path, resume: bool) -> None:
     """Refuse to write over another trial."""
     if (logdir / "metrics.jsonl").exists() and not resume:
-        raise StorageError(f"{logdir} holds a trial already: add --resume to go on with it, or name another --logdir")
+        raise StorageError(
+            f"{logdir} holds a trial already: add --resume (in Python resume=True) to go on with it, or name another "
+            "--logdir"
+        )
     if resume and not (logdir / "checkpoints").is_dir():
         raise StorageError(f"--resume: no trial in {logdir}; leave --resume out to start one")
     if resume:
@@ -87,34 +101,109 @@ def _check_logdir(logdir: Path, resume: bool) -> None:
         make_folder(logdir)
 
 
-def _train(
-    config: Config, args: argparse.Namespace, ownership: Ownership, stop: StopRequest, resume_command: str
-) -> int:
+@dataclass(frozen=True)
+class Trained:
+    """A trial that has run all its epochs."""
+
+    logdir: Path
+    """Its folder, with config.yaml, metrics.jsonl and checkpoints/."""
+    epochs: int
+    """Epochs done."""
+    best_score: float
+    """Highest evaluation score of the trained policy, -inf if no evaluation gave one."""
+    best_checkpoint: Path
+    """Checkpoint of that policy, for `load_policy`; of the untrained policy if no evaluation gave a score."""
+
+
+def train(
+    config: Config,
+    logdir: str | Path,
+    device: str | None = None,
+    *,
+    resume: bool = False,
+    force: bool = False,
+    on_epoch: Callable[[dict[str, float]], None] | None = None,
+) -> Trained:
+    """Train one policy in this process, as the command does, without printing.
+
+    A call that was interrupted goes on from its last checkpoint when it is made again with `resume`.
+
+    Example:
+        >>> trained = msk_ray.train(msk_ray.load_config("configs/cartpole.yaml"), "runs/mine")
+        >>> policy = msk_ray.load_policy(trained.best_checkpoint)
+
+    Args:
+        config: every setting, from `load_config`.
+        logdir: folder of the trial.
+        device: cpu or cuda:N; by default the first GPU, or the CPU if there is none.
+        resume: go on from the newest whole checkpoint in `logdir`.
+        force: take the folder over from a process that looks alive.
+        on_epoch: called with each epoch's row of metrics.
+
+    Raises:
+        StorageError: the folder holds another trial, belongs to another process, or cannot be written.
+        CheckpointError: `resume` is asked for, and no checkpoint is whole or the newest has other settings.
+        DeviceError, UnsupportedModelError, SimulationError: as their messages say.
+    """
+    if not isinstance(config, Config):
+        raise ConfigError(f"config must be a Config, not {type(config).__name__}: write msk_ray.load_config(...)")
+    folder = Path(logdir)
+    _check_logdir(folder, resume)
+    with owned(folder.resolve(), force) as ownership:
+        trainer = _trainer(config, ownership.folder, _choose_device(device), resume)
+        if resume:
+            for fault in trainer.restore_latest()[1]:
+                warnings.warn(f"skipped: {fault}", stacklevel=2)
+        try:
+            while not trainer.finished:
+                ownership.check()
+                row = trainer.run_epoch()
+                if on_epoch is not None:
+                    on_epoch(row)
+        finally:
+            trainer.close()
+    return Trained(trainer.logdir, trainer.epoch, trainer.best_score, trainer.best_checkpoint)
+
+
+def _choose_device(asked: str | None) -> str:
+    """The device asked for, else the first GPU, else the CPU; loads torch."""
     # Read when torch is imported: threads that wait for work are to sleep, not to spin.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    # torch and Warp take seconds to load; a wrong command line should not wait for them.
     import torch
 
-    from msk_ray.progress import Progress
+    return asked or ("cuda:0" if torch.cuda.is_available() else "cpu")
+
+
+def _trainer(config: Config, logdir: Path, device: str, resume: bool) -> "Trainer":
+    """A trainer of the trial in `logdir`, at its start."""
+    # torch and Warp take seconds to load; a wrong command line should not wait for them.
     from msk_ray.training import Trainer
     from msk_ray.training.checkpoint import newest_valid_checkpoint
 
-    logdir = ownership.folder
-    if args.resume:
+    if resume:
         newest, faults = newest_valid_checkpoint(logdir / "checkpoints")
         if newest is None and faults:
             raise CheckpointError(
-                f"--resume: no checkpoint in {logdir} is whole ({faults[0]}); name another --logdir to start anew"
+                f"--resume: no checkpoint in {logdir} is whole ({faults[0]}); name another --logdir to start again"
             )
-    device = args.device or ("cuda:0" if torch.cuda.is_available() else "cpu")
+    return Trainer(config, logdir, device)
+
+
+def _train(
+    config: Config, args: argparse.Namespace, ownership: Ownership, stop: StopRequest, resume_command: str
+) -> int:
+    device = _choose_device(args.device)
+    from msk_ray.progress import Progress
+
+    logdir = ownership.folder
     print(f"{config.env.name}: {config.trial.epochs} epochs, {config.env.nworld} worlds, on {device}; into {logdir}")
     print("preparing kernels (a first run compiles them, up to a minute) ...", flush=True)
-    trainer = Trainer(config, logdir, device)
+    trainer = _trainer(config, logdir, device, args.resume)
     if args.resume:
         path, faults = trainer.restore_latest()
         for fault in faults:
             print(f"skipped: {printable(fault)}")
-        print(f"resumed from {path}" if path else "no whole checkpoint yet: starting anew")
+        print(f"resumed from {path}" if path else "no whole checkpoint yet: starting from the beginning")
     progress = Progress(config.trial.epochs, trainer.epoch)
     with stop.deferred():
         while not trainer.finished and not stop:
@@ -136,6 +225,14 @@ def _train(
     print(f"metrics: {logdir / 'metrics.jsonl'}; curves: tensorboard --logdir {logdir}")
     return 0
 
+
+class _CallableModule(ModuleType):
+    """This module when it is called: `msk_ray.train(config, logdir)`."""
+
+    __call__ = staticmethod(train)
+
+
+sys.modules[__name__].__class__ = _CallableModule
 
 if __name__ == "__main__":
     sys.exit(run(main))

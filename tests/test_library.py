@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import mujoco
 import pytest
@@ -9,12 +10,12 @@ import torch
 from scenes import cartpole
 
 import msk_ray
-from msk_ray.errors import ConfigError
+from msk_ray.errors import ConfigError, StorageError
 
 
 def test_importing_loads_neither_torch_nor_warp() -> None:
     code = (
-        "import sys, msk_ray; dir(msk_ray); msk_ray.load_config; "
+        "import sys, msk_ray; dir(msk_ray); msk_ray.load_config; msk_ray.train; "
         "print([m for m in ('torch', 'warp', 'ray', 'mujoco_warp') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -23,13 +24,52 @@ def test_importing_loads_neither_torch_nor_warp() -> None:
 
 @pytest.mark.parametrize("name", [name for name in msk_ray.__all__ if name != "__version__"])
 def test_every_name_is_found_and_listed(name: str) -> None:
-    assert getattr(msk_ray, name).__name__ == name
+    assert getattr(msk_ray, name).__name__.rpartition(".")[2] == name
     assert name in dir(msk_ray)
 
 
 def test_an_unknown_name_says_which_there_are() -> None:
     with pytest.raises(AttributeError, match=r"no attribute 'Simulator'; it has .*Simulation"):
         _ = msk_ray.Simulator
+
+
+@pytest.mark.parametrize("first", ["msk_ray.train", "import msk_ray.train"])
+def test_train_is_a_function_and_a_module_in_either_order(first: str) -> None:
+    code = f"import msk_ray; {first}; import msk_ray.train; print(msk_ray.train.parser().prog, callable(msk_ray.train))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "python -m msk_ray.train True"
+
+
+def test_training_gives_the_best_policy(tiny_cartpole: msk_ray.Config, tmp_path: Path) -> None:
+    rows: list[dict[str, float]] = []
+    trained = msk_ray.train(tiny_cartpole, tmp_path / "mine", "cpu", on_epoch=rows.append)
+    assert [row["epoch"] for row in rows] == [1, 2, 3, 4, 5, 6]
+    assert trained.epochs == 6
+    assert trained.best_score == max(row["eval/score"] for row in rows if "eval/score" in row)
+    assert msk_ray.load_policy(trained.best_checkpoint).config == tiny_cartpole
+
+
+def test_training_goes_on_where_it_was_interrupted(tiny_cartpole: msk_ray.Config, tmp_path: Path) -> None:
+    def interrupt(row: dict[str, float]) -> None:
+        if row["epoch"] == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        msk_ray.train(tiny_cartpole, tmp_path, "cpu", on_epoch=interrupt)
+    with pytest.raises(StorageError, match="in Python resume=True"):
+        msk_ray.train(tiny_cartpole, tmp_path, "cpu")
+    rows: list[dict[str, float]] = []
+    newest = sorted((tmp_path / "checkpoints").glob("epoch_*.pt"))[-1]
+    (tmp_path / "checkpoints" / "epoch_000003.pt").write_bytes(newest.read_bytes()[:100])
+    with pytest.warns(UserWarning, match=r"skipped: .*epoch_000003\.pt"):
+        trained = msk_ray.train(tiny_cartpole, tmp_path, "cpu", resume=True, on_epoch=rows.append)
+    assert [row["epoch"] for row in rows] == [3, 4, 5, 6]
+    assert trained.epochs == 6
+
+
+def test_training_takes_settings_and_no_path(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"not str: write msk_ray\.load_config"):
+        msk_ray.train("configs/cartpole.yaml", tmp_path)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")

@@ -57,7 +57,7 @@ def test_a_trial_without_a_whole_checkpoint_is_not_begun_anew(root: Path, tmp_pa
     result = train(root, tmp_path, "--config", config, "--logdir", str(tmp_path), "--resume")
     assert result.returncode == 2
     assert "is whole" in result.stderr
-    assert "name another --logdir to start anew" in result.stderr
+    assert "name another --logdir to start again" in result.stderr
     assert (tmp_path / "metrics.jsonl").read_text() == '{"epoch": 0}\n{"epoch": 1}\n'
     assert not (tmp_path / "config.yaml").exists()
 
