@@ -23,14 +23,14 @@ from record import RESULTS, markdown_table, publish
 from msk_ray.cli import run
 from msk_ray.config import describe_fault
 from msk_ray.errors import ConfigError
+from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import Evaluation
 from msk_ray.experiment.outcomes import Outcome
-from msk_ray.tune.experiment import Experiment
-from msk_ray.tune.pruning import Pruner, make_pruner
-from msk_ray.tune.records import TrialRecord, read_records
-from msk_ray.tune.space import SchedulerSpec
-from msk_ray.tune.standing import Observer
-from msk_ray.tune.table import outcome_name
+from msk_ray.experiment.results import TrialRecord, read_records
+from msk_ray.experiment.results_table import outcome_name
+from msk_ray.experiment.trial_status import StatusReader
+from msk_ray.sweep.pruning import Pruner, make_pruner
+from msk_ray.sweep.space import SchedulerSpec
 
 NEAR = 0.01
 """What a sweep may lose of its best score and still have found as much, as a share of it."""
@@ -198,7 +198,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     odds = chances(whole, rule, args.slots, args.orders)
     named = f"{args.kind}, grace {args.grace:g}" + (f", reduction {args.reduction:g}" if args.kind == "asha" else "")
     title = f"Early stopping of {args.experiment.name}, {named}, {args.slots} trials at once"
-    ran_on = sorted({standing.device.name for standing in Observer(experiment).look(time.time())} - {""})
+    ran_on = sorted({standing.device.name for standing in StatusReader(experiment).look(time.time())} - {""})
     text = (
         f"{table(judged)}\n\nOver {odds.orders} random orders of the trials the best of all was kept in "
         f"{odds.kept / odds.orders:.0%}, and a score within {NEAR:.0%} of it in {odds.near / odds.orders:.0%}; the "

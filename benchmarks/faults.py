@@ -23,8 +23,8 @@ from fault_campaign.trainer import drive
 from record import RESULTS, markdown_table, publish
 
 from msk_ray.config import dump_yaml
-from msk_ray.tune.space import load_space
-from msk_ray.tune.trials import resolve_trials
+from msk_ray.sweep.space import load_space
+from msk_ray.sweep.trials import resolve_trials
 
 CAMPAIGNS = campaigns.CAMPAIGNS | drivers.CAMPAIGNS
 

@@ -24,9 +24,11 @@ from record import RESULTS, markdown_table, publish
 import msk_ray
 from msk_ray.config import dump_yaml
 from msk_ray.experiment.metrics import read_rows
+from msk_ray.experiment.trial import Trial
+from msk_ray.sweep.space import load_space
+from msk_ray.sweep.trials import resolve_trials
 from msk_ray.training import Trainer
-from msk_ray.tune.space import load_space
-from msk_ray.tune.trials import Trial, resolve_trials
+from msk_ray.tune import driver
 
 REPOSITORY = Path(msk_ray.__file__).resolve().parent.parent
 WARM_UP = 5
@@ -63,10 +65,9 @@ class TimedTrainer(Trainer):
 def drive(arguments: list[str]) -> int:
     """`python -m msk_ray.tune` whose trials note when they begin and end."""
     from msk_ray.cli import run
-    from msk_ray.tune import runner
     from msk_ray.tune.__main__ import main as tune_main
 
-    runner.Plan = functools.partial(runner.Plan, trainer_class=TimedTrainer)  # type: ignore[assignment,misc]
+    driver.Plan = functools.partial(driver.Plan, trainer_class=TimedTrainer)  # type: ignore[assignment,misc]
     return run(tune_main, arguments)
 
 

@@ -16,15 +16,16 @@ from typing import Any
 from record import RESULTS, markdown_table, publish
 
 from msk_ray.config import dump_yaml
+from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.outcomes import Ending, Outcome, write_ending
-from msk_ray.tune import experiment as experiments
-from msk_ray.tune.space import parse_space
-from msk_ray.tune.trials import resolve_trials
+from msk_ray.sweep import opening
+from msk_ray.sweep.space import parse_space
+from msk_ray.sweep.trials import resolve_trials
 
 TERMS = ("forward_vel", "up", "heading", "height", "action")
 
 
-def generate(folder: Path, trials: int, epochs: int) -> experiments.Experiment:
+def generate(folder: Path, trials: int, epochs: int) -> Experiment:
     """An experiment of the ant as a sweep leaves it: five sampled parameters, two of every twenty trials failed."""
     data: dict[str, Any] = {
         "question": "How does the report scale?",
@@ -43,7 +44,7 @@ def generate(folder: Path, trials: int, epochs: int) -> experiments.Experiment:
     space = parse_space(data, folder / "generated.yaml")
     (folder / "generated.yaml").write_text(dump_yaml(data))
     resolved = resolve_trials(space)
-    made = experiments.create(folder / "runs" / "generated", space, resolved, {})
+    made = opening.create(folder / "runs" / "generated", space, resolved, {})
     for trial in resolved:
         rng = random.Random(trial.index)
         own = made.trial_folder(trial.id)

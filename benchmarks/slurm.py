@@ -24,9 +24,9 @@ from hosts import Host, check_possible, network
 from record import RESULTS, markdown_table, publish
 
 from msk_ray.config import dump_yaml
+from msk_ray.experiment.manifest import Experiment, has_begun
 from msk_ray.experiment.metrics import read_rows
 from msk_ray.experiment.outcomes import read_ending
-from msk_ray.tune.experiment import Experiment, has_begun
 
 TRIALS = 3
 SPACE = {

@@ -24,8 +24,8 @@ from record import RESULTS, markdown_table, publish
 from msk_ray.config import dump_yaml
 from msk_ray.experiment.metrics import read_rows
 from msk_ray.experiment.outcomes import read_ending
-from msk_ray.tune.space import load_space
-from msk_ray.tune.trials import resolve_trials
+from msk_ray.sweep.space import load_space
+from msk_ray.sweep.trials import resolve_trials
 
 EPOCHS = 30
 SPACE = {

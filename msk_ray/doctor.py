@@ -37,7 +37,7 @@ RAY_LIMIT_S = 90.0
 MIN_FREE_GB = 2.0
 """A sweep's checkpoints and logs take about so much."""
 GRADIENT_TOLERANCE = 1e-2
-PING = [sys.executable, "-m", "msk_ray.tune.ping"]
+RAY_PROBE = [sys.executable, "-m", "msk_ray.tune.ray_probe"]
 _SLOW_S = 0.5
 
 
@@ -237,7 +237,7 @@ def check_ray(limit_s: float = RAY_LIMIT_S) -> Finding:
     # Its output goes to a file: Ray's daemons inherit a pipe, and would keep its reader waiting when all else is done.
     with tempfile.TemporaryFile("w+") as output:
         process = subprocess.Popen(
-            PING,
+            RAY_PROBE,
             stdout=output,
             stderr=subprocess.STDOUT,
             env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},

@@ -12,19 +12,12 @@ from typing import TYPE_CHECKING
 from msk_ray.cli import Parser, run
 from msk_ray.errors import MskRayError, StorageError
 from msk_ray.experiment.damage import count_damages
+from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.outcomes import Outcome
 from msk_ray.experiment.snapshot import State
+from msk_ray.experiment.trial_status import StatusReader, TrialStatus, best_of, counts, find_experiments, remaining
 from msk_ray.progress import format_duration
 from msk_ray.text import printable
-from msk_ray.tune.experiment import Experiment
-from msk_ray.tune.standing import (
-    Observer,
-    Standing,
-    best_of,
-    counts,
-    find_experiments,
-    remaining,
-)
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
@@ -66,7 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if args.watch:
             raise StorageError(f"--watch: which experiment? {_known(args.storage)}")
         return _list(args.storage)
-    observer = Observer(Experiment(find(args.experiment, args.storage)))
+    observer = StatusReader(Experiment(find(args.experiment, args.storage)))
     if args.watch:
         return _watch(observer, args.interval)
     _console().print(view(observer, _width()))
@@ -88,7 +81,7 @@ def find(name: str, storage: Path) -> Path:
     )
 
 
-def view(observer: Observer, width: int, rows: int | None = None) -> "RenderableType":
+def view(observer: StatusReader, width: int, rows: int | None = None) -> "RenderableType":
     """An experiment as a table for a terminal of `width` columns, at most `rows` trials.
 
     Raises:
@@ -97,40 +90,40 @@ def view(observer: Observer, width: int, rows: int | None = None) -> "Renderable
     from rich.console import Group
     from rich.text import Text
 
-    standings = observer.look(time.time())
-    lines: list[RenderableType] = [Text(printable(headline(observer.experiment, standings)))]
-    if not standings:
+    statuses = observer.look(time.time())
+    lines: list[RenderableType] = [Text(printable(headline(observer.experiment, statuses)))]
+    if not statuses:
         return Group(*lines, Text("no trial has started yet"))
-    shown = standings if rows is None else standings[: max(1, rows)]
+    shown = statuses if rows is None else statuses[: max(1, rows)]
     lines.append(trial_table(shown, width))
-    if len(shown) < len(standings):
-        lines.append(Text(f"... and {len(standings) - len(shown)} more", style="dim"))
+    if len(shown) < len(statuses):
+        lines.append(Text(f"... and {len(statuses) - len(shown)} more", style="dim"))
     if width < WIDE:  # a wide table has a column for it
         bad = (Outcome.ERROR, Outcome.OUT_OF_MEMORY)
         told = [s for s in shown if s.damages or s.state is State.UNREADABLE or s.outcome in bad]
         lines += [Text(printable(f"{s.id}: {s.note}"), style="red") for s in told]
-    damages = [damage for standing in standings for damage in standing.damages]
+    damages = [damage for status in statuses for damage in status.damages]
     if damages:
         lines.append(Text(f"skipped: {count_damages(damages)}", style="red"))
-    if observer.experiment.stop_file.exists() and any(s.state is not State.ENDED for s in standings):
+    if observer.experiment.stop_file.exists() and any(s.state is not State.ENDED for s in statuses):
         command = printable(observer.experiment.resume_command())
         lines.append(Text(f"stopped on request; go on with: {command}"))
     return Group(*lines)
 
 
-def headline(experiment: Experiment, standings: Sequence[Standing]) -> str:
+def headline(experiment: Experiment, statuses: Sequence[TrialStatus]) -> str:
     """`ant_lr · 2 running · 3 ended · best 12.3 (1a2b3c4d) · at most 2h05m left`."""
-    parts = [experiment.name, *(f"{n} {state}" for state, n in counts(standings).items())]
-    best = best_of(standings)
+    parts = [experiment.name, *(f"{n} {state}" for state, n in counts(statuses).items())]
+    best = best_of(statuses)
     if best is not None:
         parts.append(f"best {best.progress.best:.5g} ({best.id})")
-    left = remaining(standings)
+    left = remaining(statuses)
     if left is not None:
         parts.append(f"at most {format_duration(left)} left")
     return " · ".join(parts)
 
 
-def trial_table(standings: Sequence[Standing], width: int) -> "Table":
+def trial_table(statuses: Sequence[TrialStatus], width: int) -> "Table":
     """One row a trial. Only what was changed, half the worlds too, may wrap; a wide table shows hosts and reasons."""
     from rich import box
     from rich.table import Table
@@ -148,34 +141,34 @@ def trial_table(standings: Sequence[Standing], width: int) -> "Table":
         table.add_column(heading, justify="right", no_wrap=True)
     if wide:
         table.add_column("why", ratio=2, no_wrap=True, overflow="ellipsis")
-    seeds = len({standing.seed for standing in standings}) > 1
-    for standing in standings:
-        style = "red" if standing.outcome in _FAILED else _STYLES.get(standing.state, "")
+    seeds = len({status.seed for status in statuses}) > 1
+    for status in statuses:
+        style = "red" if status.outcome in _FAILED else _STYLES.get(status.state, "")
         # As Text: rich would take brackets and colons in a label for markup and emoji.
-        table.add_row(*(Text(printable(cell)) for cell in _cells(standing, wide, seeds)), style=style)
+        table.add_row(*(Text(printable(cell)) for cell in _cells(status, wide, seeds)), style=style)
     return table
 
 
-def _cells(standing: Standing, wide: bool, seeds: bool) -> list[str]:
-    progress, device = standing.progress, standing.device
+def _cells(status: TrialStatus, wide: bool, seeds: bool) -> list[str]:
+    progress, device = status.progress, status.device
     # "stopped_asha" is an outcome's name; in a narrow column "asha" says the same.
-    state = (standing.outcome if wide else standing.outcome.removeprefix("stopped_")) or str(standing.state)
+    state = (status.outcome if wide else status.outcome.removeprefix("stopped_")) or str(status.state)
     model = "" if device.gpu == "cpu" else device.name
     gpu = f"{device.host}:{device.gpu} {model}".strip() if wide and device.host else device.gpu
     cells = [
-        standing.id,
-        standing.variant
-        + (f", seed {standing.seed}" if seeds else "")
-        + (f" ({standing.halved})" if standing.halved is not None else ""),
+        status.id,
+        status.variant
+        + (f", seed {status.seed}" if seeds else "")
+        + (f" ({status.halved})" if status.halved is not None else ""),
         state,
-        f"{progress.epoch}/{standing.epochs}",
+        f"{progress.epoch}/{status.epochs}",
         "-" if progress.best is None else f"{progress.best:.4g}",
         short_number(progress.env_steps_per_s) if progress.env_steps_per_s is not None else "-",
         gpu,
-        "-" if standing.seconds_left is None else format_duration(standing.seconds_left),
-        "-" if standing.heartbeat_age is None else format_age(standing.heartbeat_age),
+        "-" if status.seconds_left is None else format_duration(status.seconds_left),
+        "-" if status.heartbeat_age is None else format_age(status.heartbeat_age),
     ]
-    return [*cells, standing.note] if wide else cells
+    return [*cells, status.note] if wide else cells
 
 
 def short_number(value: float) -> str:
@@ -191,7 +184,7 @@ def format_age(seconds: float) -> str:
     return f"{seconds / 86400:.0f}d" if seconds >= 2 * 86400 else format_duration(seconds)
 
 
-def _watch(observer: Observer, interval: float) -> int:
+def _watch(observer: StatusReader, interval: float) -> int:
     """Show the experiment until all its trials have ended, or until Ctrl-C."""
     console = _console()
     try:
@@ -207,7 +200,7 @@ def _watch(observer: Observer, interval: float) -> int:
     return 0
 
 
-def _watch_terminal(observer: Observer, console: "Console", interval: float) -> None:
+def _watch_terminal(observer: StatusReader, console: "Console", interval: float) -> None:
     from rich.live import Live
 
     with Live(console=console, screen=True, auto_refresh=False) as live:
@@ -217,9 +210,9 @@ def _watch_terminal(observer: Observer, console: "Console", interval: float) -> 
             time.sleep(interval)
 
 
-def _over(observer: Observer) -> bool:
-    standings = observer.look(time.time())
-    return bool(standings) and all(standing.state in (State.ENDED, State.UNREADABLE) for standing in standings)
+def _over(observer: StatusReader) -> bool:
+    statuses = observer.look(time.time())
+    return bool(statuses) and all(status.state in (State.ENDED, State.UNREADABLE) for status in statuses)
 
 
 def _list(storage: Path) -> int:
@@ -243,15 +236,15 @@ def _list(storage: Path) -> int:
 
 def _summary(experiment: Experiment) -> tuple[str, str, str, str]:
     try:
-        standings = Observer(experiment).look(time.time())
+        statuses = StatusReader(experiment).look(time.time())
         question = experiment.manifest().get("question") or ""
     except MskRayError as error:
         return "-", "-", str(error), ""
-    best = best_of(standings)
+    best = best_of(statuses)
     return (
-        str(len(standings)),
+        str(len(statuses)),
         "-" if best is None else f"{best.progress.best:.4g}",
-        ", ".join(f"{n} {state}" for state, n in counts(standings).items()) or "no trial has started yet",
+        ", ".join(f"{n} {state}" for state, n in counts(statuses).items()) or "no trial has started yet",
         question,
     )
 

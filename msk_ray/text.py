@@ -6,6 +6,8 @@ the window or overwrite what was said before, and a newline could pass for a lin
 
 import html
 import unicodedata
+from collections.abc import Mapping
+from typing import Any
 
 _HIDDEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 """Unicode categories without a shape of their own: controls, format (direction of writing), surrogates, separators."""
@@ -31,6 +33,19 @@ def markdown_text(text: str) -> str:
 def markdown_cell(text: str) -> str:
     """The same for one cell of a Markdown table."""
     return _markdown(text).replace("|", "\\|")
+
+
+def describe(value: Any) -> str:
+    """A value as tables show it: `1e-05`, `[0.33, 1]`, `start=8 end=32`."""
+    if isinstance(value, bool) or value is None:
+        return str(value).lower() if value is not None else "null"
+    if isinstance(value, float):
+        return f"{value:g}"
+    if isinstance(value, Mapping):
+        return " ".join(f"{key}={describe(item)}" for key, item in value.items())
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(describe(item) for item in value) + "]"
+    return str(value)
 
 
 def _markdown(line: str) -> str:

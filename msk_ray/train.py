@@ -24,8 +24,8 @@ from typing import TYPE_CHECKING
 from msk_ray.cli import TERMINAL_LOG, Parser, outliving, run, typed_command
 from msk_ray.config import SET_HELP, Config, load_config
 from msk_ray.errors import CheckpointError, ConfigError, StorageError
+from msk_ray.experiment.ownership import Ownership, owned
 from msk_ray.files import check_writable, make_folder
-from msk_ray.ownership import Ownership, owned
 from msk_ray.signals import RESUMABLE, StopRequest, listening
 from msk_ray.text import printable
 

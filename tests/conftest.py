@@ -1,7 +1,7 @@
 """Shared fixtures. Worlds are few and rollouts short: everything here runs on two CPU cores."""
 
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,15 +10,24 @@ from needs import need_program
 from processes import Launcher
 
 from msk_ray.config import Config, dump_yaml, load_config, parse_config
+from msk_ray.experiment.manifest import Experiment
+from msk_ray.sweep import opening
+from msk_ray.sweep.space import Space, StopSpec, parse_space
+from msk_ray.sweep.trials import resolve_trials
 from msk_ray.training import Trainer
-from msk_ray.tune import experiment as experiments
+from msk_ray.tune.finish import finish
 from msk_ray.tune.hparams import log_hparams
-from msk_ray.tune.report import finish
-from msk_ray.tune.space import StopSpec, parse_space
 from msk_ray.tune.trial_run import Hooks, run_trial
-from msk_ray.tune.trials import resolve_trials
 
 ROOT = Path(__file__).resolve().parent.parent
+MakeSpace = Callable[..., Space]
+
+BASE = {
+    "env": {"name": "cartpole", "nworld": 8},
+    "shac": {"horizon": 8},
+    "evaluation": {"interval": 2},
+    "trial": {"epochs": 20, "checkpoint_interval": 2},
+}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -77,8 +86,29 @@ def tiny_cartpole(tiny_settings: dict[str, Any]) -> Config:
     return parse_config(tiny_settings)
 
 
+@pytest.fixture
+def space_data(tmp_path: Path) -> dict[str, Any]:
+    """A space of two learning rates, whose base lies in `tmp_path`."""
+    (tmp_path / "base.yaml").write_text(dump_yaml(BASE))
+    return {
+        "question": "Which rate?",
+        "base": "base.yaml",
+        "parameters": {"shac.actor_lr": {"grid": [0.01, 0.001]}},
+    }
+
+
+@pytest.fixture
+def make_space(tmp_path: Path, space_data: dict[str, Any]) -> MakeSpace:
+    """Makes a space with some fields replaced."""
+
+    def make(**changes: Any) -> Space:
+        return parse_space(space_data | changes, tmp_path / "small.yaml")
+
+    return make
+
+
 @pytest.fixture(scope="session")
-def sweep(tmp_path_factory: pytest.TempPathFactory) -> experiments.Experiment:
+def sweep(tmp_path_factory: pytest.TempPathFactory) -> Experiment:
     """A real small sweep of CartPole, two rates by two seeds, trained here one after the other. Not to be changed."""
     folder = tmp_path_factory.mktemp("sweep")
     (folder / "base.yaml").write_text(dump_yaml(_tiny_settings()))
@@ -90,7 +120,7 @@ def sweep(tmp_path_factory: pytest.TempPathFactory) -> experiments.Experiment:
     }
     space = parse_space(data, folder / "small.yaml")
     trials = resolve_trials(space)
-    made = experiments.create(folder / "runs" / "small", space, trials, {})
+    made = opening.create(folder / "runs" / "small", space, trials, {})
     for trial in trials:
         own = made.trial_folder(trial.id)
         own.mkdir(parents=True)

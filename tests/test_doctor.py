@@ -79,7 +79,7 @@ def test_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def fake_ping(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A script that runs in the place of the one that starts Ray."""
     path = tmp_path / "ping"
-    monkeypatch.setattr(doctor, "PING", [str(path)])
+    monkeypatch.setattr(doctor, "RAY_PROBE", [str(path)])
     return path
 
 

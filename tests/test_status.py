@@ -13,14 +13,15 @@ import pytest
 from msk_ray.cli import run
 from msk_ray.config import dump_yaml
 from msk_ray.experiment.halved import Halved, write_halved
+from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import progress_of
 from msk_ray.experiment.outcomes import Ending, Outcome, write_ending
 from msk_ray.experiment.snapshot import State
+from msk_ray.experiment.trial_status import StatusReader, best_of, remaining
 from msk_ray.status import main, short_number
-from msk_ray.tune import experiment as experiments
-from msk_ray.tune.space import parse_space
-from msk_ray.tune.standing import Observer, best_of, remaining
-from msk_ray.tune.trials import resolve_trials
+from msk_ray.sweep import opening
+from msk_ray.sweep.space import parse_space
+from msk_ray.sweep.trials import resolve_trials
 
 NOW = time.time()
 GPU = {"host": "node7", "pid": 1, "visible": "3", "count": 1, "name": "NVIDIA H200"}
@@ -49,7 +50,7 @@ def fill(folder: Path, rows: list[dict[str, Any]], age: float, device: dict[str,
 
 
 @pytest.fixture
-def experiment(now: None, tmp_path: Path) -> experiments.Experiment:
+def experiment(now: None, tmp_path: Path) -> Experiment:
     """Six rates: running, silent, finished, stopped, never started, and one with a broken file."""
     (tmp_path / "base.yaml").write_text(dump_yaml({"env": {"name": "cartpole"}, "trial": {"epochs": 20}}))
     data = {
@@ -59,7 +60,7 @@ def experiment(now: None, tmp_path: Path) -> experiments.Experiment:
     }
     space = parse_space(data, tmp_path / "small.yaml")
     trials = resolve_trials(space)
-    made = experiments.create(tmp_path / "runs" / "rates", space, trials, {})
+    made = opening.create(tmp_path / "runs" / "rates", space, trials, {})
     folders = [made.trial_folder(trial.id) for trial in trials]
     fill(folders[0], [row(0, 1.0), row(5, 7.0), row(8)], age=5.0)
     fill(folders[1], [row(0, 1.0), row(4, 3.0)], age=41.0 * 4)  # ten epochs are 40 s, but never less than 60 s
@@ -72,8 +73,8 @@ def experiment(now: None, tmp_path: Path) -> experiments.Experiment:
     return made
 
 
-def test_states_from_files(experiment: experiments.Experiment) -> None:
-    standings = Observer(experiment).look(NOW)
+def test_states_from_files(experiment: Experiment) -> None:
+    standings = StatusReader(experiment).look(NOW)
     assert [s.state for s in standings] == [
         State.RUNNING,
         State.STALE,
@@ -95,44 +96,40 @@ def test_states_from_files(experiment: experiments.Experiment) -> None:
 
 
 @pytest.mark.parametrize(("age", "state"), [(59.0, State.RUNNING), (61.0, State.STALE), (-50.0, State.RUNNING)])
-def test_stale_after_a_minute_at_four_seconds_an_epoch(
-    experiment: experiments.Experiment, age: float, state: State
-) -> None:
+def test_stale_after_a_minute_at_four_seconds_an_epoch(experiment: Experiment, age: float, state: State) -> None:
     folder = experiment.trial_folder(experiment.trials()[0].id)
     os.utime(folder / "metrics.jsonl", (NOW - age, NOW - age))
     os.utime(folder / "device.json", (NOW - 900, NOW - 900))
-    assert next(s for s in Observer(experiment).look(NOW) if s.id == folder.name).state is state
+    assert next(s for s in StatusReader(experiment).look(NOW) if s.id == folder.name).state is state
 
 
 @pytest.mark.parametrize(("age", "state"), [(4.0, State.STALE), (6.0, State.RUNNING)])
-def test_a_trial_whose_driver_has_left_is_not_running(
-    experiment: experiments.Experiment, age: float, state: State
-) -> None:
+def test_a_trial_whose_driver_has_left_is_not_running(experiment: Experiment, age: float, state: State) -> None:
     """The running one was heard of 5 s ago: before the driver wrote its summary, or, resumed since, after."""
     summary = experiment.path / "summary.json"
     summary.write_text("{}")
     os.utime(summary, (NOW - age, NOW - age))
     trial = experiment.trials()[0].id
-    assert next(s for s in Observer(experiment).look(NOW) if s.id == trial).state is state
+    assert next(s for s in StatusReader(experiment).look(NOW) if s.id == trial).state is state
 
 
-def test_a_process_that_has_just_started_may_take_minutes_to_compile(experiment: experiments.Experiment) -> None:
+def test_a_process_that_has_just_started_may_take_minutes_to_compile(experiment: Experiment) -> None:
     folder = experiment.trial_folder(experiment.trials()[1].id)
     for age, state in ((500.0, State.RUNNING), (700.0, State.STALE)):
         os.utime(folder / "metrics.jsonl", (NOW - 5000, NOW - 5000))
         os.utime(folder / "device.json", (NOW - age, NOW - age))
-        assert next(s for s in Observer(experiment).look(NOW) if s.id == folder.name).state is state
+        assert next(s for s in StatusReader(experiment).look(NOW) if s.id == folder.name).state is state
 
 
 def test_a_changed_file_is_read_again_and_another_is_not(
-    experiment: experiments.Experiment, monkeypatch: pytest.MonkeyPatch
+    experiment: Experiment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from msk_ray.experiment import snapshot
 
     read: list[str] = []
     original = snapshot.load_metrics
     monkeypatch.setattr(snapshot, "load_metrics", lambda path: (read.append(path.parent.name), original(path))[1])
-    observer = Observer(experiment)
+    observer = StatusReader(experiment)
     observer.look(NOW)
     read.clear()
     folder = experiment.trial_folder(experiment.trials()[0].id)
@@ -142,11 +139,11 @@ def test_a_changed_file_is_read_again_and_another_is_not(
     assert (first.progress.epoch, first.progress.best) == (9, 8.0)
 
 
-def test_trials_a_search_makes_up_are_found_before_the_manifest_knows_them(experiment: experiments.Experiment) -> None:
+def test_trials_a_search_makes_up_are_found_before_the_manifest_knows_them(experiment: Experiment) -> None:
     trials = experiment.trials()
     (experiment.trial_folder(trials[0].id) / "config.yaml").write_text(dump_yaml(trials[0].config.as_dict()))
     experiment.set_trials(trials[1:])
-    found = next(s for s in Observer(experiment).look(NOW) if s.id == trials[0].id)
+    found = next(s for s in StatusReader(experiment).look(NOW) if s.id == trials[0].id)
     assert (found.state, found.variant, found.epochs) == (State.RUNNING, "actor_lr=0.01", 20)
 
 
@@ -158,7 +155,7 @@ def test_progress_of_nothing_and_of_scores_that_are_no_numbers() -> None:
 
 @pytest.mark.parametrize("width", [80, 200])
 def test_the_table_fits_the_terminal(
-    experiment: experiments.Experiment,
+    experiment: Experiment,
     width: int,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -180,7 +177,7 @@ def test_the_table_fits_the_terminal(
 
 
 def test_a_trial_that_ran_out_of_memory_says_what_to_lower(
-    experiment: experiments.Experiment, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    experiment: Experiment, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     trial = experiment.trials()[0]
     experiment.trial_folder(trial.id).mkdir(parents=True, exist_ok=True)
@@ -196,7 +193,7 @@ def test_a_trial_that_ran_out_of_memory_says_what_to_lower(
 
 @pytest.mark.parametrize("width", [80, 200])
 def test_a_trial_with_half_its_worlds_says_so(
-    experiment: experiments.Experiment,
+    experiment: Experiment,
     width: int,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -212,7 +209,7 @@ def test_a_trial_with_half_its_worlds_says_so(
 
 
 def test_an_experiment_by_path_with_a_request_to_stop(
-    experiment: experiments.Experiment, capsys: pytest.CaptureFixture[str]
+    experiment: Experiment, capsys: pytest.CaptureFixture[str]
 ) -> None:
     experiment.stop_file.touch()
     assert run(main, [str(experiment.path)]) == 0
@@ -223,7 +220,7 @@ def test_an_experiment_by_path_with_a_request_to_stop(
 
 
 def test_list_of_experiments(
-    experiment: experiments.Experiment, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    experiment: Experiment, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "300")  # the folder is named, however long its name is
     storage = experiment.path.parent
@@ -253,7 +250,7 @@ def test_list_of_experiments(
     ],
 )
 def test_what_is_no_experiment_is_one_line(
-    experiment: experiments.Experiment, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+    experiment: Experiment, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     storage = experiment.path.parent
     for name, text in (("torn", None), ("garbled", '{"format": 1, "tri'), ("odd", '{"format": 1}')):
@@ -273,7 +270,7 @@ def test_an_empty_storage_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixt
     assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_watch_ends_with_the_last_trial(experiment: experiments.Experiment, capsys: pytest.CaptureFixture[str]) -> None:
+def test_watch_ends_with_the_last_trial(experiment: Experiment, capsys: pytest.CaptureFixture[str]) -> None:
     for trial in experiment.trials():
         (experiment.trial_folder(trial.id)).mkdir(exist_ok=True)
         write_ending(experiment.trial_folder(trial.id), Ending(Outcome.FINISHED, "done"))
@@ -281,7 +278,7 @@ def test_watch_ends_with_the_last_trial(experiment: experiments.Experiment, caps
     assert "6 ended" in capsys.readouterr().out
 
 
-def test_neither_ray_nor_torch_is_loaded(experiment: experiments.Experiment, root: Path) -> None:
+def test_neither_ray_nor_torch_is_loaded(experiment: Experiment, root: Path) -> None:
     code = (
         "import sys; from msk_ray.status import main; "
         f"main(['rates', '--storage', {str(experiment.path.parent)!r}]); "

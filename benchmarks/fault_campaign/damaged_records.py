@@ -14,14 +14,15 @@ from fault_campaign.tally import Tally
 from msk_ray.cli import run
 from msk_ray.config import dump_yaml
 from msk_ray.experiment import layout
+from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import read_rows
 from msk_ray.experiment.outcomes import Ending, Outcome, write_ending
+from msk_ray.experiment.results import read_records
 from msk_ray.files import write_json
 from msk_ray.report.reading import read_experiment
 from msk_ray.status import main as status
-from msk_ray.tune import experiment as experiments
-from msk_ray.tune.records import read_records
-from msk_ray.tune.space import load_space
+from msk_ray.sweep import opening
+from msk_ray.sweep.space import load_space
 
 OF_A_TRIAL = (layout.METRICS_FILE, layout.OUTCOME_FILE, layout.DEVICE_FILE, layout.HALVED_FILE, "config.yaml")
 OF_THE_EXPERIMENT = (layout.MANIFEST_FILE, layout.ENVIRONMENT_FILE, layout.SPACE_FILE, layout.SUMMARY_FILE)
@@ -58,7 +59,7 @@ def damaged_records(reference: Reference, scratch: Path, rng: random.Random) -> 
     for kind, damage in KINDS.items():
         tally, started = Tally(f"a record damaged: {kind}", 0, "nothing"), time.monotonic()
         for name in (*OF_A_TRIAL, *OF_THE_EXPERIMENT) * TIMES:
-            made = experiments.Experiment(Path(shutil.copytree(whole.path, scratch / "damaged" / "e")))
+            made = Experiment(Path(shutil.copytree(whole.path, scratch / "damaged" / "e")))
             victim = rng.choice(reference.trials).id
             path = (made.trial_folder(victim) if name in OF_A_TRIAL else made.path) / name
             path.write_bytes(damage(path.read_bytes(), rng))
@@ -77,9 +78,9 @@ def damaged_records(reference: Reference, scratch: Path, rng: random.Random) -> 
     return tallies
 
 
-def _experiment(reference: Reference, scratch: Path) -> experiments.Experiment:
+def _experiment(reference: Reference, scratch: Path) -> Experiment:
     """The reference's trials as an experiment leaves them."""
-    made = experiments.create(scratch / "records", load_space(scratch / "space.yaml"), reference.trials, {})
+    made = opening.create(scratch / "records", load_space(scratch / "space.yaml"), reference.trials, {})
     for trial in reference.trials:
         folder = made.trial_folder(trial.id)
         folder.mkdir()
@@ -93,7 +94,7 @@ def _experiment(reference: Reference, scratch: Path) -> experiments.Experiment:
     return made
 
 
-def _lost(made: experiments.Experiment, victim: str, name: str) -> tuple[int, int, str]:
+def _lost(made: Experiment, victim: str, name: str) -> tuple[int, int, str]:
     """Whole rows and whole trials that are no longer shown, and what else is wrong."""
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):

@@ -6,8 +6,8 @@ from typing import Any
 from fault_campaign.space import EPOCHS, TIMING
 from msk_ray.experiment.metrics import read_rows
 from msk_ray.experiment.outcomes import read_ending
+from msk_ray.experiment.trial import Trial
 from msk_ray.training import Trainer, read_checkpoint
-from msk_ray.tune.trials import Trial
 
 
 class Reference:

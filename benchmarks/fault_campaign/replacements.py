@@ -15,9 +15,9 @@ from fault_campaign.tally import Tally
 from msk_ray.experiment import layout
 from msk_ray.experiment.checkpoint_file import read_checkpoint_file, write_checkpoint_file
 from msk_ray.experiment.halved import Halved, read_halved, write_halved
-from msk_ray.experiment.journal import Journal, Report
 from msk_ray.experiment.metrics import load_metrics
 from msk_ray.experiment.outcomes import Ending, Outcome, load_ending, write_ending
+from msk_ray.experiment.scheduler_log import LogEntry, SchedulerLog
 from msk_ray.files import write_json, write_text
 from msk_ray.training.metrics import MetricsLog
 
@@ -86,7 +86,7 @@ def replacements(reference: Reference, scratch: Path, rng: random.Random) -> lis
 
 def _writers(old: bytes, new: bytes) -> list[Writer]:
     rows = [{"epoch": epoch, "env_steps": 8.0 * epoch, "seconds": 0.5 * epoch} for epoch in range(3)]
-    reports = [Report("a", epoch, 8 * epoch, 0.5 * epoch, 1.0, False) for epoch in range(3)]
+    reports = [LogEntry("a", epoch, 8 * epoch, 0.5 * epoch, 1.0, False) for epoch in range(3)]
     text = json.dumps({"trials": ["x" * 1000] * 4})
 
     def checkpoint(name: str) -> Writer:
@@ -112,9 +112,9 @@ def _writers(old: bytes, new: bytes) -> list[Writer]:
             metrics.write(row)
         metrics.close()
 
-    def journal(folder: Path, some: list[Report]) -> None:
+    def journal(folder: Path, some: list[LogEntry]) -> None:
         for report in some:
-            Journal(folder / layout.JOURNAL_FILE).append(report)
+            SchedulerLog(folder / layout.SCHEDULER_LOG_FILE).append(report)
 
     return [
         checkpoint("best.pt"),
@@ -153,9 +153,9 @@ def _writers(old: bytes, new: bytes) -> list[Writer]:
             lambda f: load_metrics(f / layout.METRICS_FILE).rows,
         ),
         Writer(
-            f"{layout.JOURNAL_FILE}, a report added",
+            f"{layout.SCHEDULER_LOG_FILE}, a report added",
             lambda f: journal(f, reports[:2]),
             lambda f: journal(f, reports[2:]),
-            lambda f: Journal(f / layout.JOURNAL_FILE).read(),
+            lambda f: SchedulerLog(f / layout.SCHEDULER_LOG_FILE).read(),
         ),
     ]

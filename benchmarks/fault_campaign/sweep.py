@@ -15,7 +15,7 @@ import msk_ray
 from fault_campaign.processes import birth_of, descendants_of, name_of
 from msk_ray.experiment.metrics import read_rows
 from msk_ray.experiment.outcomes import read_ending
-from msk_ray.tune.trials import Trial
+from msk_ray.experiment.trial import Trial
 
 REPOSITORY = Path(msk_ray.__file__).resolve().parent.parent
 COMMAND = Path(__file__).resolve().parent.parent / "faults.py"

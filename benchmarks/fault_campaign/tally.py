@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from fault_campaign.reference import Reference
 from fault_campaign.space import EPOCHS
 from fault_campaign.sweep import Sweep
-from msk_ray.tune.trials import Trial
+from msk_ray.experiment.trial import Trial
 
 RESUMABLE = 75
 

@@ -14,6 +14,7 @@ from typing import Any
 import torch
 
 from msk_ray.training import Trainer
+from msk_ray.tune import driver, session
 
 
 class FaultyTrainer(Trainer):
@@ -77,11 +78,10 @@ def drive(arguments: list[str]) -> int:
     from ray import cloudpickle
 
     from msk_ray.cli import run
-    from msk_ray.tune import runner
     from msk_ray.tune.__main__ import main as tune_main
 
     # Trials' processes need not find this module.
     cloudpickle.register_pickle_by_value(sys.modules[__name__])
-    runner.Plan = functools.partial(runner.Plan, trainer_class=FaultyTrainer)  # type: ignore[assignment,misc]
-    runner.ray_session = functools.partial(runner.ray_session, dashboard=False)
+    driver.Plan = functools.partial(driver.Plan, trainer_class=FaultyTrainer)  # type: ignore[assignment,misc]
+    session.ray_session = functools.partial(session.ray_session, dashboard=False)
     return run(tune_main, arguments)

@@ -11,12 +11,12 @@ from msk_ray.cli import Parser, run
 from msk_ray.errors import CheckpointError, MskRayError
 from msk_ray.evaluate.targets import Kind, Target, best_checkpoint, best_of_trial, find_target
 from msk_ray.experiment.checkpoint_file import read_facts
+from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.snapshot import read_trial
 from msk_ray.files import write_json
+from msk_ray.sweep.space import parse_seeds
 from msk_ray.text import printable
-from msk_ray.tune.experiment import Experiment
-from msk_ray.tune.listing import text_table
-from msk_ray.tune.space import parse_seeds
+from msk_ray.text_table import text_table
 
 if TYPE_CHECKING:
     from msk_ray.evaluate.measure import Bench, Request

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from msk_ray.errors import CheckpointError, StorageError
 from msk_ray.experiment import layout
-from msk_ray.tune.experiment import Experiment
-from msk_ray.tune.records import best_record, read_records
-from msk_ray.tune.standing import find_experiments
+from msk_ray.experiment.manifest import Experiment
+from msk_ray.experiment.results import best_record, read_records
+from msk_ray.experiment.trial_status import find_experiments
 
 
 class Kind(StrEnum):

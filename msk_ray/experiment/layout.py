@@ -5,7 +5,7 @@ from pathlib import Path
 MANIFEST_FILE = "manifest.json"
 SPACE_FILE = "space.yaml"
 ENVIRONMENT_FILE = "env.json"
-JOURNAL_FILE = "reports.jsonl"
+SCHEDULER_LOG_FILE = "reports.jsonl"
 SUMMARY_FILE = "summary.json"
 """What a driver writes, with the table, when it ends by itself."""
 STOP_FILE = "stop"

@@ -120,7 +120,7 @@ def evaluations_of(rows: Sequence[Mapping[str, float]]) -> list[Evaluation]:
 
 
 @dataclass(frozen=True)
-class Progress:
+class TrialProgress:
     """What a trial's rows of metrics say."""
 
     epoch: int = 0
@@ -132,17 +132,17 @@ class Progress:
     """Mean over the newest rows [s]."""
 
 
-def progress_of(rows: Sequence[Mapping[str, float]]) -> Progress:
+def progress_of(rows: Sequence[Mapping[str, float]]) -> TrialProgress:
     """What rows of metrics, in order of epoch, say."""
     if not rows:
-        return Progress()
+        return TrialProgress()
     scores = [e.score for e in evaluations_of(rows) if math.isfinite(e.score)]
     recent = [row for row in rows[-RECENT - 1 :] if row["epoch"] > 0]
     speeds = [row["env_steps_per_s"] for row in recent if math.isfinite(row.get("env_steps_per_s", math.nan))]
     first, last = rows[-RECENT - 1 :][0], rows[-1]
     epochs = last["epoch"] - first["epoch"]
     seconds = last.get("seconds", math.nan) - first.get("seconds", math.nan)
-    return Progress(
+    return TrialProgress(
         int(last["epoch"]),
         max(scores, default=None),
         statistics.median(speeds) if speeds else None,

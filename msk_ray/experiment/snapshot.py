@@ -14,7 +14,7 @@ from msk_ray.experiment.layout import DEVICE_FILE, METRICS_FILE, OUTPUT_FILE, SU
 from msk_ray.experiment.metrics import (
     Evaluation,
     Metrics,
-    Progress,
+    TrialProgress,
     evaluations_of,
     load_metrics,
     progress_of,
@@ -63,7 +63,7 @@ class TrialSnapshot:
     folder: Path
     rows: tuple[dict[str, float], ...]
     """Metrics in order of epoch, each epoch once; NaN for what is not finite. Empty if they were not asked for."""
-    progress: Progress
+    progress: TrialProgress
     ending: Ending | None
     """None: not ended, whether running, waiting or interrupted."""
     halved: Halved | None
@@ -109,7 +109,7 @@ class TrialReader:
             keep_rows: whether snapshots hold all rows of metrics, or only what they say.
         """
         self._keep_rows = keep_rows
-        self._seen: dict[Path, tuple[tuple[int, int], tuple[tuple[dict[str, float], ...], Progress, Metrics]]] = {}
+        self._seen: dict[Path, tuple[tuple[int, int], tuple[tuple[dict[str, float], ...], TrialProgress, Metrics]]] = {}
 
     def read(self, folder: Path, now: float) -> TrialSnapshot:
         """A trial's folder at `now` [s since the epoch]; nothing in it makes this fail."""
@@ -128,10 +128,12 @@ class TrialReader:
             state = State.STALE if _is_silent(folder, progress, age) else State.RUNNING
         return TrialSnapshot(folder, rows, progress, ending, halved, device, state, age, tuple(damages))
 
-    def _metrics(self, path: Path, damages: list[Damage]) -> tuple[tuple[dict[str, float], ...], Progress, Metrics]:
+    def _metrics(
+        self, path: Path, damages: list[Damage]
+    ) -> tuple[tuple[dict[str, float], ...], TrialProgress, Metrics]:
         stamp = _stamp(path)
         if stamp is None:
-            return (), Progress(), Metrics()
+            return (), TrialProgress(), Metrics()
         seen = self._seen.get(path)
         if seen is not None and seen[0] == stamp:
             return seen[1]
@@ -179,7 +181,7 @@ def _last_beat(folder: Path) -> float | None:
     return max((beat for name in _BEATS if (beat := _modified(folder / name)) is not None), default=None)
 
 
-def _is_silent(folder: Path, progress: Progress, age: float) -> bool:
+def _is_silent(folder: Path, progress: TrialProgress, age: float) -> bool:
     """Whether a trial that has not ended shows no sign of life: it was silent for too long, or its driver, which writes
     the summary last of all, has left since."""
     summary, beat = _modified(folder.parent.parent / SUMMARY_FILE), _last_beat(folder)
@@ -187,7 +189,7 @@ def _is_silent(folder: Path, progress: Progress, age: float) -> bool:
     return left or age > _patience(folder, progress)
 
 
-def _patience(folder: Path, progress: Progress) -> float:
+def _patience(folder: Path, progress: TrialProgress) -> float:
     """How long a trial may be silent before it counts as stale [s]."""
     started, metrics = _modified(folder / DEVICE_FILE), _modified(folder / METRICS_FILE)
     # A process younger than the metrics, as after a retry, has not done an epoch of its own.

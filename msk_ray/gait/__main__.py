@@ -9,7 +9,7 @@ from msk_ray.cli import Parser, run
 from msk_ray.evaluate.__main__ import positive
 from msk_ray.evaluate.targets import best_checkpoint, find_target, trial_folder_of
 from msk_ray.files import write_json
-from msk_ray.tune.listing import text_table
+from msk_ray.text_table import text_table
 
 DESCRIPTION = """\
 Measure the gait of a policy of a leg environment (myoleg26, myoleg): speed, cadence, step length, duty factor, joint

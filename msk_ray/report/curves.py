@@ -10,13 +10,13 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from msk_ray.errors import ConfigError
+from msk_ray.experiment.layout import SPACE_FILE
 from msk_ray.experiment.outcomes import Outcome
 from msk_ray.report.pictures import DASHES, GREY, PALETTE, POINTS, Picture, picture, shorten, steps_axis, thin_peaks
 from msk_ray.report.reading import Reading, TrialReading
-from msk_ray.tune.budget import extreme_configs, longest_budget
-from msk_ray.tune.experiment import SPACE_FILE
-from msk_ray.tune.pruning import rungs
-from msk_ray.tune.space import load_space
+from msk_ray.sweep.budget import extreme_configs, longest_budget
+from msk_ray.sweep.pruning import rungs
+from msk_ray.sweep.space import load_space
 
 NAMED = 8
 """Variants drawn in a colour of their own."""

@@ -17,6 +17,7 @@ from pydantic import ValidationError
 from msk_ray.config import describe_fault, read_yaml
 from msk_ray.errors import MskRayError, StorageError
 from msk_ray.experiment.damage import Damage, count_damages, describe_damages
+from msk_ray.experiment.environment import read_environment
 from msk_ray.experiment.halved import Halved
 from msk_ray.experiment.layout import (
     ENVIRONMENT_FILE,
@@ -26,13 +27,13 @@ from msk_ray.experiment.layout import (
     SPACE_FILE,
     best_checkpoint,
 )
+from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import SCORE
 from msk_ray.experiment.outcomes import Ending
+from msk_ray.experiment.results import unlisted_trials
 from msk_ray.experiment.snapshot import State, TrialReader
-from msk_ray.tune.experiment import Experiment, read_environment
-from msk_ray.tune.records import unlisted_trials
-from msk_ray.tune.space import SpaceFile
-from msk_ray.tune.trials import Trial
+from msk_ray.experiment.trial import Trial
+from msk_ray.sweep.space import SpaceFile
 
 _TAIL_LINES = 12
 _NOTED = 10

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 from msk_ray.errors import ConfigError
 from msk_ray.experiment.outcomes import Outcome
+from msk_ray.experiment.snapshot import State
 from msk_ray.report.reading import Reading, TrialReading
 from msk_ray.report.statistics import Interval, difference_interval, mean_interval
-from msk_ray.tune.standing import State
 
 _PLAIN_FIGURES = ("score", "score_std", "length", "fall_rate", "diverged_rate", "best_score")
 BASELINE = "baseline"

@@ -1,5 +1,5 @@
-"""Experiments: many trials resolved from a search space and run side by side by Ray Tune.
+"""Sweeps on Ray Tune: the one room that imports Ray.
 
-The only layer that imports Ray, and it does so in three rooms alone: `runner`, `adapters` and `progress`. Everything
-that decides something (which trials, when to stop one, how to name its end) is plain Python beside them.
+What a sweep tries and when it stops a trial is decided in `sweep`, and what it leaves on disk is kept by `experiment`;
+neither knows of this room.
 """

@@ -19,20 +19,21 @@ from typing import Any
 from msk_ray.cli import TERMINAL_LOG, Parser, outliving, run
 from msk_ray.config import SET_HELP, combine, dump_yaml, parse_overrides
 from msk_ray.errors import ConfigError
+from msk_ray.experiment.manifest import REMEMBERED, Experiment, check_name, has_begun, own
 from msk_ray.experiment.outcomes import Outcome, read_ending
+from msk_ray.experiment.trial import Trial
 from msk_ray.files import make_folder
 from msk_ray.signals import RESUMABLE, StopRequest, listening
+from msk_ray.sweep import opening
+from msk_ray.sweep.budget import extreme_configs
+from msk_ray.sweep.extend import extended_space, parse_extension
+from msk_ray.sweep.search_trials import recover
+from msk_ray.sweep.smoke import shrink, without_early_stopping
+from msk_ray.sweep.space import Space, find_space, parse_seeds, parse_space, read_space
+from msk_ray.sweep.trials import find_trial, resolve_trials
 from msk_ray.text import printable, printable_lines
-from msk_ray.tune import experiment as experiments
-from msk_ray.tune.budget import extreme_configs
+from msk_ray.text_table import text_table
 from msk_ray.tune.devices import check_threads
-from msk_ray.tune.extension import extended_space, parse_extension
-from msk_ray.tune.listing import text_table, trial_rows
-from msk_ray.tune.made_up import recover
-from msk_ray.tune.one_driver import own
-from msk_ray.tune.smoke import shrink, without_early_stopping
-from msk_ray.tune.space import Space, find_space, parse_seeds, parse_space, read_space
-from msk_ray.tune.trials import Trial, find_trial, resolve_trials
 
 DESCRIPTION = """\
 Run a search space: many SHAC trials side by side, one GPU (or CPU core) each, scored by deterministic evaluation,
@@ -134,7 +135,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
     if args.start_or_resume:
-        args.resume = args.resume or experiments.has_begun(_experiment_path(args))
+        args.resume = args.resume or has_begun(_experiment_path(args))
     if args.max_concurrent is not None and args.max_concurrent < 1:
         raise ConfigError(f"--max-concurrent {args.max_concurrent}: at least 1")
     retried = _retried(args)
@@ -147,7 +148,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         raise ConfigError("--extend: a smoke run has nothing to extend; leave --smoke out")
     recorded = _recorded(args)
     if recorded is not None:
-        for option in experiments.REMEMBERED:
+        for option in REMEMBERED:
             if getattr(args, option) is None:
                 setattr(args, option, recorded.said(option))
     space = _read_space(args, (recorded.extension() if recorded is not None else {}) | extension)
@@ -188,13 +189,13 @@ def _retried(args: argparse.Namespace) -> set[Outcome]:
 def _experiment_path(args: argparse.Namespace) -> Path:
     name: str = args.name or find_space(args.space).stem + ("-smoke" if args.smoke else "")
     storage: Path = args.storage
-    return (storage / experiments.check_name(name)).resolve()
+    return (storage / check_name(name)).resolve()
 
 
-def _recorded(args: argparse.Namespace) -> experiments.Experiment | None:
+def _recorded(args: argparse.Namespace) -> Experiment | None:
     """The experiment to go on with: what was said on its command lines before, its space file does not know."""
-    experiment = experiments.Experiment(_experiment_path(args))
-    going_on = (args.resume or args.extend) and experiments.has_begun(experiment.path)
+    experiment = Experiment(_experiment_path(args))
+    going_on = (args.resume or args.extend) and has_begun(experiment.path)
     return experiment if going_on else None
 
 
@@ -236,18 +237,23 @@ def _print_trials(space: Space, trials: list[Trial]) -> None:
         print(f"{space.file.samples} trials, chosen by optuna as results come in, over:")
         print(dump_yaml(space.file.parameters), end="")
     else:
-        print(text_table(("#", "id", "changed", "seed", "epochs"), trial_rows(trials), width))
+        print(text_table(("#", "id", "changed", "seed", "epochs"), _rows(trials), width))
     print(
         f"\n{len(trials) or space.file.samples} trials · scheduler {space.file.scheduler.kind} · "
         f"base {printable(space.file.base)}"
     )
 
 
+def _rows(trials: Sequence[Trial]) -> list[tuple[str, ...]]:
+    """The resolved trials before they run."""
+    return [(str(t.index), t.id, t.variant, str(t.seed), str(t.epochs)) for t in trials]
+
+
 def _debug(args: argparse.Namespace, space: Space, trial: Trial) -> int:
     """One trial in this process, in a folder of its own."""
+    from msk_ray.experiment.results import read_record
     from msk_ray.training import Trainer
     from msk_ray.tune.devices import local_gpus
-    from msk_ray.tune.records import read_record
     from msk_ray.tune.trial_run import Hooks, run_trial
 
     folder = (args.storage / "debug" / f"{space.name}_{trial.id}_{time.strftime('%Y%m%d_%H%M%S')}").resolve()
@@ -271,7 +277,7 @@ def _run(
     space: Space,
     trials: list[Trial],
     extension: Mapping[str, Any],
-    recorded: experiments.Experiment | None,
+    recorded: Experiment | None,
 ) -> int:
     path = _experiment_path(args)
     going_on = args.resume or bool(extension)
@@ -280,27 +286,27 @@ def _run(
             ownership = stack.enter_context(own(path, new=False, force=args.force))
             experiment, trials = _go_on(args, space, trials, extension, recorded)
         # ray and torch take seconds to load; a wrong command line should not wait for them.
-        from msk_ray.tune import runner
+        from msk_ray.tune import driver, session
         from msk_ray.tune.devices import choose_placement, local_gpus
-        from msk_ray.tune.report import finish, write_report
+        from msk_ray.tune.finish import finish, write_report
 
         if args.address is None:
             placement = choose_placement(space.file.resources, args.gpus_per_trial, args.cpu, local_gpus())
         if not going_on:
             ownership = stack.enter_context(own(path, new=True, force=args.force))
-            experiment = experiments.create(path, space, trials, _options(args))
+            experiment = opening.create(path, space, trials, _options(args))
         stack.enter_context(outliving(path / TERMINAL_LOG))
         try:
-            with runner.ray_session(args.address):
+            with session.ray_session(args.address):
                 if args.address is not None:
                     placement = choose_placement(
-                        space.file.resources, args.gpus_per_trial, args.cpu, runner.cluster_gpus()
+                        space.file.resources, args.gpus_per_trial, args.cpu, session.cluster_gpus()
                     )
                 if not placement.gpus and not args.cpu:
                     print("no GPU here: trials run on CPU cores")
                 limit = args.max_concurrent or space.file.resources.max_concurrent
-                plan = runner.Plan(experiment, space, trials, placement, limit, ownership=ownership)
-                completed = runner.run_trials(plan)
+                plan = driver.Plan(experiment, space, trials, placement, limit, ownership=ownership)
+                completed = driver.run_trials(plan)
             ownership.check(now=True)
             errors = finish(experiment)
             if not completed:
@@ -319,14 +325,14 @@ def _go_on(
     space: Space,
     trials: list[Trial],
     extension: Mapping[str, Any],
-    recorded: experiments.Experiment | None,
-) -> tuple[experiments.Experiment, list[Trial]]:
+    recorded: Experiment | None,
+) -> tuple[Experiment, list[Trial]]:
     """The experiment to go on with, and its trials as recorded; none where a search makes them up."""
     searching = space.file.search == "optuna"
     another_rule = recorded is not None and args.early_stopping != recorded.said("early_stopping")
     if recorded is not None and not another_rule:
-        recorded.check_scheduler(space)
-    experiment = experiments.reopen(_experiment_path(args), None if searching else trials, extension)
+        opening.check_scheduler(recorded, space)
+    experiment = opening.reopen(_experiment_path(args), None if searching else trials, extension)
     if searching:
         # Else the manifest learns of them only at the end.
         experiment.set_trials(made.trial for made in recover(experiment, space))
@@ -335,20 +341,20 @@ def _go_on(
         trials = experiment.trials()
     experiment.clear_endings(_retried(args))
     if another_rule:
-        experiment.write_space(space)
+        opening.write_space(experiment, space)
     if args.early_stopping is False:
         _name_stopped(experiment)
-    experiment.say(**{option: getattr(args, option) for option in experiments.REMEMBERED})
+    experiment.say(**{option: getattr(args, option) for option in REMEMBERED})
     return experiment, trials
 
 
-def _stopped(stop: StopRequest, experiment: experiments.Experiment) -> int:
+def _stopped(stop: StopRequest, experiment: Experiment) -> int:
     by = "on request" if stop.signal is None else f"by {stop.signal.name}"
     print(f"stopped {by}; go on with: {printable(experiment.resume_command())}")
     return RESUMABLE
 
 
-def _name_stopped(experiment: experiments.Experiment) -> None:
+def _name_stopped(experiment: Experiment) -> None:
     """Say that trials stopped before --no-early-stopping was said stay stopped, and what lets them go on."""
     endings = [read_ending(experiment.trial_folder(trial.id)) for trial in experiment.trials()]
     stopped = [ending.outcome for ending in endings if ending is not None and ending.cut]

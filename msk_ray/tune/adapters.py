@@ -8,11 +8,11 @@ from ray.tune.schedulers import FIFOScheduler, PopulationBasedTraining, TrialSch
 from ray.tune.search import Searcher
 
 from msk_ray.errors import ConfigError
-from msk_ray.experiment.journal import Journal, Report
 from msk_ray.experiment.outcomes import Ending
-from msk_ray.tune.operators import Listed, Operator, Range
-from msk_ray.tune.pruning import Pruner
-from msk_ray.tune.space import SchedulerSpec
+from msk_ray.experiment.scheduler_log import LogEntry, SchedulerLog
+from msk_ray.sweep.operators import Listed, Operator, Range
+from msk_ray.sweep.pruning import Pruner
+from msk_ray.sweep.space import SchedulerSpec
 
 METRIC = "score"
 """What trials report to Tune; `eval/score` under a name Tune does not take for a nested key."""
@@ -32,7 +32,7 @@ class PruningScheduler(FIFOScheduler):
         self,
         pruner: Pruner,
         time_attr: str,
-        journal: Journal,
+        journal: SchedulerLog,
         identify: Callable[[Any], str],
         on_stop: Callable[[str, Ending], None],
     ) -> None:
@@ -57,7 +57,7 @@ class PruningScheduler(FIFOScheduler):
         if METRIC not in result:
             return TrialScheduler.CONTINUE
         trial_id = self._identify(trial)
-        report = Report(
+        report = LogEntry(
             trial_id,
             result["epoch"],
             result["env_steps"],

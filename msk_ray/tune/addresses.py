@@ -5,7 +5,7 @@ import socket
 _LIMIT_S = 20.0
 
 
-def knock(address: str) -> None:
+def check_reachable(address: str) -> None:
     """See whether anybody listens at HOST:PORT: Ray itself would try for minutes. Other kinds of addresses pass.
 
     Raises:

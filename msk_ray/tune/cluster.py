@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import ray
 
 from msk_ray.cli import Parser, run
-from msk_ray.tune.addresses import knock
+from msk_ray.tune.addresses import check_reachable
 
 DESCRIPTION = "Exit code: 0 if at least N nodes are alive, 1 if fewer are or nobody answers at the address."
 EXAMPLES = """\
@@ -49,7 +49,7 @@ def _alive(address: str) -> int:
     Raises:
         OSError: nobody answers.
     """
-    knock(address)
+    check_reachable(address)
     ray.init(address=address, logging_level="ERROR", log_to_driver=False)
     alive: int = sum(node["Alive"] for node in ray.nodes())
     ray.shutdown()

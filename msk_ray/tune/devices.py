@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from msk_ray.config import Config
 from msk_ray.errors import ConfigError, DeviceError
-from msk_ray.tune.space import ResourcesSpec
+from msk_ray.sweep.space import ResourcesSpec
 
 _PAUSE_S = 1.0
 

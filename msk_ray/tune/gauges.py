@@ -7,10 +7,10 @@ from typing import Any
 from ray.tune import Callback
 from ray.util.metrics import Gauge
 
+from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.outcomes import read_ending
+from msk_ray.experiment.trial import Trial
 from msk_ray.text import printable
-from msk_ray.tune.experiment import Experiment
-from msk_ray.tune.trials import Trial
 
 FIGURES = {
     "msk_ray_score": "eval/score",

@@ -5,7 +5,8 @@ from dataclasses import replace
 from msk_ray.config import parse_config
 from msk_ray.errors import ConfigError
 from msk_ray.experiment.halved import Halved
-from msk_ray.tune.trials import Trial, overlay
+from msk_ray.experiment.trial import Trial
+from msk_ray.sweep.trials import overlay
 
 _WORLDS = "env.nworld"
 

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from msk_ray.errors import StorageFailure
-from msk_ray.tune.trials import Trial
+from msk_ray.experiment.trial import Trial
 
 METRICS = ("eval/best_score", "eval/score", "progress/env_steps")
 """Scalars of the trial that the table shows beside its settings."""

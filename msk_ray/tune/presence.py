@@ -7,7 +7,7 @@ from typing import Any
 
 from ray.tune import Callback
 
-from msk_ray.tune.experiment import Experiment
+from msk_ray.experiment.manifest import Experiment
 
 
 def remove_remains(experiment: Experiment) -> None:

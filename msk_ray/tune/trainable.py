@@ -23,19 +23,19 @@ from msk_ray.errors import OwnershipLost, storage_failure
 from msk_ray.experiment.damage import DamagedFile
 from msk_ray.experiment.halved import Halved, read_halved
 from msk_ray.experiment.layout import DEVICE_FILE, HANG_FILE, OUTPUT_FILE
+from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import Evaluation, evaluations_of, read_rows
+from msk_ray.experiment.ownership import acquire_for
+from msk_ray.experiment.trial import Trial
 from msk_ray.files import write_text
-from msk_ray.ownership import acquire_for
+from msk_ray.sweep.search_trials import search_trial, write_params
+from msk_ray.sweep.space import Space
 from msk_ray.tune.adapters import BEST, METRIC, STARTS_ANEW
 from msk_ray.tune.devices import wait_for_memory
-from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.gauges import TrialGauges
 from msk_ray.tune.halved import StartAnew, as_run
 from msk_ray.tune.hparams import log_hparams
-from msk_ray.tune.made_up import make_up, write_params
-from msk_ray.tune.space import Space
 from msk_ray.tune.trial_run import Hooks, TrainerLike, run_trial
-from msk_ray.tune.trials import Trial
 
 MEMORY_LIMIT_S = 60.0
 """How long a trial waits for the memory of its GPU [s]."""
@@ -69,7 +69,7 @@ class Job:
         """
         params = config.get("params", {})
         if "id" not in config:
-            return make_up(self.space, self.base, params)
+            return search_trial(self.space, self.base, params)
         trial = self.trials[config["id"]]
         if not params:
             return trial

@@ -13,11 +13,11 @@ from msk_ray.experiment.halved import Halved, read_halved, set_aside, write_halv
 from msk_ray.experiment.layout import ABANDONED, ERROR_FILE
 from msk_ray.experiment.metrics import Evaluation, evaluations_of, read_rows
 from msk_ray.experiment.outcomes import Ending, Outcome, load_ending, write_ending
+from msk_ray.experiment.trial import Trial
 from msk_ray.files import write_text
+from msk_ray.sweep.space import StopSpec
+from msk_ray.sweep.stopping import ending_of
 from msk_ray.tune.halved import StartAnew, as_run, halve
-from msk_ray.tune.space import StopSpec
-from msk_ray.tune.stopping import ending_of
-from msk_ray.tune.trials import Trial
 
 
 class TrainerLike(Protocol):

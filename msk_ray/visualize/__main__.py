@@ -11,7 +11,7 @@ from msk_ray.cli import Parser, run
 from msk_ray.errors import CheckpointError, ConfigError
 from msk_ray.evaluate.__main__ import positive
 from msk_ray.evaluate.targets import Target, best_checkpoint, best_trial_folder, find_target, trial_folder_of
-from msk_ray.tune.listing import text_table
+from msk_ray.text_table import text_table
 
 if TYPE_CHECKING:
     from msk_ray.evaluate.measure import Bench, Request

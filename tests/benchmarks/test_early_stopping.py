@@ -10,10 +10,10 @@ import pytest
 
 from msk_ray.experiment.metrics import SCORE, Evaluation, progress_of
 from msk_ray.experiment.outcomes import Ending, Outcome
+from msk_ray.experiment.results import TrialRecord
 from msk_ray.experiment.snapshot import Device, State, TrialSnapshot
-from msk_ray.tune.pruning import SuccessiveHalving
-from msk_ray.tune.records import TrialRecord
-from msk_ray.tune.space import SchedulerSpec
+from msk_ray.sweep.pruning import SuccessiveHalving
+from msk_ray.sweep.space import SchedulerSpec
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 

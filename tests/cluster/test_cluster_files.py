@@ -29,10 +29,10 @@ from ray._private.ray_constants import PROMETHEUS_SERVICE_DISCOVERY_FILE
 from ray.autoscaler._private.util import prepare_config, validate_config
 from ray.scripts import scripts as ray_commands
 
+from msk_ray.sweep.space import find_space
 from msk_ray.tune.__main__ import parser as tune_parser
 from msk_ray.tune.cluster import parser as cluster_parser
 from msk_ray.tune.gauges import FIGURES, STATE
-from msk_ray.tune.space import find_space
 
 FOLDER = Path(__file__).resolve().parent.parent.parent / "cluster"
 KUBERNETES = "1.30"

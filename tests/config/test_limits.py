@@ -12,9 +12,9 @@ from msk_ray.config.schema import PhysicsConfig
 from msk_ray.config.sections import Section
 from msk_ray.config.yaml_text import MAX_BYTES
 from msk_ray.errors import ConfigError
+from msk_ray.sweep.space import ResourcesSpec, SpaceFile, parse_seeds, parse_space
 from msk_ray.tune import __main__ as tune
 from msk_ray.tune.devices import choose_placement
-from msk_ray.tune.space import ResourcesSpec, SpaceFile, parse_seeds, parse_space
 
 CARTPOLE = {"env": {"name": "cartpole"}}
 BOMB = "a: &a [x,x,x,x,x,x,x,x,x,x]\n" + "".join(

@@ -7,9 +7,9 @@ import pytest
 
 from msk_ray.config import combine, dump_yaml, load_config, merge, overlay, parse_overrides
 from msk_ray.errors import ConfigError
+from msk_ray.sweep.space import parse_space
+from msk_ray.sweep.trials import resolve_trials
 from msk_ray.tune import __main__ as tune
-from msk_ray.tune.space import parse_space
-from msk_ray.tune.trials import resolve_trials
 
 ADAPTIVE = {"start": 8, "target": 60.0}
 SCHEDULE = {"start": 4, "end": 16, "epochs": 50}

@@ -14,11 +14,11 @@ from msk_ray.errors import CheckpointError
 from msk_ray.evaluate.__main__ import main
 from msk_ray.evaluate.measure import Bench, Request, figures, read_evaluations, store_evaluation
 from msk_ray.experiment.halved import Halved, write_halved
+from msk_ray.experiment.manifest import Experiment
+from msk_ray.experiment.results import best_record, read_records
 from msk_ray.training import load_policy, read_metrics
 from msk_ray.training.checkpoint import milestones
 from msk_ray.training.evaluation import Episodes
-from msk_ray.tune.experiment import Experiment
-from msk_ray.tune.records import best_record, read_records
 
 
 @pytest.fixture

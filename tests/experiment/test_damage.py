@@ -18,17 +18,18 @@ from msk_ray.config import dump_yaml
 from msk_ray.errors import MskRayError, StorageFailure
 from msk_ray.experiment.damage import DamagedFile, read_object
 from msk_ray.experiment.halved import Halved, read_halved, write_halved
-from msk_ray.experiment.journal import Journal, Report
+from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import load_metrics
 from msk_ray.experiment.outcomes import Ending, Outcome, load_ending, read_ending, write_ending
+from msk_ray.experiment.results import read_records
+from msk_ray.experiment.results_table import summary, table_document
+from msk_ray.experiment.scheduler_log import LogEntry, SchedulerLog
 from msk_ray.experiment.snapshot import State, read_trial
+from msk_ray.experiment.trial_status import StatusReader
 from msk_ray.report.reading import read_experiment
-from msk_ray.tune import experiment as experiments
-from msk_ray.tune.records import read_records
-from msk_ray.tune.space import parse_space
-from msk_ray.tune.standing import Observer
-from msk_ray.tune.table import summary, table_document
-from msk_ray.tune.trials import resolve_trials
+from msk_ray.sweep import opening
+from msk_ray.sweep.space import parse_space
+from msk_ray.sweep.trials import resolve_trials
 
 ODD_LINES = [
     b"", b"null", b"7", b"true", b'"text"', b"[]", b"{}", b"\xff\xfe{}", b"\x00" * 64, b'{"epoch": 1', b"[" * 5000,
@@ -77,15 +78,15 @@ def test_an_odd_line_is_named_and_hides_no_other(odd: bytes, tmp_path: Path) -> 
 @settings(max_examples=300, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 6), anything), max_size=5), st.integers(0, 30))
 def test_lines_among_which_others_are_put_are_all_found(others: list[tuple[int, bytes]], torn: int) -> None:
-    reports = [Report("a", epoch, 10 * epoch, 0.5, 1.0 * epoch, False) for epoch in range(6)]
+    reports = [LogEntry("a", epoch, 10 * epoch, 0.5, 1.0 * epoch, False) for epoch in range(6)]
     lines = [json.dumps(vars(report)).encode() for report in reports]
     for place, other in sorted(others, key=lambda item: -item[0]):
         lines.insert(place, other)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "reports.jsonl"
         path.write_bytes(b"\n".join(lines) + b"\n" + b'{"trial": "a", "epoch": 9, "env'[:torn])
-        found, damages = Journal(path).read()
-        again = Journal(path).read()
+        found, damages = SchedulerLog(path).read()
+        again = SchedulerLog(path).read()
     assert [report for report in found if report in reports] == reports
     assert len(found) + len(damages) == sum(len(line.split(b"\n")) for line in lines)
     assert again == (found, damages)
@@ -118,14 +119,14 @@ def test_what_the_storage_does_not_give_is_no_damage(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> experiments.Experiment:
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Experiment:
     """Two finished trials and one that runs with half its worlds."""
     folder = tmp_path_factory.mktemp("whole")
     (folder / "base.yaml").write_text(dump_yaml({"env": {"name": "cartpole", "nworld": 8}, "trial": {"epochs": 4}}))
     data = {"question": "?", "base": "base.yaml", "parameters": {"shac.actor_lr": {"grid": [0.1, 0.2, 0.3]}}}
     space = parse_space(data, folder / "s.yaml")
     trials = resolve_trials(space)
-    made = experiments.create(folder / "runs" / "e", space, trials, {})
+    made = opening.create(folder / "runs" / "e", space, trials, {})
     for trial in trials:
         own = made.trial_folder(trial.id)
         own.mkdir()
@@ -172,14 +173,14 @@ def damaged_files() -> Iterator[tuple[str, str, int]]:
 
 @pytest.mark.parametrize("name", sorted({name for name, _, _ in damaged_files()}))
 def test_a_damaged_file_takes_down_neither_status_nor_report_nor_table(
-    name: str, whole: experiments.Experiment, tmp_path: Path
+    name: str, whole: Experiment, tmp_path: Path
 ) -> None:
     """Of the trials that were left alone, nothing changes; what cannot be shown is one line."""
     victim = whole.trials()[2].id
     for number, (file, kind, seed) in enumerate(damaged_files()):
         if file != name:
             continue
-        made = experiments.Experiment(Path(shutil.copytree(whole.path, tmp_path / str(number))))
+        made = Experiment(Path(shutil.copytree(whole.path, tmp_path / str(number))))
         path = made.path / file if (made.path / file).exists() else made.trial_folder(victim) / file
         path.write_bytes(KINDS[kind](path.read_bytes(), random.Random(f"{file} {kind} {seed}")))
         reading = read_experiment(made, time.time())
@@ -187,10 +188,10 @@ def test_a_damaged_file_takes_down_neither_status_nor_report_nor_table(
         made.resume_command()
         if name == "manifest.json":
             with contextlib.suppress(MskRayError):  # what is still a manifest may be one of other trials
-                Observer(made).look(time.time())
+                StatusReader(made).look(time.time())
                 read_records(made)
             continue
-        standings = Observer(made).look(time.time())
+        standings = StatusReader(made).look(time.time())
         records = read_records(made)
         assert len(reading.trials) == 3
         intact = [trial for trial in reading.trials if trial.trial.id != victim]

@@ -9,8 +9,8 @@ import torch
 
 from msk_ray.config import load_config
 from msk_ray.envs import make_env
-from msk_ray.tune.space import load_space
-from msk_ray.tune.trials import resolve_trials
+from msk_ray.sweep.space import load_space
+from msk_ray.sweep.trials import resolve_trials
 
 
 @pytest.fixture

@@ -11,10 +11,10 @@ from needs import need_drawing
 from playwright.sync_api import Page
 
 from msk_ray.cli import run
+from msk_ray.experiment.manifest import Experiment
+from msk_ray.experiment.results import best_record, read_records
 from msk_ray.report.__main__ import main
 from msk_ray.report.best import strip_text
-from msk_ray.tune.experiment import Experiment
-from msk_ray.tune.records import best_record, read_records
 
 
 @pytest.fixture(scope="module")

@@ -14,6 +14,7 @@ from msk_ray.cli import run
 from msk_ray.config import dump_yaml
 from msk_ray.experiment.checkpoint_file import write_checkpoint_file
 from msk_ray.experiment.halved import Halved, write_halved
+from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.outcomes import Ending, Outcome, write_ending
 from msk_ray.report.__main__ import main
 from msk_ray.report.curves import rung_steps
@@ -22,9 +23,9 @@ from msk_ray.report.page import make_section
 from msk_ray.report.pictures import picture, shorten
 from msk_ray.report.reading import Condition, read_experiment
 from msk_ray.report.tables import failures, variant_rows
-from msk_ray.tune import experiment as experiments
-from msk_ray.tune.space import parse_space
-from msk_ray.tune.trials import base_settings, make_trial, resolve_trials
+from msk_ray.sweep import opening
+from msk_ray.sweep.space import parse_space
+from msk_ray.sweep.trials import base_settings, make_trial, resolve_trials
 
 
 def row(epoch: int, score: float | None = None) -> dict[str, Any]:
@@ -43,7 +44,7 @@ def fill(folder: Path, scores: list[float], ending: Ending | None = None) -> Non
 
 
 @pytest.fixture
-def experiment(tmp_path: Path) -> experiments.Experiment:
+def experiment(tmp_path: Path) -> Experiment:
     """A baseline and two variants, two seeds each, all finished but the last, which failed."""
     (tmp_path / "base.yaml").write_text(dump_yaml({"env": {"name": "cartpole"}, "trial": {"epochs": 4}}))
     data = {
@@ -54,7 +55,7 @@ def experiment(tmp_path: Path) -> experiments.Experiment:
     }
     space = parse_space(data, tmp_path / "small.yaml")
     trials = resolve_trials(space)
-    made = experiments.create(tmp_path / "runs" / "e", space, trials, {})
+    made = opening.create(tmp_path / "runs" / "e", space, trials, {})
     scores = {("baseline", 0): 10.0, ("baseline", 1): 12.0, ("fast", 0): 30.0, ("fast", 1): 34.0, ("deep", 0): 11.0}
     for trial in trials:
         score = scores.get((trial.changed["variant"], trial.seed))
@@ -67,12 +68,12 @@ def experiment(tmp_path: Path) -> experiments.Experiment:
     return made
 
 
-def page_of(experiment: experiments.Experiment, *arguments: str) -> str:
+def page_of(experiment: Experiment, *arguments: str) -> str:
     assert run(main, [str(experiment.path), *arguments]) == 0
     return (experiment.path / "report" / "index.html").read_text()
 
 
-def test_tables_by_hand(experiment: experiments.Experiment) -> None:
+def test_tables_by_hand(experiment: Experiment) -> None:
     reading = read_experiment(experiment, time.time())
     assert reading.condition is Condition.FINISHED
     assert reading.notes == ()
@@ -91,7 +92,7 @@ def test_tables_by_hand(experiment: experiments.Experiment) -> None:
     assert (best.score, best.best_row["epoch"]) == (34.0, 2.0)
 
 
-def test_stopped_trials_are_compared_where_they_stopped(experiment: experiments.Experiment) -> None:
+def test_stopped_trials_are_compared_where_they_stopped(experiment: Experiment) -> None:
     """`fast` is far behind whole runs because it was stopped; where it was stopped it was ahead."""
     rising = {0: [0.0, 4.0, 50.0], 1: [0.0, 6.0, 70.0]}
     for trial in experiment.trials():
@@ -113,7 +114,7 @@ def test_stopped_trials_are_compared_where_they_stopped(experiment: experiments.
     assert "Open circles are trials stopped before their end" in page
 
 
-def compared(made: experiments.Experiment, curves: dict[str, list[tuple[int, float]]], outcome: Outcome) -> Any:
+def compared(made: Experiment, curves: dict[str, list[tuple[int, float]]], outcome: Outcome) -> Any:
     """The row of `fast`, stopped with this outcome, beside whole runs of the baseline: one seed counts of each."""
     for trial in made.trials():
         name = trial.changed["variant"]
@@ -128,7 +129,7 @@ def compared(made: experiments.Experiment, curves: dict[str, list[tuple[int, flo
     return next(r for r in rows_now if r.variant == "fast")
 
 
-def test_nobody_is_compared_with_an_untrained_policy(experiment: experiments.Experiment) -> None:
+def test_nobody_is_compared_with_an_untrained_policy(experiment: Experiment) -> None:
     """At its first evaluation the baseline was elsewhere: at epoch 6, where `fast` no longer was."""
     stopped = Outcome.STOPPED_ASHA
     fast = compared(experiment, {"baseline": [(0, 0.0), (6, 90.0)], "fast": [(0, 0.0), (4, 50.0)]}, stopped)
@@ -138,7 +139,7 @@ def test_nobody_is_compared_with_an_untrained_policy(experiment: experiments.Exp
     assert "compared at" not in page_of(experiment)
 
 
-def test_nothing_is_told_from_untrained_policies(experiment: experiments.Experiment) -> None:
+def test_nothing_is_told_from_untrained_policies(experiment: Experiment) -> None:
     """Two variants were stopped before they were evaluated: from their untrained scores ω² would be 1."""
     for trial in experiment.trials():
         if trial.changed["variant"] != "baseline":
@@ -157,7 +158,7 @@ def test_nothing_is_told_from_untrained_policies(experiment: experiments.Experim
     assert "needs 2 at each level: seed (0 has 1, and 1 more), variant (fast has none, and 1 more)." in page
 
 
-def test_a_best_policy_that_was_never_trained_is_called_so(experiment: experiments.Experiment) -> None:
+def test_a_best_policy_that_was_never_trained_is_called_so(experiment: Experiment) -> None:
     """Older versions kept the untrained policy where no trained one scored higher."""
     best = read_experiment(experiment, time.time()).best
     assert best is not None
@@ -167,7 +168,7 @@ def test_a_best_policy_that_was_never_trained_is_called_so(experiment: experimen
 
 
 def test_evaluations_at_other_env_steps_are_compared_at_the_newest_common_ones(
-    experiment: experiments.Experiment,
+    experiment: Experiment,
 ) -> None:
     """`fast` was stopped at epoch 5; the baseline was evaluated at 4 before that, where `fast` had been at 3."""
     baseline, fast = [(0, 0.0), (4, 40.0), (8, 80.0)], [(0, 0.0), (3, 35.0), (5, 55.0)]
@@ -175,13 +176,13 @@ def test_evaluations_at_other_env_steps_are_compared_at_the_newest_common_ones(
     assert (found.compared_at, found.difference) == (400.0, 35.0 - 40.0)
 
 
-def test_what_used_up_its_time_is_a_whole_run(experiment: experiments.Experiment) -> None:
+def test_what_used_up_its_time_is_a_whole_run(experiment: Experiment) -> None:
     curves = {"baseline": [(0, 0.0), (4, 40.0), (8, 80.0)], "fast": [(0, 0.0), (4, 50.0)]}
     found = compared(experiment, curves, Outcome.WALL_TIME)
     assert (found.compared_at, found.difference, found.cut) == (None, 50.0 - 80.0, 0)
 
 
-def test_the_page_says_it_all_and_takes_nothing_for_markup(experiment: experiments.Experiment) -> None:
+def test_the_page_says_it_all_and_takes_nothing_for_markup(experiment: Experiment) -> None:
     page = page_of(experiment)
     assert "Does &lt;b&gt;it&lt;/b&gt; matter?" in page
     assert "nan &lt;i&gt;at&lt;/i&gt; epoch 3" in page
@@ -195,7 +196,7 @@ def test_the_page_says_it_all_and_takes_nothing_for_markup(experiment: experimen
         assert (experiment.path / "report" / f"{name}.png").stat().st_size > 5000
 
 
-def test_half_the_worlds_are_said_wherever_a_score_is(experiment: experiments.Experiment) -> None:
+def test_half_the_worlds_are_said_wherever_a_score_is(experiment: Experiment) -> None:
     assert "half the worlds" not in page_of(experiment)
     best = read_experiment(experiment, time.time()).best
     assert best is not None
@@ -209,13 +210,13 @@ def test_half_the_worlds_are_said_wherever_a_score_is(experiment: experiments.Ex
     assert "half the worlds: 32 of 64; all 4 epochs done</td>" in page
 
 
-def test_the_baseline_can_be_chosen(experiment: experiments.Experiment, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_baseline_can_be_chosen(experiment: Experiment, capsys: pytest.CaptureFixture[str]) -> None:
     assert "Differences are from: fast" in page_of(experiment, "--baseline", "fas")
     assert run(main, [str(experiment.path), "--baseline", "slow"]) == 2
     assert "no variant of e is called so; write one of: baseline; fast; deep" in capsys.readouterr().err
 
 
-def test_command_and_files(experiment: experiments.Experiment) -> None:
+def test_command_and_files(experiment: Experiment) -> None:
     env = {"command": ["/x/y/msk_ray/tune/__main__.py", "--space", "a b"], "commit": "abc+", "packages": {"torch": "1"}}
     env |= {"gpus": ["A", "B"], "driver": "570"}
     (experiment.path / "env.json").write_text(json.dumps(env))
@@ -229,17 +230,17 @@ def test_command_and_files(experiment: experiments.Experiment) -> None:
     assert all((experiment.path / "report" / link).is_file() for link in links)
 
 
-def _empty(e: experiments.Experiment) -> None:
+def _empty(e: Experiment) -> None:
     shutil.rmtree(e.path)
     e.path.mkdir()
 
 
-def _half_written(e: experiments.Experiment) -> None:
+def _half_written(e: Experiment) -> None:
     (e.path / "manifest.json").unlink()
     shutil.rmtree(e.path / "trials")
 
 
-def _torn_manifest(e: experiments.Experiment) -> None:
+def _torn_manifest(e: Experiment) -> None:
     path = e.path / "manifest.json"
     path.write_text(path.read_text()[:200])
     # What trials wrote themselves is still found.
@@ -247,21 +248,21 @@ def _torn_manifest(e: experiments.Experiment) -> None:
         (trial_folder / "config.yaml").write_text(dump_yaml({"env": {"name": "cartpole"}}))
 
 
-def _nothing_else(e: experiments.Experiment) -> None:
+def _nothing_else(e: Experiment) -> None:
     (e.path / "env.json").unlink()
     (e.path / "space.yaml").write_text("question: [")
 
 
-def _not_begun(e: experiments.Experiment) -> None:
+def _not_begun(e: Experiment) -> None:
     for folder in (e.path / "trials").iterdir():
         shutil.rmtree(folder)
 
 
-def _folders(e: experiments.Experiment) -> list[Path]:
+def _folders(e: Experiment) -> list[Path]:
     return [e.trial_folder(trial.id) for trial in e.trials()]
 
 
-def _broken_trials(e: experiments.Experiment) -> None:
+def _broken_trials(e: Experiment) -> None:
     folders = _folders(e)
     (folders[0] / "metrics.jsonl").write_text('{"epoch": 0, "ev\n{"epoch": 1}\n')
     (folders[1] / "outcome.json").write_text('{"outcome": "fin')
@@ -270,29 +271,29 @@ def _broken_trials(e: experiments.Experiment) -> None:
     (folders[4] / "outcome.json").write_text('{"outcome": "unheard_of", "why": ""}')
 
 
-def _crashed(e: experiments.Experiment) -> None:
+def _crashed(e: Experiment) -> None:
     for folder in _folders(e)[:3]:
         (folder / "outcome.json").unlink()
         os.utime(folder / "metrics.jsonl", (1e9, 1e9))
 
 
-def _running(e: experiments.Experiment) -> None:
+def _running(e: Experiment) -> None:
     (_folders(e)[0] / "outcome.json").unlink()
 
 
-def _never_evaluated(e: experiments.Experiment) -> None:
+def _never_evaluated(e: Experiment) -> None:
     for folder in _folders(e):
         rows = [row(1), row(2)]
         (folder / "metrics.jsonl").write_text("".join(json.dumps(r) + "\n" for r in rows))
 
 
-def _nothing_finite(e: experiments.Experiment) -> None:
+def _nothing_finite(e: Experiment) -> None:
     bad = {"epoch": 1, "env_steps": 5, "seconds": 1.0, "eval/score": None, "grad/actor_norm": None}
     for folder in _folders(e):
         (folder / "metrics.jsonl").write_text(json.dumps(bad | {"nonfinite": ["eval/score", "grad/actor_norm"]}) + "\n")
 
 
-def _best_without_policy(e: experiments.Experiment) -> None:
+def _best_without_policy(e: Experiment) -> None:
     for folder in _folders(e):
         (folder / "checkpoints").mkdir()
         (folder / "checkpoints" / "best.pt").write_bytes(b"torn")
@@ -318,7 +319,7 @@ def _best_without_policy(e: experiments.Experiment) -> None:
     ],
 )
 def test_every_condition_is_named_and_never_a_traceback(
-    experiment: experiments.Experiment, damage: Any, words: list[str], capsys: pytest.CaptureFixture[str]
+    experiment: Experiment, damage: Any, words: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     damage(experiment)
     page = page_of(experiment)
@@ -328,8 +329,8 @@ def test_every_condition_is_named_and_never_a_traceback(
     assert capsys.readouterr().err == ""
 
 
-def test_several_side_by_side(experiment: experiments.Experiment, tmp_path: Path) -> None:
-    other = experiments.Experiment(Path(shutil.copytree(experiment.path, tmp_path / "runs" / "other")))
+def test_several_side_by_side(experiment: Experiment, tmp_path: Path) -> None:
+    other = Experiment(Path(shutil.copytree(experiment.path, tmp_path / "runs" / "other")))
     _crashed(other)
     out = tmp_path / "both"
     assert run(main, ["e", "other", "--storage", str(tmp_path / "runs"), "--out", str(out)]) == 0
@@ -352,7 +353,7 @@ def test_several_side_by_side(experiment: experiments.Experiment, tmp_path: Path
     ],
 )
 def test_bad_input_is_one_line(
-    experiment: experiments.Experiment,
+    experiment: Experiment,
     tmp_path: Path,
     arguments: list[str],
     message: str,
@@ -378,7 +379,7 @@ def test_rungs_of_a_search_are_drawn_where_trials_were_judged(tmp_path: Path) ->
         "scheduler": {"kind": "asha", "grace": 0.25, "reduction": 2},
     }
     space = parse_space(data, tmp_path / "search.yaml")
-    made = experiments.create(tmp_path / "runs" / "search", space, [], {})
+    made = opening.create(tmp_path / "runs" / "search", space, [], {})
     made.set_trials([make_trial(space, base_settings(space), {"shac.horizon": "4"}, {"shac.horizon": 4}, 0, 0)])
     assert rung_steps(read_experiment(made, time.time())) == ([1280.0, 2560.0], "")
     (tmp_path / "base.yaml").unlink()

@@ -9,10 +9,10 @@ import torch
 from msk_ray.config import Config, first_spelling
 from msk_ray.errors import CheckpointError, ConfigError
 from msk_ray.evaluate.measure import Bench, Request
+from msk_ray.sweep.space import ResourcesSpec
 from msk_ray.training import Trainer, load_policy, read_checkpoint
 from msk_ray.training.checkpoint import write_checkpoint
 from msk_ray.tune.devices import check_threads
-from msk_ray.tune.space import ResourcesSpec
 
 
 @pytest.fixture(autouse=True)

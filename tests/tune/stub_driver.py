@@ -20,7 +20,7 @@ from ray import cloudpickle
 from stub_trainer import StubTrainer
 
 from msk_ray.cli import run
-from msk_ray.tune import runner
+from msk_ray.tune import driver, session
 from msk_ray.tune.__main__ import main
 
 
@@ -33,10 +33,10 @@ def compile_for_ever(*of_trial: Any) -> None:
 if __name__ == "__main__":
     cloudpickle.register_pickle_by_value(stub_trainer)
     precompile = compile_for_ever if "STUB_COMPILES" in os.environ else None
-    runner.Plan = functools.partial(  # type: ignore[assignment,misc]
-        runner.Plan, trainer_class=StubTrainer, precompile=precompile, standby=False
+    driver.Plan = functools.partial(  # type: ignore[assignment,misc]
+        driver.Plan, trainer_class=StubTrainer, precompile=precompile, prestart=False
     )
-    runner.ray_session = functools.partial(
-        runner.ray_session, dashboard=None if os.environ.get("STUB_DASHBOARD") else False, trials=False
+    session.ray_session = functools.partial(
+        session.ray_session, dashboard=None if os.environ.get("STUB_DASHBOARD") else False, trials=False
     )
     sys.exit(run(main))

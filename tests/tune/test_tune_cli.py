@@ -11,11 +11,11 @@ import pytest
 
 from msk_ray.cli import run
 from msk_ray.config import dump_yaml, read_yaml
+from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.outcomes import Ending, Outcome, write_ending
 from msk_ray.signals import RESUMABLE
-from msk_ray.tune import runner
+from msk_ray.tune import driver
 from msk_ray.tune.__main__ import main
-from msk_ray.tune.experiment import Experiment
 
 
 @pytest.fixture
@@ -105,7 +105,7 @@ def test_help_teaches_with_examples(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_every_trial_to_its_end_on_request(
-    space_data: dict[str, Any], tmp_path: Path, plans: list[runner.Plan], capsys: pytest.CaptureFixture[str]
+    space_data: dict[str, Any], tmp_path: Path, plans: list[driver.Plan], capsys: pytest.CaptureFixture[str]
 ) -> None:
     """What ends trials by score is left out, what ends broken ones is not; --resume remembers."""
     space = tmp_path / "small.yaml"
@@ -149,7 +149,7 @@ def test_every_trial_to_its_end_on_request(
 
 
 def test_start_or_resume_asks_the_experiment_by_the_name_it_has(
-    space_file: Path, tmp_path: Path, plans: list[runner.Plan], capsys: pytest.CaptureFixture[str]
+    space_file: Path, tmp_path: Path, plans: list[driver.Plan], capsys: pytest.CaptureFixture[str]
 ) -> None:
     """As a scheduler does that knows nothing of what it started before."""
     command = ["--space", str(space_file), "--cpu", "--storage", str(tmp_path / "runs"), "--start-or-resume"]
@@ -165,7 +165,7 @@ def test_start_or_resume_asks_the_experiment_by_the_name_it_has(
 
 
 def test_another_rule_is_refused(
-    space_data: dict[str, Any], tmp_path: Path, plans: list[runner.Plan], capsys: pytest.CaptureFixture[str]
+    space_data: dict[str, Any], tmp_path: Path, plans: list[driver.Plan], capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Trials that one rule has stopped do not go on beside others under another; a new default is no new rule."""
     space = tmp_path / "small.yaml"

@@ -14,11 +14,11 @@ from playwright.sync_api import Page, expect
 from processes import Launcher
 
 from msk_ray.config import dump_yaml
+from msk_ray.experiment.manifest import Experiment
+from msk_ray.experiment.results import read_records
 from msk_ray.signals import RESUMABLE
-from msk_ray.tune.experiment import Experiment
-from msk_ray.tune.records import read_records
+from msk_ray.sweep.trials import resolve_trials
 from msk_ray.tune.trainable import in_frame_named
-from msk_ray.tune.trials import resolve_trials
 
 LIMIT_MS = 300_000
 """How long a page may take on a busy machine [ms]; only a failure takes so long."""

@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from msk_ray.experiment.outcomes import Ending, Outcome, write_ending
-from msk_ray.tune import experiment as experiments
+from msk_ray.sweep import opening
+from msk_ray.sweep.trials import resolve_trials
 from msk_ray.tune import gauges
-from msk_ray.tune.trials import resolve_trials
 
 
 class FakeGauge:
@@ -77,7 +77,7 @@ def test_a_value_is_set_again_and_again_until_it_is_dropped(
 def test_the_state_of_a_trial_is_the_only_one_at_1(fake: dict[str, FakeGauge], make_space: Any, tmp_path: Path) -> None:
     space = make_space()
     trials = resolve_trials(space)
-    experiment = experiments.create(tmp_path / "e", space, trials, {})
+    experiment = opening.create(tmp_path / "e", space, trials, {})
     by_id = {trial.id: trial for trial in trials}
     state = gauges.StateGauge(experiment, trials, lambda config: by_id[config["id"]])
     values = fake[gauges.STATE].values

@@ -14,24 +14,25 @@ from msk_ray.config import dump_yaml, read_yaml
 from msk_ray.errors import ConfigError
 from msk_ray.experiment import halved
 from msk_ray.experiment.halved import Halved, read_halved, write_halved
-from msk_ray.experiment.journal import Journal, Report
-from msk_ray.experiment.layout import ABANDONED, JOURNAL_FILE
+from msk_ray.experiment.layout import ABANDONED, SCHEDULER_LOG_FILE
 from msk_ray.experiment.metrics import read_rows
 from msk_ray.experiment.outcomes import Ending, Outcome, read_ending, write_ending
+from msk_ray.experiment.results import read_records
+from msk_ray.experiment.results_table import halved_note, result_rows, summary, table_document, variant_rows
+from msk_ray.experiment.scheduler_log import LogEntry, SchedulerLog
+from msk_ray.experiment.trial import Trial
 from msk_ray.signals import RESUMABLE
+from msk_ray.sweep import opening
+from msk_ray.sweep.pruning import make_pruner
+from msk_ray.sweep.replay import replay
+from msk_ray.sweep.space import SchedulerSpec, StopSpec
+from msk_ray.sweep.trials import resolve_trials
 from msk_ray.training import Trainer, read_checkpoint
-from msk_ray.tune import experiment as experiments
-from msk_ray.tune import runner, trial_run
+from msk_ray.tune import driver, trial_run
 from msk_ray.tune.__main__ import main
 from msk_ray.tune.devices import Placement
 from msk_ray.tune.halved import StartAnew
-from msk_ray.tune.journal import replay
-from msk_ray.tune.pruning import make_pruner
-from msk_ray.tune.records import read_records
-from msk_ray.tune.space import SchedulerSpec, StopSpec
-from msk_ray.tune.table import halved_note, result_rows, summary, table_document, variant_rows
 from msk_ray.tune.trial_run import Hooks
-from msk_ray.tune.trials import Trial, resolve_trials
 
 
 @pytest.fixture
@@ -213,9 +214,9 @@ def test_a_real_trainer_leaves_one_curve(
 @pytest.mark.parametrize("kind", ["asha", "median"])
 def test_early_stopping_forgets_the_attempt_with_all_worlds(kind: Any) -> None:
     spec = SchedulerSpec(kind=kind, grace=0.5, reduction=2.0, min_trials=2)
-    others = [Report(name, 5, 500, 1.0, score, False) for name, score in (("a", 5.0), ("b", 4.0))]
-    before = [Report("c", 6, 600, 1.0, 9.0, False)]
-    halves = [Report("c", 5, 500, 1.0, 1.0, False, halved=True)]
+    others = [LogEntry(name, 5, 500, 1.0, score, False) for name, score in (("a", 5.0), ("b", 4.0))]
+    before = [LogEntry("c", 6, 600, 1.0, 9.0, False)]
+    halves = [LogEntry("c", 5, 500, 1.0, 1.0, False, halved=True)]
     with_all = replay(make_pruner(spec, 1000), "env_steps", [*before, *others, *halves])
     without = replay(make_pruner(spec, 1000), "env_steps", [*others, *halves])
     assert with_all is not None
@@ -228,14 +229,14 @@ def test_a_stop_that_was_not_carried_out_is_void_once_the_worlds_are_halved(
 ) -> None:
     space = make_space(scheduler={"kind": "asha", "grace": 0.5, "reduction": 2.0, "min_trials": 2})
     trials = resolve_trials(space)
-    experiment = experiments.create(tmp_path / "e", space, trials, {})
+    experiment = opening.create(tmp_path / "e", space, trials, {})
     good, bad = (trial.id for trial in trials)
     experiment.trial_folder(bad).mkdir()
     for name, score in ((good, 2.0), (bad, 1.0)):  # at the rung, half of 20 epochs × 64 env steps
-        Journal(experiment.path / JOURNAL_FILE).append(Report(name, 10, 640, 1.0, score, False))
+        SchedulerLog(experiment.path / SCHEDULER_LOG_FILE).append(LogEntry(name, 10, 640, 1.0, score, False))
     if halved_after:
         write_halved(experiment.trial_folder(bad), Halved(8, 4, "no room"))
-    runner._finish_pruning(runner.Plan(experiment, space, trials, Placement(0.0, 1), None))
+    driver._finish_pruning(driver.Plan(experiment, space, trials, Placement(0.0, 1), None))
     ending = read_ending(experiment.trial_folder(bad))
     assert (ending and ending.outcome) == (None if halved_after else Outcome.STOPPED_ASHA)
 
@@ -250,7 +251,7 @@ def test_a_population_cannot(make_space: Any) -> None:
 
 
 def test_what_the_command_line_said_is_kept_until_it_says_otherwise(
-    space_data: dict[str, Any], tmp_path: Path, plans: list[runner.Plan]
+    space_data: dict[str, Any], tmp_path: Path, plans: list[driver.Plan]
 ) -> None:
     space = tmp_path / "small.yaml"
     space.write_text(dump_yaml(space_data))
@@ -275,7 +276,7 @@ def test_what_the_command_line_said_is_kept_until_it_says_otherwise(
 def test_tables_say_so(make_space: Any, tmp_path: Path) -> None:
     space = make_space(seeds="0-1")
     trials = resolve_trials(space)
-    experiment = experiments.create(tmp_path / "e", space, trials, {})
+    experiment = opening.create(tmp_path / "e", space, trials, {})
     for trial in trials:
         folder = experiment.trial_folder(trial.id)
         folder.mkdir()

@@ -5,8 +5,8 @@ from pathlib import Path
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams import metadata, plugin_data_pb2
 
+from msk_ray.experiment.manifest import Experiment
 from msk_ray.training.metrics import board_tag
-from msk_ray.tune.experiment import Experiment
 from msk_ray.tune.hparams import METRICS
 
 

@@ -15,7 +15,7 @@ from msk_ray.tune import local_ray
 SESSION = """
 import ipaddress, json, os, shutil, sys
 import ray, psutil
-from msk_ray.tune.runner import ray_session
+from msk_ray.tune.session import ray_session
 
 @ray.remote
 def token_file():
@@ -47,7 +47,7 @@ with ray_session(None, trials=False):
 WITHOUT_DASHBOARD = """
 import sys
 sys.modules["aiohttp_cors"] = None  # as if ray[default] were not installed
-from msk_ray.tune.runner import ray_session
+from msk_ray.tune.session import ray_session
 
 with ray_session(None, trials=False):
     pass

@@ -32,18 +32,20 @@ from stub_trainer import (
 from msk_ray.config import read_yaml
 from msk_ray.errors import ClusterLost, StorageError, StorageFailure
 from msk_ray.experiment.halved import Halved, read_halved
+from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import read_rows
 from msk_ray.experiment.outcomes import Outcome
-from msk_ray.tune import experiment as experiments
-from msk_ray.tune import runner, standby
+from msk_ray.experiment.results import TrialRecord, read_records
+from msk_ray.sweep import opening
+from msk_ray.sweep.search_trials import recover
+from msk_ray.sweep.space import Space, StopSpec
+from msk_ray.sweep.trials import resolve_trials
+from msk_ray.tune import driver, worker_prestart
 from msk_ray.tune.devices import Placement
+from msk_ray.tune.finish import finish
 from msk_ray.tune.halved import StartAnew
-from msk_ray.tune.made_up import recover
-from msk_ray.tune.records import TrialRecord, read_records
-from msk_ray.tune.report import finish
-from msk_ray.tune.space import Space, StopSpec
+from msk_ray.tune.session import ray_session
 from msk_ray.tune.trial_run import Hooks, run_trial
-from msk_ray.tune.trials import resolve_trials
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -53,7 +55,7 @@ def session() -> Iterator[None]:
     handlers = {
         number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP)
     }
-    with runner.ray_session(None, dashboard=False, trials=False):  # stubs need none of what trials import
+    with ray_session(None, dashboard=False, trials=False):  # stubs need none of what trials import
         yield
     for number, handler in handlers.items():
         signal.signal(number, handler)
@@ -63,12 +65,10 @@ def go(space: Space, path: Path, resume: bool = False) -> tuple[bool, list[Trial
     searching = space.file.search == "optuna"
     trials = [] if searching else resolve_trials(space)
     experiment = (
-        experiments.reopen(path, None if searching else trials)
-        if resume
-        else experiments.create(path, space, trials, {})
+        opening.reopen(path, None if searching else trials) if resume else opening.create(path, space, trials, {})
     )
-    plan = runner.Plan(experiment, space, trials, Placement(0.0, 1), None, StubTrainer, precompile=None, standby=False)
-    completed = runner.run_trials(plan)
+    plan = driver.Plan(experiment, space, trials, Placement(0.0, 1), None, StubTrainer, precompile=None, prestart=False)
+    completed = driver.run_trials(plan)
     finish(experiment)
     return completed, read_records(experiment)
 
@@ -210,7 +210,7 @@ def test_out_of_memory_starts_anew_with_half_the_worlds_in_a_fresh_process(
     assert "4 trials ran with half the worlds asked for" in shown
     assert shown.count("finished, half the worlds") == 2
     # The one whose process was killed between the decision and its first epoch goes on with its half.
-    experiments.Experiment(path).clear_endings({Outcome.ERROR})
+    Experiment(path).clear_endings({Outcome.ERROR})
     completed, records = go(space, path, resume=True)
     assert outcomes(records)[4] == "finished"
     assert records[4].halved is not None
@@ -237,7 +237,7 @@ def test_a_driver_killed_after_the_decision_goes_on_with_half_the_worlds(make_sp
     space = make_space(parameters={BEHAVIOUR: {"grid": [LATE_CROWD]}}, resources={"halve_worlds_on_oom": True})
     path = tmp_path / "runs" / "killed"
     (trial,) = resolve_trials(space)
-    folder = experiments.create(path, space, [trial], {}).trial_folder(trial.id)
+    folder = opening.create(path, space, [trial], {}).trial_folder(trial.id)
     folder.mkdir(parents=True)
     with pytest.raises(StartAnew):  # as far as a driver came that was killed there
         run_trial(trial, folder, "cpu", StopSpec(), StubTrainer, Hooks(), may_halve=True)
@@ -250,11 +250,11 @@ def test_a_driver_killed_after_the_decision_goes_on_with_half_the_worlds(make_sp
 
 
 def test_a_dead_node_of_ones_own_ends_the_experiment_resumably(monkeypatch: pytest.MonkeyPatch) -> None:
-    node = runner._OwnNode()
-    monkeypatch.setattr(runner._OwnNode, "INTERVAL_S", 0.0)
+    node = driver._OwnNode()
+    monkeypatch.setattr(driver._OwnNode, "INTERVAL_S", 0.0)
     node.on_step_end(0, [])
-    alive = runner.ray.nodes()
-    monkeypatch.setattr(runner.ray, "nodes", lambda: [{**facts, "Alive": False} for facts in alive])
+    alive = driver.ray.nodes()
+    monkeypatch.setattr(driver.ray, "nodes", lambda: [{**facts, "Alive": False} for facts in alive])
     with pytest.raises(ClusterLost, match="has died"):
         node.on_step_end(1, [])
     assert node.lost is not None
@@ -334,7 +334,7 @@ def test_optuna_goes_on_where_it_was(make_space: Any, tmp_path: Path) -> None:
     assert not completed
     assert None in outcomes(before)
     # As after a driver that was killed: the manifest does not know the trials yet.
-    experiments.Experiment(path).set_trials([])
+    Experiment(path).set_trials([])
     completed, after = go(space, path, resume=True)
     assert completed
     assert outcomes(after) == ["finished"] * 3
@@ -346,7 +346,7 @@ def test_optuna_goes_on_where_it_was(make_space: Any, tmp_path: Path) -> None:
     assert "going on from" in (before[0].folder / "output.log").read_text()
     assert all([row["epoch"] for row in read_rows(record.folder)] == list(range(101)) for record in after)
     with pytest.raises(StorageError, match="no longer gives the trial of"):
-        recover(experiments.Experiment(path), make_space(parameters={"shac.actor_lr": {"loguniform": [1e-3, 1e-2]}}))
+        recover(Experiment(path), make_space(parameters={"shac.actor_lr": {"loguniform": [1e-3, 1e-2]}}))
 
 
 def test_a_population_goes_on_where_it_was(make_space: Any, tmp_path: Path) -> None:
@@ -391,13 +391,13 @@ def test_no_more_at_once_than_asked_for_and_the_next_process_waits(
 
     seen: set[int] = set()
     others: list[set[int]] = []
-    start = standby.start_processes
+    start = worker_prestart.start_processes
 
     def start_and_tell(*args: Any) -> None:
         others.append(set(_processes_of_trials()))
         start(*args)
 
-    monkeypatch.setattr(standby, "start_processes", start_and_tell)
+    monkeypatch.setattr(worker_prestart, "start_processes", start_and_tell)
 
     def watch() -> None:
         deadline = time.monotonic() + 100
@@ -413,10 +413,10 @@ def test_no_more_at_once_than_asked_for_and_the_next_process_waits(
     space = make_space(parameters={}, seeds="0-1", overrides={"trial.epochs": 400})
     path = tmp_path / "runs" / "patient"
     trials = resolve_trials(space)
-    experiment = experiments.create(path, space, trials, {})
+    experiment = opening.create(path, space, trials, {})
     thread = threading.Thread(target=watch)
     thread.start()
-    assert runner.run_trials(runner.Plan(experiment, space, trials, Placement(0.0, 1), 1, Patient, precompile=None))
+    assert driver.run_trials(driver.Plan(experiment, space, trials, Placement(0.0, 1), 1, Patient, precompile=None))
     thread.join()
     first, second = sorted(read_records(experiment), key=lambda record: record.trial.seed)
     assert outcomes([first, second]) == ["finished", "finished"]

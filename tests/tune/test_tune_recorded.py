@@ -22,19 +22,20 @@ from msk_ray.config import (
 from msk_ray.config.recorded import current_settings
 from msk_ray.errors import ConfigError
 from msk_ray.evaluate import __main__ as evaluate
+from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import read_metrics
 from msk_ray.experiment.outcomes import Outcome
+from msk_ray.experiment.trial import trial_id
 from msk_ray.report import __main__ as report
 from msk_ray.signals import RESUMABLE
+from msk_ray.sweep.search_trials import recover
+from msk_ray.sweep.space import StopSpec, load_space
+from msk_ray.sweep.trials import resolve_trials, with_recorded_ids
 from msk_ray.training import Trainer
 from msk_ray.training.policy import load_policy
 from msk_ray.tune import __main__ as tune
-from msk_ray.tune import runner
-from msk_ray.tune.experiment import Experiment
-from msk_ray.tune.made_up import recover
-from msk_ray.tune.space import StopSpec, load_space
+from msk_ray.tune import driver
 from msk_ray.tune.trial_run import Hooks, run_trial
-from msk_ray.tune.trials import resolve_trials, trial_id, with_recorded_ids
 from msk_ray.visualize import __main__ as visualize
 
 RECORDED = Path(__file__).parents[1] / "fixtures" / "recorded"
@@ -133,7 +134,7 @@ def test_policies_of_other_environments_are_read(name: str) -> None:
     assert getattr(policy.config.env.reward, weight) == value
 
 
-def test_an_experiment_goes_on(recorded: Path, plans: list[runner.Plan], capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_experiment_goes_on(recorded: Path, plans: list[driver.Plan], capsys: pytest.CaptureFixture[str]) -> None:
     """The trials keep their ids and folders; the interrupted one ends as the same trial that was not interrupted."""
     command = ["--space", str(recorded / "small.yaml"), "--storage", str(recorded), "--name", "interrupted", "--cpu"]
     assert run(tune.main, [*command, "--resume"]) == RESUMABLE

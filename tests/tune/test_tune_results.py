@@ -12,23 +12,24 @@ import pytest
 from msk_ray.cli import run
 from msk_ray.config import dump_yaml
 from msk_ray.errors import ConfigError, DeviceError, StorageError
+from msk_ray.experiment.manifest import Experiment, check_name
 from msk_ray.experiment.outcomes import Ending, Outcome, read_ending, write_ending
+from msk_ray.experiment.results import best_record, read_record
+from msk_ray.experiment.results_table import markdown, outcome_name, result_rows, summary, table_document, variant_rows
+from msk_ray.experiment.trial_status import StatusReader
 from msk_ray.files import make_folder
 from msk_ray.nvidia_smi import ask_driver
 from msk_ray.status import main as status
-from msk_ray.tune import experiment as experiments
+from msk_ray.sweep import opening
+from msk_ray.sweep.space import ResourcesSpec
+from msk_ray.sweep.trials import resolve_trials
+from msk_ray.text_table import text_table
 from msk_ray.tune.__main__ import main as tune
 from msk_ray.tune.devices import Placement, choose_placement, wait_for_memory
-from msk_ray.tune.listing import text_table
-from msk_ray.tune.records import best_record, read_record
-from msk_ray.tune.report import finish, write_report
-from msk_ray.tune.space import ResourcesSpec
-from msk_ray.tune.standing import Observer
-from msk_ray.tune.table import markdown, outcome_name, result_rows, summary, table_document, variant_rows
-from msk_ray.tune.trials import resolve_trials
+from msk_ray.tune.finish import finish, write_report
 
 
-def fill(experiment: experiments.Experiment, trial_id: str, scores: list[float | None], ending: Ending | None) -> None:
+def fill(experiment: Experiment, trial_id: str, scores: list[float | None], ending: Ending | None) -> None:
     """Metrics with an evaluation every second epoch, one of them written twice."""
     folder = experiment.trial_folder(trial_id)
     (folder / "checkpoints").mkdir(parents=True)
@@ -44,18 +45,18 @@ def fill(experiment: experiments.Experiment, trial_id: str, scores: list[float |
 
 
 @pytest.fixture
-def experiment(make_space: Any, tmp_path: Path) -> experiments.Experiment:
+def experiment(make_space: Any, tmp_path: Path) -> Experiment:
     """Two rates, two seeds: finished, stopped, NaN, and never started."""
     space = make_space(seeds="0-1")
     trials = resolve_trials(space)
-    made = experiments.create(tmp_path / "runs" / "e", space, trials, {})
+    made = opening.create(tmp_path / "runs" / "e", space, trials, {})
     fill(made, trials[0].id, [0.0, 5.0, 4.0], Ending(Outcome.FINISHED, "all done"))
     fill(made, trials[1].id, [0.0, 1.0], Ending(Outcome.STOPPED_ASHA, "number 2 of 2 | rung"))
     fill(made, trials[2].id, [0.0, 7.0, None], Ending(Outcome.NONFINITE, "score is nan"))
     return made
 
 
-def test_records_and_tables(experiment: experiments.Experiment, tmp_path: Path) -> None:
+def test_records_and_tables(experiment: Experiment, tmp_path: Path) -> None:
     records = [read_record(t, experiment.trial_folder(t.id)) for t in experiment.trials()]
     assert [len(r.evaluations) for r in records] == [2, 1, 2, 0], "the untrained policy's does not count"
     assert [outcome_name(r) for r in records] == ["finished", "stopped_asha", "nonfinite", "waiting"]
@@ -77,7 +78,7 @@ def test_records_and_tables(experiment: experiments.Experiment, tmp_path: Path) 
     assert facts["best"]["id"] == records[2].trial.id
 
 
-def test_an_untrained_policy_has_no_score(experiment: experiments.Experiment, make_space: Any) -> None:
+def test_an_untrained_policy_has_no_score(experiment: Experiment, make_space: Any) -> None:
     """It scores higher than anything that was trained, and is all that two stopped trials have."""
     trials = experiment.trials()
     for number, scores in enumerate([[90.0, 5.0, 4.0], [90.0], [90.0, 7.0, None], [90.0]]):
@@ -101,47 +102,43 @@ def test_an_untrained_policy_has_no_score(experiment: experiments.Experiment, ma
         (7.0, 2, False),
         (None, None, True),
     ]
-    shown = {standing.id: standing.progress.best for standing in Observer(experiment).look(time.time())}
+    shown = {standing.id: standing.progress.best for standing in StatusReader(experiment).look(time.time())}
     assert [shown[trial.id] for trial in trials] == [5.0, None, 7.0, None]
 
 
-def test_a_sweep_ends_in_its_report(
-    experiment: experiments.Experiment, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_sweep_ends_in_its_report(experiment: Experiment, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     write_report(experiment)
     page = experiment.path / "report" / "index.html"
     assert f"report       {page}" in capfd.readouterr().out
     assert "Which rate?" in page.read_text()
     # Whatever becomes of it, the sweep's results stand, and the way to try again is named.
-    write_report(experiments.Experiment(tmp_path / "nowhere"))
+    write_report(Experiment(tmp_path / "nowhere"))
     shown = capfd.readouterr()
     assert "no report (exit code 2); to try again: python -m msk_ray.report" in shown.out
 
 
-def test_an_existing_experiment_is_refused_and_a_changed_space_named(
-    experiment: experiments.Experiment, make_space: Any
-) -> None:
+def test_an_existing_experiment_is_refused_and_a_changed_space_named(experiment: Experiment, make_space: Any) -> None:
     space = make_space(seeds="0-1")
     with pytest.raises(StorageError, match="holds an experiment already: add --resume"):
-        experiments.create(experiment.path, space, [], {})
-    experiments.reopen(experiment.path, resolve_trials(space))
+        opening.create(experiment.path, space, [], {})
+    opening.reopen(experiment.path, resolve_trials(space))
     edited = make_space(seeds="0-1", overrides={"shac.gamma": 0.5})
     with pytest.raises(StorageError, match=r"trial 0 changed: shac.gamma 0.99 → 0.5"):
-        experiments.reopen(experiment.path, resolve_trials(edited))
+        opening.reopen(experiment.path, resolve_trials(edited))
     with pytest.raises(StorageError, match=r"2 gone \(actor_lr=0.01 seed 1"):
-        experiments.reopen(experiment.path, resolve_trials(make_space()))
+        opening.reopen(experiment.path, resolve_trials(make_space()))
     with pytest.raises(StorageError, match="no experiment at"):
-        experiments.reopen(experiment.path.with_name("other"), [])
+        opening.reopen(experiment.path.with_name("other"), [])
 
 
-def test_errored_trials_can_be_tried_again(experiment: experiments.Experiment) -> None:
+def test_errored_trials_can_be_tried_again(experiment: Experiment) -> None:
     folders = [experiment.trial_folder(trial.id) for trial in experiment.trials()]
     write_ending(folders[0], Ending(Outcome.ERROR, "died"))
     experiment.clear_endings({Outcome.ERROR})
     assert [read_ending(folder) is None for folder in folders] == [True, False, False, True]
 
 
-def test_space_is_kept_as_written(experiment: experiments.Experiment) -> None:
+def test_space_is_kept_as_written(experiment: Experiment) -> None:
     assert "actor_lr" in (experiment.path / "space.yaml").read_text()
     environment = json.loads((experiment.path / "env.json").read_text())
     assert environment["packages"]["ray"]
@@ -153,7 +150,7 @@ def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
     with pytest.raises(StorageError, match="cannot write to"):
         make_folder(tmp_path / "file" / "runs")
     with pytest.raises(StorageError, match="letters, digits"):
-        experiments.check_name("../x")
+        check_name("../x")
 
 
 def test_endings_round_trip(tmp_path: Path) -> None:
@@ -210,7 +207,7 @@ def test_labels_and_reasons_reach_neither_terminal_nor_markdown_as_they_are(
     evil = "\x1b[2J\n| <script>alert(1)</script>"
     levels = [{"label": f"a{evil}", "value": 0.01}, {"label": "b [bold]:smile:", "value": 0.001}]
     space = make_space(parameters={"shac.actor_lr": {"grid": levels}}, question=f"Which?{evil}")
-    made = experiments.create(tmp_path / "runs" / "e", space, resolve_trials(space), {})
+    made = opening.create(tmp_path / "runs" / "e", space, resolve_trials(space), {})
     for trial in made.trials():
         fill(made, trial.id, [0.0, 5.0], Ending(Outcome.ERROR, f"because{evil}"))
     finish(made)

@@ -34,7 +34,7 @@ def start(*arguments: str, **environment: str) -> "subprocess.CompletedProcess[s
 
 
 def test_a_stale_note_of_a_cluster_does_not_matter(ray_folder: Path) -> None:
-    result = start("msk_ray.tune.ping", RAY_TMPDIR=str(ray_folder))
+    result = start("msk_ray.tune.ray_probe", RAY_TMPDIR=str(ray_folder))
     assert result.returncode == 0, result.stderr
     assert '"cpus"' in result.stdout
     assert (ray_folder / "ray" / "session_latest").exists()  # where the note was

@@ -16,10 +16,10 @@ from stub_trainer import HELD_AT
 
 from msk_ray.config import dump_yaml
 from msk_ray.errors import ClusterLost
+from msk_ray.experiment.manifest import Experiment
+from msk_ray.experiment.results import read_records
 from msk_ray.signals import NUMBERS, RESUMABLE, listening
 from msk_ray.tune import interrupts
-from msk_ray.tune.experiment import Experiment
-from msk_ray.tune.records import read_records
 
 Start = Callable[..., "subprocess.Popen[str]"]
 

@@ -16,10 +16,10 @@ from processes import Launcher, wait_until
 from stub_trainer import HELD_AT
 
 from msk_ray.config import dump_yaml
+from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import read_rows
+from msk_ray.experiment.results import read_records
 from msk_ray.signals import RESUMABLE
-from msk_ray.tune.experiment import Experiment
-from msk_ray.tune.records import read_records
 
 EPOCHS = 150
 

@@ -17,8 +17,8 @@ from PIL import Image
 from msk_ray.cli import run
 from msk_ray.errors import DeviceError
 from msk_ray.evaluate.measure import Bench, Request
+from msk_ray.experiment.manifest import Experiment
 from msk_ray.training import load_policy
-from msk_ray.tune.experiment import Experiment
 from msk_ray.visualize import render
 from msk_ray.visualize.__main__ import main
 from msk_ray.visualize.episodes import record

@@ -1,0 +1,87 @@
+"""What an experiment ran with: versions, command, and the machine it was started on."""
+
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import msk_ray
+from msk_ray.experiment.damage import Damage, DamagedFile, cut, field, read_object, texts
+from msk_ray.experiment.versions import installed_versions
+from msk_ray.nvidia_smi import ask_driver
+
+_PACKAGES = ("msk-ray", "torch", "warp-lang", "mujoco", "mujoco-warp", "ray", "numpy")
+_ENVIRONMENT = {
+    "command": list,
+    "python": str,
+    "platform": str,
+    "host": str,
+    "cpus": int,
+    "gpus": list,
+    "driver": str,
+    "packages": dict,
+    "commit": str,
+}
+
+
+def read_environment(path: Path) -> tuple[dict[str, Any], list[Damage]]:
+    """What an experiment ran with, as far as its file says, and what of it cannot be used.
+
+    Raises:
+        StorageFailure: the storage does not give it.
+    """
+    damages: list[Damage] = []
+
+    def usable(data: dict[str, Any]) -> dict[str, Any]:
+        found = {}
+        for name in data.keys() & _ENVIRONMENT.keys():
+            if data[name] is None:
+                continue  # not known, which null says
+            try:
+                value: Any = field(data, name, _ENVIRONMENT[name])
+                inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+                if not texts(inner):
+                    raise ValueError(f"{name} holds something else than texts")
+                found[name] = value
+            except ValueError as error:
+                damages.append(Damage(path, cut(error)))
+        return {name: found[name] for name in _ENVIRONMENT if name in found}
+
+    try:
+        return read_object(path, usable) or {}, damages
+    except DamagedFile as error:
+        return {}, [error.damage]
+
+
+def environment() -> dict[str, Any]:
+    """What the experiment ran with: versions, command, and the machine it was started on."""
+    driver = ask_driver()
+    return {
+        "command": sys.argv,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "host": platform.node(),
+        "cpus": os.cpu_count(),
+        "gpus": list(driver.gpus),
+        "driver": driver.driver,
+        "packages": installed_versions(_PACKAGES),
+        "commit": _commit(),
+    }
+
+
+def _commit() -> str | None:
+    """The checkout's commit, `+` for uncommitted changes; None outside a checkout."""
+    root = Path(msk_ray.__file__).resolve().parent.parent
+    if not (root / ".git").exists():
+        return None
+    try:
+        head = subprocess.run(["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
+        changes = subprocess.run(
+            ["git", "-C", str(root), "status", "--porcelain"], capture_output=True, text=True, check=True
+        )
+    except (OSError, subprocess.CalledProcessError):
+        # git is not installed, or refuses a folder of another owner: the commit is unknown, which null says.
+        return None
+    return head.stdout.strip() + ("+" if changes.stdout.strip() else "")

@@ -1,0 +1,287 @@
+"""An experiment's folder: what it is made of, who owns it, and how it is read back.
+
+runs/<experiment>/
+    manifest.json     the trials: ids, changed parameters, full configs
+    space.yaml        the space as it was run
+    env.json          versions, devices, commit, command line
+    owner.json        the driver at work, if there is one
+    tune/             Ray's own state
+    trials/<id>/      config.yaml, metrics.jsonl, checkpoints/, outcome.json, output.log, eval.json; halved.json and
+                      abandoned/ if it was started anew with half its worlds
+    summary.json, table.md, eval.json, report/
+"""
+
+import contextlib
+import re
+import time
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from msk_ray.cli import typed_command
+from msk_ray.config import current_values, parse_recorded
+from msk_ray.errors import StorageError, StorageFailure, brief
+from msk_ray.experiment.damage import DamagedFile, field, read_object, texts
+from msk_ray.experiment.environment import read_environment
+from msk_ray.experiment.layout import ENVIRONMENT_FILE, MANIFEST_FILE, METRICS_FILE, OUTCOME_FILE, STOP_FILE
+from msk_ray.experiment.metrics import read_metrics
+from msk_ray.experiment.outcomes import Outcome, read_ending
+from msk_ray.experiment.ownership import Ownership, owned
+from msk_ray.experiment.trial import Trial
+from msk_ray.files import check_writable, make_folder, write_json
+
+FORMAT = 1
+REMEMBERED = ("halve_worlds", "early_stopping")
+"""Options that --resume goes on with unless it says otherwise."""
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """An experiment on disk."""
+
+    path: Path
+    """Absolute."""
+
+    @property
+    def name(self) -> str:
+        return self.path.name
+
+    def resume_command(self) -> str:
+        """The command that goes on with it: the one it was begun with, and --resume, which remembers the last word on
+        `REMEMBERED`."""
+        flags = {f"--{no}{option.replace('_', '-')}" for option in REMEMBERED for no in ("", "no-")}
+        argv = read_environment(self.path / ENVIRONMENT_FILE)[0].get("command")
+        if not argv:
+            # What was typed is lost, or was never whole; its options are in nobody else's hands.
+            return "python -m msk_ray.tune --resume, with the options it was begun with"
+        return typed_command([word for word in argv if word not in flags], "--resume")
+
+    @property
+    def tune(self) -> Path:
+        """Folder of Ray's state."""
+        return self.path / "tune"
+
+    @property
+    def stop_file(self) -> Path:
+        return self.path / STOP_FILE
+
+    def trial_folder(self, trial_id: str) -> Path:
+        """Where a trial keeps everything."""
+        return self.path / "trials" / trial_id
+
+    def make_trial_folder(self, trial_id: str) -> Path:
+        """Make a trial's folder, once, before it first starts.
+
+        Raises:
+            StorageFailure: the disk is full or gone, or the experiment has.
+        """
+        folder = self.trial_folder(trial_id)
+        self.check_there()
+        try:
+            folder.mkdir(exist_ok=True)  # without those above it: an experiment that was moved is not begun again
+        except OSError as error:
+            raise StorageFailure(f"cannot write {folder}: {error.strerror or error}") from error
+        return folder
+
+    def check_there(self, trial_id: str | None = None) -> None:
+        """Notice that the experiment, or a trial's folder, has gone since it was opened.
+
+        Raises:
+            StorageFailure: it has.
+        """
+        for path in (self.path / MANIFEST_FILE, *([] if trial_id is None else [self.trial_folder(trial_id)])):
+            try:
+                path.stat()
+            except OSError as error:
+                raise StorageFailure(f"{path} has gone: moved, removed or not mounted ({error.strerror})") from error
+
+    def lost(self, trial_id: str | None = None) -> StorageFailure | None:
+        """What `check_there` raises, if anything."""
+        try:
+            self.check_there(trial_id)
+        except StorageFailure as failure:
+            return failure
+        return None
+
+    def asked_to_stop(self) -> bool:
+        """Whether trials are to save themselves and end.
+
+        Raises:
+            StorageFailure: the experiment has gone, and with it any such request.
+        """
+        if self.stop_file.exists():
+            return True
+        self.check_there()
+        return False
+
+    def manifest(self) -> dict[str, Any]:
+        """The manifest as plain data.
+
+        Raises:
+            StorageError: missing, unreadable, or of another format.
+        """
+        try:
+            manifest = read_object(self.path / MANIFEST_FILE, _manifest)
+        except DamagedFile as error:
+            raise DamagedFile(error.damage, "restore it, or start again under another --name") from None
+        if manifest is None:
+            raise StorageError(f"{self.path} holds no experiment: {MANIFEST_FILE} is missing")
+        return manifest
+
+    def begin(self, space: str, question: str, trials: Sequence[Trial], options: Mapping[str, Any]) -> None:
+        """Write the manifest of a new experiment, last of all: a folder with a manifest is a whole experiment.
+
+        Args:
+            space: name of its space.
+            question: that it is to answer.
+            trials: all that are known.
+            options: of the command line.
+        """
+        manifest = {
+            "format": FORMAT,
+            "name": self.name,
+            "space": space,
+            "question": question,
+            "created": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+            "options": dict(options),
+            "trials": [_entry(trial) for trial in trials],
+        }
+        write_json(self.path / MANIFEST_FILE, manifest)
+
+    def trials(self) -> list[Trial]:
+        """The trials of the manifest."""
+        trials = []
+        for entry in self.manifest()["trials"]:
+            config = parse_recorded(entry["config"], f"{self.path / MANIFEST_FILE}: trial {entry['id']}")
+            changed, values = (current_values(entry[part], config.env.name) for part in ("changed", "values"))
+            trials.append(Trial(entry["index"], entry["id"], changed, values, config))
+        return trials
+
+    def clear_endings(self, outcomes: Collection[Outcome]) -> None:
+        """Take back the endings of trials that ended in one of these ways, so that they go on."""
+        for trial in self.trials():
+            folder = self.trial_folder(trial.id)
+            ending = read_ending(folder)
+            if ending is not None and ending.outcome in outcomes:
+                (folder / OUTCOME_FILE).unlink()
+
+    def said(self, option: str) -> bool | None:
+        """What was said of one of `REMEMBERED` on a command line; None if nothing was, so that the space decides."""
+        said: bool | None = (self.manifest().get("options") or {}).get(option)
+        return said
+
+    def say(self, **options: bool | None) -> None:
+        """Keep what is said of such options now, for the next time; None says nothing."""
+        manifest = self.manifest()
+        said = {option: value for option, value in options.items() if value is not None}
+        write_json(self.path / MANIFEST_FILE, manifest | {"options": (manifest.get("options") or {}) | said})
+
+    def extension(self) -> dict[str, Any]:
+        """How the experiment was extended since it was made: epochs, samples, seeds."""
+        recorded: dict[str, Any] = self.manifest().get("extended", {})
+        return recorded
+
+    def extend(self, trials: Iterable[Trial], extension: Mapping[str, Any]) -> None:
+        """Replace the manifest's list of trials by a longer one, and say in it what was asked for."""
+        extended = {"extended": self.extension() | dict(extension)}
+        write_json(
+            self.path / MANIFEST_FILE, self.manifest() | extended | {"trials": [_entry(trial) for trial in trials]}
+        )
+
+    def clear_outgrown(self) -> None:
+        """Take back the endings of trials that finished before their epochs were extended."""
+        for trial in self.trials():
+            folder = self.trial_folder(trial.id)
+            ending = read_ending(folder)
+            if ending is None or ending.outcome is not Outcome.FINISHED:
+                continue
+            rows = read_metrics(folder / METRICS_FILE)
+            if rows and rows[-1]["epoch"] < trial.epochs:
+                (folder / OUTCOME_FILE).unlink()
+
+    def set_trials(self, trials: Iterable[Trial]) -> None:
+        """Replace the manifest's list of trials."""
+        write_json(self.path / MANIFEST_FILE, self.manifest() | {"trials": [_entry(trial) for trial in trials]})
+
+
+def has_begun(path: Path) -> bool:
+    """Whether the folder holds a whole experiment, which --resume goes on with."""
+    return (path / MANIFEST_FILE).is_file()
+
+
+def refuse_old(path: Path) -> None:
+    """Raise StorageError where there is an experiment already."""
+    if has_begun(path):
+        raise StorageError(f"{path} holds an experiment already: add --resume to go on with it, or pass another --name")
+
+
+def check_name(name: str) -> str:
+    """An experiment's name, which becomes a folder's.
+
+    Raises:
+        StorageError: it would not be a plain folder name.
+    """
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}", name):
+        raise StorageError(f"--name {brief(name)}: use at most 128 letters, digits, '.', '_' and '-'")
+    return name
+
+
+def _manifest(data: dict[str, Any]) -> dict[str, Any]:
+    """A manifest as it is.
+
+    Raises:
+        ValueError: it is none that this version reads.
+    """
+    if data.get("format") != FORMAT:
+        raise ValueError(f"it has format {data.get('format')!r:.40}, this version reads {FORMAT}")
+    for number, entry in enumerate(field(data, "trials", list)):
+        if not isinstance(entry, dict):
+            raise ValueError(f"trial {number} is no object")
+        try:
+            field(entry, "index", int)
+            if not re.fullmatch(r"[A-Za-z0-9_-]+", field(entry, "id", str)):
+                raise ValueError("id is no trial's")
+            if not texts(field(entry, "changed", dict).values()):
+                raise ValueError("changed holds something else than texts")
+            field(entry, "values", dict)
+            field(entry, "config", dict)
+        except ValueError as error:
+            raise ValueError(f"trial {number}: {error}") from None
+    for name, kind in (("question", str), ("options", dict), ("extended", dict)):
+        if data.get(name) is not None:
+            field(data, name, kind)
+    return data
+
+
+def _entry(trial: Trial) -> dict[str, Any]:
+    return {
+        "index": trial.index,
+        "id": trial.id,
+        "changed": trial.changed,
+        "values": trial.values,
+        "config": trial.config.as_dict(),
+    }
+
+
+@contextlib.contextmanager
+def own(path: Path, *, new: bool, force: bool = False) -> Iterator[Ownership]:
+    """Own an experiment's folder for a block, before anything in it is written.
+
+    Args:
+        path: its folder; made here for a new one.
+        new: whether the experiment is to be begun, not gone on with.
+        force: take it over from a driver that looks alive.
+
+    Raises:
+        StorageError: there is an experiment already, or none; another driver is at work; the folder cannot be written.
+    """
+    if new:
+        refuse_old(path)
+        make_folder(path)
+    elif not path.is_dir():
+        raise StorageError(f"no experiment at {path} to go on with; leave --resume and --extend out to start one")
+    else:
+        check_writable(path)
+    with owned(path, force) as ownership:
+        yield ownership

@@ -1,0 +1,130 @@
+"""The trials of an experiment with what their folders hold: for tables, and to go on from."""
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from msk_ray.config import current_key, parse_recorded, read_yaml
+from msk_ray.errors import MskRayError
+from msk_ray.experiment.damage import Damage, cut
+from msk_ray.experiment.halved import Halved
+from msk_ray.experiment.manifest import Experiment
+from msk_ray.experiment.metrics import Evaluation
+from msk_ray.experiment.outcomes import Ending
+from msk_ray.experiment.snapshot import TrialReader, TrialSnapshot, read_trial
+from msk_ray.experiment.trial import Trial
+from msk_ray.text import describe
+
+
+@dataclass(frozen=True)
+class TrialRecord:
+    """One trial and what its folder holds."""
+
+    trial: Trial
+    snapshot: TrialSnapshot
+
+    @property
+    def folder(self) -> Path:
+        return self.snapshot.folder
+
+    @property
+    def epochs_done(self) -> int:
+        return self.snapshot.epochs_done
+
+    @property
+    def seconds(self) -> float:
+        """Training time [s]."""
+        return self.snapshot.seconds
+
+    @property
+    def evaluations(self) -> tuple[Evaluation, ...]:
+        return self.snapshot.evaluations
+
+    @property
+    def ending(self) -> Ending | None:
+        """None: not ended, whether running, waiting or interrupted."""
+        return self.snapshot.ending
+
+    @property
+    def halved(self) -> Halved | None:
+        """Set if it runs with half its worlds: then its scores do not compare with the others'."""
+        return self.snapshot.halved
+
+    @property
+    def best(self) -> Evaluation | None:
+        """The evaluation of the trained policy with the highest score; None if there was none with a score."""
+        finite = [evaluation for evaluation in self.evaluations if math.isfinite(evaluation.score)]
+        return max(finite, key=lambda evaluation: evaluation.score) if finite else None
+
+    @property
+    def best_checkpoint(self) -> Path | None:
+        """Checkpoint of the best evaluation's policy; None if it is missing, or no trained policy has a score."""
+        return self.snapshot.best_checkpoint if self.best is not None else None
+
+    @property
+    def cut(self) -> bool:
+        """Whether it stands before its end without having failed: given more, its score might have risen."""
+        return self.ending.cut if self.ending is not None else bool(self.evaluations)
+
+    @property
+    def errored(self) -> bool:
+        return self.snapshot.errored
+
+
+def read_record(trial: Trial, folder: Path) -> TrialRecord:
+    """A trial's record; an empty one if it never started."""
+    return TrialRecord(trial, read_trial(folder, time.time()))
+
+
+def read_records(experiment: Experiment) -> list[TrialRecord]:
+    """Records of all trials of an experiment, in order."""
+    reader, now = TrialReader(), time.time()
+    return [TrialRecord(trial, reader.read(experiment.trial_folder(trial.id), now)) for trial in experiment.trials()]
+
+
+def best_record(records: Sequence[TrialRecord]) -> TrialRecord | None:
+    """The trial with the highest score at any evaluation; None if none has a score."""
+    scored = [(record.best.score, -record.trial.index, record) for record in records if record.best is not None]
+    return max(scored, key=lambda item: item[:2])[2] if scored else None
+
+
+def unlisted_trials(
+    experiment: Experiment, listed: set[str], parameters: Sequence[str]
+) -> tuple[list[Trial], list[Damage]]:
+    """Trials that the manifest does not know: those a search has made up, or all if it is lost.
+
+    Args:
+        listed: ids of those it knows.
+        parameters: dotted keys that the space varies.
+
+    Returns:
+        The trials, as their folders' `config.yaml` has them, and those of these files that cannot be used.
+    """
+    root = experiment.path / "trials"
+    folders = [path for path in root.iterdir() if path.name not in listed and path.is_dir()] if root.is_dir() else []
+    found: list[Trial] = []
+    damages = []
+    for folder in sorted(folders):
+        path = folder / "config.yaml"
+        if not path.is_file():
+            continue  # made, but nothing was written into it
+        try:
+            config = parse_recorded(read_yaml(path), str(path))
+            settings = config.as_dict()
+            values = {key: _at(settings, key) for key in (current_key(key, config.env.name) for key in parameters)}
+        except (MskRayError, KeyError, TypeError) as error:
+            damages.append(Damage(path, cut(f"no settings of a trial: {error}")))
+            continue
+        changed = {key: describe(value) for key, value in values.items()}
+        found.append(Trial(len(listed) + len(found), folder.name, changed, values, config))
+    return found, damages
+
+
+def _at(settings: Mapping[str, Any], dotted: str) -> Any:
+    node: Any = settings
+    for part in dotted.split("."):
+        node = node[part]
+    return node

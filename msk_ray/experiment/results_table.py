@@ -1,0 +1,144 @@
+"""The result of an experiment as a table, a list and plain data."""
+
+import statistics
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from msk_ray.experiment.results import TrialRecord, best_record
+from msk_ray.text import markdown_cell, markdown_text, printable
+
+HEADER = ("trial", "changed", "seed", "score", "at epoch", "epochs", "stopped", "path", "why")
+
+
+def result_rows(records: Sequence[TrialRecord]) -> list[tuple[str, ...]]:
+    """One row a trial, the highest score first."""
+    ordered = sorted(records, key=lambda record: -record.best.score if record.best else float("inf"))
+    return [_row(record) for record in ordered]
+
+
+def variant_rows(records: Sequence[TrialRecord]) -> list[tuple[str, ...]]:
+    """One row a variant: seeds, mean, standard deviation and range of the best scores. The highest mean first."""
+    groups: dict[str, list[TrialRecord]] = {}
+    for record in records:
+        groups.setdefault(record.trial.variant, []).append(record)
+    rows = []
+    for variant, group in groups.items():
+        scored = [record for record in group if record.best is not None]
+        scores = [record.best.score for record in scored if record.best is not None]
+        if not scores:
+            rows.append((float("-inf"), (variant, "0", "-", "-", "-", "-")))
+            continue
+        counts = {
+            "before the end": sum(record.cut for record in scored),
+            "with half the worlds": sum(record.halved is not None for record in scored),
+        }
+        remarks = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
+        seeds = f"{len(scores)} ({remarks})" if remarks else str(len(scores))
+        mean = statistics.fmean(scores)
+        deviation = f"{statistics.stdev(scores):.4g}" if len(scores) > 1 else "-"
+        texts = (variant, seeds, f"{mean:.5g}", deviation, f"{min(scores):.5g}", f"{max(scores):.5g}")
+        rows.append((mean, texts))
+    return [texts for _, texts in sorted(rows, key=lambda row: -row[0])]
+
+
+def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table that shows its cells as they are, whatever is in them."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(markdown_cell(cell) for cell in line) + " |" for line in lines) + "\n"
+
+
+def summary(name: str, question: str, records: Sequence[TrialRecord]) -> dict[str, Any]:
+    """Everything the tables show, as plain data. Paths are relative to the experiment's folder."""
+    best = best_record(records)
+    return {
+        "experiment": name,
+        "question": question,
+        "best": None if best is None else _facts(best),
+        "trials": [_facts(record) for record in records],
+    }
+
+
+def table_document(name: str, question: str, records: Sequence[TrialRecord]) -> str:
+    """The Markdown report of an experiment."""
+    parts = [
+        f"# {markdown_text(name)}\n",
+        f"{markdown_text(question)}\n" if question else "",
+        markdown(HEADER, result_rows(records)),
+    ]
+    if len({record.trial.seed for record in records}) > 1:
+        header = ("variant", "seeds", "mean score", "std", "min", "max")
+        parts += ["By variant, over seeds:\n", markdown(header, variant_rows(records))]
+        if any(record.cut for record in records):
+            parts.append(
+                "Trials that stand or were stopped before their end count with the best score they had, which might "
+                "have risen further: the report compares variants at equal env steps.\n"
+            )
+    best = best_record(records)
+    if best is not None:
+        half = f", {best.halved}" if best.halved is not None else ""
+        variant = markdown_text(printable(best.trial.variant))
+        parts.append(f"Best policy: `{_relative(best)}` ({variant}, seed {best.trial.seed}{half}).\n")
+    if (note := halved_note(records)) is not None:
+        parts.append(f"{note}\n")
+    parts.append(f"Curves and more: [report](report/index.html), by `python -m msk_ray.report {name}`.\n")
+    return "\n".join(part for part in parts if part)
+
+
+def outcome_name(record: TrialRecord) -> str:
+    """The outcome's name; `interrupted` or `waiting` for a trial without one."""
+    if record.ending is not None:
+        return str(record.ending.outcome)
+    return "interrupted" if record.epochs_done else "waiting"
+
+
+def halved_note(records: Sequence[TrialRecord]) -> str | None:
+    """What the reader of a table must know of trials with half their worlds; None if there are none."""
+    count = sum(record.halved is not None for record in records)
+    if not count:
+        return None
+    trials = "1 trial" if count == 1 else f"{count} trials"
+    return (
+        f"{trials} ran with half the worlds asked for, after running out of memory with all of them: "
+        "not comparable with the others."
+    )
+
+
+def _row(record: TrialRecord) -> tuple[str, ...]:
+    trial, best = record.trial, record.best
+    return (
+        trial.id,
+        trial.variant,
+        str(trial.seed),
+        "-" if best is None else f"{best.score:.5g}",
+        "-" if best is None else str(best.epoch),
+        f"{record.epochs_done}/{trial.epochs}",
+        # Here, not with the reason: a terminal may cut that.
+        outcome_name(record) + (", half the worlds" if record.halved is not None else ""),
+        f"trials/{trial.id}",
+        "; ".join(str(part) for part in (record.halved, record.ending and record.ending.why) if part),
+    )
+
+
+def _facts(record: TrialRecord) -> dict[str, Any]:
+    best = record.best
+    return {
+        "id": record.trial.id,
+        "changed": record.trial.changed,
+        "values": record.trial.values,
+        "seed": record.trial.seed,
+        "score": None if best is None else best.score,
+        "score_epoch": None if best is None else best.epoch,
+        "epochs": record.epochs_done,
+        "epochs_planned": record.trial.epochs,
+        "seconds": record.seconds,
+        "outcome": outcome_name(record),
+        "why": record.ending.why if record.ending is not None else "",
+        "halved": None if record.halved is None else {"asked": record.halved.asked, "worlds": record.halved.worlds},
+        "folder": f"trials/{record.trial.id}",
+        "best_checkpoint": str(_relative(record)) if record.best_checkpoint else None,
+    }
+
+
+def _relative(record: TrialRecord) -> Path:
+    return Path("trials") / record.trial.id / "checkpoints" / "best.pt"

@@ -1,0 +1,91 @@
+"""What the early-stopping rule was told, in the order it was told.
+
+Trials' own records do not tell the order between trials, nor which of their last rows the driver had heard of when it
+died; and a rule that is told an evaluation twice judges it twice, the second time against more trials.
+"""
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from msk_ray.errors import StorageFailure
+from msk_ray.experiment.damage import Damage, field, number, read_bytes, read_lines
+from msk_ray.experiment.metrics import EPOCH_LIMIT, Evaluation
+from msk_ray.files import write_bytes
+
+
+@dataclass(frozen=True)
+class LogEntry:
+    """One evaluation as the driver heard of it."""
+
+    trial: str
+    epoch: int
+    env_steps: int
+    seconds: float
+    score: float
+    ended: bool
+    """Whether the trial had ended by itself."""
+    halved: bool = False
+    """Whether it ran with half its worlds; what it reported with all of them no longer counts then."""
+
+    def time(self, attribute: str) -> float:
+        """Progress as `env_steps`, `epoch` or `seconds`."""
+        return Evaluation(self.epoch, self.env_steps, self.seconds, self.score).time(attribute)
+
+
+class SchedulerLog:
+    """The entries of an experiment, one JSON object a line."""
+
+    def __init__(self, path: Path, guard: Callable[[], None] = lambda: None) -> None:
+        """
+        Args:
+            path: of the file.
+            guard: called before it is written; raises if the experiment is another driver's by now.
+        """
+        self._path = path
+        self._guard = guard
+
+    def read(self) -> tuple[list[LogEntry], tuple[Damage, ...]]:
+        """All entries, and the lines that cannot be used; a last line torn by the driver's death is cut off.
+
+        Raises:
+            StorageFailure: the storage does not give it, or the torn line cannot be cut off.
+        """
+        data = read_bytes(self._path) or b""
+        whole, newline, torn = data.rpartition(b"\n")
+        if torn:
+            write_bytes(self._path, whole + newline)
+        return read_lines(self._path, _entry)
+
+    def append(self, entry: LogEntry) -> None:
+        """Add one entry; it outlives this process when this returns.
+
+        Raises:
+            StorageFailure: the disk is full or gone, or as the guard says.
+        """
+        self._guard()
+        try:
+            with self._path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(asdict(entry)) + "\n")
+        except OSError as error:
+            raise StorageFailure(f"cannot write {self._path}: {error.strerror or error}") from error
+
+
+def _entry(data: dict[str, Any]) -> LogEntry:
+    epoch, env_steps = field(data, "epoch", int), field(data, "env_steps", int)
+    if not 0 <= epoch < EPOCH_LIMIT:
+        raise ValueError("an epoch that cannot be")
+    if not 0 <= env_steps < 10**300:
+        raise ValueError("env_steps that cannot be")
+    return LogEntry(
+        field(data, "trial", str),
+        epoch,
+        env_steps,
+        number(data, "seconds"),
+        # It may be NaN: written so, and the rule knows what to do with it.
+        float(data["score"]) if isinstance(data.get("score"), float) else number(data, "score"),
+        field(data, "ended", bool),
+        field(data, "halved", bool) if "halved" in data else False,
+    )

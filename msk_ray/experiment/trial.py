@@ -1,0 +1,82 @@
+"""One trial of an experiment: what it is called, what sets it apart, and its full settings."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from msk_ray.config import Config, first_spelling
+from msk_ray.text import describe, printable
+
+ID_DIGITS = 8
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One training run of an experiment."""
+
+    index: int
+    """Place in the experiment, from 0."""
+    id: str
+    """Hash of what is trained, seed included; the name of the trial's folder."""
+    changed: dict[str, str]
+    """What sets this trial apart, parameter → value as text, without the seed."""
+    values: dict[str, Any]
+    """The same as data: dotted key → value."""
+    config: Config
+
+    @property
+    def seed(self) -> int:
+        return self.config.trial.seed
+
+    @property
+    def epochs(self) -> int:
+        return self.config.trial.epochs
+
+    @property
+    def variant(self) -> str:
+        """The changed parameters on one line; equal for all seeds of a variant."""
+        return variant_text(self.changed)
+
+    @property
+    def label(self) -> str:
+        """Id, changed parameters and seed on one line of printable characters, for Ray's lists and profiles."""
+        # A profile separates its frames by semicolons.
+        return printable(f"{self.id} {self.variant} seed={self.seed}").replace(";", ",")
+
+
+def variant_text(changed: Mapping[str, str]) -> str:
+    """`actor_lr=0.002, horizon=16, hard friction`: keys without their sections, and whole sections by label alone."""
+    parts = [f"{key.rsplit('.', 1)[1]}={value}" if "." in key else value for key, value in changed.items()]
+    return ", ".join(parts) or "base"
+
+
+def trial_id(config: Config) -> str:
+    """First digits of the SHA-256 of a config's content. Equal configs have equal ids wherever they are resolved, and
+    by whatever version."""
+    text = json.dumps(first_spelling(config.as_dict()), sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()[:ID_DIGITS]
+
+
+def with_epochs(trial: Trial, epochs: int) -> Trial:
+    """The same trial, id included, of another length."""
+    longer = trial.config.trial.model_copy(update={"epochs": epochs})
+    return replace(trial, config=trial.config.model_copy(update={"trial": longer}))
+
+
+def describe_changes(old: Config, new: Config) -> str:
+    """`shac.actor_lr 0.002 → 0.001, …`: the settings in which two configs differ."""
+    before, after = _flat(old.as_dict()), _flat(new.as_dict())
+    keys = [key for key in {**before, **after} if before.get(key) != after.get(key)]
+    return ", ".join(f"{key} {describe(before.get(key))} → {describe(after.get(key))}" for key in keys)
+
+
+def _flat(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in data.items():
+        if isinstance(value, Mapping):
+            flat |= _flat(value, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = value
+    return flat

@@ -1,0 +1,162 @@
+"""Where an experiment stands, from its files alone: while it runs, after it died, or from another machine."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from msk_ray.config import read_yaml
+from msk_ray.errors import MskRayError
+from msk_ray.experiment.damage import Damage, describe_damages
+from msk_ray.experiment.eta import eta
+from msk_ray.experiment.halved import Halved
+from msk_ray.experiment.layout import ENVIRONMENT_FILE, MANIFEST_FILE, SPACE_FILE
+from msk_ray.experiment.manifest import Experiment
+from msk_ray.experiment.metrics import TrialProgress
+from msk_ray.experiment.results import unlisted_trials
+from msk_ray.experiment.snapshot import Device, State, TrialReader
+from msk_ray.experiment.trial import Trial
+
+
+@dataclass(frozen=True)
+class TrialStatus:
+    """One trial as its files show it at one moment."""
+
+    id: str
+    variant: str
+    seed: int
+    epochs: int
+    """Planned."""
+    state: State
+    progress: TrialProgress
+    device: Device
+    heartbeat_age: float | None
+    """Time since its process last wrote something [s]; None if it never did."""
+    outcome: str = ""
+    """Name of its ending, if it has one."""
+    note: str = ""
+    """Why it ended, or what is wrong with its files."""
+    halved: Halved | None = None
+    """Set if it runs with half its worlds."""
+    damages: tuple[Damage, ...] = ()
+    """What was skipped in its files."""
+
+    @property
+    def seconds_left(self) -> float | None:
+        """Until its last epoch at its present speed [s]; None unless it is running at a known speed."""
+        speed = self.progress.seconds_per_epoch
+        if self.state is not State.RUNNING or speed is None:
+            return None
+        return max(0, self.epochs - self.progress.epoch) * speed
+
+
+class StatusReader:
+    """Reads an experiment again and again; a file that has not changed is not read twice."""
+
+    def __init__(self, experiment: Experiment) -> None:
+        self.experiment = experiment
+        self._reader = TrialReader(keep_rows=False)
+        self._trials: list[Trial] = []
+        self._manifest: tuple[int, int] | None = None
+
+    def look(self, now: float) -> list[TrialStatus]:
+        """All trials at `now` [s since the epoch], those at work first, then by score.
+
+        Raises:
+            StorageError: the folder holds no readable experiment.
+        """
+        found = [self._status(trial, now) for trial in self._known()]
+        found += self._unlisted({status.id for status in found}, now)
+        return sorted(found, key=_order)
+
+    def _known(self) -> list[Trial]:
+        stamp = _stamp(self.experiment.path / MANIFEST_FILE)
+        if stamp is None or stamp != self._manifest:
+            self._trials, self._manifest = self.experiment.trials(), stamp
+        return self._trials
+
+    def _unlisted(self, listed: set[str], now: float) -> list[TrialStatus]:
+        """Trials a search has made up: the manifest learns of them only at the end."""
+        if all(path.name in listed for path in _subfolders(self.experiment.path / "trials")):
+            return []
+        try:
+            varied = list(read_yaml(self.experiment.path / SPACE_FILE).get("parameters") or {})
+        except (MskRayError, TypeError):
+            varied = []  # their settings are known all the same; only what sets them apart is not
+        trials, damages = unlisted_trials(self.experiment, listed, varied)
+        return [self._status(trial, now) for trial in trials] + [self._unreadable(damage) for damage in damages]
+
+    def _unreadable(self, damage: Damage) -> TrialStatus:
+        (note,) = describe_damages([damage], damage.path.parent)
+        name = damage.path.parent.name
+        return TrialStatus(
+            name, "?", 0, 0, State.UNREADABLE, TrialProgress(), Device(), None, note=note, damages=(damage,)
+        )
+
+    def _status(self, trial: Trial, now: float) -> TrialStatus:
+        seen = self._reader.read(self.experiment.trial_folder(trial.id), now)
+        why = [] if seen.ending is None else [seen.ending.why]
+        return TrialStatus(
+            trial.id,
+            trial.variant,
+            trial.seed,
+            trial.epochs,
+            seen.state,
+            seen.progress,
+            seen.device,
+            seen.age,
+            "" if seen.ending is None else str(seen.ending.outcome),
+            "; ".join([*why, *describe_damages(seen.damages, seen.folder)]),
+            seen.halved,
+            seen.damages,
+        )
+
+
+def counts(statuses: Sequence[TrialStatus]) -> dict[State, int]:
+    """How many trials are in each state; states that none is in are left out."""
+    return {state: n for state in State if (n := sum(status.state is state for status in statuses))}
+
+
+def remaining(statuses: Sequence[TrialStatus]) -> float | None:
+    """Seconds until the experiment is done, at most; None while none of its trials runs at a known speed."""
+    running = [s for s in statuses if s.state is State.RUNNING]
+    idle = [s for s in statuses if s.state in (State.WAITING, State.STALE)]
+    return eta(
+        [(s.epochs - s.progress.epoch, s.progress.seconds_per_epoch) for s in running],
+        [s.epochs - s.progress.epoch for s in idle],
+        max(1, len(running)),
+    )
+
+
+def best_of(statuses: Sequence[TrialStatus]) -> TrialStatus | None:
+    """The trial with the highest score; None if none has one."""
+    scored = [s for s in statuses if s.progress.best is not None]
+    return max(scored, key=lambda s: s.progress.best or -math.inf) if scored else None
+
+
+def find_experiments(storage: Path) -> list[Path]:
+    """Folders in a storage folder that are, or began to be, an experiment; the newest last."""
+    found = [
+        path
+        for path in _subfolders(storage)
+        if any((path / part).exists() for part in (MANIFEST_FILE, SPACE_FILE, ENVIRONMENT_FILE))
+    ]
+    return sorted(found, key=lambda path: (path.stat().st_mtime, path.name))
+
+
+def _order(status: TrialStatus) -> tuple[int, float]:
+    rank = [State.RUNNING, State.STALE, State.UNREADABLE, State.ENDED, State.WAITING].index(status.state)
+    return rank, -status.progress.best if status.progress.best is not None else math.inf
+
+
+def _stamp(path: Path) -> tuple[int, int] | None:
+    """Modification time [ns] and size; None if there is no such file."""
+    try:
+        facts = path.stat()
+    except FileNotFoundError:
+        return None
+    return facts.st_mtime_ns, facts.st_size
+
+
+def _subfolders(path: Path) -> list[Path]:
+    return [child for child in path.iterdir() if child.is_dir()] if path.is_dir() else []

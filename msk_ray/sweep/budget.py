@@ -1,0 +1,72 @@
+"""How long the longest trial of a space can be: what the scheduler's `grace`, rungs and `interval` are shares of."""
+
+import itertools
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
+
+from msk_ray.config import AdaptiveHorizon, Config, HorizonSchedule, overlay, parse_config
+from msk_ray.sweep.operators import Level, Listed, Operator
+from msk_ray.sweep.space import Space, SpaceFile
+from msk_ray.sweep.trials import base_settings, check_ranges, leaves
+
+_DECIDING = ("shac.horizon", "trial.epochs", "env.nworld")
+"""Settings, and sections of settings, that decide how many env steps a trial takes."""
+
+
+def env_steps_budget(config: Config) -> int:
+    """The most env steps a trial can take to its last epoch: the sum over epochs of horizon × worlds.
+
+    An adaptive horizon counts with its `longest`.
+    """
+    horizon, epochs = config.shac.horizon, config.trial.epochs
+    if isinstance(horizon, HorizonSchedule):
+        return config.env.nworld * sum(horizon.at(epoch) for epoch in range(epochs))
+    return config.env.nworld * epochs * (horizon.longest if isinstance(horizon, AdaptiveHorizon) else horizon)
+
+
+def longest_budget(file: SpaceFile, configs: Iterable[Config]) -> float:
+    """The largest budget of some trials, in the scheduler's unit of time.
+
+    Args:
+        file: the space, whose scheduler asks.
+        configs: of the trials; of a search `extreme_configs`, as its trials are not known yet.
+    """
+    attribute = file.scheduler.time_attr
+    if attribute == "env_steps":
+        return max(env_steps_budget(config) for config in configs)
+    if attribute == "epoch":
+        return max(config.trial.epochs for config in configs)
+    return file.stop.wall_time_s or 0.0
+
+
+def extreme_configs(space: Space) -> list[Config]:
+    """Configs among which is the longest one that a search can make up: every combination of what decides the length.
+
+    A trial's length rises or falls with each number that it depends on, so the two ends of a range are enough. Other
+    parameters stand at their first level or lower end.
+
+    Raises:
+        ConfigError: the base, an end of a range or such a combination is no valid config.
+    """
+    base = base_settings(space)
+    check_ranges(space, base)
+    return list(_combinations(space, base))
+
+
+def _combinations(space: Space, base: Mapping[str, Any]) -> Iterator[Config]:
+    choices = [_levels(op) if _decides(key, op) else _levels(op)[:1] for key, op in space.sampled.items()]
+    for levels in itertools.product(*choices):
+        chosen = dict(zip(space.sampled, levels, strict=True))
+        name = ", ".join(f"{key} {level.label}" for key, level in chosen.items())
+        settings = overlay(base, {key: level.value for key, level in chosen.items()})
+        yield parse_config(settings, f"{space.name}: {name}")
+
+
+def _levels(op: Operator) -> tuple[Level, ...]:
+    return op.levels if isinstance(op, Listed) else op.ends()
+
+
+def _decides(key: str, op: Operator) -> bool:
+    """Whether a parameter sets something that decides how long a trial is."""
+    touched = (leaf for level in _levels(op) for leaf in leaves(key, level.value))
+    return any(leaf == known or leaf.startswith(f"{known}.") for leaf in touched for known in _DECIDING)

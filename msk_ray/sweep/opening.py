@@ -1,0 +1,121 @@
+"""An experiment of a space: begun, or opened again to go on with it."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from msk_ray.config import dump_yaml, read_yaml
+from msk_ray.errors import MskRayError, StorageError
+from msk_ray.experiment.environment import environment
+from msk_ray.experiment.layout import ENVIRONMENT_FILE, SPACE_FILE
+from msk_ray.experiment.manifest import Experiment, refuse_old
+from msk_ray.experiment.trial import Trial, describe_changes
+from msk_ray.files import check_writable, make_folder, write_json, write_text
+from msk_ray.sweep.extend import extend_trials
+from msk_ray.sweep.space import Space, SpaceFile
+from msk_ray.sweep.trials import with_recorded_ids
+from msk_ray.text import printable
+
+
+def create(path: Path, space: Space, trials: list[Trial], options: dict[str, Any]) -> Experiment:
+    """Make a new experiment's folder and say in it what it is.
+
+    Raises:
+        StorageError: the folder cannot be written, or holds an experiment already.
+    """
+    experiment = Experiment(path)
+    refuse_old(path)
+    make_folder(path)
+    make_folder(path / "trials")
+    write_space(experiment, space)
+    write_json(path / ENVIRONMENT_FILE, environment())
+    experiment.begin(space.name, space.file.question.strip(), trials, options)
+    return experiment
+
+
+def reopen(path: Path, trials: list[Trial] | None, extension: Mapping[str, Any] | None = None) -> Experiment:
+    """Open an experiment to go on with it.
+
+    Args:
+        path: its folder.
+        trials: what the space, extended, resolves to now, to be compared; None to take the manifest's word.
+        extension: what to extend it by: epochs, samples, seeds.
+
+    Raises:
+        StorageError: there is none, it cannot be written, or its trials are not those of the space as it is now.
+        ConfigError: the extension takes something away.
+    """
+    experiment = Experiment(path)
+    if not path.is_dir():
+        raise StorageError(f"no experiment at {path} to go on with; leave --resume and --extend out to start one")
+    recorded = experiment.trials()
+    check_writable(path)
+    if trials is not None:
+        trials = with_recorded_ids(trials, recorded)
+    if extension:
+        assert trials is not None
+        recorded = extend_trials(recorded, trials, extension.get("epochs"))
+        experiment.extend(recorded, extension)
+    difference = difference_of(recorded, trials) if trials is not None else None
+    if difference:
+        raise StorageError(
+            f"--resume: the space no longer gives the trials of {path}: {difference}; undo that, or pass another "
+            f"--name (--extend adds samples, seeds or epochs). As it was begun, it goes on with: "
+            f"{experiment.resume_command()}"
+        )
+    # Also without a new extension: an earlier one may have been interrupted right after its manifest.
+    experiment.clear_outgrown()
+    experiment.stop_file.unlink(missing_ok=True)
+    return experiment
+
+
+def write_space(experiment: Experiment, space: Space) -> None:
+    """Record the space as it is run, its scheduler in full: a default may change, and the rungs with it."""
+    written = space.file.model_dump(mode="json", exclude_unset=True)
+    written["scheduler"] = space.file.scheduler.model_dump(mode="json")
+    write_text(experiment.path / SPACE_FILE, dump_yaml(written))
+
+
+def check_scheduler(experiment: Experiment, space: Space) -> None:
+    """Refuse to go on by another rule than trials have been stopped by so far.
+
+    Raises:
+        StorageError: the space's scheduler is not the recorded one.
+    """
+    try:
+        recorded = SpaceFile.model_validate(read_yaml(experiment.path / SPACE_FILE)).scheduler.model_dump()
+    except (MskRayError, ValidationError) as error:
+        # Nothing hangs on it but this check and the report.
+        text = " ".join(str(error).split())
+        print(f"whether the space's scheduler is still the one trials were stopped by is not known: {printable(text)}")
+        return
+    now = space.file.scheduler.model_dump()
+    changes = [f"{key} {recorded[key]} → {now[key]}" for key in now if now[key] != recorded[key]]
+    if changes:
+        raise StorageError(
+            f"--resume: the space's scheduler is not the one of {experiment.path}: {', '.join(changes)}; undo that, or "
+            "pass another --name"
+        )
+
+
+def difference_of(recorded: list[Trial], now: list[Trial]) -> str | None:
+    """How two lists of trials differ, on one line; None if they are the same."""
+    old, new = {trial.id: trial for trial in recorded}, {trial.id: trial for trial in now}
+    gone = [trial for trial in recorded if trial.id not in new]
+    added = [trial for trial in now if trial.id not in old]
+    if not gone and not added:
+        return None
+    # Trials at the same place were most likely one trial before an edit; then the edit itself says the most.
+    for before, after in zip(gone, added, strict=False):
+        if before.index == after.index:
+            return f"trial {before.index} changed: {describe_changes(before.config, after.config)}"
+    parts = [f"{len(gone)} gone ({_few(gone)})"] if gone else []
+    parts += [f"{len(added)} new ({_few(added)})"] if added else []
+    return ", ".join(parts)
+
+
+def _few(trials: list[Trial]) -> str:
+    shown = ", ".join(f"{trial.variant} seed {trial.seed}" for trial in trials[:2])
+    return shown + (", ..." if len(trials) > 2 else "")

@@ -1,0 +1,23 @@
+"""The early-stopping rule, fed again with what it was told, is where it was."""
+
+from collections.abc import Sequence
+
+from msk_ray.experiment.outcomes import Ending
+from msk_ray.experiment.scheduler_log import LogEntry
+from msk_ray.sweep.pruning import Pruner
+
+
+def replay(pruner: Pruner, time_attr: str, reports: Sequence[LogEntry]) -> Ending | None:
+    """Feed a rule with recorded reports, but for those of untrained policies, which older versions recorded.
+
+    Returns:
+        What it answered to the last one, which the driver may not have lived to carry out.
+    """
+    ending = None
+    halved: set[str] = set()
+    for report in reports:
+        if report.halved and report.trial not in halved:
+            halved.add(report.trial)
+            pruner.forget(report.trial)
+        ending = pruner.report(report.trial, report.time(time_attr), report.score) if report.epoch > 0 else None
+    return None if not reports or reports[-1].ended else ending

@@ -1,0 +1,76 @@
+"""Trials that a search makes up as it goes: what it chose for each is kept in the trial's folder, to go on from."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from msk_ray.config import current_values, env_name
+from msk_ray.errors import ConfigError, StorageError
+from msk_ray.experiment.damage import DamagedFile, read_object
+from msk_ray.experiment.layout import PARAMS_FILE
+from msk_ray.experiment.manifest import Experiment
+from msk_ray.experiment.trial import Trial
+from msk_ray.files import write_json
+from msk_ray.sweep.operators import Listed
+from msk_ray.sweep.space import Space
+from msk_ray.sweep.trials import base_settings, make_trial
+from msk_ray.text import describe
+
+
+@dataclass(frozen=True)
+class SearchTrial:
+    """A trial of a search, and what the search chose for it."""
+
+    trial: Trial
+    params: dict[str, Any]
+    """Dotted key → value; the label of a listed one."""
+
+
+def search_trial(space: Space, base: Mapping[str, Any], params: Mapping[str, Any]) -> Trial:
+    """The trial that a search's choice stands for."""
+    values, changed = {}, {}
+    for key, op in space.sampled.items():
+        level = next((lv for lv in op.levels if lv.label == params[key]), None) if isinstance(op, Listed) else None
+        values[key] = params[key] if level is None else level.value
+        changed[key] = describe(params[key])
+    return make_trial(space, base, changed, values, space.seeds[0], 0)
+
+
+def write_params(folder: Path, params: Mapping[str, Any]) -> None:
+    """Keep a search's choice in the trial's folder."""
+    write_json(folder / PARAMS_FILE, dict(params))
+
+
+def recover(experiment: Experiment, space: Space) -> list[SearchTrial]:
+    """All trials that a search has made up so far, in the order they were begun, numbered in it.
+
+    Raises:
+        StorageError: the space gives other trials now.
+    """
+    base = base_settings(space)
+    files = sorted(experiment.path.glob(f"trials/*/{PARAMS_FILE}"), key=lambda path: (path.stat().st_mtime, path))
+    found: list[SearchTrial] = []
+    for file in files:
+        try:
+            recorded = read_object(file, dict)
+        except DamagedFile as error:
+            advice = f"what the search chose is not known: remove {file.parent}, and the search makes up another trial"
+            raise DamagedFile(error.damage, advice) from None
+        if recorded is None:
+            continue  # removed since it was found
+        params = current_values(recorded, env_name(base))
+        try:
+            trial = search_trial(space, base, params)
+        except (ConfigError, KeyError) as error:
+            raise _changed(file, f"{error}") from error
+        if trial.id != file.parent.name:
+            raise _changed(file, f"it makes {trial.id} of them")
+        found.append(SearchTrial(replace(trial, index=len(found)), params))
+    return found
+
+
+def _changed(file: Path, why: str) -> StorageError:
+    return StorageError(
+        f"--resume: the space no longer gives the trial of {file}: {why}; undo that, or pass another --name"
+    )

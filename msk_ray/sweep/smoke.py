@@ -1,0 +1,88 @@
+"""`--smoke`: the same space in minutes, to see that every part of it runs."""
+
+from typing import Any
+
+from msk_ray.config import AdaptiveHorizon, Config
+from msk_ray.experiment.trial import Trial
+from msk_ray.sweep.space import Space
+from msk_ray.sweep.trials import base_settings, make_trial
+
+EPOCHS = 3
+WORLDS = 8
+EVALUATION_WORLDS = 4
+EVALUATION_STEPS = 32
+
+
+def without_early_stopping(space: Space) -> Space:
+    """The space with no trial ended because of its score or the others': each runs to its end. pbt stays, which ends
+    none."""
+    file = space.file
+    changes: dict[str, Any] = {"stop": file.stop.model_copy(update={"plateau": None, "target": None})}
+    if file.scheduler.kind in ("asha", "median"):
+        changes["scheduler"] = file.scheduler.model_copy(update={"kind": "none"})
+    return space.model_copy(update={"file": file.model_copy(update=changes)})
+
+
+def shrink(space: Space, trials: list[Trial]) -> list[Trial]:
+    """A few short trials in which every value of every factor occurs at least once.
+
+    Raises:
+        ConfigError: the space's own `smoke.overrides` do not fit.
+    """
+    base = base_settings(space)
+    short: dict[str, Trial] = {}
+    for trial in cover(trials)[: space.file.smoke.max_trials]:
+        values = {**trial.values, **shorten(trial.config), **space.file.smoke.overrides}
+        small = make_trial(space, base, trial.changed, values, trial.seed, len(short))
+        # Two variants that differ only in what was shortened come out equal; one of them is enough.
+        short.setdefault(small.id, small)
+    return list(short.values())
+
+
+def cover(trials: list[Trial]) -> list[Trial]:
+    """The fewest trials, taken greedily in order, that show every level of every factor, with the first seed alone."""
+    missing = {pair for trial in trials for pair in trial.changed.items()}
+    pool = [trial for trial in trials if trial.seed == trials[0].seed]
+    chosen: list[Trial] = []
+    while missing:
+        best = max(pool, key=lambda trial: len(missing & set(trial.changed.items())))
+        gain = missing & set(best.changed.items())
+        if not gain:
+            break
+        chosen.append(best)
+        missing -= gain
+    # One trial alone would show neither concurrency nor a comparison.
+    for trial in trials:
+        if len(chosen) >= min(2, len(trials)):
+            break
+        if trial not in chosen:
+            chosen.append(trial)
+    return sorted(chosen, key=lambda trial: trial.index)
+
+
+def shorten(config: Config) -> dict[str, Any]:
+    """Dotted settings that make a trial last seconds: few epochs, worlds and steps, a quarter of the horizon."""
+    horizon: Any = config.shac.horizon
+    if isinstance(horizon, int):
+        horizon = _quarter(horizon)
+    elif isinstance(horizon, AdaptiveHorizon):
+        lengths = {name: _quarter(getattr(horizon, name)) for name in ("start", "shortest", "longest")}
+        horizon = {**lengths, "target": horizon.target, "rate": horizon.rate}
+    else:
+        horizon = {"start": _quarter(horizon.start), "end": _quarter(horizon.end), "epochs": EPOCHS - 1}
+    steps = config.evaluation.steps or config.env.episode_length
+    return {
+        "trial.epochs": min(config.trial.epochs, EPOCHS),
+        "trial.checkpoint_interval": 1,
+        "env.nworld": min(config.env.nworld, WORLDS),
+        "shac.horizon": horizon,
+        "shac.critic_batches": 1,
+        "shac.critic_iterations": min(config.shac.critic_iterations, 2),
+        "evaluation.interval": 1,
+        "evaluation.nworld": min(config.evaluation.nworld, EVALUATION_WORLDS),
+        "evaluation.steps": min(steps, EVALUATION_STEPS),
+    }
+
+
+def _quarter(horizon: int) -> int:
+    return max(2, horizon // 4)

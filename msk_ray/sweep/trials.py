@@ -1,0 +1,167 @@
+"""From a space to its trials: every combination resolved, checked against the config schema, and given a stable id."""
+
+import difflib
+import itertools
+import random
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from msk_ray.config import overlay, parse_config, read_config
+from msk_ray.errors import ConfigError
+from msk_ray.experiment.trial import ID_DIGITS, Trial, trial_id, variant_text, with_epochs
+from msk_ray.sweep.operators import Level, Listed, Range
+from msk_ray.sweep.space import Space
+
+
+def resolve_trials(space: Space) -> list[Trial]:
+    """All trials of an enumerable space, in the order they are started: every variant with the first seed, then the
+    next seed.
+
+    Raises:
+        ConfigError: a setting that does not exist or fit, two parameters that set the same key, or two trials that
+            come out equal.
+    """
+    base = base_settings(space)
+    check_ranges(space, base)
+    trials: list[Trial] = []
+    by_id: dict[str, Trial] = {}
+    variants = list(_variants(space))
+    for seed in space.seeds:
+        for changed, values in variants:
+            trial = make_trial(space, base, changed, values, seed, len(trials))
+            twin = by_id.setdefault(trial.id, trial)
+            if twin is not trial:
+                raise ConfigError(
+                    f"{space.name}: {trial.variant!r} and {twin.variant!r} (seed {seed}) come out as the same trial; "
+                    "drop one of them"
+                )
+            trials.append(trial)
+    return trials
+
+
+def base_settings(space: Space) -> dict[str, Any]:
+    """The space's base config with its own overrides laid over it, as nested plain data, checked.
+
+    Raises:
+        ConfigError: the base cannot be read, or is no valid config.
+    """
+    settings = overlay(read_config(space.base_path), space.file.overrides)
+    parse_config(settings, f"{space.name}: {space.base_path.name} with the space's overrides")
+    return settings
+
+
+def make_trial(
+    space: Space, base: Mapping[str, Any], changed: dict[str, str], values: dict[str, Any], seed: int, index: int
+) -> Trial:
+    """The trial that `values` (dotted key → value) and a seed make of the base settings.
+
+    Raises:
+        ConfigError: the result is no valid config.
+    """
+    name = f"{space.name}: trial {index} ({variant_text(changed)})"
+    config = parse_config(overlay(overlay(base, values), {"trial.seed": seed}), name)
+    return Trial(index, trial_id(config), dict(changed), dict(values), config)
+
+
+def with_recorded_ids(planned: Sequence[Trial], recorded: Sequence[Trial]) -> list[Trial]:
+    """Planned trials under the ids that the same trials are recorded under.
+
+    Ids differ where an earlier version accepted, and hashed, settings that nothing reads; and after an extension,
+    which leaves ids but not epochs as they were.
+    """
+    one_length = len({trial.epochs for trial in recorded}) == 1 == len({trial.epochs for trial in planned})
+
+    def content(trial: Trial) -> str:
+        return trial_id(with_epochs(trial, 1).config if one_length else trial.config)
+
+    ids = {trial.id for trial in recorded}
+    by_content = {content(trial): trial.id for trial in recorded}
+    return [
+        trial if trial.id in ids else replace(trial, id=by_content.get(content(trial), trial.id)) for trial in planned
+    ]
+
+
+def check_ranges(space: Space, base: Mapping[str, Any]) -> None:
+    """Refuse a range one end of which is no valid setting: found now rather than by the unlucky draw.
+
+    Other parameters stand at their first level or lower end meanwhile.
+
+    Raises:
+        ConfigError: naming the parameter and the end.
+    """
+    first = {key: op.levels[0] if isinstance(op, Listed) else op.ends()[0] for key, op in space.parameters.items()}
+    for key, op in space.parameters.items():
+        if isinstance(op, Range):
+            for end in op.ends():
+                values = {k: level.value for k, level in first.items()} | {key: end.value}
+                parse_config(overlay(base, values), f"{space.name}: {key} {op.kind} at its end {end.label}")
+    _check_collisions(space)
+
+
+def _variants(space: Space) -> Iterator[tuple[dict[str, str], dict[str, Any]]]:
+    """(labels, values) of every variant, seeds apart."""
+    if space.file.ablate is not None:
+        yield from _ablations(space)
+        return
+    rng = random.Random(space.file.sample_seed)
+    # The draw is the outer loop: more samples append trials and leave the earlier ones as they are.
+    for _ in range(space.file.samples):
+        for point in grid_points(space.grids):
+            drawn = {key: _draw(op, rng) for key, op in space.sampled.items()}
+            levels = {key: (point | drawn)[key] for key in space.parameters}
+            yield {key: level.label for key, level in levels.items()}, {k: level.value for k, level in levels.items()}
+
+
+def grid_points(grids: Mapping[str, Listed]) -> Iterator[dict[str, Level]]:
+    """Every combination of the grids' levels; the last parameter turns fastest."""
+    for combination in itertools.product(*(op.levels for op in grids.values())):
+        yield dict(zip(grids, combination, strict=True))
+
+
+def _draw(op: Listed | Range, rng: random.Random) -> Level:
+    return op.draw(rng) if isinstance(op, Range) else rng.choice(op.levels)
+
+
+def _ablations(space: Space) -> Iterator[tuple[dict[str, str], dict[str, Any]]]:
+    ablate = space.file.ablate
+    assert ablate is not None
+    yield {"variant": "baseline"}, dict(ablate.baseline)
+    for name, changes in ablate.variants.items():
+        yield {"variant": name}, {**ablate.baseline, **changes}
+
+
+def _check_collisions(space: Space) -> None:
+    """Refuse two parameters that set the same config key."""
+    owner: dict[str, str] = {}
+    for key, op in space.parameters.items():
+        levels: Iterable[Level] = op.levels if isinstance(op, Listed) else op.ends()
+        for leaf in sorted({leaf for level in levels for leaf in leaves(key, level.value)}):
+            other = owner.setdefault(leaf, key)
+            if other != key:
+                raise ConfigError(f"{space.name}: parameters {other!r} and {key!r} both set {leaf}")
+
+
+def leaves(key: str, value: Any) -> Iterator[str]:
+    """The dotted keys that a value sets: `key` itself, or those of all settings in a section."""
+    if isinstance(value, Mapping) and value:
+        for name, item in value.items():
+            yield from leaves(f"{key}.{name}", item)
+    else:
+        yield key
+
+
+def find_trial(trials: list[Trial], text: str) -> Trial:
+    """The trial that a number or (the beginning of) an id means.
+
+    Raises:
+        ConfigError: there is none, or more than one.
+    """
+    if text.isdigit() and len(text) < ID_DIGITS and int(text) < len(trials):
+        return trials[int(text)]
+    matches = [trial for trial in trials if trial.id.startswith(text)]
+    if len(matches) == 1:
+        return matches[0]
+    near = difflib.get_close_matches(text, [trial.id for trial in trials], n=1)
+    hint = f"did you mean {near[0]}?" if near else f"give 0 to {len(trials) - 1}, or an id from --dry-run"
+    raise ConfigError(f"no trial {text!r}; {hint}")

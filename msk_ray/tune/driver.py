@@ -1,0 +1,379 @@
+"""Runs an experiment's trials with Ray Tune."""
+
+import logging
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import ray
+from ray import tune
+from ray.exceptions import RayTaskError
+from ray.tune import Callback
+from ray.tune.search import BasicVariantGenerator, Searcher
+from ray.tune.stopper import Stopper
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+from msk_ray.config import Config, parse_recorded, read_yaml
+from msk_ray.errors import ClusterLost, MskRayError, OwnershipLost, StorageFailure, storage_failure
+from msk_ray.experiment.damage import describe_damages
+from msk_ray.experiment.layout import HALVED_FILE, SCHEDULER_LOG_FILE
+from msk_ray.experiment.manifest import Experiment
+from msk_ray.experiment.outcomes import read_ending, write_ending
+from msk_ray.experiment.ownership import Ownership
+from msk_ray.experiment.results import read_record
+from msk_ray.experiment.scheduler_log import SchedulerLog
+from msk_ray.experiment.trial import Trial
+from msk_ray.progress import format_duration
+from msk_ray.signals import StopRequest, listening
+from msk_ray.sweep.budget import extreme_configs, longest_budget
+from msk_ray.sweep.operators import Listed
+from msk_ray.sweep.pruning import make_pruner
+from msk_ray.sweep.replay import replay
+from msk_ray.sweep.search_trials import SearchTrial, recover
+from msk_ray.sweep.space import Space
+from msk_ray.sweep.trials import base_settings
+from msk_ray.training import Trainer, precompile
+from msk_ray.tune import worker_prestart
+from msk_ray.tune.adapters import METRIC, Population, PruningScheduler, domain, optuna_search
+from msk_ray.tune.devices import Placement
+from msk_ray.tune.gauges import StateGauge
+from msk_ray.tune.interrupts import run_in_thread
+from msk_ray.tune.presence import Presence, remove_remains
+from msk_ray.tune.supervisor import Supervisor
+from msk_ray.tune.trainable import Job, make_trainable
+from msk_ray.tune.trial_run import TrainerLike
+from msk_ray.tune.worker_prestart import WorkerPrestart, nodes_for
+
+Precompile = Callable[[Config, str, Path], None]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything that decides how an experiment's trials are run."""
+
+    experiment: Experiment
+    space: Space
+    trials: list[Trial]
+    """All trials of the experiment, ended ones included; empty when a search makes them up."""
+    placement: Placement
+    max_concurrent: int | None
+    trainer_class: type[TrainerLike] = Trainer
+    precompile: Precompile | None = precompile
+    """Compiles a config's kernels on a node before trials start; None where there is nothing to compile."""
+    prestart: bool = True
+    """Whether processes are kept ready for the trials that come next."""
+    ownership: Ownership | None = None
+    """Of the experiment; None where nobody else can know of it."""
+
+    def guard(self) -> None:
+        """Make sure that the experiment is still this driver's.
+
+        Raises:
+            OwnershipLost: it is not.
+        """
+        if self.ownership is not None:
+            self.ownership.check()
+
+
+def run_trials(plan: Plan) -> bool:
+    """Run what has not ended yet. Needs a Ray session.
+
+    Returns:
+        False if a request to stop ended it before its time; the experiment can be resumed.
+
+    Raises:
+        StorageFailure: the disk is full or gone; the experiment can be resumed once it is back.
+        MskRayError: kernels could not be compiled for a trial, or the search is not installed.
+    """
+    experiment, space = plan.experiment, plan.space
+    _finish_pruning(plan)
+    remaining = [t for t in plan.trials if read_record(t, experiment.trial_folder(t.id)).ending is None]
+    made_up = [] if plan.trials else recover(experiment, space)
+    begun = [m for m in made_up if read_record(m.trial, experiment.trial_folder(m.trial.id)).ending is None]
+    missing = space.file.samples - len(made_up) + len(begun)
+    if (plan.trials and not remaining) or (made_up and missing <= 0):
+        print("all trials have ended already")
+        return True
+    base = base_settings(space) if not plan.trials else {}
+    job = Job(
+        experiment,
+        space,
+        base,
+        {trial.id: trial for trial in plan.trials},
+        plan.placement.device,
+        plan.placement.gpus,
+        plan.trainer_class,
+        None if plan.ownership is None else plan.ownership.owner.token,
+    )
+    if plan.precompile is not None:
+        _precompile(plan, remaining or [_first_suggestion(job)])
+    for trial in remaining:
+        experiment.make_trial_folder(trial.id)
+    total = ray.cluster_resources()
+    concurrent = plan.placement.concurrent(total.get("GPU", 0.0), total.get("CPU", 1.0), plan.max_concurrent)
+    print(
+        f"{len(remaining) or missing} trials, {concurrent} at once on "
+        f"{f'{plan.placement.gpus:g} GPU each' if plan.placement.gpus else 'CPU'}; into {experiment.path}",
+        flush=True,
+    )
+    with listening() as stop, stop.deferred():
+        live = Supervisor(experiment, remaining, job.trial_of, concurrent, stop, plan.guard, [m.trial for m in made_up])
+        _fit(plan, job, live, stop, remaining, made_up)
+        if not plan.trials:
+            # A search makes trials up as it goes; they enter the manifest once they are known.
+            experiment.set_trials(live.started)
+        return not stop
+
+
+def _journal(plan: Plan) -> SchedulerLog:
+    return SchedulerLog(plan.experiment.path / SCHEDULER_LOG_FILE, plan.guard)
+
+
+def _finish_pruning(plan: Plan) -> None:
+    """Write the ending of a trial that the rule had just stopped when the driver died."""
+    spec = plan.space.file.scheduler
+    reports, damages = _journal(plan).read()
+    for line in describe_damages(damages, plan.experiment.path):
+        print(f"skipped: {line}", flush=True)
+    if not reports or not plan.trials or spec.kind == "pbt":
+        return
+    ending = replay(make_pruner(spec, _budget(plan)), spec.time_attr, reports)
+    folder = plan.experiment.trial_folder(reports[-1].trial)
+    if ending is None or read_ending(folder) is not None:
+        return
+    # What a trial scored with all its worlds does not end it when it has half of them.
+    if reports[-1].halved or not (folder / HALVED_FILE).exists():
+        write_ending(folder, ending)
+
+
+def _fit(
+    plan: Plan, job: Job, live: Supervisor, stop: StopRequest, remaining: list[Trial], made_up: list[SearchTrial]
+) -> None:
+    spec, file = plan.space.file.scheduler, plan.space.file
+    budget = _budget(plan)
+    if spec.kind == "pbt":
+        scheduler: Any = Population(spec, budget, plan.space.sampled)
+    else:
+        pruner = make_pruner(spec, budget)
+        journal = _journal(plan)
+        replay(pruner, spec.time_attr, journal.read()[0])
+        scheduler = PruningScheduler(
+            pruner, spec.time_attr, journal, lambda trial: job.trial_of(trial.config).id, live.pruned
+        )
+    resources = {"cpu": plan.placement.cpus} | ({"gpu": plan.placement.gpus} if plan.placement.gpus else {})
+    searching = file.search == "optuna"
+    search, samples = _search(plan, made_up) if searching else (_listed(plan), 1)
+    node = _OwnNode()
+    prestarts = plan.prestart and worker_prestart.available()
+    spare = [WorkerPrestart(plan.placement, plan.max_concurrent, live.waiting)] if prestarts else []
+    if plan.prestart and not spare:
+        print("no process on standby, so trials begin seconds later: pip install grpcio to have them", flush=True)
+    states = StateGauge(plan.experiment, remaining, job.trial_of)
+    tuner = tune.Tuner(
+        make_trainable(job, resources),
+        param_space=_param_space(job, remaining),
+        tune_config=tune.TuneConfig(
+            metric=METRIC,
+            mode="max",
+            scheduler=scheduler,
+            search_alg=search,
+            num_samples=samples,
+            max_concurrent_trials=plan.max_concurrent,
+            reuse_actors=False,  # a process of its own frees a trial's GPU memory, whatever it did
+            trial_dirname_creator=lambda trial: f"{trial.config.get('id', 'trial')}_{trial.trial_id}",
+        ),
+        run_config=tune.RunConfig(
+            name="tune",
+            storage_path=str(plan.experiment.path),
+            verbose=0,
+            # Supervisor first: it writes the endings that only the driver knows.
+            callbacks=[
+                live,
+                states,
+                node,
+                Presence(plan.experiment, plan.guard),
+                *spare,
+            ],
+            stop=_StopWhen(live),
+            failure_config=tune.FailureConfig(max_failures=file.resources.max_failures),
+            # None are deleted: only a population reports them, and another member may be about to take one over.
+            checkpoint_config=tune.CheckpointConfig(num_to_keep=None),
+        ),
+    )
+    try:
+        with closing(states), _log_to(plan.experiment.path / "ray.log"):
+            run_in_thread(tuner.fit, stop)
+    except Exception as error:
+        remove_remains(plan.experiment)
+        if node.lost is not None:
+            raise node.lost from error
+        # The driver may meet a full disk before any trial does.
+        failure = live.storage_failure or storage_failure(error) or plan.experiment.lost()
+        if failure is None:
+            raise
+        raise _advised(failure) from error
+    if live.storage_failure is not None:
+        remove_remains(plan.experiment)
+        raise _advised(live.storage_failure)
+
+
+def _listed(plan: Plan) -> BasicVariantGenerator:
+    # Tune limits a generator it was given no more than this one limits itself.
+    return BasicVariantGenerator(max_concurrent=plan.max_concurrent or 0)
+
+
+def _search(plan: Plan, made_up: list[SearchTrial]) -> tuple[Searcher, int]:
+    """Optuna's search, told what it has done so far, and how many trials are still to be run."""
+    begun, scored, ended = [], [], 0
+    for made in made_up:
+        record = read_record(made.trial, plan.experiment.trial_folder(made.trial.id))
+        if record.ending is None:
+            begun.append(made.params)
+            continue
+        ended += 1
+        if record.best is not None:
+            scored.append((made.params, record.best.score))
+    file = plan.space.file
+    return optuna_search(file.sample_seed, begun, scored), file.samples - ended
+
+
+class _OwnNode(Callback):
+    """Ends the experiment when this process's own Ray node has died: Ray itself waits for ever for another one."""
+
+    INTERVAL_S = 2.0
+
+    def __init__(self) -> None:
+        self._id = ray.get_runtime_context().get_node_id()
+        self._checked = time.monotonic()
+        self.lost: ClusterLost | None = None
+
+    def on_step_end(self, iteration: int, trials: list[Any], **info: Any) -> None:
+        if time.monotonic() - self._checked < self.INTERVAL_S:
+            return
+        self._checked = time.monotonic()
+        if any(node["NodeID"] == self._id and not node["Alive"] for node in ray.nodes()):
+            self.lost = ClusterLost("the Ray node of this machine has died (raylet killed?); go on with --resume")
+            raise self.lost
+
+
+def _advised(failure: StorageFailure) -> StorageFailure:
+    if isinstance(failure, OwnershipLost):
+        return failure
+    return StorageFailure(f"{failure}; mend that and go on with --resume")
+
+
+@contextmanager
+def _log_to(path: Path) -> Iterator[None]:
+    """Send what Ray logs, prints and warns of in this process to a file; what matters of it is said by `Live`."""
+    logger = logging.getLogger("ray")
+    handlers, level = logger.handlers, logger.level
+    file = logging.FileHandler(path, encoding="utf-8")
+    file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    logger.handlers = [file]
+    logger.setLevel(logging.INFO)
+    # Of Ray's advice on settings chosen here on purpose, such as a process of its own for each trial.
+    # Its notices of dead workers are printed, past any logger.
+    with warnings.catch_warnings(), path.open("a", encoding="utf-8") as log, redirect_stdout(log), redirect_stderr(log):
+        warnings.filterwarnings("ignore", category=UserWarning, module=r"ray\.")
+        try:
+            yield
+        finally:
+            logger.handlers = handlers
+            logger.setLevel(level)
+            file.close()
+
+
+class _StopWhen(Stopper):
+    """Ends the whole experiment once a request to stop has been carried out."""
+
+    def __init__(self, live: Supervisor) -> None:
+        self._live = live
+
+    def __call__(self, trial_id: str, result: dict[str, Any]) -> bool:
+        return False
+
+    def stop_all(self) -> bool:
+        return self._live.stopped
+
+
+def _param_space(job: Job, remaining: list[Trial]) -> dict[str, Any]:
+    sampled = job.space.sampled
+    if not job.trials:
+        return {"params": {key: domain(op) for key, op in sampled.items()}}
+    if not job.population:
+        return {"id": tune.grid_search([trial.id for trial in remaining])}
+    # Members of a population move: each begins where its folder says it was last.
+    params = {trial.id: _current_params(job, trial) for trial in remaining}
+    return {
+        "id": tune.grid_search(list(params)),
+        "params": tune.sample_from(lambda spec: params[spec.config["id"]]),
+    }
+
+
+def _current_params(job: Job, trial: Trial) -> dict[str, Any]:
+    params = {key: trial.values[key] for key in job.space.sampled}
+    written = job.experiment.trial_folder(trial.id) / "config.yaml"
+    if not written.is_file():
+        return params
+    settings = parse_recorded(read_yaml(written), str(written)).as_dict()
+    for key in params:
+        node: Any = settings
+        for part in key.split("."):
+            node = node[part]
+        params[key] = node
+    return params
+
+
+def _budget(plan: Plan) -> float:
+    """What the longest trial can take, in the scheduler's unit of time."""
+    configs = [trial.config for trial in plan.trials] or extreme_configs(plan.space)
+    return longest_budget(plan.space.file, configs)
+
+
+def _first_suggestion(job: Job) -> Trial:
+    """A stand-in for the trials a search will make up, of the same model."""
+    params = {
+        key: op.levels[0].label if isinstance(op, Listed) else op.ends()[0].value
+        for key, op in job.space.sampled.items()
+    }
+    return job.trial_of({"params": params})
+
+
+def _precompile(plan: Plan, trials: Sequence[Trial]) -> None:
+    """Compile the kernels of every distinct model once on every node, so that trials find them in Warp's cache."""
+    models: dict[str, Trial] = {}
+    for trial in trials:
+        c = trial.config
+        models.setdefault(repr((c.env.name, c.physics, c.evaluation.variant)), trial)
+    nodes = nodes_for(plan.placement)
+    started = time.monotonic()
+    print(f"compiling kernels of {len(models)} model(s) on {len(nodes)} node(s) ...", flush=True)
+    compile_model = plan.precompile
+    assert compile_model is not None
+
+    def task(config: Config, device: str) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            compile_model(config, device, Path(folder))
+
+    remote = ray.remote(task)
+    pending = [
+        remote.options(
+            num_cpus=plan.placement.cpus,
+            num_gpus=plan.placement.gpus,
+            scheduling_strategy=NodeAffinitySchedulingStrategy(node_id=node["NodeID"], soft=False),
+        ).remote(trial.config, plan.placement.device)
+        for node in nodes
+        for trial in models.values()
+    ]
+    try:
+        ray.get(pending)
+    except RayTaskError as error:
+        if isinstance(error.cause, MskRayError):
+            raise error.cause from None
+        raise
+    print(f"kernels ready after {format_duration(time.monotonic() - started)}", flush=True)

@@ -1,0 +1,30 @@
+"""`python -m msk_ray.tune.ping`: start Ray as a sweep does, run one task, and print what it found as JSON.
+
+A process of its own, because a Ray that does not come up can be given a time limit only from outside.
+"""
+
+import json
+import sys
+
+import ray
+
+from msk_ray.tune.session import ray_session
+
+
+def _versions() -> dict[str, str]:
+    """Run in a worker: it must find the package too."""
+    import msk_ray
+
+    return {"msk_ray": msk_ray.__version__, "python": sys.version.split()[0]}
+
+
+def main() -> None:
+    """Print {"worker": versions, "cpus", "gpus"} as the last line."""
+    with ray_session(None, dashboard=False, trials=False):
+        worker = ray.get(ray.remote(_versions).options(num_cpus=1).remote())
+        total = ray.cluster_resources()
+    print(json.dumps({"worker": worker, "cpus": total.get("CPU", 0), "gpus": total.get("GPU", 0)}))
+
+
+if __name__ == "__main__":
+    main()

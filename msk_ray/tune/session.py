@@ -1,0 +1,74 @@
+"""The Ray that trials run on: one of our own on this machine, or a cluster that is there."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import ray
+
+from msk_ray.errors import DeviceError
+from msk_ray.tune import worker_prestart
+from msk_ray.tune.addresses import check_reachable
+from msk_ray.tune.interrupts import end_ray, starting_ray
+from msk_ray.tune.local_ray import start_local, way_in
+
+
+@contextmanager
+def ray_session(address: str | None, dashboard: bool | None = None, trials: bool = True) -> Iterator[None]:
+    """A Ray of our own on this machine, or the one at `address`.
+
+    Args:
+        address: of a running cluster.
+        dashboard: whether to start one; None starts it where its packages (ray[default]) are installed.
+        trials: whether trials are to run; then every process imports what they need as soon as it is there.
+
+    Raises:
+        DeviceError: the cluster at `address` cannot be reached.
+    """
+    os.environ.update(
+        RAY_AIR_NEW_OUTPUT="0",
+        RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO="1",  # a trial without GPUs sees none, rather than all
+        TUNE_DISABLE_AUTO_CALLBACK_LOGGERS="1",  # trials write their own metrics, at once
+        TUNE_DISABLE_STRICT_METRIC_CHECKING="1",  # a trial asked to stop may not have been evaluated yet
+        TUNE_DISABLE_SIGINT_HANDLER="1",  # a request to stop lets trials save themselves first
+    )
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    # Ray starts a cluster by itself for whoever asks it something after `ray.shutdown`.
+    os.environ["RAY_ENABLE_AUTO_CONNECT"] = "0"
+    # Off by default because it runs a program in the cluster; so can everybody who has the token it asks for.
+    os.environ.setdefault("RAY_DASHBOARD_ENABLE_PROFILING", "1")
+    # Ray would have trials give way to everything else on the machine.
+    os.environ.setdefault("RAY_worker_niceness", "0")
+    common: dict[str, Any] = {
+        "logging_level": "ERROR",
+        "log_to_driver": False,
+        "runtime_env": {"worker_process_setup_hook": worker_prestart.HOOK} if trials else None,
+    }
+    try:
+        with starting_ray():
+            context = _init(address, dashboard, common)
+        if context.dashboard_url:
+            print(f"Ray dashboard: http://{context.dashboard_url}{way_in()}", flush=True)
+        elif dashboard is None:
+            print("no Ray dashboard: pip install 'ray[default]' to have one", flush=True)
+        yield
+    finally:
+        end_ray()
+
+
+def _init(address: str | None, dashboard: bool | None, common: dict[str, Any]) -> Any:
+    if address is None:
+        return start_local(dashboard, common)
+    try:
+        check_reachable(address)
+        return ray.init(address=address, **common)
+    except OSError as error:  # ConnectionError too
+        raise DeviceError(
+            f"no Ray cluster at {address} (--address or RAY_ADDRESS): {str(error).splitlines()[0]}"
+        ) from error
+
+
+def cluster_gpus() -> int:
+    """GPUs of all nodes of the Ray session."""
+    return int(ray.cluster_resources().get("GPU", 0))

@@ -1,0 +1,142 @@
+"""Processes that wait for the next trials with everything imported: importing takes longer than all else a start does.
+
+Every trial still gets a process of its own. One on standby has not touched a GPU: CUDA is initialised when a trial
+begins in it, on the GPU that trial was given.
+"""
+
+import importlib
+import importlib.util
+import os
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import ray
+from ray.tune import Callback
+from ray.tune.execution.class_cache import DEFAULT_ENV_VARS, ENV_VARS_TO_PROPAGATE
+
+from msk_ray.tune.devices import Placement
+
+MODULES = ("msk_ray.training", "msk_ray.tune.trainable", "torch._dynamo")
+"""What a trial's process imports; the last one when torch makes its first optimizer, for two seconds."""
+KEEP_S = 24 * 3600
+"""How long Ray keeps a process that has not been used [s]; those left over end with the driver."""
+_CALL_LIMIT_S = 10.0
+
+
+def import_all() -> None:
+    """Run by every process of a trial as soon as it is there; what cannot be imported, the trial will say."""
+    # Numerical libraries read it when they are imported; a trial sets its own number of threads (`trial.threads`).
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # threads that wait for work sleep rather than spin
+    # CUDA reads it once, when it is initialised. Should an import do that, the trial is to fail without a GPU, not to
+    # run on another trial's.
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+    os.environ["CUDA_VISIBLE_DEVICES"] = ""
+    for name in MODULES:
+        importlib.import_module(name)
+    if visible is None:
+        del os.environ["CUDA_VISIBLE_DEVICES"]
+    else:
+        os.environ["CUDA_VISIBLE_DEVICES"] = visible
+
+
+HOOK = f"{import_all.__module__}.{import_all.__name__}"
+"""For the runtime environment of Ray's session."""
+
+
+def available() -> bool:
+    """Whether raylets can be spoken to from here; grpc comes with ray[default]."""
+    return importlib.util.find_spec("grpc") is not None
+
+
+def nodes_for(placement: Placement) -> list[dict[str, Any]]:
+    """Ray's description of every node alive that a trial fits on."""
+    return [node for node in ray.nodes() if node["Alive"] and _fits(node["Resources"], placement)]
+
+
+def _fits(resources: dict[str, float], placement: Placement) -> bool:
+    return resources.get("CPU", 0.0) >= placement.cpus and resources.get("GPU", 0.0) >= placement.gpus
+
+
+class WorkerPrestart(Callback):
+    """Once a trial that has started trains, sees to it that as many processes wait as may be needed at once.
+
+    Not at once when it starts: on a machine of few cores it would wait for those that import.
+    """
+
+    def __init__(self, placement: Placement, limit: int | None, waiting: Callable[[], int]) -> None:
+        """
+        Args:
+            placement: of a trial.
+            limit: trials at once, on all nodes.
+            waiting: how many trials have not started yet.
+        """
+        self._placement = placement
+        self._limit = limit
+        self._waiting = waiting
+        self._probe: Any = None
+        self._due = False
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Ray pickles callbacks into its own state, which is never read back.
+        return {}
+
+    def on_trial_start(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
+        self._due = True
+
+    def on_trial_result(
+        self, iteration: int, trials: list[Any], trial: Any, result: dict[str, Any], **info: Any
+    ) -> None:
+        waiting = self._waiting()
+        if not self._due or not waiting:
+            return
+        if self._probe is None:
+            self._probe = _environment_of_trials()
+        if not ray.wait([self._probe], timeout=0)[0]:
+            return
+        self._due = False
+        environment = ray.get(self._probe)
+        for node in nodes_for(self._placement):
+            total = node["Resources"]
+            at_once = self._placement.concurrent(total.get("GPU", 0.0), total.get("CPU", 1.0), self._limit)
+            start_processes(node, min(at_once, waiting), environment)
+
+
+def start_processes(node: dict[str, Any], count: int, environment: str) -> None:
+    """Have a node's raylet see to it that `count` unused processes wait in its pool.
+
+    Args:
+        node: Ray's description of it.
+        count: processes, those that wait already included.
+        environment: serialised runtime environment of those who are to use them.
+    """
+    import grpc
+    from ray._private.grpc_utils import init_grpc_channel
+    from ray.core.generated import common_pb2, node_manager_pb2, node_manager_pb2_grpc
+
+    request = node_manager_pb2.PrestartWorkersRequest(
+        language=common_pb2.PYTHON,
+        job_id=bytes.fromhex(ray.get_runtime_context().get_job_id()),
+        keep_alive_duration_secs=KEEP_S,
+        num_workers=count,
+    )
+    request.runtime_env_info.serialized_runtime_env = environment
+    with init_grpc_channel(f"{node['NodeManagerAddress']}:{node['NodeManagerPort']}") as channel:
+        try:
+            node_manager_pb2_grpc.NodeManagerServiceStub(channel).PrestartWorkers(request, timeout=_CALL_LIMIT_S)
+        except grpc.RpcError as error:
+            # The node may have died this moment. Without processes on standby trials begin later, and nothing else.
+            print(f"no process on standby at {node['NodeManagerAddress']}: {error}", file=sys.stderr)
+
+
+def _environment_of_trials() -> Any:
+    """A reference to it, serialised: Tune gives trials' processes a runtime environment of their own, laid over that of
+    Ray's session, and Ray takes no process of another one."""
+    variables = DEFAULT_ENV_VARS | {name: os.environ[name] for name in ENV_VARS_TO_PROPAGATE if name in os.environ}
+    return ray.remote(_environment).options(num_cpus=0, runtime_env={"env_vars": variables}).remote()
+
+
+def _environment() -> str:
+    text: str = ray.get_runtime_context().get_runtime_env_string()
+    return text

@@ -1,0 +1,169 @@
+"""Stopping and pruning rules, by hand-worked histories."""
+
+import math
+
+import pytest
+
+from msk_ray.experiment.metrics import Evaluation, evaluations_of
+from msk_ray.experiment.outcomes import Outcome
+from msk_ray.experiment.scheduler_log import LogEntry
+from msk_ray.sweep.pruning import MedianStopping, SuccessiveHalving, make_pruner, rungs
+from msk_ray.sweep.replay import replay
+from msk_ray.sweep.space import PlateauSpec, SchedulerSpec, StopSpec
+from msk_ray.sweep.stopping import ending_of, plateau
+
+
+def evaluations(*scores: float) -> list[Evaluation]:
+    return [Evaluation(10 * i, 1000 * i, float(i), score) for i, score in enumerate(scores)]
+
+
+def row(epoch: int = 10, **metrics: float) -> dict[str, float]:
+    return {"epoch": epoch, "env_steps": 100.0 * epoch, "seconds": float(epoch), **metrics}
+
+
+def test_rungs() -> None:
+    assert rungs(10, 100, 3) == (10, 30, 90)
+    assert rungs(10, 90, 3) == (10, 30)
+
+
+def test_halving_in_lockstep_stops_the_worse_at_its_next_report() -> None:
+    rule = SuccessiveHalving((100,), 2)
+    assert rule.report("bad", 100, 1.0) is None  # nobody to compare with yet
+    assert rule.report("good", 100, 2.0) is None
+    ending = rule.report("bad", 140, 1.5)
+    assert ending is not None
+    assert ending.outcome is Outcome.STOPPED_ASHA
+    assert "number 2 of 2 at rung 100" in ending.why
+    assert rule.report("good", 140, 0.0) is None  # judged by what it had at the rung
+    assert rule.report("bad", 142, 1.5) is None  # past 100 · √2 the rung at 100 says nothing any more
+
+
+def test_halving_compares_best_scores_so_far() -> None:
+    rule = SuccessiveHalving((100,), 2)
+    rule.report("a", 50, 5.0)
+    rule.report("a", 100, 1.0)
+    assert rule.report("b", 100, 4.0) is not None  # a counts with 5
+
+
+def test_halving_waits_for_enough_trials() -> None:
+    rule = SuccessiveHalving((100,), 3)
+    assert rule.report("a", 100, 3.0) is None
+    assert rule.report("b", 100, 2.0) is None
+    ending = rule.report("c", 100, 1.0)
+    assert ending is not None  # three are there, one goes on
+    assert rule.report("b", 110, 9.0) is not None
+    assert rule.report("a", 110, 0.0) is None
+
+
+def test_halving_judges_by_the_newest_rung_only() -> None:
+    rule = SuccessiveHalving((100, 200), 2)
+    rule.report("a", 100, 1.0)
+    rule.report("a", 200, 10.0)
+    rule.report("b", 100, 2.0)
+    assert rule.report("a", 210, 10.0) is None
+    assert rule.report("b", 200, 5.0) is not None
+
+
+def test_halving_ignores_nan_and_repeated_rows() -> None:
+    rule = SuccessiveHalving((100,), 2)
+    assert rule.report("nan", 100, math.nan) is None
+    rule.report("a", 100, 1.0)
+    rule.report("a", 100, 5.0)
+    assert rule.report("b", 100, 2.0) is None  # a counts with its first score there, 1.0
+
+
+def test_halving_is_the_same_after_replay() -> None:
+    history = [("a", 100.0, 1.0), ("b", 100.0, 3.0), ("c", 100.0, 2.0), ("b", 200.0, 4.0), ("c", 200.0, 5.0)]
+    whole, resumed = SuccessiveHalving((100, 200), 2), SuccessiveHalving((100, 200), 2)
+    for item in history:
+        whole.report(*item)
+    for item in history:
+        resumed.report(*item)
+    for probe in [("d", 100.0, 0.5), ("b", 210.0, 0.0), ("d", 200.0, 9.0)]:
+        assert whole.report(*probe) == resumed.report(*probe)
+
+
+def test_median_compares_best_with_the_median_of_means() -> None:
+    rule = MedianStopping(grace=10, min_trials=3)
+    for name, scores in {"a": (2.0, 4.0), "b": (4.0, 6.0), "c": (6.0, 8.0)}.items():
+        for time, score in zip((10, 20), scores, strict=True):
+            assert rule.report(name, time, score) is None
+    # Means of the others up to 20: 3, 5, 7; the median is 5.
+    assert rule.report("low", 20, 4.9) is not None
+    assert rule.report("fine", 20, 5.1) is None
+
+
+def test_median_in_lockstep_compares_where_the_others_have_been() -> None:
+    rule = MedianStopping(grace=10, min_trials=2)
+    assert rule.report("low", 10, 1.0) is None
+    rule.report("a", 10, 2.0)
+    rule.report("b", 10, 3.0)
+    ending = rule.report("low", 20, 1.5)
+    assert ending is not None
+    assert "up to 10" in ending.why
+
+
+def test_grace_is_a_share_of_the_budget() -> None:
+    rule = make_pruner(SchedulerSpec(kind="asha", grace=0.25, reduction=2.0, min_trials=2), budget=1000)
+    rule.report("a", 249, 1.0)
+    rule.report("b", 249, 2.0)
+    assert rule.report("a", 249, 1.0) is None
+    rule.report("b", 250, 2.0)
+    assert rule.report("a", 250, 1.0) is not None
+
+
+def test_plateau_needs_patience_and_grace() -> None:
+    spec = PlateauSpec(patience=2, min_delta=1.0, grace=0.5)
+    assert plateau(spec, evaluations(5, 5, 5), epochs=100) is None  # epoch 20 of 100
+    flat = plateau(spec, evaluations(1, 5, 8, 8.5, 9), epochs=80)  # epoch 40 of 80; rise of 1.0 is not more than 1.0
+    assert flat is not None
+    assert flat.outcome is Outcome.STOPPED_PLATEAU
+    assert plateau(spec, evaluations(1, 5, 8, 8.5, 9.5), epochs=80) is None
+
+
+@pytest.mark.parametrize(
+    ("metrics", "outcome"),
+    [
+        ({"eval/score": math.nan}, Outcome.NONFINITE),
+        ({"train/critic_loss": math.inf}, Outcome.NONFINITE),
+        ({"eval/score": 7.0}, Outcome.STOPPED_TARGET),
+        ({"train/episode_return": math.nan}, None),
+        ({}, None),
+    ],
+)
+def test_ending_of_an_epoch(metrics: dict[str, float], outcome: Outcome | None) -> None:
+    stop = StopSpec(target=6.0)
+    seen = evaluations(1.0, metrics.get("eval/score", 2.0))
+    ending = ending_of(stop, row(**metrics), seen, epochs=100, elapsed_s=1.0)
+    assert (ending and ending.outcome) == outcome
+
+
+def test_last_epoch_and_wall_time() -> None:
+    last = ending_of(StopSpec(), row(100), evaluations(1.0), epochs=100, elapsed_s=1.0)
+    assert last is not None
+    assert last.outcome is Outcome.FINISHED
+    late = ending_of(StopSpec(wall_time_s=5.0), row(10), evaluations(1.0), epochs=100, elapsed_s=5.0)
+    assert late is not None
+    assert late.outcome is Outcome.WALL_TIME
+
+
+def test_the_untrained_policy_counts_in_no_rule() -> None:
+    """It reaches the target and is never surpassed; the trial goes on."""
+    rows = [row(epoch, **{"eval/score": score}) for epoch, score in enumerate([100.0, 1.0, 2.0, 3.0])]
+    seen = evaluations_of(rows)
+    assert [evaluation.epoch for evaluation in seen] == [1, 2, 3]
+    assert ending_of(StopSpec(target=50.0), row(1), evaluations_of(rows[:1]), 20, 1.0) is None
+    rule = StopSpec(target=50.0, plateau=PlateauSpec(patience=2, grace=0.0))
+    assert ending_of(rule, rows[3], seen, 20, 3.0) is None
+
+
+def test_a_journal_of_an_older_version_has_untrained_policies_in_it() -> None:
+    spec = SchedulerSpec(kind="asha", grace=0.25, reduction=2)
+    old = [
+        LogEntry("a", 0, 0, 0.0, 100.0, False),
+        LogEntry("a", 3, 300, 3.0, 1.0, False),
+        LogEntry("b", 3, 300, 3.0, 2.0, False),
+    ]
+    pruner = make_pruner(spec, 1000)
+    assert replay(pruner, "env_steps", old) is None, "b is the better of the two"
+    assert pruner.report("a", 310, 1.0) is not None

@@ -1,0 +1,38 @@
+"""What the driver decides while trials run, on a clock of its own."""
+
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from msk_ray.signals import listening
+from msk_ray.sweep import opening
+from msk_ray.sweep.space import Space
+from msk_ray.sweep.trials import resolve_trials
+from msk_ray.tune import supervisor
+from msk_ray.tune.supervisor import LONGEST_STEP_S, SHUTDOWN_GRACE_S, Supervisor
+
+
+def test_time_in_which_the_driver_was_frozen_is_not_the_trials(
+    make_space: Callable[..., Space], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = SimpleNamespace(now=1000.0)
+    monkeypatch.setattr(supervisor.time, "monotonic", lambda: clock.now)
+    space = make_space()
+    trials = resolve_trials(space)
+    experiment = opening.create(tmp_path / "runs" / "small", space, trials, {})
+    with listening() as stop, stop.deferred():
+        driver = Supervisor(experiment, trials, lambda config: trials[0], 1, stop, lambda: None)
+        driver.on_trial_start(0, [], SimpleNamespace(config={}))
+        stop.receive(signal.SIGTERM)
+        driver.on_step_end(0, [])
+        assert experiment.stop_file.exists()
+        clock.now += 10 * SHUTDOWN_GRACE_S  # the laptop slept; the trial has had no time to save itself
+        driver.on_step_end(1, [])
+        assert not driver.stopped
+        for step in range(round(SHUTDOWN_GRACE_S / LONGEST_STEP_S)):
+            clock.now += LONGEST_STEP_S
+            driver.on_step_end(step, [])
+        assert driver.stopped
