@@ -96,7 +96,10 @@ def test_trials_that_set_what_nothing_reads_keep_their_ids(root: Path, tmp_path:
 
 
 @pytest.mark.parametrize("name", ["finished", "interrupted", "searched"])
-def test_status_and_report_read_it(name: str, recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_status_and_report_read_it(
+    name: str, recorded: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "120")  # a narrower terminal breaks what was changed over two lines
     assert run(status.main, [name, "--storage", str(recorded)]) == 0
     shown = capsys.readouterr().out
     assert "cart_action_penalty=0.02" in shown
