@@ -9,7 +9,7 @@ from torch.autograd.function import once_differentiable
 
 from msk_ray.errors import UnsupportedModelError
 from msk_ray.physics import Graph, WorldBatch
-from msk_ray.physics.adjoint.paths import TendonAdjoint
+from msk_ray.physics.adjoint.tendon_adjoint import TendonAdjoint
 from msk_ray.simulation.buffers import stream_of
 
 

@@ -1,5 +1,8 @@
 """The launches of one substep's pullback, apart from the modes that use them."""
 
+from collections.abc import Iterator
+from types import SimpleNamespace
+
 import mujoco_warp as mjw
 import numpy as np
 import pytest
@@ -10,9 +13,25 @@ from test_adjoint_features import SCENES, random_points
 
 from msk_ray.physics import WorldBatch
 from msk_ray.physics.adjoint import StepAdjoint, solve
+from msk_ray.physics.adjoint.groups import State, gather
 from msk_ray.physics.adjoint.stages import recompute_stages
 
 _RESULTS = ("live", "grad_qpos", "grad_qvel", "grad_act", "grad_ctrl")
+_GROUPS = ("multipliers", "slopes", "fields", "bars", "tendon_bars", "laws", "_bars")
+
+
+def buffers(holder: object) -> Iterator[tuple[str, wp.array]]:
+    """Every floating-point array that the adjoint and its stages hold and the model does not."""
+    for name, value in vars(holder).items():
+        if isinstance(value, wp.array):
+            if value.dtype is not wp.int32:
+                yield name, value
+        elif name in _GROUPS:
+            yield from ((key, array) for key, array in vars(value).items() if isinstance(array, wp.array))
+        else:
+            for part in value if isinstance(value, list) else [value]:
+                if type(part).__module__.startswith("msk_ray.physics.adjoint"):
+                    yield from buffers(part)
 
 
 def pulled(model, points, poison: bool) -> dict[str, np.ndarray]:
@@ -26,10 +45,11 @@ def pulled(model, points, poison: bool) -> dict[str, np.ndarray]:
     qvel_next = wp.clone(data.qvel)
     adjoint = StepAdjoint(model, batch.model, data)
     if poison:
-        for name, array in vars(adjoint).items():
-            kind = isinstance(array, wp.array) and array.dtype is not wp.int32
+        found = {name for name, _ in buffers(adjoint)}
+        assert {"lam", "jar", "cacc", "moved", "length", "rhs", "_hessian", "_cacc_sum", "frame"} <= found
+        for name, array in buffers(adjoint):
             # Where no tendon, wrap or joint row exists, its buffers are read as they were made.
-            if kind and name not in (*_RESULTS, "_touch", "_dense"):
+            if name not in (*_RESULTS, "_touch", "_dense"):
                 wp.copy(array, wp.full(array.shape, array.dtype(np.nan), dtype=array.dtype))
     rng = np.random.default_rng(0)
     for name in ("grad_qpos", "grad_qvel", "grad_act"):
@@ -59,3 +79,14 @@ def test_large_models_solve_serially_to_the_same(name, monkeypatch):
     monkeypatch.setattr(solve, "TILE_LIMIT", 0)
     for key, value in pulled(model, points, poison=False).items():
         assert relative(value, tiled[key]) < 1e-5, key
+
+
+def test_a_group_names_the_array_that_has_changed():
+    """An upgrade of mujoco_warp that changes an array fails when the adjoint is made, not in its numbers."""
+    arrays = {"qpos": wp.zeros((1, 1), dtype=float), "qvel": wp.zeros((1, 1), dtype=float)}
+    with pytest.raises(AttributeError, match="qacc"):
+        gather(State, SimpleNamespace(**arrays))
+    with pytest.raises(TypeError, match=r"'qacc'.*2 dimension"):
+        gather(State, SimpleNamespace(**arrays, qacc=wp.zeros(1, dtype=float)))
+    with pytest.raises(TypeError, match=r"'qacc'.*float32"):
+        gather(State, SimpleNamespace(**arrays, qacc=wp.zeros((1, 1), dtype=int)))

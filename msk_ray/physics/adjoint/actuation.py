@@ -3,6 +3,8 @@
 import warp as wp
 from mujoco_warp import BiasType, DynType, GainType, JointType, TrnType
 
+from msk_ray.physics.adjoint.groups import DofSlopes, Multipliers, State, Substep, TendonBars, allocate, gather
+from msk_ray.physics.adjoint.workspace import Workspace
 from msk_ray.physics.mjw_private import muscle_bias, muscle_dynamics, muscle_gain, muscle_gain_vel_deriv, vec10
 
 wp.set_module_options({"enable_backward": False})
@@ -124,6 +126,60 @@ def actuator_score(
     return score + force_weight * actuator_force(law, drive, length, velocity)
 
 
+@wp.struct
+class ActuatorSettings:
+    """Parameters of actuators, and limits of the joints they act on."""
+
+    jnt_type: wp.array[int]
+    jnt_actfrclimited: wp.array[bool]
+    jnt_actfrcrange: wp.array2d[wp.vec2]
+    dof_jntid: wp.array[int]
+    actuator_trntype: wp.array[int]
+    actuator_trnid: wp.array[wp.vec2i]
+    actuator_gear: wp.array2d[wp.spatial_vector]
+    actuator_dyntype: wp.array[int]
+    actuator_gaintype: wp.array[int]
+    actuator_biastype: wp.array[int]
+    actuator_ctrladr: wp.array[int]
+    actuator_ctrlnum: wp.array[int]
+    actuator_actadr: wp.array[int]
+    actuator_actnum: wp.array[int]
+    actuator_dynprm: wp.array2d[vec10]
+    actuator_gainprm: wp.array2d[vec10]
+    actuator_biasprm: wp.array2d[vec10]
+    actuator_actlimited: wp.array[bool]
+    actuator_actrange: wp.array2d[wp.vec2]
+    actuator_actearly: wp.array[bool]
+    actuator_forcelimited: wp.array[bool]
+    actuator_forcerange: wp.array2d[wp.vec2]
+    actuator_ctrllimited: wp.array[bool]
+    actuator_ctrlrange: wp.array2d[wp.vec2]
+    actuator_acc0: wp.array2d[float]
+    actuator_lengthrange: wp.array2d[wp.vec2]
+
+
+@wp.struct
+class Drive:
+    """Controls and activations, and how actuators pull: lengths (W, U), sparse moments, total on every dof."""
+
+    ctrl: wp.array2d[float]
+    act: wp.array2d[float]
+    actuator_length: wp.array2d[float]
+    moment_rownnz: wp.array2d[int]
+    moment_rowadr: wp.array2d[int]
+    moment_colind: wp.array2d[int]
+    actuator_moment: wp.array2d[float]
+    qfrc_actuator: wp.array2d[float]
+
+
+@wp.struct
+class ActuatorBars:
+    """∂Φ/∂(length), and ∂Φ/∂(m·λ, m·v, m·μ, m·â), (W, U)."""
+
+    length: wp.array2d[float]
+    rate: wp.array2d[wp.vec4]
+
+
 @wp.kernel
 def pull_actuators(
     # Model:
@@ -131,59 +187,18 @@ def pull_actuators(
     clampctrl: bool,
     implicit_all: bool,
     inertia_address: wp.array2d[int],
-    jnt_type: wp.array[int],
-    jnt_actfrclimited: wp.array[bool],
-    jnt_actfrcrange: wp.array2d[wp.vec2],
-    dof_jntid: wp.array[int],
-    actuator_trntype: wp.array[int],
-    actuator_trnid: wp.array[wp.vec2i],
-    actuator_gear: wp.array2d[wp.spatial_vector],
-    actuator_dyntype: wp.array[int],
-    actuator_gaintype: wp.array[int],
-    actuator_biastype: wp.array[int],
-    actuator_ctrladr: wp.array[int],
-    actuator_ctrlnum: wp.array[int],
-    actuator_actadr: wp.array[int],
-    actuator_actnum: wp.array[int],
-    actuator_dynprm: wp.array2d[vec10],
-    actuator_gainprm: wp.array2d[vec10],
-    actuator_biasprm: wp.array2d[vec10],
-    actuator_actlimited: wp.array[bool],
-    actuator_actrange: wp.array2d[wp.vec2],
-    actuator_actearly: wp.array[bool],
-    actuator_forcelimited: wp.array[bool],
-    actuator_forcerange: wp.array2d[wp.vec2],
-    actuator_ctrllimited: wp.array[bool],
-    actuator_ctrlrange: wp.array2d[wp.vec2],
-    actuator_acc0: wp.array2d[float],
-    actuator_lengthrange: wp.array2d[wp.vec2],
+    actuators: ActuatorSettings,
     # In:
     live_in: wp.array[int],
-    ctrl_in: wp.array2d[float],
-    act_in: wp.array2d[float],
-    qvel_in: wp.array2d[float],
-    length_in: wp.array2d[float],
-    moment_rownnz_in: wp.array2d[int],
-    moment_rowadr_in: wp.array2d[int],
-    moment_colind_in: wp.array2d[int],
-    moment_in: wp.array2d[float],
-    qfrc_actuator_in: wp.array2d[float],
-    qacc_in: wp.array2d[float],
-    lam_in: wp.array2d[float],
-    mu_in: wp.array2d[float],
-    excess_in: wp.array2d[float],
+    drive_in: Drive,
+    state_in: State,
+    multipliers_in: Multipliers,
     # Out:
     grad_act_out: wp.array2d[float],
     grad_ctrl_out: wp.array2d[float],
-    phi_qpos_out: wp.array2d[float],
-    phi_qvel_out: wp.array2d[float],
-    ten_length_bar_out: wp.array2d[float],
-    ten_qvel_bar_out: wp.array2d[float],
-    ten_lam_bar_out: wp.array2d[float],
-    ten_mu_bar_out: wp.array2d[float],
-    ten_smooth_bar_out: wp.array2d[float],
-    length_bar_out: wp.array2d[float],
-    rate_bar_out: wp.array2d[wp.vec4],
+    slopes_out: DofSlopes,
+    tendon_bars_out: TendonBars,
+    actuator_bars_out: ActuatorBars,
 ) -> None:
     """Φ ∋ -(m·λ) F(len, m·v, act, ctrl) - h κ dF/dv and ḡ·act': gradients of ctrl and act, and those of len and rates.
 
@@ -193,48 +208,48 @@ def pull_actuators(
     worldid, uid = wp.tid()
     law = ActuatorLaw()
     law.timestep = opt_timestep[worldid % opt_timestep.shape[0]]
-    law.dyntype = actuator_dyntype[uid]
-    law.gaintype = actuator_gaintype[uid]
-    law.biastype = actuator_biastype[uid]
-    law.early = int(actuator_actearly[uid])
-    law.clamp_act = int(actuator_actlimited[uid])
-    law.clamp_force = int(actuator_forcelimited[uid])
-    law.dynprm = actuator_dynprm[worldid % actuator_dynprm.shape[0], uid]
-    law.gainprm = actuator_gainprm[worldid % actuator_gainprm.shape[0], uid]
-    law.biasprm = actuator_biasprm[worldid % actuator_biasprm.shape[0], uid]
-    law.actrange = actuator_actrange[worldid % actuator_actrange.shape[0], uid]
-    law.forcerange = actuator_forcerange[worldid % actuator_forcerange.shape[0], uid]
-    law.lengthrange = actuator_lengthrange[worldid % actuator_lengthrange.shape[0], uid]
-    law.acc0 = actuator_acc0[worldid % actuator_acc0.shape[0], uid]
+    law.dyntype = actuators.actuator_dyntype[uid]
+    law.gaintype = actuators.actuator_gaintype[uid]
+    law.biastype = actuators.actuator_biastype[uid]
+    law.early = int(actuators.actuator_actearly[uid])
+    law.clamp_act = int(actuators.actuator_actlimited[uid])
+    law.clamp_force = int(actuators.actuator_forcelimited[uid])
+    law.dynprm = actuators.actuator_dynprm[worldid % actuators.actuator_dynprm.shape[0], uid]
+    law.gainprm = actuators.actuator_gainprm[worldid % actuators.actuator_gainprm.shape[0], uid]
+    law.biasprm = actuators.actuator_biasprm[worldid % actuators.actuator_biasprm.shape[0], uid]
+    law.actrange = actuators.actuator_actrange[worldid % actuators.actuator_actrange.shape[0], uid]
+    law.forcerange = actuators.actuator_forcerange[worldid % actuators.actuator_forcerange.shape[0], uid]
+    law.lengthrange = actuators.actuator_lengthrange[worldid % actuators.actuator_lengthrange.shape[0], uid]
+    law.acc0 = actuators.actuator_acc0[worldid % actuators.actuator_acc0.shape[0], uid]
     ctrl = float(0.0)
-    source = actuator_ctrladr[uid]
-    if actuator_ctrlnum[uid] > 0:
-        ctrl = ctrl_in[worldid, source]
-        law.ctrlrange = actuator_ctrlrange[worldid % actuator_ctrlrange.shape[0], source]
-        law.clamp_ctrl = int(actuator_ctrllimited[source] and clampctrl)
+    source = actuators.actuator_ctrladr[uid]
+    if actuators.actuator_ctrlnum[uid] > 0:
+        ctrl = drive_in.ctrl[worldid, source]
+        law.ctrlrange = actuators.actuator_ctrlrange[worldid % actuators.actuator_ctrlrange.shape[0], source]
+        law.clamp_ctrl = int(actuators.actuator_ctrllimited[source] and clampctrl)
     act = float(0.0)
     act_weight = float(0.0)
-    slot = actuator_actadr[uid] + actuator_actnum[uid] - 1
+    slot = actuators.actuator_actadr[uid] + actuators.actuator_actnum[uid] - 1
     if law.dyntype != DynType.NONE:
-        act = act_in[worldid, slot]
+        act = drive_in.act[worldid, slot]
         act_weight = grad_act_out[worldid, slot]
 
-    start = moment_rowadr_in[worldid, uid]
-    end = start + moment_rownnz_in[worldid, uid]
+    start = drive_in.moment_rowadr[worldid, uid]
+    end = start + drive_in.moment_rownnz[worldid, uid]
     rate = float(0.0)
     velocity = float(0.0)
     for k in range(start, end):
-        dof = moment_colind_in[worldid, k]
-        velocity += moment_in[worldid, k] * qvel_in[worldid, dof]
+        dof = drive_in.moment_colind[worldid, k]
+        velocity += drive_in.actuator_moment[worldid, k] * state_in.qvel[worldid, dof]
         held = bool(False)
-        jnt = dof_jntid[dof]
-        if jnt_actfrclimited[jnt]:
+        jnt = actuators.dof_jntid[dof]
+        if actuators.jnt_actfrclimited[jnt]:
             # A joint at its actuator force limit passes nothing on.
-            bounds = jnt_actfrcrange[worldid % jnt_actfrcrange.shape[0], jnt]
-            total = qfrc_actuator_in[worldid, dof]
+            bounds = actuators.jnt_actfrcrange[worldid % actuators.jnt_actfrcrange.shape[0], jnt]
+            total = drive_in.qfrc_actuator[worldid, dof]
             held = total <= bounds[0] or total >= bounds[1]
         if not held:
-            rate += moment_in[worldid, k] * lam_in[worldid, dof]
+            rate += drive_in.actuator_moment[worldid, k] * multipliers_in.lam[worldid, dof]
 
     law.implicit = 0
     h = law.timestep
@@ -244,50 +259,90 @@ def pull_actuators(
     if implicit_all:
         law.implicit = 1
         for k in range(start, end):
-            i = moment_colind_in[worldid, k]
-            rate_mu += moment_in[worldid, k] * mu_in[worldid, i]
-            rate_smooth += moment_in[worldid, k] * (qacc_in[worldid, i] - excess_in[worldid, i])
+            i = drive_in.moment_colind[worldid, k]
+            rate_mu += drive_in.actuator_moment[worldid, k] * multipliers_in.mu[worldid, i]
+            rate_smooth += drive_in.actuator_moment[worldid, k] * (
+                state_in.qacc[worldid, i] - multipliers_in.excess[worldid, i]
+            )
             for m in range(start, end):
-                j = moment_colind_in[worldid, m]
+                j = drive_in.moment_colind[worldid, m]
                 if inertia_address[wp.max(i, j), wp.min(i, j)] >= 0:
-                    smooth = qacc_in[worldid, j] - excess_in[worldid, j]
-                    kappa += moment_in[worldid, k] * moment_in[worldid, m] * mu_in[worldid, i] * smooth
+                    smooth = state_in.qacc[worldid, j] - multipliers_in.excess[worldid, j]
+                    kappa += (
+                        drive_in.actuator_moment[worldid, k]
+                        * drive_in.actuator_moment[worldid, m]
+                        * multipliers_in.mu[worldid, i]
+                        * smooth
+                    )
 
-    length = length_in[worldid, uid]
+    length = drive_in.actuator_length[worldid, uid]
     _l, ctrl_slope, act_slope, length_slope, velocity_slope, _a, force, slope = wp.grad(actuator_score)(
         law, ctrl, act, length, velocity, act_weight, rate, h * kappa
     )
     live = live_in[worldid] != 0
     if law.dyntype != DynType.NONE:
         grad_act_out[worldid, slot] = wp.where(live, act_slope, 0.0)
-    if live and actuator_ctrlnum[uid] > 0:
+    if live and actuators.actuator_ctrlnum[uid] > 0:
         grad_ctrl_out[worldid, source] += ctrl_slope
-    length_bar_out[worldid, uid] = -length_slope
+    actuator_bars_out.length[worldid, uid] = -length_slope
     # ∂Φ/∂(m·λ) = -F ,  ∂Φ/∂(m·μ) = -h F' m·â ,  ∂Φ/∂(m·â) = -h F' m·μ
     rate_bar = wp.vec4(-force, -velocity_slope, -h * slope * rate_smooth, -h * slope * rate_mu)
     if not implicit_all:
         rate_bar[2] = 0.0
         rate_bar[3] = 0.0
-    rate_bar_out[worldid, uid] = rate_bar
-    kind = actuator_trntype[uid]
+    actuator_bars_out.rate[worldid, uid] = rate_bar
+    kind = actuators.actuator_trntype[uid]
     if kind == TrnType.TENDON:
-        t = actuator_trnid[uid][0]
-        gear = actuator_gear[worldid % actuator_gear.shape[0], uid][0]
-        wp.atomic_add(ten_length_bar_out, worldid, t, -gear * length_slope)
-        wp.atomic_add(ten_qvel_bar_out, worldid, t, gear * rate_bar[1])
-        wp.atomic_add(ten_lam_bar_out, worldid, t, gear * rate_bar[0])
-        wp.atomic_add(ten_mu_bar_out, worldid, t, gear * rate_bar[2])
-        wp.atomic_add(ten_smooth_bar_out, worldid, t, gear * rate_bar[3])
+        t = actuators.actuator_trnid[uid][0]
+        gear = actuators.actuator_gear[worldid % actuators.actuator_gear.shape[0], uid][0]
+        wp.atomic_add(tendon_bars_out.length, worldid, t, -gear * length_slope)
+        wp.atomic_add(tendon_bars_out.qvel, worldid, t, gear * rate_bar[1])
+        wp.atomic_add(tendon_bars_out.lam, worldid, t, gear * rate_bar[0])
+        wp.atomic_add(tendon_bars_out.mu, worldid, t, gear * rate_bar[2])
+        wp.atomic_add(tendon_bars_out.smooth, worldid, t, gear * rate_bar[3])
         return
     if kind == TrnType.SITE:
         return
     # Length is the integral of the moment for hinges and slides; where it is not, `transmission` does it.
     straight = bool(False)
     if kind == TrnType.JOINT or kind == TrnType.JOINTINPARENT:
-        joint = jnt_type[actuator_trnid[uid][0]]
+        joint = actuators.jnt_type[actuators.actuator_trnid[uid][0]]
         straight = joint == JointType.HINGE or joint == JointType.SLIDE
     for k in range(start, end):
-        dof = moment_colind_in[worldid, k]
-        wp.atomic_add(phi_qvel_out, worldid, dof, rate_bar[1] * moment_in[worldid, k])
+        dof = drive_in.moment_colind[worldid, k]
+        wp.atomic_add(slopes_out.qvel, worldid, dof, rate_bar[1] * drive_in.actuator_moment[worldid, k])
         if straight:
-            wp.atomic_add(phi_qpos_out, worldid, dof, -length_slope * moment_in[worldid, k])
+            wp.atomic_add(slopes_out.qpos, worldid, dof, -length_slope * drive_in.actuator_moment[worldid, k])
+
+
+class ActuatorForces:
+    """Launches of what actuators give ∂Φ, and of the gradients of controls and activations.
+
+    Attributes:
+        bars: what `transmission` takes on.
+    """
+
+    def __init__(self, work: Workspace) -> None:
+        self._work = work
+        self._settings = gather(ActuatorSettings, work.model)
+        self.bars = allocate(ActuatorBars, work.nworld, work.model.nactuator)
+
+    def launch(self, at: Substep) -> None:
+        """Launch the pullback of all actuators."""
+        work, m, settings = self._work, self._work.model, self._work.settings
+        wp.launch(
+            pull_actuators,
+            dim=(work.nworld, m.nactuator),
+            inputs=[
+                m.opt.timestep,
+                settings.clampctrl,
+                settings.implicit_all,
+                work.tables.inertia_address,
+                self._settings,
+                work.live,
+                gather(Drive, at.data),
+                at.state,
+                work.multipliers,
+            ],
+            outputs=[work.grad_act, work.grad_ctrl, work.slopes, work.tendon_bars, self.bars],
+        )

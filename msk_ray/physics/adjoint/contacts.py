@@ -7,9 +7,25 @@ plain field x, along the frame's axes (k < 3), and the relative spin (k ≥ 3). 
 
 import warp as wp
 
+from msk_ray.physics.adjoint.coverage import colliding_pairs
+from msk_ray.physics.adjoint.geometry import PairKinds, pull_geometry_kernel
+from msk_ray.physics.adjoint.groups import (
+    ContactBars,
+    Contacts,
+    FieldBars,
+    Fields,
+    Motion,
+    RowLaws,
+    Rows,
+    Shapes,
+    Substep,
+    allocate,
+    gather,
+)
 from msk_ray.physics.adjoint.rows import cone_law, cone_slope, row_slopes, vec6
 from msk_ray.physics.adjoint.spatial import carried, point_velocity, wrench
-from msk_ray.physics.mjw_private import ConstraintType, vec5
+from msk_ray.physics.adjoint.workspace import Workspace
+from msk_ray.physics.mjw_private import ConstraintType
 
 wp.set_module_options({"enable_backward": False})
 
@@ -47,59 +63,37 @@ def pull_contacts(
     opt_timestep: wp.array[float],
     opt_disableflags: int,
     opt_impratio_invsqrt: wp.array[float],
-    body_rootid: wp.array[int],
-    geom_bodyid: wp.array[int],
+    shapes: Shapes,
     # In:
     nacon_in: wp.array[int],
-    type_in: wp.array2d[int],
-    mass_in: wp.array2d[float],
-    jar_in: wp.array2d[float],
-    force_in: wp.array2d[float],
-    slope_in: wp.array2d[float],
-    contact_dist_in: wp.array[float],
-    contact_pos_in: wp.array[wp.vec3],
-    contact_frame_in: wp.array[wp.mat33],
-    contact_margin_in: wp.array[float],
-    contact_friction_in: wp.array[vec5],
-    contact_solref_in: wp.array[wp.vec2],
-    contact_solreffriction_in: wp.array[wp.vec2],
-    contact_solimp_in: wp.array[vec5],
-    contact_dim_in: wp.array[int],
-    contact_geom_in: wp.array[wp.vec2i],
-    contact_address_in: wp.array2d[int],
-    contact_worldid_in: wp.array[int],
-    subtree_com_in: wp.array2d[wp.vec3],
-    lam_field_in: wp.array2d[wp.spatial_vector],
-    qacc_field_in: wp.array2d[wp.spatial_vector],
-    cvel_in: wp.array2d[wp.spatial_vector],
+    rows_in: Rows,
+    laws_in: RowLaws,
+    contacts_in: Contacts,
+    motion_in: Motion,
+    fields_in: Fields,
     # Out:
-    lam_bar_out: wp.array2d[wp.spatial_vector],
-    qacc_bar_out: wp.array2d[wp.spatial_vector],
-    qvel_bar_out: wp.array2d[wp.spatial_vector],
-    moved_bar_out: wp.array2d[wp.spatial_vector],
-    phi_dist_out: wp.array[float],
-    phi_pos_out: wp.array[wp.vec3],
-    phi_frame_out: wp.array[wp.mat33],
+    bars_out: FieldBars,
+    contact_bars_out: ContactBars,
 ) -> None:
     """Φ ∋ -Σ_r ρ_r(λ) f_r(ρ(a) - aref): wrenches on both bodies, and cotangents of (dist, pos, frame)."""
     con = wp.tid()
-    if con >= wp.min(nacon_in[0], contact_dist_in.shape[0]):
+    if con >= wp.min(nacon_in[0], contacts_in.dist.shape[0]):
         return
-    phi_dist_out[con] = 0.0
-    phi_pos_out[con] = wp.vec3(0.0)
-    phi_frame_out[con] = wp.mat33()
-    first = contact_address_in[con, 0]
+    contact_bars_out.dist[con] = 0.0
+    contact_bars_out.pos[con] = wp.vec3(0.0)
+    contact_bars_out.frame[con] = wp.mat33()
+    first = contacts_in.efc_address[con, 0]
     if first < 0:
         return
-    worldid = contact_worldid_in[con]
-    dim = contact_dim_in[con]
-    elliptic = type_in[worldid, first] == ConstraintType.CONTACT_ELLIPTIC
+    worldid = contacts_in.worldid[con]
+    dim = contacts_in.dim[con]
+    elliptic = rows_in.type[worldid, first] == ConstraintType.CONTACT_ELLIPTIC
     count = dim
     if not elliptic and dim > 1:
         count = 2 * (dim - 1)
-    if contact_address_in[con, count - 1] < 0:
+    if contacts_in.efc_address[con, count - 1] < 0:
         return
-    friction = contact_friction_in[con]
+    friction = contacts_in.friction[con]
     mu = friction[0] * opt_impratio_invsqrt[worldid % opt_impratio_invsqrt.shape[0]]
 
     # A contact none of whose rows pushes has no slope anywhere.
@@ -108,30 +102,30 @@ def pull_contacts(
     active = bool(False)
     if elliptic:
         for i in range(dim):
-            jar[i] = jar_in[worldid, first + i]
-            mass[i] = mass_in[worldid, first + i]
+            jar[i] = laws_in.jar[worldid, first + i]
+            mass[i] = rows_in.D[worldid, first + i]
     cone = cone_law(jar, mass, friction, mu, dim)
     if elliptic:
         active = cone.zone != 0
     else:
         for i in range(count):
-            active = active or slope_in[worldid, first + i] != 0.0
+            active = active or laws_in.slope[worldid, first + i] != 0.0
     if not active:
         return
 
-    geoms = contact_geom_in[con]
-    body1 = geom_bodyid[geoms[0]]
-    body2 = geom_bodyid[geoms[1]]
-    point = contact_pos_in[con]
-    frame = contact_frame_in[con]
-    arm1 = point - subtree_com_in[worldid, body_rootid[body1]]
-    arm2 = point - subtree_com_in[worldid, body_rootid[body2]]
-    lam1 = lam_field_in[worldid, body1]
-    lam2 = lam_field_in[worldid, body2]
-    acc1 = qacc_field_in[worldid, body1]
-    acc2 = qacc_field_in[worldid, body2]
-    vel1 = cvel_in[worldid, body1]
-    vel2 = cvel_in[worldid, body2]
+    geoms = contacts_in.geom[con]
+    body1 = shapes.geom_bodyid[geoms[0]]
+    body2 = shapes.geom_bodyid[geoms[1]]
+    point = contacts_in.pos[con]
+    frame = contacts_in.frame[con]
+    arm1 = point - motion_in.subtree_com[worldid, shapes.body_rootid[body1]]
+    arm2 = point - motion_in.subtree_com[worldid, shapes.body_rootid[body2]]
+    lam1 = fields_in.lam[worldid, body1]
+    lam2 = fields_in.lam[worldid, body2]
+    acc1 = fields_in.qacc[worldid, body1]
+    acc2 = fields_in.qacc[worldid, body2]
+    vel1 = motion_in.cvel[worldid, body1]
+    vel2 = motion_in.cvel[worldid, body2]
     lam_slide = point_velocity(lam2, arm2) - point_velocity(lam1, arm1)
     acc_slide = point_velocity(acc2, arm2) - point_velocity(acc1, arm1)
     vel_slide = point_velocity(vel2, arm2) - point_velocity(vel1, arm1)
@@ -141,16 +135,16 @@ def pull_contacts(
     rate = components(frame, lam_slide, lam_spin, dim)
 
     timestep = opt_timestep[worldid % opt_timestep.shape[0]]
-    pos = contact_dist_in[con] - contact_margin_in[con]
-    solref = contact_solref_in[con]
-    solimp = contact_solimp_in[con]
+    pos = contacts_in.dist[con] - contacts_in.includemargin[con]
+    solref = contacts_in.solref[con]
+    solimp = contacts_in.solimp[con]
     normal_row = row_slopes(opt_disableflags, timestep, solref, solimp, pos)
     lam_bar = vec6()
     acc_bar = vec6()
     vel_bar = vec6()
     dist_bar = float(0.0)
     if elliptic:
-        sideways = contact_solreffriction_in[con]
+        sideways = contacts_in.solreffriction[con]
         if sideways[0] == 0.0 and sideways[1] == 0.0:
             sideways = solref
         side_row = row_slopes(opt_disableflags, timestep, sideways, solimp, pos)
@@ -167,9 +161,9 @@ def pull_contacts(
     else:
         for i in range(count):
             row = first + i
-            s = slope_in[worldid, row]
+            s = laws_in.slope[worldid, row]
             if s != 0.0:
-                f = force_in[worldid, row]
+                f = laws_in.force[worldid, row]
                 k = i / 2 + 1
                 lean = float(0.0)
                 if dim > 1:
@@ -194,10 +188,12 @@ def pull_contacts(
     acc_torque = along_frame(frame, acc_bar, 3)
     vel_torque = along_frame(frame, vel_bar, 3)
 
-    phi_dist_out[con] = dist_bar
+    contact_bars_out.dist[con] = dist_bar
     # ρ moves with the point as ω × dp  ⇒  p̄ = Σ_x ū(x) × ω(x)
-    phi_pos_out[con] = wp.cross(lam_force, lam_spin) + wp.cross(acc_force, acc_spin) + wp.cross(vel_force, vel_spin)
-    phi_frame_out[con] = (
+    contact_bars_out.pos[con] = (
+        wp.cross(lam_force, lam_spin) + wp.cross(acc_force, acc_spin) + wp.cross(vel_force, vel_spin)
+    )
+    contact_bars_out.frame[con] = (
         frame_weight(frame, lam_bar, lam_slide, lam_spin)
         + frame_weight(frame, acc_bar, acc_slide, acc_spin)
         + frame_weight(frame, vel_bar, vel_slide, vel_spin)
@@ -220,8 +216,56 @@ def pull_contacts(
             lam_wrench = sign * wrench(lam_force, lam_torque, arm)
             acc_wrench = sign * wrench(acc_force, acc_torque, arm)
             vel_wrench = sign * wrench(vel_force, vel_torque, arm)
-            wp.atomic_add(lam_bar_out, worldid, body, lam_wrench)
-            wp.atomic_add(qacc_bar_out, worldid, body, acc_wrench)
-            wp.atomic_add(qvel_bar_out, worldid, body, vel_wrench)
+            wp.atomic_add(bars_out.lam, worldid, body, lam_wrench)
+            wp.atomic_add(bars_out.qacc, worldid, body, acc_wrench)
+            wp.atomic_add(bars_out.qvel, worldid, body, vel_wrench)
             moved = carried(lam, lam_wrench) + carried(acc, acc_wrench) + carried(vel, vel_wrench)
-            wp.atomic_add(moved_bar_out, worldid, body, moved)
+            wp.atomic_add(bars_out.moved, worldid, body, moved)
+
+
+class ContactForces:
+    """Launches of the contacts' part of ∂Φ, through their rows and through their geometry."""
+
+    def __init__(self, work: Workspace, contacts: int) -> None:
+        self._work, self._contacts = work, contacts
+        mjm = work.mjm
+        types = {(int(mjm.geom_type[a]), int(mjm.geom_type[b])) for a, b in colliding_pairs(mjm)}
+        self._pull_geometry = pull_geometry_kernel(PairKinds.of(mjm, types))
+        self._shapes = gather(Shapes, work.model)
+        self._bars = allocate(ContactBars, contacts)
+
+    def launch(self, at: Substep) -> None:
+        """Launch both."""
+        work, m, d = self._work, self._work.model, at.data
+        wp.launch(
+            pull_contacts,
+            dim=self._contacts,
+            inputs=[
+                m.opt.timestep,
+                m.opt.disableflags,
+                m.opt.impratio_invsqrt,
+                self._shapes,
+                d.nacon,
+                at.rows,
+                work.laws,
+                at.contacts,
+                at.motion,
+                work.fields,
+            ],
+            outputs=[work.bars, self._bars],
+        )
+        wp.launch(
+            self._pull_geometry,
+            dim=self._contacts,
+            inputs=[
+                self._shapes,
+                work.touch_counter.substep,
+                d.nacon,
+                at.contacts,
+                d.geom_xpos,
+                d.geom_xmat,
+                d.subtree_com,
+                self._bars,
+            ],
+            outputs=[work.bars.moved, work.touch_counter.touches],
+        )

@@ -10,8 +10,10 @@ from both bodies' spins and angular accelerations; `turn_score` holds them and i
 import warp as wp
 from mujoco_warp import ObjType
 
+from msk_ray.physics.adjoint.groups import FieldBars, Fields, Motion, RowLaws, Rows, Substep, gather
 from msk_ray.physics.adjoint.rows import row_slopes
 from msk_ray.physics.adjoint.spatial import carried, point_velocity, wrench
+from msk_ray.physics.adjoint.workspace import Workspace
 from msk_ray.physics.mjw_private import ConstraintType, EqType, vec5, vec12
 
 wp.set_module_options({"enable_backward": False})
@@ -82,74 +84,81 @@ def spin_of(q: wp.vec4, bar: wp.vec4) -> wp.vec3:
     return 0.5 * wp.vec3(p[1], p[2], p[3])
 
 
+@wp.struct
+class Anchors:
+    """Parameters of equalities, and the bodies and sites they hold."""
+
+    body_rootid: wp.array[int]
+    site_bodyid: wp.array[int]
+    site_quat: wp.array2d[wp.quat]
+    eq_type: wp.array[int]
+    eq_objtype: wp.array[int]
+    eq_obj1id: wp.array[int]
+    eq_obj2id: wp.array[int]
+    eq_solref: wp.array2d[wp.vec2]
+    eq_solimp: wp.array2d[vec5]
+    eq_data: wp.array2d[vec12]
+
+
+@wp.struct
+class AnchorPoses:
+    """Poses of bodies and sites."""
+
+    xpos: wp.array2d[wp.vec3]
+    xquat: wp.array2d[wp.quat]
+    xmat: wp.array2d[wp.mat33]
+    site_xpos: wp.array2d[wp.vec3]
+
+
 @wp.kernel
 def pull_anchors(
     # Model:
     opt_timestep: wp.array[float],
     opt_disableflags: int,
-    body_rootid: wp.array[int],
-    site_bodyid: wp.array[int],
-    eq_type: wp.array[int],
-    eq_objtype: wp.array[int],
-    eq_obj1id: wp.array[int],
-    eq_obj2id: wp.array[int],
-    eq_solref: wp.array2d[wp.vec2],
-    eq_solimp: wp.array2d[vec5],
-    eq_data: wp.array2d[vec12],
-    site_quat: wp.array2d[wp.quat],
+    anchors: Anchors,
     # In:
     nefc_in: wp.array[int],
-    type_in: wp.array2d[int],
-    id_in: wp.array2d[int],
-    slope_in: wp.array2d[float],
-    force_in: wp.array2d[float],
-    xpos_in: wp.array2d[wp.vec3],
-    xquat_in: wp.array2d[wp.quat],
-    xmat_in: wp.array2d[wp.mat33],
-    site_xpos_in: wp.array2d[wp.vec3],
-    subtree_com_in: wp.array2d[wp.vec3],
-    lam_field_in: wp.array2d[wp.spatial_vector],
-    cvel_in: wp.array2d[wp.spatial_vector],
-    cacc_in: wp.array2d[wp.spatial_vector],
+    rows_in: Rows,
+    laws_in: RowLaws,
+    poses_in: AnchorPoses,
+    motion_in: Motion,
+    fields_in: Fields,
     # Out:
-    lam_bar_out: wp.array2d[wp.spatial_vector],
-    qvel_bar_out: wp.array2d[wp.spatial_vector],
-    cacc_bar_out: wp.array2d[wp.spatial_vector],
-    moved_bar_out: wp.array2d[wp.spatial_vector],
+    bars_out: FieldBars,
 ) -> None:
     """Φ ∋ -ρ(λ)·f(jar): one thread a row; that of an equality's first row does all three or six."""
     worldid, row = wp.tid()
-    if row + 2 >= wp.min(nefc_in[worldid], slope_in.shape[1]):
+    if row + 2 >= wp.min(nefc_in[worldid], laws_in.slope.shape[1]):
         return
-    if type_in[worldid, row] != ConstraintType.EQUALITY:
+    if rows_in.type[worldid, row] != ConstraintType.EQUALITY:
         return
-    eq = id_in[worldid, row]
-    weld = eq_type[eq] == EqType.WELD
-    if eq_type[eq] != EqType.CONNECT and not weld:
+    eq = rows_in.id[worldid, row]
+    weld = anchors.eq_type[eq] == EqType.WELD
+    if anchors.eq_type[eq] != EqType.CONNECT and not weld:
         return
-    if weld and row + 5 >= wp.min(nefc_in[worldid], slope_in.shape[1]):
+    if weld and row + 5 >= wp.min(nefc_in[worldid], laws_in.slope.shape[1]):
         return
     # Rows of one equality are consecutive: the first is the one before which another equality ends.
     if row > 0:
-        if type_in[worldid, row - 1] == ConstraintType.EQUALITY and id_in[worldid, row - 1] == eq:
+        if rows_in.type[worldid, row - 1] == ConstraintType.EQUALITY and rows_in.id[worldid, row - 1] == eq:
             return
-    data = eq_data[worldid % eq_data.shape[0], eq]
-    body1 = eq_obj1id[eq]
-    body2 = eq_obj2id[eq]
+    data = anchors.eq_data[worldid % anchors.eq_data.shape[0], eq]
+    body1 = anchors.eq_obj1id[eq]
+    body2 = anchors.eq_obj2id[eq]
     point1 = wp.vec3(0.0)
     point2 = wp.vec3(0.0)
     q1 = wp.vec4(1.0, 0.0, 0.0, 0.0)
     q2 = wp.vec4(1.0, 0.0, 0.0, 0.0)
-    if eq_objtype[eq] == ObjType.SITE:
+    if anchors.eq_objtype[eq] == ObjType.SITE:
         site1 = body1
         site2 = body2
-        point1 = site_xpos_in[worldid, site1]
-        point2 = site_xpos_in[worldid, site2]
-        body1 = site_bodyid[site1]
-        body2 = site_bodyid[site2]
-        rest = worldid % site_quat.shape[0]
-        q1 = quat_product(as_vec4(xquat_in[worldid, body1]), as_vec4(site_quat[rest, site1]))
-        q2 = quat_product(as_vec4(xquat_in[worldid, body2]), as_vec4(site_quat[rest, site2]))
+        point1 = poses_in.site_xpos[worldid, site1]
+        point2 = poses_in.site_xpos[worldid, site2]
+        body1 = anchors.site_bodyid[site1]
+        body2 = anchors.site_bodyid[site2]
+        rest = worldid % anchors.site_quat.shape[0]
+        q1 = quat_product(as_vec4(poses_in.xquat[worldid, body1]), as_vec4(anchors.site_quat[rest, site1]))
+        q2 = quat_product(as_vec4(poses_in.xquat[worldid, body2]), as_vec4(anchors.site_quat[rest, site2]))
     else:
         anchor1 = wp.vec3(data[0], data[1], data[2])
         anchor2 = wp.vec3(data[3], data[4], data[5])
@@ -157,10 +166,10 @@ def pull_anchors(
             # A weld lists its second body's anchor first.
             anchor1 = wp.vec3(data[3], data[4], data[5])
             anchor2 = wp.vec3(data[0], data[1], data[2])
-            q1 = quat_product(as_vec4(xquat_in[worldid, body1]), wp.vec4(data[6], data[7], data[8], data[9]))
-            q2 = as_vec4(xquat_in[worldid, body2])
-        point1 = xpos_in[worldid, body1] + xmat_in[worldid, body1] @ anchor1
-        point2 = xpos_in[worldid, body2] + xmat_in[worldid, body2] @ anchor2
+            q1 = quat_product(as_vec4(poses_in.xquat[worldid, body1]), wp.vec4(data[6], data[7], data[8], data[9]))
+            q2 = as_vec4(poses_in.xquat[worldid, body2])
+        point1 = poses_in.xpos[worldid, body1] + poses_in.xmat[worldid, body1] @ anchor1
+        point2 = poses_in.xpos[worldid, body2] + poses_in.xmat[worldid, body2] @ anchor2
     gap = point1 - point2
     turn = wp.vec3(0.0)
     scale = float(0.0)
@@ -169,31 +178,33 @@ def pull_anchors(
         whole = quat_product(conjugate(q2), q1)
         turn = scale * wp.vec3(whole[1], whole[2], whole[3])
     size = wp.sqrt(wp.dot(gap, gap) + wp.dot(turn, turn))
-    arm1 = point1 - subtree_com_in[worldid, body_rootid[body1]]
-    arm2 = point2 - subtree_com_in[worldid, body_rootid[body2]]
-    rate = point_velocity(lam_field_in[worldid, body1], arm1) - point_velocity(lam_field_in[worldid, body2], arm2)
-    mass = slope_in[worldid, row]
+    arm1 = point1 - motion_in.subtree_com[worldid, anchors.body_rootid[body1]]
+    arm2 = point2 - motion_in.subtree_com[worldid, anchors.body_rootid[body2]]
+    rate = point_velocity(fields_in.lam[worldid, body1], arm1) - point_velocity(fields_in.lam[worldid, body2], arm2)
+    mass = laws_in.slope[worldid, row]
     # ∂Φ/∂jar = D ρ(λ)
     y = mass * rate
-    push = wp.vec3(force_in[worldid, row], force_in[worldid, row + 1], force_in[worldid, row + 2])
+    push = wp.vec3(laws_in.force[worldid, row], laws_in.force[worldid, row + 1], laws_in.force[worldid, row + 2])
 
     # All three rows share the impedance at |gap|: slopes at pos = |gap| along the gap.
-    solref = eq_solref[worldid % eq_solref.shape[0], eq]
-    solimp = eq_solimp[worldid % eq_solimp.shape[0], eq]
+    solref = anchors.eq_solref[worldid % anchors.eq_solref.shape[0], eq]
+    solimp = anchors.eq_solimp[worldid % anchors.eq_solimp.shape[0], eq]
     timestep = opt_timestep[worldid % opt_timestep.shape[0]]
     slopes = row_slopes(opt_disableflags, timestep, solref, solimp, size)
-    lam_spin = wp.spatial_top(lam_field_in[worldid, body1]) - wp.spatial_top(lam_field_in[worldid, body2])
-    spin1 = wp.spatial_top(cvel_in[worldid, body1])
-    spin2 = wp.spatial_top(cvel_in[worldid, body2])
-    accel = wp.spatial_top(cacc_in[worldid, body1]) - wp.spatial_top(cacc_in[worldid, body2])
+    lam_spin = wp.spatial_top(fields_in.lam[worldid, body1]) - wp.spatial_top(fields_in.lam[worldid, body2])
+    spin1 = wp.spatial_top(motion_in.cvel[worldid, body1])
+    spin2 = wp.spatial_top(motion_in.cvel[worldid, body2])
+    accel = wp.spatial_top(fields_in.cacc[worldid, body1]) - wp.spatial_top(fields_in.cacc[worldid, body2])
     turn_y = wp.vec3(0.0)
     turn_push = wp.vec3(0.0)
     turn_rate = wp.vec3(0.0)
     if weld:
         under = quat_product(conjugate(q2), turned(lam_spin, q1))
         turn_rate = 0.5 * scale * wp.vec3(under[1], under[2], under[3])
-        turn_y = slope_in[worldid, row + 3] * turn_rate
-        turn_push = wp.vec3(force_in[worldid, row + 3], force_in[worldid, row + 4], force_in[worldid, row + 5])
+        turn_y = laws_in.slope[worldid, row + 3] * turn_rate
+        turn_push = wp.vec3(
+            laws_in.force[worldid, row + 3], laws_in.force[worldid, row + 4], laws_in.force[worldid, row + 5]
+        )
     along = wp.vec3(0.0)
     turn_along = wp.vec3(0.0)
     if size > 1.0e-12:
@@ -244,9 +255,9 @@ def pull_anchors(
             spin_bar = spin2_bar
             torque = torque2
         if body > 0:
-            lam = lam_field_in[worldid, body]
-            vel = cvel_in[worldid, body]
-            acc = cacc_in[worldid, body]
+            lam = fields_in.lam[worldid, body]
+            vel = motion_in.cvel[worldid, body]
+            acc = fields_in.cacc[worldid, body]
             omega = wp.spatial_top(vel)
             alpha = wp.spatial_top(acc)
             speed = point_velocity(vel, arm)
@@ -259,8 +270,37 @@ def pull_anchors(
             # dp enters as α × dp + ω × (ω × dp), and in u(λ) and b u
             moved = wp.cross(yy, alpha) + wp.cross(swirl + damp * yy, omega)
             moved += wp.cross(-sign * push, wp.spatial_top(lam)) + sign * place
-            wp.atomic_add(lam_bar_out, worldid, body, lam_wrench)
-            wp.atomic_add(cacc_bar_out, worldid, body, acc_wrench)
-            wp.atomic_add(qvel_bar_out, worldid, body, vel_wrench)
+            wp.atomic_add(bars_out.lam, worldid, body, lam_wrench)
+            wp.atomic_add(bars_out.cacc, worldid, body, acc_wrench)
+            wp.atomic_add(bars_out.qvel, worldid, body, vel_wrench)
             total = carried(lam, lam_wrench) + carried(acc, acc_wrench) + carried(vel, vel_wrench)
-            wp.atomic_add(moved_bar_out, worldid, body, total + wrench(moved, torque, arm))
+            wp.atomic_add(bars_out.moved, worldid, body, total + wrench(moved, torque, arm))
+
+
+class AnchorRows:
+    """Launches of what connect and weld equalities give ∂Φ."""
+
+    def __init__(self, work: Workspace) -> None:
+        self._work = work
+        self._anchors = gather(Anchors, work.model)
+
+    def launch(self, at: Substep) -> None:
+        """Launch the pullback of their rows."""
+        work, m, d = self._work, self._work.model, at.data
+        poses = gather(AnchorPoses, d)
+        wp.launch(
+            pull_anchors,
+            dim=(work.nworld, work.njmax),
+            inputs=[
+                m.opt.timestep,
+                m.opt.disableflags,
+                self._anchors,
+                d.nefc,
+                at.rows,
+                work.laws,
+                poses,
+                at.motion,
+                work.fields,
+            ],
+            outputs=[work.bars],
+        )

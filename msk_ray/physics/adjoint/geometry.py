@@ -18,6 +18,7 @@ from mujoco_warp import GeomType
 from msk_ray.physics.adjoint.approximated import Touches, count_touch
 from msk_ray.physics.adjoint.box_pairs import box_box_wrenches, capsule_box_wrenches
 from msk_ray.physics.adjoint.coverage import approximated_types
+from msk_ray.physics.adjoint.groups import ContactBars, Contacts, Shapes
 from msk_ray.physics.adjoint.pair_laws import (
     SCORED_PAIRS,
     ParallelLaw,
@@ -77,51 +78,40 @@ def pull_geometry_kernel(kinds: PairKinds) -> Any:
     @wp.kernel(module="unique", enable_backward=False)
     def pull_geometry(
         # Model:
-        body_rootid: wp.array[int],
-        geom_bodyid: wp.array[int],
-        geom_type: wp.array[int],
-        geom_size: wp.array2d[wp.vec3],
+        shapes: Shapes,
         substep: int,
         # In:
         nacon_in: wp.array[int],
-        contact_dist_in: wp.array[float],
-        contact_pos_in: wp.array[wp.vec3],
-        contact_frame_in: wp.array[wp.mat33],
-        contact_geom_in: wp.array[wp.vec2i],
-        contact_index_in: wp.array[int],
-        contact_address_in: wp.array2d[int],
-        contact_worldid_in: wp.array[int],
+        contacts_in: Contacts,
         geom_xpos_in: wp.array2d[wp.vec3],
         geom_xmat_in: wp.array2d[wp.mat33],
         subtree_com_in: wp.array2d[wp.vec3],
-        phi_dist_in: wp.array[float],
-        phi_pos_in: wp.array[wp.vec3],
-        phi_frame_in: wp.array[wp.mat33],
+        contact_bars_in: ContactBars,
         # Out:
         moved_bar_out: wp.array2d[wp.spatial_vector],
         touches_out: Touches,
     ) -> None:
         """Cotangents of (dist, pos, frame) to wrenches on the two bodies whose displacement moves them."""
         con = wp.tid()
-        if con >= wp.min(nacon_in[0], contact_dist_in.shape[0]):
+        if con >= wp.min(nacon_in[0], contacts_in.dist.shape[0]):
             return
-        if contact_address_in[con, 0] < 0:
+        if contacts_in.efc_address[con, 0] < 0:
             return
-        worldid = contact_worldid_in[con]
-        geoms = contact_geom_in[con]
-        type1 = geom_type[geoms[0]]
-        type2 = geom_type[geoms[1]]
-        body1 = geom_bodyid[geoms[0]]
-        body2 = geom_bodyid[geoms[1]]
-        dist = contact_dist_in[con]
-        point = contact_pos_in[con]
-        frame = contact_frame_in[con]
+        worldid = contacts_in.worldid[con]
+        geoms = contacts_in.geom[con]
+        type1 = shapes.geom_type[geoms[0]]
+        type2 = shapes.geom_type[geoms[1]]
+        body1 = shapes.geom_bodyid[geoms[0]]
+        body2 = shapes.geom_bodyid[geoms[1]]
+        dist = contacts_in.dist[con]
+        point = contacts_in.pos[con]
+        frame = contacts_in.frame[con]
         normal = frame[0]
-        dist_bar = phi_dist_in[con]
-        pos_bar = phi_pos_in[con]
-        weight = phi_frame_in[con]
-        com1 = subtree_com_in[worldid, body_rootid[body1]]
-        com2 = subtree_com_in[worldid, body_rootid[body2]]
+        dist_bar = contact_bars_in.dist[con]
+        pos_bar = contact_bars_in.pos[con]
+        weight = contact_bars_in.frame[con]
+        com1 = subtree_com_in[worldid, shapes.body_rootid[body1]]
+        com2 = subtree_com_in[worldid, shapes.body_rootid[body2]]
         pos1 = geom_xpos_in[worldid, geoms[0]]
         pos2 = geom_xpos_in[worldid, geoms[1]]
         mat1 = geom_xmat_in[worldid, geoms[0]]
@@ -150,12 +140,18 @@ def pull_geometry_kernel(kinds: PairKinds) -> Any:
             known = is_scored(type1, type2)
         if wp.static(scored):
             if known:
-                size1 = geom_size[worldid % geom_size.shape[0], geoms[0]]
-                size2 = geom_size[worldid % geom_size.shape[0], geoms[1]]
+                size1 = shapes.geom_size[worldid % shapes.geom_size.shape[0], geoms[0]]
+                size2 = shapes.geom_size[worldid % shapes.geom_size.shape[0], geoms[1]]
                 law = ParallelLaw()
                 if type1 == GeomType.CAPSULE:
                     law = parallel_law(
-                        contact_index_in[con], pos1, column(mat1, 2), size1[1], pos2, column(mat2, 2), size2[1]
+                        contacts_in.geomcollisionid[con],
+                        pos1,
+                        column(mat1, 2),
+                        size1[1],
+                        pos2,
+                        column(mat2, 2),
+                        size2[1],
                     )
                 _t1, _t2, pos1_bar, mat1_bar, _s1, pos2_bar, mat2_bar, _s2, _l, _d, _p, _n = wp.grad(pair_score)(
                     type1,
@@ -178,11 +174,11 @@ def pull_geometry_kernel(kinds: PairKinds) -> Any:
         if wp.static(boxes):
             if type2 == GeomType.BOX and (type1 == GeomType.BOX or type1 == GeomType.CAPSULE):
                 known = bool(True)
-                half1 = geom_size[worldid % geom_size.shape[0], geoms[0]]
-                half2 = geom_size[worldid % geom_size.shape[0], geoms[1]]
+                half1 = shapes.geom_size[worldid % shapes.geom_size.shape[0], geoms[0]]
+                half2 = shapes.geom_size[worldid % shapes.geom_size.shape[0], geoms[1]]
                 if type1 == GeomType.CAPSULE:
                     force1, torque1, force2, torque2 = capsule_box_wrenches(
-                        contact_index_in[con],
+                        contacts_in.geomcollisionid[con],
                         pos1,
                         mat1,
                         half1,
@@ -217,7 +213,7 @@ def pull_geometry_kernel(kinds: PairKinds) -> Any:
             # end, a box's corner, a mesh's vertex; a cylinder's rim point also runs around the rim.
             radius = float(0.0)
             if type2 == GeomType.SPHERE or type2 == GeomType.CAPSULE:
-                radius = geom_size[worldid % geom_size.shape[0], geoms[1]][0]
+                radius = shapes.geom_size[worldid % shapes.geom_size.shape[0], geoms[1]][0]
             core = point + normal * (radius + 0.5 * dist)
             # pos = core - n (r + dist/2) ,  dist = n·(core - o) - r
             reach = dist_bar - 0.5 * wp.dot(normal, pos_bar)
@@ -245,7 +241,9 @@ def pull_geometry_kernel(kinds: PairKinds) -> Any:
                 place2 = point
                 # A contact that pushes nothing, or whose world has no cotangent, has none either.
                 if dist_bar != 0.0 or wp.dot(pos_bar, pos_bar) != 0.0:
-                    count_touch(touches_out, worldid, substep, geom_type.shape[0], geoms[0], geoms[1], type1, type2)
+                    count_touch(
+                        touches_out, worldid, substep, shapes.geom_type.shape[0], geoms[0], geoms[1], type1, type2
+                    )
         if body1 > 0:
             wp.atomic_add(moved_bar_out, worldid, body1, wrench(force1, torque1, place1 - com1))
         if body2 > 0:

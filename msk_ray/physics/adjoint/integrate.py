@@ -6,6 +6,8 @@ Rotations are perturbed on the right (body frame), as MuJoCo's ball and free joi
 import warp as wp
 from mujoco_warp import JointType
 
+from msk_ray.physics.adjoint.groups import DofSlopes, Joints, Substep, gather
+from msk_ray.physics.adjoint.workspace import Workspace
 from msk_ray.physics.mjw_private import dof_damping_total, poly_force_deriv
 
 wp.set_module_options({"enable_backward": False})
@@ -41,21 +43,27 @@ def rate_pullback(phi: wp.vec3, g: wp.vec3) -> wp.vec3:
     return g + b * cr + c * wp.cross(phi, cr)
 
 
+@wp.struct
+class DofDampers:
+    """Linear and higher-order damping of dofs, that of actuators included."""
+
+    jnt_actuatorid: wp.array[int]
+    dof_jntid: wp.array[int]
+    dof_damping: wp.array2d[float]
+    dof_dampingpoly: wp.array2d[wp.vec2]
+    actuator_trntype: wp.array[int]
+    actuator_trnid: wp.array[wp.vec2i]
+    actuator_damping: wp.array2d[float]
+    actuator_dampingpoly: wp.array2d[wp.vec2]
+    actuator_gear: wp.array2d[wp.spatial_vector]
+
+
 @wp.kernel
 def pull_position(
     # Model:
     opt_timestep: wp.array[float],
-    jnt_type: wp.array[int],
-    jnt_dofadr: wp.array[int],
-    jnt_actuatorid: wp.array[int],
-    dof_jntid: wp.array[int],
-    dof_damping: wp.array2d[float],
-    dof_dampingpoly: wp.array2d[wp.vec2],
-    actuator_trntype: wp.array[int],
-    actuator_trnid: wp.array[wp.vec2i],
-    actuator_damping: wp.array2d[float],
-    actuator_dampingpoly: wp.array2d[wp.vec2],
-    actuator_gear: wp.array2d[wp.spatial_vector],
+    joints: Joints,
+    dampers: DofDampers,
     implicit_damping: bool,
     # In:
     qvel_in: wp.array2d[float],
@@ -66,8 +74,7 @@ def pull_position(
     grad_qpos_out: wp.array2d[float],
     grad_qvel_out: wp.array2d[float],
     rhs_out: wp.array2d[float],
-    phi_qpos_out: wp.array2d[float],
-    phi_qvel_out: wp.array2d[float],
+    slopes_out: DofSlopes,
 ) -> None:
     """Turns cotangents of (q', v') into those of (q, v') in place, and starts this substep's sums.
 
@@ -75,8 +82,8 @@ def pull_position(
     """
     worldid, jntid = wp.tid()
     h = opt_timestep[worldid % opt_timestep.shape[0]]
-    kind = jnt_type[jntid]
-    dof = jnt_dofadr[jntid]
+    kind = joints.jnt_type[jntid]
+    dof = joints.jnt_dofadr[jntid]
     count = int(1)
     turn = dof
     if kind == JointType.FREE:
@@ -101,15 +108,15 @@ def pull_position(
         # v' = v + h (M + hB)⁻¹ M a: the right-hand side of (M + hB) μ = h v̄'
         rhs_out[worldid, j] = h * grad_qvel_out[worldid, j]
         linear, poly = dof_damping_total(
-            jnt_actuatorid,
-            dof_jntid,
-            dof_damping,
-            dof_dampingpoly,
-            actuator_trntype,
-            actuator_trnid,
-            actuator_damping,
-            actuator_dampingpoly,
-            actuator_gear,
+            dampers.jnt_actuatorid,
+            dampers.dof_jntid,
+            dampers.dof_damping,
+            dampers.dof_dampingpoly,
+            dampers.actuator_trntype,
+            dampers.actuator_trnid,
+            dampers.actuator_damping,
+            dampers.actuator_dampingpoly,
+            dampers.actuator_gear,
             worldid,
             j,
         )
@@ -118,16 +125,14 @@ def pull_position(
         step_out[worldid, j] = 0.0
         if implicit_damping:
             step_out[worldid, j] = h * poly_force_deriv(linear, poly, qvel_in[worldid, j], 1)
-        phi_qpos_out[worldid, j] = 0.0
-        phi_qvel_out[worldid, j] = 0.0
+        slopes_out.qpos[worldid, j] = 0.0
+        slopes_out.qvel[worldid, j] = 0.0
 
 
 @wp.kernel
 def project(
     # Model:
-    jnt_type: wp.array[int],
-    jnt_qposadr: wp.array[int],
-    jnt_dofadr: wp.array[int],
+    joints: Joints,
     # In:
     qpos_in: wp.array2d[float],
     raw_in: wp.array2d[float],
@@ -136,9 +141,9 @@ def project(
 ) -> None:
     """Raw gradient (W, nq) to tangent gradient (W, nv): the vector part of ½ q*⊗g for a quaternion."""
     worldid, jntid = wp.tid()
-    kind = jnt_type[jntid]
-    q = jnt_qposadr[jntid]
-    v = jnt_dofadr[jntid]
+    kind = joints.jnt_type[jntid]
+    q = joints.jnt_qposadr[jntid]
+    v = joints.jnt_dofadr[jntid]
     if kind == JointType.FREE:
         for i in range(3):
             tangent_out[worldid, v + i] = raw_in[worldid, q + i]
@@ -160,9 +165,7 @@ def project(
 @wp.kernel
 def lift(
     # Model:
-    jnt_type: wp.array[int],
-    jnt_qposadr: wp.array[int],
-    jnt_dofadr: wp.array[int],
+    joints: Joints,
     # In:
     qpos_in: wp.array2d[float],
     tangent_in: wp.array2d[float],
@@ -171,9 +174,9 @@ def lift(
 ) -> None:
     """Tangent gradient (W, nv) to the raw one (W, nq) without a component along q: 2 q⊗[0, g]."""
     worldid, jntid = wp.tid()
-    kind = jnt_type[jntid]
-    q = jnt_qposadr[jntid]
-    v = jnt_dofadr[jntid]
+    kind = joints.jnt_type[jntid]
+    q = joints.jnt_qposadr[jntid]
+    v = joints.jnt_dofadr[jntid]
     if kind == JointType.FREE:
         for i in range(3):
             raw_out[worldid, q + i] = tangent_in[worldid, v + i]
@@ -264,3 +267,69 @@ def add_into(
     """y += x, as gradients add up."""
     i, j = wp.tid()
     y_out[i, j] = y_out[i, j] + x_in[i, j]
+
+
+class Integrator:
+    """Launches of the integration of positions, and of what begins and ends an env step's pullback.
+
+    Attributes:
+        rhs: h v̄', shape (W, nv).
+        damping: each dof's damping coefficients (c₀, c₁, c₂), shape (W, nv), vec3.
+        damping_step: hB where it is diagonal, shape (W, nv).
+    """
+
+    def __init__(self, work: Workspace) -> None:
+        self._work = work
+        shape = (work.nworld, work.mjm.nv)
+        self._dampers = gather(DofDampers, work.model)
+        self.rhs, self.damping_step = wp.zeros(shape, dtype=float), wp.zeros(shape, dtype=float)
+        self.damping = wp.zeros(shape, dtype=wp.vec3)
+
+    def start(self, qpos: wp.array, raw_qpos: wp.array) -> None:
+        """Launch the change of a raw cotangent (W, nq) at `qpos` to tangent coordinates, and find the live worlds."""
+        work = self._work
+        wp.launch(
+            project,
+            dim=(work.nworld, work.model.njnt),
+            inputs=[work.joints, qpos, raw_qpos],
+            outputs=[work.grad_qpos],
+        )
+        wp.launch(mark_live, dim=work.nworld, inputs=[raw_qpos, work.grad_qvel, work.grad_act], outputs=[work.live])
+        work.grad_ctrl.zero_()
+
+    def finish(self, qpos: wp.array, raw_qpos: wp.array) -> None:
+        """Launch the change of the tangent gradient at `qpos` to raw coordinates (W, nq)."""
+        work = self._work
+        wp.launch(
+            lift,
+            dim=(work.nworld, work.model.njnt),
+            inputs=[work.joints, qpos, work.grad_qpos],
+            outputs=[raw_qpos],
+        )
+
+    def clip(self, bound: float, clipped: wp.array) -> None:
+        """Launch the bound on each world's state cotangent; `clipped` (W,) counts where it acted."""
+        work = self._work
+        wp.launch(
+            clip_norm,
+            dim=work.nworld,
+            inputs=[bound],
+            outputs=[work.grad_qpos, work.grad_qvel, work.grad_act, clipped],
+        )
+
+    def launch(self, at: Substep, qvel_next: wp.array) -> None:
+        """Launch the pullback of q' = q ⊕ h v' and the right-hand side of the first linear system."""
+        work = self._work
+        wp.launch(
+            pull_position,
+            dim=(work.nworld, work.model.njnt),
+            inputs=[
+                work.model.opt.timestep,
+                work.joints,
+                self._dampers,
+                work.settings.euler_damping,
+                at.state.qvel,
+                qvel_next,
+            ],
+            outputs=[self.damping, self.damping_step, work.grad_qpos, work.grad_qvel, self.rhs, work.slopes],
+        )

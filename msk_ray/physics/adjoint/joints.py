@@ -3,6 +3,8 @@
 import warp as wp
 from mujoco_warp import JointType
 
+from msk_ray.physics.adjoint.groups import Joints, Springs, Substep
+from msk_ray.physics.adjoint.workspace import Workspace
 from msk_ray.physics.mjw_private import poly_force, quat_sub
 
 wp.set_module_options({"enable_backward": False})
@@ -33,12 +35,8 @@ def spring_slope(stiffness: float, poly: wp.vec2, dif: wp.vec3, lam: wp.vec3) ->
 @wp.kernel
 def pull_turning_springs(
     # Model:
-    qpos_spring: wp.array2d[float],
-    jnt_type: wp.array[int],
-    jnt_qposadr: wp.array[int],
-    jnt_dofadr: wp.array[int],
-    jnt_stiffness: wp.array2d[float],
-    jnt_stiffnesspoly: wp.array2d[wp.vec2],
+    joints: Joints,
+    springs: Springs,
     # In:
     qpos_in: wp.array2d[float],
     lam_in: wp.array2d[float],
@@ -47,21 +45,21 @@ def pull_turning_springs(
 ) -> None:
     """Φ ∋ λ·k(|d|) d: d the displacement from rest, for a rotation its logarithm."""
     worldid, jntid = wp.tid()
-    kind = jnt_type[jntid]
+    kind = joints.jnt_type[jntid]
     if kind != JointType.FREE and kind != JointType.BALL:
         return
-    stiffness = jnt_stiffness[worldid % jnt_stiffness.shape[0], jntid]
-    poly = jnt_stiffnesspoly[worldid % jnt_stiffnesspoly.shape[0], jntid]
+    stiffness = springs.jnt_stiffness[worldid % springs.jnt_stiffness.shape[0], jntid]
+    poly = springs.jnt_stiffnesspoly[worldid % springs.jnt_stiffnesspoly.shape[0], jntid]
     if stiffness == 0.0 and poly[0] == 0.0 and poly[1] == 0.0:
         return
-    q = jnt_qposadr[jntid]
-    v = jnt_dofadr[jntid]
-    rest = worldid % qpos_spring.shape[0]
+    q = joints.jnt_qposadr[jntid]
+    v = joints.jnt_dofadr[jntid]
+    rest = worldid % springs.qpos_spring.shape[0]
     if kind == JointType.FREE:
         dif = wp.vec3(0.0)
         lam = wp.vec3(0.0)
         for i in range(3):
-            dif[i] = qpos_in[worldid, q + i] - qpos_spring[rest, q + i]
+            dif[i] = qpos_in[worldid, q + i] - springs.qpos_spring[rest, q + i]
             lam[i] = lam_in[worldid, v + i]
         slope = spring_slope(stiffness, poly, dif, lam)
         for i in range(3):
@@ -69,9 +67,31 @@ def pull_turning_springs(
         q += 3
         v += 3
     now = wp.quat(qpos_in[worldid, q], qpos_in[worldid, q + 1], qpos_in[worldid, q + 2], qpos_in[worldid, q + 3])
-    still = wp.quat(qpos_spring[rest, q], qpos_spring[rest, q + 1], qpos_spring[rest, q + 2], qpos_spring[rest, q + 3])
+    still = wp.quat(
+        springs.qpos_spring[rest, q],
+        springs.qpos_spring[rest, q + 1],
+        springs.qpos_spring[rest, q + 2],
+        springs.qpos_spring[rest, q + 3],
+    )
     phi = quat_sub(wp.normalize(now), still)
     turn = wp.vec3(lam_in[worldid, v], lam_in[worldid, v + 1], lam_in[worldid, v + 2])
     slope = log_rate_pullback(phi, spring_slope(stiffness, poly, phi, turn))
     for i in range(3):
         wp.atomic_add(phi_qpos_out, worldid, v + i, slope[i])
+
+
+class TurningSprings:
+    """Launches of what springs of free and ball joints give ∂Φ."""
+
+    def __init__(self, work: Workspace) -> None:
+        self._work = work
+
+    def launch(self, at: Substep) -> None:
+        """Launch the pullback of these springs."""
+        work = self._work
+        wp.launch(
+            pull_turning_springs,
+            dim=(work.nworld, work.model.njnt),
+            inputs=[work.joints, work.springs, at.state.qpos, work.multipliers.lam],
+            outputs=[work.slopes.qpos],
+        )

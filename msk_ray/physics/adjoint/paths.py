@@ -1,103 +1,253 @@
-"""Lengths and rates of all tendons as functions of (q, v), and their exact pullback.
+"""Paths of spatial tendons: how the rates of a tendon's length turn with q.
 
-With cotangents l̄ and ρ̄ of a tendon's length and rate, Φ = Σ l̄ l + ρ̄ J v has no other fields than v, so the launches
-of a substep's adjoint give ∂Φ/∂q and ∂Φ/∂v once λ, μ, a and a - â are zero.
+A tendon's rate under a plain field x is ρ(x) = J x, and a spatial tendon's J turns with q:
+
+    ρ(x) = n·(u₂(x) - u₁(x)) ,  n = (p₂ - p₁)/|p₂ - p₁| ,  u the velocities of the segment's ends under x.
+
+On a wrapping geom the ends are tangent points that move over the surface; the rate sees them fixed to the geom's body
+(the length is stationary in them), its own change sees them move.
 """
 
-from typing import Any
-
-import mujoco_warp as mjw
 import warp as wp
 
-from msk_ray.physics.adjoint.step import StepAdjoint
-from msk_ray.physics.adjoint.tendons import tendon_rate
+from msk_ray.physics.adjoint.groups import FieldBars, Fields, Motion, Substep, TendonBars, gather
+from msk_ray.physics.adjoint.spatial import carried, point_velocity, wrench
+from msk_ray.physics.adjoint.workspace import Workspace
+from msk_ray.physics.adjoint.wrapping import PathPoses, Paths, touch_paths
+from msk_ray.physics.mjw_private import MJ_MAXVAL, wrap
+
+wp.set_module_options({"enable_backward": False})
 
 
-@wp.kernel(enable_backward=False)
-def tendon_rates(
-    # Model:
-    ten_J_rownnz: wp.array[int],
-    ten_J_rowadr: wp.array[int],
-    ten_J_colind: wp.array[int],
-    # In:
-    qvel_in: wp.array2d[float],
-    ten_J_in: wp.array2d[float],
-    # Out:
-    rate_out: wp.array2d[float],
-) -> None:
-    """ρ = J v."""
-    worldid, t = wp.tid()
-    rate_out[worldid, t] = tendon_rate(
-        ten_J_rownnz[t], ten_J_rowadr[t], ten_J_colind, ten_J_in[worldid], qvel_in[worldid]
-    )
+@wp.func
+def wrap_score(
+    start: wp.vec3,
+    end: wp.vec3,
+    pos: wp.vec3,
+    mat: wp.mat33,
+    radius: wp.float32,
+    kind: wp.int32,
+    side: wp.vec3,
+    weight0: wp.vec3,
+    weight1: wp.vec3,
+) -> wp.float32:
+    """⟨weights, tangent points⟩ of a path from `start` to `end` around a sphere or cylinder."""
+    _length, point0, point1 = wrap(start, end, pos, mat, radius, kind, side)
+    return wp.dot(weight0, point0) + wp.dot(weight1, point1)
 
 
-@wp.kernel(enable_backward=False)
-def negated(
-    # In:
-    length_bar_in: wp.array2d[float],
-    rate_bar_in: wp.array2d[float],
-    # Out:
-    length_out: wp.array2d[float],
-    rate_out: wp.array2d[float],
-) -> None:
-    """-Φ: the sweep subtracts its slopes."""
-    worldid, t = wp.tid()
-    length_out[worldid, t] = -length_bar_in[worldid, t]
-    rate_out[worldid, t] = -rate_bar_in[worldid, t]
+@wp.struct
+class Rates:
+    """Cotangents of one tendon's rates, times its pulley's share."""
+
+    lam: float
+    qacc: float
+    qvel: float
+    mu: float
+    smooth: float
 
 
-class TendonAdjoint(StepAdjoint):
-    """Buffers and launches for `nworld` worlds, on a `mujoco_warp.Data` whose qpos and qvel are set.
+@wp.struct
+class Twists:
+    """Plain fields of one body."""
 
-    Attributes:
-        rate: J v of every tendon [m/s], shape (W, ntendon).
-        length_bar, rate_bar: cotangents of length and rate, read by `launch_pullback`, shape (W, ntendon).
-        grad_qpos, grad_qvel: what they pull back to, in tangent coordinates, shape (W, nv).
+    lam: wp.spatial_vectorf
+    qacc: wp.spatial_vectorf
+    qvel: wp.spatial_vectorf
+    mu: wp.spatial_vectorf
+    smooth: wp.spatial_vectorf
+
+
+@wp.func
+def weigh(rates: Rates, fields: Twists) -> wp.spatial_vectorf:
+    """Σ_x ρ̄(x) V(x): one field that carries all that a direction's cotangent needs."""
+    out = rates.lam * fields.lam + rates.qacc * fields.qacc + rates.qvel * fields.qvel
+    return out + rates.mu * fields.mu + rates.smooth * fields.smooth
+
+
+@wp.func
+def segment_turn(start: wp.vec3, end: wp.vec3, slide: wp.vec3) -> wp.vec3:
+    """Cotangent of the segment's end (minus that of its start): n̄ = Σ ρ̄ Δu ,  dn = (1 - n nᵀ) dp / |p|.
+
+    Zero for a segment without length, which has no direction that could turn.
     """
+    dif = end - start
+    length = wp.length(dif)
+    if length == 0.0:
+        return wp.vec3(0.0)
+    n = dif / length
+    return (slide - n * wp.dot(n, slide)) / length
 
-    def __init__(self, mjm: Any, model: Any, data: Any) -> None:
-        super().__init__(mjm, model, data)
-        with wp.ScopedDevice(self.device):
-            shape = (self.nworld, mjm.ntendon)
-            self.rate, self.length_bar, self.rate_bar = (wp.zeros(shape, dtype=float) for _ in range(3))
 
-    def launch_forward(self, data: Any) -> None:
-        """Launch lengths, into `data.ten_length`, and rates."""
-        m = self.model
-        mjw.kinematics(m, data)
-        mjw.com_pos(m, data)
-        mjw.tendon(m, data)
+@wp.func
+def push_point(
+    body: int,
+    worldid: int,
+    arm: wp.vec3,
+    direction: wp.vec3,
+    turn: wp.vec3,
+    rates: Rates,
+    fields: Twists,
+    bars_out: FieldBars,
+) -> None:
+    """Adds what one end of a segment gives its body: rates ρ̄(x) along `direction`, and the end's own cotangent."""
+    if body > 0:
+        zero = wp.vec3(0.0)
+        along = wrench(direction, zero, arm)
+        total = weigh(rates, fields)
+        wp.atomic_add(bars_out.lam, worldid, body, rates.lam * along)
+        # â = a - (a - â): its cotangent goes to both fields
+        wp.atomic_add(bars_out.qacc, worldid, body, (rates.qacc + rates.smooth) * along)
+        wp.atomic_add(bars_out.qvel, worldid, body, rates.qvel * along)
+        if rates.mu != 0.0 or rates.smooth != 0.0:
+            wp.atomic_add(bars_out.mu, worldid, body, rates.mu * along)
+            wp.atomic_add(bars_out.excess, worldid, body, -rates.smooth * along)
+        # The velocity of the end changes with its place as ω × dp ⇒ p̄ ∋ direction × Σ ρ̄ ω
+        place = turn + wp.cross(direction, wp.spatial_top(total))
+        wp.atomic_add(bars_out.moved, worldid, body, carried(total, along) + wrench(place, zero, arm))
+
+
+@wp.func
+def fields_of(
+    body: int,
+    worldid: int,
+    fields_in: Fields,
+    cvel_in: wp.array2d[wp.spatial_vector],
+) -> Twists:
+    """Fields of one body."""
+    out = Twists()
+    out.lam = fields_in.lam[worldid, body]
+    out.qacc = fields_in.qacc[worldid, body]
+    out.qvel = cvel_in[worldid, body]
+    out.mu = fields_in.mu[worldid, body]
+    out.smooth = out.qacc - fields_in.excess[worldid, body]
+    return out
+
+
+@wp.kernel
+def pull_paths(
+    # Model:
+    paths: Paths,
+    # In:
+    touch_in: wp.array2d[wp.spatial_vector],
+    poses_in: PathPoses,
+    motion_in: Motion,
+    fields_in: Fields,
+    tendon_bars_in: TendonBars,
+    # Out:
+    bars_out: FieldBars,
+) -> None:
+    """How J x of a spatial tendon turns with q: one thread a stretch of path between two sites, geom or not."""
+    worldid, e = wp.tid()
+    t = paths.segment_tendon[e]
+    first = paths.segment_first[e]
+    share = paths.wrap_pulley_scale[first]
+    rates = Rates()
+    rates.lam = share * tendon_bars_in.lam[worldid, t]
+    rates.qacc = share * tendon_bars_in.qacc[worldid, t]
+    rates.qvel = share * tendon_bars_in.qvel[worldid, t]
+    rates.mu = share * tendon_bars_in.mu[worldid, t]
+    rates.smooth = share * tendon_bars_in.smooth[worldid, t]
+    site0 = paths.wrap_objid[first]
+    site1 = paths.wrap_objid[paths.segment_last[e]]
+    body0 = paths.site_bodyid[site0]
+    body1 = paths.site_bodyid[site1]
+    start = poses_in.site_xpos[worldid, site0]
+    end = poses_in.site_xpos[worldid, site1]
+    com0 = motion_in.subtree_com[worldid, paths.body_rootid[body0]]
+    com1 = motion_in.subtree_com[worldid, paths.body_rootid[body1]]
+    f0 = fields_of(body0, worldid, fields_in, motion_in.cvel)
+    f1 = fields_of(body1, worldid, fields_in, motion_in.cvel)
+
+    place = paths.segment_geom[e]
+    geom = int(0)
+    kind = int(0)
+    radius = float(0.0)
+    side = wp.vec3(MJ_MAXVAL)
+    if place >= 0:
+        geom = paths.wrap_objid[place]
+        kind = paths.wrap_type[place]
+        radius = paths.geom_size[worldid % paths.geom_size.shape[0], geom][0]
+        sidesite = int(wp.round(paths.wrap_prm[place]))
+        if sidesite >= 0:
+            side = poses_in.site_xpos[worldid, sidesite]
+    touch0 = wp.spatial_top(touch_in[worldid, e])
+    touch1 = wp.spatial_bottom(touch_in[worldid, e])
+    if touch_in[worldid, e][0] >= MJ_MAXVAL:
+        if body0 == body1:
+            return
+        n = wp.normalize(end - start)
+        slide = point_velocity(weigh(rates, f1), end - com1) - point_velocity(weigh(rates, f0), start - com0)
+        turn = segment_turn(start, end, slide)
+        push_point(body0, worldid, start - com0, -n, -turn, rates, f0, bars_out)
+        push_point(body1, worldid, end - com1, n, turn, rates, f1, bars_out)
+        return
+
+    body = paths.geom_bodyid[geom]
+    com = motion_in.subtree_com[worldid, paths.body_rootid[body]]
+    fg = fields_of(body, worldid, fields_in, motion_in.cvel)
+    total = weigh(rates, fg)
+    zero = wp.vec3(0.0)
+    touch0_bar = zero
+    touch1_bar = zero
+    if body0 != body:
+        n = wp.normalize(touch0 - start)
+        slide = point_velocity(total, touch0 - com) - point_velocity(weigh(rates, f0), start - com0)
+        turn = segment_turn(start, touch0, slide)
+        push_point(body0, worldid, start - com0, -n, -turn, rates, f0, bars_out)
+        # The tangent point's displacement is not the geom's: its cotangent goes through the wrap below.
+        touch0_bar = turn + wp.cross(n, wp.spatial_top(total))
+        push_point(body, worldid, touch0 - com, n, -wp.cross(n, wp.spatial_top(total)), rates, fg, bars_out)
+    if body1 != body:
+        n = wp.normalize(end - touch1)
+        slide = point_velocity(weigh(rates, f1), end - com1) - point_velocity(total, touch1 - com)
+        turn = segment_turn(touch1, end, slide)
+        push_point(body1, worldid, end - com1, n, turn, rates, f1, bars_out)
+        touch1_bar = -turn - wp.cross(n, wp.spatial_top(total))
+        push_point(body, worldid, touch1 - com, -n, wp.cross(n, wp.spatial_top(total)), rates, fg, bars_out)
+    mat = poses_in.geom_xmat[worldid, geom]
+    pos = poses_in.geom_xpos[worldid, geom]
+    start_bar, end_bar, pos_bar, mat_bar, _r, _k, side_bar, _w0, _w1 = wp.grad(wrap_score)(
+        start, end, pos, mat, radius, kind, side, touch0_bar, touch1_bar
+    )
+    # dR = [ω] R  ⇒  torque Σ_k R_k × R̄_k over the columns
+    torque = zero
+    for k in range(3):
+        column = wp.vec3(mat[0, k], mat[1, k], mat[2, k])
+        column_bar = wp.vec3(mat_bar[0, k], mat_bar[1, k], mat_bar[2, k])
+        torque += wp.cross(column, column_bar)
+    if body0 > 0:
+        wp.atomic_add(bars_out.moved, worldid, body0, wrench(start_bar, zero, start - com0))
+    if body1 > 0:
+        wp.atomic_add(bars_out.moved, worldid, body1, wrench(end_bar, zero, end - com1))
+    if body > 0:
+        wp.atomic_add(bars_out.moved, worldid, body, wrench(pos_bar, torque, pos - com))
+    sidesite = int(wp.round(paths.wrap_prm[place]))
+    if sidesite >= 0:
+        owner = paths.site_bodyid[sidesite]
+        if owner > 0:
+            arm = side - motion_in.subtree_com[worldid, paths.body_rootid[owner]]
+            wp.atomic_add(bars_out.moved, worldid, owner, wrench(side_bar, zero, arm))
+
+
+class TendonPaths:
+    """Launches of the tangent points on wrapping geoms, and of what paths give ∂Φ."""
+
+    def __init__(self, work: Workspace) -> None:
+        self._work = work
+        self._paths = gather(Paths, work.tables, work.model)
+        shape = (work.nworld, work.tables.segment_tendon.size)
+        self._touch = wp.full(shape, wp.spatial_vector(*([MJ_MAXVAL] * 6)), dtype=wp.spatial_vector)
+
+    def launch(self, at: Substep) -> None:
+        """Launch both."""
+        work = self._work
+        poses = gather(PathPoses, at.data)
+        if work.tables.has_wrapping:
+            wp.launch(touch_paths, dim=self._touch.shape, inputs=[self._paths, poses], outputs=[self._touch])
         wp.launch(
-            tendon_rates,
-            dim=(self.nworld, m.ntendon),
-            inputs=[m.ten_J_rownnz, m.ten_J_rowadr, m.ten_J_colind, data.qvel, data.ten_J],
-            outputs=[self.rate],
+            pull_paths,
+            dim=self._touch.shape,
+            inputs=[self._paths, self._touch, poses, at.motion, work.fields, work.tendon_bars],
+            outputs=[work.bars],
         )
-
-    def launch_pullback(self, data: Any) -> None:
-        """Launch the pullback of `length_bar` and `rate_bar` at the state in `data`."""
-        self.launch_forward(data)
-        mjw.com_vel(self.model, data)
-        for array in (
-            self.grad_qpos,
-            self.grad_qvel,
-            self._phi_qpos,
-            self._phi_qvel,
-            self._lam,
-            self._mu,
-            self._excess,
-        ):
-            array.zero_()
-        data.qacc.zero_()
-        self._fields(data)
-        for array in (self._ten_lam_bar, self._ten_qacc_bar, self._ten_mu_bar, self._ten_smooth_bar):
-            array.zero_()
-        wp.launch(
-            negated,
-            dim=(self.nworld, self.model.ntendon),
-            inputs=[self.length_bar, self.rate_bar],
-            outputs=[self._ten_length_bar, self._ten_qvel_bar],
-        )
-        self._pull_tendons(data)
-        self._sweep(data)

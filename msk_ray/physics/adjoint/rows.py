@@ -7,6 +7,8 @@ T = |φᵢ jarᵢ| and are finished in `contacts`.
 
 import warp as wp
 
+from msk_ray.physics.adjoint.groups import Contacts, RowLaws, Rows, Substep
+from msk_ray.physics.adjoint.workspace import Workspace
 from msk_ray.physics.mjw_private import ConstraintType, contact_kbimp, vec5
 
 wp.set_module_options({"enable_backward": False})
@@ -93,41 +95,36 @@ def row_laws(
     nv: int,
     # In:
     nefc_in: wp.array[int],
-    type_in: wp.array2d[int],
+    rows_in: Rows,
     jacobian_in: wp.array3d[float],
-    mass_in: wp.array2d[float],
-    aref_in: wp.array2d[float],
-    frictionloss_in: wp.array2d[float],
     qacc_in: wp.array2d[float],
     # Out:
-    jar_out: wp.array2d[float],
-    force_out: wp.array2d[float],
-    slope_out: wp.array2d[float],
+    laws_out: RowLaws,
 ) -> None:
     """jar = J a - aref, the force f of uncoupled rows, and their slope s = -∂f/∂jar. Elliptic rows get f = s = 0."""
     worldid, row = wp.tid()
-    if row >= wp.min(nefc_in[worldid], jar_out.shape[1]):
+    if row >= wp.min(nefc_in[worldid], laws_out.jar.shape[1]):
         return
-    jar = -aref_in[worldid, row]
+    jar = -rows_in.aref[worldid, row]
     for j in range(nv):
         jar += jacobian_in[worldid, row, j] * qacc_in[worldid, j]
-    d = mass_in[worldid, row]
-    kind = type_in[worldid, row]
+    d = rows_in.D[worldid, row]
+    kind = rows_in.type[worldid, row]
     force = float(0.0)
     slope = float(0.0)
     if kind == ConstraintType.EQUALITY:
         force = -d * jar
         slope = d
     elif kind == ConstraintType.FRICTION_DOF or kind == ConstraintType.FRICTION_TENDON:
-        loss = frictionloss_in[worldid, row]
+        loss = rows_in.frictionloss[worldid, row]
         force = wp.clamp(-d * jar, -loss, loss)
         slope = wp.where(wp.abs(d * jar) < loss, d, 0.0)
     elif kind != ConstraintType.CONTACT_ELLIPTIC and jar < 0.0:
         force = -d * jar
         slope = d
-    jar_out[worldid, row] = jar
-    force_out[worldid, row] = force
-    slope_out[worldid, row] = slope
+    laws_out.jar[worldid, row] = jar
+    laws_out.force[worldid, row] = force
+    laws_out.slope[worldid, row] = slope
 
 
 @wp.struct
@@ -197,37 +194,75 @@ def scaled_jacobian(
     opt_impratio_invsqrt: wp.array[float],
     # In:
     nefc_in: wp.array[int],
-    type_in: wp.array2d[int],
-    id_in: wp.array2d[int],
+    rows_in: Rows,
     jacobian_in: wp.array3d[float],
-    mass_in: wp.array2d[float],
-    jar_in: wp.array2d[float],
-    slope_in: wp.array2d[float],
-    contact_dim_in: wp.array[int],
-    contact_friction_in: wp.array[vec5],
-    contact_address_in: wp.array2d[int],
+    laws_in: RowLaws,
+    contacts_in: Contacts,
     # Out:
     scaled_out: wp.array3d[float],
 ) -> None:
     """S J, one thread a (row, dof); needed for elliptic cones only, whose S couples the rows of a contact."""
     worldid, row, dof = wp.tid()
-    if row >= wp.min(nefc_in[worldid], jar_in.shape[1]):
+    if row >= wp.min(nefc_in[worldid], laws_in.jar.shape[1]):
         return
-    if type_in[worldid, row] != ConstraintType.CONTACT_ELLIPTIC:
-        scaled_out[worldid, row, dof] = slope_in[worldid, row] * jacobian_in[worldid, row, dof]
+    if rows_in.type[worldid, row] != ConstraintType.CONTACT_ELLIPTIC:
+        scaled_out[worldid, row, dof] = laws_in.slope[worldid, row] * jacobian_in[worldid, row, dof]
         return
-    con = id_in[worldid, row]
-    first = contact_address_in[con, 0]
-    dim = contact_dim_in[con]
+    con = rows_in.id[worldid, row]
+    first = contacts_in.efc_address[con, 0]
+    dim = contacts_in.dim[con]
     jar = vec6()
     mass = vec6()
     column = vec6()
     for i in range(dim):
-        jar[i] = jar_in[worldid, first + i]
-        mass[i] = mass_in[worldid, first + i]
+        jar[i] = laws_in.jar[worldid, first + i]
+        mass[i] = rows_in.D[worldid, first + i]
         column[i] = jacobian_in[worldid, first + i, dof]
-    friction = contact_friction_in[con]
+    friction = contacts_in.friction[con]
     mu = friction[0] * opt_impratio_invsqrt[worldid % opt_impratio_invsqrt.shape[0]]
     cone = cone_law(jar, mass, friction, mu, dim)
     product = cone_slope(cone, mass, friction, dim, column)
     scaled_out[worldid, row, dof] = product[row - first]
+
+
+class ConstraintLaws:
+    """Launches of everything about constraint rows that depends on the acceleration alone.
+
+    Attributes:
+        scaled: S J for elliptic cones, shape (W, njmax, nv).
+    """
+
+    def __init__(self, work: Workspace) -> None:
+        self._work = work
+        shape = (work.nworld, work.njmax, work.mjm.nv)
+        self.scaled = wp.zeros(shape if work.settings.elliptic else (1, 1, 1), dtype=float)
+        self._dense = wp.zeros(shape, dtype=float) if work.model.is_sparse else None
+
+    def jacobian(self, at: Substep) -> wp.array:
+        """The constraint Jacobian that `launch` leaves, shape (W, njmax, nv or more)."""
+        return at.data.efc.J if self._dense is None else self._dense
+
+    def launch(self, at: Substep) -> None:
+        """Launch the Jacobian as a full matrix, the laws and S J."""
+        work, m, d = self._work, self._work.model, at.data
+        if self._dense is not None:
+            wp.launch(
+                densify_rows,
+                dim=(work.nworld, work.njmax),
+                inputs=[d.nefc, d.efc.J_rownnz, d.efc.J_rowadr, d.efc.J_colind, d.efc.J],
+                outputs=[self._dense],
+            )
+        jacobian = self.jacobian(at)
+        wp.launch(
+            row_laws,
+            dim=(work.nworld, work.njmax),
+            inputs=[m.nv, d.nefc, at.rows, jacobian, d.qacc],
+            outputs=[work.laws],
+        )
+        if work.settings.elliptic:
+            wp.launch(
+                scaled_jacobian,
+                dim=(work.nworld, work.njmax, m.nv),
+                inputs=[m.opt.impratio_invsqrt, d.nefc, at.rows, jacobian, work.laws, at.contacts],
+                outputs=[self.scaled],
+            )

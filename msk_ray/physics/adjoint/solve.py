@@ -5,10 +5,17 @@ from typing import Any
 
 import warp as wp
 
+from msk_ray.physics.adjoint.groups import Substep
+from msk_ray.physics.adjoint.integrate import Integrator
+from msk_ray.physics.adjoint.rows import ConstraintLaws
+from msk_ray.physics.adjoint.stages import implicit_matrix
+from msk_ray.physics.adjoint.workspace import Workspace
+
 wp.set_module_options({"enable_backward": False})
 
 # Largest nv whose matrices fit the shared memory of one block (two tiles of nv² floats).
 TILE_LIMIT = 64
+_BLOCK = 32
 
 
 @wp.kernel
@@ -227,3 +234,70 @@ def solve_serial(
         lam_out[worldid, i] = rhs_in[worldid, i] - damping_in[worldid, i] * mu_out[worldid, i]
     _factor(hessian_in[worldid], nv)
     _substitute(hessian_in[worldid], nv, lam_out[worldid])
+
+
+class LinearSystems:
+    """Launches of the solves for μ, a - â and λ."""
+
+    def __init__(self, work: Workspace, integrator: Integrator, laws: ConstraintLaws) -> None:
+        self._work, self._integrator, self._laws = work, integrator, laws
+        worlds, nv = work.nworld, work.mjm.nv
+        self._implicit, self._hessian = (wp.zeros((worlds, nv, nv), dtype=float) for _ in range(2))
+        if work.settings.implicit_all:
+            self._step = wp.zeros((worlds, work.model.nC), dtype=float)
+            self._push = wp.zeros((worlds, nv), dtype=float)
+
+    def launch(self, at: Substep) -> None:
+        """Launch the matrices and their solves."""
+        work, m, d, settings = self._work, self._work.model, at.data, self._work.settings
+        if settings.implicit_all:
+            implicit_matrix(m, d, self._step)
+        wp.launch(
+            build_matrices,
+            dim=(work.nworld, m.nv, m.nv),
+            inputs=[
+                settings.elliptic,
+                work.tables.inertia_address,
+                d.nefc,
+                d.M,
+                self._step if settings.implicit_all else self._integrator.damping_step,
+                settings.implicit_all,
+                self._laws.jacobian(at),
+                work.laws.slope,
+                self._laws.scaled,
+            ],
+            outputs=[self._implicit, self._hessian],
+        )
+        if settings.implicit_all:
+            self._solve_implicit(d)
+            return
+        inputs = [self._implicit, self._hessian, self._integrator.rhs, self._integrator.damping_step, d.qacc]
+        outputs = [work.multipliers.mu, work.multipliers.excess, work.multipliers.lam]
+        if m.nv <= TILE_LIMIT:
+            wp.launch_tiled(solve_tiled(m.nv), dim=work.nworld, inputs=inputs, outputs=outputs, block_dim=_BLOCK)
+        else:
+            wp.launch(solve_serial, dim=work.nworld, inputs=[m.nv, *inputs], outputs=outputs)
+
+    def _solve_implicit(self, d: Any) -> None:
+        """μ, a - â and λ where B is a matrix: (M + hB)(a - â) = hB a ,  H λ = h v̄' - hB μ."""
+        found, rhs = self._work.multipliers, self._integrator.rhs
+        self._product(d, d.qacc, 1.0)
+        self._solve_two(self._implicit, rhs, self._push, [found.mu, found.excess])
+        self._product(d, found.mu, -1.0)
+        self._solve_two(self._hessian, self._push, self._push, [found.lam, self._push])
+
+    def _product(self, d: Any, x: wp.array, scale: float) -> None:
+        work = self._work
+        wp.launch(
+            damping_product,
+            dim=(work.nworld, work.model.nv),
+            inputs=[work.tables.inertia_address, d.M, self._step, x, self._integrator.rhs, scale],
+            outputs=[self._push],
+        )
+
+    def _solve_two(self, matrix: wp.array, first: wp.array, second: wp.array, outputs: list[wp.array]) -> None:
+        worlds, nv, inputs = self._work.nworld, self._work.model.nv, [matrix, first, second]
+        if nv <= TILE_LIMIT:
+            wp.launch_tiled(solve_two_tiled(nv), dim=worlds, inputs=inputs, outputs=outputs, block_dim=_BLOCK)
+        else:
+            wp.launch(solve_two_serial, dim=worlds, inputs=[nv, *inputs], outputs=outputs)

@@ -1,6 +1,6 @@
 """Tangent points of tendon paths on wrapping geoms.
 
-Kept apart from `tendons`: Warp drops the derivative of a function that another kernel of the module runs forward only.
+Kept apart from `paths`: Warp drops the derivative of a function that another kernel of the module runs forward only.
 """
 
 import warp as wp
@@ -13,20 +13,39 @@ _LEAST_ARC = wp.constant(1.0e-6)
 """Arcs up to this long count as a straight path [m]."""
 
 
+@wp.struct
+class Paths:
+    """Stretches of tendon paths, and the sites and geoms they run over."""
+
+    body_rootid: wp.array[int]
+    geom_bodyid: wp.array[int]
+    geom_size: wp.array2d[wp.vec3]
+    site_bodyid: wp.array[int]
+    wrap_type: wp.array[int]
+    wrap_objid: wp.array[int]
+    wrap_prm: wp.array[float]
+    wrap_pulley_scale: wp.array[float]
+    segment_tendon: wp.array[int]
+    segment_first: wp.array[int]
+    segment_geom: wp.array[int]
+    segment_last: wp.array[int]
+
+
+@wp.struct
+class PathPoses:
+    """Poses of geoms and sites."""
+
+    geom_xpos: wp.array2d[wp.vec3]
+    geom_xmat: wp.array2d[wp.mat33]
+    site_xpos: wp.array2d[wp.vec3]
+
+
 @wp.kernel
 def touch_paths(
     # Model:
-    geom_size: wp.array2d[wp.vec3],
-    wrap_type: wp.array[int],
-    wrap_objid: wp.array[int],
-    wrap_prm: wp.array[float],
-    segment_first: wp.array[int],
-    segment_geom: wp.array[int],
-    segment_last: wp.array[int],
+    paths: Paths,
     # In:
-    geom_xpos_in: wp.array2d[wp.vec3],
-    geom_xmat_in: wp.array2d[wp.mat33],
-    site_xpos_in: wp.array2d[wp.vec3],
+    poses_in: PathPoses,
     # Out:
     touch_out: wp.array2d[wp.spatial_vector],
 ) -> None:
@@ -34,21 +53,21 @@ def touch_paths(
     worldid, e = wp.tid()
     far = wp.vec3(MJ_MAXVAL)
     touch_out[worldid, e] = wp.spatial_vector(far, far)
-    place = segment_geom[e]
+    place = paths.segment_geom[e]
     if place < 0:
         return
-    geom = wrap_objid[place]
+    geom = paths.wrap_objid[place]
     side = far
-    sidesite = int(wp.round(wrap_prm[place]))
+    sidesite = int(wp.round(paths.wrap_prm[place]))
     if sidesite >= 0:
-        side = site_xpos_in[worldid, sidesite]
+        side = poses_in.site_xpos[worldid, sidesite]
     arc, point0, point1 = wrap(
-        site_xpos_in[worldid, wrap_objid[segment_first[e]]],
-        site_xpos_in[worldid, wrap_objid[segment_last[e]]],
-        geom_xpos_in[worldid, geom],
-        geom_xmat_in[worldid, geom],
-        geom_size[worldid % geom_size.shape[0], geom][0],
-        wrap_type[place],
+        poses_in.site_xpos[worldid, paths.wrap_objid[paths.segment_first[e]]],
+        poses_in.site_xpos[worldid, paths.wrap_objid[paths.segment_last[e]]],
+        poses_in.geom_xpos[worldid, geom],
+        poses_in.geom_xmat[worldid, geom],
+        paths.geom_size[worldid % paths.geom_size.shape[0], geom][0],
+        paths.wrap_type[place],
         side,
     )
     # A path that only just touches has the rates of a straight one; its arc's length, a square root, has no slope.

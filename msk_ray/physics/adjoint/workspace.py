@@ -1,0 +1,88 @@
+"""What the stages of a substep's pullback share: settings of the model, its tables, and the arrays they hand on."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import warp as wp
+
+from msk_ray.physics.adjoint.approximated import TouchCounter
+from msk_ray.physics.adjoint.groups import (
+    DofSlopes,
+    FieldBars,
+    Fields,
+    Joints,
+    Multipliers,
+    RowLaws,
+    Springs,
+    TendonBars,
+    TendonRows,
+    allocate,
+    gather,
+)
+from msk_ray.physics.adjoint.tables import build_tables
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a model's options switch on."""
+
+    gravity: bool
+    spring: bool
+    damper: bool
+    euler_damping: bool
+    """Whether the integrator treats joint damping implicitly."""
+    implicit_all: bool
+    """Whether it treats all damping implicitly."""
+    elliptic: bool
+    actuation: bool
+    clampctrl: bool
+
+    @staticmethod
+    def of(mjm: mujoco.MjModel) -> "Settings":
+        """Those of a model."""
+        disabled, bit = mjm.opt.disableflags, mujoco.mjtDisableBit
+        euler = mjm.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+        return Settings(
+            gravity=not disabled & bit.mjDSBL_GRAVITY,
+            spring=not disabled & bit.mjDSBL_SPRING,
+            damper=not disabled & bit.mjDSBL_DAMPER,
+            euler_damping=bool(euler and not disabled & (bit.mjDSBL_EULERDAMP | bit.mjDSBL_DAMPER)),
+            implicit_all=bool(mjm.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST),
+            elliptic=bool(mjm.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC),
+            actuation=bool(mjm.nu > 0 and not disabled & bit.mjDSBL_ACTUATION),
+            clampctrl=not disabled & bit.mjDSBL_CLAMPCTRL,
+        )
+
+
+class Workspace:
+    """Allocates for `nworld` worlds of one model, on the device of `data`.
+
+    Attributes:
+        live: worlds whose gradient is wanted, shape (W,), int.
+        grad_qpos, grad_qvel, grad_act, grad_ctrl: cotangents, in tangent coordinates.
+        multipliers, slopes, fields, bars, tendon_bars, laws: as their groups say.
+    """
+
+    def __init__(self, mjm: mujoco.MjModel, model: Any, data: Any) -> None:
+        self.mjm = mjm
+        self.model = model
+        self.device = data.qpos.device
+        self.nworld = data.nworld
+        self.njmax = data.efc.D.shape[1]
+        self.settings = Settings.of(mjm)
+        worlds, nv, nbody = data.nworld, mjm.nv, mjm.nbody
+        with wp.ScopedDevice(self.device):
+            self.tables = build_tables(mjm, model)
+            self.joints, self.tendon_rows = gather(Joints, model), gather(TendonRows, model)
+            self.springs = gather(Springs, self.tables, model)
+            self.touch_counter = TouchCounter(mjm, worlds)
+            self.live = wp.ones(worlds, dtype=int)
+            self.grad_qpos, self.grad_qvel = (wp.zeros((worlds, nv), dtype=float) for _ in range(2))
+            self.grad_act, self.grad_ctrl = (wp.zeros((worlds, n), dtype=float) for n in (mjm.na, mjm.nu))
+            self.multipliers = allocate(Multipliers, worlds, nv)
+            self.slopes = allocate(DofSlopes, worlds, nv)
+            self.fields = allocate(Fields, worlds, nbody)
+            self.bars = allocate(FieldBars, worlds, nbody)
+            self.tendon_bars = allocate(TendonBars, worlds, max(mjm.ntendon, 1))
+            self.laws = allocate(RowLaws, worlds, self.njmax)
