@@ -1,5 +1,6 @@
 """Contacts and constraint rows that a step lost: found on the device as it happens, heard of on the host."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,6 @@ from mujoco_warp import OverflowType
 
 from msk_ray.errors import SimulationError
 from msk_ray.physics.capacity import Capacity
-from msk_ray.physics.poison import note_losses
 
 ITERATION_BITS = int(OverflowType.ITERATIONS | OverflowType.LS_ITERATIONS)
 """The solver stopped at an iteration limit: that costs accuracy, which the residual measures, and loses nothing."""
@@ -23,6 +23,38 @@ _INCURABLE = {
 }
 # CONTACT_MATCH and TACTILE are left out: they touch sensor data alone, which no step or gradient depends on.
 LOST_BITS = _CONTACT_BITS | _ROW_BITS | int(sum(_INCURABLE))
+_NAN = wp.constant(math.nan)
+
+
+@wp.kernel
+def note_losses(
+    # In:
+    overflow_in: wp.array[int],
+    nefc_in: wp.array[int],
+    nacon_in: wp.array[int],
+    ncollision_in: wp.array[int],
+    lost_bits: int,
+    # Out:
+    qpos_out: wp.array2d[float],
+    qvel_out: wp.array2d[float],
+    act_out: wp.array2d[float],
+    peaks_out: wp.array[int],
+    heard_out: wp.array[int],
+) -> None:
+    """Per world: raise the peaks; where the step lost something, make its results NaN and tell the host."""
+    world = wp.tid()
+    if nefc_in[world] > peaks_out[1]:
+        wp.atomic_max(peaks_out, 1, nefc_in[world])
+    if world == 0:
+        peaks_out[0] = wp.max(peaks_out[0], wp.max(nacon_in[0], ncollision_in[0]))
+    if (overflow_in[world] & lost_bits) != 0:
+        for i in range(qpos_out.shape[1]):
+            qpos_out[world, i] = _NAN
+        for i in range(qvel_out.shape[1]):
+            qvel_out[world, i] = _NAN
+        for i in range(act_out.shape[1]):
+            act_out[world, i] = _NAN
+        heard_out[0] = 1
 
 
 class LossWatch:

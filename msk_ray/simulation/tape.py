@@ -16,11 +16,11 @@ from torch import Tensor
 from msk_ray.physics import Graph, WorldBatch
 from msk_ray.physics.adjoint import StepAdjoint
 from msk_ray.physics.adjoint.coverage import check_supported
+from msk_ray.physics.adjoint.residual import ResidualGauge
 from msk_ray.physics.adjoint.stages import recompute_stages
 from msk_ray.simulation.backward import Backward, InputGradients, Needs, StepState
 from msk_ray.simulation.buffers import device_of, stream_of
 from msk_ray.simulation.pool import Pool
-from msk_ray.simulation.residual import ResidualGauge
 
 # Arrays of mujoco_warp.Data that the adjoint of a substep reads, besides the checkpointed state.
 _KEPT_DATA = (

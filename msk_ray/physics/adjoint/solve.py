@@ -1,6 +1,5 @@
 """The two linear systems of a substep: (M + hB) μ = h v̄' and H λ = M μ with H = M + JᵀSJ."""
 
-from functools import cache
 from typing import Any
 
 import warp as wp
@@ -9,6 +8,7 @@ from msk_ray.physics.adjoint.groups import Substep
 from msk_ray.physics.adjoint.integrate import Integrator
 from msk_ray.physics.adjoint.rows import ConstraintLaws
 from msk_ray.physics.adjoint.stages import implicit_matrix
+from msk_ray.physics.adjoint.tiles import solve_tiled, solve_two_tiled
 from msk_ray.physics.adjoint.workspace import Workspace
 
 wp.set_module_options({"enable_backward": False})
@@ -64,68 +64,6 @@ def build_matrices(
                 entry += s * jacobian_in[worldid, r, i] * jacobian_in[worldid, r, j]
     hessian_out[worldid, i, j] = entry
     hessian_out[worldid, j, i] = entry
-
-
-@cache
-def solve_tiled(nv: int) -> Any:
-    """Both solves of a world in one block, for nv up to TILE_LIMIT."""
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def kernel(
-        # In:
-        implicit_in: wp.array3d[float],
-        hessian_in: wp.array3d[float],
-        rhs_in: wp.array2d[float],
-        damping_in: wp.array2d[float],
-        qacc_in: wp.array2d[float],
-        # Out:
-        mu_out: wp.array2d[float],
-        excess_out: wp.array2d[float],
-        lam_out: wp.array2d[float],
-    ) -> None:
-        worldid = wp.tid()
-        rhs = wp.tile_load(rhs_in[worldid], shape=wp.static(nv))
-        damping = wp.tile_load(damping_in[worldid], shape=wp.static(nv))
-        qacc = wp.tile_load(qacc_in[worldid], shape=wp.static(nv))
-        implicit = wp.tile_load(implicit_in[worldid], shape=(wp.static(nv), wp.static(nv)))
-        wp.tile_cholesky_inplace(implicit)
-        # (M + hB) μ = h v̄'
-        mu = wp.tile_cholesky_solve(implicit, rhs)
-        wp.tile_store(mu_out[worldid], mu)
-        # â = (M + hB)⁻¹ M a  ⇒  a - â = (M + hB)⁻¹ hB a
-        wp.tile_store(excess_out[worldid], wp.tile_cholesky_solve(implicit, wp.tile_map(wp.mul, damping, qacc)))
-        # M μ = h v̄' - hB μ ,  H λ = M μ
-        push = wp.tile_map(wp.sub, rhs, wp.tile_map(wp.mul, damping, mu))
-        hessian = wp.tile_load(hessian_in[worldid], shape=(wp.static(nv), wp.static(nv)))
-        wp.tile_cholesky_inplace(hessian)
-        wp.tile_store(lam_out[worldid], wp.tile_cholesky_solve(hessian, push))
-
-    return kernel
-
-
-@cache
-def solve_two_tiled(nv: int) -> Any:
-    """A⁻¹ of two right-hand sides, for nv up to TILE_LIMIT."""
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def kernel(
-        # In:
-        matrix_in: wp.array3d[float],
-        first_in: wp.array2d[float],
-        second_in: wp.array2d[float],
-        # Out:
-        first_out: wp.array2d[float],
-        second_out: wp.array2d[float],
-    ) -> None:
-        worldid = wp.tid()
-        matrix = wp.tile_load(matrix_in[worldid], shape=(wp.static(nv), wp.static(nv)))
-        wp.tile_cholesky_inplace(matrix)
-        first = wp.tile_load(first_in[worldid], shape=wp.static(nv))
-        wp.tile_store(first_out[worldid], wp.tile_cholesky_solve(matrix, first))
-        second = wp.tile_load(second_in[worldid], shape=wp.static(nv))
-        wp.tile_store(second_out[worldid], wp.tile_cholesky_solve(matrix, second))
-
-    return kernel
 
 
 @wp.kernel
