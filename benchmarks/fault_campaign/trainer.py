@@ -38,7 +38,7 @@ class FaultyTrainer(Trainer):
             case "memory":
                 self._crowd()
             case "nan":
-                next(self.shac.actor.parameters()).data.fill_(math.nan)
+                next(self.algorithm.network.parameters()).data.fill_(math.nan)
         row = super().run_epoch()
         match kind:
             case "torn_row":
@@ -57,13 +57,13 @@ class FaultyTrainer(Trainer):
         pages = int(Path("/proc/self/statm").read_text().split()[0])
         limit = pages * resource.getpagesize() + 2**28
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-        update = self.shac.update
+        update = self.algorithm.update
 
         def crowded(epoch: int) -> Any:
             torch.empty(2**30)
             return update(epoch)
 
-        self.shac.update = crowded  # type: ignore[method-assign]
+        self.algorithm.update = crowded  # type: ignore[method-assign]
 
 
 def _kill_self() -> None:

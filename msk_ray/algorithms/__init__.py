@@ -1,6 +1,5 @@
-"""Learning algorithms, and what the trainer asks of one."""
+"""Learning algorithms, and what the trainer asks of one. Each is loaded where it is named."""
 
-from msk_ray.algorithms.base import Algorithm, EpochResult
-from msk_ray.algorithms.shac import Shac
+from msk_ray.algorithms.base import Algorithm, EpochResult, algorithm_class
 
-__all__ = ["Algorithm", "EpochResult", "Shac"]
+__all__ = ["Algorithm", "EpochResult", "algorithm_class"]

@@ -1,10 +1,20 @@
 """What the trainer asks of an algorithm."""
 
+import time
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, ClassVar
 
-from torch import Tensor
+import torch
+from torch import Tensor, nn
+
+from msk_ray.config import ALGORITHMS, AlgorithmSettings, Config, check_installed, resolve_class
+from msk_ray.envs import Env
+from msk_ray.errors import ConfigError
+
+_OF_GRADIENTS = frozenset({"approximated_share"})
+"""Figures of the simulation that speak of its gradients; the others speak of its physics."""
 
 
 @dataclass(frozen=True)
@@ -17,38 +27,152 @@ class EpochResult:
     """For logs, by name; nothing in the program reads them back."""
 
 
-class Algorithm(Protocol):
-    """Learns a policy for one environment, epoch by epoch. Made from a trial's config and its environment."""
+class Algorithm(ABC):
+    """Learns a policy for one environment, epoch by epoch.
 
+    A class of its own needs `policy_network` and `update`; its settings, if it has any, are `Settings`. Everything it
+    draws from torch's global generator is drawn again the same when a trial is resumed.
+
+    Attributes:
+        config: the trial's.
+        settings: the algorithm's own part of it, of type `Settings`.
+        env: the worlds it trains in.
+        network: the policy, on the environment's device.
+    """
+
+    Settings: ClassVar[type[AlgorithmSettings]] = AlgorithmSettings
+
+    def __init__(self, config: Config, env: Env[Any], network: nn.Module | None = None) -> None:
+        """
+        Args:
+            config: the trial's.
+            env: the worlds to train in.
+            network: the policy; None takes a new `policy_network`.
+        """
+        torch.manual_seed(config.trial.seed)
+        self.config = config
+        self.settings: Any = config.algorithm_settings
+        self.env = env
+        made = self.policy_network(config, env.obs_size, env.action_size) if network is None else network
+        self.network = made.to(env.device)
+
+    @classmethod
+    @abstractmethod
+    def policy_network(cls, config: Config, obs_size: int, action_size: int) -> nn.Module:
+        """A fresh policy: a module from raw observations (..., O) to deterministic actions (..., A) in [-1, 1]."""
+
+    @abstractmethod
     def update(self, epoch: int) -> EpochResult:
         """Train one epoch, counted from 0.
 
         Raises:
             SimulationError: training cannot go on: a gradient is not finite, or the physics failed.
         """
-        ...
 
+    @classmethod
+    def policy_modules(cls, network: nn.Module) -> dict[str, nn.Module]:
+        """The parts of a policy as they are saved, by name."""
+        return {"policy": network}
+
+    def modules(self) -> dict[str, nn.Module]:
+        """Everything that is saved as a module, by name: the policy's parts, and whatever else there is."""
+        return self.policy_modules(self.network)
+
+    @torch.no_grad()
     def policy(self, obs: Tensor) -> Tensor:
         """Deterministic actions (W, A) in [-1, 1] for raw observations (W, O), without gradients."""
-        ...
+        action: Tensor = self.network(obs)
+        return action
 
     def policy_state_dict(self) -> dict[str, Any]:
         """State of the modules that `policy` uses, by module name."""
-        ...
+        return {name: module.state_dict() for name, module in self.policy_modules(self.network).items()}
 
     def state_dict(self) -> dict[str, Any]:
         """Everything a later `load_state_dict` needs to go on exactly, environment state included."""
-        ...
+        state = {
+            "modules": {name: module.state_dict() for name, module in self.modules().items()},
+            "torch_generator": torch.get_rng_state(),
+            **self.env.state_dict(),
+        }
+        if self.env.device.type == "cuda":
+            state["torch_cuda_generator"] = torch.cuda.get_rng_state(self.env.device)
+        return state
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from what `state_dict` gave."""
-        ...
+        for name, module in self.modules().items():
+            module.load_state_dict(state["modules"][name])
+        # Generator states are host tensors whatever device they drive. Older checkpoints have none: SHAC's draws come
+        # from generators of its own.
+        if "torch_generator" in state:
+            torch.set_rng_state(state["torch_generator"].cpu())
+        if "torch_cuda_generator" in state and self.env.device.type == "cuda":
+            torch.cuda.set_rng_state(state["torch_cuda_generator"].cpu(), self.env.device)
+        self.env.load_state_dict(state)
 
     def start_from(self, modules: Mapping[str, Any]) -> None:
         """Take networks and statistics from another trial's states, by module name.
+
+        What is not there, such as the critic of a policy saved alone, stays as it is.
 
         Raises:
             KeyError: a module that the policy needs is not there.
             RuntimeError: a network has another shape.
         """
-        ...
+        needed = self.policy_modules(self.network)
+        for name, module in self.modules().items():
+            if name in modules or name in needed:
+                module.load_state_dict(modules[name])
+
+
+def algorithm_class(config: Config) -> type[Algorithm]:
+    """The class of the algorithm that a trial runs.
+
+    Raises:
+        ConfigError: there is none of that name, it lacks a method, has settings of another type, or needs a package
+            that is not installed.
+    """
+    check_installed(config.algorithm, config.algorithm_settings)
+    path = ALGORITHMS.path(config.algorithm.name)
+    found: type[Algorithm] = resolve_class(path, ALGORITHMS.key, Algorithm)  # type: ignore[type-abstract]
+    lacking = sorted(found.__abstractmethods__)
+    if lacking:
+        raise ConfigError(
+            f"algorithm.name: {path} lacks {', '.join(lacking)}: write them as msk_ray.algorithms.Algorithm describes"
+        )
+    if not isinstance(config.algorithm_settings, found.Settings):
+        wanted, given = f"{found.Settings.__module__}.{found.Settings.__qualname__}", type(config.algorithm_settings)
+        raise ConfigError(f"algorithm.name: {path} takes settings of type {wanted}, not {given.__qualname__}")
+    return found
+
+
+def simulation_metrics(env: Env[Any]) -> dict[str, float]:
+    """What the simulation says of itself since it was last asked, by metric name.
+
+    Raises:
+        SimulationError: contacts or constraint rows were lost to a full buffer.
+    """
+    return {
+        f"{'grad' if name in _OF_GRADIENTS else 'physics'}/{name}": value
+        for name, value in env.sim.diagnostics().items()
+    }
+
+
+class Clock:
+    """Seconds between laps, the device's queued work included."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+        self._last = self._now()
+
+    def _now(self) -> float:
+        if self._device.type == "cuda":
+            torch.cuda.synchronize(self._device)
+        return time.perf_counter()
+
+    def lap(self) -> float:
+        """Seconds since the last lap, or since the clock was made."""
+        now = self._now()
+        elapsed, self._last = now - self._last, now
+        return elapsed

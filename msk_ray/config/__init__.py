@@ -1,30 +1,47 @@
 """What a trial is: one frozen, checked tree of settings, read from YAML."""
 
+from msk_ray.config.algorithms import (
+    ALGORITHMS,
+    AdaptiveHorizon,
+    AlgorithmConfig,
+    AlgorithmSettings,
+    EntropyConfig,
+    HorizonSchedule,
+    PpoConfig,
+    ShacConfig,
+    check_installed,
+)
 from msk_ray.config.environments import ENVIRONMENTS, settings_class
-from msk_ray.config.load import describe_fault, load_config, parse_config, parse_recorded, read_config
-from msk_ray.config.overlay import SET_HELP, combine, merge, overlay, parse_override, parse_overrides
+from msk_ray.config.load import (
+    describe_fault,
+    load_config,
+    parse_config,
+    parse_recorded,
+    read_config,
+    refuse_ignored,
+)
+from msk_ray.config.overlay import SET_HELP, combine, leaves, merge, overlay, parse_override, parse_overrides
 from msk_ray.config.physics import FdConfig, PhysicsConfig
 from msk_ray.config.recorded import current_key, current_values, env_name, first_spelling
 from msk_ray.config.resolve import Registry, resolve, resolve_class
 from msk_ray.config.schema import (
-    AdaptiveHorizon,
     Config,
     ContactCurriculum,
     ContactStart,
-    EntropyConfig,
     EvaluationConfig,
-    HorizonSchedule,
     NetworkConfig,
-    ShacConfig,
     TrialConfig,
 )
 from msk_ray.config.sections import EnvSettings, Reward
 from msk_ray.config.yaml_text import dump_yaml, parse_yaml, read_yaml
 
 __all__ = [
+    "ALGORITHMS",
     "ENVIRONMENTS",
     "SET_HELP",
     "AdaptiveHorizon",
+    "AlgorithmConfig",
+    "AlgorithmSettings",
     "Config",
     "ContactCurriculum",
     "ContactStart",
@@ -35,10 +52,12 @@ __all__ = [
     "HorizonSchedule",
     "NetworkConfig",
     "PhysicsConfig",
+    "PpoConfig",
     "Registry",
     "Reward",
     "ShacConfig",
     "TrialConfig",
+    "check_installed",
     "combine",
     "current_key",
     "current_values",
@@ -46,6 +65,7 @@ __all__ = [
     "dump_yaml",
     "env_name",
     "first_spelling",
+    "leaves",
     "load_config",
     "merge",
     "overlay",
@@ -56,6 +76,7 @@ __all__ = [
     "parse_yaml",
     "read_config",
     "read_yaml",
+    "refuse_ignored",
     "resolve",
     "resolve_class",
     "settings_class",

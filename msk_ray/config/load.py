@@ -1,5 +1,6 @@
 """Reading configurations: YAML in, a checked `Config` out, or one line saying what to write instead."""
 
+import contextlib
 import difflib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -7,8 +8,9 @@ from typing import Annotated, Any, get_args, get_origin
 
 from pydantic import BaseModel, Tag, ValidationError
 
+from msk_ray.config.algorithms import BUILT_IN, settings_from_outside
 from msk_ray.config.environments import settings_class
-from msk_ray.config.overlay import merge, overlay, parse_overrides
+from msk_ray.config.overlay import leaves, merge, overlay, parse_overrides
 from msk_ray.config.recorded import current_settings, env_name
 from msk_ray.config.schema import RECORDED, Config
 from msk_ray.config.unread import unread_settings
@@ -69,17 +71,44 @@ def load_config(path: Path, overrides: Iterable[str] = ()) -> Config:
     """Read a config file and apply "a.b=value" overrides to it.
 
     Raises:
-        ConfigError: as `read_config`, `parse_override` and `parse_config`.
+        ConfigError: as `read_config`, `parse_override`, `parse_config` and `refuse_ignored`.
     """
-    return parse_config(overlay(read_config(path), parse_overrides(overrides)), str(path))
+    values = parse_overrides(overrides)
+    config = parse_config(overlay(read_config(path), values), str(path))
+    refuse_ignored(values, [config], "--set")
+    return config
+
+
+def refuse_ignored(values: Mapping[str, Any], configs: Iterable[Config], source: str) -> None:
+    """Refuse dotted settings that the algorithm of none of the trials reads. `source` names them in errors.
+
+    A file may hold settings for algorithms that the trial does not run; what is said of the trial itself may not.
+
+    Raises:
+        ConfigError: naming the first of them.
+    """
+    ignored = {config.algorithm.name: config.ignored for config in configs}
+    for leaf in (leaf for key, value in values.items() for leaf in leaves(key, value)):
+        if ignored and all(any(f"{leaf}.".startswith(f"{key}.") for key in keys) for keys in ignored.values()):
+            raise ConfigError(
+                f"{source} {shortened(leaf)}: nothing reads it while algorithm.name is {' or '.join(ignored)}; "
+                "leave it out"
+            )
 
 
 def _named(data: Any) -> dict[str, type[BaseModel]]:
-    """Sections whose settings are declared by what the section names, as far as it is found."""
-    try:
-        return {"env": settings_class(env_name(data))} if isinstance(data, Mapping) else {}
-    except ConfigError:
-        return {}  # the fault described is this one
+    """Sections, dotted, whose settings are declared by what `name` beside them names, as far as it is found."""
+    found: dict[str, type[BaseModel]] = {}
+    if not isinstance(data, Mapping):
+        return found
+    with contextlib.suppress(ConfigError):  # the fault described is this one
+        found["env"] = settings_class(env_name(data))
+    algorithm = data.get("algorithm")
+    name = algorithm.get("name") if isinstance(algorithm, Mapping) else None
+    if name is not None and name not in BUILT_IN:
+        with contextlib.suppress(ConfigError):
+            found["algorithm.settings"] = settings_from_outside(name)
+    return found
 
 
 def describe_fault(
@@ -90,7 +119,7 @@ def describe_fault(
     Args:
         error: what validating raised.
         root: the class validated.
-        named: of sections of `root` that are open, the class that was taken.
+        named: of sections of `root`, dotted, that are open: the class that was taken.
     """
     faults = error.errors()
     # A misspelt key is often missing under its right name too; the misspelling is what to mend.
@@ -145,8 +174,9 @@ def _model_at(
     """The section of `root` a fault lies in."""
     model: Any = root
     for depth, section in enumerate(sections):
-        if depth == 0 and section in named:
-            model = named[section]
+        dotted = ".".join(sections[: depth + 1])
+        if dotted in named:
+            model = named[dotted]
             continue
         annotation = model.model_fields[section].annotation
         # A member of a union is Annotated with its tag.

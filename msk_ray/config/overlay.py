@@ -1,15 +1,15 @@
 """Laying settings over settings: the one rule that `--set`, `extends` and search spaces follow.
 
 A mapping is laid over the section that stands there, key by key; anything else replaces what stands there. Where a
-setting takes mappings of several kinds (`shac.horizon`, `env` by its `name`), a mapping of another kind replaces the
-old one, so that kinds never mix. `null` takes a section away.
+setting takes mappings of several kinds (`shac.horizon`; `env` and `algorithm`, by their `name`), a mapping of another
+kind replaces the old one, so that kinds never mix. `null` takes a section away.
 """
 
 import copy
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-from msk_ray.config.schema import AdaptiveHorizon, HorizonSchedule
+from msk_ray.config.algorithms import AdaptiveHorizon, HorizonSchedule
 from msk_ray.config.yaml_text import MAX_DEPTH, parse_yaml
 from msk_ray.errors import ConfigError, brief, shortened
 
@@ -82,6 +82,15 @@ def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     return merged
 
 
+def leaves(key: str, value: Any) -> Iterator[str]:
+    """Dotted keys of the values within a value; mappings are sections."""
+    if isinstance(value, Mapping) and value:
+        for name, item in value.items():
+            yield from leaves(f"{key}.{name}", item)
+    else:
+        yield key
+
+
 def _laid_over(path: list[str], old: Any, new: Any) -> Any:
     if not (isinstance(old, Mapping) and isinstance(new, Mapping)) or _another_kind(path, old, new):
         return copy.deepcopy(new)
@@ -94,7 +103,7 @@ _HORIZONS = (set(HorizonSchedule.model_fields), set(AdaptiveHorizon.model_fields
 
 def _another_kind(path: list[str], old: Mapping[str, Any], new: Mapping[str, Any]) -> bool:
     """Whether two mappings for the same setting describe different things."""
-    if path == ["env"]:
+    if path in (["env"], ["algorithm"]):
         return "name" in new and "name" in old and new["name"] != old["name"]
     if path == ["shac", "horizon"]:
         schedule, adaptive = _HORIZONS

@@ -16,6 +16,10 @@ STEPPING = frozenset(
     )
 )
 """Settings that every environment reads."""
+GRADIENTS = frozenset(
+    (*("backward", "substep_grad_clip"), *("fd.eps_ctrl", "fd.eps_qpos", "fd.eps_qvel", "fd.eps_act", "fd.max_worlds"))
+)
+"""Settings that say how steps are differentiated."""
 SOLVING = frozenset(("tolerance", "iterations", "ls_iterations", "cone", "impratio", "nconmax", "njmax"))
 """Those of the constraint solver, which a model without contacts and limits does without."""
 CONTACTS = frozenset(("solref", "solimp", "friction", "solreffriction"))

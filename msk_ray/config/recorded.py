@@ -67,8 +67,10 @@ def first_spelling(settings: Mapping[str, Any]) -> dict[str, Any]:
     for (section, key), default in _LATER.items():
         if spelt[section].get(key) == default:
             spelt[section] = {name: value for name, value in spelt[section].items() if name != key}
+    if not spelt["algorithm"]:
+        del spelt["algorithm"]
     return spelt
 
 
-_LATER: dict[tuple[str, str], Any] = {("trial", "threads"): 1}
+_LATER: dict[tuple[str, str], Any] = {("trial", "threads"): 1, ("algorithm", "name"): "shac"}
 """Settings that the first version did not have, (section, name), with the default at which they leave ids alone."""

@@ -1,26 +1,21 @@
-"""The settings of a trial. Every field has a unit or range; unknown keys are refused.
-
-Sources of the defaults: SHAC (Xu et al. 2022, "Accelerated Policy Learning with Parallel Differentiable Simulation",
-arXiv:2204.07137) and the hyperparameters published with it.
-"""
+"""The settings of a trial. Every field has a unit or range; unknown keys are refused."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import (
-    BeforeValidator,
-    Discriminator,
-    Field,
-    PositiveFloat,
-    SerializeAsAny,
-    Tag,
-    ValidationInfo,
-    model_validator,
-)
+from pydantic import BeforeValidator, Field, PositiveFloat, SerializeAsAny, ValidationInfo, model_validator
 
+from msk_ray.config.algorithms import (
+    BUILT_IN,
+    AlgorithmConfig,
+    AlgorithmSettings,
+    PpoConfig,
+    ShacConfig,
+    ignored_settings,
+)
 from msk_ray.config.environments import settings_class
 from msk_ray.config.physics import PhysicsConfig, Vec5
-from msk_ray.config.sections import Count, EnvSettings, Fraction, Section, Text, Whole
+from msk_ray.config.sections import Count, EnvSettings, Section, Text, Whole
 from msk_ray.config.unread import unread_settings
 from msk_ray.errors import ConfigError, brief
 
@@ -34,71 +29,6 @@ def _declared_settings(value: Any, info: ValidationInfo) -> Any:
     except ConfigError as error:
         raise ValueError(str(error)) from error
     return settings.model_validate(value, context=info.context)
-
-
-class HorizonSchedule(Section):
-    """Rollout length by epoch: `start` at epoch 0, `end` from epoch `epochs` on, linear between."""
-
-    start: Count
-    end: Count
-    epochs: Count
-
-    def at(self, epoch: int) -> int:
-        """Env steps at `epoch`, counted from 0."""
-        progress = min(1.0, epoch / self.epochs)
-        return round(self.start + (self.end - self.start) * progress)
-
-
-class AdaptiveHorizon(Section):
-    """Rollout length that follows the gradient: longer while cotangents stay small, shorter when they grow.
-
-    After each epoch H ← H (target / p90)^rate within bounds, p90 being the 90th percentile of the state cotangents'
-    norms in units of reward. Adaptive horizons are the idea of AHAC (Georgiev et al. 2024, arXiv:2405.17784), which
-    follows a constraint on contact forces; this one follows the cotangents themselves.
-    """
-
-    start: Count
-    shortest: Count = 4
-    longest: Count = 64
-    target: PositiveFloat
-    """Wanted 90th percentile of the cotangent norms, before any bound [reward]."""
-    rate: Annotated[float, Field(gt=0.0, le=1.0)] = 0.1
-
-    @model_validator(mode="after")
-    def _bounds(self) -> "AdaptiveHorizon":
-        if not self.shortest <= self.start <= self.longest:
-            raise ValueError(
-                f"adaptive horizon: start {self.start} must lie between shortest {self.shortest} and longest "
-                f"{self.longest}"
-            )
-        return self
-
-
-def _kind_of_horizon(value: Any) -> str:
-    if isinstance(value, dict):
-        return "adaptive" if "target" in value else "schedule"
-    if isinstance(value, AdaptiveHorizon):
-        return "adaptive"
-    return "schedule" if isinstance(value, HorizonSchedule) else "constant"
-
-
-Horizon = Annotated[
-    Annotated[Count, Tag("constant")]
-    | Annotated[HorizonSchedule, Tag("schedule")]
-    | Annotated[AdaptiveHorizon, Tag("adaptive")],
-    Discriminator(_kind_of_horizon),
-]
-
-
-class EntropyConfig(Section):
-    """Bonus α for the policy's entropy, as in SAPO (Xing et al. 2024, arXiv:2412.12089); values become soft values."""
-
-    coefficient: PositiveFloat = 0.01
-    """α [reward per nat], or where it starts if there is a target."""
-    target: float | None = None
-    """Entropy per action dimension [nat] that α is adapted to hold; null keeps α. Uniform actions have ln 2 = 0.69."""
-    rate: PositiveFloat = 5e-3
-    """Change of log α per epoch and nat of missing entropy."""
 
 
 class ContactStart(Section):
@@ -156,53 +86,6 @@ class CriticConfig(NetworkConfig):
     """Critics trained; with two, the smaller value is used."""
 
 
-class ShacConfig(Section):
-    """Short-Horizon Actor-Critic."""
-
-    horizon: Horizon = 32
-    """Env steps H of a rollout the gradient flows through: constant, {start, end, epochs}, or by the gradient as
-    {start, target}."""
-    gamma: Fraction = 0.99
-    """Discount."""
-    lam: Fraction = 0.95
-    """λ of the TD(λ) targets."""
-    critic_method: Literal["td-lambda", "one-step"] = "td-lambda"
-    """Targets of the critic."""
-    critic_iterations: Count = 16
-    """Passes over the rollout an epoch."""
-    critic_batches: Count = 4
-    """Minibatches a pass."""
-    target_critic_alpha: Fraction = 0.2
-    """target ← α·target + (1 − α)·critic after each epoch."""
-    actor_lr: PositiveFloat = 2e-3
-    critic_lr: PositiveFloat = 2e-3
-    lr_schedule: Literal["linear", "constant"] = "linear"
-    """`linear` goes from the given rate to `final_lr` at the last epoch."""
-    final_lr: PositiveFloat = 1e-5
-    betas: tuple[Fraction, Fraction] = (0.7, 0.95)
-    """Adam's moment decays."""
-    actor_grad_norm: PositiveFloat | None = 1.0
-    """Norm the actor's gradient is clipped to; null leaves it."""
-    critic_grad_norm: PositiveFloat | None = 1.0
-    """Norm each critic's gradient is clipped to; null leaves it."""
-    state_bptt: bool = True
-    """Let gradients flow through the state from one env step to the next; False cuts them after each step."""
-    state_grad_clip: PositiveFloat | None = None
-    """Bound on each world's state cotangent between env steps, in units of reward; null leaves it.
-
-    The loss is a mean over H·W, so a world's cotangent of norm c/(H·W) is what one reward of c would give.
-    """
-    entropy: EntropyConfig | None = None
-    """Bonus for the policy's entropy; null gives none."""
-    normalize_obs: bool = True
-    """Normalise observations by their running mean and variance."""
-    normalize_return: bool = False
-    """Divide rewards by the running standard deviation of the return."""
-    reward_scale: PositiveFloat = 1.0
-    max_nonfinite_share: Fraction = 0.05
-    """Share of worlds whose gradient may be non-finite in an epoch before the trial stops with an error."""
-
-
 class EvaluationConfig(Section):
     """Deterministic evaluation on fixed seeds: the only thing policies are ranked by."""
 
@@ -244,11 +127,39 @@ class Config(Section):
     physics: PhysicsConfig = PhysicsConfig()
     curriculum: ContactCurriculum | None = None
     """Softer contacts to begin with; null trains in `physics` from the start."""
+    algorithm: AlgorithmConfig = AlgorithmConfig()
     shac: ShacConfig = ShacConfig()
+    ppo: PpoConfig = PpoConfig()
     actor: ActorConfig = ActorConfig()
     critic: CriticConfig = CriticConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
     trial: TrialConfig = TrialConfig()
+
+    @property
+    def algorithm_settings(self) -> AlgorithmSettings:
+        """The settings of the algorithm that the trial runs."""
+        if self.algorithm.name in BUILT_IN:
+            section: AlgorithmSettings = getattr(self, self.algorithm.name)
+            return section
+        return self.algorithm.settings
+
+    @property
+    def algorithm_section(self) -> str:
+        """Where those stand, dotted."""
+        return self.algorithm.name if self.algorithm.name in BUILT_IN else "algorithm.settings"
+
+    @property
+    def ignored(self) -> list[str]:
+        """Sections and settings, dotted, that the trial's algorithm does not read. They stand at their defaults."""
+        return ignored_settings(self.algorithm.name, self.algorithm_settings)
+
+    @model_validator(mode="after")
+    def _without_what_the_algorithm_ignores(self) -> "Config":
+        # A base config can serve several algorithms: what is written for the others is not of this trial.
+        for key in self.ignored:
+            section, *path = key.split(".")
+            self.__dict__[section] = _at_default(self, section, path)
+        return self
 
     @model_validator(mode="after")
     def _physics_fits_env(self) -> "Config":
@@ -262,18 +173,7 @@ class Config(Section):
     @model_validator(mode="after")
     def _consistent(self) -> "Config":
         self.physics.resolve_substeps(self.env.control_timestep)
-        horizon = self.shac.horizon
-        if isinstance(horizon, HorizonSchedule):
-            shortest = min(horizon.start, horizon.end)
-        else:
-            shortest = horizon if isinstance(horizon, int) else horizon.shortest
-        if (shortest * self.env.nworld) % self.shac.critic_batches:
-            raise ValueError(
-                f"shac.critic_batches {self.shac.critic_batches} must divide shac.horizon × env.nworld "
-                f"({shortest} × {self.env.nworld})"
-            )
-        if self.shac.entropy is not None and not self.actor.stochastic:
-            raise ValueError("shac.entropy needs a stochastic policy: write actor.stochastic: true")
+        self.algorithm_settings.check(self)
         if self.curriculum is not None:
             self._check_curriculum()
         return self
@@ -292,5 +192,24 @@ class Config(Section):
         return self
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain data that `parse_config` reads back."""
-        return self.model_dump(mode="json")
+        """Plain data that `parse_config` reads back, without what the algorithm ignores."""
+        data = self.model_dump(mode="json")
+        for key in self.ignored:
+            *sections, name = key.split(".")
+            owner = data
+            for section in sections:
+                owner = owner[section]
+            del owner[name]
+        if not data["physics"]["fd"]:
+            del data["physics"]["fd"]
+        if self.algorithm.name in BUILT_IN:
+            del data["algorithm"]["settings"]
+        return data
+
+
+def _at_default(owner: Section, name: str, path: list[str]) -> Any:
+    """A setting at its default, or a section with the setting at `path` in it at its default."""
+    if not path:
+        return type(owner).model_fields[name].get_default(call_default_factory=True)
+    section: Section = getattr(owner, name)
+    return section.model_copy(update={path[0]: _at_default(section, path[0], path[1:])})

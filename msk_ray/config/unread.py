@@ -27,7 +27,7 @@ def unread_settings(config: Config) -> Iterator[tuple[str, str, Any]]:
 
 
 def _unread(config: Config) -> dict[str, str]:
-    env, physics, shac = config.env, config.physics, config.shac
+    env, physics = config.env, config.physics
     unread = {f"physics.{name}": _while("physics.backward", physics.backward) for name in _unread_by_backward(config)}
     if (physics.cone or ("pyramidal" if physics.variant in env.pyramidal_variants else "elliptic")) == "pyramidal":
         why = "nothing reads it while friction cones are pyramids; write physics.cone: elliptic, or"
@@ -37,14 +37,9 @@ def _unread(config: Config) -> dict[str, str]:
     alien = [name for name in PhysicsConfig.names() if name not in env.reads_physics]
     unread |= {f"physics.{name}": f"env {env.name} does not read it;" for name in alien}
     unread |= {f"env.{name}": f"nothing reads it while {why};" for name, why in env.unread().items()}
-    if shac.lr_schedule == "constant":
-        unread["shac.final_lr"] = _while("shac.lr_schedule", "constant")
-    if shac.critic_method == "one-step":
-        unread["shac.lam"] = _while("shac.critic_method", "one-step")
-    if not shac.state_bptt:
-        unread["shac.state_grad_clip"] = _while("shac.state_bptt", "false")
-    if shac.entropy is not None and shac.entropy.target is None:
-        unread["shac.entropy.rate"] = _while("shac.entropy.target", "null")
+    section = config.algorithm_section
+    own = config.algorithm_settings.unread()
+    unread |= {f"{section}.{name}": f"nothing reads it while {section}.{why};" for name, why in own.items()}
     if not config.actor.stochastic:
         unread["actor.log_std"] = _while("actor.stochastic", "false")
     return unread

@@ -15,14 +15,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from msk_ray.algorithms import algorithm_class
 from msk_ray.config import Config, PhysicsConfig, load_config
 from msk_ray.diagnose.exact import ExactKinematics, ExactTendons
 from msk_ray.envs import Env, EnvState, make_env
 from msk_ray.errors import ConfigError, SimulationError
 from msk_ray.gradcheck import Oracle, Point
-from msk_ray.networks import Actor
 from msk_ray.simulation import StepState
-from msk_ray.training import PolicyNetwork, SavedPolicy, load_policy
+from msk_ray.training import SavedPolicy, load_policy
 
 STATE_KINDS = ("reset", "standing", "gait")
 """Where trajectories start: fresh resets; settled under zero action; the policy's own motion after a while."""
@@ -43,7 +43,7 @@ class Subject:
     saved: SavedPolicy | None
     """The trained policy; None for a fresh one."""
 
-    def network(self, env: Env[Any]) -> PolicyNetwork:
+    def network(self, env: Env[Any]) -> nn.Module:
         """The policy's network for an environment, on its device.
 
         Raises:
@@ -51,9 +51,10 @@ class Subject:
         """
         if self.saved is not None:
             return self.saved.network(env)
-        generator = torch.Generator().manual_seed(self.config.trial.seed)
-        actor = Actor(self.config.actor, env.obs_size, env.action_size, generator)
-        return PolicyNetwork(actor, None).to(env.device)
+        # Some algorithms draw their networks from the global generator.
+        torch.manual_seed(self.config.trial.seed)
+        algorithm = algorithm_class(self.config)
+        return algorithm.policy_network(self.config, env.obs_size, env.action_size).to(env.device)
 
 
 def read_subject(path: Path, overrides: Sequence[str] = ()) -> Subject:
@@ -131,7 +132,7 @@ def probe(
 
 
 @torch.no_grad()
-def _starting_state(env: Env[Any], network: PolicyNetwork, kind: str) -> EnvState:
+def _starting_state(env: Env[Any], network: nn.Module, kind: str) -> EnvState:
     env.state = env.reset_state()
     for _ in range({"reset": 0, "standing": _SETTLE, "gait": _STRIDE}[kind]):
         action = network(env.observation()) if kind == "gait" else torch.zeros_like(env.state.action)
@@ -158,7 +159,7 @@ def _returns(env: Env[Any], network: nn.Module, step: Step, start: EnvState, hor
 
 def _compare(
     env: Env[Any],
-    network: PolicyNetwork,
+    network: nn.Module,
     start: EnvState,
     horizons: Sequence[int],
     count: int,
@@ -166,7 +167,7 @@ def _compare(
     variant: str,
     state: str,
 ) -> Iterator[Quality]:
-    parameters = list(network.actor.mean.parameters())
+    parameters = _acting(network, network, env.observation())
     leaves = StepState(*(t.clone().requires_grad_(True) for t in start.physics))
     returns = _returns(env, network, lambda a, s: env.sim.step(a, *s), start._replace(physics=leaves), horizons)
     size = sum(p.numel() for p in parameters)
@@ -195,15 +196,22 @@ def _compare(
             )
 
 
+@torch.enable_grad()
+def _acting(owner: nn.Module, network: nn.Module, obs: Tensor) -> list[nn.Parameter]:
+    """Those parameters of `owner`, a copy of `network`, that a deterministic action depends on: no log σ, for one."""
+    found = torch.autograd.grad(network(obs.detach()).sum(), list(network.parameters()), allow_unused=True)
+    return [p for p, gradient in zip(owner.parameters(), found, strict=True) if gradient is not None]
+
+
 @torch.no_grad()
 def _differences(
-    env: Env[Any], network: PolicyNetwork, start: EnvState, horizons: Sequence[int], directions: np.ndarray
+    env: Env[Any], network: nn.Module, start: EnvState, horizons: Sequence[int], directions: np.ndarray
 ) -> np.ndarray:
     """Derivatives (H, W, K) of the return along directions (K, P), by C MuJoCo in float64."""
     exact = copy.deepcopy(network).double().cpu()
     ideal = _double(env)
     oracle = Oracle(env.model, env.sim.substeps)
-    parameters = list(exact.actor.mean.parameters())
+    parameters = _acting(exact, network, env.observation())
     at = nn.utils.parameters_to_vector(parameters)
 
     def step(action: Tensor, state: StepState) -> StepState:

@@ -5,7 +5,7 @@ Axes: W worlds, O observation, A action.
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from msk_ray.config import EnvSettings, PhysicsConfig
 from msk_ray.errors import ConfigError
+from msk_ray.physics.capacity import Capacity
 from msk_ray.simulation import Backward, Simulation, StepState
 from msk_ray.simulation.kinematics import Frames, Kinematics, Names
 from msk_ray.simulation.tendons import Tendons
@@ -170,6 +171,25 @@ class Env(ABC, Generic[SettingsT]):
         """Draw the initial states that the next `steps` env steps may need, all at once."""
         drawn = self.draw_physics(steps * self.nworld)
         self._fresh = [StepState(*parts) for parts in zip(*(t.split(self.nworld) for t in drawn), strict=True)]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Where the worlds are, what the next resets draw from, and the room that the simulation has grown to."""
+        state = self.state
+        return {
+            "env_generator": self.generator.get_state(),
+            "env_state": [t.detach().clone() for t in (*state.physics, state.action, state.age)],
+            "capacity": tuple(self.sim.capacity),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from what `state_dict` gave."""
+        # A generator's state is a host tensor whatever device it drives.
+        self.generator.set_state(state["env_generator"].cpu())
+        *physics, action, age = state["env_state"]
+        self.state = EnvState(StepState(*physics), action, age)
+        if "capacity" in state:
+            # Room that the trial grew to: what comes next may need it at once.
+            self.sim.reserve(Capacity(*state["capacity"]))
 
     def observation(self) -> Tensor:
         """Observation (W, O) of the current state."""

@@ -58,6 +58,9 @@ def named_physics(config: Config, name: str) -> tuple[str, PhysicsConfig]:
     return name, env_type.reference_physics(config.physics, name)
 
 
+_WORLDS = ("--worlds", "evaluation.nworld")
+
+
 class Bench:
     """Evaluates policies on one device; trials of equal environment, physics and size share one simulation."""
 
@@ -78,7 +81,7 @@ class Bench:
         settings = env_class(config.env).reference_settings(config.env)
         key = repr((settings, physics, own.nworld, own.steps, own.seed))
         if key not in self._evaluators:
-            with named_out_of_memory(self._device, own.nworld):
+            with named_out_of_memory(self._device, own.nworld, *_WORLDS):
                 self._evaluators[key] = Evaluator(config, self._device, physics)
         return self._evaluators[key], shown
 
@@ -92,7 +95,7 @@ class Bench:
         evaluator, physics = self.evaluator(policy.config, request)
         own = policy.config.evaluation
         seeds = request.seeds or (own.seed,)
-        with named_out_of_memory(self._device, evaluator.env.nworld):
+        with named_out_of_memory(self._device, evaluator.env.nworld, *_WORLDS):
             runs = [evaluator.episodes(policy.on(evaluator.env), seed) for seed in seeds]
         reference = named_physics(policy.config, REFERENCE)[1]
         canonical = (

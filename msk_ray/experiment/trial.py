@@ -48,8 +48,14 @@ class Trial:
 
 def variant_text(changed: Mapping[str, str]) -> str:
     """`actor_lr=0.002, horizon=16, hard friction`: keys without their sections, and whole sections by label alone."""
-    parts = [f"{key.rsplit('.', 1)[1]}={value}" if "." in key else value for key, value in changed.items()]
+    parts = [f"{short_key(key)}={value}" if "." in key else value for key, value in changed.items()]
     return ", ".join(parts) or "base"
+
+
+def short_key(key: str) -> str:
+    """A dotted key without its sections: `shac.actor_lr` → `actor_lr`; `algorithm.name` → `algorithm`."""
+    section, _, leaf = key.rpartition(".")
+    return section if leaf == "name" else leaf
 
 
 def trial_id(config: Config) -> str:

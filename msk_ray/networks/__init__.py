@@ -3,5 +3,6 @@
 from msk_ray.networks.actor import Actor
 from msk_ray.networks.critic import Critic
 from msk_ray.networks.normalizer import RunningMeanStd
+from msk_ray.networks.policy import PolicyNetwork
 
-__all__ = ["Actor", "Critic", "RunningMeanStd"]
+__all__ = ["Actor", "Critic", "PolicyNetwork", "RunningMeanStd"]

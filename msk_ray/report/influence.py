@@ -11,6 +11,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 
+from msk_ray.experiment.trial import short_key
 from msk_ray.report.pictures import GREY, PALETTE, Picture, picture, shorten
 from msk_ray.report.reading import Reading, TrialReading
 from msk_ray.report.statistics import LEAST, Effect, Scored, effects, mean_interval
@@ -80,7 +81,7 @@ def parameter_effects(found: Sequence[Effect], name: str) -> Picture | None:
 
 def _too_few_words(found: Sequence[Effect]) -> str:
     """Which parameters have too few trained trials for a share of the variance, and where."""
-    short = [f"{_leaf(effect.factor)} ({effect.too_few})" for effect in found if effect.too_few]
+    short = [f"{short_key(effect.factor)} ({effect.too_few})" for effect in found if effect.too_few]
     if not short:
         return ""
     more = f" and {len(short) - AXES} more parameters" if len(short) > AXES else ""
@@ -98,7 +99,7 @@ def _draw_ranking(axes: Axes, found: Sequence[Effect], shares: bool) -> None:
     for place, effect in enumerate(found):
         text = f"{effect.spread:.3g}" if not shares else _share_text(effect)
         axes.text(values[place], place, f" {text}", va="center", fontsize=8)
-    axes.set_yticks(places, [shorten(_leaf(e.factor), 18) for e in found], fontsize=8)
+    axes.set_yticks(places, [shorten(short_key(e.factor), 18) for e in found], fontsize=8)
     axes.set_ylim(max(len(found), 5) - 0.5, -0.5)
     axes.set_xlabel("share of variance (ω²)" if shares else "spread of mean scores", fontsize=8)
     axes.tick_params(axis="x", labelsize=8)
@@ -114,7 +115,7 @@ def _share_text(effect: Effect) -> str:
 
 def _draw_levels(axes: Axes, effect: Effect) -> None:
     levels = [(level, effect.scored(level)) for level in effect.levels]
-    title = _leaf(effect.factor)
+    title = short_key(effect.factor)
     if len(levels) > LEVELS:
         # Too many to tell apart.
         ordered = sorted(levels, key=lambda level: -float(np.mean(effect.levels[level[0]])))
@@ -174,7 +175,7 @@ def parallel_coordinates(reading: Reading, found: Sequence[Effect], name: str) -
                 box = {"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.6}
                 ha = ("left" if height < 0.1 else "right" if height > 0.9 else "center") if narrow else "left"
                 axes.text(*spot, shorten(label, 16), fontsize=7, ha=ha, va="center", bbox=box)
-        names = [shorten(_leaf(f), 18) for f in factors] + ["best score"]
+        names = [shorten(short_key(f), 18) for f in factors] + ["best score"]
         if narrow:
             axes.set_yticks(x, names, fontsize=8)
             axes.set_xticks([])
@@ -200,8 +201,8 @@ def parallel_coordinates(reading: Reading, found: Sequence[Effect], name: str) -
     return picture(
         name,
         "All trials over all parameters",
-        f"Parallel coordinates of {len(trials)} trials over {', '.join(_leaf(f) for f in factors)} and the best score; "
-        f"the best has {best.trial.variant}.",
+        f"Parallel coordinates of {len(trials)} trials over {', '.join(short_key(f) for f in factors)} and the best "
+        f"score; the best has {best.trial.variant}.",
         "A line is a trial, its colour the best score. Numbers that span a factor of 30 lie on a logarithmic axis.",
         draw,
         (9.0, 4.6),
@@ -232,7 +233,3 @@ def _coordinate(factor: str, trials: Sequence[TrialReading]) -> tuple[np.ndarray
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _leaf(factor: str) -> str:
-    return factor.rsplit(".", 1)[-1]

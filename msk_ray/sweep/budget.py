@@ -4,24 +4,28 @@ import itertools
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-from msk_ray.config import AdaptiveHorizon, Config, HorizonSchedule, overlay, parse_config
+from msk_ray.config import Config, leaves, overlay, parse_config
+from msk_ray.config.algorithms import BUILT_IN
 from msk_ray.sweep.operators import Level, Listed, Operator
 from msk_ray.sweep.space import Space, SpaceFile
-from msk_ray.sweep.trials import base_settings, check_ranges, leaves
+from msk_ray.sweep.trials import base_settings, check_algorithms_read, check_ranges
 
-_DECIDING = ("shac.horizon", "trial.epochs", "env.nworld")
+_DECIDING = (
+    "algorithm",
+    *(f"{section}.{settings.length}" for section, settings in BUILT_IN.items()),
+    "trial.epochs",
+    "env.nworld",
+)
 """Settings, and sections of settings, that decide how many env steps a trial takes."""
 
 
 def env_steps_budget(config: Config) -> int:
-    """The most env steps a trial can take to its last epoch: the sum over epochs of horizon × worlds.
+    """The most env steps a trial can take to its last epoch.
 
-    An adaptive horizon counts with its `longest`.
+    Raises:
+        ConfigError: its algorithm does not say.
     """
-    horizon, epochs = config.shac.horizon, config.trial.epochs
-    if isinstance(horizon, HorizonSchedule):
-        return config.env.nworld * sum(horizon.at(epoch) for epoch in range(epochs))
-    return config.env.nworld * epochs * (horizon.longest if isinstance(horizon, AdaptiveHorizon) else horizon)
+    return config.algorithm_settings.env_steps(config.env.nworld, config.trial.epochs)
 
 
 def longest_budget(file: SpaceFile, configs: Iterable[Config]) -> float:
@@ -50,7 +54,9 @@ def extreme_configs(space: Space) -> list[Config]:
     """
     base = base_settings(space)
     check_ranges(space, base)
-    return list(_combinations(space, base))
+    configs = list(_combinations(space, base))
+    check_algorithms_read(space, configs)
+    return configs
 
 
 def _combinations(space: Space, base: Mapping[str, Any]) -> Iterator[Config]:

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from msk_ray.config import AdaptiveHorizon, Config
+from msk_ray.config import Config
 from msk_ray.experiment.trial import Trial
 from msk_ray.sweep.space import Space
 from msk_ray.sweep.trials import base_settings, make_trial
@@ -61,28 +61,15 @@ def cover(trials: list[Trial]) -> list[Trial]:
 
 
 def shorten(config: Config) -> dict[str, Any]:
-    """Dotted settings that make a trial last seconds: few epochs, worlds and steps, a quarter of the horizon."""
-    horizon: Any = config.shac.horizon
-    if isinstance(horizon, int):
-        horizon = _quarter(horizon)
-    elif isinstance(horizon, AdaptiveHorizon):
-        lengths = {name: _quarter(getattr(horizon, name)) for name in ("start", "shortest", "longest")}
-        horizon = {**lengths, "target": horizon.target, "rate": horizon.rate}
-    else:
-        horizon = {"start": _quarter(horizon.start), "end": _quarter(horizon.end), "epochs": EPOCHS - 1}
+    """Dotted settings that make a trial last seconds: few epochs, worlds and steps, and short epochs."""
     steps = config.evaluation.steps or config.env.episode_length
+    own = config.algorithm_settings.shortened(EPOCHS)
     return {
         "trial.epochs": min(config.trial.epochs, EPOCHS),
         "trial.checkpoint_interval": 1,
         "env.nworld": min(config.env.nworld, WORLDS),
-        "shac.horizon": horizon,
-        "shac.critic_batches": 1,
-        "shac.critic_iterations": min(config.shac.critic_iterations, 2),
+        **{f"{config.algorithm_section}.{key}": value for key, value in own.items()},
         "evaluation.interval": 1,
         "evaluation.nworld": min(config.evaluation.nworld, EVALUATION_WORLDS),
         "evaluation.steps": min(steps, EVALUATION_STEPS),
     }
-
-
-def _quarter(horizon: int) -> int:
-    return max(2, horizon // 4)

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from msk_ray.config import overlay, parse_config, read_config
+from msk_ray.config import Config, leaves, overlay, parse_config, read_config, refuse_ignored
 from msk_ray.errors import ConfigError
 from msk_ray.experiment.trial import ID_DIGITS, Trial, trial_id, variant_text, with_epochs
 from msk_ray.sweep.operators import Level, Listed, Range
@@ -24,19 +24,20 @@ def resolve_trials(space: Space) -> list[Trial]:
     """
     base = base_settings(space)
     check_ranges(space, base)
-    trials: list[Trial] = []
-    by_id: dict[str, Trial] = {}
     variants = list(_variants(space))
-    for seed in space.seeds:
-        for changed, values in variants:
-            trial = make_trial(space, base, changed, values, seed, len(trials))
-            twin = by_id.setdefault(trial.id, trial)
-            if twin is not trial:
-                raise ConfigError(
-                    f"{space.name}: {trial.variant!r} and {twin.variant!r} (seed {seed}) come out as the same trial; "
-                    "drop one of them"
-                )
-            trials.append(trial)
+    trials = [
+        make_trial(space, base, changed, values, seed, index)
+        for index, (seed, (changed, values)) in enumerate(itertools.product(space.seeds, variants))
+    ]
+    check_algorithms_read(space, (trial.config for trial in trials))
+    by_id: dict[str, Trial] = {}
+    for trial in trials:
+        twin = by_id.setdefault(trial.id, trial)
+        if twin is not trial:
+            raise ConfigError(
+                f"{space.name}: {trial.variant!r} and {twin.variant!r} (seed {trial.seed}) come out as the same trial; "
+                "drop one of them"
+            )
     return trials
 
 
@@ -99,6 +100,28 @@ def check_ranges(space: Space, base: Mapping[str, Any]) -> None:
     _check_collisions(space)
 
 
+def check_algorithms_read(space: Space, configs: Iterable[Config]) -> None:
+    """Refuse what a space sets or varies if the algorithm of none of its trials reads it.
+
+    Args:
+        space: the space.
+        configs: of its trials, or of one trial for each algorithm that a search can choose.
+
+    Raises:
+        ConfigError: naming the setting.
+    """
+    configs = list({config.algorithm.name: config for config in configs}.values())
+    file, ablate = space.file, space.file.ablate
+    refuse_ignored(file.overrides, configs, f"{space.name}: overrides:")
+    refuse_ignored(file.smoke.overrides, configs, f"{space.name}: smoke.overrides:")
+    for key, op in space.parameters.items():
+        for level in op.levels if isinstance(op, Listed) else op.ends():
+            refuse_ignored({key: level.value}, configs, f"{space.name}: parameters:")
+    if ablate is not None:
+        for values in (ablate.baseline, *ablate.variants.values()):
+            refuse_ignored(values, configs, f"{space.name}: ablate:")
+
+
 def _variants(space: Space) -> Iterator[tuple[dict[str, str], dict[str, Any]]]:
     """(labels, values) of every variant, seeds apart."""
     if space.file.ablate is not None:
@@ -140,15 +163,6 @@ def _check_collisions(space: Space) -> None:
             other = owner.setdefault(leaf, key)
             if other != key:
                 raise ConfigError(f"{space.name}: parameters {other!r} and {key!r} both set {leaf}")
-
-
-def leaves(key: str, value: Any) -> Iterator[str]:
-    """The dotted keys that a value sets: `key` itself, or those of all settings in a section."""
-    if isinstance(value, Mapping) and value:
-        for name, item in value.items():
-            yield from leaves(f"{key}.{name}", item)
-    else:
-        yield key
 
 
 def find_trial(trials: list[Trial], text: str) -> Trial:

@@ -54,6 +54,9 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         raise CheckpointError(
             f"{path} holds no state of a trial (a {type(state).__name__}); use an older one of {path.parent}"
         )
+    if "algorithm" not in state and "shac" in state:
+        # As versions wrote it that knew no other algorithm.
+        state["algorithm"] = state.pop("shac")
     return facts, state
 
 

@@ -19,8 +19,8 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 @contextmanager
-def named_out_of_memory(device: str, nworld: int) -> Iterator[None]:
-    """Turn any library's failed allocation into a `SimulationError` that says which setting to lower.
+def named_out_of_memory(device: str, nworld: int, *lower: str) -> Iterator[None]:
+    """Turn any library's failed allocation into a `SimulationError` that says which of the settings `lower` to lower.
 
     Raises:
         SimulationError: with `Failure.OUT_OF_MEMORY`; any other exception passes as it is.
@@ -32,7 +32,6 @@ def named_out_of_memory(device: str, nworld: int) -> Iterator[None]:
             raise
         what = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise SimulationError(
-            f"out_of_memory: {device} has no room for {nworld} worlds; lower env.nworld (now {nworld}), or "
-            f"shac.horizon ({what})",
+            f"out_of_memory: {device} has no room for {nworld} worlds; lower {' or '.join(lower)} ({what})",
             Failure.OUT_OF_MEMORY,
         ) from error

@@ -1,4 +1,4 @@
-"""A policy read back from a checkpoint: the actor and the statistics of its observations, nothing to train."""
+"""A policy read back from a checkpoint, with nothing to train."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,25 +7,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from msk_ray.algorithms import algorithm_class
 from msk_ray.config import Config, parse_recorded
 from msk_ray.envs import Env
 from msk_ray.errors import CheckpointError
-from msk_ray.networks import Actor, RunningMeanStd
 from msk_ray.training.checkpoint import load_checkpoint
 from msk_ray.training.evaluation import Policy
-
-
-class PolicyNetwork(nn.Module):
-    """Raw observations (W, O) to deterministic actions (W, A), differentiable."""
-
-    def __init__(self, actor: Actor, normalizer: RunningMeanStd | None) -> None:
-        super().__init__()
-        self.actor = actor
-        self.normalizer = normalizer
-
-    def forward(self, obs: Tensor) -> Tensor:
-        action: Tensor = self.actor(obs if self.normalizer is None else self.normalizer.normalize(obs))
-        return action
 
 
 @dataclass(frozen=True)
@@ -39,22 +26,20 @@ class SavedPolicy:
     sha256: str
     """Of what the checkpoint holds; evaluations and pictures are known by it."""
     modules: dict[str, Any]
-    """State of the actor and, if observations are normalised, of the normalizer."""
+    """States of the policy's modules, by name; of a whole trial's checkpoint, all modules of its algorithm."""
 
-    def network(self, env: Env[Any]) -> PolicyNetwork:
+    def network(self, env: Env[Any]) -> nn.Module:
         """The policy's network on an environment's device.
 
         Raises:
             CheckpointError: it was trained on other observations or actions.
+            ConfigError: its algorithm is not found, or not installed.
         """
-        network = PolicyNetwork(
-            Actor(self.config.actor, env.obs_size, env.action_size, torch.Generator()),
-            RunningMeanStd((env.obs_size,)) if self.config.shac.normalize_obs else None,
-        )
+        algorithm = algorithm_class(self.config)
+        network = algorithm.policy_network(self.config, env.obs_size, env.action_size)
         try:
-            network.actor.load_state_dict(self.modules["actor"])
-            if network.normalizer is not None:
-                network.normalizer.load_state_dict(self.modules["normalizer"])
+            for name, module in algorithm.policy_modules(network).items():
+                module.load_state_dict(self.modules[name])
         except (KeyError, RuntimeError) as error:
             what = str(error).splitlines()[-1].strip()
             raise CheckpointError(
@@ -67,7 +52,7 @@ class SavedPolicy:
         """The policy on an environment's device: raw observations (W, O) to actions (W, A), without gradients.
 
         Raises:
-            CheckpointError: it was trained on other observations or actions.
+            CheckpointError, ConfigError: as `network`.
         """
         network = self.network(env)
 
@@ -92,7 +77,7 @@ def load_policy(path: Path) -> SavedPolicy:
             state["config"],
             state["epoch"],
             state["env_steps"],
-            state["shac"]["modules"],
+            state["algorithm"]["modules"],
         )
     except (KeyError, TypeError) as error:
         raise CheckpointError(f"{path} holds no policy: {error} is missing") from error

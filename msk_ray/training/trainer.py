@@ -1,13 +1,14 @@
-"""The trainer: epochs of SHAC with evaluation, logs and checkpoints in one folder."""
+"""The trainer: epochs of an algorithm with evaluation, logs and checkpoints in one folder."""
 
 import math
 import time
 from collections.abc import Collection
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-from msk_ray.algorithms import Shac
-from msk_ray.config import Config, dump_yaml, parse_recorded
+from msk_ray.algorithms import algorithm_class
+from msk_ray.config import Config, dump_yaml, overlay, parse_config, parse_recorded
 from msk_ray.envs import make_env
 from msk_ray.errors import CheckpointError, StorageError
 from msk_ray.experiment.damage import Damage, describe_damages
@@ -45,14 +46,17 @@ class Trainer:
     checkpoint, which on CPU gives exactly the metrics of an uninterrupted run.
 
     Attributes:
+        env: the worlds that are trained in.
+        algorithm: what trains in them.
         epoch: epochs done.
         best_score: highest evaluation score of the trained policy so far, -inf before the first; that of `best.pt`.
 
     Raises:
-        DeviceError, UnsupportedModelError, StorageError, SimulationError: as their messages say.
+        ConfigError, DeviceError, UnsupportedModelError, StorageError, SimulationError: as their messages say.
     """
 
     def __init__(self, config: Config, logdir: Path, device: str) -> None:
+        algorithm = algorithm_class(config)
         self.config = config
         self.logdir = logdir
         self.epoch = 0
@@ -70,9 +74,16 @@ class Trainer:
             self._write_config()
         self._device = device
         use_threads(config)
-        with named_out_of_memory(device, config.env.nworld):
-            self.env = make_env(config.env, config.physics, config.env.nworld, device, config.trial.seed)
-            self.shac = Shac(config, self.env)
+        with self._memory():
+            self.env = make_env(
+                config.env,
+                config.physics,
+                config.env.nworld,
+                device,
+                config.trial.seed,
+                differentiable=config.algorithm_settings.differentiates,
+            )
+            self.algorithm = algorithm(config, self.env)
             self.evaluator = Evaluator(config, device)
         self._log = MetricsLog(logdir)
         self._damages: tuple[Damage, ...] = ()
@@ -104,15 +115,21 @@ class Trainer:
                 stays as it is.
             CheckpointError: the first epoch, and the checkpoint to start from is missing, torn, or does not fit.
         """
-        with named_out_of_memory(self._device, self.env.nworld):
+        with self._memory():
             return self._run_epoch()
+
+    def _memory(self) -> AbstractContextManager[None]:
+        length = self.config.algorithm_settings.length
+        other = [] if length is None else [f"{self.config.algorithm_section}.{length}"]
+        return named_out_of_memory(self._device, self.config.env.nworld, "env.nworld", *other)
 
     def _run_epoch(self) -> dict[str, float]:
         if self.epoch == 0:
             self._start_from(self.config.trial.start_from)
             self._evaluate_initial()
         started = time.perf_counter()
-        result = self.shac.update(self.epoch)
+        self.env.begin_epoch(self.epoch)
+        result = self.algorithm.update(self.epoch)
         self.epoch += 1
         self.env_steps += result.env_steps
         elapsed = time.perf_counter() - started
@@ -157,7 +174,7 @@ class Trainer:
                 f"{self.config.trial.epochs}"
             )
         self._write_config()
-        self.shac.load_state_dict(_to_device(state["shac"], self.env.device))
+        self.algorithm.load_state_dict(_to_device(state["algorithm"], self.env.device))
         self.epoch, self.env_steps = state["epoch"], state["env_steps"]
         self._seconds = state["seconds"]
         self._damages = self._log.rewind(self.epoch)
@@ -200,12 +217,12 @@ class Trainer:
             return
         state = read_checkpoint(Path(path))
         try:
-            self.shac.start_from(_to_device(state["shac"]["modules"], self.env.device))
+            self.algorithm.start_from(_to_device(state["algorithm"]["modules"], self.env.device))
         except (KeyError, TypeError, RuntimeError) as error:
             what = str(error).splitlines()[-1].strip()
             raise CheckpointError(
-                f"trial.start_from: {path} does not fit this trial ({what}): give a checkpoint of the same env and "
-                "networks"
+                f"trial.start_from: {path} does not fit this trial ({what}): give a checkpoint of the same env, "
+                "algorithm and networks"
             ) from error
 
     def _evaluate_initial(self) -> None:
@@ -213,7 +230,7 @@ class Trainer:
 
     def _evaluate(self) -> dict[str, float]:
         started = time.perf_counter()
-        figures = self.evaluator.run(self.shac.policy)
+        figures = self.evaluator.run(self.algorithm.policy)
         if self.epoch == 0:
             # For whoever wants to look at it; it has no score, so that any trained policy replaces it.
             self._write(self.best_checkpoint)
@@ -240,7 +257,7 @@ class Trainer:
             "config": self.config.as_dict(),
             "epoch": self.epoch,
             "env_steps": self.env_steps,
-            "shac": {"modules": self.shac.policy_state_dict()},
+            "algorithm": {"modules": self.algorithm.policy_state_dict()},
         }
         facts = {"epoch": self.epoch, "score": _finite(score)}
         write_checkpoint(milestone_path(self.checkpoints, self.epoch), state, facts)
@@ -255,29 +272,35 @@ class Trainer:
             "env_steps": self.env_steps,
             "seconds": self._seconds,
             "best_score": self.best_score,
-            "shac": self.shac.state_dict(),
+            "algorithm": self.algorithm.state_dict(),
         }
         write_checkpoint(path, state, {"epoch": self.epoch, "best_score": _finite(self.best_score)})
 
 
 def precompile(config: Config, device: str, logdir: Path) -> None:
-    """Compile every kernel this configuration needs into Warp's cache, by one epoch of a two-step horizon.
+    """Compile every kernel this configuration needs into Warp's cache, by one epoch as short as its algorithm has.
 
     In few worlds: kernels are the same in many, and a device too small for those is the trial's to name.
     """
-    tiny = config.as_dict()
-    tiny["env"] |= {"nworld": 2}
-    tiny["shac"] |= {"horizon": 2, "critic_iterations": 1, "critic_batches": 1}
-    tiny["evaluation"] |= {"steps": 1, "nworld": 2}
-    tiny["trial"] |= {"epochs": 1, "start_from": None}
-    trainer = Trainer(Config.model_validate(tiny), logdir, device)
+    own = config.algorithm_settings.shortest()
+    tiny = {
+        "env.nworld": 2,
+        **{f"{config.algorithm_section}.{key}": value for key, value in own.items()},
+        "evaluation.steps": 1,
+        "evaluation.nworld": 2,
+        "trial.epochs": 1,
+        "trial.start_from": None,
+    }
+    trainer = Trainer(parse_config(overlay(config.as_dict(), tiny), "a short epoch"), logdir, device)
     trainer.run_epoch()
     trainer.close()
 
 
 def _expect(path: Path, state: dict[str, Any]) -> dict[str, Any]:
     """The state of a trial, with everything that going on needs."""
-    missing = [key for key in ("config", "epoch", "env_steps", "seconds", "best_score", "shac") if key not in state]
+    missing = [
+        key for key in ("config", "epoch", "env_steps", "seconds", "best_score", "algorithm") if key not in state
+    ]
     if missing:
         raise CheckpointError(f"{path} holds no trial to go on with: {', '.join(missing)} missing")
     return state

@@ -19,8 +19,11 @@ from msk_ray.training.memory import named_out_of_memory
     ],
 )
 def test_a_failed_allocation_names_the_setting_to_lower(error: Exception) -> None:
-    advice = r"lower env\.nworld \(now 64\)"
-    with pytest.raises(SimulationError, match=advice) as caught, named_out_of_memory("cpu", 64):
+    advice = r"no room for 64 worlds; lower env\.nworld or ppo\.steps \("
+    with (
+        pytest.raises(SimulationError, match=advice) as caught,
+        named_out_of_memory("cpu", 64, "env.nworld", "ppo.steps"),
+    ):
         raise error
     assert caught.value.failure is Failure.OUT_OF_MEMORY
     assert "\n" not in str(caught.value)
@@ -29,10 +32,13 @@ def test_a_failed_allocation_names_the_setting_to_lower(error: Exception) -> Non
 
 
 def test_torch_itself_is_understood() -> None:
-    with pytest.raises(SimulationError, match="out_of_memory: cpu"), named_out_of_memory("cpu", 4):
+    with (
+        pytest.raises(SimulationError, match="out_of_memory: cpu"),
+        named_out_of_memory("cpu", 64, "env.nworld", "ppo.steps"),
+    ):
         torch.empty(2**55)
 
 
 def test_other_errors_pass() -> None:
-    with pytest.raises(RuntimeError, match="shapes"), named_out_of_memory("cpu", 4):
+    with pytest.raises(RuntimeError, match="shapes"), named_out_of_memory("cpu", 64, "env.nworld", "ppo.steps"):
         raise RuntimeError("shapes do not match")

@@ -2,34 +2,29 @@
 
 import copy
 import math
-import time
 from collections.abc import Mapping
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from msk_ray.algorithms.base import EpochResult
+from msk_ray.algorithms.base import Algorithm, Clock, EpochResult, simulation_metrics
+from msk_ray.algorithms.episodes import EpisodeTracker
 from msk_ray.algorithms.shac import returns
 from msk_ray.algorithms.shac.critic_fit import CriticFit
 from msk_ray.algorithms.shac.curriculum import ContactSchedule
 from msk_ray.algorithms.shac.entropy import EntropyBonus
-from msk_ray.algorithms.shac.episodes import EpisodeTracker
 from msk_ray.algorithms.shac.gate import CotangentGate, Norms
 from msk_ray.algorithms.shac.half_batch_cosine import HalfBatchCosine
 from msk_ray.algorithms.shac.rollout import Rollout, collect
 from msk_ray.algorithms.shac.schedules import adapted_horizon, horizon_at, learning_rate_at
-from msk_ray.config import AdaptiveHorizon, Config
+from msk_ray.config import AdaptiveHorizon, Config, ShacConfig
 from msk_ray.envs import Env
 from msk_ray.errors import Failure, SimulationError
-from msk_ray.networks import Actor, Critic, RunningMeanStd
-from msk_ray.physics.capacity import Capacity
-
-_OF_GRADIENTS = frozenset({"approximated_share"})
-"""Figures of the simulation that speak of its gradients; the others speak of its physics."""
+from msk_ray.networks import Actor, Critic, PolicyNetwork, RunningMeanStd
 
 
-class Shac:
+class Shac(Algorithm):
     """Actor, critic, their optimisers and the statistics they need, trained on one environment.
 
     Attributes:
@@ -37,16 +32,18 @@ class Shac:
         normalizer: observation statistics, or None if observations are used raw.
     """
 
+    Settings = ShacConfig
+    settings: ShacConfig
+    network: PolicyNetwork
+
     def __init__(self, config: Config, env: Env[Any]) -> None:
-        self.config = config
-        self.env = env
-        c = config.shac
-        device = env.device
         init = torch.Generator().manual_seed(config.trial.seed)
-        self.actor = Actor(config.actor, env.obs_size, env.action_size, init).to(device)
+        super().__init__(config, env, _network(config, env.obs_size, env.action_size, init))
+        c = self.settings
+        device = env.device
+        self.actor, self.normalizer = self.network.actor, self.network.normalizer
         self.critic = Critic(config.critic, env.obs_size, init).to(device)
         self.target_critic = copy.deepcopy(self.critic).requires_grad_(False)
-        self.normalizer = RunningMeanStd((env.obs_size,)).to(device) if c.normalize_obs else None
         self.return_statistics = RunningMeanStd(()).to(device) if c.normalize_return else None
         self.actor_optimizer = torch.optim.Adam(self.actor.parameters(), lr=c.actor_lr, betas=c.betas)
         self.critic_fit = CriticFit(self.critic, c.critic_lr, c.betas, c.critic_grad_norm)
@@ -56,6 +53,22 @@ class Shac:
         self._horizon = float(c.horizon.start) if isinstance(c.horizon, AdaptiveHorizon) else None
         self._entropy = EntropyBonus(c.entropy, env.action_size) if c.entropy is not None else None
         self._contacts = ContactSchedule(config.curriculum, env) if config.curriculum is not None else None
+
+    @classmethod
+    def policy_network(cls, config: Config, obs_size: int, action_size: int) -> PolicyNetwork:
+        """An untrained actor, as the trial's seed makes it, after statistics that leave observations as they are."""
+        return _network(config, obs_size, action_size, torch.Generator().manual_seed(config.trial.seed))
+
+    @classmethod
+    def policy_modules(cls, network: nn.Module) -> dict[str, nn.Module]:
+        """Actor and, if observations are normalised, their statistics."""
+        assert isinstance(network, PolicyNetwork)
+        return network.parts()
+
+    def modules(self) -> dict[str, nn.Module]:
+        """Policy, critics and statistics."""
+        found = {**self.network.parts(), "critic": self.critic, "target_critic": self.target_critic}
+        return found if self.return_statistics is None else found | {"return_statistics": self.return_statistics}
 
     def update(self, epoch: int) -> EpochResult:
         """Train one epoch, counted from 0.
@@ -67,7 +80,7 @@ class Shac:
             SimulationError: too many worlds had a non-finite gradient, the policy's gradient is not finite, or the
                 physics ran out of buffer space.
         """
-        c = self.config.shac
+        c = self.settings
         horizon = self._horizon_now(epoch)
         epochs = self.config.trial.epochs
         actor_lr = learning_rate_at(c.actor_lr, c.final_lr, c.lr_schedule, epoch, epochs)
@@ -75,8 +88,7 @@ class Shac:
         for group in self.actor_optimizer.param_groups:
             group["lr"] = actor_lr
         self.critic_fit.set_learning_rate(critic_lr)
-        clock = _Clock(self.env.device)
-        self.env.begin_epoch(epoch)
+        clock = Clock(self.env.device)
 
         # A cotangent of norm 1/(H·W) is what a reward of one in one world sends back through the mean loss.
         unit = 1.0 / (horizon * self.env.nworld)
@@ -121,55 +133,31 @@ class Shac:
             "time/rollout_s": rollout_s,
             "time/backward_s": backward_s,
             "time/critic_s": critic_s,
-            **{
-                f"{'grad' if name in _OF_GRADIENTS else 'physics'}/{name}": value
-                for name, value in self.env.sim.diagnostics().items()
-            },
+            **simulation_metrics(self.env),
         }
         return EpochResult(horizon * self.env.nworld, numbers)
 
-    @torch.no_grad()
-    def policy(self, obs: Tensor) -> Tensor:
-        """Deterministic actions (W, A) for raw observations (W, O)."""
-        action: Tensor = self.actor(self.normalizer.normalize(obs) if self.normalizer is not None else obs)
-        return action
-
-    def policy_state_dict(self) -> dict[str, Any]:
-        """State of the modules that `policy` uses."""
-        return {
-            name: module.state_dict() for name, module in self._modules().items() if name in ("actor", "normalizer")
-        }
-
     def state_dict(self) -> dict[str, Any]:
         """Everything a later `load_state_dict` needs to go on exactly, environment state included."""
-        state = self.env.state
         return {
-            "modules": {name: module.state_dict() for name, module in self._modules().items()},
+            **super().state_dict(),
             "actor_optimizer": self.actor_optimizer.state_dict(),
             "critic_optimizer": self.critic_fit.optimizer.state_dict(),
             "noise_generator": self.noise_generator.get_state(),
-            "env_generator": self.env.generator.get_state(),
-            "env_state": [t.detach().clone() for t in (*state.physics, state.action, state.age)],
             "episodes": self.episodes.state_dict(),
             "discounted": self._discounted.clone(),
             "horizon": self._horizon,
             "entropy_coefficient": None if self._entropy is None else self._entropy.coefficient,
             "curriculum": None if self._contacts is None else self._contacts.progress,
-            "capacity": tuple(self.env.sim.capacity),
         }
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from what `state_dict` gave."""
-        for name, module in self._modules().items():
-            module.load_state_dict(state["modules"][name])
+        super().load_state_dict(state)
         self.actor_optimizer.load_state_dict(state["actor_optimizer"])
         self.critic_fit.load_state_dict(state["critic_optimizer"])
         # Generator states are host tensors whatever device they drive.
         self.noise_generator.set_state(state["noise_generator"].cpu())
-        self.env.generator.set_state(state["env_generator"].cpu())
-        *physics, action, age = state["env_state"]
-        now = self.env.state
-        self.env.state = now._replace(physics=type(now.physics)(*physics), action=action, age=age)
         self.episodes.load_state_dict(state["episodes"])
         self._discounted = state["discounted"]
         self._horizon = state.get("horizon")
@@ -177,26 +165,9 @@ class Shac:
             self._entropy.coefficient = state["entropy_coefficient"]
         if self._contacts is not None:
             self._contacts.set_progress(state["curriculum"])
-        if "capacity" in state:
-            # Room that the trial grew to: what comes next may need it at once.
-            self.env.sim.reserve(Capacity(*state["capacity"]))
-
-    def start_from(self, modules: Mapping[str, Any]) -> None:
-        """Take networks and statistics from another trial's states, by module name; the actor has to be among them.
-
-        What is not there, such as the critic of a policy saved alone, stays as it is.
-
-        Raises:
-            KeyError: there is no actor, or no statistics of the observations that it expects normalised.
-            RuntimeError: a network has another shape.
-        """
-        needed = {"actor"} | ({"normalizer"} if self.normalizer is not None else set())
-        for name, module in self._modules().items():
-            if name in modules or name in needed:
-                module.load_state_dict(modules[name])
 
     def _horizon_now(self, epoch: int) -> int:
-        configured = self.config.shac.horizon
+        configured = self.settings.horizon
         if isinstance(configured, AdaptiveHorizon):
             assert self._horizon is not None
             return round(self._horizon)
@@ -214,10 +185,10 @@ class Shac:
             Where they stood, by metric name.
         """
         stood: dict[str, float] = {}
-        if isinstance(self.config.shac.horizon, AdaptiveHorizon):
+        if isinstance(self.settings.horizon, AdaptiveHorizon):
             assert self._horizon is not None
             p90 = math.nan if norms is None else float(norms.p90)
-            self._horizon = adapted_horizon(self.config.shac.horizon, self._horizon, p90)
+            self._horizon = adapted_horizon(self.settings.horizon, self._horizon, p90)
         if self._entropy is not None:
             assert rollout.neg_log_prob is not None
             entropy = float(rollout.neg_log_prob.detach().mean())
@@ -228,19 +199,9 @@ class Shac:
             self._contacts.advance(reward)
         return stood
 
-    def _modules(self) -> dict[str, nn.Module]:
-        found: dict[str, nn.Module | None] = {
-            "actor": self.actor,
-            "critic": self.critic,
-            "target_critic": self.target_critic,
-            "normalizer": self.normalizer,
-            "return_statistics": self.return_statistics,
-        }
-        return {name: module for name, module in found.items() if module is not None}
-
     def _forward(self, horizon: int, gate: CotangentGate) -> tuple[Rollout, Tensor, Tensor, Tensor]:
         """Rollout, actor loss, attached values of the states reached (H, W), and detached rewards for the critic."""
-        c = self.config.shac
+        c = self.settings
         noise = torch.randn(
             (horizon, self.env.nworld, self.env.action_size), generator=self.noise_generator, device=self.env.device
         )
@@ -271,7 +232,7 @@ class Shac:
         assert self.return_statistics is not None
         running = []
         for reward, ended in zip(rewards, done, strict=True):
-            self._discounted = self._discounted * self.config.shac.gamma + reward
+            self._discounted = self._discounted * self.settings.gamma + reward
             running.append(self._discounted)
             self._discounted = torch.where(ended, 0.0, self._discounted)
         self.return_statistics.update(torch.stack(running).flatten())
@@ -282,9 +243,9 @@ class Shac:
         Returns:
             The gradient's norm before clipping.
         """
-        limit = self.config.shac.actor_grad_norm
+        limit = self.settings.actor_grad_norm
         norm = nn.utils.clip_grad_norm_(self.actor.parameters(), float("inf") if limit is None else limit)
-        allowed = self.config.shac.max_nonfinite_share
+        allowed = self.settings.max_nonfinite_share
         if lost > allowed:
             raise SimulationError(
                 f"nonfinite_gradient: the state cotangent of {lost:.1%} of the worlds was not finite "
@@ -301,7 +262,7 @@ class Shac:
 
     def _train_critic(self, rollout: Rollout, next_values: Tensor, rewards: Tensor) -> Tensor:
         """Fit the critic to its targets, move the target critic, and return the last pass's mean loss."""
-        c = self.config.shac
+        c = self.settings
         if c.critic_method == "td-lambda":
             targets = returns.td_lambda_targets(rewards, next_values, rollout.terminated, rollout.done, c.gamma, c.lam)
         else:
@@ -315,19 +276,10 @@ class Shac:
         return loss
 
 
-class _Clock:
-    """Seconds between laps, the device's queued work included."""
-
-    def __init__(self, device: torch.device) -> None:
-        self._device = device
-        self._last = self._now()
-
-    def _now(self) -> float:
-        if self._device.type == "cuda":
-            torch.cuda.synchronize(self._device)
-        return time.perf_counter()
-
-    def lap(self) -> float:
-        now = self._now()
-        elapsed, self._last = now - self._last, now
-        return elapsed
+def _network(config: Config, obs_size: int, action_size: int, generator: torch.Generator) -> PolicyNetwork:
+    settings = config.algorithm_settings
+    assert isinstance(settings, ShacConfig)
+    return PolicyNetwork(
+        Actor(config.actor, obs_size, action_size, generator),
+        RunningMeanStd((obs_size,)) if settings.normalize_obs else None,
+    )

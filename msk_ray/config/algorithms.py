@@ -1,0 +1,390 @@
+"""The algorithms that `algorithm.name` can take, and the settings that each declares.
+
+The package's own have a section of their own at the top of a config, `shac` and `ppo`; those from outside have
+`algorithm.settings`. Sources of SHAC's defaults: Xu et al. 2022, "Accelerated Policy Learning with Parallel
+Differentiable Simulation", arXiv:2204.07137, and the hyperparameters published with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+from pydantic import (
+    BeforeValidator,
+    Discriminator,
+    Field,
+    PositiveFloat,
+    SerializeAsAny,
+    Tag,
+    ValidationInfo,
+    model_validator,
+)
+
+from msk_ray.config.physics import GRADIENTS
+from msk_ray.config.resolve import Registry, resolve
+from msk_ray.config.sections import Count, Fraction, NonNegative, Section, Text
+from msk_ray.errors import ConfigError
+
+if TYPE_CHECKING:
+    from msk_ray.config.schema import Config
+
+ALGORITHMS = Registry(
+    "algorithm.name",
+    "msk_ray.algorithms",
+    {"shac": "msk_ray.algorithms.shac.algorithm:Shac", "ppo": "msk_ray.algorithms.ppo.algorithm:Ppo"},
+)
+"""Classes of algorithms. Those of the package have their settings in the config's section of the same name."""
+
+
+class AlgorithmSettings(Section):
+    """The settings of an algorithm, and what it declares of itself."""
+
+    differentiates: ClassVar[bool] = True
+    """Whether it needs gradients of the simulation; without, it reads no setting of theirs."""
+    reads_not: ClassVar[frozenset[str]] = frozenset()
+    """Settings of the sections `actor` and `critic`, dotted, that it does not read."""
+    packages: ClassVar[Mapping[str, str]] = {}
+    """Modules it needs that not every installation has, and what to install for each."""
+    length: ClassVar[str | None] = None
+    """Its setting that says how many env steps a world takes in an epoch."""
+
+    def env_steps(self, nworld: int, epochs: int) -> int:
+        """The most env steps that so many epochs of W worlds can take.
+
+        Raises:
+            ConfigError: the algorithm does not say.
+        """
+        raise ConfigError(
+            f"{type(self).__qualname__} does not say how many env steps an epoch takes: write its method env_steps, "
+            "or scheduler.time_attr: epoch"
+        )
+
+    def shortened(self, epochs: int) -> dict[str, Any]:
+        """Settings that make each of `epochs` epochs last a second or so, to see that everything runs."""
+        return {}
+
+    def shortest(self) -> dict[str, Any]:
+        """Settings of an epoch that launches every kernel and does little else."""
+        return {}
+
+    def check(self, config: Config) -> None:
+        """Refuse other sections' settings that do not go with these.
+
+        Raises:
+            ValueError: with what to write instead.
+        """
+
+    def unread(self) -> dict[str, str]:
+        """Settings of this section, dotted, that nothing reads because of others, and what makes it so."""
+        return {}
+
+
+class HorizonSchedule(Section):
+    """Rollout length by epoch: `start` at epoch 0, `end` from epoch `epochs` on, linear between."""
+
+    start: Count
+    end: Count
+    epochs: Count
+
+    def at(self, epoch: int) -> int:
+        """Env steps at `epoch`, counted from 0."""
+        progress = min(1.0, epoch / self.epochs)
+        return round(self.start + (self.end - self.start) * progress)
+
+
+class AdaptiveHorizon(Section):
+    """Rollout length that follows the gradient: longer while cotangents stay small, shorter when they grow.
+
+    After each epoch H ← H (target / p90)^rate within bounds, p90 being the 90th percentile of the state cotangents'
+    norms in units of reward. Adaptive horizons are the idea of AHAC (Georgiev et al. 2024, arXiv:2405.17784), which
+    follows a constraint on contact forces; this one follows the cotangents themselves.
+    """
+
+    start: Count
+    shortest: Count = 4
+    longest: Count = 64
+    target: PositiveFloat
+    """Wanted 90th percentile of the cotangent norms, before any bound [reward]."""
+    rate: Annotated[float, Field(gt=0.0, le=1.0)] = 0.1
+
+    @model_validator(mode="after")
+    def _bounds(self) -> AdaptiveHorizon:
+        if not self.shortest <= self.start <= self.longest:
+            raise ValueError(
+                f"adaptive horizon: start {self.start} must lie between shortest {self.shortest} and longest "
+                f"{self.longest}"
+            )
+        return self
+
+
+def _kind_of_horizon(value: Any) -> str:
+    if isinstance(value, dict):
+        return "adaptive" if "target" in value else "schedule"
+    if isinstance(value, AdaptiveHorizon):
+        return "adaptive"
+    return "schedule" if isinstance(value, HorizonSchedule) else "constant"
+
+
+Horizon = Annotated[
+    Annotated[Count, Tag("constant")]
+    | Annotated[HorizonSchedule, Tag("schedule")]
+    | Annotated[AdaptiveHorizon, Tag("adaptive")],
+    Discriminator(_kind_of_horizon),
+]
+
+
+class EntropyConfig(Section):
+    """Bonus α for the policy's entropy, as in SAPO (Xing et al. 2024, arXiv:2412.12089); values become soft values."""
+
+    coefficient: PositiveFloat = 0.01
+    """α [reward per nat], or where it starts if there is a target."""
+    target: float | None = None
+    """Entropy per action dimension [nat] that α is adapted to hold; null keeps α. Uniform actions have ln 2 = 0.69."""
+    rate: PositiveFloat = 5e-3
+    """Change of log α per epoch and nat of missing entropy."""
+
+
+class ShacConfig(AlgorithmSettings):
+    """Short-Horizon Actor-Critic."""
+
+    length: ClassVar[str | None] = "horizon"
+
+    horizon: Horizon = 32
+    """Env steps H of a rollout the gradient flows through: constant, {start, end, epochs}, or by the gradient as
+    {start, target}."""
+    gamma: Fraction = 0.99
+    """Discount."""
+    lam: Fraction = 0.95
+    """λ of the TD(λ) targets."""
+    critic_method: Literal["td-lambda", "one-step"] = "td-lambda"
+    """Targets of the critic."""
+    critic_iterations: Count = 16
+    """Passes over the rollout an epoch."""
+    critic_batches: Count = 4
+    """Minibatches a pass."""
+    target_critic_alpha: Fraction = 0.2
+    """target ← α·target + (1 − α)·critic after each epoch."""
+    actor_lr: PositiveFloat = 2e-3
+    critic_lr: PositiveFloat = 2e-3
+    lr_schedule: Literal["linear", "constant"] = "linear"
+    """`linear` goes from the given rate to `final_lr` at the last epoch."""
+    final_lr: PositiveFloat = 1e-5
+    betas: tuple[Fraction, Fraction] = (0.7, 0.95)
+    """Adam's moment decays."""
+    actor_grad_norm: PositiveFloat | None = 1.0
+    """Norm the actor's gradient is clipped to; null leaves it."""
+    critic_grad_norm: PositiveFloat | None = 1.0
+    """Norm each critic's gradient is clipped to; null leaves it."""
+    state_bptt: bool = True
+    """Let gradients flow through the state from one env step to the next; False cuts them after each step."""
+    state_grad_clip: PositiveFloat | None = None
+    """Bound on each world's state cotangent between env steps, in units of reward; null leaves it.
+
+    The loss is a mean over H·W, so a world's cotangent of norm c/(H·W) is what one reward of c would give.
+    """
+    entropy: EntropyConfig | None = None
+    """Bonus for the policy's entropy; null gives none."""
+    normalize_obs: bool = True
+    """Normalise observations by their running mean and variance."""
+    normalize_return: bool = False
+    """Divide rewards by the running standard deviation of the return."""
+    reward_scale: PositiveFloat = 1.0
+    max_nonfinite_share: Fraction = 0.05
+    """Share of worlds whose gradient may be non-finite in an epoch before the trial stops with an error."""
+
+    def env_steps(self, nworld: int, epochs: int) -> int:
+        """The sum over epochs of horizon × worlds; an adaptive horizon counts with its `longest`."""
+        horizon = self.horizon
+        if isinstance(horizon, HorizonSchedule):
+            return nworld * sum(horizon.at(epoch) for epoch in range(epochs))
+        return nworld * epochs * (horizon.longest if isinstance(horizon, AdaptiveHorizon) else horizon)
+
+    def shortened(self, epochs: int) -> dict[str, Any]:
+        """A quarter of the horizon, and two passes of one batch for the critic."""
+        horizon: Any = self.horizon
+        if isinstance(horizon, int):
+            horizon = _quarter(horizon)
+        elif isinstance(horizon, AdaptiveHorizon):
+            lengths = {name: _quarter(getattr(horizon, name)) for name in ("start", "shortest", "longest")}
+            horizon = {**lengths, "target": horizon.target, "rate": horizon.rate}
+        else:
+            horizon = {"start": _quarter(horizon.start), "end": _quarter(horizon.end), "epochs": epochs - 1}
+        return {"horizon": horizon, "critic_batches": 1, "critic_iterations": min(self.critic_iterations, 2)}
+
+    def shortest(self) -> dict[str, Any]:
+        """A horizon of two steps, and one pass of one batch for the critic."""
+        return {"horizon": 2, "critic_iterations": 1, "critic_batches": 1}
+
+    def check(self, config: Config) -> None:
+        """Refuse critic batches that do not divide a rollout, and a bonus for the entropy of a policy without one."""
+        horizon, nworld = self.horizon, config.env.nworld
+        if isinstance(horizon, HorizonSchedule):
+            shortest = min(horizon.start, horizon.end)
+        else:
+            shortest = horizon if isinstance(horizon, int) else horizon.shortest
+        if (shortest * nworld) % self.critic_batches:
+            raise ValueError(
+                f"shac.critic_batches {self.critic_batches} must divide shac.horizon × env.nworld "
+                f"({shortest} × {nworld})"
+            )
+        if self.entropy is not None and not config.actor.stochastic:
+            raise ValueError("shac.entropy needs a stochastic policy: write actor.stochastic: true")
+
+    def unread(self) -> dict[str, str]:
+        """Settings that another one switches off."""
+        unread = {}
+        if self.lr_schedule == "constant":
+            unread["final_lr"] = "lr_schedule is constant"
+        if self.critic_method == "one-step":
+            unread["lam"] = "critic_method is one-step"
+        if not self.state_bptt:
+            unread["state_grad_clip"] = "state_bptt is false"
+        if self.entropy is not None and self.entropy.target is None:
+            unread["entropy.rate"] = "entropy.target is null"
+        return unread
+
+
+class PpoConfig(AlgorithmSettings):
+    """Proximal Policy Optimization by rsl-rl-lib. Its defaults are those that library's authors use for locomotion."""
+
+    differentiates: ClassVar[bool] = False
+    reads_not: ClassVar[frozenset[str]] = frozenset(
+        ("actor.layer_norm", "actor.log_std", "actor.output_gain", "critic.layer_norm", "critic.count")
+    )
+    packages: ClassVar[Mapping[str, str]] = {"rsl_rl": "msk-ray[ppo]"}
+    length: ClassVar[str | None] = "steps"
+
+    steps: Count = 24
+    """Env steps a world takes in an epoch."""
+    passes: Count = 5
+    """Passes over an epoch's steps."""
+    minibatches: Count = 4
+    """Minibatches a pass."""
+    clip: PositiveFloat = 0.2
+    """Bound on how far the ratio of new to old probabilities, and the value, may move in an epoch."""
+    clip_value: bool = True
+    """Whether the value is bounded so, too."""
+    gamma: Fraction = 0.99
+    """Discount."""
+    lam: Fraction = 0.95
+    """λ of the generalised advantage estimate."""
+    lr: PositiveFloat = 1e-3
+    """Adam's rate, or where it starts if it is adaptive."""
+    lr_schedule: Literal["adaptive", "constant"] = "adaptive"
+    """`adaptive` divides or multiplies the rate by 1.5, between 1e-5 and 1e-2, to hold `desired_kl`."""
+    desired_kl: PositiveFloat = 0.01
+    """Divergence of the new policy from the old one [nat]."""
+    value_coefficient: PositiveFloat = 1.0
+    """Weight of the value's loss beside the policy's."""
+    entropy_coefficient: NonNegative = 0.0
+    """Weight of the bonus for the policy's entropy."""
+    grad_norm: PositiveFloat = 1.0
+    """Norm that the gradients of policy and value are each clipped to."""
+    init_std: PositiveFloat = 1.0
+    """Initial standard deviation of actions."""
+    normalize_obs: bool = True
+    """Normalise observations by their running mean and variance."""
+
+    def env_steps(self, nworld: int, epochs: int) -> int:
+        """Worlds × steps × epochs."""
+        return nworld * self.steps * epochs
+
+    def shortened(self, epochs: int) -> dict[str, Any]:
+        """A quarter of the steps, two passes of one batch."""
+        return {"steps": _quarter(self.steps), "passes": min(self.passes, 2), "minibatches": 1}
+
+    def shortest(self) -> dict[str, Any]:
+        """Two steps, one pass of one batch."""
+        return {"steps": 2, "passes": 1, "minibatches": 1}
+
+    def check(self, config: Config) -> None:
+        """Refuse minibatches that do not divide an epoch, and what PPO cannot do."""
+        if (self.steps * config.env.nworld) % self.minibatches:
+            raise ValueError(
+                f"ppo.minibatches {self.minibatches} must divide ppo.steps × env.nworld "
+                f"({self.steps} × {config.env.nworld})"
+            )
+        if not config.actor.stochastic:
+            raise ValueError("ppo explores by its policy's noise: write actor.stochastic: true")
+        for name, network in (("actor", config.actor), ("critic", config.critic)):
+            if not network.hidden:
+                raise ValueError(f"ppo needs hidden layers: write {name}.hidden: [64, 64]")
+        if config.curriculum is not None:
+            raise ValueError("curriculum: ppo trains without one; write curriculum: null, or algorithm.name: shac")
+
+    def unread(self) -> dict[str, str]:
+        """Settings that another one switches off."""
+        return {"desired_kl": "lr_schedule is constant"} if self.lr_schedule == "constant" else {}
+
+
+def _quarter(length: int) -> int:
+    return max(2, length // 4)
+
+
+BUILT_IN: Mapping[str, type[AlgorithmSettings]] = {"shac": ShacConfig, "ppo": PpoConfig}
+"""Settings of the package's algorithms, by the section that holds them."""
+
+
+def _settings_from_outside(value: Any, info: ValidationInfo) -> Any:
+    """`algorithm.settings` as the settings that the algorithm named declares."""
+    name = info.data.get("name")
+    if type(value) is AlgorithmSettings:
+        value = {}  # none were given
+    if name is None or isinstance(value, AlgorithmSettings):
+        return value
+    if name in BUILT_IN:
+        if value == {}:
+            return AlgorithmSettings()
+        first = f".{next(iter(value))}" if isinstance(value, Mapping) else ""
+        raise ValueError(f"algorithm.settings: the settings of {name} are a section of their own; write {name}{first}")
+    try:
+        settings = settings_from_outside(name)
+    except ConfigError as error:
+        raise ValueError(str(error)) from error
+    return settings.model_validate(value, context=info.context)
+
+
+class AlgorithmConfig(Section):
+    """Which algorithm learns."""
+
+    name: Text = "shac"
+    """`shac`, `ppo`, or package.module:Class."""
+    settings: Annotated[SerializeAsAny[AlgorithmSettings], BeforeValidator(_settings_from_outside)] = (
+        AlgorithmSettings()
+    )
+    """Of an algorithm from outside, as its class declares them. Those of shac and ppo are in their own sections."""
+
+
+def settings_from_outside(name: Any) -> type[AlgorithmSettings]:
+    """The settings that the algorithm at this import path, or of this installed name, declares.
+
+    Raises:
+        ConfigError: there is no such algorithm, or it declares something else.
+    """
+    path = ALGORITHMS.path(name)
+    declared = getattr(resolve(path, ALGORITHMS.key), "Settings", None)
+    if not (isinstance(declared, type) and issubclass(declared, AlgorithmSettings)):
+        raise ConfigError(f"algorithm.name: {path} declares no settings: write `class Settings(AlgorithmSettings)`")
+    return declared
+
+
+def check_installed(algorithm: AlgorithmConfig, settings: AlgorithmSettings) -> None:
+    """Refuse an algorithm whose packages are not installed.
+
+    Raises:
+        ConfigError: naming what to install.
+    """
+    for module, install in settings.packages.items():
+        if find_spec(module) is None:
+            raise ConfigError(
+                f"algorithm.name: {algorithm.name} needs {module}, which is not installed: pip install '{install}'"
+            )
+
+
+def ignored_settings(name: str, settings: AlgorithmSettings) -> list[str]:
+    """Sections and settings, dotted, that a trial of this algorithm does not read."""
+    sections = [section for section in BUILT_IN if section != name]
+    gradients = [] if settings.differentiates else [f"physics.{key}" for key in sorted(GRADIENTS)]
+    return [*sections, *sorted(settings.reads_not), *gradients]
