@@ -8,6 +8,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from msk_ray.algorithms import Algorithm as Algorithm
+    from msk_ray.algorithms import EpochResult as EpochResult
+    from msk_ray.config import AlgorithmSettings as AlgorithmSettings
     from msk_ray.config import Config as Config
     from msk_ray.config import EnvSettings as EnvSettings
     from msk_ray.config import Reward as Reward
@@ -29,10 +32,13 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOMES = {
+    "Algorithm": "msk_ray.algorithms",
+    "AlgorithmSettings": "msk_ray.config",
     "Backward": "msk_ray.simulation",
     "Config": "msk_ray.config",
     "Env": "msk_ray.envs",
     "EnvSettings": "msk_ray.config",
+    "EpochResult": "msk_ray.algorithms",
     "FdJacobian": "msk_ray.simulation",
     "Hybrid": "msk_ray.simulation",
     "MjcfEnv": "msk_ray.envs",

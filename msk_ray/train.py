@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from msk_ray.training import Trainer
 
 DESCRIPTION = """\
-Train one policy with SHAC: one trial, in this process, without Ray.
+Train one policy, by SHAC or another algorithm: one trial, in this process, without Ray.
 
 Writes into the log folder: config.yaml (every setting), metrics.jsonl (one row an epoch), TensorBoard events and
 checkpoints/ with the newest two and best.pt, the trained policy with the highest evaluation score (until the first
@@ -43,6 +43,7 @@ EXAMPLES = """\
   python -m msk_ray.train --config configs/cartpole.yaml
   python -m msk_ray.train --config configs/ant.yaml --device cuda:0 --seed 1 --set shac.horizon=32
   python -m msk_ray.train --config configs/ant.yaml --set 'shac.horizon={start: 8, end: 32, epochs: 100}'
+  python -m msk_ray.train --config configs/cartpole.yaml --set algorithm.name=ppo
   python -m msk_ray.train --config configs/cartpole.yaml --logdir runs/mine --resume   # after a crash or Ctrl-C
   tensorboard --logdir runs"""
 

@@ -56,13 +56,33 @@ HEALTH = {
 }
 """Metric → what it is, and whether it is drawn on a logarithmic axis."""
 
+_OVER = {
+    "env_steps": ("Learning curves", "env steps", ""),
+    "seconds": (
+        "Learning curves over time",
+        "seconds of training",
+        " Times compare where trials ran on equal devices, each alone on its own.",
+    ),
+}
+"""Column of the metrics → the picture's title, the axis' name, and what to know about it."""
+
 Curve = tuple[np.ndarray, np.ndarray]
 
 
-def learning_curves(groups: Mapping[str, Sequence[TrialReading]], baseline: str | None, name: str) -> Picture | None:
-    """Score over env steps, a line a variant and a band over its seeds; None if no trained policy has a score."""
+def learning_curves(
+    groups: Mapping[str, Sequence[TrialReading]], baseline: str | None, name: str, *, over: str = "env_steps"
+) -> Picture | None:
+    """Score over training, a line a variant and a band over its seeds; None if no trained policy has a score.
+
+    Args:
+        groups: trials by variant.
+        baseline: the variant that is drawn whatever its rank.
+        name: the picture's.
+        over: the x axis, `env_steps` or `seconds`.
+    """
     means = {v: float(np.mean(scores)) for v, trials in groups.items() if (scores := _best_scores(trials))}
-    curves = {v: [t.curve for t in groups[v] if len(t.curve[0])] for v in means}
+    curves = {v: [t.curve_over(over) for t in groups[v] if len(t.curve[0])] for v in means}
+    title, axis, more = _OVER[over]
     ranked = sorted(curves, key=lambda v: -means[v])
     if not ranked:
         return None
@@ -78,10 +98,11 @@ def learning_curves(groups: Mapping[str, Sequence[TrialReading]], baseline: str 
             _draw_variant(axes, curves[variant], number, shorten(variant, 34 if narrow else 44))
             for trial in groups[variant]:
                 if trial.ending is not None and trial.ending.outcome in _STOPPED and len(trial.curve[0]):
-                    x, y = trial.curve
+                    x, y = trial.curve_over(over)
                     axes.plot(x[-1], y[-1], "x", color=_colour(number), markersize=7, markeredgewidth=2)
         _limit_below(axes, [curve for own in curves.values() for curve in own])
         steps_axis(axes)
+        axes.set_xlabel(axis)
         axes.set_ylabel("evaluation score")
         axes.grid(alpha=0.3)
         handles, labels = axes.get_legend_handles_labels()
@@ -95,11 +116,12 @@ def learning_curves(groups: Mapping[str, Sequence[TrialReading]], baseline: str 
     best = means[ranked[0]]
     return picture(
         name,
-        "Learning curves",
-        f"Evaluation score over env steps of {len(ranked)} variants; the best is {ranked[0]} with a mean best score of "
+        title,
+        f"Evaluation score over {axis} of {len(ranked)} variants; the best is {ranked[0]} with a mean best score of "
         f"{best:.5g}.",
         ("Mean over seeds, band: their range. " if seeds > 1 else "")
-        + "A cross ends a trial that was stopped before its time; from there the mean is over those that went on.",
+        + "A cross ends a trial that was stopped before its time; from there the mean is over those that went on."
+        + more,
         draw,
     )
 

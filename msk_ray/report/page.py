@@ -97,8 +97,12 @@ def make_section(reading: Reading, folder: Path, prefix: str, baseline: str | No
     """
     chosen = baseline_of(reading, baseline)
     found = ranked_effects(reading)
+    several = len(reading.algorithms) > 1
+    times = learning_curves(reading.variants, chosen, f"{prefix}times", over="seconds") if several else None
     drawn = {
         "curves": learning_curves(reading.variants, chosen, f"{prefix}curves"),
+        # An env step of one algorithm costs another time than one of another.
+        "times": times,
         "effects": parameter_effects(found, f"{prefix}effects"),
         "parallel": parallel_coordinates(reading, found, f"{prefix}parallel"),
         "stops": stopping_map(reading, f"{prefix}stops"),

@@ -78,10 +78,14 @@ class TrialReading:
     def curve(self) -> tuple[np.ndarray, np.ndarray]:
         """Env steps and scores of the evaluations with a finite score, both (N,); that of the untrained policy, from
         which a curve begins, is among them."""
+        return self.curve_over("env_steps")
+
+    def curve_over(self, column: str) -> tuple[np.ndarray, np.ndarray]:
+        """The same over another column of the metrics, such as `seconds`."""
         if SCORE not in self.columns:
             return np.zeros(0), np.zeros(0)
-        keep = np.isfinite(self.columns[SCORE])
-        return self.columns["env_steps"][keep], self.columns[SCORE][keep]
+        keep = np.isfinite(self.columns[SCORE]) & np.isfinite(self.columns[column])
+        return self.columns[column][keep], self.columns[SCORE][keep]
 
     @cached_property
     def trained(self) -> tuple[np.ndarray, np.ndarray]:
@@ -201,6 +205,11 @@ class Reading:
         for trial in self.trials:
             groups.setdefault(trial.trial.variant, []).append(trial)
         return groups
+
+    @property
+    def algorithms(self) -> set[str]:
+        """Names of the algorithms that trials run."""
+        return {trial.trial.config.algorithm.name for trial in self.trials}
 
     @property
     def halved(self) -> list[TrialReading]:

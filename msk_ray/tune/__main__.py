@@ -36,7 +36,7 @@ from msk_ray.text_table import text_table
 from msk_ray.tune.devices import check_threads
 
 DESCRIPTION = """\
-Run a search space: many SHAC trials side by side, one GPU (or CPU core) each, scored by deterministic evaluation,
+Run a search space: many trials side by side, one GPU (or CPU core) each, scored by deterministic evaluation,
 the hopeless ones stopped early.
 
 Writes runs/EXPERIMENT/: the trials' folders, and at the end summary.json, table.md and report/."""

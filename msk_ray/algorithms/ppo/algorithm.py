@@ -1,0 +1,211 @@
+"""PPO: one rollout without gradients, several passes of minibatches. Networks and losses are those of rsl-rl-lib."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+
+from msk_ray.algorithms.base import Algorithm, Clock, EpochResult, simulation_metrics
+from msk_ray.algorithms.episodes import EpisodeTracker
+from msk_ray.config import Config, NetworkConfig, PpoConfig
+from msk_ray.envs import Env
+from msk_ray.errors import Failure, SimulationError
+
+if TYPE_CHECKING:
+    from rsl_rl.models import MLPModel
+
+_GROUP = "obs"
+"""rsl_rl's observations are groups by name; here is one, which both networks read."""
+_ACTIVATIONS = {"silu": "swish"}
+"""rsl_rl's names of activations, where they are others than ours."""
+
+
+class GaussianPolicy(nn.Module):
+    """Raw observations (..., O) to the mean (..., A) of rsl_rl's Gaussian policy, clamped to [-1, 1]."""
+
+    def __init__(self, actor: MLPModel) -> None:
+        super().__init__()
+        self.actor = actor
+
+    def forward(self, obs: Tensor) -> Tensor:
+        mean: Tensor = self.actor({_GROUP: obs})
+        return mean.clamp(-1.0, 1.0)
+
+
+class Ppo(Algorithm):
+    """Actor, critic and optimiser of rsl_rl's PPO, trained on one environment, whose actions are clamped to [-1, 1].
+
+    Noise and minibatches are drawn from torch's global generators.
+    """
+
+    Settings = PpoConfig
+    settings: PpoConfig
+    network: GaussianPolicy
+
+    def __init__(self, config: Config, env: Env[Any]) -> None:
+        from rsl_rl.algorithms import PPO
+        from rsl_rl.storage import RolloutStorage
+
+        super().__init__(config, env)
+        c, device = self.settings, str(env.device)
+        critic = _network(config.critic, c, "critic", env.obs_size, 1).to(env.device)
+        storage = RolloutStorage("rl", env.nworld, c.steps, self._observe(), [env.action_size], device)
+        self.ppo = PPO(
+            self.network.actor,
+            critic,
+            storage,
+            num_learning_epochs=c.passes,
+            num_mini_batches=c.minibatches,
+            clip_param=c.clip,
+            use_clipped_value_loss=c.clip_value,
+            gamma=c.gamma,
+            lam=c.lam,
+            learning_rate=c.lr,
+            schedule="adaptive" if c.lr_schedule == "adaptive" else "fixed",
+            desired_kl=c.desired_kl,
+            value_loss_coef=c.value_coefficient,
+            entropy_coef=c.entropy_coefficient,
+            max_grad_norm=c.grad_norm,
+            device=device,
+        )
+        self.ppo.train_mode()
+        self.episodes = EpisodeTracker(env.nworld, env.device)
+
+    @classmethod
+    def policy_network(cls, config: Config, obs_size: int, action_size: int) -> GaussianPolicy:
+        """A policy with weights drawn from torch's global generator, and statistics that hold no observation yet."""
+        settings = config.algorithm_settings
+        assert isinstance(settings, PpoConfig)
+        noise = {"class_name": "GaussianDistribution", "init_std": settings.init_std, "std_type": "log"}
+        return GaussianPolicy(_network(config.actor, settings, "actor", obs_size, action_size, noise))
+
+    @classmethod
+    def policy_modules(cls, network: nn.Module) -> dict[str, nn.Module]:
+        """The actor, its statistics of observations included."""
+        assert isinstance(network, GaussianPolicy)
+        return {"actor": network.actor}
+
+    def modules(self) -> dict[str, nn.Module]:
+        """Actor and critic."""
+        return {"actor": self.network.actor, "critic": self.ppo.critic}
+
+    def update(self, epoch: int) -> EpochResult:
+        """Train one epoch, counted from 0.
+
+        Returns:
+            Env steps, and metrics with seconds spent in the rollout and in learning from it.
+
+        Raises:
+            SimulationError: an observation, a reward, a loss or a weight is not finite, or the physics ran out of
+                buffer space.
+        """
+        clock = Clock(self.env.device)
+        try:
+            rewards, done, diverged = self._collect()
+            rollout_s = clock.lap()
+            values = self.ppo.storage.values.mean()
+            losses = self.ppo.update()
+        except (RuntimeError, ValueError):
+            # What torch raises for a standard deviation that is NaN, for one.
+            self._check("weights", self._weights())
+            raise
+        self._check("losses and weights", [*losses.values(), *self._weights()])
+        learning_s = clock.lap()
+        metrics = {
+            "train/actor_loss": losses["surrogate"],
+            "train/critic_loss": losses["value"],
+            "train/entropy": losses["entropy"],
+            "train/reward": rewards.mean(),
+            "train/value": values,
+            "train/diverged": diverged,
+            "train/std": self.ppo.actor.output_std.detach().mean(),
+            **self.episodes.update(rewards, done),
+        }
+        numbers = {name: float(value) for name, value in metrics.items()}
+        numbers |= {
+            "train/actor_lr": self.ppo.learning_rate,
+            "time/rollout_s": rollout_s,
+            "time/learning_s": learning_s,
+            **simulation_metrics(self.env),
+        }
+        return EpochResult(self.settings.steps * self.env.nworld, numbers)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything a later `load_state_dict` needs to go on exactly, environment state included."""
+        return {
+            **super().state_dict(),
+            "optimizer": self.ppo.optimizer.state_dict(),
+            "learning_rate": self.ppo.learning_rate,
+            "episodes": self.episodes.state_dict(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from what `state_dict` gave."""
+        super().load_state_dict(state)
+        self.ppo.optimizer.load_state_dict(state["optimizer"])
+        self.ppo.learning_rate = state["learning_rate"]
+        self.episodes.load_state_dict(state["episodes"])
+
+    @torch.no_grad()
+    def _collect(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Fill rsl_rl's storage; rewards (H, W), ends of episodes (H, W) bool, and how many worlds diverged."""
+        env, ppo = self.env, self.ppo
+        env.state = env.state.detach()
+        env.stock_resets(self.settings.steps)
+        rewards, ends = [], []
+        diverged = torch.zeros((), dtype=torch.int64, device=env.device)
+        obs = self._observe()
+        for _ in range(self.settings.steps):
+            transition = env.step(ppo.act(obs).clamp(-1.0, 1.0))
+            done = transition.terminated | transition.truncated
+            obs = self._observe()
+            # A time limit ends no task: rsl_rl adds the value of the state that an episode was cut in.
+            ppo.process_env_step(obs, transition.reward, done, {"time_outs": transition.truncated})
+            rewards.append(transition.reward)
+            ends.append(done)
+            diverged += transition.diverged.sum()
+        self._check("observations and rewards", [*ppo.storage.observations.values(), *rewards])
+        ppo.compute_returns(obs)
+        return torch.stack(rewards), torch.stack(ends), diverged
+
+    def _weights(self) -> list[nn.Parameter]:
+        return [*self.ppo.actor.parameters(), *self.ppo.critic.parameters()]
+
+    def _observe(self) -> Any:
+        from tensordict import TensorDict
+
+        return TensorDict({_GROUP: self.env.observation()}, batch_size=[self.env.nworld])
+
+    def _check(self, what: str, values: Iterable[Tensor | float]) -> None:
+        finite = [torch.as_tensor(value, device=self.env.device).isfinite().all() for value in values]
+        if not bool(torch.stack(finite).all()):
+            raise SimulationError(
+                f"nonfinite_update: PPO's {what} are not finite; lower ppo.lr or ppo.desired_kl, or look at the reward",
+                Failure.NONFINITE,
+            )
+
+
+def _network(
+    config: NetworkConfig,
+    settings: PpoConfig,
+    name: str,
+    inputs: int,
+    outputs: int,
+    noise: dict[str, Any] | None = None,
+) -> MLPModel:
+    """rsl_rl's multilayer perceptron, with the weights torch gives linear layers by default."""
+    from rsl_rl.models import MLPModel
+
+    return MLPModel(
+        {_GROUP: torch.zeros(1, inputs)},
+        {name: [_GROUP]},
+        name,
+        outputs,
+        hidden_dims=list(config.hidden),
+        activation=_ACTIVATIONS.get(config.activation, config.activation),
+        obs_normalization=settings.normalize_obs,
+        distribution_cfg=noise,
+    )
