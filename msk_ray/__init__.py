@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from msk_ray.simulation import TapeAll as TapeAll
     from msk_ray.simulation import TapePerSubstep as TapePerSubstep
     from msk_ray.train import train as train
+    from msk_ray.training.loggers import Logger as Logger
     from msk_ray.training.policy import load_policy as load_policy
 
 __version__ = "0.1.0"
@@ -41,6 +42,7 @@ _HOMES = {
     "EpochResult": "msk_ray.algorithms",
     "FdJacobian": "msk_ray.simulation",
     "Hybrid": "msk_ray.simulation",
+    "Logger": "msk_ray.training.loggers",
     "MjcfEnv": "msk_ray.envs",
     "MjcfSettings": "msk_ray.envs",
     "Reward": "msk_ray.config",

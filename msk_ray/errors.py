@@ -50,6 +50,10 @@ class StorageFailure(StorageError):
     exit_code = 75  # EX_TEMPFAIL
 
 
+class LoggerError(MskRayError):
+    """A logger raised an exception. What it was given is in the trial's own record."""
+
+
 class OwnershipLost(StorageFailure):
     """Another process has become the owner of a folder that this one was writing to, or the folder has gone."""
 

@@ -19,7 +19,7 @@ from msk_ray.experiment.metrics import load_metrics
 from msk_ray.experiment.outcomes import Ending, Outcome, load_ending, write_ending
 from msk_ray.experiment.scheduler_log import LogEntry, SchedulerLog
 from msk_ray.files import write_json, write_text
-from msk_ray.training.metrics import MetricsLog
+from msk_ray.training.loggers.jsonl import JsonLines
 
 KILLS = 30
 """Of each kind of file, where it has as many places."""
@@ -107,10 +107,9 @@ def _writers(old: bytes, new: bytes) -> list[Writer]:
         )
 
     def log(folder: Path, some: list[dict[str, float]]) -> None:
-        metrics = MetricsLog(folder)
+        metrics = JsonLines(folder)
         for row in some:
             metrics.write(row)
-        metrics.close()
 
     def journal(folder: Path, some: list[LogEntry]) -> None:
         for report in some:
@@ -149,7 +148,7 @@ def _writers(old: bytes, new: bytes) -> list[Writer]:
         Writer(
             f"{layout.METRICS_FILE}, rows taken back",
             lambda f: log(f, rows),
-            lambda f: MetricsLog(f).rewind(1),
+            lambda f: JsonLines(f).rewind(1),
             lambda f: load_metrics(f / layout.METRICS_FILE).rows,
         ),
         Writer(

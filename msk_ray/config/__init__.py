@@ -20,6 +20,7 @@ from msk_ray.config.load import (
     read_config,
     refuse_ignored,
 )
+from msk_ray.config.loggers import logger_paths
 from msk_ray.config.overlay import SET_HELP, combine, leaves, merge, overlay, parse_override, parse_overrides
 from msk_ray.config.physics import FdConfig, PhysicsConfig
 from msk_ray.config.recorded import current_key, current_values, env_name, first_spelling
@@ -67,6 +68,7 @@ __all__ = [
     "first_spelling",
     "leaves",
     "load_config",
+    "logger_paths",
     "merge",
     "overlay",
     "parse_config",

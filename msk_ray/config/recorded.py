@@ -72,5 +72,9 @@ def first_spelling(settings: Mapping[str, Any]) -> dict[str, Any]:
     return spelt
 
 
-_LATER: dict[tuple[str, str], Any] = {("trial", "threads"): 1, ("algorithm", "name"): "shac"}
+_LATER: dict[tuple[str, str], Any] = {
+    ("trial", "threads"): 1,
+    ("trial", "loggers"): ["tensorboard"],
+    ("algorithm", "name"): "shac",
+}
 """Settings that the first version did not have, (section, name), with the default at which they leave ids alone."""

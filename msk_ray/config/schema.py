@@ -3,7 +3,15 @@
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, PositiveFloat, SerializeAsAny, ValidationInfo, model_validator
+from pydantic import (
+    BeforeValidator,
+    Field,
+    PositiveFloat,
+    SerializeAsAny,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from msk_ray.config.algorithms import (
     BUILT_IN,
@@ -14,6 +22,7 @@ from msk_ray.config.algorithms import (
     ignored_settings,
 )
 from msk_ray.config.environments import settings_class
+from msk_ray.config.loggers import LOGGERS
 from msk_ray.config.physics import PhysicsConfig, Vec5
 from msk_ray.config.sections import Count, EnvSettings, Section, Text, Whole
 from msk_ray.config.unread import unread_settings
@@ -111,9 +120,21 @@ class TrialConfig(Section):
     """Epochs between checkpoints."""
     keep_checkpoints: Annotated[int, Field(ge=2)] = 2
     """Newest checkpoints kept, beside the best."""
+    loggers: Annotated[tuple[Text, ...], Field(max_length=16)] = ("tensorboard",)
+    """Where rows go beside `metrics.jsonl`: `tensorboard`, `wandb`, `mlflow`, or package.module:Class."""
     threads: Count = 1
     """Threads that torch computes with on the CPU. Sums depend on their number, and so do the figures of a trial: it is
     this setting's, never the machine's. Networks of a few hundred units gain nothing by more than one."""
+
+    @field_validator("loggers")
+    @classmethod
+    def _known_loggers(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        try:
+            for name in names:
+                LOGGERS.path(name)
+        except ConfigError as error:
+            raise ValueError(str(error)) from error
+        return names
 
 
 RECORDED = "recorded"

@@ -24,13 +24,13 @@ from msk_ray.training.checkpoint import (
     write_checkpoint,
 )
 from msk_ray.training.evaluation import Evaluator
+from msk_ray.training.loggers import TrialLog
 from msk_ray.training.memory import named_out_of_memory
-from msk_ray.training.metrics import MetricsLog
 from msk_ray.training.threads import use_threads
 
 # Settings that may differ between a checkpoint and the trial that goes on from it.
 _EXTENDABLE = {
-    "trial": {"epochs", "checkpoint_interval", "keep_checkpoints"},
+    "trial": {"epochs", "checkpoint_interval", "keep_checkpoints", "loggers"},
     "physics": {"nconmax", "njmax"},  # room, which an error may ask for; results do not depend on it
 }
 _MILESTONES = 8
@@ -40,10 +40,11 @@ _MILESTONES = 8
 class Trainer:
     """One trial in this process.
 
-    Writes `config.yaml`, `metrics.jsonl`, TensorBoard events and `checkpoints/` under `logdir`; there the newest whole
-    states, `best.pt` (until the first evaluation the untrained policy), and the policies alone (`policy_*.pt`) of about
-    every eighth of the way. Call `run_epoch` until `finished`; or `restore_latest` first to go on from the newest whole
-    checkpoint, which on CPU gives exactly the metrics of an uninterrupted run.
+    Writes `config.yaml`, `metrics.jsonl` and `checkpoints/` under `logdir`, and what its loggers write. Among the
+    checkpoints are the newest whole states, `best.pt` (until the first evaluation the untrained policy), and the
+    policies alone (`policy_*.pt`) of about every eighth of the way. Call `run_epoch` until `finished`; or
+    `restore_latest` first to go on from the newest whole checkpoint, which on CPU gives exactly the metrics of an
+    uninterrupted run.
 
     Attributes:
         env: the worlds that are trained in.
@@ -57,6 +58,7 @@ class Trainer:
 
     def __init__(self, config: Config, logdir: Path, device: str) -> None:
         algorithm = algorithm_class(config)
+        self._log = TrialLog(logdir, config)
         self.config = config
         self.logdir = logdir
         self.epoch = 0
@@ -85,7 +87,6 @@ class Trainer:
             )
             self.algorithm = algorithm(config, self.env)
             self.evaluator = Evaluator(config, device)
-        self._log = MetricsLog(logdir)
         self._damages: tuple[Damage, ...] = ()
 
     @property
@@ -282,6 +283,7 @@ def precompile(config: Config, device: str, logdir: Path) -> None:
 
     In few worlds: kernels are the same in many, and a device too small for those is the trial's to name.
     """
+    TrialLog(logdir, config)  # a logger that is not there is to be known before the trials start
     own = config.algorithm_settings.shortest()
     tiny = {
         "env.nworld": 2,
@@ -290,6 +292,7 @@ def precompile(config: Config, device: str, logdir: Path) -> None:
         "evaluation.nworld": 2,
         "trial.epochs": 1,
         "trial.start_from": None,
+        "trial.loggers": [],
     }
     trainer = Trainer(parse_config(overlay(config.as_dict(), tiny), "a short epoch"), logdir, device)
     trainer.run_epoch()

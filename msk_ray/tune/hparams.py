@@ -12,12 +12,16 @@ METRICS = ("eval/best_score", "eval/score", "progress/env_steps")
 def log_hparams(folder: Path, trial: Trial) -> None:
     """Write a trial's settings into an event file of its folder; the scores come from the trial's own scalars.
 
+    A trial without the logger `tensorboard` has no such file.
+
     Call it before those are written: TensorBoard reads the files of a folder in the order of their age, and goes on to
     follow the newest one.
 
     Raises:
         StorageFailure: the disk is full or the folder not writable.
     """
+    if "tensorboard" not in trial.config.trial.loggers:
+        return
     # Loads torch, which importing this module need not.
     from torch.utils.tensorboard import SummaryWriter
     from torch.utils.tensorboard.summary import hparams

@@ -10,7 +10,7 @@ from msk_ray.evaluate.measure import Bench, Request
 from msk_ray.experiment.layout import best_checkpoint
 from msk_ray.training import load_policy
 from msk_ray.training.checkpoint import milestones
-from msk_ray.training.metrics import log_image
+from msk_ray.training.loggers.tensorboard import log_image
 from msk_ray.visualize.episodes import Recording, record
 from msk_ray.visualize.film import grid
 from msk_ray.visualize.render import View, frames

@@ -27,4 +27,5 @@ class RandomSearch(Algorithm):
 
     def reward(self):
         steps = range(self.settings.steps)
-        return sum(float(self.env.step(self.policy(self.env.observation())).reward.mean()) for _ in steps)
+        rewards = [self.env.step(self.policy(self.env.observation())).reward for _ in steps]
+        return float(torch.stack(rewards).mean())

@@ -6,7 +6,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.plugins.hparams import metadata, plugin_data_pb2
 
 from msk_ray.experiment.manifest import Experiment
-from msk_ray.training.metrics import board_tag
+from msk_ray.training.loggers.tensorboard import board_tag
 from msk_ray.tune.hparams import METRICS
 
 

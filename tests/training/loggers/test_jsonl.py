@@ -3,29 +3,23 @@
 import json
 from pathlib import Path
 
-import numpy as np
-import pytest
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
 from msk_ray.experiment.metrics import read_metrics
-from msk_ray.training.metrics import MetricsLog, board_tag, log_image
+from msk_ray.training.loggers.jsonl import JsonLines
 
 
 def test_rows_are_on_disk_at_once_and_nan_is_named(tmp_path: Path) -> None:
-    log = MetricsLog(tmp_path)
+    log = JsonLines(tmp_path)
     log.write({"epoch": 1, "a": 2.0, "b": float("nan")})
     line = (tmp_path / "metrics.jsonl").read_text().splitlines()[0]
     assert json.loads(line) == {"epoch": 1, "a": 2.0, "b": None, "nonfinite": ["b"]}
-    log.close()
 
 
 def test_rewinding_drops_later_rows(tmp_path: Path) -> None:
-    log = MetricsLog(tmp_path)
+    log = JsonLines(tmp_path)
     for epoch in range(5):
         log.write({"epoch": epoch, "a": 0.0})
     log.rewind(2)
     log.write({"epoch": 3, "a": 1.0})
-    log.close()
     assert [(r["epoch"], r["a"]) for r in read_metrics(tmp_path / "metrics.jsonl")] == [(0, 0), (1, 0), (2, 0), (3, 1)]
 
 
@@ -40,9 +34,8 @@ def test_reading_keeps_the_latest_row_of_an_epoch_and_forgives_a_torn_end(tmp_pa
 def test_rewinding_past_a_damaged_line_keeps_the_others_and_names_it(tmp_path: Path) -> None:
     path = tmp_path / "metrics.jsonl"
     path.write_bytes(b'{"epoch": 0, "a": 1}\n\xff\xff\n{"epoch": 2, "a": 3}\n{"epoch": 3, "a": 4}\n{"epoch": 4')
-    log = MetricsLog(tmp_path)
+    log = JsonLines(tmp_path)
     (damage,) = log.rewind(2)
-    log.close()
     assert str(damage) == f"{path}, line 2: not UTF-8 text: byte 0 is 0xff"
     assert [(r["epoch"], r["a"]) for r in read_metrics(path)] == [(0, 1), (2, 3)]
     assert path.read_bytes().count(b"\n") == 2
@@ -51,26 +44,7 @@ def test_rewinding_past_a_damaged_line_keeps_the_others_and_names_it(tmp_path: P
 def test_rewinding_to_before_the_first_row_drops_a_torn_one(tmp_path: Path) -> None:
     path = tmp_path / "metrics.jsonl"
     path.write_text('{"epoch": 0, "a": 1}\n{"epoch": 1')
-    log = MetricsLog(tmp_path)
+    log = JsonLines(tmp_path)
     log.rewind(-1)
     log.write({"epoch": 0, "a": 2.0})
-    log.close()
     assert [(r["epoch"], r["a"]) for r in read_metrics(path)] == [(0, 2)]
-
-
-def test_tensorboard_groups_by_what_a_figure_is_about(tmp_path: Path) -> None:
-    assert board_tag("eval/score") == "eval/score"
-    log = MetricsLog(tmp_path)
-    log.write({"epoch": 3, "env_steps": 9.0, "train/actor_lr": 1e-3, "train/reward": 1.0, "eval/term/up": 2.0})
-    log.close()
-    events = EventAccumulator(str(tmp_path)).Reload()
-    expected = {"progress/env_steps": 9.0, "schedule/actor_lr": 1e-3, "train/reward": 1.0, "eval_terms/up": 2.0}
-    assert {tag: events.Scalars(tag)[0].value for tag in events.Tags()["scalars"]} == pytest.approx(expected)
-    assert events.Scalars("train/reward")[0].step == 3
-
-
-def test_a_picture_in_tensorboard(tmp_path: Path) -> None:
-    log_image(tmp_path / "film", "film/evaluation", np.zeros((4, 6, 3), np.uint8), 7)
-    events = EventAccumulator(str(tmp_path / "film")).Reload()
-    (image,) = events.Images("film/evaluation")
-    assert (image.height, image.width, image.step) == (4, 6, 7)

@@ -1,0 +1,35 @@
+"""The loggers that `trial.loggers` can name."""
+
+from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
+
+from msk_ray.config.resolve import Registry
+from msk_ray.errors import ConfigError
+
+LOGGERS = Registry(
+    "trial.loggers",
+    "msk_ray.loggers",
+    {
+        "tensorboard": "msk_ray.training.loggers.tensorboard:TensorBoard",
+        "wandb": "msk_ray.training.loggers.wandb:Wandb",
+        "mlflow": "msk_ray.training.loggers.mlflow:MLflow",
+    },
+)
+"""Classes of loggers."""
+_PACKAGES: Mapping[str, str] = {"wandb": "msk-ray[wandb]", "mlflow": "msk-ray[mlflow]"}
+"""Packages of the same name as their logger that not every installation has, and what to install."""
+
+
+def logger_paths(names: Sequence[str]) -> list[str]:
+    """The import paths of loggers.
+
+    Raises:
+        ConfigError: there is none of a name, one is named twice, or its package is not installed.
+    """
+    paths = [LOGGERS.path(name) for name in names]
+    for name, path in zip(names, paths, strict=True):
+        if paths.count(path) > 1:
+            raise ConfigError(f"trial.loggers: {name} is named twice; write it once")
+        if name in _PACKAGES and find_spec(name) is None:
+            raise ConfigError(f"trial.loggers: {name} is not installed: pip install '{_PACKAGES[name]}'")
+    return paths

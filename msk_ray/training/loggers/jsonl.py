@@ -1,0 +1,58 @@
+"""A trial's own record: one JSON object a line, on disk before anything else happens."""
+
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+from msk_ray.errors import StorageFailure
+from msk_ray.experiment.damage import Damage
+from msk_ray.experiment.layout import METRICS_FILE
+from msk_ray.experiment.metrics import load_metrics
+from msk_ray.files import write_bytes
+
+
+class JsonLines:
+    """Appends rows to `metrics.jsonl`: what status, reports and a resumed trial read.
+
+    A value that is not finite is written as null and named in the row's `nonfinite` list: JSON has no NaN.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / METRICS_FILE
+
+    def rewind(self, epoch: int) -> tuple[Damage, ...]:
+        """Drop rows after `epoch`, which a resumed trial will write again, and with them what is damaged.
+
+        Returns:
+            The damaged lines.
+
+        Raises:
+            StorageFailure: the rows cannot be read or written.
+        """
+        if not self._path.is_file():
+            return ()
+        metrics = load_metrics(self._path)
+        rows = [row for row in metrics.rows if row["epoch"] <= epoch]
+        write_bytes(self._path, "".join(json.dumps(row) + "\n" for row in rows).encode())
+        return metrics.damages
+
+    def write(self, row: dict[str, float]) -> None:
+        """Append one row; it is on its way to disk when this returns.
+
+        Raises:
+            StorageFailure: the disk is full or gone.
+        """
+        bad = [name for name, value in row.items() if not math.isfinite(value)]
+        clean: dict[str, Any] = {name: None if name in bad else value for name, value in row.items()}
+        clean["epoch"] = int(row["epoch"])
+        if bad:
+            clean["nonfinite"] = bad
+        try:
+            with self._path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(clean) + "\n")
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:
+            raise StorageFailure(f"cannot write {self._path}: {error.strerror or error}") from error

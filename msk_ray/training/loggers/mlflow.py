@@ -1,0 +1,84 @@
+"""MLflow."""
+
+import os
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from mlflow.entities import Metric, Param
+from mlflow.tracking import MlflowClient
+
+from msk_ray.files import write_text
+from msk_ray.training.loggers.base import Logger
+from msk_ray.training.loggers.run_name import run_name
+
+RUN_FILE = "mlflow_run.txt"
+_LONGEST_PARAM = 500
+"""Characters of a setting's value; MLflow's stores take no less."""
+_PARAMS_AT_ONCE = 100
+
+
+class MLflow(Logger):
+    """One run a trial, in the MLflow experiment of the sweep's name, its steps being epochs.
+
+    MLFLOW_TRACKING_URI says where it goes; without, to `mlflow.db` beside the trial. A resumed trial is the same run,
+    in which the rows that come again count as they first came.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self._settings: dict[str, Any] = {}
+        self._client: MlflowClient | None = None
+        self._run = ""
+        self._last = -1
+
+    def config(self, settings: dict[str, Any]) -> None:
+        """Keep the settings for the run that the first row opens."""
+        self._settings = settings
+
+    def write(self, row: dict[str, float]) -> None:
+        """Take in a row."""
+        if self._client is None:
+            self._client = self._open()
+        epoch, now = int(row["epoch"]), int(1000 * time.time())
+        if epoch <= self._last:
+            return
+        metrics = [Metric(name, value, now, epoch) for name, value in row.items() if name != "epoch"]
+        self._client.log_batch(self._run, metrics=metrics)
+        self._last = epoch
+
+    def close(self) -> None:
+        """Say that nobody writes to the run now."""
+        client, self._client = self._client, None
+        if client is not None:
+            client.set_terminated(self._run)
+
+    def _open(self) -> MlflowClient:
+        client = MlflowClient(os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{self.folder / 'mlflow.db'}")
+        path = self.folder / RUN_FILE
+        if path.is_file():
+            self._run = path.read_text(encoding="utf-8").strip()
+            self._last = max((m.step for m in client.get_metric_history(self._run, "env_steps")), default=-1)
+            client.update_run(self._run, status="RUNNING")
+            return client
+        experiment, trial = run_name(self.folder)
+        found = client.get_experiment_by_name(experiment)
+        number = client.create_experiment(experiment) if found is None else found.experiment_id
+        self._run = client.create_run(number, run_name=trial).info.run_id
+        params = [Param(key, value) for key, value in _flat(self._settings).items()]
+        for first in range(0, len(params), _PARAMS_AT_ONCE):
+            client.log_batch(self._run, params=params[first : first + _PARAMS_AT_ONCE])
+        write_text(path, self._run)
+        return client
+
+
+def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+    """Dotted keys and their values as text, cut to what MLflow takes."""
+    flat: dict[str, str] = {}
+    for key, value in settings.items():
+        if isinstance(value, Mapping):
+            flat |= _flat(value, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = str(value)[:_LONGEST_PARAM]
+    return flat

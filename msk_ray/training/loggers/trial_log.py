@@ -1,0 +1,98 @@
+"""All of a trial's loggers as one."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+from msk_ray.config import Config, logger_paths, resolve_class
+from msk_ray.config.loggers import LOGGERS
+from msk_ray.errors import ConfigError, LoggerError, StorageFailure, storage_failure
+from msk_ray.experiment.damage import Damage
+from msk_ray.training.loggers.base import Logger
+from msk_ray.training.loggers.jsonl import JsonLines
+
+
+class TrialLog:
+    """Writes each row to `metrics.jsonl`, then hands it to every logger.
+
+    Raises:
+        ConfigError: there is no logger of a name, or its package is not installed.
+    """
+
+    def __init__(self, folder: Path, config: Config) -> None:
+        self._lines = JsonLines(folder)
+        self._settings = config.as_dict()
+        paths = logger_paths(config.trial.loggers)
+        classes = [_logger_class(path) for path in paths]
+        self._loggers = {name: kind(folder) for name, kind in zip(config.trial.loggers, classes, strict=True)}
+        self._told = False
+
+    def rewind(self, epoch: int) -> tuple[Damage, ...]:
+        """Drop rows after `epoch`, which a resumed trial will write again, and with them what is damaged.
+
+        Returns:
+            The damaged lines of `metrics.jsonl`.
+
+        Raises:
+            StorageFailure: the rows cannot be read or written.
+            LoggerError: as `write`.
+        """
+        damages = self._lines.rewind(epoch)
+        self._each(lambda logger: logger.rewind(epoch))
+        return damages
+
+    def write(self, row: dict[str, float]) -> None:
+        """Append one row.
+
+        Raises:
+            StorageFailure: the disk is full or gone.
+            LoggerError: a logger failed. The row is in `metrics.jsonl`, and the other loggers have it.
+        """
+        self._lines.write(row)
+        if not self._told:
+            self._told = True
+            self._each(lambda logger: logger.config(self._settings))
+        finite = {name: value for name, value in row.items() if math.isfinite(value)}
+        self._each(lambda logger: logger.write(dict(finite)))
+
+    def close(self) -> None:
+        """Have every logger write out what is still on its way.
+
+        Raises:
+            StorageFailure, LoggerError: as `write`; the rows are in `metrics.jsonl` all the same.
+        """
+        self._each(lambda logger: logger.close())
+
+    def _each(self, call: Callable[[Logger], None]) -> None:
+        first: Exception | None = None
+        for name, logger in self._loggers.items():
+            try:
+                call(logger)
+            except Exception as error:  # of whatever type: what a logger calls decides
+                fault = _named(name, error)
+                fault.__cause__ = error
+                first = first or fault
+        if first is not None:
+            raise first
+
+
+def _logger_class(path: str) -> type[Logger]:
+    found: type[Logger] = resolve_class(path, LOGGERS.key, Logger)  # type: ignore[type-abstract]
+    lacking = sorted(found.__abstractmethods__)
+    if lacking:
+        raise ConfigError(f"trial.loggers: {path} lacks {', '.join(lacking)}: write it as msk_ray.Logger describes")
+    return found
+
+
+def _named(name: str, error: Exception) -> Exception:
+    stored = storage_failure(error)
+    if stored is None and isinstance(error, OSError) and error.filename is not None:
+        # The trial's folder has gone, for example.
+        stored = StorageFailure(f"{error.filename}: {error.strerror or error}")
+    if stored is not None:
+        return StorageFailure(f"trial.loggers: {name} cannot write: {stored}")
+    text = (str(error).splitlines() or [""])[0]
+    return LoggerError(
+        f"trial.loggers: {name} failed ({type(error).__name__}: {text}); the rows are in metrics.jsonl: go on without "
+        "it by leaving it out, or mend it"
+    )
