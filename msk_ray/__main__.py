@@ -12,22 +12,22 @@ COMMANDS = {
     "tune": ("msk_ray.tune.__main__", "run a search space as a Ray Tune experiment"),
     "evaluate": ("msk_ray.evaluate.__main__", "evaluate policies: fixed seeds, no noise, every reward term"),
     "visualize": ("msk_ray.visualize.__main__", "watch a policy: viewer, video, frames, film strip"),
-    "gait": ("msk_ray.gait.__main__", "measure how a leg policy walks, beside people"),
+    "gait": ("msk_ray.gait.__main__", "measure how a leg policy walks, compared with people"),
     "report": ("msk_ray.report.__main__", "write an experiment's report: curves, tables, the best policy"),
-    "status": ("msk_ray.status", "show where experiments stand, from their files"),
-    "doctor": ("msk_ray.doctor", "check that this machine can run trials, and say what to mend"),
+    "status": ("msk_ray.status", "show the progress of experiments, read from their files"),
+    "doctor": ("msk_ray.doctor", "check that this machine can run trials, and say what to fix"),
     "diagnose": ("msk_ray.diagnose.__main__", "compare a policy's gradients with float64 differences, by horizon"),
     "gradcheck": ("msk_ray.gradcheck.__main__", "check a model's gradients against float64 finite differences"),
 }
 
 SAVING = ("train", "tune")
-"""Those that save what they have when they are asked to stop."""
+"""The commands that save their state when they are asked to stop."""
 
 
 def usage() -> str:
     """The list of commands."""
     lines = [f"  {name:10} {text}" for name, (_, text) in COMMANDS.items()]
-    return "usage: msk-ray COMMAND [options]\n\n" + "\n".join(lines) + "\n\nmsk-ray COMMAND --help says more."
+    return "usage: msk-ray COMMAND [options]\n\n" + "\n".join(lines) + "\n\nRun msk-ray COMMAND --help for details."
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -41,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"error: no command {name!r}; write one of {', '.join(COMMANDS)}", file=sys.stderr)
         return 2
     if name in SAVING:
-        # Before what takes time to load.
+        # Before the imports that take time to load.
         signals.listen()
     return run(import_module(COMMANDS[name][0]).main, rest)
 

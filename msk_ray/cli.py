@@ -1,4 +1,4 @@
-"""What the command-line entry points share."""
+"""Helpers shared by the command-line entry points."""
 
 import argparse
 import contextlib
@@ -17,13 +17,13 @@ from msk_ray.errors import MskRayError, StorageFailure, brief
 from msk_ray.text import printable
 
 TERMINAL_LOG = "terminal.log"
-"""In the folder of what runs: what the terminal would have shown, from when it was closed."""
+"""File in a run's folder that receives the output once the terminal is closed."""
 _UNREAD = (errno.EPIPE, errno.EIO)
-"""A pipe whose reader has left, and a terminal that is gone."""
+"""Errors from a pipe whose reader has exited, and from a closed terminal."""
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser that keeps the examples in its help as they are written."""
+    """An argument parser that keeps the line breaks of the examples in its help."""
 
     def __init__(self, prog: str, description: str, examples: str) -> None:
         super().__init__(
@@ -34,12 +34,12 @@ class Parser(argparse.ArgumentParser):
         )
 
     def error(self, message: str) -> NoReturn:
-        """Say what is wrong with the command line on one line that is safe for a terminal, and exit with 2."""
+        """Print what is wrong with the command line, on one line that is safe for a terminal, and exit with 2."""
         super().error(printable(message))
 
 
 def typed_command(argv: Sequence[str], *more: str) -> str:
-    """A process's arguments as one would type them, and `more` options that are not among them yet."""
+    """The command line that a user would type for `argv`, with those options of `more` that it does not have yet."""
     program = Path(argv[0])
     # `python -m msk_ray.tune` shows up as the path of the file it runs.
     module = _module_of(program)
@@ -53,9 +53,10 @@ def typed_command(argv: Sequence[str], *more: str) -> str:
 
 
 def _module_of(program: Path) -> str | None:
-    """The module of this package that a file is, in this checkout or another one; None if it is none.
+    """The module of this package that a file belongs to, in this checkout or another one; None if it is no such module.
 
-    Told by what this package holds: the checkout's folder, or any other on the way, may be called msk_ray too.
+    Decided by comparing with this package's files, because the checkout's folder, or any other in the path, may be
+    called msk_ray too.
     """
     package = Path(__file__).resolve().parent
     for place, part in enumerate(program.parts):
@@ -67,12 +68,12 @@ def _module_of(program: Path) -> str | None:
 
 
 def run(main: Callable[[Sequence[str] | None], int], argv: Sequence[str] | None = None) -> int:
-    """Run an entry point: a fault the user can mend becomes one line on stderr and a non-zero exit code.
+    """Run an entry point: an error that the user can fix becomes one line on stderr and a non-zero exit code.
 
-    In a program that listens to `signals`, a request to stop that `main` had nothing to save for ends it with 75.
+    In a program that listens to `signals`, a request to stop for which `main` had nothing to save ends it with 75.
     """
-    # `python -m` looks for modules in the current folder, a console script does not: a class that a configuration names
-    # by import path is to be found either way.
+    # `python -m` looks for modules in the current folder, a console script does not. A class that a configuration names
+    # by import path must be found either way.
     if "" not in sys.path:
         sys.path.append("")
     stop = signals.current()
@@ -90,14 +91,14 @@ def run(main: Callable[[Sequence[str] | None], int], argv: Sequence[str] | None 
         print("interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:
-        # The reader of our output, such as `head`, has left.
+        # The reader of our output, such as `head`, has exited.
         sys.stderr.close()
         return 0
     except OSError as error:
         if error.errno != errno.ENAMETOOLONG:
             raise
         print(
-            f"error: {printable(brief(error.filename))}: too long for the name of a file; write a shorter one",
+            f"error: {printable(brief(error.filename))}: too long for a file name; write a shorter one",
             file=sys.stderr,
         )
         return MskRayError.exit_code
@@ -107,7 +108,7 @@ def run(main: Callable[[Sequence[str] | None], int], argv: Sequence[str] | None 
 
 
 class _Outliving(io.TextIOBase):
-    """A standard stream, written to without a buffer, that moves to a file once nobody reads it."""
+    """An unbuffered standard stream that continues in a file once nobody reads it."""
 
     def __init__(self, descriptor: int, log: Path, descriptors: Sequence[int]) -> None:
         self._descriptor = descriptor
@@ -132,13 +133,13 @@ class _Outliving(io.TextIOBase):
         return os.isatty(self._descriptor)
 
     def _move(self, error: OSError) -> None:
-        """Point this stream, and the other if it is the same pipe or terminal, to the file."""
+        """Redirect this stream to the file, and the other one too if it is the same pipe or terminal."""
         try:
             file = os.open(self._log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
         except OSError as fault:
             raise StorageFailure(f"cannot write {self._log}: {fault.strerror}") from fault
         when = time.strftime("%Y-%m-%d %H:%M:%S")
-        os.write(file, f"--- {when}: nobody reads the output any more ({error.strerror}); it goes on here\n".encode())
+        os.write(file, f"--- {when}: nobody reads the output any more ({error.strerror}); it continues here\n".encode())
         lost = os.fstat(self._descriptor)
         for descriptor in self._descriptors:
             if os.path.samestat(os.fstat(descriptor), lost):
@@ -148,15 +149,15 @@ class _Outliving(io.TextIOBase):
 
 @contextlib.contextmanager
 def outliving(log: Path) -> Iterator[None]:
-    """Let what runs go on when nobody reads its output any more: from then on, lines go into a file.
+    """Let a program continue when nobody reads its output any more: from then on, the output goes to a file.
 
-    Standard output and error stay there when this returns, whoever writes to them: children, or Python at its exit.
+    Standard output and error stay redirected after this returns, for child processes and for Python at its exit.
 
     Args:
-        log: the file; made only then.
+        log: the file; created only when it is needed.
 
     Raises:
-        StorageFailure: while it is entered: the file cannot be written.
+        StorageFailure: inside the block, if the file cannot be written.
     """
     descriptors = [_descriptor(stream) for stream in (sys.stdout, sys.stderr)]
     known = [descriptor for descriptor in descriptors if descriptor is not None]
@@ -169,7 +170,8 @@ def outliving(log: Path) -> Iterator[None]:
 
 
 def _descriptor(stream: object) -> int | None:
-    """Of a standard stream; None if it has none, as under a test runner, or with one that was closed from the start."""
+    """The file descriptor of a standard stream; None if it has none, as under a test runner or if it was closed from
+    the start."""
     if stream is None:
         return None
     try:

@@ -1,4 +1,4 @@
-"""`python -m msk_ray.doctor`: can this machine run trials? If not, what is to be mended?"""
+"""`python -m msk_ray.doctor`: can this machine run trials? If not, what needs fixing?"""
 
 import importlib.util
 import json
@@ -25,17 +25,17 @@ from msk_ray.nvidia_smi import ask_driver
 DESCRIPTION = """\
 Check that this machine can run trials: versions, GPU and driver, gradients of one step, Ray, the storage folder.
 
-Each line says ok, or what to do. Exit code: 0 if nothing is broken, 1 if something is."""
+Each line says ok, or what to fix. Exit code: 0 if there is nothing to fix, 1 otherwise."""
 
 EXAMPLES = """\
   python -m msk_ray.doctor
   python -m msk_ray.doctor --device cuda:1 --storage /shared/runs
-  python -m msk_ray.doctor --device cpu          # leave the GPUs alone"""
+  python -m msk_ray.doctor --device cpu          # do not use the GPUs"""
 
 RAY_LIMIT_S = 90.0
-"""Ray comes up in seconds; on a loaded machine with a cold disk it may take ten times as long."""
+"""Ray starts within seconds; on a loaded machine with a cold disk it may take ten times as long."""
 MIN_FREE_GB = 2.0
-"""A sweep's checkpoints and logs take about so much."""
+"""About what the checkpoints and logs of a sweep take."""
 GRADIENT_TOLERANCE = 1e-2
 RAY_PROBE = [sys.executable, "-m", "msk_ray.tune.ray_probe"]
 _SLOW_S = 0.5
@@ -47,19 +47,19 @@ class Finding:
 
     subject: str
     text: str
-    """What is so, or what to do."""
+    """The fact, or what to fix."""
     broken: bool = False
 
 
 @dataclass(frozen=True)
 class GpuFacts:
-    """What driver, torch and Warp say about GPUs."""
+    """What driver, torch and Warp report about GPUs."""
 
     driver: str | None
     """Version of the NVIDIA driver; None without one."""
     driver_gpus: int
     driver_cuda: tuple[int, int] | None
-    """Highest CUDA version the driver runs, by Warp; None if Warp sees no driver."""
+    """Highest CUDA version that the driver supports, according to Warp; None if Warp sees no driver."""
     torch_cuda: str | None
     """CUDA version torch was built with; None for a CPU build."""
     torch_gpus: int
@@ -71,14 +71,16 @@ class GpuFacts:
 
 
 _NEEDED = ("torch", "warp", "mujoco", "mujoco_warp", "ray")
-"""Modules without which nothing more can be checked."""
+"""Modules that the remaining checks need."""
 
 
 def parser() -> Parser:
     """The command line."""
     p = Parser("python -m msk_ray.doctor", DESCRIPTION, EXAMPLES)
-    p.add_argument("--device", help="cpu or cuda:N; by default the first GPU, or the CPU if there is none")
-    p.add_argument("--storage", type=Path, default=Path("runs"), metavar="DIR", help="by default runs/")
+    p.add_argument("--device", help="cpu or cuda:N (default: the first GPU, or the CPU if there is none)")
+    p.add_argument(
+        "--storage", type=Path, default=Path("runs"), metavar="DIR", help="folder of experiments (default: runs/)"
+    )
     return p
 
 
@@ -96,14 +98,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     ]
     broken = 0
     for check in checks:
-        # Each line as soon as it is known: kernels may take a minute to compile.
+        # Print each line as soon as it is known: kernels may take a minute to compile.
         findings = check()
         for finding in findings:
-            print(f"{'MEND' if finding.broken else 'ok':5} {finding.subject:9} {finding.text}", flush=True)
+            print(f"{'FIX' if finding.broken else 'ok':5} {finding.subject:9} {finding.text}", flush=True)
             broken += finding.broken
         if check is check_imports and findings:
             break
-    print("all is well" if not broken else f"{broken} thing(s) to mend")
+    print(f"{broken} problem(s) to fix" if broken else "all checks passed")
     return 1 if broken else 0
 
 
@@ -117,13 +119,13 @@ def check_python() -> list[Finding]:
 
 
 def check_packages() -> list[Finding]:
-    """Whether the packages installed are those that the project asks for."""
+    """Whether the installed packages have the versions that the project requires."""
     from packaging.requirements import Requirement
 
     try:
         wanted = [Requirement(text) for text in metadata.requires("msk-ray") or []]
     except metadata.PackageNotFoundError:
-        return [Finding("packages", "msk-ray is not installed here: run pip install -e . in its folder", True)]
+        return [Finding("packages", "msk-ray is not installed: run pip install -e . in its folder", True)]
     return package_findings(
         {r.name: str(r.specifier) for r in wanted if r.marker is None or r.marker.evaluate({"extra": ""})},
         {distribution.name.lower(): distribution.version for distribution in metadata.distributions()},
@@ -131,15 +133,15 @@ def check_packages() -> list[Finding]:
 
 
 def check_imports() -> list[Finding]:
-    """Whether what all further checks need can be imported at all; nothing to say if it can."""
+    """Whether the modules that the remaining checks need can be imported; no finding if they can."""
     missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
     if not missing:
         return []
-    return [Finding("packages", f"{', '.join(missing)} cannot be imported: the rest was not checked", True)]
+    return [Finding("packages", f"{', '.join(missing)} cannot be imported: nothing else was checked", True)]
 
 
 def package_findings(wanted: dict[str, str], installed: dict[str, str]) -> list[Finding]:
-    """One line on all packages that fit, and one on each that does not.
+    """One finding on all packages that fit, and one on each that does not.
 
     Args:
         wanted: name → version specifier.
@@ -160,19 +162,19 @@ def package_findings(wanted: dict[str, str], installed: dict[str, str]) -> list[
 
 
 def check_gpus(device: str | None) -> list[Finding]:
-    """Whether driver, torch and Warp fit one another."""
+    """Whether driver, torch and Warp are compatible."""
     return gpu_findings(_gpu_facts(), device)
 
 
 def gpu_findings(facts: GpuFacts, device: str | None) -> list[Finding]:
-    """What the facts mean for trials on `device` (None for the first GPU there is)."""
+    """What the facts mean for trials on `device` (None: the first GPU)."""
     wants_gpu = device is not None and device != "cpu"
     if not facts.driver_gpus and not facts.torch_gpus and not facts.warp_gpus:
         if wants_gpu:
-            return [Finding("gpu", f"no GPU here, and {device} was asked for: pass --device cpu", True)]
-        return [Finding("gpu", "no GPU here: fine for work on CPU; trials run on CPU cores")]
+            return [Finding("gpu", f"no GPU found, but {device} was requested: pass --device cpu", True)]
+        return [Finding("gpu", "no GPU found: trials run on CPU cores")]
     if device == "cpu":
-        return [Finding("gpu", f"{facts.driver_gpus} GPU(s), left alone as asked")]
+        return [Finding("gpu", f"{facts.driver_gpus} GPU(s), not used, as requested")]
     if facts.visible is not None and not facts.visible.strip(" -1"):
         return [
             Finding(
@@ -181,7 +183,7 @@ def gpu_findings(facts: GpuFacts, device: str | None) -> list[Finding]:
         ]
     found = []
     if facts.torch_cuda is None:
-        found.append(Finding("gpu", "torch is a build for CPU only: install one with CUDA from pytorch.org", True))
+        found.append(Finding("gpu", "torch is a CPU-only build: install one with CUDA from pytorch.org", True))
     elif not facts.torch_gpus:
         found.append(Finding("gpu", _no_gpu("torch", facts.torch_cuda, facts), True))
     if facts.warp_cuda is None:
@@ -192,19 +194,19 @@ def gpu_findings(facts: GpuFacts, device: str | None) -> list[Finding]:
         return found
     if wants_gpu and (index := _index(device)) is not None and index >= facts.torch_gpus:
         last = facts.torch_gpus - 1
-        return [Finding("gpu", f"{device} was asked for, GPUs here are cuda:0 to cuda:{last}: name one of them", True)]
+        return [Finding("gpu", f"{device} was requested; the GPUs are cuda:0 to cuda:{last}: name one of them", True)]
     driver_cuda = "?" if facts.driver_cuda is None else "{}.{}".format(*facts.driver_cuda)
     return [
         Finding(
             "gpu",
-            f"{facts.torch_gpus} GPU(s); driver {facts.driver or '?'} runs CUDA up to {driver_cuda}, "
+            f"{facts.torch_gpus} GPU(s); driver {facts.driver or '?'} supports CUDA up to {driver_cuda}, "
             f"torch built for {facts.torch_cuda}, Warp for {'{}.{}'.format(*facts.warp_cuda or (0, 0))}",
         )
     ]
 
 
 def check_gradient(device: str | None) -> Finding:
-    """Gradients of one step of CartPole by the analytic backward pass, against float64 differences of C MuJoCo."""
+    """Gradients of one step of CartPole, compared with float64 differences of C MuJoCo."""
     import torch
 
     from msk_ray.config import PhysicsConfig
@@ -220,12 +222,12 @@ def check_gradient(device: str | None) -> Finding:
         model = env_class(env).build_model(env, PhysicsConfig())
         report = check_gradients(Simulation(model, nworld=4, substeps=1, device=where))
     except (MskRayError, RuntimeError, ValueError, OSError) as error:
-        # Compilers, drivers and memory fail with errors of these kinds; whatever it is, it is the finding.
+        # Compilers, drivers and memory allocation fail with errors of these types, and the error is the finding.
         return Finding("gradient", f"one step on {where} failed: {_one_line(error)}", True)
     seconds = time.monotonic() - started
     text = f"one step on {where}: largest relative error {report.max_rel_error:.1e} ({seconds:.0f} s with compilation)"
     if report.max_rel_error > GRADIENT_TOLERANCE:
-        return Finding("gradient", f"{text}, past {GRADIENT_TOLERANCE:g}: reinstall warp-lang and mujoco-warp", True)
+        return Finding("gradient", f"{text}, above {GRADIENT_TOLERANCE:g}: reinstall warp-lang and mujoco-warp", True)
     return Finding("gradient", text)
 
 
@@ -234,7 +236,8 @@ def check_ray(limit_s: float = RAY_LIMIT_S) -> Finding:
     started = time.monotonic()
     package = str(Path(msk_ray.__file__).resolve().parent.parent)
     paths = [package, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
-    # Its output goes to a file: Ray's daemons inherit a pipe, and would keep its reader waiting when all else is done.
+    # Its output goes to a file: Ray's daemons would inherit a pipe and keep its reader waiting after the probe has
+    # ended.
     with tempfile.TemporaryFile("w+") as output:
         process = subprocess.Popen(
             RAY_PROBE,
@@ -251,7 +254,7 @@ def check_ray(limit_s: float = RAY_LIMIT_S) -> Finding:
             return Finding(
                 "ray",
                 f"did not start within {limit_s:.0f} s: look into /tmp/ray/session_latest/logs; "
-                "a proxy, a firewall on 127.0.0.1 or a full /tmp are usual causes",
+                "a proxy, a firewall on 127.0.0.1 or a full /tmp are common causes",
                 True,
             )
         output.seek(0)
@@ -264,7 +267,7 @@ def check_ray(limit_s: float = RAY_LIMIT_S) -> Finding:
 
 
 def check_storage(storage: Path) -> Finding:
-    """Whether files can be made, flushed to disk and renamed in the storage folder."""
+    """Whether files can be created, flushed to disk and renamed in the storage folder."""
     folder = storage.resolve()
     try:
         with _made(folder):
@@ -276,13 +279,15 @@ def check_storage(storage: Path) -> Finding:
     except OSError as error:
         return Finding("storage", f"{folder}: {error.strerror or error}; choose another --storage", True)
     if free < MIN_FREE_GB:
-        return Finding("storage", f"{folder} has {free:.1f} GB left: make room, or choose another --storage", True)
+        return Finding(
+            "storage", f"{folder} has {free:.1f} GB left: free some space, or choose another --storage", True
+        )
     slow = f"; slow: a row of metrics takes {seconds:.1f} s to reach the disk" if seconds > _SLOW_S else ""
-    return Finding("storage", f"{folder} can be written, {free:.0f} GB free{slow}")
+    return Finding("storage", f"{folder} is writable, {free:.0f} GB free{slow}")
 
 
 def _write_as_a_trial_does(folder: Path) -> float:
-    """Flush a file to disk and rename it; returns the seconds it took."""
+    """Flush a file to disk and rename it; returns the time it took [s]."""
     started = time.monotonic()
     with tempfile.TemporaryDirectory(prefix=".doctor", dir=folder) as scratch:
         path = Path(scratch) / "a"
@@ -296,7 +301,7 @@ def _write_as_a_trial_does(folder: Path) -> float:
 
 @contextmanager
 def _made(folder: Path) -> Iterator[None]:
-    """Take away afterwards the folders that the check itself has to make."""
+    """Remove afterwards the folders that the check itself has created."""
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         yield
@@ -310,7 +315,7 @@ def _gpu_facts() -> GpuFacts:
     import torch
     import warp as wp
 
-    # Importing it sets Warp's log level, which keeps it from listing devices on start.
+    # The import sets Warp's log level, so that Warp does not list the devices when it starts.
     import msk_ray.physics  # noqa: F401
 
     wp.init()
@@ -328,7 +333,7 @@ def _gpu_facts() -> GpuFacts:
 
 
 def _no_gpu(who: str, built_for: str, facts: GpuFacts) -> str:
-    runs = "" if facts.driver_cuda is None else ", which runs CUDA up to {}.{}".format(*facts.driver_cuda)
+    runs = "" if facts.driver_cuda is None else ", which supports CUDA up to {}.{}".format(*facts.driver_cuda)
     return (
         f"{who} is built for CUDA {built_for} and cannot use the GPU with driver {facts.driver or '?'}{runs}: "
         f"update the driver, or install a {who} build for an older CUDA"

@@ -1,4 +1,4 @@
-"""Errors a user can mend. Each message is one line that says what to write or do instead."""
+"""Errors that a user can fix. Each message is one line that says what to write or do instead."""
 
 import errno
 import reprlib
@@ -8,7 +8,7 @@ _STORAGE_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.ERO
 
 
 def shortened(text: str, limit: int = 80) -> str:
-    """The first `limit` characters of a text, with dots where more is left out."""
+    """A text cut to at most `limit` characters, ending in dots if something was left out."""
     return text if len(text) <= limit else f"{text[: limit - 3]}..."
 
 
@@ -22,13 +22,13 @@ def brief(value: object) -> str:
 
 
 class MskRayError(Exception):
-    """Base of every error whose cause lies outside the code; entry points print it as one line and exit 2."""
+    """Base of every error whose cause is outside the code; entry points print it as one line and exit with 2."""
 
     exit_code = 2
 
 
 class ConfigError(MskRayError):
-    """A configuration, search space or command line asks for something that does not exist or fit."""
+    """A configuration, search space or command line asks for something that does not exist or is not possible."""
 
 
 class DeviceError(MskRayError):
@@ -36,7 +36,7 @@ class DeviceError(MskRayError):
 
 
 class CheckpointError(MskRayError):
-    """A checkpoint is missing, torn, or belongs to another configuration."""
+    """A checkpoint is missing, incomplete, or belongs to another configuration."""
 
 
 class StorageError(MskRayError):
@@ -44,8 +44,8 @@ class StorageError(MskRayError):
 
 
 class StorageFailure(StorageError):
-    """Writing failed in the middle of the work: the disk is full or gone. What was saved before is whole, and work can
-    be resumed from it."""
+    """Writing failed while the work was running: the disk is full or gone. What was saved before is complete, and the
+    work can be resumed from it."""
 
     exit_code = 75  # EX_TEMPFAIL
 
@@ -55,20 +55,20 @@ class LoggerError(MskRayError):
 
 
 class OwnershipLost(StorageFailure):
-    """Another process has become the owner of a folder that this one was writing to, or the folder has gone."""
+    """Another process has become the owner of a folder that this one was writing to, or the folder has disappeared."""
 
 
 class ClusterLost(MskRayError):
-    """The Ray node this process belongs to has died. Trials go on from what they saved, with another Ray."""
+    """The Ray node that this process belongs to has died. Trials continue from their checkpoints in a new Ray."""
 
     exit_code = 75  # EX_TEMPFAIL
 
 
 def storage_failure(error: BaseException) -> StorageFailure | None:
-    """The failed storage behind an exception, itself or one that it came from; None if it has another cause."""
+    """The storage failure that is, or has caused, an exception; None if it has another cause."""
     seen: BaseException | None = error
     while seen is not None:
-        # Ray wraps the exception of another process, which it carries as `cause`, into one of the same class.
+        # Ray wraps an exception from another process in one of the same class, which carries it as `cause`.
         inner = getattr(seen, "cause", None)
         if isinstance(inner, BaseException):
             seen = inner
@@ -97,7 +97,7 @@ class Failure(StrEnum):
 
 
 class SimulationError(MskRayError):
-    """The physics could not be computed as asked."""
+    """The physics could not be computed with these settings."""
 
     def __init__(self, message: str, failure: Failure = Failure.DIVERGED) -> None:
         super().__init__(message, failure)  # both, so that the error survives pickling between processes

@@ -1,4 +1,4 @@
-"""Files that are whole or not there at all, and folders that take them."""
+"""Write files completely or not at all, and check that folders are writable."""
 
 import contextlib
 import json
@@ -11,15 +11,15 @@ from typing import Any
 from msk_ray.errors import StorageError, StorageFailure
 
 STALE_S = 3600.0
-"""Age after which a temporary file has lost its writer."""
+"""Age [s] after which a temporary file counts as abandoned by its writer."""
 _PART = ".part"
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder that files can be written to, with those above it, or find it there.
+    """Create a folder and its parents if they do not exist, and check that files can be written to it.
 
     Raises:
-        StorageError: it did not work.
+        StorageError: it cannot be created or written to.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -29,10 +29,10 @@ def make_folder(path: Path) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Write a file into a folder: permissions alone do not tell (full disks, read-only mounts).
+    """Check a folder by writing a file: permissions alone do not reveal full disks or read-only mounts.
 
     Raises:
-        StorageError: it did not work, or there is no such folder.
+        StorageError: the folder cannot be written to or does not exist.
     """
     probe = path / f".probe.{socket.gethostname()}.{os.getpid()}"
     try:
@@ -47,12 +47,12 @@ def _cannot_write(path: Path, error: OSError) -> StorageError:
 
 
 def write_bytes(path: Path, payload: bytes) -> None:
-    """Put `payload` at `path` so that a reader never sees half a file, and the file survives a crash right after.
+    """Write `payload` to `path` so that a reader never sees half a file and the file survives a crash right afterwards.
 
     Raises:
-        StorageFailure: the disk is full or the folder not writable; what was there before is untouched.
+        StorageFailure: the disk is full or the folder not writable; an existing file is left unchanged.
     """
-    # Another process, perhaps of another host, may write the same file: each has its own temporary.
+    # Another process, perhaps on another host, may write the same file: each has its own temporary file.
     temporary = path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}{_PART}")
     try:
         with temporary.open("wb") as file:
@@ -66,9 +66,9 @@ def write_bytes(path: Path, payload: bytes) -> None:
 
 
 def remove_stale(folder: Path) -> None:
-    """Remove temporaries that processes killed while writing have left here: none takes `STALE_S` to write."""
+    """Remove temporary files left by processes killed while writing: no file takes `STALE_S` to write."""
     for path in folder.glob(f".*{_PART}"):
-        with contextlib.suppress(FileNotFoundError):  # its writer, or another process here, was faster
+        with contextlib.suppress(FileNotFoundError):  # its writer, or another process calling this, was faster
             if time.time() - path.stat().st_mtime > STALE_S:
                 path.unlink()
 

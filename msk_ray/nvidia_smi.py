@@ -1,4 +1,4 @@
-"""GPUs as the driver lists them. Asking torch or Warp for a name would take GPU memory for this process."""
+"""The GPUs that the driver lists. Asking torch or Warp for a name would allocate GPU memory in this process."""
 
 import shutil
 import subprocess
@@ -7,16 +7,16 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class DriverView:
-    """What nvidia-smi says; CUDA_VISIBLE_DEVICES does not hide anything from it."""
+    """What nvidia-smi reports, regardless of CUDA_VISIBLE_DEVICES."""
 
     driver: str | None
-    """Version of the driver; None without one that works."""
+    """Version of the driver; None without a working one."""
     gpus: tuple[str, ...]
     """Names, in the driver's order."""
 
 
 def ask_driver(timeout_s: float = 30.0) -> DriverView:
-    """Ask nvidia-smi, for at most `timeout_s` seconds."""
+    """Run nvidia-smi and wait at most `timeout_s` seconds for its answer."""
     if shutil.which("nvidia-smi") is None:
         return DriverView(None, ())
     query = ["nvidia-smi", "--query-gpu=driver_version,name", "--format=csv,noheader"]

@@ -1,11 +1,11 @@
-"""A progress line with an estimate of the time left."""
+"""A line that shows the progress of training with an estimate of the time left."""
 
 import sys
 import time
 
 
-class Progress:
-    """Shows epoch, speed, scores and time left: in place on a terminal, a line every ten seconds elsewhere."""
+class ProgressLine:
+    """Shows epoch, speed, scores and time left: updated in place on a terminal, a line every ten seconds elsewhere."""
 
     def __init__(self, epochs: int, done: int) -> None:
         self._epochs = epochs
@@ -16,7 +16,7 @@ class Progress:
         self._score = ""
 
     def show(self, row: dict[str, float]) -> None:
-        """Take in a row of metrics."""
+        """Show a row of metrics."""
         epoch = int(row["epoch"])
         now = time.monotonic()
         left = (now - self._start) / max(1, epoch - self._first) * (self._epochs - epoch)

@@ -1,9 +1,9 @@
-"""Signals that ask a program to stop: from its first line to its last they mean "save what there is, exit 75".
+"""Signals that ask a program to stop: from its first line to its last they mean "save everything, exit with 75".
 
-What a signal does depends on what goes on: while modules load, nothing has begun and the process ends at once; later
-the running code is interrupted, as by Ctrl-C; and a loop that can save what it has done (`StopRequest.deferred`) is
-only told, and stops by itself at its next safe point. Imports the standard library alone, so that a program can begin
-with it.
+What a signal does depends on the phase. While modules are imported, nothing has started and the process ends at once.
+Later the running code is interrupted, as by Ctrl-C. A loop that can save its work (`StopRequest.deferred`) is only
+notified, and stops by itself at its next safe point. This module imports only the standard library, so that it can be
+the first import of a program.
 """
 
 import contextlib
@@ -19,14 +19,14 @@ NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP)
 
 
 class StopRequest:
-    """Set by the first of `NUMBERS` that arrives; a second SIGINT interrupts whatever runs.
+    """Set by the first of `NUMBERS` that arrives; a second SIGINT interrupts the running code.
 
-    SIGHUP, which comes when the terminal closes, stays ignored where it is: nohup.
+    SIGHUP, which a closing terminal sends, stays ignored if it already is (nohup).
 
     Attributes:
-        signal: the one that arrived; None before.
+        signal: the signal that arrived; None before.
         insisted: whether a second SIGINT arrived.
-        loading: whether nothing has begun yet, so that a request ends the process at once.
+        loading: whether nothing has started yet, so that a request ends the process at once.
     """
 
     def __init__(self) -> None:
@@ -36,37 +36,37 @@ class StopRequest:
         self._deferred = False
 
     def install(self) -> None:
-        """Take over the signals, again if a library has taken them meanwhile."""
+        """Install the handlers, again if a library has replaced them."""
         for number in NUMBERS:
             if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, self.receive)
 
     @contextlib.contextmanager
     def deferred(self) -> Iterator[None]:
-        """For a loop that asks this object itself whether to stop.
+        """For a loop that checks this object to know whether to stop.
 
         Raises:
-            KeyboardInterrupt: on entry, if the request has been made already.
+            KeyboardInterrupt: on entry, if a stop has already been requested.
         """
         self._deferred = True
         try:
             if self:
-                # It may have interrupted code that let no exception through, such as a destructor.
+                # The request may have interrupted code that suppresses exceptions, such as a destructor.
                 raise KeyboardInterrupt
             yield
         finally:
             self._deferred = False
 
     def settle(self) -> None:
-        """The work is done and the exit code known: a request changes nothing any more.
+        """Ignore further requests, because the work is done and the exit code known.
 
-        Ignored rather than handled: an interpreter that ends takes handlers away before it has ended.
+        Ignored rather than handled, because an exiting interpreter removes its handlers before it has ended.
         """
         for number in NUMBERS:
             signal.signal(number, signal.SIG_IGN)
 
     def receive(self, number: int, frame: FrameType | None = None) -> None:
-        """Do what a signal of this number asks for."""
+        """Handle a signal of this number."""
         first = self.signal is None
         if first:
             self.signal = signal.Signals(number)
@@ -75,9 +75,9 @@ class StopRequest:
         else:
             return
         if self.loading:
-            # Raised here, an exception would meet whatever module is half loaded.
-            with contextlib.suppress(OSError):  # with the terminal goes whoever reads from it
-                os.write(2, f"stopped by {self.signal.name} before anything began\n".encode())  # type: ignore[union-attr]
+            # An exception raised here would hit a half-imported module.
+            with contextlib.suppress(OSError):  # the terminal may be closed, and nobody reads
+                os.write(2, f"stopped by {self.signal.name} before anything started\n".encode())  # type: ignore[union-attr]
             os._exit(RESUMABLE)
         if self.insisted or not self._deferred:
             raise KeyboardInterrupt
@@ -90,8 +90,8 @@ _current: StopRequest | None = None
 
 
 def listen() -> StopRequest:
-    """Begin to listen, for the life of this process: the first line of a program. While it is `loading`, a request ends
-    it."""
+    """Start to listen for the life of this process; call it in the first line of a program. While the program is
+    `loading`, a request ends it."""
     global _current
     if _current is None:
         _current = StopRequest()
@@ -101,13 +101,13 @@ def listen() -> StopRequest:
 
 
 def current() -> StopRequest | None:
-    """Whoever listens; None in a program that signals end as they end any other."""
+    """The listener; None in a program in which signals have their default effect."""
     return _current
 
 
 @contextlib.contextmanager
 def listening() -> Iterator[StopRequest]:
-    """Whoever listens; where nobody does, as under a test runner, one for this block."""
+    """The listener; if there is none, as under a test runner, one for this block."""
     global _current
     if _current is not None:
         yield _current

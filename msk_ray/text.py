@@ -1,7 +1,7 @@
-"""Text from files and users made safe for where it is shown: a terminal's line, a Markdown page.
+"""Make text from files and users safe for display on a terminal or in a Markdown page.
 
-A label or an error may hold anything. Written to a terminal as it is, an escape sequence could clear the screen, rename
-the window or overwrite what was said before, and a newline could pass for a line of our own.
+A label or an error may contain anything. Printed unchanged on a terminal, an escape sequence could clear the screen,
+rename the window or overwrite earlier output, and text after a newline could pass for a line of ours.
 """
 
 import html
@@ -10,23 +10,23 @@ from collections.abc import Mapping
 from typing import Any
 
 _HIDDEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}
-"""Unicode categories without a shape of their own: controls, format (direction of writing), surrogates, separators."""
+"""Unicode categories that are not visible: controls, format (direction of writing), surrogates, separators."""
 
 
 def printable(text: str) -> str:
-    r"""`text` on one line, every control character written as Python would write it: `\n`, `\x1b`, `\u202e`."""
+    r"""`text` on one line, with every control character escaped as in Python: `\n`, `\x1b`, `\u202e`."""
     if text.isprintable():
         return text
     return "".join(_visible(character) for character in text)
 
 
 def printable_lines(text: str) -> str:
-    """The same for text of several lines, which stay lines."""
+    """The same for text of several lines, which stay separate."""
     return "\n".join(printable(line) for line in text.split("\n"))
 
 
 def markdown_text(text: str) -> str:
-    """Text for a paragraph of Markdown, shown as it is: no HTML, links or pictures, and nothing hidden."""
+    """Text for a paragraph of Markdown, shown literally: no HTML, links or pictures, and nothing hidden."""
     return "\n".join(_markdown(line) for line in text.split("\n"))
 
 

@@ -1,11 +1,11 @@
 """`python -m msk_ray.train`, and `msk_ray.train(config, ...)`: one trial in this process, without Ray.
 
-The module can be called, because `msk_ray.train` names both: the module once it is imported, and for a library the
-function.
+The module is callable because `msk_ray.train` names two things: the function for users of the library, and this module
+once it is imported.
 """
 
 if __name__ == "__main__":
-    # Before whatever takes time to load.
+    # Before the imports that take time to load.
     from msk_ray import signals
 
     signals.listen()
@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 DESCRIPTION = """\
 Train one policy, by SHAC or another algorithm: one trial, in this process, without Ray.
 
-Writes into the log folder: config.yaml (every setting), metrics.jsonl (one row an epoch), TensorBoard events and
+Writes into the log folder: config.yaml (every setting), metrics.jsonl (one row per epoch), TensorBoard events and
 checkpoints/ with the newest two and best.pt, the trained policy with the highest evaluation score (until the first
-evaluation the untrained one)."""
+evaluation, the untrained policy)."""
 
 EXAMPLES = """\
   python -m msk_ray.train --config configs/cartpole.yaml
@@ -51,16 +51,18 @@ EXAMPLES = """\
 def parser() -> Parser:
     """The command line."""
     p = Parser("python -m msk_ray.train", DESCRIPTION, EXAMPLES)
-    p.add_argument("--config", type=Path, required=True, metavar="FILE", help="a file of configs/")
+    p.add_argument("--config", type=Path, required=True, metavar="FILE", help="a YAML file, such as one of configs/")
     p.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help=SET_HELP)
     p.add_argument("--seed", type=int, help="same as --set trial.seed=N")
-    p.add_argument("--device", help="cpu or cuda:N; by default the first GPU, or the CPU if there is none")
-    p.add_argument("--logdir", type=Path, metavar="DIR", help="by default runs/train/CONFIG_seedN")
-    p.add_argument("--resume", action="store_true", help="go on from the newest whole checkpoint in the log folder")
+    p.add_argument("--device", help="cpu or cuda:N (default: the first GPU, or the CPU if there is none)")
+    p.add_argument("--logdir", type=Path, metavar="DIR", help="log folder (default: runs/train/CONFIG_seedN)")
+    p.add_argument(
+        "--resume", action="store_true", help="continue from the newest complete checkpoint in the log folder"
+    )
     p.add_argument(
         "--force",
         action="store_true",
-        help="take the log folder over from a process that looks alive, after looking: the other one stops by itself",
+        help="take over the log folder although its owner seems to run (check first); the other process then stops",
     )
     return p
 
@@ -80,10 +82,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         except KeyboardInterrupt:
             if stop.signal is None or stop.insisted:
                 raise
-            # Not between two epochs: the kernels are not there yet, or the disk is slow.
+            # Not between two epochs: kernels are still being prepared, or the disk is slow.
             begun = (logdir / "checkpoints").is_dir()
             command = typed_command(words, *(["--resume"] if begun else []))
-            print(f"stopped by {stop.signal.name}; go on with: {printable(command)}")
+            print(f"stopped by {stop.signal.name}; continue with: {printable(command)}")
             return RESUMABLE
 
 
@@ -91,11 +93,11 @@ def _check_logdir(logdir: Path, resume: bool) -> None:
     """Refuse to write over another trial."""
     if (logdir / "metrics.jsonl").exists() and not resume:
         raise StorageError(
-            f"{logdir} holds a trial already: add --resume (in Python resume=True) to go on with it, or name another "
+            f"{logdir} already holds a trial: add --resume (in Python resume=True) to continue it, or choose another "
             "--logdir"
         )
     if resume and not (logdir / "checkpoints").is_dir():
-        raise StorageError(f"--resume: no trial in {logdir}; leave --resume out to start one")
+        raise StorageError(f"--resume: no trial in {logdir}; leave out --resume to start one")
     if resume:
         check_writable(logdir)
     else:
@@ -109,9 +111,9 @@ class Trained:
     logdir: Path
     """Its folder, with config.yaml, metrics.jsonl and checkpoints/."""
     epochs: int
-    """Epochs done."""
+    """Number of epochs trained."""
     best_score: float
-    """Highest evaluation score of the trained policy, -inf if no evaluation gave one."""
+    """Highest evaluation score of the trained policy; -inf if no evaluation gave one."""
     best_checkpoint: Path
     """Checkpoint of that policy, for `load_policy`; of the untrained policy if no evaluation gave a score."""
 
@@ -125,9 +127,9 @@ def train(
     force: bool = False,
     on_epoch: Callable[[dict[str, float]], None] | None = None,
 ) -> Trained:
-    """Train one policy in this process, as the command does, without printing.
+    """Train one policy in this process, like the command, but without printing.
 
-    A call that was interrupted goes on from its last checkpoint when it is made again with `resume`.
+    To continue an interrupted call from its last checkpoint, repeat it with `resume`.
 
     Example:
         >>> trained = msk_ray.train(msk_ray.load_config("configs/cartpole.yaml"), "runs/mine")
@@ -137,13 +139,13 @@ def train(
         config: every setting, from `load_config`.
         logdir: folder of the trial.
         device: cpu or cuda:N; by default the first GPU, or the CPU if there is none.
-        resume: go on from the newest whole checkpoint in `logdir`.
-        force: take the folder over from a process that looks alive.
+        resume: continue from the newest complete checkpoint in `logdir`.
+        force: take over the folder although its owner seems to be running.
         on_epoch: called with each epoch's row of metrics.
 
     Raises:
         StorageError: the folder holds another trial, belongs to another process, or cannot be written.
-        CheckpointError: `resume` is asked for, and no checkpoint is whole or the newest has other settings.
+        CheckpointError: with `resume`, no checkpoint is complete or the newest has other settings.
         DeviceError, UnsupportedModelError, SimulationError: as their messages say.
     """
     if not isinstance(config, Config):
@@ -168,7 +170,7 @@ def train(
 
 def _choose_device(asked: str | None) -> str:
     """The device asked for, else the first GPU, else the CPU; loads torch."""
-    # Read when torch is imported: threads that wait for work are to sleep, not to spin.
+    # torch reads this when it is imported: threads that wait for work should sleep, not spin.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     import torch
 
@@ -185,7 +187,7 @@ def _trainer(config: Config, logdir: Path, device: str, resume: bool) -> "Traine
         newest, faults = newest_valid_checkpoint(logdir / "checkpoints")
         if newest is None and faults:
             raise CheckpointError(
-                f"--resume: no checkpoint in {logdir} is whole ({faults[0]}); name another --logdir to start again"
+                f"--resume: no checkpoint in {logdir} is complete ({faults[0]}); choose another --logdir to start again"
             )
     return Trainer(config, logdir, device)
 
@@ -194,18 +196,20 @@ def _train(
     config: Config, args: argparse.Namespace, ownership: Ownership, stop: StopRequest, resume_command: str
 ) -> int:
     device = _choose_device(args.device)
-    from msk_ray.progress import Progress
+    from msk_ray.progress import ProgressLine
 
     logdir = ownership.folder
-    print(f"{config.env.name}: {config.trial.epochs} epochs, {config.env.nworld} worlds, on {device}; into {logdir}")
+    print(
+        f"{config.env.name}: {config.trial.epochs} epochs, {config.env.nworld} worlds, on {device}; log folder {logdir}"
+    )
     print("preparing kernels (a first run compiles them, up to a minute) ...", flush=True)
     trainer = _trainer(config, logdir, device, args.resume)
     if args.resume:
         path, faults = trainer.restore_latest()
         for fault in faults:
             print(f"skipped: {printable(fault)}")
-        print(f"resumed from {path}" if path else "no whole checkpoint yet: starting from the beginning")
-    progress = Progress(config.trial.epochs, trainer.epoch)
+        print(f"resumed from {path}" if path else "no complete checkpoint yet: starting from the beginning")
+    progress = ProgressLine(config.trial.epochs, trainer.epoch)
     with stop.deferred():
         while not trainer.finished and not stop:
             ownership.check()
@@ -216,7 +220,8 @@ def _train(
             trainer.save()
             trainer.close()
             assert stop.signal is not None
-            print(f"stopped by {stop.signal.name} after epoch {trainer.epoch}; go on with: {printable(resume_command)}")
+            command = printable(resume_command)
+            print(f"stopped by {stop.signal.name} after epoch {trainer.epoch}; continue with: {command}")
             return RESUMABLE
         trainer.close()
     if math.isfinite(trainer.best_score):
@@ -228,7 +233,7 @@ def _train(
 
 
 class _CallableModule(ModuleType):
-    """This module when it is called: `msk_ray.train(config, logdir)`."""
+    """A module that can be called: `msk_ray.train(config, logdir)`."""
 
     __call__ = staticmethod(train)
 

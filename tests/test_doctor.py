@@ -1,4 +1,4 @@
-"""`doctor`: every line says ok or what to do, and something broken is found."""
+"""`doctor`: every line says ok or what to fix, and what is broken is found."""
 
 import os
 from dataclasses import replace
@@ -17,7 +17,7 @@ TWO = GpuFacts("570.1", 2, (12, 8), "12.8", 2, (12, 9), 2, None)
 def test_a_machine_without_gpu_is_fine_for_cpu_work() -> None:
     (finding,) = gpu_findings(NO_GPU, None)
     assert not finding.broken
-    assert "fine for work on CPU" in finding.text
+    assert "trials run on CPU cores" in finding.text
     (finding,) = gpu_findings(NO_GPU, "cuda:0")
     assert finding.broken
     assert "--device cpu" in finding.text
@@ -26,17 +26,17 @@ def test_a_machine_without_gpu_is_fine_for_cpu_work() -> None:
 def test_gpus_that_fit() -> None:
     (finding,) = gpu_findings(TWO, "cuda:1")
     assert not finding.broken
-    assert finding.text == "2 GPU(s); driver 570.1 runs CUDA up to 12.8, torch built for 12.8, Warp for 12.9"
+    assert finding.text == "2 GPU(s); driver 570.1 supports CUDA up to 12.8, torch built for 12.8, Warp for 12.9"
 
 
 @pytest.mark.parametrize(
     ("facts", "device", "to_do"),
     [
-        (replace(TWO, torch_cuda=None, torch_gpus=0), None, "torch is a build for CPU only"),
+        (replace(TWO, torch_cuda=None, torch_gpus=0), None, "torch is a CPU-only build"),
         (replace(TWO, torch_cuda="13.0", torch_gpus=0), None, "torch is built for CUDA 13.0 and cannot use the GPU"),
         (replace(TWO, warp_cuda=None, warp_gpus=0), None, "Warp is a build without CUDA"),
         (replace(TWO, warp_cuda=(13, 4), warp_gpus=0), None, "update the driver, or install a Warp build"),
-        (replace(TWO, warp_cuda=(13, 4)), None, "driver 570.1, which runs CUDA up to 12.8"),
+        (replace(TWO, warp_cuda=(13, 4)), None, "driver 570.1, which supports CUDA up to 12.8"),
         (replace(TWO, visible="", torch_gpus=0, warp_gpus=0), None, "hides all GPUs: unset it"),
         (TWO, "cuda:2", "cuda:0 to cuda:1: name one of them"),
     ],
@@ -72,7 +72,7 @@ def test_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "MIN_FREE_GB", 1e9)
     finding = check_storage(tmp_path)
     assert finding.broken
-    assert "make room" in finding.text
+    assert "free some space" in finding.text
 
 
 @pytest.fixture
@@ -114,7 +114,7 @@ def test_the_whole_on_cpu(
     assert [line.split()[:2] for line in lines[:-1]] == [
         ["ok", name] for name in ("python", "packages", "gpu", "gradient", "ray", "storage")
     ]
-    assert lines[-1] == "all is well"
+    assert lines[-1] == "all checks passed"
 
 
 def test_something_broken_gives_exit_1(
@@ -124,9 +124,9 @@ def test_something_broken_gives_exit_1(
     monkeypatch.setattr(doctor, "_gpu_facts", lambda: NO_GPU)
     assert run(main, ["--device", "cuda:0", "--storage", "/proc/x"]) == 1
     text = capsys.readouterr().out
-    for line in ("MEND  gpu", "MEND  gradient", "MEND  ray       does not start: exit code 9", "MEND  storage"):
+    for line in ("FIX   gpu", "FIX   gradient", "FIX   ray       does not start: exit code 9", "FIX   storage"):
         assert line in text
-    assert "4 thing(s) to mend" in text
+    assert "4 problem(s) to fix" in text
 
 
 def test_without_its_packages_it_says_so_and_stops(
@@ -136,6 +136,6 @@ def test_without_its_packages_it_says_so_and_stops(
     assert run(main, ["--storage", str(tmp_path / "runs")]) == 1
     lines = capsys.readouterr().out.splitlines()
     assert lines[-2:] == [
-        "MEND  packages  no_such_module_here cannot be imported: the rest was not checked",
-        "1 thing(s) to mend",
+        "FIX   packages  no_such_module_here cannot be imported: nothing else was checked",
+        "1 problem(s) to fix",
     ]

@@ -68,7 +68,7 @@ def test_the_handlers_of_others_come_back() -> None:
 @pytest.mark.parametrize(
     ("body", "code", "output"),
     [
-        ("os.kill(os.getpid(), signal.SIGTERM); run(lambda argv: 0)", RESUMABLE, "SIGTERM before anything began\n"),
+        ("os.kill(os.getpid(), signal.SIGTERM); run(lambda argv: 0)", RESUMABLE, "SIGTERM before anything started\n"),
         ("sys.exit(run(lambda argv: os.kill(os.getpid(), signal.SIGUSR1)))", RESUMABLE, "stopped by SIGUSR1\n"),
         ("code = run(lambda argv: 0); os.kill(os.getpid(), signal.SIGTERM); sys.exit(code)", 0, ""),
         # When modules are taken down, handlers have been.

@@ -49,15 +49,15 @@ def test_a_folder_that_holds_a_trial_is_left_alone(root: Path, tmp_path: Path) -
     assert (tmp_path / "metrics.jsonl").read_text() == '{"epoch": 0}\n'
 
 
-def test_a_trial_without_a_whole_checkpoint_is_not_begun_anew(root: Path, tmp_path: Path) -> None:
+def test_a_trial_without_a_complete_checkpoint_is_not_restarted(root: Path, tmp_path: Path) -> None:
     (tmp_path / "checkpoints").mkdir()
     (tmp_path / "checkpoints" / "epoch_000004.pt").write_bytes(b"torn")
     (tmp_path / "metrics.jsonl").write_text('{"epoch": 0}\n{"epoch": 1}\n')
     config = str(root / "configs" / "cartpole.yaml")
     result = train(root, tmp_path, "--config", config, "--logdir", str(tmp_path), "--resume")
     assert result.returncode == 2
-    assert "is whole" in result.stderr
-    assert "name another --logdir to start again" in result.stderr
+    assert "is complete" in result.stderr
+    assert "choose another --logdir to start again" in result.stderr
     assert (tmp_path / "metrics.jsonl").read_text() == '{"epoch": 0}\n{"epoch": 1}\n'
     assert not (tmp_path / "config.yaml").exists()
 

@@ -195,7 +195,7 @@ def test_a_signal_saves_and_says_resumable(
         output, _ = process.communicate()
         assert process.returncode == 75
     assert f"stopped by {number.name}" in output
-    assert f"go on with: python -m msk_ray.train --config {tmp_path / 'config.yaml'}" in output
+    assert f"continue with: python -m msk_ray.train --config {tmp_path / 'config.yaml'}" in output
     assert output.rstrip().endswith("--resume")
     assert len(epoch_checkpoints(tmp_path / "run" / "checkpoints")) == 1
     rows = [json.loads(line) for line in metrics.read_text().splitlines()]

@@ -76,7 +76,7 @@ def test_a_terminal_that_closes_lets_trials_save_themselves(
     assert os.waitstatus_to_exitcode(status) == RESUMABLE
     assert (experiment.path / "summary.json").is_file()
     log = (experiment.path / "terminal.log").read_text()
-    assert "nobody reads the output any more (Input/output error); it goes on here" in log
+    assert "nobody reads the output any more (Input/output error); it continues here" in log
     assert "SIGHUP: 2 trials save themselves" in log
     assert log.rstrip().endswith(f"go on with: python stub_driver.py {shlex.join(command[2:])} --resume")
     for record in read_records(experiment):
