@@ -29,8 +29,9 @@ from msk_ray.experiment.outcomes import Outcome
 from msk_ray.experiment.results import TrialRecord, read_records
 from msk_ray.experiment.results_table import outcome_name
 from msk_ray.experiment.trial_status import StatusReader
-from msk_ray.sweep.pruning import Pruner, make_pruner
-from msk_ray.sweep.space import SchedulerSpec
+from msk_ray.sweep.rules.asha import Asha
+from msk_ray.sweep.rules.early_stopping import Pruner, SchedulerSpec
+from msk_ray.sweep.rules.median import Median
 
 NEAR = 0.01
 """What a sweep may lose of its best score and still have found as much, as a share of it."""
@@ -60,7 +61,7 @@ class Rule:
 
     def fresh(self) -> Pruner:
         """The rule, knowing nothing yet."""
-        return make_pruner(self.spec, self.budget)
+        return self.spec.pruner(self.budget)
 
 
 def judge(records: Sequence[TrialRecord], pruner: Pruner, time_attr: str, slots: int) -> list[Judged]:
@@ -187,7 +188,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     if args.slots < 1 or args.orders < 1:
         raise ConfigError(f"--slots {args.slots} --orders {args.orders}: at least 1 of each")
     try:
-        spec = SchedulerSpec(kind=args.kind, grace=args.grace, reduction=args.reduction)
+        if args.kind == "asha":
+            spec: SchedulerSpec = Asha(kind="asha", grace=args.grace, reduction=args.reduction)
+        else:
+            spec = Median(kind="median", grace=args.grace)
     except ValidationError as error:
         raise ConfigError(f"--{describe_fault(error, SchedulerSpec)}") from error
     experiment = Experiment(args.experiment.resolve())

@@ -157,9 +157,7 @@ def _cells(status: TrialStatus, wide: bool, seeds: bool) -> list[str]:
     gpu = f"{device.host}:{device.gpu} {model}".strip() if wide and device.host else device.gpu
     cells = [
         status.id,
-        status.variant
-        + (f", seed {status.seed}" if seeds else "")
-        + (f" ({status.halved})" if status.halved is not None else ""),
+        status.variant + (f", seed {status.seed}" if seeds else "") + status.attempt.suffix,
         state,
         f"{progress.epoch}/{status.epochs}",
         "-" if progress.best is None else f"{progress.best:.4g}",

@@ -12,7 +12,8 @@ from processes import Launcher
 from msk_ray.config import Config, dump_yaml, load_config, parse_config
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.sweep import opening
-from msk_ray.sweep.space import Space, StopSpec, parse_space
+from msk_ray.sweep.rules.stopping import StopSpec
+from msk_ray.sweep.space import Space, parse_space
 from msk_ray.sweep.trials import resolve_trials
 from msk_ray.training import Trainer
 from msk_ray.tune.finish import finish

@@ -12,7 +12,7 @@ import pytest
 
 from msk_ray.cli import run
 from msk_ray.config import dump_yaml
-from msk_ray.experiment.halved import Halved, write_halved
+from msk_ray.experiment.attempts import Attempt, Reduced
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import progress_of
 from msk_ray.experiment.outcomes import Ending, Outcome, write_ending
@@ -198,7 +198,7 @@ def test_a_trial_with_half_its_worlds_says_so(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    write_halved(experiment.trial_folder(experiment.trials()[0].id), Halved(64, 32, "no room", cleared=True))
+    Attempt(Reduced(64, 32, "no room", cleared=True)).write(experiment.trial_folder(experiment.trials()[0].id))
     monkeypatch.setenv("COLUMNS", str(width))
     assert run(main, [experiment.name, "--storage", str(experiment.path.parent)]) == 0
     lines = capsys.readouterr().out.splitlines()

@@ -13,8 +13,8 @@ from fault_campaign.killed import calls_of, die_within
 from fault_campaign.reference import Reference
 from fault_campaign.tally import Tally
 from msk_ray.experiment import layout
+from msk_ray.experiment.attempts import Attempt, Reduced, load_attempt
 from msk_ray.experiment.checkpoint_file import read_checkpoint_file, write_checkpoint_file
-from msk_ray.experiment.halved import Halved, read_halved, write_halved
 from msk_ray.experiment.metrics import load_metrics
 from msk_ray.experiment.outcomes import Ending, Outcome, load_ending, write_ending
 from msk_ray.experiment.scheduler_log import LogEntry, SchedulerLog
@@ -135,9 +135,9 @@ def _writers(old: bytes, new: bytes) -> list[Writer]:
         ),
         Writer(
             layout.HALVED_FILE,
-            lambda f: write_halved(f, Halved(8, 4, "old")),
-            lambda f: write_halved(f, Halved(8, 4, "old", cleared=True)),
-            read_halved,
+            lambda f: Attempt(Reduced(8, 4, "old")).write(f),
+            lambda f: Attempt(Reduced(8, 4, "old", cleared=True)).write(f),
+            load_attempt,
         ),
         Writer(
             f"{layout.METRICS_FILE}, a row added",

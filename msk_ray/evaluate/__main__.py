@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 from msk_ray.cli import Parser, run
 from msk_ray.errors import CheckpointError, MskRayError
 from msk_ray.evaluate.targets import Kind, Target, best_checkpoint, best_of_trial, find_target
+from msk_ray.experiment.attempts import read_attempt
 from msk_ray.experiment.checkpoint_file import read_facts
 from msk_ray.experiment.manifest import Experiment
-from msk_ray.experiment.snapshot import read_trial
 from msk_ray.files import write_json
 from msk_ray.sweep.space import parse_seeds
 from msk_ray.text import printable
@@ -163,8 +163,7 @@ def evaluate_experiment(experiment: Experiment, bench: "Bench", requests: "Seque
                 failed[trial.id] = str(error)
                 print(f"{number}/{len(trials)}  {trial.id}  {printable(str(error))}", flush=True)
                 continue
-            halved = read_trial(experiment.trial_folder(trial.id)).halved
-            name = trial.variant + (f" ({halved})" if halved is not None else "")
+            name = trial.variant + read_attempt(experiment.trial_folder(trial.id)).suffix
             ranking.append({"trial": trial.id, "variant": name, "seed": trial.seed, **entry})
             print(f"{number}/{len(trials)}  {trial.id}  {entry['score']['mean']:.5g}", flush=True)
         ranking.sort(key=lambda entry: -entry["score"]["mean"])

@@ -7,7 +7,7 @@ runs/<experiment>/
     owner.json        the driver at work, if there is one
     tune/             Ray's own state
     trials/<id>/      config.yaml, metrics.jsonl, checkpoints/, outcome.json, output.log, eval.json; halved.json and
-                      abandoned/ if it was started anew with half its worlds
+                      abandoned/ if it was tried again with half its worlds
     summary.json, table.md, eval.json, report/
 """
 

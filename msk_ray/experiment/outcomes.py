@@ -23,6 +23,8 @@ class Outcome(StrEnum):
     """Its best score no longer rose."""
     STOPPED_TARGET = "stopped_target"
     """It reached the score asked for."""
+    STOPPED_RULE = "stopped_rule"
+    """A rule of the user's own stopped it."""
     WALL_TIME = "wall_time"
     """It used up its time."""
     NONFINITE = "nonfinite"

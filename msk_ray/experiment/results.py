@@ -9,8 +9,8 @@ from typing import Any
 
 from msk_ray.config import current_key, parse_recorded, read_yaml
 from msk_ray.errors import MskRayError
+from msk_ray.experiment.attempts import Attempt
 from msk_ray.experiment.damage import Damage, cut
-from msk_ray.experiment.halved import Halved
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import Evaluation
 from msk_ray.experiment.outcomes import Ending
@@ -49,9 +49,9 @@ class TrialRecord:
         return self.snapshot.ending
 
     @property
-    def halved(self) -> Halved | None:
-        """Set if it runs with half its worlds: then its scores do not compare with the others'."""
-        return self.snapshot.halved
+    def attempt(self) -> Attempt:
+        """The scores of one with fewer worlds do not compare with the others'."""
+        return self.snapshot.attempt
 
     @property
     def best(self) -> Evaluation | None:

@@ -31,7 +31,7 @@ def variant_rows(records: Sequence[TrialRecord]) -> list[tuple[str, ...]]:
             continue
         counts = {
             "before the end": sum(record.cut for record in scored),
-            "with half the worlds": sum(record.halved is not None for record in scored),
+            "with half the worlds": sum(record.attempt.reduced is not None for record in scored),
         }
         remarks = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
         seeds = f"{len(scores)} ({remarks})" if remarks else str(len(scores))
@@ -76,10 +76,10 @@ def table_document(name: str, question: str, records: Sequence[TrialRecord]) -> 
             )
     best = best_record(records)
     if best is not None:
-        half = f", {best.halved}" if best.halved is not None else ""
+        half = f", {best.attempt}" if best.attempt.reduced is not None else ""
         variant = markdown_text(printable(best.trial.variant))
         parts.append(f"Best policy: `{_relative(best)}` ({variant}, seed {best.trial.seed}{half}).\n")
-    if (note := halved_note(records)) is not None:
+    if (note := reduced_note(records)) is not None:
         parts.append(f"{note}\n")
     parts.append(f"Curves and more: [report](report/index.html), by `python -m msk_ray.report {name}`.\n")
     return "\n".join(part for part in parts if part)
@@ -92,9 +92,9 @@ def outcome_name(record: TrialRecord) -> str:
     return "interrupted" if record.epochs_done else "waiting"
 
 
-def halved_note(records: Sequence[TrialRecord]) -> str | None:
+def reduced_note(records: Sequence[TrialRecord]) -> str | None:
     """What the reader of a table must know of trials with half their worlds; None if there are none."""
-    count = sum(record.halved is not None for record in records)
+    count = sum(record.attempt.reduced is not None for record in records)
     if not count:
         return None
     trials = "1 trial" if count == 1 else f"{count} trials"
@@ -114,14 +114,14 @@ def _row(record: TrialRecord) -> tuple[str, ...]:
         "-" if best is None else str(best.epoch),
         f"{record.epochs_done}/{trial.epochs}",
         # Here, not with the reason: a terminal may cut that.
-        outcome_name(record) + (", half the worlds" if record.halved is not None else ""),
+        outcome_name(record) + record.attempt.mark,
         f"trials/{trial.id}",
-        "; ".join(str(part) for part in (record.halved, record.ending and record.ending.why) if part),
+        "; ".join(part for part in (str(record.attempt), record.ending.why if record.ending else "") if part),
     )
 
 
 def _facts(record: TrialRecord) -> dict[str, Any]:
-    best = record.best
+    best, reduced = record.best, record.attempt.reduced
     return {
         "id": record.trial.id,
         "changed": record.trial.changed,
@@ -134,7 +134,7 @@ def _facts(record: TrialRecord) -> dict[str, Any]:
         "seconds": record.seconds,
         "outcome": outcome_name(record),
         "why": record.ending.why if record.ending is not None else "",
-        "halved": None if record.halved is None else {"asked": record.halved.asked, "worlds": record.halved.worlds},
+        "halved": None if reduced is None else {"asked": reduced.asked, "worlds": reduced.worlds},
         "folder": f"trials/{record.trial.id}",
         "best_checkpoint": str(_relative(record)) if record.best_checkpoint else None,
     }

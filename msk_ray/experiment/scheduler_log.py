@@ -27,8 +27,8 @@ class LogEntry:
     score: float
     ended: bool
     """Whether the trial had ended by itself."""
-    halved: bool = False
-    """Whether it ran with half its worlds; what it reported with all of them no longer counts then."""
+    attempt: int = 1
+    """Which attempt at the trial it was; what an earlier one reported no longer counts then."""
 
     def time(self, attribute: str) -> float:
         """Progress as `env_steps`, `epoch` or `seconds`."""
@@ -87,5 +87,12 @@ def _entry(data: dict[str, Any]) -> LogEntry:
         # It may be NaN: written so, and the rule knows what to do with it.
         float(data["score"]) if isinstance(data.get("score"), float) else number(data, "score"),
         field(data, "ended", bool),
-        field(data, "halved", bool) if "halved" in data else False,
+        _attempt(data),
     )
+
+
+def _attempt(data: dict[str, Any]) -> int:
+    """From 1. Earlier versions wrote whether it had half its worlds."""
+    if "attempt" in data:
+        return field(data, "attempt", int)
+    return 2 if "halved" in data and field(data, "halved", bool) else 1

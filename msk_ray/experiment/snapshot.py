@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from msk_ray.errors import StorageFailure
+from msk_ray.experiment.attempts import FIRST, Attempt, load_attempt
 from msk_ray.experiment.damage import Damage, DamagedFile, cut, field, read_object
-from msk_ray.experiment.halved import Halved, read_halved
 from msk_ray.experiment.layout import DEVICE_FILE, METRICS_FILE, OUTPUT_FILE, SUMMARY_FILE, best_checkpoint
 from msk_ray.experiment.metrics import (
     Evaluation,
@@ -66,8 +66,8 @@ class TrialSnapshot:
     progress: TrialProgress
     ending: Ending | None
     """None: not ended, whether running, waiting or interrupted."""
-    halved: Halved | None
-    """Set if it runs with half its worlds: then its scores do not compare with the others'."""
+    attempt: Attempt
+    """The scores of one with fewer worlds do not compare with the others'."""
     device: Device
     state: State
     age: float | None
@@ -116,9 +116,9 @@ class TrialReader:
         damages: list[Damage] = []
         rows, progress, metrics = self._metrics(folder / METRICS_FILE, damages)
         damages += metrics.damages
-        ending = _attempt(lambda: load_ending(folder), None, folder, damages)
-        halved = _attempt(lambda: read_halved(folder), None, folder, damages)
-        device = _attempt(lambda: read_object(folder / DEVICE_FILE, _device), None, folder, damages) or Device()
+        ending = _try(lambda: load_ending(folder), None, folder, damages)
+        attempt = _try(lambda: load_attempt(folder), FIRST, folder, damages)
+        device = _try(lambda: read_object(folder / DEVICE_FILE, _device), None, folder, damages) or Device()
         age = _heartbeat_age(folder, now)
         if ending is not None:
             state = State.ENDED
@@ -126,7 +126,7 @@ class TrialReader:
             state = State.WAITING
         else:
             state = State.STALE if _is_silent(folder, progress, age) else State.RUNNING
-        return TrialSnapshot(folder, rows, progress, ending, halved, device, state, age, tuple(damages))
+        return TrialSnapshot(folder, rows, progress, ending, attempt, device, state, age, tuple(damages))
 
     def _metrics(
         self, path: Path, damages: list[Damage]
@@ -137,7 +137,7 @@ class TrialReader:
         seen = self._seen.get(path)
         if seen is not None and seen[0] == stamp:
             return seen[1]
-        metrics = _attempt(lambda: load_metrics(path), Metrics(), path, damages)
+        metrics = _try(lambda: load_metrics(path), Metrics(), path, damages)
         rows = tuple(with_nan(row) for row in metrics.rows)
         found = rows if self._keep_rows else (), progress_of(rows), Metrics((), metrics.damages)
         if not damages:
@@ -150,7 +150,7 @@ def read_trial(folder: Path, now: float = 0.0) -> TrialSnapshot:
     return TrialReader().read(folder, now)
 
 
-def _attempt(read: Callable[[], T], otherwise: T, path: Path, damages: list[Damage]) -> T:
+def _try(read: Callable[[], T], otherwise: T, path: Path, damages: list[Damage]) -> T:
     try:
         return read()
     except DamagedFile as error:

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from msk_ray.config import read_yaml
 from msk_ray.errors import MskRayError
+from msk_ray.experiment.attempts import FIRST, Attempt
 from msk_ray.experiment.damage import Damage, describe_damages
 from msk_ray.experiment.eta import eta
-from msk_ray.experiment.halved import Halved
 from msk_ray.experiment.layout import ENVIRONMENT_FILE, MANIFEST_FILE, SPACE_FILE
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import TrialProgress
@@ -36,8 +36,7 @@ class TrialStatus:
     """Name of its ending, if it has one."""
     note: str = ""
     """Why it ended, or what is wrong with its files."""
-    halved: Halved | None = None
-    """Set if it runs with half its worlds."""
+    attempt: Attempt = FIRST
     damages: tuple[Damage, ...] = ()
     """What was skipped in its files."""
 
@@ -107,7 +106,7 @@ class StatusReader:
             seen.age,
             "" if seen.ending is None else str(seen.ending.outcome),
             "; ".join([*why, *describe_damages(seen.damages, seen.folder)]),
-            seen.halved,
+            seen.attempt,
             seen.damages,
         )
 

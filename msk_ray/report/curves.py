@@ -15,8 +15,7 @@ from msk_ray.experiment.outcomes import Outcome
 from msk_ray.report.pictures import DASHES, GREY, PALETTE, POINTS, Picture, picture, shorten, steps_axis, thin_peaks
 from msk_ray.report.reading import Reading, TrialReading
 from msk_ray.sweep.budget import extreme_configs, longest_budget
-from msk_ray.sweep.pruning import rungs
-from msk_ray.sweep.space import load_space
+from msk_ray.sweep.space import recorded_space
 
 NAMED = 8
 """Variants drawn in a colour of their own."""
@@ -298,22 +297,20 @@ def stopping_map(reading: Reading, name: str) -> Picture | None:
 
 
 def rung_steps(reading: Reading) -> tuple[list[float], str]:
-    """Env steps at which asha compares trials, and why they are not known if they are not.
+    """Env steps at which all trials are compared, and why they are not known if they are not.
 
     None for other rules, or if trials are compared at something else.
     """
     if reading.space is None:
         return [], ""
-    spec = reading.space.scheduler
-    if spec.kind != "asha" or spec.time_attr != "env_steps":
+    scheduler = reading.space.scheduler
+    if scheduler.time_attr != "env_steps" or not scheduler.rungs(1.0):
         return [], ""
     configs = [trial.trial.config for trial in reading.trials]
-    if reading.space.search == "optuna":
+    if reading.space.searches:
         # The rungs of a search come from what it may suggest, whatever it has suggested so far.
-        path = reading.experiment.path / SPACE_FILE
         try:
-            configs = extreme_configs(load_space(path))
+            configs = extreme_configs(recorded_space(reading.experiment.path / SPACE_FILE))
         except ConfigError as error:
-            return [], f"Where the rungs of asha lie is not known: {error}. "
-    budget = longest_budget(reading.space, configs)
-    return list(rungs(spec.grace * budget, budget, spec.reduction)), ""
+            return [], f"Where the rungs of {scheduler.kind} lie is not known: {error}. "
+    return list(scheduler.rungs(longest_budget(reading.space, configs))), ""

@@ -12,13 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
-from msk_ray.config import describe_fault, read_yaml
+from msk_ray.config import read_yaml
 from msk_ray.errors import MskRayError, StorageError
+from msk_ray.experiment.attempts import FIRST, Attempt
 from msk_ray.experiment.damage import Damage, count_damages, describe_damages
 from msk_ray.experiment.environment import read_environment
-from msk_ray.experiment.halved import Halved
 from msk_ray.experiment.layout import (
     ENVIRONMENT_FILE,
     ERROR_FILE,
@@ -33,7 +32,7 @@ from msk_ray.experiment.outcomes import Ending
 from msk_ray.experiment.results import unlisted_trials
 from msk_ray.experiment.snapshot import State, TrialReader
 from msk_ray.experiment.trial import Trial
-from msk_ray.sweep.space import SpaceFile
+from msk_ray.sweep.space import SpaceFile, read_file
 
 _TAIL_LINES = 12
 _NOTED = 10
@@ -66,8 +65,8 @@ class TrialReading:
     """What is wrong with its files."""
     device: str = ""
     """GPU model, or cpu; empty if it was not recorded."""
-    halved: Halved | None = None
-    """Set if it runs with half its worlds: then its scores do not compare with the others'."""
+    attempt: Attempt = FIRST
+    """The scores of one with fewer worlds do not compare with the others'."""
 
     @property
     def epochs_done(self) -> int:
@@ -141,8 +140,8 @@ class TrialReading:
 
     @property
     def why(self) -> str:
-        parts = (self.halved, self.ending and self.ending.why, self.note)
-        return "; ".join(str(part) for part in parts if part)
+        parts = (self.attempt, self.ending and self.ending.why, self.note)
+        return "; ".join(str(part) for part in parts if str(part or ""))
 
     @property
     def failed(self) -> bool:
@@ -212,9 +211,9 @@ class Reading:
         return {trial.trial.config.algorithm.name for trial in self.trials}
 
     @property
-    def halved(self) -> list[TrialReading]:
+    def reduced(self) -> list[TrialReading]:
         """Trials that run with half their worlds."""
-        return [trial for trial in self.trials if trial.halved is not None]
+        return [trial for trial in self.trials if trial.attempt.reduced is not None]
 
     @property
     def seeds(self) -> set[int]:
@@ -276,7 +275,7 @@ def _read_trial(reader: TrialReader, trial: Trial, folder: Path, now: float) -> 
     note = "; ".join(describe_damages(seen.damages, folder))
     columns = columns_of(seen.rows)
     return TrialReading(
-        trial, folder, columns, seen.state, seen.ending, note, seen.device.name, seen.halved
+        trial, folder, columns, seen.state, seen.ending, note, seen.device.name, seen.attempt
     ), seen.damages
 
 
@@ -296,9 +295,7 @@ def _read_space(path: Path, notes: list[str]) -> tuple[str, SpaceFile | None]:
         return "", None
     try:
         text = path.read_text(encoding="utf-8")
-        return text, SpaceFile.model_validate(read_yaml(path))
-    except ValidationError as error:
-        notes.append(f"space.yaml cannot be read: {describe_fault(error, SpaceFile)}.")
+        return text, read_file(read_yaml(path), "space.yaml", recorded=True)
     except (MskRayError, OSError, ValueError) as error:
         notes.append(f"space.yaml cannot be read: {explain(error)}.")
     return "", None

@@ -43,7 +43,7 @@ class VariantRow:
     is_baseline: bool
     figures: dict[str, float]
     """Mean over seeds of further evaluation figures at the best evaluation, such as the speed."""
-    halved: int = 0
+    reduced: int = 0
     """How many of the scores are of trials with half their worlds."""
     cut: int = 0
     """How many are of trials that ended, or stand, before their end without having failed."""
@@ -122,7 +122,7 @@ def variant_rows(reading: Reading, baseline: str | None) -> list[VariantRow]:
                 at if pair else None,
                 own,
                 figures,
-                sum(trial.halved is not None and trial.score is not None for trial in trials),
+                sum(trial.attempt.reduced is not None and trial.score is not None for trial in trials),
                 sum(trial.cut and trial.score is not None for trial in trials),
             )
         )

@@ -6,7 +6,7 @@ from typing import Any
 
 from msk_ray.config import Config, leaves, overlay, parse_config
 from msk_ray.config.algorithms import BUILT_IN
-from msk_ray.sweep.operators import Level, Listed, Operator
+from msk_ray.sweep.operators import Operator
 from msk_ray.sweep.space import Space, SpaceFile
 from msk_ray.sweep.trials import base_settings, check_algorithms_read, check_ranges
 
@@ -40,11 +40,11 @@ def longest_budget(file: SpaceFile, configs: Iterable[Config]) -> float:
         return max(env_steps_budget(config) for config in configs)
     if attribute == "epoch":
         return max(config.trial.epochs for config in configs)
-    return file.stop.wall_time_s or 0.0
+    return file.stop.wall_time_s.seconds if file.stop.wall_time_s is not None else 0.0
 
 
 def extreme_configs(space: Space) -> list[Config]:
-    """Configs among which is the longest one that a search can make up: every combination of what decides the length.
+    """Configs among which is the longest one that a search can suggest: every combination of what decides the length.
 
     A trial's length rises or falls with each number that it depends on, so the two ends of a range are enough. Other
     parameters stand at their first level or lower end.
@@ -60,7 +60,7 @@ def extreme_configs(space: Space) -> list[Config]:
 
 
 def _combinations(space: Space, base: Mapping[str, Any]) -> Iterator[Config]:
-    choices = [_levels(op) if _decides(key, op) else _levels(op)[:1] for key, op in space.sampled.items()]
+    choices = [op.extremes() if _decides(key, op) else op.extremes()[:1] for key, op in space.sampled.items()]
     for levels in itertools.product(*choices):
         chosen = dict(zip(space.sampled, levels, strict=True))
         name = ", ".join(f"{key} {level.label}" for key, level in chosen.items())
@@ -68,11 +68,7 @@ def _combinations(space: Space, base: Mapping[str, Any]) -> Iterator[Config]:
         yield parse_config(settings, f"{space.name}: {name}")
 
 
-def _levels(op: Operator) -> tuple[Level, ...]:
-    return op.levels if isinstance(op, Listed) else op.ends()
-
-
 def _decides(key: str, op: Operator) -> bool:
     """Whether a parameter sets something that decides how long a trial is."""
-    touched = (leaf for level in _levels(op) for leaf in leaves(key, level.value))
+    touched = (leaf for level in op.extremes() for leaf in leaves(key, level.value))
     return any(leaf == known or leaf.startswith(f"{known}.") for leaf in touched for known in _DECIDING)

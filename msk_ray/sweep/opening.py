@@ -4,8 +4,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from msk_ray.config import dump_yaml, read_yaml
 from msk_ray.errors import MskRayError, StorageError
 from msk_ray.experiment.environment import environment
@@ -14,7 +12,7 @@ from msk_ray.experiment.manifest import Experiment, refuse_old
 from msk_ray.experiment.trial import Trial, describe_changes
 from msk_ray.files import check_writable, make_folder, write_json, write_text
 from msk_ray.sweep.extend import extend_trials
-from msk_ray.sweep.space import Space, SpaceFile
+from msk_ray.sweep.space import Space, read_file
 from msk_ray.sweep.trials import with_recorded_ids
 from msk_ray.text import printable
 
@@ -85,14 +83,18 @@ def check_scheduler(experiment: Experiment, space: Space) -> None:
         StorageError: the space's scheduler is not the recorded one.
     """
     try:
-        recorded = SpaceFile.model_validate(read_yaml(experiment.path / SPACE_FILE)).scheduler.model_dump()
-    except (MskRayError, ValidationError) as error:
+        path = experiment.path / SPACE_FILE
+        recorded = read_file(read_yaml(path), str(path), recorded=True).scheduler.model_dump()
+    except MskRayError as error:
         # Nothing hangs on it but this check and the report.
         text = " ".join(str(error).split())
         print(f"whether the space's scheduler is still the one trials were stopped by is not known: {printable(text)}")
         return
     now = space.file.scheduler.model_dump()
-    changes = [f"{key} {recorded[key]} → {now[key]}" for key in now if now[key] != recorded[key]]
+    if recorded["kind"] != now["kind"]:
+        changes = [f"kind {recorded['kind']} → {now['kind']}"]  # each kind has settings of its own
+    else:
+        changes = [f"{key} {recorded[key]} → {now[key]}" for key in now if now[key] != recorded[key]]
     if changes:
         raise StorageError(
             f"--resume: the space's scheduler is not the one of {experiment.path}: {', '.join(changes)}; undo that, or "

@@ -12,10 +12,8 @@ from msk_ray.experiment.layout import PARAMS_FILE
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.trial import Trial
 from msk_ray.files import write_json
-from msk_ray.sweep.operators import Listed
 from msk_ray.sweep.space import Space
 from msk_ray.sweep.trials import base_settings, make_trial
-from msk_ray.text import describe
 
 
 @dataclass(frozen=True)
@@ -31,9 +29,8 @@ def search_trial(space: Space, base: Mapping[str, Any], params: Mapping[str, Any
     """The trial that a search's choice stands for."""
     values, changed = {}, {}
     for key, op in space.sampled.items():
-        level = next((lv for lv in op.levels if lv.label == params[key]), None) if isinstance(op, Listed) else None
-        values[key] = params[key] if level is None else level.value
-        changed[key] = describe(params[key])
+        level = op.recorded(params[key])
+        values[key], changed[key] = level.value, level.label
     return make_trial(space, base, changed, values, space.seeds[0], 0)
 
 

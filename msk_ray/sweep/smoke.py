@@ -4,6 +4,7 @@ from typing import Any
 
 from msk_ray.config import Config
 from msk_ray.experiment.trial import Trial
+from msk_ray.sweep.rules.no_scheduler import NoScheduler
 from msk_ray.sweep.space import Space
 from msk_ray.sweep.trials import base_settings, make_trial
 
@@ -17,9 +18,9 @@ def without_early_stopping(space: Space) -> Space:
     """The space with no trial ended because of its score or the others': each runs to its end. pbt stays, which ends
     none."""
     file = space.file
-    changes: dict[str, Any] = {"stop": file.stop.model_copy(update={"plateau": None, "target": None})}
-    if file.scheduler.kind in ("asha", "median"):
-        changes["scheduler"] = file.scheduler.model_copy(update={"kind": "none"})
+    changes: dict[str, Any] = {"stop": file.stop.without_scores()}
+    if file.scheduler.ends_trials:
+        changes["scheduler"] = NoScheduler()
     return space.model_copy(update={"file": file.model_copy(update=changes)})
 
 

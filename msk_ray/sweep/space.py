@@ -4,17 +4,21 @@ import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
-from pydantic import ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, SerializeAsAny, ValidationError
 
 import msk_ray
 from msk_ray.config import current_values, describe_fault, env_name, read_config, read_yaml
 from msk_ray.config.sections import Count, Section, Text, Whole
 from msk_ray.errors import ConfigError, brief
-from msk_ray.sweep.operators import Listed, Operator, Range, parse_operator
+from msk_ray.sweep.operators import Operator, Range, parse_operator
+from msk_ray.sweep.rules.early_stopping import SchedulerSpec
+from msk_ray.sweep.rules.no_scheduler import NoScheduler
+from msk_ray.sweep.rules.scheduler import RECORDED, read_scheduler, scheduler_class
+from msk_ray.sweep.rules.stopping import StopSpec
+from msk_ray.sweep.search import search_class
 
-Share = Annotated[float, Field(gt=0.0, lt=1.0)]
 MAX_SEEDS = 100_000
 
 
@@ -23,50 +27,6 @@ class AblateSpec(Section):
 
     baseline: dict[str, Any] = Field(default_factory=dict)
     variants: Annotated[dict[str, dict[str, Any]], Field(min_length=1)]
-
-
-class SchedulerSpec(Section):
-    """Which trials are stopped early because others do better."""
-
-    kind: Literal["asha", "median", "pbt", "none"] = "none"
-    time_attr: Literal["env_steps", "epoch", "seconds"] = "env_steps"
-    """What trials are compared at. Env steps is fair between horizons, and trials need not run in lockstep."""
-    grace: Share = 0.25
-    """Share of the longest trial's budget that no trial is stopped within: of the longest one that a search may
-    suggest, an adaptive horizon counted with its `longest`. Too small a one loses slow starters."""
-    reduction: Annotated[float, Field(ge=1.5, le=16)] = 3.0
-    """asha: one in this many goes on past each rung; rungs are grace × reductionⁿ."""
-    min_trials: Count | None = None
-    """Trials that must have come as far before one is stopped; null is `reduction` rounded up (asha), 3 (median)."""
-    interval: Share = 0.1
-    """pbt: share of the budget between two exchanges."""
-    quantile: Annotated[float, Field(gt=0.0, le=0.5)] = 0.25
-    """pbt: this share of the worst trials goes on from the best ones."""
-    resample: Annotated[float, Field(ge=0.0, le=1.0)] = 0.25
-    """pbt: probability that an exchanged value is drawn anew instead of being moved by a fifth."""
-
-
-class PlateauSpec(Section):
-    """Stop a trial whose best score no longer rises."""
-
-    patience: Count
-    """Evaluations without a rise."""
-    min_delta: Annotated[float, Field(ge=0.0)] = 0.0
-    """What counts as a rise [score]."""
-    grace: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.2
-    """Share of the trial's epochs before which it is not stopped."""
-
-
-class StopSpec(Section):
-    """When a trial ends by itself before its last epoch."""
-
-    nonfinite: bool = True
-    """End a trial whose score or loss is NaN or infinite."""
-    plateau: PlateauSpec | None = None
-    wall_time_s: Annotated[float, Field(gt=0.0)] | None = None
-    """Seconds of work a trial may take, over all its attempts."""
-    target: float | None = None
-    """Score at which a trial has done its work."""
 
 
 class ResourcesSpec(Section):
@@ -82,7 +42,7 @@ class ResourcesSpec(Section):
     hang_s: Annotated[float, Field(gt=0.0)] | None = 1800.0
     """Seconds without an epoch after which a trial's process is ended and tried again; null waits for ever."""
     halve_worlds_on_oom: bool = False
-    """Start a trial that runs out of memory anew, once, with half its worlds."""
+    """Try a trial that runs out of memory once more, from the beginning, with half its worlds."""
 
 
 class SmokeSpec(Section):
@@ -112,11 +72,17 @@ class SpaceFile(Section):
     """Draws of the sampled parameters (choice, uniform, loguniform, randint), for each point of the grid."""
     sample_seed: Whole = 0
     """Seed of those draws."""
-    search: Literal["random", "optuna"] = "random"
-    scheduler: SchedulerSpec = SchedulerSpec()
+    search: Text = "random"
+    """`random` resolves all trials beforehand; else what suggests them, by its name or import path."""
+    scheduler: Annotated[SerializeAsAny[SchedulerSpec], BeforeValidator(read_scheduler)] = NoScheduler()
     stop: StopSpec = StopSpec()
     resources: ResourcesSpec = ResourcesSpec()
     smoke: SmokeSpec = SmokeSpec()
+
+    @property
+    def searches(self) -> bool:
+        """Whether trials are suggested one by one as results come in, rather than known beforehand."""
+        return self.search != "random"
 
 
 class Space(Section):
@@ -133,12 +99,12 @@ class Space(Section):
     @property
     def sampled(self) -> dict[str, Operator]:
         """The parameters that are drawn rather than enumerated."""
-        return {k: op for k, op in self.parameters.items() if isinstance(op, Range) or op.kind == "choice"}
+        return {key: op for key, op in self.parameters.items() if not op.enumerated}
 
     @property
-    def grids(self) -> dict[str, Listed]:
+    def grids(self) -> dict[str, Operator]:
         """The parameters whose values are all tried."""
-        return {k: op for k, op in self.parameters.items() if isinstance(op, Listed) and op.kind == "grid"}
+        return {key: op for key, op in self.parameters.items() if op.enumerated}
 
 
 def find_space(name: str) -> Path:
@@ -169,6 +135,15 @@ def load_space(path: Path) -> Space:
     return parse_space(read_space(path), path)
 
 
+def recorded_space(path: Path) -> Space:
+    """Read and check the space that an experiment has kept.
+
+    Raises:
+        ConfigError: as `load_space`.
+    """
+    return parse_space(read_space(path), path, recorded=True)
+
+
 def read_space(path: Path) -> dict[str, Any]:
     """The plain data of a space file, in today's spelling.
 
@@ -197,16 +172,37 @@ def read_space(path: Path) -> dict[str, Any]:
     return data
 
 
-def parse_space(data: Mapping[str, Any], path: Path) -> Space:
-    """Check a space's plain data. `path` names it in errors and anchors its `base`.
+def read_file(data: Any, source: str, *, recorded: bool = False) -> SpaceFile:
+    """Check a space's plain data by itself. `source` names it in errors.
+
+    Args:
+        recorded: whether an experiment has kept it, perhaps one of an earlier version.
 
     Raises:
         ConfigError: with the first fault on one line.
     """
     try:
-        file = SpaceFile.model_validate(data)
+        return SpaceFile.model_validate(data, context=RECORDED if recorded else None)
     except ValidationError as error:
-        raise ConfigError(f"{path}: {describe_fault(error, SpaceFile)}") from None
+        raise ConfigError(f"{source}: {describe_fault(error, SpaceFile, named=_named(data))}") from None
+
+
+def _named(data: Any) -> dict[str, type[BaseModel]]:
+    """Sections whose settings are declared by what the section names, as far as it is found."""
+    scheduler = data.get("scheduler") if isinstance(data, Mapping) else None
+    try:
+        return {"scheduler": scheduler_class(scheduler.get("kind"))} if isinstance(scheduler, Mapping) else {}
+    except ConfigError:
+        return {}  # the fault described is this one
+
+
+def parse_space(data: Mapping[str, Any], path: Path, *, recorded: bool = False) -> Space:
+    """Check a space's plain data. `path` names it in errors and anchors its `base`.
+
+    Raises:
+        ConfigError: with the first fault on one line.
+    """
+    file = read_file(data, str(path), recorded=recorded)
     try:
         parameters = {key: parse_operator(key, value) for key, value in file.parameters.items()}
         _check_count(file, parameters)
@@ -251,7 +247,7 @@ def _seed_ranges(text: str | int | list[int]) -> list[tuple[int, int]]:
 def _check_count(file: SpaceFile, parameters: Mapping[str, Operator]) -> None:
     """Refuse a space of more than `max_trials`, counted before a single one is made."""
     seeds = sum(last - first + 1 for first, last in _seed_ranges(file.seeds))
-    grids = [len(op.levels) for op in parameters.values() if isinstance(op, Listed) and op.kind == "grid"]
+    grids = [len(op.levels) for op in parameters.values() if op.enumerated]
     variants = len(file.ablate.variants) + 1 if file.ablate is not None else file.samples * math.prod(grids)
     if variants * seeds > file.max_trials:
         raise ConfigError(
@@ -262,33 +258,16 @@ def _check_count(file: SpaceFile, parameters: Mapping[str, Operator]) -> None:
 
 def _check_combination(file: SpaceFile, parameters: Mapping[str, Operator], seeds: tuple[int, ...]) -> None:
     """Refuse settings that are each fine and make no sense together."""
-    grids = [key for key, op in parameters.items() if isinstance(op, Listed) and op.kind == "grid"]
-    sampled = [key for key in parameters if key not in grids]
+    sampled = {key: op for key, op in parameters.items() if not op.enumerated}
     if "trial.seed" in parameters:
         raise ConfigError("parameters.trial.seed: seeds are an axis of their own; write seeds: 0-4")
     if file.ablate is not None and parameters:
         raise ConfigError("ablate varies one factor at a time; drop parameters, or write the factors as grids there")
     if file.samples > 1 and not sampled:
         raise ConfigError("samples: nothing is drawn; give a parameter choice, uniform, loguniform or randint")
-    if file.search == "optuna":
-        if grids:
-            raise ConfigError(f"parameters.{grids[0]}.grid: search: optuna cannot enumerate; write choice instead")
-        if not sampled:
-            raise ConfigError("search: optuna needs parameters with choice, uniform, loguniform or randint")
-        if len(seeds) > 1:
-            raise ConfigError("search: optuna runs every suggestion once; give a single seed")
-    if file.scheduler.time_attr == "seconds" and file.scheduler.kind != "none" and file.stop.wall_time_s is None:
-        raise ConfigError("scheduler.time_attr: seconds needs stop.wall_time_s, the budget that grace is a share of")
-    if file.scheduler.kind == "pbt":
-        if not any(isinstance(parameters[key], Range) for key in sampled):
-            raise ConfigError("scheduler.kind: pbt needs a parameter with a range to move in (uniform, loguniform)")
-        if file.resources.halve_worlds_on_oom:
-            raise ConfigError(
-                "resources.halve_worlds_on_oom (--halve-worlds): pbt hands the states of all worlds from one trial to "
-                "another, so all need as many; write false"
-            )
-        if file.search == "optuna":
-            raise ConfigError("scheduler.kind: pbt chooses values itself; write search: random")
+    if file.searches:
+        search_class(file.search).check(parameters, seeds)
+    file.scheduler.check(file, [key for key, op in sampled.items() if isinstance(op, Range)])
 
 
 def _find_base(base: str, space_path: Path) -> Path:

@@ -10,7 +10,7 @@ from typing import Any
 from msk_ray.config import Config, leaves, overlay, parse_config, read_config, refuse_ignored
 from msk_ray.errors import ConfigError
 from msk_ray.experiment.trial import ID_DIGITS, Trial, trial_id, variant_text, with_epochs
-from msk_ray.sweep.operators import Level, Listed, Range
+from msk_ray.sweep.operators import Level, Operator
 from msk_ray.sweep.space import Space
 
 
@@ -91,12 +91,11 @@ def check_ranges(space: Space, base: Mapping[str, Any]) -> None:
     Raises:
         ConfigError: naming the parameter and the end.
     """
-    first = {key: op.levels[0] if isinstance(op, Listed) else op.ends()[0] for key, op in space.parameters.items()}
+    first = {key: op.extremes()[0].value for key, op in space.parameters.items()}
     for key, op in space.parameters.items():
-        if isinstance(op, Range):
-            for end in op.ends():
-                values = {k: level.value for k, level in first.items()} | {key: end.value}
-                parse_config(overlay(base, values), f"{space.name}: {key} {op.kind} at its end {end.label}")
+        for end in op.check():
+            name = f"{space.name}: {key} {type(op).__name__.lower()} at its end {end.label}"
+            parse_config(overlay(base, first | {key: end.value}), name)
     _check_collisions(space)
 
 
@@ -115,7 +114,7 @@ def check_algorithms_read(space: Space, configs: Iterable[Config]) -> None:
     refuse_ignored(file.overrides, configs, f"{space.name}: overrides:")
     refuse_ignored(file.smoke.overrides, configs, f"{space.name}: smoke.overrides:")
     for key, op in space.parameters.items():
-        for level in op.levels if isinstance(op, Listed) else op.ends():
+        for level in op.extremes():
             refuse_ignored({key: level.value}, configs, f"{space.name}: parameters:")
     if ablate is not None:
         for values in (ablate.baseline, *ablate.variants.values()):
@@ -131,19 +130,15 @@ def _variants(space: Space) -> Iterator[tuple[dict[str, str], dict[str, Any]]]:
     # The draw is the outer loop: more samples append trials and leave the earlier ones as they are.
     for _ in range(space.file.samples):
         for point in grid_points(space.grids):
-            drawn = {key: _draw(op, rng) for key, op in space.sampled.items()}
+            drawn = {key: op.draw(rng) for key, op in space.sampled.items()}
             levels = {key: (point | drawn)[key] for key in space.parameters}
             yield {key: level.label for key, level in levels.items()}, {k: level.value for k, level in levels.items()}
 
 
-def grid_points(grids: Mapping[str, Listed]) -> Iterator[dict[str, Level]]:
+def grid_points(grids: Mapping[str, Operator]) -> Iterator[dict[str, Level]]:
     """Every combination of the grids' levels; the last parameter turns fastest."""
     for combination in itertools.product(*(op.levels for op in grids.values())):
         yield dict(zip(grids, combination, strict=True))
-
-
-def _draw(op: Listed | Range, rng: random.Random) -> Level:
-    return op.draw(rng) if isinstance(op, Range) else rng.choice(op.levels)
 
 
 def _ablations(space: Space) -> Iterator[tuple[dict[str, str], dict[str, Any]]]:
@@ -158,8 +153,7 @@ def _check_collisions(space: Space) -> None:
     """Refuse two parameters that set the same config key."""
     owner: dict[str, str] = {}
     for key, op in space.parameters.items():
-        levels: Iterable[Level] = op.levels if isinstance(op, Listed) else op.ends()
-        for leaf in sorted({leaf for level in levels for leaf in leaves(key, level.value)}):
+        for leaf in sorted({leaf for level in op.extremes() for leaf in leaves(key, level.value)}):
             other = owner.setdefault(leaf, key)
             if other != key:
                 raise ConfigError(f"{space.name}: parameters {other!r} and {key!r} both set {leaf}")

@@ -4,9 +4,10 @@ import logging
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +15,14 @@ import ray
 from ray import tune
 from ray.exceptions import RayTaskError
 from ray.tune import Callback
-from ray.tune.search import BasicVariantGenerator, Searcher
 from ray.tune.stopper import Stopper
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from msk_ray.config import Config, parse_recorded, read_yaml
 from msk_ray.errors import ClusterLost, MskRayError, OwnershipLost, StorageFailure, storage_failure
+from msk_ray.experiment.attempts import read_attempt
 from msk_ray.experiment.damage import describe_damages
-from msk_ray.experiment.layout import HALVED_FILE, SCHEDULER_LOG_FILE
+from msk_ray.experiment.layout import SCHEDULER_LOG_FILE
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.outcomes import read_ending, write_ending
 from msk_ray.experiment.ownership import Ownership
@@ -32,18 +33,20 @@ from msk_ray.progress import format_duration
 from msk_ray.signals import StopRequest, listening
 from msk_ray.sweep.budget import extreme_configs, longest_budget
 from msk_ray.sweep.operators import Listed
-from msk_ray.sweep.pruning import make_pruner
-from msk_ray.sweep.replay import replay
+from msk_ray.sweep.rules.population import PopulationBasedTraining
+from msk_ray.sweep.rules.replay import replay
+from msk_ray.sweep.search import search_class
 from msk_ray.sweep.search_trials import SearchTrial, recover
 from msk_ray.sweep.space import Space
 from msk_ray.sweep.trials import base_settings
 from msk_ray.training import Trainer, precompile
-from msk_ray.tune import worker_prestart
-from msk_ray.tune.adapters import METRIC, Population, PruningScheduler, domain, optuna_search
+from msk_ray.tune.console import Console
 from msk_ray.tune.devices import Placement
 from msk_ray.tune.gauges import StateGauge
 from msk_ray.tune.interrupts import run_in_thread
 from msk_ray.tune.presence import Presence, remove_remains
+from msk_ray.tune.queue import Identify, Suggestions, TrialList
+from msk_ray.tune.schedulers import METRIC, Population, PruningScheduler
 from msk_ray.tune.supervisor import Supervisor
 from msk_ray.tune.trainable import Job, make_trainable
 from msk_ray.tune.trial_run import TrainerLike
@@ -122,11 +125,20 @@ def run_trials(plan: Plan) -> bool:
         flush=True,
     )
     with listening() as stop, stop.deferred():
-        live = Supervisor(experiment, remaining, job.trial_of, concurrent, stop, plan.guard, [m.trial for m in made_up])
-        _fit(plan, job, live, stop, remaining, made_up)
+        console = Console(remaining, concurrent)
+        supervisor = Supervisor(
+            experiment,
+            job.trial_of,
+            console,
+            stop,
+            plan.guard,
+            waiting=remaining,
+            started=[m.trial for m in made_up],
+        )
+        _fit(plan, job, supervisor, stop, remaining, made_up)
         if not plan.trials:
             # A search makes trials up as it goes; they enter the manifest once they are known.
-            experiment.set_trials(live.started)
+            experiment.set_trials(supervisor.started)
         return not stop
 
 
@@ -140,39 +152,41 @@ def _finish_pruning(plan: Plan) -> None:
     reports, damages = _journal(plan).read()
     for line in describe_damages(damages, plan.experiment.path):
         print(f"skipped: {line}", flush=True)
-    if not reports or not plan.trials or spec.kind == "pbt":
+    if not reports or not plan.trials:
         return
-    ending = replay(make_pruner(spec, _budget(plan)), spec.time_attr, reports)
+    ending = replay(spec.pruner(_budget(plan)), spec.time_attr, reports)
     folder = plan.experiment.trial_folder(reports[-1].trial)
     if ending is None or read_ending(folder) is not None:
         return
-    # What a trial scored with all its worlds does not end it when it has half of them.
-    if reports[-1].halved or not (folder / HALVED_FILE).exists():
+    # What a trial scored in one attempt does not end another.
+    if reports[-1].attempt == read_attempt(folder).number:
         write_ending(folder, ending)
 
 
 def _fit(
-    plan: Plan, job: Job, live: Supervisor, stop: StopRequest, remaining: list[Trial], made_up: list[SearchTrial]
+    plan: Plan, job: Job, supervisor: Supervisor, stop: StopRequest, remaining: list[Trial], made_up: list[SearchTrial]
 ) -> None:
     spec, file = plan.space.file.scheduler, plan.space.file
     budget = _budget(plan)
-    if spec.kind == "pbt":
+    if isinstance(spec, PopulationBasedTraining):
         scheduler: Any = Population(spec, budget, plan.space.sampled)
     else:
-        pruner = make_pruner(spec, budget)
+        pruner = spec.pruner(budget)
         journal = _journal(plan)
         replay(pruner, spec.time_attr, journal.read()[0])
         scheduler = PruningScheduler(
-            pruner, spec.time_attr, journal, lambda trial: job.trial_of(trial.config).id, live.pruned
+            pruner, spec.time_attr, journal, lambda trial: job.trial_of(trial.config).id, supervisor.pruned
         )
     resources = {"cpu": plan.placement.cpus} | ({"gpu": plan.placement.gpus} if plan.placement.gpus else {})
-    searching = file.search == "optuna"
-    search, samples = _search(plan, made_up) if searching else (_listed(plan), 1)
+    identify = partial(_identify, job)
+    # A search ends by itself; a list is the parameter space, once.
+    search: Any
+    if file.searches:
+        search, samples = _suggestions(plan, made_up, identify), -1
+    else:
+        search, samples = TrialList(plan.experiment, identify, plan.max_concurrent), 1
     node = _OwnNode()
-    prestarts = plan.prestart and worker_prestart.available()
-    spare = [WorkerPrestart(plan.placement, plan.max_concurrent, live.waiting)] if prestarts else []
-    if plan.prestart and not spare:
-        print("no process on standby, so trials begin seconds later: pip install grpcio to have them", flush=True)
+    ahead = WorkerPrestart(plan.placement, plan.max_concurrent, supervisor.waiting, supervisor.console.say)
     states = StateGauge(plan.experiment, remaining, job.trial_of)
     tuner = tune.Tuner(
         make_trainable(job, resources),
@@ -193,13 +207,13 @@ def _fit(
             verbose=0,
             # Supervisor first: it writes the endings that only the driver knows.
             callbacks=[
-                live,
+                supervisor,
                 states,
                 node,
                 Presence(plan.experiment, plan.guard),
-                *spare,
+                *([ahead] if plan.prestart else []),
             ],
-            stop=_StopWhen(live),
+            stop=_StopWhen(supervisor),
             failure_config=tune.FailureConfig(max_failures=file.resources.max_failures),
             # None are deleted: only a population reports them, and another member may be about to take one over.
             checkpoint_config=tune.CheckpointConfig(num_to_keep=None),
@@ -213,33 +227,35 @@ def _fit(
         if node.lost is not None:
             raise node.lost from error
         # The driver may meet a full disk before any trial does.
-        failure = live.storage_failure or storage_failure(error) or plan.experiment.lost()
+        failure = supervisor.storage_failure or storage_failure(error) or plan.experiment.lost()
         if failure is None:
             raise
         raise _advised(failure) from error
-    if live.storage_failure is not None:
+    if supervisor.storage_failure is not None:
         remove_remains(plan.experiment)
-        raise _advised(live.storage_failure)
+        raise _advised(supervisor.storage_failure)
 
 
-def _listed(plan: Plan) -> BasicVariantGenerator:
-    # Tune limits a generator it was given no more than this one limits itself.
-    return BasicVariantGenerator(max_concurrent=plan.max_concurrent or 0)
+def _identify(job: Job, config: Mapping[str, Any]) -> str:
+    # Until a trial starts, Tune keeps placeholders where the other values of a listed one will be.
+    return config["id"] if "id" in config else job.trial_of(config).id
 
 
-def _search(plan: Plan, made_up: list[SearchTrial]) -> tuple[Searcher, int]:
-    """Optuna's search, told what it has done so far, and how many trials are still to be run."""
-    begun, scored, ended = [], [], 0
+def _suggestions(plan: Plan, made_up: list[SearchTrial], identify: Identify) -> Suggestions:
+    """The space's search, told what came of its choices so far."""
+    begun, scored = [], []
     for made in made_up:
         record = read_record(made.trial, plan.experiment.trial_folder(made.trial.id))
         if record.ending is None:
             begun.append(made.params)
-            continue
-        ended += 1
-        if record.best is not None:
-            scored.append((made.params, record.best.score))
+        else:
+            scored.append((made.params, None if record.best is None else record.best.score))
     file = plan.space.file
-    return optuna_search(file.sample_seed, begun, scored), file.samples - ended
+    # With the seed of the first time, the draws of the first time would be repeated.
+    search = search_class(file.search)(plan.space.sampled, file.sample_seed + len(made_up))
+    for params, score in scored:
+        search.tell(params, score)
+    return Suggestions(plan.experiment, identify, search, begun, file.samples - len(scored))
 
 
 class _OwnNode(Callback):
@@ -291,20 +307,19 @@ def _log_to(path: Path) -> Iterator[None]:
 class _StopWhen(Stopper):
     """Ends the whole experiment once a request to stop has been carried out."""
 
-    def __init__(self, live: Supervisor) -> None:
-        self._live = live
+    def __init__(self, supervisor: Supervisor) -> None:
+        self._supervisor = supervisor
 
     def __call__(self, trial_id: str, result: dict[str, Any]) -> bool:
         return False
 
     def stop_all(self) -> bool:
-        return self._live.stopped
+        return self._supervisor.stopped
 
 
 def _param_space(job: Job, remaining: list[Trial]) -> dict[str, Any]:
-    sampled = job.space.sampled
     if not job.trials:
-        return {"params": {key: domain(op) for key, op in sampled.items()}}
+        return {}  # the search gives everything
     if not job.population:
         return {"id": tune.grid_search([trial.id for trial in remaining])}
     # Members of a population move: each begins where its folder says it was last.
@@ -338,7 +353,7 @@ def _budget(plan: Plan) -> float:
 def _first_suggestion(job: Job) -> Trial:
     """A stand-in for the trials a search will make up, of the same model."""
     params = {
-        key: op.levels[0].label if isinstance(op, Listed) else op.ends()[0].value
+        key: op.extremes()[0].label if isinstance(op, Listed) else op.extremes()[0].value
         for key, op in job.space.sampled.items()
     }
     return job.trial_of({"params": params})

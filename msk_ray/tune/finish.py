@@ -8,7 +8,7 @@ from msk_ray.experiment.damage import count_damages, describe_damages
 from msk_ray.experiment.layout import SUMMARY_FILE
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.results import best_record, read_records
-from msk_ray.experiment.results_table import HEADER, halved_note, result_rows, summary, table_document, variant_rows
+from msk_ray.experiment.results_table import HEADER, reduced_note, result_rows, summary, table_document, variant_rows
 from msk_ray.files import write_json, write_text
 from msk_ray.text import printable
 from msk_ray.text_table import text_table
@@ -37,12 +37,11 @@ def finish(experiment: Experiment) -> int:
     if damages:
         print(f"\nskipped {count_damages(damages)}:")
         print("\n".join(describe_damages(damages, experiment.path)))
-    if (note := halved_note(records)) is not None:
+    if (note := reduced_note(records)) is not None:
         print(f"\n{note}")
     best = best_record(records)
     if best is not None and best.best is not None:
-        half = f" ({best.halved})" if best.halved is not None else ""
-        name = f"{best.trial.variant} seed={best.trial.seed}{half}"
+        name = f"{best.trial.variant} seed={best.trial.seed}{best.attempt.suffix}"
         print(f"\nbest trial   {best.trial.id}: {printable(name)}, score {best.best.score:.5g}")
         print(f"best policy  {printable(str(best.best_checkpoint or 'its checkpoint is missing'))}")
     print(printable(f"table        {experiment.path / 'table.md'}"))

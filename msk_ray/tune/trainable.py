@@ -20,8 +20,7 @@ from ray.tune.trainable import wrap_function
 
 from msk_ray.config import overlay, parse_config
 from msk_ray.errors import OwnershipLost, storage_failure
-from msk_ray.experiment.damage import DamagedFile
-from msk_ray.experiment.halved import Halved, read_halved
+from msk_ray.experiment.attempts import read_attempt
 from msk_ray.experiment.layout import DEVICE_FILE, HANG_FILE, OUTPUT_FILE
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import Evaluation, evaluations_of, read_rows
@@ -30,11 +29,10 @@ from msk_ray.experiment.trial import Trial
 from msk_ray.files import write_text
 from msk_ray.sweep.search_trials import search_trial, write_params
 from msk_ray.sweep.space import Space
-from msk_ray.tune.adapters import BEST, METRIC, STARTS_ANEW
 from msk_ray.tune.devices import wait_for_memory
 from msk_ray.tune.gauges import TrialGauges
-from msk_ray.tune.halved import StartAnew, as_run
 from msk_ray.tune.hparams import log_hparams
+from msk_ray.tune.schedulers import BEST, METRIC
 from msk_ray.tune.trial_run import Hooks, TrainerLike, run_trial
 
 MEMORY_LIMIT_S = 60.0
@@ -60,7 +58,7 @@ class Job:
     @property
     def population(self) -> bool:
         """Whether trials exchange their state and settings."""
-        return self.space.file.scheduler.kind == "pbt"
+        return self.space.file.scheduler.exchanges
 
     def trial_of(self, config: Mapping[str, Any]) -> Trial:
         """The trial that a Tune config stands for.
@@ -90,7 +88,7 @@ def make_trainable(job: Job, resources: dict[str, float]) -> type[tune.Trainable
                 job.experiment.make_trial_folder(trial.id)
                 write_params(folder, config["params"])
             with _owned(folder, job):
-                in_frame_named(trial.label, lambda: attempt(trial, folder))
+                in_frame_named(trial.label, lambda: work(trial, folder))
         except Exception as error:
             # Whatever stumbled over a full disk first, a line of output perhaps: the driver must hear of the disk.
             # Or over a file that is no longer there, as nothing is.
@@ -99,11 +97,11 @@ def make_trainable(job: Job, resources: dict[str, float]) -> type[tune.Trainable
                 raise
             raise failure from error
 
-    def attempt(trial: Trial, folder: Path) -> None:
+    def work(trial: Trial, folder: Path) -> None:
         _redirect_output(folder / OUTPUT_FILE)
         _record_device(folder / DEVICE_FILE)
-        halved = _halved(folder)
-        log_hparams(folder, as_run(trial, halved))
+        attempt = read_attempt(folder)
+        log_hparams(folder, attempt.effective(trial))
         if job.gpus:
             _wait_for_gpu(job.gpus)
         with (
@@ -116,7 +114,7 @@ def make_trainable(job: Job, resources: dict[str, float]) -> type[tune.Trainable
                 watch.alive()
                 gauges.show(row)
 
-            report = _report_with_checkpoint if job.population else _reporter(halved is not None)
+            report = _report_with_checkpoint if job.population else _reporter(attempt.number)
 
             def on_evaluation(evaluation: Evaluation, ended: bool, trainer: TrainerLike) -> None:
                 with watch.suspended():
@@ -127,23 +125,16 @@ def make_trainable(job: Job, resources: dict[str, float]) -> type[tune.Trainable
                 on_evaluation=on_evaluation,
                 pause=job.experiment.asked_to_stop,
             )
-            try:
-                run_trial(
-                    trial,
-                    folder,
-                    job.device,
-                    job.space.file.stop,
-                    _exchanging(job, folder) if job.population else job.trainer_class,
-                    hooks,
-                    _handed_checkpoint(Path(scratch)) if job.population else None,
-                    job.space.file.resources.halve_worlds_on_oom,
-                )
-            except StartAnew as again:
-                # Tune starts a trial in a fresh process only after a failure. The driver hears of this one before it
-                # happens, and does not count it.
-                with watch.suspended():
-                    tune.report({STARTS_ANEW: again.halved.worlds})
-                raise
+            run_trial(
+                trial,
+                folder,
+                job.device,
+                job.space.file.stop,
+                _exchanging(job, folder) if job.population else job.trainer_class,
+                hooks,
+                _handed_checkpoint(Path(scratch)) if job.population else None,
+                job.space.file.resources.halve_worlds_on_oom,
+            )
 
     # Given the function alone, Tune makes a class `ImplicitFunc` of it whose actors all look alike.
     class TrialActor(wrap_function(tune.with_resources(train, resources))):  # type: ignore[misc]
@@ -163,13 +154,6 @@ def in_frame_named(name: str, call: Callable[[], None]) -> None:
 
     frame.__code__ = frame.__code__.replace(co_name=name, co_qualname=name)
     frame()
-
-
-def _halved(folder: Path) -> Halved | None:
-    try:
-        return read_halved(folder)
-    except DamagedFile:
-        return None  # the trial ends by that in a moment, and says so
 
 
 @contextmanager
@@ -195,12 +179,12 @@ def _leave(lost: OwnershipLost) -> None:
     os._exit(lost.exit_code)
 
 
-def _reporter(halved: bool) -> Callable[[Evaluation, bool, TrainerLike], None]:
+def _reporter(attempt: int) -> Callable[[Evaluation, bool, TrainerLike], None]:
     """Reports to Tune. State stays out of it: a retried trial goes on from its own folder, where a torn newest
     checkpoint is passed over; Ray would insist on it at every retry."""
 
     def report(evaluation: Evaluation, ended: bool, trainer: TrainerLike) -> None:
-        tune.report(_figures(evaluation, ended, trainer.best_score, halved))
+        tune.report(_figures(evaluation, ended, trainer.best_score, attempt))
 
     return report
 
@@ -210,11 +194,11 @@ def _report_with_checkpoint(evaluation: Evaluation, ended: bool, trainer: Traine
     path = trainer.save()
     with tempfile.TemporaryDirectory() as folder:
         shutil.copy(path, folder)
-        figures = _figures(evaluation, ended, trainer.best_score, False)
+        figures = _figures(evaluation, ended, trainer.best_score, 1)
         tune.report(figures, checkpoint=tune.Checkpoint.from_directory(folder))
 
 
-def _figures(evaluation: Evaluation, ended: bool, best: float, halved: bool) -> dict[str, Any]:
+def _figures(evaluation: Evaluation, ended: bool, best: float, attempt: int) -> dict[str, Any]:
     return {
         METRIC: evaluation.score,
         BEST: best,
@@ -222,7 +206,7 @@ def _figures(evaluation: Evaluation, ended: bool, best: float, halved: bool) -> 
         "env_steps": evaluation.env_steps,
         "seconds": evaluation.seconds,
         "ended": ended,
-        "halved": halved,
+        "attempt": attempt,
     }
 
 

@@ -8,16 +8,15 @@ from typing import Protocol
 
 from msk_ray.config import Config
 from msk_ray.errors import ConfigError, Failure, MskRayError, SimulationError, StorageFailure
+from msk_ray.experiment.attempts import FIRST, Attempt, load_attempt, read_attempt
 from msk_ray.experiment.damage import DamagedFile
-from msk_ray.experiment.halved import Halved, read_halved, set_aside, write_halved
 from msk_ray.experiment.layout import ABANDONED, ERROR_FILE
 from msk_ray.experiment.metrics import Evaluation, evaluations_of, read_rows
 from msk_ray.experiment.outcomes import Ending, Outcome, load_ending, write_ending
 from msk_ray.experiment.trial import Trial
 from msk_ray.files import write_text
-from msk_ray.sweep.space import StopSpec
-from msk_ray.sweep.stopping import ending_of
-from msk_ray.tune.halved import StartAnew, as_run, halve
+from msk_ray.sweep.rules.stop_rule import History
+from msk_ray.sweep.rules.stopping import StopSpec
 
 
 class TrainerLike(Protocol):
@@ -70,15 +69,14 @@ def run_trial(
     to `folder`, which is there: a trial whose folder was moved does not begin again.
 
     Args:
-        may_halve: whether the trial may start anew with half its worlds when it runs out of memory, once. One that
+        may_halve: whether the trial may be tried once more, with half its worlds, when it runs out of memory. One that
             has half of them already keeps to that, whatever is said here.
 
     Returns:
-        How it ended; None if it was paused before.
+        How it ended; None if it was paused before, or is to be run again by a process in which this attempt has left
+        no memory: then `folder` holds the next attempt.
 
     Raises:
-        StartAnew: it ran out of memory and is to be run again, by a fresh process, with half its worlds. That is kept
-            in `folder`.
         StorageFailure: the disk is full or gone, or the folder is; the trial can go on once it is back.
         Exception: anything that is neither a failed simulation nor a fault the user can mend. Its traceback is kept in
             `error.txt`, and the trial may be tried again.
@@ -94,17 +92,16 @@ def run_trial(
         return done
     # What an earlier attempt stumbled over stays in the trial's output; this file is about the latest one.
     (folder / ERROR_FILE).unlink(missing_ok=True)
-    halved = None
+    attempt = FIRST
     try:
-        halved = _read_halved(folder)
-        if halved is not None:
-            # The process that decided it may not have lived to do this.
-            halved = set_aside(folder, halved)
-            print(halved, flush=True)
-        ending = _train(as_run(trial, halved), folder, device, stop, trainer_class, hooks, checkpoint, halved)
+        # The process that decided on it may not have lived to begin it.
+        attempt = _attempt_in(folder).begin(folder)
+        if attempt.reduced is not None:
+            print(attempt, flush=True)
+        ending = _train(attempt.effective(trial), folder, device, stop, trainer_class, hooks, checkpoint)
     except SimulationError as error:
         if error.failure is Failure.OUT_OF_MEMORY:
-            ending = _out_of_memory(trial, folder, str(error), halved, may_halve)
+            ending = _out_of_memory(trial, folder, str(error), attempt, may_halve)
         else:
             ending = Ending(Outcome(error.failure.value), str(error))
     except StorageFailure:
@@ -121,9 +118,9 @@ def run_trial(
     return ending
 
 
-def _read_halved(folder: Path) -> Halved | None:
+def _attempt_in(folder: Path) -> Attempt:
     try:
-        return read_halved(folder)
+        return load_attempt(folder)
     except DamagedFile as error:
         advice = (
             'how many worlds the trial has is not known: write {"asked": N, "worlds": HALF, "why": "", "cleared": '
@@ -132,22 +129,17 @@ def _read_halved(folder: Path) -> Halved | None:
         raise DamagedFile(error.damage, advice) from None
 
 
-def _out_of_memory(trial: Trial, folder: Path, why: str, halved: Halved | None, may_halve: bool) -> Ending:
-    """How a trial ends whose device has no room for it, unless it is to start anew."""
-    if halved is not None:
-        why += f"; {halved.asked} worlds were asked for, and half of them has been tried"
-    elif may_halve:
-        try:
-            decided = halve(trial, why)
-        except ConfigError as fault:
-            why += f"; half of them could not be tried: {fault}"
-        else:
-            write_halved(folder, decided)
-            set_aside(folder, decided)
-            again = StartAnew(decided)
-            print(f"{why}\n{again}; what was done so far is in {ABANDONED}/", flush=True)
-            raise again
-    return Ending(Outcome.OUT_OF_MEMORY, why)
+def _out_of_memory(trial: Trial, folder: Path, why: str, attempt: Attempt, may_halve: bool) -> Ending | None:
+    """How a trial ends whose device has no room for it; None if there is to be another attempt."""
+    if attempt.reduced is None and not may_halve:
+        return Ending(Outcome.OUT_OF_MEMORY, why)
+    try:
+        following = attempt.next(trial, why)
+    except ConfigError as fault:
+        return Ending(Outcome.OUT_OF_MEMORY, f"{why}; {fault}")
+    following.begin(folder)
+    print(f"{why}\nthe trial begins again with {following}; what was done so far is in {ABANDONED}/", flush=True)
+    return None
 
 
 def _train(
@@ -158,14 +150,14 @@ def _train(
     trainer_class: type[TrainerLike],
     hooks: Hooks,
     checkpoint: Path | None,
-    halved: Halved | None,
 ) -> Ending | None:
     trainer = trainer_class(trial.config, folder, device)
     try:
-        if halved is not None:
+        note = str(read_attempt(folder))
+        if note:
             # For whoever reads these settings alone.
             settings = folder / "config.yaml"
-            write_text(settings, f"# {halved} asked for\n{settings.read_text(encoding='utf-8')}")
+            write_text(settings, f"# {note} asked for\n{settings.read_text(encoding='utf-8')}")
         if checkpoint is not None:
             trainer.restore(checkpoint)
         else:
@@ -182,7 +174,7 @@ def _loop(trial: Trial, folder: Path, stop: StopSpec, trainer: TrainerLike, hook
     if trainer.epoch > 0:
         rows = [row for row in read_rows(folder) if row["epoch"] <= trainer.epoch]
         seen = evaluations_of(rows)
-        ending = ending_of(stop, rows[-1], seen, trial.epochs, rows[-1]["seconds"]) if rows else None
+        ending = stop.ending(History(rows[-1], seen, trial.epochs, rows[-1]["seconds"])) if rows else None
         if seen:
             # The process may have died between the checkpoint and the report; a repeated report changes nothing.
             hooks.on_evaluation(seen[-1], ending is not None, trainer)
@@ -198,7 +190,7 @@ def _loop(trial: Trial, folder: Path, stop: StopSpec, trainer: TrainerLike, hook
             evaluations = evaluations_of([r for r in read_rows(folder) if r["epoch"] <= row["epoch"]])
         elif evaluation is not None:
             evaluations.append(evaluation)
-        ending = ending_of(stop, row, evaluations, trial.epochs, row["seconds"])
+        ending = stop.ending(History(row, evaluations, trial.epochs, row["seconds"]))
         if ending is not None and ending.outcome is Outcome.NONFINITE:
             return ending
         if evaluation is not None:

@@ -1,19 +1,18 @@
-"""Processes that wait for the next trials with everything imported: importing takes longer than all else a start does.
+"""Processes started ahead for the next trials, with everything imported: importing takes longer than all else a start
+does.
 
-Every trial still gets a process of its own. One on standby has not touched a GPU: CUDA is initialised when a trial
-begins in it, on the GPU that trial was given.
+Every trial still gets a process of its own. One that waits has not touched a GPU: CUDA is initialised when a trial
+begins in it, on the GPU that trial was given. Ray has no public way to ask for such processes, so what is done here may
+fail with another version of it. Then trials begin seconds later, which is said once, and nothing else changes.
 """
 
 import importlib
-import importlib.util
 import os
-import sys
 from collections.abc import Callable
 from typing import Any
 
 import ray
 from ray.tune import Callback
-from ray.tune.execution.class_cache import DEFAULT_ENV_VARS, ENV_VARS_TO_PROPAGATE
 
 from msk_ray.tune.devices import Placement
 
@@ -45,11 +44,6 @@ HOOK = f"{import_all.__module__}.{import_all.__name__}"
 """For the runtime environment of Ray's session."""
 
 
-def available() -> bool:
-    """Whether raylets can be spoken to from here; grpc comes with ray[default]."""
-    return importlib.util.find_spec("grpc") is not None
-
-
 def nodes_for(placement: Placement) -> list[dict[str, Any]]:
     """Ray's description of every node alive that a trial fits on."""
     return [node for node in ray.nodes() if node["Alive"] and _fits(node["Resources"], placement)]
@@ -65,16 +59,21 @@ class WorkerPrestart(Callback):
     Not at once when it starts: on a machine of few cores it would wait for those that import.
     """
 
-    def __init__(self, placement: Placement, limit: int | None, waiting: Callable[[], int]) -> None:
+    def __init__(
+        self, placement: Placement, limit: int | None, waiting: Callable[[], int], say: Callable[[str], None]
+    ) -> None:
         """
         Args:
             placement: of a trial.
             limit: trials at once, on all nodes.
             waiting: how many trials have not started yet.
+            say: prints a line.
         """
         self._placement = placement
         self._limit = limit
         self._waiting = waiting
+        self._say = say
+        self._said: set[str] = set()
         self._probe: Any = None
         self._due = False
 
@@ -91,16 +90,27 @@ class WorkerPrestart(Callback):
         waiting = self._waiting()
         if not self._due or not waiting:
             return
+        try:
+            self._due = not self._prestart(waiting)
+        except Exception as error:  # whatever another version of Ray, or a node that dies this moment, makes of it
+            self._due, self._probe = False, None
+            reason = f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
+            if reason not in self._said:
+                self._said.add(reason)
+                self._say(f"no process was started ahead, so trials begin seconds later: {reason}")
+
+    def _prestart(self, waiting: int) -> bool:
+        """Start what may be needed at once; False while it is not known yet which environment trials have."""
         if self._probe is None:
             self._probe = _environment_of_trials()
         if not ray.wait([self._probe], timeout=0)[0]:
-            return
-        self._due = False
+            return False
         environment = ray.get(self._probe)
         for node in nodes_for(self._placement):
             total = node["Resources"]
             at_once = self._placement.concurrent(total.get("GPU", 0.0), total.get("CPU", 1.0), self._limit)
             start_processes(node, min(at_once, waiting), environment)
+        return True
 
 
 def start_processes(node: dict[str, Any], count: int, environment: str) -> None:
@@ -110,8 +120,10 @@ def start_processes(node: dict[str, Any], count: int, environment: str) -> None:
         node: Ray's description of it.
         count: processes, those that wait already included.
         environment: serialised runtime environment of those who are to use them.
+
+    Raises:
+        Exception: as Ray's internals do; grpc.RpcError if the node does not answer.
     """
-    import grpc
     from ray._private.grpc_utils import init_grpc_channel
     from ray.core.generated import common_pb2, node_manager_pb2, node_manager_pb2_grpc
 
@@ -123,16 +135,14 @@ def start_processes(node: dict[str, Any], count: int, environment: str) -> None:
     )
     request.runtime_env_info.serialized_runtime_env = environment
     with init_grpc_channel(f"{node['NodeManagerAddress']}:{node['NodeManagerPort']}") as channel:
-        try:
-            node_manager_pb2_grpc.NodeManagerServiceStub(channel).PrestartWorkers(request, timeout=_CALL_LIMIT_S)
-        except grpc.RpcError as error:
-            # The node may have died this moment. Without processes on standby trials begin later, and nothing else.
-            print(f"no process on standby at {node['NodeManagerAddress']}: {error}", file=sys.stderr)
+        node_manager_pb2_grpc.NodeManagerServiceStub(channel).PrestartWorkers(request, timeout=_CALL_LIMIT_S)
 
 
 def _environment_of_trials() -> Any:
     """A reference to it, serialised: Tune gives trials' processes a runtime environment of their own, laid over that of
     Ray's session, and Ray takes no process of another one."""
+    from ray.tune.execution.class_cache import DEFAULT_ENV_VARS, ENV_VARS_TO_PROPAGATE
+
     variables = DEFAULT_ENV_VARS | {name: os.environ[name] for name in ENV_VARS_TO_PROPAGATE if name in os.environ}
     return ray.remote(_environment).options(num_cpus=0, runtime_env={"env_vars": variables}).remote()
 

@@ -12,8 +12,7 @@ from msk_ray.experiment.metrics import SCORE, Evaluation, progress_of
 from msk_ray.experiment.outcomes import Ending, Outcome
 from msk_ray.experiment.results import TrialRecord
 from msk_ray.experiment.snapshot import Device, State, TrialSnapshot
-from msk_ray.sweep.pruning import SuccessiveHalving
-from msk_ray.sweep.space import SchedulerSpec
+from msk_ray.sweep.rules.asha import Asha, SuccessiveHalving
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 
@@ -73,7 +72,7 @@ def test_a_freed_slot_is_taken_at_once(benchmark: dict[str, Any]) -> None:
 def test_over_all_orders(benchmark: dict[str, Any]) -> None:
     """One after another, a rung at 100 that the better half passes: `late`, the worst there, goes on only if it comes
     first and meets nobody. `early` goes on in any order."""
-    rule = benchmark["Rule"](SchedulerSpec(kind="asha", grace=0.5, reduction=2), 200.0)
+    rule = benchmark["Rule"](Asha(kind="asha", grace=0.5, reduction=2), 200.0)
     odds = benchmark["chances"](RECORDS, rule, 1, 600)
     kept = odds.kept / odds.orders
     assert odds.near == odds.kept, "nothing else comes near"
@@ -85,7 +84,7 @@ def test_over_all_orders(benchmark: dict[str, Any]) -> None:
 
 def test_a_twin_is_as_good(benchmark: dict[str, Any]) -> None:
     twins = [RECORDS[0], record("twin", 2.0, 2.0, 8.95), record("early", 3.0, 3.0, 4.0)]
-    rule = benchmark["Rule"](SchedulerSpec(kind="asha", grace=0.5, reduction=2), 200.0)
+    rule = benchmark["Rule"](Asha(kind="asha", grace=0.5, reduction=2), 200.0)
     odds = benchmark["chances"](twins, rule, 1, 600)
     # `late` goes on only if it is first; the twin in all orders but `early, twin, late`, where it is worse of two.
     assert odds.kept / 600 == pytest.approx(1 / 3, abs=0.06)

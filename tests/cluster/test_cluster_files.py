@@ -30,9 +30,9 @@ from ray.autoscaler._private.util import prepare_config, validate_config
 from ray.scripts import scripts as ray_commands
 
 from msk_ray.sweep.space import find_space
-from msk_ray.tune.__main__ import parser as tune_parser
 from msk_ray.tune.cluster import parser as cluster_parser
 from msk_ray.tune.gauges import FIGURES, STATE
+from msk_ray.tune.options import parser as tune_parser
 
 FOLDER = Path(__file__).resolve().parent.parent.parent / "cluster"
 KUBERNETES = "1.30"

@@ -10,6 +10,7 @@ from msk_ray.errors import ConfigError
 from msk_ray.sweep.space import parse_space
 from msk_ray.sweep.trials import resolve_trials
 from msk_ray.tune import __main__ as tune
+from msk_ray.tune.options import read_options
 
 ADAPTIVE = {"start": 8, "target": 60.0}
 SCHEDULE = {"start": 4, "end": 16, "epochs": 50}
@@ -113,7 +114,7 @@ def test_every_way_in_means_the_same(
         found[name] = resolve_trials(parse_space(data | changes, tmp_path / "small.yaml"))[-1].config
     (tmp_path / "small.yaml").write_text(dump_yaml(data))
     args = ["--space", str(tmp_path / "small.yaml"), *(word for text in texts for word in ("--set", text))]
-    found["tune"] = resolve_trials(tune._read_space(tune.parser().parse_args(args), {}))[0].config
+    found["tune"] = resolve_trials(tune._read_space(read_options(args), {}))[0].config
     assert {name: config.as_dict()["shac"][setting] for name, config in found.items()} == dict.fromkeys(found, expected)
 
 
@@ -121,7 +122,7 @@ def test_set_is_laid_over_a_spaces_own_override(tmp_path: Path) -> None:
     (tmp_path / "base.yaml").write_text("env: {name: cartpole}\n")
     data = {"question": "?", "base": "base.yaml", "overrides": {"shac.entropy": {"coefficient": 0.3}}}
     (tmp_path / "small.yaml").write_text(dump_yaml(data))
-    args = tune.parser().parse_args(["--space", str(tmp_path / "small.yaml"), "--set", "shac.entropy={target: 0.5}"])
+    args = read_options(["--space", str(tmp_path / "small.yaml"), "--set", "shac.entropy={target: 0.5}"])
     (trial,) = resolve_trials(tune._read_space(args, {}))
     assert trial.config.shac.entropy is not None
     assert (trial.config.shac.entropy.coefficient, trial.config.shac.entropy.target) == (0.3, 0.5)

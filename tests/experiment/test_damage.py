@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 from msk_ray.config import dump_yaml
 from msk_ray.errors import MskRayError, StorageFailure
+from msk_ray.experiment.attempts import Attempt, Reduced, load_attempt
 from msk_ray.experiment.damage import DamagedFile, read_object
-from msk_ray.experiment.halved import Halved, read_halved, write_halved
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import load_metrics
 from msk_ray.experiment.outcomes import Ending, Outcome, load_ending, read_ending, write_ending
@@ -99,7 +99,7 @@ def test_a_file_of_anything_is_read_or_refused_in_one_line(data: bytes) -> None:
         folder = Path(name)
         for file in ("outcome.json", "halved.json", "device.json", "metrics.jsonl"):
             (folder / file).write_bytes(data)
-        for load in (load_ending, read_halved):
+        for load in (load_ending, load_attempt):
             with contextlib.suppress(DamagedFile):
                 load(folder)
         read_ending(folder)
@@ -134,7 +134,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Experiment:
         (own / "device.json").write_text(json.dumps({"host": "h", "visible": "", "count": 0, "name": "cpu"}))
         (own / "config.yaml").write_text(dump_yaml(trial.config.as_dict()))
         write_ending(own, Ending(Outcome.FINISHED, "all 4 epochs done"))
-    write_halved(own, Halved(8, 4, "no room", cleared=True))
+    Attempt(Reduced(8, 4, "no room", cleared=True)).write(own)
     (made.path / "summary.json").write_text("{}")
     return made
 

@@ -19,7 +19,8 @@ from msk_ray.experiment import ownership
 from msk_ray.experiment.ownership import LOCK_FILE, STALE_S, Owner, acquire, acquire_for, owned
 
 HOLD = (
-    "import sys; from pathlib import Path; from msk_ray.ownership import acquire\nacquire(Path(sys.argv[1])); input()"
+    "import sys; from pathlib import Path; from msk_ray.experiment.ownership import acquire\n"
+    "acquire(Path(sys.argv[1])); input()"
 )
 
 
@@ -172,7 +173,7 @@ def test_a_trials_process_waits_for_the_one_before_it_and_serves_the_owner(
 
 def test_of_many_that_want_a_stale_lock_one_gets_it(tmp_path: Path, launcher: Launcher, root: Path) -> None:
     code = (
-        "import sys; from pathlib import Path; from msk_ray.ownership import acquire\n"
+        "import sys; from pathlib import Path; from msk_ray.experiment.ownership import acquire\n"
         "from msk_ray.errors import StorageError\n"
         "input()\n"
         "try: acquire(Path(sys.argv[1])); print('got it', flush=True)\n"

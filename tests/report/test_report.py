@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 
 from msk_ray.cli import run
 from msk_ray.config import dump_yaml
+from msk_ray.experiment.attempts import Attempt, Reduced
 from msk_ray.experiment.checkpoint_file import write_checkpoint_file
-from msk_ray.experiment.halved import Halved, write_halved
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.outcomes import Ending, Outcome, write_ending
 from msk_ray.report.__main__ import main
@@ -200,7 +200,7 @@ def test_half_the_worlds_are_said_wherever_a_score_is(experiment: Experiment) ->
     assert "half the worlds" not in page_of(experiment)
     best = read_experiment(experiment, time.time()).best
     assert best is not None
-    write_halved(best.folder, Halved(64, 32, "no room", cleared=True))
+    Attempt(Reduced(64, 32, "no room", cleared=True)).write(best.folder)
     page = " ".join(page_of(experiment).split())
     note = f"with half the worlds asked for, after running out of memory with all of them (<code>{best.trial.id}<"
     assert note in page

@@ -8,7 +8,6 @@ import pytest
 from msk_ray.errors import ConfigError
 from msk_ray.sweep import opening
 from msk_ray.sweep.budget import env_steps_budget, extreme_configs, longest_budget
-from msk_ray.sweep.pruning import rungs
 from msk_ray.sweep.trials import resolve_trials
 from msk_ray.tune import driver
 from msk_ray.tune.__main__ import main
@@ -83,7 +82,7 @@ def test_rungs_of_a_search_are_shares_of_its_longest_trial(make_space: Any, tmp_
     made = opening.create(tmp_path / "runs" / "search", space, [], {})
     plan = driver.Plan(made, space, [], Placement(0.0, 1), None)
     budget = driver._budget(plan)
-    assert rungs(0.25 * budget, budget, 2.0) == (1280.0, 2560.0)
+    assert space.file.scheduler.rungs(budget) == (1280.0, 2560.0)
 
 
 def test_a_search_with_a_wrong_setting_is_refused_before_it_begins(make_space: Any, tmp_path: Path) -> None:

@@ -6,22 +6,24 @@ import random
 import pytest
 
 from msk_ray.errors import ConfigError
-from msk_ray.sweep.operators import Level, Listed, Range, parse_operator
+from msk_ray.sweep.operators import Level, parse_operator
+from msk_ray.sweep.operators.lists import Grid
+from msk_ray.sweep.operators.ranges import LogUniform, RandInt, Uniform
 from msk_ray.text import describe
 
 
 def test_grid_keeps_order_and_takes_labels() -> None:
     op = parse_operator("shac.horizon", {"grid": [16, {"label": "grow", "value": {"start": 8, "end": 32}}]})
-    assert op == Listed("grid", (Level(16, "16"), Level({"start": 8, "end": 32}, "grow")))
+    assert op == Grid((Level(16, "16"), Level({"start": 8, "end": 32}, "grow")))
 
 
 def test_text_numbers_of_yaml_are_numbers() -> None:
-    assert parse_operator("a", {"loguniform": ["1e-5", "1e-2"]}) == Range("loguniform", 1e-5, 1e-2)
+    assert parse_operator("a", {"loguniform": ["1e-5", "1e-2"]}) == LogUniform(1e-5, 1e-2)
 
 
 def test_draws_stay_inside_and_cover_the_range() -> None:
     rng = random.Random(0)
-    draws = [Range("loguniform", 1e-4, 1e-2).draw(rng).value for _ in range(2000)]
+    draws = [LogUniform(1e-4, 1e-2).draw(rng).value for _ in range(2000)]
     assert 1e-4 <= min(draws) < 1.05e-4
     assert 0.95e-2 < max(draws) <= 1e-2
     # Half of a log-uniform draw lies below the geometric mean.
@@ -30,18 +32,18 @@ def test_draws_stay_inside_and_cover_the_range() -> None:
 
 def test_randint_includes_both_ends() -> None:
     rng = random.Random(0)
-    assert {Range("randint", 2, 4).draw(rng).value for _ in range(100)} == {2, 3, 4}
+    assert {RandInt(2, 4).draw(rng).value for _ in range(100)} == {2, 3, 4}
 
 
 def test_draws_have_six_digits() -> None:
-    value = Range("uniform", 0.0, 1.0).draw(random.Random(1)).value
+    value = Uniform(0.0, 1.0).draw(random.Random(1)).value
     assert value == float(f"{value:.6g}")
     assert math.isclose(value, random.Random(1).uniform(0, 1), rel_tol=1e-5)
 
 
 def test_clip() -> None:
-    assert Range("uniform", 0.0, 1.0).clip(1.12) == 1.0
-    assert Range("randint", 2, 9).clip(4.6) == 5
+    assert Uniform(0.0, 1.0).clip(1.12) == 1.0
+    assert RandInt(2, 9).clip(4.6) == 5
 
 
 @pytest.mark.parametrize(

@@ -7,10 +7,12 @@ import pytest
 from msk_ray.experiment.metrics import Evaluation, evaluations_of
 from msk_ray.experiment.outcomes import Outcome
 from msk_ray.experiment.scheduler_log import LogEntry
-from msk_ray.sweep.pruning import MedianStopping, SuccessiveHalving, make_pruner, rungs
-from msk_ray.sweep.replay import replay
-from msk_ray.sweep.space import PlateauSpec, SchedulerSpec, StopSpec
-from msk_ray.sweep.stopping import ending_of, plateau
+from msk_ray.sweep.rules.asha import Asha, SuccessiveHalving
+from msk_ray.sweep.rules.median import MedianStopping
+from msk_ray.sweep.rules.plateau import Plateau
+from msk_ray.sweep.rules.replay import replay
+from msk_ray.sweep.rules.stop_rule import History
+from msk_ray.sweep.rules.stopping import StopSpec
 
 
 def evaluations(*scores: float) -> list[Evaluation]:
@@ -21,9 +23,15 @@ def row(epoch: int = 10, **metrics: float) -> dict[str, float]:
     return {"epoch": epoch, "env_steps": 100.0 * epoch, "seconds": float(epoch), **metrics}
 
 
+def after(seen: list[Evaluation], epochs: int) -> History:
+    """Of a trial whose newest epoch was evaluated."""
+    return History(row(seen[-1].epoch, **{"eval/score": seen[-1].score}), seen, epochs, 1.0)
+
+
 def test_rungs() -> None:
-    assert rungs(10, 100, 3) == (10, 30, 90)
-    assert rungs(10, 90, 3) == (10, 30)
+    rule = Asha(kind="asha", grace=0.125, reduction=3)
+    assert rule.rungs(80) == (10, 30)
+    assert Asha(kind="asha", grace=0.1, reduction=3).rungs(100) == (10, 30, 90)
 
 
 def test_halving_in_lockstep_stops_the_worse_at_its_next_report() -> None:
@@ -104,7 +112,7 @@ def test_median_in_lockstep_compares_where_the_others_have_been() -> None:
 
 
 def test_grace_is_a_share_of_the_budget() -> None:
-    rule = make_pruner(SchedulerSpec(kind="asha", grace=0.25, reduction=2.0, min_trials=2), budget=1000)
+    rule = Asha(kind="asha", grace=0.25, reduction=2.0, min_trials=2).pruner(budget=1000)
     rule.report("a", 249, 1.0)
     rule.report("b", 249, 2.0)
     assert rule.report("a", 249, 1.0) is None
@@ -113,12 +121,11 @@ def test_grace_is_a_share_of_the_budget() -> None:
 
 
 def test_plateau_needs_patience_and_grace() -> None:
-    spec = PlateauSpec(patience=2, min_delta=1.0, grace=0.5)
-    assert plateau(spec, evaluations(5, 5, 5), epochs=100) is None  # epoch 20 of 100
-    flat = plateau(spec, evaluations(1, 5, 8, 8.5, 9), epochs=80)  # epoch 40 of 80; rise of 1.0 is not more than 1.0
+    spec = Plateau(patience=2, min_delta=1.0, grace=0.5)
+    assert spec.why(after(evaluations(5, 5, 5), 100)) is None  # epoch 20 of 100
+    flat = spec.why(after(evaluations(1, 5, 8, 8.5, 9), 80))  # epoch 40 of 80; rise of 1.0 is not more than 1.0
     assert flat is not None
-    assert flat.outcome is Outcome.STOPPED_PLATEAU
-    assert plateau(spec, evaluations(1, 5, 8, 8.5, 9.5), epochs=80) is None
+    assert spec.why(after(evaluations(1, 5, 8, 8.5, 9.5), 80)) is None
 
 
 @pytest.mark.parametrize(
@@ -134,15 +141,15 @@ def test_plateau_needs_patience_and_grace() -> None:
 def test_ending_of_an_epoch(metrics: dict[str, float], outcome: Outcome | None) -> None:
     stop = StopSpec(target=6.0)
     seen = evaluations(1.0, metrics.get("eval/score", 2.0))
-    ending = ending_of(stop, row(**metrics), seen, epochs=100, elapsed_s=1.0)
+    ending = stop.ending(History(row(**metrics), seen, 100, 1.0))
     assert (ending and ending.outcome) == outcome
 
 
 def test_last_epoch_and_wall_time() -> None:
-    last = ending_of(StopSpec(), row(100), evaluations(1.0), epochs=100, elapsed_s=1.0)
+    last = StopSpec().ending(History(row(100), evaluations(1.0), 100, 1.0))
     assert last is not None
     assert last.outcome is Outcome.FINISHED
-    late = ending_of(StopSpec(wall_time_s=5.0), row(10), evaluations(1.0), epochs=100, elapsed_s=5.0)
+    late = StopSpec(wall_time_s=5.0).ending(History(row(10), evaluations(1.0), 100, 5.0))
     assert late is not None
     assert late.outcome is Outcome.WALL_TIME
 
@@ -152,18 +159,18 @@ def test_the_untrained_policy_counts_in_no_rule() -> None:
     rows = [row(epoch, **{"eval/score": score}) for epoch, score in enumerate([100.0, 1.0, 2.0, 3.0])]
     seen = evaluations_of(rows)
     assert [evaluation.epoch for evaluation in seen] == [1, 2, 3]
-    assert ending_of(StopSpec(target=50.0), row(1), evaluations_of(rows[:1]), 20, 1.0) is None
-    rule = StopSpec(target=50.0, plateau=PlateauSpec(patience=2, grace=0.0))
-    assert ending_of(rule, rows[3], seen, 20, 3.0) is None
+    assert StopSpec(target=50.0).ending(History(row(1), evaluations_of(rows[:1]), 20, 1.0)) is None
+    rule = StopSpec(target=50.0, plateau=Plateau(patience=2, grace=0.0))
+    assert rule.ending(History(rows[3], seen, 20, 3.0)) is None
 
 
 def test_a_journal_of_an_older_version_has_untrained_policies_in_it() -> None:
-    spec = SchedulerSpec(kind="asha", grace=0.25, reduction=2)
+    spec = Asha(kind="asha", grace=0.25, reduction=2)
     old = [
         LogEntry("a", 0, 0, 0.0, 100.0, False),
         LogEntry("a", 3, 300, 3.0, 1.0, False),
         LogEntry("b", 3, 300, 3.0, 2.0, False),
     ]
-    pruner = make_pruner(spec, 1000)
+    pruner = spec.pruner(1000)
     assert replay(pruner, "env_steps", old) is None, "b is the better of the two"
     assert pruner.report("a", 310, 1.0) is not None

@@ -14,6 +14,8 @@ from msk_ray.config import dump_yaml, read_yaml
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.outcomes import Ending, Outcome, write_ending
 from msk_ray.signals import RESUMABLE
+from msk_ray.sweep.rules.nonfinite import NonFinite
+from msk_ray.sweep.rules.wall_time import WallTime
 from msk_ray.tune import driver
 from msk_ray.tune.__main__ import main
 
@@ -116,7 +118,7 @@ def test_every_trial_to_its_end_on_request(
         code = run(main, ["--space", str(space), "--cpu", "--storage", str(tmp_path / "runs"), *arguments])
         assert code == RESUMABLE
         file = plans.pop().space.file
-        assert (file.stop.nonfinite, file.stop.wall_time_s) == (True, 60.0)
+        assert (file.stop.nonfinite, file.stop.wall_time_s) == (NonFinite(), WallTime(seconds=60.0))
         by_score = {file.scheduler.kind != "none", file.stop.plateau is not None, file.stop.target is not None}
         assert len(by_score) == 1, "all of them or none"
         return by_score.pop()

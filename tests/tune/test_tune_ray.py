@@ -31,19 +31,19 @@ from stub_trainer import (
 
 from msk_ray.config import read_yaml
 from msk_ray.errors import ClusterLost, StorageError, StorageFailure
-from msk_ray.experiment.halved import Halved, read_halved
+from msk_ray.experiment.attempts import Attempt, Reduced, read_attempt
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import read_rows
 from msk_ray.experiment.outcomes import Outcome
 from msk_ray.experiment.results import TrialRecord, read_records
 from msk_ray.sweep import opening
+from msk_ray.sweep.rules.stopping import StopSpec
 from msk_ray.sweep.search_trials import recover
-from msk_ray.sweep.space import Space, StopSpec
+from msk_ray.sweep.space import Space
 from msk_ray.sweep.trials import resolve_trials
 from msk_ray.tune import driver, worker_prestart
 from msk_ray.tune.devices import Placement
 from msk_ray.tune.finish import finish
-from msk_ray.tune.halved import StartAnew
 from msk_ray.tune.session import ray_session
 from msk_ray.tune.trial_run import Hooks, run_trial
 
@@ -179,12 +179,12 @@ def test_what_has_gone_stops_the_sweep_and_is_not_made_again(
         assert len((record.folder / "processes").read_text().splitlines()) == 2
 
 
-def test_out_of_memory_starts_anew_with_half_the_worlds_in_a_fresh_process(
+def test_out_of_memory_begins_again_with_half_the_worlds_in_a_fresh_process(
     make_space: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     space = make_space(
         parameters={BEHAVIOUR: {"grid": [0.0, CROWD, LATE_CROWD, MEMORY, DOOMED_CROWD]}},
-        # No death is forgiven, and being started anew is none.
+        # No death is forgiven, and another attempt is none.
         resources={"max_failures": 0, "halve_worlds_on_oom": True},
         scheduler={"kind": "asha", "grace": 0.9},
     )
@@ -193,28 +193,28 @@ def test_out_of_memory_starts_anew_with_half_the_worlds_in_a_fresh_process(
     shown = capsys.readouterr().out
     assert completed
     assert outcomes(records) == ["finished", "finished", "finished", "out_of_memory", "error"]
-    assert [record.halved and record.halved.worlds for record in records] == [None, ROOM, ROOM, ROOM, ROOM]
+    assert [record.attempt.number for record in records] == [1, 2, 2, 2, 2]
+    assert {str(record.attempt) for record in records[1:]} == {f"half the worlds: {ROOM} of 8"}
     assert all("8 worlds were asked for, and half" in r.ending.why for r in records[3:4])  # type: ignore[union-attr]
     assert records[4].ending.why == "its process died (killed, or out of memory)"  # type: ignore[union-attr]
     for record in records[1:]:
         processes = (record.folder / "processes").read_text().split()
         assert len(processes) == len(set(processes)) == 2
-        assert f"{record.trial.id} ran out of memory with 8 worlds; starting anew with 4" in shown
+        assert f"{record.trial.id} ran out of memory; it begins again with half the worlds: 4 of 8" in shown
         assert f"{record.trial.id} again  {record.trial.variant} seed=0 (half the worlds: 4 of 8)" in shown
     for record in records[:3]:
         assert [row["epoch"] for row in read_rows(record.folder)] == list(range(21))
     # What the rule heard of the attempt with all worlds is heard again with half of them.
     heard = [json.loads(line) for line in (path / "reports.jsonl").read_text().splitlines()]
-    late = [(report["halved"], report["epoch"]) for report in heard if report["trial"] == records[2].trial.id]
-    assert late == [(False, 2), (False, 4), *((True, epoch) for epoch in range(2, 21, 2))]
+    late = [(report["attempt"], report["epoch"]) for report in heard if report["trial"] == records[2].trial.id]
+    assert late == [(1, 2), (1, 4), *((2, epoch) for epoch in range(2, 21, 2))]
     assert "4 trials ran with half the worlds asked for" in shown
     assert shown.count("finished, half the worlds") == 2
     # The one whose process was killed between the decision and its first epoch goes on with its half.
     Experiment(path).clear_endings({Outcome.ERROR})
     completed, records = go(space, path, resume=True)
     assert outcomes(records)[4] == "finished"
-    assert records[4].halved is not None
-    assert (records[4].halved.asked, records[4].halved.worlds) == (8, 4)
+    assert str(records[4].attempt) == "half the worlds: 4 of 8"
     assert "(half the worlds: 4 of 8)" in capsys.readouterr().out
 
 
@@ -229,7 +229,7 @@ def test_a_search_goes_on_with_half_the_worlds(make_space: Any, tmp_path: Path) 
     completed, (record,) = go(space, tmp_path / "runs" / "optuna")
     assert completed
     assert outcomes([record]) == ["finished"]
-    assert record.halved is not None
+    assert record.attempt.number == 2
     assert [row["epoch"] for row in read_rows(record.folder)] == list(range(7))
 
 
@@ -239,13 +239,13 @@ def test_a_driver_killed_after_the_decision_goes_on_with_half_the_worlds(make_sp
     (trial,) = resolve_trials(space)
     folder = opening.create(path, space, [trial], {}).trial_folder(trial.id)
     folder.mkdir(parents=True)
-    with pytest.raises(StartAnew):  # as far as a driver came that was killed there
-        run_trial(trial, folder, "cpu", StopSpec(), StubTrainer, Hooks(), may_halve=True)
+    # As far as a driver came that was killed there.
+    assert run_trial(trial, folder, "cpu", StopSpec(), StubTrainer, Hooks(), may_halve=True) is None
     # Whoever goes on may not halve, and need not: it has been decided.
     completed, (record,) = go(make_space(parameters={BEHAVIOUR: {"grid": [LATE_CROWD]}}), path, True)
     assert completed
     assert outcomes([record]) == ["finished"]
-    assert record.halved == Halved(8, 4, "out_of_memory: made up", cleared=True) == read_halved(folder)
+    assert record.attempt == Attempt(Reduced(8, 4, "out_of_memory: made up", cleared=True)) == read_attempt(folder)
     assert [row["epoch"] for row in read_rows(folder)] == list(range(21))
 
 
@@ -372,6 +372,22 @@ def test_a_population_goes_on_where_it_was(make_space: Any, tmp_path: Path) -> N
         assert 1e-4 <= read_yaml(record.folder / "config.yaml")["shac"]["actor_lr"] <= 1e-2
 
 
+def test_processes_that_cannot_be_started_ahead_are_said_once_and_cost_no_trial(
+    make_space: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def absent(*args: Any) -> None:
+        raise AttributeError("no such call in this Ray")
+
+    monkeypatch.setattr(worker_prestart, "start_processes", absent)
+    space = make_space(parameters={}, seeds="0-2", overrides={"trial.epochs": 30})
+    trials = resolve_trials(space)
+    experiment = opening.create(tmp_path / "runs" / "alone", space, trials, {})
+    assert driver.run_trials(driver.Plan(experiment, space, trials, Placement(0.0, 1), 1, StubTrainer, precompile=None))
+    assert outcomes(read_records(experiment)) == ["finished"] * 3
+    shown = capsys.readouterr().out
+    assert shown.count("no process was started ahead, so trials begin seconds later: AttributeError: no such call") == 1
+
+
 def test_no_more_at_once_than_asked_for_and_the_next_process_waits(
     make_space: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -444,9 +460,8 @@ def _processes_of_trials() -> list[int]:
 
 def _terminate_when(path: Path) -> None:
     """SIGTERM to this process once a trial has begun to train."""
-    deadline = time.monotonic() + 60
     while not list(path.glob("trials/*/checkpoints/epoch_000004.pt")):
-        if time.monotonic() > deadline:
-            return
+        if (path / "summary.json").exists():
+            return  # the sweep has ended without it
         time.sleep(0.05)
     os.kill(os.getpid(), signal.SIGTERM)

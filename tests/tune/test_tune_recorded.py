@@ -28,8 +28,9 @@ from msk_ray.experiment.outcomes import Outcome
 from msk_ray.experiment.trial import trial_id
 from msk_ray.report import __main__ as report
 from msk_ray.signals import RESUMABLE
+from msk_ray.sweep.rules.stopping import StopSpec
 from msk_ray.sweep.search_trials import recover
-from msk_ray.sweep.space import StopSpec, load_space
+from msk_ray.sweep.space import load_space
 from msk_ray.sweep.trials import resolve_trials, with_recorded_ids
 from msk_ray.training import Trainer
 from msk_ray.training.policy import load_policy

@@ -9,10 +9,11 @@ import pytest
 
 from msk_ray.experiment.outcomes import Ending
 from msk_ray.experiment.scheduler_log import LogEntry, SchedulerLog
-from msk_ray.sweep.pruning import make_pruner
-from msk_ray.sweep.replay import replay
-from msk_ray.sweep.space import SchedulerSpec
-from msk_ray.tune.adapters import METRIC, PruningScheduler
+from msk_ray.sweep.rules.asha import Asha
+from msk_ray.sweep.rules.early_stopping import SchedulerSpec
+from msk_ray.sweep.rules.median import Median
+from msk_ray.sweep.rules.replay import replay
+from msk_ray.tune.schedulers import METRIC, PruningScheduler
 
 EPOCHS = 24
 CHECKPOINT_INTERVAL = 4
@@ -25,7 +26,7 @@ class Driver:
 
     def __init__(self, spec: SchedulerSpec, path: Path) -> None:
         journal = SchedulerLog(path)
-        pruner = make_pruner(spec, 100 * EPOCHS)
+        pruner = spec.pruner(100 * EPOCHS)
         replay(pruner, spec.time_attr, journal.read()[0])
         self.stopped: dict[str, tuple[int, str]] = {}
         self._epoch = 0
@@ -38,7 +39,7 @@ class Driver:
         self._epoch = epoch
         start, slope = CURVES[trial]
         result = {METRIC: start + slope * epoch, "epoch": epoch, "env_steps": 100 * epoch, "seconds": 0.1 * epoch}
-        result |= {"ended": epoch == EPOCHS, "halved": False}
+        result |= {"ended": epoch == EPOCHS, "attempt": 1}
         self._scheduler.on_trial_result(None, SimpleNamespace(id=trial), result)
 
 
@@ -57,7 +58,11 @@ def life(driver: Driver, reports: list[tuple[str, int]], stopped: dict[str, Any]
 
 @pytest.mark.parametrize("kind", ["asha", "median"])
 def test_a_driver_killed_after_any_report_stops_the_same_trials_at_the_same_epochs(kind: Any, tmp_path: Path) -> None:
-    spec = SchedulerSpec(kind=kind, grace=0.15, reduction=2.0, min_trials=2)
+    spec = (
+        Asha(kind=kind, grace=0.15, reduction=2.0, min_trials=2)
+        if kind == "asha"
+        else Median(kind=kind, grace=0.15, min_trials=2)
+    )
     whole: dict[str, Any] = {}
     life(Driver(spec, tmp_path / "whole"), order(), whole)
     assert 2 <= len(whole) < len(CURVES)
@@ -80,12 +85,12 @@ def _checkpoint(trial: str, reports: list[tuple[str, int]]) -> int:
 
 
 def test_a_stop_that_was_decided_but_not_carried_out_is_found(tmp_path: Path) -> None:
-    spec = SchedulerSpec(kind="asha", grace=0.5, reduction=2.0, min_trials=2)
+    spec = Asha(kind="asha", grace=0.5, reduction=2.0, min_trials=2)
     reports = [LogEntry("good", 5, 500, 1.0, 2.0, False), LogEntry("bad", 5, 500, 1.0, 1.0, False)]
-    ending = replay(make_pruner(spec, 1000), "env_steps", reports)
+    ending = replay(spec.pruner(1000), "env_steps", reports)
     assert ending is not None
     assert "number 2 of 2" in ending.why
-    assert replay(make_pruner(spec, 1000), "env_steps", reports[:1]) is None
+    assert replay(spec.pruner(1000), "env_steps", reports[:1]) is None
 
 
 def test_a_torn_end_is_cut_off(tmp_path: Path) -> None:

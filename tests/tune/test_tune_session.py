@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from msk_ray.tune.__main__ import parser
+from msk_ray.tune.options import parser
 
 ABSENT = "127.0.0.1:1"
 """Nobody listens there."""

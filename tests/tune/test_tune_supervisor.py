@@ -12,6 +12,7 @@ from msk_ray.sweep import opening
 from msk_ray.sweep.space import Space
 from msk_ray.sweep.trials import resolve_trials
 from msk_ray.tune import supervisor
+from msk_ray.tune.console import Console
 from msk_ray.tune.supervisor import LONGEST_STEP_S, SHUTDOWN_GRACE_S, Supervisor
 
 
@@ -24,7 +25,7 @@ def test_time_in_which_the_driver_was_frozen_is_not_the_trials(
     trials = resolve_trials(space)
     experiment = opening.create(tmp_path / "runs" / "small", space, trials, {})
     with listening() as stop, stop.deferred():
-        driver = Supervisor(experiment, trials, lambda config: trials[0], 1, stop, lambda: None)
+        driver = Supervisor(experiment, lambda config: trials[0], Console(trials, 1), stop, lambda: None, trials)
         driver.on_trial_start(0, [], SimpleNamespace(config={}))
         stop.receive(signal.SIGTERM)
         driver.on_step_end(0, [])

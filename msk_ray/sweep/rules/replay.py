@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from msk_ray.experiment.outcomes import Ending
 from msk_ray.experiment.scheduler_log import LogEntry
-from msk_ray.sweep.pruning import Pruner
+from msk_ray.sweep.rules.early_stopping import Pruner
 
 
 def replay(pruner: Pruner, time_attr: str, reports: Sequence[LogEntry]) -> Ending | None:
@@ -14,10 +14,10 @@ def replay(pruner: Pruner, time_attr: str, reports: Sequence[LogEntry]) -> Endin
         What it answered to the last one, which the driver may not have lived to carry out.
     """
     ending = None
-    halved: set[str] = set()
+    attempts: dict[str, int] = {}
     for report in reports:
-        if report.halved and report.trial not in halved:
-            halved.add(report.trial)
+        if report.attempt > attempts.setdefault(report.trial, report.attempt):
+            attempts[report.trial] = report.attempt
             pruner.forget(report.trial)
         ending = pruner.report(report.trial, report.time(time_attr), report.score) if report.epoch > 0 else None
     return None if not reports or reports[-1].ended else ending

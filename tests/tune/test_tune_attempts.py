@@ -12,26 +12,25 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from msk_ray.cli import run
 from msk_ray.config import dump_yaml, read_yaml
 from msk_ray.errors import ConfigError
-from msk_ray.experiment import halved
-from msk_ray.experiment.halved import Halved, read_halved, write_halved
+from msk_ray.experiment import attempts
+from msk_ray.experiment.attempts import FIRST, Attempt, Reduced, read_attempt
 from msk_ray.experiment.layout import ABANDONED, SCHEDULER_LOG_FILE
 from msk_ray.experiment.metrics import read_rows
 from msk_ray.experiment.outcomes import Ending, Outcome, read_ending, write_ending
 from msk_ray.experiment.results import read_records
-from msk_ray.experiment.results_table import halved_note, result_rows, summary, table_document, variant_rows
+from msk_ray.experiment.results_table import reduced_note, result_rows, summary, table_document, variant_rows
 from msk_ray.experiment.scheduler_log import LogEntry, SchedulerLog
 from msk_ray.experiment.trial import Trial
 from msk_ray.signals import RESUMABLE
 from msk_ray.sweep import opening
-from msk_ray.sweep.pruning import make_pruner
-from msk_ray.sweep.replay import replay
-from msk_ray.sweep.space import SchedulerSpec, StopSpec
+from msk_ray.sweep.rules.replay import replay
+from msk_ray.sweep.rules.stopping import StopSpec
+from msk_ray.sweep.space import read_file
 from msk_ray.sweep.trials import resolve_trials
 from msk_ray.training import Trainer, read_checkpoint
 from msk_ray.tune import driver, trial_run
 from msk_ray.tune.__main__ import main
 from msk_ray.tune.devices import Placement
-from msk_ray.tune.halved import StartAnew
 from msk_ray.tune.trial_run import Hooks
 
 
@@ -59,7 +58,7 @@ def epochs(folder: Path) -> list[float]:
 def test_only_if_asked_to(crowded: Any, tmp_path: Path) -> None:
     ending = attempt(crowded(LATE_CROWD), tmp_path, may_halve=False)
     assert ending == Ending(Outcome.OUT_OF_MEMORY, "out_of_memory: made up")
-    assert read_halved(tmp_path) is None
+    assert read_attempt(tmp_path) == FIRST
     assert epochs(tmp_path) == [0, 1, 2, 3, 4]
 
 
@@ -68,8 +67,7 @@ def test_half_the_worlds_from_the_beginning(
     behaviour: float, done: list[int], crowded: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     trial = crowded(behaviour)
-    with pytest.raises(StartAnew):
-        attempt(trial, tmp_path)
+    assert attempt(trial, tmp_path) is None
     assert read_ending(tmp_path) is None
     assert not (tmp_path / "error.txt").exists()
     assert epochs(tmp_path) == []
@@ -80,7 +78,7 @@ def test_half_the_worlds_from_the_beginning(
             "epoch_000004.pt",
         ]
     said = capsys.readouterr().out
-    assert "out of memory with 8 worlds: starting anew with half of them, 4; what was done so far is in" in said
+    assert "the trial begins again with half the worlds: 4 of 8; what was done so far is in" in said
     ending = attempt(trial, tmp_path)
     assert ending is not None
     assert ending.outcome is Outcome.FINISHED
@@ -104,8 +102,7 @@ def test_a_damaged_outcome_is_said_and_the_trial_goes_on(
 
 def test_a_trial_whose_number_of_worlds_is_damaged_ends_and_says_what_to_write(crowded: Any, tmp_path: Path) -> None:
     trial = crowded(LATE_CROWD)
-    with pytest.raises(StartAnew):
-        attempt(trial, tmp_path)
+    assert attempt(trial, tmp_path) is None
     (tmp_path / "halved.json").write_text("null")
     before = sorted(path.name for path in tmp_path.rglob("*"))
     ending = attempt(trial, tmp_path)
@@ -129,9 +126,16 @@ def test_a_process_killed_after_the_decision_halves_no_second_time(
     trial = crowded(LATE_CROWD)
     with monkeypatch.context() as patch:
         if where == "before anything is set aside":
-            patch.setattr(trial_run, "set_aside", die)
+            mkdir = Path.mkdir
+
+            def make_others(path: Path, **options: Any) -> None:
+                if path.name == ABANDONED:
+                    die()
+                mkdir(path, **options)
+
+            patch.setattr(Path, "mkdir", make_others)
         elif where == "after the last one":
-            patch.setattr(halved, "write_text", die)
+            patch.setattr(attempts, "write_text", die)
         else:
             rename, moved = Path.rename, list[Path]()
 
@@ -145,11 +149,11 @@ def test_a_process_killed_after_the_decision_halves_no_second_time(
             patch.setattr(Path, "rename", rename_once)
         with pytest.raises(Killed):
             attempt(trial, tmp_path)
-    assert read_halved(tmp_path) == Halved(8, 4, "out_of_memory: made up", cleared=False)
+    assert read_attempt(tmp_path) == Attempt(Reduced(8, 4, "out_of_memory: made up", cleared=False))
     ending = attempt(trial, tmp_path)
     assert ending is not None
     assert ending.outcome is Outcome.FINISHED
-    assert read_halved(tmp_path) == Halved(8, 4, "out_of_memory: made up", cleared=True)
+    assert read_attempt(tmp_path) == Attempt(Reduced(8, 4, "out_of_memory: made up", cleared=True))
     assert epochs(tmp_path) == list(range(21))
     assert epochs(tmp_path / ABANDONED) == [0, 1, 2, 3, 4]
     assert (tmp_path / ABANDONED / "checkpoints" / "epoch_000004.pt").is_file()
@@ -157,8 +161,7 @@ def test_a_process_killed_after_the_decision_halves_no_second_time(
 
 def test_the_second_time_it_ends(crowded: Any, tmp_path: Path) -> None:
     trial = crowded(MEMORY)
-    with pytest.raises(StartAnew):
-        attempt(trial, tmp_path)
+    assert attempt(trial, tmp_path) is None
     ending = attempt(trial, tmp_path)
     why = "out_of_memory: made up; 8 worlds were asked for, and half of them has been tried"
     assert ending == Ending(Outcome.OUT_OF_MEMORY, why) == read_ending(tmp_path)
@@ -181,7 +184,7 @@ def test_what_cannot_be_halved_ends_at_once_and_says_so(
     assert "; half of them could not be tried: " in ending.why
     assert why in ending.why
     assert "\n" not in ending.why
-    assert read_halved(tmp_path) is None
+    assert read_attempt(tmp_path) == FIRST
 
 
 def test_a_real_trainer_leaves_one_curve(
@@ -196,8 +199,7 @@ def test_a_real_trainer_leaves_one_curve(
     (tmp_path / "base.yaml").write_text(dump_yaml(tiny_settings))
     (trial,) = resolve_trials(make_space(parameters={}))
     folder = tmp_path / trial.id
-    with pytest.raises(StartAnew):
-        attempt(trial, folder, trainer=Crowded)
+    assert attempt(trial, folder, trainer=Crowded) is None
     assert epochs(folder / ABANDONED) == [0, 1, 2, 3]
     ending = attempt(trial, folder, trainer=Crowded)
     assert ending is not None
@@ -213,12 +215,13 @@ def test_a_real_trainer_leaves_one_curve(
 
 @pytest.mark.parametrize("kind", ["asha", "median"])
 def test_early_stopping_forgets_the_attempt_with_all_worlds(kind: Any) -> None:
-    spec = SchedulerSpec(kind=kind, grace=0.5, reduction=2.0, min_trials=2)
+    shared = {"kind": kind, "grace": 0.5, "min_trials": 2} | ({"reduction": 2.0} if kind == "asha" else {})
+    spec = read_file({"question": "?", "base": "b", "scheduler": shared}, "space").scheduler
     others = [LogEntry(name, 5, 500, 1.0, score, False) for name, score in (("a", 5.0), ("b", 4.0))]
     before = [LogEntry("c", 6, 600, 1.0, 9.0, False)]
-    halves = [LogEntry("c", 5, 500, 1.0, 1.0, False, halved=True)]
-    with_all = replay(make_pruner(spec, 1000), "env_steps", [*before, *others, *halves])
-    without = replay(make_pruner(spec, 1000), "env_steps", [*others, *halves])
+    halves = [LogEntry("c", 5, 500, 1.0, 1.0, False, attempt=2)]
+    with_all = replay(spec.pruner(1000), "env_steps", [*before, *others, *halves])
+    without = replay(spec.pruner(1000), "env_steps", [*others, *halves])
     assert with_all is not None
     assert with_all == without
 
@@ -235,7 +238,7 @@ def test_a_stop_that_was_not_carried_out_is_void_once_the_worlds_are_halved(
     for name, score in ((good, 2.0), (bad, 1.0)):  # at the rung, half of 20 epochs × 64 env steps
         SchedulerLog(experiment.path / SCHEDULER_LOG_FILE).append(LogEntry(name, 10, 640, 1.0, score, False))
     if halved_after:
-        write_halved(experiment.trial_folder(bad), Halved(8, 4, "no room"))
+        Attempt(Reduced(8, 4, "no room")).write(experiment.trial_folder(bad))
     driver._finish_pruning(driver.Plan(experiment, space, trials, Placement(0.0, 1), None))
     ending = read_ending(experiment.trial_folder(bad))
     assert (ending and ending.outcome) == (None if halved_after else Outcome.STOPPED_ASHA)
@@ -283,8 +286,8 @@ def test_tables_say_so(make_space: Any, tmp_path: Path) -> None:
         row = {"epoch": 20, "env_steps": 1, "seconds": 1.0, "eval/score": 1.0 + trial.index}
         (folder / "metrics.jsonl").write_text(json.dumps(row) + "\n")
         write_ending(folder, Ending(Outcome.FINISHED, "all 20 epochs done"))
-    assert halved_note(read_records(experiment)) is None
-    write_halved(experiment.trial_folder(trials[3].id), Halved(8, 4, "no room", cleared=True))
+    assert reduced_note(read_records(experiment)) is None
+    Attempt(Reduced(8, 4, "no room", cleared=True)).write(experiment.trial_folder(trials[3].id))
     records = read_records(experiment)
     best = result_rows(records)[0]
     assert best[6] == "finished, half the worlds"

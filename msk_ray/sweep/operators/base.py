@@ -1,0 +1,157 @@
+"""What a search space may write for a parameter: an operator, which says what values are tried.
+
+An operator of one's own is a class derived from `Operator`, `Listed` or `Range`; a space names it by its import path,
+`{"package.module:Class": [...]}`.
+"""
+
+import math
+import random
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+from msk_ray.errors import ConfigError, brief
+from msk_ray.text import describe
+
+
+@dataclass(frozen=True)
+class Level:
+    """One value of a parameter and the text tables show for it."""
+
+    value: Any
+    label: str
+
+
+class Operator(ABC):
+    """The values of one parameter."""
+
+    enumerated: ClassVar[bool] = False
+    """Whether every level is tried, rather than one drawn for each trial."""
+    levels: tuple[Level, ...]
+    """All values, of one that is enumerated."""
+
+    @classmethod
+    @abstractmethod
+    def parse(cls, where: str, values: list[Any]) -> Self:
+        """The operator for the values that a space writes.
+
+        Args:
+            where: the key in the space, for errors.
+            values: not empty.
+
+        Raises:
+            ConfigError: they do not fit.
+        """
+
+    @abstractmethod
+    def draw(self, rng: random.Random) -> Level:
+        """One value at random."""
+
+    @abstractmethod
+    def extremes(self) -> tuple[Level, ...]:
+        """Levels among which those lie that make a trial longest; the first one stands for the parameter where its
+        value makes no difference."""
+
+    def check(self) -> tuple[Level, ...]:
+        """Levels to check against the settings beforehand: where they are valid, so is every draw."""
+        return ()
+
+    def recorded(self, written: Any) -> Level:
+        """The level that a search's recorded choice stands for."""
+        return Level(written, describe(written))
+
+
+@dataclass(frozen=True)
+class Listed(Operator):
+    """Named values."""
+
+    levels: tuple[Level, ...]
+
+    @classmethod
+    def parse(cls, where: str, values: list[Any]) -> Self:
+        return cls(tuple(_level(value) for value in values))
+
+    def draw(self, rng: random.Random) -> Level:
+        return rng.choice(self.levels)
+
+    def extremes(self) -> tuple[Level, ...]:
+        return self.levels
+
+    def recorded(self, written: Any) -> Level:
+        """By its label, which is what a search chooses among."""
+        found = next((level for level in self.levels if level.label == written), None)
+        return super().recorded(written) if found is None else found
+
+
+@dataclass(frozen=True)
+class Range(Operator):
+    """Numbers from `low` to `high`, both included."""
+
+    log: ClassVar[bool] = False
+    """Whether it is spread evenly over orders of magnitude."""
+    whole: ClassVar[bool] = False
+    """Whether it holds whole numbers alone."""
+
+    low: float
+    high: float
+
+    @classmethod
+    def parse(cls, where: str, values: list[Any]) -> Self:
+        numbers = [number for number in map(_number, values) if number is not None]
+        if len(values) != 2 or len(numbers) != 2:
+            raise ConfigError(f"{where}: write [low, high], two numbers, not {brief(values)}")
+        low, high = numbers
+        if not low < high:
+            raise ConfigError(f"{where}: low {low:g} must be below high {high:g}")
+        if cls.log and low <= 0:
+            raise ConfigError(f"{where}: low {low:g} must be above 0")
+        if cls.whole and not (isinstance(low, int) and isinstance(high, int)):
+            raise ConfigError(f"{where}: both ends must be whole numbers, not {brief(values)}")
+        return cls(low, high)
+
+    def draw(self, rng: random.Random) -> Level:
+        """One value. Rounded to 6 digits, so that tables, hashes and YAML all hold the same number."""
+        if self.whole:
+            number: float = rng.randint(int(self.low), int(self.high))
+        elif self.log:
+            number = _six_digits(math.exp(rng.uniform(math.log(self.low), math.log(self.high))))
+        else:
+            number = _six_digits(rng.uniform(self.low, self.high))
+        return Level(self.clip(number), f"{number:g}")
+
+    def clip(self, number: float) -> float:
+        """The nearest value inside the range."""
+        inside = min(max(number, self.low), self.high)
+        return round(inside) if self.whole else inside
+
+    def extremes(self) -> tuple[Level, ...]:
+        """Both ends."""
+        low, high = self.clip(self.low), self.clip(self.high)
+        return Level(low, f"{low:g}"), Level(high, f"{high:g}")
+
+    def check(self) -> tuple[Level, ...]:
+        return self.extremes()
+
+
+def _level(value: Any) -> Level:
+    if isinstance(value, Mapping) and set(value) == {"label", "value"}:
+        return Level(value["value"], str(value["label"]))
+    return Level(value, describe(value))
+
+
+def _number(value: Any) -> int | float | None:
+    """`value` as a number below 2^53 in size, or None. YAML reads 1e-3 as text (it wants 1.0e-3), so text is tried
+    too."""
+    if isinstance(value, str):
+        try:
+            value = float(value)
+        except ValueError:
+            return None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 2**53:
+        return None
+    return value
+
+
+def _six_digits(number: float) -> float:
+    return float(f"{number:.6g}")

@@ -1,0 +1,94 @@
+"""Successive halving (ASHA): at each rung one in so many trials goes on.
+
+Ray's own ASHA decides once, when a trial first reaches a rung, against those that came before it: trials that run in
+lockstep find the rung empty and pass unjudged. Here a trial is judged again by the newest rung it has reached at each
+report until half way (as a ratio) to the next rung, so the order of arrival matters little, and replaying recorded
+evaluations gives the same rungs.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Annotated
+
+from pydantic import Field
+
+from msk_ray.config.sections import Count
+from msk_ray.experiment.outcomes import Ending, Outcome
+from msk_ray.sweep.rules.early_stopping import Pruner, SchedulerSpec, Share
+
+
+class Asha(SchedulerSpec):
+    """Stops the worse trials at each rung."""
+
+    grace: Share = 0.25
+    """Share of the longest trial's budget that no trial is stopped within: of the longest one that a search may
+    suggest, an adaptive horizon counted with its `longest`. Too small a one loses slow starters."""
+    reduction: Annotated[float, Field(ge=1.5, le=16)] = 3.0
+    """One in this many goes on past each rung; rungs are grace × reductionⁿ."""
+    min_trials: Count | None = None
+    """Trials that must have come as far before one is stopped; null is `reduction` rounded up."""
+
+    def pruner(self, budget: float) -> Pruner:
+        return SuccessiveHalving(self.rungs(budget), self.reduction, self.min_trials)
+
+    def rungs(self, budget: float) -> tuple[float, ...]:
+        """grace · reductionⁿ, as long as it lies below the budget."""
+        times = [self.grace * budget]
+        while times[-1] * self.reduction < budget:
+            times.append(times[-1] * self.reduction)
+        return tuple(times)
+
+
+class SuccessiveHalving:
+    """ASHA: at each rung one in `reduction` trials goes on (rounded up).
+
+    Trials are compared by their best score so far, as in the final ranking; single evaluations scatter too much.
+    """
+
+    def __init__(self, rungs: Sequence[float], reduction: float, min_trials: int | None = None) -> None:
+        """
+        Args:
+            rungs: times at which trials are compared, ascending.
+            reduction: one in this many goes on.
+            min_trials: trials that must have reached a rung before one is stopped there.
+        """
+        self._rungs = tuple(rungs)
+        self._scores: list[dict[str, float]] = [{} for _ in rungs]
+        self._best: dict[str, float] = {}
+        self._reduction = reduction
+        self._min_trials = math.ceil(reduction) if min_trials is None else min_trials
+
+    def report(self, trial: str, time: float, score: float) -> Ending | None:
+        if not math.isfinite(score):
+            return None
+        best = self._best[trial] = max(score, self._best.get(trial, score))
+        newest: int | None = None
+        for index, (rung, scores) in enumerate(zip(self._rungs, self._scores, strict=True)):
+            if time >= rung:
+                # The first report past a rung counts there, whatever follows: repeated rows change nothing.
+                scores.setdefault(trial, best)
+                newest = index
+        # Far past its rung, a trial is left to the next one: latecomers should not undo most of its work.
+        if newest is None or time >= self._rungs[newest] * math.sqrt(self._reduction):
+            return None
+        return self._judge(trial, newest)
+
+    def forget(self, trial: str) -> None:
+        self._best.pop(trial, None)
+        for scores in self._scores:
+            scores.pop(trial, None)
+
+    def _judge(self, trial: str, index: int) -> Ending | None:
+        scores = self._scores[index]
+        if len(scores) < max(self._min_trials, 2):
+            return None
+        survivors = math.ceil(len(scores) / self._reduction)
+        better = sum(score > scores[trial] for score in scores.values())
+        if better < survivors:
+            return None
+        cutoff = sorted(scores.values(), reverse=True)[survivors - 1]
+        return Ending(
+            Outcome.STOPPED_ASHA,
+            f"best score {scores[trial]:.4g} is number {better + 1} of {len(scores)} at rung {self._rungs[index]:.6g}; "
+            f"{survivors} go on, from {cutoff:.4g}",
+        )

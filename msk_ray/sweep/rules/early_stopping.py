@@ -1,0 +1,83 @@
+"""What decides between trials: rules that stop one because others do better.
+
+Fed with evaluations, they answer with a reason, and replaying recorded evaluations gives the same answers.
+"""
+
+from collections.abc import Collection
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Protocol
+
+from pydantic import Field
+
+from msk_ray.config.sections import Section, Text
+from msk_ray.errors import ConfigError
+from msk_ray.experiment.outcomes import Ending
+
+if TYPE_CHECKING:
+    from msk_ray.sweep.space import SpaceFile
+
+Share = Annotated[float, Field(gt=0.0, lt=1.0)]
+
+
+class Pruner(Protocol):
+    """A rule that compares trials."""
+
+    def report(self, trial: str, time: float, score: float) -> Ending | None:
+        """Take in one evaluation; answer why the trial should end now, or None."""
+
+    def forget(self, trial: str) -> None:
+        """Drop what a trial has reported: it starts again from the beginning."""
+
+
+class NeverPrune:
+    """Lets every trial run."""
+
+    def report(self, trial: str, time: float, score: float) -> Ending | None:
+        return None
+
+    def forget(self, trial: str) -> None:
+        return None
+
+
+class SchedulerSpec(Section):
+    """The `scheduler` section of a space: a rule with its settings, which are the fields of its class.
+
+    One of your own is a class derived from this one, named in a space by its import path:
+    `scheduler: {kind: "package.module:Class", setting: value}`.
+    """
+
+    ends_trials: ClassVar[bool] = True
+    """Whether it ends trials by their scores: then --no-early-stopping and --smoke leave it out."""
+    exchanges: ClassVar[bool] = False
+    """Whether trials go on from each other's state and settings."""
+
+    kind: Text
+    """Name of the rule, or its import path."""
+    time_attr: Literal["env_steps", "epoch", "seconds"] = "env_steps"
+    """What trials are compared at. Env steps is fair between horizons, and trials need not run in lockstep."""
+
+    def pruner(self, budget: float) -> Pruner:
+        """The rule, knowing nothing yet.
+
+        Args:
+            budget: what the longest trial takes, in the unit of `time_attr`.
+        """
+        return NeverPrune()
+
+    def rungs(self, budget: float) -> tuple[float, ...]:
+        """Times at which all trials are compared, for pictures; none if there are no such times."""
+        return ()
+
+    def check(self, file: "SpaceFile", ranges: Collection[str]) -> None:
+        """Refuse what does not go with this rule.
+
+        Args:
+            file: the space.
+            ranges: its parameters that move in a range.
+
+        Raises:
+            ConfigError: saying what to write.
+        """
+        if self.time_attr == "seconds" and file.stop.wall_time_s is None:
+            raise ConfigError(
+                "scheduler.time_attr: seconds needs stop.wall_time_s, the budget that grace is a share of"
+            )

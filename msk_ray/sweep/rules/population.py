@@ -1,0 +1,38 @@
+"""Population-based training: the worst trials go on from the best ones, with their settings moved a little."""
+
+from collections.abc import Collection
+from typing import TYPE_CHECKING, Annotated
+
+from pydantic import Field
+
+from msk_ray.errors import ConfigError
+from msk_ray.sweep.rules.early_stopping import SchedulerSpec, Share
+
+if TYPE_CHECKING:
+    from msk_ray.sweep.space import SpaceFile
+
+
+class PopulationBasedTraining(SchedulerSpec):
+    """Ends no trial, but lets trials take over others' state and settings."""
+
+    ends_trials = False
+    exchanges = True
+
+    interval: Share = 0.1
+    """Share of the budget between two exchanges."""
+    quantile: Annotated[float, Field(gt=0.0, le=0.5)] = 0.25
+    """This share of the worst trials goes on from the best ones."""
+    resample: Annotated[float, Field(ge=0.0, le=1.0)] = 0.25
+    """Probability that an exchanged value is drawn again instead of being moved by a fifth."""
+
+    def check(self, file: "SpaceFile", ranges: Collection[str]) -> None:
+        super().check(file, ranges)
+        if not ranges:
+            raise ConfigError("scheduler.kind: pbt needs a parameter with a range to move in (uniform, loguniform)")
+        if file.resources.halve_worlds_on_oom:
+            raise ConfigError(
+                "resources.halve_worlds_on_oom (--halve-worlds): pbt hands the states of all worlds from one trial to "
+                "another, so all need as many; write false"
+            )
+        if file.searches:
+            raise ConfigError("scheduler.kind: pbt chooses values itself; write search: random")

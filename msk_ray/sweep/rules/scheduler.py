@@ -1,0 +1,52 @@
+"""The `scheduler` section of a space, by the rule that it names."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import ValidationInfo
+
+from msk_ray.config import Registry, resolve_class
+from msk_ray.errors import ConfigError
+from msk_ray.sweep.rules.early_stopping import SchedulerSpec
+
+_HERE = "msk_ray.sweep.rules"
+SCHEDULERS = Registry(
+    "scheduler.kind",
+    "msk_ray.schedulers",
+    {
+        "asha": f"{_HERE}.asha:Asha",
+        "median": f"{_HERE}.median:Median",
+        "pbt": f"{_HERE}.population:PopulationBasedTraining",
+        "none": f"{_HERE}.no_scheduler:NoScheduler",
+    },
+)
+RECORDED = {"recorded": True}
+"""Validation context of a space that an experiment has recorded."""
+_SHARED = frozenset({"time_attr", "grace", "reduction", "min_trials", "interval", "quantile", "resample"})
+"""Settings that every rule had, read or not, before each had its own."""
+
+
+def scheduler_class(name: Any) -> type[SchedulerSpec]:
+    """The class of a rule, by its name or import path; None is `none`.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    return resolve_class(SCHEDULERS.path("none" if name is None else name), "scheduler.kind", SchedulerSpec)
+
+
+def read_scheduler(value: Any, info: ValidationInfo) -> Any:
+    """The section as the settings that its rule declares. In one that was recorded, settings of other rules, which
+    nothing read, are left out."""
+    if isinstance(value, SchedulerSpec) or not isinstance(value, Mapping):
+        return value
+    try:
+        kind = scheduler_class(value.get("kind"))
+    except ConfigError as error:
+        raise ValueError(str(error)) from error
+    if info.context == RECORDED:
+        unread = _SHARED - kind.model_fields.keys()
+        value = {key: setting for key, setting in value.items() if key not in unread}
+        if value.get("kind") == "none":
+            value.pop("time_attr", None)
+    return kind.model_validate(value)

@@ -1,0 +1,64 @@
+"""What a rule is by which a trial ends itself, from its own history alone."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from pydantic import ModelWrapValidatorHandler, SerializerFunctionWrapHandler, model_serializer, model_validator
+
+from msk_ray.config.sections import Section
+from msk_ray.experiment.metrics import Evaluation
+from msk_ray.experiment.outcomes import Outcome
+
+
+@dataclass(frozen=True)
+class History:
+    """What a trial has done, after an epoch."""
+
+    row: Mapping[str, float]
+    """Metrics of the epoch just done."""
+    evaluations: Sequence[Evaluation]
+    """All evaluations of the trained policy, the newest last."""
+    epochs: int
+    """The trial's full length."""
+    elapsed_s: float
+    """Work so far over all attempts [s]."""
+
+    @property
+    def epoch(self) -> int:
+        """Epochs done."""
+        return int(self.row["epoch"])
+
+
+class StopRule(Section, ABC):
+    """A rule with its settings, which are the fields of its class.
+
+    One of your own is a class derived from this one, named in a space by its import path:
+    `stop: {rules: {"package.module:Class": {setting: value}}}`.
+    """
+
+    outcome: ClassVar[Outcome] = Outcome.STOPPED_RULE
+    """How a trial ends that it stops."""
+    by_score: ClassVar[bool] = True
+    """Whether scores decide: then --no-early-stopping and --smoke leave it out."""
+    before_the_end: ClassVar[bool] = False
+    """Whether it is asked even after the last epoch, before that ends the trial."""
+    shorthand: ClassVar[str | None] = None
+    """The setting that a bare value stands for: `target: 5` for `target: {score: 5}`."""
+
+    @abstractmethod
+    def why(self, history: History) -> str | None:
+        """The reason why the trial ends now, in words; None to go on."""
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _from_a_bare_value(cls, data: Any, handler: ModelWrapValidatorHandler["StopRule"]) -> "StopRule":
+        if cls.shorthand is not None and not isinstance(data, Mapping | StopRule):
+            data = {cls.shorthand: data}
+        return handler(data)
+
+    @model_serializer(mode="wrap")
+    def _as_a_bare_value(self, handler: SerializerFunctionWrapHandler) -> Any:
+        written = handler(self)
+        return written[self.shorthand] if self.shorthand is not None and set(written) == {self.shorthand} else written

@@ -1,0 +1,85 @@
+"""The `stop` section of a space: which rules end its trials."""
+
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, Field, SerializeAsAny, ValidationError, model_validator
+
+from msk_ray.config import Registry, describe_fault, resolve_class
+from msk_ray.config.sections import Section
+from msk_ray.errors import ConfigError
+from msk_ray.experiment.outcomes import Ending, Outcome
+from msk_ray.sweep.rules.nonfinite import NonFinite
+from msk_ray.sweep.rules.plateau import Plateau
+from msk_ray.sweep.rules.stop_rule import History, StopRule
+from msk_ray.sweep.rules.target import Target
+from msk_ray.sweep.rules.wall_time import WallTime
+
+STOP_RULES = Registry("stop.rules", "msk_ray.stop_rules", {})
+"""Of installed packages; our own are fields of the section."""
+
+
+def _found(value: Any) -> Any:
+    """Rules from outside, by what names them."""
+    if not isinstance(value, Mapping):
+        return value
+    return {name: _rule(name, settings) for name, settings in value.items()}
+
+
+def _rule(name: Any, settings: Any) -> StopRule:
+    if isinstance(settings, StopRule):
+        return settings
+    try:
+        # mypy takes no abstract class where a class is asked for.
+        kind = resolve_class(STOP_RULES.path(name), f"stop.rules.{name}", StopRule)  # type: ignore[type-abstract]
+    except ConfigError as error:
+        raise ValueError(str(error)) from error
+    try:
+        return kind.model_validate({} if settings is None else settings)
+    except ValidationError as error:
+        raise ValueError(f"stop.rules.{name}: {describe_fault(error, kind)}") from error
+
+
+class StopSpec(Section):
+    """When a trial ends by itself before its last epoch."""
+
+    nonfinite: NonFinite | None = NonFinite()
+    """Written as true or false."""
+    target: Target | None = None
+    wall_time_s: WallTime | None = None
+    plateau: Plateau | None = None
+    rules: Annotated[dict[str, SerializeAsAny[StopRule]], BeforeValidator(_found)] = Field(default_factory=dict)
+    """Rules of your own: import path, or name of an installed one → its settings."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _switch(cls, data: Any) -> Any:
+        if not isinstance(data, dict) or not isinstance(data.get("nonfinite"), bool):
+            return data
+        return data | {"nonfinite": {} if data["nonfinite"] else None}
+
+    def all_rules(self) -> Iterator[StopRule]:
+        """The rules in force, in the order in which they are asked."""
+        for rule in (self.nonfinite, self.target, self.wall_time_s, self.plateau):
+            if rule is not None:
+                yield rule
+        yield from self.rules.values()
+
+    def without_scores(self) -> "StopSpec":
+        """The rules that do not judge by scores."""
+        named = {name: getattr(self, name) for name in ("target", "plateau", "wall_time_s", "nonfinite")}
+        left_out = {name: None for name, rule in named.items() if rule is not None and rule.by_score}
+        kept = {name: rule for name, rule in self.rules.items() if not rule.by_score}
+        return self.model_copy(update=left_out | ({"rules": kept} if kept != self.rules else {}))
+
+    def ending(self, history: History) -> Ending | None:
+        """Whether a trial ends after an epoch, and how; None to go on."""
+        rules = list(self.all_rules())
+        finished = history.epoch >= history.epochs
+        for rule in sorted(rules, key=lambda rule: not rule.before_the_end):
+            if finished and not rule.before_the_end:
+                break
+            why = rule.why(history)
+            if why is not None:
+                return Ending(rule.outcome, why)
+        return Ending(Outcome.FINISHED, f"all {history.epochs} epochs done") if finished else None

@@ -1,0 +1,53 @@
+"""Optuna's tree-structured Parzen estimator."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from msk_ray.errors import ConfigError
+from msk_ray.sweep.operators import Listed, Operator, Range
+from msk_ray.sweep.search.base import Search
+
+
+class OptunaSearch(Search):
+    """Suggests what resembles the better half of what was tried."""
+
+    name = "optuna"
+
+    def __init__(self, parameters: Mapping[str, Operator], seed: int) -> None:
+        super().__init__(parameters, seed)
+        try:
+            import optuna
+        except ImportError:
+            raise ConfigError("search: optuna needs the optuna package: pip install optuna") from None
+        optuna.logging.set_verbosity(optuna.logging.ERROR)
+        self._distributions = {key: _distribution(key, op) for key, op in self.parameters.items()}
+        self._study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=seed), direction="maximize")
+        self._open: list[Any] = []
+
+    def ask(self) -> dict[str, Any]:
+        trial = self._study.ask(self._distributions)
+        self._open.append(trial)
+        return dict(trial.params)
+
+    def tell(self, params: Mapping[str, Any], score: float | None) -> None:
+        from optuna.trial import TrialState, create_trial
+
+        asked = next((trial for trial in self._open if trial.params == params), None)
+        if asked is not None:
+            self._open.remove(asked)
+            self._study.tell(asked, score, state=TrialState.FAIL if score is None else None)
+        elif score is not None:
+            done = create_trial(params=dict(params), distributions=self._distributions, value=score)
+            self._study.add_trial(done)
+
+
+def _distribution(key: str, op: Operator) -> Any:
+    from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+
+    if isinstance(op, Listed):
+        return CategoricalDistribution([level.label for level in op.levels])
+    if not isinstance(op, Range):
+        raise ConfigError(f"parameters.{key}: optuna searches lists and ranges, not {type(op).__name__}")
+    if op.whole:
+        return IntDistribution(int(op.low), int(op.high), log=op.log)
+    return FloatDistribution(op.low, op.high, log=op.log)

@@ -1,0 +1,152 @@
+"""What the terminal shows while an experiment runs: a line an event, and now and then where everything stands."""
+
+import math
+import sys
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from msk_ray.experiment.attempts import FIRST, Attempt
+from msk_ray.experiment.eta import eta
+from msk_ray.experiment.outcomes import Ending, Outcome
+from msk_ray.experiment.trial import Trial
+from msk_ray.progress import format_duration
+from msk_ray.text import printable, printable_lines
+
+STATUS_INTERVAL_S = 30.0
+
+
+@dataclass
+class _Running:
+    trial: Trial
+    since: float
+    first_epoch: int | None = None
+    epoch: int = 0
+    score: float = math.nan
+    best: float = -math.inf
+
+
+class Console:
+    """Prints what it is told of the trials. Decides nothing, and asks neither Ray nor the disk."""
+
+    def __init__(self, waiting: Iterable[Trial], concurrent: int) -> None:
+        """
+        Args:
+            waiting: trials to be run, as far as they are known.
+            concurrent: trials at once.
+        """
+        self._waiting = {trial.id: trial for trial in waiting}
+        self._concurrent = concurrent
+        self._running: dict[str, _Running] = {}
+        self._begun: set[str] = set()
+        self._ended = 0
+        self._bests: dict[str, tuple[float, Trial]] = {}
+        """The best score of each trial that has reported one, and the trial."""
+        self._attempts: dict[str, Attempt] = {}
+        self._seconds_per_epoch: dict[str, float] = {}
+        self._start = time.monotonic()
+        self._last_status = self._start
+        # Kept, because what Ray itself prints is sent elsewhere while trials run.
+        self._out = sys.stdout
+
+    def say(self, text: str) -> None:
+        """Print some lines, with the time since the beginning."""
+        shown = printable_lines(text)
+        print(f"[{format_duration(time.monotonic() - self._start):>6}] {shown}", file=self._out, flush=True)
+
+    def started(self, trial: Trial, attempt: Attempt, quiet: bool = False) -> None:
+        """A trial has begun, or begun again; `quiet` if that is of no interest."""
+        self._waiting.pop(trial.id, None)
+        self._attempts[trial.id] = attempt
+        again = trial.id in self._begun
+        self._begun.add(trial.id)
+        self._running[trial.id] = _Running(trial, time.monotonic())
+        if not quiet:
+            self.say(f"{trial.id} {'again' if again else 'start'}  {self._name(trial)}")
+
+    def evaluated(self, trial: Trial, epoch: int, score: float, best: float) -> None:
+        """A trial has been evaluated; `best` is its best score so far."""
+        run = self._running.setdefault(trial.id, _Running(trial, time.monotonic()))
+        run.epoch, run.score = epoch, score
+        if run.first_epoch is None:
+            # Speed is taken from the first report on: what came before includes start-up and compilation.
+            run.first_epoch, run.since = epoch, time.monotonic()
+        elif epoch > run.first_epoch:
+            self._seconds_per_epoch[trial.id] = (time.monotonic() - run.since) / (epoch - run.first_epoch)
+        run.best = max(run.best, best)
+        if not math.isfinite(run.best):
+            return  # no score has been a number yet
+        before = self._best
+        if trial.id not in self._bests or run.best > self._bests[trial.id][0]:
+            self._bests[trial.id] = run.best, trial
+        if before is None or run.best > before[0]:
+            when = f" at epoch {epoch}/{trial.epochs}" if score == run.best else ""
+            self.say(f"{trial.id} best so far: score {run.best:.5g}{when}{self._suffix(trial)}")
+
+    def retried(self, trial: Trial, why: str) -> None:
+        """A trial's process has ended before its time, and another one takes its place."""
+        self.say(f"{trial.id} {why}; trying again from its newest checkpoint")
+
+    def attempted_again(self, trial: Trial, attempt: Attempt) -> None:
+        """A trial is to have another attempt."""
+        self._running.pop(trial.id, None)
+        # What it scored with all its worlds is set aside.
+        self._bests.pop(trial.id, None)
+        self._seconds_per_epoch.pop(trial.id, None)
+        self._waiting[trial.id] = trial
+        self.say(f"{trial.id} ran out of memory; it begins again with {attempt}")
+
+    def ended(self, trial: Trial, ending: Ending) -> None:
+        """A trial has ended."""
+        run = self._running.pop(trial.id, None)
+        self._ended += 1
+        compared = ending.outcome in (Outcome.STOPPED_ASHA, Outcome.STOPPED_MEDIAN)  # their reason names the score
+        score = "" if run is None or compared or run.best == -math.inf else f"; best score {run.best:.5g}"
+        self.say(f"{trial.id} {ending.outcome}: {printable(ending.why)}{score}{self._suffix(trial)}")
+
+    def failed(self, trial: Trial, why: str, where: object) -> None:
+        """A trial has ended in an error."""
+        self._running.pop(trial.id, None)
+        self._ended += 1
+        self.say(f"{trial.id} error: {why}; see {where}{self._suffix(trial)}")
+
+    def left(self, trial: Trial) -> None:
+        """A trial's process has ended and the trial has not."""
+        self._running.pop(trial.id, None)
+
+    def tick(self) -> None:
+        """Print where everything stands, if that was long ago."""
+        if time.monotonic() - self._last_status >= STATUS_INTERVAL_S:
+            self._last_status = time.monotonic()
+            self.say(self.status())
+
+    def status(self) -> str:
+        """Where everything stands: a line, and one for each trial that runs."""
+        parts = [f"{len(self._running)} running", f"{len(self._waiting)} waiting", f"{self._ended} ended"]
+        best = self._best
+        if best is not None:
+            parts.append(f"best {best[0]:.5g} ({best[1].id})")
+        running = [
+            (run.trial.epochs - run.epoch, self._seconds_per_epoch.get(run.trial.id)) for run in self._running.values()
+        ]
+        left = eta(running, [trial.epochs for trial in self._waiting.values()], self._concurrent)
+        if left is not None:
+            parts.append(f"at most {format_duration(left)} left")
+        lines = [" · ".join(parts)]
+        for run in self._running.values():
+            score = "no evaluation yet" if math.isnan(run.score) else f"score {run.score:.5g} (best {run.best:.5g})"
+            lines.append(
+                f"    {run.trial.id}  epoch {run.epoch:>4}/{run.trial.epochs}  {score}  {self._name(run.trial)}"
+            )
+        return "\n".join(lines)
+
+    @property
+    def _best(self) -> tuple[float, Trial] | None:
+        return max(self._bests.values(), key=lambda best: best[0], default=None)
+
+    def _name(self, trial: Trial) -> str:
+        return f"{printable(trial.variant)} seed={trial.seed}{self._suffix(trial)}"
+
+    def _suffix(self, trial: Trial) -> str:
+        """What sets the trial's attempt apart, in brackets."""
+        return self._attempts.get(trial.id, FIRST).suffix

@@ -1,0 +1,159 @@
+"""Which trial Tune runs next: those of a list or of a search, and again those that are to have another attempt.
+
+Another attempt needs a process of its own, as the process of the one before still holds its memory, and Tune gives a
+new process to what it takes for a new trial. So a trial whose process ended without an ending, but with a later attempt
+in its folder, is handed to Tune once more.
+"""
+
+import copy
+import math
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from ray.tune.search import BasicVariantGenerator, Searcher
+
+from msk_ray.experiment.attempts import read_attempt
+from msk_ray.experiment.manifest import Experiment
+from msk_ray.experiment.outcomes import read_ending
+from msk_ray.sweep.search import Search
+from msk_ray.tune.schedulers import BEST, METRIC
+
+Identify = Callable[[Mapping[str, Any]], str]
+"""The id of the trial that a Tune config stands for."""
+
+
+class _Runs:
+    """Tune's trials that have not ended, and the Tune configs of those to be run again."""
+
+    def __init__(self, experiment: Experiment, identify: Identify) -> None:
+        self._experiment = experiment
+        self._identify = identify
+        self._running: dict[str, tuple[Mapping[str, Any], int]] = {}
+        self.again: deque[Mapping[str, Any]] = deque()
+
+    def began(self, ray_id: str, config: Mapping[str, Any]) -> None:
+        """Tune has been given a trial."""
+        attempt = read_attempt(self._experiment.trial_folder(self._identify(config)))
+        self._running[ray_id] = config, attempt.number
+
+    def ended(self, ray_id: str) -> Mapping[str, Any] | None:
+        """Tune has done with a trial. Returns its config, unless it is to be run again."""
+        config, attempt = self._running.pop(ray_id)
+        folder = self._experiment.trial_folder(self._identify(config))
+        if read_ending(folder) is None and read_attempt(folder).number > attempt:
+            self.again.append(config)
+            return None
+        return config
+
+    def __bool__(self) -> bool:
+        """Whether a trial may still be run again."""
+        return bool(self._running or self.again)
+
+
+class TrialList(BasicVariantGenerator):
+    """A list of trials, as Tune's own generator makes them of the parameter space."""
+
+    def __init__(self, experiment: Experiment, identify: Identify, max_concurrent: int | None) -> None:
+        # Tune limits a generator it was given no more than this one limits itself.
+        super().__init__(max_concurrent=max_concurrent or 0)
+        self._runs = _Runs(experiment, identify)
+        self._given: Any = None
+        self._asking = False
+        self._stopped = False
+
+    def add_configurations(self, experiments: Any) -> None:
+        if self._given is None:
+            self._given = experiments[0] if isinstance(experiments, list) else experiments
+        super().add_configurations(experiments)
+
+    def next_trial(self) -> Any:
+        self._asking = True
+        try:
+            return self._next_trial()
+        finally:
+            self._asking = False
+
+    def _next_trial(self) -> Any:
+        trial = super().next_trial()
+        if trial is None and self._runs.again and super().is_finished():
+            more = copy.copy(self._given)
+            more.spec = {**self._given.spec, "config": dict(self._runs.again.popleft()), "num_samples": 1}
+            super().add_configurations([more])
+            trial = super().next_trial()
+        if trial is not None:
+            self._runs.began(trial.trial_id, trial.config)
+        return trial
+
+    def on_trial_complete(self, trial_id: str, result: dict[str, Any] | None = None, error: bool = False) -> None:
+        super().on_trial_complete(trial_id, result, error)
+        self._runs.ended(trial_id)
+
+    def set_finished(self) -> None:
+        super().set_finished()
+        # By the generator itself when its list is at an end, or by Tune when everything is to stop.
+        self._stopped = self._stopped or not self._asking
+
+    def is_finished(self) -> bool:
+        finished: bool = super().is_finished()
+        return self._stopped or (finished and not self._runs)
+
+    def save_to_dir(self, dirpath: str, session_str: str) -> None:
+        """Nothing: an experiment goes on from its trials' folders."""
+
+    def has_checkpoint(self, dirpath: str) -> bool:
+        return False
+
+
+class Suggestions(Searcher):
+    """What a search suggests; it is told the best score of each trial that has ended."""
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        identify: Identify,
+        search: Search,
+        begun: Sequence[Mapping[str, Any]],
+        samples: int,
+    ) -> None:
+        """
+        Args:
+            experiment: whose trials they are.
+            identify: the id of the trial that a Tune config stands for.
+            search: told already what came of trials that have ended.
+            begun: values suggested before whose trials have not ended: they are tried first.
+            samples: trials to be run, those begun included.
+        """
+        super().__init__(metric=METRIC, mode="max")
+        self._runs = _Runs(experiment, identify)
+        self._search = search
+        self._begun = deque(begun)
+        self._left = samples
+        self._best: dict[str, float] = {}
+
+    def suggest(self, trial_id: str) -> Any:
+        """The Tune config of the next trial; None while none is to be begun."""
+        if self._runs.again:
+            config = self._runs.again.popleft()
+        elif self._left > 0:
+            self._left -= 1
+            config = {"params": dict(self._begun.popleft() if self._begun else self._search.ask())}
+        else:
+            return None if self._runs else Searcher.FINISHED
+        self._runs.began(trial_id, config)
+        return dict(config)
+
+    def on_trial_result(self, trial_id: str, result: dict[str, Any]) -> None:
+        if math.isfinite(result.get(BEST, math.nan)):
+            self._best[trial_id] = result[BEST]
+
+    def on_trial_complete(self, trial_id: str, result: dict[str, Any] | None = None, error: bool = False) -> None:
+        if result:
+            self.on_trial_result(trial_id, result)
+        best = self._best.pop(trial_id, None)
+        config = self._runs.ended(trial_id)
+        if config is not None:
+            self._search.tell(config["params"], best)
+
+    def save(self, checkpoint_path: str) -> None:
+        """Nothing: an experiment goes on from its trials' folders."""
