@@ -1,4 +1,4 @@
-"""What every environment shares: stepping, truncation against termination, reset and divergence.
+"""The base of every environment: stepping, truncation and termination, reset and divergence.
 
 Axes: W worlds, O observation, A action.
 """
@@ -22,12 +22,12 @@ from msk_ray.simulation.tendons import Tendons
 
 SettingsT = TypeVar("SettingsT", bound=EnvSettings)
 
-# A world whose state leaves this bound has diverged: no model here reaches it while the solver works.
+# A world whose state exceeds this bound has diverged: no model here reaches it as long as the solver works.
 _ABSURD = 1e6
 
 
 class EnvState(NamedTuple):
-    """Where every world is."""
+    """The state of every world."""
 
     physics: StepState
     """Physical state, attached to the graph."""
@@ -53,9 +53,9 @@ class Transition(NamedTuple):
     terminated: Tensor
     """The episode ended by itself (fell, diverged): nothing follows, shape (W,) bool."""
     truncated: Tensor
-    """The episode was cut by the time limit: its value goes on, shape (W,) bool."""
+    """The time limit cut the episode: the value of later steps still counts, shape (W,) bool."""
     diverged: Tensor
-    """The physics left all bounds, shape (W,) bool; counted in `terminated`."""
+    """The physics exceeded all bounds, shape (W,) bool; included in `terminated`."""
 
 
 class Env(ABC, Generic[SettingsT]):
@@ -63,9 +63,9 @@ class Env(ABC, Generic[SettingsT]):
 
     Attributes:
         state: current state of all worlds; `detach` it to start a new graph.
-        generator: source of reset states, on the environment's device; one on the CPU may be put in its place, which
-            draws the same states for every device.
-        ignore_contact_forces: whether they are read as 0, in a comparison of gradients, which they have none of.
+        generator: source of reset states, on the environment's device; replace it by one on the CPU to draw the same
+            states on every device.
+        ignore_contact_forces: whether contact forces read as 0, for comparisons of gradients, because they carry none.
     """
 
     action_size: int
@@ -73,7 +73,7 @@ class Env(ABC, Generic[SettingsT]):
     reward_names: ClassVar[tuple[str, ...]]
     """Names of the T parts of the reward."""
     Settings: ClassVar[type[EnvSettings]]
-    """Its section of the configuration, which also says what physics has a name here, and what physics is read."""
+    """Its section of the configuration, which also lists its named physics and the physics settings it reads."""
 
     def __init__(
         self,
@@ -110,26 +110,26 @@ class Env(ABC, Generic[SettingsT]):
     @classmethod
     @abstractmethod
     def build_model(cls, config: SettingsT, physics: PhysicsConfig) -> mujoco.MjModel:
-        """Compile the model these settings describe."""
+        """Compile the model that these settings describe."""
 
     @classmethod
     def reference_settings(cls, config: SettingsT) -> SettingsT:
-        """`config` with the reward that policies are scored under, the section's defaults; all else stays."""
+        """`config` with the reward that policies are scored under: the section's defaults; the rest is unchanged."""
         return config.model_copy(update={"reward": type(config.reward)()})
 
     @classmethod
     def reference_physics(cls, physics: PhysicsConfig, variant: str | None) -> PhysicsConfig:
-        """The physics that policies are scored under: a named variant as it stands, or `physics` if there is none."""
+        """The physics that policies are scored under: an unchanged named variant, or `physics` if there is none."""
         variants = cls.Settings.variants
         if not variants:
             return physics
         return PhysicsConfig(variant=variant or variants[0], nconmax=physics.nconmax, njmax=physics.njmax)
 
     def prepare(self) -> None:
-        """Put constants on the device: copying one there in every step would make the host wait for the GPU."""
+        """Create constants on the device: copying one there in every step would make the host wait for the GPU."""
 
     def begin_epoch(self, epoch: int) -> None:
-        """Called before each training epoch, counted from 0: what changes with training changes here."""
+        """Called before each training epoch, counted from 0: change here what depends on the progress of training."""
 
     def control(self, action: Tensor) -> Tensor:
         """Controls (W, nu) of the model for actions (W, A) in the current state."""
@@ -152,11 +152,11 @@ class Env(ABC, Generic[SettingsT]):
         return torch.zeros(self.nworld, dtype=torch.bool, device=self.device)
 
     def outcome_terms(self, state: StepState) -> dict[str, Tensor]:
-        """Further per-world figures (W,) that evaluation averages over an episode."""
+        """Further quantities per world (W,) that the evaluation averages over an episode."""
         return {}
 
     def success(self, tail: dict[str, Tensor]) -> Tensor | None:
-        """Worlds (W,) bool that met the task, from the outcome terms of an episode's last second, each (T, W)."""
+        """Worlds (W,) bool that succeeded, from the outcome terms of an episode's last second, each (T, W)."""
         return None
 
     def reset_state(self) -> EnvState:
@@ -173,7 +173,7 @@ class Env(ABC, Generic[SettingsT]):
         self._fresh = [StepState(*parts) for parts in zip(*(t.split(self.nworld) for t in drawn), strict=True)]
 
     def state_dict(self) -> dict[str, Any]:
-        """Where the worlds are, what the next resets draw from, and the room that the simulation has grown to."""
+        """The state of the worlds, the generator of resets, and the buffer sizes that the simulation has grown to."""
         state = self.state
         return {
             "env_generator": self.generator.get_state(),
@@ -182,13 +182,13 @@ class Env(ABC, Generic[SettingsT]):
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from what `state_dict` gave."""
-        # A generator's state is a host tensor whatever device it drives.
+        """Continue from a `state_dict`."""
+        # The state of a generator is a host tensor on every device.
         self.generator.set_state(state["env_generator"].cpu())
         *physics, action, age = state["env_state"]
         self.state = EnvState(StepState(*physics), action, age)
         if "capacity" in state:
-            # Room that the trial grew to: what comes next may need it at once.
+            # The buffer sizes that the trial had grown to: the next step may need them.
             self.sim.reserve(Capacity(*state["capacity"]))
 
     def observation(self) -> Tensor:
@@ -198,8 +198,8 @@ class Env(ABC, Generic[SettingsT]):
     def step(self, action: Tensor, *, auto_reset: bool = True) -> Transition:
         """Advance all worlds under actions (W, A) in [-1, 1] and reset those whose episode ended.
 
-        A world whose physics left all bounds keeps its state of before, cut from the graph, for the observation
-        here returned, gets no reward for the step, and counts as terminated.
+        A world whose physics exceeded all bounds gets no reward for the step and counts as terminated; its observation
+        is that of the state before the step, cut from the graph.
         """
         before = self.state.physics
         after = self.sim.step(self.control(action), *before)
@@ -223,9 +223,9 @@ class Env(ABC, Generic[SettingsT]):
         return Transition(reward, terms.detach(), obs, terminated, truncated, diverged)
 
     def frames(self, state: StepState) -> Frames:
-        """Bodies, sites, geoms and centres of mass in `state` (W worlds): where they are and how they move.
+        """Positions, orientations and velocities of bodies, sites, geoms and centres of mass in `state` (W worlds).
 
-        All of it carries gradients. What several functions ask for of one state is computed once.
+        All carry gradients. They are computed once per state, even if several functions ask for them.
         """
         frames: Frames = self._once("frames", state, lambda: self._kinematics(state.qpos, state.qvel))
         return frames
@@ -240,11 +240,11 @@ class Env(ABC, Generic[SettingsT]):
         return found
 
     def contact_forces(self, state: StepState, geom: Names) -> Tensor:
-        """Force of all contacts on geoms [N], world coordinates: (W, 3) of one name or id, (W, n, 3) of several.
+        """Force of all contacts on geoms [N], world coordinates: (W, 3) for one name or id, (W, n, 3) for several.
 
         Values only: no gradient flows through them. They are those of the last substep of the step that led to
-        `state`, and 0 in a world that diverged in it. So only `reward_terms`, `fell` and `outcome_terms` can ask: an
-        observation is also taken of states that no step has led to.
+        `state`, and 0 in a world that diverged in it. Only `reward_terms`, `fell` and `outcome_terms` may use them,
+        because `observe` is also called for states that no step has led to.
 
         Raises:
             ConfigError: no step has just led to `state`, or there is no such geom.
@@ -253,7 +253,7 @@ class Env(ABC, Generic[SettingsT]):
             return torch.zeros_like(self.frames(state).geom_position(geom))
         if state is not self._reached:
             raise ConfigError(
-                f"{type(self).__qualname__}: contact forces belong to a step, not to a state: ask for them in "
+                f"{type(self).__qualname__}: contact forces belong to a step, not to a state: use them in "
                 "reward_terms, fell or outcome_terms, not in observe"
             )
         force = self._once("contact_forces", state, self.sim.contact_forces)
@@ -261,7 +261,7 @@ class Env(ABC, Generic[SettingsT]):
         return torch.where(self._diverged.view(-1, *[1] * (chosen.dim() - 1)), 0.0, chosen)
 
     def _once(self, what: str, state: StepState, measure: Callable[[], Any]) -> Any:
-        """What `measure` gives for `state`, computed once for as long as it is the newest one asked about."""
+        """The result of `measure` for `state`, cached until another state is asked for."""
         grad = torch.is_grad_enabled()
         kept = self._measured.get(what)
         if kept is None or kept[0] is not state or kept[1] != grad:
@@ -269,7 +269,7 @@ class Env(ABC, Generic[SettingsT]):
         return kept[2]
 
     def measure_by(self, kinematics: Kinematics, tendons: Tendons) -> None:
-        """Take `frames` and `tendons` from these: those of a simulation in float64, for example."""
+        """Compute `frames` and `tendons` with these, for example with those of a simulation in float64."""
         self._kinematics, self._tendons = kinematics, tendons
         self._measured = {}
 

@@ -9,10 +9,10 @@ from msk_ray.simulation.modes import configured_backward
 
 
 def env_class(config: EnvSettings) -> type[Env[Any]]:
-    """The environment that these settings name.
+    """The class of the environment that these settings name.
 
     Raises:
-        ConfigError: there is none of that name, or it has settings of another type.
+        ConfigError: there is no such class, or it has settings of another type.
     """
     path = ENVIRONMENTS.path(config.name)
     found: type[Env[Any]] = resolve_class(path, ENVIRONMENTS.key, Env)  # type: ignore[type-abstract]
@@ -31,7 +31,7 @@ def make_env(
     """Build the environment of a config section.
 
     Raises:
-        ConfigError: as `env_class`.
+        ConfigError: as for `env_class`.
         UnsupportedModelError: the model cannot be stepped, or not differentiated by `physics.backward`.
         DeviceError: no such device.
     """

@@ -13,7 +13,7 @@ _CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCo
 
 
 def add_sky(spec: mujoco.MjSpec) -> None:
-    """A light background for pictures; the physics does not know of it."""
+    """A light background for pictures, without effect on the physics."""
     spec.add_texture(
         name="sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
@@ -36,7 +36,7 @@ def apply_options(spec: mujoco.MjSpec, physics: PhysicsConfig, control_timestep:
 
 
 def override_options(spec: mujoco.MjSpec, physics: PhysicsConfig) -> None:
-    """Set what `physics` says of solver and integrator; what it leaves null stays."""
+    """Set the solver and integrator settings of `physics`; those that are null stay as they are."""
     option = spec.option
     if physics.integrator is not None:
         option.integrator = _INTEGRATORS[physics.integrator]

@@ -1,1 +1,1 @@
-"""What is a policy worth? Deterministic evaluation of checkpoints, trials and whole experiments."""
+"""How good is a policy? Deterministic evaluation of checkpoints, trials and whole experiments."""

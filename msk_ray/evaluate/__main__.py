@@ -22,12 +22,12 @@ if TYPE_CHECKING:
     from msk_ray.evaluate.measure import Bench, Request
 
 DESCRIPTION = """\
-Evaluate a policy: without noise, from fixed initial states, under the environment's own reward weights.
+Evaluate a policy: without noise, from fixed initial states, under the environment's default reward weights.
 
-Prints score, speed, falls, episode length and every reward term with its spread over episodes, and keeps them in the
-trial's eval.json. On an experiment it evaluates the best policy of each trial, ranks them, and writes the ranking into
-the experiment's eval.json. Without options the score is the one trials are ranked by (eval/score), to the last digit on
-the same device."""
+Prints score, speed, falls, episode length and every reward term with its spread over episodes, and stores them in the
+trial's eval.json. For an experiment it evaluates the best policy of each trial, ranks them, and writes the ranking into
+the experiment's eval.json. Without options the score is the one by which trials are ranked (eval/score), to the last
+digit on the same device."""
 
 EXAMPLES = """\
   python -m msk_ray.evaluate runs/demo                                   # every trial's best policy, ranked
@@ -45,24 +45,27 @@ def parser() -> Parser:
     p.add_argument(
         "target", metavar="CHECKPOINT|TRIAL|EXPERIMENT", help="a .pt file, a folder, or an experiment's name"
     )
-    p.add_argument("--worlds", type=positive, metavar="W", help="episodes a seed; by default the trial's own, 64")
-    p.add_argument("--seeds", metavar="LIST", help="of the initial states, such as 0-4; by default the trial's own")
-    p.add_argument("--steps", type=positive, metavar="N", help="env steps an episode, at most")
+    p.add_argument("--worlds", type=positive, metavar="W", help="episodes per seed (default: the trial's, 64)")
+    p.add_argument("--seeds", metavar="LIST", help="seeds of the initial states, such as 0-4 (default: the trial's)")
+    p.add_argument("--steps", type=positive, metavar="N", help="maximum env steps per episode")
     p.add_argument(
         "--physics",
         default="reference",
         metavar="LIST",
-        help="reference (what scores are taken under), own (what the trial trains on) or the environment's named ones",
+        help="comma-separated: reference (the physics of scores), own (that of training), or named ones of the "
+        "environment (default: reference)",
     )
-    p.add_argument("--device", help="cpu or cuda:N; by default the first GPU, or the CPU if there is none")
-    p.add_argument("--storage", type=Path, default=Path("runs"), metavar="DIR", help="of experiments; by default runs/")
+    p.add_argument("--device", help="cpu or cuda:N (default: the first GPU, or the CPU if there is none)")
+    p.add_argument(
+        "--storage", type=Path, default=Path("runs"), metavar="DIR", help="folder of experiments (default: runs/)"
+    )
     return p
 
 
 def positive(text: str) -> int:
-    """A whole number from 1 on."""
+    """A whole number of at least 1."""
     if not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"a whole number from 1 on, not {text}")
+        raise argparse.ArgumentTypeError(f"must be a whole number of at least 1, not {text}")
     return int(text)
 
 
@@ -79,7 +82,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     from msk_ray.simulation.simulation import resolve_device
 
     device = args.device or default_device()
-    resolve_device(device)  # one that is missing is no trial's fault
+    resolve_device(device)  # a missing device is not the fault of any trial
     bench = Bench(device)
     requests = [Request(name, args.worlds, seeds, args.steps) for name in names]
     if target.kind is Kind.EXPERIMENT:
@@ -123,7 +126,7 @@ SHARES = {"fall_rate": "fell", "diverged_rate": "diverged", "success_rate": "suc
 
 
 def figure_rows(entry: dict[str, Any]) -> list[tuple[str, dict[str, float]]]:
-    """Score, length, outcome terms such as the speed, and reward terms of an evaluation, by name."""
+    """Names and values of an evaluation's score, length, outcome terms such as the speed, and reward terms."""
     return [
         ("score", entry["score"]),
         ("length", entry["length"]),
@@ -133,13 +136,13 @@ def figure_rows(entry: dict[str, Any]) -> list[tuple[str, dict[str, float]]]:
 
 
 def evaluate_experiment(experiment: Experiment, bench: "Bench", requests: "Sequence[Request]") -> int:
-    """Evaluate the best policy of each trial, keep the figures beside it, and rank them.
+    """Evaluate the best policy of each trial, store the results in its folder, and rank the trials.
 
-    A trial whose policy cannot be evaluated is named and does not hold up the others. One that has only its untrained
-    policy is named too, and has no rank.
+    A trial whose policy cannot be evaluated is listed and does not stop the others. A trial that has only its untrained
+    policy is listed too, without a rank.
 
     Returns:
-        The exit code: 1 if there was such a trial.
+        The exit code: 1 if a policy could not be evaluated.
     """
     from msk_ray.evaluate.measure import EVAL_FILE, FORMAT, eval_file_of, store_evaluation
     from msk_ray.training import load_policy

@@ -1,4 +1,4 @@
-"""Evaluations of one policy under one physics: figures with their spread over episodes."""
+"""Evaluate a policy under one physics: results with their spread over episodes."""
 
 import datetime
 import platform
@@ -30,7 +30,7 @@ _PACKAGES = ("msk-ray", "torch", "warp-lang", "mujoco", "mujoco-warp")
 
 @dataclass(frozen=True)
 class Request:
-    """How to evaluate. None takes what the trial's own evaluation uses."""
+    """How to evaluate. None stands for the setting of the trial's own evaluation."""
 
     physics: str = REFERENCE
     """`reference`, `own` (what the trial trains on), or a named physics of the environment."""
@@ -40,10 +40,10 @@ class Request:
 
 
 def named_physics(config: Config, name: str) -> tuple[str, PhysicsConfig]:
-    """The physics a name means for a trial, and the name to show.
+    """The physics that a name stands for in a trial, and the name to show.
 
     Raises:
-        ConfigError: its environment has no such physics.
+        ConfigError: the environment has no physics of that name.
     """
     env_type = env_class(config.env)
     variants = config.env.variants
@@ -69,7 +69,7 @@ class Bench:
         self._evaluators: dict[str, Evaluator] = {}
 
     def evaluator(self, config: Config, request: Request) -> tuple[Evaluator, str]:
-        """The evaluator a request asks for, and the name of its physics.
+        """The evaluator for a request, and the name of its physics.
 
         Raises:
             ConfigError, DeviceError, UnsupportedModelError, SimulationError: as their messages say.
@@ -86,10 +86,10 @@ class Bench:
         return self._evaluators[key], shown
 
     def evaluate(self, policy: SavedPolicy, request: Request) -> dict[str, Any]:
-        """One entry of `eval.json`: what was evaluated, how, and the figures.
+        """One entry of `eval.json`: what was evaluated, how, and the results.
 
         Raises:
-            MskRayError: as `evaluator`, or the checkpoint does not fit its environment.
+            MskRayError: as for `evaluator`, or the checkpoint does not fit its environment.
         """
         use_threads(policy.config)
         evaluator, physics = self.evaluator(policy.config, request)
@@ -125,12 +125,12 @@ class Bench:
 
 
 def figures(runs: Sequence[Episodes], reward_names: Sequence[str]) -> dict[str, Any]:
-    """Figures over the episodes of all runs.
+    """Results over the episodes of all runs.
 
     Returns:
-        `score`, `length`, `outcomes` and `terms`, each {mean, std, min, max} over episodes (std with n − 1; 0 of one
-        episode), and the shares `fall_rate`, `diverged_rate` and, where defined, `success_rate`. An outcome term's
-        mean is over env steps, its spread over the episodes' own means.
+        `score`, `length`, `outcomes` and `terms`, each {mean, std, min, max} over episodes (std with n − 1; 0 for a
+        single episode), and the shares `fall_rate`, `diverged_rate` and, where defined, `success_rate`. The mean of an
+        outcome term is over env steps, its spread over the means of the episodes.
     """
     score, length, terms = (torch.cat([getattr(run, name) for run in runs]) for name in ("score", "length", "terms"))
     sums = {name: torch.cat([run.outcomes[name] for run in runs]) for name in runs[0].outcomes}
@@ -172,15 +172,15 @@ def default_device() -> str:
 
 
 def eval_file_of(checkpoint: Path) -> Path:
-    """Where evaluations of a checkpoint are kept: in its trial's folder."""
+    """Where evaluations of a checkpoint are stored: in its trial's folder."""
     return trial_folder_of(checkpoint) / EVAL_FILE
 
 
 def read_evaluations(path: Path) -> list[dict[str, Any]]:
-    """The entries of an `eval.json`; none if there is no such file.
+    """The entries of an `eval.json`; an empty list if the file does not exist.
 
     Raises:
-        StorageError: it is not such a file.
+        StorageError: the file holds something else.
     """
     try:
         return read_object(path, _evaluations) or []
@@ -224,10 +224,10 @@ def _check_evaluation(entry: dict[str, Any]) -> None:
 
 
 def store_evaluation(path: Path, entry: Mapping[str, Any]) -> None:
-    """Put an entry into an `eval.json`, in place of one of the same checkpoint, physics and size.
+    """Put an entry into an `eval.json`, replacing the one for the same checkpoint, physics and size.
 
     Raises:
-        StorageError: the file is there and holds something else, or cannot be written.
+        StorageError: the file exists and holds something else, or cannot be written.
     """
     key = ("checkpoint", "physics", "worlds", "seeds", "steps")
     kept = [old for old in read_evaluations(path) if any(old.get(k) != entry[k] for k in key)]

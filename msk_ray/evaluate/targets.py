@@ -13,7 +13,7 @@ from msk_ray.experiment.trial_status import find_experiments
 
 
 class Kind(StrEnum):
-    """What a target is."""
+    """The kinds of targets."""
 
     CHECKPOINT = "checkpoint"
     TRIAL = "trial"
@@ -22,7 +22,7 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True)
 class Target:
-    """Something to look at, on disk."""
+    """Something on disk to look at."""
 
     kind: Kind
     path: Path
@@ -30,7 +30,7 @@ class Target:
 
 
 def find_target(text: str, storage: Path) -> Target:
-    """The checkpoint, trial or experiment that a path means, or the experiment of that name in `storage`.
+    """The checkpoint, trial or experiment at a path, or the experiment of that name in `storage`.
 
     Raises:
         StorageError: there is none.
@@ -38,7 +38,7 @@ def find_target(text: str, storage: Path) -> Target:
     for path in (storage / text, Path(text)):
         if path.is_file():
             if path.suffix != ".pt":
-                raise StorageError(f"{path} is no checkpoint: give a .pt file, a trial's folder or an experiment")
+                raise StorageError(f"{path} is not a checkpoint: give a .pt file, a trial's folder or an experiment")
             return Target(Kind.CHECKPOINT, path.resolve())
         if path.is_dir():
             return Target(_kind_of(path), path.resolve())
@@ -52,7 +52,7 @@ def find_target(text: str, storage: Path) -> Target:
 
 
 def find_experiment(text: str, storage: Path) -> Experiment:
-    """The experiment that a name or a path means.
+    """The experiment of a name or at a path.
 
     Raises:
         StorageError: there is none, or it is something else.
@@ -64,7 +64,7 @@ def find_experiment(text: str, storage: Path) -> Experiment:
 
 
 def best_checkpoint(target: Target) -> Path:
-    """The one checkpoint a target stands for: itself, a trial's best, or that of the best trial.
+    """The checkpoint that a target stands for: the target itself, a trial's best, or the best trial's best.
 
     Raises:
         CheckpointError: there is none yet.
@@ -75,7 +75,7 @@ def best_checkpoint(target: Target) -> Path:
 
 
 def best_trial_folder(target: Target) -> Path:
-    """The folder of the one trial a target stands for.
+    """The folder of the trial that a target stands for.
 
     Raises:
         CheckpointError: no trial of the experiment has a score yet.
@@ -87,8 +87,8 @@ def best_trial_folder(target: Target) -> Path:
     best = best_record(read_records(Experiment(target.path)))
     if best is None:
         raise CheckpointError(
-            f"no trained policy of {target.path} has a score yet; come back after the first evaluation of one, or name "
-            "a trial to look at its untrained policy"
+            f"no trained policy of {target.path} has a score yet: wait for the first evaluation, or name a trial to "
+            "look at its untrained policy"
         )
     return best.folder
 
@@ -101,12 +101,14 @@ def best_of_trial(folder: Path) -> Path:
     """
     path = layout.best_checkpoint(folder)
     if not path.is_file():
-        raise CheckpointError(f"{folder} has no checkpoints/{path.name}: the trial was not evaluated yet, or lost it")
+        raise CheckpointError(
+            f"{folder} has no checkpoints/{path.name}: the trial has not been evaluated yet, or the file was lost"
+        )
     return path
 
 
 def trial_folder_of(checkpoint: Path) -> Path:
-    """The folder of the trial a checkpoint belongs to; the checkpoint's own folder if it lies alone."""
+    """The folder of the trial that a checkpoint belongs to; the checkpoint's own folder if there is no trial."""
     return checkpoint.parent.parent if checkpoint.parent.name == "checkpoints" else checkpoint.parent
 
 
@@ -117,5 +119,5 @@ def _kind_of(path: Path) -> Kind:
         return Kind.TRIAL
     if path.name == "checkpoints":
         raise StorageError(f"{path}: give one of its .pt files, or the trial's folder above it")
-    # An experiment that died before its first file is an empty folder; what is wrong with it is said by who reads it.
+    # An experiment that died before its first file is an empty folder; its reader says what is wrong with it.
     return Kind.EXPERIMENT

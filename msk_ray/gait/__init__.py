@@ -1,1 +1,1 @@
-"""How does a policy walk? Outcome measures of gait analysis, beside those of people."""
+"""How does a policy walk? Measures of gait analysis, compared with those of people."""

@@ -1,4 +1,4 @@
-"""`python -m msk_ray.gait`: how does a policy walk, beside people?"""
+"""`python -m msk_ray.gait`: how does a policy walk, compared with people?"""
 
 import sys
 from collections.abc import Sequence
@@ -13,10 +13,10 @@ from msk_ray.text_table import text_table
 
 DESCRIPTION = """\
 Measure the gait of a policy of a leg environment (myoleg26, myoleg): speed, cadence, step length, duty factor, joint
-angles and ground reaction over the gait cycle, symmetry, cost and falls, each beside the range of healthy adults.
+angles and ground reaction over the gait cycle, symmetry, cost and falls, compared with the range of healthy adults.
 
 Episodes are those of the evaluation: without noise or assistance, from fixed initial states. Their first second is
-left out. Writes gait.json and gait.png into the trial's folder, or where --out says."""
+left out. Writes gait.json and gait.png into the trial's folder or that of --out."""
 
 EXAMPLES = """\
   python -m msk_ray.gait runs/train/myoleg26_seed0
@@ -26,12 +26,16 @@ EXAMPLES = """\
 def parser() -> Parser:
     """The command line."""
     p = Parser("python -m msk_ray.gait", DESCRIPTION, EXAMPLES)
-    p.add_argument("target", metavar="CHECKPOINT|TRIAL|EXPERIMENT", help="whose (best) policy is measured")
-    p.add_argument("--worlds", type=positive, default=16, metavar="W", help="episodes (default %(default)s)")
-    p.add_argument("--steps", type=positive, metavar="N", help="env steps an episode, at most")
-    p.add_argument("--out", type=Path, metavar="DIR", help="where to write; by default the trial's folder")
-    p.add_argument("--device", help="cpu or cuda:N; by default the first GPU, or the CPU if there is none")
-    p.add_argument("--storage", type=Path, default=Path("runs"), metavar="DIR", help="of experiments; by default runs/")
+    p.add_argument(
+        "target", metavar="CHECKPOINT|TRIAL|EXPERIMENT", help="the policy to measure: itself, or the best one"
+    )
+    p.add_argument("--worlds", type=positive, default=16, metavar="W", help="episodes (default: %(default)s)")
+    p.add_argument("--steps", type=positive, metavar="N", help="maximum env steps per episode")
+    p.add_argument("--out", type=Path, metavar="DIR", help="folder to write to (default: the trial's)")
+    p.add_argument("--device", help="cpu or cuda:N (default: the first GPU, or the CPU if there is none)")
+    p.add_argument(
+        "--storage", type=Path, default=Path("runs"), metavar="DIR", help="folder of experiments (default: runs/)"
+    )
     return p
 
 

@@ -1,4 +1,4 @@
-"""Time series of an episode that gait analysis needs, from its states by C MuJoCo in float64.
+"""The time series that gait analysis needs, computed from an episode's states by C MuJoCo in float64.
 
 Axes: T samples, U muscles.
 """
@@ -21,29 +21,29 @@ _JOINTS = {"hip_flexion": "hip_flexion", "knee_flexion": "knee_angle", "ankle_do
 
 @dataclass(frozen=True)
 class Episode:
-    """One episode; by side `r` and `l` where it says so."""
+    """One episode. "By side" means a dict with the keys `r` and `l`."""
 
     timestep: float
-    """Between samples [s]."""
+    """Time between samples [s]."""
     weight: float
-    """Of the body [N]."""
+    """Body weight [N]."""
     forward: Array
-    """Place of the pelvis along the way [m], shape (T,)."""
+    """Position of the pelvis along the walking direction [m], shape (T,)."""
     feet: dict[str, Array]
-    """Place of each heel along the way [m], by side (T,)."""
+    """Position of each heel along the walking direction [m], by side, each (T,)."""
     curves: dict[str, dict[str, Array]]
     """`CURVES` by name and side, each (T,)."""
     activation: Array
     """Activations, shape (T, U)."""
     muscle_power: Array
-    """Power that muscles give [W], what they absorb left out, shape (T,)."""
+    """Power that muscles deliver [W], without the power they absorb, shape (T,)."""
 
 
 def analyse(model: mujoco.MjModel, qpos: Array, qvel: Array, act: Array, timestep: float) -> Episode:
     """Time series of states (T, nq), (T, nv), (T, na) that are `timestep` [s] apart.
 
     Raises:
-        ConfigError: the model has no legs of the names that the leg environments use.
+        ConfigError: the model has no legs with the names that the leg environments use.
     """
     check_legs(model)
     axes = world_axes(model)
@@ -73,7 +73,7 @@ def analyse(model: mujoco.MjModel, qpos: Array, qvel: Array, act: Array, timeste
 
 
 def check_legs(model: mujoco.MjModel) -> None:
-    """Raise ConfigError unless a model has the bodies, joints and standing keyframe that gait is measured by."""
+    """Raise ConfigError unless a model has the bodies, joints and standing keyframe that measuring a gait needs."""
     try:
         model.key("stand")
         for side in SIDES:
@@ -87,7 +87,7 @@ def check_legs(model: mujoco.MjModel) -> None:
 
 
 def ground_reaction(model: mujoco.MjModel, data: mujoco.MjData, bodies: frozenset[int]) -> Array:
-    """Force of the world on a set of bodies [N], in the world, shape (3,)."""
+    """Force of the world on a set of bodies [N], in the world frame, shape (3,)."""
     total, wrench = np.zeros(3), np.zeros(6)
     for k in range(data.ncon):
         first, second = (int(model.geom_bodyid[g]) for g in data.contact.geom[k])
@@ -100,7 +100,7 @@ def ground_reaction(model: mujoco.MjModel, data: mujoco.MjData, bodies: frozense
 
 
 def _carried_by(model: mujoco.MjModel, body: int) -> frozenset[int]:
-    """A body and everything it carries."""
+    """A body and its subtree."""
     found = {body}
     for other in range(body + 1, model.nbody):
         if int(model.body_parentid[other]) in found:
@@ -109,7 +109,8 @@ def _carried_by(model: mujoco.MjModel, body: int) -> frozenset[int]:
 
 
 def _angles(model: mujoco.MjModel, joint: str, qpos: Array) -> dict[str, Array]:
-    """Angles [°] of a joint by side (T,), positive in flexion: knees flex towards the longer end of their range."""
+    """Angles [°] of a joint by side, each (T,), positive in flexion: knees flex towards the longer end of their
+    range."""
     found = {}
     for side in SIDES:
         entry = model.joint(f"{joint}_{side}")

@@ -1,6 +1,6 @@
-"""Gait cycles out of time series: pure functions, all of one episode.
+"""Find gait cycles in the time series of one episode: pure functions.
 
-Axes: T samples at equal times.
+Axes: T equally spaced samples.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 POINTS = 101
-"""Samples of a cycle: one a percent, both ends included."""
+"""Samples of a cycle: one per percent, both ends included."""
 
 
 class Stride(NamedTuple):
@@ -32,7 +32,7 @@ class Stride(NamedTuple):
 
     @property
     def duty(self) -> float:
-        """Share of the stride that the foot is on the ground."""
+        """Share of the stride during which the foot is on the ground."""
         return (self.toe_off - self.start) / self.samples
 
 
@@ -43,7 +43,7 @@ def on_ground(force: Array, weight: float, *, threshold: float = 0.05, least: in
         force: ground reaction force of the foot.
         weight: of the body [N].
         threshold: load from which a foot is on the ground, in body weights.
-        least: contacts and gaps shorter than this many samples are chatter and are undone, gaps first.
+        least: contacts and gaps shorter than this many samples are chatter and are removed, gaps first.
     """
     flags = force > threshold * weight
     for value in (False, True):
@@ -64,7 +64,7 @@ def strikes(contact: Flags) -> NDArray[np.int64]:
 
 
 def strides(contact: Flags) -> list[Stride]:
-    """Whole strides of a foot."""
+    """Complete strides of a foot."""
     starts = strikes(contact)
     found = []
     for start, end in pairwise(starts):
@@ -80,13 +80,13 @@ def over_cycle(values: Array, stride: Stride) -> Array:
 
 
 def step_lengths(contact: Flags, own: Array, other: Array) -> Array:
-    """How far a foot is ahead of the other when it comes down [m], from both feet's places along the way (T,)."""
+    """How far a foot is ahead of the other when it comes down [m], from the positions of both feet (T,)."""
     at = strikes(contact)
     return own[at] - other[at]
 
 
 def cadence(right: Flags, left: Flags, timestep: float) -> float | None:
-    """Steps a minute, over the time from the first strike of any foot to the last; None with fewer than two."""
+    """Steps per minute between the first strike of any foot and the last; None with fewer than two strikes."""
     at = np.sort(np.concatenate((strikes(right), strikes(left))))
     if len(at) < 2:
         return None
@@ -94,7 +94,7 @@ def cadence(right: Flags, left: Flags, timestep: float) -> float | None:
 
 
 def symmetry_index(right: float, left: float) -> float | None:
-    """Robinson's index [%]: difference of both sides over their mean size; 0 is symmetric, None where both are zero."""
+    """Robinson's index [%]: difference of both sides over their mean size; 0 is symmetric, None if both are zero."""
     size = (abs(right) + abs(left)) / 2.0
     return 100.0 * abs(right - left) / size if size > 0.0 else None
 

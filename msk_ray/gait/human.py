@@ -1,9 +1,8 @@
 """How people walk: published ranges of healthy adults at free speed on level ground.
 
-Textbook figures, meant to place a gait at a glance. The printed tables were not at hand when they were entered, so
-check the source before quoting a limit. What they were checked against: the means that Murray, Drought & Kory (1964,
-men) and Murray, Kory & Sepic (1970, women) measured lie inside them (1.54 and 1.31 m/s, 117 steps a minute, steps of
-0.79 and 0.66 m).
+Textbook figures for a quick comparison. They were entered without the printed tables at hand, so check the source
+before quoting a limit. As a check, the means measured by Murray, Drought & Kory (1964, men) and Murray, Kory & Sepic
+(1970, women) are inside them (1.54 and 1.31 m/s, 117 steps per minute, steps of 0.79 and 0.66 m).
 """
 
 from typing import Final, NamedTuple
@@ -13,7 +12,7 @@ _PERRY: Final = "Perry & Burnfield 2010, Gait analysis: normal and pathological 
 
 
 class Range(NamedTuple):
-    """What most healthy adults do."""
+    """The range of most healthy adults."""
 
     least: float
     most: float
@@ -36,7 +35,7 @@ class Landmark(NamedTuple):
 
     curve: str
     phase: tuple[float, float]
-    """Percent of the cycle within which it is looked for."""
+    """Percentages of the cycle between which it is looked for."""
     kind: str
     """`max`, `min`, or `at` the first phase."""
     range: Range

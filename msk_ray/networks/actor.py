@@ -37,7 +37,7 @@ class Actor(nn.Module):
         """
         assert self.log_std is not None
         raw = self.mean(obs) + self.log_std.exp() * noise
-        # log(1 − tanh² u) = 2 (log 2 − u − softplus(−2u)), which stays finite where tanh² rounds to 1.
+        # log(1 − tanh² u) = 2 (log 2 − u − softplus(−2u)); this form stays finite where tanh² rounds to 1.
         squash = 2.0 * (math.log(2.0) - raw - nn.functional.softplus(-2.0 * raw))
         gaussian = 0.5 * noise.square() + self.log_std + 0.5 * math.log(2.0 * math.pi)
         return torch.tanh(raw), (gaussian + squash).sum(-1)

@@ -19,5 +19,5 @@ class Critic(nn.Module):
         return torch.stack([member(obs).squeeze(-1) for member in self.members])
 
     def value(self, obs: Tensor) -> Tensor:
-        """Value (...): the smaller one where there are two networks."""
+        """Value (...); with two networks, the smaller one."""
         return self(obs).amin(0)

@@ -1,4 +1,4 @@
-"""The multilayer perceptron both networks are made of."""
+"""The multilayer perceptron that both networks use."""
 
 from itertools import pairwise
 
@@ -15,8 +15,8 @@ def make_mlp(
 ) -> nn.Sequential:
     """Linear, activation and optional LayerNorm per hidden layer; a linear last layer.
 
-    Weights are orthogonal, with gain √2 in hidden layers and `output_gain` in the last; biases are zero. Drawn from
-    `generator`.
+    Weights are orthogonal, drawn from `generator`, with gain √2 in hidden layers and `output_gain` in the last; biases
+    are zero.
     """
     layers: list[nn.Module] = []
     sizes = (inputs, *config.hidden)

@@ -22,7 +22,7 @@ class RunningMeanStd(nn.Module):
 
     @torch.no_grad()
     def update(self, rows: Tensor) -> None:
-        """Take in rows (N, *shape)."""
+        """Update the statistics with rows (N, *shape)."""
         n = rows.shape[0]
         mean, var = rows.mean(0), rows.var(0, unbiased=False)
         delta = mean - self.mean

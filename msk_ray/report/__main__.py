@@ -1,4 +1,4 @@
-"""`python -m msk_ray.report`: an experiment's results on one page, from the files on disk."""
+"""`python -m msk_ray.report`: the results of an experiment on one page, read from its files."""
 
 import sys
 import time
@@ -17,17 +17,17 @@ from msk_ray.text import printable
 
 DESCRIPTION = """\
 Write one self-contained page about an experiment, or several side by side: learning curves, the ablation table with
-confidence intervals, what each parameter does, which trial stopped when and why, gradient health, failures by name, the
-best policy with its evaluation and film strip, and the command to repeat it all.
+confidence intervals, the effect of each parameter, which trial stopped when and why, gradient health, failures by
+outcome, the best policy with its evaluation and film strip, and the command that repeats the experiment.
 
-Reads files alone, so it works while the sweep runs and after it died, and says what is missing. Writes
+It only reads files, so it works while the sweep runs and after it has died, and says what is missing. Writes
 EXPERIMENT/report/index.html and every picture as PNG beside it."""
 
 EXAMPLES = """\
   python -m msk_ray.report demo                            # runs/demo/report/index.html
-  python -m msk_ray.report ant_ablate --baseline matched   # differences are taken from this variant
+  python -m msk_ray.report ant_ablate --baseline matched   # compare with this variant
   python -m msk_ray.report ant_lr ant_horizon --out both   # side by side
-  python -m msk_ray.report demo --best never               # numbers and curves alone: seconds, no simulation"""
+  python -m msk_ray.report demo --best never               # numbers and curves only: seconds, no simulation"""
 
 
 def parser() -> Parser:
@@ -37,7 +37,7 @@ def parser() -> Parser:
     p.add_argument(
         "--baseline",
         metavar="TEXT",
-        help="variant to compare with: (part of) its name; by default `baseline`, or the first",
+        help="variant to compare with: (part of) its name (default: `baseline`, or the first)",
     )
     p.add_argument(
         "--best",
@@ -45,9 +45,13 @@ def parser() -> Parser:
         default="auto",
         help="evaluate the best policy and draw its film strip; auto leaves that out while trials run",
     )
-    p.add_argument("--out", type=Path, metavar="DIR", help="by default report/ in the (first) experiment's folder")
-    p.add_argument("--device", help="for the best policy: cpu or cuda:N; by default the first GPU, or the CPU")
-    p.add_argument("--storage", type=Path, default=Path("runs"), metavar="DIR", help="by default runs/")
+    p.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder to write to (default: report/ in the first experiment)"
+    )
+    p.add_argument("--device", help="for the best policy: cpu or cuda:N (default: the first GPU, or the CPU)")
+    p.add_argument(
+        "--storage", type=Path, default=Path("runs"), metavar="DIR", help="folder of experiments (default: runs/)"
+    )
     return p
 
 

@@ -1,1 +1,1 @@
-"""What does a policy do? Viewer, videos and film strips, drawn by C MuJoCo from trajectories of the simulator."""
+"""Watch a policy: viewer, videos and film strips, drawn by C MuJoCo from trajectories of the simulator."""

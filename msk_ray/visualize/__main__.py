@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from msk_ray.visualize.episodes import Recording
 
 DESCRIPTION = """\
-Watch a policy: in MuJoCo's viewer where there is a display, or as video, frames, film strip or statistics without one.
+Watch a policy: in MuJoCo's viewer if there is a display, or as video, frames, film strip or statistics without one.
 
 Episodes are those of the evaluation: without noise, from fixed initial states, under reference physics unless
---physics says otherwise. Contact forces are drawn as arrows (as long as the model for its whole weight), muscles from
-blue (relaxed) to red (active). Of a trial its best policy is shown, of an experiment that of its best trial."""
+--physics says otherwise. Contact forces are drawn as arrows (a force of the model's weight is as long as the model),
+muscles from blue (relaxed) to red (active). A trial stands for its best policy, an experiment for its best trial."""
 
 EXAMPLES = """\
   python -m msk_ray.visualize runs/demo                                  # the viewer
@@ -32,7 +32,7 @@ EXAMPLES = """\
   python -m msk_ray.visualize runs/demo --save-frames frames/
   python -m msk_ray.visualize --progression runs/demo --strip out.png    # policies over training × time
 
-Without a display, EGL or OSMesa draws, whichever works; MUJOCO_GL=egl or osmesa asks for one of them."""
+Without a display, EGL or OSMesa is used, whichever works; MUJOCO_GL=egl or MUJOCO_GL=osmesa chooses one of them."""
 
 PROGRESSION_FRAMES = 6
 
@@ -45,32 +45,40 @@ def parser() -> Parser:
     what.add_argument("--no-render", action="store_true", help="statistics of the episodes, no pictures")
     what.add_argument("--video", type=Path, metavar="FILE", help="an .mp4")
     what.add_argument("--save-frames", type=Path, metavar="DIR", help="numbered .png files")
-    what.add_argument("--strip", type=Path, metavar="FILE", help="frames side by side, at equal times over an episode")
+    what.add_argument("--strip", type=Path, metavar="FILE", help="frames side by side, evenly spaced over an episode")
     what.add_argument(
         "--progression",
         metavar="EXPERIMENT|TRIAL",
-        help="a row for each policy kept along the (best) trial's way; written where --strip says, or progression.png",
+        help="a row for each policy saved during training (of the best trial), written to the FILE of --strip or to "
+        "progression.png",
     )
     how = p.add_argument_group("how")
     how.add_argument(
-        "--episodes", type=positive, metavar="N", help="one by default, ten with --no-render; the viewer goes on"
+        "--episodes",
+        type=positive,
+        metavar="N",
+        help="number of episodes (default: 1; with --no-render 10; in the viewer until its window is closed)",
     )
     how.add_argument(
-        "--seed", type=int, metavar="N", help="of the initial states; by default the trial's evaluation seed"
+        "--seed", type=int, metavar="N", help="seed of the initial states (default: the trial's evaluation seed)"
     )
-    how.add_argument("--steps", type=positive, metavar="N", help="env steps an episode, at most")
-    how.add_argument("--physics", default="reference", metavar="NAME", help="reference, own, or a named one")
+    how.add_argument("--steps", type=positive, metavar="N", help="maximum env steps per episode")
     how.add_argument(
-        "--frames", type=positive, metavar="N", help="of a strip, by default 8; of a row of --progression 6"
+        "--physics", default="reference", metavar="NAME", help="reference, own, or a named one (default: reference)"
     )
-    how.add_argument("--fps", type=float, default=30.0, metavar="F", help="frames a simulated second, by default 30")
-    how.add_argument("--speed", type=float, default=1.0, metavar="X", help="of the viewer, by default 1 (real time)")
-    how.add_argument("--size", type=_size, metavar="WxH", help="of a frame, such as 640x480; both even")
-    how.add_argument("--camera", default="", metavar="NAME", help="one of the model's; by default its first")
-    how.add_argument("--tensorboard", action="store_true", help="put the strip into the trial's TensorBoard too")
-    how.add_argument("--device", help="of the simulation: cpu or cuda:N; by default the first GPU, or the CPU")
     how.add_argument(
-        "--storage", type=Path, default=Path("runs"), metavar="DIR", help="of experiments; by default runs/"
+        "--frames", type=positive, metavar="N", help="frames in a strip (default: 8) or a row of --progression (6)"
+    )
+    how.add_argument("--fps", type=float, default=30.0, metavar="F", help="frames per simulated second (default: 30)")
+    how.add_argument(
+        "--speed", type=float, default=1.0, metavar="X", help="speed of the viewer (default: 1, real time)"
+    )
+    how.add_argument("--size", type=_size, metavar="WxH", help="size of a frame, such as 640x480; both even")
+    how.add_argument("--camera", default="", metavar="NAME", help="a camera of the model (default: its first)")
+    how.add_argument("--tensorboard", action="store_true", help="add the strip to the trial's TensorBoard too")
+    how.add_argument("--device", help="for the simulation: cpu or cuda:N (default: the first GPU, or the CPU)")
+    how.add_argument(
+        "--storage", type=Path, default=Path("runs"), metavar="DIR", help="folder of experiments (default: runs/)"
     )
     return p
 
@@ -115,7 +123,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _check(args: argparse.Namespace) -> Target:
-    """What the command line asks for, refused before anything slow if it cannot be done."""
+    """The target of the command line, which is refused before anything slow if it cannot be shown."""
     given = args.progression if args.progression is not None else args.target
     if given is None or (args.progression is not None and args.target is not None):
         raise ConfigError("name one thing to watch: a checkpoint, a trial, or an experiment")
@@ -125,9 +133,11 @@ def _check(args: argparse.Namespace) -> Target:
     best_checkpoint(target)
     drawing = args.video or args.save_frames or args.strip or args.progression is not None
     if args.no_render and drawing:
-        raise ConfigError("--no-render draws nothing: leave it out, or --video, --save-frames, --strip, --progression")
+        raise ConfigError(
+            "--no-render draws nothing: leave it out, or leave out --video, --save-frames, --strip and --progression"
+        )
     if args.tensorboard and not args.strip:
-        raise ConfigError("--tensorboard goes with --strip FILE")
+        raise ConfigError("--tensorboard needs --strip FILE")
     if args.video is not None:
         from msk_ray.visualize.film import check_video_path
 
@@ -210,7 +220,7 @@ def _progression(args: argparse.Namespace, target: Target, bench: "Bench", reque
     view = View(width, height, args.camera)
     image, rows = progression(bench, folder, request, args.frames or PROGRESSION_FRAMES, view)
     if image is None:
-        raise CheckpointError(f"{folder / 'checkpoints'} keeps no policies along the way (policy_*.pt)")
+        raise CheckpointError(f"{folder / 'checkpoints'} has no policies saved during training (policy_*.pt)")
     save_image(image, out)
     print("\n".join(rows))
     print(f"{len(rows)} policies of {folder} in {out}")

@@ -1,4 +1,4 @@
-"""Episodes of a policy with every state kept, for drawing and for statistics."""
+"""Record episodes of a policy with every state, for drawing and for statistics."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -26,7 +26,7 @@ class Recording:
     states: StepState
     """Shapes (T + 1, W, ·), on the CPU."""
     controls: Tensor
-    """Shape (T + 1, W, nu); the last ones are those of the step before."""
+    """Shape (T + 1, W, nu); the last row repeats the one before."""
 
     @property
     def count(self) -> int:
@@ -44,7 +44,7 @@ class Recording:
         return States(self.model, qpos, qvel, act, ctrl)
 
     def frames_at(self, world: int, fps: float) -> States:
-        """One episode's states at so many a second of simulated time."""
+        """One episode's states, `fps` per second of simulated time."""
         count = int(self.length(world) * self.timestep * fps) + 1
         return self.world(world).at(np.round(np.arange(count) / (fps * self.timestep)).astype(int))
 
@@ -59,7 +59,7 @@ def record(bench: Bench, policy: SavedPolicy, request: Request) -> Recording:
     """Run `request.worlds` episodes from the first of the request's seeds and keep every state.
 
     Raises:
-        MskRayError: as `Bench.evaluator`, or the checkpoint does not fit its environment.
+        MskRayError: as for `Bench.evaluator`, or the checkpoint does not fit its environment.
     """
     evaluator, physics = bench.evaluator(policy.config, request)
     states: list[StepState] = []

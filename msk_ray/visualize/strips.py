@@ -16,8 +16,8 @@ from msk_ray.visualize.film import grid
 from msk_ray.visualize.render import View, frames
 
 STRIP_FOLDER = "film"
-"""In a trial's folder, with events of its own: TensorBoard reads one file of a folder after the other, and would no
-longer follow the trial's."""
+"""Subfolder of a trial with separate events: TensorBoard reads the files of a folder one after the other, and would
+stop following the trial's own."""
 
 
 def episode_frames(recording: Recording, count: int, view: View, world: int = 0) -> tuple[list[np.ndarray], list[str]]:
@@ -34,15 +34,15 @@ def episode_frames(recording: Recording, count: int, view: View, world: int = 0)
 def progression(
     bench: Bench, trial: Path, request: Request, count: int, view: View
 ) -> tuple[Image.Image | None, list[str]]:
-    """A row of `count` frames for each policy kept along a trial's way, and for its best.
+    """A row of `count` frames for each policy that a trial saved during training, and for its best.
 
-    All rows show the same times, those of the longest episode; a row ends where its episode did.
+    All rows show the same times, those of the longest episode; a row ends with its episode.
 
     Returns:
-        The picture, or None if the trial keeps no policies, and each row's title.
+        The picture, or None if the trial saved no such policies, and the title of each row.
 
     Raises:
-        CheckpointError: a policy is torn. DeviceError: no OpenGL platform works here.
+        CheckpointError: a policy file is incomplete. DeviceError: no OpenGL platform works here.
     """
     folder = trial / "checkpoints"
     paths = [path for _, path in milestones(folder)]
@@ -69,20 +69,20 @@ def progression(
 
 
 def log_strip(image: Image.Image, trial: Path, epoch: int) -> Path:
-    """Put a strip into a trial's TensorBoard as `film/evaluation`, at its policy's epoch.
+    """Add a strip to a trial's TensorBoard as `film/evaluation`, at its policy's epoch.
 
     Raises:
-        CheckpointError: `trial` is no trial's folder.
+        CheckpointError: `trial` is not the folder of a trial.
     """
     if not (trial / "config.yaml").is_file():
-        raise CheckpointError(f"--tensorboard: {trial} is no trial's folder")
+        raise CheckpointError(f"--tensorboard: {trial} is not a trial's folder")
     folder = trial / STRIP_FOLDER
     log_image(folder, "film/evaluation", np.asarray(image), epoch)
     return folder
 
 
 def _spread(length: int, count: int) -> np.ndarray:
-    """`count` indices from 0 to length - 1 at equal distances; fewer if there are not as many."""
+    """`count` evenly spaced indices from 0 to length - 1; all of them if there are fewer."""
     return np.unique(np.round(np.linspace(0, length - 1, count)).astype(int))
 
 

@@ -1,4 +1,4 @@
-"""The interactive viewer: episodes in real time in MuJoCo's own window."""
+"""The interactive viewer: episodes in real time in MuJoCo's window."""
 
 import os
 import sys
@@ -19,34 +19,34 @@ from msk_ray.visualize.look import Look, default_camera
 
 
 def check_display() -> None:
-    """Refuse to open a window where none can be shown.
+    """Check that a window can be shown.
 
     Raises:
-        DeviceError: naming what works without one.
+        DeviceError: there is no display; the message names the options that work without one.
     """
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise DeviceError(
-            "no display here: add --video out.mp4, --strip out.png, --save-frames DIR or --no-render (over ssh: ssh -X)"
+            "there is no display: add --video out.mp4, --strip out.png, --save-frames DIR or --no-render (or ssh -X)"
         )
 
 
 @contextmanager
 def window(model: mujoco.MjModel, data: mujoco.MjData) -> Iterator[Any]:
-    """MuJoCo's passive viewer; when this ends, its thread has ended too."""
+    """MuJoCo's passive viewer; its thread has ended when the block is left."""
     before = set(threading.enumerate())
     with mujoco.viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False) as viewer:
         yield viewer
-    # The interpreter must not be taken down under a thread that still tears down OpenGL.
+    # The interpreter must not exit while a thread is still closing OpenGL.
     for thread in set(threading.enumerate()) - before:
         thread.join(timeout=10.0)
 
 
 def watch(bench: Bench, policy: SavedPolicy, request: Request, episodes: int | None, speed: float) -> int:
-    """Show episodes until the window is closed, or so many of them.
+    """Show episodes until the window is closed, or a given number of them.
 
     Args:
-        episodes: how many; None goes on until the window is closed.
-        speed: simulated seconds a second.
+        episodes: how many; None continues until the window is closed.
+        speed: simulated seconds per second.
 
     Returns:
         How many episodes ended.

@@ -1,6 +1,6 @@
-"""The process that draws: states in from a file, raw frames out on its standard output.
+"""The drawing process: reads states from a file and writes raw frames to its standard output.
 
-A process of its own, because a broken OpenGL library ends the process that tries it, and because MuJoCo settles on one
+It is a separate process because a broken OpenGL library ends the process that tries it, and because MuJoCo chooses its
 OpenGL platform when it is first imported.
 
     MUJOCO_GL=egl python -m msk_ray.visualize.worker --probe
@@ -20,7 +20,7 @@ PROBE = """<mujoco><worldbody><light pos="0 0 3"/><geom type="box" size="1 1 1" 
 
 
 def probe() -> int:
-    """Draw a box; 0 if something of it can be seen."""
+    """Draw a box; 0 if it is visible."""
     model = mujoco.MjModel.from_xml_string(PROBE)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -36,7 +36,7 @@ def draw(
 
     Args:
         states: `qpos` (F, nq), `qvel` (F, nv), `act` (F, na), `ctrl` (F, nu).
-        camera: name; empty takes the default one.
+        camera: name; empty for the default one.
     """
     model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
     model.vis.global_.offheight = max(model.vis.global_.offheight, height)
@@ -49,7 +49,7 @@ def draw(
         for number in range(len(states["qpos"])):
             for field, values in states.items():
                 getattr(data, field)[:] = values[number]
-            # Contact forces belong to the state drawn, so they are solved for anew here.
+            # Contact forces must belong to the state that is drawn, so they are recomputed here.
             mujoco.mj_forward(model, data)
             look.colour(data.act)
             renderer.update_scene(data, view, option)
@@ -59,7 +59,7 @@ def draw(
 
 def main() -> int:
     """Entry point; returns the exit code."""
-    # Frames alone go to standard output: what libraries print there is sent to the errors.
+    # Only frames go to standard output: what libraries print there is redirected to standard error.
     frames = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     if sys.argv[1:] == ["--probe"]:

@@ -185,7 +185,7 @@ def test_a_world_that_diverged_has_no_forces(home: Path) -> None:
         ("Ball", {"env__stochastic_reset": False, "env__reset_noise": 0.1}, "env.reset_noise: nothing reads it while"),
         ("Ball", {"env__reward__heigt": 1.0}, "env.reward.heigt: unknown key; did you mean 'height'"),
         ("Free", {}, "actuator aim has no ctrlrange, so no control for actions of -1 and 1: write a ctrlrange"),
-        ("Feeling", {}, "ask for them in reward_terms, fell or outcome_terms, not in observe"),
+        ("Feeling", {}, "use them in reward_terms, fell or outcome_terms, not in observe"),
         ("Flat", {}, r"observe of Flat has shape \(4,\), not \(worlds, entries\) with 4 worlds"),
         ("Strung", {}, "the model has no tendons"),
         ("Homeless", {}, "Homeless has no model: write `mjcf = 'model.xml'` in the class"),

@@ -168,7 +168,7 @@ def test_a_broken_eval_file_is_not_overwritten(trial: Path) -> None:
         (["small", "--physics", "published"], "env cartpole has no such physics"),
         (["small", "--seeds", "x"], "write whole numbers"),
         (["small", "--device", "cuda:9"], "write --device cpu"),
-        (["small/manifest.json"], "is no checkpoint"),
+        (["small/manifest.json"], "is not a checkpoint"),
         (["small/trials/nothing"], "give a .pt file"),
     ],
 )

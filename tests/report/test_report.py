@@ -348,7 +348,7 @@ def test_several_side_by_side(experiment: Experiment, tmp_path: Path) -> None:
     [
         (["e", "e"], "the same experiment twice"),
         (["x"], "did you mean 'e'?"),
-        (["../base.yaml"], "is no checkpoint"),
+        (["../base.yaml"], "is not a checkpoint"),
         (["../elsewhere"], "holds no experiment"),
     ],
 )

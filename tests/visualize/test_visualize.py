@@ -181,10 +181,10 @@ def test_a_drawing_process_that_dies_is_reported(drawing: str) -> None:
     ("arguments", "message"),
     [
         ([], "name one thing to watch"),
-        (["small"], "no display here: add --video"),
+        (["small"], "there is no display: add --video"),
         (["small", "--no-render", "--video", "a.mp4"], "--no-render draws nothing"),
         (["small", "--video", "a.gif"], "ends in .mp4"),
-        (["small", "--tensorboard", "--no-render"], "goes with --strip"),
+        (["small", "--tensorboard", "--no-render"], "needs --strip"),
         (["small", "--no-render", "--fps", "0"], "must be above 0"),
         (["small", "--progression", "small"], "name one thing to watch"),
         (["smal", "--no-render"], "did you mean 'small'?"),

@@ -21,7 +21,7 @@ STAND_JOINTS = (0.0, 1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0)
 
 @dataclass(frozen=True)
 class AntPhysics:
-    """What a named physics of the ant fixes; units as in `PhysicsConfig`."""
+    """The values of a named physics of the ant; units as in `PhysicsConfig`."""
 
     cone: str
     solref: tuple[float, float]
@@ -38,8 +38,8 @@ class AntPhysics:
     density: float
 
 
-# Contacts, limits and damping of `matched` reproduce those of the dflex ant that SHAC's reference results were
-# obtained on; solreffriction (0.19, 1) is as soft as its friction, which is viscous below about 0.11 m/s.
+# Contacts, limits and damping of `matched` reproduce those of the dflex ant, with which SHAC's reference results were
+# obtained; solreffriction (0.19, 1) is as soft as its friction, which is viscous below about 0.11 m/s.
 _MATCHED = AntPhysics(
     cone="elliptic",
     solref=(0.065, 1.0),
@@ -103,7 +103,7 @@ def resolve_ant_physics(physics: PhysicsConfig) -> AntPhysics:
 def build_ant(env: AntSettings, physics: PhysicsConfig) -> mujoco.MjModel:
     """Free torso and 8 hinges (hip, ankle of the legs at +x+y, -x+y, -x-y, +x-y), 8 motors in the same order.
 
-    All contacts are explicit pairs of a geom with the floor, so that friction can be softened by itself.
+    All contacts are explicit pairs of a geom with the floor, so that friction can be softened independently.
     """
     p = resolve_ant_physics(physics)
     spec = mujoco.MjSpec()
@@ -127,7 +127,7 @@ def build_ant(env: AntSettings, physics: PhysicsConfig) -> mujoco.MjModel:
     world.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], material="grid", **ground)
 
     torso = world.add_body(name="torso", pos=[0, 0, STAND_HEIGHT])
-    # Camera and light go along: shadows are cast within a few metres of the light's place only.
+    # Camera and light follow: shadows are cast only within a few metres of the light.
     along = mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM
     torso.add_camera(name="track", mode=along, pos=[0, -4, 1.2], xyaxes=[1, 0, 0, 0, 0.3, 1])
     torso.add_light(mode=along, pos=[0, 0, 6], dir=[0, 0, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)

@@ -1,1 +1,1 @@
-"""What environments of muscle-driven legs share."""
+"""The shared part of the environments of muscle-driven legs."""

@@ -1,4 +1,4 @@
-"""The settings that muscle-driven legs share."""
+"""The settings shared by muscle-driven legs."""
 
 from typing import Annotated
 
@@ -25,46 +25,46 @@ class LegReward(Reward):
     alive: float = 0.5
     """Reward for every step without a fall."""
     effort: NonNegative = 0.2
-    """Weight of the mean squared activation: nothing at rest."""
+    """Weight of the mean squared activation; zero at rest."""
     joint_limit: NonNegative = 0.1
-    """Weight of the summed squared overshoot past joint limits less a margin of 0.05 rad, in units of 0.1 rad."""
+    """Weight of the summed squared overshoot past the joint limits, minus a margin of 0.05 rad, in units of 0.1 rad."""
     smoothness: NonNegative = 0.02
     """Weight of the mean squared change of the action."""
     capture: NonNegative = 0.3
-    """Weight of √(1 + (d / capture_scale)²) - 1, d being the distance of the capture point from the line walked on, or
-    from the start if asked to stand. That point is where the body would come to rest as a pendulum,
-    x + v / √(g / height), with x and v of its centre of mass taken from pelvis and lean of the trunk."""
+    """Weight of √(1 + (d / capture_scale)²) - 1, where d is the distance of the capture point from the walking line, or
+    from the start when standing. The capture point is where the body would come to rest as a pendulum,
+    x + v / √(g / height), with x and v of its centre of mass estimated from pelvis and lean of the trunk."""
     capture_scale: PositiveFloat = 0.1
-    """Distance from which the term above grows in proportion [m]: a fall must not cost without bound."""
+    """Distance beyond which the term above grows linearly [m], so that the cost of a fall stays moderate."""
     sway: NonNegative = 0.02
     """Weight of the squared angular velocity of the pelvis [s²/rad²]."""
     symmetry: NonNegative = 0.0
     """Weight of the squared sum of both hips' flexion rates [s²/rad²]: legs in antiphase, without a reference gait."""
     stride: NonNegative = 0.0
-    """Weight of (r - 1)² with r² = (d / stride_angle)² + (d' / (stride_angle ω))², d being the angle between both hips'
-    flexions, d' its rate, ω = 2π cadence / 120 s. Nothing is paid where the legs swing against each other as a pendulum
-    of that angle and cadence, in whatever phase; quick small steps pay at each of their turning points."""
+    """Weight of (r - 1)² with r² = (d / stride_angle)² + (d' / (stride_angle ω))², where d is the angle between both
+    hips' flexions, d' its rate and ω = 2π cadence / 120 s. The cost is zero if the legs swing against each other like a
+    pendulum of that angle and cadence, in any phase; quick small steps are penalised at each turning point."""
     stride_angle: PositiveFloat = 0.75
     """Largest angle between the hips' flexions [rad]: 2 asin(step length / (2 leg length)) for 0.67 m and 0.9 m."""
     cadence: PositiveFloat = 112.0
-    """Steps a minute; at 1.25 m/s people take about as many [1/min]."""
+    """Steps per minute, about as many as people take at 1.25 m/s [1/min]."""
 
 
 class LegSettings(EnvSettings):
-    """What the muscle-driven legs share."""
+    """The settings shared by muscle-driven legs."""
 
     episode_length: Count = 500
     control_timestep: PositiveFloat = 0.02
     target_speed: NonNegative = 1.25
-    """Forward speed asked for [m/s]; 0 asks to stand."""
+    """Target forward speed [m/s]; 0 means standing."""
     min_height: float = 0.65
-    """Pelvis height above the ground, as a share of standing, below which an episode ends."""
+    """Pelvis height above the ground, as a share of the standing height, below which an episode ends."""
     min_upright: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.5
     """Cosine between the trunk's up axis and +z below which an episode ends."""
     early_termination: bool = True
     """End an episode on a fall."""
     rest_excitation: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.02
-    """Least excitation of a muscle at action 0, where standing keyframes do not ask for more."""
+    """Smallest excitation of a muscle at action 0, unless the standing keyframe has a larger one."""
     success_speed: NonNegative = 0.8
     """Mean speed over the episode from which walking counts as a success [m/s]."""
     reward: LegReward = LegReward()

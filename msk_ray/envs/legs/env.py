@@ -1,4 +1,4 @@
-"""What muscle-driven legs share: excitation, observation of muscles, reward, falls and outcomes.
+"""The shared part of muscle-driven legs: excitation, observation of muscles, reward, falls and outcomes.
 
 Axes: W worlds, U muscles, N hinges of the legs.
 """
@@ -23,17 +23,17 @@ _GRAVITY = 9.81
 _TRUNK_LEVER = 0.18
 """How far the centre of mass moves with the trunk's up axis [m]: 34 kg of 75 kg, 0.4 m above the pelvis."""
 _LIMIT_MARGIN = 0.05
-"""Joints pay from this far inside their limits on [rad]."""
+"""Distance from a joint limit at which the penalty starts [rad]."""
 _LIMIT_UNIT = 0.1
 _VELOCITY_SCALE = 0.1
-"""Of joint velocities in the observation [s/rad]."""
+"""Scale of joint velocities in the observation [s/rad]."""
 
 
 class Root(NamedTuple):
     """The pelvis in the world, each (W,) or (W, k), world frame: x forward, y left, z up."""
 
     height: Tensor
-    """Above the ground [m]."""
+    """Height above the ground [m]."""
     up: Tensor
     """The trunk's up axis, (W, 3)."""
     heading: Tensor
@@ -41,9 +41,9 @@ class Root(NamedTuple):
     place: Tensor
     """Forward and to the left of the start [m], (W, 2)."""
     pose: Tensor
-    """What the observation tells of place and orientation (W, k)."""
+    """Position and orientation in the observation (W, k)."""
     velocity: Tensor
-    """[m/s], (W, 3)."""
+    """Velocity [m/s], (W, 3)."""
     spin: Tensor
     """Angular velocity [rad/s], (W, 3)."""
 
@@ -67,8 +67,8 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
     """Observation, in this order, for U muscles and N leg hinges:
 
     ======= ===================================================================
-    1       pelvis height above the ground, less the standing height [m]
-    k       pose of the pelvis, as the model's class says
+    1       pelvis height above the ground, minus the standing height [m]
+    k       pose of the pelvis, documented in the model's class
     3, 3    its velocity [m/s] and angular velocity [rad/s], world frame
     N, N    hinge angles [rad] and velocities × 0.1 [rad/s]
     U       activations
@@ -76,13 +76,13 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
     U       fibre rates [largest shortening speeds]
     U       muscle forces [peak isometric forces]
     U       last action
-    1       speed asked for [m/s]
+    1       target speed [m/s]
     ======= ===================================================================
 
-    All of it is attached: lengths and rates have exact gradients, forces follow from them.
+    All entries carry gradients: lengths and rates have exact ones, forces are computed from them.
 
-    Actions are squashed into excitations by the logistic curve that takes action 0 to the excitation of standing
-    (`rest_excitation` at least) and ±1 to 0 and 1, with a slope that is nowhere zero.
+    Actions are squashed into excitations by the logistic curve that maps action 0 to the excitation of standing
+    (at least `rest_excitation`) and ±1 to 0 and 1, with a slope that is never zero.
     """
 
     reward_names = (
@@ -173,7 +173,7 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
         angles = state.qpos[:, self._hinge_qpos]
         overshoot = (torch.relu(low - angles) + torch.relu(angles - high)) / _LIMIT_UNIT
         change = action - self.state.action
-        # The trunk is half of the body: where it leans, the centre of mass goes with it.
+        # The trunk is half of the body: the centre of mass moves with its lean.
         place = root.place + _TRUNK_LEVER * (root.up[:, :2] - self._upright[:2])
         velocity = root.velocity + _TRUNK_LEVER * torch.linalg.cross(root.spin, root.up)
         place = place + velocity[:, :2] * self._pendulum_time
@@ -214,7 +214,7 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
         }
 
     def success(self, tail: dict[str, Tensor]) -> Tensor | None:
-        """Still on its feet at the end; where it was to walk, at `success_speed` or more over the whole episode."""
+        """Upright at the end and, when walking, with a mean speed of at least `success_speed` over the episode."""
         standing = tail["upright"][-1] > self.config.min_upright
         if self.config.target_speed == 0.0:
             return standing

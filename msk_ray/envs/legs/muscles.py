@@ -37,7 +37,7 @@ class MuscleCurves:
         self.tendons = torch.tensor(model.actuator_trnid[found, 0].astype(np.int64), device=device)
         ranges = model.actuator_lengthrange[found]
         optimum = (ranges[:, 1] - ranges[:, 0]) / (prm[:, 1] - prm[:, 0])
-        # A negative force asks for scale / (acceleration per unit force) instead.
+        # A negative force means scale / (acceleration per unit force) instead.
         peak = np.where(prm[:, 2] < 0, prm[:, 3] / model.actuator_acc0[found], prm[:, 2])
         self.peak = tensor(peak)
         self._optimum = tensor(optimum)

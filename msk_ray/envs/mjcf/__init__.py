@@ -1,1 +1,1 @@
-"""The usual case: a model from an MJCF file, with an observation and a reward of one's own."""
+"""The usual case: a model from an MJCF file, with your own observation and reward."""

@@ -7,10 +7,10 @@ from msk_ray.config.sections import Count, EnvSettings, NonNegative, Text
 
 
 class MjcfSettings(EnvSettings):
-    """A class of one's own adds a `reward` section, and what else its environment reads.
+    """A subclass adds a `reward` section and any other settings of its environment.
 
-    The model's own options hold where the physics section leaves a setting null; with neither `physics.substeps` nor
-    `physics.timestep`, so does its timestep.
+    Settings that the physics section leaves null keep the model's own values; so does the timestep, if neither
+    `physics.substeps` nor `physics.timestep` is set.
     """
 
     reads_physics = STEPPING | SOLVING
@@ -18,9 +18,9 @@ class MjcfSettings(EnvSettings):
     episode_length: Count = 500
     control_timestep: PositiveFloat = 0.02
     model: Text | None = None
-    """Path of another MJCF file, relative to the folder of the environment's class; null takes the class's own."""
+    """Path of another MJCF file, relative to the folder of the environment's class; null: the class's own."""
     keyframe: Text | None = None
-    """Keyframe that episodes start from; null takes the model's first, or its reference configuration at rest."""
+    """Keyframe that episodes start from; null: the model's first, or its reference configuration at rest."""
     reset_noise: NonNegative = 0.02
     """Spread of initial positions about the keyframe [m, rad], along every degree of freedom, within joint ranges."""
     reset_velocity_noise: NonNegative = 0.02

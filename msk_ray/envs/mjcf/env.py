@@ -24,19 +24,19 @@ AnyMjcfSettings = TypeVar("AnyMjcfSettings", bound=MjcfSettings)
 
 
 class MjcfEnv(Env[AnyMjcfSettings], Generic[AnyMjcfSettings]):
-    """A model from an MJCF file; a class of one's own adds what is observed and what is rewarded.
+    """A model from an MJCF file; a subclass defines the observation and the reward.
 
-    It has to have `mjcf`, `reward_names`, `observe` and `reward_terms`, and settings with its own reward:
+    The subclass needs `mjcf`, `reward_names`, `observe` and `reward_terms`, and settings with its own reward:
 
         class Settings(MjcfEnv.Settings):
             reward: WalkerReward = WalkerReward()
 
-    Actions in [-1, 1] become controls over each actuator's ctrlrange (`control`), episodes start about a keyframe
-    (`draw_physics`) and end at the time limit or where `fell` says so. `edit` may change the model before it is
-    compiled. Constants for the device are made in `prepare`.
+    Actions in [-1, 1] are mapped to each actuator's ctrlrange (`control`), episodes start near a keyframe
+    (`draw_physics`) and end at the time limit or when `fell` says so. `edit` may change the model before it is
+    compiled. Create constants on the device in `prepare`.
 
-    Observation and reward may use the state's (qpos, qvel, act), `frames` and `tendons`, all with gradients, and the
-    reward `contact_forces` too, which have none.
+    Observation and reward may use the state's (qpos, qvel, act), `frames` and `tendons`, all with gradients; the
+    reward may also use `contact_forces`, which have none.
 
     Raises:
         ConfigError: the model cannot be read, has no keyframe of that name, or does not fit the settings.
@@ -44,7 +44,7 @@ class MjcfEnv(Env[AnyMjcfSettings], Generic[AnyMjcfSettings]):
 
     Settings = MjcfSettings
     mjcf: ClassVar[str]
-    """Path of the model's file, relative to the folder of the class that has this line; or the MJCF itself."""
+    """Path of the model's file, relative to the folder of the class that sets it; or the MJCF text itself."""
 
     def __init__(
         self,
@@ -85,11 +85,11 @@ class MjcfEnv(Env[AnyMjcfSettings], Generic[AnyMjcfSettings]):
 
     @classmethod
     def edit(cls, spec: mujoco.MjSpec, config: AnyMjcfSettings, physics: PhysicsConfig) -> None:
-        """Change the model before it is compiled: its named physics, or what further settings say."""
+        """Change the model before it is compiled, for a named physics or for further settings."""
 
     @classmethod
     def _read(cls, config: AnyMjcfSettings) -> tuple[str, mujoco.MjSpec]:
-        """The model's file, or what stands for it in messages, and its specification."""
+        """The model's file, or a name for it in messages, and its specification."""
         owner = next((base for base in cls.__mro__ if "mjcf" in vars(base)), None)
         if owner is None:
             raise ConfigError(f"{cls.__qualname__} has no model: write `mjcf = 'model.xml'` in the class")
@@ -107,7 +107,7 @@ class MjcfEnv(Env[AnyMjcfSettings], Generic[AnyMjcfSettings]):
 
     @cached_property
     def _start(self) -> StepState:
-        """Where episodes start but for the noise, each (1, n)."""
+        """The state in which episodes start, without the noise, each part (1, n)."""
         model, name = self.model, self.config.keyframe
         data = mujoco.MjData(model)
         if name is not None:
@@ -124,7 +124,7 @@ class MjcfEnv(Env[AnyMjcfSettings], Generic[AnyMjcfSettings]):
 
     @cached_property
     def _ranges(self) -> tuple[Tensor, Tensor]:
-        """Least and largest qpos (nq,) that an episode starts from; infinite where no joint limits it."""
+        """Smallest and largest qpos (nq,) of an initial state; infinite where no joint limits it."""
         model = self.model
         start = self._start.qpos[0].cpu().numpy()
         bounds = np.tile(np.array([[-np.inf], [np.inf]]), model.nq)
@@ -175,6 +175,6 @@ def _whole_substeps(source: str, timestep: float, control_timestep: float) -> in
 
 
 def _folder_of(owner: type) -> Path:
-    """The folder of the file that a class is written in; the current one if it is typed in."""
+    """The folder of the file that defines a class; the current folder if the class was typed in."""
     file = getattr(sys.modules.get(owner.__module__), "__file__", None)
     return Path(file).resolve().parent if file else Path.cwd()

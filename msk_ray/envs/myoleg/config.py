@@ -8,14 +8,15 @@ from msk_ray.envs.legs.config import LegSettings
 
 
 class MyoLegSettings(LegSettings):
-    """Legs of an installed myosuite or myo_sim, or of a model file: its contacts, limits and joints are its own."""
+    """Legs of an installed myosuite or myo_sim, or of a model file, with the model's own contacts, limits and
+    joints."""
 
     reads_physics = STEPPING | SOLVING | ACTIVATION
 
     model: Text | None = None
-    """Path of an MJCF file, or `myolegs` (80 muscles) or `myolegs26`; null takes `myolegs`."""
+    """Path of an MJCF file, or `myolegs` (80 muscles) or `myolegs26`; null: `myolegs`."""
     source: Literal["auto", "myosuite2", "myosuite3", "myo_sim"] = "auto"
-    """Package to take it from; `auto` takes the first that is installed, in this order."""
+    """Package of the model; `auto`: the first that is installed, in this order."""
     reset_noise: NonNegative = 0.01
     """Spread of initial joint angles [rad]; coupled joints follow those they are coupled to."""
 

@@ -19,8 +19,8 @@ _log = logging.getLogger(__name__)
 
 
 class MyoLeg(LegEnv[MyoLegSettings]):
-    """The pose of the pelvis in the observation (7): its place to the left of its line [m], its forward axis and its up
-    axis (3 each) in the world.
+    """The pose of the pelvis in the observation (7): its position to the left of its line [m], its forward axis and its
+    up axis (3 each) in the world.
 
     Forward, left and up are the frame in which the model stands: these models walk along -y of MuJoCo's world. The
     forward axis is found from heel to toes, the up axis from gravity.
@@ -71,7 +71,7 @@ class MyoLeg(LegEnv[MyoLegSettings]):
         qpos[:, self._hinge_qpos] = angles.clamp(*self._ranges)
         qpos[:, 2] += 0.2 * noise * (1.0 + self.uniform(count, 1)[:, 0])
         qvel[:, self._hinge_dofs] = 10.0 * noise * self.uniform(count, len(self.hinges))
-        # Coupled joints follow those they are coupled to, in place and velocity.
+        # Coupled joints follow those they are coupled to, in position and velocity.
         offset = qpos[:, self._driving] - self._driving_reference
         c = self._coefficients
         powers = torch.stack([offset**k for k in range(5)], dim=-1)

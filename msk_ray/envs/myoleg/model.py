@@ -1,7 +1,7 @@
-"""`myoleg`: a muscle-driven leg model that is installed on this machine, or a file of one's own.
+"""`myoleg`: a muscle-driven leg model that is installed on this machine, or a model file.
 
-Looked for, in this order: an explicit path; the XML that myosuite 2 ships; the XML that myosuite 3 builds through its
-`ModelBuilder`; the models that `myo_sim` composes. What was taken is said by `describe`, and logged by the trial.
+Models are looked for in this order: an explicit path; the XML that myosuite 2 ships; the XML that myosuite 3 builds
+through its `ModelBuilder`; the models that `myo_sim` composes. `describe` names the model found, and the trial logs it.
 """
 
 import importlib.util
@@ -36,13 +36,13 @@ class Source(NamedTuple):
     package: str
     """`file`, `myosuite2`, `myosuite3` or `myo_sim`."""
     version: str
-    """Of the package; empty for a file."""
+    """Version of the package; empty for a file."""
     name: str
-    """Of the model, or the path of its file."""
+    """Name of the model, or the path of its file."""
     load: Callable[[], mujoco.MjSpec]
 
     def describe(self) -> str:
-        """One line on what was taken."""
+        """One line that names the source."""
         return f"myoleg: {self.name} from {self.package} {self.version}".rstrip()
 
 
@@ -104,7 +104,7 @@ def _myosuite3(name: str) -> Source | None:
         from myosuite.core.model_builder import ModelBuilder
         from myosuite.envs.myo.assets._resolve import resolve_leg_xml
 
-        # The file refers to parts that live in myo_sim; myosuite's own resolver writes their paths into it.
+        # The file refers to parts of myo_sim; myosuite's own resolver writes their paths into it.
         spec: mujoco.MjSpec = ModelBuilder.from_xml_file(resolve_leg_xml(_V3_FILE.name)).build_spec()
         return spec
 
@@ -128,11 +128,11 @@ def _myo_sim(name: str) -> Source | None:
 def build_myoleg(env: MyoLegSettings, physics: PhysicsConfig) -> mujoco.MjModel:
     """Compile the model found, with this trial's solver settings and, as keyframe `stand`, its standing pose.
 
-    Changed are the smoothing of every muscle's activation and, in the packages' models, what is touched: scenery but
-    for its plane (height fields, a pedestal), and pairs of meshes, have no exact gradient and are switched off.
+    Every muscle's activation is smoothed. In the packages' models, contacts that have no exact gradient are switched
+    off: those with scenery other than the plane (height fields, a pedestal) and those between meshes.
 
     Raises:
-        ConfigError: as `find_model`, or the model has no free root joint or no `hip_flexion_r`.
+        ConfigError: as for `find_model`, or the model has no free root joint or no `hip_flexion_r`.
     """
     source = find_model(env.model, env.source)
     spec = source.load()
@@ -203,7 +203,7 @@ class Couplings:
         self.joints = {int(j) for j in first}
 
     def satisfied(self, qpos: NDArray[np.float64]) -> NDArray[np.float64]:
-        """qpos (nq,) with every dependent joint where its equality wants it."""
+        """qpos (nq,) with every dependent joint set by its equality."""
         out = qpos.copy()
         offset = out[self.driving] - self.driving_reference
         out[self.dependent] = self.reference + sum(self.coefficients[:, k] * offset**k for k in range(5))
@@ -211,10 +211,10 @@ class Couplings:
 
 
 def standing_pose(model: mujoco.MjModel) -> NDArray[np.float64]:
-    """The reference configuration with its equalities satisfied, let down until it touches the ground.
+    """The reference configuration with its equalities satisfied, lowered until it touches the ground.
 
     Raises:
-        ConfigError: it touches nothing on the way down by two metres.
+        ConfigError: it touches nothing over two metres.
     """
     data = mujoco.MjData(model)
     pose = Couplings(model).satisfied(model.qpos0)

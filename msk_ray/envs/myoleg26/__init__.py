@@ -1,1 +1,1 @@
-"""Two legs of 26 muscles under one trunk, built here."""
+"""Two legs with 26 muscles under one trunk, built here."""

@@ -1,4 +1,4 @@
-"""The settings of the two legs of 26 muscles."""
+"""The settings of the two legs with 26 muscles."""
 
 from typing import Literal
 
@@ -23,9 +23,9 @@ class TerrainConfig(Section):
     roughness: NonNegative = 0.03
     """Largest height of `rough` strips and `height_field` [m]."""
     start: NonNegative = 0.8
-    """Where the ground stops being flat [m]; a slope starts at the origin."""
+    """Position at which the flat ground ends [m]; a slope starts at the origin."""
     seed: Whole = 0
-    """Of the heights of `rough` and `height_field`."""
+    """Seed of the heights of `rough` and `height_field`."""
 
 
 _TERRAIN_READS: dict[str, tuple[str, ...]] = {
@@ -35,23 +35,24 @@ _TERRAIN_READS: dict[str, tuple[str, ...]] = {
     "rough": ("step_depth", "roughness", "start", "seed"),
     "height_field": ("roughness", "start", "seed"),
 }
-"""What each kind of ground is made by."""
+"""The settings that each kind of ground reads."""
 
 
 class AssistConfig(Section):
-    """Springs and dampers that hold the pelvis up during training, annealed linearly to nothing.
+    """Springs and dampers that hold the pelvis up during training, annealed linearly to zero.
 
-    Evaluation never has them.
+    Evaluation never uses them.
     """
 
     epochs: Whole = 0
-    """Epochs until they are gone; 0 has none at all."""
+    """Epochs until they are gone; 0: none at all."""
     share: Fraction = 1.0
-    """Of the stiffness below, at epoch 0."""
+    """Share of the stiffness below, at epoch 0."""
     balance: NonNegative = 800.0
-    """Righting torque of tilt and list [N m/rad]; of the turn as much less as its inertia is. Critically damped."""
+    """Righting torque of tilt and list [N m/rad]; that of rotation is smaller in proportion to its inertia. Critically
+    damped."""
     lateral: NonNegative = 800.0
-    """Force towards the line walked on [N/m]. Critically damped."""
+    """Force towards the walking line [N/m]. Critically damped."""
     support: Fraction = 0.0
     """Share of the body's weight that is carried."""
 
@@ -64,10 +65,10 @@ class MyoLeg26Settings(LegSettings):
     terrain: TerrainConfig = TerrainConfig()
     assist: AssistConfig = AssistConfig()
     reset: Literal["stand", "walk", "mixed"] = "stand"
-    """Initial states about the standing keyframe, the two walking ones, or all three alike."""
+    """Initial states near the standing keyframe, the two walking ones, or all three with equal probability."""
     reset_noise: NonNegative = 0.02
-    """Spread of initial joint angles [rad]; velocities, the pelvis's among them, spread five times that a second, which
-    moves the capture point by 3 cm: feet on the spot can still catch it."""
+    """Spread of initial joint angles [rad]; velocities, including those of the pelvis, have five times that spread per
+    second, which moves the capture point by 3 cm, so that the policy can still balance without a step."""
 
     def unread(self) -> dict[str, str]:
         unread = super().unread()

@@ -16,15 +16,15 @@ from msk_ray.envs.myoleg26.terrain import Terrain
 from msk_ray.simulation import StepState
 
 _TRUNK_INERTIA = (7.0, 7.0, 0.85)
-"""Inertia of pelvis and trunk about tilt, list and rotation [kg m²]: what the assistance turns, the legs hanging on."""
+"""Inertia about tilt, list and rotation [kg m²] of pelvis and trunk with hanging legs, which the assistance turns."""
 _GRAVITY = 9.81
 
 
 class MyoLeg26(LegEnv[MyoLeg26Settings]):
-    """The pose of the pelvis in the observation (4): its place to the right of its line [m], its tilt, list and
+    """The pose of the pelvis in the observation (4): its position to the right of its line [m], its tilt, list and
     rotation [rad].
 
-    The pelvis is three slides and three hinges, so that tilt and list are coordinates and no quaternion is needed.
+    The pelvis has three slides and three hinges, so that tilt and list are coordinates and no quaternion is needed.
     """
 
     Settings = MyoLeg26Settings
@@ -57,7 +57,7 @@ class MyoLeg26(LegEnv[MyoLeg26Settings]):
         mass = float(model.body_subtreemass[0])
         a = self.config.assist
         # Critical damping: c = 2 √(k m).
-        # The same frequency about all three axes, or the light one would ring within a control step.
+        # The same frequency about all three axes; otherwise the light one would oscillate within a control step.
         righting = [a.balance * inertia / _TRUNK_INERTIA[0] for inertia in _TRUNK_INERTIA]
         damping = [2.0 * math.sqrt(k * inertia) for k, inertia in zip(righting, _TRUNK_INERTIA, strict=True)]
         self._springs = self._tensor([0.0, 0.0, a.lateral, *righting])
@@ -89,7 +89,7 @@ class MyoLeg26(LegEnv[MyoLeg26Settings]):
         else:
             pick = torch.zeros(count, dtype=torch.long, device=self.device)
         qpos, qvel, act = (part[pick].clone() for part in self._starts)
-        # Places stay: a foot must not start inside the ground. Hinges, the pelvis's among them, are shaken.
+        # Positions stay, because a foot must not start inside the ground. Noise goes on hinges, including the pelvis's.
         qpos[:, 3:] += noise * self.uniform(count, self.model.nq - 3)
         qpos[:, 6:] = qpos[:, 6:].clamp(*self._ranges)
         qpos[:, 1] += 0.2 * noise * (1.0 + self.uniform(count, 1)[:, 0])

@@ -4,10 +4,10 @@ The pelvis moves on three slides and three hinges, so qpos is 18 numbers without
 pelvis [m], its tilt, list and rotation [rad], then hip flexion, adduction, rotation, knee, ankle, toes of the right leg
 and of the left. The left leg mirrors the right at the plane z = 0 of the pelvis.
 
-Fibres. Tendons are rigid here, so a fibre takes the whole excursion of its path, which at the fibre lengths of the
-sources leaves the force-length curve. Each muscle is refitted: L0 is the least length, not below the source's, for
-which the lengths over all joint ranges lie in `WINDOW` of the curve and the length in the anatomical position within
-`REFERENCE_SHIFT` of its published place (`FIBRE_REFERENCE`). Largest shortening speeds are kept in m/s, so the joint
+Fibres. Tendons are rigid here, so a fibre takes up the whole excursion of its path, which with the fibre lengths of the
+sources leaves the force-length curve. Each muscle is refitted: L0 is the smallest length, not below the source's, for
+which the lengths over all joint ranges are in `WINDOW` of the curve and the length in the anatomical position is within
+`REFERENCE_SHIFT` of its published value (`FIBRE_REFERENCE`). Largest shortening speeds are kept in m/s, so the joint
 speed at which a muscle goes slack is the published one.
 
 Force-length curve. MuJoCo's active curve (two parabolas meeting at half force) from 0 to 2 L0 is the one of its kind
@@ -37,7 +37,7 @@ REFERENCE_SHIFT = 0.05
 PASSIVE = 0.5
 """Twice the passive force at 1.5 L0, in F."""
 LENGTHENING = 1.4
-"""Force of a fibre that is stretched fast, in its isometric force (Thelen 2003)."""
+"""Force of a fibre that is stretched fast, in units of its isometric force (Thelen 2003)."""
 TIME_CONSTANTS = (0.01, 0.04, 0.2)
 """Activation and deactivation [s] of the sources; width of the blend between them, in excitation."""
 ASSIST_PREFIX = "assist_"
@@ -47,11 +47,11 @@ _MUSCLE_JOINTS = {
     "foot": ("knee_angle", "ankle_angle", "mtp_angle"),
 }
 _GRID = 9
-"""Samples of each joint range where path lengths are taken."""
+"""Samples of each joint range at which path lengths are measured."""
 
 
 def resolve_physics(physics: PhysicsConfig) -> PhysicsConfig:
-    """`physics` with this model's values where it names none."""
+    """`physics` with this model's values for the settings it leaves null."""
     own = PhysicsConfig(
         integrator="implicitfast",
         cone="elliptic",
@@ -81,7 +81,7 @@ def build_myoleg26(env: MyoLeg26Settings, physics: PhysicsConfig) -> mujoco.MjMo
     """Compile the model. ctrl is the excitation of 26 muscles in [0, 1], right leg first, then any assistance."""
     p = resolve_physics(physics)
     spec = _body_spec(env, p)
-    # Path lengths do not depend on muscles, so a model without them tells what to fit.
+    # Path lengths do not depend on muscles, so a model without muscles is enough for the fit.
     lengths = path_lengths(spec.compile())
     for side in SIDES:
         for muscle in tables.MUSCLES:
@@ -154,7 +154,7 @@ def _mirrored(vector: tuple[float, float, float], side: str) -> list[float]:
 
 
 def _mirrored_axis(axis: tuple[float, float, float], side: str) -> list[float]:
-    """An axis of rotation turns the other way in a mirror, but for the part along the mirrored direction."""
+    """A mirrored axis of rotation: it is reversed, except for its part along the mirrored direction."""
     x, y, z = axis
     return list(axis) if side == "r" else [-x, -y, z]
 
@@ -183,7 +183,7 @@ def _body_spec(env: MyoLeg26Settings, p: PhysicsConfig) -> mujoco.MjSpec:
     # x forward, y up, z right in the body; x forward, z up in the world.
     half = float(np.sqrt(0.5))
     pelvis = world.add_body(name="pelvis", quat=[half, half, 0.0, 0.0])
-    # Camera and light go along: shadows are cast within a few metres of the light's place only.
+    # Camera and light follow: shadows are cast only within a few metres of the light.
     along = mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM
     pelvis.add_camera(name="track", mode=along, pos=[0.3, 0.2, 3.2], xyaxes=[1, 0, 0, 0, 1, 0])
     pelvis.add_light(mode=along, pos=[0, 6, 0], dir=[0, -1, 0], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
@@ -219,7 +219,7 @@ def _body_spec(env: MyoLeg26Settings, p: PhysicsConfig) -> mujoco.MjSpec:
         for floor in ground:
             _add_contact(spec, floor, geom, p)
     for part in ("shank", "foot"):
-        # Legs that pass through each other would be no walk. Frictionless: they slide off.
+        # Legs must not pass through each other. Frictionless, so that they slide off.
         _add_contact(spec, f"{part}_r", f"{part}_l", p, condim=1)
     return spec
 

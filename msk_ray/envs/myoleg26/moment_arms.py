@@ -1,4 +1,4 @@
-"""Moment arms of a leg's muscles, and the published ranges they are held against."""
+"""Moment arms of a leg's muscles, and the published ranges they are compared with."""
 
 from typing import Final, NamedTuple
 
@@ -17,7 +17,7 @@ class PublishedArm(NamedTuple):
     angles: tuple[float, float]
     """Joint angles [degrees] from and to."""
     least: float
-    """[m], positive where the muscle turns the joint in its positive sense."""
+    """Range [m], positive where the muscle turns the joint in its positive sense."""
     most: float
     source: str
 

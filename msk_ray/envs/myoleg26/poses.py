@@ -1,7 +1,7 @@
 """Keyframes of `myoleg26`: standing, and just after either foot struck the ground at walking speed.
 
-Angles are chosen, heights and the trailing knee are solved for, so that soles touch the ground and no joint is beyond
-its range. Walking velocities are those of a pelvis moving forward over feet that do not slip.
+Angles are chosen; heights and the trailing knee are solved for, so that the soles touch the ground and no joint is
+beyond its range. Walking velocities are those of a pelvis moving forward over feet that do not slip.
 """
 
 from typing import Final
@@ -13,16 +13,17 @@ from numpy.typing import NDArray
 from msk_ray.envs.myoleg26.tables import OUTLINE
 
 WALKING_SPEED: Final = 1.25
-"""Of the walking keyframes [m/s]."""
+"""Speed of the walking keyframes [m/s]."""
 REST_ACTIVATION: Final = 0.02
-"""Of every muscle in the walking keyframes, and at least in standing: a little tension makes joints stiff."""
+"""Activation of every muscle in the walking keyframes, and the smallest in standing: a little tension stiffens
+joints."""
 _LEAST_EFFORT: Final = 1e-4
 _SOLVER_STEPS: Final = 3000
 _PRESSED: Final = 5e-4
-"""Depth to which the lowest point of a sole enters the ground [m], so that contact is there from the first step."""
+"""Depth to which the lowest point of a sole enters the ground [m], so that there is contact from the first step."""
 
 STAND: Final = {"pelvis_tilt": -0.07, "hip_flexion": 0.05, "knee_angle": -0.1, "ankle_angle": 0.12}
-"""Standing [rad], feet flat, knees a little bent: the centre of mass lies over the middle of the feet."""
+"""Standing [rad], feet flat, knees a little bent: the centre of mass is over the middle of the feet."""
 _TRUNK: Final = {"pelvis_tilt": -0.05}
 # Angles about heel strike of level walking (Winter 1991, "The biomechanics and motor control of human gait"): hip
 # flexed by 20° in front and extended by 10° behind, leading knee nearly straight, trailing heel off the ground.
@@ -31,7 +32,7 @@ _TRAILING: Final = {"hip_flexion": -0.15, "knee_angle": -0.3, "ankle_angle": 0.1
 
 
 def add_keyframes(spec: mujoco.MjSpec) -> None:
-    """Add stand, walk_left and walk_right (the foot that has struck) to a spec whose muscles are there."""
+    """Add stand, walk_left and walk_right (the foot that has struck) to a spec that already has its muscles."""
     model = spec.compile()
     act = np.full(model.na, REST_ACTIVATION)
     ctrl = np.zeros(model.nu)
@@ -74,7 +75,7 @@ def holding_activations(model: mujoco.MjModel, qpos: NDArray[np.float64]) -> NDA
         columns.append(weight * jacobian[2:3].T)
     matrix = np.concatenate(columns, axis=1)
     wanted = data.qfrc_bias - moment.T @ forces[0]
-    # Rows of joints of very different strength: each counts by the torque its muscles can give.
+    # The rows belong to joints of very different strength: each is weighted by the torque its muscles can give.
     scale = 1.0 / np.maximum(np.linalg.norm(matrix, axis=1), 1.0)
     matrix, wanted = matrix * scale[:, None], wanted * scale
     ridge = np.zeros(matrix.shape[1])
@@ -98,7 +99,7 @@ def _address(model: mujoco.MjModel, joint: str) -> int:
 def _posed(
     model: mujoco.MjModel, both: dict[str, float], right: dict[str, float], left: dict[str, float]
 ) -> mujoco.MjData:
-    """Data with joint angles of the trunk or both legs, and of each leg, its kinematics up to date."""
+    """Data with these joint angles of the trunk or both legs and of each leg, and up-to-date kinematics."""
     data = mujoco.MjData(model)
     for angles, sides in ((both, "rl"), (right, "r"), (left, "l")):
         for name, angle in angles.items():
@@ -144,7 +145,7 @@ def _double_support(model: mujoco.MjModel, leading: str, trailing: str) -> mujoc
 
 
 def _rolling(model: mujoco.MjModel, data: mujoco.MjData, leading: str, trailing: str) -> NDArray[np.float64]:
-    """Velocities of least size, the pelvis moving forward, at which both lowest points of the soles stand still."""
+    """Smallest velocities with the pelvis moving forward at which the lowest points of both soles stand still."""
     rows = []
     for side in (leading, trailing):
         geom = min(

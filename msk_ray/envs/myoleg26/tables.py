@@ -9,7 +9,7 @@ Sources:
 Frames are those of the sources: x forward, y up, z to the right, of the right leg; the builder mirrors it. Lengths [m],
 masses [kg], inertias [kg m²] about the centre of mass, forces [N], angles [rad].
 
-What is not in the sources: `OUTLINE` (contact primitives laid along the sole and trunk), joint ranges (those of daily
+Not from the sources: `OUTLINE` (contact primitives laid along the sole and trunk), joint ranges (those of daily
 activity rather than the ±120° of the sources, so that fibres can stay inside their range), the cylinder that replaces
 the moving and conditional path points of the knee extensors, the origin of gastrocnemius, 9 mm further up in place of
 its conditional point, and the hamstrings' conditional point, which is always on their path.
@@ -26,7 +26,7 @@ class Segment(NamedTuple):
     name: str
     parent: str
     origin: Vec3
-    """In the parent's frame."""
+    """Position in the parent's frame."""
     mass: float
     centre: Vec3
     """Centre of mass."""
@@ -53,9 +53,9 @@ class Muscle(NamedTuple):
     fibre: float
     """Optimal fibre length of the source."""
     pennation: float
-    """At optimal fibre length; its cosine scales F, since the model's fibres lie along the path."""
+    """Pennation at optimal fibre length; its cosine scales F, since the model's fibres run along the path."""
     speed: float
-    """Largest shortening speed [optimal fibre lengths of the source a second]."""
+    """Largest shortening speed [optimal fibre lengths of the source per second]."""
     path: tuple[tuple[str, Vec3], ...]
     """Points by segment; a segment written `wrap:NAME` is the cylinder NAME, its point the side the path keeps to."""
 
@@ -201,7 +201,7 @@ MUSCLES: Final = (
         ),
     ),
 )  # fmt: skip
-"""13 of a leg, from gait14dof22 but for the two marked gait2392."""
+"""The 13 muscles of a leg, from gait14dof22 except for the two marked gait2392."""
 
 FIBRE_REFERENCE: Final = {
     "abd": 0.93,
@@ -230,5 +230,5 @@ OUTLINE: Final = {
 }
 """Spheres of the sole by segment, (centre, radius): heel, outer and inner ball, outer toes, great toe.
 
-Their lowest points lie in one plane, 30 mm below the origin of calcn, while the toes are straight.
+Their lowest points are in one plane, 30 mm below the origin of calcn, while the toes are straight.
 """

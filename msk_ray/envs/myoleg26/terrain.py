@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from msk_ray.envs.myoleg26.config import TerrainConfig
 
 _PIECES = 20
-"""Boxes of stepped and rough ground; more would raise the number of contact pairs beyond what is bounded tightly."""
+"""Boxes of stepped and rough ground; with more, the number of contact pairs could no longer be bounded tightly."""
 _HALF_WIDTH = 4.0
 _DEPTH = 2.0
 """Thickness of the boxes [m]: nothing slips between or under them."""
@@ -19,7 +19,7 @@ _FIELD_SHAPE = (21, 201)
 
 
 class Terrain:
-    """The ground a config section describes.
+    """The ground that a config section describes.
 
     Attributes:
         edges: x at which the height changes [m], ascending, shape (K,); empty for plane ground.
@@ -45,12 +45,12 @@ class Terrain:
             xs = np.linspace(-_FIELD[0], _FIELD[0], _FIELD_SHAPE[1])
             field[:, xs < config.start] = 0.0
             self._field = field
-            # Rows run along y; the middle one is what is walked on.
+            # Rows run along y; the walking line is the middle one.
             self.edges = (xs[:-1] + xs[1:]) / 2.0
             self.levels = config.roughness * field[_FIELD_SHAPE[0] // 2]
 
     def add_to(self, spec: mujoco.MjSpec, material: str) -> list[str]:
-        """Add the ground's geoms to the world, touching nothing by themselves, and return their names."""
+        """Add the ground's geoms to the world, without contacts of their own, and return their names."""
         look = {"contype": 0, "conaffinity": 0, "material": material}
         world = spec.worldbody
         names = ["floor"]
