@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import ScalarFormatter
 
 from msk_ray.errors import ConfigError
 from msk_ray.experiment.layout import SPACE_FILE
@@ -101,6 +102,8 @@ def learning_curves(
                     axes.plot(x[-1], y[-1], "x", color=_colour(number), markersize=7, markeredgewidth=2)
         _limit_below(axes, [curve for own in curves.values() for curve in own])
         steps_axis(axes)
+        if over == "seconds":
+            axes.xaxis.set_major_formatter(ScalarFormatter())  # "100m" would be read as minutes
         axes.set_xlabel(axis)
         axes.set_ylabel("evaluation score")
         axes.grid(alpha=0.3)

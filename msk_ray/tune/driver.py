@@ -4,7 +4,7 @@ import logging
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from functools import partial
@@ -359,12 +359,19 @@ def _first_suggestion(job: Job) -> Trial:
     return job.trial_of({"params": params})
 
 
-def _precompile(plan: Plan, trials: Sequence[Trial]) -> None:
-    """Compile the kernels of every distinct model once on every node, so that trials find them in Warp's cache."""
-    models: dict[str, Trial] = {}
+def with_kernels_of_their_own(trials: Iterable[Trial]) -> list[Trial]:
+    """One trial for each model and algorithm, which launch kernels of their own, and for each set of loggers: those
+    that are not there are found out along the way."""
+    found: dict[str, Trial] = {}
     for trial in trials:
         c = trial.config
-        models.setdefault(repr((c.env.name, c.physics, c.evaluation.variant)), trial)
+        found.setdefault(repr((c.env.name, c.physics, c.evaluation.variant, c.algorithm.name, c.trial.loggers)), trial)
+    return list(found.values())
+
+
+def _precompile(plan: Plan, trials: Sequence[Trial]) -> None:
+    """Compile the kernels of every distinct model once on every node, so that trials find them in Warp's cache."""
+    models = with_kernels_of_their_own(trials)
     nodes = nodes_for(plan.placement)
     started = time.monotonic()
     print(f"compiling kernels of {len(models)} model(s) on {len(nodes)} node(s) ...", flush=True)
@@ -383,7 +390,7 @@ def _precompile(plan: Plan, trials: Sequence[Trial]) -> None:
             scheduling_strategy=NodeAffinitySchedulingStrategy(node_id=node["NodeID"], soft=False),
         ).remote(trial.config, plan.placement.device)
         for node in nodes
-        for trial in models.values()
+        for trial in models
     ]
     try:
         ray.get(pending)

@@ -397,3 +397,20 @@ def test_a_dollar_in_a_label_is_no_formula() -> None:
 
     assert picture("x", "", "", "", draw).wide
     assert shorten("a$b\n", 40) == "a\\$b\\n"
+
+
+@pytest.mark.parametrize("several", [True, False])
+def test_several_algorithms_are_compared_over_seconds_too(several: bool, tmp_path: Path) -> None:
+    (tmp_path / "base.yaml").write_text(dump_yaml({"env": {"name": "cartpole"}, "trial": {"epochs": 4}}))
+    name, levels = ("algorithm.name", ["shac", "ppo"]) if several else ("shac.gamma", [0.9, 0.8])
+    data = {"question": "?", "base": "base.yaml", "parameters": {name: {"grid": levels}}}
+    space = parse_space(data, tmp_path / "two.yaml")
+    made = opening.create(tmp_path / "runs" / "two", space, resolve_trials(space), {})
+    for trial in made.trials():
+        fill(made.trial_folder(trial.id), [1.0, 2.0, 3.0], Ending(Outcome.FINISHED, "all 4 epochs done"))
+    page = page_of(made)
+    assert ("algorithm=ppo" in page) == several
+    assert ("Evaluation score over seconds of training of 2 variants" in page) == several
+    assert (made.path / "report" / "times.png").is_file() == several
+    reading = read_experiment(made, time.time())
+    assert [list(x) for x in reading.trials[0].curve_over("seconds")] == [[0.0, 4.0, 8.0], [1.0, 2.0, 3.0]]
