@@ -1,4 +1,4 @@
-"""`python -m msk_ray.status`: where experiments stand, read from their files."""
+"""`python -m msk_ray.status`: the progress of experiments, read from their files."""
 
 import argparse
 import difflib
@@ -24,20 +24,20 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 DESCRIPTION = """\
-Show where an experiment stands, trial by trial; without EXPERIMENT, which experiments there are.
+Show the progress of every trial of an experiment; without EXPERIMENT, list the experiments.
 
-Reads files alone, so it works while the sweep runs, after it died, and from another machine on a shared storage.
+It only reads files, so it works while the sweep runs, after it has died, and from another machine on a shared storage.
 
-  running  wrote something lately           waiting  not started yet
+  running  has written something lately     waiting  not started yet
   stale    silent for ten of its epochs     else     how it ended: finished, asha, plateau, nonfinite, error ..."""
 
 EXAMPLES = """\
   python -m msk_ray.status                              # the experiments in runs/
-  python -m msk_ray.status ant_ablate --watch           # until all trials have ended; Ctrl-C leaves
+  python -m msk_ray.status ant_ablate --watch           # until all trials have ended, or Ctrl-C
   python -m msk_ray.status ant_ablate --storage /shared/runs"""
 
 WIDE = 140
-"""Terminals of so many columns show hosts, GPU models and reasons too."""
+"""Columns of a terminal from which hosts, GPU models and reasons are shown too."""
 _STYLES = {State.RUNNING: "green", State.STALE: "yellow", State.UNREADABLE: "red", State.WAITING: "dim"}
 _FAILED = (Outcome.ERROR, Outcome.NONFINITE, Outcome.DIVERGED, Outcome.OUT_OF_MEMORY)
 
@@ -45,10 +45,16 @@ _FAILED = (Outcome.ERROR, Outcome.NONFINITE, Outcome.DIVERGED, Outcome.OUT_OF_ME
 def parser() -> Parser:
     """The command line."""
     p = Parser("python -m msk_ray.status", DESCRIPTION, EXAMPLES)
-    p.add_argument("experiment", nargs="?", metavar="EXPERIMENT", help="its name in the storage folder, or its folder")
-    p.add_argument("--watch", action="store_true", help="show it anew again and again")
-    p.add_argument("--interval", type=_seconds, default=2.0, metavar="S", help="of --watch [s], by default 2")
-    p.add_argument("--storage", type=Path, default=Path("runs"), metavar="DIR", help="by default runs/")
+    p.add_argument(
+        "experiment", nargs="?", metavar="EXPERIMENT", help="name of an experiment in the storage folder, or its folder"
+    )
+    p.add_argument("--watch", action="store_true", help="refresh until all trials have ended")
+    p.add_argument(
+        "--interval", type=_seconds, default=2.0, metavar="S", help="seconds between refreshes of --watch (default: 2)"
+    )
+    p.add_argument(
+        "--storage", type=Path, default=Path("runs"), metavar="DIR", help="folder of experiments (default: runs/)"
+    )
     return p
 
 
@@ -67,7 +73,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def find(name: str, storage: Path) -> Path:
-    """The folder of an experiment given by name or path.
+    """The folder of the experiment with this name or path.
 
     Raises:
         StorageError: there is none.
@@ -82,7 +88,7 @@ def find(name: str, storage: Path) -> Path:
 
 
 def view(observer: StatusReader, width: int, rows: int | None = None) -> "RenderableType":
-    """An experiment as a table for a terminal of `width` columns, at most `rows` trials.
+    """An experiment as a table for a terminal of `width` columns, with at most `rows` trials.
 
     Raises:
         StorageError: the folder holds no readable experiment.
@@ -98,7 +104,7 @@ def view(observer: StatusReader, width: int, rows: int | None = None) -> "Render
     lines.append(trial_table(shown, width))
     if len(shown) < len(statuses):
         lines.append(Text(f"... and {len(statuses) - len(shown)} more", style="dim"))
-    if width < WIDE:  # a wide table has a column for it
+    if width < WIDE:  # a wide table has a column for this
         bad = (Outcome.ERROR, Outcome.OUT_OF_MEMORY)
         told = [s for s in shown if s.damages or s.state is State.UNREADABLE or s.outcome in bad]
         lines += [Text(printable(f"{s.id}: {s.note}"), style="red") for s in told]
@@ -107,7 +113,7 @@ def view(observer: StatusReader, width: int, rows: int | None = None) -> "Render
         lines.append(Text(f"skipped: {count_damages(damages)}", style="red"))
     if observer.experiment.stop_file.exists() and any(s.state is not State.ENDED for s in statuses):
         command = printable(observer.experiment.resume_command())
-        lines.append(Text(f"stopped on request; go on with: {command}"))
+        lines.append(Text(f"stopped on request; continue with: {command}"))
     return Group(*lines)
 
 
@@ -124,7 +130,7 @@ def headline(experiment: Experiment, statuses: Sequence[TrialStatus]) -> str:
 
 
 def trial_table(statuses: Sequence[TrialStatus], width: int) -> "Table":
-    """One row a trial. Only what was changed, half the worlds too, may wrap; a wide table shows hosts and reasons."""
+    """One row per trial. Only the column of changes may wrap; a wide table also shows hosts and reasons."""
     from rich import box
     from rich.table import Table
     from rich.text import Text
@@ -178,7 +184,7 @@ def short_number(value: float) -> str:
 
 
 def format_age(seconds: float) -> str:
-    """As `format_duration`, in days from two days on."""
+    """Like `format_duration`, but in days from two days on."""
     return f"{seconds / 86400:.0f}d" if seconds >= 2 * 86400 else format_duration(seconds)
 
 
@@ -220,7 +226,7 @@ def _list(storage: Path) -> int:
 
     paths = find_experiments(storage)
     if not paths:
-        raise StorageError(f"no experiment in {storage}: start one with python -m msk_ray.tune, or name its --storage")
+        raise StorageError(f"no experiment in {storage}: start one with python -m msk_ray.tune, or give its --storage")
     table = Table(box=box.SIMPLE_HEAD, width=_width(), pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
     for heading in ("experiment", "trials", "best"):
         table.add_column(heading, no_wrap=True)
@@ -249,7 +255,7 @@ def _summary(experiment: Experiment) -> tuple[str, str, str, str]:
 
 def _known(storage: Path) -> str:
     names = [path.name for path in find_experiments(storage)]
-    return f"there are {', '.join(names[-5:])}" if names else "it holds none; name another --storage"
+    return f"there are {', '.join(names[-5:])}" if names else "it holds none; give another --storage"
 
 
 def _seconds(text: str) -> float:

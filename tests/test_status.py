@@ -216,7 +216,7 @@ def test_an_experiment_by_path_with_a_request_to_stop(
     command = experiment.resume_command()
     assert command.endswith(" --resume")
     said = "".join(capsys.readouterr().out.split())
-    assert "stoppedonrequest;goonwith:" + "".join(command.split()) in said
+    assert "stoppedonrequest;continuewith:" + "".join(command.split()) in said
 
 
 def test_list_of_experiments(

@@ -94,7 +94,9 @@ class Experiment:
             try:
                 path.stat()
             except OSError as error:
-                raise StorageFailure(f"{path} has gone: moved, removed or not mounted ({error.strerror})") from error
+                raise StorageFailure(
+                    f"{path} does not exist: moved, removed or not mounted ({error.strerror})"
+                ) from error
 
     def lost(self, trial_id: str | None = None) -> StorageFailure | None:
         """What `check_there` raises, if anything."""
@@ -213,7 +215,7 @@ def has_begun(path: Path) -> bool:
 def refuse_old(path: Path) -> None:
     """Raise StorageError where there is an experiment already."""
     if has_begun(path):
-        raise StorageError(f"{path} holds an experiment already: add --resume to go on with it, or pass another --name")
+        raise StorageError(f"{path} already holds an experiment: add --resume to continue it, or pass another --name")
 
 
 def check_name(name: str) -> str:
@@ -280,7 +282,7 @@ def own(path: Path, *, new: bool, force: bool = False) -> Iterator[Ownership]:
         refuse_old(path)
         make_folder(path)
     elif not path.is_dir():
-        raise StorageError(f"no experiment at {path} to go on with; leave --resume and --extend out to start one")
+        raise StorageError(f"no experiment at {path} to continue; leave out --resume and --extend to start one")
     else:
         check_writable(path)
     with owned(path, force) as ownership:

@@ -152,7 +152,7 @@ class Ownership:
                 os.utime(self._file)
                 self._seen = time.monotonic()
         except FileNotFoundError as error:
-            self._lost = OwnershipLost(f"{error.filename} has gone: moved, removed or taken over")
+            self._lost = OwnershipLost(f"{error.filename} does not exist: moved, removed or taken over")
         except OSError as error:
             # A storage that does not answer for a moment. Where it is longer, others may have taken this for dead.
             if time.monotonic() - self._seen > STALE_S / 2:

@@ -47,7 +47,7 @@ def reopen(path: Path, trials: list[Trial] | None, extension: Mapping[str, Any] 
     """
     experiment = Experiment(path)
     if not path.is_dir():
-        raise StorageError(f"no experiment at {path} to go on with; leave --resume and --extend out to start one")
+        raise StorageError(f"no experiment at {path} to continue; leave out --resume and --extend to start one")
     recorded = experiment.trials()
     check_writable(path)
     if trials is not None:

@@ -305,7 +305,7 @@ def _expect(path: Path, state: dict[str, Any]) -> dict[str, Any]:
         key for key in ("config", "epoch", "env_steps", "seconds", "best_score", "algorithm") if key not in state
     ]
     if missing:
-        raise CheckpointError(f"{path} holds no trial to go on with: {', '.join(missing)} missing")
+        raise CheckpointError(f"{path} holds no trial to continue: {', '.join(missing)} missing")
     return state
 
 

@@ -1,5 +1,5 @@
-"""Sweeps on Ray Tune: the one room that imports Ray.
+"""Sweeps on Ray Tune: the only package that imports Ray.
 
-What a sweep tries and when it stops a trial is decided in `sweep`, and what it leaves on disk is kept by `experiment`;
-neither knows of this room.
+`sweep` decides what a sweep tries and when it stops a trial, and `experiment` reads and writes its files; neither
+depends on this package.
 """

@@ -1,7 +1,7 @@
 """`python -m msk_ray.tune`: an experiment of many trials, one GPU each, with Ray Tune."""
 
 if __name__ == "__main__":
-    # Before whatever takes time to load.
+    # Before the imports that take time to load.
     from msk_ray import signals
 
     signals.listen()
@@ -42,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     space = _read_space(options, (recorded.extension() if recorded is not None else {}) | dict(options.extension))
     if options.extension and (space.file.searches or space.file.scheduler.exchanges):
         kind = space.file.search if space.file.searches else space.file.scheduler.kind
-        raise ConfigError(f"--extend: {kind} cannot go on from a recorded experiment; pass another --name")
+        raise ConfigError(f"--extend: {kind} cannot continue a recorded experiment; pass another --name")
     trials = _resolve(space)
     if options.smoke:
         trials = shrink(space, trials) if trials else []
@@ -56,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _resolve(space: Space) -> list[Trial]:
-    """The space's trials; none of a search, whose settings are checked as far as they are known."""
+    """The space's trials; none for a search, whose settings are checked as far as they are known."""
     if space.file.searches:
         check_threads(extreme_configs(space), space.file.resources)
         return []
@@ -66,7 +66,7 @@ def _resolve(space: Space) -> list[Trial]:
 
 
 def _read_space(options: Options, extension: Mapping[str, Any]) -> Space:
-    """The space with the command line's changes laid over it, checked again as a whole."""
+    """The space with the command line's changes merged in, checked again as a whole."""
     path = options.space
     data = read_space(path)
     changes = parse_overrides(options.overrides)
@@ -88,8 +88,8 @@ def _read_space(options: Options, extension: Mapping[str, Any]) -> Space:
     if options.early_stopping is False:
         if space.file.scheduler.exchanges:
             raise ConfigError(
-                f"--no-early-stopping: in {path.name} trials go on from each other ({space.file.scheduler.kind}); "
-                "leave it out, or say --early-stopping if the experiment remembers it"
+                f"--no-early-stopping: in {path.name} trials continue from each other ({space.file.scheduler.kind}); "
+                "leave it out, or give --early-stopping if the experiment remembers it"
             )
         space = without_early_stopping(space)
     return space
@@ -110,12 +110,12 @@ def _print_trials(space: Space, trials: list[Trial]) -> None:
 
 
 def _rows(trials: Sequence[Trial]) -> list[tuple[str, ...]]:
-    """The resolved trials before they run."""
+    """Print the resolved trials."""
     return [(str(t.index), t.id, t.variant, str(t.seed), str(t.epochs)) for t in trials]
 
 
 def _debug(options: Options, space: Space, trial: Trial) -> int:
-    """One trial in this process, in a folder of its own."""
+    """Run one trial in this process, in a separate folder."""
     from msk_ray.experiment.results import read_record
     from msk_ray.training import Trainer
     from msk_ray.tune.devices import local_gpus
@@ -166,7 +166,7 @@ def _run(
                         space.file.resources, options.gpus_per_trial, options.cpu, session.cluster_gpus()
                     )
                 if not placement.gpus and not options.cpu:
-                    print("no GPU here: trials run on CPU cores")
+                    print("no GPU found: trials run on CPU cores")
                 limit = options.max_concurrent or space.file.resources.max_concurrent
                 plan = driver.Plan(experiment, space, trials, placement, limit, ownership=ownership)
                 completed = driver.run_trials(plan)
@@ -176,7 +176,7 @@ def _run(
                 return _stopped(stop, experiment)
             write_report(experiment)
         except KeyboardInterrupt:
-            # Where there is nothing to save: Ray starts, kernels are compiled, the report is written.
+            # There is nothing to save while Ray starts, kernels are compiled, or the report is written.
             if stop.signal is None or stop.insisted:
                 raise
             return _stopped(stop, experiment)
@@ -189,17 +189,17 @@ def _go_on(
     trials: list[Trial],
     recorded: Experiment | None,
 ) -> tuple[Experiment, list[Trial]]:
-    """The experiment to go on with, and its trials as recorded; none where a search makes them up."""
+    """The experiment to continue, and its recorded trials; none if a search suggests them."""
     searching = space.file.searches
     another_rule = recorded is not None and options.early_stopping != recorded.said("early_stopping")
     if recorded is not None and not another_rule:
         opening.check_scheduler(recorded, space)
     experiment = opening.reopen(options.path, None if searching else trials, options.extension)
     if searching:
-        # Else the manifest learns of them only at the end.
+        # Otherwise the manifest would contain them only at the end.
         experiment.set_trials(made.trial for made in recover(experiment, space))
     else:
-        # As recorded: with the ids they began with, and the epochs they were extended to.
+        # As recorded: with their original ids, and the epochs they were extended to.
         trials = experiment.trials()
     experiment.clear_endings(options.retried)
     if another_rule:
@@ -212,17 +212,17 @@ def _go_on(
 
 def _stopped(stop: StopRequest, experiment: Experiment) -> int:
     by = "on request" if stop.signal is None else f"by {stop.signal.name}"
-    print(f"stopped {by}; go on with: {printable(experiment.resume_command())}")
+    print(f"stopped {by}; continue with: {printable(experiment.resume_command())}")
     return RESUMABLE
 
 
 def _name_stopped(experiment: Experiment) -> None:
-    """Say that trials stopped before --no-early-stopping was said stay stopped, and what lets them go on."""
+    """Say that trials stopped before --no-early-stopping was given stay stopped, and how to continue them."""
     endings = [read_ending(experiment.trial_folder(trial.id)) for trial in experiment.trials()]
     stopped = [ending.outcome for ending in endings if ending is not None and ending.cut]
     if stopped:
         names = ",".join(sorted(set(stopped)))
-        print(f"stopped early before, and left so: {len(stopped)} trials; --retry {names} lets them go on")
+        print(f"still stopped early: {len(stopped)} trials; --retry {names} lets them continue")
 
 
 if __name__ == "__main__":

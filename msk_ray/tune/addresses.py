@@ -6,10 +6,10 @@ _LIMIT_S = 20.0
 
 
 def check_reachable(address: str) -> None:
-    """See whether anybody listens at HOST:PORT: Ray itself would try for minutes. Other kinds of addresses pass.
+    """Check that something listens at HOST:PORT, because Ray itself would try for minutes. Other addresses pass.
 
     Raises:
-        OSError: nobody does.
+        OSError: nothing does.
     """
     host, _, port = address.rpartition(":")
     if "://" not in address and port.isdigit():

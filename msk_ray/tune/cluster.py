@@ -9,10 +9,10 @@ import ray
 from msk_ray.cli import Parser, run
 from msk_ray.tune.addresses import check_reachable
 
-DESCRIPTION = "Exit code: 0 if at least N nodes are alive, 1 if fewer are or nobody answers at the address."
+DESCRIPTION = "Exit code: 0 if at least N nodes are alive, 1 if fewer are or nothing answers at the address."
 EXAMPLES = """\
   python -m msk_ray.tune.cluster --address 10.0.0.1:6379 --nodes 2
-  python -m msk_ray.tune.cluster --address auto --nodes 3 --wait 900   # up to so many seconds"""
+  python -m msk_ray.tune.cluster --address auto --nodes 3 --wait 900   # wait up to 900 s"""
 _PAUSE_S = 5.0
 
 
@@ -21,7 +21,7 @@ def parser() -> Parser:
     p = Parser("python -m msk_ray.tune.cluster", DESCRIPTION, EXAMPLES)
     p.add_argument("--address", required=True, metavar="HOST:PORT", help="'auto' for the cluster this machine is in")
     p.add_argument("--nodes", required=True, type=int, metavar="N")
-    p.add_argument("--wait", type=float, default=0.0, metavar="S", help="wait so long for them [s], by default not")
+    p.add_argument("--wait", type=float, default=0.0, metavar="S", help="seconds to wait for them (default: 0)")
     return p
 
 
@@ -33,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         try:
             alive = _alive(args.address)
         except OSError as error:  # ConnectionError too
-            print(f"nobody answers at {args.address} yet: {' '.join(str(error).split())}", flush=True)
+            print(f"nothing answers at {args.address} yet: {' '.join(str(error).split())}", flush=True)
         else:
             print(f"{alive} of {args.nodes} node(s) have joined", flush=True)
             if alive >= args.nodes:
@@ -44,10 +44,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _alive(address: str) -> int:
-    """Nodes alive.
+    """The number of nodes alive.
 
     Raises:
-        OSError: nobody answers.
+        OSError: nothing answers.
     """
     check_reachable(address)
     ray.init(address=address, logging_level="ERROR", log_to_driver=False)

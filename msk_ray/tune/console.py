@@ -1,4 +1,4 @@
-"""What the terminal shows while an experiment runs: a line an event, and now and then where everything stands."""
+"""What the terminal shows while an experiment runs: a line per event, and from time to time an overview."""
 
 import math
 import sys
@@ -27,13 +27,13 @@ class _Running:
 
 
 class Console:
-    """Prints what it is told of the trials. Decides nothing, and asks neither Ray nor the disk."""
+    """Prints what it is told about the trials. It decides nothing, and reads neither from Ray nor from disk."""
 
     def __init__(self, waiting: Iterable[Trial], concurrent: int) -> None:
         """
         Args:
-            waiting: trials to be run, as far as they are known.
-            concurrent: trials at once.
+            waiting: trials still to run, as far as they are known.
+            concurrent: trials that run at the same time.
         """
         self._waiting = {trial.id: trial for trial in waiting}
         self._concurrent = concurrent
@@ -46,16 +46,16 @@ class Console:
         self._seconds_per_epoch: dict[str, float] = {}
         self._start = time.monotonic()
         self._last_status = self._start
-        # Kept, because what Ray itself prints is sent elsewhere while trials run.
+        # Kept, because Ray's own output is redirected while trials run.
         self._out = sys.stdout
 
     def say(self, text: str) -> None:
-        """Print some lines, with the time since the beginning."""
+        """Print some lines, with the time since the start."""
         shown = printable_lines(text)
         print(f"[{format_duration(time.monotonic() - self._start):>6}] {shown}", file=self._out, flush=True)
 
     def started(self, trial: Trial, attempt: Attempt, quiet: bool = False) -> None:
-        """A trial has begun, or begun again; `quiet` if that is of no interest."""
+        """A trial has started or restarted; `quiet` prints nothing."""
         self._waiting.pop(trial.id, None)
         self._attempts[trial.id] = attempt
         again = trial.id in self._begun
@@ -69,7 +69,7 @@ class Console:
         run = self._running.setdefault(trial.id, _Running(trial, time.monotonic()))
         run.epoch, run.score = epoch, score
         if run.first_epoch is None:
-            # Speed is taken from the first report on: what came before includes start-up and compilation.
+            # The speed counts from the first result: the time before includes start-up and compilation.
             run.first_epoch, run.since = epoch, time.monotonic()
         elif epoch > run.first_epoch:
             self._seconds_per_epoch[trial.id] = (time.monotonic() - run.since) / (epoch - run.first_epoch)
@@ -84,17 +84,17 @@ class Console:
             self.say(f"{trial.id} best so far: score {run.best:.5g}{when}{self._suffix(trial)}")
 
     def retried(self, trial: Trial, why: str) -> None:
-        """A trial's process has ended before its time, and another one takes its place."""
-        self.say(f"{trial.id} {why}; trying again from its newest checkpoint")
+        """A trial's process has ended early, and another one takes its place."""
+        self.say(f"{trial.id} {why}; retrying from its newest checkpoint")
 
     def attempted_again(self, trial: Trial, attempt: Attempt) -> None:
         """A trial is to have another attempt."""
         self._running.pop(trial.id, None)
-        # What it scored with all its worlds is set aside.
+        # Its scores with all its worlds are set aside.
         self._bests.pop(trial.id, None)
         self._seconds_per_epoch.pop(trial.id, None)
         self._waiting[trial.id] = trial
-        self.say(f"{trial.id} ran out of memory; it begins again with {attempt}")
+        self.say(f"{trial.id} ran out of memory; it restarts with {attempt}")
 
     def ended(self, trial: Trial, ending: Ending) -> None:
         """A trial has ended."""
@@ -115,13 +115,13 @@ class Console:
         self._running.pop(trial.id, None)
 
     def tick(self) -> None:
-        """Print where everything stands, if that was long ago."""
+        """Print the overview if the last one was long ago."""
         if time.monotonic() - self._last_status >= STATUS_INTERVAL_S:
             self._last_status = time.monotonic()
             self.say(self.status())
 
     def status(self) -> str:
-        """Where everything stands: a line, and one for each trial that runs."""
+        """The overview: one line, and one for each running trial."""
         parts = [f"{len(self._running)} running", f"{len(self._waiting)} waiting", f"{self._ended} ended"]
         best = self._best
         if best is not None:
@@ -148,5 +148,5 @@ class Console:
         return f"{printable(trial.variant)} seed={trial.seed}{self._suffix(trial)}"
 
     def _suffix(self, trial: Trial) -> str:
-        """What sets the trial's attempt apart, in brackets."""
+        """What distinguishes the trial's attempt, in brackets."""
         return self._attempts.get(trial.id, FIRST).suffix

@@ -1,4 +1,4 @@
-"""What a trial runs on: GPUs if there are any and nothing else was asked for."""
+"""What a trial runs on: GPUs if there are any, unless something else was requested."""
 
 import math
 import os
@@ -22,12 +22,12 @@ class Placement:
 
     @property
     def device(self) -> str:
-        """Name of the device inside the trial's process, which sees its own GPU only."""
+        """Name of the device inside the trial's process, which sees only its own GPU."""
         return "cuda:0" if self.gpus else "cpu"
 
     def concurrent(self, total_gpus: float, total_cpus: float, limit: int | None) -> int:
-        """Trials that fit at once, at least one."""
-        # A trial that needs a whole share of one GPU cannot use what is left over on two.
+        """Number of trials that fit at the same time, at least one."""
+        # A trial that needs its whole share on one GPU cannot use what is left over on two.
         if self.gpus >= 1:
             by_gpu = total_gpus // self.gpus
         else:
@@ -41,9 +41,9 @@ def choose_placement(resources: ResourcesSpec, gpus_per_trial: float | None, cpu
 
     Args:
         resources: the space's section.
-        gpus_per_trial: what the command line asks for explicitly.
-        cpu: whether it asks for CPUs.
-        gpus: GPUs there are.
+        gpus_per_trial: what the command line requests explicitly.
+        cpu: whether it requests CPUs.
+        gpus: number of GPUs available.
 
     Raises:
         ConfigError: the request makes no sense.
@@ -55,25 +55,25 @@ def choose_placement(resources: ResourcesSpec, gpus_per_trial: float | None, cpu
         if not (0 < gpus_per_trial <= 1 or gpus_per_trial % 1 == 0 < gpus_per_trial):  # NaN is neither
             raise ConfigError(f"--gpus-per-trial {gpus_per_trial:g}: write 1, 2, ... or a share such as 0.5")
         if gpus == 0:
-            raise DeviceError(f"--gpus-per-trial {gpus_per_trial:g}: no GPU here; pass --cpu to run on CPUs")
+            raise DeviceError(f"--gpus-per-trial {gpus_per_trial:g}: there is no GPU; pass --cpu to run on CPUs")
     if cpu or gpus == 0:
         return Placement(0.0, resources.cpus_per_trial)
     wanted = resources.gpus_per_trial if gpus_per_trial is None else gpus_per_trial
     if wanted > gpus:
-        raise DeviceError(f"{wanted:g} GPUs a trial asked for, {gpus} here")
+        raise DeviceError(f"{wanted:g} GPUs per trial requested, but there are {gpus}")
     return Placement(wanted, resources.cpus_per_trial)
 
 
 def check_threads(configs: Iterable[Config], resources: ResourcesSpec) -> None:
-    """Refuse trials that compute with more threads than they are given cores.
+    """Refuse trials that use more threads than they have cores.
 
     Raises:
-        ConfigError: saying what to write.
+        ConfigError: the message says what to write.
     """
     most = max((config.trial.threads for config in configs), default=1)
     if most > resources.cpus_per_trial:
         raise ConfigError(
-            f"trial.threads {most}, {resources.cpus_per_trial} cores a trial: write resources.cpus_per_trial: {most}"
+            f"trial.threads {most}, {resources.cpus_per_trial} cores per trial: write resources.cpus_per_trial: {most}"
         )
 
 
@@ -83,16 +83,16 @@ def wait_for_memory(
     """Wait for the GPU memory of a process that has died: drivers give it back seconds later.
 
     Args:
-        share: of the GPU's memory that a trial was given.
-        free_share: asks what share is free now.
-        limit_s: patience [s].
-        pause: sleeps for so many seconds.
+        share: the trial's share of the GPU's memory.
+        free_share: returns the share that is free now.
+        limit_s: how long to wait [s].
+        pause: sleeps for a number of seconds.
 
     Returns:
-        None once nearly all of `share` is free; else what share is free when patience has run out.
+        None once nearly all of `share` is free; otherwise the share that is free after `limit_s`.
     """
     for _ in range(math.ceil(limit_s / _PAUSE_S)):
-        # Every process holds some hundred megabytes for its own context.
+        # Every process holds a few hundred megabytes for its own context.
         if free_share() >= 0.9 * share:
             return None
         pause(_PAUSE_S)

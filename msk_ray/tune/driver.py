@@ -57,37 +57,37 @@ Precompile = Callable[[Config, str, Path], None]
 
 @dataclass(frozen=True)
 class Plan:
-    """Everything that decides how an experiment's trials are run."""
+    """Everything that determines how an experiment's trials are run."""
 
     experiment: Experiment
     space: Space
     trials: list[Trial]
-    """All trials of the experiment, ended ones included; empty when a search makes them up."""
+    """All trials of the experiment, including those that have ended; empty if a search suggests them."""
     placement: Placement
     max_concurrent: int | None
     trainer_class: type[TrainerLike] = Trainer
     precompile: Precompile | None = precompile
-    """Compiles a config's kernels on a node before trials start; None where there is nothing to compile."""
+    """Compiles a config's kernels on a node before trials start; None if there is nothing to compile."""
     prestart: bool = True
-    """Whether processes are kept ready for the trials that come next."""
+    """Whether processes are kept ready for the next trials."""
     ownership: Ownership | None = None
-    """Of the experiment; None where nobody else can know of it."""
+    """Ownership of the experiment; None if nobody else can know of it."""
 
     def guard(self) -> None:
-        """Make sure that the experiment is still this driver's.
+        """Check that this driver still owns the experiment.
 
         Raises:
-            OwnershipLost: it is not.
+            OwnershipLost: it does not.
         """
         if self.ownership is not None:
             self.ownership.check()
 
 
 def run_trials(plan: Plan) -> bool:
-    """Run what has not ended yet. Needs a Ray session.
+    """Run the trials that have not ended yet. Needs a Ray session.
 
     Returns:
-        False if a request to stop ended it before its time; the experiment can be resumed.
+        False if a request to stop ended it early; the experiment can be resumed.
 
     Raises:
         StorageFailure: the disk is full or gone; the experiment can be resumed once it is back.
@@ -120,7 +120,7 @@ def run_trials(plan: Plan) -> bool:
     total = ray.cluster_resources()
     concurrent = plan.placement.concurrent(total.get("GPU", 0.0), total.get("CPU", 1.0), plan.max_concurrent)
     print(
-        f"{len(remaining) or missing} trials, {concurrent} at once on "
+        f"{len(remaining) or missing} trials, {concurrent} at a time on "
         f"{f'{plan.placement.gpus:g} GPU each' if plan.placement.gpus else 'CPU'}; into {experiment.path}",
         flush=True,
     )
@@ -137,7 +137,7 @@ def run_trials(plan: Plan) -> bool:
         )
         _fit(plan, job, supervisor, stop, remaining, made_up)
         if not plan.trials:
-            # A search makes trials up as it goes; they enter the manifest once they are known.
+            # A search suggests trials as it goes; they enter the manifest once they are known.
             experiment.set_trials(supervisor.started)
         return not stop
 
@@ -158,7 +158,7 @@ def _finish_pruning(plan: Plan) -> None:
     folder = plan.experiment.trial_folder(reports[-1].trial)
     if ending is None or read_ending(folder) is not None:
         return
-    # What a trial scored in one attempt does not end another.
+        # The scores of one attempt do not end another.
     if reports[-1].attempt == read_attempt(folder).number:
         write_ending(folder, ending)
 
@@ -179,7 +179,7 @@ def _fit(
         )
     resources = {"cpu": plan.placement.cpus} | ({"gpu": plan.placement.gpus} if plan.placement.gpus else {})
     identify = partial(_identify, job)
-    # A search ends by itself; a list is the parameter space, once.
+    # A search ends by itself; a list of trials is used once as the parameter space.
     search: Any
     if file.searches:
         search, samples = _suggestions(plan, made_up, identify), -1
@@ -198,14 +198,14 @@ def _fit(
             search_alg=search,
             num_samples=samples,
             max_concurrent_trials=plan.max_concurrent,
-            reuse_actors=False,  # a process of its own frees a trial's GPU memory, whatever it did
+            reuse_actors=False,  # a new process per trial frees all of its GPU memory
             trial_dirname_creator=lambda trial: f"{trial.config.get('id', 'trial')}_{trial.trial_id}",
         ),
         run_config=tune.RunConfig(
             name="tune",
             storage_path=str(plan.experiment.path),
             verbose=0,
-            # Supervisor first: it writes the endings that only the driver knows.
+            # The supervisor comes first: it writes the endings that only the driver knows.
             callbacks=[
                 supervisor,
                 states,
@@ -215,7 +215,7 @@ def _fit(
             ],
             stop=_StopWhen(supervisor),
             failure_config=tune.FailureConfig(max_failures=file.resources.max_failures),
-            # None are deleted: only a population reports them, and another member may be about to take one over.
+            # None are deleted: only a population has them, and another member may be about to take one over.
             checkpoint_config=tune.CheckpointConfig(num_to_keep=None),
         ),
     )
@@ -242,7 +242,7 @@ def _identify(job: Job, config: Mapping[str, Any]) -> str:
 
 
 def _suggestions(plan: Plan, made_up: list[SearchTrial], identify: Identify) -> Suggestions:
-    """The space's search, told what came of its choices so far."""
+    """The space's search, told the results of its suggestions so far."""
     begun, scored = [], []
     for made in made_up:
         record = read_record(made.trial, plan.experiment.trial_folder(made.trial.id))
@@ -251,7 +251,7 @@ def _suggestions(plan: Plan, made_up: list[SearchTrial], identify: Identify) -> 
         else:
             scored.append((made.params, None if record.best is None else record.best.score))
     file = plan.space.file
-    # With the seed of the first time, the draws of the first time would be repeated.
+    # With the original seed, the original draws would be repeated.
     search = search_class(file.search)(plan.space.sampled, file.sample_seed + len(made_up))
     for params, score in scored:
         search.tell(params, score)
@@ -259,7 +259,7 @@ def _suggestions(plan: Plan, made_up: list[SearchTrial], identify: Identify) -> 
 
 
 class _OwnNode(Callback):
-    """Ends the experiment when this process's own Ray node has died: Ray itself waits for ever for another one."""
+    """Ends the experiment when this process's Ray node has died: Ray itself would wait for ever for another one."""
 
     INTERVAL_S = 2.0
 
@@ -273,27 +273,27 @@ class _OwnNode(Callback):
             return
         self._checked = time.monotonic()
         if any(node["NodeID"] == self._id and not node["Alive"] for node in ray.nodes()):
-            self.lost = ClusterLost("the Ray node of this machine has died (raylet killed?); go on with --resume")
+            self.lost = ClusterLost("the Ray node of this machine has died (raylet killed?); continue with --resume")
             raise self.lost
 
 
 def _advised(failure: StorageFailure) -> StorageFailure:
     if isinstance(failure, OwnershipLost):
         return failure
-    return StorageFailure(f"{failure}; mend that and go on with --resume")
+    return StorageFailure(f"{failure}; fix that and continue with --resume")
 
 
 @contextmanager
 def _log_to(path: Path) -> Iterator[None]:
-    """Send what Ray logs, prints and warns of in this process to a file; what matters of it is said by `Live`."""
+    """Redirect Ray's logs, output and warnings in this process to a file; the console says what matters."""
     logger = logging.getLogger("ray")
     handlers, level = logger.handlers, logger.level
     file = logging.FileHandler(path, encoding="utf-8")
     file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     logger.handlers = [file]
     logger.setLevel(logging.INFO)
-    # Of Ray's advice on settings chosen here on purpose, such as a process of its own for each trial.
-    # Its notices of dead workers are printed, past any logger.
+    # Ray warns about settings chosen here on purpose, such as a new process for each trial, and prints notices of dead
+    # workers without using a logger.
     with warnings.catch_warnings(), path.open("a", encoding="utf-8") as log, redirect_stdout(log), redirect_stderr(log):
         warnings.filterwarnings("ignore", category=UserWarning, module=r"ray\.")
         try:
@@ -322,7 +322,7 @@ def _param_space(job: Job, remaining: list[Trial]) -> dict[str, Any]:
         return {}  # the search gives everything
     if not job.population:
         return {"id": tune.grid_search([trial.id for trial in remaining])}
-    # Members of a population move: each begins where its folder says it was last.
+        # The settings of a population's members change: each starts with those last recorded in its folder.
     params = {trial.id: _current_params(job, trial) for trial in remaining}
     return {
         "id": tune.grid_search(list(params)),
@@ -345,13 +345,13 @@ def _current_params(job: Job, trial: Trial) -> dict[str, Any]:
 
 
 def _budget(plan: Plan) -> float:
-    """What the longest trial can take, in the scheduler's unit of time."""
+    """The longest possible duration of a trial, in the scheduler's unit of time."""
     configs = [trial.config for trial in plan.trials] or extreme_configs(plan.space)
     return longest_budget(plan.space.file, configs)
 
 
 def _first_suggestion(job: Job) -> Trial:
-    """A stand-in for the trials a search will make up, of the same model."""
+    """A placeholder, with the same model, for the trials that a search will suggest."""
     params = {
         key: op.extremes()[0].label if isinstance(op, Listed) else op.extremes()[0].value
         for key, op in job.space.sampled.items()

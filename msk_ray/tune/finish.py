@@ -1,4 +1,4 @@
-"""What an experiment leaves at its end: a table on the terminal, summary.json, table.md, and the report."""
+"""The results at the end of an experiment: a table on the terminal, summary.json, table.md, and the report."""
 
 import shutil
 import subprocess
@@ -15,13 +15,13 @@ from msk_ray.text_table import text_table
 
 
 def finish(experiment: Experiment) -> int:
-    """Write and print the results as they stand on disk.
+    """Write and print the results that are on disk.
 
     Returns:
         How many trials ended in an error.
 
     Raises:
-        StorageFailure: the disk is full or gone, or the experiment is.
+        StorageFailure: the disk is full or gone, or the experiment has disappeared.
     """
     experiment.check_there()
     manifest = experiment.manifest()
@@ -52,8 +52,8 @@ def finish(experiment: Experiment) -> int:
 def write_report(experiment: Experiment) -> None:
     """Have `python -m msk_ray.report` write the experiment's page and print its path.
 
-    In a process of its own: it draws with OpenGL and simulates the best policy, and whatever becomes of that, the
-    results above stand.
+    It runs in a separate process, because it draws with OpenGL and simulates the best policy, and a failure there must
+    not affect the results above.
     """
     command = [sys.executable, "-m", "msk_ray.report", str(experiment.path)]
     code = subprocess.run(command).returncode

@@ -1,4 +1,4 @@
-"""Where trials stand, as gauges on Ray's metrics port, for Prometheus and the dashboard in `cluster/grafana/`."""
+"""The progress of trials as gauges on Ray's metrics port, for Prometheus and the dashboard in `cluster/grafana/`."""
 
 import threading
 from collections.abc import Callable, Iterable, Mapping
@@ -21,18 +21,18 @@ FIGURES = {
 }
 """Gauge → metric. Ray serves a gauge as `ray_` and its name."""
 STATE = "msk_ray_trial_state"
-"""1 at a trial's present state (`waiting`, `running` or how it ended); one that it has left goes to 0 and then away."""
+"""1 for a trial's current state (`waiting`, `running` or how it ended); an earlier state goes to 0 and is dropped."""
 
 
 REPEAT_S = 5.0
-"""Time after which a value is set once more [s]."""
+"""Interval at which every value is set again [s]."""
 
 
 class Kept:
     """Values of gauges that stay until they are dropped.
 
-    Ray hands a value on once after it was set, and after 20 s it no longer serves one that was not set since: a state
-    that lasts, or a score between two evaluations, would be gone. So a thread sets every value again and again.
+    Ray exports a value once after it was set, and stops serving it if it is not set again within 20 s: a lasting state,
+    or a score between two evaluations, would disappear. Therefore a thread sets every value again periodically.
     """
 
     def __init__(self) -> None:
@@ -50,14 +50,14 @@ class Kept:
             gauge.set(value, given)
 
     def drop(self, gauge: Gauge, tags: Mapping[str, str]) -> None:
-        """Set to 0, and no longer show."""
+        """Set a value to 0, and stop showing it."""
         given = dict(tags)
         with self._lock:
             del self._values[_key(gauge, given)]
             gauge.set(0, given)
 
     def close(self) -> None:
-        """Let go of all values."""
+        """Drop all values."""
         self._closed.set()
         self._thread.join()
 
@@ -73,7 +73,7 @@ def _key(gauge: Gauge, tags: Mapping[str, str]) -> tuple[int, tuple[tuple[str, s
 
 
 class TrialGauges:
-    """A trial's newest figures, set by its own process."""
+    """A trial's newest values, set by its own process."""
 
     def __init__(self, experiment: str, trial: Trial) -> None:
         tags = _tags(experiment, trial)
@@ -85,7 +85,7 @@ class TrialGauges:
             self._gauges[metric] = gauge
 
     def show(self, row: Mapping[str, float]) -> None:
-        """Set what a row of metrics holds."""
+        """Set the values of a row of metrics."""
         for metric, gauge in self._gauges.items():
             if metric in row:
                 self._kept.set(gauge, row[metric])
@@ -103,8 +103,8 @@ class StateGauge(Callback):
     ) -> None:
         """
         Args:
-            experiment: where endings are read; whoever writes them has to be called before this is.
-            waiting: trials to be run.
+            experiment: where endings are read; they must be written before this callback is called.
+            waiting: trials still to run.
             trial_of: the trial that a Tune config stands for.
         """
         self._experiment = experiment
@@ -151,6 +151,6 @@ class StateGauge(Callback):
 
 
 def _tags(experiment: str, trial: Trial) -> dict[str, str]:
-    # Ray takes no other characters in tags.
+    # Ray allows no other characters in tags.
     variant = printable(trial.variant).replace("→", "->").encode("ascii", "backslashreplace").decode()
     return {"experiment": experiment, "trial": trial.id, "variant": variant, "seed": str(trial.seed)}

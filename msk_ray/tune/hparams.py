@@ -1,4 +1,4 @@
-"""What sets a trial apart, for TensorBoard's table of hyperparameters."""
+"""A trial's varied settings, for TensorBoard's table of hyperparameters."""
 
 from pathlib import Path
 
@@ -6,7 +6,7 @@ from msk_ray.errors import StorageFailure
 from msk_ray.experiment.trial import Trial
 
 METRICS = ("eval/best_score", "eval/score", "progress/env_steps")
-"""Scalars of the trial that the table shows beside its settings."""
+"""Scalars of the trial that the table shows with its settings."""
 
 
 def log_hparams(folder: Path, trial: Trial) -> None:
@@ -14,15 +14,15 @@ def log_hparams(folder: Path, trial: Trial) -> None:
 
     A trial without the logger `tensorboard` has no such file.
 
-    Call it before those are written: TensorBoard reads the files of a folder in the order of their age, and goes on to
-    follow the newest one.
+    Call it before those are written: TensorBoard reads the files of a folder in the order of their age, and then
+    follows the newest one.
 
     Raises:
         StorageFailure: the disk is full or the folder not writable.
     """
     if "tensorboard" not in trial.config.trial.loggers:
         return
-    # Loads torch, which importing this module need not.
+    # Loads torch, which importing this module should not.
     from torch.utils.tensorboard import SummaryWriter
     from torch.utils.tensorboard.summary import hparams
 
@@ -38,7 +38,7 @@ def log_hparams(folder: Path, trial: Trial) -> None:
 
 
 def hparams_of(trial: Trial) -> dict[str, float | str]:
-    """Seed and changed parameters by name: numbers as such, everything else as tables show it."""
+    """Seed and changed parameters by name: numbers unchanged, everything else as text."""
     found: dict[str, float | str] = {"seed": trial.seed}
     for key, text in trial.changed.items():
         value = trial.values.get(key)

@@ -1,6 +1,6 @@
-"""Signals and Ray: the driver alone hears that it is asked to stop, whatever Ray does in the same process.
+"""Signals and Ray: only the driver receives requests to stop, whatever Ray does in the same process.
 
-Ray's daemons and the trials' processes hear none of these signals, also where one goes to the whole process group or
+Ray's daemons and the trials' processes receive none of these signals, even if one is sent to the whole process group or
 control group (`timeout`, systemd, `kill -- -PGID`): trials are asked to save themselves, and Ray ends when they have.
 """
 
@@ -27,24 +27,25 @@ _LAST_WORD_S = 180.0
 
 @contextmanager
 def starting_ray() -> Iterator[None]:
-    """For `ray.init`: what it starts does not hear the signals above, and afterwards the handlers are this program's.
+    """For `ray.init`: the processes it starts do not receive the signals above, and this program's handlers are
+    restored.
 
     Raises:
-        KeyboardInterrupt: this program was asked to stop meanwhile.
+        KeyboardInterrupt: this program was asked to stop in the meantime.
     """
     stop = current()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, KEPT_FROM_CHILDREN)
     try:
         yield
     except SystemExit as error:
-        # Ray's own handler, in place from the beginning of `ray.init` on, exits so.
+        # Ray's own handler, installed at the start of `ray.init`, exits like this.
         if stop is None or error.code != signal.SIGTERM:
             raise
         stop.receive(signal.SIGTERM)
     finally:
         if stop is not None:
             stop.install()
-        # One that came meanwhile is heard now.
+        # A signal that arrived in the meantime is handled now.
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
@@ -70,7 +71,7 @@ def end_ray() -> None:
 
 
 def _deaf_children() -> Iterator[int]:
-    """Children of this process that have SIGTERM blocked."""
+    """Child processes of this process that have SIGTERM blocked."""
     for entry in Path("/proc").iterdir():
         if not entry.name.isdigit():
             continue
@@ -84,10 +85,10 @@ def _deaf_children() -> Iterator[int]:
 
 
 def run_in_thread(work: Callable[[], object], stop: StopRequest) -> None:
-    """Run Tune's loop in a thread, where it takes no signal for itself and cannot keep this thread from hearing one.
+    """Run Tune's loop in a thread, where it receives no signals and cannot keep this thread from receiving them.
 
     Raises:
-        ClusterLost: the loop did not end when it was asked to: Ray does not answer.
+        ClusterLost: the loop did not end when asked to, because Ray does not answer.
         Exception: whatever the loop raised.
     """
     failure: list[BaseException] = []
@@ -101,12 +102,14 @@ def run_in_thread(work: Callable[[], object], stop: StopRequest) -> None:
     # A daemon: one that waits for a dead cluster must not keep the process.
     thread = threading.Thread(target=body, name="tune", daemon=True)
     thread.start()
-    # Ticks rather than a clock: time in which this process itself is stopped does not count.
+    # Ticks rather than a clock: time during which this process itself is stopped does not count.
     waited = 0.0
     while thread.is_alive():
         thread.join(_TICK_S)
         waited += _TICK_S if stop else 0.0
         if waited > _LAST_WORD_S:
-            raise ClusterLost("asked to stop, Ray did not answer; trials go on from what they saved, with --resume")
+            raise ClusterLost(
+                "Ray did not answer the request to stop; --resume continues the trials from their checkpoints"
+            )
     if failure:
         raise failure[0]

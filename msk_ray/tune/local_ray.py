@@ -1,4 +1,4 @@
-"""What a Ray of our own on this machine shows to others: its ports, its token, and its dashboard."""
+"""What our own Ray on this machine exposes to others: its ports, its token, and its dashboard."""
 
 import os
 import secrets
@@ -17,42 +17,42 @@ import msk_ray
 from msk_ray.errors import StorageError
 
 TOKEN_FILE = Path(".ray") / "auth_token"
-"""Where Ray keeps the token of local sessions, below the home folder."""
+"""Where Ray keeps the token of local sessions, relative to the home folder."""
 
 
 def start_local(dashboard: bool | None, options: Mapping[str, Any]) -> Any:
-    """Start a Ray for this process alone, and join it.
+    """Start a Ray for this process only, and connect to it.
 
     Args:
-        dashboard: whether to start one; None starts it where its packages (ray[default]) are installed.
+        dashboard: whether to start one; None starts it if its packages (ray[default]) are installed.
         options: for `ray.init`.
 
     Returns:
-        What `ray.init` does.
+        The result of `ray.init`.
 
     Raises:
-        StorageError: there is no place for its token.
+        StorageError: its token cannot be stored.
     """
     # Workers must import the package this process runs, wherever it was started from.
     package = str(Path(msk_ray.__file__).resolve().parent.parent)
     paths = [package, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
     os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys(paths))
-    # The dashboard finds its profiler where programs of this environment are, activated or not.
+    # The dashboard finds its profiler among the programs of this environment, activated or not.
     programs = [*os.environ.get("PATH", os.defpath).split(os.pathsep), str(Path(sys.executable).parent)]
     os.environ["PATH"] = os.pathsep.join(dict.fromkeys(programs))
     make_token_private()
     with loopback_only():
-        # By default Ray would join whatever cluster a `ray start` on this machine once left a note of.
+        # By default Ray would join any cluster whose address a `ray start` on this machine has left behind.
         return ray.init("local", include_dashboard=dashboard, dashboard_host="127.0.0.1", **options)
 
 
 @contextmanager
 def loopback_only() -> Iterator[None]:
-    """A Ray started meanwhile listens on the loopback interface alone.
+    """A Ray started inside this block listens only on the loopback interface.
 
-    Ray gives every server the address of its node, and takes the machine's own address for it even where it is told
-    127.0.0.1; with the switch below, its default on macOS and Windows, it takes the loopback address. The switch is
-    read from the environment when Ray is imported, so it is set here instead.
+    Ray gives every server the address of its node, for which it uses the machine's own address even if told 127.0.0.1;
+    with the switch below, its default on macOS and Windows, it uses the loopback address. The switch is read from the
+    environment when Ray is imported, so it is set here instead.
     """
     before = ray_constants.ENABLE_RAY_CLUSTER
     ray_constants.ENABLE_RAY_CLUSTER = False
@@ -63,12 +63,12 @@ def loopback_only() -> Iterator[None]:
 
 
 def make_token_private() -> None:
-    """Make the token file of local sessions, or tighten the one there is, so that nobody else can read it.
+    """Create the token file of local sessions, or restrict the existing one, so that nobody else can read it.
 
-    Whoever has the token can run programs as this user, and Ray writes it with the permissions of an ordinary file.
+    Anyone who has the token can run programs as this user, and Ray writes it with the permissions of an ordinary file.
 
     Raises:
-        StorageError: the file cannot be written, or belongs to somebody else.
+        StorageError: the file cannot be written, or belongs to another user.
     """
     mode = os.environ.get("RAY_AUTH_MODE")
     if (mode is not None and mode.lower() != "token") or _own_token():
@@ -91,7 +91,7 @@ def make_token_private() -> None:
 
 
 def way_in() -> str:
-    """How to get into the dashboard of the Ray this process has joined, to be printed behind its address."""
+    """How to log in to the dashboard of the Ray that this process uses, printed after its address."""
     if os.environ.get("RAY_AUTH_MODE", "").lower() != "token":
         return ""
     if os.environ.get("RAY_AUTH_TOKEN"):
@@ -105,7 +105,7 @@ def _own_token() -> bool:
 
 
 def _make(path: Path) -> None:
-    """Make the token unless there is one. It is whole from the start: another session may read it at any time."""
+    """Create the token unless it exists. It appears complete at once: another session may read it at any time."""
     if path.exists():
         return
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -113,7 +113,7 @@ def _make(path: Path) -> None:
     try:
         with os.fdopen(descriptor, "w") as file:
             file.write(secrets.token_hex(32))
-        # Another session may have been faster: its token holds.
+        # Another session may have been faster: its token is used.
         with suppress(FileExistsError):
             os.link(temporary, path)
     finally:

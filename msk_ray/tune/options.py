@@ -1,4 +1,4 @@
-"""The command line of `python -m msk_ray.tune`, read once into an object that nothing changes afterwards."""
+"""The command line of `python -m msk_ray.tune`, parsed once into an immutable object."""
 
 import argparse
 import os
@@ -17,43 +17,43 @@ from msk_ray.sweep.space import find_space, parse_seeds
 
 DESCRIPTION = """\
 Run a search space: many trials side by side, one GPU (or CPU core) each, scored by deterministic evaluation,
-the hopeless ones stopped early.
+with hopeless ones stopped early.
 
-Writes runs/EXPERIMENT/: the trials' folders, and at the end summary.json, table.md and report/."""
+Writes runs/EXPERIMENT/: a folder for each trial, and at the end summary.json, table.md and report/."""
 
 EXAMPLES = """\
   python -m msk_ray.tune --space cartpole_smoke --cpu               # minutes on two cores
   python -m msk_ray.tune --space ant_ablate --dry-run               # which trials would run?
-  python -m msk_ray.tune --space ant_ablate --smoke --cpu           # does all of it run at all?
+  python -m msk_ray.tune --space ant_ablate --smoke --cpu           # does everything run?
   python -m msk_ray.tune --space ant_lr --seeds 0-4 --gpus-per-trial 0.5
   python -m msk_ray.tune --space ant_lr --set trial.epochs=100 --name ant_lr_short
   python -m msk_ray.tune --space ant_ablate --no-early-stopping --name ant_ablate_whole   # to rank what is varied
   python -m msk_ray.tune --space ant_lr --resume                    # after Ctrl-C, a crash or a lost node
-  python -m msk_ray.tune --space ant_lr --extend epochs=600         # it has ended; go on to more epochs
-  python -m msk_ray.tune --space ant_lr --debug-trial 3             # that trial alone, here, without Ray
+  python -m msk_ray.tune --space ant_lr --extend epochs=600         # it has ended; continue to more epochs
+  python -m msk_ray.tune --space ant_lr --debug-trial 3             # only that trial, in this process, without Ray
 
-exit codes: 0 all trials ended, 1 some ended in an error, 2 refused before any work began, 75 stopped on request and
+exit codes: 0 all trials ended, 1 some ended in an error, 2 refused before any work started, 75 stopped on request and
 resumable."""
 
 
 def parser() -> Parser:
     """The command line."""
     p = Parser("python -m msk_ray.tune", DESCRIPTION, EXAMPLES)
-    p.add_argument("--space", required=True, metavar="NAME|FILE", help="a file, or a name in tune_spaces/")
+    p.add_argument("--space", required=True, metavar="NAME|FILE", help="a space file, or a name in tune_spaces/")
     p.add_argument(
         "--set",
         dest="overrides",
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help=f"of all trials: {SET_HELP}",
+        help=f"for all trials: {SET_HELP}",
     )
-    p.add_argument("--seeds", metavar="LIST", help="seeds instead of the space's, such as 0-4 or 0,3,7")
+    p.add_argument("--seeds", metavar="LIST", help="seeds to use instead of the space's, such as 0-4 or 0,3,7")
     p.add_argument(
         "--early-stopping",
         action=argparse.BooleanOptionalAction,
-        help="whether scores end trials (asha, median, stop.plateau, stop.target) as the space says, or all run to "
-        "their end; with --resume as before",
+        help="whether scores end trials (asha, median, stop.plateau, stop.target) as the space says, or all trials "
+        "run to their end; with --resume, as before",
     )
     p.add_argument(
         "--smoke",
@@ -61,47 +61,51 @@ def parser() -> Parser:
         help="shrink to minutes: every value of every factor, few epochs, no early stopping",
     )
     p.add_argument("--dry-run", action="store_true", help="print the resolved trials and stop")
-    p.add_argument("--debug-trial", metavar="K", help="run trial K (number or id of --dry-run) here, without Ray")
+    p.add_argument(
+        "--debug-trial", metavar="K", help="run trial K (number or id of --dry-run) in this process, without Ray"
+    )
     where = p.add_argument_group("where and how")
-    where.add_argument("--gpus-per-trial", type=float, metavar="G", help="GPUs a trial; below 1, trials share one")
+    where.add_argument("--gpus-per-trial", type=float, metavar="G", help="GPUs per trial; below 1, trials share a GPU")
     where.add_argument(
         "--halve-worlds",
         action=argparse.BooleanOptionalAction,
-        help="try a trial that runs out of memory once more, with half of its env.nworld, and say so in all tables; "
-        "by default as the space says (resources.halve_worlds_on_oom), with --resume as before",
+        help="restart a trial that runs out of memory once, with half of its env.nworld, and say so in all tables; "
+        "by default as the space says (resources.halve_worlds_on_oom); with --resume, as before",
     )
     where.add_argument("--cpu", action="store_true", help="run on CPU cores even if there are GPUs")
-    where.add_argument("--max-concurrent", type=int, metavar="N", help="at most N trials at once")
+    where.add_argument("--max-concurrent", type=int, metavar="N", help="at most N trials at a time")
     where.add_argument(
         "--address",
         metavar="HOST:PORT",
         default=os.environ.get("RAY_ADDRESS") or None,
-        help="use a running Ray cluster, by default the one RAY_ADDRESS names, instead of starting one; 'auto' finds "
-        "what `ray start` began here",
+        help="use a running Ray cluster (default: that of RAY_ADDRESS) instead of starting Ray; 'auto' finds the "
+        "cluster that `ray start` started on this machine",
     )
-    where.add_argument("--storage", type=Path, default=Path("runs"), metavar="DIR", help="by default runs/")
-    where.add_argument("--name", help="the experiment's name; by default the space's")
-    where.add_argument("--resume", action="store_true", help="go on with an experiment that was interrupted")
+    where.add_argument(
+        "--storage", type=Path, default=Path("runs"), metavar="DIR", help="folder of experiments (default: runs/)"
+    )
+    where.add_argument("--name", help="name of the experiment (default: that of the space)")
+    where.add_argument("--resume", action="store_true", help="continue an experiment that was interrupted")
     where.add_argument(
         "--start-or-resume",
         action="store_true",
-        help="--resume if the experiment has begun, start it if not: for schedulers that run the same command again",
+        help="--resume if the experiment exists, start it if not: for schedulers that run the same command again",
     )
     where.add_argument(
         "--force",
         action="store_true",
-        help="take the experiment over from a driver that looks alive, after looking: the other one stops by itself",
+        help="take over the experiment although its driver seems to run (check first); the other driver then stops",
     )
     where.add_argument(
         "--extend",
         action="append",
         default=[],
         metavar="KIND=TOTAL",
-        help="go on with an experiment that has ended, with more: epochs=N (those that ran to their end go on to N), "
-        "samples=N or seeds=LIST (new trials beside the old ones); totals, not additions",
+        help="extend an experiment that has ended: epochs=N (trials that ran to their end continue to N), samples=N or "
+        "seeds=LIST (new trials beside the old ones); the values are totals, not additions",
     )
     where.add_argument(
-        "--retry-errored", action="store_true", help="with --resume: try trials again that ended in an error"
+        "--retry-errored", action="store_true", help="with --resume: retry trials that ended in an error"
     )
     where.add_argument(
         "--retry",
@@ -113,19 +117,19 @@ def parser() -> Parser:
 
 @dataclass(frozen=True)
 class Options:
-    """What was asked for."""
+    """The options of a sweep."""
 
     space: Path
     """The space's file."""
     path: Path
-    """The experiment's folder, absolute; it need not be there."""
+    """The experiment's folder, absolute; it may not exist yet."""
     overrides: tuple[str, ...] = ()
-    """Settings of all trials, `KEY=VALUE`."""
+    """Settings for all trials, `KEY=VALUE`."""
     seeds: str | None = None
     early_stopping: bool | None = None
-    """Whether scores end trials; None as the space says."""
+    """Whether scores end trials; None: as the space says."""
     halve_worlds: bool | None = None
-    """Whether a trial that runs out of memory gets another attempt; None as the space says."""
+    """Whether a trial that runs out of memory gets another attempt; None: as the space says."""
     smoke: bool = False
     dry_run: bool = False
     debug_trial: str | None = None
@@ -133,32 +137,32 @@ class Options:
     cpu: bool = False
     max_concurrent: int | None = None
     address: str | None = None
-    """Of a running Ray cluster."""
+    """Address of a running Ray cluster."""
     resume: bool = False
     force: bool = False
     extension: Mapping[str, Any] = field(default_factory=dict)
     """Epochs, samples or seeds, as totals."""
     retried: frozenset[Outcome] = frozenset()
-    """Outcomes whose trials are to go on."""
+    """Outcomes whose trials should continue."""
 
     @property
     def going_on(self) -> bool:
-        """Whether an experiment is to go on that there is already."""
+        """Whether to continue an existing experiment."""
         return self.resume or bool(self.extension)
 
     def recorded(self) -> Experiment | None:
-        """The experiment to go on with, if there is one."""
+        """The experiment to continue, if there is one."""
         return Experiment(self.path) if self.going_on and has_begun(self.path) else None
 
     def remembering(self, experiment: Experiment | None) -> "Options":
-        """These options with what was said on the command lines of an experiment before, where nothing is said now."""
+        """These options, completed by those of the experiment's earlier command lines."""
         if experiment is None:
             return self
         known = {name: experiment.said(name) if now is None else now for name, now in self.remembered().items()}
         return replace(self, halve_worlds=known["halve_worlds"], early_stopping=known["early_stopping"])
 
     def remembered(self) -> dict[str, bool | None]:
-        """Those of the options that an experiment remembers, by name."""
+        """The options that an experiment remembers, by name."""
         return {"halve_worlds": self.halve_worlds, "early_stopping": self.early_stopping}
 
     def as_data(self) -> dict[str, Any]:
@@ -168,10 +172,10 @@ class Options:
 
 
 def read_options(argv: Sequence[str] | None) -> Options:
-    """What a command line asks for.
+    """The options of a command line.
 
     Raises:
-        ConfigError: options that do not go together, or a space that is not there.
+        ConfigError: incompatible options, or a space that does not exist.
         StorageError: a name that no experiment can have.
     """
     args = parser().parse_args(argv)
@@ -183,12 +187,12 @@ def read_options(argv: Sequence[str] | None) -> Options:
         raise ConfigError(f"--max-concurrent {args.max_concurrent}: at least 1")
     retried = _retried(args)
     if retried and not resume:
-        raise ConfigError(f"--retry{'-errored' if args.retry_errored else ''} goes with --resume")
+        raise ConfigError(f"--retry{'-errored' if args.retry_errored else ''} needs --resume")
     if args.smoke and args.early_stopping:
-        raise ConfigError("--early-stopping: a smoke run ends no trial by its score; leave one of them out")
+        raise ConfigError("--early-stopping: a smoke run does not end trials by their score; leave out one of the two")
     extension = parse_extension(args.extend)
     if extension and args.smoke:
-        raise ConfigError("--extend: a smoke run has nothing to extend; leave --smoke out")
+        raise ConfigError("--extend: a smoke run cannot be extended; leave out --smoke")
     if args.seeds is not None:
         parse_seeds(args.seeds)
     return Options(
@@ -213,7 +217,7 @@ def read_options(argv: Sequence[str] | None) -> Options:
 
 
 def _retried(args: argparse.Namespace) -> frozenset[Outcome]:
-    """The outcomes whose trials are to be tried again."""
+    """The outcomes whose trials are retried."""
     known = [str(outcome) for outcome in Outcome if outcome is not Outcome.FINISHED]
     names = args.retry.split(",") if args.retry is not None else []
     for name in names:

@@ -1,4 +1,4 @@
-"""Ends a sweep whose experiment's folder has gone (moved, removed, or no longer mounted) or has another owner."""
+"""Ends a sweep whose experiment folder has disappeared (moved, removed, no longer mounted) or has another owner."""
 
 import shutil
 import time
@@ -11,8 +11,8 @@ from msk_ray.experiment.manifest import Experiment
 
 
 def remove_remains(experiment: Experiment) -> None:
-    """Remove what Ray has written at the place of an experiment that has gone: it makes the folders it writes to, and
-    an experiment that is moved back would land inside them."""
+    """Remove what Ray has written in place of an experiment that has disappeared: Ray creates the folders it writes to,
+    and an experiment that is moved back would end up inside them."""
     path = experiment.path
     if not path.is_dir() or experiment.lost() is None:
         return
@@ -21,9 +21,9 @@ def remove_remains(experiment: Experiment) -> None:
 
 
 class Presence(Callback):
-    """Looks for the experiment's manifest now and then; without it, trials have nowhere to save themselves.
+    """Checks from time to time that the experiment's manifest exists; without it, trials cannot save themselves.
 
-    Also makes sure that the experiment is still this driver's.
+    It also checks that this driver still owns the experiment.
     """
 
     INTERVAL_S = 2.0

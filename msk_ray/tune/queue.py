@@ -1,8 +1,8 @@
-"""Which trial Tune runs next: those of a list or of a search, and again those that are to have another attempt.
+"""Which trial Tune runs next: those of a list or of a search, and again those that get another attempt.
 
-Another attempt needs a process of its own, as the process of the one before still holds its memory, and Tune gives a
-new process to what it takes for a new trial. So a trial whose process ended without an ending, but with a later attempt
-in its folder, is handed to Tune once more.
+Another attempt needs a new process, because the previous one still holds its memory, and Tune starts a new process for
+what it considers a new trial. So a trial whose process ended without an ending, but with a later attempt in its folder,
+is handed to Tune again.
 """
 
 import copy
@@ -24,7 +24,7 @@ Identify = Callable[[Mapping[str, Any]], str]
 
 
 class _Runs:
-    """Tune's trials that have not ended, and the Tune configs of those to be run again."""
+    """Tune's trials that have not ended, and the Tune configs of those to run again."""
 
     def __init__(self, experiment: Experiment, identify: Identify) -> None:
         self._experiment = experiment
@@ -33,12 +33,12 @@ class _Runs:
         self.again: deque[Mapping[str, Any]] = deque()
 
     def began(self, ray_id: str, config: Mapping[str, Any]) -> None:
-        """Tune has been given a trial."""
+        """A trial has been handed to Tune."""
         attempt = read_attempt(self._experiment.trial_folder(self._identify(config)))
         self._running[ray_id] = config, attempt.number
 
     def ended(self, ray_id: str) -> Mapping[str, Any] | None:
-        """Tune has done with a trial. Returns its config, unless it is to be run again."""
+        """Tune has finished with a trial. Returns its config, unless the trial is to run again."""
         config, attempt = self._running.pop(ray_id)
         folder = self._experiment.trial_folder(self._identify(config))
         if read_ending(folder) is None and read_attempt(folder).number > attempt:
@@ -47,15 +47,15 @@ class _Runs:
         return config
 
     def __bool__(self) -> bool:
-        """Whether a trial may still be run again."""
+        """Whether any trial may still run again."""
         return bool(self._running or self.again)
 
 
 class TrialList(BasicVariantGenerator):
-    """A list of trials, as Tune's own generator makes them of the parameter space."""
+    """A list of trials, as Tune's own generator creates them from the parameter space."""
 
     def __init__(self, experiment: Experiment, identify: Identify, max_concurrent: int | None) -> None:
-        # Tune limits a generator it was given no more than this one limits itself.
+        # Tune does not limit a given generator; this one limits itself.
         super().__init__(max_concurrent=max_concurrent or 0)
         self._runs = _Runs(experiment, identify)
         self._given: Any = None
@@ -91,7 +91,7 @@ class TrialList(BasicVariantGenerator):
 
     def set_finished(self) -> None:
         super().set_finished()
-        # By the generator itself when its list is at an end, or by Tune when everything is to stop.
+        # Set by the generator itself at the end of its list, or by Tune when everything stops.
         self._stopped = self._stopped or not self._asking
 
     def is_finished(self) -> bool:
@@ -99,7 +99,7 @@ class TrialList(BasicVariantGenerator):
         return self._stopped or (finished and not self._runs)
 
     def save_to_dir(self, dirpath: str, session_str: str) -> None:
-        """Nothing: an experiment goes on from its trials' folders."""
+        """Nothing: an experiment is resumed from its trials' folders."""
 
     def has_checkpoint(self, dirpath: str) -> bool:
         return False
@@ -120,9 +120,9 @@ class Suggestions(Searcher):
         Args:
             experiment: whose trials they are.
             identify: the id of the trial that a Tune config stands for.
-            search: told already what came of trials that have ended.
-            begun: values suggested before whose trials have not ended: they are tried first.
-            samples: trials to be run, those begun included.
+            search: already told the results of the trials that have ended.
+            begun: earlier suggestions whose trials have not ended: they are tried first.
+            samples: trials to run, including those already started.
         """
         super().__init__(metric=METRIC, mode="max")
         self._runs = _Runs(experiment, identify)
@@ -132,7 +132,7 @@ class Suggestions(Searcher):
         self._best: dict[str, float] = {}
 
     def suggest(self, trial_id: str) -> Any:
-        """The Tune config of the next trial; None while none is to be begun."""
+        """The Tune config of the next trial; None while none should start."""
         if self._runs.again:
             config = self._runs.again.popleft()
         elif self._left > 0:
@@ -156,4 +156,4 @@ class Suggestions(Searcher):
             self._search.tell(config["params"], best)
 
     def save(self, checkpoint_path: str) -> None:
-        """Nothing: an experiment goes on from its trials' folders."""
+        """Nothing: an experiment is resumed from its trials' folders."""

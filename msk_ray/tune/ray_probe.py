@@ -1,6 +1,6 @@
-"""`python -m msk_ray.tune.ping`: start Ray as a sweep does, run one task, and print what it found as JSON.
+"""`python -m msk_ray.tune.ray_probe`: start Ray as a sweep does, run one task, and print the result as JSON.
 
-A process of its own, because a Ray that does not come up can be given a time limit only from outside.
+It is a separate process because a time limit on the start of Ray can only be enforced from outside.
 """
 
 import json
@@ -12,7 +12,7 @@ from msk_ray.tune.session import ray_session
 
 
 def _versions() -> dict[str, str]:
-    """Run in a worker: it must find the package too."""
+    """Runs in a worker, which must find the package too."""
     import msk_ray
 
     return {"msk_ray": msk_ray.__version__, "python": sys.version.split()[0]}

@@ -19,9 +19,9 @@ BEST = "best"
 
 
 class PruningScheduler(FIFOScheduler):
-    """Stops the trials a `Pruner` names, and says so.
+    """Stops the trials that a `Pruner` names, and records why.
 
-    A report that is heard again, from a trial that went on from its checkpoint, has been judged already.
+    A result that arrives again, from a trial that was resumed from its checkpoint, has already been judged.
     """
 
     def __init__(
@@ -34,17 +34,17 @@ class PruningScheduler(FIFOScheduler):
     ) -> None:
         """
         Args:
-            pruner: the rule, as far as the journal goes.
-            time_attr: key of a report that trials are compared at.
-            journal: what the rule has been told; what it is told now is added.
+            pruner: the rule, in the state recorded by the journal.
+            time_attr: key of a result at which trials are compared.
+            journal: what the rule has been told so far; new results are appended.
             identify: id of the trial that a Ray trial runs.
-            on_stop: told the id and the ending before the trial is stopped.
+            on_stop: called with the id and the ending before the trial is stopped.
         """
         super().__init__()
         self._pruner = pruner
         self._time_attr = time_attr
         self._journal = journal
-        # The first report of another attempt is new, whatever was heard of the one before.
+        # The first result of another attempt is new, whatever the previous attempt has reported.
         self._heard = {report.trial: (report.attempt, report.epoch) for report in journal.read()[0]}
         self._identify = identify
         self._on_stop = on_stop
@@ -80,8 +80,8 @@ class PruningScheduler(FIFOScheduler):
 class Population(PopulationBasedTraining):
     """Population-based training over the sampled ranges of a space.
 
-    Values stay inside their ranges, and a member that goes on from a better one stays itself: Ray alone would let it
-    leave the ranges, and copy the better one's whole config, identity included.
+    Values stay inside their ranges, and a member that continues from a better one keeps its identity: Ray by itself
+    would let values leave the ranges, and copy the better member's whole config, including its identity.
     """
 
     def __init__(self, spec: PopulationSpec, budget: float, sampled: Mapping[str, Operator]) -> None:
@@ -102,6 +102,6 @@ class Population(PopulationBasedTraining):
 
 
 def _draw(op: Operator) -> Callable[[], Any]:
-    """Draws a value from a range, each time another one."""
+    """Draws a new value from a range at each call."""
     rng = random.Random()
     return lambda: op.draw(rng).value

@@ -1,4 +1,4 @@
-"""The Ray that trials run on: one of our own on this machine, or a cluster that is there."""
+"""The Ray session that trials run in: our own on this machine, or a running cluster."""
 
 import os
 from collections.abc import Iterator
@@ -16,12 +16,12 @@ from msk_ray.tune.local_ray import start_local, way_in
 
 @contextmanager
 def ray_session(address: str | None, dashboard: bool | None = None, trials: bool = True) -> Iterator[None]:
-    """A Ray of our own on this machine, or the one at `address`.
+    """Our own Ray on this machine, or the one at `address`.
 
     Args:
-        address: of a running cluster.
-        dashboard: whether to start one; None starts it where its packages (ray[default]) are installed.
-        trials: whether trials are to run; then every process imports what they need as soon as it is there.
+        address: address of a running cluster.
+        dashboard: whether to start one; None starts it if its packages (ray[default]) are installed.
+        trials: whether trials will run; then every process imports what they need as soon as it starts.
 
     Raises:
         DeviceError: the cluster at `address` cannot be reached.
@@ -34,11 +34,11 @@ def ray_session(address: str | None, dashboard: bool | None = None, trials: bool
         TUNE_DISABLE_SIGINT_HANDLER="1",  # a request to stop lets trials save themselves first
     )
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    # Ray starts a cluster by itself for whoever asks it something after `ray.shutdown`.
+    # Ray starts a cluster automatically when it is used after `ray.shutdown`.
     os.environ["RAY_ENABLE_AUTO_CONNECT"] = "0"
-    # Off by default because it runs a program in the cluster; so can everybody who has the token it asks for.
+    # Off by default because it runs a program in the cluster; but so can everybody who has the token it requires.
     os.environ.setdefault("RAY_DASHBOARD_ENABLE_PROFILING", "1")
-    # Ray would have trials give way to everything else on the machine.
+    # Otherwise Ray would give trials a lower priority than everything else on the machine.
     os.environ.setdefault("RAY_worker_niceness", "0")
     common: dict[str, Any] = {
         "logging_level": "ERROR",

@@ -1,4 +1,4 @@
-"""What the driver decides while trials run: when everything stops, and the endings that no trial can write itself."""
+"""The driver's decisions while trials run: when everything stops, and the endings that no trial can write itself."""
 
 import pickle
 import time
@@ -22,13 +22,13 @@ from msk_ray.tune.console import Console
 from msk_ray.tune.schedulers import BEST, METRIC
 
 SHUTDOWN_GRACE_S = 120.0
-"""How long trials may take to reach the end of their epoch and save, after a request to stop."""
+"""Time [s] in which trials must reach the end of their epoch and save, after a request to stop."""
 LONGEST_STEP_S = 5.0
-"""What a step of Tune's loop counts for at most: in the rest this process was itself stopped or asleep [s]."""
+"""The most that a step of Tune's loop counts [s]: if it took longer, this process was stopped or asleep."""
 
 
 class Supervisor(Callback):
-    """Follows the trials: names the endings that only the driver sees, stops everything on request, and tells the
+    """Follows the trials: records the endings that only the driver sees, stops everything on request, and informs the
     console."""
 
     def __init__(
@@ -45,10 +45,10 @@ class Supervisor(Callback):
         Args:
             experiment: whose trials they are.
             trial_of: the trial that a Tune config stands for.
-            console: told of what happens.
-            stop: asked between any two events.
-            guard: called before anything is written; raises if the experiment is another driver's by now.
-            waiting: trials to be run, as far as they are known.
+            console: informed of what happens.
+            stop: checked between any two events.
+            guard: called before anything is written; raises if another driver owns the experiment by now.
+            waiting: trials still to run, as far as they are known.
             started: trials started before, in that order.
         """
         self._experiment = experiment
@@ -58,15 +58,15 @@ class Supervisor(Callback):
         self._guard = guard
         self._waiting = {trial.id for trial in waiting}
         self._attempts: dict[str, int] = {}
-        """Trials that run, and which attempt at each."""
+        """Running trials, and the attempt of each."""
         self._saving: set[str] = set()
         self.started: list[Trial] = list(started)
-        """Trials that were started, in that order, each once, with its place in it."""
+        """Trials that were started, in that order, each once, with its position."""
         self._stopping = False
         self._stopping_s = 0.0
         self._last_step = time.monotonic()
         self.storage_failure: StorageFailure | None = None
-        """What a trial met when it wrote; then everything is stopped, as every trial would meet it."""
+        """The error of a trial that could not write; everything is stopped then, because every trial would meet it."""
 
     def __getstate__(self) -> dict[str, Any]:
         # Ray pickles callbacks into its own state, which is never read back: resuming begins from the trials' folders.
@@ -78,7 +78,7 @@ class Supervisor(Callback):
 
     @property
     def stopped(self) -> bool:
-        """Whether a request to stop has been carried out: every trial that ran has saved itself, or time is up."""
+        """Whether a request to stop has been carried out: every running trial has saved itself, or time is up."""
         return self._stopping and (not self._saving or self._stopping_s > SHUTDOWN_GRACE_S)
 
     def on_step_end(self, iteration: int, trials: list[Any], **info: Any) -> None:
@@ -141,12 +141,12 @@ class Supervisor(Callback):
         self.console.failed(mine, ending.why, folder)
 
     def pruned(self, trial_id: str, ending: Ending) -> None:
-        """A scheduler stops a trial: its process will not live to write its ending."""
+        """A scheduler stops a trial, whose process will not get to write its ending."""
         self._guard()
         write_ending(self._experiment.trial_folder(trial_id), ending)
 
     def _meet_storage_failure(self, trial: Any) -> bool:
-        """Whether the disk failed a trial; then all are stopped, and none has ended by that."""
+        """Whether the disk failed for a trial; then all trials are stopped, which is not an ending for any."""
         error = _error_of(trial)
         failure = None if error is None else storage_failure(error)
         if failure is None:
@@ -169,18 +169,18 @@ class Supervisor(Callback):
         try:
             self._experiment.stop_file.touch()
         except OSError as error:
-            # Then the trials meet the same disk at their next row, and end by that.
+            # Then the trials fail on the same disk at their next row, and stop there.
             self.console.say(f"cannot write {self._experiment.stop_file}: {error.strerror}")
 
     def _reason(self, mine: Trial, trial: Any) -> str:
-        """Why a trial's process ended before its time, on one line."""
+        """Why a trial's process ended early, on one line."""
         return printable(_reason(self._experiment.trial_folder(mine.id), trial))
 
 
 def _error_of(trial: Any) -> Exception | None:
     """The exception that ended a Ray trial's process; None if there was none.
 
-    Ray's own accessor reads the storage, where the file arrives later, or never on a full disk.
+    Ray's own accessor reads it from the storage, where the file arrives later, or never if the disk is full.
     """
     path = trial.pickled_error_file
     if path is None or not Path(path).is_file():
@@ -192,7 +192,7 @@ def _error_of(trial: Any) -> Exception | None:
 def _reason(folder: Path, trial: Any) -> str:
     hang_file, error_file = folder / HANG_FILE, folder / ERROR_FILE
     if hang_file.is_file() and hang_file.stat().st_size:
-        return f"it hung; where is in {hang_file}"
+        return f"it hung; its stacks are in {hang_file}"
     if error_file.is_file():
         return error_file.read_text(encoding="utf-8", errors="replace").strip().splitlines()[-1]
     error = _error_of(trial)

@@ -1,4 +1,4 @@
-"""What Ray Tune runs in a trial's process: `run_trial` with reports, gauges and its output in a file."""
+"""What Ray Tune runs in a trial's process: `run_trial` with results for Tune, gauges, and its output in a file."""
 
 import faulthandler
 import json
@@ -41,19 +41,19 @@ MEMORY_LIMIT_S = 60.0
 
 @dataclass(frozen=True)
 class Job:
-    """What the process of a trial needs to know beyond its Tune config."""
+    """What the process of a trial needs besides its Tune config."""
 
     experiment: Experiment
     space: Space
     base: dict[str, Any]
     trials: dict[str, Trial]
-    """Trials by id; empty when a search makes them up."""
+    """Trials by id; empty if a search suggests them."""
     device: str
     gpus: float
-    """GPUs of a trial, 0 on CPU."""
+    """GPUs per trial, 0 on CPU."""
     trainer_class: type[TrainerLike]
     owner: str | None = None
-    """Token of the experiment's owner; None where it has none."""
+    """Token of the experiment's owner; None if it has none."""
 
     @property
     def population(self) -> bool:
@@ -90,8 +90,9 @@ def make_trainable(job: Job, resources: dict[str, float]) -> type[tune.Trainable
             with _owned(folder, job):
                 in_frame_named(trial.label, lambda: work(trial, folder))
         except Exception as error:
-            # Whatever stumbled over a full disk first, a line of output perhaps: the driver must hear of the disk.
-            # Or over a file that is no longer there, as nothing is.
+            # Whatever failed first on a full disk, perhaps a line of output: the driver must be told about the
+            # disk. The same
+            # holds for a missing file when the whole folder is missing.
             failure = storage_failure(error) or job.experiment.lost(trial.id)
             if failure is None or failure is error:
                 raise
@@ -136,7 +137,7 @@ def make_trainable(job: Job, resources: dict[str, float]) -> type[tune.Trainable
                 job.space.file.resources.halve_worlds_on_oom,
             )
 
-    # Given the function alone, Tune makes a class `ImplicitFunc` of it whose actors all look alike.
+    # From the function itself, Tune would create a class `ImplicitFunc` whose actors all look alike.
     class TrialActor(wrap_function(tune.with_resources(train, resources))):  # type: ignore[misc]
         def __repr__(self) -> str:
             """Names the actor in Ray's dashboard, in its lists, and in front of its lines of output."""
@@ -147,7 +148,7 @@ def make_trainable(job: Job, resources: dict[str, float]) -> type[tune.Trainable
 
 
 def in_frame_named(name: str, call: Callable[[], None]) -> None:
-    """Call a function from a frame of this name: profilers and tracebacks show which trial it was."""
+    """Call a function from a frame of this name, so that profilers and tracebacks show the trial."""
 
     def frame() -> None:
         call()
@@ -160,8 +161,8 @@ def in_frame_named(name: str, call: Callable[[], None]) -> None:
 def _owned(folder: Path, job: Job) -> Iterator[None]:
     """Own a trial's folder on behalf of the driver that started this process.
 
-    A process left over from an earlier driver, or from a node that Ray gave up, holds it until it notices: the one that
-    serves the experiment's present owner wins, and waits for it.
+    A process left over from an earlier driver, or from a node that Ray has given up, holds it until it notices that.
+    The process that serves the experiment's current owner wins, and waits for the other.
     """
     if job.owner is None:
         yield
@@ -174,14 +175,14 @@ def _owned(folder: Path, job: Job) -> Iterator[None]:
 
 
 def _leave(lost: OwnershipLost) -> None:
-    """End this process where it stands: another one may be writing to the same files already."""
+    """End this process at once: another one may already be writing to the same files."""
     os.write(2, f"{lost}; this process ends\n".encode())
     os._exit(lost.exit_code)
 
 
 def _reporter(attempt: int) -> Callable[[Evaluation, bool, TrainerLike], None]:
-    """Reports to Tune. State stays out of it: a retried trial goes on from its own folder, where a torn newest
-    checkpoint is passed over; Ray would insist on it at every retry."""
+    """Sends results to Tune, but no state: a retried trial continues from its own folder, where an incomplete newest
+    checkpoint is skipped; Ray would use that checkpoint at every retry."""
 
     def report(evaluation: Evaluation, ended: bool, trainer: TrainerLike) -> None:
         tune.report(_figures(evaluation, ended, trainer.best_score, attempt))
@@ -190,7 +191,7 @@ def _reporter(attempt: int) -> Callable[[Evaluation, bool, TrainerLike], None]:
 
 
 def _report_with_checkpoint(evaluation: Evaluation, ended: bool, trainer: TrainerLike) -> None:
-    """Report with state, which Ray hands on to another member of the population."""
+    """Sends results with state, which Ray passes on to another member of the population."""
     path = trainer.save()
     with tempfile.TemporaryDirectory() as folder:
         shutil.copy(path, folder)
@@ -211,7 +212,7 @@ def _figures(evaluation: Evaluation, ended: bool, best: float, attempt: int) -> 
 
 
 def _handed_checkpoint(scratch: Path) -> Path | None:
-    """The checkpoint Ray hands to this trial, if any: its own after a crash, or a better member's."""
+    """The checkpoint that Ray gives to this trial, if any: its own after a crash, or a better member's."""
     handed = tune.get_checkpoint()
     if handed is None:
         return None
@@ -226,7 +227,7 @@ def _exchanging(job: Job, folder: Path) -> type[TrainerLike]:
     class Exchanging(job.trainer_class):  # type: ignore[name-defined]
         def restore(self, path: Path) -> None:
             super().restore(path, changed=moving)
-            # best.pt is this trial's own; a better member's best score would keep it from ever being replaced.
+            # best.pt belongs to this trial; with a better member's best score it would never be replaced.
             own = [e.score for e in evaluations_of(read_rows(folder)) if math.isfinite(e.score)]
             self.best_score = max(own, default=-math.inf)
 
@@ -234,7 +235,7 @@ def _exchanging(job: Job, folder: Path) -> type[TrainerLike]:
 
 
 def _redirect_output(path: Path) -> None:
-    """Send everything this process prints, from any language, to the end of a file."""
+    """Append everything that this process prints, from any language, to a file."""
     file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
     sys.stdout.flush()
     sys.stderr.flush()
@@ -244,9 +245,9 @@ def _redirect_output(path: Path) -> None:
 
 
 class _Watch:
-    """Ends this process if it is not heard of for `limit_s`, and leaves its stacks in a file.
+    """Ends this process if it gives no sign of life for `limit_s`, and writes its stacks to a file.
 
-    faulthandler counts in a thread of its own below Python, so that a call that hangs in a driver is caught too.
+    faulthandler counts in a thread outside Python, so that a call that hangs in a device driver is caught too.
     """
 
     def __init__(self, limit_s: float | None, file: TextIO | None) -> None:
@@ -255,13 +256,13 @@ class _Watch:
         self.alive()
 
     def alive(self) -> None:
-        """Count from the beginning."""
+        """Restart the count."""
         if self._limit_s is not None and self._file is not None:
             faulthandler.dump_traceback_later(self._limit_s, exit=True, file=self._file)
 
     @contextmanager
     def suspended(self) -> Iterator[None]:
-        """Not to count in a block: a report waits for the driver, which may be stopped, asleep or busy."""
+        """Pause the count in a block: sending a result waits for the driver, which may be stopped, asleep or busy."""
         faulthandler.cancel_dump_traceback_later()
         try:
             yield
@@ -271,7 +272,7 @@ class _Watch:
 
 @contextmanager
 def _watchdog(folder: Path, limit_s: float | None) -> Iterator[_Watch]:
-    """Watch over this process for a block; the stacks of one that hung are left in `hang.txt`."""
+    """Watch this process during a block; if it hangs, its stacks are written to `hang.txt`."""
     path = folder / HANG_FILE
     path.unlink(missing_ok=True)
     if limit_s is None:
@@ -296,13 +297,13 @@ def _wait_for_gpu(share: float) -> None:
     left = wait_for_memory(min(share, 1.0), free_share, MEMORY_LIMIT_S)
     if left is not None:
         print(
-            f"the GPU has only {left:.0%} of its memory free after {MEMORY_LIMIT_S:.0f} s: who else uses it?",
+            f"the GPU has only {left:.0%} of its memory free after {MEMORY_LIMIT_S:.0f} s: what else is using it?",
             flush=True,
         )
 
 
 def _record_device(path: Path) -> None:
-    """Keep which host, process and GPUs the trial was given: the evidence that it had them to itself."""
+    """Record which host, process and GPUs the trial was given, as evidence that it had them to itself."""
     import torch
 
     cuda = torch.cuda.is_available()

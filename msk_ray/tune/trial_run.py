@@ -1,4 +1,4 @@
-"""One trial from wherever it stands to its end. Knows nothing of Ray, so it can be stepped through with a debugger."""
+"""Run one trial from its current state to its end. Independent of Ray, so it can be stepped through in a debugger."""
 
 import traceback
 from collections.abc import Callable, Mapping
@@ -43,14 +43,14 @@ class TrainerLike(Protocol):
 
 @dataclass(frozen=True)
 class Hooks:
-    """What the surroundings of a trial want to know and may ask for."""
+    """How the caller follows a trial and can pause it."""
 
     on_epoch: Callable[[Mapping[str, float]], None] = field(default=lambda row: None)
     """Called with every row of metrics."""
     on_evaluation: Callable[[Evaluation, bool, TrainerLike], None] = field(default=lambda e, last, trainer: None)
     """Called after each evaluation with whether the trial has ended, and the trainer."""
     pause: Callable[[], bool] = field(default=lambda: False)
-    """Asked before every epoch; True makes the trial save itself and return."""
+    """Called before every epoch; True makes the trial save itself and return."""
 
 
 def run_trial(
@@ -63,38 +63,38 @@ def run_trial(
     checkpoint: Path | None = None,
     may_halve: bool = False,
 ) -> Ending | None:
-    """Train until the trial ends, by its last epoch or by one of its own rules.
+    """Train until the trial ends, at its last epoch or by one of its own rules.
 
-    Goes on from the newest whole checkpoint in `folder`, or from `checkpoint` if one is given. The ending is written
-    to `folder`, which is there: a trial whose folder was moved does not begin again.
+    Continues from the newest complete checkpoint in `folder`, or from `checkpoint` if one is given. The ending is
+    written to `folder`, which must exist: a trial whose folder was moved does not start again.
 
     Args:
-        may_halve: whether the trial may be tried once more, with half its worlds, when it runs out of memory. One that
-            has half of them already keeps to that, whatever is said here.
+        may_halve: whether the trial may be restarted once, with half its worlds, when it runs out of memory. A trial
+            that already has half of them keeps them in any case.
 
     Returns:
-        How it ended; None if it was paused before, or is to be run again by a process in which this attempt has left
-        no memory: then `folder` holds the next attempt.
+        How it ended; None if it was paused before its end, or must be run again in a new process, which holds no memory
+        of this attempt: then `folder` holds the next attempt.
 
     Raises:
-        StorageFailure: the disk is full or gone, or the folder is; the trial can go on once it is back.
-        Exception: anything that is neither a failed simulation nor a fault the user can mend. Its traceback is kept in
-            `error.txt`, and the trial may be tried again.
+        StorageFailure: the disk is full, or the disk or folder is gone; the trial can continue once it is back.
+        Exception: anything that is neither a failed simulation nor an error that the user can fix. Its traceback is
+            written to `error.txt`, and the trial may be retried.
     """
     if not folder.is_dir():
-        raise StorageFailure(f"{folder} has gone: moved, removed or not mounted")
+        raise StorageFailure(f"{folder} does not exist: moved, removed or not mounted")
     try:
         done = load_ending(folder)
     except DamagedFile as error:
-        print(f"{error}; going on as if it had not ended", flush=True)
+        print(f"{error}; continuing as if it had not ended", flush=True)
         done = None
     if done is not None:
         return done
-    # What an earlier attempt stumbled over stays in the trial's output; this file is about the latest one.
+        # The error of an earlier attempt stays in the trial's output; this file is about the latest one.
     (folder / ERROR_FILE).unlink(missing_ok=True)
     attempt = FIRST
     try:
-        # The process that decided on it may not have lived to begin it.
+        # The process that decided on it may have died before starting it.
         attempt = _attempt_in(folder).begin(folder)
         if attempt.reduced is not None:
             print(attempt, flush=True)
@@ -105,7 +105,7 @@ def run_trial(
         else:
             ending = Ending(Outcome(error.failure.value), str(error))
     except StorageFailure:
-        # The disk's fault, not the trial's: it has not ended, and goes on once there is room.
+        # The disk failed, not the trial: it has not ended, and continues once there is space.
         raise
     except MskRayError as error:
         ending = Ending(Outcome.ERROR, str(error))
@@ -130,7 +130,7 @@ def _attempt_in(folder: Path) -> Attempt:
 
 
 def _out_of_memory(trial: Trial, folder: Path, why: str, attempt: Attempt, may_halve: bool) -> Ending | None:
-    """How a trial ends whose device has no room for it; None if there is to be another attempt."""
+    """How a trial ends that does not fit on its device; None if there will be another attempt."""
     if attempt.reduced is None and not may_halve:
         return Ending(Outcome.OUT_OF_MEMORY, why)
     try:
@@ -138,7 +138,7 @@ def _out_of_memory(trial: Trial, folder: Path, why: str, attempt: Attempt, may_h
     except ConfigError as fault:
         return Ending(Outcome.OUT_OF_MEMORY, f"{why}; {fault}")
     following.begin(folder)
-    print(f"{why}\nthe trial begins again with {following}; what was done so far is in {ABANDONED}/", flush=True)
+    print(f"{why}\nthe trial restarts with {following}; its work so far is in {ABANDONED}/", flush=True)
     return None
 
 
@@ -155,7 +155,7 @@ def _train(
     try:
         note = str(read_attempt(folder))
         if note:
-            # For whoever reads these settings alone.
+            # For anyone who reads only these settings.
             settings = folder / "config.yaml"
             write_text(settings, f"# {note} asked for\n{settings.read_text(encoding='utf-8')}")
         if checkpoint is not None:
@@ -164,7 +164,7 @@ def _train(
             path, faults = trainer.restore_latest()
             for fault in faults:
                 print(f"skipped: {fault}", flush=True)
-            print(f"going on from {path}" if path else "starting", flush=True)
+            print(f"continuing from {path}" if path else "starting", flush=True)
         return _loop(trial, folder, stop, trainer, hooks)
     finally:
         trainer.close()
@@ -176,7 +176,7 @@ def _loop(trial: Trial, folder: Path, stop: StopSpec, trainer: TrainerLike, hook
         seen = evaluations_of(rows)
         ending = stop.ending(History(rows[-1], seen, trial.epochs, rows[-1]["seconds"])) if rows else None
         if seen:
-            # The process may have died between the checkpoint and the report; a repeated report changes nothing.
+            # The process may have died between the checkpoint and its result; a repeated result changes nothing.
             hooks.on_evaluation(seen[-1], ending is not None, trainer)
         if ending is not None:
             return ending
@@ -186,7 +186,7 @@ def _loop(trial: Trial, folder: Path, stop: StopSpec, trainer: TrainerLike, hook
         hooks.on_epoch(row)
         evaluation = Evaluation.from_row(row)
         if evaluations is None:
-            # Holds also the evaluation before the first epoch, which no row returned here shows.
+            # It also has the evaluation before the first epoch, which no row returned here shows.
             evaluations = evaluations_of([r for r in read_rows(folder) if r["epoch"] <= row["epoch"]])
         elif evaluation is not None:
             evaluations.append(evaluation)
@@ -195,7 +195,7 @@ def _loop(trial: Trial, folder: Path, stop: StopSpec, trainer: TrainerLike, hook
             return ending
         if evaluation is not None:
             if ending is not None:
-                # Before the report: whoever hears of the last evaluation must find the ending.
+                # Before the result is sent: whoever receives the last evaluation must find the ending.
                 write_ending(folder, ending)
             hooks.on_evaluation(evaluation, ending is not None, trainer)
         if ending is not None:

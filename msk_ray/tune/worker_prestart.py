@@ -1,9 +1,9 @@
-"""Processes started ahead for the next trials, with everything imported: importing takes longer than all else a start
-does.
+"""Start processes for the next trials ahead of time, with everything imported: the imports are the longest part of a
+start.
 
-Every trial still gets a process of its own. One that waits has not touched a GPU: CUDA is initialised when a trial
-begins in it, on the GPU that trial was given. Ray has no public way to ask for such processes, so what is done here may
-fail with another version of it. Then trials begin seconds later, which is said once, and nothing else changes.
+Every trial still gets its own process. A waiting process does not use a GPU: CUDA is initialised when a trial starts in
+it, on the GPU assigned to that trial. Ray has no public interface for such processes, so this may fail with another
+version of Ray. Then one line says so, trials start a few seconds later, and nothing else changes.
 """
 
 import importlib
@@ -17,19 +17,19 @@ from ray.tune import Callback
 from msk_ray.tune.devices import Placement
 
 MODULES = ("msk_ray.training", "msk_ray.tune.trainable", "torch._dynamo")
-"""What a trial's process imports; the last one when torch makes its first optimizer, for two seconds."""
+"""What a trial's process imports; torch would import the last one with its first optimizer, which takes two seconds."""
 KEEP_S = 24 * 3600
-"""How long Ray keeps a process that has not been used [s]; those left over end with the driver."""
+"""How long Ray keeps an unused process [s]; unused processes end with the driver."""
 _CALL_LIMIT_S = 10.0
 
 
 def import_all() -> None:
-    """Run by every process of a trial as soon as it is there; what cannot be imported, the trial will say."""
-    # Numerical libraries read it when they are imported; a trial sets its own number of threads (`trial.threads`).
+    """Run by every process of a trial as soon as it starts; the trial itself reports what cannot be imported."""
+    # Numerical libraries read this when they are imported; a trial sets its own number of threads (`trial.threads`).
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # threads that wait for work sleep rather than spin
-    # CUDA reads it once, when it is initialised. Should an import do that, the trial is to fail without a GPU, not to
-    # run on another trial's.
+    # CUDA reads this once, when it is initialised. If an import did that, the trial should fail without a GPU rather
+    # than run on another trial's.
     visible = os.environ.get("CUDA_VISIBLE_DEVICES")
     os.environ["CUDA_VISIBLE_DEVICES"] = ""
     for name in MODULES:
@@ -45,7 +45,7 @@ HOOK = f"{import_all.__module__}.{import_all.__name__}"
 
 
 def nodes_for(placement: Placement) -> list[dict[str, Any]]:
-    """Ray's description of every node alive that a trial fits on."""
+    """Ray's description of every living node that has room for a trial."""
     return [node for node in ray.nodes() if node["Alive"] and _fits(node["Resources"], placement)]
 
 
@@ -54,9 +54,9 @@ def _fits(resources: dict[str, float], placement: Placement) -> bool:
 
 
 class WorkerPrestart(Callback):
-    """Once a trial that has started trains, sees to it that as many processes wait as may be needed at once.
+    """Once a started trial trains, makes sure that enough idle processes wait for the next trials.
 
-    Not at once when it starts: on a machine of few cores it would wait for those that import.
+    It does not do so as soon as a trial starts: on a machine with few cores, the imports would slow the trial down.
     """
 
     def __init__(
@@ -64,8 +64,8 @@ class WorkerPrestart(Callback):
     ) -> None:
         """
         Args:
-            placement: of a trial.
-            limit: trials at once, on all nodes.
+            placement: resources of a trial.
+            limit: number of trials at the same time, on all nodes.
             waiting: how many trials have not started yet.
             say: prints a line.
         """
@@ -92,15 +92,15 @@ class WorkerPrestart(Callback):
             return
         try:
             self._due = not self._prestart(waiting)
-        except Exception as error:  # whatever another version of Ray, or a node that dies this moment, makes of it
+        except Exception as error:  # any error of another version of Ray, or of a node that is dying
             self._due, self._probe = False, None
             reason = f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
             if reason not in self._said:
                 self._said.add(reason)
-                self._say(f"no process was started ahead, so trials begin seconds later: {reason}")
+                self._say(f"no process was started ahead of time, so trials start a few seconds later: {reason}")
 
     def _prestart(self, waiting: int) -> bool:
-        """Start what may be needed at once; False while it is not known yet which environment trials have."""
+        """Start the processes that may be needed; False while the trials' environment is not known yet."""
         if self._probe is None:
             self._probe = _environment_of_trials()
         if not ray.wait([self._probe], timeout=0)[0]:
@@ -114,15 +114,15 @@ class WorkerPrestart(Callback):
 
 
 def start_processes(node: dict[str, Any], count: int, environment: str) -> None:
-    """Have a node's raylet see to it that `count` unused processes wait in its pool.
+    """Make a node's raylet keep `count` unused processes in its pool.
 
     Args:
-        node: Ray's description of it.
-        count: processes, those that wait already included.
-        environment: serialised runtime environment of those who are to use them.
+        node: Ray's description of the node.
+        count: number of processes, including those already waiting.
+        environment: serialised runtime environment of the trials that will use them.
 
     Raises:
-        Exception: as Ray's internals do; grpc.RpcError if the node does not answer.
+        Exception: any error of Ray's internals; grpc.RpcError if the node does not answer.
     """
     from ray._private.grpc_utils import init_grpc_channel
     from ray.core.generated import common_pb2, node_manager_pb2, node_manager_pb2_grpc
@@ -139,8 +139,8 @@ def start_processes(node: dict[str, Any], count: int, environment: str) -> None:
 
 
 def _environment_of_trials() -> Any:
-    """A reference to it, serialised: Tune gives trials' processes a runtime environment of their own, laid over that of
-    Ray's session, and Ray takes no process of another one."""
+    """A serialised reference to the runtime environment: Tune gives trials' processes their own, merged over that of
+    Ray's session, and Ray does not use processes of another one."""
     from ray.tune.execution.class_cache import DEFAULT_ENV_VARS, ENV_VARS_TO_PROPAGATE
 
     variables = DEFAULT_ENV_VARS | {name: os.environ[name] for name in ENV_VARS_TO_PROPAGATE if name in os.environ}

@@ -122,7 +122,7 @@ def test_a_loss_is_noticed_without_being_asked_for(tmp_path: Path, monkeypatch: 
         assert not noticed.wait(0.1)
         with owned(experiment, force=True):
             wait_until(noticed.is_set)
-        with pytest.raises(OwnershipLost, match=r"is no longer its owner|has gone"):
+        with pytest.raises(OwnershipLost, match=r"is no longer its owner|does not exist"):
             mine.check()
         mine.release()
 

@@ -70,5 +70,5 @@ def test_earlier_checkpoints_are_gone_on_from(tiny_cartpole: Config, tmp_path: P
 
 def test_more_threads_than_cores_are_refused(tiny_cartpole: Config) -> None:
     check_threads([tiny_cartpole, with_threads(tiny_cartpole, 2)], ResourcesSpec(cpus_per_trial=2))
-    with pytest.raises(ConfigError, match=r"trial\.threads 2, 1 cores a trial: write resources\.cpus_per_trial: 2"):
+    with pytest.raises(ConfigError, match=r"trial\.threads 2, 1 cores per trial: write resources\.cpus_per_trial: 2"):
         check_threads([tiny_cartpole, with_threads(tiny_cartpole, 2)], ResourcesSpec())

@@ -78,7 +78,7 @@ def test_half_the_worlds_from_the_beginning(
             "epoch_000004.pt",
         ]
     said = capsys.readouterr().out
-    assert "the trial begins again with half the worlds: 4 of 8; what was done so far is in" in said
+    assert "the trial restarts with half the worlds: 4 of 8; its work so far is in" in said
     ending = attempt(trial, tmp_path)
     assert ending is not None
     assert ending.outcome is Outcome.FINISHED

@@ -65,7 +65,7 @@ def test_dry_run_imports_neither_ray_nor_torch(space_file: Path, root: Path) -> 
         (["--space", "SPACE", "--debug-trial", "7"], "no trial '7'"),
         (["--space", "SPACE", "--name", "a/b"], "letters, digits"),
         (["--space", "SPACE", "--resume"], "no experiment at"),
-        (["--space", "SPACE", "--retry-errored"], "goes with --resume"),
+        (["--space", "SPACE", "--retry-errored"], "needs --resume"),
         (["--space", "SPACE", "--gpus-per-trial", "1", "--cpu"], "exclude each other"),
         (["--space", "SPACE", "--storage", "/proc/x"], "cannot write to"),
     ],
@@ -94,7 +94,7 @@ def test_one_gpu_a_trial_without_gpu(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("msk_ray.tune.devices.local_gpus", lambda: 0)
     assert run(main, ["--space", str(space_file), "--gpus-per-trial", "1"]) == 2
-    assert capsys.readouterr().err == "error: --gpus-per-trial 1: no GPU here; pass --cpu to run on CPUs\n"
+    assert capsys.readouterr().err == "error: --gpus-per-trial 1: there is no GPU; pass --cpu to run on CPUs\n"
     assert not (tmp_path / "runs").exists()
 
 
@@ -137,17 +137,17 @@ def test_every_trial_to_its_end_on_request(
     assert early("--resume")
     capsys.readouterr()
     assert not early("--resume", "--no-early-stopping")
-    assert "left so: 1 trials; --retry stopped_asha lets them go on" in capsys.readouterr().out
+    assert "still stopped early: 1 trials; --retry stopped_asha lets them continue" in capsys.readouterr().out
     facts = json.loads((made.path / "env.json").read_text())
     (made.path / "env.json").write_text(json.dumps(facts | {"command": ["msk-ray", "tune", "--no-early-stopping"]}))
     assert made.resume_command() == "msk-ray tune --resume", "not what would undo a later word"
     assert early("--resume", "--early-stopping")
     assert early("--name", "other")
     assert run(main, ["--space", str(space), "--cpu", "--smoke", "--early-stopping"]) == 2
-    assert "a smoke run ends no trial by its score" in capsys.readouterr().err
+    assert "a smoke run does not end trials by their score" in capsys.readouterr().err
     space.write_text(dump_yaml(space_data | {"scheduler": {"kind": "pbt"}, **drawn_rate()}))
     assert run(main, ["--space", str(space), "--dry-run", "--no-early-stopping"]) == 2
-    assert "in small.yaml trials go on from each other (pbt)" in capsys.readouterr().err
+    assert "in small.yaml trials continue from each other (pbt)" in capsys.readouterr().err
 
 
 def test_start_or_resume_asks_the_experiment_by_the_name_it_has(

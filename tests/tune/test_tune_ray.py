@@ -94,7 +94,7 @@ def test_faults_are_named_and_killed_or_hung_trials_go_on(
     shown = capsys.readouterr()
     assert "its process died (killed, or out of memory); trying again" in shown.out
     assert "raylet" not in shown.out + shown.err  # Ray's own notices are in ray.log
-    assert "it hung; where is in" in shown.out
+    assert "it hung; its stacks are in" in shown.out
     # The killed trial has every epoch once, with the scores of the one that was left alone.
     intact = (records[0], records[1], records[5])
     scores = [[row["eval/score"] for row in read_rows(r.folder) if "eval/score" in row] for r in intact]
@@ -125,7 +125,7 @@ def test_a_full_disk_stops_everything_and_ends_nothing(
 ) -> None:
     space = make_space(parameters={BEHAVIOUR: {"grid": [FULL_DISK, MEMORY]}})
     path = tmp_path / "runs" / "disk"
-    with pytest.raises(StorageFailure, match="No space left on device; mend that and go on with --resume"):
+    with pytest.raises(StorageFailure, match="No space left on device; fix that and continue with --resume"):
         go(space, path)
     assert "stopping all trials" in capsys.readouterr().out
     completed, records = go(space, path, resume=True)
@@ -154,12 +154,12 @@ def test_what_has_gone_stops_the_sweep_and_is_not_made_again(
     ended = threading.Event()
     mover = threading.Thread(target=gone, args=(path, what, ended))
     mover.start()
-    with pytest.raises(StorageFailure, match=r"has gone|cannot write") as caught:
+    with pytest.raises(StorageFailure, match=r"does not exist|cannot write") as caught:
         go(space, path)
     ended.set()
     mover.join()
     assert caught.value.exit_code == 75
-    assert "go on with --resume" in str(caught.value)
+    assert "continue with --resume" in str(caught.value)
     elsewhere = path.parent / "elsewhere"
     lost = {"experiment": path, "manifest": path / "manifest.json"}.get(what)
     if lost is None:
@@ -200,7 +200,7 @@ def test_out_of_memory_begins_again_with_half_the_worlds_in_a_fresh_process(
     for record in records[1:]:
         processes = (record.folder / "processes").read_text().split()
         assert len(processes) == len(set(processes)) == 2
-        assert f"{record.trial.id} ran out of memory; it begins again with half the worlds: 4 of 8" in shown
+        assert f"{record.trial.id} ran out of memory; it restarts with half the worlds: 4 of 8" in shown
         assert f"{record.trial.id} again  {record.trial.variant} seed=0 (half the worlds: 4 of 8)" in shown
     for record in records[:3]:
         assert [row["epoch"] for row in read_rows(record.folder)] == list(range(21))
@@ -343,7 +343,7 @@ def test_optuna_goes_on_where_it_was(make_space: Any, tmp_path: Path) -> None:
     assert ids[: len(before)] == [record.trial.id for record in before]
     assert len(set(ids)) == 3
     assert [record.trial.index for record in after] == [0, 1, 2]
-    assert "going on from" in (before[0].folder / "output.log").read_text()
+    assert "continuing from" in (before[0].folder / "output.log").read_text()
     assert all([row["epoch"] for row in read_rows(record.folder)] == list(range(101)) for record in after)
     with pytest.raises(StorageError, match="no longer gives the trial of"):
         recover(Experiment(path), make_space(parameters={"shac.actor_lr": {"loguniform": [1e-3, 1e-2]}}))
@@ -385,7 +385,12 @@ def test_processes_that_cannot_be_started_ahead_are_said_once_and_cost_no_trial(
     assert driver.run_trials(driver.Plan(experiment, space, trials, Placement(0.0, 1), 1, StubTrainer, precompile=None))
     assert outcomes(read_records(experiment)) == ["finished"] * 3
     shown = capsys.readouterr().out
-    assert shown.count("no process was started ahead, so trials begin seconds later: AttributeError: no such call") == 1
+    assert (
+        shown.count(
+            "no process was started ahead of time, so trials start a few seconds later: AttributeError: no such call"
+        )
+        == 1
+    )
 
 
 def test_no_more_at_once_than_asked_for_and_the_next_process_waits(

@@ -119,7 +119,7 @@ def test_a_sweep_ends_in_its_report(experiment: Experiment, tmp_path: Path, capf
 
 def test_an_existing_experiment_is_refused_and_a_changed_space_named(experiment: Experiment, make_space: Any) -> None:
     space = make_space(seeds="0-1")
-    with pytest.raises(StorageError, match="holds an experiment already: add --resume"):
+    with pytest.raises(StorageError, match="already holds an experiment: add --resume"):
         opening.create(experiment.path, space, [], {})
     opening.reopen(experiment.path, resolve_trials(space))
     edited = make_space(seeds="0-1", overrides={"shac.gamma": 0.5})
@@ -165,9 +165,9 @@ def test_placement() -> None:
     assert choose_placement(resources, None, cpu=False, gpus=0) == Placement(0.0, 1)
     assert choose_placement(resources, None, cpu=True, gpus=4) == Placement(0.0, 1)
     assert choose_placement(resources, 0.5, cpu=False, gpus=1).device == "cuda:0"
-    with pytest.raises(DeviceError, match="no GPU here; pass --cpu"):
+    with pytest.raises(DeviceError, match="there is no GPU; pass --cpu"):
         choose_placement(resources, 1.0, cpu=False, gpus=0)
-    with pytest.raises(DeviceError, match="4 GPUs a trial asked for, 2 here"):
+    with pytest.raises(DeviceError, match="4 GPUs per trial requested, but there are 2"):
         choose_placement(resources, 4.0, cpu=False, gpus=2)
     for wrong in (0.0, -1.0, 1.5):
         with pytest.raises(ConfigError, match="write 1, 2"):

@@ -101,7 +101,7 @@ def test_a_signal_before_the_first_trial_is_a_request_to_stop_too(
     assert driver.returncode == RESUMABLE, output
     assert f"stopped by {number.name}" in output
     if moment is not modules_load:
-        assert "go on with: python stub_driver.py" in output
+        assert "continue with: python stub_driver.py" in output
     wait_until(lambda: not members_of(driver.pid))
 
 

@@ -78,7 +78,7 @@ def test_a_terminal_that_closes_lets_trials_save_themselves(
     log = (experiment.path / "terminal.log").read_text()
     assert "nobody reads the output any more (Input/output error); it continues here" in log
     assert "SIGHUP: 2 trials save themselves" in log
-    assert log.rstrip().endswith(f"go on with: python stub_driver.py {shlex.join(command[2:])} --resume")
+    assert log.rstrip().endswith(f"continue with: python stub_driver.py {shlex.join(command[2:])} --resume")
     for record in read_records(experiment):
         # They saved themselves: the newest checkpoint is of the last epoch done, due or not.
         newest = sorted((record.folder / "checkpoints").glob("epoch_*.pt"))[-1]

@@ -93,6 +93,6 @@ def _named(name: str, error: Exception) -> Exception:
         return StorageFailure(f"trial.loggers: {name} cannot write: {stored}")
     text = (str(error).splitlines() or [""])[0]
     return LoggerError(
-        f"trial.loggers: {name} failed ({type(error).__name__}: {text}); the rows are in metrics.jsonl: go on without "
-        "it by leaving it out, or mend it"
+        f"trial.loggers: {name} failed ({type(error).__name__}: {text}); the rows are in metrics.jsonl: leave it "
+        "out, or fix it, to continue"
     )
