@@ -3,9 +3,16 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
-from pydantic import ModelWrapValidatorHandler, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import (
+    ModelWrapValidatorHandler,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+    model_validator,
+)
+from pydantic_core import InitErrorDetails
 
 from msk_ray.config.sections import Section
 from msk_ray.experiment.metrics import Evaluation
@@ -54,9 +61,14 @@ class StopRule(Section, ABC):
     @model_validator(mode="wrap")
     @classmethod
     def _from_a_bare_value(cls, data: Any, handler: ModelWrapValidatorHandler["StopRule"]) -> "StopRule":
-        if cls.shorthand is not None and not isinstance(data, Mapping | StopRule):
-            data = {cls.shorthand: data}
-        return handler(data)
+        if cls.shorthand is None or isinstance(data, Mapping | StopRule):
+            return handler(data)
+        try:
+            return handler({cls.shorthand: data})
+        except ValidationError as error:
+            # The file has no such key: the fault is where the bare value is.
+            faults = cast(list[InitErrorDetails], [fault | {"loc": fault["loc"][1:]} for fault in error.errors()])
+            raise ValidationError.from_exception_data(cls.__name__, faults) from None
 
     @model_serializer(mode="wrap")
     def _as_a_bare_value(self, handler: SerializerFunctionWrapHandler) -> Any:
