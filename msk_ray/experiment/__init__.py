@@ -1,2 +1,2 @@
-"""An experiment's and a trial's files on disk: what each is called, how it is written and how it is read back, whatever
-its condition. No Ray, no torch."""
+"""The files of experiments and trials: their names, how they are written, and how they are read back in any condition.
+No Ray, no torch."""

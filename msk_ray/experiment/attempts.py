@@ -1,9 +1,9 @@
 """Which attempt at a trial its folder holds, and with what settings.
 
-A trial that runs out of memory may be tried once more, with half its worlds. The decision comes first, as a file:
-whoever goes on from the folder, after whatever death, finds it and halves no second time. Then what the first attempt
-left is set aside: states of W worlds do not fit half of them, and rows of both attempts would be no one's curve.
-Everything that depends on the attempt asks the `Attempt` of the folder.
+A trial that runs out of memory may be restarted once, with half its worlds. The decision is written to a file first, so
+that any process that continues from the folder, even after a crash, finds it and does not halve again. Then the files
+of the first attempt are set aside: states of W worlds do not fit half of them, and rows of two attempts do not form one
+curve. Everything that depends on the attempt uses the `Attempt` of the folder.
 """
 
 from dataclasses import dataclass, replace
@@ -23,20 +23,20 @@ _LEFT = ("checkpoints", EVAL_FILE)
 
 @dataclass(frozen=True)
 class Reduced:
-    """That an attempt has half the worlds asked for, and why."""
+    """Records that an attempt has half the worlds asked for, and why."""
 
     asked: int
     worlds: int
-    """Worlds it has."""
+    """Number of worlds it has."""
     why: str
-    """What the attempt with all of them ended by."""
+    """Why the attempt with all of them ended."""
     cleared: bool = False
-    """Whether what that attempt left has been set aside."""
+    """Whether the files of that attempt have been set aside."""
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """An attempt at a trial: the first, with what was asked for, or the second, with half its worlds."""
+    """An attempt at a trial: the first, with the original settings, or the second, with half its worlds."""
 
     reduced: Reduced | None = None
 
@@ -46,24 +46,24 @@ class Attempt:
         return 1 if self.reduced is None else 2
 
     def __str__(self) -> str:
-        """What sets it apart from what was asked for; empty for the first."""
+        """How it differs from the original settings; empty for the first attempt."""
         return "" if self.reduced is None else f"half the worlds: {self.reduced.worlds} of {self.reduced.asked}"
 
     @property
     def suffix(self) -> str:
-        """The same in brackets, to put behind a trial's name."""
+        """The same in brackets, to follow a trial's name."""
         return f" ({self})" if self.reduced is not None else ""
 
     @property
     def mark(self) -> str:
-        """The same in short, to put behind an outcome."""
+        """A short form, to follow an outcome."""
         return ", half the worlds" if self.reduced is not None else ""
 
     def effective(self, trial: Trial) -> Trial:
-        """A trial as this attempt runs it. It keeps its id, which stands for what was asked for.
+        """A trial with the settings of this attempt. It keeps its id, which stands for the original settings.
 
         Raises:
-            ConfigError: half the worlds do not go with its other settings.
+            ConfigError: half the worlds are not possible with its other settings.
         """
         if self.reduced is None:
             return trial
@@ -80,11 +80,11 @@ class Attempt:
         """The attempt that follows this one.
 
         Args:
-            trial: as it was asked for.
-            why: what this attempt ran out of memory at.
+            trial: with its original settings.
+            why: where this attempt ran out of memory.
 
         Raises:
-            ConfigError: there is none, saying why.
+            ConfigError: there can be none; the message says why.
         """
         if self.reduced is not None:
             raise ConfigError(f"{self.reduced.asked} worlds were asked for, and half of them has been tried")
@@ -99,8 +99,8 @@ class Attempt:
         return following
 
     def begin(self, folder: Path) -> "Attempt":
-        """Decide on this attempt and move what the one before has left out of the way; safe to be cut short anywhere,
-        and to be repeated. The decision outlives this process when this returns.
+        """Decide on this attempt and set aside the files of the previous one. This may be interrupted anywhere and
+        repeated; once it returns, the decision survives a crash.
 
         TensorBoard's events stay: an empty metrics file tells the trainer to have them purged.
 
@@ -114,7 +114,7 @@ class Attempt:
         try:
             aside.mkdir(exist_ok=True)
             for name in (*_LEFT, METRICS_FILE):
-                # What is there already was moved before this was cut short; nothing was trained since.
+                # Files that are there already were moved before an interruption; nothing was trained since.
                 if (folder / name).exists() and not (aside / name).exists():
                     (folder / name).rename(aside / name)
         except OSError as error:
@@ -125,7 +125,7 @@ class Attempt:
         return cleared
 
     def write(self, folder: Path) -> None:
-        """Keep which attempt it is in a trial's folder.
+        """Record in a trial's folder which attempt it is.
 
         Raises:
             StorageFailure: the disk is full or gone.
@@ -148,8 +148,8 @@ def load_attempt(folder: Path) -> Attempt:
 
 
 def read_attempt(folder: Path) -> Attempt:
-    """The same, for who only shows it: one whose file cannot be used counts as the first. `TrialSnapshot` names the
-    damage, and the trial itself ends by it."""
+    """The same, for display only: an attempt whose file cannot be used counts as the first. `TrialSnapshot` names the
+    damage, and the trial itself ends with an error."""
     try:
         return load_attempt(folder)
     except DamagedFile:

@@ -1,13 +1,14 @@
-"""The bytes of a checkpoint: one file that vouches for itself, replaced whole.
+"""The format of a checkpoint: one file that contains its own checksums and is always replaced as a whole.
 
     msk_ray checkpoint 2 <SHA-256 of the next line>\\n
     {"bytes": ..., "sha256": <of the payload>, "epoch": ..., ...}\\n
     payload
 
-The first two lines are the head: facts such as the epoch and the score are read from it alone. Every bit of the file is
-covered: by the first line, the digest in it, or the digest in the second.
+The first two lines are the head: metadata such as the epoch and the score can be read without the payload. Every bit of
+the file is verified: by the first line, the digest in it, or the digest in the second.
 
-Checkpoints of format 1 are a payload and, beside it, `<name>.json` with its SHA-256 and the facts; they are still read.
+Checkpoints of format 1 are a payload and a separate `<name>.json` with its SHA-256 and the metadata; they can still be
+read.
 """
 
 import hashlib
@@ -25,30 +26,31 @@ _NAME = b"msk_ray checkpoint "
 _DIGEST = 64
 """Hexadecimal digits of a SHA-256."""
 _HEAD_LIMIT = 1 << 16
-"""No head is longer [bytes]."""
+"""Maximum length of a head [bytes]."""
 
 
 def write_checkpoint_file(path: Path, payload: bytes, facts: Mapping[str, Any]) -> None:
-    """Put a checkpoint at `path`. Whenever the process dies, what lies there is the whole old one or the whole new one.
+    """Write a checkpoint to `path`. If the process dies at any moment, the complete old or the complete new one is
+    there.
 
     Args:
-        payload: what the checkpoint holds.
-        facts: plain data to be read without the payload, such as epoch and score; no NaN.
+        payload: content of the checkpoint.
+        facts: plain data that can be read without the payload, such as epoch and score; no NaN.
 
     Raises:
-        StorageFailure: the disk is full or gone; what was there before is untouched.
+        StorageFailure: the disk is full or gone; an existing checkpoint is left unchanged.
     """
     facts = {**facts, "format": FORMAT, "bytes": len(payload), "sha256": hashlib.sha256(payload).hexdigest()}
     line = json.dumps(facts, allow_nan=False).encode()
     assert len(line) < _HEAD_LIMIT // 2
     first = _NAME + b"%d " % FORMAT + hashlib.sha256(line).hexdigest().encode()
     write_bytes(path, b"\n".join([first, line, payload]))
-    # Of a checkpoint of format 1 that lay here; a file that vouches for itself is not judged by it.
+    # The manifest of an earlier checkpoint of format 1; it does not apply to the new file.
     _old_manifest(path).unlink(missing_ok=True)
 
 
 def remove_checkpoint_file(path: Path) -> None:
-    """Delete a checkpoint, of whichever format."""
+    """Delete a checkpoint of any format."""
     path.unlink()
     _old_manifest(path).unlink(missing_ok=True)
 
@@ -56,10 +58,10 @@ def remove_checkpoint_file(path: Path) -> None:
 def read_facts(path: Path) -> dict[str, Any]:
     """The facts of a checkpoint: format, bytes, sha256 of its payload, and those given when it was written.
 
-    The payload is not read; that the file is as long as it must be is checked.
+    The payload is not read, but the length of the file is checked.
 
     Raises:
-        CheckpointError: it is missing, torn, or of another format.
+        CheckpointError: it is missing, incomplete, or of another format.
     """
     try:
         with path.open("rb") as file:
@@ -76,7 +78,7 @@ def read_checkpoint_file(path: Path) -> tuple[dict[str, Any], bytes]:
     """Facts and payload of a checkpoint.
 
     Raises:
-        CheckpointError: it is missing, torn, or of another format.
+        CheckpointError: it is missing, incomplete, or of another format.
     """
     try:
         with path.open("rb") as file:
@@ -108,7 +110,7 @@ def _read_head(path: Path, file: BinaryIO) -> tuple[dict[str, Any], int]:
 
 
 def _old_manifest(path: Path) -> Path:
-    """Where the manifest of a checkpoint of format 1 lies."""
+    """Path of the manifest of a checkpoint of format 1."""
     return path.with_suffix(".json")
 
 

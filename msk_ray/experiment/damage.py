@@ -1,20 +1,20 @@
-"""Reading JSON files that may be damaged: what cannot be used is named by file and line, and never hides the rest.
+"""Read JSON files that may be damaged: unusable parts are named with file and line, and do not hide the rest.
 
-What follows from a damaged file, by its kind:
+The consequences of a damaged file:
 
-| file | what is damaged | what is done |
+| file | what is damaged | consequence |
 |---|---|---|
-| `metrics.jsonl` | a line | the line is skipped and counted; a trial that goes on writes the others again without it |
+| `metrics.jsonl` | a line | the line is skipped and counted; a trial that continues rewrites the file without it |
 | `reports.jsonl` | a line | the line is skipped and counted; the stopping rule is told the others |
-| both | the last line, cut short | what a killed writer leaves: dropped without a word |
-| `outcome.json` | the file | the trial has not ended: it goes on from its newest checkpoint and ends again |
-| `device.json` | the file | the device is not known |
-| `halved.json` | the file | the trial ends in an error until it is repaired: how many worlds it has is not known |
-| `params.json` | the file | `--resume` is refused: what the search chose is not known; remove the trial's folder |
+| both | the last line, incomplete | left by a killed writer: dropped silently |
+| `outcome.json` | the file | the trial counts as not ended: it continues from its newest checkpoint and ends again |
+| `device.json` | the file | the device is unknown |
+| `halved.json` | the file | the trial ends in an error until it is repaired: its number of worlds is unknown |
+| `params.json` | the file | `--resume` is refused: the search's choice is unknown; remove the trial's folder |
 | `manifest.json` | the file | refused, except by `report`, which shows what the trials' folders hold |
-| `env.json` | the file, a field | versions and command are not known |
+| `env.json` | the file, a field | versions and command are unknown |
 | `eval.json` | the file, an entry | refused: remove it to have it written again |
-| a checkpoint | the file | passed over for the one before; `best.pt` is refused by who asks for it |
+| a checkpoint | the file | skipped in favour of the one before; `best.pt` is refused when it is needed |
 
 `summary.json`, `table.md` and the report are written and never read.
 """
@@ -43,14 +43,14 @@ class Damage:
     path: Path
     what: str
     line: int | None = None
-    """From 1; None if it is about the whole file."""
+    """Counted from 1; None if the whole file is damaged."""
 
     def __str__(self) -> str:
         return f"{self.path}{'' if self.line is None else f', line {self.line}'}: {self.what}"
 
 
 class DamagedFile(StorageError):
-    """A file holds something else than it should."""
+    """A file does not hold what it should."""
 
     def __init__(self, damage: Damage, advice: str = "") -> None:
         super().__init__(damage, advice)  # both, so that the error survives pickling between processes
@@ -62,8 +62,8 @@ class DamagedFile(StorageError):
 
 
 def describe_damages(damages: Sequence[Damage], root: Path) -> list[str]:
-    """A line for each damaged file, its path from `root` on: how many lines of it were skipped, and what is wrong with
-    the first."""
+    """A line for each damaged file, with its path relative to `root`: how many of its lines were skipped, and what is
+    wrong with the first."""
     files: dict[Path, list[Damage]] = {}
     for damage in damages:
         files.setdefault(damage.path, []).append(damage)
@@ -80,14 +80,14 @@ def describe_damages(damages: Sequence[Damage], root: Path) -> list[str]:
 
 
 def count_damages(damages: Sequence[Damage]) -> str:
-    """`3 damaged lines and 1 damaged file`; empty for none."""
+    """`3 damaged lines and 1 damaged file`; empty if there are none."""
     lines = sum(damage.line is not None for damage in damages)
     counts = ((lines, "line"), (len(damages) - lines, "file"))
     return " and ".join(f"{n} damaged {what}{'' if n == 1 else 's'}" for n, what in counts if n)
 
 
 def read_bytes(path: Path) -> bytes | None:
-    """What a file holds; None if there is no such file.
+    """The content of a file; None if there is no such file.
 
     Raises:
         StorageFailure: the storage does not give it.
@@ -101,10 +101,10 @@ def read_bytes(path: Path) -> bytes | None:
 
 
 def read_object(path: Path, build: Callable[[dict[str, Any]], T]) -> T | None:
-    """What a file with one JSON object stands for; None if there is no such file.
+    """The value stored as a JSON object in a file; None if there is no such file.
 
     Args:
-        build: makes it of the object; raises ValueError with what is wrong with it.
+        build: creates the value from the object; raises ValueError that says what is wrong.
 
     Raises:
         DamagedFile: it cannot be used.
@@ -120,13 +120,13 @@ def read_object(path: Path, build: Callable[[dict[str, Any]], T]) -> T | None:
 
 
 def read_lines(path: Path, build: Callable[[dict[str, Any]], T]) -> tuple[list[T], tuple[Damage, ...]]:
-    """What the lines of a file, a JSON object each, stand for, and those that cannot be used.
+    """The values stored as JSON objects in the lines of a file, and the lines that cannot be used.
 
-    A last line without its end that cannot be used is what a writer leaves that is not done, or was killed: it counts
-    as not written.
+    An unusable last line without a line end comes from a writer that is still writing or was killed: it counts as not
+    written.
 
     Args:
-        build: makes it of a line's object; raises ValueError with what is wrong with it.
+        build: creates a value from a line's object; raises ValueError that says what is wrong.
 
     Raises:
         StorageFailure: the storage does not give it.
@@ -150,15 +150,15 @@ def _load(data: bytes) -> Any:
     try:
         return orjson.loads(data)
     except orjson.JSONDecodeError:
-        # It knows no NaN either; and says less about what is wrong.
+        # It does not accept NaN either, and its messages are less precise.
         return json.loads(data.decode("utf-8"))
 
 
 def parse_object(data: bytes) -> dict[str, Any]:
-    """A JSON object. NaN and infinity, which JSON does not know, are numbers here, and none that is finite.
+    """A JSON object. NaN and infinity, which JSON does not have, are accepted as numbers that are not finite.
 
     Raises:
-        ValueError: it is none, with the reason.
+        ValueError: it is not a JSON object; the message says why.
     """
     try:
         value = _load(data)
@@ -174,7 +174,7 @@ def parse_object(data: bytes) -> dict[str, Any]:
 
 
 def field(data: Mapping[str, Any], name: str, kind: type[T]) -> T:
-    """A field of an object; true and false are no numbers.
+    """A field of an object; true and false do not count as numbers.
 
     Raises:
         ValueError: it is missing or of another kind.
@@ -191,7 +191,7 @@ def number(data: Mapping[str, Any], name: str) -> float:
     """A field that is a finite number.
 
     Raises:
-        ValueError: it is missing, or none.
+        ValueError: it is missing, or not a finite number.
     """
     if name not in data:
         raise ValueError(f"{name} is missing")
@@ -202,7 +202,7 @@ def number(data: Mapping[str, Any], name: str) -> float:
 
 
 def is_number(value: Any) -> bool:
-    """Whether a value is a finite number, as a float can hold it; true and false are none."""
+    """Whether a value is a finite number that fits a float; true and false are not numbers."""
     if type(value) is float:
         return math.isfinite(value)
     return type(value) is int and -(10**300) < value < 10**300

@@ -27,7 +27,7 @@ _ENVIRONMENT = {
 
 
 def read_environment(path: Path) -> tuple[dict[str, Any], list[Damage]]:
-    """What an experiment ran with, as far as its file says, and what of it cannot be used.
+    """What an experiment ran with, as far as it is recorded, and the damaged parts of its file.
 
     Raises:
         StorageFailure: the storage does not give it.
@@ -82,6 +82,6 @@ def _commit() -> str | None:
             ["git", "-C", str(root), "status", "--porcelain"], capture_output=True, text=True, check=True
         )
     except (OSError, subprocess.CalledProcessError):
-        # git is not installed, or refuses a folder of another owner: the commit is unknown, which null says.
+        # git is not installed, or refuses a folder of another owner: null means that the commit is unknown.
         return None
     return head.stdout.strip() + ("+" if changes.stdout.strip() else "")

@@ -2,12 +2,12 @@
 
 
 def eta(running: list[tuple[int, float | None]], waiting: list[int], concurrent: int) -> float | None:
-    """Seconds until all trials have run to their last epoch: an upper bound, as some will be stopped before.
+    """Seconds until all trials have run to their last epoch: an upper bound, because some will be stopped earlier.
 
     Args:
         running: for each running trial its epochs left and its seconds per epoch, None while unknown.
         waiting: epochs of each trial not yet started.
-        concurrent: trials that run at once.
+        concurrent: number of trials that run at the same time.
 
     Returns:
         None while no speed is known.
@@ -16,7 +16,7 @@ def eta(running: list[tuple[int, float | None]], waiting: list[int], concurrent:
     if not known:
         return None
     mean = sum(known) / len(known)
-    # Longest first onto the slot that is free earliest.
+    # The longest first, each in the slot that is free earliest.
     slots = sorted(left * (speed if speed is not None else mean) for left, speed in running)
     slots = [0.0] * max(0, concurrent - len(slots)) + slots
     for epochs in sorted(waiting, reverse=True):

@@ -1,4 +1,4 @@
-"""What the files of an experiment and of its trials are called."""
+"""The names of the files of an experiment and of its trials."""
 
 from pathlib import Path
 
@@ -7,9 +7,9 @@ SPACE_FILE = "space.yaml"
 ENVIRONMENT_FILE = "env.json"
 SCHEDULER_LOG_FILE = "reports.jsonl"
 SUMMARY_FILE = "summary.json"
-"""What a driver writes, with the table, when it ends by itself."""
+"""Written by a driver, with the table, when it ends normally."""
 STOP_FILE = "stop"
-"""While this file lies in the experiment's folder, trials save themselves and end at their next epoch."""
+"""While this file is in the experiment's folder, trials save themselves and end at their next epoch."""
 
 METRICS_FILE = "metrics.jsonl"
 OUTCOME_FILE = "outcome.json"
@@ -21,9 +21,9 @@ OUTPUT_FILE = "output.log"
 ERROR_FILE = "error.txt"
 HANG_FILE = "hang.txt"
 ABANDONED = "abandoned"
-"""Folder, in the trial's own, of what was done with all its worlds."""
+"""Subfolder of a trial with the files of the attempt with all its worlds."""
 
 
 def best_checkpoint(folder: Path) -> Path:
-    """Where the best policy of the trial in `folder` is kept."""
+    """Path of the best policy of the trial in `folder`."""
     return folder / "checkpoints" / "best.pt"

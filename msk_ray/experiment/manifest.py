@@ -1,4 +1,4 @@
-"""An experiment's folder: what it is made of, who owns it, and how it is read back.
+"""An experiment's folder: its files, its owner, and how it is read back.
 
 runs/<experiment>/
     manifest.json     the trials: ids, changed parameters, full configs
@@ -7,7 +7,7 @@ runs/<experiment>/
     owner.json        the driver at work, if there is one
     tune/             Ray's own state
     trials/<id>/      config.yaml, metrics.jsonl, checkpoints/, outcome.json, output.log, eval.json; halved.json and
-                      abandoned/ if it was tried again with half its worlds
+                      abandoned/ if it was restarted with half its worlds
     summary.json, table.md, eval.json, report/
 """
 
@@ -33,7 +33,7 @@ from msk_ray.files import check_writable, make_folder, write_json
 
 FORMAT = 1
 REMEMBERED = ("halve_worlds", "early_stopping")
-"""Options that --resume goes on with unless it says otherwise."""
+"""Options that --resume keeps unless it overrides them."""
 
 
 @dataclass(frozen=True)
@@ -48,18 +48,18 @@ class Experiment:
         return self.path.name
 
     def resume_command(self) -> str:
-        """The command that goes on with it: the one it was begun with, and --resume, which remembers the last word on
+        """The command that continues the experiment: the original one with --resume, which keeps the latest values of
         `REMEMBERED`."""
         flags = {f"--{no}{option.replace('_', '-')}" for option in REMEMBERED for no in ("", "no-")}
         argv = read_environment(self.path / ENVIRONMENT_FILE)[0].get("command")
         if not argv:
-            # What was typed is lost, or was never whole; its options are in nobody else's hands.
-            return "python -m msk_ray.tune --resume, with the options it was begun with"
+            # The command is lost, or was never complete; its options are not recorded anywhere else.
+            return "python -m msk_ray.tune --resume, with the options it was started with"
         return typed_command([word for word in argv if word not in flags], "--resume")
 
     @property
     def tune(self) -> Path:
-        """Folder of Ray's state."""
+        """Folder of Ray's own files."""
         return self.path / "tune"
 
     @property
@@ -67,14 +67,14 @@ class Experiment:
         return self.path / STOP_FILE
 
     def trial_folder(self, trial_id: str) -> Path:
-        """Where a trial keeps everything."""
+        """The folder of a trial."""
         return self.path / "trials" / trial_id
 
     def make_trial_folder(self, trial_id: str) -> Path:
-        """Make a trial's folder, once, before it first starts.
+        """Create a trial's folder, once, before it first starts.
 
         Raises:
-            StorageFailure: the disk is full or gone, or the experiment has.
+            StorageFailure: the disk is full or gone, or the experiment has disappeared.
         """
         folder = self.trial_folder(trial_id)
         self.check_there()
@@ -85,10 +85,10 @@ class Experiment:
         return folder
 
     def check_there(self, trial_id: str | None = None) -> None:
-        """Notice that the experiment, or a trial's folder, has gone since it was opened.
+        """Check that the experiment, and a trial's folder, still exist.
 
         Raises:
-            StorageFailure: it has.
+            StorageFailure: they do not.
         """
         for path in (self.path / MANIFEST_FILE, *([] if trial_id is None else [self.trial_folder(trial_id)])):
             try:
@@ -99,7 +99,7 @@ class Experiment:
                 ) from error
 
     def lost(self, trial_id: str | None = None) -> StorageFailure | None:
-        """What `check_there` raises, if anything."""
+        """The error that `check_there` raises, if any."""
         try:
             self.check_there(trial_id)
         except StorageFailure as failure:
@@ -107,10 +107,10 @@ class Experiment:
         return None
 
     def asked_to_stop(self) -> bool:
-        """Whether trials are to save themselves and end.
+        """Whether trials should save themselves and end.
 
         Raises:
-            StorageFailure: the experiment has gone, and with it any such request.
+            StorageFailure: the experiment has disappeared, and with it any such request.
         """
         if self.stop_file.exists():
             return True
@@ -132,13 +132,13 @@ class Experiment:
         return manifest
 
     def begin(self, space: str, question: str, trials: Sequence[Trial], options: Mapping[str, Any]) -> None:
-        """Write the manifest of a new experiment, last of all: a folder with a manifest is a whole experiment.
+        """Write the manifest of a new experiment, after all other files: a folder with a manifest is complete.
 
         Args:
             space: name of its space.
-            question: that it is to answer.
-            trials: all that are known.
-            options: of the command line.
+            question: the question that it answers.
+            trials: all trials that are known.
+            options: options of the command line.
         """
         manifest = {
             "format": FORMAT,
@@ -161,7 +161,7 @@ class Experiment:
         return trials
 
     def clear_endings(self, outcomes: Collection[Outcome]) -> None:
-        """Take back the endings of trials that ended in one of these ways, so that they go on."""
+        """Remove the endings of trials that ended in one of these ways, so that they continue."""
         for trial in self.trials():
             folder = self.trial_folder(trial.id)
             ending = read_ending(folder)
@@ -169,23 +169,23 @@ class Experiment:
                 (folder / OUTCOME_FILE).unlink()
 
     def said(self, option: str) -> bool | None:
-        """What was said of one of `REMEMBERED` on a command line; None if nothing was, so that the space decides."""
+        """The value that a command line gave for one of `REMEMBERED`; None if none did, so that the space decides."""
         said: bool | None = (self.manifest().get("options") or {}).get(option)
         return said
 
     def say(self, **options: bool | None) -> None:
-        """Keep what is said of such options now, for the next time; None says nothing."""
+        """Record the values that this command line gives for such options; None changes nothing."""
         manifest = self.manifest()
         said = {option: value for option, value in options.items() if value is not None}
         write_json(self.path / MANIFEST_FILE, manifest | {"options": (manifest.get("options") or {}) | said})
 
     def extension(self) -> dict[str, Any]:
-        """How the experiment was extended since it was made: epochs, samples, seeds."""
+        """How the experiment has been extended since it was created: epochs, samples, seeds."""
         recorded: dict[str, Any] = self.manifest().get("extended", {})
         return recorded
 
     def extend(self, trials: Iterable[Trial], extension: Mapping[str, Any]) -> None:
-        """Replace the manifest's list of trials by a longer one, and say in it what was asked for."""
+        """Replace the manifest's list of trials by a longer one, and record the extension."""
         extended = {"extended": self.extension() | dict(extension)}
         write_json(
             self.path / MANIFEST_FILE, self.manifest() | extended | {"trials": [_entry(trial) for trial in trials]}
@@ -230,10 +230,10 @@ def check_name(name: str) -> str:
 
 
 def _manifest(data: dict[str, Any]) -> dict[str, Any]:
-    """A manifest as it is.
+    """The checked content of a manifest.
 
     Raises:
-        ValueError: it is none that this version reads.
+        ValueError: this version cannot read it.
     """
     if data.get("format") != FORMAT:
         raise ValueError(f"it has format {data.get('format')!r:.40}, this version reads {FORMAT}")
@@ -268,15 +268,16 @@ def _entry(trial: Trial) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def own(path: Path, *, new: bool, force: bool = False) -> Iterator[Ownership]:
-    """Own an experiment's folder for a block, before anything in it is written.
+    """Own an experiment's folder during a block, before anything in it is written.
 
     Args:
-        path: its folder; made here for a new one.
-        new: whether the experiment is to be begun, not gone on with.
-        force: take it over from a driver that looks alive.
+        path: its folder; created for a new experiment.
+        new: whether to start the experiment rather than continue it.
+        force: take it over although its driver seems to run.
 
     Raises:
-        StorageError: there is an experiment already, or none; another driver is at work; the folder cannot be written.
+        StorageError: the experiment already exists, or does not; another driver is running; the folder cannot be
+            written.
     """
     if new:
         refuse_old(path)

@@ -1,4 +1,4 @@
-"""Reading a trial's `metrics.jsonl`, apart from writing it: who only looks need not load torch."""
+"""Read a trial's `metrics.jsonl`, separately from writing it, because readers should not have to load torch."""
 
 import math
 import statistics
@@ -11,18 +11,18 @@ from msk_ray.experiment.damage import Damage, field, is_number, number, read_lin
 from msk_ray.experiment.layout import METRICS_FILE
 
 SCORE = "eval/score"
-"""The canonical evaluation metric trials are ranked by; higher is better."""
+"""The canonical evaluation metric, by which trials are ranked; higher is better."""
 EPOCH_LIMIT = 10**9
 """No trial has this many epochs."""
 RECENT = 10
-"""Newest rows that speed is taken from."""
+"""Number of newest rows from which the speed is computed."""
 
 
 @dataclass(frozen=True)
 class Evaluation:
     """One deterministic evaluation of a trial's policy after it was trained for an epoch or more.
 
-    What the policy scores before training is drawn in curves and counts nowhere: no trial has earned it.
+    The score before training is drawn in curves but counts nowhere, because it is not a result of the trial.
     """
 
     epoch: int
@@ -47,8 +47,8 @@ class Metrics:
     """A trial's metrics."""
 
     rows: tuple[dict[str, Any], ...] = ()
-    """In order of epoch, each epoch once: its latest row. As in the file: what is not finite is None, and named in the
-    row's `nonfinite`."""
+    """In order of epoch, each epoch once: its latest row. As in the file, a value that is not finite is None, and named
+    in the row's `nonfinite`."""
     damages: tuple[Damage, ...] = ()
 
 
@@ -69,10 +69,10 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
 
 
 def _row(row: dict[str, Any]) -> dict[str, Any]:
-    """A row as it is.
+    """A checked row.
 
     Raises:
-        ValueError: it is none of a trial's.
+        ValueError: it is not a row of a trial.
     """
     epoch = field(row, "epoch", int)
     if not 0 <= epoch < EPOCH_LIMIT:
@@ -90,7 +90,7 @@ def _row(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _all_finite(row: Mapping[str, Any]) -> bool:
-    """Whether all values are finite numbers, found out fast: most rows are such. False also where it is not certain."""
+    """A fast check whether all values are finite numbers, as in most rows. It may be False although they are."""
     try:
         return set(map(type, row.values())) <= {int, float} and math.isfinite(sum(row.values()))
     except OverflowError:
@@ -121,7 +121,7 @@ def evaluations_of(rows: Sequence[Mapping[str, float]]) -> list[Evaluation]:
 
 @dataclass(frozen=True)
 class TrialProgress:
-    """What a trial's rows of metrics say."""
+    """A summary of a trial's rows of metrics."""
 
     epoch: int = 0
     best: float | None = None
@@ -133,7 +133,7 @@ class TrialProgress:
 
 
 def progress_of(rows: Sequence[Mapping[str, float]]) -> TrialProgress:
-    """What rows of metrics, in order of epoch, say."""
+    """A summary of rows of metrics, which are in order of epoch."""
     if not rows:
         return TrialProgress()
     scores = [e.score for e in evaluations_of(rows) if math.isfinite(e.score)]

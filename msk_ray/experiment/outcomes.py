@@ -1,4 +1,4 @@
-"""How a trial ended: a name, and why, kept in the trial's own folder."""
+"""How a trial ended: a name and a reason, recorded in the trial's folder."""
 
 from dataclasses import asdict, dataclass
 from enum import StrEnum
@@ -16,15 +16,15 @@ class Outcome(StrEnum):
     FINISHED = "finished"
     """Ran to its last epoch."""
     STOPPED_ASHA = "stopped_asha"
-    """Others did better at the same number of env steps."""
+    """Other trials were better at the same number of env steps."""
     STOPPED_MEDIAN = "stopped_median"
-    """Its best score lay below the median of the others' running means."""
+    """Its best score was below the median of the others' running means."""
     STOPPED_PLATEAU = "stopped_plateau"
     """Its best score no longer rose."""
     STOPPED_TARGET = "stopped_target"
-    """It reached the score asked for."""
+    """It reached the target score."""
     STOPPED_RULE = "stopped_rule"
-    """A rule of the user's own stopped it."""
+    """A rule written by the user stopped it."""
     WALL_TIME = "wall_time"
     """It used up its time."""
     NONFINITE = "nonfinite"
@@ -53,12 +53,12 @@ class Ending:
 
     @property
     def cut(self) -> bool:
-        """Whether the trial ended before it had used what it was given, without failing: its score might have risen."""
+        """Whether the trial ended before its end without failing, so that its score might have risen."""
         return not self.failed and self.outcome not in (Outcome.FINISHED, Outcome.WALL_TIME)
 
 
 def write_ending(folder: Path, ending: Ending) -> None:
-    """Put `ending` into a trial's folder, whole or not at all."""
+    """Write `ending` to a trial's folder, completely or not at all."""
     write_json(folder / OUTCOME_FILE, asdict(ending))
 
 
@@ -73,8 +73,8 @@ def load_ending(folder: Path) -> Ending | None:
 
 
 def read_ending(folder: Path) -> Ending | None:
-    """The same, for who goes on with trials: one whose ending cannot be used has not ended. `TrialSnapshot` names the
-    damage."""
+    """The same, for continuing trials: a trial whose ending cannot be used counts as not ended. `TrialSnapshot` names
+    the damage."""
     try:
         return load_ending(folder)
     except DamagedFile:

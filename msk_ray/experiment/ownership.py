@@ -1,15 +1,15 @@
-"""One owner at a time for a folder: whoever writes an experiment, a trial or a training run holds the lock in it.
+"""One owner at a time for a folder: a process that writes an experiment, a trial or a training run holds its lock.
 
-The lock is a file, `owner.json`, that names its owner and that the owner touches every `BEAT_S`. It holds on shared
-storage and outlives no owner:
+The lock is a file, `owner.json`, that names its owner and that the owner touches every `BEAT_S`. It works on shared
+storage and does not outlive its owner:
 
-- It appears whole and once: written aside, then linked to its name, which fails if the name is taken. No `flock`, which
-  shared file systems do not all have.
-- An owner of this machine is looked up among its processes by number and birth, so that one that was killed is known
-  at once. An owner of another machine is judged by the age of the lock's last touch: stale after `STALE_S`. The two
-  times that this takes, the touch and now, are stamped by the file server; the hosts' clocks do not matter.
-- Whoever finds a stale lock renames it away, looks whether that was the one it judged, and links its own. An owner that
-  was taken for dead, frozen for a while perhaps, finds another name in the file, or none, and must stop
+- It is created atomically: written under another name, then linked to its name, which fails if the name is taken.
+  `flock` is not used, because some shared file systems lack it.
+- An owner on this machine is looked up among the processes by number and start time, so that a killed one is known to
+  be dead at once. An owner on another machine is judged by the age of the lock's last touch: stale after `STALE_S`.
+  Both times that this needs, the touch and now, come from the file server; the clocks of the hosts do not matter.
+- A process that finds a stale lock renames it, checks that it was the one it judged, and links its own. An owner that
+  was wrongly judged dead, perhaps because it was frozen, finds another name in the file, or none, and must stop
   (`Ownership.check`) without touching anything.
 """
 
@@ -29,12 +29,12 @@ from msk_ray.errors import OwnershipLost, StorageError, StorageFailure
 
 LOCK_FILE = "owner.json"
 BEAT_S = 5.0
-"""Between two touches of a lock [s]."""
+"""Time between two touches of a lock [s]."""
 STALE_S = 60.0
 """Age of the last touch after which an owner on another machine counts as dead [s]."""
 _WAIT_S = 0.5
 _CHECKED_S = 1.0
-"""For so long one look at the lock is good enough [s]."""
+"""How long one check of the lock remains valid [s]."""
 
 
 @dataclass(frozen=True)
@@ -44,27 +44,27 @@ class Owner:
     host: str
     pid: int
     birth: str
-    """When the process was started, in the kernel's ticks since boot: its number alone may be used again."""
+    """When the process was started, in the kernel's ticks since boot, because process numbers are reused."""
     machine: str
-    """Boot and process-number namespace: where `pid` means something."""
+    """Boot and process-number namespace, within which `pid` is valid."""
     token: str
-    """Drawn when the lock was taken."""
+    """A random token, drawn when the lock was taken."""
     began: str
     """Date and time, for people."""
     serves: str | None = None
-    """Of a trial's process: the token of the experiment's owner that started it."""
+    """For a trial's process: the token of the experiment's owner that started it."""
 
     def alive_here(self) -> bool | None:
-        """Whether the process lives; None if it is one of another machine, or of another container."""
+        """Whether the process is alive; None if it belongs to another machine or container."""
         return _birth_of(self.pid) == self.birth if self.machine == _machine() else None
 
 
 @dataclass(frozen=True)
 class _Found:
-    """A lock as it lies there."""
+    """A lock found in a folder."""
 
     owner: Owner | None
-    """None if the file is damaged: then its age alone tells."""
+    """None if the file is damaged; then only its age can be judged."""
     age_s: float
 
     @property
@@ -80,23 +80,23 @@ class _Found:
 
 
 class Ownership:
-    """A lock that is held: touched by a thread of its own until `release`."""
+    """A lock that is held: a thread touches it until `release`."""
 
     def __init__(
         self, folder: Path, owner: Owner, above: Path | None, on_loss: Callable[[OwnershipLost], None] | None
     ) -> None:
         """
         Args:
-            folder: what is owned.
-            owner: as it stands in the file.
-            above: the folder whose owner this one serves, if it serves one.
-            on_loss: called once from the thread when the lock is found lost.
+            folder: the folder that is owned.
+            owner: the owner recorded in the file.
+            above: the folder whose owner this one serves, if any.
+            on_loss: called once from the thread when it finds the lock lost.
         """
         self.folder = folder
         self.owner = owner
         self._above = above
         self._on_loss = on_loss
-        # Touching the file that was made, not whatever has its name: another's lock is never kept alive.
+        # Touch the file that was created, not whatever has its name now, so that another's lock is never kept alive.
         self._file = os.open(folder / LOCK_FILE, os.O_RDONLY)
         self._lost: OwnershipLost | None = None
         self._seen = time.monotonic()
@@ -109,13 +109,13 @@ class Ownership:
         return {"folder": self.folder, "owner": self.owner}
 
     def check(self, now: bool = False) -> None:
-        """Make sure that the lock is still held; cheap enough for every step of a loop.
+        """Check that the lock is still held; cheap enough for every step of a loop.
 
         Args:
-            now: even if that was seen a moment ago.
+            now: check even if the last check is recent.
 
         Raises:
-            OwnershipLost: another has taken it over, it is gone, or it cannot be read for so long that it may be.
+            OwnershipLost: another has taken it over, it is gone, or it has been unreadable for so long that it may be.
         """
         if self._lost is None and (now or time.monotonic() - self._seen > _CHECKED_S):
             self._look()
@@ -123,7 +123,7 @@ class Ownership:
             raise self._lost
 
     def release(self) -> None:
-        """Give the lock back, if it is still held."""
+        """Release the lock, if it is still held."""
         self._done.set()
         self._thread.join()
         os.close(self._file)
@@ -140,7 +140,7 @@ class Ownership:
                 return
 
     def _look(self) -> None:
-        """See whether the lock is still held, and touch it if so."""
+        """Check whether the lock is still held, and touch it if so."""
         try:
             if _token_in(self.folder / LOCK_FILE) != self.owner.token:
                 self._lost = OwnershipLost(f"{self.folder} has been taken over by {_find(self.folder) or 'another'}")
@@ -154,7 +154,7 @@ class Ownership:
         except FileNotFoundError as error:
             self._lost = OwnershipLost(f"{error.filename} does not exist: moved, removed or taken over")
         except OSError as error:
-            # A storage that does not answer for a moment. Where it is longer, others may have taken this for dead.
+            # The storage may not answer for a moment. After a longer time, others may have judged this owner dead.
             if time.monotonic() - self._seen > STALE_S / 2:
                 self._lost = OwnershipLost(f"cannot keep the lock {self.folder / LOCK_FILE}: {error.strerror}")
 
@@ -163,11 +163,11 @@ def acquire(folder: Path, *, force: bool = False) -> Ownership:
     """Become a folder's owner.
 
     Args:
-        folder: there already.
-        force: take it from whoever has it.
+        folder: an existing folder.
+        force: take it over from any owner.
 
     Raises:
-        StorageError: another one lives, or may.
+        StorageError: another owner is alive, or may be.
         StorageFailure: the folder cannot be written.
     """
     owner = _this_process(None)
@@ -178,13 +178,13 @@ def acquire(folder: Path, *, force: bool = False) -> Ownership:
 def acquire_for(
     folder: Path, above: Path, serves: str, on_loss: Callable[[OwnershipLost], None], patience_s: float = 2 * STALE_S
 ) -> Ownership:
-    """Become the owner of a folder on behalf of the owner of one above it, for as long as that one stays its owner.
+    """Become the owner of a folder on behalf of the owner of a folder above it, for as long as that owner stays.
 
-    A process that holds it and lives is waited for: one that serves an earlier owner finds that out, and stops.
+    If a living process holds the folder, wait for it: one that serves an earlier owner notices that and stops.
 
     Args:
-        folder: of a trial.
-        above: of its experiment.
+        folder: the folder of a trial.
+        above: the folder of its experiment.
         serves: the token of the experiment's owner.
         on_loss: called once, from another thread, when the lock is lost, or the experiment has another owner.
         patience_s: how long to wait [s].
@@ -237,7 +237,7 @@ def _take(folder: Path, owner: Owner, force: bool, patience_s: float) -> None:
 
 @contextlib.contextmanager
 def owned(folder: Path, force: bool = False) -> Iterator[Ownership]:
-    """Own a folder for a block, as `acquire` says."""
+    """Own a folder during a block; see `acquire`."""
     ownership = acquire(folder, force=force)
     try:
         yield ownership
@@ -252,7 +252,7 @@ def _refusal(folder: Path, found: _Found) -> str:
 
 
 def _link(folder: Path, owner: Owner) -> bool:
-    """Put a lock in place; False if there is one."""
+    """Create a lock; False if there already is one."""
     path = folder / LOCK_FILE
     temporary = folder / f".{LOCK_FILE}.{owner.token}.part"
     data = (json.dumps(asdict(owner)) + "\n").encode()
@@ -266,7 +266,7 @@ def _link(folder: Path, owner: Owner) -> bool:
         except FileExistsError:
             return False
         except OSError:
-            # A file system without links. Whoever reads it before it is written takes it for damaged, and young.
+            # A file system without links. A process that reads it before it is written sees a damaged, recent lock.
             try:
                 descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
             except FileExistsError:
@@ -279,7 +279,7 @@ def _link(folder: Path, owner: Owner) -> bool:
 
 
 def _find(folder: Path) -> _Found | None:
-    """The lock as it lies there, and how long ago it was touched; None if there is none."""
+    """The lock in a folder, and how long ago it was touched; None if there is none."""
     path = folder / LOCK_FILE
     probe = folder / f".{LOCK_FILE}.{uuid.uuid4().hex}.part"
     try:
@@ -301,7 +301,7 @@ def _find(folder: Path) -> _Found | None:
 
 
 def _remove(folder: Path, found: _Found) -> None:
-    """Take a lock away, if it is still the one that was found."""
+    """Remove a lock, if it is still the one that was found."""
     judged = None if found.owner is None else found.owner.token
     aside = folder / f".{LOCK_FILE}.{uuid.uuid4().hex}.part"
     try:
@@ -311,7 +311,7 @@ def _remove(folder: Path, found: _Found) -> None:
     except FileNotFoundError:
         return  # likewise
     if _token_in(aside) != judged:
-        # It changed hands in between: back with it. If a third one has linked its own meanwhile, the second will see.
+        # The owner changed in between: put it back. If a third process has linked its own by then, the second will see.
         with contextlib.suppress(FileExistsError):
             os.link(aside, folder / LOCK_FILE)
     aside.unlink(missing_ok=True)
@@ -328,7 +328,7 @@ def _token_in(lock: Path) -> str | None:
 
 
 def _birth_of(pid: int) -> str:
-    """When a process of this machine was started, in the kernel's ticks; empty if there is none, or a dead one."""
+    """When a process of this machine was started, in the kernel's ticks; empty if it does not exist or is dead."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:
@@ -337,6 +337,6 @@ def _birth_of(pid: int) -> str:
 
 
 def _machine() -> str:
-    """What tells this run of this machine, and this container, from others."""
+    """An identifier of this boot of this machine, and of this container."""
     boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     return f"{boot} {os.readlink('/proc/self/ns/pid')}"

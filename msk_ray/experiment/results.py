@@ -1,4 +1,4 @@
-"""The trials of an experiment with what their folders hold: for tables, and to go on from."""
+"""The trials of an experiment with the content of their folders, for tables and for resuming."""
 
 import math
 import time
@@ -21,7 +21,7 @@ from msk_ray.text import describe
 
 @dataclass(frozen=True)
 class TrialRecord:
-    """One trial and what its folder holds."""
+    """One trial and the content of its folder."""
 
     trial: Trial
     snapshot: TrialSnapshot
@@ -66,7 +66,7 @@ class TrialRecord:
 
     @property
     def cut(self) -> bool:
-        """Whether it stands before its end without having failed: given more, its score might have risen."""
+        """Whether it has not reached its end and has not failed, so that its score might still have risen."""
         return self.ending.cut if self.ending is not None else bool(self.evaluations)
 
     @property
@@ -94,14 +94,14 @@ def best_record(records: Sequence[TrialRecord]) -> TrialRecord | None:
 def unlisted_trials(
     experiment: Experiment, listed: set[str], parameters: Sequence[str]
 ) -> tuple[list[Trial], list[Damage]]:
-    """Trials that the manifest does not know: those a search has made up, or all if it is lost.
+    """Trials that are not in the manifest: those suggested by a search, or all trials if the manifest is lost.
 
     Args:
-        listed: ids of those it knows.
+        listed: ids of the trials in the manifest.
         parameters: dotted keys that the space varies.
 
     Returns:
-        The trials, as their folders' `config.yaml` has them, and those of these files that cannot be used.
+        The trials, read from the `config.yaml` of their folders, and those of these files that cannot be used.
     """
     root = experiment.path / "trials"
     folders = [path for path in root.iterdir() if path.name not in listed and path.is_dir()] if root.is_dir() else []

@@ -12,13 +12,13 @@ HEADER = ("trial", "changed", "seed", "score", "at epoch", "epochs", "stopped", 
 
 
 def result_rows(records: Sequence[TrialRecord]) -> list[tuple[str, ...]]:
-    """One row a trial, the highest score first."""
+    """One row per trial, the highest score first."""
     ordered = sorted(records, key=lambda record: -record.best.score if record.best else float("inf"))
     return [_row(record) for record in ordered]
 
 
 def variant_rows(records: Sequence[TrialRecord]) -> list[tuple[str, ...]]:
-    """One row a variant: seeds, mean, standard deviation and range of the best scores. The highest mean first."""
+    """One row per variant: seeds, mean, standard deviation and range of the best scores. The highest mean first."""
     groups: dict[str, list[TrialRecord]] = {}
     for record in records:
         groups.setdefault(record.trial.variant, []).append(record)
@@ -43,7 +43,7 @@ def variant_rows(records: Sequence[TrialRecord]) -> list[tuple[str, ...]]:
 
 
 def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table that shows its cells as they are, whatever is in them."""
+    """A Markdown table that shows its cells literally, whatever they contain."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join(markdown_cell(cell) for cell in line) + " |" for line in lines) + "\n"
 
@@ -60,7 +60,7 @@ def summary(name: str, question: str, records: Sequence[TrialRecord]) -> dict[st
 
 
 def table_document(name: str, question: str, records: Sequence[TrialRecord]) -> str:
-    """The Markdown report of an experiment."""
+    """The results of an experiment as Markdown."""
     parts = [
         f"# {markdown_text(name)}\n",
         f"{markdown_text(question)}\n" if question else "",
@@ -71,8 +71,8 @@ def table_document(name: str, question: str, records: Sequence[TrialRecord]) -> 
         parts += ["By variant, over seeds:\n", markdown(header, variant_rows(records))]
         if any(record.cut for record in records):
             parts.append(
-                "Trials that stand or were stopped before their end count with the best score they had, which might "
-                "have risen further: the report compares variants at equal env steps.\n"
+                "Trials that were interrupted or stopped before their end count with their best score so far, which "
+                "might have risen further: the report compares variants at equal env steps.\n"
             )
     best = best_record(records)
     if best is not None:
@@ -93,7 +93,7 @@ def outcome_name(record: TrialRecord) -> str:
 
 
 def reduced_note(records: Sequence[TrialRecord]) -> str | None:
-    """What the reader of a table must know of trials with half their worlds; None if there are none."""
+    """A note for the reader of a table on trials with half their worlds; None if there are none."""
     count = sum(record.attempt.reduced is not None for record in records)
     if not count:
         return None

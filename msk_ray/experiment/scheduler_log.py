@@ -1,7 +1,7 @@
-"""What the early-stopping rule was told, in the order it was told.
+"""The evaluations that the early-stopping rule was told, in their original order.
 
-Trials' own records do not tell the order between trials, nor which of their last rows the driver had heard of when it
-died; and a rule that is told an evaluation twice judges it twice, the second time against more trials.
+The trials' own records contain neither the order between trials nor which of their last rows had reached the driver
+when it died; and a rule that is told an evaluation twice judges it twice, the second time against more trials.
 """
 
 import json
@@ -18,7 +18,7 @@ from msk_ray.files import write_bytes
 
 @dataclass(frozen=True)
 class LogEntry:
-    """One evaluation as the driver heard of it."""
+    """One evaluation as it reached the driver."""
 
     trial: str
     epoch: int
@@ -26,9 +26,9 @@ class LogEntry:
     seconds: float
     score: float
     ended: bool
-    """Whether the trial had ended by itself."""
+    """Whether the trial had ended on its own."""
     attempt: int = 1
-    """Which attempt at the trial it was; what an earlier one reported no longer counts then."""
+    """The attempt at the trial; results of earlier attempts no longer count."""
 
     def time(self, attribute: str) -> float:
         """Progress as `env_steps`, `epoch` or `seconds`."""
@@ -36,19 +36,19 @@ class LogEntry:
 
 
 class SchedulerLog:
-    """The entries of an experiment, one JSON object a line."""
+    """The entries of an experiment, one JSON object per line."""
 
     def __init__(self, path: Path, guard: Callable[[], None] = lambda: None) -> None:
         """
         Args:
-            path: of the file.
-            guard: called before it is written; raises if the experiment is another driver's by now.
+            path: path of the file.
+            guard: called before it is written; raises if another driver owns the experiment by now.
         """
         self._path = path
         self._guard = guard
 
     def read(self) -> tuple[list[LogEntry], tuple[Damage, ...]]:
-        """All entries, and the lines that cannot be used; a last line torn by the driver's death is cut off.
+        """All entries, and the lines that cannot be used; an incomplete last line, left by a crash, is removed.
 
         Raises:
             StorageFailure: the storage does not give it, or the torn line cannot be cut off.
@@ -60,10 +60,10 @@ class SchedulerLog:
         return read_lines(self._path, _entry)
 
     def append(self, entry: LogEntry) -> None:
-        """Add one entry; it outlives this process when this returns.
+        """Add one entry; once this returns, the entry survives a crash.
 
         Raises:
-            StorageFailure: the disk is full or gone, or as the guard says.
+            StorageFailure: the disk is full or gone, or the guard raises it.
         """
         self._guard()
         try:
@@ -84,7 +84,7 @@ def _entry(data: dict[str, Any]) -> LogEntry:
         epoch,
         env_steps,
         number(data, "seconds"),
-        # It may be NaN: written so, and the rule knows what to do with it.
+        # It may be NaN, which is written as such and handled by the rule.
         float(data["score"]) if isinstance(data.get("score"), float) else number(data, "score"),
         field(data, "ended", bool),
         _attempt(data),
@@ -92,7 +92,7 @@ def _entry(data: dict[str, Any]) -> LogEntry:
 
 
 def _attempt(data: dict[str, Any]) -> int:
-    """From 1. Earlier versions wrote whether it had half its worlds."""
+    """Counted from 1. Earlier versions recorded whether the trial had half its worlds."""
     if "attempt" in data:
         return field(data, "attempt", int)
     return 2 if "halved" in data and field(data, "halved", bool) else 1

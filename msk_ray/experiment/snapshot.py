@@ -1,4 +1,4 @@
-"""The one reader of a trial's folder: what its files say at one moment, in whatever condition they are."""
+"""The one reader of a trial's folder: the content of its files at one moment, in any condition."""
 
 import math
 from collections.abc import Callable
@@ -38,16 +38,16 @@ class State(StrEnum):
 
     RUNNING = "running"
     STALE = "stale"
-    """No sign of life for too long: its process, its machine or the whole experiment has died, or was stopped."""
+    """Silent for too long: its process, its machine or the whole experiment has died, or was stopped."""
     WAITING = "waiting"
     ENDED = "ended"
     UNREADABLE = "unreadable"
-    """Which trial it is cannot be read."""
+    """Its files do not say which trial it is."""
 
 
 @dataclass(frozen=True)
 class Device:
-    """What a trial's process was given."""
+    """The device assigned to a trial's process."""
 
     host: str = ""
     gpu: str = "-"
@@ -58,11 +58,11 @@ class Device:
 
 @dataclass(frozen=True)
 class TrialSnapshot:
-    """What a trial's folder holds at one moment."""
+    """The content of a trial's folder at one moment."""
 
     folder: Path
     rows: tuple[dict[str, float], ...]
-    """Metrics in order of epoch, each epoch once; NaN for what is not finite. Empty if they were not asked for."""
+    """Metrics in order of epoch, each epoch once; NaN for values that are not finite. Empty if not requested."""
     progress: TrialProgress
     ending: Ending | None
     """None: not ended, whether running, waiting or interrupted."""
@@ -106,13 +106,13 @@ class TrialReader:
     def __init__(self, keep_rows: bool = True) -> None:
         """
         Args:
-            keep_rows: whether snapshots hold all rows of metrics, or only what they say.
+            keep_rows: whether snapshots hold all rows of metrics, or only their summary.
         """
         self._keep_rows = keep_rows
         self._seen: dict[Path, tuple[tuple[int, int], tuple[tuple[dict[str, float], ...], TrialProgress, Metrics]]] = {}
 
     def read(self, folder: Path, now: float) -> TrialSnapshot:
-        """A trial's folder at `now` [s since the epoch]; nothing in it makes this fail."""
+        """A trial's folder at `now` [s since the epoch]; no content of it makes this fail."""
         damages: list[Damage] = []
         rows, progress, metrics = self._metrics(folder / METRICS_FILE, damages)
         damages += metrics.damages
@@ -146,7 +146,7 @@ class TrialReader:
 
 
 def read_trial(folder: Path, now: float = 0.0) -> TrialSnapshot:
-    """A trial's folder at `now` [s since the epoch], which only tells running trials from silent ones."""
+    """A trial's folder at `now` [s since the epoch], which is only used to tell running trials from silent ones."""
     return TrialReader().read(folder, now)
 
 
@@ -171,7 +171,7 @@ def _device(facts: dict[str, Any]) -> Device:
 def _heartbeat_age(folder: Path, now: float) -> float | None:
     """Seconds since a trial's process last wrote; None if it never did.
 
-    Clocks of machines that share a storage differ: a heartbeat from the future is a fresh one.
+    The clocks of machines that share a storage differ: a time in the future counts as now.
     """
     beat = _last_beat(folder)
     return None if beat is None else max(0.0, now - beat)
@@ -182,8 +182,8 @@ def _last_beat(folder: Path) -> float | None:
 
 
 def _is_silent(folder: Path, progress: TrialProgress, age: float) -> bool:
-    """Whether a trial that has not ended shows no sign of life: it was silent for too long, or its driver, which writes
-    the summary last of all, has left since."""
+    """Whether a trial that has not ended is stale: it has been silent for too long, or its driver, which writes the
+    summary at its very end, has exited since."""
     summary, beat = _modified(folder.parent.parent / SUMMARY_FILE), _last_beat(folder)
     left = summary is not None and (beat is None or beat < summary)
     return left or age > _patience(folder, progress)
@@ -192,7 +192,7 @@ def _is_silent(folder: Path, progress: TrialProgress, age: float) -> bool:
 def _patience(folder: Path, progress: TrialProgress) -> float:
     """How long a trial may be silent before it counts as stale [s]."""
     started, metrics = _modified(folder / DEVICE_FILE), _modified(folder / METRICS_FILE)
-    # A process younger than the metrics, as after a retry, has not done an epoch of its own.
+    # A process younger than the metrics, as after a retry, has not completed an epoch yet.
     starting = metrics is None or (started is not None and started >= metrics)
     if starting or progress.seconds_per_epoch is None:
         return STALE_STARTING_S

@@ -1,4 +1,4 @@
-"""One trial of an experiment: what it is called, what sets it apart, and its full settings."""
+"""One trial of an experiment: its name, its varied settings, and its full settings."""
 
 import hashlib
 import json
@@ -17,11 +17,11 @@ class Trial:
     """One training run of an experiment."""
 
     index: int
-    """Place in the experiment, from 0."""
+    """Position in the experiment, from 0."""
     id: str
     """Hash of what is trained, seed included; the name of the trial's folder."""
     changed: dict[str, str]
-    """What sets this trial apart, parameter → value as text, without the seed."""
+    """The varied settings of this trial, parameter → value as text, without the seed."""
     values: dict[str, Any]
     """The same as data: dotted key → value."""
     config: Config
@@ -59,14 +59,14 @@ def short_key(key: str) -> str:
 
 
 def trial_id(config: Config) -> str:
-    """First digits of the SHA-256 of a config's content. Equal configs have equal ids wherever they are resolved, and
-    by whatever version."""
+    """First digits of the SHA-256 of a config's content. Equal configs have equal ids on every machine and in every
+    version."""
     text = json.dumps(first_spelling(config.as_dict()), sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()[:ID_DIGITS]
 
 
 def with_epochs(trial: Trial, epochs: int) -> Trial:
-    """The same trial, id included, of another length."""
+    """The same trial, with the same id, of another length."""
     longer = trial.config.trial.model_copy(update={"epochs": epochs})
     return replace(trial, config=trial.config.model_copy(update={"trial": longer}))
 

@@ -1,4 +1,4 @@
-"""Where an experiment stands, from its files alone: while it runs, after it died, or from another machine."""
+"""The progress of an experiment, read from its files: while it runs, after it has died, or from another machine."""
 
 import math
 from collections.abc import Sequence
@@ -20,13 +20,13 @@ from msk_ray.experiment.trial import Trial
 
 @dataclass(frozen=True)
 class TrialStatus:
-    """One trial as its files show it at one moment."""
+    """The state of one trial at one moment, according to its files."""
 
     id: str
     variant: str
     seed: int
     epochs: int
-    """Planned."""
+    """Planned epochs."""
     state: State
     progress: TrialProgress
     device: Device
@@ -42,7 +42,7 @@ class TrialStatus:
 
     @property
     def seconds_left(self) -> float | None:
-        """Until its last epoch at its present speed [s]; None unless it is running at a known speed."""
+        """Time to its last epoch at its current speed [s]; None unless it is running at a known speed."""
         speed = self.progress.seconds_per_epoch
         if self.state is not State.RUNNING or speed is None:
             return None
@@ -50,7 +50,7 @@ class TrialStatus:
 
 
 class StatusReader:
-    """Reads an experiment again and again; a file that has not changed is not read twice."""
+    """Reads an experiment repeatedly; a file that has not changed is not read twice."""
 
     def __init__(self, experiment: Experiment) -> None:
         self.experiment = experiment
@@ -75,7 +75,7 @@ class StatusReader:
         return self._trials
 
     def _unlisted(self, listed: set[str], now: float) -> list[TrialStatus]:
-        """Trials a search has made up: the manifest learns of them only at the end."""
+        """Trials suggested by a search: the manifest contains them only at the end."""
         if all(path.name in listed for path in _subfolders(self.experiment.path / "trials")):
             return []
         try:
@@ -112,7 +112,7 @@ class StatusReader:
 
 
 def counts(statuses: Sequence[TrialStatus]) -> dict[State, int]:
-    """How many trials are in each state; states that none is in are left out."""
+    """How many trials are in each state; states without trials are left out."""
     return {state: n for state in State if (n := sum(status.state is state for status in statuses))}
 
 
@@ -134,7 +134,7 @@ def best_of(statuses: Sequence[TrialStatus]) -> TrialStatus | None:
 
 
 def find_experiments(storage: Path) -> list[Path]:
-    """Folders in a storage folder that are, or began to be, an experiment; the newest last."""
+    """Folders in a storage folder that are experiments, complete or not; the newest last."""
     found = [
         path
         for path in _subfolders(storage)

@@ -5,7 +5,7 @@ from importlib import metadata
 
 
 def installed_versions(packages: Iterable[str]) -> dict[str, str]:
-    """Version of each package that is installed; a checkout that runs without being installed has none."""
+    """Version of each package that is installed; a checkout that is not installed has none."""
     found = {}
     for package in packages:
         try:

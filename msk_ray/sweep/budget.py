@@ -1,4 +1,4 @@
-"""How long the longest trial of a space can be: what the scheduler's `grace`, rungs and `interval` are shares of."""
+"""The longest possible trial of a space: the scheduler's `grace`, rungs and `interval` are shares of its length."""
 
 import itertools
 from collections.abc import Iterable, Iterator, Mapping
@@ -16,7 +16,7 @@ _DECIDING = (
     "trial.epochs",
     "env.nworld",
 )
-"""Settings, and sections of settings, that decide how many env steps a trial takes."""
+"""Settings, and sections of settings, that determine how many env steps a trial takes."""
 
 
 def env_steps_budget(config: Config) -> int:
@@ -32,8 +32,8 @@ def longest_budget(file: SpaceFile, configs: Iterable[Config]) -> float:
     """The largest budget of some trials, in the scheduler's unit of time.
 
     Args:
-        file: the space, whose scheduler asks.
-        configs: of the trials; of a search `extreme_configs`, as its trials are not known yet.
+        file: the space, with its scheduler.
+        configs: configs of the trials; for a search `extreme_configs`, because its trials are not known yet.
     """
     attribute = file.scheduler.time_attr
     if attribute == "env_steps":
@@ -44,13 +44,13 @@ def longest_budget(file: SpaceFile, configs: Iterable[Config]) -> float:
 
 
 def extreme_configs(space: Space) -> list[Config]:
-    """Configs among which is the longest one that a search can suggest: every combination of what decides the length.
+    """Configs that include the longest one that a search can suggest: all combinations of what determines the length.
 
     A trial's length rises or falls with each number that it depends on, so the two ends of a range are enough. Other
-    parameters stand at their first level or lower end.
+    parameters have their first level or lower end.
 
     Raises:
-        ConfigError: the base, an end of a range or such a combination is no valid config.
+        ConfigError: the base, an end of a range or such a combination is not a valid config.
     """
     base = base_settings(space)
     check_ranges(space, base)
@@ -69,6 +69,6 @@ def _combinations(space: Space, base: Mapping[str, Any]) -> Iterator[Config]:
 
 
 def _decides(key: str, op: Operator) -> bool:
-    """Whether a parameter sets something that decides how long a trial is."""
+    """Whether a parameter affects the length of a trial."""
     touched = (leaf for level in op.extremes() for leaf in leaves(key, level.value))
     return any(leaf == known or leaf.startswith(f"{known}.") for leaf in touched for known in _DECIDING)

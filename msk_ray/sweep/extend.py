@@ -1,7 +1,7 @@
 """`--extend`: more trials or more epochs for an experiment that exists. Pure: lists of trials in, a list out.
 
-A trial keeps its id, and so its folder, for life: the id is the hash of what it was first planned as, before any
-extension of its epochs.
+A trial always keeps its id, and so its folder: the id is the hash of its original settings, before any extension of its
+epochs.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,7 +19,7 @@ def parse_extension(texts: Sequence[str]) -> dict[str, Any]:
     """`["epochs=400", "seeds=0-4"]` as data.
 
     Raises:
-        ConfigError: something else than epochs, samples or seeds, or no whole number.
+        ConfigError: a key other than epochs, samples and seeds, or a value that is not a whole number.
     """
     extension: dict[str, Any] = {}
     for text in texts:
@@ -42,11 +42,11 @@ def extended_space(data: Mapping[str, Any], extension: Mapping[str, Any]) -> dic
 
 
 def extend_trials(recorded: Sequence[Trial], planned: Sequence[Trial], epochs: int | None) -> list[Trial]:
-    """The trials of an extended experiment: those there are, in their places, then the new ones.
+    """The trials of an extended experiment: the existing ones, in their order, then the new ones.
 
     Args:
-        recorded: the experiment's trials as they are.
-        planned: what the extended space resolves to, with the epochs the space gives.
+        recorded: the experiment's current trials.
+        planned: the trials of the extended space, with the space's epochs.
         epochs: new length of every trial; None leaves it.
 
     Raises:
@@ -66,7 +66,7 @@ def extend_trials(recorded: Sequence[Trial], planned: Sequence[Trial], epochs: i
         lengths = {trial.epochs for trial in recorded}
         epochs = lengths.pop() if len(lengths) == 1 else None
     elif len({trial.epochs for trial in planned}) > 1:
-        raise ConfigError("--extend epochs: the space varies trial.epochs; start another experiment instead")
+        raise ConfigError("--extend epochs: the space varies trial.epochs; start a new experiment instead")
     elif any(trial.epochs > epochs for trial in recorded):
         longest = max(trial.epochs for trial in recorded)
         raise ConfigError(f"--extend epochs={epochs}: trials have {longest} epochs already; write the new total")

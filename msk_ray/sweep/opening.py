@@ -1,4 +1,4 @@
-"""An experiment of a space: begun, or opened again to go on with it."""
+"""Start an experiment of a space, or open one to continue it."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,10 +18,10 @@ from msk_ray.text import printable
 
 
 def create(path: Path, space: Space, trials: list[Trial], options: dict[str, Any]) -> Experiment:
-    """Make a new experiment's folder and say in it what it is.
+    """Create the folder of a new experiment with its description.
 
     Raises:
-        StorageError: the folder cannot be written, or holds an experiment already.
+        StorageError: the folder cannot be written, or already holds an experiment.
     """
     experiment = Experiment(path)
     refuse_old(path)
@@ -34,16 +34,16 @@ def create(path: Path, space: Space, trials: list[Trial], options: dict[str, Any
 
 
 def reopen(path: Path, trials: list[Trial] | None, extension: Mapping[str, Any] | None = None) -> Experiment:
-    """Open an experiment to go on with it.
+    """Open an experiment to continue it.
 
     Args:
         path: its folder.
-        trials: what the space, extended, resolves to now, to be compared; None to take the manifest's word.
-        extension: what to extend it by: epochs, samples, seeds.
+        trials: the current trials of the (extended) space, for comparison; None trusts the manifest.
+        extension: what to extend: epochs, samples, seeds.
 
     Raises:
-        StorageError: there is none, it cannot be written, or its trials are not those of the space as it is now.
-        ConfigError: the extension takes something away.
+        StorageError: there is none, it cannot be written, or its trials are not those of the current space.
+        ConfigError: the extension would remove something.
     """
     experiment = Experiment(path)
     if not path.is_dir():
@@ -60,24 +60,24 @@ def reopen(path: Path, trials: list[Trial] | None, extension: Mapping[str, Any] 
     if difference:
         raise StorageError(
             f"--resume: the space no longer gives the trials of {path}: {difference}; undo that, or pass another "
-            f"--name (--extend adds samples, seeds or epochs). As it was begun, it goes on with: "
+            f"--name (--extend adds samples, seeds or epochs). To continue it with its original settings: "
             f"{experiment.resume_command()}"
         )
-    # Also without a new extension: an earlier one may have been interrupted right after its manifest.
+        # Also without a new extension: an earlier one may have been interrupted right after writing its manifest.
     experiment.clear_outgrown()
     experiment.stop_file.unlink(missing_ok=True)
     return experiment
 
 
 def write_space(experiment: Experiment, space: Space) -> None:
-    """Record the space as it is run, its scheduler in full: a default may change, and the rungs with it."""
+    """Record the space, with all settings of its scheduler: a default may change, and the rungs with it."""
     written = space.file.model_dump(mode="json", exclude_unset=True)
     written["scheduler"] = space.file.scheduler.model_dump(mode="json")
     write_text(experiment.path / SPACE_FILE, dump_yaml(written))
 
 
 def check_scheduler(experiment: Experiment, space: Space) -> None:
-    """Refuse to go on by another rule than trials have been stopped by so far.
+    """Refuse to continue with a rule other than the one that has stopped trials so far.
 
     Raises:
         StorageError: the space's scheduler is not the recorded one.
@@ -86,13 +86,13 @@ def check_scheduler(experiment: Experiment, space: Space) -> None:
         path = experiment.path / SPACE_FILE
         recorded = read_file(read_yaml(path), str(path), recorded=True).scheduler.model_dump()
     except MskRayError as error:
-        # Nothing hangs on it but this check and the report.
+        # Only this check and the report depend on it.
         text = " ".join(str(error).split())
-        print(f"whether the space's scheduler is still the one trials were stopped by is not known: {printable(text)}")
+        print(f"it is not known whether the space's scheduler is still the one that stopped trials: {printable(text)}")
         return
     now = space.file.scheduler.model_dump()
     if recorded["kind"] != now["kind"]:
-        changes = [f"kind {recorded['kind']} → {now['kind']}"]  # each kind has settings of its own
+        changes = [f"kind {recorded['kind']} → {now['kind']}"]  # each kind has its own settings
     else:
         changes = [f"{key} {recorded[key]} → {now[key]}" for key in now if now[key] != recorded[key]]
     if changes:
@@ -109,7 +109,8 @@ def difference_of(recorded: list[Trial], now: list[Trial]) -> str | None:
     added = [trial for trial in now if trial.id not in old]
     if not gone and not added:
         return None
-    # Trials at the same place were most likely one trial before an edit; then the edit itself says the most.
+        # Trials at the same position were most likely one trial before an edit, and the edit is the best
+        # description.
     for before, after in zip(gone, added, strict=False):
         if before.index == after.index:
             return f"trial {before.index} changed: {describe_changes(before.config, after.config)}"

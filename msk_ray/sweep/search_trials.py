@@ -1,4 +1,4 @@
-"""Trials that a search makes up as it goes: what it chose for each is kept in the trial's folder, to go on from."""
+"""Trials that a search suggests as it goes: its choice for each is recorded in the trial's folder, for resuming."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -18,15 +18,15 @@ from msk_ray.sweep.trials import base_settings, make_trial
 
 @dataclass(frozen=True)
 class SearchTrial:
-    """A trial of a search, and what the search chose for it."""
+    """A trial of a search, with the search's choice."""
 
     trial: Trial
     params: dict[str, Any]
-    """Dotted key → value; the label of a listed one."""
+    """Dotted key → value; for a listed value, its label."""
 
 
 def search_trial(space: Space, base: Mapping[str, Any], params: Mapping[str, Any]) -> Trial:
-    """The trial that a search's choice stands for."""
+    """The trial of a search's choice."""
     values, changed = {}, {}
     for key, op in space.sampled.items():
         level = op.recorded(params[key])
@@ -35,15 +35,15 @@ def search_trial(space: Space, base: Mapping[str, Any], params: Mapping[str, Any
 
 
 def write_params(folder: Path, params: Mapping[str, Any]) -> None:
-    """Keep a search's choice in the trial's folder."""
+    """Record a search's choice in the trial's folder."""
     write_json(folder / PARAMS_FILE, dict(params))
 
 
 def recover(experiment: Experiment, space: Space) -> list[SearchTrial]:
-    """All trials that a search has made up so far, in the order they were begun, numbered in it.
+    """All trials that a search has suggested so far, in the order in which they were started, and numbered in it.
 
     Raises:
-        StorageError: the space gives other trials now.
+        StorageError: the current space gives other trials.
     """
     base = base_settings(space)
     files = sorted(experiment.path.glob(f"trials/*/{PARAMS_FILE}"), key=lambda path: (path.stat().st_mtime, path))
@@ -52,7 +52,7 @@ def recover(experiment: Experiment, space: Space) -> list[SearchTrial]:
         try:
             recorded = read_object(file, dict)
         except DamagedFile as error:
-            advice = f"what the search chose is not known: remove {file.parent}, and the search makes up another trial"
+            advice = f"the search's choice is not known: remove {file.parent}, and the search suggests another trial"
             raise DamagedFile(error.damage, advice) from None
         if recorded is None:
             continue  # removed since it was found
@@ -62,7 +62,7 @@ def recover(experiment: Experiment, space: Space) -> list[SearchTrial]:
         except (ConfigError, KeyError) as error:
             raise _changed(file, f"{error}") from error
         if trial.id != file.parent.name:
-            raise _changed(file, f"it makes {trial.id} of them")
+            raise _changed(file, f"it gives {trial.id} for them")
         found.append(SearchTrial(replace(trial, index=len(found)), params))
     return found
 

@@ -1,4 +1,4 @@
-"""`--smoke`: the same space in minutes, to see that every part of it runs."""
+"""`--smoke`: the same space in minutes, to check that every part of it runs."""
 
 from typing import Any
 
@@ -15,8 +15,7 @@ EVALUATION_STEPS = 32
 
 
 def without_early_stopping(space: Space) -> Space:
-    """The space with no trial ended because of its score or the others': each runs to its end. pbt stays, which ends
-    none."""
+    """The space without early stopping by scores: each trial runs to its end. pbt stays, because it ends no trial."""
     file = space.file
     changes: dict[str, Any] = {"stop": file.stop.without_scores()}
     if file.scheduler.ends_trials:
@@ -35,13 +34,13 @@ def shrink(space: Space, trials: list[Trial]) -> list[Trial]:
     for trial in cover(trials)[: space.file.smoke.max_trials]:
         values = {**trial.values, **shorten(trial.config), **space.file.smoke.overrides}
         small = make_trial(space, base, trial.changed, values, trial.seed, len(short))
-        # Two variants that differ only in what was shortened come out equal; one of them is enough.
+        # Two variants that differ only in what was shortened become equal; one of them is enough.
         short.setdefault(small.id, small)
     return list(short.values())
 
 
 def cover(trials: list[Trial]) -> list[Trial]:
-    """The fewest trials, taken greedily in order, that show every level of every factor, with the first seed alone."""
+    """A small set of trials, chosen greedily in order, with every level of every factor and only the first seed."""
     missing = {pair for trial in trials for pair in trial.changed.items()}
     pool = [trial for trial in trials if trial.seed == trials[0].seed]
     chosen: list[Trial] = []
@@ -52,7 +51,7 @@ def cover(trials: list[Trial]) -> list[Trial]:
             break
         chosen.append(best)
         missing -= gain
-    # One trial alone would show neither concurrency nor a comparison.
+    # A single trial would test neither concurrency nor comparison.
     for trial in trials:
         if len(chosen) >= min(2, len(trials)):
             break

@@ -1,4 +1,4 @@
-"""The search space file: a question, a base config, and what is varied in it."""
+"""The search space file: a question, a base config, and what varies."""
 
 import math
 import re
@@ -23,40 +23,40 @@ MAX_SEEDS = 100_000
 
 
 class AblateSpec(Section):
-    """One factor at a time: the baseline, and each variant laid over it. Keys are dotted config keys."""
+    """One factor at a time: the baseline, and each variant merged into it. Keys are dotted config keys."""
 
     baseline: dict[str, Any] = Field(default_factory=dict)
     variants: Annotated[dict[str, dict[str, Any]], Field(min_length=1)]
 
 
 class ResourcesSpec(Section):
-    """What a trial gets, and how often it is tried again."""
+    """The resources of a trial, and how often it is retried."""
 
     gpus_per_trial: Annotated[float, Field(gt=0.0)] = 1.0
-    """GPUs of a trial where there are any; below 1, trials share one."""
+    """GPUs per trial if there are any; below 1, trials share a GPU."""
     cpus_per_trial: Count = 1
-    """CPU cores of a trial; at least its `trial.threads`."""
+    """CPU cores per trial; at least its `trial.threads`."""
     max_concurrent: Count | None = None
     max_failures: Whole = 3
-    """How often a trial whose process or node died goes on from its checkpoint."""
+    """How often a trial whose process or node has died is retried from its checkpoint."""
     hang_s: Annotated[float, Field(gt=0.0)] | None = 1800.0
-    """Seconds without an epoch after which a trial's process is ended and tried again; null waits for ever."""
+    """Seconds without an epoch after which a trial's process is ended and restarted; null waits for ever."""
     halve_worlds_on_oom: bool = False
-    """Try a trial that runs out of memory once more, from the beginning, with half its worlds."""
+    """Restart a trial that runs out of memory once, from the beginning, with half its worlds."""
 
 
 class SmokeSpec(Section):
-    """What `--smoke` changes beyond the general rule."""
+    """What `--smoke` changes in addition to its general rule."""
 
     overrides: dict[str, Any] = Field(default_factory=dict)
     max_trials: Count = 8
 
 
 class SpaceFile(Section):
-    """A search space as written."""
+    """The content of a search space file."""
 
     question: Text
-    """What the experiment is to answer."""
+    """The question that the experiment answers."""
     base: Text
     """Config file, relative to the space file, the working directory, or the folder that holds `configs/`."""
     overrides: dict[str, Any] = Field(default_factory=dict)
@@ -67,13 +67,13 @@ class SpaceFile(Section):
     seeds: str | int | list[int] = "0"
     """Seeds every trial is run with: "0-4", "0,3", 7 or [0, 3]."""
     max_trials: Count = 2000
-    """Most trials the space may make; more are refused before any is made."""
+    """Largest number of trials of the space; more are refused before any is created."""
     samples: Count = 1
-    """Draws of the sampled parameters (choice, uniform, loguniform, randint), for each point of the grid."""
+    """Random draws of the sampled parameters (choice, uniform, loguniform, randint) for each point of the grid."""
     sample_seed: Whole = 0
     """Seed of those draws."""
     search: Text = "random"
-    """`random` resolves all trials beforehand; else what suggests them, by its name or import path."""
+    """`random` resolves all trials in advance; otherwise the search that suggests them, by name or import path."""
     scheduler: Annotated[SerializeAsAny[SchedulerSpec], BeforeValidator(read_scheduler)] = NoScheduler()
     stop: StopSpec = StopSpec()
     resources: ResourcesSpec = ResourcesSpec()
@@ -81,7 +81,7 @@ class SpaceFile(Section):
 
     @property
     def searches(self) -> bool:
-        """Whether trials are suggested one by one as results come in, rather than known beforehand."""
+        """Whether trials are suggested one by one as results come in, rather than known in advance."""
         return self.search != "random"
 
 
@@ -108,10 +108,10 @@ class Space(Section):
 
 
 def find_space(name: str) -> Path:
-    """The file a space's name or path means: as given, in `tune_spaces/` here, or beside the package.
+    """The file of a space's name or path: as given, in `tune_spaces/` of the current folder, or next to the package.
 
     Raises:
-        ConfigError: there is none; the message lists those there are.
+        ConfigError: there is none; the message lists the known spaces.
     """
     folders = [Path.cwd() / "tune_spaces", _repository() / "tune_spaces"]
     if name.endswith((".yaml", ".yml")) or "/" in name:
@@ -130,16 +130,16 @@ def load_space(path: Path) -> Space:
     """Read and check a space file.
 
     Raises:
-        ConfigError: as `parse_space`, or the file cannot be read.
+        ConfigError: as for `parse_space`, or the file cannot be read.
     """
     return parse_space(read_space(path), path)
 
 
 def recorded_space(path: Path) -> Space:
-    """Read and check the space that an experiment has kept.
+    """Read and check the space that an experiment has recorded.
 
     Raises:
-        ConfigError: as `load_space`.
+        ConfigError: as for `load_space`.
     """
     return parse_space(read_space(path), path, recorded=True)
 
@@ -173,13 +173,13 @@ def read_space(path: Path) -> dict[str, Any]:
 
 
 def read_file(data: Any, source: str, *, recorded: bool = False) -> SpaceFile:
-    """Check a space's plain data by itself. `source` names it in errors.
+    """Check a space's plain data without its base. `source` names it in errors.
 
     Args:
-        recorded: whether an experiment has kept it, perhaps one of an earlier version.
+        recorded: whether an experiment has recorded it, perhaps with an earlier version.
 
     Raises:
-        ConfigError: with the first fault on one line.
+        ConfigError: with the first error on one line.
     """
     try:
         return SpaceFile.model_validate(data, context=RECORDED if recorded else None)
@@ -188,7 +188,7 @@ def read_file(data: Any, source: str, *, recorded: bool = False) -> SpaceFile:
 
 
 def _named(data: Any) -> dict[str, type[BaseModel]]:
-    """Sections whose settings are declared by what the section names, as far as it is found."""
+    """Sections whose settings are declared by the class that they name, if it can be found."""
     scheduler = data.get("scheduler") if isinstance(data, Mapping) else None
     try:
         return {"scheduler": scheduler_class(scheduler.get("kind"))} if isinstance(scheduler, Mapping) else {}
@@ -197,10 +197,10 @@ def _named(data: Any) -> dict[str, type[BaseModel]]:
 
 
 def parse_space(data: Mapping[str, Any], path: Path, *, recorded: bool = False) -> Space:
-    """Check a space's plain data. `path` names it in errors and anchors its `base`.
+    """Check a space's plain data. `path` names it in errors, and its `base` is relative to it.
 
     Raises:
-        ConfigError: with the first fault on one line.
+        ConfigError: with the first error on one line.
     """
     file = read_file(data, str(path), recorded=recorded)
     try:
@@ -230,7 +230,7 @@ def parse_seeds(text: str | int | list[int]) -> tuple[int, ...]:
 
 
 def _seed_ranges(text: str | int | list[int]) -> list[tuple[int, int]]:
-    """(first, last) of each piece of a list of seeds; nothing is written out."""
+    """(first, last) of each piece of a list of seeds, without expanding it."""
     pieces = [str(piece) for piece in text] if isinstance(text, list) else str(text).split(",")
     ranges = []
     for piece in pieces:
@@ -245,22 +245,22 @@ def _seed_ranges(text: str | int | list[int]) -> list[tuple[int, int]]:
 
 
 def _check_count(file: SpaceFile, parameters: Mapping[str, Operator]) -> None:
-    """Refuse a space of more than `max_trials`, counted before a single one is made."""
+    """Refuse a space with more than `max_trials` trials, counted before any is created."""
     seeds = sum(last - first + 1 for first, last in _seed_ranges(file.seeds))
     grids = [len(op.levels) for op in parameters.values() if op.enumerated]
     variants = len(file.ablate.variants) + 1 if file.ablate is not None else file.samples * math.prod(grids)
     if variants * seeds > file.max_trials:
         raise ConfigError(
             f"{variants} variants × {seeds} seeds are {variants * seeds} trials, more than max_trials "
-            f"{file.max_trials}: take some away, or write a larger max_trials in the space"
+            f"{file.max_trials}: remove some, or write a larger max_trials in the space"
         )
 
 
 def _check_combination(file: SpaceFile, parameters: Mapping[str, Operator], seeds: tuple[int, ...]) -> None:
-    """Refuse settings that are each fine and make no sense together."""
+    """Refuse settings that are valid separately but not together."""
     sampled = {key: op for key, op in parameters.items() if not op.enumerated}
     if "trial.seed" in parameters:
-        raise ConfigError("parameters.trial.seed: seeds are an axis of their own; write seeds: 0-4")
+        raise ConfigError("parameters.trial.seed: seeds have a section of their own; write seeds: 0-4")
     if file.ablate is not None and parameters:
         raise ConfigError("ablate varies one factor at a time; drop parameters, or write the factors as grids there")
     if file.samples > 1 and not sampled:
@@ -279,5 +279,5 @@ def _find_base(base: str, space_path: Path) -> Path:
 
 
 def _repository() -> Path:
-    """The folder the package lies in; in a checkout it also holds `configs/` and `tune_spaces/`."""
+    """The folder that contains the package; in a checkout also `configs/` and `tune_spaces/`."""
     return Path(msk_ray.__file__).resolve().parent.parent

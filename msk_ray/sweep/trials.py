@@ -15,8 +15,8 @@ from msk_ray.sweep.space import Space
 
 
 def resolve_trials(space: Space) -> list[Trial]:
-    """All trials of an enumerable space, in the order they are started: every variant with the first seed, then the
-    next seed.
+    """All trials of an enumerable space, in the order in which they start: every variant with the first seed, then with
+    the next seed.
 
     Raises:
         ConfigError: a setting that does not exist or fit, two parameters that set the same key, or two trials that

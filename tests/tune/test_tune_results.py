@@ -71,7 +71,7 @@ def test_records_and_tables(experiment: Experiment, tmp_path: Path) -> None:
     document = table_document("e", "Which?", records)
     assert "number 2 of 2 \\| rung" in document
     assert f"trials/{records[2].trial.id}/checkpoints/best.pt" in document
-    assert "count with the best score they had" in document
+    assert "count with their best score so far" in document
     whole = table_document("e", "Which?", [records[0], records[2]])
     assert "before the" not in whole
     facts = json.loads(json.dumps(summary("e", "Which?", records), allow_nan=False))

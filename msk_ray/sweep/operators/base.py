@@ -1,6 +1,6 @@
-"""What a search space may write for a parameter: an operator, which says what values are tried.
+"""The operators of a search space: what a space may write for a parameter, to say which values are tried.
 
-An operator of one's own is a class derived from `Operator`, `Listed` or `Range`; a space names it by its import path,
+Your own operator is a class derived from `Operator`, `Listed` or `Range`; a space names it by its import path,
 `{"package.module:Class": [...]}`.
 """
 
@@ -17,7 +17,7 @@ from msk_ray.text import describe
 
 @dataclass(frozen=True)
 class Level:
-    """One value of a parameter and the text tables show for it."""
+    """One value of a parameter and its text in tables."""
 
     value: Any
     label: str
@@ -29,7 +29,7 @@ class Operator(ABC):
     enumerated: ClassVar[bool] = False
     """Whether every level is tried, rather than one drawn for each trial."""
     levels: tuple[Level, ...]
-    """All values, of one that is enumerated."""
+    """All values, if they are enumerated."""
 
     @classmethod
     @abstractmethod
@@ -46,19 +46,19 @@ class Operator(ABC):
 
     @abstractmethod
     def draw(self, rng: random.Random) -> Level:
-        """One value at random."""
+        """A random value."""
 
     @abstractmethod
     def extremes(self) -> tuple[Level, ...]:
-        """Levels among which those lie that make a trial longest; the first one stands for the parameter where its
-        value makes no difference."""
+        """Levels that include the ones that make a trial longest; the first one is used where the parameter does not
+        matter."""
 
     def check(self) -> tuple[Level, ...]:
-        """Levels to check against the settings beforehand: where they are valid, so is every draw."""
+        """Levels to check against the settings in advance: if they are valid, so is every draw."""
         return ()
 
     def recorded(self, written: Any) -> Level:
-        """The level that a search's recorded choice stands for."""
+        """The level of a search's recorded choice."""
         return Level(written, describe(written))
 
 
@@ -79,7 +79,7 @@ class Listed(Operator):
         return self.levels
 
     def recorded(self, written: Any) -> Level:
-        """By its label, which is what a search chooses among."""
+        """The level with this label; a search chooses among labels."""
         found = next((level for level in self.levels if level.label == written), None)
         return super().recorded(written) if found is None else found
 
@@ -91,7 +91,7 @@ class Range(Operator):
     log: ClassVar[bool] = False
     """Whether it is spread evenly over orders of magnitude."""
     whole: ClassVar[bool] = False
-    """Whether it holds whole numbers alone."""
+    """Whether it holds only whole numbers."""
 
     low: float
     high: float
@@ -111,7 +111,7 @@ class Range(Operator):
         return cls(low, high)
 
     def draw(self, rng: random.Random) -> Level:
-        """One value. Rounded to 6 digits, so that tables, hashes and YAML all hold the same number."""
+        """A random value, rounded to 6 digits, so that tables, hashes and YAML all hold the same number."""
         if self.whole:
             number: float = rng.randint(int(self.low), int(self.high))
         elif self.log:

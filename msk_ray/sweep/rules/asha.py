@@ -1,9 +1,9 @@
-"""Successive halving (ASHA): at each rung one in so many trials goes on.
+"""Successive halving (ASHA): at each rung one trial in `reduction` continues.
 
-Ray's own ASHA decides once, when a trial first reaches a rung, against those that came before it: trials that run in
-lockstep find the rung empty and pass unjudged. Here a trial is judged again by the newest rung it has reached at each
-report until half way (as a ratio) to the next rung, so the order of arrival matters little, and replaying recorded
-evaluations gives the same rungs.
+Ray's own ASHA decides once, when a trial first reaches a rung, by comparison with the trials that came before it:
+trials that run in lockstep find the rung empty and pass unjudged. Here a trial is judged again by the newest rung it
+has reached at each evaluation until half way (as a ratio) to the next rung, so the order of arrival matters little, and
+replaying recorded evaluations gives the same rungs.
 """
 
 import math
@@ -21,18 +21,18 @@ class Asha(SchedulerSpec):
     """Stops the worse trials at each rung."""
 
     grace: Share = 0.25
-    """Share of the longest trial's budget that no trial is stopped within: of the longest one that a search may
-    suggest, an adaptive horizon counted with its `longest`. Too small a one loses slow starters."""
+    """Share of the longest trial's budget within which no trial is stopped. For a search, the longest is the longest it
+    may suggest; an adaptive horizon counts as its `longest`. A small share loses trials that start slowly."""
     reduction: Annotated[float, Field(ge=1.5, le=16)] = 3.0
-    """One in this many goes on past each rung; rungs are grace × reductionⁿ."""
+    """One trial in this many continues past each rung; rungs are grace × reductionⁿ."""
     min_trials: Count | None = None
-    """Trials that must have come as far before one is stopped; null is `reduction` rounded up."""
+    """Number of trials that must have come as far before one is stopped; null: `reduction` rounded up."""
 
     def pruner(self, budget: float) -> Pruner:
         return SuccessiveHalving(self.rungs(budget), self.reduction, self.min_trials)
 
     def rungs(self, budget: float) -> tuple[float, ...]:
-        """grace · reductionⁿ, as long as it lies below the budget."""
+        """grace · reductionⁿ, as long as it is below the budget."""
         times = [self.grace * budget]
         while times[-1] * self.reduction < budget:
             times.append(times[-1] * self.reduction)
@@ -40,17 +40,17 @@ class Asha(SchedulerSpec):
 
 
 class SuccessiveHalving:
-    """ASHA: at each rung one in `reduction` trials goes on (rounded up).
+    """ASHA: at each rung one trial in `reduction` continues (rounded up).
 
-    Trials are compared by their best score so far, as in the final ranking; single evaluations scatter too much.
+    Trials are compared by their best score so far, as in the final ranking; single evaluations vary too much.
     """
 
     def __init__(self, rungs: Sequence[float], reduction: float, min_trials: int | None = None) -> None:
         """
         Args:
             rungs: times at which trials are compared, ascending.
-            reduction: one in this many goes on.
-            min_trials: trials that must have reached a rung before one is stopped there.
+            reduction: one trial in this many continues.
+            min_trials: number of trials that must have reached a rung before one is stopped there.
         """
         self._rungs = tuple(rungs)
         self._scores: list[dict[str, float]] = [{} for _ in rungs]
@@ -65,7 +65,7 @@ class SuccessiveHalving:
         newest: int | None = None
         for index, (rung, scores) in enumerate(zip(self._rungs, self._scores, strict=True)):
             if time >= rung:
-                # The first report past a rung counts there, whatever follows: repeated rows change nothing.
+                # The first result past a rung counts there, whatever follows: repeated rows change nothing.
                 scores.setdefault(trial, best)
                 newest = index
         # Far past its rung, a trial is left to the next one: latecomers should not undo most of its work.
@@ -90,5 +90,5 @@ class SuccessiveHalving:
         return Ending(
             Outcome.STOPPED_ASHA,
             f"best score {scores[trial]:.4g} is number {better + 1} of {len(scores)} at rung {self._rungs[index]:.6g}; "
-            f"{survivors} go on, from {cutoff:.4g}",
+            f"the best {survivors} continue, from {cutoff:.4g}",
         )

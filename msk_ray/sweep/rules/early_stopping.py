@@ -1,6 +1,6 @@
-"""What decides between trials: rules that stop one because others do better.
+"""Rules that compare trials and stop one because others do better.
 
-Fed with evaluations, they answer with a reason, and replaying recorded evaluations gives the same answers.
+They take evaluations and answer with a reason to stop; replaying recorded evaluations gives the same answers.
 """
 
 from collections.abc import Collection
@@ -22,10 +22,10 @@ class Pruner(Protocol):
     """A rule that compares trials."""
 
     def report(self, trial: str, time: float, score: float) -> Ending | None:
-        """Take in one evaluation; answer why the trial should end now, or None."""
+        """Take one evaluation into account; returns why the trial should end now, or None."""
 
     def forget(self, trial: str) -> None:
-        """Drop what a trial has reported: it starts again from the beginning."""
+        """Forget the results of a trial, because it restarts from the beginning."""
 
 
 class NeverPrune:
@@ -46,38 +46,36 @@ class SchedulerSpec(Section):
     """
 
     ends_trials: ClassVar[bool] = True
-    """Whether it ends trials by their scores: then --no-early-stopping and --smoke leave it out."""
+    """Whether it ends trials by their scores; if so, --no-early-stopping and --smoke leave it out."""
     exchanges: ClassVar[bool] = False
-    """Whether trials go on from each other's state and settings."""
+    """Whether trials continue from each other's state and settings."""
 
     kind: Text
     """Name of the rule, or its import path."""
     time_attr: Literal["env_steps", "epoch", "seconds"] = "env_steps"
-    """What trials are compared at. Env steps is fair between horizons, and trials need not run in lockstep."""
+    """The progress at which trials are compared. Env steps are fair between horizons, and do not need lockstep."""
 
     def pruner(self, budget: float) -> Pruner:
-        """The rule, knowing nothing yet.
+        """The rule, without any evaluations yet.
 
         Args:
-            budget: what the longest trial takes, in the unit of `time_attr`.
+            budget: length of the longest trial, in the unit of `time_attr`.
         """
         return NeverPrune()
 
     def rungs(self, budget: float) -> tuple[float, ...]:
-        """Times at which all trials are compared, for pictures; none if there are no such times."""
+        """Times at which all trials are compared, for pictures; empty if there are none."""
         return ()
 
     def check(self, file: "SpaceFile", ranges: Collection[str]) -> None:
-        """Refuse what does not go with this rule.
+        """Refuse a space that does not work with this rule.
 
         Args:
             file: the space.
-            ranges: its parameters that move in a range.
+            ranges: its parameters with a range.
 
         Raises:
-            ConfigError: saying what to write.
+            ConfigError: the message says what to write.
         """
         if self.time_attr == "seconds" and file.stop.wall_time_s is None:
-            raise ConfigError(
-                "scheduler.time_attr: seconds needs stop.wall_time_s, the budget that grace is a share of"
-            )
+            raise ConfigError("scheduler.time_attr: seconds needs stop.wall_time_s, of which grace is a share")

@@ -12,22 +12,22 @@ class Median(SchedulerSpec):
     """Stops trials below the median."""
 
     grace: Share = 0.25
-    """Share of the longest trial's budget that no trial is stopped within."""
+    """Share of the longest trial's budget within which no trial is stopped."""
     min_trials: Count | None = None
-    """Other trials that must have come as far before one is stopped; null is 3."""
+    """Number of other trials that must have come as far before one is stopped; null: 3."""
 
     def pruner(self, budget: float) -> Pruner:
         return MedianStopping(self.grace * budget, self.min_trials or 3)
 
 
 class MedianStopping:
-    """Stops a trial whose best score lies below the median of the other trials' mean scores up to the same time."""
+    """Stops a trial whose best score is below the median of the other trials' mean scores up to the same time."""
 
     def __init__(self, grace: float, min_trials: int = 3) -> None:
         """
         Args:
             grace: time before which nothing is compared.
-            min_trials: other trials that must have come as far.
+            min_trials: number of other trials that must have come as far.
         """
         self._grace = grace
         self._min_trials = min_trials
@@ -38,7 +38,7 @@ class MedianStopping:
             return None
         own = self._history.setdefault(trial, {})
         own[time] = score
-        # In lockstep nobody has come as far as the one that reports; then compare where enough others have been.
+        # In lockstep no other trial has come as far as this one; then compare at the time that enough have reached.
         for moment in sorted((t for t in own if self._grace <= t <= time), reverse=True):
             means = [
                 statistics.fmean(s for t, s in history.items() if t <= moment)

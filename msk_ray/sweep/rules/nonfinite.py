@@ -1,4 +1,4 @@
-"""Ends a trial whose numbers are none."""
+"""Ends a trial whose results are not finite."""
 
 import math
 from collections.abc import Mapping
@@ -21,9 +21,9 @@ class NonFinite(StopRule):
 
 
 def nonfinite_metric(row: Mapping[str, float]) -> str | None:
-    """The first metric that must be a number and is none: the score, a loss, or a gradient norm.
+    """The first metric that must be finite and is not: the score, a loss, or a gradient norm.
 
-    Others, such as the return of episodes in an epoch where none ended, may well be undefined.
+    Other metrics may be undefined, such as the return of episodes in an epoch in which none ended.
     """
     for key, value in row.items():
         if (key == SCORE or key.endswith(("loss", "grad_norm"))) and not math.isfinite(value):

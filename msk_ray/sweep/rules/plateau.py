@@ -11,14 +11,14 @@ from msk_ray.sweep.rules.stop_rule import History, StopRule
 
 
 class Plateau(StopRule):
-    """Ends a trial when its last `patience` evaluations brought no rise over the best before them."""
+    """Ends a trial when its last `patience` evaluations did not improve on the best before them."""
 
     outcome = Outcome.STOPPED_PLATEAU
 
     patience: Count
-    """Evaluations without a rise."""
+    """Number of evaluations without an improvement."""
     min_delta: Annotated[float, Field(ge=0.0)] = 0.0
-    """A rise is more than this [score]."""
+    """Smallest improvement that counts [score]."""
     grace: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.2
     """Share of the trial's epochs before which it is not stopped."""
 
@@ -33,4 +33,4 @@ class Plateau(StopRule):
         best_recent = max(evaluation.score for evaluation in recent)
         if best_recent > best_before + self.min_delta:
             return None
-        return f"no rise over {best_before:.4g} in {self.patience} evaluations, since epoch {before[-1].epoch}"
+        return f"no improvement over {best_before:.4g} in {self.patience} evaluations, since epoch {before[-1].epoch}"

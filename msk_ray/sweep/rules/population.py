@@ -1,4 +1,4 @@
-"""Population-based training: the worst trials go on from the best ones, with their settings moved a little."""
+"""Population-based training: the worst trials continue from the best ones, with slightly changed settings."""
 
 from collections.abc import Collection
 from typing import TYPE_CHECKING, Annotated
@@ -13,26 +13,26 @@ if TYPE_CHECKING:
 
 
 class PopulationBasedTraining(SchedulerSpec):
-    """Ends no trial, but lets trials take over others' state and settings."""
+    """Ends no trial, but lets trials take over the state and settings of others."""
 
     ends_trials = False
     exchanges = True
 
     interval: Share = 0.1
-    """Share of the budget between two exchanges."""
+    """Time between two exchanges, as a share of the budget."""
     quantile: Annotated[float, Field(gt=0.0, le=0.5)] = 0.25
-    """This share of the worst trials goes on from the best ones."""
+    """Share of trials that continue from better ones at an exchange."""
     resample: Annotated[float, Field(ge=0.0, le=1.0)] = 0.25
-    """Probability that an exchanged value is drawn again instead of being moved by a fifth."""
+    """Probability that an exchanged value is drawn again instead of being changed by a fifth."""
 
     def check(self, file: "SpaceFile", ranges: Collection[str]) -> None:
         super().check(file, ranges)
         if not ranges:
-            raise ConfigError("scheduler.kind: pbt needs a parameter with a range to move in (uniform, loguniform)")
+            raise ConfigError("scheduler.kind: pbt needs a parameter with a range (uniform, loguniform)")
         if file.resources.halve_worlds_on_oom:
             raise ConfigError(
-                "resources.halve_worlds_on_oom (--halve-worlds): pbt hands the states of all worlds from one trial to "
-                "another, so all need as many; write false"
+                "resources.halve_worlds_on_oom (--halve-worlds): pbt passes the states of all worlds from one trial to "
+                "another, so all need the same number; write false"
             )
         if file.searches:
             raise ConfigError("scheduler.kind: pbt chooses values itself; write search: random")

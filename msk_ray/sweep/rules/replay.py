@@ -1,4 +1,4 @@
-"""The early-stopping rule, fed again with what it was told, is where it was."""
+"""Restore an early-stopping rule by replaying its recorded evaluations."""
 
 from collections.abc import Sequence
 
@@ -8,10 +8,10 @@ from msk_ray.sweep.rules.early_stopping import Pruner
 
 
 def replay(pruner: Pruner, time_attr: str, reports: Sequence[LogEntry]) -> Ending | None:
-    """Feed a rule with recorded reports, but for those of untrained policies, which older versions recorded.
+    """Replay recorded evaluations, except those of untrained policies, which older versions recorded.
 
     Returns:
-        What it answered to the last one, which the driver may not have lived to carry out.
+        The rule's answer to the last one, which the driver may have died before carrying out.
     """
     ending = None
     attempts: dict[str, int] = {}

@@ -1,4 +1,4 @@
-"""The `scheduler` section of a space, by the rule that it names."""
+"""The `scheduler` section of a space, with the settings of the rule that it names."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -23,11 +23,11 @@ SCHEDULERS = Registry(
 RECORDED = {"recorded": True}
 """Validation context of a space that an experiment has recorded."""
 _SHARED = frozenset({"time_attr", "grace", "reduction", "min_trials", "interval", "quantile", "resample"})
-"""Settings that every rule had, read or not, before each had its own."""
+"""Settings that every rule used to have, read or not, before each had its own."""
 
 
 def scheduler_class(name: Any) -> type[SchedulerSpec]:
-    """The class of a rule, by its name or import path; None is `none`.
+    """The class of a rule, by its name or import path; None stands for `none`.
 
     Raises:
         ConfigError: there is none.
@@ -36,8 +36,8 @@ def scheduler_class(name: Any) -> type[SchedulerSpec]:
 
 
 def read_scheduler(value: Any, info: ValidationInfo) -> Any:
-    """The section as the settings that its rule declares. In one that was recorded, settings of other rules, which
-    nothing read, are left out."""
+    """The section as the settings that its rule declares. In a recorded section, settings of other rules, which nothing
+    reads, are left out."""
     if isinstance(value, SchedulerSpec) or not isinstance(value, Mapping):
         return value
     try:

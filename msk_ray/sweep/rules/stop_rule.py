@@ -1,4 +1,4 @@
-"""What a rule is by which a trial ends itself, from its own history alone."""
+"""The base of rules by which a trial ends itself, judged only by its own history."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -21,16 +21,16 @@ from msk_ray.experiment.outcomes import Outcome
 
 @dataclass(frozen=True)
 class History:
-    """What a trial has done, after an epoch."""
+    """The history of a trial, after an epoch."""
 
     row: Mapping[str, float]
-    """Metrics of the epoch just done."""
+    """Metrics of the last epoch."""
     evaluations: Sequence[Evaluation]
     """All evaluations of the trained policy, the newest last."""
     epochs: int
     """The trial's full length."""
     elapsed_s: float
-    """Work so far over all attempts [s]."""
+    """Training time so far, over all attempts [s]."""
 
     @property
     def epoch(self) -> int:
@@ -46,17 +46,17 @@ class StopRule(Section, ABC):
     """
 
     outcome: ClassVar[Outcome] = Outcome.STOPPED_RULE
-    """How a trial ends that it stops."""
+    """The outcome of a trial that it stops."""
     by_score: ClassVar[bool] = True
-    """Whether scores decide: then --no-early-stopping and --smoke leave it out."""
+    """Whether it decides by scores; if so, --no-early-stopping and --smoke leave it out."""
     before_the_end: ClassVar[bool] = False
-    """Whether it is asked even after the last epoch, before that ends the trial."""
+    """Whether it is also checked after the last epoch, before that ends the trial."""
     shorthand: ClassVar[str | None] = None
     """The setting that a bare value stands for: `target: 5` for `target: {score: 5}`."""
 
     @abstractmethod
     def why(self, history: History) -> str | None:
-        """The reason why the trial ends now, in words; None to go on."""
+        """Why the trial ends now, in words; None to continue."""
 
     @model_validator(mode="wrap")
     @classmethod

@@ -16,11 +16,11 @@ from msk_ray.sweep.rules.target import Target
 from msk_ray.sweep.rules.wall_time import WallTime
 
 STOP_RULES = Registry("stop.rules", "msk_ray.stop_rules", {})
-"""Of installed packages; our own are fields of the section."""
+"""Entry points of installed packages; our own rules are fields of the section."""
 
 
 def _found(value: Any) -> Any:
-    """Rules from outside, by what names them."""
+    """Rules from outside, by name or import path."""
     if not isinstance(value, Mapping):
         return value
     return {name: _rule(name, settings) for name, settings in value.items()}
@@ -59,21 +59,21 @@ class StopSpec(Section):
         return data | {"nonfinite": {} if data["nonfinite"] else None}
 
     def all_rules(self) -> Iterator[StopRule]:
-        """The rules in force, in the order in which they are asked."""
+        """The active rules, in the order in which they are checked."""
         for rule in (self.nonfinite, self.target, self.wall_time_s, self.plateau):
             if rule is not None:
                 yield rule
         yield from self.rules.values()
 
     def without_scores(self) -> "StopSpec":
-        """The rules that do not judge by scores."""
+        """The rules that do not decide by scores."""
         named = {name: getattr(self, name) for name in ("target", "plateau", "wall_time_s", "nonfinite")}
         left_out = {name: None for name, rule in named.items() if rule is not None and rule.by_score}
         kept = {name: rule for name, rule in self.rules.items() if not rule.by_score}
         return self.model_copy(update=left_out | ({"rules": kept} if kept != self.rules else {}))
 
     def ending(self, history: History) -> Ending | None:
-        """Whether a trial ends after an epoch, and how; None to go on."""
+        """How a trial ends after an epoch; None to continue."""
         rules = list(self.all_rules())
         finished = history.epoch >= history.epochs
         for rule in sorted(rules, key=lambda rule: not rule.before_the_end):

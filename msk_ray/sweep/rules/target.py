@@ -1,4 +1,4 @@
-"""Ends a trial that has done its work."""
+"""Ends a trial that has reached its goal."""
 
 from msk_ray.experiment.outcomes import Outcome
 from msk_ray.sweep.rules.stop_rule import History, StopRule
@@ -12,10 +12,10 @@ class Target(StopRule):
     shorthand = "score"
 
     score: float
-    """Score at which a trial has done its work."""
+    """Score at which a trial has reached its goal."""
 
     def why(self, history: History) -> str | None:
         if not history.evaluations or history.evaluations[-1].score < self.score:
             return None
         newest = history.evaluations[-1]
-        return f"score {newest.score:.4g} at epoch {newest.epoch}, asked {self.score:g}"
+        return f"score {newest.score:.4g} at epoch {newest.epoch}, target {self.score:g}"

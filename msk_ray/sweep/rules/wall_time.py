@@ -9,14 +9,14 @@ from msk_ray.sweep.rules.stop_rule import History, StopRule
 
 
 class WallTime(StopRule):
-    """Ends a trial after so much work."""
+    """Ends a trial after a given training time."""
 
     outcome = Outcome.WALL_TIME
     by_score = False
     shorthand = "seconds"
 
     seconds: Annotated[float, Field(gt=0.0)]
-    """Seconds of work a trial may take, over all its attempts."""
+    """Training time that a trial may take, over all its attempts [s]."""
 
     def why(self, history: History) -> str | None:
         if history.elapsed_s < self.seconds:

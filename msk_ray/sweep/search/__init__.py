@@ -1,4 +1,4 @@
-"""What suggests trials one by one as results come in, by name."""
+"""The searches, which suggest trials one by one as results come in, by name."""
 
 from msk_ray.config import Registry, resolve_class
 from msk_ray.sweep.search.base import Search

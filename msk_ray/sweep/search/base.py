@@ -1,4 +1,4 @@
-"""What a search is: it suggests a trial's values, and is told what came of them."""
+"""The base of searches: a search suggests a trial's values, and is told the result."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping
@@ -16,31 +16,31 @@ class Search(ABC):
     """
 
     name: ClassVar[str] = ""
-    """In messages; by default the class's."""
+    """Name in messages; by default that of the class."""
 
     def __init__(self, parameters: Mapping[str, Operator], seed: int) -> None:
         """
         Args:
             parameters: dotted key → the values it may have.
-            seed: of its draws; another one each time an experiment goes on.
+            seed: seed of its draws, a new one each time an experiment is resumed.
 
         Raises:
-            ConfigError: what it needs is not installed, or it cannot search such values.
+            ConfigError: a required package is not installed, or it cannot search such values.
         """
         self.parameters = dict(parameters)
         self.seed = seed
 
     @abstractmethod
     def ask(self) -> dict[str, Any]:
-        """The values of the next trial, by dotted key; of listed values their label."""
+        """The values of the next trial, by dotted key; for listed values, their label."""
 
     @abstractmethod
     def tell(self, params: Mapping[str, Any], score: float | None) -> None:
-        """Take in what came of a trial.
+        """Take the result of a trial into account.
 
         Args:
-            params: its values, suggested now or when the experiment ran before.
-            score: its best one; None if it has none.
+            params: its values, suggested in this run of the experiment or an earlier one.
+            score: its best score; None if it has none.
         """
 
     @classmethod
@@ -48,7 +48,7 @@ class Search(ABC):
         """Refuse a space that cannot be searched.
 
         Raises:
-            ConfigError: saying what to write.
+            ConfigError: the message says what to write.
         """
         name = cls.name or cls.__name__
         grids = [key for key, op in parameters.items() if op.enumerated]
@@ -57,4 +57,4 @@ class Search(ABC):
         if not parameters:
             raise ConfigError(f"search: {name} needs parameters with choice, uniform, loguniform or randint")
         if len(seeds) > 1:
-            raise ConfigError(f"search: {name} runs every suggestion once; give a single seed")
+            raise ConfigError(f"search: {name} runs every suggestion once; write a single seed")

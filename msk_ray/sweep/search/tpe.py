@@ -9,7 +9,7 @@ from msk_ray.sweep.search.base import Search
 
 
 class OptunaSearch(Search):
-    """Suggests what resembles the better half of what was tried."""
+    """Suggests values that resemble the better half of those tried."""
 
     name = "optuna"
 
