@@ -181,7 +181,7 @@ def test_a_trial_that_ran_out_of_memory_says_what_to_lower(
 ) -> None:
     trial = experiment.trials()[0]
     experiment.trial_folder(trial.id).mkdir(parents=True, exist_ok=True)
-    why = "out_of_memory: cuda:0 has no room for 4096 worlds; lower env.nworld"
+    why = "out_of_memory: cuda:0 has too little memory for 4096 worlds; lower env.nworld"
     write_ending(experiment.trial_folder(trial.id), Ending(Outcome.OUT_OF_MEMORY, why))
     monkeypatch.setenv("COLUMNS", "80")
     assert run(main, [experiment.name, "--storage", str(experiment.path.parent)]) == 0

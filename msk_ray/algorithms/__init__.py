@@ -1,4 +1,4 @@
-"""Learning algorithms, and what the trainer asks of one. Each is loaded where it is named."""
+"""Learning algorithms and their interface to the trainer. Each is loaded only when it is named."""
 
 from msk_ray.algorithms.base import Algorithm, EpochResult, algorithm_class
 

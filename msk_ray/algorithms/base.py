@@ -1,4 +1,4 @@
-"""What the trainer asks of an algorithm."""
+"""The interface between the trainer and an algorithm."""
 
 import time
 from abc import ABC, abstractmethod
@@ -14,28 +14,28 @@ from msk_ray.envs import Env
 from msk_ray.errors import ConfigError
 
 _OF_GRADIENTS = frozenset({"approximated_share"})
-"""Figures of the simulation that speak of its gradients; the others speak of its physics."""
+"""Diagnostics of the simulation that concern its gradients; the others concern its physics."""
 
 
 @dataclass(frozen=True)
 class EpochResult:
-    """What came of one epoch."""
+    """The result of one epoch."""
 
     env_steps: int
     """Env steps simulated, all worlds together."""
     metrics: dict[str, float]
-    """For logs, by name; nothing in the program reads them back."""
+    """Metrics for the logs, by name; nothing in the program reads them back."""
 
 
 class Algorithm(ABC):
     """Learns a policy for one environment, epoch by epoch.
 
-    A class of its own needs `policy_network` and `update`; its settings, if it has any, are `Settings`. Everything it
-    draws from torch's global generator is drawn again the same when a trial is resumed.
+    A subclass needs `policy_network` and `update`; its settings, if it has any, are `Settings`. A resumed trial draws
+    the same numbers from torch's global generator again.
 
     Attributes:
-        config: the trial's.
-        settings: the algorithm's own part of it, of type `Settings`.
+        config: the trial's config.
+        settings: the algorithm's part of it, of type `Settings`.
         env: the worlds it trains in.
         network: the policy, on the environment's device.
     """
@@ -45,9 +45,9 @@ class Algorithm(ABC):
     def __init__(self, config: Config, env: Env[Any], network: nn.Module | None = None) -> None:
         """
         Args:
-            config: the trial's.
+            config: the trial's config.
             env: the worlds to train in.
-            network: the policy; None takes a new `policy_network`.
+            network: the policy; None creates a new `policy_network`.
         """
         torch.manual_seed(config.trial.seed)
         self.config = config
@@ -66,16 +66,16 @@ class Algorithm(ABC):
         """Train one epoch, counted from 0.
 
         Raises:
-            SimulationError: training cannot go on: a gradient is not finite, or the physics failed.
+            SimulationError: training cannot continue: a gradient is not finite, or the physics failed.
         """
 
     @classmethod
     def policy_modules(cls, network: nn.Module) -> dict[str, nn.Module]:
-        """The parts of a policy as they are saved, by name."""
+        """The parts of a policy that are saved, by name."""
         return {"policy": network}
 
     def modules(self) -> dict[str, nn.Module]:
-        """Everything that is saved as a module, by name: the policy's parts, and whatever else there is."""
+        """Everything that is saved as a module, by name: the policy's parts and any others."""
         return self.policy_modules(self.network)
 
     @torch.no_grad()
@@ -89,7 +89,7 @@ class Algorithm(ABC):
         return {name: module.state_dict() for name, module in self.policy_modules(self.network).items()}
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything a later `load_state_dict` needs to go on exactly, environment state included."""
+        """Everything that a later `load_state_dict` needs to continue exactly, including the environment's state."""
         state = {
             "modules": {name: module.state_dict() for name, module in self.modules().items()},
             "torch_generator": torch.get_rng_state(),
@@ -100,7 +100,7 @@ class Algorithm(ABC):
         return state
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from what `state_dict` gave."""
+        """Continue from a `state_dict`."""
         for name, module in self.modules().items():
             module.load_state_dict(state["modules"][name])
         # Generator states are host tensors whatever device they drive. Older checkpoints have none: SHAC's draws come
@@ -114,10 +114,10 @@ class Algorithm(ABC):
     def start_from(self, modules: Mapping[str, Any]) -> None:
         """Take networks and statistics from another trial's states, by module name.
 
-        What is not there, such as the critic of a policy saved alone, stays as it is.
+        Missing modules, such as the critic in a file with only a policy, stay unchanged.
 
         Raises:
-            KeyError: a module that the policy needs is not there.
+            KeyError: a module that the policy needs is missing.
             RuntimeError: a network has another shape.
         """
         needed = self.policy_modules(self.network)
@@ -148,7 +148,7 @@ def algorithm_class(config: Config) -> type[Algorithm]:
 
 
 def simulation_metrics(env: Env[Any]) -> dict[str, float]:
-    """What the simulation says of itself since it was last asked, by metric name.
+    """The simulation's diagnostics since the last call, by metric name.
 
     Raises:
         SimulationError: contacts or constraint rows were lost to a full buffer.
@@ -160,7 +160,7 @@ def simulation_metrics(env: Env[Any]) -> dict[str, float]:
 
 
 class Clock:
-    """Seconds between laps, the device's queued work included."""
+    """Measures the seconds between laps, including work queued on the device."""
 
     def __init__(self, device: torch.device) -> None:
         self._device = device
@@ -172,7 +172,7 @@ class Clock:
         return time.perf_counter()
 
     def lap(self) -> float:
-        """Seconds since the last lap, or since the clock was made."""
+        """Seconds since the last lap, or since the clock was created."""
         now = self._now()
         elapsed, self._last = now - self._last, now
         return elapsed

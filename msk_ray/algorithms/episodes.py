@@ -1,4 +1,4 @@
-"""Returns and lengths of whole training episodes, which span many rollouts."""
+"""Returns and lengths of complete training episodes, which span many rollouts."""
 
 import torch
 from torch import Tensor
@@ -12,7 +12,7 @@ class EpisodeTracker:
         self._length = torch.zeros(nworld, device=device)
 
     def update(self, rewards: Tensor, done: Tensor) -> dict[str, Tensor]:
-        """Take in a rollout's rewards and ends, both (H, W).
+        """Add the rewards and ends of a rollout, both (H, W).
 
         Returns:
             Mean return and length of the episodes that ended in it, and their number; only the number if none did.
@@ -42,5 +42,5 @@ class EpisodeTracker:
         return {"return": self._return.clone(), "length": self._length.clone()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Continue from what `state_dict` gave."""
+        """Continue from a `state_dict`."""
         self._return, self._length = state["return"], state["length"]

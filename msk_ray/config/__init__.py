@@ -1,4 +1,4 @@
-"""What a trial is: one frozen, checked tree of settings, read from YAML."""
+"""The settings of a trial: one frozen, checked tree, read from YAML."""
 
 from msk_ray.config.algorithms import (
     ALGORITHMS,

@@ -1,6 +1,6 @@
 """The algorithms that `algorithm.name` can take, and the settings that each declares.
 
-The package's own have a section of their own at the top of a config, `shac` and `ppo`; those from outside have
+The package's algorithms have their own top-level sections in a config, `shac` and `ppo`; those from outside use
 `algorithm.settings`. Sources of SHAC's defaults: Xu et al. 2022, "Accelerated Policy Learning with Parallel
 Differentiable Simulation", arXiv:2204.07137, and the hyperparameters published with it.
 """
@@ -39,19 +39,19 @@ ALGORITHMS = Registry(
 
 
 class AlgorithmSettings(Section):
-    """The settings of an algorithm, and what it declares of itself."""
+    """The settings of an algorithm, and what it declares."""
 
     differentiates: ClassVar[bool] = True
-    """Whether it needs gradients of the simulation; without, it reads no setting of theirs."""
+    """Whether it needs gradients of the simulation; if not, it reads none of their settings."""
     reads_not: ClassVar[frozenset[str]] = frozenset()
     """Settings of the sections `actor` and `critic`, dotted, that it does not read."""
     packages: ClassVar[Mapping[str, str]] = {}
-    """Modules it needs that not every installation has, and what to install for each."""
+    """Optional modules that it needs, and what to install for each."""
     length: ClassVar[str | None] = None
-    """Its setting that says how many env steps a world takes in an epoch."""
+    """Its setting for the number of env steps that a world takes in an epoch."""
 
     def env_steps(self, nworld: int, epochs: int) -> int:
-        """The most env steps that so many epochs of W worlds can take.
+        """The largest number of env steps that a number of epochs of W worlds can take.
 
         Raises:
             ConfigError: the algorithm does not say.
@@ -62,7 +62,7 @@ class AlgorithmSettings(Section):
         )
 
     def shortened(self, epochs: int) -> dict[str, Any]:
-        """Settings that make each of `epochs` epochs last a second or so, to see that everything runs."""
+        """Settings that make each of `epochs` epochs last about a second, to check that everything runs."""
         return {}
 
     def shortest(self) -> dict[str, Any]:
@@ -70,14 +70,14 @@ class AlgorithmSettings(Section):
         return {}
 
     def check(self, config: Config) -> None:
-        """Refuse other sections' settings that do not go with these.
+        """Refuse settings of other sections that are incompatible with these.
 
         Raises:
-            ValueError: with what to write instead.
+            ValueError: the message says what to write instead.
         """
 
     def unread(self) -> dict[str, str]:
-        """Settings of this section, dotted, that nothing reads because of others, and what makes it so."""
+        """Settings of this section, dotted, that nothing reads because of others, and the reason for each."""
         return {}
 
 
@@ -97,7 +97,7 @@ class HorizonSchedule(Section):
 class AdaptiveHorizon(Section):
     """Rollout length that follows the gradient: longer while cotangents stay small, shorter when they grow.
 
-    After each epoch H ← H (target / p90)^rate within bounds, p90 being the 90th percentile of the state cotangents'
+    After each epoch H ← H (target / p90)^rate within bounds, where p90 is the 90th percentile of the state cotangents'
     norms in units of reward. Adaptive horizons are the idea of AHAC (Georgiev et al. 2024, arXiv:2405.17784), which
     follows a constraint on contact forces; this one follows the cotangents themselves.
     """
@@ -106,14 +106,14 @@ class AdaptiveHorizon(Section):
     shortest: Count = 4
     longest: Count = 64
     target: PositiveFloat
-    """Wanted 90th percentile of the cotangent norms, before any bound [reward]."""
+    """Target for the 90th percentile of the cotangent norms, before any bound [reward]."""
     rate: Annotated[float, Field(gt=0.0, le=1.0)] = 0.1
 
     @model_validator(mode="after")
     def _bounds(self) -> AdaptiveHorizon:
         if not self.shortest <= self.start <= self.longest:
             raise ValueError(
-                f"adaptive horizon: start {self.start} must lie between shortest {self.shortest} and longest "
+                f"adaptive horizon: start {self.start} must be between shortest {self.shortest} and longest "
                 f"{self.longest}"
             )
         return self
@@ -139,9 +139,9 @@ class EntropyConfig(Section):
     """Bonus α for the policy's entropy, as in SAPO (Xing et al. 2024, arXiv:2412.12089); values become soft values."""
 
     coefficient: PositiveFloat = 0.01
-    """α [reward per nat], or where it starts if there is a target."""
+    """α [reward per nat], or its initial value if there is a target."""
     target: float | None = None
-    """Entropy per action dimension [nat] that α is adapted to hold; null keeps α. Uniform actions have ln 2 = 0.69."""
+    """Entropy per action dimension [nat] to which α is adapted; null keeps α. Uniform actions have ln 2 = 0.69."""
     rate: PositiveFloat = 5e-3
     """Change of log α per epoch and nat of missing entropy."""
 
@@ -152,8 +152,8 @@ class ShacConfig(AlgorithmSettings):
     length: ClassVar[str | None] = "horizon"
 
     horizon: Horizon = 32
-    """Env steps H of a rollout the gradient flows through: constant, {start, end, epochs}, or by the gradient as
-    {start, target}."""
+    """Env steps H of a rollout through which the gradient flows: constant, {start, end, epochs}, or adapted to the
+    gradient by {start, target}."""
     gamma: Fraction = 0.99
     """Discount."""
     lam: Fraction = 0.95
@@ -161,7 +161,7 @@ class ShacConfig(AlgorithmSettings):
     critic_method: Literal["td-lambda", "one-step"] = "td-lambda"
     """Targets of the critic."""
     critic_iterations: Count = 16
-    """Passes over the rollout an epoch."""
+    """Passes over the rollout per epoch."""
     critic_batches: Count = 4
     """Minibatches a pass."""
     target_critic_alpha: Fraction = 0.2
@@ -169,23 +169,23 @@ class ShacConfig(AlgorithmSettings):
     actor_lr: PositiveFloat = 2e-3
     critic_lr: PositiveFloat = 2e-3
     lr_schedule: Literal["linear", "constant"] = "linear"
-    """`linear` goes from the given rate to `final_lr` at the last epoch."""
+    """`linear` decreases from the given rate to `final_lr` at the last epoch."""
     final_lr: PositiveFloat = 1e-5
     betas: tuple[Fraction, Fraction] = (0.7, 0.95)
     """Adam's moment decays."""
     actor_grad_norm: PositiveFloat | None = 1.0
-    """Norm the actor's gradient is clipped to; null leaves it."""
+    """Norm to which the actor's gradient is clipped; null: no clipping."""
     critic_grad_norm: PositiveFloat | None = 1.0
-    """Norm each critic's gradient is clipped to; null leaves it."""
+    """Norm to which each critic's gradient is clipped; null: no clipping."""
     state_bptt: bool = True
     """Let gradients flow through the state from one env step to the next; False cuts them after each step."""
     state_grad_clip: PositiveFloat | None = None
-    """Bound on each world's state cotangent between env steps, in units of reward; null leaves it.
+    """Bound on each world's state cotangent between env steps, in units of reward; null: no bound.
 
-    The loss is a mean over H·W, so a world's cotangent of norm c/(H·W) is what one reward of c would give.
+    The loss is a mean over H·W, so a cotangent of norm c/(H·W) in a world is what a single reward of c would give.
     """
     entropy: EntropyConfig | None = None
-    """Bonus for the policy's entropy; null gives none."""
+    """Bonus for the policy's entropy; null: none."""
     normalize_obs: bool = True
     """Normalise observations by their running mean and variance."""
     normalize_return: bool = False
@@ -195,7 +195,7 @@ class ShacConfig(AlgorithmSettings):
     """Share of worlds whose gradient may be non-finite in an epoch before the trial stops with an error."""
 
     def env_steps(self, nworld: int, epochs: int) -> int:
-        """The sum over epochs of horizon × worlds; an adaptive horizon counts with its `longest`."""
+        """The sum over epochs of horizon × worlds; an adaptive horizon counts as its `longest`."""
         horizon = self.horizon
         if isinstance(horizon, HorizonSchedule):
             return nworld * sum(horizon.at(epoch) for epoch in range(epochs))
@@ -263,25 +263,25 @@ class PpoConfig(AlgorithmSettings):
     minibatches: Count = 4
     """Minibatches a pass."""
     clip: PositiveFloat = 0.2
-    """Bound on how far the ratio of new to old probabilities, and the value, may move in an epoch."""
+    """Bound on how much the ratio of new to old probabilities, and the value, may change in an epoch."""
     clip_value: bool = True
-    """Whether the value is bounded so, too."""
+    """Whether the value is bounded too."""
     gamma: Fraction = 0.99
     """Discount."""
     lam: Fraction = 0.95
     """λ of the generalised advantage estimate."""
     lr: PositiveFloat = 1e-3
-    """Adam's rate, or where it starts if it is adaptive."""
+    """Adam's rate, or its initial value if it is adaptive."""
     lr_schedule: Literal["adaptive", "constant"] = "adaptive"
     """`adaptive` divides or multiplies the rate by 1.5, between 1e-5 and 1e-2, to hold `desired_kl`."""
     desired_kl: PositiveFloat = 0.01
     """Divergence of the new policy from the old one [nat]."""
     value_coefficient: PositiveFloat = 1.0
-    """Weight of the value's loss beside the policy's."""
+    """Weight of the value's loss relative to the policy's."""
     entropy_coefficient: NonNegative = 0.0
     """Weight of the bonus for the policy's entropy."""
     grad_norm: PositiveFloat = 1.0
-    """Norm that the gradients of policy and value are each clipped to."""
+    """Norm to which the gradients of policy and value are each clipped."""
     init_std: PositiveFloat = 1.0
     """Initial standard deviation of actions."""
     normalize_obs: bool = True
@@ -338,7 +338,7 @@ def _settings_from_outside(value: Any, info: ValidationInfo) -> Any:
         if value == {}:
             return AlgorithmSettings()
         first = f".{next(iter(value))}" if isinstance(value, Mapping) else ""
-        raise ValueError(f"algorithm.settings: the settings of {name} are a section of their own; write {name}{first}")
+        raise ValueError(f"algorithm.settings: the settings of {name} have their own section; write {name}{first}")
     try:
         settings = settings_from_outside(name)
     except ConfigError as error:
@@ -354,7 +354,7 @@ class AlgorithmConfig(Section):
     settings: Annotated[SerializeAsAny[AlgorithmSettings], BeforeValidator(_settings_from_outside)] = (
         AlgorithmSettings()
     )
-    """Of an algorithm from outside, as its class declares them. Those of shac and ppo are in their own sections."""
+    """Settings of an algorithm from outside, declared by its class. Those of shac and ppo have their own sections."""
 
 
 def settings_from_outside(name: Any) -> type[AlgorithmSettings]:
@@ -374,7 +374,7 @@ def check_installed(algorithm: AlgorithmConfig, settings: AlgorithmSettings) -> 
     """Refuse an algorithm whose packages are not installed.
 
     Raises:
-        ConfigError: naming what to install.
+        ConfigError: the message names what to install.
     """
     for module, install in settings.packages.items():
         if find_spec(module) is None:

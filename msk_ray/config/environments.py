@@ -29,8 +29,8 @@ SETTINGS = Registry(
         "myoleg": "msk_ray.envs.myoleg.config:MyoLegSettings",
     },
 )
-"""Settings that can be imported without their environment, which loads torch. A name that is only in `ENVIRONMENTS` has
-those of its class."""
+"""Settings that can be imported without their environment, which loads torch. A name that is only in `ENVIRONMENTS`
+uses the settings of its class."""
 
 
 def settings_class(name: Any) -> type[EnvSettings]:

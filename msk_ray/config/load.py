@@ -1,4 +1,4 @@
-"""Reading configurations: YAML in, a checked `Config` out, or one line saying what to write instead."""
+"""Read configurations: from YAML to a checked `Config`, or one line that says what to write instead."""
 
 import contextlib
 import difflib
@@ -22,7 +22,7 @@ def parse_config(data: Mapping[str, Any], source: str = "config") -> Config:
     """Check nested plain data and freeze it. `source` names it in errors.
 
     Raises:
-        ConfigError: with the first fault on one line.
+        ConfigError: with the first error on one line.
     """
     try:
         return Config.model_validate(data)
@@ -31,12 +31,12 @@ def parse_config(data: Mapping[str, Any], source: str = "config") -> Config:
 
 
 def parse_recorded(data: Mapping[str, Any], source: str) -> Config:
-    """The configuration that a trial's files hold, written by this version or an earlier one.
+    """The configuration in a trial's files, written by this version or an earlier one.
 
-    Settings that nothing read then, and that are refused now, come back at their defaults.
+    Settings that nothing read then, and that are refused now, get their defaults.
 
     Raises:
-        ConfigError: as `parse_config`.
+        ConfigError: as for `parse_config`.
     """
     settings = current_settings(data, env_name(data)) if isinstance(data, Mapping) else data
     try:
@@ -48,12 +48,12 @@ def parse_recorded(data: Mapping[str, Any], source: str) -> Config:
 
 
 def read_config(path: Path) -> dict[str, Any]:
-    """The settings of a config file laid over those of the file its `extends` names, if any, in today's spelling.
+    """The settings of a config file merged into those of the file that it `extends`, if any, in the current spelling.
 
-    `extends` is a path relative to the file, and goes one level deep: what is extended may not extend another.
+    `extends` is a path relative to the file, and only one level deep: an extended file may not extend another.
 
     Raises:
-        ConfigError: as `read_yaml`, or a chain of `extends`.
+        ConfigError: as for `read_yaml`, or a chain of `extends`.
     """
     data = read_yaml(path)
     base_name = data.pop("extends", None)
@@ -71,7 +71,7 @@ def load_config(path: Path, overrides: Iterable[str] = ()) -> Config:
     """Read a config file and apply "a.b=value" overrides to it.
 
     Raises:
-        ConfigError: as `read_config`, `parse_override`, `parse_config` and `refuse_ignored`.
+        ConfigError: as for `read_config`, `parse_override`, `parse_config` and `refuse_ignored`.
     """
     values = parse_overrides(overrides)
     config = parse_config(overlay(read_config(path), values), str(path))
@@ -82,10 +82,11 @@ def load_config(path: Path, overrides: Iterable[str] = ()) -> Config:
 def refuse_ignored(values: Mapping[str, Any], configs: Iterable[Config], source: str) -> None:
     """Refuse dotted settings that the algorithm of none of the trials reads. `source` names them in errors.
 
-    A file may hold settings for algorithms that the trial does not run; what is said of the trial itself may not.
+    A file may hold settings for algorithms that the trial does not run, but settings given for the trial itself may
+    not.
 
     Raises:
-        ConfigError: naming the first of them.
+        ConfigError: the message names the first of them.
     """
     ignored = {config.algorithm.name: config.ignored for config in configs}
     for leaf in (leaf for key, value in values.items() for leaf in leaves(key, value)):
@@ -97,11 +98,11 @@ def refuse_ignored(values: Mapping[str, Any], configs: Iterable[Config], source:
 
 
 def _named(data: Any) -> dict[str, type[BaseModel]]:
-    """Sections, dotted, whose settings are declared by what `name` beside them names, as far as it is found."""
+    """Sections, dotted, whose settings are declared by the class of the `name` beside them, if it can be found."""
     found: dict[str, type[BaseModel]] = {}
     if not isinstance(data, Mapping):
         return found
-    with contextlib.suppress(ConfigError):  # the fault described is this one
+    with contextlib.suppress(ConfigError):  # this is the error that is described
         found["env"] = settings_class(env_name(data))
     algorithm = data.get("algorithm")
     name = algorithm.get("name") if isinstance(algorithm, Mapping) else None
@@ -114,17 +115,17 @@ def _named(data: Any) -> dict[str, type[BaseModel]]:
 def describe_fault(
     error: ValidationError, root: type[BaseModel] = Config, *, named: Mapping[str, type[BaseModel]] | None = None
 ) -> str:
-    """The first fault found while validating a `root`, and how many more there are, on one line.
+    """The first error found while validating a `root`, and how many more there are, on one line.
 
     Args:
-        error: what validating raised.
+        error: the error that the validation raised.
         root: the class validated.
-        named: of sections of `root`, dotted, that are open: the class that was taken.
+        named: open sections of `root`, dotted, with the class that each was validated as.
     """
     faults = error.errors()
-    # A misspelt key is often missing under its right name too; the misspelling is what to mend.
+    # A misspelt key is often missing under its right name too; report the misspelling.
     first = min(faults, key=lambda fault: fault["type"] != "extra_forbidden")
-    # Discriminated unions put the tag into the location; it is no key of the file.
+    # Discriminated unions put the tag into the location; it is not a key of the file.
     location = [shortened(str(part)) for part in first["loc"] if part not in _TAGS]
     where = ".".join(location)
     if first["type"] == "extra_forbidden":
@@ -145,14 +146,14 @@ def describe_fault(
         text = f"{where}: {first['msg']}, not {brief(first['input'])}"
     more = len(faults) - 1
     text = shortened(" ".join(text.split()), _MAX_MESSAGE)
-    return text + (f" (and {more} more fault{'s' if more > 1 else ''})" if more else "")
+    return text + (f" (and {more} more error{'s' if more > 1 else ''})" if more else "")
 
 
 _MAX_MESSAGE = 400
 
 
 _TAGS = ("constant", "schedule", "adaptive")
-"""Tags of discriminated unions, which pydantic puts into a fault's location."""
+"""Tags of discriminated unions, which pydantic puts into an error's location."""
 
 
 def _is_model(kind: Any) -> bool:
@@ -171,7 +172,7 @@ def _subsection_with(section: type[BaseModel], key: str, named: Mapping[str, typ
 def _model_at(
     root: type[BaseModel], sections: list[str], location: tuple[Any, ...], named: Mapping[str, type[BaseModel]]
 ) -> type[BaseModel]:
-    """The section of `root` a fault lies in."""
+    """The section of `root` that contains an error."""
     model: Any = root
     for depth, section in enumerate(sections):
         dotted = ".".join(sections[: depth + 1])

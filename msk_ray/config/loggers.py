@@ -17,19 +17,19 @@ LOGGERS = Registry(
 )
 """Classes of loggers."""
 _PACKAGES: Mapping[str, str] = {"wandb": "msk-ray[wandb]", "mlflow": "msk-ray[mlflow]"}
-"""Packages of the same name as their logger that not every installation has, and what to install."""
+"""Optional packages with the same name as their logger, and what to install."""
 
 
 def logger_paths(names: Sequence[str]) -> list[str]:
     """The import paths of loggers.
 
     Raises:
-        ConfigError: there is none of a name, one is named twice, or its package is not installed.
+        ConfigError: a name is unknown or given twice, or its package is not installed.
     """
     paths = [LOGGERS.path(name) for name in names]
     for name, path in zip(names, paths, strict=True):
         if paths.count(path) > 1:
-            raise ConfigError(f"trial.loggers: {name} is named twice; write it once")
+            raise ConfigError(f"trial.loggers: {name} is given twice; write it once")
         if name in _PACKAGES and find_spec(name) is None:
             raise ConfigError(f"trial.loggers: {name} is not installed: pip install '{_PACKAGES[name]}'")
     return paths

@@ -1,8 +1,8 @@
-"""Laying settings over settings: the one rule that `--set`, `extends` and search spaces follow.
+"""Merge settings: the one rule that `--set`, `extends` and search spaces follow.
 
-A mapping is laid over the section that stands there, key by key; anything else replaces what stands there. Where a
-setting takes mappings of several kinds (`shac.horizon`; `env` and `algorithm`, by their `name`), a mapping of another
-kind replaces the old one, so that kinds never mix. `null` takes a section away.
+A mapping is merged into the existing section key by key; any other value replaces the existing one. Where a setting
+accepts mappings of several kinds (`shac.horizon`; `env` and `algorithm`, by their `name`), a mapping of another kind
+replaces the old one, so that kinds never mix. `null` removes a section.
 """
 
 import copy
@@ -14,9 +14,8 @@ from msk_ray.config.yaml_text import MAX_DEPTH, parse_yaml
 from msk_ray.errors import ConfigError, brief, shortened
 
 SET_HELP = (
-    "override a setting, KEY being dotted and VALUE YAML; a mapping is laid over the section KEY names, keeping the "
-    "section's other settings (shac.entropy={target: 0.5} keeps coefficient), unless it is of another kind; null takes "
-    "the section away"
+    "override a setting: KEY is dotted, VALUE is YAML. A mapping is merged into the section KEY, keeping its other "
+    "settings (shac.entropy={target: 0.5} keeps coefficient), unless it is of another kind; null removes the section"
 )
 
 
@@ -33,18 +32,18 @@ def parse_override(text: str) -> tuple[str, Any]:
 
 
 def parse_overrides(texts: Iterable[str]) -> dict[str, Any]:
-    """What several "a.b=value" say together, in order, for `overlay`.
+    """Several "a.b=value" combined in order, for `overlay`.
 
     Raises:
-        ConfigError: as `parse_override`.
+        ConfigError: as for `parse_override`.
     """
     return combine({}, [parse_override(text) for text in texts])
 
 
 def combine(first: Mapping[str, Any], then: Iterable[tuple[str, Any]]) -> dict[str, Any]:
-    """Dotted keys and values that say what `first` and afterwards `then` say.
+    """Dotted keys and values equivalent to `first` followed by `then`.
 
-    A key said twice comes in its last place, mappings laid over each other.
+    A key that occurs twice takes its last position, with mappings merged.
     """
     combined = dict(first)
     for key, value in then:
@@ -63,7 +62,7 @@ def overlay(settings: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str,
     for dotted, value in values.items():
         path = dotted.split(".")
         if len(path) > MAX_DEPTH:
-            raise ConfigError(f"{shortened(dotted)}: no setting lies {len(path)} sections deep")
+            raise ConfigError(f"{shortened(dotted)}: no setting is {len(path)} sections deep")
         node = result
         for section in path[:-1]:
             if node.get(section) is None:
@@ -77,7 +76,7 @@ def overlay(settings: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str,
 
 
 def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """`over` laid over `base`, section by section."""
+    """`over` merged into `base`, section by section."""
     merged: dict[str, Any] = _laid_over([], dict(base), over)
     return merged
 

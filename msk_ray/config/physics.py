@@ -19,9 +19,9 @@ STEPPING = frozenset(
 GRADIENTS = frozenset(
     (*("backward", "substep_grad_clip"), *("fd.eps_ctrl", "fd.eps_qpos", "fd.eps_qvel", "fd.eps_act", "fd.max_worlds"))
 )
-"""Settings that say how steps are differentiated."""
+"""Settings of how steps are differentiated."""
 SOLVING = frozenset(("tolerance", "iterations", "ls_iterations", "cone", "impratio", "nconmax", "njmax"))
-"""Those of the constraint solver, which a model without contacts and limits does without."""
+"""Those of the constraint solver, which a model without contacts and limits does not need."""
 CONTACTS = frozenset(("solref", "solimp", "friction", "solreffriction"))
 """Those of contacts, in models that declare their own."""
 LIMITS = frozenset(("solref_limit", "solimp_limit"))
@@ -44,7 +44,7 @@ class FdConfig(Section):
     eps_act: PositiveFloat = 5e-4
     """Perturbation of act [its own unit]."""
     max_worlds: Count = 131072
-    """Perturbed copies run at once; more are done in chunks."""
+    """Number of perturbed copies that run at the same time; more are processed in chunks."""
 
 
 class PhysicsConfig(Section):
@@ -56,10 +56,10 @@ class PhysicsConfig(Section):
     """Backward mode of the step. `tape_*` are exact; `fd_jacobian` differentiates any model by finite differences;
     `hybrid` takes the state's gradient from the tape and the control's from finite differences, for diagnosis."""
     substep_grad_clip: PositiveFloat | None = None
-    """Bound on each world's state cotangent between substeps, in the loss's own units; null leaves it. Tapes only."""
+    """Bound on each world's state cotangent between substeps, in units of the loss; null: no bound. Tapes only."""
     fd: FdConfig = FdConfig()
     substeps: Count | None = None
-    """Physics steps an env step. Set this or `timestep`; 4 if neither is set."""
+    """Physics steps per env step. Set this or `timestep`; 4 if neither is set."""
     timestep: PositiveFloat | None = None
     """Duration of a physics step [s]; must divide the env's control_timestep."""
     tolerance: PositiveFloat | None = None
@@ -80,7 +80,7 @@ class PhysicsConfig(Section):
     friction: PositiveFloat | None = None
     """Sliding friction coefficient."""
     solreffriction: Vec2 | None = None
-    """Solver reference of the friction directions alone [s, ratio], set on contact pairs; needs the elliptic cone.
+    """Solver reference of only the friction directions [s, ratio], set on contact pairs; needs the elliptic cone.
 
     Friction acts like a damper with this time constant: (0.02, 1) sticks, (1, 1) is viscous. `(0, 0)` uses solref.
     """
@@ -95,15 +95,15 @@ class PhysicsConfig(Section):
     gear: PositiveFloat | None = None
     """Force or torque of a motor at full control [N, N m]."""
     nconmax: Count | None = None
-    """Contacts a world; null takes a bound from the geometry or, where that is large, tries the model out and lets the
-    room grow with use. What is given does not grow."""
+    """Contacts per world; null: a bound from the geometry or, if that is large, the result of a probe, which grows with
+    use. A given number does not grow."""
     njmax: Count | None = None
-    """Constraint rows a world; null as for nconmax."""
+    """Constraint rows per world; null as for nconmax."""
 
     @model_validator(mode="after")
     def _friction_direction_needs_ellipse(self) -> "PhysicsConfig":
         if self.solreffriction is not None and self.cone == "pyramidal":
-            raise ValueError("solreffriction acts with the elliptic cone only: write cone: elliptic")
+            raise ValueError("solreffriction only acts with the elliptic cone: write cone: elliptic")
         return self
 
     @classmethod
@@ -112,7 +112,7 @@ class PhysicsConfig(Section):
         return [*(name for name in cls.model_fields if name != "fd"), *(f"fd.{name}" for name in FdConfig.model_fields)]
 
     def resolve_substeps(self, control_timestep: float) -> int:
-        """Physics steps an env step of `control_timestep` [s].
+        """Physics steps per env step of `control_timestep` [s].
 
         Raises:
             ValueError: `timestep` does not divide it, or `substeps` and `timestep` disagree.

@@ -1,7 +1,7 @@
-"""Settings as earlier versions wrote them: the one place that turns old spellings into today's.
+"""Settings written by earlier versions: the one place that converts old spellings to the current one.
 
-Until November 2026 the weights of the reward stood among the other settings of `env`; now they are `env.reward`. Files
-are read in either spelling; what is typed is refused in the old one.
+Until November 2026 the reward weights were among the other settings of `env`; now they are `env.reward`. Files are read
+in either spelling; on the command line the old one is refused.
 """
 
 from collections.abc import Mapping
@@ -24,14 +24,14 @@ _ONCE_FLAT: dict[str, tuple[str, ...]] = {
 
 
 def env_name(settings: Mapping[str, Any]) -> str | None:
-    """The environment that nested settings name, if they do."""
+    """The name of the environment in nested settings, if there is one."""
     env = settings.get("env")
     name = env.get("name") if isinstance(env, Mapping) else None
     return name if isinstance(name, str) else None
 
 
 def current_settings(settings: Mapping[str, Any], name: str | None) -> dict[str, Any]:
-    """Nested settings of environment `name` in today's spelling."""
+    """Nested settings of environment `name` in the current spelling."""
     moved = _ONCE_FLAT.get(name or "", ())
     env = settings.get("env")
     if not isinstance(env, Mapping) or "reward" in env or not any(key in env for key in moved):
@@ -42,13 +42,13 @@ def current_settings(settings: Mapping[str, Any], name: str | None) -> dict[str,
 
 
 def current_key(dotted: str, name: str | None) -> str:
-    """A dotted key of environment `name` in today's spelling."""
+    """A dotted key of environment `name` in the current spelling."""
     section, _, key = dotted.partition(".")
     return f"env.reward.{key}" if section == "env" and key in _ONCE_FLAT.get(name or "", ()) else dotted
 
 
 def current_values(values: Mapping[str, Any], name: str | None) -> dict[str, Any]:
-    """Dotted keys and what they are set to, for environment `name`, in today's spelling."""
+    """Dotted keys and their values, for environment `name`, in the current spelling."""
     return {
         current_key(key, name): current_settings({"env": value}, name)["env"] if key == "env" else value
         for key, value in values.items()
@@ -56,9 +56,9 @@ def current_values(values: Mapping[str, Any], name: str | None) -> dict[str, Any
 
 
 def first_spelling(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """A complete configuration's plain data as the first version wrote it, which trials' ids are hashes of.
+    """A complete configuration's plain data in the form of the first version, whose hashes are the trials' ids.
 
-    So a trial keeps its id from version to version. A setting that comes later belongs in `_LATER`.
+    This way a trial keeps its id in every version. A setting that was added later belongs in `_LATER`.
     """
     env = dict(settings["env"])
     if env["name"] in _ONCE_FLAT:
@@ -77,4 +77,4 @@ _LATER: dict[tuple[str, str], Any] = {
     ("trial", "loggers"): ["tensorboard"],
     ("algorithm", "name"): "shac",
 }
-"""Settings that the first version did not have, (section, name), with the default at which they leave ids alone."""
+"""Settings that the first version did not have, (section, name), with the default that leaves ids unchanged."""

@@ -13,14 +13,14 @@ T = TypeVar("T")
 
 
 def resolve(path: str, key: str) -> Any:
-    """What stands at the import path `package.module:Name`.
+    """The object at the import path `package.module:Name`.
 
     Args:
         path: the import path.
-        key: the setting it was written in, for errors.
+        key: the setting that contains it, for errors.
 
     Raises:
-        ConfigError: it is no such path, the module is not found or fails while it is imported, or has no such name.
+        ConfigError: it is not such a path, the module is not found, fails during its import, or has no such name.
     """
     module_name, _, attribute = path.partition(":")
     if not all(part.isidentifier() for part in (*module_name.split("."), attribute)):
@@ -48,11 +48,11 @@ def resolve_class(path: str, key: str, base: type[T]) -> type[T]:
     """The class at an import path, a subclass of `base`.
 
     Raises:
-        ConfigError: as `resolve`, or what stands there is something else.
+        ConfigError: as for `resolve`, or the object is not such a class.
     """
     found = resolve(path, key)
     if not (isinstance(found, type) and issubclass(found, base)):
-        raise ConfigError(f"{key}: {path} is no subclass of {base.__module__}.{base.__qualname__}")
+        raise ConfigError(f"{key}: {path} is not a subclass of {base.__module__}.{base.__qualname__}")
     return found
 
 
@@ -67,12 +67,12 @@ def _broken(module: str, key: str, error: Exception) -> ConfigError:
 class Registry:
     """Import paths by short name: the package's own, and those of installed packages.
 
-    A name of the package's own cannot be taken by another.
+    Another package cannot take one of the package's own names.
 
     Args:
         key: the setting that takes the names, for errors.
         group: the entry-point group in which installed packages declare theirs.
-        own: the package's.
+        own: the package's own.
     """
 
     def __init__(self, key: str, group: str, own: Mapping[str, str]) -> None:
@@ -88,7 +88,7 @@ class Registry:
         """The import path of a short name; None if there is none of that name.
 
         Raises:
-            ConfigError: installed packages disagree about what it stands for.
+            ConfigError: installed packages declare it differently.
         """
         if name in self._own:
             return self._own[name]

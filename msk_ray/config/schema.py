@@ -41,7 +41,7 @@ def _declared_settings(value: Any, info: ValidationInfo) -> Any:
 
 
 class ContactStart(Section):
-    """Contact physics at the start of a curriculum; fields left null stay as the trial's physics has them."""
+    """Contact physics at the start of a curriculum; fields left null have the values of the trial's physics."""
 
     solref: tuple[PositiveFloat, PositiveFloat] | None = None
     """Contact time constant [s] and damping ratio."""
@@ -59,13 +59,13 @@ class ContactStart(Section):
 
 
 class ContactCurriculum(Section):
-    """Train first in softer contacts, and go over to those of `physics` step by step."""
+    """Train with softer contacts first, and move to those of `physics` step by step."""
 
     start: ContactStart
     epochs: Count
-    """Steps from `start` to the trial's physics, one an epoch."""
+    """Steps from `start` to the trial's physics, one per epoch."""
     reward: float | None = None
-    """Mean reward per env step an epoch must reach for a step to be taken; null takes one every epoch."""
+    """Mean reward per env step that an epoch must reach for a step to be taken; null: one step every epoch."""
 
 
 class NetworkConfig(Section):
@@ -85,46 +85,46 @@ class ActorConfig(NetworkConfig):
     log_std: float = -1.0
     """Initial log standard deviation, before tanh."""
     output_gain: PositiveFloat = 1.0
-    """Gain of the last layer's initial weights; a small one starts from action 0, whatever is observed."""
+    """Gain of the last layer's initial weights; a small gain starts near action 0 for every observation."""
 
 
 class CriticConfig(NetworkConfig):
     """Value network(s)."""
 
     count: Annotated[int, Field(ge=1, le=2)] = 1
-    """Critics trained; with two, the smaller value is used."""
+    """Number of critics; with two, the smaller value is used."""
 
 
 class EvaluationConfig(Section):
-    """Deterministic evaluation on fixed seeds: the only thing policies are ranked by."""
+    """Deterministic evaluation on fixed seeds, by which alone policies are ranked."""
 
     interval: Count = 10
     """Epochs between evaluations."""
     nworld: Count = 64
     steps: Count | None = None
-    """Env steps; null takes the env's episode length."""
+    """Env steps; null: the env's episode length."""
     seed: Whole = 1234
     variant: Text | None = None
-    """Physics the score is taken under; null takes the env's reference physics."""
+    """Physics of the score; null: the env's reference physics."""
 
 
 class TrialConfig(Section):
-    """How long, from which seed, and how often to save."""
+    """Length, seed, and saving of a trial."""
 
     epochs: Count = 500
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
     start_from: Text | None = None
-    """Checkpoint of another trial whose networks and observation statistics this one starts from, such as a best.pt;
-    null starts from random ones. Optimisers and worlds are new either way."""
+    """Checkpoint of another trial, such as a best.pt, from whose networks and observation statistics this one starts;
+    null starts from random networks. Optimisers and worlds are new either way."""
     checkpoint_interval: Count = 10
     """Epochs between checkpoints."""
     keep_checkpoints: Annotated[int, Field(ge=2)] = 2
-    """Newest checkpoints kept, beside the best."""
+    """Number of newest checkpoints kept, in addition to the best."""
     loggers: Annotated[tuple[Text, ...], Field(max_length=16)] = ("tensorboard",)
-    """Where rows go beside `metrics.jsonl`: `tensorboard`, `wandb`, `mlflow`, or package.module:Class."""
+    """Loggers in addition to `metrics.jsonl`: `tensorboard`, `wandb`, `mlflow`, or package.module:Class."""
     threads: Count = 1
-    """Threads that torch computes with on the CPU. Sums depend on their number, and so do the figures of a trial: it is
-    this setting's, never the machine's. Networks of a few hundred units gain nothing by more than one."""
+    """Number of CPU threads of torch. Sums, and so the results of a trial, depend on it; therefore it comes from this
+    setting, never from the machine. Networks of a few hundred units gain nothing from more than one."""
 
     @field_validator("loggers")
     @classmethod
@@ -138,7 +138,7 @@ class TrialConfig(Section):
 
 
 RECORDED = "recorded"
-"""Context of validation in which settings that nothing reads are let through: earlier versions let them be written."""
+"""Context of validation in which settings that nothing reads are accepted, because earlier versions allowed them."""
 
 
 class Config(Section):
@@ -147,7 +147,7 @@ class Config(Section):
     env: Annotated[SerializeAsAny[EnvSettings], BeforeValidator(_declared_settings)]
     physics: PhysicsConfig = PhysicsConfig()
     curriculum: ContactCurriculum | None = None
-    """Softer contacts to begin with; null trains in `physics` from the start."""
+    """Softer contacts at the start; null trains with `physics` from the start."""
     algorithm: AlgorithmConfig = AlgorithmConfig()
     shac: ShacConfig = ShacConfig()
     ppo: PpoConfig = PpoConfig()
@@ -166,17 +166,17 @@ class Config(Section):
 
     @property
     def algorithm_section(self) -> str:
-        """Where those stand, dotted."""
+        """The section of those settings, dotted."""
         return self.algorithm.name if self.algorithm.name in BUILT_IN else "algorithm.settings"
 
     @property
     def ignored(self) -> list[str]:
-        """Sections and settings, dotted, that the trial's algorithm does not read. They stand at their defaults."""
+        """Sections and settings, dotted, that the trial's algorithm does not read. They have their defaults."""
         return ignored_settings(self.algorithm.name, self.algorithm_settings)
 
     @model_validator(mode="after")
     def _without_what_the_algorithm_ignores(self) -> "Config":
-        # A base config can serve several algorithms: what is written for the others is not of this trial.
+        # A base config can serve several algorithms: settings for the others are not part of this trial.
         for key in self.ignored:
             section, *path = key.split(".")
             self.__dict__[section] = _at_default(self, section, path)

@@ -1,4 +1,4 @@
-"""What all groups of settings are made of."""
+"""The base classes and types of all groups of settings."""
 
 from functools import cache
 from typing import Annotated, Any, ClassVar, get_args
@@ -8,9 +8,9 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validato
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 NonNegative = Annotated[float, Field(ge=0.0)]
 Count = Annotated[int, Field(gt=0, lt=2**31)]
-"""A number of things, at least one; what Warp and CUDA can count."""
+"""A count of at least one, within the range of Warp and CUDA."""
 Whole = Annotated[int, Field(ge=0, lt=2**31)]
-"""A whole number from 0 on."""
+"""A whole number of at least 0."""
 Text = Annotated[str, Field(max_length=4096)]
 
 
@@ -22,7 +22,7 @@ class Section(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _no_truth_for_numbers(cls, data: Any) -> Any:
-        # Python takes True for 1. Here, before anything is converted, it is made something that no number is.
+        # Python accepts True as 1. Here, before any conversion, it is replaced by something that is not a number.
         if not isinstance(data, dict):
             return data
         numeric = _without_truth(cls)
@@ -30,7 +30,7 @@ class Section(BaseModel):
 
 
 class _NotANumber:
-    """Stands for a `true` or `false` where neither is meant, until it is refused."""
+    """Stands for a `true` or `false` where neither is allowed, until it is refused."""
 
     def __init__(self, value: bool) -> None:
         self._value = value
@@ -49,7 +49,7 @@ def _no_number(value: Any) -> Any:
 
 @cache
 def _without_truth(section: type[Section]) -> frozenset[str]:
-    """Fields that take neither true nor false."""
+    """Fields that accept neither true nor false."""
     return frozenset(name for name, field in section.model_fields.items() if not _takes_truth(field.annotation))
 
 
@@ -58,33 +58,32 @@ def _takes_truth(annotation: Any) -> bool:
 
 
 class Reward(Section):
-    """The weights and shapes of an environment's reward. Their defaults are the reference reward: what policies are
-    scored under, whatever they were trained on."""
+    """The weights and shapes of an environment's reward. Their defaults are the reference reward, under which policies
+    are scored whatever they were trained on."""
 
 
 class EnvSettings(Section):
-    """What every environment has, and what it declares of itself."""
+    """The settings of every environment, and what it declares."""
 
     variants: ClassVar[tuple[str, ...]] = ()
-    """Named physics of the environment, the one that policies are scored under first."""
+    """Named physics of the environment; the first is the one that policies are scored under."""
     pyramidal_variants: ClassVar[frozenset[str]] = frozenset()
-    """Those of them whose friction cone is a pyramid unless `physics.cone` says otherwise."""
+    """The named physics whose friction cone is a pyramid unless `physics.cone` says otherwise."""
     reads_physics: ClassVar[frozenset[str]]
-    """Settings of the physics section that do something here, `fd.eps_act` for one within a section; others are
-    refused."""
+    """Settings of the physics section that it reads, dotted if nested, such as `fd.eps_act`; others are refused."""
 
     name: Text
-    """Of the environment: a short name, or package.module:Class."""
+    """The environment: a short name, or package.module:Class."""
     nworld: Count = 64
-    """Worlds W simulated at once."""
+    """Number of worlds W."""
     episode_length: Count
     """Env steps after which an episode is truncated."""
     control_timestep: PositiveFloat = 1.0 / 60.0
     """Duration of an env step [s]."""
     stochastic_reset: bool = True
-    """Draw the initial state at random; False starts every episode in the same state."""
+    """Draw random initial states; False starts every episode in the same state."""
     reward: Reward = Reward()
 
     def unread(self) -> dict[str, str]:
-        """Settings of this section, dotted, that nothing reads because of others, and what makes it so."""
+        """Settings of this section, dotted, that nothing reads because of others, and the reason for each."""
         return {}

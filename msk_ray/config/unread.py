@@ -1,6 +1,6 @@
-"""Settings that do nothing in a trial, because its environment or another setting leaves them unread.
+"""Settings that have no effect in a trial, because its environment or another setting leaves them unread.
 
-They are refused: a sweep over one would be many names for one trial.
+They are refused, because a sweep over one would run the same trial under many names.
 """
 
 from __future__ import annotations

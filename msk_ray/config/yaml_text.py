@@ -1,4 +1,5 @@
-"""The one reader of YAML: plain data only, within limits, so that no file can hang or exhaust the program."""
+"""The one reader of YAML: only plain data, within limits, so that no file can hang the program or exhaust its
+memory."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,32 +10,32 @@ import yaml
 from msk_ray.errors import ConfigError, brief, shortened
 
 MAX_BYTES = 1 << 20
-"""Largest file or value [B]: a space of thousands of variants is a tenth of it."""
+"""Largest file or value [B]: a space of thousands of variants takes a tenth of it."""
 MAX_DEPTH = 32
-"""Mappings and lists inside each other."""
+"""Largest nesting depth of mappings and lists."""
 MAX_NODES = 200_000
-"""Values after aliases (`*name`) are written out."""
+"""Largest number of values after aliases (`*name`) are expanded."""
 MAX_INTEGER = 1 << 63
 
 
 class _NotSettings(yaml.YAMLError):
-    """A document is more than settings may be."""
+    """A document exceeds the limits for settings."""
 
 
 class _Loader(yaml.SafeLoader):
-    """PyYAML's safe loader, with limits on what a document expands to, and without keys that are written twice."""
+    """PyYAML's safe loader, with limits on the expanded size of a document, and without duplicate keys."""
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
         self._depth = 0
         self._extent: dict[yaml.Node, tuple[int, int]] = {}
-        """Values in and depth below each node that has been read, its aliases written out."""
+        """Number of values in, and depth below, each node that has been read, with aliases expanded."""
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         alias = self.check_event(yaml.AliasEvent)
         tag = getattr(self.peek_event(), "tag", None)
         if tag not in (None, "!"):
-            raise _NotSettings(f"settings are plain data; leave the tag {brief(tag)} out")
+            raise _NotSettings(f"settings are plain data; leave out the tag {brief(tag)}")
         self._depth += 1
         if self._depth > MAX_DEPTH:
             raise _NotSettings(f"more than {MAX_DEPTH} mappings and lists inside each other")
@@ -71,7 +72,7 @@ class _Loader(yaml.SafeLoader):
 
 
 _Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
-# A date is text: no setting is one, and one that does not exist could not be read.
+# A date is read as text: no setting is a date, and an invalid one could not be read.
 _Loader.yaml_implicit_resolvers = {
     first: [(tag, pattern) for tag, pattern in resolvers if tag != "tag:yaml.org,2002:timestamp"]
     for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
@@ -79,7 +80,7 @@ _Loader.yaml_implicit_resolvers = {
 
 
 def _check_keys(node: yaml.MappingNode) -> None:
-    """Refuse a key that is written twice, of which YAML would take the last."""
+    """Refuse a duplicate key, of which YAML would take the last value."""
     seen: set[tuple[str, str]] = set()
     for key, _ in node.value:
         if not isinstance(key, yaml.ScalarNode):
@@ -93,7 +94,7 @@ def parse_yaml(text: str, source: str) -> Any:
     """Plain data from YAML text. `source` names it in errors.
 
     Raises:
-        ConfigError: it is no YAML, holds something else than plain data, a key twice, or exceeds the limits.
+        ConfigError: it is not YAML, holds anything but plain data, has a duplicate key, or exceeds the limits.
     """
     if len(text) > MAX_BYTES:
         raise ConfigError(f"{source} is larger than {MAX_BYTES} bytes: too large for settings")

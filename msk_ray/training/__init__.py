@@ -1,4 +1,4 @@
-"""One trial: train, evaluate, log, checkpoint, resume. Knows nothing of Ray."""
+"""One trial: train, evaluate, log, checkpoint, resume. Independent of Ray."""
 
 from msk_ray.experiment.metrics import read_metrics
 from msk_ray.training.checkpoint import newest_valid_checkpoint, read_checkpoint

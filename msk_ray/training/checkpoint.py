@@ -1,4 +1,4 @@
-"""Checkpoints that are either whole or not there: PyTorch states in files that vouch for themselves."""
+"""Checkpoints that are either complete or absent: PyTorch states in files with their own checksums."""
 
 import io
 import re
@@ -15,10 +15,11 @@ _POLICY_NAME = re.compile(r"policy_(\d+)\.pt")
 
 
 def write_checkpoint(path: Path, state: dict[str, Any], facts: dict[str, Any]) -> Path:
-    """Write `state` to `path`, with `facts` such as the epoch to be read without it; what was there is replaced whole.
+    """Write `state` to `path`, with `facts` such as the epoch that can be read without it; an existing file is replaced
+    as a whole.
 
     Raises:
-        StorageFailure: the disk is full or gone; what was there before is untouched.
+        StorageFailure: the disk is full or gone; an existing file is left unchanged.
     """
     buffer = io.BytesIO()
     torch.save(state, buffer)

@@ -25,15 +25,15 @@ class Episodes(NamedTuple):
     length: Tensor
     """Env steps, shape (W,)."""
     fell: Tensor
-    """Ended by itself, shape (W,) bool; diverged ones not counted."""
+    """Whether it ended with a fall, shape (W,) bool; not counting those that diverged."""
     diverged: Tensor
-    """Ended because the physics left all bounds, shape (W,) bool."""
+    """Whether it ended because the physics exceeded all bounds, shape (W,) bool."""
     terms: Tensor
     """Return of each reward term, shape (W, T)."""
     outcomes: dict[str, Tensor]
     """Sum over the episode of each of the environment's outcome terms, shape (W,)."""
     success: Tensor | None
-    """Met the task, shape (W,) bool; None where the environment defines no success, or ended early everywhere."""
+    """Whether it succeeded, shape (W,) bool; None if the environment defines no success or all episodes ended early."""
 
     def cpu(self) -> "Episodes":
         """The same on the CPU."""
@@ -51,15 +51,15 @@ class Episodes(NamedTuple):
 class Evaluator:
     """Runs a policy from the same initial states every time, under reference rewards and reference physics.
 
-    The score is R_ref: the return of each world's first episode under the environment's own reward weights, whatever
-    weights the trial trains on, and under the physics `evaluation.variant` names (the environment's reference if
-    null). So trials with different rewards or contacts are comparable. Initial states are drawn on the CPU: they are
+    The score is R_ref: the return of each world's first episode under the environment's default reward weights,
+    whatever weights the trial trains on, and under the physics of `evaluation.variant` (the environment's reference if
+    null). So trials with different rewards or contacts are comparable. Initial states are drawn on the CPU, so they are
     the same on every device.
 
     Args:
-        config: the trial; its `evaluation` section says worlds, steps and seed.
+        config: the trial's config; its `evaluation` section sets worlds, steps and seed.
         device: "cpu" or "cuda:N".
-        physics: physics to evaluate under instead of the reference.
+        physics: physics to use instead of the reference.
     """
 
     def __init__(self, config: Config, device: str, physics: PhysicsConfig | None = None) -> None:
@@ -82,7 +82,7 @@ class Evaluator:
 
         Args:
             policy: raw observations (W, O) to actions (W, A).
-            seed: of the initial states; None takes `evaluation.seed`.
+            seed: seed of the initial states; None: `evaluation.seed`.
             on_step: called with the physical state before each env step and the controls (W, nu) of that step, and
                 once more at the end with the last state and the controls that led to it.
 

@@ -1,4 +1,4 @@
-"""Running out of memory, by name: what torch, Warp and NumPy each say in their own way."""
+"""Recognise out-of-memory errors of torch, Warp and NumPy."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -7,7 +7,7 @@ import torch
 
 from msk_ray.errors import Failure, SimulationError
 
-# Warp and torch's CPU allocator raise plain RuntimeErrors; their wording is all there is to tell them by.
+# Warp and torch's CPU allocator raise plain RuntimeErrors, which can only be recognised by their wording.
 _WORDING = ("failed to allocate", "can't allocate memory", "cudaerrormemoryallocation", "error 2: out of memory")
 
 
@@ -20,10 +20,10 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 @contextmanager
 def named_out_of_memory(device: str, nworld: int, *lower: str) -> Iterator[None]:
-    """Turn any library's failed allocation into a `SimulationError` that says which of the settings `lower` to lower.
+    """Turn any library's failed allocation into a `SimulationError` that names the settings `lower` as those to lower.
 
     Raises:
-        SimulationError: with `Failure.OUT_OF_MEMORY`; any other exception passes as it is.
+        SimulationError: with `Failure.OUT_OF_MEMORY`; any other exception passes unchanged.
     """
     try:
         yield
@@ -32,6 +32,6 @@ def named_out_of_memory(device: str, nworld: int, *lower: str) -> Iterator[None]
             raise
         what = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise SimulationError(
-            f"out_of_memory: {device} has no room for {nworld} worlds; lower {' or '.join(lower)} ({what})",
+            f"out_of_memory: {device} has too little memory for {nworld} worlds; lower {' or '.join(lower)} ({what})",
             Failure.OUT_OF_MEMORY,
         ) from error

@@ -1,4 +1,4 @@
-"""A policy read back from a checkpoint, with nothing to train."""
+"""A policy read from a checkpoint, without the means to train it."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,9 +24,9 @@ class SavedPolicy:
     epoch: int
     env_steps: int
     sha256: str
-    """Of what the checkpoint holds; evaluations and pictures are known by it."""
+    """Hash of the checkpoint's content, which identifies evaluations and pictures."""
     modules: dict[str, Any]
-    """States of the policy's modules, by name; of a whole trial's checkpoint, all modules of its algorithm."""
+    """States of the policy's modules, by name; in a trial's full checkpoint, all modules of its algorithm."""
 
     def network(self, env: Env[Any]) -> nn.Module:
         """The policy's network on an environment's device.
@@ -52,7 +52,7 @@ class SavedPolicy:
         """The policy on an environment's device: raw observations (W, O) to actions (W, A), without gradients.
 
         Raises:
-            CheckpointError, ConfigError: as `network`.
+            CheckpointError, ConfigError: as for `network`.
         """
         network = self.network(env)
 
@@ -68,8 +68,8 @@ def load_policy(path: Path) -> SavedPolicy:
     """Read the policy in a checkpoint, on CPU.
 
     Raises:
-        CheckpointError: the checkpoint is missing, torn, of another format, or holds no policy.
-        ConfigError: its settings are not known to this version.
+        CheckpointError: the checkpoint is missing, incomplete, of another format, or holds no policy.
+        ConfigError: this version does not know its settings.
     """
     facts, state = load_checkpoint(path)
     try:

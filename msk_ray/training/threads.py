@@ -1,7 +1,7 @@
-"""Torch's threads on the CPU: as many as a trial's settings say, whatever the machine has.
+"""Torch's threads on the CPU: their number comes from the trial's settings, whatever the machine has.
 
-By default torch takes one for each core, and those that wait for work spin. On a machine that computes something else
-too, small networks then take many times as long; and sums over another number of parts round differently.
+By default torch uses one per core, and threads that wait for work spin. On a machine that is also busy with something
+else, small networks then take many times as long; and sums over a different number of parts round differently.
 """
 
 import torch
@@ -10,5 +10,5 @@ from msk_ray.config import Config
 
 
 def use_threads(config: Config) -> None:
-    """Have torch compute with `trial.threads` threads, in this whole process."""
+    """Make torch use `trial.threads` threads in this process."""
     torch.set_num_threads(config.trial.threads)

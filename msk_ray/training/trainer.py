@@ -1,4 +1,4 @@
-"""The trainer: epochs of an algorithm with evaluation, logs and checkpoints in one folder."""
+"""The trainer: runs the epochs of an algorithm, with evaluation, logs and checkpoints in one folder."""
 
 import math
 import time
@@ -28,28 +28,27 @@ from msk_ray.training.loggers import TrialLog
 from msk_ray.training.memory import named_out_of_memory
 from msk_ray.training.threads import use_threads
 
-# Settings that may differ between a checkpoint and the trial that goes on from it.
+# Settings that may differ between a checkpoint and the trial that continues from it.
 _EXTENDABLE = {
     "trial": {"epochs", "checkpoint_interval", "keep_checkpoints", "loggers"},
-    "physics": {"nconmax", "njmax"},  # room, which an error may ask for; results do not depend on it
+    "physics": {"nconmax", "njmax"},  # buffer sizes, which an error may ask for; results do not depend on them
 }
 _MILESTONES = 8
-"""Policies kept along the way beside the first; they are what `visualize --progression` shows."""
+"""Number of policies saved during training in addition to the first, for `visualize --progression`."""
 
 
 class Trainer:
     """One trial in this process.
 
-    Writes `config.yaml`, `metrics.jsonl` and `checkpoints/` under `logdir`, and what its loggers write. Among the
-    checkpoints are the newest whole states, `best.pt` (until the first evaluation the untrained policy), and the
-    policies alone (`policy_*.pt`) of about every eighth of the way. Call `run_epoch` until `finished`; or
-    `restore_latest` first to go on from the newest whole checkpoint, which on CPU gives exactly the metrics of an
-    uninterrupted run.
+    Writes `config.yaml`, `metrics.jsonl`, `checkpoints/` and the files of its loggers under `logdir`. The checkpoints
+    are the newest complete states, `best.pt` (until the first evaluation the untrained policy), and at about every
+    eighth of training the policy (`policy_*.pt`). Call `run_epoch` until `finished`; call `restore_latest` first to
+    continue from the newest complete checkpoint, which on CPU gives exactly the metrics of an uninterrupted run.
 
     Attributes:
-        env: the worlds that are trained in.
-        algorithm: what trains in them.
-        epoch: epochs done.
+        env: the worlds used for training.
+        algorithm: the algorithm that trains in them.
+        epoch: number of epochs done.
         best_score: highest evaluation score of the trained policy so far, -inf before the first; that of `best.pt`.
 
     Raises:
@@ -72,7 +71,7 @@ class Trainer:
         for folder in (logdir, self.checkpoints):
             remove_stale(folder)
         if not epoch_checkpoints(self.checkpoints):
-            # Else the file says what those were trained under, until one of them is gone on from.
+            # Otherwise the file describes what those were trained under, until one of them is resumed.
             self._write_config()
         self._device = device
         use_threads(config)
@@ -113,8 +112,9 @@ class Trainer:
 
         Raises:
             SimulationError: the gradient or the physics failed, or the device ran out of memory; the last checkpoint
-                stays as it is.
-            CheckpointError: the first epoch, and the checkpoint to start from is missing, torn, or does not fit.
+                stays unchanged.
+            CheckpointError: in the first epoch, if the checkpoint to start from is missing, incomplete, or does not
+                fit.
         """
         with self._memory():
             return self._run_epoch()
@@ -145,21 +145,21 @@ class Trainer:
         return row
 
     def save(self) -> Path:
-        """Write a checkpoint of everything and return its path; one that is there already is kept."""
+        """Write a checkpoint of everything and return its path; an existing one is kept."""
         path = self.checkpoints / f"epoch_{self.epoch:06d}.pt"
         self._write(path)
         prune_checkpoints(self.checkpoints, self.config.trial.keep_checkpoints)
         return path
 
     def restore(self, path: Path, changed: Collection[str] = ()) -> None:
-        """Go on from a checkpoint.
+        """Continue from a checkpoint.
 
         Args:
             path: the checkpoint.
             changed: dotted settings that may differ from those it was written under.
 
         Raises:
-            CheckpointError: it is missing, torn, or was written under other settings.
+            CheckpointError: it is missing, incomplete, or was written under other settings.
         """
         state = _expect(path, read_checkpoint(path))
         difference = _first_difference(
@@ -167,7 +167,7 @@ class Trainer:
         )
         if difference:
             raise CheckpointError(
-                f"{path} was written under other settings: {difference}; say what was said then, or start another trial"
+                f"{path} was written under other settings: {difference}; use those, or start another trial"
             )
         if state["epoch"] > self.config.trial.epochs:
             raise CheckpointError(
@@ -182,7 +182,7 @@ class Trainer:
         self.best_score = self._trained_best(state["best_score"])
 
     def _trained_best(self, recorded: float) -> float:
-        """A checkpoint's best score; -inf if it is what the policy scored untrained, which older versions counted.
+        """A checkpoint's best score; -inf if it is the score of the untrained policy, which older versions counted.
 
         Then `best.pt` is the untrained policy, and the next evaluation replaces it.
         """
@@ -192,17 +192,17 @@ class Trainer:
         return -math.inf if recorded in untrained and recorded not in trained else recorded
 
     def restore_latest(self) -> tuple[Path | None, list[str]]:
-        """Go on from the newest whole checkpoint, or from the start if there is none.
+        """Continue from the newest complete checkpoint, or from the start if there is none.
 
         Returns:
-            Its path or None, and a line on each newer checkpoint that was torn and on damaged metrics.
+            Its path or None, and a line on each newer checkpoint that is incomplete and on damaged metrics.
         """
         path, faults = newest_valid_checkpoint(self.checkpoints)
         if path is not None:
             self.restore(path)
         else:
             self._write_config()
-            # An attempt that died before its first checkpoint may have left rows, the last of them torn.
+            # An attempt that died before its first checkpoint may have left rows, the last of them incomplete.
             self._damages = self._log.rewind(-1)
         return path, [*faults, *describe_damages(self._damages, self.logdir)]
 
@@ -233,7 +233,7 @@ class Trainer:
         started = time.perf_counter()
         figures = self.evaluator.run(self.algorithm.policy)
         if self.epoch == 0:
-            # For whoever wants to look at it; it has no score, so that any trained policy replaces it.
+            # Only to look at; it has no score, so that any trained policy replaces it.
             self._write(self.best_checkpoint)
         elif figures["score"] > self.best_score:
             self.best_score = figures["score"]
@@ -246,9 +246,9 @@ class Trainer:
         return row | {"time/evaluation_s": time.perf_counter() - started}
 
     def _at_milestone(self) -> bool:
-        """Whether this evaluation is the first one past another eighth of the trial, or the one before training.
+        """Whether this evaluation is the first one after another eighth of the trial, or the one before training.
 
-        Told from the epoch alone, so that a resumed trial keeps the same ones.
+        This depends only on the epoch, so that a resumed trial saves the same ones.
         """
         epochs, previous = self.config.trial.epochs, self.epoch - self.config.evaluation.interval
         return self.epoch == 0 or _MILESTONES * self.epoch // epochs > _MILESTONES * previous // epochs
@@ -279,11 +279,11 @@ class Trainer:
 
 
 def precompile(config: Config, device: str, logdir: Path) -> None:
-    """Compile every kernel this configuration needs into Warp's cache, by one epoch as short as its algorithm has.
+    """Compile every kernel of this configuration into Warp's cache, by running the shortest epoch of its algorithm.
 
-    In few worlds: kernels are the same in many, and a device too small for those is the trial's to name.
+    It uses few worlds: kernels do not depend on their number, and the trial itself reports a device that is too small.
     """
-    TrialLog(logdir, config)  # a logger that is not there is to be known before the trials start
+    TrialLog(logdir, config)  # a missing logger must be reported before the trials start
     own = config.algorithm_settings.shortest()
     tiny = {
         "env.nworld": 2,
@@ -300,7 +300,7 @@ def precompile(config: Config, device: str, logdir: Path) -> None:
 
 
 def _expect(path: Path, state: dict[str, Any]) -> dict[str, Any]:
-    """The state of a trial, with everything that going on needs."""
+    """The complete state of a trial, with everything needed to continue."""
     missing = [
         key for key in ("config", "epoch", "env_steps", "seconds", "best_score", "algorithm") if key not in state
     ]
@@ -310,7 +310,7 @@ def _expect(path: Path, state: dict[str, Any]) -> dict[str, Any]:
 
 
 def _finite(score: float) -> float | None:
-    """A score for a checkpoint's facts, which know no infinity: None before the first evaluation."""
+    """A score for a checkpoint's facts, which cannot hold infinity: None before the first evaluation."""
     return score if math.isfinite(score) else None
 
 

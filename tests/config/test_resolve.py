@@ -111,7 +111,7 @@ def test_a_fault_inside_an_imported_module_says_where(outside: Path) -> None:
 
 def test_a_class_that_is_no_environment_is_refused_before_it_is_built(outside: Path) -> None:
     config = parse_config({"env": {"name": "outside_walker:Walker"}})
-    with pytest.raises(ConfigError, match=r"outside_walker:Walker is no subclass of msk_ray.envs.base.Env"):
+    with pytest.raises(ConfigError, match=r"outside_walker:Walker is not a subclass of msk_ray.envs.base.Env"):
         env_class(config.env)
 
 
@@ -132,7 +132,7 @@ def test_an_entry_point_gives_a_short_name(outside: Path) -> None:
 def test_settings_of_an_entry_point_may_stand_apart_from_their_environment(outside: Path) -> None:
     _declare(outside, "walkers", "outside_broken:Walker")
     _declare(outside, "light", "outside_walker:Silent", "msk_ray.env_settings")
-    with pytest.raises(ConfigError, match="outside_walker:Silent is no subclass of"):
+    with pytest.raises(ConfigError, match="outside_walker:Silent is not a subclass of"):
         settings_class("walker")
     assert "outside_broken" not in sys.modules
 

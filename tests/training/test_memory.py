@@ -19,7 +19,7 @@ from msk_ray.training.memory import named_out_of_memory
     ],
 )
 def test_a_failed_allocation_names_the_setting_to_lower(error: Exception) -> None:
-    advice = r"no room for 64 worlds; lower env\.nworld or ppo\.steps \("
+    advice = r"too little memory for 64 worlds; lower env\.nworld or ppo\.steps \("
     with (
         pytest.raises(SimulationError, match=advice) as caught,
         named_out_of_memory("cpu", 64, "env.nworld", "ppo.steps"),

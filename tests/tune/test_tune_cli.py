@@ -187,7 +187,7 @@ def test_another_rule_is_refused(
     assert len(plans) == 2
     (tmp_path / "runs" / "small" / "space.yaml").unlink()
     assert run(main, [*arguments, "--resume"]) == RESUMABLE
-    assert "the one trials were stopped by is not known" in capsys.readouterr().out
+    assert "is still the one that stopped trials" in capsys.readouterr().out
 
 
 def drawn_rate() -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""PPO: one rollout without gradients, several passes of minibatches. Networks and losses are those of rsl-rl-lib."""
+"""PPO: one rollout without gradients, then several passes of minibatches, with networks and losses of rsl-rl-lib."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from rsl_rl.models import MLPModel
 
 _GROUP = "obs"
-"""rsl_rl's observations are groups by name; here is one, which both networks read."""
+"""rsl_rl's observations are named groups; here there is one, which both networks read."""
 _ACTIVATIONS = {"silu": "swish"}
-"""rsl_rl's names of activations, where they are others than ours."""
+"""rsl_rl's names of activations that differ from ours."""
 
 
 class GaussianPolicy(nn.Module):
@@ -36,7 +36,7 @@ class GaussianPolicy(nn.Module):
 
 
 class Ppo(Algorithm):
-    """Actor, critic and optimiser of rsl_rl's PPO, trained on one environment, whose actions are clamped to [-1, 1].
+    """Actor, critic and optimiser of rsl_rl's PPO, trained in one environment, with actions clamped to [-1, 1].
 
     Noise and minibatches are drawn from torch's global generators.
     """
@@ -76,7 +76,7 @@ class Ppo(Algorithm):
 
     @classmethod
     def policy_network(cls, config: Config, obs_size: int, action_size: int) -> GaussianPolicy:
-        """A policy with weights drawn from torch's global generator, and statistics that hold no observation yet."""
+        """A policy with weights drawn from torch's global generator, and statistics without any observation yet."""
         settings = config.algorithm_settings
         assert isinstance(settings, PpoConfig)
         noise = {"class_name": "GaussianDistribution", "init_std": settings.init_std, "std_type": "log"}
@@ -84,7 +84,7 @@ class Ppo(Algorithm):
 
     @classmethod
     def policy_modules(cls, network: nn.Module) -> dict[str, nn.Module]:
-        """The actor, its statistics of observations included."""
+        """The actor, including its observation statistics."""
         assert isinstance(network, GaussianPolicy)
         return {"actor": network.actor}
 
@@ -134,7 +134,7 @@ class Ppo(Algorithm):
         return EpochResult(self.settings.steps * self.env.nworld, numbers)
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything a later `load_state_dict` needs to go on exactly, environment state included."""
+        """Everything that a later `load_state_dict` needs to continue exactly, including the environment's state."""
         return {
             **super().state_dict(),
             "optimizer": self.ppo.optimizer.state_dict(),
@@ -143,7 +143,7 @@ class Ppo(Algorithm):
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from what `state_dict` gave."""
+        """Continue from a `state_dict`."""
         super().load_state_dict(state)
         self.ppo.optimizer.load_state_dict(state["optimizer"])
         self.ppo.learning_rate = state["learning_rate"]
@@ -162,7 +162,7 @@ class Ppo(Algorithm):
             transition = env.step(ppo.act(obs).clamp(-1.0, 1.0))
             done = transition.terminated | transition.truncated
             obs = self._observe()
-            # A time limit ends no task: rsl_rl adds the value of the state that an episode was cut in.
+            # A time limit does not end the task: rsl_rl adds the value of the state in which the episode was cut.
             ppo.process_env_step(obs, transition.reward, done, {"time_outs": transition.truncated})
             rewards.append(transition.reward)
             ends.append(done)
@@ -196,7 +196,7 @@ def _network(
     outputs: int,
     noise: dict[str, Any] | None = None,
 ) -> MLPModel:
-    """rsl_rl's multilayer perceptron, with the weights torch gives linear layers by default."""
+    """rsl_rl's multilayer perceptron, with torch's default initial weights of linear layers."""
     from rsl_rl.models import MLPModel
 
     return MLPModel(

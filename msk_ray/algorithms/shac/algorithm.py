@@ -25,11 +25,11 @@ from msk_ray.networks import Actor, Critic, PolicyNetwork, RunningMeanStd
 
 
 class Shac(Algorithm):
-    """Actor, critic, their optimisers and the statistics they need, trained on one environment.
+    """Actor, critic, their optimisers and the statistics they need, trained in one environment.
 
     Attributes:
         actor, critic, target_critic: the networks.
-        normalizer: observation statistics, or None if observations are used raw.
+        normalizer: observation statistics, or None if raw observations are used.
     """
 
     Settings = ShacConfig
@@ -56,7 +56,7 @@ class Shac(Algorithm):
 
     @classmethod
     def policy_network(cls, config: Config, obs_size: int, action_size: int) -> PolicyNetwork:
-        """An untrained actor, as the trial's seed makes it, after statistics that leave observations as they are."""
+        """An untrained actor drawn from the trial's seed, with statistics that leave observations unchanged."""
         return _network(config, obs_size, action_size, torch.Generator().manual_seed(config.trial.seed))
 
     @classmethod
@@ -138,7 +138,7 @@ class Shac(Algorithm):
         return EpochResult(horizon * self.env.nworld, numbers)
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything a later `load_state_dict` needs to go on exactly, environment state included."""
+        """Everything that a later `load_state_dict` needs to continue exactly, including the environment's state."""
         return {
             **super().state_dict(),
             "actor_optimizer": self.actor_optimizer.state_dict(),
@@ -152,11 +152,11 @@ class Shac(Algorithm):
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from what `state_dict` gave."""
+        """Continue from a `state_dict`."""
         super().load_state_dict(state)
         self.actor_optimizer.load_state_dict(state["actor_optimizer"])
         self.critic_fit.load_state_dict(state["critic_optimizer"])
-        # Generator states are host tensors whatever device they drive.
+        # Generator states are host tensors on every device.
         self.noise_generator.set_state(state["noise_generator"].cpu())
         self.episodes.load_state_dict(state["episodes"])
         self._discounted = state["discounted"]
@@ -174,15 +174,15 @@ class Shac(Algorithm):
         return horizon_at(configured, epoch)
 
     def _adapt(self, rollout: Rollout, reward: float, norms: Norms | None) -> dict[str, float]:
-        """Move horizon, entropy bonus and contacts on after an epoch.
+        """Advance horizon, entropy bonus and contacts after an epoch.
 
         Args:
-            rollout: the epoch's.
+            rollout: the epoch's rollout.
             reward: its mean reward per env step.
-            norms: of its state cotangents.
+            norms: norms of its state cotangents.
 
         Returns:
-            Where they stood, by metric name.
+            Their values before, by metric name.
         """
         stood: dict[str, float] = {}
         if isinstance(self.settings.horizon, AdaptiveHorizon):
@@ -238,7 +238,7 @@ class Shac(Algorithm):
         self.return_statistics.update(torch.stack(running).flatten())
 
     def _step_actor(self, lost: float) -> Tensor:
-        """Take the actor's step, `lost` being the share of worlds without a finite gradient.
+        """Take the actor's step; `lost` is the share of worlds without a finite gradient.
 
         Returns:
             The gradient's norm before clipping.

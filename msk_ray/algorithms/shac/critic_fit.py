@@ -1,4 +1,4 @@
-"""Fitting the critic to its targets, one minibatch at a time."""
+"""Fit the critic to its targets, one minibatch at a time."""
 
 from dataclasses import dataclass
 
@@ -38,7 +38,7 @@ class CriticFit:
         self._grad_norm = grad_norm
         self._device = next(critic.parameters()).device
         self._on_cuda = self._device.type == "cuda"
-        # A recorded graph reads the rate from memory; a number would be frozen into it.
+        # A recorded graph reads the rate from memory; a number would be fixed in it.
         rate = torch.tensor(learning_rate, device=self._device) if self._on_cuda else learning_rate
         self.optimizer = torch.optim.Adam(
             critic.parameters(), lr=rate, betas=betas, fused=self._on_cuda, capturable=self._on_cuda
@@ -59,7 +59,7 @@ class CriticFit:
         self._captured.clear()
 
     def run(self, obs: Tensor, targets: Tensor, passes: int, batches: int, generator: torch.Generator) -> Tensor:
-        """Go `passes` times over rows obs (N, O) and targets (N,) in `batches` minibatches drawn in random order.
+        """Make `passes` passes over rows obs (N, O) and targets (N,) in `batches` minibatches in random order.
 
         Rows that do not fill a minibatch are left out of a pass. Returns the mean loss of the last pass.
         """
@@ -95,7 +95,7 @@ class CriticFit:
         return loss.detach()
 
     def _capture(self, obs: Tensor, targets: Tensor) -> _Captured:
-        """Record a step on these buffers, leaving parameters and moments as they are."""
+        """Record a step on these buffers without changing parameters and moments."""
         before = {id(t): t.detach().clone() for t in self._tensors()}
         stream = torch.cuda.Stream(self._device)
         stream.wait_stream(torch.cuda.current_stream(self._device))

@@ -1,4 +1,4 @@
-"""Contacts that begin soft and become those of the trial's physics as training goes on."""
+"""Contacts that start soft and become those of the trial's physics during training."""
 
 import math
 from collections.abc import Sequence
@@ -12,9 +12,9 @@ from msk_ray.errors import ConfigError
 
 
 def between(start: Sequence[float], end: Sequence[float], progress: float) -> list[float]:
-    """Numbers on the way from `start` (progress 0) to `end` (1): by constant ratio if both are positive, else evenly.
+    """Numbers between `start` (progress 0) and `end` (1): geometric if both are positive, otherwise linear.
 
-    Time constants span decades, where an even step would change nothing at first and everything in the end.
+    Time constants span decades, where equal steps would change nothing at first and everything in the end.
     """
     mixed = []
     for a, b in zip(start, end, strict=True):
@@ -26,10 +26,10 @@ def between(start: Sequence[float], end: Sequence[float], progress: float) -> li
 
 
 class ContactSchedule:
-    """Keeps an environment's contact pairs where the curriculum says they are.
+    """Sets an environment's contact pairs to those of the curriculum.
 
     Raises:
-        ConfigError: the model's contacts are no explicit pairs.
+        ConfigError: the model's contacts are not explicit pairs.
 
     Attributes:
         progress: 0 at the curriculum's start, 1 where the trial's own physics is reached.
@@ -51,7 +51,7 @@ class ContactSchedule:
         self._apply()
 
     def advance(self, reward: float) -> None:
-        """Take in an epoch's mean reward per env step, and move on if the curriculum does."""
+        """Process an epoch's mean reward per env step, and advance if the curriculum does."""
         if self.config.reward is None or reward >= self.config.reward:
             self.set_progress(self.progress + 1.0 / self.config.epochs)
 

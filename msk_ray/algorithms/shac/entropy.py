@@ -9,7 +9,7 @@ class EntropyBonus:
     """The coefficient α of −log π in the reward, constant or adapted to hold a target entropy.
 
     Attributes:
-        coefficient: α now [reward per nat].
+        coefficient: the current α [reward per nat].
     """
 
     def __init__(self, config: EntropyConfig, action_size: int) -> None:
@@ -18,7 +18,7 @@ class EntropyBonus:
         self.coefficient = config.coefficient
 
     def adapt(self, entropy: float) -> None:
-        """Take in an epoch's mean entropy of the policy [nat]: log α += rate (target − entropy), by dual ascent.
+        """Update with an epoch's mean entropy of the policy [nat]: log α += rate (target − entropy), by dual ascent.
 
         The temperature's gradient step of Haarnoja et al. 2018 (arXiv:1812.05905, equation 18), on log α.
         """

@@ -1,4 +1,4 @@
-"""What passes between env steps on the way back: each world's state cotangent, bounded and watched."""
+"""The gate between env steps in the backward pass: it bounds and measures each world's state cotangent."""
 
 from typing import Any, NamedTuple
 
@@ -10,18 +10,18 @@ from msk_ray.simulation import StepState
 
 
 class Norms(NamedTuple):
-    """Norms of the state cotangents that were finite; scalars, still on the device."""
+    """Statistics of the norms of finite state cotangents; scalars, still on the device."""
 
     median: Tensor
     p90: Tensor
     """90th percentile."""
     maximum: Tensor
     clipped_share: Tensor
-    """Share of all cotangents that were longer than the bound."""
+    """Share of all cotangents above the bound."""
 
 
 class CotangentStatistics(NamedTuple):
-    """What passed a gate in one backward pass."""
+    """What a gate measured in one backward pass."""
 
     nonfinite_share: Tensor
     """Share of worlds with a cotangent that was not finite, a scalar on the device."""
@@ -43,13 +43,13 @@ class CotangentStatistics(NamedTuple):
 
 
 class CotangentGate:
-    """Bounds each world's state cotangent and counts what it saw in one backward pass.
+    """Bounds each world's state cotangent and measures it in one backward pass.
 
-    A few worlds whose cotangents explode over the horizon would otherwise carry the whole policy gradient. The bound
-    keeps direction. A world whose cotangent is not finite passes nothing back, and is counted as such.
+    A few worlds whose cotangents explode over the horizon would otherwise dominate the whole policy gradient. The bound
+    keeps the direction. A world whose cotangent is not finite passes nothing back, and is counted.
 
     Args:
-        bound: largest norm let through; None bounds nothing.
+        bound: largest norm let through; None for no bound.
         nworld: number of worlds W.
     """
 
@@ -65,9 +65,9 @@ class CotangentGate:
         return StepState(*_Gate.apply(self, *state))
 
     def screen(self, action: Tensor) -> Tensor:
-        """The same actions (W, A); a world's cotangent that is not finite will pass nothing, and be counted.
+        """The same actions (W, A); a world whose cotangent is not finite will pass nothing, and be counted.
 
-        Where a step's derivatives overflow inside, the control's cotangent is lost with the state's.
+        If a step's derivatives overflow internally, the control's cotangent is lost with the state's.
         """
         return _Screen.apply(self, action) if action.requires_grad else action
 

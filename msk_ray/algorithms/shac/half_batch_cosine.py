@@ -12,11 +12,12 @@ from torch import Tensor, nn
 class HalfBatchCosine:
     """Splits the gradient of one backward pass into the parts of the two halves of the worlds.
 
-    A linear layer's weight gradient is the sum over steps and worlds of (output cotangent) ⊗ (input). Both are at hand
-    while the pass runs, so the sum over either half costs one matrix product a layer afterwards and no second pass.
+    A linear layer's weight gradient is the sum over steps and worlds of (output cotangent) ⊗ (input). Both are
+    available during the pass, so the sum over either half costs one matrix product per layer afterwards and no second
+    pass.
 
     Args:
-        network: its linear layers are watched; inputs have shape (W, n) with the worlds first.
+        network: its linear layers are observed; inputs have shape (W, n) with the worlds first.
     """
 
     def __init__(self, network: nn.Module) -> None:
@@ -26,7 +27,7 @@ class HalfBatchCosine:
 
     @contextmanager
     def watching(self) -> Iterator[None]:
-        """Watch the calls of the network made inside."""
+        """Observe the calls of the network inside this block."""
         handles = [m.register_forward_hook(self._saw) for m in self._layers]
         try:
             yield

@@ -21,8 +21,9 @@ def discounts(done: Tensor, gamma: float) -> Tensor:
 def actor_loss(rewards: Tensor, next_values: Tensor, terminated: Tensor, done: Tensor, gamma: float) -> Tensor:
     """The negated mean H-step return (SHAC equation 5), a scalar.
 
-    Every episode piece inside the rollout counts Σ γᵏ r plus, unless it terminated, γᵏ⁺¹ V of where it ended:
-    at the episode's end or at the horizon. Divided by H·W. Differentiable in `rewards` and `next_values`, (H, W).
+    Every piece of an episode inside the rollout counts Σ γᵏ r plus, unless it terminated, γᵏ⁺¹ V of the state in which
+    it ended: at the episode's end or at the horizon. Divided by H·W. Differentiable in `rewards` and `next_values`,
+    (H, W).
     """
     weight = discounts(done, gamma)
     end = done.clone()
@@ -50,5 +51,5 @@ def td_lambda_targets(
 
 
 def one_step_targets(rewards: Tensor, next_values: Tensor, terminated: Tensor, gamma: float) -> Tensor:
-    """Critic targets (H, W): r + γ V(s'), a terminated state having value 0."""
+    """Critic targets (H, W): r + γ V(s'), where a terminated state has value 0."""
     return rewards + gamma * torch.where(terminated, 0.0, next_values)

@@ -1,4 +1,4 @@
-"""One rollout of the horizon under the current policy, with its graph."""
+"""One rollout over the horizon under the current policy, with its graph."""
 
 from dataclasses import dataclass
 
@@ -15,9 +15,9 @@ class Rollout:
     """H steps of W worlds."""
 
     obs: Tensor
-    """Raw observations the actions were chosen from, detached, shape (H, W, O)."""
+    """Raw observations from which the actions were chosen, detached, shape (H, W, O)."""
     next_obs: Tensor
-    """Normalised observations reached, before any reset, attached, shape (H, W, O)."""
+    """Normalised observations of the states reached, before any reset, attached, shape (H, W, O)."""
     rewards: Tensor
     """Attached, shape (H, W)."""
     terminated: Tensor
@@ -27,7 +27,7 @@ class Rollout:
     diverged: Tensor
     """Shape (H, W) bool."""
     neg_log_prob: Tensor | None
-    """−log π of the actions taken [nat], attached, shape (H, W); None if it was not asked for."""
+    """−log π of the actions taken [nat], attached, shape (H, W); None if not requested."""
 
 
 def collect(
@@ -40,10 +40,10 @@ def collect(
     state_bptt: bool,
     with_neg_log_prob: bool = False,
 ) -> Rollout:
-    """Roll the policy out for as many steps as `noise` (H, W, A) has, from where the worlds are.
+    """Roll the policy out for as many steps as `noise` (H, W, A) has, from the current state of the worlds.
 
-    The graph starts anew at the first state. With `state_bptt` false it starts anew at every state, so that an
-    action's gradient comes from its own step alone. `normalizer` is held fixed during the rollout.
+    A new graph starts at the first state. If `state_bptt` is false, a new one starts at every state, so that an
+    action's gradient comes only from its own step. `normalizer` is held fixed during the rollout.
     """
     env.state = env.state.detach()
     env.stock_resets(len(noise))

@@ -1,4 +1,4 @@
-"""A trial's own record: one JSON object a line, on disk before anything else happens."""
+"""A trial's own record: one JSON object per line, on disk before anything else happens."""
 
 import json
 import math
@@ -23,7 +23,7 @@ class JsonLines:
         self._path = folder / METRICS_FILE
 
     def rewind(self, epoch: int) -> tuple[Damage, ...]:
-        """Drop rows after `epoch`, which a resumed trial will write again, and with them what is damaged.
+        """Drop rows after `epoch`, which a resumed trial will write again, and damaged lines.
 
         Returns:
             The damaged lines.
@@ -39,7 +39,7 @@ class JsonLines:
         return metrics.damages
 
     def write(self, row: dict[str, float]) -> None:
-        """Append one row; it is on its way to disk when this returns.
+        """Append one row, and flush it.
 
         Raises:
             StorageFailure: the disk is full or gone.

@@ -15,15 +15,15 @@ from msk_ray.training.loggers.run_name import run_name
 
 RUN_FILE = "mlflow_run.txt"
 _LONGEST_PARAM = 500
-"""Characters of a setting's value; MLflow's stores take no less."""
+"""Maximum length of a setting's value, which all of MLflow's stores accept."""
 _PARAMS_AT_ONCE = 100
 
 
 class MLflow(Logger):
-    """One run a trial, in the MLflow experiment of the sweep's name, its steps being epochs.
+    """One run per trial, in the MLflow experiment with the sweep's name; its steps are epochs.
 
-    MLFLOW_TRACKING_URI says where it goes; without, to `mlflow.db` beside the trial. A resumed trial is the same run,
-    in which the rows that come again count as they first came.
+    MLFLOW_TRACKING_URI sets the destination, by default `mlflow.db` beside the trial. A resumed trial continues the
+    same run, in which repeated rows keep their first values.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -38,7 +38,7 @@ class MLflow(Logger):
         self._settings = settings
 
     def write(self, row: dict[str, float]) -> None:
-        """Take in a row."""
+        """Log a row."""
         if self._client is None:
             self._client = self._open()
         epoch, now = int(row["epoch"]), int(1000 * time.time())
@@ -49,7 +49,7 @@ class MLflow(Logger):
         self._last = epoch
 
     def close(self) -> None:
-        """Say that nobody writes to the run now."""
+        """Mark the run as no longer being written."""
         client, self._client = self._client, None
         if client is not None:
             client.set_terminated(self._run)
@@ -74,7 +74,7 @@ class MLflow(Logger):
 
 
 def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
-    """Dotted keys and their values as text, cut to what MLflow takes."""
+    """Dotted keys and their values as text, cut to the length that MLflow accepts."""
     flat: dict[str, str] = {}
     for key, value in settings.items():
         if isinstance(value, Mapping):

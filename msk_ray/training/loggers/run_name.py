@@ -1,4 +1,4 @@
-"""What a trial is called outside its folder."""
+"""The name of a trial outside its folder."""
 
 import uuid
 from pathlib import Path
@@ -7,13 +7,13 @@ from msk_ray.files import write_text
 
 
 def run_name(folder: Path) -> tuple[str, str]:
-    """The experiment and the trial: of `runs/NAME/trials/ID` NAME and ID, of `runs/train/NAME` train and NAME."""
+    """The experiment and the trial: for `runs/NAME/trials/ID` NAME and ID, for `runs/train/NAME` train and NAME."""
     experiment = folder.parent.parent if folder.parent.name == "trials" else folder.parent
     return experiment.name, folder.name
 
 
 def run_id(folder: Path, file: str) -> str:
-    """An id for the trial, the same each time it goes on: kept in a file of its folder.
+    """An id for the trial, the same each time it is resumed: stored in a file of its folder.
 
     Raises:
         StorageFailure: the file cannot be written.

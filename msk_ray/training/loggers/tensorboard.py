@@ -14,7 +14,7 @@ _TERM = "eval/term/"
 
 
 def board_tag(name: str) -> str:
-    """The TensorBoard tag of a metric: what comes before the slash is the group its chart is shown in.
+    """The TensorBoard tag of a metric: the part before the slash is the group of its chart.
 
     `env_steps` → `progress/env_steps`, `eval/term/x` → `eval_terms/x`, `train/actor_lr` → `schedule/actor_lr`; others
     keep their names.
@@ -27,18 +27,18 @@ def board_tag(name: str) -> str:
 
 
 class TensorBoard(Logger):
-    """A chart a figure over epochs; of a resumed trial, the rows that it went back behind are hidden."""
+    """One chart per metric over epochs; rows that a resumed trial repeats are hidden."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
         self._board: SummaryWriter | None = None
 
     def rewind(self, epoch: int) -> None:
-        """Hide what earlier files say of later epochs."""
+        """Hide later epochs in earlier files."""
         self._board = SummaryWriter(str(self.folder), purge_step=epoch + 1)
 
     def write(self, row: dict[str, float]) -> None:
-        """Take in a row."""
+        """Log a row."""
         if self._board is None:
             self._board = SummaryWriter(str(self.folder))
         for name, value in row.items():
@@ -56,10 +56,10 @@ def log_image(folder: Path, tag: str, image: np.ndarray, epoch: int) -> None:
     """Put a picture into TensorBoard.
 
     Args:
-        folder: of its event file; not that of a trial's scalars, whose own file TensorBoard would then leave.
+        folder: folder of its event file; not that of a trial's scalars, whose file TensorBoard would then stop reading.
         tag: the chart's name.
         image: shape (height, width, 3), uint8.
-        epoch: where it stands.
+        epoch: its step.
 
     Raises:
         StorageFailure: the disk is full or the folder not writable.

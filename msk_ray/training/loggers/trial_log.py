@@ -13,10 +13,10 @@ from msk_ray.training.loggers.jsonl import JsonLines
 
 
 class TrialLog:
-    """Writes each row to `metrics.jsonl`, then hands it to every logger.
+    """Writes each row to `metrics.jsonl`, then passes it to every logger.
 
     Raises:
-        ConfigError: there is no logger of a name, or its package is not installed.
+        ConfigError: a logger's name is unknown, or its package is not installed.
     """
 
     def __init__(self, folder: Path, config: Config) -> None:
@@ -28,14 +28,14 @@ class TrialLog:
         self._told = False
 
     def rewind(self, epoch: int) -> tuple[Damage, ...]:
-        """Drop rows after `epoch`, which a resumed trial will write again, and with them what is damaged.
+        """Drop rows after `epoch`, which a resumed trial will write again, and damaged lines.
 
         Returns:
             The damaged lines of `metrics.jsonl`.
 
         Raises:
             StorageFailure: the rows cannot be read or written.
-            LoggerError: as `write`.
+            LoggerError: as for `write`.
         """
         damages = self._lines.rewind(epoch)
         self._each(lambda logger: logger.rewind(epoch))
@@ -56,10 +56,10 @@ class TrialLog:
         self._each(lambda logger: logger.write(dict(finite)))
 
     def close(self) -> None:
-        """Have every logger write out what is still on its way.
+        """Have every logger write out everything that is still buffered.
 
         Raises:
-            StorageFailure, LoggerError: as `write`; the rows are in `metrics.jsonl` all the same.
+            StorageFailure, LoggerError: as for `write`; the rows are in `metrics.jsonl` in any case.
         """
         self._each(lambda logger: logger.close())
 
@@ -87,7 +87,7 @@ def _logger_class(path: str) -> type[Logger]:
 def _named(name: str, error: Exception) -> Exception:
     stored = storage_failure(error)
     if stored is None and isinstance(error, OSError) and error.filename is not None:
-        # The trial's folder has gone, for example.
+        # For example, the trial's folder has disappeared.
         stored = StorageFailure(f"{error.filename}: {error.strerror or error}")
     if stored is not None:
         return StorageFailure(f"trial.loggers: {name} cannot write: {stored}")

@@ -13,10 +13,10 @@ RUN_FILE = "wandb_run.txt"
 
 
 class Wandb(Logger):
-    """One run a trial, in the project WANDB_PROJECT (by default msk_ray), its steps being epochs.
+    """One run per trial, in the project WANDB_PROJECT (by default msk_ray); its steps are epochs.
 
-    W&B's own environment variables say where it goes; WANDB_MODE=offline keeps it in the trial's folder for
-    `wandb sync`. A resumed trial is the same run, in which the rows that come again count as they first came.
+    W&B's own environment variables set the destination; WANDB_MODE=offline keeps the run in the trial's folder for
+    `wandb sync`. A resumed trial continues the same run, in which repeated rows keep their first values.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -29,7 +29,7 @@ class Wandb(Logger):
         self._settings = settings
 
     def write(self, row: dict[str, float]) -> None:
-        """Take in a row."""
+        """Log a row."""
         if self._run is None:
             experiment, trial = run_name(self.folder)
             self._run = wandb.init(

@@ -148,9 +148,9 @@ def test_a_loggers_full_or_lost_disk_is_the_trials(outside: Any, tmp_path: Path,
         (["tensorbord"], "trial.loggers: unknown name 'tensorbord'; did you mean 'tensorboard'"),
         (["no_such_module:Log"], "trial.loggers: no module 'no_such_module'"),
         (["loggers_outside:Herd"], "did you mean 'Heard'"),
-        (["loggers_outside:NoLogger"], "is no subclass of msk_ray.training.loggers.base.Logger"),
+        (["loggers_outside:NoLogger"], "is not a subclass of msk_ray.training.loggers.base.Logger"),
         (["loggers_outside:Silent"], "loggers_outside:Silent lacks write"),
-        (["tensorboard", "tensorboard"], "tensorboard is named twice"),
+        (["tensorboard", "tensorboard"], "tensorboard is given twice"),
     ],
 )
 @pytest.mark.usefixtures("outside")
