@@ -15,7 +15,7 @@ import mujoco
 from record import RESULTS, markdown_table, publish
 
 from msk_ray.errors import MskRayError, UnsupportedModelError
-from msk_ray.gradcheck import GradientReport, check_gradients
+from msk_ray.gradcheck import GradientCheck, check_gradients
 from msk_ray.physics.capacity import default_capacity, geometric_bound
 from msk_ray.simulation import Simulation
 
@@ -85,13 +85,13 @@ def measure(model: mujoco.MjModel, args: argparse.Namespace) -> list[str]:
     return [*sizes, "partly exact" if partly else "exact", *_errors(report), _noteworthy(report)]
 
 
-def _errors(report: GradientReport) -> list[str]:
+def _errors(report: GradientCheck) -> list[str]:
     worst = [r.rel_error for r in report.results]
     counts = f"{report.checked} ({report.kinks}, {report.forward_mismatches})"
     return [counts, f"{statistics.median(worst):.0e}", f"{max(worst):.0e}"] if worst else [counts, "-", "-"]
 
 
-def _noteworthy(report: GradientReport) -> str:
+def _noteworthy(report: GradientCheck) -> str:
     named = {name: report.diagnostics.get(name, 0.0) for name in ("approximated_share", "solver_residual_max")}
     return f"approximated {named['approximated_share']:.2f}, residual {named['solver_residual_max']:.0e}"
 

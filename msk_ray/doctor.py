@@ -220,13 +220,13 @@ def check_gradient(device: str | None) -> Finding:
     started = time.monotonic()
     try:
         model = env_class(env).build_model(env, PhysicsConfig())
-        report = check_gradients(Simulation(model, nworld=4, substeps=1, device=where))
+        result = check_gradients(Simulation(model, nworld=4, substeps=1, device=where))
     except (MskRayError, RuntimeError, ValueError, OSError) as error:
         # Compilers, drivers and memory allocation fail with errors of these types, and the error is the finding.
         return Finding("gradient", f"one step on {where} failed: {_one_line(error)}", True)
     seconds = time.monotonic() - started
-    text = f"one step on {where}: largest relative error {report.max_rel_error:.1e} ({seconds:.0f} s with compilation)"
-    if report.max_rel_error > GRADIENT_TOLERANCE:
+    text = f"one step on {where}: largest relative error {result.max_rel_error:.1e} ({seconds:.0f} s with compilation)"
+    if result.max_rel_error > GRADIENT_TOLERANCE:
         return Finding("gradient", f"{text}, above {GRADIENT_TOLERANCE:g}: reinstall warp-lang and mujoco-warp", True)
     return Finding("gradient", text)
 

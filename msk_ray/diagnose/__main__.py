@@ -1,4 +1,4 @@
-"""`python -m msk_ray.diagnose`: how good are the gradients where the policy really is?"""
+"""`python -m msk_ray.diagnose`: how good are the gradients in the states that a policy visits?"""
 
 import json
 import statistics
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 
 DESCRIPTION = """\
 Compare the policy gradient of the environment's reward with float64 central differences of C MuJoCo, over several
-horizons, from states the policy meets, under several physics.
+horizons, from states that the policy visits, under several physics.
 
-cosine      1: backpropagation points where the differences do; below about 0.9 the horizon is too long for this physics
-norm ratio  1: it is as long; far above, products of Jacobians explode
-cotangent   norm of the gradient to the starting state [reward]: what shac.state_grad_clip bounds
+cosine      1: both gradients have the same direction; below about 0.9 the horizon is too long for this physics
+norm ratio  1: both have the same length; far above 1, products of Jacobians explode
+cotangent   norm of the gradient to the starting state [reward], which shac.state_grad_clip bounds
 
-A config is diagnosed with a fresh policy, a checkpoint with its own. Writes table.md, rows.json and quality.png."""
+A config is diagnosed with a new policy, a checkpoint with its own. Writes table.md, rows.json and quality.png."""
 
 EXAMPLES = """\
   python -m msk_ray.diagnose configs/ant.yaml --variants matched published
@@ -37,14 +37,19 @@ def parser() -> Parser:
     p.add_argument(
         "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help=f"for a config: {SET_HELP}"
     )
-    p.add_argument("--variants", nargs="+", metavar="NAME", help="named physics; by default all of the environment")
-    p.add_argument("--states", nargs="+", choices=("reset", "standing", "gait"), help="by default all that apply")
+    p.add_argument("--variants", nargs="+", metavar="NAME", help="named physics (default: all of the environment)")
+    p.add_argument(
+        "--states",
+        nargs="+",
+        choices=("reset", "standing", "gait"),
+        help="where trajectories start (default: all that apply)",
+    )
     p.add_argument("--horizons", nargs="+", type=int, default=[1, 4, 8, 16, 32], metavar="H", help="env steps")
     p.add_argument("--worlds", type=int, default=4, help="starting states of each kind")
     p.add_argument("--directions", type=int, default=16, help="random directions in parameter space")
     p.add_argument("--seed", type=int, default=0)
     p.add_argument("--device", default="cpu", help="cpu or cuda:N")
-    p.add_argument("--output", type=Path, metavar="DIR", help="by default runs/diagnose/NAME")
+    p.add_argument("--output", type=Path, metavar="DIR", help="folder to write to (default: runs/diagnose/NAME)")
     return p
 
 
@@ -67,7 +72,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if name not in known:
             raise ConfigError(
                 f"env {subject.config.env.name} has no physics named {name!r}; "
-                + (f"write {', '.join(known)}" if known else "leave --variants out")
+                + (f"write {', '.join(known)}" if known else "leave out --variants")
             )
     states = args.states or (("reset", "standing") if subject.saved is None else ("reset", "standing", "gait"))
     name = args.subject.stem if subject.saved is None else f"{args.subject.parent.parent.name}_{args.subject.stem}"

@@ -1,4 +1,4 @@
-"""What environments measure of a state, by C MuJoCo in float64: the reference for gradients, without any of its own.
+"""What environments measure of a state, computed by C MuJoCo in float64: a reference for gradients, without gradients.
 
 Axes: W worlds, B bodies.
 """

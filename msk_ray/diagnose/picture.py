@@ -9,7 +9,7 @@ from msk_ray.diagnose.probe import Quality
 
 
 def draw(rows: Sequence[Quality], path: Path) -> Path:
-    """Write a PNG: a column a kind of state, a line a physics; median over worlds with the range behind it."""
+    """Write a PNG: one column per kind of state, one line per physics; median over worlds with their range."""
     import matplotlib
 
     matplotlib.use("Agg")

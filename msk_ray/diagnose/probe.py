@@ -1,8 +1,8 @@
-"""The policy gradient of an environment's own reward over several horizons, against float64 differences.
+"""The policy gradient of an environment's reward over several horizons, compared with float64 differences.
 
 The gradient is that of the undiscounted return of H env steps of the deterministic policy, without resets and without
 the critic's bootstrap. The reference is C MuJoCo in float64 under the same policy and reward, displaced along random
-directions of the policy's parameters: a policy has too many parameters to displace each.
+directions in parameter space, because a policy has too many parameters to displace each one.
 """
 
 import copy
@@ -25,10 +25,10 @@ from msk_ray.simulation import StepState
 from msk_ray.training import SavedPolicy, load_policy
 
 STATE_KINDS = ("reset", "standing", "gait")
-"""Where trajectories start: fresh resets; settled under zero action; the policy's own motion after a while."""
+"""Where trajectories start: new resets; settled under zero action; in the policy's own motion after a while."""
 
 _SETTLE, _STRIDE = 60, 120
-"""Env steps before a standing and a gait state."""
+"""Env steps before a standing state and before a gait state."""
 _STEP = 1e-6
 """Length of a displacement in parameter space; rounding of float64 leaves six digits."""
 
@@ -37,11 +37,11 @@ Step = Callable[[Tensor, StepState], StepState]
 
 @dataclass(frozen=True)
 class Subject:
-    """What is diagnosed: a trial's settings and a policy for it, trained or fresh."""
+    """What is diagnosed: a trial's settings and a policy for it, trained or new."""
 
     config: Config
     saved: SavedPolicy | None
-    """The trained policy; None for a fresh one."""
+    """The trained policy; None for a new one."""
 
     def network(self, env: Env[Any]) -> nn.Module:
         """The policy's network for an environment, on its device.
@@ -61,7 +61,7 @@ def read_subject(path: Path, overrides: Sequence[str] = ()) -> Subject:
     """A checkpoint (.pt) or a trial's config (.yaml).
 
     Raises:
-        CheckpointError, ConfigError: it cannot be read, or settings are to be overridden in a checkpoint.
+        CheckpointError, ConfigError: it cannot be read, or overrides are given for a checkpoint.
     """
     if path.suffix == ".pt":
         if overrides:
@@ -80,9 +80,9 @@ class Quality:
     horizon: int
     world: int
     cosine: float
-    """Between the derivatives along the directions, backpropagated and by differences."""
+    """Cosine between the derivatives along the directions, backpropagated and by differences."""
     norm_ratio: float
-    """Length of the first over that of the second."""
+    """Norm of the first divided by that of the second."""
     norm: float
     """Norm of the backpropagated gradient to all parameters [reward]."""
     cotangent: float
@@ -113,7 +113,7 @@ def probe(
         device: where Warp runs.
 
     Raises:
-        ConfigError: "gait" asked of a fresh policy.
+        ConfigError: "gait" for a new policy.
         SimulationError: the policy falls everywhere before its gait state.
     """
     if "gait" in states and subject.saved is None:
@@ -121,7 +121,7 @@ def probe(
     for variant in variants:
         physics = subject.config.physics if variant is None else PhysicsConfig(variant=variant)
         env = make_env(subject.config.env, physics, worlds, device, seed)
-        # Finite differences would see forces that the gradient does not: both leave them out.
+        # Finite differences would include forces that the gradient does not: leave them out of both.
         env.ignore_contact_forces = True
         network = subject.network(env)
         for state in states:
@@ -136,7 +136,7 @@ def _starting_state(env: Env[Any], network: nn.Module, kind: str) -> EnvState:
     env.state = env.reset_state()
     for _ in range({"reset": 0, "standing": _SETTLE, "gait": _STRIDE}[kind]):
         action = network(env.observation()) if kind == "gait" else torch.zeros_like(env.state.action)
-        # A world that ends on the way starts anew, so that all worlds count.
+        # A world whose episode ends before is reset, so that all worlds count.
         env.step(action)
     if kind == "gait" and int(env.state.age.max()) < _STRIDE:
         raise SimulationError(f"the policy falls in every world within {_STRIDE} env steps: it has no gait to diagnose")
@@ -198,7 +198,8 @@ def _compare(
 
 @torch.enable_grad()
 def _acting(owner: nn.Module, network: nn.Module, obs: Tensor) -> list[nn.Parameter]:
-    """Those parameters of `owner`, a copy of `network`, that a deterministic action depends on: no log σ, for one."""
+    """The parameters of `owner`, a copy of `network`, on which a deterministic action depends; log σ is not among
+    them."""
     found = torch.autograd.grad(network(obs.detach()).sum(), list(network.parameters()), allow_unused=True)
     return [p for p, gradient in zip(owner.parameters(), found, strict=True) if gradient is not None]
 
@@ -244,7 +245,7 @@ def _double(env: Env[Any]) -> Env[Any]:
 
 
 def _in_double(value: Any) -> Any:
-    """Tensors, also within tuples, lists and dicts, in float64 on the CPU; anything else as it is."""
+    """Tensors, also within tuples, lists and dicts, in float64 on the CPU; anything else unchanged."""
     match value:
         case Tensor():
             return value.cpu().double() if value.is_floating_point() else value.cpu()

@@ -1,4 +1,4 @@
-"""Outcome measures of gait over episodes."""
+"""Gait measures over episodes."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -20,20 +20,20 @@ from msk_ray.gait.cycles import (
 from msk_ray.gait.human import LANDMARKS, MEASURES
 
 SETTLING = 1.0
-"""Start of an episode that is left out [s]: the gait that is measured is the one it settles into."""
+"""Start of an episode that is left out [s], so that the settled gait is measured."""
 
 
 def measure(episodes: Sequence[Episode], fell: Sequence[bool]) -> dict[str, Any]:
-    """Measures over all episodes, JSON types only; null for what no episode showed.
+    """Measures over all episodes, JSON types only; null for what no episode contained.
 
     Args:
         episodes: time series, each up to its end.
         fell: whether each ended in a fall.
 
     Returns:
-        `measures`: value, human range, unit, source and whether it lies within, of speed, cadence, step length, duty
-        factor and symmetry. `landmarks`: the same of points of the curves. `curves`: mean and standard deviation over
-        strides at each percent of the cycle, by side. `costs`, `falls`, `strides`, `episodes`.
+        `measures`: value, human range, unit, source and whether the value is in the range, for speed, cadence, step
+        length, duty factor and symmetry. `landmarks`: the same for points of the curves. `curves`: mean and standard
+        deviation over strides at each percent of the cycle, by side. `costs`, `falls`, `strides`, `episodes`.
     """
     values: dict[str, list[float]] = {"speed": [], "cadence": []}
     sided: dict[str, dict[str, list[float]]] = {
@@ -104,7 +104,7 @@ def _mean(values: Sequence[float]) -> float | None:
 
 
 def _beside(value: float | None, limits: Any) -> dict[str, Any]:
-    """A value beside the human range."""
+    """A value with the human range."""
     within = None if value is None else bool(limits.least <= value <= limits.most)
     return {
         "value": value,

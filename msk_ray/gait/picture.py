@@ -1,4 +1,4 @@
-"""The gait as a picture: curves over the cycle with human landmarks, and measures beside human ranges."""
+"""The gait as a picture: curves over the cycle with human landmarks, and measures with human ranges."""
 
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ _COLOURS = {"r": "tab:red", "l": "tab:blue"}
 
 
 def draw(gait: dict[str, Any], title: str, path: Path) -> None:
-    """Write a png of what `measure` returned."""
+    """Write a PNG of the result of `measure`."""
     figure, axes = plt.subplots(2, 3, figsize=(13, 7), constrained_layout=True)
     phase = np.arange(101)
     for axis, (name, label) in zip(axes.flat, _PANELS.items(), strict=False):

@@ -1,7 +1,7 @@
-"""Checks gradients of a model against float64 central differences of C MuJoCo."""
+"""Check gradients of a model against float64 central differences of C MuJoCo."""
 
 from msk_ray.gradcheck.chain import ChainComparison, check_chain
-from msk_ray.gradcheck.check import Comparison, GradientReport, Limits, check_gradients
+from msk_ray.gradcheck.check import Comparison, GradientCheck, Limits, check_gradients
 from msk_ray.gradcheck.nonfinite import NonFinite
 from msk_ray.gradcheck.oracle import Linearization, Oracle, Point
 from msk_ray.gradcheck.states import STATE_KINDS, make_states
@@ -10,7 +10,7 @@ __all__ = [
     "STATE_KINDS",
     "ChainComparison",
     "Comparison",
-    "GradientReport",
+    "GradientCheck",
     "Limits",
     "Linearization",
     "NonFinite",

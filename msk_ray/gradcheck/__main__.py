@@ -15,7 +15,7 @@ from msk_ray.errors import ConfigError, UnsupportedModelError
 if TYPE_CHECKING:
     import mujoco
 
-    from msk_ray.gradcheck.check import GradientReport
+    from msk_ray.gradcheck.check import GradientCheck
 
 DESCRIPTION = """\
 Check gradients of an env step of MODEL.xml against float64 central differences of C MuJoCo.
@@ -25,12 +25,12 @@ to ctrl, qpos, qvel and act are compared in tangent space. States where the step
 forward pass itself differs from C MuJoCo, are left out and counted.
 
   rel_error   |g - g_ref| / |g_ref|    0 is right
-  cosine      between g and g_ref      1 is right; tells direction from magnitude
+  cosine      between g and g_ref      1 is right; separates direction from magnitude
   norm_ratio  |g| / |g_ref|            1 is right; far above 1 means exploding gradients
 
 A step or a gradient that is not finite, at any state, fails the check; its elements are named.
 
-Exit code: 0 within the tolerance, 1 past it, 2 for a model that is not supported or a wrong command line."""
+Exit code: 0 within the tolerance, 1 above it, 2 for an unsupported model or a wrong command line."""
 
 EXAMPLES = """\
   python -m msk_ray.gradcheck my_robot.xml
@@ -40,7 +40,7 @@ EXAMPLES = """\
   python -m msk_ray.gradcheck my_robot.xml --json > gradients.json"""
 
 MANY_EXCLUDED = 0.25
-"""Share of excluded states from which the table says that it speaks for few states."""
+"""Share of excluded states above which the table adds a note."""
 
 
 def _positive(kind: type) -> Any:
@@ -61,43 +61,47 @@ def parser() -> Parser:
         "model",
         type=Path,
         metavar="MODEL.xml",
-        help="an MJCF or URDF file, a compiled .mjb, or a trial's .yaml: the model it trains on",
+        help="an MJCF or URDF file, a compiled .mjb, or a trial's .yaml, for the model that it trains",
     )
     p.add_argument(
         "--mode",
         default="tape_per_substep",
         metavar="MODE",
-        help="backward mode (default %(default)s); fd_jacobian takes any model, an unknown name lists them all",
+        help="backward mode (default: %(default)s); fd_jacobian works with any model, an unknown name lists all modes",
     )
     p.add_argument("--substeps", type=_positive(int), default=1, metavar="N", help="physics steps (default 1)")
     p.add_argument(
         "--states",
         default="standing,random",
         metavar="KINDS",
-        help="comma-separated: standing, random, contact (in touch, under random controls; anywhere along them if "
-        "nothing ever touches), policy (along a smooth rollout); default %(default)s",
+        help="comma-separated: standing, random, contact (in contact during rollouts under random controls; any state "
+        "if nothing ever touches), policy (along a smooth rollout) (default: %(default)s)",
     )
     p.add_argument("--worlds", type=_positive(int), default=8, metavar="W", help="states of each kind (default 8)")
     p.add_argument(
-        "--tolerance", type=_positive(float), default=1e-2, metavar="T", help="largest rel_error (default %(default)s)"
+        "--tolerance", type=_positive(float), default=1e-2, metavar="T", help="largest rel_error (default: %(default)s)"
     )
-    p.add_argument("--seed", type=int, default=0, help="of states and cotangents (default 0)")
+    p.add_argument("--seed", type=int, default=0, help="seed of states and cotangents (default: 0)")
     p.add_argument("--device", default="cpu", help="cpu or cuda:N (default cpu)")
     p.add_argument(
-        "--solver-tolerance", type=_positive(float), metavar="T", help="of Warp's solver; by default the model's own"
+        "--solver-tolerance",
+        type=_positive(float),
+        metavar="T",
+        help="tolerance of Warp's solver (default: the model's)",
     )
     p.add_argument(
         "--forward-tolerance",
         type=_positive(float),
         metavar="T",
-        help="forward mismatch from which a state is left out, relative to its motion (default 3e-5)",
+        help="forward mismatch above which a state is left out, relative to its motion (default: 3e-5)",
     )
     p.add_argument(
-        "--nconmax", type=_positive(int), metavar="N", help="room for contacts a world; by default tried out, and grows"
+        "--nconmax",
+        type=_positive(int),
+        metavar="N",
+        help="contacts per world (default: from a probe, growing with use)",
     )
-    p.add_argument(
-        "--njmax", type=_positive(int), metavar="N", help="room for constraint rows a world; by default the same"
-    )
+    p.add_argument("--njmax", type=_positive(int), metavar="N", help="constraint rows per world (default: likewise)")
     p.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
     return p
 
@@ -132,7 +136,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if args.seed < 0:
         raise ConfigError(f"--seed must not be negative, not {args.seed}")
     # torch and Warp take seconds to load; a wrong command line should not wait for them.
-    from msk_ray.gradcheck.check import GradientReport, Limits, check_gradients, check_request
+    from msk_ray.gradcheck.check import GradientCheck, Limits, check_gradients, check_request
     from msk_ray.simulation import Simulation
     from msk_ray.simulation.modes import make_backward
 
@@ -152,21 +156,21 @@ def main(argv: Sequence[str] | None = None) -> int:
             njmax=args.njmax,
             tolerance=args.solver_tolerance,
         )
-        report = check_gradients(sim, states=states, seed=args.seed, limits=limits)
+        result = check_gradients(sim, states=states, seed=args.seed, limits=limits)
     except UnsupportedModelError as error:
         if args.json:
-            empty = GradientReport(args.mode, args.substeps, args.worlds)
+            empty = GradientCheck(args.mode, args.substeps, args.worlds)
             print(json.dumps(as_json(empty, str(args.model), args.tolerance, [str(error)])))
         raise
     if args.json:
-        print(json.dumps(as_json(report, str(args.model), args.tolerance, [])))
+        print(json.dumps(as_json(result, str(args.model), args.tolerance, [])))
     else:
-        print_table(report, str(args.model), args.tolerance)
-    if not report.checked and not report.nonfinite:
+        print_table(result, str(args.model), args.tolerance)
+    if not result.checked and not result.nonfinite:
         raise ConfigError(
-            f"nothing could be compared: {_excluded(report)}; take other --states, more --worlds or --forward-tolerance"
+            f"nothing could be compared: {_excluded(result)}; try other --states, more --worlds or --forward-tolerance"
         )
-    return 0 if report.max_rel_error <= args.tolerance else 1
+    return 0 if result.max_rel_error <= args.tolerance else 1
 
 
 def _finite(value: float | None) -> float | None:
@@ -174,17 +178,17 @@ def _finite(value: float | None) -> float | None:
     return value if value is not None and math.isfinite(value) else None
 
 
-def as_json(report: "GradientReport", model: str, tolerance: float, unsupported: list[str]) -> dict[str, Any]:
-    """The report as JSON types; one result a state and input, null for what is not finite or not defined."""
+def as_json(result: "GradientCheck", model: str, tolerance: float, unsupported: list[str]) -> dict[str, Any]:
+    """The result as JSON types; one entry per state and input, null for values that are not finite or not defined."""
     return {
         "model": model,
-        "mode": report.mode,
-        "substeps": report.substeps,
-        "worlds": report.worlds,
-        "checked": report.checked,
-        "excluded": report.excluded,
-        "excluded_kinks": report.kinks,
-        "excluded_forward_mismatches": report.forward_mismatches,
+        "mode": result.mode,
+        "substeps": result.substeps,
+        "worlds": result.worlds,
+        "checked": result.checked,
+        "excluded": result.excluded,
+        "excluded_kinks": result.kinks,
+        "excluded_forward_mismatches": result.forward_mismatches,
         "results": [
             {
                 "state": r.state,
@@ -194,14 +198,14 @@ def as_json(report: "GradientReport", model: str, tolerance: float, unsupported:
                 "cosine": r.cosine,
                 "norm_ratio": r.norm_ratio,
             }
-            for r in report.results
+            for r in result.results
         ],
-        "approximated": report.approximated,
-        "nonfinite": [asdict(lost) for lost in report.nonfinite],
-        "max_rel_error": _finite(report.max_rel_error),
+        "approximated": result.approximated,
+        "nonfinite": [asdict(lost) for lost in result.nonfinite],
+        "max_rel_error": _finite(result.max_rel_error),
         "tolerance": tolerance,
-        "diagnostics": {name: _finite(figure) for name, figure in report.diagnostics.items()},
-        "ok": not unsupported and report.max_rel_error <= tolerance,
+        "diagnostics": {name: _finite(figure) for name, figure in result.diagnostics.items()},
+        "ok": not unsupported and result.max_rel_error <= tolerance,
         "unsupported": unsupported,
     }
 
@@ -210,25 +214,25 @@ def _figure(error: float) -> str:
     return f"{error:.1e}" if math.isfinite(error) else "non-finite"
 
 
-def _excluded(report: "GradientReport") -> str:
-    total = report.checked + report.excluded
+def _excluded(result: "GradientCheck") -> str:
+    total = result.checked + result.excluded
     return (
-        f"{report.excluded} of {total} states left out ({report.kinks} at a kink, {report.forward_mismatches} where "
+        f"{result.excluded} of {total} states left out ({result.kinks} at a kink, {result.forward_mismatches} where "
         "the Warp forward pass differs from C MuJoCo)"
     )
 
 
-def print_table(report: "GradientReport", model: str, tolerance: float) -> None:
-    """One row a kind of state and input, over the states compared."""
+def print_table(result: "GradientCheck", model: str, tolerance: float) -> None:
+    """Print one row per kind of state and input, over the states compared."""
     import numpy as np
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(title=f"{model}: {report.mode}, {report.substeps} substep(s)", title_justify="left")
+    table = Table(title=f"{model}: {result.mode}, {result.substeps} substep(s)", title_justify="left")
     for heading in ("state", "input", "states", "rel_error median", "rel_error max", "cosine min", "norm_ratio"):
         table.add_column(heading, justify="left" if heading in ("state", "input") else "right", no_wrap=True)
-    for state, name in dict.fromkeys((r.state, r.input) for r in report.results):
-        rows = report.of(name, state)
+    for state, name in dict.fromkeys((r.state, r.input) for r in result.results):
+        rows = result.of(name, state)
         errors = [r.rel_error for r in rows]
         cosines = [r.cosine for r in rows if r.cosine is not None]
         ratios = [r.norm_ratio for r in rows if r.norm_ratio is not None]
@@ -246,20 +250,20 @@ def print_table(report: "GradientReport", model: str, tolerance: float) -> None:
     # A pipe or file has no width: wide enough that no column is cut.
     console = Console(width=None if sys.stdout.isatty() else 120, soft_wrap=True, highlight=False)
     console.print(table)
-    console.print(_excluded(report))
-    if report.checked and report.excluded > MANY_EXCLUDED * (report.checked + report.excluded):
-        console.print("note: many states were left out, so this speaks for the others only")
-    if report.approximated:
-        share, count = report.diagnostics["approximated_share"], len(report.approximated)
+    console.print(_excluded(result))
+    if result.checked and result.excluded > MANY_EXCLUDED * (result.checked + result.excluded):
+        console.print("note: many states were left out; the result only covers the others")
+    if result.approximated:
+        share, count = result.diagnostics["approximated_share"], len(result.approximated)
         console.print(
-            f"contacts only partly exact: {', '.join(report.approximated[:3])}{' …' if count > 3 else ''} ({count} "
+            f"contacts only partly exact: {', '.join(result.approximated[:3])}{' …' if count > 3 else ''} ({count} "
             f"pair(s) may touch); one touched in {share:.1%} of the substeps",
             markup=False,
         )
-    for lost in report.nonfinite:
+    for lost in result.nonfinite:
         console.print(f"non-finite: {lost}", markup=False)
-    verdict = "ok" if report.max_rel_error <= tolerance else "past the tolerance"
-    console.print(f"largest relative error {_figure(report.max_rel_error)}, tolerance {tolerance:.1e}: {verdict}")
+    verdict = "ok" if result.max_rel_error <= tolerance else "above the tolerance"
+    console.print(f"largest relative error {_figure(result.max_rel_error)}, tolerance {tolerance:.1e}: {verdict}")
 
 
 if __name__ == "__main__":

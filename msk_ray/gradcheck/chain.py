@@ -1,4 +1,4 @@
-"""The policy gradient through many env steps, against float64 central differences of the whole loss."""
+"""The policy gradient through many env steps, compared with float64 central differences of the whole loss."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -78,10 +78,10 @@ def check_chain(
         backward: a mode that no Simulation uses yet.
         points: starting states; their controls are ignored.
         horizons: env steps H of each rollout.
-        substeps: physics steps an env step.
-        seed: of the policy and of w.
+        substeps: physics steps per env step.
+        seed: seed of the policy and of w.
         device: where Warp runs.
-        solver_tolerance: of Warp's solver.
+        solver_tolerance: tolerance of Warp's solver.
     """
     policy = ChainPolicy(model, seed)
     weights = np.random.default_rng(seed).normal(size=model.nv)

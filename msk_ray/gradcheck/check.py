@@ -1,4 +1,4 @@
-"""Gradients of a Simulation against the float64 reference, state by state.
+"""Gradients of a Simulation compared with the float64 reference, state by state.
 
 Axes: W worlds of one kind of state, R = 2 nv + na rows, the tangent of (qpos', qvel', act').
 """
@@ -28,11 +28,13 @@ class Limits:
     """When a state is left out of the comparison."""
 
     step_disagreement: float = 1e-3
-    """Kink: the reference's two step sizes differ by more, relative; it may then itself be wrong by 1 % of that."""
+    """Kink: the reference's two step sizes differ by more than this, relative; the reference may then itself be wrong
+    by 1 % of that."""
     side_disagreement: float = 1e-2
-    """Kink: the reference's one-sided differences differ by more, relative; 3e-3 is smooth, stiff contact."""
+    """Kink: the reference's one-sided differences differ by more than this, relative; smooth, stiff contact has
+    3e-3."""
     forward_mismatch: float = 3e-5
-    """Forward mismatch: Warp's results differ from C MuJoCo's by more, relative to the motion of the step.
+    """Forward mismatch: Warp's results differ from C MuJoCo's by more than this, relative to the motion of the step.
 
     Float32 alone gives up to 2e-5 on an ant in contact over 16 substeps; another contact frame 4e-5 to 1e-1.
     """
@@ -45,20 +47,20 @@ class Comparison:
     state: str
     """Kind of state."""
     world: int
-    """Which of that kind."""
+    """Index among the states of that kind."""
     input: str
     """ctrl, qpos, qvel or act."""
     rel_error: float
     """‖g − g_ref‖ / ‖g_ref‖; where the reference vanishes, ‖g‖ / ‖cotangent‖. Infinite where g is not finite."""
     cosine: float | None
-    """Of the angle between g and g_ref; None where either vanishes or is not finite."""
+    """Cosine between g and g_ref; None where either vanishes or is not finite."""
     norm_ratio: float | None
     """‖g‖ / ‖g_ref‖; None where the reference vanishes or g is not finite."""
 
 
 @dataclass
-class GradientReport:
-    """What a check found."""
+class GradientCheck:
+    """The result of a check."""
 
     mode: str
     substeps: int
@@ -72,10 +74,10 @@ class GradientReport:
     checked: int = 0
     """States compared."""
     diagnostics: dict[str, float] = field(default_factory=dict)
-    """What the simulation and its backward mode report of themselves, the largest over the kinds of state."""
+    """Diagnostics of the simulation and its backward mode, the largest over the kinds of state."""
     approximated: list[str] = field(default_factory=list)
-    """Pairs of geoms whose contacts the mode differentiates only in part; `approximated_share` of the diagnostics tells
-    in which share of the substeps one touched."""
+    """Pairs of geoms whose contacts the mode differentiates only in part; `approximated_share` of the diagnostics is
+    the share of the substeps in which one touched."""
     nonfinite: list[NonFinite] = field(default_factory=list)
     """States, compared or left out, at which the step or its gradient is not finite."""
 
@@ -92,7 +94,7 @@ class GradientReport:
         return max((r.rel_error for r in self.results), default=math.inf)
 
     def of(self, name: str, state: str | None = None) -> list[Comparison]:
-        """Comparisons of one input, of one kind of state or all."""
+        """Comparisons of one input, for one kind of state or all."""
         return [r for r in self.results if r.input == name and state in (None, r.state)]
 
 
@@ -111,9 +113,9 @@ def compare(gradient: Array, reference: Array, cotangent_norm: float) -> tuple[f
 def forward_mismatch(oracle: Oracle, start: Point, expected: Point, actual: Point) -> float:
     """How far a float32 step ends from the float64 one, relative to the motion of that step; infinite if not finite.
 
-    Positions are measured against their own change, velocities against the speeds before and after, both with a
-    floor of one env step of free fall; activations absolutely, they being of order one. Rounding of the state
-    itself, which no step can avoid, is subtracted from the positions' difference.
+    Positions are compared with their own change, velocities with the speeds before and after, both with a
+    floor of one env step of free fall; activations absolutely, because they are of order one. Rounding of the state
+    itself, which no step can avoid, is subtracted from the difference of positions.
     """
     if not all(np.all(np.isfinite(v)) for v in (actual.qpos, actual.qvel, actual.act)):
         return math.inf
@@ -134,7 +136,7 @@ def check_request(model: mujoco.MjModel, states: Sequence[str]) -> None:
     """Raise ConfigError for an unknown kind of state, or a model without degrees of freedom."""
     unknown = [kind for kind in states if kind not in STATE_KINDS]
     if unknown or not states:
-        raise ConfigError(f"unknown kinds of state {unknown}: write some of {', '.join(STATE_KINDS)}")
+        raise ConfigError(f"unknown kinds of state {unknown}: choose from {', '.join(STATE_KINDS)}")
     if model.nv == 0:
         raise ConfigError("the model has no degrees of freedom, so there is no gradient to check")
 
@@ -145,54 +147,54 @@ def check_gradients(
     states: Sequence[str] = ("standing", "random"),
     seed: int = 0,
     limits: Limits | None = None,
-) -> GradientReport:
+) -> GradientCheck:
     """Compare gradients of one env step of `sim` with float64 central differences of C MuJoCo.
 
     Every state gets its own random normal cotangent on all of (qpos', qvel', act').
 
     Args:
-        sim: the simulation, with a backward mode; its number of worlds W is that of states of each kind.
-        states: kinds of state, of `STATE_KINDS`.
-        seed: of the states and cotangents.
+        sim: the simulation, with a backward mode; its number of worlds W is the number of states of each kind.
+        states: kinds of state, from `STATE_KINDS`.
+        seed: seed of the states and cotangents.
         limits: what counts as a kink and as a forward mismatch.
 
     Returns:
-        The comparisons; none where every state was excluded, which `max_rel_error` does not let pass.
+        The comparisons; if every state was excluded there are none, and `max_rel_error` is infinite.
 
     Raises:
         ConfigError: unknown kind of state, a model without degrees of freedom, or a simulation that is forward only.
-        SimulationError: the model diverges in C MuJoCo, or Warp had too little room for its contacts.
+        SimulationError: the model diverges in C MuJoCo, or Warp's buffers were too small for its contacts.
     """
     model, worlds, substeps = sim.model, sim.nworld, sim.substeps
     check_request(model, states)
     if sim.backward is None:
         raise ConfigError("this Simulation has no gradient to check: make it with a backward mode")
     oracle, limits = Oracle(model, substeps), limits or Limits()
-    report = GradientReport(sim.backward.name, substeps, worlds)
+    result = GradientCheck(sim.backward.name, substeps, worlds)
     for kind in dict.fromkeys(states):
         points = make_states(model, kind, worlds, seed)
         rng = np.random.default_rng([seed, list(STATE_KINDS).index(kind), 1])
-        # Rounded, so that both sides pull the same numbers back.
+        # Rounded, so that both sides use the same cotangents.
         cotangents = rng.standard_normal((worlds, 2 * model.nv + model.na)).astype(np.float32).astype(np.float64)
         ends, gradients = simulated_gradients(sim, points, cotangents)
         for name, figure in sim.diagnostics().items():
-            report.diagnostics[name] = max(report.diagnostics.get(name, -math.inf), figure)
+            result.diagnostics[name] = max(result.diagnostics.get(name, -math.inf), figure)
         for world, (point, end) in enumerate(zip(points, ends, strict=True)):
             own = {name: gradient[world] for name, gradient in gradients.items()}
             lost = find_nonfinite(sim, kind, world, point, end, own)
             if lost is not None:
-                report.nonfinite.append(lost)
+                result.nonfinite.append(lost)
             reference = oracle.linearize(point)
             if forward_mismatch(oracle, point, reference.end, end) > limits.forward_mismatch:
-                report.forward_mismatches += 1
+                result.forward_mismatches += 1
             elif reference.at_kink(limits.step_disagreement, limits.side_disagreement):
-                report.kinks += 1
+                result.kinks += 1
             else:
-                report.checked += 1
-                report.results += _comparisons(kind, world, reference, cotangents[world], own)
-    if "approximated_share" in report.diagnostics:
-        report.approximated = partly_exact(model)
-    return report
+                result.checked += 1
+                result.results += _comparisons(kind, world, reference, cotangents[world], own)
+    if "approximated_share" in result.diagnostics:
+        result.approximated = partly_exact(model)
+    return result
 
 
 def _comparisons(

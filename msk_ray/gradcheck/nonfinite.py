@@ -11,7 +11,7 @@ from msk_ray.gradcheck.pullback import simulated_gradients
 from msk_ray.simulation import Simulation
 
 _SHOWN = 4
-"""Elements that a line names; it counts the others."""
+"""Number of elements that a line names; the others are counted."""
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class NonFinite:
     state: str
     """Kind of state."""
     world: int
-    """Which of that kind."""
+    """Index among the states of that kind."""
     results: tuple[str, ...]
     """Results of the step that are not finite, or whose gradient is not."""
     inputs: tuple[str, ...]
@@ -40,7 +40,7 @@ def _few(names: Sequence[str]) -> str:
 
 
 def dof_names(model: mujoco.MjModel) -> list[str]:
-    """A name for every degree of freedom: that of its joint, and which of the joint's it is."""
+    """A name for every degree of freedom: that of its joint, and its index within the joint."""
     out = []
     for joint in range(model.njnt):
         name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint)
@@ -74,11 +74,11 @@ def element_names(model: mujoco.MjModel) -> dict[str, list[str]]:
 def find_nonfinite(
     sim: Simulation, kind: str, world: int, point: Point, end: Point, gradients: dict[str, Array]
 ) -> NonFinite | None:
-    """What of a step's results and gradients is not finite; None where all is finite.
+    """The parts of a step's results and gradients that are not finite; None if all are finite.
 
     Args:
-        kind: of the state.
-        world: which of that kind.
+        kind: kind of the state.
+        world: index among the states of that kind.
         point: the inputs of the step.
         end: its results in Warp.
         gradients: by input, of some cotangent at this state.
@@ -95,7 +95,7 @@ def find_nonfinite(
         return None
     rows = [*names["qpos"], *names["qvel"], *names["act"]]
     results, inputs = set(), {(name, int(k)) for name in INPUTS for k in np.flatnonzero(~np.isfinite(gradients[name]))}
-    # One row of the Jacobian a world.
+    # One row of the Jacobian per world.
     for first in range(0, len(rows), sim.nworld):
         cotangents = np.zeros((sim.nworld, len(rows)))
         count = min(sim.nworld, len(rows) - first)

@@ -1,6 +1,6 @@
 """Derivatives of an env step by float64 central differences of C MuJoCo.
 
-Independent of everything it judges: no Warp, no torch, no adjoint, only `mj_step` called at perturbed inputs.
+Independent of everything that it checks: no Warp, no torch, no adjoint, only `mj_step` called at perturbed inputs.
 
 Axes: R = 2 nv + na rows, the tangent of (qpos', qvel', act'); nu, nv, na as in MuJoCo.
 """
@@ -60,13 +60,13 @@ class Linearization:
     """By input, ‖J(fine) − J(coarse)‖ / ‖J(fine)‖.
 
     Up to 1e-4 where the step is smooth but sharply curved (impedances that change over a millimetre), which the
-    extrapolation to no perturbation takes out; far above on a kink.
+    extrapolation to zero perturbation removes; far above on a kink.
     """
     side_disagreement: Mapping[str, float]
     """By input, ‖J(forward) − J(backward)‖ / ‖J(fine)‖ of the fine one-sided differences.
 
-    Of order FINE_STEP times the curvature where the step is smooth, of order one on a kink. It sees the kink that
-    the two central differences agree about: the one that passes through the state itself.
+    Of order FINE_STEP times the curvature where the step is smooth, of order one on a kink. It detects the kink on
+    which the two central differences agree: one that passes through the state itself.
     """
 
     def at_kink(self, step_limit: float, side_limit: float) -> bool:
@@ -83,10 +83,10 @@ class Linearization:
 
 
 def reference_model(model: mujoco.MjModel) -> mujoco.MjModel:
-    """A copy whose solver runs to float64 convergence and whose step depends on (ctrl, qpos, qvel, act) alone.
+    """A copy whose solver runs to float64 convergence and whose step depends only on (ctrl, qpos, qvel, act).
 
-    The constraint problem is convex with one optimum, so the solver, its warm start and its iteration limits may
-    change without changing the step that is meant.
+    The constraint problem is convex with one optimum, so the solver, its warm start and its iteration limits may be
+    changed without changing the exact step.
     """
     reference = copy.copy(model)
     option = reference.opt
@@ -106,7 +106,7 @@ class Oracle:
 
     Args:
         model: the compiled model; it is not changed.
-        substeps: calls of `mj_step` an env step, under one control.
+        substeps: calls of `mj_step` per env step, under one control.
     """
 
     def __init__(self, model: mujoco.MjModel, substeps: int) -> None:
@@ -135,7 +135,7 @@ class Oracle:
         if any(data.warning[kind].number for kind in _DIVERGED):
             mujoco.mj_resetData(self.model, data)
             raise SimulationError(
-                f"C MuJoCo diverged within {self.substeps} substeps: lower the model's timestep or take other states"
+                f"C MuJoCo diverged within {self.substeps} substeps: lower the model's timestep or use other states"
             )
         return Point(point.ctrl, data.qpos.copy(), data.qvel.copy(), data.act.copy())
 
@@ -158,13 +158,13 @@ class Oracle:
         return Point(**fields)
 
     def difference(self, start: Point, end: Point) -> Array:
-        """Tangent (R,) that leads from `start` to `end`; its qpos rows live in the tangent space at `start`."""
+        """Tangent (R,) that leads from `start` to `end`; its qpos rows are in the tangent space at `start`."""
         rotation = np.zeros(self.model.nv)
         mujoco.mj_differentiatePos(self.model, rotation, 1.0, start.qpos, end.qpos)
         return np.concatenate((rotation, end.qvel - start.qvel, end.act - start.act))
 
     def linearize(self, point: Point) -> Linearization:
-        """Results and full Jacobian of one env step, by central differences of two step sizes, extrapolated.
+        """Results and full Jacobian of one env step, extrapolated from central differences with two step sizes.
 
         Costs 1 + 4·(nu + 2 nv + na) env steps.
 
@@ -183,7 +183,7 @@ class Oracle:
             forward_coarse, backward_coarse = self._one_sided(point, end, name, columns, COARSE_STEP)
             coarse = (forward_coarse + backward_coarse) / 2.0
             scale = max(float(np.linalg.norm(fine)), np.finfo(float).tiny)
-            # Richardson: the error of a central difference goes with the square of its step, so this cancels it.
+            # Richardson: the error of a central difference is proportional to the square of its step; this cancels it.
             ratio = (COARSE_STEP / FINE_STEP) ** 2
             jacobian[name] = fine + (fine - coarse) / (ratio - 1.0)
             steps[name] = float(np.linalg.norm(fine - coarse)) / scale

@@ -29,7 +29,7 @@ def simulated_gradients(
     """Results of one env step of `sim` from W points, and gradients of ⟨cotangent, results⟩ in tangent coordinates.
 
     Args:
-        points: one a world.
+        points: one per world.
         cotangents: tangent cotangents of (qpos', qvel', act'), shape (W, R).
 
     Returns:

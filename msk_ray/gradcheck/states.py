@@ -1,4 +1,4 @@
-"""States to check gradients at, one generator a kind, deterministic by seed.
+"""States at which gradients are checked, one generator per kind, deterministic by seed.
 
 All are rolled out by C MuJoCo in float64 and then rounded to float32, so that Warp and the reference start from the
 same numbers.
@@ -17,9 +17,9 @@ _SETTLING_TIME = 0.5
 _ROLLOUT_TIME = 2.0
 """Length of a contact or policy rollout [s]."""
 _CONTROL_INTERVAL = 1.0 / 60.0
-"""How long a rollout holds each control [s], whatever the substeps under test: those see the same states."""
+"""How long a rollout holds each control [s], whatever the substeps under test, so that all see the same states."""
 _INSIDE = 0.9
-"""Share of a control range that is used: a control on its bound sits on a kink of the clamp."""
+"""Share of a control range that is used: a control at its bound is on a kink of the clamp."""
 
 
 def _span(model: mujoco.MjModel) -> tuple[Array, Array]:
@@ -44,12 +44,12 @@ def _gentle_ctrl(model: mujoco.MjModel, rng: np.random.Generator) -> Array:
     middle, half = _span(model)
     rest = np.clip(0.0, middle - half, middle + half)
     nudge = 0.05 * half * rng.standard_normal(model.nu)
-    # Away from the bound that the rest may sit on.
+    # Away from the bound on which the rest value may be.
     return rest + np.where(rest == 0.0, nudge, np.abs(nudge) * np.sign(middle - rest))
 
 
 def _random_act(model: mujoco.MjModel, rng: np.random.Generator) -> Array:
-    """Activations inside their range, in [0, 1] where they have none."""
+    """Activations inside their range, or in [0, 1] if they have none."""
     low, high = np.zeros(model.na), np.ones(model.na)
     for actuator in range(model.nu):
         if model.actuator_actlimited[actuator]:
@@ -65,7 +65,7 @@ def _displaced(model: mujoco.MjModel, qpos: Array, delta: Array) -> Array:
 
 
 def _start(model: mujoco.MjModel) -> Point:
-    """Keyframe 0 where there is one, else the reference configuration at rest under zero controls."""
+    """Keyframe 0 if there is one, otherwise the reference configuration at rest under zero controls."""
     if model.nkey:
         return Point(*(key[0].copy() for key in (model.key_ctrl, model.key_qpos, model.key_qvel, model.key_act)))
     return Point(np.zeros(model.nu), model.qpos0.copy(), np.zeros(model.nv), np.zeros(model.na))
@@ -86,8 +86,8 @@ def _settled(oracle: Oracle) -> Point:
 def standing(oracle: Oracle, worlds: int, rng: np.random.Generator) -> list[Point]:
     """The starting pose settled into its contacts, then nudged differently in every world.
 
-    The nudges (1 mm or mrad, 1 cm/s, controls of 5 %) tell the worlds apart and move them off kinks such as a muscle
-    excitation of exactly zero.
+    The nudges (1 mm or mrad, 1 cm/s, controls of 5 %) make the worlds different and move them off kinks such as a
+    muscle excitation of exactly zero.
     """
     model, rest = oracle.model, _settled(oracle)
     return [
@@ -116,9 +116,9 @@ def random(oracle: Oracle, worlds: int, rng: np.random.Generator) -> list[Point]
 
 
 def contact(oracle: Oracle, worlds: int, rng: np.random.Generator) -> list[Point]:
-    """One state in contact of each of `worlds` rollouts under random controls, drawn anew every env step.
+    """One state in contact from each of `worlds` rollouts under random controls, which change every env step.
 
-    A model that touched nothing in any rollout gives states drawn from the whole of each rollout.
+    If the model touched nothing in any rollout, states are drawn from all of each rollout.
     """
     rollouts = []
     for _ in range(worlds):
@@ -135,7 +135,7 @@ def contact(oracle: Oracle, worlds: int, rng: np.random.Generator) -> list[Point
         if choices:
             picked.append(choices[rng.integers(len(choices))])
     if len(picked) < worlds:
-        # Some rollouts stayed in the air; the others supply their worlds too.
+        # Some rollouts stayed in the air; the others provide their states too.
         pool = [point for visited in rollouts for touching, point in visited if touching]
         picked += [pool[rng.integers(len(pool))] for _ in range(worlds - len(picked))]
     return picked
@@ -172,12 +172,12 @@ def make_states(model: mujoco.MjModel, kind: str, worlds: int, seed: int) -> lis
 
     Raises:
         ConfigError: no such kind.
-        SimulationError: the model diverges on the way.
+        SimulationError: the model diverges during a rollout.
     """
     generate = STATE_KINDS.get(kind)
     if generate is None:
         raise ConfigError(f"unknown kind of state {kind!r}: write one of {', '.join(STATE_KINDS)}")
-    # One stream a kind, so that asking for fewer kinds does not change the states of the others.
+    # One random stream per kind, so that leaving out a kind does not change the states of the others.
     rng = np.random.default_rng([seed, list(STATE_KINDS).index(kind)])
     oracle = Oracle(model, max(1, round(_CONTROL_INTERVAL / model.opt.timestep)))
     points = generate(oracle, worlds, rng)

@@ -1,4 +1,4 @@
-"""The interface every way of differentiating an env step fulfils.
+"""The interface of every way to differentiate an env step.
 
 Axes: W worlds. `nq, nv, na, nu` as in MuJoCo.
 """
@@ -13,7 +13,7 @@ from msk_ray.physics import WorldBatch
 
 
 class StepState(NamedTuple):
-    """Tensors of one side of an env step."""
+    """The state before or after an env step."""
 
     qpos: Tensor
     """Generalised positions [m, rad, unit quaternions], shape (W, nq)."""
@@ -24,7 +24,7 @@ class StepState(NamedTuple):
 
 
 class InputGradients(NamedTuple):
-    """Gradients with respect to the inputs of an env step; None where none was asked for."""
+    """Gradients with respect to the inputs of an env step; None where none was requested."""
 
     ctrl: Tensor | None
     """Shape (W, nu)."""
@@ -37,7 +37,7 @@ class InputGradients(NamedTuple):
 
 
 class Needs(NamedTuple):
-    """Which inputs a gradient is wanted for."""
+    """The inputs for which a gradient is needed."""
 
     ctrl: bool
     qpos: bool
@@ -46,24 +46,24 @@ class Needs(NamedTuple):
 
 
 class Backward(ABC):
-    """One way of differentiating an env step: records what it needs of the forward pass, then pulls cotangents back.
+    """One way to differentiate an env step: records what it needs of the forward pass, then pulls cotangents back.
 
-    A Simulation calls `attach` once, replays `launch_step` for every forward pass, `record` right after it if a
-    gradient will be wanted, and `vjp` once for each recorded step, latest first.
+    A Simulation calls `attach` once, replays `launch_step` for every forward pass, calls `record` right after it if a
+    gradient will be needed, and `vjp` once for each recorded step, latest first.
     """
 
     name: str
 
     @abstractmethod
     def attach(self, batch: WorldBatch) -> None:
-        """Check that the model is supported and allocate for it.
+        """Check that the model is supported and allocate buffers for it.
 
         Raises:
-            UnsupportedModelError: the model has a feature this mode cannot differentiate.
+            UnsupportedModelError: the model has a feature that this mode cannot differentiate.
         """
 
     def fresh(self) -> Self:
-        """A mode with the same settings, to attach to another batch. `attach` has to set all that is not a setting."""
+        """A mode with the same settings, to attach to another batch. `attach` must set everything but the settings."""
         return copy.copy(self)
 
     def launch_step(self, batch: WorldBatch) -> None:
@@ -74,17 +74,17 @@ class Backward(ABC):
         batch.launch_step()
 
     def last_data(self, batch: WorldBatch) -> Any:
-        """The mujoco_warp.Data in which the last substep of an env step was made."""
+        """The mujoco_warp.Data in which the last substep of an env step was computed."""
         return batch.data
 
     @abstractmethod
     def record(self, ctrl: Tensor, start: StepState, end: StepState) -> tuple[Tensor, ...]:
-        """Tensors `vjp` will need of the step just made. They must not alias buffers the next step overwrites."""
+        """Tensors of the last step that `vjp` will need. They must not alias buffers that the next step overwrites."""
 
     @abstractmethod
     def vjp(self, saved: tuple[Tensor, ...], cotangent: StepState, needs: Needs) -> InputGradients:
         """Vector-Jacobian product of the recorded step: cotangents of its results, in raw coordinates, pulled back."""
 
     def diagnostics(self) -> dict[str, float]:
-        """Figures gathered since the last call, by metric name."""
+        """Diagnostics gathered since the last call, by metric name."""
         return {}

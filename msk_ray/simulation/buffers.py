@@ -1,4 +1,4 @@
-"""Sharing arrays and streams between torch and Warp."""
+"""Share arrays and streams between torch and Warp."""
 
 import torch
 import warp as wp
@@ -9,12 +9,12 @@ from msk_ray.simulation.backward import StepState
 
 
 def device_of(batch: WorldBatch) -> torch.device:
-    """The batch's device, as torch names it."""
+    """The batch's device as a torch device."""
     return torch.device(str(batch.device))
 
 
 def wait_for(device: torch.device) -> None:
-    """Wait until torch's current stream on `device` has done what was asked of it."""
+    """Wait until torch's current stream on `device` has finished its work."""
     if device.type == "cuda":
         torch.cuda.current_stream(device).synchronize()
 

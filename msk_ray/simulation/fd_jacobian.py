@@ -13,20 +13,19 @@ from msk_ray.simulation.tangent import Tangent
 class FdJacobian(Backward):
     """Perturbed copies of every world run as extra worlds of one batch; differences are taken in tangent space.
 
-    Works with every model and integrator mujoco_warp steps. Cost: 2·(nu + 2·nv + na) extra worlds a world, fewer
-    where some inputs need no gradient.
+    Works with every model and integrator that mujoco_warp steps. Cost: 2·(nu + 2·nv + na) extra worlds per world, fewer
+    if some inputs need no gradient.
 
-    Accuracy: rounding of float32 is divided by the perturbation, and a kink or jump inside it is taken for a slope.
-    Medians over 1 to 16 substeps with the defaults: 1e-6 to 5e-4 on a cartpole, 1e-5 to 1e-3 on an ant that stands.
-    On an ant that moves in contact 1e-4 to 1e-3 for ctrl and qvel, but there a qpos gradient is wrong by any factor
-    wherever a touch begins or ends inside the perturbation: a tenth of the states at 1 substep, half of them at 16.
+    Accuracy: rounding of float32 is divided by the perturbation, and a kink or jump inside it is mistaken for a slope.
+    Medians over 1 to 16 substeps with the defaults: 1e-6 to 5e-4 on a cartpole, 1e-5 to 1e-3 on a standing ant.
+    On an ant moving in contact 1e-4 to 1e-3 for ctrl and qvel, but there a qpos gradient is wrong by any factor
+    where a contact begins or ends inside the perturbation: a tenth of the states at 1 substep, half of them at 16.
 
     Args:
-        eps_ctrl: perturbation of ctrl [its own unit].
-        eps_qpos: perturbation of qpos along a tangent direction [m, rad].
-        eps_qvel: perturbation of qvel [m/s, rad/s].
-        eps_act: perturbation of act [its own unit]; small because a resting muscle's lies just above its clamp at 0.
-        max_worlds: perturbed copies are run in chunks of at most this many worlds.
+        eps_ctrl: perturbation of ctrl [its own unit]. eps_qpos: perturbation of qpos along a tangent direction [m,
+        rad]. eps_qvel: perturbation of qvel [m/s, rad/s]. eps_act: perturbation of act [its own unit]; small because
+        that of a resting muscle is just above its clamp at 0. max_worlds: perturbed copies are run in chunks of at most
+        this many worlds.
     """
 
     name = "fd_jacobian"

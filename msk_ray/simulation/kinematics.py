@@ -1,6 +1,6 @@
-"""Where bodies, sites and centres of mass are and how they move, as autograd functions of (qpos, qvel).
+"""Positions and velocities of bodies, sites and centres of mass, as autograd functions of (qpos, qvel).
 
-Axes: W worlds, B bodies, n of what was asked for.
+Axes: W worlds, B bodies, n names in a list.
 """
 
 from collections.abc import Sequence
@@ -39,10 +39,10 @@ class _Walk(torch.autograd.Function):
 
 
 class _Constants(NamedTuple):
-    """What centres of mass are computed from; on the device."""
+    """Constants for centres of mass, on the device."""
 
     mass: Tensor
-    """Of each body [kg], (B,)."""
+    """Mass of each body [kg], (B,)."""
     inertia: Tensor
     """Principal moments of each body [kg m²], (B, 3)."""
     center: Tensor
@@ -113,7 +113,7 @@ class Kinematics:
 
         Args:
             kind: `body`, `site` or `geom`.
-            names: what is asked for.
+            names: one name or id, or several.
 
         Raises:
             ConfigError: the model has none of that name.
@@ -175,10 +175,9 @@ class Kinematics:
 
 
 class Frames:
-    """Bodies, sites, geoms and centres of mass in one state, in world coordinates; all of it in the graph.
+    """Bodies, sites, geoms and centres of mass in one state, in world coordinates, all with gradients.
 
-    Every method takes a name or an id and gives (W, ·), or a list of them and gives (W, n, ·). What several terms ask
-    for is computed once.
+    Every method takes a name or an id and returns (W, ·), or a list of them and returns (W, n, ·). Results are cached.
     """
 
     def __init__(self, kinematics: Kinematics, pos: Tensor, quat: Tensor, linvel: Tensor, angvel: Tensor) -> None:
@@ -204,7 +203,7 @@ class Frames:
         return self._angvel[:, self._kinematics.indices("body", body)]
 
     def axis(self, body: Names, axis: int) -> Tensor:
-        """Where axis 0, 1 or 2 (x, y, z) of bodies points, unit vectors (W, 3) or (W, n, 3)."""
+        """Direction of axis 0, 1 or 2 (x, y, z) of bodies, unit vectors (W, 3) or (W, n, 3)."""
         quat = self.orientation(body)
         unit = torch.zeros(3, dtype=quat.dtype, device=quat.device)
         unit[axis] = 1.0
@@ -234,7 +233,7 @@ class Frames:
         return self._point("geom", geom)[1]
 
     def center_of_mass(self, body: Names = 0) -> Tensor:
-        """Centre of mass of the subtrees of bodies, by default of everything [m], (W, 3) or (W, n, 3)."""
+        """Centre of mass of the subtrees of bodies, by default of the whole model [m], (W, 3) or (W, n, 3)."""
         return self._subtree(self._centers[0], body)
 
     def com_velocity(self, body: Names = 0) -> Tensor:

@@ -38,7 +38,7 @@ def make_backward(name: str, **options: Any) -> Backward:
 
 
 def configured_backward(physics: PhysicsConfig) -> Backward:
-    """The backward mode a physics section describes."""
+    """The backward mode of a physics section."""
     match physics.backward:
         case "fd_jacobian":
             return FdJacobian(**physics.fd.model_dump())

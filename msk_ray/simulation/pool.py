@@ -11,14 +11,14 @@ _ALIGN = 64  # words; keeps every array on a 256-byte boundary
 
 
 class Pool:
-    """Gathers claims first, then places them all in one allocation and hands the arrays out."""
+    """First collects claims, then places them all in one allocation and provides the arrays."""
 
     def __init__(self, device: wp.Device) -> None:
         self._device = device
         self._claims: list[tuple[Callable[[wp.array], None], tuple[int, ...], Any]] = []
 
     def floats(self, holder: dict[str, wp.array], name: str, *shape: int) -> None:
-        """Claim a float32 array to be put at holder[name]."""
+        """Claim a float32 array, which will be stored in holder[name]."""
         self._claims.append((lambda array: holder.__setitem__(name, array), shape, wp.float32))
 
     def adopt(self, holder: Any, name: str) -> None:
@@ -34,7 +34,7 @@ class Pool:
         self._claims.append((place, old.shape, old.dtype))
 
     def allocate(self) -> Tensor:
-        """Place all arrays; the buffer as one float32 tensor, which must outlive them."""
+        """Place all arrays; returns the buffer as one float32 tensor, which must outlive them."""
         offsets, total = [], 0
         for _, shape, dtype in self._claims:
             offsets.append(total)

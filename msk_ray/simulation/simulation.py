@@ -37,7 +37,7 @@ def resolve_device(device: str) -> torch.device:
         seen = f"{count} CUDA device(s)" if count else "no CUDA device"
         raise DeviceError(
             f"device {device!r} asked for, but torch sees {seen}: write --device cpu (in Python device='cpu'), "
-            "or mend the driver"
+            "or fix the driver"
         )
     if not wp.is_cuda_available():
         raise DeviceError("torch sees a CUDA device but Warp does not: check that driver and warp-lang fit")
@@ -53,7 +53,7 @@ class WarpSimStep(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, Tensor]:
         start = StepState(qpos, qvel, act)
         end = sim.advance(ctrl, start)
-        # The one that made this step: the simulation may go on with another.
+        # The engine that computed this step: the simulation may continue with another.
         ctx.engine = sim.engine
         ctx.save_for_backward(*sim.require_backward().record(ctrl, start, end))
         return end
@@ -66,7 +66,7 @@ class WarpSimStep(torch.autograd.Function):
         ctx.engine.batch.check_model()
         ctx.engine.settle()
         gradients = ctx.engine.backward.vjp(ctx.saved_tensors, cotangent, needs)
-        # A linear map takes zero to zero, also in a world whose Jacobian is not finite: 0 × NaN must not leak out.
+        # A linear map takes zero to zero, even in a world whose Jacobian is not finite: 0 × NaN must not leak out.
         used = torch.cat(cotangent, dim=-1).ne(0).any(-1, keepdim=True)
         return (None, *(None if g is None else torch.where(used, g, 0.0) for g in gradients))
 
@@ -81,11 +81,11 @@ class Simulation:
         backward: how to differentiate: a mode or its name (tape_per_substep, tape_all, fd_jacobian, hybrid); None for
             forward only.
         device: "cpu", "cuda" or "cuda:N".
-        nconmax, njmax: contacts and constraint rows a world. By default a bound from the geometry where that is small,
-            else what a short probe in C MuJoCo needed and half as much again, which grows with use.
-        tolerance: solver tolerance, below mujoco_warp's floor of 1e-6 if wanted.
+        nconmax, njmax: contacts and constraint rows per world. By default a bound from the geometry if that is small,
+            otherwise 1.5 times what a short probe in C MuJoCo needed, which grows with use.
+        tolerance: solver tolerance, which may be below mujoco_warp's floor of 1e-6.
 
-    The model must not be edited while the simulation lives; the next step or backward refuses to go on if it was.
+    The model must not be edited while the simulation exists; if it was, the next step or backward pass raises an error.
 
     Raises:
         UnsupportedModelError: the model cannot be stepped, or not differentiated by `backward`.
@@ -124,12 +124,12 @@ class Simulation:
 
     @property
     def engine(self) -> Engine:
-        """What made the last step."""
+        """The engine that computed the last step."""
         return self._stepper.engine
 
     @property
     def batch(self) -> WorldBatch:
-        """The worlds. A step or `diagnostics` that makes more room replaces it, so ask for it where it is used."""
+        """The worlds. A step or `diagnostics` that enlarges buffers replaces it, so do not keep a reference."""
         return self.engine.batch
 
     @property
@@ -143,7 +143,7 @@ class Simulation:
         return float(self.model.opt.timestep) * self.substeps
 
     def require_backward(self) -> Backward:
-        """The backward mode, which a forward-only simulation lacks."""
+        """The backward mode; raises if the simulation is forward only."""
         if self.backward is None:
             raise ConfigError("this Simulation was made without a backward mode; wrap the call in torch.no_grad()")
         return self.backward
@@ -165,9 +165,9 @@ class Simulation:
 
         Raises:
             ConfigError: an argument has another shape, dtype or device.
-            SimulationError: a step lost contacts or constraint rows, and more room was not allowed or would not help.
-                On CUDA it may be an earlier step, whose results are NaN in the worlds concerned.
-            ConfigError: the MjModel was edited since the simulation was made.
+            SimulationError: a step lost contacts or constraint rows, and larger buffers were not allowed or would not
+                help. On CUDA it may be an earlier step, whose results are NaN in the affected worlds.
+            ConfigError: the MjModel was edited after the simulation was created.
         """
         self._check_inputs(ctrl, qpos, qvel, act)
         if torch.is_grad_enabled() and any(t.requires_grad for t in (ctrl, qpos, qvel, act)):
@@ -177,8 +177,8 @@ class Simulation:
     def contact_forces(self) -> Tensor:
         """Force of all contacts on every geom in world coordinates [N], shape (W, G, 3).
 
-        Values only, without a gradient, of the last substep of the last `step`: ask before the next one, and before a
-        backward pass, which goes through the same buffers.
+        Values only, without a gradient, from the last substep of the last `step`: read them before the next step, and
+        before a backward pass, which uses the same buffers.
         """
         return self.engine.contact_forces()
 
@@ -204,16 +204,16 @@ class Simulation:
 
     @property
     def capacity(self) -> Capacity:
-        """Contacts and constraint rows a world that there is room for now."""
+        """Contacts and constraint rows per world that currently fit."""
         return self.batch.capacity
 
     def reserve(self, capacity: Capacity) -> None:
-        """Make room for at least `capacity` a world, as far as it is not fixed by `nconmax` and `njmax`."""
+        """Enlarge the buffers to at least `capacity` per world, unless `nconmax` and `njmax` fix them."""
         self._stepper.reserve(capacity)
 
     def diagnostics(self) -> dict[str, float]:
-        """Figures since the last call: share of worlds at a solver limit, largest shares of the room for contacts and
-        rows that a step ended with, and those of the backward mode. Buffers that are nearly full grow.
+        """Diagnostics since the last call: share of worlds at a solver limit, largest shares of the buffers for
+        contacts and rows that a step used, and those of the backward mode. Buffers that are nearly full grow.
 
         Raises:
             SimulationError: contacts or constraint rows were lost to a full buffer.

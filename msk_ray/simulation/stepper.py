@@ -1,4 +1,4 @@
-"""Env steps of tensors, on recorded graphs whose buffers grow where a step needs more room."""
+"""Env steps of tensors, on recorded graphs whose buffers grow if a step needs more."""
 
 import warp as wp
 from torch import Tensor
@@ -10,13 +10,13 @@ from msk_ray.simulation.backward import Backward, StepState
 from msk_ray.simulation.buffers import BatchTensors, device_of, stream_of, wait_for
 
 _NEARLY_FULL = 0.75
-"""Share of a buffer in use from which it grows between epochs, before a step that it is too small for."""
+"""Share of a buffer in use above which it grows between epochs, before a step needs more."""
 
 
 class Engine:
-    """One batch, the graph of its step and the backward mode attached to it: everything whose size is fixed.
+    """One batch, the graph of its step and the backward mode attached to it: everything with a fixed size.
 
-    A recorded env step is pulled back by the engine that made it, whatever others came after.
+    A recorded env step is pulled back by the engine that computed it, even if others have replaced it since.
     """
 
     def __init__(self, batch: WorldBatch, backward: Backward | None) -> None:
@@ -43,21 +43,21 @@ class Engine:
         return force.clone()
 
     def advance(self, ctrl: Tensor, start: StepState) -> StepState:
-        """One env step, whatever it lost."""
+        """One env step, even if it lost contacts or rows."""
         self._buffers.load(ctrl, start)
         self._graph.replay(stream_of(self.device))
         self._unseen = True
         return self._buffers.read()
 
     def settle(self) -> None:
-        """Raise SimulationError if a step made so far lost something. Waits for the device, once after each step."""
+        """Raise SimulationError if any step so far lost something. Waits for the device, once after each step."""
         if self._unseen:
             wait_for(self.device)
             self._unseen = False
         self.batch.raise_losses()
 
     def diagnostics(self) -> tuple[dict[str, float], Capacity]:
-        """Figures since the last call, and the most room a world used.
+        """Diagnostics since the last call, and the largest use of the buffers by a world.
 
         Raises:
             SimulationError: a step lost contacts or constraint rows.
@@ -74,13 +74,13 @@ class Engine:
 
 
 class Stepper:
-    """Steps a batch; on CPU, where a loss is known at once, a step that lost something is repeated with more room.
+    """Steps a batch; on CPU, where a loss is known at once, a step that lost something is repeated with larger buffers.
 
-    On CUDA the results of such a step are NaN, and an error follows at the first call after the device got there: at
+    On CUDA the results of such a step are NaN, and the first call after the device has run the step raises an error, at
     the latest when it is pulled back.
 
     Attributes:
-        engine: what made the last step.
+        engine: the engine that computed the last step.
     """
 
     def __init__(self, batch: WorldBatch, backward: Backward | None = None) -> None:
@@ -97,21 +97,22 @@ class Stepper:
         self.engine.batch.check_model()
         self.engine.batch.raise_losses()
         end = self.engine.advance(ctrl, start)
-        # On CUDA what is heard of here may be the loss of an earlier step, which this one started from.
+        # On CUDA this may be the loss of an earlier step, from which this one started.
         while self.engine.device.type == "cpu" and self.engine.batch.losses.heard():
             self._replace(self.engine.batch.larger())
             end = self.engine.advance(ctrl, start)
         return end
 
     def reserve(self, wanted: Capacity) -> None:
-        """Make room for at least `wanted` a world, as far as it may grow."""
+        """Enlarge the buffers to at least `wanted` per world, as far as they may grow."""
         batch = self.engine.batch
         allowed = batch.growth(wanted)
         if allowed != batch.capacity:
             self._replace(batch.resized(batch.nworld, allowed))
 
     def diagnostics(self) -> dict[str, float]:
-        """Figures since the last call, the largest where there were several engines; makes room where it runs short.
+        """Diagnostics since the last call, the largest if there were several engines; enlarges buffers that are
+        filling.
 
         Raises:
             SimulationError: a step lost contacts or constraint rows.

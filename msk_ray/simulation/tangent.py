@@ -54,7 +54,7 @@ def quat_rotate(q: Tensor, v: Tensor) -> Tensor:
 
 
 class Tangent:
-    """Where each joint of a model lives in qpos (nq) and in the tangent space (nv)."""
+    """The position of each joint of a model in qpos (nq) and in the tangent space (nv)."""
 
     def __init__(self, model: mujoco.MjModel, device: torch.device) -> None:
         self.nq, self.nv = model.nq, model.nv

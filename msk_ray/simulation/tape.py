@@ -37,11 +37,11 @@ _KEPT_CONTACT = (
 
 
 class _Tape(Backward):
-    """What the two tapes share: checkpoints, the backward graph, and reading it out.
+    """The shared part of the two tapes: checkpoints, the backward graph, and reading its results.
 
     Args:
         substep_grad_clip: bound on the Euclidean norm of each world's state cotangent between substeps, in the
-            cotangent's own units; direction is kept. None for no bound.
+            cotangent's own units; the direction is kept. None for no bound.
         residual_tolerance: a world is counted as unconverged where the solver left more than this share of its
             forces unbalanced, |Ma - τ - Jᵀf| / |(Ma, τ, Jᵀf)|.
     """
@@ -82,11 +82,11 @@ class _Tape(Backward):
         self._graph: Graph | None = None
 
     def _prepare(self, pool: Pool) -> None:
-        """Claim further room in the buffer that is copied out per recorded step."""
+        """Claim further arrays in the buffer that is copied out per recorded step."""
 
     @abstractmethod
     def _stages(self, k: int) -> Any:
-        """Launch what puts the stages before substep k into a mujoco_warp.Data, and return it."""
+        """Launch what restores the stages before substep k into a mujoco_warp.Data, and return it."""
 
     def record(self, ctrl: Tensor, start: StepState, end: StepState) -> tuple[Tensor, ...]:
         return (ctrl.detach().clone(), self._saved.clone())
@@ -108,7 +108,7 @@ class _Tape(Backward):
         return InputGradients(*(g.clone() if need else None for g, need in zip(gradients, needs, strict=True)))
 
     def bytes_recorded(self) -> int:
-        """Size of what one recorded env step keeps, all worlds together; its control comes on top."""
+        """Size of the data of one recorded env step, for all worlds together, without its control."""
         return self._saved.numel() * self._saved.element_size()
 
     def launch_backward(self) -> None:
@@ -133,9 +133,9 @@ class _Tape(Backward):
         return figures
 
     def _approximated_share(self) -> float:
-        """Share of the worlds' substeps pulled back whose gradient went through a contact that is approximated.
+        """Share of the worlds' substeps whose gradient went through an approximated contact.
 
-        Warns when it is above zero for the first time.
+        Warns the first time it is above zero.
         """
         count, pairs = self._adjoint.touch_counter.read()
         share = count / (max(1, self._pulled) * self._batch.substeps * self._batch.nworld)
@@ -176,7 +176,7 @@ class TapePerSubstep(_Tape):
 
 
 class TapeAll(_Tape):
-    """Keeps everything the adjoint of every substep reads: nothing is recomputed, at a price in memory."""
+    """Keeps everything that the adjoint of every substep reads: nothing is recomputed, at the cost of memory."""
 
     name = "tape_all"
 
@@ -248,9 +248,9 @@ class Hybrid(Backward):
         return self._stepping().last_data(batch)
 
     def _stepping(self) -> Backward:
-        """The mode whose launches make the step."""
+        """The mode whose launches compute the step."""
         own = [m for m in (self.state, self.ctrl) if type(m).launch_step is not Backward.launch_step]
-        assert len(own) <= 1, "two modes that each launch the step their own way cannot be mixed"
+        assert len(own) <= 1, "two modes that each launch the step in their own way cannot be combined"
         return own[0] if own else self.state
 
     def record(self, ctrl: Tensor, start: StepState, end: StepState) -> tuple[Tensor, ...]:

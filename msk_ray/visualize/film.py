@@ -1,4 +1,4 @@
-"""Frames put together: video, numbered pictures, film strip, grid."""
+"""Combine frames: video, numbered pictures, film strip, grid."""
 
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
@@ -26,7 +26,7 @@ def write_video(frames: Iterable[np.ndarray], path: Path, fps: float) -> int:
     count = 0
     stream = None
     try:
-        # The index goes to the front of the file, so that it plays while it loads.
+        # Put the index at the front of the file, so that it plays while it loads.
         with av.open(str(path), "w", options={"movflags": "faststart"}) as container:
             for frame in frames:
                 count += 1
@@ -44,10 +44,10 @@ def write_video(frames: Iterable[np.ndarray], path: Path, fps: float) -> int:
 
 
 def check_video_path(path: Path) -> None:
-    """Refuse a name that no container goes with, before anything is computed.
+    """Refuse a file name whose suffix has no container format, before anything is computed.
 
     Raises:
-        ConfigError: naming the suffixes that work.
+        ConfigError: the message names the suffixes that work.
     """
     if path.suffix not in (".mp4", ".mkv", ".mov"):
         raise ConfigError(f"--video {path}: write a name that ends in .mp4, .mkv or .mov")
@@ -66,7 +66,7 @@ def write_frames(frames: Iterable[np.ndarray], folder: Path) -> int:
 
 
 def save_image(image: Image.Image, path: Path) -> None:
-    """Write a picture; its folder is made.
+    """Write a picture and create its folder.
 
     Raises:
         StorageFailure: it cannot be written.
@@ -86,7 +86,7 @@ def strip(frames: Sequence[np.ndarray], captions: Sequence[str]) -> Image.Image:
 def grid(rows: Sequence[Sequence[np.ndarray]], titles: Sequence[str], captions: Sequence[Sequence[str]]) -> Image.Image:
     """Rows of frames of equal size, each frame with a caption below and each row with a title above.
 
-    A row may be shorter than the others; an empty title takes no room.
+    A row may be shorter than the others; an empty title takes no space.
     """
     height, width = rows[0][0].shape[:2]
     size = max(11, height // 14)

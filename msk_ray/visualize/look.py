@@ -1,4 +1,4 @@
-"""How a scene is drawn: contact forces as arrows, muscles in the colour of their activation. MuJoCo alone."""
+"""How a scene is drawn: contact forces as arrows, muscles in the colour of their activation. Uses only MuJoCo."""
 
 import mujoco
 import numpy as np
@@ -9,23 +9,23 @@ FORCE = (0.95, 0.15, 0.55, 1.0)
 """Colour of contact forces."""
 _BODY_ALPHA = 0.4
 _TENDON_WIDTH = 0.005
-"""Least radius of a muscle's tendon, in units of the model's extent."""
+"""Smallest radius of a muscle's tendon, in units of the model's extent."""
 _ARROW = 2.0
 """Size of an arrow for a force equal to the whole weight, in units of the model's extent. MuJoCo draws half of it."""
 
 
 class Look:
-    """Draws the state of one model; changes the model's visual fields alone."""
+    """Draws the state of one model; changes only the model's visual fields."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self._model = model
         self._muscles = muscle_tendons(model)
         weight = float(model.body_mass.sum()) * float(np.linalg.norm(model.opt.gravity))
         if weight > 0.0:
-            # MuJoCo draws map.force / meanmass metres for a newton.
+            # MuJoCo draws map.force / meanmass metres per newton.
             model.vis.map.force = _ARROW * model.stat.extent * model.stat.meanmass / weight
         if self._muscles:
-            # Muscles run close to the bones, mostly inside the shapes that stand for them.
+            # Muscles run close to the bones, mostly inside their geoms.
             model.vis.map.alpha = _BODY_ALPHA
             width = _TENDON_WIDTH * float(model.stat.extent)
             for tendon in self._muscles:
@@ -38,14 +38,14 @@ class Look:
         return bool(self._muscles)
 
     def switch_on(self, option: mujoco.MjvOption) -> None:
-        """Draw contact forces, and tendons where there are any; bodies with muscles are drawn transparent."""
+        """Draw contact forces, and tendons if there are any; bodies of models with muscles are transparent."""
         option.flags[mujoco.mjtVisFlag.mjVIS_TRANSPARENT] = self.has_muscles
         option.flags[mujoco.mjtVisFlag.mjVIS_CONTACTFORCE] = True
         option.flags[mujoco.mjtVisFlag.mjVIS_CONTACTPOINT] = True
         option.flags[mujoco.mjtVisFlag.mjVIS_TENDON] = True
 
     def colour(self, act: np.ndarray) -> None:
-        """Colour every muscle's tendon by its activation; of several on one tendon by the most active.
+        """Colour every muscle's tendon by its activation; with several muscles on a tendon, by the most active one.
 
         Args:
             act: shape (na,).

@@ -1,4 +1,4 @@
-"""Frames of a trajectory, drawn in a process of its own by whichever OpenGL platform works here."""
+"""Frames of a trajectory, drawn in a separate process with an OpenGL platform that works here."""
 
 import os
 import subprocess
@@ -16,7 +16,7 @@ import msk_ray
 from msk_ray.errors import DeviceError
 
 BACKENDS = ("egl", "osmesa")
-"""Headless OpenGL platforms, the faster first."""
+"""Headless OpenGL platforms, the faster one first."""
 _PROBE_S = 120.0
 ADVICE = "on Debian or Ubuntu: apt install libegl1 (GPU or Mesa), or apt install libosmesa6 (software)"
 
@@ -50,15 +50,15 @@ class View:
     width: int = 640
     height: int = 480
     camera: str = ""
-    """Name of one of the model's cameras; empty takes the first, or one that follows the body."""
+    """Name of one of the model's cameras; empty: the first, or one that follows the body."""
 
 
 @cache
 def headless_backend() -> str:
-    """The OpenGL platform that draws without a display here: `egl`, `osmesa`, or what MUJOCO_GL says.
+    """The OpenGL platform that works without a display here: `egl`, `osmesa`, or that of MUJOCO_GL.
 
     Raises:
-        DeviceError: none does; the message names the packages to install.
+        DeviceError: none works; the message names the packages to install.
     """
     asked = os.environ.get("MUJOCO_GL", "").lower()
     if sys.platform != "linux":
@@ -70,7 +70,7 @@ def headless_backend() -> str:
             return backend
         faults[backend] = fault
     tried = "; ".join(f"{name}: {fault}" for name, fault in faults.items())
-    raise DeviceError(f"nothing draws without a display here ({tried}); {ADVICE}")
+    raise DeviceError(f"no OpenGL platform works without a display ({tried}); {ADVICE}")
 
 
 def probe(backend: str) -> str | None:
@@ -131,7 +131,7 @@ def _check_camera(model: mujoco.MjModel, camera: str) -> None:
 
 
 def _environment(backend: str) -> dict[str, str]:
-    """Of the drawing process: the platform, and this package wherever it was started from."""
+    """Environment of the drawing process: the platform, and the path of this package."""
     package = str(Path(msk_ray.__file__).resolve().parent.parent)
     paths = [package, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
     found = os.environ | {"PYTHONPATH": os.pathsep.join(dict.fromkeys(paths))}

@@ -9,7 +9,7 @@ import torch
 from conftest import ant_xml
 
 from msk_ray.errors import ConfigError, SimulationError
-from msk_ray.gradcheck import STATE_KINDS, GradientReport, Limits, Oracle, Point, check_gradients
+from msk_ray.gradcheck import STATE_KINDS, GradientCheck, Limits, Oracle, Point, check_gradients
 from msk_ray.gradcheck.check import check_request, compare, forward_mismatch
 from msk_ray.simulation import FdJacobian, Simulation
 from msk_ray.simulation.backward import InputGradients
@@ -27,7 +27,7 @@ class Altered(FdJacobian):
         return gradients._replace(**{self._altered: self._change(getattr(gradients, self._altered))})
 
 
-def errors(report: GradientReport, name: str, state: str | None = None) -> list[float]:
+def errors(report: GradientCheck, name: str, state: str | None = None) -> list[float]:
     return [r.rel_error for r in report.of(name, state)]
 
 

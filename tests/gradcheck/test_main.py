@@ -61,7 +61,7 @@ def test_a_config_stands_for_its_model(root, capsys):
 
 def test_past_tolerance(cartpole_file, capsys):
     assert run(main, [str(cartpole_file), *FAST, "--tolerance", "1e-12"]) == 1
-    assert "past the tolerance" in capsys.readouterr().out
+    assert "above the tolerance" in capsys.readouterr().out
 
 
 def test_nonfinite_elements_are_named(cartpole_file, capsys, monkeypatch):
@@ -70,7 +70,7 @@ def test_nonfinite_elements_are_named(cartpole_file, capsys, monkeypatch):
     assert run(main, [str(cartpole_file), *FAST]) == 1
     out = capsys.readouterr().out
     assert "non-finite: state 0 of random: the slope of qvel of joint slide by qvel of joint hinge\n" in out
-    assert "largest relative error non-finite, tolerance 1.0e-02: past the tolerance" in out
+    assert "largest relative error non-finite, tolerance 1.0e-02: above the tolerance" in out
     assert "inf" not in out.replace("non-finite", "")
     assert run(main, [str(cartpole_file), *FAST, "--json"]) == 1
     report = json.loads(capsys.readouterr().out)
