@@ -1,4 +1,4 @@
-"""How right gradients are: each mode against float64 central differences of C MuJoCo, on the environments' models."""
+"""Accuracy of gradients: each mode against float64 central differences of C MuJoCo, on the environments' models."""
 
 import argparse
 import statistics

@@ -21,13 +21,13 @@ from msk_ray.visualize.episodes import record
 from msk_ray.visualize.render import States
 
 SETTLED = 2.5
-"""Seconds after which the gait counts."""
+"""Time after which the gait is measured [s]."""
 SLOWEST = 0.5
-"""Strides a second below which an oscillation is no stride."""
+"""Frequency below which an oscillation does not count as a stride [1/s]."""
 LOCKED = 0.75
-"""Share of the time at an end of its range from which a joint is named."""
+"""Share of the time at an end of its range above which a joint is named."""
 MARGIN = 0.05
-"""A joint so near an end of its range is at it [rad]: the limits of these models are soft."""
+"""Distance within which a joint counts as at the end of its range [rad]: the limits of these models are soft."""
 
 
 @dataclass(frozen=True)
@@ -91,14 +91,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         policy = load_policy(checkpoint)
         enough = round(2 * SETTLED / policy.config.env.control_timestep)
         if args.steps < enough:
-            raise ConfigError(f"--steps {args.steps}: a gait is told from {enough} env steps or more")
+            raise ConfigError(f"--steps {args.steps}: a gait needs {enough} env steps or more")
         recording = record(bench, policy, request)
         joints = recording.model.jnt_type
         if recording.model.nv < 7 or joints[0] != mujoco.mjtJoint.mjJNT_FREE or recording.model.nq != len(joints) + 6:
             raise ConfigError(f"{checkpoint}: its model is no free root with hinges; ant is")
         whole = [w for w in range(recording.count) if recording.length(w) >= enough]
         if not whole:
-            raise ConfigError(f"{checkpoint}: all episodes ended within {2 * SETTLED:g} s; name a policy that goes on")
+            raise ConfigError(
+                f"{checkpoint}: all episodes ended within {2 * SETTLED:g} s; name a policy that lasts longer"
+            )
         gaits = [gait(recording.world(w), recording.timestep) for w in whole]
         vx, flight, rate = (float(np.median([getattr(g, key) for g in gaits])) for key in ("vx", "flight", "rate"))
         shares, past = (np.mean([getattr(g, key) for g in gaits], axis=0) for key in ("at_end", "past"))

@@ -1,4 +1,4 @@
-"""How wrong gradients are where a pair of geoms touches whose contacts are approximated, resting and sliding."""
+"""Errors of gradients through approximated contacts, with the pair of geoms resting and sliding."""
 
 import argparse
 import statistics
@@ -38,7 +38,7 @@ def scene(table: str, thing: str) -> mujoco.MjModel:
 
 
 def states(oracle: Oracle, count: int, sliding: bool) -> list[Point]:
-    """States in touch: dropped in a random pose and settled, and then pushed if they are to slide."""
+    """States in contact: dropped in a random pose and settled, and then pushed if they should slide."""
     rng = np.random.default_rng(0)
     model, found = oracle.model, []
     while len(found) < count:

@@ -1,10 +1,10 @@
-"""What would early stopping have done? A sweep that ran without it, judged afterwards by a space's rule.
+"""What would early stopping have done? A sweep that ran without it is judged afterwards by a space's rule.
 
-The recorded evaluations are told to the rule in the order in which so many trials at once would have reached them; a
-trial it names ends there, and the next one begins. The table says what that saves, and what it costs: the best score
-kept beside the best of all. Which trial meets which others at a rung hangs on the order they begin in, so the rule is
-also judged over random orders. A sweep that was itself stopped early cannot be judged: what its trials would have
-become is not known.
+The recorded evaluations are replayed to the rule in the order in which a given number of trials at a time would have
+reached them; a trial that the rule names ends there, and the next one starts. The table shows what that saves and what
+it costs: the best score kept, compared with the best of all. Which trials meet at a rung depends on the order in which
+they start, so the rule is also judged over random orders. A sweep that was itself stopped early cannot be judged,
+because the final scores of its trials are not known.
 """
 
 import argparse
@@ -34,7 +34,7 @@ from msk_ray.sweep.rules.early_stopping import Pruner, SchedulerSpec
 from msk_ray.sweep.rules.median import Median
 
 NEAR = 0.01
-"""What a sweep may lose of its best score and still have found as much, as a share of it."""
+"""Share of its best score that a sweep may lose and still count as equally good."""
 
 
 @dataclass(frozen=True)
@@ -54,29 +54,29 @@ class Judged:
 
 @dataclass(frozen=True)
 class Rule:
-    """What a space's scheduler asks for, over trials whose longest takes `budget` of its time."""
+    """The rule of a space's scheduler, for trials of which the longest takes `budget`."""
 
     spec: SchedulerSpec
     budget: float
 
     def fresh(self) -> Pruner:
-        """The rule, knowing nothing yet."""
+        """The rule, without any evaluations yet."""
         return self.spec.pruner(self.budget)
 
 
 def judge(records: Sequence[TrialRecord], pruner: Pruner, time_attr: str, slots: int) -> list[Judged]:
-    """Tell a rule what trials reported, as if `slots` of them ran at once, each as fast as it did.
+    """Replay the trials' evaluations to a rule, as if `slots` trials ran at a time, each at its own speed.
 
     Args:
-        records: finished trials, in the order they begin.
-        pruner: the rule, knowing nothing yet.
-        time_attr: what it compares trials at.
-        slots: trials at once.
+        records: finished trials, in the order in which they start.
+        pruner: the rule, without any evaluations yet.
+        time_attr: the progress at which it compares trials.
+        slots: number of trials at a time.
     """
     waiting = deque(range(len(records)))
     reports = [record.evaluations for record in records]
     judged: dict[int, Judged] = {}
-    # Next report of each running trial: when, which trial, its how manieth, when the trial began.
+    # Next evaluation of each running trial: its time, the trial, its number, and the trial's start time.
     running: list[tuple[float, int, int, float]] = []
 
     def begin(now: float) -> None:
@@ -99,7 +99,7 @@ def judge(records: Sequence[TrialRecord], pruner: Pruner, time_attr: str, slots:
 
 
 def table(judged: Sequence[Judged]) -> str:
-    """A row a trial, the best first, and what was saved."""
+    """One row per trial, the best first, and what was saved."""
     rows = []
     for one in sorted(judged, key=lambda j: -_whole(j)):
         trial = one.record.trial
@@ -124,17 +124,17 @@ class Chances:
 
     orders: int
     kept: int
-    """Orders in which the best of all got as far as its best score."""
+    """Number of orders in which the best trial reached its best score."""
     near: int
-    """Orders that left a score within NEAR of it: the best trial often has a twin."""
+    """Number of orders that kept a score within NEAR of it: the best trial often has a twin."""
     mean_best: float
-    """Best score that was left, mean over orders."""
+    """Best score that was kept, mean over orders."""
     saved: tuple[float, float, float]
-    """Share of the env steps saved: least, mean, most."""
+    """Share of the env steps saved: smallest, mean, largest."""
 
 
 def chances(records: Sequence[TrialRecord], rule: Rule, slots: int, orders: int) -> Chances:
-    """Judge a rule over so many random orders of the trials, the same ones in every call."""
+    """Judge a rule over a number of random orders of the trials, the same ones in every call."""
     draw = random.Random(0)
     best = max(e.score for record in records for e in record.evaluations)
     whole = sum(record.evaluations[-1].env_steps for record in records)
@@ -154,8 +154,8 @@ def choose(
     """Trials that ran to their end, and the others.
 
     Raises:
-        ConfigError: there are others, and they are not to be left out or were themselves stopped early: to judge the
-            ones that survived a rule would flatter any rule.
+        ConfigError: there are others, and they should not be left out or were themselves stopped early: judging only
+            the survivors of a rule would flatter any rule.
     """
     whole = [r for r in records if r.ending is not None and r.ending.outcome is Outcome.FINISHED]
     others = [r for r in records if r not in whole]
@@ -178,11 +178,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument("experiment", type=Path, help="folder of a sweep that ran with --no-early-stopping")
     p.add_argument("--kind", choices=("asha", "median"), default="asha")
-    p.add_argument("--grace", type=float, default=0.25, help="share of the budget that no trial is stopped within")
-    p.add_argument("--reduction", type=float, default=3.0, help="asha: one in so many goes on")
+    p.add_argument("--grace", type=float, default=0.25, help="share of the budget within which no trial is stopped")
+    p.add_argument("--reduction", type=float, default=3.0, help="asha: one trial in this many continues")
     p.add_argument("--slots", type=int, default=4, help="trials at once")
-    p.add_argument("--orders", type=int, default=1000, help="random orders of the trials to judge besides")
-    p.add_argument("--leave-out-unfinished", action="store_true", help="judge the others, and name what is left out")
+    p.add_argument("--orders", type=int, default=1000, help="number of random orders of the trials to judge too")
+    p.add_argument("--leave-out-unfinished", action="store_true", help="leave out unfinished trials, and name them")
     p.add_argument("--results", type=Path, default=RESULTS, help="folder the table is appended in")
     args = p.parse_args(argv)
     if args.slots < 1 or args.orders < 1:

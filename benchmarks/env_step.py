@@ -1,4 +1,5 @@
-"""Time of `Simulation.step` as a user calls it, alone and with its backward; of two trees in turn with --against.
+"""Time of `Simulation.step` as a user calls it, alone and with its backward pass; with --against for two checkouts in
+turn.
 
 Wall time on a GPU, the process's own time on CPU.
 """
@@ -41,7 +42,7 @@ def seconds(sim: Simulation, steps: int, backward: bool) -> float:
 
 
 def measure(name: str, args: argparse.Namespace) -> list[float]:
-    """Least duration over repeats of a step [ms], and of a step with its backward."""
+    """Shortest duration over repeats of a step [ms], and of a step with its backward pass."""
     sim = Simulation(MODELS[name](), args.worlds, args.substeps, TapePerSubstep(), args.device)
     times = []
     for backward in (False, True):

@@ -1,10 +1,11 @@
-"""What a sweep survives: CartPole trials under Ray Tune, shot at with a fixed seed, compared with trials left alone.
+"""Which faults a sweep survives: faults drawn from a fixed seed hit CartPole trials under Ray Tune, which are then
+compared with undisturbed trials.
 
-The reference is `Trainer` in a loop, without Ray. After its faults, every sweep is brought to its end by `--resume` (or
-by nothing, where none is needed). Then every trial must have finished, each row of the reference be there once on
-reading, with equal values (timings left out), and the last checkpoint hold equal tensors.
+The reference is `Trainer` in a loop, without Ray. After its faults, every sweep is completed with `--resume` (if that
+is needed). Then every trial must have finished, each row of the reference must be present exactly once with equal
+values (except timings), and the last checkpoint must hold equal tensors.
 
-Faults inside a trial's process strike at a chosen epoch and once each (`FaultyTrainer`); those from outside (driver,
+Faults inside a trial's process happen once each, at a chosen epoch (`FaultyTrainer`); those from outside (driver,
 raylet, files, disk) when the trials have written a number of rows drawn from the seed.
 """
 
@@ -45,7 +46,7 @@ def main() -> int:
         reference = Reference(trials, scratch / "reference")
         print(f"reference: {len(trials)} trials in {time.monotonic() - started:.0f} s", flush=True)
         for name in args.only or CAMPAIGNS:
-            # A seed of its own, so that a part alone repeats what it does in the whole.
+            # A separate seed, so that a part on its own repeats what it does in the whole campaign.
             found = CAMPAIGNS[name](reference, scratch, random.Random(f"{args.seed} {name}"))
             for tally in found:
                 print(

@@ -1,6 +1,6 @@
 """Gradients of robot models from PyPI packages, with default buffers, against float64 differences of C MuJoCo.
 
-The packages are needed for their files alone: `pip install --no-deps mjlab gymnasium-robotics dm-control`.
+The packages are only needed for their files: `pip install --no-deps mjlab gymnasium-robotics dm-control`.
 """
 
 import argparse
@@ -27,7 +27,7 @@ class Model(NamedTuple):
     path: str
 
     def compile(self) -> mujoco.MjModel:
-        """The compiled model, on a floor where it brings none.
+        """The compiled model, with a floor if it has none.
 
         Raises:
             FileNotFoundError: the package is not installed, or no longer has the file.

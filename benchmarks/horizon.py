@@ -1,4 +1,4 @@
-"""How right the policy gradient stays over long rollouts: BPTT against float64 differences of the whole loss."""
+"""Accuracy of the policy gradient over long rollouts: BPTT against float64 differences of the whole loss."""
 
 import argparse
 import statistics

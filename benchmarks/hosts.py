@@ -1,4 +1,4 @@
-"""Hosts made on one Linux machine: namespaces of their own for network, processes, host name and mounts, and a link."""
+"""Virtual hosts on one Linux machine: separate namespaces for network, processes, host name and mounts, and a link."""
 
 import os
 import shutil
@@ -15,11 +15,11 @@ REPOSITORY = Path(msk_ray.__file__).resolve().parent.parent
 
 
 FIRST = "exec bash -c 'while true; do sleep 3600 & wait; done'"
-"""A host's first process: bash, unlike sleep, takes note of the end of those whose parents ended before them."""
+"""A host's first process: bash, unlike sleep, reaps processes whose parents have ended before them."""
 
 
 def check_possible() -> None:
-    """End the program with what is missing for hosts to be made."""
+    """Exit with a message on what is missing to create hosts."""
     if os.geteuid() or shutil.which("ip") is None:
         sys.exit("network namespaces need root and the ip command (apt-get install iproute2)")
 

@@ -1,4 +1,5 @@
-"""Control steps a second of the muscle-driven legs: forward, and forward with backward, beside C MuJoCo and myosuite.
+"""Control steps per second of the muscle-driven legs: forward, and forward with backward, compared with C MuJoCo and
+myosuite.
 
 A control step is what the environment does for one action: 20 ms of physics, observation, reward and resets.
 """

@@ -1,6 +1,7 @@
-"""Does every panel of cluster/grafana show something? A real sweep, scraped by a real Prometheus, asked panel by panel.
+"""Does every panel of cluster/grafana show something? A real Prometheus scrapes a real sweep and is queried panel by
+panel.
 
-Needs the program `prometheus` (apt install prometheus) and nothing that runs already: ports and folders are its own. A
+Needs the program `prometheus` (apt install prometheus); it uses its own ports and folders. A
 sweep of CartPole trains on CPU with cluster/prometheus.yml scraping it; each panel's query goes to Prometheus with the
 dashboard's variable set to all experiments, as Grafana sends it. Exit code 1 if a panel stays empty.
 """
@@ -36,7 +37,7 @@ RAY_FOLDER = "/tmp/ray"
 """Where Ray keeps its files unless RAY_TMPDIR says otherwise, as `CONFIG` has it."""
 PAUSE_S = 2.0
 LASTING_S = 60.0
-"""Panels are to show something so long after they first did, too: Ray drops gauges that are not set again."""
+"""Panels must still show something after this time [s]: Ray drops gauges that are not set again."""
 SPACE: dict[str, Any] = {
     "question": "Do the gauges arrive?",
     "base": "base.yaml",
@@ -51,7 +52,7 @@ BASE: dict[str, Any] = {
     "evaluation": {"interval": 2, "nworld": 4, "steps": 20},
     "trial": {"epochs": 1_000_000, "checkpoint_interval": 1000},
 }
-"""Trials that go on until they are stopped."""
+"""Trials that run until they are stopped."""
 
 
 @dataclass(frozen=True)

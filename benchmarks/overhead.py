@@ -1,4 +1,5 @@
-"""What Ray Tune costs: a sweep of real trials, one after another, against the same trials by `msk_ray.train` in a loop.
+"""The overhead of Ray Tune: a sweep of real trials, one after another, against the same trials by `msk_ray.train` in a
+loop.
 
 The median epoch of every trial under Tune relative to that in the loop, which is run before and after it, so that a
 machine that grows slower or faster cancels out and shows how far it can be trusted. The time a trial spends between its

@@ -1,4 +1,4 @@
-"""What every benchmark writes beside its figures: device, versions, command; and where it appends its table."""
+"""Record a benchmark's table with device, versions and command, and append it to the results."""
 
 import datetime
 import os

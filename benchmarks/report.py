@@ -1,4 +1,4 @@
-"""How long status and report of a large experiment take, and how large its page is: generated trials."""
+"""How long status and report of a large generated experiment take, and how large its page is."""
 
 import argparse
 import json

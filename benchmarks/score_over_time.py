@@ -2,7 +2,8 @@
 
     python benchmarks/score_over_time.py out.png 'SHAC=runs/ant_s*' 'PPO=runs/ppo_s*'
 
-Each group is a colour; a line a trial, its seeds; the thick line is the median where all of them have one.
+Each group has a colour, with a thin line per trial (its seeds); the thick line is the median where all trials have a
+score.
 """
 
 import argparse

@@ -1,9 +1,9 @@
-"""Sweeps through cluster/slurm.sbatch on a real SLURM of two nodes, stopped in every way that SLURM knows.
+"""Sweeps through cluster/slurm.sbatch on a real SLURM with two nodes, stopped in every way that SLURM has.
 
-The nodes are namespaces of one Linux machine (root needed), each with a slurmd; slurmctld runs on the first. In every
-scenario a CartPole sweep is submitted, stopped, and started again by the queue or by hand until it ends. Then every
-trial must have finished with every epoch there once, and of each job no process and no token may be left. SLURM's own
-files lie in a temporary folder; a SLURM that this machine has already is not touched.
+The nodes are namespaces of one Linux machine (needs root), each with a slurmd; slurmctld runs on the first. In every
+scenario a CartPole sweep is submitted, stopped, and restarted by the queue or by hand until it ends. Then every trial
+must have finished with every epoch present exactly once, and no job may leave a process or a token behind. SLURM's own
+files are in a temporary folder; an existing SLURM of this machine is not touched.
 """
 
 import argparse
@@ -44,7 +44,7 @@ ADDRESSES = {"slurm-a": "10.214.78.1", "slurm-b": "10.214.78.2"}
 """Node names and addresses."""
 NEEDED = ("slurmctld", "slurmd", "sbatch", "scontrol", "scancel", "srun", "munged")
 LIMIT_S = 1500.0
-"""Far more than any one step takes on a busy machine."""
+"""Far longer than any single step takes on a busy machine."""
 BEGUN = "job begins"
 """In the log each time that slurm.sbatch starts."""
 CONF = """\
@@ -151,7 +151,7 @@ class Slurm:
         return self.job(job)
 
     def wait_for_restart(self, job: str, count: int) -> None:
-        """Until it has been put back into the queue so many times and runs again."""
+        """Wait until it has been put back into the queue a number of times and runs again."""
         self.wait(
             f"restart {count}",
             lambda: (state := self.job(job))["Restarts"] == str(count) and state["JobState"] == "RUNNING",
@@ -159,7 +159,7 @@ class Slurm:
         )
 
     def wait_for_log(self, job: str, restarts: int, condition: Callable[[str], bool]) -> None:
-        """Until what the job said since its last restart fulfils a condition."""
+        """Wait until the job's output since its last restart fulfils a condition."""
 
         def said() -> bool:
             runs = self.log(job).split(BEGUN)

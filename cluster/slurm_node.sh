@@ -3,7 +3,7 @@
 #
 #   slurm_node.sh FOLDER ray start --block ...
 #
-# FOLDER, on the node's own disk, is made for this user alone and holds Ray's sockets and logs and the token.
+# FOLDER, on the node's own disk, is created for this user only and holds Ray's sockets and logs and the token.
 
 # They ask the driver to stop, which needs Ray until all trials have saved. Whatever Ray starts ignores them too.
 trap '' USR1 HUP INT
@@ -15,7 +15,7 @@ umask 077
 folder=$1
 shift
 
-# A folder is locked as long as its step lives. What jobs that were killed left here goes now, tokens included.
+# A folder is locked as long as its step runs. What killed jobs have left here is removed now, tokens included.
 for left in "${folder%/*}"/msk_ray-*; do
     if [[ -d $left && ! -L $left && -O $left ]]; then
         # shellcheck disable=SC2094 # a lock is neither read nor written
@@ -23,7 +23,7 @@ for left in "${folder%/*}"/msk_ray-*; do
         (if flock --nonblock 8; then rm -rf -- "$left"; fi) 8<"$left" || [[ ! -e $left ]]
     fi
 done
-# Under another name until it is locked, so that no other job takes it for left over. mkdir refuses what exists.
+# Under another name until it is locked, so that no other job takes it for a leftover. mkdir fails if it exists.
 mkdir -m 700 -- "${folder%/*}/new-${folder##*/}"
 exec 9<"${folder%/*}/new-${folder##*/}"
 flock --nonblock 9
@@ -31,7 +31,7 @@ mv -T -- "${folder%/*}/new-${folder##*/}" "$folder"
 cat >"$folder/token.new"
 mv -- "$folder/token.new" "$folder/token"
 
-# In braces: bash reads them whole, so that a change of this file does not reach a node that runs.
+# In braces, which bash reads as a whole, so that editing this file does not affect a running node.
 {
     code=0
     if ((!ended)); then

@@ -1,16 +1,16 @@
 # shellcheck shell=bash
-# What slurm.sbatch and start_or_resume.sh share. Both begin with
+# Shared by slurm.sbatch and start_or_resume.sh. Both begin with
 #   asked=0
 #   trap 'asked=1' USR1 TERM INT HUP
 # so that from their first line on a stop signal is remembered instead of ending them.
 
-resumable=75 # exit code of what was asked to stop, saved its state, and can go on
+resumable=75 # exit code of a program that was asked to stop, saved its state, and can be resumed
 
 # shellcheck disable=SC2154 # they set `asked`
 # Wait for a child and pass a request to stop on to it. Its exit code is left in `code`.
 #
-# A poll, because `wait` can miss a signal that comes just before it. The request is passed on as USR1, which no library
-# takes over, and repeated, because a child that is still a copy of this shell loses it.
+# It polls, because `wait` can miss a signal that arrives just before it. The request is passed on as USR1, which no
+# library intercepts, and repeated, because a child that is still a copy of this shell loses it.
 await() {
     local turn=0
     while kill -0 "$1" 2>/dev/null; do
@@ -21,7 +21,7 @@ await() {
     done
     code=0
     wait "$1" || code=$?
-    # Killed by the request: it had not begun to handle signals, or had already stopped to. Nothing is left to save.
+    # Killed by the request: it did not handle signals yet, or no longer. Nothing is left to save.
     if ((asked && (code == 129 || code == 138 || code == 143))); then # 128 + HUP, USR1, TERM
         code=$resumable
     fi

@@ -46,7 +46,7 @@ def inside_workers(reference: Reference, scratch: Path, rng: random.Random) -> l
 
 
 def nan(reference: Reference, scratch: Path, rng: random.Random) -> list[Tally]:
-    """A policy turns to NaN: the trial ends there by name, and goes on from its checkpoint when asked to."""
+    """A policy becomes NaN: the trial ends there with that outcome, and continues from its checkpoint on request."""
     sweep = Sweep("nan", scratch, reference.trials)
     for trial in sweep.trials:
         sweep.plant(trial, {rng.randrange(2, EPOCHS + 1): "nan"})

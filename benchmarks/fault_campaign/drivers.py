@@ -44,7 +44,7 @@ def two_drivers(reference: Reference, scratch: Path, rng: random.Random) -> list
 
 
 def frozen_driver(reference: Reference, scratch: Path, rng: random.Random) -> list[Tally]:
-    """The driver stands still for longer than a trial may be silent (a laptop asleep, SIGSTOP), and goes on."""
+    """The driver is stopped for longer than a trial may be silent (a laptop asleep, SIGSTOP), and continues."""
     sweep = Sweep("frozen_driver", scratch, reference.trials)
     total = len(sweep.trials) * (EPOCHS + 1)
     tally = Tally("driver frozen for twice hang_s", 0, "nothing")

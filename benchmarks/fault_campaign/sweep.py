@@ -62,7 +62,7 @@ class Sweep:
         self._rows_at_launch = self.rows()
 
     def beside(self) -> int:
-        """Try to go on with the experiment while its driver is at work; the exit code of the second one."""
+        """Try to resume the experiment while its driver is running; the exit code of the second one."""
         second = self._start(["--resume"])
         return second.wait()
 

@@ -1,4 +1,4 @@
-"""The best policy of an experiment: its evaluation and its film strip, made once for each checkpoint and kept."""
+"""The best policy of an experiment: its evaluation and its film strip, made once for each checkpoint and stored."""
 
 import io
 from collections.abc import Mapping
@@ -30,24 +30,24 @@ class Best:
     strip: Path | None = None
     strip_text: str = ""
     narrow_strip: Path | None = None
-    """The same frames two a row, for a phone."""
+    """The same frames in rows of two, for a phone."""
     notes: tuple[str, ...] = field(default=())
-    """What could not be had, and why."""
+    """What is missing, and why."""
 
 
 def look_at_best(trial: TrialReading, folder: Path, prefix: str, make: bool, device: str | None) -> Best:
     """Gather the evaluation and the strip of a trial's best policy.
 
     Args:
-        folder: of the report's pictures.
-        prefix: of the strip's file name.
-        make: evaluate and draw what is not there yet; else only what is there is shown.
-        device: of the simulation; None takes the first GPU, or the CPU.
+        folder: folder of the report's pictures.
+        prefix: prefix of the strip's file name.
+        make: evaluate and draw what does not exist yet; otherwise only show what exists.
+        device: device of the simulation; None: the first GPU, or the CPU.
     """
     notes: list[str] = []
     try:
         path = best_of_trial(trial.folder)
-        # Loads torch, which a report of plain numbers need not wait for.
+        # Loads torch, for which a report without simulation should not wait.
         from msk_ray.evaluate.measure import EVAL_FILE, read_evaluations
 
         facts = read_facts(path)
@@ -56,8 +56,8 @@ def look_at_best(trial: TrialReading, folder: Path, prefix: str, make: bool, dev
         return Best(trial, notes=(f"There is no policy to look at: {explain(error)}.",))
     if facts.get("epoch") == 0:
         notes.append(
-            "Its best.pt is the untrained policy, which an older version kept because no trained one scored higher: "
-            "what follows is that policy's."
+            "Its best.pt is the untrained policy, which an older version kept because no trained one scored higher; "
+            "the following is about that policy."
         )
     entries: list[dict[str, Any]] = []
     try:
@@ -76,26 +76,26 @@ def look_at_best(trial: TrialReading, folder: Path, prefix: str, make: bool, dev
         except (MskRayError, OSError) as error:
             notes.append(f"Its film strip could not be drawn: {explain(error)}.")
     elif text is None:
-        notes.append("Its film strip is not drawn yet: add --best always.")
+        notes.append("Its film strip has not been drawn yet: add --best always.")
     if text is None:
         return Best(trial, tuple(entries), notes=tuple(notes))
     return Best(trial, tuple(entries), strip, text, narrow_strip(strip), tuple(notes))
 
 
 def narrow_strip(strip: Path) -> Path:
-    """Where the version of a strip for narrow screens lies."""
+    """Path of the version of a strip for narrow screens."""
     return strip.with_name(f"{strip.stem}_narrow.png")
 
 
 def strip_text(path: Path, sha: str) -> str | None:
-    """What a strip shows, in words; None if there is none of the checkpoint with this hash."""
+    """Description of a strip; None if there is none of the checkpoint with this hash."""
     if not path.is_file() or not narrow_strip(path).is_file():
         return None
     try:
         with Image.open(path) as image:
             facts = dict(image.info)
     except OSError:
-        return None  # torn: it is drawn anew
+        return None  # incomplete: it is drawn again
     return str(facts.get("Description", "")) if facts.get(_STAMP) == sha else None
 
 
@@ -126,7 +126,7 @@ def _draw(path: Path, out: Path, sha: str, device: str | None) -> None:
     recording = record(Bench(device or default_device()), policy, Request(worlds=1))
     frames, times = episode_frames(recording, FRAMES, View(*_FRAME))
     text = (
-        f"{len(frames)} frames of one episode at equal times, under {recording.physics} physics: score "
+        f"{len(frames)} evenly spaced frames of one episode, under {recording.physics} physics: score "
         f"{float(recording.episodes.score[0]):.5g} in {recording.length(0) * recording.timestep:.1f} s, "
         f"ended by {recording.ending(0)}"
     )
@@ -137,7 +137,7 @@ def _draw(path: Path, out: Path, sha: str, device: str | None) -> None:
     rows = range(0, len(frames), 2)
     narrow = grid([frames[row : row + 2] for row in rows], [""] * len(rows), [times[row : row + 2] for row in rows])
     out.parent.mkdir(parents=True, exist_ok=True)
-    # The wide one last: with its stamp on disk, both are there.
+    # The wide one last: once its stamp is on disk, both exist.
     _save(narrow, narrow_strip(out), PngImagePlugin.PngInfo())
     _save(image, out, stamp)
     trial = path.parent.parent

@@ -19,9 +19,9 @@ from msk_ray.sweep.budget import extreme_configs, longest_budget
 from msk_ray.sweep.space import recorded_space
 
 NAMED = 8
-"""Variants drawn in a colour of their own."""
+"""Number of variants that are drawn in their own colour."""
 LABELLED = 60
-"""Trials named at their bar."""
+"""Maximum number of trials that are named at their bar."""
 _STOPPED = {
     Outcome.STOPPED_ASHA,
     Outcome.STOPPED_MEDIAN,

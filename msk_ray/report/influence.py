@@ -1,4 +1,4 @@
-"""Pictures of what the parameters do to the score: ranked effects, and all trials over all parameters."""
+"""Pictures of the effect of parameters on the score: ranked effects, and all trials over all parameters."""
 
 import math
 from collections.abc import Sequence
@@ -17,17 +17,17 @@ from msk_ray.report.reading import Reading, TrialReading
 from msk_ray.report.statistics import LEAST, Effect, Scored, effects, mean_interval
 
 PANELS = 4
-"""Parameters whose levels are drawn one by one."""
+"""Number of parameters whose levels are drawn."""
 LEVELS = 16
-"""Levels of a parameter that are drawn; of more, the best and the worst ones."""
+"""Maximum number of drawn levels of a parameter; if there are more, the best and the worst ones."""
 AXES = 8
-"""Parameters of the parallel coordinates."""
+"""Maximum number of parameters in the parallel coordinates."""
 _CUT_WORDS = (
-    "Open circles are trials stopped before their end, or still running, with the best score they had: they might "
-    "have risen further, so effects beside them are of the sweep as it was run, not of whole runs. "
+    "Open circles are trials that were stopped before their end or are still running, with their best score so far, "
+    "which might have risen further: the effects are those of this sweep, not of complete runs. "
 )
 _DECADES = 30.0
-"""Numbers whose largest is so many times the smallest are drawn on a logarithmic axis."""
+"""Numbers whose largest is more than this many times the smallest are drawn on a logarithmic axis."""
 
 
 def ranked_effects(reading: Reading) -> list[Effect]:
@@ -65,11 +65,11 @@ def parameter_effects(found: Sequence[Effect], name: str) -> Picture | None:
         f"{len(drawn)} parameters ranked by their effect on the best score. First: {first.factor}{share}, "
         f"{first.spread:.4g} between its best and its worst level.",
         (
-            "First: share of the scores' variance that a parameter explains alone, less what chance would (ω²; "
-            "Hays 1963). Then: best scores at each level, with their mean and its 95 % bootstrap interval. "
+            "First: share of the scores' variance that a parameter explains on its own, minus the share expected by "
+            "chance (ω²; Hays 1963). Then: best scores at each level, with their mean and its 95 % bootstrap interval. "
             if shares
-            else "First: between the mean scores of a parameter's best and worst level, which cannot be told from "
-            "chance. Then: the scores. "
+            else "First: difference between the mean scores of a parameter's best and worst level, which cannot be "
+            "distinguished from chance. Then: the scores. "
         )
         + _too_few_words(found)
         + (_CUT_WORDS if any(trial.cut for level in first.trials.values() for trial in level) else ""),
@@ -86,7 +86,7 @@ def _too_few_words(found: Sequence[Effect]) -> str:
         return ""
     more = f" and {len(short) - AXES} more parameters" if len(short) > AXES else ""
     return (
-        f"Too few trials with a score of a trained policy for the share of the variance, which needs {LEAST} at each "
+        f"Too few trained trials with a score for the share of the variance, which needs {LEAST} at each "
         f"level: {', '.join(short[:AXES])}{more}. "
     )
 
@@ -133,7 +133,7 @@ def _draw_levels(axes: Axes, effect: Effect) -> None:
         if interval is not None:
             axes.plot([place, place], [interval.low, interval.high], color=PALETTE[1], linewidth=1.4)
     slanted = max(len(label) for label, _ in levels) > 6 or len(levels) > 5
-    # A slanted label ends at its tick; centred ones would run into each other.
+    # A slanted label ends at its tick; centred labels would overlap.
     turned: dict[str, Any] = {"rotation": 40, "ha": "right", "rotation_mode": "anchor"} if slanted else {}
     axes.set_xticks(range(len(levels)), [shorten(label, 18) for label, _ in levels], fontsize=7, **turned)
     axes.tick_params(axis="y", labelsize=7)
@@ -143,7 +143,7 @@ def _draw_levels(axes: Axes, effect: Effect) -> None:
 
 
 def parallel_coordinates(reading: Reading, found: Sequence[Effect], name: str) -> Picture | None:
-    """A line a trial through its parameters to its score; None with fewer than two trials or no parameter."""
+    """One line per trial through its parameters to its score; None with fewer than two trials or no parameter."""
     factors = [effect.factor for effect in found if effect.factor != "seed" and effect.spread is not None][:AXES]
     trials = [t for t in reading.trials if t.score is not None and all(f in t.trial.changed for f in factors)]
     if len(trials) < 2 or not factors:
@@ -203,7 +203,7 @@ def parallel_coordinates(reading: Reading, found: Sequence[Effect], name: str) -
         "All trials over all parameters",
         f"Parallel coordinates of {len(trials)} trials over {', '.join(short_key(f) for f in factors)} and the best "
         f"score; the best has {best.trial.variant}.",
-        "A line is a trial, its colour the best score. Numbers that span a factor of 30 lie on a logarithmic axis.",
+        "Each line is a trial, coloured by its best score. Numbers that span a factor of 30 are on a logarithmic axis.",
         draw,
         (9.0, 4.6),
         (4.2, 1.4 + 1.0 * heights.shape[1]),

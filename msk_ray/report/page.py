@@ -1,4 +1,4 @@
-"""The page: one HTML file that needs nothing else, and its pictures beside it."""
+"""The page: one self-contained HTML file, with its pictures as separate files too."""
 
 import base64
 import os
@@ -26,10 +26,10 @@ PAGE = "index.html"
 _FILES = ("config.yaml", "metrics.jsonl", "output.log", "error.txt", "eval.json", "checkpoints/best.pt")
 _WORDS = {
     Condition.RUNNING: "Trials are still running: this is the state at the time above.",
-    Condition.INTERRUPTED: "It is not at its end, and no trial shows a sign of life: it was stopped or has crashed. "
-    "The command under Repeat it, with --resume, goes on.",
-    Condition.WAITING: "No trial has begun yet.",
-    Condition.EMPTY: "It has no trials: it was interrupted before its first file was whole, or has not begun.",
+    Condition.INTERRUPTED: "It has not ended, but no trial has written anything for some time: it was stopped or has "
+    "crashed. The command under Repeat it, with --resume, continues it.",
+    Condition.WAITING: "No trial has started yet.",
+    Condition.EMPTY: "It has no trials: it was interrupted before its first file was complete, or has not started.",
     Condition.FINISHED: "",
 }
 
@@ -44,7 +44,7 @@ class Section:
     best: Best | None
     pictures: dict[str, Picture]
     folder: Path
-    """Of the page, which links are relative to."""
+    """Folder of the page; links are relative to it."""
 
     @property
     def words(self) -> str:
@@ -67,7 +67,7 @@ class Section:
         return sorted(self.reading.trials, key=lambda t: (t.score is None, -(t.score or 0.0), t.trial.index))
 
     def files(self, trial: TrialReading) -> list[tuple[str, str]]:
-        """(name, link) of a trial's files that are there."""
+        """(name, link) of a trial's existing files."""
         return [(Path(name).stem, self.link(trial.folder / name)) for name in _FILES if (trial.folder / name).is_file()]
 
     def devices(self) -> dict[str, int]:
@@ -82,7 +82,7 @@ class Section:
         return Path(os.path.relpath(path, self.folder)).as_posix()
 
     def command(self) -> str:
-        """The command line that was run, as one would type it."""
+        """The command line that was run, as a user would type it."""
         argv = self.reading.environment.get("command")
         if not isinstance(argv, list) or not argv:
             return ""
@@ -93,7 +93,7 @@ def make_section(reading: Reading, folder: Path, prefix: str, baseline: str | No
     """Draw an experiment's pictures.
 
     Raises:
-        ConfigError: there is no variant of the name asked for.
+        ConfigError: there is no variant with the requested name.
     """
     chosen = baseline_of(reading, baseline)
     found = ranked_effects(reading)

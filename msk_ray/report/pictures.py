@@ -16,11 +16,11 @@ Draw = Callable[[Figure, bool], None]
 """Draws into an empty figure; told whether it is the narrow one."""
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8B5A2B", "#4B0082")
-"""Colours that are told apart with any colour vision (Okabe and Ito 2008, the two last ones added)."""
+"""Colours that can be distinguished with any colour vision (Okabe and Ito 2008, with two added at the end)."""
 DASHES = ("-", "--", "-.", ":")
 GREY = "#9a9a9a"
 POINTS = 300
-"""A curve is drawn with so many points at most."""
+"""Maximum number of points of a drawn curve."""
 _WIDE_DPI, _NARROW_DPI = 120, 150
 
 
@@ -29,15 +29,15 @@ class Picture:
     """A figure of the page."""
 
     name: str
-    """Its file's name without suffix."""
+    """Name of its file without suffix."""
     title: str
     alt: str
-    """What it shows, in words."""
+    """Description of what it shows."""
     caption: str
     wide: bytes
     """PNG."""
     narrow: bytes | None
-    """PNG for screens up to 600 pixels; None takes the wide one."""
+    """PNG for screens up to 600 pixels; None: the wide one."""
 
 
 def picture(
@@ -62,7 +62,7 @@ def _png(draw: Draw, size: tuple[float, float], narrow: bool) -> bytes:
 
 
 def thin_peaks(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A curve (N,) over `x` with POINTS points at most: of each stretch its largest value, at its own place."""
+    """A curve (N,) over `x` with at most POINTS points: the largest value of each stretch, at its position."""
     if len(x) <= POINTS:
         return x, y
     stretch = math.ceil(len(x) / POINTS)
@@ -81,7 +81,7 @@ def steps_axis(axes: Axes) -> None:
 
 
 def shorten(text: str, length: int) -> str:
-    """`text` on one line, cut to `length` characters, for a picture: a dollar sign begins no formula there."""
+    """`text` on one line, cut to `length` characters, for a picture, where a dollar sign must not start a formula."""
     line = printable(text)
     return (line if len(line) <= length else line[: length - 1] + "…").replace("$", "\\$")
 

@@ -1,6 +1,6 @@
-"""An experiment as its files show it, in whatever condition: running, finished, crashed, half-written, empty.
+"""Read an experiment from its files, in any condition: running, finished, crashed, half-written, empty.
 
-What cannot be read is named in `notes`, or in the trial it belongs to; it never hides the rest.
+What cannot be read is named in `notes`, or in its trial, and does not hide the rest.
 """
 
 import math
@@ -36,7 +36,7 @@ from msk_ray.sweep.space import SpaceFile, read_file
 
 _TAIL_LINES = 12
 _NOTED = 10
-"""Damaged files that are named; of more, the number is said."""
+"""Number of damaged files that are named; the others are counted."""
 
 
 class Condition(StrEnum):
@@ -45,7 +45,7 @@ class Condition(StrEnum):
     RUNNING = "running"
     FINISHED = "finished"
     INTERRUPTED = "interrupted"
-    """Trials are left, and none shows a sign of life: stopped on request, or crashed."""
+    """Trials are left, but none has written anything lately: stopped on request, or crashed."""
     WAITING = "not started"
     EMPTY = "empty"
     """No trial is known."""
@@ -58,7 +58,7 @@ class TrialReading:
     trial: Trial
     folder: Path
     columns: dict[str, np.ndarray]
-    """Every metric by name, shape (E,); NaN where an epoch has none, or no number."""
+    """Every metric by name, shape (E,); NaN where an epoch has no finite value."""
     state: State
     ending: Ending | None = None
     note: str = ""
@@ -75,8 +75,8 @@ class TrialReading:
 
     @cached_property
     def curve(self) -> tuple[np.ndarray, np.ndarray]:
-        """Env steps and scores of the evaluations with a finite score, both (N,); that of the untrained policy, from
-        which a curve begins, is among them."""
+        """Env steps and scores of the evaluations with a finite score, both (N,), including that of the untrained
+        policy, with which a curve starts."""
         return self.curve_over("env_steps")
 
     def curve_over(self, column: str) -> tuple[np.ndarray, np.ndarray]:
@@ -88,7 +88,7 @@ class TrialReading:
 
     @cached_property
     def trained(self) -> tuple[np.ndarray, np.ndarray]:
-        """The same of the trained policy alone, both (N,): what counts as its score."""
+        """The same for the trained policy only, both (N,), from which its score is taken."""
         if SCORE not in self.columns:
             return np.zeros(0), np.zeros(0)
         keep = np.isfinite(self.columns[SCORE]) & (self.columns["epoch"] > 0)
@@ -114,15 +114,15 @@ class TrialReading:
 
     @property
     def cut(self) -> bool:
-        """Whether it stands before its end without having failed: stopped, interrupted or running. Given more, its
-        score might have risen."""
+        """Whether it has not reached its end and has not failed: stopped, interrupted or running. Its score might still
+        have risen."""
         if self.state is State.ENDED:
             return self.ending is not None and self.ending.cut
         return self.state in (State.RUNNING, State.STALE)
 
     @property
     def best_row(self) -> dict[str, float]:
-        """The evaluation with the highest score: its epoch, env steps, and every `eval/` figure that is a number."""
+        """The evaluation with the highest score: its epoch, env steps, and every finite `eval/` metric."""
         if self.score is None:
             return {}
         trained = (self.columns["epoch"] > 0) & np.isfinite(self.columns[SCORE])
@@ -153,7 +153,7 @@ class TrialReading:
         return path if path.is_file() else None
 
     def tail(self) -> str:
-        """The last lines of what it stumbled over, or else of its output."""
+        """The last lines of its error, or otherwise of its output."""
         for name in (ERROR_FILE, OUTPUT_FILE):
             path = self.folder / name
             if path.is_file():
@@ -199,7 +199,7 @@ class Reading:
 
     @property
     def variants(self) -> dict[str, list[TrialReading]]:
-        """Trials by variant, which is everything but the seed; in order of the experiment."""
+        """Trials by variant, that is by everything but the seed, in the order of the experiment."""
         groups: dict[str, list[TrialReading]] = {}
         for trial in self.trials:
             groups.setdefault(trial.trial.variant, []).append(trial)
@@ -265,7 +265,7 @@ def read_experiment(experiment: Experiment, now: float) -> Reading:
 
 
 def explain(error: Exception) -> str:
-    """An error on one line, without its type if it is one of ours."""
+    """An error on one line, with its type unless it is one of this package."""
     text = " ".join(str(error).split())
     return text if isinstance(error, MskRayError) else f"{type(error).__name__}: {text}"
 
@@ -280,7 +280,7 @@ def _read_trial(reader: TrialReader, trial: Trial, folder: Path, now: float) -> 
 
 
 def columns_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
-    """Rows of metrics as arrays (E,) by name; what a row lacks is NaN."""
+    """Rows of metrics as arrays (E,) by name; missing values are NaN."""
     if not rows:
         return {}
     names: dict[str, None] = dict.fromkeys(("epoch", "env_steps", "seconds"))
@@ -312,8 +312,8 @@ def check_folder(experiment: Experiment) -> None:
     """Refuse a folder that cannot be an experiment.
 
     Raises:
-        StorageError: it holds files, and none that an experiment begins with.
+        StorageError: it holds files, but none of an experiment.
     """
     names = [path.name for path in experiment.path.iterdir()]
     if names and not {MANIFEST_FILE, SPACE_FILE, ENVIRONMENT_FILE, "trials"} & set(names):
-        raise StorageError(f"{experiment.path} holds no experiment (nor the beginning of one)")
+        raise StorageError(f"{experiment.path} holds no experiment, not even an incomplete one")

@@ -1,4 +1,4 @@
-"""What the scores of few trials say: intervals over seeds, and which parameters matter. Pure functions."""
+"""Statistics of the scores of few trials: intervals over seeds, and which parameters matter. Pure functions."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,7 @@ CONFIDENCE = 0.95
 LEAST = 2
 """Scores that each level needs for the share of the variance that a parameter explains."""
 BINS = 4
-"""Groups of equal size that a drawn number is sorted into."""
+"""Number of equal groups into which drawn numbers are sorted."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,8 @@ class Interval:
 
 
 def mean_interval(scores: Sequence[float]) -> Interval | None:
-    """Percentile bootstrap of the mean: the scores are drawn again with replacement, DRAWS times; the interval holds
-    the middle 95 % of the means. None of fewer than two scores.
+    """Percentile bootstrap of the mean: the scores are resampled with replacement DRAWS times; the interval holds the
+    middle 95 % of the means. None for fewer than two scores.
 
     Efron and Tibshirani 1993, "An Introduction to the Bootstrap", chapter 13; over runs with different seeds as in
     Agarwal et al. 2021, "Deep Reinforcement Learning at the Edge of the Statistical Precipice", arXiv:2108.13264. With
@@ -41,7 +41,7 @@ def mean_interval(scores: Sequence[float]) -> Interval | None:
 
 
 def difference_interval(scores: Sequence[float], baseline: Sequence[float]) -> Interval | None:
-    """Percentile bootstrap of mean(scores) − mean(baseline), both drawn again independently; as `mean_interval`.
+    """Percentile bootstrap of mean(scores) − mean(baseline), both resampled independently; see `mean_interval`.
 
     None unless both have at least two scores.
     """
@@ -64,7 +64,7 @@ def _interval(statistic: np.ndarray) -> Interval:
 
 @dataclass(frozen=True)
 class Scored:
-    """A trial's best score, if its trained policy has one, and what led to it."""
+    """A trial's best score, if its trained policy has one, and its parameters."""
 
     changed: Mapping[str, str]
     """Its parameters as text."""
@@ -73,7 +73,7 @@ class Scored:
     seed: int
     score: float | None
     cut: bool = False
-    """It ended before its time: given more, the score might have risen."""
+    """It ended early: the score might still have risen."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Effect:
 
     factor: str
     trials: dict[str, list[Scored]]
-    """Trials at each level, in order of the level; those without a score too."""
+    """Trials at each level, in order of the level, including those without a score."""
 
     @property
     def levels(self) -> dict[str, list[float]]:
@@ -96,7 +96,7 @@ class Effect:
 
     @property
     def too_few(self) -> str:
-        """At which level there are fewer than LEAST scores; empty if at none."""
+        """The level with fewer than LEAST scores; empty if there is none."""
         levels = self.levels
         counts = {level: len(levels.get(level, ())) for level in self.trials}
         short = {level: count for level, count in counts.items() if count < LEAST}
@@ -108,12 +108,12 @@ class Effect:
 
     @cached_property
     def share(self) -> float | None:
-        """Of the variance of the scores, ω²; None if there are too few at any level."""
+        """Share of the variance of the scores, ω²; None if any level has too few scores."""
         return None if self.too_few else variance_share(list(self.levels.values()))
 
     @property
     def spread(self) -> float | None:
-        """Between the best and the worst level's mean score; None unless two levels have one."""
+        """Difference between the best and the worst level's mean score; None unless two levels have one."""
         means = [sum(scores) / len(scores) for scores in self.levels.values()]
         return max(means) - min(means) if len(means) > 1 else None
 
@@ -123,7 +123,7 @@ def effects(trials: Sequence[Scored]) -> list[Effect]:
     few scores for that, by their spread.
 
     Args:
-        trials: all that were planned, those without a score too: an effect is not told from the levels that have one.
+        trials: all planned trials, including those without a score: levels that happen to have scores are not enough.
 
     Returns:
         An effect for each parameter with at least two levels, and one called `seed` for comparison if there are
@@ -143,11 +143,10 @@ def effects(trials: Sequence[Scored]) -> list[Effect]:
 
 
 def levels_of(rows: Sequence[tuple[str, Any, T]]) -> dict[str, list[T]]:
-    """Trials, or their scores, by level. Of numbers with many values, as drawn ones have, the levels are quarters of
-    equal size.
+    """Trials, or their scores, by level. For numbers with many values, such as drawn ones, the levels are quartiles.
 
     Args:
-        rows: the level as text and as data, and what is to be sorted by it.
+        rows: the level as text and as data, and the item to sort by it.
     """
     numbers = [value for _, value, _ in rows if isinstance(value, int | float) and not isinstance(value, bool)]
     levels: dict[str, list[T]] = {}
@@ -168,7 +167,7 @@ def levels_of(rows: Sequence[tuple[str, Any, T]]) -> dict[str, list[T]]:
 
 def variance_share(groups: Sequence[Sequence[float]]) -> float | None:
     """ω² = (SS_between − (k − 1) MS_within) / (SS_total + MS_within) of k groups, n values: the share of the variance
-    that lies between groups, less what chance alone would put there; below 0 means none.
+    between groups, minus what chance alone would produce; below 0 means none.
 
     Hays 1963, "Statistics for Psychologists", chapter 12. None if no group has two values; 0 if all are equal.
     """

@@ -18,8 +18,8 @@ MEANINGS = {
     Outcome.DIVERGED: "too many simulated worlds diverged, or contacts were lost",
     Outcome.OUT_OF_MEMORY: "the device has less memory than the settings need",
     Outcome.ERROR: "an exception, or the process died too often",
-    State.UNREADABLE: "the trial's files make no sense",
-    "interrupted": "no sign of life for too long, and no ending",
+    State.UNREADABLE: "the trial's files cannot be read",
+    "interrupted": "silent for too long, without an ending",
 }
 
 
@@ -34,19 +34,19 @@ class VariantRow:
     mean: float | None
     interval: Interval | None
     difference: float | None
-    """Of the mean from the baseline's, over the env steps of `compared_at`; None for the baseline itself, or without
-    scores."""
+    """Difference of the mean from the baseline's, over the env steps of `compared_at`; None for the baseline itself, or
+    without scores."""
     difference_interval: Interval | None
     compared_at: float | None
-    """If trials of this variant or of the baseline stand before their end: the env steps they are compared at. None if
-    all ran to their end."""
+    """If trials of this variant or of the baseline have not run to their end: the env steps at which they are compared.
+    None if all ran to their end."""
     is_baseline: bool
     figures: dict[str, float]
-    """Mean over seeds of further evaluation figures at the best evaluation, such as the speed."""
+    """Mean over seeds of further outcomes at the best evaluation, such as the speed."""
     reduced: int = 0
     """How many of the scores are of trials with half their worlds."""
     cut: int = 0
-    """How many are of trials that ended, or stand, before their end without having failed."""
+    """How many are of trials that were stopped or interrupted before their end, without having failed."""
 
     @property
     def verdict(self) -> str:
@@ -68,7 +68,7 @@ def baseline_of(reading: Reading, asked: str | None) -> str | None:
     """The variant that others are compared with: the one asked for, the one called baseline, or the first.
 
     Raises:
-        ConfigError: no variant, or more than one, is called so.
+        ConfigError: no variant, or more than one, has this name.
     """
     variants = list(reading.variants)
     if asked is not None:
@@ -76,7 +76,7 @@ def baseline_of(reading: Reading, asked: str | None) -> str | None:
         if len(found) != 1:
             known = "; ".join((found or variants)[:8])
             raise ConfigError(
-                f"--baseline {asked!r}: {'more than one' if found else 'no'} variant of {reading.name} is called so; "
+                f"--baseline {asked!r}: {'more than one' if found else 'no'} variant of {reading.name} has this name; "
                 f"write one of: {known}"
             )
         return found[0]
@@ -95,7 +95,7 @@ def outcome_figures(trials: Sequence[TrialReading]) -> list[str]:
 
 
 def variant_rows(reading: Reading, baseline: str | None) -> list[VariantRow]:
-    """A row a variant, the highest mean first, those without a score last."""
+    """One row per variant, the highest mean first, those without a score last."""
     groups = reading.variants
     reference = groups[baseline] if baseline is not None else []
     names = outcome_figures(reading.trials)
@@ -132,14 +132,14 @@ def variant_rows(reading: Reading, baseline: str | None) -> list[VariantRow]:
 def _on_equal_terms(
     trials: Sequence[TrialReading], reference: Sequence[TrialReading]
 ) -> tuple[float | None, tuple[list[float], list[float]] | None]:
-    """Where two groups are compared, and their best scores up to there.
+    """The env steps at which two groups are compared, and their best scores up to there.
 
-    A stopped trial's score says what it had; beside a whole run's it looks worse than it is. So if any stands before
-    its end, all count up to the newest evaluation that none is behind at; failed ones count with what they had, those
-    not evaluated since they began do not count.
+    Compared with a complete run, a stopped trial looks worse than it is. So if any trial has not run to its end, all
+    are compared up to the latest evaluation that all have reached; failed trials count with the best score they had,
+    and trials without an evaluation do not count.
 
     Returns:
-        Env steps, None if all ran to their end; and the scores of either group, None if one has none.
+        Env steps, None if all ran to their end; and the scores of both groups, None if one has none.
     """
     begun = [t for t in (*trials, *reference) if not t.cut or t.last_within(math.inf) is not None]
     counted = {id(t) for t in begun}
@@ -147,7 +147,7 @@ def _on_equal_terms(
     if any(t.cut for t in begun):
         going = [t for t in begun if t.score is not None and not t.failed]
         limit = min(t.last_within(math.inf) or 0.0 for t in going if t.cut)
-        # Whoever is evaluated at other env steps would else be ahead or behind by what lies between.
+        # Otherwise a trial that is evaluated at other env steps would be ahead or behind by the difference.
         limit = min(t.last_within(limit) or 0.0 for t in going)
 
     def within(group: Sequence[TrialReading]) -> list[float]:
@@ -163,7 +163,7 @@ def _mean(scores: Sequence[float]) -> float:
 
 
 def failures(reading: Reading) -> list[tuple[str, str, list[TrialReading]]]:
-    """(name, meaning, trials) of each way trials failed, the most frequent first; interrupted ones too."""
+    """(name, meaning, trials) of each kind of failure, the most frequent first; interrupted trials too."""
     found: dict[str, list[TrialReading]] = {}
     for trial in reading.trials:
         if trial.failed or trial.state is State.STALE:
@@ -173,7 +173,7 @@ def failures(reading: Reading) -> list[tuple[str, str, list[TrialReading]]]:
 
 
 def outcome_counts(reading: Reading) -> dict[str, int]:
-    """How many trials ended, or stand, in each way; the most frequent first."""
+    """How many trials have each outcome or state; the most frequent first."""
     counts: dict[str, int] = {}
     for trial in reading.trials:
         counts[trial.outcome] = counts.get(trial.outcome, 0) + 1

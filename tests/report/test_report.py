@@ -202,7 +202,7 @@ def test_half_the_worlds_are_said_wherever_a_score_is(experiment: Experiment) ->
     assert best is not None
     Attempt(Reduced(64, 32, "no room", cleared=True)).write(best.folder)
     page = " ".join(page_of(experiment).split())
-    note = f"with half the worlds asked for, after running out of memory with all of them (<code>{best.trial.id}<"
+    note = f"with half the requested worlds, after running out of memory with all of them (<code>{best.trial.id}<"
     assert note in page
     assert "fast, seed 1, half the worlds: 32 of 64</dd>" in page
     assert ">2 of 2 (1 with half the worlds)</td>" in page
@@ -213,7 +213,7 @@ def test_half_the_worlds_are_said_wherever_a_score_is(experiment: Experiment) ->
 def test_the_baseline_can_be_chosen(experiment: Experiment, capsys: pytest.CaptureFixture[str]) -> None:
     assert "Differences are from: fast" in page_of(experiment, "--baseline", "fas")
     assert run(main, [str(experiment.path), "--baseline", "slow"]) == 2
-    assert "no variant of e is called so; write one of: baseline; fast; deep" in capsys.readouterr().err
+    assert "no variant of e has this name; write one of: baseline; fast; deep" in capsys.readouterr().err
 
 
 def test_command_and_files(experiment: Experiment) -> None:
@@ -306,14 +306,14 @@ def _best_without_policy(e: Experiment) -> None:
         (_half_written, ["Which trials were planned is not known", "manifest.json is missing", "It has no trials"]),
         (_torn_manifest, ["Which trials were planned is not known", "6 trials"]),
         (_nothing_else, ["env.json is missing", "space.yaml cannot be read", "Versions and command were not recorded"]),
-        (_not_begun, ["not started", "No trial has begun yet", "No trained policy has a score yet"]),
+        (_not_begun, ["not started", "No trial has started yet", "No trained policy has a score yet"]),
         (
             _broken_trials,
             ["Skipped: 1 damaged line and 2 damaged files.", "line 1: not JSON", "unheard_of", "3 finished"],
         ),
-        (_crashed, ["interrupted", "with --resume, goes on", "3 interrupted"]),
+        (_crashed, ["interrupted", "with --resume, continues it", "3 interrupted"]),
         (_running, ["Trials are still running", "1 running"]),
-        (_never_evaluated, ["No trained policy has a score yet", "Too few trials with a score of a trained policy"]),
+        (_never_evaluated, ["No trained policy has a score yet", "Too few trained trials with a score"]),
         (_nothing_finite, ["No trained policy has a score yet", "No trial has recorded a gradient yet"]),
         (_best_without_policy, ["is torn: it has neither a head nor a manifest"]),
     ],
