@@ -44,7 +44,7 @@ class Speed:
 
 
 def space(config: Path, seeds: int, seconds: float, overrides: dict[str, object]) -> dict[str, object]:
-    """A space of as many seeds, each trained for so many seconds, with next to no evaluation and no checkpoints."""
+    """A space of `seeds` seeds, each trained for `seconds`, with almost no evaluation and no checkpoints."""
     quiet: dict[str, object] = {
         "trial.epochs": 1_000_000,
         "trial.checkpoint_interval": 1_000_000,

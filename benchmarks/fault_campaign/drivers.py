@@ -77,8 +77,8 @@ def group_signal(reference: Reference, scratch: Path, rng: random.Random, number
 def memory_limit(reference: Reference, scratch: Path, rng: random.Random) -> list[Tally]:
     """A trial's process may have no more memory than it has (RLIMIT_AS): the next large allocation fails.
 
-    The trial starts anew with half its worlds; the others are untouched. What it computes with half of them is not what
-    the reference computes, so that it is judged by its ending alone.
+    The trial restarts with half its worlds; the others are not affected. Its results differ from the reference, so only
+    its ending is judged.
     """
     sweep = Sweep("memory_limit", scratch, reference.trials)
     struck = sweep.trials[rng.randrange(len(sweep.trials))]

@@ -105,7 +105,7 @@ class Sweep:
         return sum(len(read_rows(self.path / "trials" / trial.id)) for trial in self.trials)
 
     def wait_for_rows(self, count: int) -> bool:
-        """Wait for so many rows, one of them new since the launch; False if the driver ended before."""
+        """Wait for a number of rows, one of them new since the launch; False if the driver ended before."""
         assert self._driver is not None
         deadline = time.monotonic() + LAUNCH_LIMIT_S
         # Trials of a dead raylet train on for a moment, perhaps past the next share already.

@@ -283,7 +283,7 @@ def _find(folder: Path) -> _Found | None:
     path = folder / LOCK_FILE
     probe = folder / f".{LOCK_FILE}.{uuid.uuid4().hex}.part"
     try:
-        with path.open("rb") as file:  # opening asks the file server anew
+        with path.open("rb") as file:  # opening asks the file server again
             data = file.read()
             touched = os.fstat(file.fileno()).st_mtime
     except FileNotFoundError:

@@ -62,8 +62,8 @@ class WorldBatch:
         nworld: number of worlds W.
         substeps: physics steps an env step.
         device: the Warp device.
-        capacity: contacts and rows a world that `data` has room for.
-        losses: what steps lost for want of room; ask it between steps.
+        capacity: contacts and rows per world that fit into `data`.
+        losses: what steps lost to full buffers; check it between steps.
 
     Raises:
         UnsupportedModelError: mujoco_warp cannot load the model, or it has state outside (qpos, qvel, act).
@@ -136,7 +136,7 @@ class WorldBatch:
         """The batch to repeat a step with that lost something here; waits for the device.
 
         Raises:
-            SimulationError: the room was given by the user, or more of it would not help.
+            SimulationError: the user fixed the buffer sizes, or larger ones would not help.
         """
         lost, _, peak = self.losses.read()
         wanted = needed(lost, self.capacity, peak)

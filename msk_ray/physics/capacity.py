@@ -1,4 +1,4 @@
-"""How many contacts and constraint rows one world needs room for: bounded by the geometry, or tried out in C MuJoCo."""
+"""How many contacts and constraint rows a world needs: bounded by the geometry, or measured by a probe in C MuJoCo."""
 
 import hashlib
 import math
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from msk_ray.physics.pairs import candidate_pairs, contacts_of, rows_per_contact
 
 _LARGEST_BOUND = 256
-"""Contacts a world up to which the geometric bound is allocated as it is; above it a probe tells what happens."""
+"""Contacts per world up to which the geometric bound is allocated; above it a probe measures what is needed."""
 _MARGIN = 1.5
 """Room beyond what the probe saw: a policy takes the model to places that random controls do not."""
 _PROBE_TIME = 1.0

@@ -1,4 +1,4 @@
-"""Contacts and constraint rows that a step lost: found on the device as it happens, heard of on the host."""
+"""Contacts and constraint rows that a step lost: detected on the device, and reported to the host."""
 
 import math
 from typing import Any
@@ -87,7 +87,7 @@ class LossWatch:
         )
 
     def heard(self) -> bool:
-        """Whether a step that the device has finished lost anything. Does not wait for those under way."""
+        """Whether a step that the device has finished lost anything. Does not wait for steps that are still running."""
         return bool(self._heard_view[0])
 
     def read(self) -> tuple[int, float, Capacity]:

@@ -38,7 +38,7 @@ RECORDS = [record("late", 1.0, 1.0, 9.0), record("middle", 2.0, 2.0, 3.0), recor
 
 
 def test_side_by_side_the_late_one_is_stopped(benchmark: dict[str, Any]) -> None:
-    """At 100 it is first and alone; at 120 it is third of three, of which two go on."""
+    """At 100 it is first and alone; at 120 it is third of three, of which two continue."""
     judged = benchmark["judge"](RECORDS, SuccessiveHalving([100.0], 2.0), "env_steps", 3)
     assert [(j.record.trial.id, j.last.env_steps, j.stopped, j.best) for j in judged] == [
         ("late", 120, True, 1.0),
@@ -61,7 +61,7 @@ def test_a_freed_slot_is_taken_at_once(benchmark: dict[str, Any]) -> None:
     """Two at once: `late` is stopped at 120 s only if `early` and `middle` have been at the rung by then."""
     order = [RECORDS[2], RECORDS[1], RECORDS[0]]
     judged = benchmark["judge"](order, SuccessiveHalving([100.0], 2.0), "env_steps", 2)
-    # `early` and `middle` are at the rung at 100 s: one of two goes on, so `middle` stops and `late` takes its place.
+    # `early` and `middle` are at the rung at 100 s: one of two continues, so `middle` stops and `late` takes its place.
     assert [(j.record.trial.id, j.stopped, j.last.env_steps) for j in judged] == [
         ("early", False, 200),
         ("middle", True, 100),
@@ -70,8 +70,8 @@ def test_a_freed_slot_is_taken_at_once(benchmark: dict[str, Any]) -> None:
 
 
 def test_over_all_orders(benchmark: dict[str, Any]) -> None:
-    """One after another, a rung at 100 that the better half passes: `late`, the worst there, goes on only if it comes
-    first and meets nobody. `early` goes on in any order."""
+    """One after another, a rung at 100 that the better half passes: `late`, the worst there, continues only if it comes
+    first and meets nobody. `early` continues in any order."""
     rule = benchmark["Rule"](Asha(kind="asha", grace=0.5, reduction=2), 200.0)
     odds = benchmark["chances"](RECORDS, rule, 1, 600)
     kept = odds.kept / odds.orders
@@ -86,7 +86,7 @@ def test_a_twin_is_as_good(benchmark: dict[str, Any]) -> None:
     twins = [RECORDS[0], record("twin", 2.0, 2.0, 8.95), record("early", 3.0, 3.0, 4.0)]
     rule = benchmark["Rule"](Asha(kind="asha", grace=0.5, reduction=2), 200.0)
     odds = benchmark["chances"](twins, rule, 1, 600)
-    # `late` goes on only if it is first; the twin in all orders but `early, twin, late`, where it is worse of two.
+    # `late` continues only if it is first; the twin in all orders but `early, twin, late`, where it is worse of two.
     assert odds.kept / 600 == pytest.approx(1 / 3, abs=0.06)
     assert odds.near / 600 == pytest.approx(5 / 6, abs=0.06)
 

@@ -1,7 +1,7 @@
 """Every file in `cluster/`, against the schema of who reads it; and every key in it, misspelt, is found.
 
 Without a cloud: Ray's check of cluster YAML, EC2's RunInstances from botocore, Kubernetes' schema of pods and
-claims, shellcheck, hadolint. Where whoever reads a file publishes no schema that can be had offline (KubeRay, Google's
+claims, shellcheck, hadolint. If the program that reads a file publishes no schema for offline use (KubeRay, Google's
 machines, Grafana, Prometheus), `schemas/` holds a strict one of the fields that are set, and no other field passes.
 """
 

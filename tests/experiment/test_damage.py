@@ -110,7 +110,7 @@ def test_a_file_of_anything_is_read_or_refused_in_one_line(data: bytes) -> None:
 
 
 def test_what_the_storage_does_not_give_is_no_damage(tmp_path: Path) -> None:
-    """Else a trial that goes on would write its metrics again without what could not be read for a moment."""
+    """Otherwise a trial that continues would write its metrics again without what could not be read for a moment."""
     (tmp_path / "metrics.jsonl").mkdir()
     with pytest.raises(StorageFailure, match="cannot read"):
         load_metrics(tmp_path / "metrics.jsonl")

@@ -108,7 +108,7 @@ def test_the_best_policy_is_shown_and_not_made_twice(reported: Experiment, capsy
     text = (reported.path / "report" / "index.html").read_text()
     assert f"{best.trial.id}" in text
     assert f"{best.best.score:.5g}".replace("-", "−") in text
-    assert "the score trials are ranked by" in text
+    assert "the score by which trials are ranked" in text
     assert "reward: pole_angle" in text
     assert len(text) < 3e6
     strip = reported.path / "report" / "strip.png"

@@ -111,7 +111,7 @@ def test_stopped_trials_are_compared_where_they_stopped(experiment: Experiment) 
     page = page_of(experiment)
     assert "2 of 2 (2 before the end)" in page
     assert "compared at" in page
-    assert "Open circles are trials stopped before their end" in page
+    assert "Open circles are trials that were stopped before their end" in page
 
 
 def compared(made: Experiment, curves: dict[str, list[tuple[int, float]]], outcome: Outcome) -> Any:

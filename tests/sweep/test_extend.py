@@ -1,4 +1,4 @@
-"""An experiment that has ended goes on with more trials or more epochs; nothing it has is lost or done again."""
+"""An experiment that has ended continues with more trials or more epochs; nothing it has is lost or done again."""
 
 from pathlib import Path
 from typing import Any

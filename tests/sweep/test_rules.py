@@ -58,7 +58,7 @@ def test_halving_waits_for_enough_trials() -> None:
     assert rule.report("a", 100, 3.0) is None
     assert rule.report("b", 100, 2.0) is None
     ending = rule.report("c", 100, 1.0)
-    assert ending is not None  # three are there, one goes on
+    assert ending is not None  # three are there, one continues
     assert rule.report("b", 110, 9.0) is not None
     assert rule.report("a", 110, 0.0) is None
 
@@ -155,7 +155,7 @@ def test_last_epoch_and_wall_time() -> None:
 
 
 def test_the_untrained_policy_counts_in_no_rule() -> None:
-    """It reaches the target and is never surpassed; the trial goes on."""
+    """It reaches the target and is never surpassed; the trial continues."""
     rows = [row(epoch, **{"eval/score": score}) for epoch, score in enumerate([100.0, 1.0, 2.0, 3.0])]
     seen = evaluations_of(rows)
     assert [evaluation.epoch for evaluation in seen] == [1, 2, 3]

@@ -186,7 +186,7 @@ def test_a_signal_saves_and_says_resumable(
     metrics = tmp_path / "run" / "metrics.jsonl"
     wait_until(lambda: rows_in(metrics) > 3, process)
     if number is signal.SIGHUP:
-        process.stdout.close()  # with the terminal goes whoever reads from it
+        process.stdout.close()  # the reader disappears with the terminal
         process.send_signal(number)
         assert process.wait() == 75
         output = (tmp_path / "run" / "terminal.log").read_text()

@@ -1,4 +1,4 @@
-"""A trial that runs out of memory starts anew with half its worlds, once; whoever dies when, and nobody is misled."""
+"""A trial that runs out of memory restarts once with half its worlds, whichever process dies, and all tables say so."""
 
 import json
 from collections.abc import Callable

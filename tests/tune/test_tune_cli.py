@@ -169,7 +169,7 @@ def test_start_or_resume_asks_the_experiment_by_the_name_it_has(
 def test_another_rule_is_refused(
     space_data: dict[str, Any], tmp_path: Path, plans: list[driver.Plan], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Trials that one rule has stopped do not go on beside others under another; a new default is no new rule."""
+    """Trials that one rule has stopped do not continue beside others under another; a new default is no new rule."""
     space = tmp_path / "small.yaml"
     space.write_text(dump_yaml(space_data | {"scheduler": {"kind": "asha"}}))
     arguments = ["--space", str(space), "--cpu", "--storage", str(tmp_path / "runs")]

@@ -26,7 +26,7 @@ def test_settings_and_scores_meet_in_a_trials_folder(sweep: Experiment) -> None:
     scalars = EventAccumulator(str(folder)).Reload().Tags()["scalars"]
     assert set(METRICS) <= set(scalars), "every figure of the table is one that trials write"
     assert board_tag("env_steps") in METRICS
-    # The file of settings is the older one: TensorBoard goes on to follow the other.
+    # The file of settings is the older one: TensorBoard then follows the other.
     files = sorted(folder.glob("events*"))
     assert len(files) == 2
     assert files[0].stat().st_size < files[1].stat().st_size

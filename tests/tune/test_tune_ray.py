@@ -210,7 +210,7 @@ def test_out_of_memory_begins_again_with_half_the_worlds_in_a_fresh_process(
     assert late == [(1, 2), (1, 4), *((2, epoch) for epoch in range(2, 21, 2))]
     assert "4 trials ran with half the worlds asked for" in shown
     assert shown.count("finished, half the worlds") == 2
-    # The one whose process was killed between the decision and its first epoch goes on with its half.
+    # The one whose process was killed between the decision and its first epoch continues with its half.
     Experiment(path).clear_endings({Outcome.ERROR})
     completed, records = go(space, path, resume=True)
     assert outcomes(records)[4] == "finished"
@@ -241,7 +241,7 @@ def test_a_driver_killed_after_the_decision_goes_on_with_half_the_worlds(make_sp
     folder.mkdir(parents=True)
     # As far as a driver came that was killed there.
     assert run_trial(trial, folder, "cpu", StopSpec(), StubTrainer, Hooks(), may_halve=True) is None
-    # Whoever goes on may not halve, and need not: it has been decided.
+    # The resumed sweep may not halve, and need not: the decision has been made.
     completed, (record,) = go(make_space(parameters={BEHAVIOUR: {"grid": [LATE_CROWD]}}), path, True)
     assert completed
     assert outcomes([record]) == ["finished"]

@@ -1,4 +1,4 @@
-"""Early stopping goes on after a driver's death as if nothing had happened: killed after every single report."""
+"""Early stopping continues after a driver's death as if nothing had happened: killed after every single report."""
 
 import json
 from pathlib import Path
@@ -73,7 +73,7 @@ def test_a_driver_killed_after_any_report_stops_the_same_trials_at_the_same_epoc
         life(Driver(spec, path), reports[:killed_after], stopped)
         with path.open("a") as file:
             file.write('{"trial": "a", "epo')  # it died in the middle of a line
-        # Trials go on from their checkpoints, and report again what came after those.
+        # Trials continue from their checkpoints, and report again what came after those.
         again = [(t, e) for t, e in reports[:killed_after] if e > _checkpoint(t, reports[:killed_after])]
         life(Driver(spec, path), again + reports[killed_after:], stopped)
         assert stopped == whole
