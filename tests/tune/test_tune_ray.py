@@ -92,7 +92,7 @@ def test_faults_are_named_and_killed_or_hung_trials_go_on(
     assert "train/actor_loss is nan at epoch 5" in records[2].ending.why  # type: ignore[union-attr]
     assert records[4].ending.why == "RuntimeError: made up"  # type: ignore[union-attr]
     shown = capsys.readouterr()
-    assert "its process died (killed, or out of memory); trying again" in shown.out
+    assert "its process died (killed, or out of memory); retrying" in shown.out
     assert "raylet" not in shown.out + shown.err  # Ray's own notices are in ray.log
     assert "it hung; its stacks are in" in shown.out
     # The killed trial has every epoch once, with the scores of the one that was left alone.
