@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING
 from msk_ray.cli import TERMINAL_LOG, Parser, outliving, run, typed_command
 from msk_ray.config import SET_HELP, Config, load_config
 from msk_ray.errors import CheckpointError, ConfigError, StorageError
+from msk_ray.experiment.metrics import SCORE, read_rows
 from msk_ray.experiment.ownership import Ownership, owned
 from msk_ray.files import check_writable, make_folder
 from msk_ray.signals import RESUMABLE, StopRequest, listening
@@ -225,11 +226,18 @@ def _train(
             return RESUMABLE
         trainer.close()
     if math.isfinite(trainer.best_score):
-        print(f"best evaluation score {trainer.best_score:.1f}: {trainer.best_checkpoint}")
+        untrained = _untrained_score(logdir)
+        print(f"best evaluation score {trainer.best_score:.1f}{untrained}: {trainer.best_checkpoint}")
     else:
         print(f"no evaluation gave a score; {trainer.best_checkpoint} is the untrained policy")
     print(f"metrics: {logdir / 'metrics.jsonl'}; curves: tensorboard --logdir {logdir}")
     return 0
+
+
+def _untrained_score(logdir: Path) -> str:
+    """What the policy scored before training, in words; empty if it was not evaluated."""
+    first = next(iter(read_rows(logdir)), {})
+    return f" (untrained {first[SCORE]:.1f})" if first.get("epoch") == 0 and SCORE in first else ""
 
 
 class _CallableModule(ModuleType):

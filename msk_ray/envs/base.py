@@ -4,6 +4,7 @@ Axes: W worlds, O observation, A action.
 """
 
 import math
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from functools import cached_property
@@ -213,6 +214,13 @@ class Env(ABC, Generic[SettingsT]):
             raise ConfigError(
                 f"reward_terms of {type(self).__qualname__} has shape {tuple(terms.shape)}, but reward_names has "
                 f"{len(self.reward_names)} names for {self.nworld} worlds: return torch.stack(terms, dim=-1)"
+            )
+        if after.qpos.requires_grad and not terms.requires_grad:
+            # Legitimate only where the critic alone is to teach the policy.
+            warnings.warn(
+                f"reward_terms of {type(self).__qualname__} has no gradient to the state or the action: compute it "
+                "with torch from state, frames, tendons and action, without .detach(), .item() or numpy",
+                stacklevel=2,
             )
         reward = torch.where(diverged, 0.0, terms.sum(-1))
         age = self.state.age + 1

@@ -1,6 +1,7 @@
 """Environments from an MJCF file: model, start, controls, what can be measured, and what is refused."""
 
 import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +53,10 @@ class Feeling(Ball):
 class Short(Ball):
     def reward_terms(self, state, action, obs):
         return super().reward_terms(state, action, obs)[:, 0]
+
+class Cut(Ball):
+    def reward_terms(self, state, action, obs):
+        return super().reward_terms(state, action, obs).detach()
 
 class Flat(Ball):
     def observe(self, state, action):
@@ -205,6 +210,15 @@ def test_a_reward_of_another_shape_than_its_names_is_refused(home: Path) -> None
     env = _make("Short")
     with pytest.raises(ConfigError, match=r"reward_terms of Short has shape \(4,\), but reward_names has 2 names"):
         env.step(torch.zeros(4, 1))
+
+
+def test_a_reward_without_a_gradient_is_warned_of_where_one_is_wanted(home: Path) -> None:
+    env = _make("Cut", nworld=2, differentiable=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env.step(torch.zeros(2, 1))
+    with pytest.warns(UserWarning, match="reward_terms of Cut has no gradient to the state or the action"):
+        env.step(torch.zeros(2, 1, requires_grad=True))
 
 
 def test_forces_are_those_of_the_last_substep_in_every_backward_mode() -> None:

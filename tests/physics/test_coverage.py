@@ -25,7 +25,10 @@ def test_own_models_are_covered():
 @pytest.mark.parametrize(
     ("xml", "named"),
     [
-        ('<option integrator="RK4"/><worldbody><body><joint/><geom size=".1"/></body></worldbody>', "RK4"),
+        (
+            '<option integrator="RK4"/><worldbody><body><joint/><geom size=".1"/></body></worldbody>',
+            r'\(integrator RK4\)\. Write integrator="Euler" or "implicitfast" in the model\.',
+        ),
         ('<option density="1.2"/><worldbody><body><joint/><geom size=".1"/></body></worldbody>', "fluid"),
         (
             '<option integrator="implicitfast"/><worldbody><body name="ball"><freejoint/><geom size=".1"/></body>'

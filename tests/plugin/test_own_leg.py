@@ -29,7 +29,7 @@ def test_it_is_in_the_reward_with_its_weight(root: Path) -> None:
     assert terms[1][:, -1].tolist() == [0.0, 0.0]
 
 
-def test_it_trains_and_is_scored_term_by_term(root: Path, tmp_path: Path) -> None:
+def test_it_trains_and_is_scored_term_by_term(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     small = ("shac.horizon=2", "trial.epochs=1", "actor.hidden=[8]", "critic.hidden=[8]", "env.reward.bounce=2")
     small += ("evaluation.nworld=2", "evaluation.steps=3", "evaluation.interval=1")
     sets = [part for setting in (*(f"env.{s}" for s in SMALL), *small) for part in ("--set", setting)]
@@ -37,3 +37,5 @@ def test_it_trains_and_is_scored_term_by_term(root: Path, tmp_path: Path) -> Non
     assert run(main, ["--config", config, "--device", "cpu", "--logdir", str(tmp_path / "run"), *sets]) == 0
     row = json.loads((tmp_path / "run" / "metrics.jsonl").read_text().splitlines()[-1])
     assert row["eval/term/bounce"] < 0.0
+    first = json.loads((tmp_path / "run" / "metrics.jsonl").read_text().splitlines()[0])
+    assert f"(untrained {first['eval/score']:.1f})" in capsys.readouterr().out

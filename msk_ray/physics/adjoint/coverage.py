@@ -278,6 +278,13 @@ def approximated_types(m: mujoco.MjModel) -> set[tuple[int, int]]:
     return types & _APPROXIMATED_PAIRS
 
 
+_EXACT_INTEGRATORS = (_INTEGRATOR.mjINT_EULER, _INTEGRATOR.mjINT_IMPLICITFAST)
+
+
+def _integrator_name(model: mujoco.MjModel) -> str:
+    return f"integrator {_INTEGRATOR(model.opt.integrator).name.removeprefix('mjINT_')}"
+
+
 def _integrator(*kinds: int) -> Finder:
     return _option(lambda m: m.opt.integrator in kinds, "option integrator")
 
@@ -288,10 +295,7 @@ FEATURES: tuple[Feature, ...] = (
     Feature(
         "integrators implicit, RK4, discrete",
         False,
-        _option(
-            lambda m: m.opt.integrator not in (_INTEGRATOR.mjINT_EULER, _INTEGRATOR.mjINT_IMPLICITFAST),
-            "option integrator",
-        ),
+        lambda m: [] if m.opt.integrator in _EXACT_INTEGRATORS else [_integrator_name(m)],
     ),
     Feature(
         "solvers Newton and CG",
@@ -414,9 +418,11 @@ def check_supported(model: mujoco.MjModel, mode: str) -> None:
     found = unsupported(model)
     if found:
         lines = [f"{name} ({_few(elements)})" for name, elements in found.items()]
+        integrator = model.opt.integrator not in _EXACT_INTEGRATORS
+        instead = ' Write integrator="Euler" or "implicitfast" in the model.' if integrator else ""
         raise UnsupportedModelError(
-            f"{mode} does not differentiate {'; '.join(lines)}. Finite differences do: physics.backward=fd_jacobian in "
-            "a config, --mode fd_jacobian of gradcheck, backward=FdJacobian() in Python"
+            f"{mode} does not differentiate {'; '.join(lines)}.{instead} Finite differences do: "
+            "physics.backward=fd_jacobian in a config, --mode fd_jacobian of gradcheck, backward=FdJacobian() in Python"
         )
     for feature in FEATURES:
         if feature.partly and (elements := feature.find(model)):
