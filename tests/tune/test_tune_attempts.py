@@ -245,7 +245,7 @@ def test_a_stop_that_was_not_carried_out_is_void_once_the_worlds_are_halved(
 
 
 def test_a_population_cannot(make_space: Any) -> None:
-    with pytest.raises(ConfigError, match="all need as many; write false"):
+    with pytest.raises(ConfigError, match="all need the same number; write false"):
         make_space(
             parameters={"shac.actor_lr": {"loguniform": [1e-4, 1e-2]}},
             scheduler={"kind": "pbt"},
