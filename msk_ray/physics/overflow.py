@@ -26,7 +26,7 @@ LOST_BITS = _CONTACT_BITS | _ROW_BITS | int(sum(_INCURABLE))
 _NAN = wp.constant(math.nan)
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def note_losses(
     # In:
     overflow_in: wp.array[int],
