@@ -131,7 +131,7 @@ class TrialReader:
     def _metrics(
         self, path: Path, damages: list[Damage]
     ) -> tuple[tuple[dict[str, float], ...], TrialProgress, Metrics]:
-        stamp = _stamp(path)
+        stamp = file_stamp(path)
         if stamp is None:
             return (), TrialProgress(), Metrics()
         seen = self._seen.get(path)
@@ -199,7 +199,7 @@ def _patience(folder: Path, progress: TrialProgress) -> float:
     return max(STALE_S, STALE_EPOCHS * progress.seconds_per_epoch)
 
 
-def _stamp(path: Path) -> tuple[int, int] | None:
+def file_stamp(path: Path) -> tuple[int, int] | None:
     """Modification time [ns] and size; None if there is no such file."""
     try:
         facts = path.stat()
@@ -209,5 +209,5 @@ def _stamp(path: Path) -> tuple[int, int] | None:
 
 
 def _modified(path: Path) -> float | None:
-    stamp = _stamp(path)
+    stamp = file_stamp(path)
     return None if stamp is None else stamp[0] * 1e-9

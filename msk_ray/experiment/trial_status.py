@@ -14,7 +14,7 @@ from msk_ray.experiment.layout import ENVIRONMENT_FILE, MANIFEST_FILE, SPACE_FIL
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import TrialProgress
 from msk_ray.experiment.results import unlisted_trials
-from msk_ray.experiment.snapshot import Device, State, TrialReader
+from msk_ray.experiment.snapshot import Device, State, TrialReader, file_stamp
 from msk_ray.experiment.trial import Trial
 
 
@@ -69,7 +69,7 @@ class StatusReader:
         return sorted(found, key=_order)
 
     def _known(self) -> list[Trial]:
-        stamp = _stamp(self.experiment.path / MANIFEST_FILE)
+        stamp = file_stamp(self.experiment.path / MANIFEST_FILE)
         if stamp is None or stamp != self._manifest:
             self._trials, self._manifest = self.experiment.trials(), stamp
         return self._trials
@@ -146,15 +146,6 @@ def find_experiments(storage: Path) -> list[Path]:
 def _order(status: TrialStatus) -> tuple[int, float]:
     rank = [State.RUNNING, State.STALE, State.UNREADABLE, State.ENDED, State.WAITING].index(status.state)
     return rank, -status.progress.best if status.progress.best is not None else math.inf
-
-
-def _stamp(path: Path) -> tuple[int, int] | None:
-    """Modification time [ns] and size; None if there is no such file."""
-    try:
-        facts = path.stat()
-    except FileNotFoundError:
-        return None
-    return facts.st_mtime_ns, facts.st_size
 
 
 def _subfolders(path: Path) -> list[Path]:
