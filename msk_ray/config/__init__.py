@@ -21,7 +21,7 @@ from msk_ray.config.load import (
     refuse_ignored,
 )
 from msk_ray.config.loggers import logger_paths
-from msk_ray.config.overlay import SET_HELP, combine, leaves, merge, overlay, parse_override, parse_overrides
+from msk_ray.config.overlay import SET_HELP, combine, flattened, leaves, merge, overlay, parse_override, parse_overrides
 from msk_ray.config.physics import FdConfig, PhysicsConfig
 from msk_ray.config.recorded import current_key, current_values, env_name, first_spelling
 from msk_ray.config.resolve import Registry, resolve, resolve_class
@@ -66,6 +66,7 @@ __all__ = [
     "dump_yaml",
     "env_name",
     "first_spelling",
+    "flattened",
     "leaves",
     "load_config",
     "logger_paths",

@@ -89,7 +89,7 @@ def refuse_ignored(values: Mapping[str, Any], configs: Iterable[Config], source:
         ConfigError: the message names the first of them.
     """
     ignored = {config.algorithm.name: config.ignored for config in configs}
-    for leaf in (leaf for key, value in values.items() for leaf in leaves(key, value)):
+    for leaf in (leaf for key, value in values.items() for leaf, _ in leaves(key, value)):
         if ignored and all(any(f"{leaf}.".startswith(f"{key}.") for key in keys) for keys in ignored.values()):
             raise ConfigError(
                 f"{source} {shortened(leaf)}: nothing reads it while algorithm.name is {' or '.join(ignored)}; "

@@ -81,13 +81,19 @@ def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     return merged
 
 
-def leaves(key: str, value: Any) -> Iterator[str]:
-    """Dotted keys of the values within a value; mappings are sections."""
+def leaves(key: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """Dotted keys of the values within a value, and these values; mappings are sections."""
     if isinstance(value, Mapping) and value:
         for name, item in value.items():
             yield from leaves(f"{key}.{name}", item)
     else:
-        yield key
+        yield key, value
+
+
+def flattened(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested settings by dotted key, without empty sections."""
+    pairs = (pair for key, value in settings.items() for pair in leaves(key, value))
+    return {key: value for key, value in pairs if not isinstance(value, Mapping)}
 
 
 def _laid_over(path: list[str], old: Any, new: Any) -> Any:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from msk_ray.config import Config, first_spelling
+from msk_ray.config import Config, first_spelling, flattened
 from msk_ray.text import describe, printable
 
 ID_DIGITS = 8
@@ -73,16 +73,6 @@ def with_epochs(trial: Trial, epochs: int) -> Trial:
 
 def describe_changes(old: Config, new: Config) -> str:
     """`shac.actor_lr 0.002 → 0.001, …`: the settings in which two configs differ."""
-    before, after = _flat(old.as_dict()), _flat(new.as_dict())
+    before, after = flattened(old.as_dict()), flattened(new.as_dict())
     keys = [key for key in {**before, **after} if before.get(key) != after.get(key)]
     return ", ".join(f"{key} {describe(before.get(key))} → {describe(after.get(key))}" for key in keys)
-
-
-def _flat(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in data.items():
-        if isinstance(value, Mapping):
-            flat |= _flat(value, f"{prefix}{key}.")
-        else:
-            flat[f"{prefix}{key}"] = value
-    return flat

@@ -70,5 +70,5 @@ def _combinations(space: Space, base: Mapping[str, Any]) -> Iterator[Config]:
 
 def _decides(key: str, op: Operator) -> bool:
     """Whether a parameter affects the length of a trial."""
-    touched = (leaf for level in op.extremes() for leaf in leaves(key, level.value))
+    touched = (leaf for level in op.extremes() for leaf, _ in leaves(key, level.value))
     return any(leaf == known or leaf.startswith(f"{known}.") for leaf in touched for known in _DECIDING)

@@ -153,7 +153,7 @@ def _check_collisions(space: Space) -> None:
     """Refuse two parameters that set the same config key."""
     owner: dict[str, str] = {}
     for key, op in space.parameters.items():
-        for leaf in sorted({leaf for level in op.extremes() for leaf in leaves(key, level.value)}):
+        for leaf in sorted({leaf for level in op.extremes() for leaf, _ in leaves(key, level.value)}):
             other = owner.setdefault(leaf, key)
             if other != key:
                 raise ConfigError(f"{space.name}: parameters {other!r} and {key!r} both set {leaf}")

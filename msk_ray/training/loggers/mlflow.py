@@ -2,13 +2,13 @@
 
 import os
 import time
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from mlflow.entities import Metric, Param
 from mlflow.tracking import MlflowClient
 
+from msk_ray.config import flattened
 from msk_ray.files import write_text
 from msk_ray.training.loggers.base import Logger
 from msk_ray.training.loggers.run_name import run_name
@@ -66,19 +66,8 @@ class MLflow(Logger):
         found = client.get_experiment_by_name(experiment)
         number = client.create_experiment(experiment) if found is None else found.experiment_id
         self._run = client.create_run(number, run_name=trial).info.run_id
-        params = [Param(key, value) for key, value in _flat(self._settings).items()]
+        params = [Param(key, str(value)[:_LONGEST_PARAM]) for key, value in flattened(self._settings).items()]
         for first in range(0, len(params), _PARAMS_AT_ONCE):
             client.log_batch(self._run, params=params[first : first + _PARAMS_AT_ONCE])
         write_text(path, self._run)
         return client
-
-
-def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
-    """Dotted keys and their values as text, cut to the length that MLflow accepts."""
-    flat: dict[str, str] = {}
-    for key, value in settings.items():
-        if isinstance(value, Mapping):
-            flat |= _flat(value, f"{prefix}{key}.")
-        else:
-            flat[f"{prefix}{key}"] = str(value)[:_LONGEST_PARAM]
-    return flat
