@@ -136,11 +136,6 @@ def algorithm_class(config: Config) -> type[Algorithm]:
     check_installed(config.algorithm, config.algorithm_settings)
     path = ALGORITHMS.path(config.algorithm.name)
     found: type[Algorithm] = resolve_class(path, ALGORITHMS.key, Algorithm)  # type: ignore[type-abstract]
-    lacking = sorted(found.__abstractmethods__)
-    if lacking:
-        raise ConfigError(
-            f"algorithm.name: {path} lacks {', '.join(lacking)}: write them as msk_ray.algorithms.Algorithm describes"
-        )
     if not isinstance(config.algorithm_settings, found.Settings):
         wanted, given = f"{found.Settings.__module__}.{found.Settings.__qualname__}", type(config.algorithm_settings)
         raise ConfigError(f"algorithm.name: {path} takes settings of type {wanted}, not {given.__qualname__}")

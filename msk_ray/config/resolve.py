@@ -48,11 +48,15 @@ def resolve_class(path: str, key: str, base: type[T]) -> type[T]:
     """The class at an import path, a subclass of `base`.
 
     Raises:
-        ConfigError: as for `resolve`, or the object is not such a class.
+        ConfigError: as for `resolve`, or the object is not such a class, or lacks methods that `base` asks for.
     """
     found = resolve(path, key)
+    wanted = f"{base.__module__}.{base.__qualname__}"
     if not (isinstance(found, type) and issubclass(found, base)):
-        raise ConfigError(f"{key}: {path} is not a subclass of {base.__module__}.{base.__qualname__}")
+        raise ConfigError(f"{key}: {path} is not a subclass of {wanted}")
+    lacking = sorted(getattr(found, "__abstractmethods__", ()))
+    if lacking:
+        raise ConfigError(f"{key}: {path} lacks {', '.join(lacking)}: write what {wanted} describes")
     return found
 
 

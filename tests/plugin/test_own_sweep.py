@@ -85,6 +85,8 @@ def test_a_search_is_asked_and_told(make_space: Any, tmp_path: Path) -> None:
         ({"stop": {"rules": {"own_sweep:Enough": {"evaluation": 3}}}}, "did you mean 'evaluations'"),
         ({"stop": {"rules": {"own_sweep:Enuogh": {}}}}, "did you mean 'Enough'"),
         ({"stop": {"rules": {"own_sweep:LowToHigh": {}}}}, "not a subclass of msk_ray.sweep.rules.stop_rule.StopRule"),
+        ({"stop": {"rules": {"msk_ray.sweep.rules.stop_rule:StopRule": {}}}}, "StopRule lacks why"),
+        ({"search": "msk_ray.sweep.search:Search"}, "search: msk_ray.sweep.search:Search lacks "),
         ({"scheduler": {"kind": "own_sweep:Floor", "flor": 1}}, "did you mean 'floor'"),
         ({"scheduler": {"kind": "ahsa"}}, "scheduler.kind: unknown name 'ahsa'; did you mean 'asha'"),
         ({"scheduler": {"kind": "asha", "quantile": 0.2}}, "scheduler.quantile: unknown key; known keys: kind, "),
