@@ -10,7 +10,7 @@ from typing import Any
 from msk_ray.cli import Parser
 from msk_ray.config import SET_HELP
 from msk_ray.errors import ConfigError
-from msk_ray.experiment.manifest import Experiment, check_name, has_begun
+from msk_ray.experiment.manifest import REMEMBERED, Experiment, check_name, has_begun
 from msk_ray.experiment.outcomes import Outcome
 from msk_ray.sweep.extend import parse_extension
 from msk_ray.sweep.space import find_space, parse_seeds
@@ -158,12 +158,14 @@ class Options:
         """These options, completed by those of the experiment's earlier command lines."""
         if experiment is None:
             return self
-        known = {name: experiment.said(name) if now is None else now for name, now in self.remembered().items()}
-        return replace(self, halve_worlds=known["halve_worlds"], early_stopping=known["early_stopping"])
+        known: dict[str, Any] = {
+            name: experiment.said(name) if now is None else now for name, now in self.remembered().items()
+        }
+        return replace(self, **known)
 
     def remembered(self) -> dict[str, bool | None]:
         """The options that an experiment remembers, by name."""
-        return {"halve_worlds": self.halve_worlds, "early_stopping": self.early_stopping}
+        return {name: getattr(self, name) for name in REMEMBERED}
 
     def as_data(self) -> dict[str, Any]:
         """As plain data, for the manifest."""
