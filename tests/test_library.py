@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import pytest
@@ -47,6 +48,25 @@ def test_training_gives_the_best_policy(tiny_cartpole: msk_ray.Config, tmp_path:
     assert trained.epochs == 6
     assert trained.best_score == max(row["eval/score"] for row in rows if "eval/score" in row)
     assert msk_ray.load_policy(trained.best_checkpoint).config == tiny_cartpole
+
+
+def test_the_readme_example_runs(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a CPU, with another model, and with two epochs of few worlds instead of all of them."""
+    example = (root / "README.md").read_text().split("```python\n")[1].split("```")[0]
+    small = '["trial.epochs=2", "env.nworld=4", "evaluation.nworld=2", "evaluation.steps=4", "shac.critic_batches=1"]'
+    for text, instead in (
+        ('device="cuda"', 'device="cpu"'),
+        ('"configs/cartpole.yaml"', f'"{root}/configs/cartpole.yaml", {small}'),
+    ):
+        assert text in example
+        example = example.replace(text, instead)
+    mujoco.mj_saveLastXML(str(tmp_path / "model.xml"), cartpole())
+    monkeypatch.chdir(tmp_path)
+    found: dict[str, Any] = {}
+    exec(example, found)
+    assert found["ctrl"].grad.shape == (64, 1)
+    assert found["ctrl"].grad.abs().min() > 0.0
+    assert found["policy"].epoch == found["trained"].epochs == 2
 
 
 def test_training_goes_on_where_it_was_interrupted(tiny_cartpole: msk_ray.Config, tmp_path: Path) -> None:

@@ -67,14 +67,14 @@ def read_config(path: Path) -> dict[str, Any]:
     return merge(current_settings(base, name), current_settings(data, name))
 
 
-def load_config(path: Path, overrides: Iterable[str] = ()) -> Config:
+def load_config(path: str | Path, overrides: Iterable[str] = ()) -> Config:
     """Read a config file and apply "a.b=value" overrides to it.
 
     Raises:
         ConfigError: as for `read_config`, `parse_override`, `parse_config` and `refuse_ignored`.
     """
     values = parse_overrides(overrides)
-    config = parse_config(overlay(read_config(path), values), str(path))
+    config = parse_config(overlay(read_config(Path(path)), values), str(path))
     refuse_ignored(values, [config], "--set")
     return config
 

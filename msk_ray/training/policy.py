@@ -64,13 +64,14 @@ class SavedPolicy:
         return policy
 
 
-def load_policy(path: Path) -> SavedPolicy:
+def load_policy(path: str | Path) -> SavedPolicy:
     """Read the policy in a checkpoint, on CPU.
 
     Raises:
         CheckpointError: the checkpoint is missing, incomplete, of another format, or holds no policy.
         ConfigError: this version does not know its settings.
     """
+    path = Path(path)
     facts, state = load_checkpoint(path)
     try:
         config, epoch, env_steps, modules = (
