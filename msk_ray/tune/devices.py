@@ -1,7 +1,6 @@
 """What a trial runs on: GPUs if there are any, unless something else was requested."""
 
 import math
-import os
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -105,8 +104,3 @@ def local_gpus() -> int:
     import torch
 
     return torch.cuda.device_count()
-
-
-def local_cpus() -> int:
-    """CPU cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
