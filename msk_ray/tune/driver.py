@@ -158,7 +158,7 @@ def _finish_pruning(plan: Plan) -> None:
     folder = plan.experiment.trial_folder(reports[-1].trial)
     if ending is None or read_ending(folder) is not None:
         return
-        # The scores of one attempt do not end another.
+    # The scores of one attempt do not end another.
     if reports[-1].attempt == read_attempt(folder).number:
         write_ending(folder, ending)
 
@@ -322,7 +322,7 @@ def _param_space(job: Job, remaining: list[Trial]) -> dict[str, Any]:
         return {}  # the search gives everything
     if not job.population:
         return {"id": tune.grid_search([trial.id for trial in remaining])}
-        # The settings of a population's members change: each starts with those last recorded in its folder.
+    # The settings of a population's members change: each starts with those last recorded in its folder.
     params = {trial.id: _current_params(job, trial) for trial in remaining}
     return {
         "id": tune.grid_search(list(params)),

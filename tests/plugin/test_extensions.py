@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 import re
 import sys
 from collections.abc import Iterator
@@ -14,9 +15,13 @@ from msk_ray import train
 from msk_ray.cli import run
 from msk_ray.config import dump_yaml, parse_config, read_yaml
 from msk_ray.diagnose import __main__ as diagnose
+from msk_ray.errors import ConfigError
 from msk_ray.evaluate import __main__ as evaluate
 from msk_ray.experiment.metrics import SCORE, read_metrics
+from msk_ray.sweep.budget import longest_budget
 from msk_ray.sweep.smoke import shorten
+from msk_ray.sweep.space import parse_space
+from msk_ray.sweep.trials import resolve_trials
 from msk_ray.training import Trainer, load_policy
 from msk_ray.training.checkpoint import epoch_checkpoints
 from msk_ray.tune import __main__ as tune
@@ -93,6 +98,23 @@ def test_a_space_varies_its_settings(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert run(tune.main, ["--space", str(tmp_path / "noise.yaml"), "--dry-run"]) == 0
     assert "noise=0.3" in capsys.readouterr().out
     assert "trial.epochs" in shorten(parse_config(SETTINGS))
+
+
+def test_a_space_of_an_algorithm_that_does_not_say_its_env_steps(tmp_path: Path) -> None:
+    (tmp_path / "base.yaml").write_text(dump_yaml(SETTINGS))
+    grid = {"algorithm.settings.noise": {"grid": [0.1, 0.2]}}
+    described = {"question": "How much noise?", "base": "base.yaml", "parameters": grid}
+    assert budget(described, tmp_path) == math.inf
+    compared = {"kind": "asha", "time_attr": "epoch"}
+    assert budget({**described, "scheduler": compared}, tmp_path) == 4
+    with pytest.raises(ConfigError, match=r"env_steps, or scheduler\.time_attr: epoch"):
+        budget({**described, "scheduler": {"kind": "asha"}}, tmp_path)
+
+
+def budget(described: dict[str, object], folder: Path) -> float:
+    """The longest trial of a space with this file."""
+    space = parse_space(described, folder / "noise.yaml")
+    return longest_budget(space.file, [trial.config for trial in resolve_trials(space)])
 
 
 @pytest.mark.parametrize(("page", "file"), [("algorithms", "random_search"), ("loggers", "table_logger")])
