@@ -1,7 +1,6 @@
 """The longest possible trial of a space: the scheduler's `grace`, rungs and `interval` are shares of its length."""
 
 import itertools
-import math
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
@@ -30,14 +29,12 @@ def env_steps_budget(config: Config) -> int:
 
 
 def longest_budget(file: SpaceFile, configs: Iterable[Config]) -> float:
-    """The largest budget of some trials, in the scheduler's unit of time; infinite if no rule asks how far trials are.
+    """The largest budget of some trials, in the scheduler's unit of time.
 
     Args:
         file: the space, with its scheduler.
         configs: configs of the trials; for a search `extreme_configs`, because its trials are not known yet.
     """
-    if not (file.scheduler.ends_trials or file.scheduler.exchanges):
-        return math.inf  # an algorithm from outside need not say how many env steps it takes
     attribute = file.scheduler.time_attr
     if attribute == "env_steps":
         return max(env_steps_budget(config) for config in configs)

@@ -1,6 +1,7 @@
 """Runs an experiment's trials with Ray Tune."""
 
 import logging
+import math
 import tempfile
 import time
 import warnings
@@ -345,7 +346,10 @@ def _current_params(job: Job, trial: Trial) -> dict[str, Any]:
 
 
 def _budget(plan: Plan) -> float:
-    """The longest possible duration of a trial, in the scheduler's unit of time."""
+    """The longest possible duration of a trial, in the scheduler's unit of time; infinite if no rule asks for it."""
+    scheduler = plan.space.file.scheduler
+    if not (scheduler.ends_trials or scheduler.exchanges):
+        return math.inf  # an algorithm from outside need not say how many env steps it takes
     configs = [trial.config for trial in plan.trials] or extreme_configs(plan.space)
     return longest_budget(plan.space.file, configs)
 

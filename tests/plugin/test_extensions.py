@@ -17,14 +17,16 @@ from msk_ray.config import dump_yaml, parse_config, read_yaml
 from msk_ray.diagnose import __main__ as diagnose
 from msk_ray.errors import ConfigError
 from msk_ray.evaluate import __main__ as evaluate
+from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import SCORE, read_metrics
-from msk_ray.sweep.budget import longest_budget
 from msk_ray.sweep.smoke import shorten
 from msk_ray.sweep.space import parse_space
 from msk_ray.sweep.trials import resolve_trials
 from msk_ray.training import Trainer, load_policy
 from msk_ray.training.checkpoint import epoch_checkpoints
 from msk_ray.tune import __main__ as tune
+from msk_ray.tune import driver
+from msk_ray.tune.devices import Placement
 
 HERE = Path(__file__).resolve().parent
 SETTINGS = {
@@ -114,7 +116,8 @@ def test_a_space_of_an_algorithm_that_does_not_say_its_env_steps(tmp_path: Path)
 def budget(described: dict[str, object], folder: Path) -> float:
     """The longest trial of a space with this file."""
     space = parse_space(described, folder / "noise.yaml")
-    return longest_budget(space.file, [trial.config for trial in resolve_trials(space)])
+    experiment = Experiment(folder / "runs")
+    return driver._budget(driver.Plan(experiment, space, resolve_trials(space), Placement(0.0, 1), None))
 
 
 @pytest.mark.parametrize(("page", "file"), [("algorithms", "random_search"), ("loggers", "table_logger")])
