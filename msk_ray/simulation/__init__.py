@@ -2,6 +2,7 @@
 
 from msk_ray.simulation.backward import Backward, InputGradients, StepState
 from msk_ray.simulation.fd_jacobian import FdJacobian
+from msk_ray.simulation.jacobian import Linearization
 from msk_ray.simulation.simulation import Simulation, WarpSimStep
 from msk_ray.simulation.tape import Hybrid, TapeAll, TapePerSubstep
 
@@ -10,6 +11,7 @@ __all__ = [
     "FdJacobian",
     "Hybrid",
     "InputGradients",
+    "Linearization",
     "Simulation",
     "StepState",
     "TapeAll",

@@ -7,9 +7,12 @@ import copy
 from abc import ABC, abstractmethod
 from typing import Any, NamedTuple, Self
 
+import torch
 from torch import Tensor
 
 from msk_ray.physics import WorldBatch
+from msk_ray.simulation.jacobian import rows_of, state_size, unit_cotangents
+from msk_ray.simulation.tangent import Tangent
 
 
 class StepState(NamedTuple):
@@ -49,7 +52,8 @@ class Backward(ABC):
     """One way to differentiate an env step: records what it needs of the forward pass, then pulls cotangents back.
 
     A Simulation calls `attach` once, replays `launch_step` for every forward pass, calls `record` right after it if a
-    gradient will be needed, and `vjp` once for each recorded step, latest first.
+    gradient will be needed, and `vjp` once for each recorded step, latest first; `jacobian` instead where the whole
+    Jacobian is wanted.
     """
 
     name: str
@@ -84,6 +88,26 @@ class Backward(ABC):
     @abstractmethod
     def vjp(self, saved: tuple[Tensor, ...], cotangent: StepState, needs: Needs) -> InputGradients:
         """Vector-Jacobian product of the recorded step: cotangents of its results, in raw coordinates, pulled back."""
+
+    def jacobian(
+        self, saved: tuple[Tensor, ...], start: StepState, end: StepState, tangent: Tangent
+    ) -> tuple[Tensor, Tensor]:
+        """(A, B) of the recorded step in tangent space, shapes (W, S, S) and (W, S, nu) with S = 2 nv + na.
+
+        This one takes a `vjp` for each row; a mode that knows a faster way overrides it.
+
+        Args:
+            saved: what `record` returned for the step.
+            start, end: the states before and after it.
+            tangent: the joints of the model.
+        """
+        needs = Needs(ctrl=True, qpos=True, qvel=True, act=True)
+        rows = []
+        for row in range(state_size(end)):
+            cotangents = unit_cotangents(tangent, end, range(row, row + 1), 1)
+            found = self.vjp(saved, StepState(*(part[0] for part in cotangents)), needs)
+            rows.append(rows_of(tangent, start, found))
+        return torch.stack([a for a, _ in rows], dim=1), torch.stack([b for _, b in rows], dim=1)
 
     def diagnostics(self) -> dict[str, float]:
         """Diagnostics gathered since the last call, by metric name."""

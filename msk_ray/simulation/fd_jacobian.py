@@ -1,11 +1,14 @@
 """`fd_jacobian`: gradients of any model by central differences of the whole env step."""
 
+from collections.abc import Iterable, Iterator
+
 import torch
 from torch import Tensor
 
 from msk_ray.physics import WorldBatch
 from msk_ray.simulation.backward import Backward, InputGradients, Needs, StepState
 from msk_ray.simulation.buffers import device_of
+from msk_ray.simulation.jacobian import state_size
 from msk_ray.simulation.stepper import Stepper
 from msk_ray.simulation.tangent import Tangent
 
@@ -54,15 +57,13 @@ class FdJacobian(Backward):
     @torch.no_grad()
     def vjp(self, saved: tuple[Tensor, ...], cotangent: StepState, needs: Needs) -> InputGradients:
         ctrl, qpos, qvel, act, qpos_end = saved
-        weights = cotangent._replace(qpos=self._tangent.project(qpos_end, cotangent.qpos))
+        weights = torch.cat((self._tangent.project(qpos_end, cotangent.qpos), *cotangent[1:]), dim=-1)
         wanted = [name for name, need in needs._asdict().items() if need and self._sizes[name]]
-        columns = [(name, i) for name in wanted for i in range(self._sizes[name])]
+        columns = self._columns(wanted)
         start = StepState(qpos, qvel, act)
         slopes = torch.empty((len(columns), self._batch.nworld), device=self._device)
-        width = max(1, min(len(columns), self.max_worlds // (2 * self._batch.nworld)))
-        for first in range(0, len(columns), width):
-            chunk = columns[first : first + width]
-            slopes[first : first + len(chunk)] = self._slopes(chunk, width, ctrl, start, weights)
+        for chunk, changes in self._derivatives(columns, ctrl, start):
+            slopes[chunk.start : chunk.stop] = (changes * weights).sum(-1)
         gradients: dict[str, Tensor] = {}
         for name in wanted:
             picked = [k for k, (owner, _) in enumerate(columns) if owner == name]
@@ -74,15 +75,39 @@ class FdJacobian(Backward):
             *(gradients.get(n, torch.zeros_like(shapes[n])) if getattr(needs, n) else None for n in shapes)
         )
 
+    @torch.no_grad()
+    def jacobian(
+        self, saved: tuple[Tensor, ...], start: StepState, end: StepState, tangent: Tangent
+    ) -> tuple[Tensor, Tensor]:
+        """Column by column: the perturbed copies give whole columns of (A, B)."""
+        columns = self._columns(("qpos", "qvel", "act", "ctrl"))
+        size = state_size(end)
+        found = torch.empty((len(columns), self._batch.nworld, size), device=self._device)
+        for chunk, changes in self._derivatives(columns, saved[0], start):
+            found[chunk.start : chunk.stop] = changes
+        a, b = found.permute(1, 2, 0).split([size, len(columns) - size], dim=-1)
+        return a.contiguous(), b.contiguous()
+
     def diagnostics(self) -> dict[str, float]:
         """Share of perturbed copies whose solver met an iteration limit since the last call."""
         shares = [copies.diagnostics()["solver_limit_share"] for copies in self._copies.values()]
         return {"fd_solver_limit_share": max(shares, default=0.0)}
 
-    def _slopes(
-        self, chunk: list[tuple[str, int]], width: int, ctrl: Tensor, start: StepState, weights: StepState
-    ) -> Tensor:
-        """Directional derivatives of ⟨weights, end⟩, shape (len(chunk), W), along each column of `chunk`."""
+    def _columns(self, names: Iterable[str]) -> list[tuple[str, int]]:
+        """(input, entry) of each input's perturbations."""
+        return [(name, i) for name in names for i in range(self._sizes[name])]
+
+    def _derivatives(
+        self, columns: list[tuple[str, int]], ctrl: Tensor, start: StepState
+    ) -> Iterator[tuple[range, Tensor]]:
+        """Derivatives of the state after the step along each of `columns`, (chunk, W, S), chunk by chunk."""
+        width = max(1, min(len(columns), self.max_worlds // (2 * self._batch.nworld)))
+        for first in range(0, len(columns), width):
+            chunk = columns[first : first + width]
+            yield range(first, first + len(chunk)), self._changes(chunk, width, ctrl, start)
+
+    def _changes(self, chunk: list[tuple[str, int]], width: int, ctrl: Tensor, start: StepState) -> Tensor:
+        """Derivatives of the state after the step along each column of `chunk`, (len(chunk), W, S)."""
         copies = self._copies.get(width)
         if copies is None:
             copies = self._copies[width] = Stepper(self._batch.resized(2 * width * self._batch.nworld))
@@ -90,7 +115,7 @@ class FdJacobian(Backward):
         inputs = {"ctrl": ctrl, **start._asdict()}
         spread = {name: value.expand(*shape, -1).clone() for name, value in inputs.items()}
         deltas = torch.zeros((*shape, self._tangent.nv), device=self._device)
-        steps = torch.ones(len(chunk), 1, device=self._device)
+        steps = torch.ones(len(chunk), 1, 1, device=self._device)
         for k, (name, i) in enumerate(chunk):
             target = deltas if name == "qpos" else spread[name]
             target[0, k, :, i] += self.eps[name]
@@ -101,9 +126,6 @@ class FdJacobian(Backward):
         inputs = {name: value.flatten(0, 2) for name, value in spread.items()}
         end = copies.advance(inputs.pop("ctrl"), StepState(**inputs))
         copies.engine.settle()
-        plus_q, minus_q = end.qpos.view(*shape, -1)[:, : len(chunk)]
-        change = (self._tangent.difference(minus_q, plus_q) * weights.qpos).sum(-1)
-        for value, weight in ((end.qvel, weights.qvel), (end.act, weights.act)):
-            plus, minus = value.view(*shape, -1)[:, : len(chunk)]
-            change = change + ((plus - minus) * weight).sum(-1)
-        return change / steps
+        ends = [value.view(*shape, -1)[:, : len(chunk)] for value in end]
+        changes = [self._tangent.difference(ends[0][1], ends[0][0]), *(e[0] - e[1] for e in ends[1:])]
+        return torch.cat(changes, dim=-1) / steps

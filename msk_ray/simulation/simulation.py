@@ -12,6 +12,7 @@ from msk_ray.errors import ConfigError, DeviceError
 from msk_ray.physics import WorldBatch
 from msk_ray.physics.capacity import Capacity
 from msk_ray.simulation.backward import Backward, Needs, StepState
+from msk_ray.simulation.jacobian import Linearization
 from msk_ray.simulation.modes import make_backward
 from msk_ray.simulation.stepper import Engine, Stepper
 from msk_ray.simulation.tangent import Tangent
@@ -173,6 +174,33 @@ class Simulation:
         if torch.is_grad_enabled() and any(t.requires_grad for t in (ctrl, qpos, qvel, act)):
             return StepState(*WarpSimStep.apply(self, ctrl, qpos, qvel, act))
         return self.advance(ctrl, StepState(qpos, qvel, act))
+
+    @torch.no_grad()
+    def linearize(self, ctrl: Tensor, qpos: Tensor, qvel: Tensor, act: Tensor) -> Linearization:
+        """Jacobians of one env step of every world, in tangent space: x' = end + A δx + B δu to first order.
+
+        By the backward mode: exact with the tapes, whose rows run as further worlds, without another forward pass;
+        from perturbed copies with fd_jacobian. Clips of gradients do not act on them.
+
+        Args:
+            ctrl, qpos, qvel, act: as for `step`.
+
+        Returns:
+            A (W, 2 nv + na, 2 nv + na), B (W, 2 nv + na, nu) and the state after the step. Entries are ordered as by
+            MuJoCo's mjd_transitionFD: positions in tangent space, velocities, activations.
+
+        Raises:
+            ConfigError: as for `step`, or the simulation has no backward mode.
+            SimulationError: as for `step`.
+        """
+        self.require_backward()
+        self._check_inputs(ctrl, qpos, qvel, act)
+        start = StepState(qpos, qvel, act)
+        end = self.advance(ctrl, start)
+        mode = self.require_backward()  # after the step, which may have replaced it with larger buffers
+        saved = mode.record(ctrl, start, end)
+        self.engine.settle()
+        return Linearization(*mode.jacobian(saved, start, end, self.tangent), end)
 
     def contact_forces(self) -> Tensor:
         """Force of all contacts on every geom in world coordinates [N], shape (W, G, 3).

@@ -7,6 +7,7 @@ nothing is solved); `tape_all` keeps them.
 
 import warnings
 from abc import abstractmethod
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -20,7 +21,12 @@ from msk_ray.physics.adjoint.residual import ResidualGauge
 from msk_ray.physics.adjoint.stages import recompute_stages
 from msk_ray.simulation.backward import Backward, InputGradients, Needs, StepState
 from msk_ray.simulation.buffers import device_of, stream_of
+from msk_ray.simulation.jacobian import rows_of, state_size, unit_cotangents
 from msk_ray.simulation.pool import Pool
+from msk_ray.simulation.tangent import Tangent
+
+JACOBIAN_WORLDS = 131072
+"""Worlds in which `jacobian` pulls rows back at the same time; further rows follow."""
 
 # Arrays of mujoco_warp.Data that the adjoint of a substep reads, besides the checkpointed state.
 _KEPT_DATA = (
@@ -80,6 +86,7 @@ class _Tape(Backward):
         )
         self._grad_ctrl = wp.to_torch(adjoint.grad_ctrl, requires_grad=False)
         self._graph: Graph | None = None
+        self._rows: dict[int, TapePerSubstep] = {}
 
     def _prepare(self, pool: Pool) -> None:
         """Claim further arrays in the buffer that is copied out per recorded step."""
@@ -94,18 +101,67 @@ class _Tape(Backward):
     @torch.no_grad()
     def vjp(self, saved: tuple[Tensor, ...], cotangent: StepState, needs: Needs) -> InputGradients:
         ctrl, kept = saved
+        self.ready()
+        self._ctrl.copy_(ctrl)
+        self._saved.copy_(kept)
+        gradients = self.pull(cotangent)
+        return InputGradients(
+            *(g.clone() if need and g is not None else None for g, need in zip(gradients, needs, strict=True))
+        )
+
+    def ready(self) -> None:
+        """Record the backward pass if it is not yet, which leaves the checkpoints undefined."""
         if self._graph is None:
             self._graph = Graph(self.launch_backward, self._batch.device)
             self._clipped.zero_()
             self._adjoint.touch_counter.clear()
-        self._ctrl.copy_(ctrl)
-        self._saved.copy_(kept)
+
+    def pull(self, cotangent: StepState) -> InputGradients:
+        """Replay the backward pass of the step whose checkpoints are in place; the result lasts until the next."""
+        assert self._graph is not None
         for view, value in zip(self.cotangent, cotangent, strict=True):
             view.copy_(value)
         self._graph.replay(stream_of(self._device))
         self._pulled += 1
-        gradients = (self._grad_ctrl, *self.cotangent)
-        return InputGradients(*(g.clone() if need else None for g, need in zip(gradients, needs, strict=True)))
+        return InputGradients(self._grad_ctrl, *self.cotangent)
+
+    def load(self, ctrl: Tensor, states: Sequence[dict[str, wp.array]]) -> None:
+        """Take the checkpoints of a step of fewer worlds, `ctrl` (w, nu) and `states`; W / w copies of each world."""
+        self.ready()
+        copies = self._batch.nworld // len(ctrl)
+        self._ctrl.copy_(ctrl.repeat(copies, 1))
+        for here, there in zip(self.checkpoints, states, strict=True):
+            for name, array in there.items():
+                value = wp.to_torch(array, requires_grad=False)
+                wp.to_torch(here[name], requires_grad=False).copy_(value.repeat(copies, 1))
+
+    @property
+    def checkpoints(self) -> list[dict[str, wp.array]]:
+        """Checkpoints of a step: the states before each substep, and the last one."""
+        return [*self._states, self._last]
+
+    @torch.no_grad()
+    def jacobian(
+        self, saved: tuple[Tensor, ...], start: StepState, end: StepState, tangent: Tangent
+    ) -> tuple[Tensor, Tensor]:
+        """As many rows at once as fit in `JACOBIAN_WORLDS` worlds. Not clipped."""
+        ctrl, kept = saved
+        self._saved.copy_(kept)
+        size, worlds = state_size(end), self._batch.nworld
+        width = max(1, min(size, JACOBIAN_WORLDS // worlds))
+        if width not in self._rows:
+            self._rows[width] = TapePerSubstep()
+            self._rows[width].attach(self._batch.resized(width * worlds))
+        self._rows[width].load(ctrl, self.checkpoints)
+        found = []
+        for first in range(0, size, width):
+            chunk = range(first, min(first + width, size))
+            cotangents = unit_cotangents(tangent, end, chunk, width)
+            gradients = self._rows[width].pull(StepState(*(part.flatten(0, 1) for part in cotangents)))
+            split = (None if g is None else g.clone().unflatten(0, (width, worlds)) for g in gradients)
+            found.append(rows_of(tangent, start, InputGradients(*split)))
+        a, b = (torch.cat(parts)[:size].transpose(0, 1).contiguous() for parts in zip(*found, strict=True))
+        return a, b
 
     def bytes_recorded(self) -> int:
         """Size of the data of one recorded env step, for all worlds together, without its control."""
@@ -128,7 +184,8 @@ class _Tape(Backward):
             figures["substep_clip_share"] = float(self._clipped.numpy().sum()) / between
             self._clipped.zero_()
         if self._adjoint.touch_counter.present:
-            figures["approximated_share"] = self._approximated_share()
+            of_rows = [rows.diagnostics()["approximated_share"] for rows in self._rows.values()]
+            figures["approximated_share"] = max([self._approximated_share(), *of_rows])
         self._pulled = 0
         return figures
 
@@ -262,6 +319,13 @@ class Hybrid(Backward):
         state = self.state.vjp(saved[: self._split], cotangent, needs._replace(ctrl=False))
         ctrl = self.ctrl.vjp(saved[self._split :], cotangent, Needs(needs.ctrl, False, False, False))
         return state._replace(ctrl=ctrl.ctrl)
+
+    def jacobian(
+        self, saved: tuple[Tensor, ...], start: StepState, end: StepState, tangent: Tangent
+    ) -> tuple[Tensor, Tensor]:
+        a, _ = self.state.jacobian(saved[: self._split], start, end, tangent)
+        _, b = self.ctrl.jacobian(saved[self._split :], start, end, tangent)
+        return a, b
 
     def diagnostics(self) -> dict[str, float]:
         return self.state.diagnostics() | self.ctrl.diagnostics()
