@@ -5,7 +5,7 @@ Axes: W worlds. `nq, nv, na, nu` as in MuJoCo.
 
 import copy
 from abc import ABC, abstractmethod
-from typing import Any, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -26,6 +26,15 @@ class StepState(NamedTuple):
     """Actuator activations, shape (W, na)."""
 
 
+class Applied(NamedTuple):
+    """Forces from outside the model, held over the substeps of an env step."""
+
+    qfrc: Tensor
+    """Forces on degrees of freedom [N, N m], shape (W, nv)."""
+    xfrc: Tensor
+    """Force [N] and torque [N m] on every body at its centre of mass, in world coordinates, shape (W, nbody, 6)."""
+
+
 class InputGradients(NamedTuple):
     """Gradients with respect to the inputs of an env step; None where none was requested."""
 
@@ -37,6 +46,10 @@ class InputGradients(NamedTuple):
     """Shape (W, nv)."""
     act: Tensor | None
     """Shape (W, na)."""
+    qfrc_applied: Tensor | None = None
+    """Shape (W, nv)."""
+    xfrc_applied: Tensor | None = None
+    """Shape (W, nbody, 6)."""
 
 
 class Needs(NamedTuple):
@@ -46,6 +59,8 @@ class Needs(NamedTuple):
     qpos: bool
     qvel: bool
     act: bool
+    qfrc_applied: bool = False
+    xfrc_applied: bool = False
 
 
 class Backward(ABC):
@@ -57,6 +72,8 @@ class Backward(ABC):
     """
 
     name: str
+    covers_applied: ClassVar[bool] = False
+    """Whether it differentiates steps under applied forces, which `record` then gets."""
 
     @abstractmethod
     def attach(self, batch: WorldBatch) -> None:
@@ -82,8 +99,13 @@ class Backward(ABC):
         return batch.data
 
     @abstractmethod
-    def record(self, ctrl: Tensor, start: StepState, end: StepState) -> tuple[Tensor, ...]:
-        """Tensors of the last step that `vjp` will need. They must not alias buffers that the next step overwrites."""
+    def record(
+        self, ctrl: Tensor, start: StepState, end: StepState, applied: Applied | None = None
+    ) -> tuple[Tensor, ...]:
+        """Tensors of the last step that `vjp` will need. They must not alias buffers that the next step overwrites.
+
+        `applied` is only given where there are applied forces.
+        """
 
     @abstractmethod
     def vjp(self, saved: tuple[Tensor, ...], cotangent: StepState, needs: Needs) -> InputGradients:

@@ -8,10 +8,10 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from msk_ray.errors import ConfigError, DeviceError
+from msk_ray.errors import ConfigError, DeviceError, UnsupportedModelError
 from msk_ray.physics import WorldBatch
 from msk_ray.physics.capacity import Capacity
-from msk_ray.simulation.backward import Backward, Needs, StepState
+from msk_ray.simulation.backward import Applied, Backward, Needs, StepState
 from msk_ray.simulation.jacobian import Linearization
 from msk_ray.simulation.modes import make_backward
 from msk_ray.simulation.stepper import Engine, Stepper
@@ -46,17 +46,17 @@ def resolve_device(device: str) -> torch.device:
 
 
 class WarpSimStep(torch.autograd.Function):
-    """(ctrl, qpos, qvel, act) to (qpos, qvel, act) one env step later, differentiable in all four."""
+    """(ctrl, qpos, qvel, act, forces) to (qpos, qvel, act) one env step later, differentiable in all of them."""
 
     @staticmethod
     def forward(
-        ctx: Any, sim: "Simulation", ctrl: Tensor, qpos: Tensor, qvel: Tensor, act: Tensor
+        ctx: Any, sim: "Simulation", ctrl: Tensor, qpos: Tensor, qvel: Tensor, act: Tensor, *forces: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         start = StepState(qpos, qvel, act)
-        end = sim.advance(ctrl, start)
+        end, saved = sim.recorded(ctrl, start, Applied(*forces) if forces else None)
         # The engine that computed this step: the simulation may continue with another.
         ctx.engine = sim.engine
-        ctx.save_for_backward(*sim.require_backward().record(ctrl, start, end))
+        ctx.save_for_backward(*saved)
         return end
 
     @staticmethod
@@ -68,8 +68,9 @@ class WarpSimStep(torch.autograd.Function):
         ctx.engine.settle()
         gradients = ctx.engine.backward.vjp(ctx.saved_tensors, cotangent, needs)
         # A linear map takes zero to zero, even in a world whose Jacobian is not finite: 0 × NaN must not leak out.
-        used = torch.cat(cotangent, dim=-1).ne(0).any(-1, keepdim=True)
-        return (None, *(None if g is None else torch.where(used, g, 0.0) for g in gradients))
+        used = torch.cat(cotangent, dim=-1).ne(0).any(-1)
+        masked = (None if g is None else torch.where(used.view(-1, *[1] * (g.dim() - 1)), g, 0.0) for g in gradients)
+        return (None, *list(masked)[: len(ctx.needs_input_grad) - 1])
 
 
 class Simulation:
@@ -155,11 +156,23 @@ class Simulation:
         qpos0 = torch.as_tensor(self.model.qpos0, dtype=torch.float32, device=self.device)
         return StepState(qpos0.expand(self.nworld, -1).clone(), zeros(self.model.nv), zeros(self.model.na))
 
-    def step(self, ctrl: Tensor, qpos: Tensor, qvel: Tensor, act: Tensor) -> StepState:
+    def step(
+        self,
+        ctrl: Tensor,
+        qpos: Tensor,
+        qvel: Tensor,
+        act: Tensor,
+        *,
+        qfrc_applied: Tensor | None = None,
+        xfrc_applied: Tensor | None = None,
+    ) -> StepState:
         """Advance all worlds by one env step; a pure, differentiable function of its arguments.
 
         Args:
             ctrl: shape (W, nu). qpos: (W, nq). qvel: (W, nv). act: (W, na). float32 on `device`.
+            qfrc_applied: forces on the degrees of freedom [N, N m], (W, nv), held over the substeps; None for none.
+            xfrc_applied: force [N] and torque [N m] on each body at its centre of mass, in world coordinates,
+                (W, nbody, 6), held likewise.
 
         Returns:
             New tensors (qpos, qvel, act).
@@ -169,21 +182,33 @@ class Simulation:
             SimulationError: a step lost contacts or constraint rows, and larger buffers were not allowed or would not
                 help. On CUDA it may be an earlier step, whose results are NaN in the affected worlds.
             ConfigError: the MjModel was edited after the simulation was created.
+            UnsupportedModelError: a gradient is needed, and the backward mode does not cover applied forces.
         """
         self._check_inputs(ctrl, qpos, qvel, act)
-        if torch.is_grad_enabled() and any(t.requires_grad for t in (ctrl, qpos, qvel, act)):
-            return StepState(*WarpSimStep.apply(self, ctrl, qpos, qvel, act))
-        return self.advance(ctrl, StepState(qpos, qvel, act))
+        applied = self._applied(qfrc_applied, xfrc_applied)
+        inputs = (ctrl, qpos, qvel, act, *(applied or ()))
+        if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
+            return StepState(*WarpSimStep.apply(self, *inputs))
+        return self.advance(ctrl, StepState(qpos, qvel, act), applied)
 
     @torch.no_grad()
-    def linearize(self, ctrl: Tensor, qpos: Tensor, qvel: Tensor, act: Tensor) -> Linearization:
+    def linearize(
+        self,
+        ctrl: Tensor,
+        qpos: Tensor,
+        qvel: Tensor,
+        act: Tensor,
+        *,
+        qfrc_applied: Tensor | None = None,
+        xfrc_applied: Tensor | None = None,
+    ) -> Linearization:
         """Jacobians of one env step of every world, in tangent space: x' = end + A δx + B δu to first order.
 
         By the backward mode: exact with the tapes, whose rows run as further worlds, without another forward pass;
         from perturbed copies with fd_jacobian. Clips of gradients do not act on them.
 
         Args:
-            ctrl, qpos, qvel, act: as for `step`.
+            ctrl, qpos, qvel, act, qfrc_applied, xfrc_applied: as for `step`.
 
         Returns:
             A (W, 2 nv + na, 2 nv + na), B (W, 2 nv + na, nu) and the state after the step. Entries are ordered as by
@@ -191,16 +216,14 @@ class Simulation:
 
         Raises:
             ConfigError: as for `step`, or the simulation has no backward mode.
-            SimulationError: as for `step`.
+            SimulationError, UnsupportedModelError: as for `step`.
         """
         self.require_backward()
         self._check_inputs(ctrl, qpos, qvel, act)
         start = StepState(qpos, qvel, act)
-        end = self.advance(ctrl, start)
-        mode = self.require_backward()  # after the step, which may have replaced it with larger buffers
-        saved = mode.record(ctrl, start, end)
+        end, saved = self.recorded(ctrl, start, self._applied(qfrc_applied, xfrc_applied))
         self.engine.settle()
-        return Linearization(*mode.jacobian(saved, start, end, self.tangent), end)
+        return Linearization(*self.require_backward().jacobian(saved, start, end, self.tangent), end)
 
     def contact_forces(self) -> Tensor:
         """Force of all contacts on every geom in world coordinates [N], shape (W, G, 3).
@@ -213,22 +236,58 @@ class Simulation:
     def _check_inputs(self, *inputs: Tensor) -> None:
         # Copying into the batch's buffers would broadcast one world to all, and convert dtypes and devices silently.
         for (name, width), value in zip(self._widths, inputs, strict=True):
-            if value.shape != (self.nworld, width):
-                raise ConfigError(
-                    f"step: {name} has shape {tuple(value.shape)}, but {self.nworld} worlds of this model take "
-                    f"({self.nworld}, {width})"
-                )
-            if value.dtype != torch.float32:
-                raise ConfigError(f"step: {name} is {value.dtype}: write {name}.float()")
-            if value.device != self._place:
-                raise ConfigError(
-                    f"step: {name} is on {value.device}, the simulation on {self._place}: write "
-                    f"{name}.to({str(self._place)!r})"
-                )
+            self._check_input(name, value, width)
 
-    def advance(self, ctrl: Tensor, start: StepState) -> StepState:
+    def _check_input(self, name: str, value: Tensor, *shape: int) -> None:
+        if value.shape != (self.nworld, *shape):
+            raise ConfigError(
+                f"step: {name} has shape {tuple(value.shape)}, but {self.nworld} worlds of this model take "
+                f"{(self.nworld, *shape)}"
+            )
+        if value.dtype != torch.float32:
+            raise ConfigError(f"step: {name} is {value.dtype}: write {name}.float()")
+        if value.device != self._place:
+            raise ConfigError(
+                f"step: {name} is on {value.device}, the simulation on {self._place}: write "
+                f"{name}.to({str(self._place)!r})"
+            )
+
+    def _applied(self, qfrc: Tensor | None, xfrc: Tensor | None) -> Applied | None:
+        """Both kinds of applied forces, checked; None if there are none."""
+        if qfrc is None and xfrc is None:
+            return None
+        nv, nbody = self.model.nv, self.model.nbody
+        applied = Applied(
+            torch.zeros((self.nworld, nv), device=self._place) if qfrc is None else qfrc,
+            torch.zeros((self.nworld, nbody, 6), device=self._place) if xfrc is None else xfrc,
+        )
+        self._check_input("qfrc_applied", applied.qfrc, nv)
+        self._check_input("xfrc_applied", applied.xfrc, nbody, 6)
+        return applied
+
+    def advance(self, ctrl: Tensor, start: StepState, applied: Applied | None = None) -> StepState:
         """The forward pass alone, outside autograd."""
-        return self._stepper.advance(ctrl, start)
+        return self._stepper.advance(ctrl, start, applied)
+
+    def recorded(self, ctrl: Tensor, start: StepState, applied: Applied | None) -> tuple[StepState, tuple[Tensor, ...]]:
+        """The forward pass, and what the backward mode needs of it.
+
+        Raises:
+            ConfigError: the simulation has no backward mode.
+            UnsupportedModelError: the mode does not cover applied forces.
+        """
+        mode = self.require_backward()
+        if applied is None:
+            end = self.advance(ctrl, start)
+            # The step may have replaced the mode by one with larger buffers.
+            return end, self.require_backward().record(ctrl, start, end)
+        if not mode.covers_applied:
+            raise UnsupportedModelError(
+                f"backward mode {mode.name} does not differentiate steps with applied forces: write "
+                "backward='tape_per_substep', or leave qfrc_applied and xfrc_applied out"
+            )
+        end = self.advance(ctrl, start, applied)
+        return end, self.require_backward().record(ctrl, start, end, applied)
 
     @property
     def capacity(self) -> Capacity:

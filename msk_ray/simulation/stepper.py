@@ -6,7 +6,7 @@ from torch import Tensor
 from msk_ray.physics import Graph, WorldBatch
 from msk_ray.physics.capacity import Capacity
 from msk_ray.physics.touch import ContactForces
-from msk_ray.simulation.backward import Backward, StepState
+from msk_ray.simulation.backward import Applied, Backward, StepState
 from msk_ray.simulation.buffers import BatchTensors, device_of, stream_of, wait_for
 
 _NEARLY_FULL = 0.75
@@ -42,9 +42,9 @@ class Engine:
         force: Tensor = wp.to_torch(self._touch.force, requires_grad=False)
         return force.clone()
 
-    def advance(self, ctrl: Tensor, start: StepState) -> StepState:
+    def advance(self, ctrl: Tensor, start: StepState, applied: Applied | None = None) -> StepState:
         """One env step, even if it lost contacts or rows."""
-        self._buffers.load(ctrl, start)
+        self._buffers.load(ctrl, start, applied)
         self._graph.replay(stream_of(self.device))
         self._unseen = True
         return self._buffers.read()
@@ -87,8 +87,8 @@ class Stepper:
         self.engine = Engine(batch, backward)
         self._retired: list[Engine] = []
 
-    def advance(self, ctrl: Tensor, start: StepState) -> StepState:
-        """The state after one env step under `ctrl` (W, nu).
+    def advance(self, ctrl: Tensor, start: StepState, applied: Applied | None = None) -> StepState:
+        """The state after one env step under `ctrl` (W, nu) and applied forces.
 
         Raises:
             SimulationError: a step lost contacts or constraint rows, on CUDA perhaps an earlier one.
@@ -96,11 +96,11 @@ class Stepper:
         """
         self.engine.batch.check_model()
         self.engine.batch.raise_losses()
-        end = self.engine.advance(ctrl, start)
+        end = self.engine.advance(ctrl, start, applied)
         # On CUDA this may be the loss of an earlier step, from which this one started.
         while self.engine.device.type == "cpu" and self.engine.batch.losses.heard():
             self._replace(self.engine.batch.larger())
-            end = self.engine.advance(ctrl, start)
+            end = self.engine.advance(ctrl, start, applied)
         return end
 
     def reserve(self, wanted: Capacity) -> None:

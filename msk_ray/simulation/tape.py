@@ -19,8 +19,8 @@ from msk_ray.physics.adjoint import StepAdjoint
 from msk_ray.physics.adjoint.coverage import check_supported
 from msk_ray.physics.adjoint.residual import ResidualGauge
 from msk_ray.physics.adjoint.stages import recompute_stages
-from msk_ray.simulation.backward import Backward, InputGradients, Needs, StepState
-from msk_ray.simulation.buffers import device_of, stream_of
+from msk_ray.simulation.backward import Applied, Backward, InputGradients, Needs, StepState
+from msk_ray.simulation.buffers import applied_of, device_of, stream_of
 from msk_ray.simulation.jacobian import rows_of, state_size, unit_cotangents
 from msk_ray.simulation.pool import Pool
 from msk_ray.simulation.tangent import Tangent
@@ -51,6 +51,8 @@ class _Tape(Backward):
         residual_tolerance: a world is counted as unconverged where the solver left more than this share of its
             forces unbalanced, |Ma - τ - Jᵀf| / |(Ma, τ, Jᵀf)|.
     """
+
+    covers_applied = True
 
     def __init__(self, substep_grad_clip: float | None = None, residual_tolerance: float = 1e-3) -> None:
         self.substep_grad_clip = substep_grad_clip
@@ -85,7 +87,8 @@ class _Tape(Backward):
             *(wp.to_torch(a, requires_grad=False) for a in (self._raw_qpos, adjoint.grad_qvel, adjoint.grad_act))
         )
         self._grad_ctrl = wp.to_torch(adjoint.grad_ctrl, requires_grad=False)
-        self._graph: Graph | None = None
+        self._applied = applied_of(batch.data)
+        self._graphs: dict[bool, Graph] = {}
         self._rows: dict[int, TapePerSubstep] = {}
 
     def _prepare(self, pool: Pool) -> None:
@@ -95,45 +98,58 @@ class _Tape(Backward):
     def _stages(self, k: int) -> Any:
         """Launch what restores the stages before substep k into a mujoco_warp.Data, and return it."""
 
-    def record(self, ctrl: Tensor, start: StepState, end: StepState) -> tuple[Tensor, ...]:
-        return (ctrl.detach().clone(), self._saved.clone())
+    def record(
+        self, ctrl: Tensor, start: StepState, end: StepState, applied: Applied | None = None
+    ) -> tuple[Tensor, ...]:
+        forces = () if applied is None else (force.detach().clone() for force in applied)
+        return (ctrl.detach().clone(), self._saved.clone(), *forces)
 
     @torch.no_grad()
     def vjp(self, saved: tuple[Tensor, ...], cotangent: StepState, needs: Needs) -> InputGradients:
-        ctrl, kept = saved
-        self.ready()
+        ctrl, kept, *forces = saved
+        self.ready(bool(forces))
         self._ctrl.copy_(ctrl)
         self._saved.copy_(kept)
-        gradients = self.pull(cotangent)
+        for view, value in zip(self._applied, forces, strict=False):
+            view.copy_(value)
+        gradients = self.pull(cotangent, bool(forces))
+        if forces:
+            for view in self._applied:  # the next step may have none
+                view.zero_()
         return InputGradients(
             *(g.clone() if need and g is not None else None for g, need in zip(gradients, needs, strict=True))
         )
 
-    def ready(self) -> None:
-        """Record the backward pass if it is not yet, which leaves the checkpoints undefined."""
-        if self._graph is None:
-            self._graph = Graph(self.launch_backward, self._batch.device)
+    def ready(self, applied: bool) -> None:
+        """Record the backward pass, of steps with or without applied forces; leaves the checkpoints undefined."""
+        if applied not in self._graphs:
+            self._graphs[applied] = Graph(lambda: self.launch_backward(applied), self._batch.device)
             self._clipped.zero_()
             self._adjoint.touch_counter.clear()
 
-    def pull(self, cotangent: StepState) -> InputGradients:
+    def pull(self, cotangent: StepState, applied: bool) -> InputGradients:
         """Replay the backward pass of the step whose checkpoints are in place; the result lasts until the next."""
-        assert self._graph is not None
         for view, value in zip(self.cotangent, cotangent, strict=True):
             view.copy_(value)
-        self._graph.replay(stream_of(self._device))
+        self._graphs[applied].replay(stream_of(self._device))
         self._pulled += 1
-        return InputGradients(self._grad_ctrl, *self.cotangent)
+        if not applied:
+            return InputGradients(self._grad_ctrl, *self.cotangent)
+        found = self._adjoint.cover_applied()
+        forces = (wp.to_torch(a, requires_grad=False) for a in (found.grad_qfrc, found.grad_xfrc))
+        return InputGradients(self._grad_ctrl, *self.cotangent, *forces)
 
-    def load(self, ctrl: Tensor, states: Sequence[dict[str, wp.array]]) -> None:
-        """Take the checkpoints of a step of fewer worlds, `ctrl` (w, nu) and `states`; W / w copies of each world."""
-        self.ready()
+    def load(self, ctrl: Tensor, states: Sequence[dict[str, wp.array]], forces: Sequence[Tensor]) -> None:
+        """Take the step of a batch of w worlds, W / w copies of each: its control, checkpoints and applied forces."""
+        self.ready(bool(forces))
         copies = self._batch.nworld // len(ctrl)
         self._ctrl.copy_(ctrl.repeat(copies, 1))
         for here, there in zip(self.checkpoints, states, strict=True):
             for name, array in there.items():
                 value = wp.to_torch(array, requires_grad=False)
                 wp.to_torch(here[name], requires_grad=False).copy_(value.repeat(copies, 1))
+        for view, value in zip(self._applied, forces, strict=False):
+            view.copy_(value.repeat(copies, *[1] * (value.dim() - 1)))
 
     @property
     def checkpoints(self) -> list[dict[str, wp.array]]:
@@ -145,20 +161,20 @@ class _Tape(Backward):
         self, saved: tuple[Tensor, ...], start: StepState, end: StepState, tangent: Tangent
     ) -> tuple[Tensor, Tensor]:
         """As many rows at once as fit in `JACOBIAN_WORLDS` worlds. Not clipped."""
-        ctrl, kept = saved
+        ctrl, kept, *forces = saved
         self._saved.copy_(kept)
         size, worlds = state_size(end), self._batch.nworld
         width = max(1, min(size, JACOBIAN_WORLDS // worlds))
         if width not in self._rows:
             self._rows[width] = TapePerSubstep()
             self._rows[width].attach(self._batch.resized(width * worlds))
-        self._rows[width].load(ctrl, self.checkpoints)
+        self._rows[width].load(ctrl, self.checkpoints, forces)
         found = []
         for first in range(0, size, width):
             chunk = range(first, min(first + width, size))
             cotangents = unit_cotangents(tangent, end, chunk, width)
-            gradients = self._rows[width].pull(StepState(*(part.flatten(0, 1) for part in cotangents)))
-            split = (None if g is None else g.clone().unflatten(0, (width, worlds)) for g in gradients)
+            gradients = self._rows[width].pull(StepState(*(part.flatten(0, 1) for part in cotangents)), bool(forces))
+            split = (None if g is None else g.clone().unflatten(0, (width, worlds)) for g in gradients[:4])
             found.append(rows_of(tangent, start, InputGradients(*split)))
         a, b = (torch.cat(parts)[:size].transpose(0, 1).contiguous() for parts in zip(*found, strict=True))
         return a, b
@@ -167,12 +183,15 @@ class _Tape(Backward):
         """Size of the data of one recorded env step, for all worlds together, without its control."""
         return self._saved.numel() * self._saved.element_size()
 
-    def launch_backward(self) -> None:
+    def launch_backward(self, with_applied: bool) -> None:
         """Launch the pullback of a whole env step: from `cotangent` of its end to the same buffers for its start."""
+        applied = self._adjoint.cover_applied() if with_applied else None
+        if applied is not None:
+            applied.start()
         self._adjoint.start(self._last["qpos"], self._raw_qpos)
         for k in reversed(range(self._batch.substeps)):
             after = self._states[k + 1] if k + 1 < self._batch.substeps else self._last
-            self._adjoint.pull_back(self._stages(k), after["qvel"])
+            self._adjoint.pull_back(self._stages(k), after["qvel"], applied)
             if self.substep_grad_clip is not None and k > 0:
                 self._adjoint.clip(self.substep_grad_clip, self._clipped)
         self._adjoint.finish(self._states[0]["qpos"], self._raw_qpos)
@@ -244,6 +263,7 @@ class TapeAll(_Tape):
             data = batch.resized(batch.nworld).data
             data.overflow = batch.data.overflow
             data.ctrl = batch.data.ctrl
+            data.qfrc_applied, data.xfrc_applied = batch.data.qfrc_applied, batch.data.xfrc_applied
             for holder, names in ((data, _KEPT_DATA), (data.efc, _KEPT_EFC), (data.contact, _KEPT_CONTACT)):
                 for name in names:
                     pool.adopt(holder, name)
@@ -310,10 +330,18 @@ class Hybrid(Backward):
         assert len(own) <= 1, "two modes that each launch the step in their own way cannot be combined"
         return own[0] if own else self.state
 
-    def record(self, ctrl: Tensor, start: StepState, end: StepState) -> tuple[Tensor, ...]:
-        first = self.state.record(ctrl, start, end)
+    @property
+    def covers_applied(self) -> bool:  # type: ignore[override]
+        """Whether both modes do."""
+        return self.state.covers_applied and self.ctrl.covers_applied
+
+    def record(
+        self, ctrl: Tensor, start: StepState, end: StepState, applied: Applied | None = None
+    ) -> tuple[Tensor, ...]:
+        forces = () if applied is None else (applied,)
+        first = self.state.record(ctrl, start, end, *forces)
         self._split = len(first)
-        return (*first, *self.ctrl.record(ctrl, start, end))
+        return (*first, *self.ctrl.record(ctrl, start, end, *forces))
 
     def vjp(self, saved: tuple[Tensor, ...], cotangent: StepState, needs: Needs) -> InputGradients:
         state = self.state.vjp(saved[: self._split], cotangent, needs._replace(ctrl=False))

@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 
 from msk_ray.physics.adjoint.actuation import ActuatorForces
+from msk_ray.physics.adjoint.applied import AppliedForces
 from msk_ray.physics.adjoint.bodies import Bodies
 from msk_ray.physics.adjoint.contacts import ContactForces
 from msk_ray.physics.adjoint.equality import AnchorRows
@@ -52,6 +53,7 @@ class StepAdjoint:
         grad_ctrl: shape (W, nu); every substep adds to it.
         touch_counter: how many substeps' gradients went through a contact that is approximated.
         live: worlds whose gradient is wanted; the others get exact zeros. Shape (W,), int.
+        applied: gradients of applied forces; None until `cover_applied` asks for them.
         inertia_address: place of M_ij (j ≤ i) in the sparse inertia, -1 where it is zero; shape (nv, nv).
     """
 
@@ -61,6 +63,8 @@ class StepAdjoint:
         self.grad_act, self.grad_ctrl = work.grad_act, work.grad_ctrl
         self.live, self.touch_counter = work.live, work.touch_counter
         self.inertia_address = work.tables.inertia_address
+        self.applied: AppliedForces | None = None
+        self._work = work
         with wp.ScopedDevice(work.device):
             self._integrator = Integrator(work)
             self._laws = ConstraintLaws(work)
@@ -77,6 +81,13 @@ class StepAdjoint:
         self._integrator.start(qpos, raw_qpos)
         self.touch_counter.start()
 
+    def cover_applied(self) -> AppliedForces:
+        """Allocate the gradients of applied forces, if they are not yet there."""
+        if self.applied is None:
+            with wp.ScopedDevice(self._work.device):
+                self.applied = AppliedForces(self._work)
+        return self.applied
+
     def finish(self, qpos: wp.array, raw_qpos: wp.array) -> None:
         """Launch the change of the tangent gradient at `qpos` to raw coordinates (W, nq)."""
         self._integrator.finish(qpos, raw_qpos)
@@ -85,8 +96,14 @@ class StepAdjoint:
         """Launch the bound on each world's state cotangent; `clipped` (W,) counts where it acted."""
         self._integrator.clip(bound, clipped)
 
-    def pull_back(self, data: Any, qvel_next: wp.array) -> None:
-        """Launch the pullback of one substep; `qvel_next` (W, nv) is the velocity after it."""
+    def pull_back(self, data: Any, qvel_next: wp.array, applied: AppliedForces | None = None) -> None:
+        """Launch the pullback of one substep.
+
+        Args:
+            data: the stages of the state before it.
+            qvel_next: the velocity after it, (W, nv).
+            applied: gradients of applied forces, for a step that has some.
+        """
         self.touch_counter.substep += 1
         at = Substep(data)
         self._integrator.launch(at, qvel_next)
@@ -95,7 +112,7 @@ class StepAdjoint:
         self._bodies.launch_fields(at)
         if self._tendons is not None:
             self._tendons.launch_start(at)
-        for stage in self._forces:
+        for stage in self._forces if applied is None else (*self._forces, applied):
             stage.launch(at)
         if self._tendons is not None:
             self._tendons.launch_pullback(at)
