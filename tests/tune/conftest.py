@@ -3,6 +3,7 @@
 import contextlib
 
 import pytest
+from stub_runs import stub_session
 
 from msk_ray.tune import driver, session
 
@@ -14,3 +15,6 @@ def plans(monkeypatch: pytest.MonkeyPatch) -> list[driver.Plan]:
     monkeypatch.setattr(session, "ray_session", lambda *args: contextlib.nullcontext())
     monkeypatch.setattr(driver, "run_trials", lambda plan: bool(made.append(plan)))
     return made
+
+
+__all__ = ["plans", "stub_session"]

@@ -1,18 +1,12 @@
-"""Real Ray, a trainer of milliseconds: stopping, faults, pausing and resuming."""
+"""Real Ray, a trainer of milliseconds: faults, what has gone, and memory."""
 
-import contextlib
 import json
-import os
-import signal
 import threading
-import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-import stub_trainer
-from ray import cloudpickle
+from stub_runs import go, outcomes
 from stub_trainer import (
     BEHAVIOUR,
     BUG,
@@ -29,52 +23,18 @@ from stub_trainer import (
     StubTrainer,
 )
 
-from msk_ray.config import read_yaml
-from msk_ray.errors import ClusterLost, StorageError, StorageFailure
+from msk_ray.errors import ClusterLost, StorageFailure
 from msk_ray.experiment.attempts import Attempt, Reduced, read_attempt
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import read_rows
 from msk_ray.experiment.outcomes import Outcome
-from msk_ray.experiment.results import TrialRecord, read_records
 from msk_ray.sweep import opening
 from msk_ray.sweep.rules.stopping import StopSpec
-from msk_ray.sweep.search_trials import recover
-from msk_ray.sweep.space import Space
 from msk_ray.sweep.trials import resolve_trials
-from msk_ray.tune import driver, worker_prestart
-from msk_ray.tune.devices import Placement
-from msk_ray.tune.finish import finish
-from msk_ray.tune.session import ray_session
+from msk_ray.tune import driver
 from msk_ray.tune.trial_run import Hooks, run_trial
 
-
-@pytest.fixture(scope="module", autouse=True)
-def session() -> Iterator[None]:
-    """One Ray for all tests here."""
-    cloudpickle.register_pickle_by_value(stub_trainer)
-    handlers = {
-        number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP)
-    }
-    with ray_session(None, dashboard=False, trials=False):  # stubs need none of what trials import
-        yield
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
-
-
-def go(space: Space, path: Path, resume: bool = False) -> tuple[bool, list[TrialRecord]]:
-    searching = space.file.search == "optuna"
-    trials = [] if searching else resolve_trials(space)
-    experiment = (
-        opening.reopen(path, None if searching else trials) if resume else opening.create(path, space, trials, {})
-    )
-    plan = driver.Plan(experiment, space, trials, Placement(0.0, 1), None, StubTrainer, precompile=None, prestart=False)
-    completed = driver.run_trials(plan)
-    finish(experiment)
-    return completed, read_records(experiment)
-
-
-def outcomes(records: list[TrialRecord]) -> list[str | None]:
-    return [record.ending and str(record.ending.outcome) for record in records]
+pytestmark = pytest.mark.usefixtures("stub_session")
 
 
 def test_faults_are_named_and_killed_or_hung_trials_go_on(
@@ -259,214 +219,3 @@ def test_a_dead_node_of_ones_own_ends_the_experiment_resumably(monkeypatch: pyte
         node.on_step_end(1, [])
     assert node.lost is not None
     assert node.lost.exit_code == 75
-
-
-def test_asha_stops_the_bad_ones_and_a_stop_request_is_resumable(
-    make_space: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    space = make_space(
-        parameters={"shac.actor_lr": {"grid": [1e-2, 3e-3, 3e-4, 2e-4]}},
-        scheduler={"kind": "asha", "grace": 0.2, "reduction": 2},
-        overrides={"trial.epochs": 60},
-    )
-    path = tmp_path / "runs" / "asha"
-    timer = threading.Thread(target=_terminate_when, args=(path,))
-    timer.start()
-    completed, records = go(space, path)
-    timer.join()
-    assert not completed
-    assert None in outcomes(records)
-    completed, records = go(space, path, resume=True)
-    assert completed
-    assert outcomes(records)[0] == "finished"
-    assert "stopped_asha" in outcomes(records)
-    stopped = next(record for record in records if str(record.ending and record.ending.outcome) == "stopped_asha")
-    assert stopped.epochs_done < 60
-    assert read_rows(records[0].folder)[-1]["epoch"] == 60
-    assert "SIGTERM: " in capsys.readouterr().out
-    assert go(space, path, resume=True)[0]  # nothing left to do
-
-
-def test_population_stays_in_its_range(make_space: Any, tmp_path: Path) -> None:
-    space = make_space(
-        parameters={"shac.actor_lr": {"loguniform": [1e-4, 1e-2]}},
-        samples=2,
-        scheduler={"kind": "pbt", "interval": 0.3, "quantile": 0.5},
-        # Twelve seconds: members must meet, however far apart a busy machine starts their processes.
-        overrides={"evaluation.interval": 100, "trial.epochs": 600},
-    )
-    completed, records = go(space, tmp_path / "runs" / "pbt")
-    assert completed
-    assert outcomes(records) == ["finished"] * 2
-    before = [record.trial.config.shac.actor_lr for record in records]
-    after = [read_yaml(record.folder / "config.yaml")["shac"]["actor_lr"] for record in records]
-    assert before != after  # the worse one moved
-    assert all(1e-4 <= rate <= 1e-2 for rate in after)
-
-
-def test_optuna_trials_enter_the_manifest(make_space: Any, tmp_path: Path) -> None:
-    pytest.importorskip("optuna")
-    space = make_space(
-        parameters={"shac.actor_lr": {"loguniform": [1e-3, 1e-2]}, "shac.horizon": {"choice": [8, 16]}},
-        samples=3,
-        search="optuna",
-        overrides={"trial.epochs": 4},
-    )
-    completed, records = go(space, tmp_path / "runs" / "optuna")
-    assert completed
-    assert len(records) >= 2
-    assert set(outcomes(records)) == {"finished"}
-
-
-def test_optuna_goes_on_where_it_was(make_space: Any, tmp_path: Path) -> None:
-    pytest.importorskip("optuna")
-    space = make_space(
-        parameters={"shac.actor_lr": {"loguniform": [1e-3, 1e-2]}, "shac.horizon": {"choice": [8, 16]}},
-        samples=3,
-        search="optuna",
-        overrides={"trial.epochs": 100},
-    )
-    path = tmp_path / "runs" / "optuna"
-    timer = threading.Thread(target=_terminate_when, args=(path,))
-    timer.start()
-    completed, before = go(space, path)
-    timer.join()
-    assert not completed
-    assert None in outcomes(before)
-    # As after a driver that was killed: the manifest does not know the trials yet.
-    Experiment(path).set_trials([])
-    completed, after = go(space, path, resume=True)
-    assert completed
-    assert outcomes(after) == ["finished"] * 3
-    # Those that had begun went on, from their checkpoints, and the others are new.
-    ids = [record.trial.id for record in after]
-    assert ids[: len(before)] == [record.trial.id for record in before]
-    assert len(set(ids)) == 3
-    assert [record.trial.index for record in after] == [0, 1, 2]
-    assert "continuing from" in (before[0].folder / "output.log").read_text()
-    assert all([row["epoch"] for row in read_rows(record.folder)] == list(range(101)) for record in after)
-    with pytest.raises(StorageError, match="no longer gives the trial of"):
-        recover(Experiment(path), make_space(parameters={"shac.actor_lr": {"loguniform": [1e-3, 1e-2]}}))
-
-
-def test_a_population_goes_on_where_it_was(make_space: Any, tmp_path: Path) -> None:
-    space = make_space(
-        parameters={"shac.actor_lr": {"loguniform": [1e-4, 1e-2]}},
-        samples=2,
-        scheduler={"kind": "pbt", "interval": 0.6, "quantile": 0.5},
-        overrides={"evaluation.interval": 20, "trial.epochs": 100},
-    )
-    path = tmp_path / "runs" / "pbt"
-    timer = threading.Thread(target=_terminate_when, args=(path,))
-    timer.start()
-    completed, before = go(space, path)
-    timer.join()
-    assert not completed
-    reached = [record.epochs_done for record in before]
-    completed, after = go(space, path, resume=True)
-    assert completed
-    assert outcomes(after) == ["finished"] * 2
-    assert max(reached) > 0
-    for record in after:
-        assert [row["epoch"] for row in read_rows(record.folder)] == list(range(101))
-        assert 1e-4 <= read_yaml(record.folder / "config.yaml")["shac"]["actor_lr"] <= 1e-2
-
-
-def test_processes_that_cannot_be_started_ahead_are_said_once_and_cost_no_trial(
-    make_space: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def absent(*args: Any) -> None:
-        raise AttributeError("no such call in this Ray")
-
-    monkeypatch.setattr(worker_prestart, "start_processes", absent)
-    space = make_space(parameters={}, seeds="0-2", overrides={"trial.epochs": 30})
-    trials = resolve_trials(space)
-    experiment = opening.create(tmp_path / "runs" / "alone", space, trials, {})
-    assert driver.run_trials(driver.Plan(experiment, space, trials, Placement(0.0, 1), 1, StubTrainer, precompile=None))
-    assert outcomes(read_records(experiment)) == ["finished"] * 3
-    shown = capsys.readouterr().out
-    assert (
-        shown.count(
-            "no process was started ahead of time, so trials start a few seconds later: AttributeError: no such call"
-        )
-        == 1
-    )
-
-
-def test_no_more_at_once_than_asked_for_and_the_next_process_waits(
-    make_space: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    go_on = tmp_path / "go_on"
-
-    class Patient(StubTrainer):
-        """Its first trial does not end before a process for the next one waits."""
-
-        def run_epoch(self) -> dict[str, float]:
-            row = super().run_epoch()
-            if self.config.trial.seed == 0 and self.finished:
-                deadline = time.monotonic() + 120
-                while not go_on.exists():
-                    assert time.monotonic() < deadline
-                    time.sleep(0.05)
-            return row
-
-    seen: set[int] = set()
-    others: list[set[int]] = []
-    start = worker_prestart.start_processes
-
-    def start_and_tell(*args: Any) -> None:
-        others.append(set(_processes_of_trials()))
-        start(*args)
-
-    monkeypatch.setattr(worker_prestart, "start_processes", start_and_tell)
-
-    def watch() -> None:
-        deadline = time.monotonic() + 100
-        while not (others and seen - others[0]) and time.monotonic() < deadline:
-            seen.update(_processes_of_trials() if others else ())
-            time.sleep(0.1)
-        go_on.touch()
-        # More than one may wait, and Ray chooses: all that are there before the first trial has ended count.
-        ended = experiment.trial_folder(trials[0].id) / "outcome.json"
-        while not ended.exists() and time.monotonic() < deadline:
-            seen.update(_processes_of_trials())
-
-    space = make_space(parameters={}, seeds="0-1", overrides={"trial.epochs": 400})
-    path = tmp_path / "runs" / "patient"
-    trials = resolve_trials(space)
-    experiment = opening.create(path, space, trials, {})
-    thread = threading.Thread(target=watch)
-    thread.start()
-    assert driver.run_trials(driver.Plan(experiment, space, trials, Placement(0.0, 1), 1, Patient, precompile=None))
-    thread.join()
-    first, second = sorted(read_records(experiment), key=lambda record: record.trial.seed)
-    assert outcomes([first, second]) == ["finished", "finished"]
-    began = [json.loads((record.folder / "device.json").read_text()) for record in (first, second)]
-    assert began[1]["began"] >= (first.folder / "outcome.json").stat().st_mtime
-    assert began[0]["pid"] != began[1]["pid"]
-    assert began[1]["pid"] in seen  # it was there before the trial before it had ended
-
-
-def _processes_of_trials() -> list[int]:
-    """Processes of this Ray that have the environment of trials."""
-
-    def parent(pid: int) -> int:
-        return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
-
-    found = []
-    for path in Path("/proc").glob("[0-9]*/environ"):
-        with contextlib.suppress(OSError):  # gone since it was listed
-            text = path.read_bytes()
-            pid = int(path.parent.name)
-            if b"PL_DISABLE_FORK" in text and parent(parent(pid)) == os.getpid():
-                found.append(pid)
-    return found
-
-
-def _terminate_when(path: Path) -> None:
-    """SIGTERM to this process once a trial has begun to train."""
-    while not list(path.glob("trials/*/checkpoints/epoch_000004.pt")):
-        if (path / "summary.json").exists():
-            return  # the sweep has ended without it
-        time.sleep(0.05)
-    os.kill(os.getpid(), signal.SIGTERM)
