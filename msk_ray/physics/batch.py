@@ -21,7 +21,6 @@ def check_state(model: mujoco.MjModel) -> None:
         "actuator or sensor delay (nhistory > 0)": getattr(model, "nhistory", 0) > 0,
         "plastic springs (nplastic > 0)": getattr(model, "nplastic", 0) > 0,
         "sleeping (<flag sleep='enable'/>)": bool(model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP),
-        "mocap bodies (nmocap > 0)": model.nmocap > 0,
     }
     found = [name for name, present in hidden.items() if present]
     if found:

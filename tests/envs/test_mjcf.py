@@ -78,6 +78,9 @@ class Unfinished(MjcfEnv):
 class Free(Ball):
     mjcf = "models/free.xml"
 
+class Led(Ball):
+    mjcf = "models/led.xml"
+
 class Edited(Ball):
     @classmethod
     def edit(cls, spec, config, physics):
@@ -93,6 +96,8 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (home / "ball.py").write_text(BALL)
     (home / "models" / "ball.xml").write_text(MODEL)
     (home / "models" / "free.xml").write_text(MODEL.replace(' ctrlrange="0.1 0.5"', ""))
+    led = MODEL.replace("<worldbody>", '<worldbody><body name="hook" mocap="true"/>')
+    (home / "models" / "led.xml").write_text(led.replace('name="high"', 'name="high" mpos="0 0 3"'))
     (home / "models" / "torn.xml").write_text(MODEL[:100])
     monkeypatch.syspath_prepend(home)
     monkeypatch.chdir(tmp_path)
@@ -190,6 +195,7 @@ def test_a_world_that_diverged_has_no_forces(home: Path) -> None:
         ("Ball", {"env__stochastic_reset": False, "env__reset_noise": 0.1}, "env.reset_noise: nothing reads it while"),
         ("Ball", {"env__reward__heigt": 1.0}, "env.reward.heigt: unknown key; did you mean 'height'"),
         ("Free", {}, "actuator aim has no ctrlrange, so no control for actions of -1 and 1: write a ctrlrange"),
+        ("Led", {}, "the keyframe moves mocap body hook, which stays where the model puts it: write mpos and mquat of"),
         ("Feeling", {}, "use them in reward_terms, fell or outcome_terms, not in observe"),
         ("Flat", {}, r"observe of Flat has shape \(4,\), not \(worlds, entries\) with 4 worlds"),
         ("Strung", {}, "the model has no tendons"),

@@ -13,8 +13,8 @@ from msk_ray.simulation.modes import BACKWARD_MODES
 
 FAST = ["--worlds", "2", "--states", "random"]
 UNSUPPORTED = """
-<mujoco><worldbody>
-  <body mocap="true"/><body><joint/><geom size=".1"/></body>
+<mujoco><option noslip_iterations="2"/><worldbody>
+  <body><joint/><geom size=".1"/></body>
 </worldbody></mujoco>"""
 
 
@@ -123,14 +123,14 @@ def test_json(cartpole_file):
 
 
 def test_unsupported_model(tmp_path, capsys):
-    path = tmp_path / "mocap.xml"
+    path = tmp_path / "noslip.xml"
     path.write_text(UNSUPPORTED)
     assert run(main, [str(path), "--json"]) == 2
     captured = capsys.readouterr()
     report = json.loads(captured.out)
     assert report["results"] == []
     assert report["max_rel_error"] is None
-    assert "mocap" in report["unsupported"][0]
+    assert "noslip" in report["unsupported"][0]
     assert captured.err.startswith("error: ")
     assert captured.err.count("\n") == 1
 

@@ -130,6 +130,10 @@ SCENES = {
         'torquescale=".3" solref=".1 1"/></equality>'
     ),
     "weld_sites": lambda: scene('<equality><weld site1="s4" site2="s5" solref=".1 1" torquescale="2"/></equality>'),
+    "weld_mocap": lambda: scene(
+        '<equality><weld body1="target" body2="hand" relpose=".1 .2 0 1 0 0 0" solref=".1 1"/></equality>',
+        world='<body name="target" mocap="true" pos=".5 .1 1.2" quat=".9 .1 .2 .3"/>',
+    ),
     "equality_tendon": lambda: scene(
         f"<tendon>{_FIXED.format('')}{_FIXED2}{_PATH_P}"
         '</tendon><equality><tendon tendon1="t" tendon2="t2" polycoef=".1 .5 .2 0 0"/><tendon tendon1="p"/>'

@@ -119,6 +119,7 @@ class MjcfEnv(Env[AnyMjcfSettings], Generic[AnyMjcfSettings]):
             mujoco.mj_resetDataKeyframe(model, data, known.index(name))
         elif model.nkey:
             mujoco.mj_resetDataKeyframe(model, data, 0)
+        _check_mocap(data)
         mujoco.mj_normalizeQuat(model, data.qpos)
         return StepState(*(self._tensor(part)[None] for part in (data.qpos, data.qvel, data.act)))
 
@@ -162,6 +163,19 @@ class MjcfEnv(Env[AnyMjcfSettings], Generic[AnyMjcfSettings]):
 
     def _tensor(self, values: np.ndarray) -> Tensor:
         return torch.as_tensor(np.array(values), dtype=torch.float32, device=self.device)
+
+
+def _check_mocap(data: mujoco.MjData) -> None:
+    """Raise ConfigError if a keyframe loaded into `data` moves a mocap body, which the simulation holds still."""
+    model = data.model
+    for body in np.flatnonzero(model.body_mocapid >= 0):
+        slot = model.body_mocapid[body]
+        pose = np.r_[data.mocap_pos[slot], data.mocap_quat[slot]]
+        if not np.allclose(pose, np.r_[model.body_pos[body], model.body_quat[body]]):
+            raise ConfigError(
+                f"the keyframe moves mocap body {model.body(body).name or body}, which stays where the model puts it: "
+                "write mpos and mquat of the keyframe as pos and quat of the body"
+            )
 
 
 def _whole_substeps(source: str, timestep: float, control_timestep: float) -> int:

@@ -304,6 +304,12 @@ FEATURES: tuple[Feature, ...] = (
         "as far as the solver has converged: its residual is reported; CG in float32 stops about ten times earlier",
     ),
     Feature("noslip iterations", False, _option(lambda m: m.opt.noslip_iterations > 0, "option noslip_iterations")),
+    Feature(
+        "mocap bodies",
+        True,
+        _where(_OBJ.mjOBJ_BODY, "body", lambda m: m.body_mocapid >= 0),
+        "constants: they stay where the model's bodies are",
+    ),
     Feature("joints free, hinge, slide", True, _joint_type(_JNT.mjJNT_FREE, _JNT.mjJNT_HINGE, _JNT.mjJNT_SLIDE)),
     Feature("ball joints", True, _joint_type(_JNT.mjJNT_BALL)),
     Feature("springs on hinge and slide joints", True, _spring(_JNT.mjJNT_HINGE, _JNT.mjJNT_SLIDE)),
