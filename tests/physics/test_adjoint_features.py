@@ -15,6 +15,7 @@ ARM = """
   <geom name="ball" type="sphere" size=".06" pos=".3 0 0" mass=".2"/>
   <geom name="rod" type="cylinder" size=".05 .1" pos=".25 0 0" euler="90 0 0" mass=".2"/>
   <site name="s0" pos=".05 0 .07"/><site name="s1" pos=".2 0 .09"/><site name="side" pos=".3 .0 .12"/>
+  <site name="core" pos=".28 0 .01"/>
   <body name="fore" pos=".3 0 0">
     <joint name="c" axis="0 1 0" {c}/>
     <geom type="capsule" size=".04" fromto="0 0 0 .3 .05 0"/>
@@ -108,6 +109,8 @@ SCENES = {
     "sphere_wrap_side": lambda: _tendon(_SPHERE.format('sidesite="side"'), _SERVO),
     "cylinder_wrap": lambda: _tendon(_CYLINDER.format(""), _SERVO),
     "cylinder_wrap_side": lambda: _tendon(_CYLINDER.format('sidesite="side"'), _SERVO),
+    "sphere_wrap_inside": lambda: _tendon(_SPHERE.format('sidesite="core"'), _SERVO),
+    "cylinder_wrap_inside": lambda: _tendon(_CYLINDER.format('sidesite="core"'), _SERVO),
     "muscle": lambda: _tendon(_SPHERE.format('sidesite="side"'), _MUSCLE),
     "muscle_cylinder": lambda: _tendon(_CYLINDER.format(""), _MUSCLE),
     "equality_joint": lambda: scene(
@@ -224,10 +227,10 @@ def test_feature(name, substeps):
     model = SCENES[name]()
     points = random_points(model, 4, seed=5)
     if "wrap" in name or "muscle" in name:
-        # Bend the elbow over its sphere and cylinder.
+        # Bend the elbow over its sphere and cylinder, or away from them, where the path is held inside.
         wrapped = 0
         for point in points:
-            point.qpos[2] = np.float32(point.qpos[2] + 1.2)
+            point.qpos[2] = np.float32(point.qpos[2] + (-0.5 if "inside" in name else 1.2))
             wrapped += _wraps(model, point)
         assert wrapped >= 2
     worst, kept = compare(model, points, substeps)

@@ -65,7 +65,11 @@ MEMBERS = {
         "JOINT": mujoco.mjtEq.mjEQ_JOINT,
         "TENDON": mujoco.mjtEq.mjEQ_TENDON,
     },
-    "WrapType": {"JOINT": mujoco.mjtWrap.mjWRAP_JOINT},
+    "WrapType": {
+        "JOINT": mujoco.mjtWrap.mjWRAP_JOINT,
+        "SPHERE": mujoco.mjtWrap.mjWRAP_SPHERE,
+        "CYLINDER": mujoco.mjtWrap.mjWRAP_CYLINDER,
+    },
 }
 LENGTHS = {"vec5": 5, "vec10": 10, "vec12": 12}
 

@@ -121,22 +121,6 @@ def _tendon_armature(m: mujoco.MjModel) -> np.ndarray:
     return has
 
 
-def _inside_wraps(m: mujoco.MjModel) -> list[str]:
-    """Tendons with a sidesite inside its geom at the reference pose, which makes the path wrap inside."""
-    kinds = [int(mujoco.mjtWrap.mjWRAP_SPHERE), int(mujoco.mjtWrap.mjWRAP_CYLINDER)]
-    data = mujoco.MjData(m)
-    mujoco.mj_kinematics(m, data)
-    found = []
-    for tendon in range(m.ntendon):
-        for place in range(m.tendon_adr[tendon], m.tendon_adr[tendon] + m.tendon_num[tendon]):
-            side = round(float(m.wrap_prm[place]))
-            if int(m.wrap_type[place]) in kinds and side >= 0:
-                geom = int(m.wrap_objid[place])
-                if np.linalg.norm(data.site_xpos[side] - data.geom_xpos[geom]) < m.geom_size[geom, 0]:
-                    found.append(tendon)
-    return _named(m, _OBJ.mjOBJ_TENDON, "tendon", sorted(set(found)))
-
-
 def _lone_free_bodies(m: mujoco.MjModel) -> list[str]:
     """Free bodies whose tree has their six dofs only: implicitfast adds their gyroscopic slope, an asymmetric block."""
     if m.opt.integrator != int(_INTEGRATOR.mjINT_IMPLICITFAST):
@@ -346,8 +330,11 @@ FEATURES: tuple[Feature, ...] = (
     Feature("contact with height fields and signed distance fields", False, _pairs(None, _KNOWN_PAIRS)),
     Feature("contact adhesion and surface velocity", False, _odd_surfaces),
     Feature("fixed tendons", True, _tendon(lambda m: ~_spatial_tendons(m))),
-    Feature("spatial tendons: sites, pulleys, sphere and cylinder wrapping", True, _tendon(_spatial_tendons)),
-    Feature("tendons that wrap inside a geom", False, _inside_wraps),
+    Feature(
+        "spatial tendons: sites, pulleys, sphere and cylinder wrapping, also inside the geom",
+        True,
+        _tendon(_spatial_tendons),
+    ),
     Feature("tendon springs and dampers", True, _tendon(lambda m: (m.tendon_stiffness != 0) | (m.tendon_damping != 0))),
     Feature("tendon limits", True, _tendon(lambda m: m.tendon_limited != 0)),
     Feature("tendon friction loss", True, _tendon(lambda m: m.tendon_frictionloss != 0)),

@@ -11,6 +11,7 @@ On a wrapping geom the ends are tangent points that move over the surface; the r
 import warp as wp
 
 from msk_ray.physics.adjoint.groups import FieldBars, Fields, Motion, Substep, TendonBars, gather
+from msk_ray.physics.adjoint.inside_wrap import inside_score
 from msk_ray.physics.adjoint.spatial import carried, point_velocity, wrench
 from msk_ray.physics.adjoint.workspace import Workspace
 from msk_ray.physics.adjoint.wrapping import PathPoses, Paths, touch_paths
@@ -130,6 +131,7 @@ def pull_paths(
     paths: Paths,
     # In:
     touch_in: wp.array2d[wp.spatial_vector],
+    inside_in: wp.array2d[wp.vec4],
     poses_in: PathPoses,
     motion_in: Motion,
     fields_in: Fields,
@@ -207,9 +209,20 @@ def pull_paths(
         push_point(body, worldid, touch1 - com, -n, wp.cross(n, wp.spatial_top(total)), rates, fg, bars_out)
     mat = poses_in.geom_xmat[worldid, geom]
     pos = poses_in.geom_xpos[worldid, geom]
-    start_bar, end_bar, pos_bar, mat_bar, _r, _k, side_bar, _w0, _w1 = wp.grad(wrap_score)(
-        start, end, pos, mat, radius, kind, side, touch0_bar, touch1_bar
-    )
+    start_bar = zero
+    end_bar = zero
+    pos_bar = zero
+    mat_bar = wp.mat33(0.0)
+    side_bar = zero
+    spot = inside_in[worldid, e]
+    if spot[3] != 0.0:
+        start_bar, end_bar, pos_bar, mat_bar, _r, _k, _p, _w = wp.grad(inside_score)(
+            start, end, pos, mat, radius, kind, wp.vec3(spot[0], spot[1], spot[2]), touch0_bar + touch1_bar
+        )
+    else:
+        start_bar, end_bar, pos_bar, mat_bar, _r, _k, side_bar, _w0, _w1 = wp.grad(wrap_score)(
+            start, end, pos, mat, radius, kind, side, touch0_bar, touch1_bar
+        )
     # dR = [ω] R  ⇒  torque Σ_k R_k × R̄_k over the columns
     torque = zero
     for k in range(3):
@@ -238,16 +251,19 @@ class TendonPaths:
         self._paths = gather(Paths, work.tables, work.model)
         shape = (work.nworld, work.tables.segment_tendon.size)
         self._touch = wp.full(shape, wp.spatial_vector(*([MJ_MAXVAL] * 6)), dtype=wp.spatial_vector)
+        self._inside = wp.zeros(shape, dtype=wp.vec4)
 
     def launch(self, at: Substep) -> None:
         """Launch both."""
         work = self._work
         poses = gather(PathPoses, at.data)
         if work.tables.has_wrapping:
-            wp.launch(touch_paths, dim=self._touch.shape, inputs=[self._paths, poses], outputs=[self._touch])
+            wp.launch(
+                touch_paths, dim=self._touch.shape, inputs=[self._paths, poses], outputs=[self._touch, self._inside]
+            )
         wp.launch(
             pull_paths,
             dim=self._touch.shape,
-            inputs=[self._paths, self._touch, poses, at.motion, work.fields, work.tendon_bars],
+            inputs=[self._paths, self._touch, self._inside, poses, at.motion, work.fields, work.tendon_bars],
             outputs=[work.bars],
         )

@@ -5,6 +5,7 @@ Kept apart from `paths`: Warp drops the derivative of a function that another ke
 
 import warp as wp
 
+from msk_ray.physics.adjoint.inside_wrap import inside_place
 from msk_ray.physics.mjw_private import MJ_MAXVAL, wrap
 
 wp.set_module_options({"enable_backward": False})
@@ -48,11 +49,16 @@ def touch_paths(
     poses_in: PathPoses,
     # Out:
     touch_out: wp.array2d[wp.spatial_vector],
+    inside_out: wp.array2d[wp.vec4],
 ) -> None:
-    """Both tangent points of each stretch of path, MJ_MAXVAL where it runs straight."""
+    """Both tangent points of each stretch of path, MJ_MAXVAL where it runs straight.
+
+    For a path inside its geom, also `inside_place` and a one; zeros for others.
+    """
     worldid, e = wp.tid()
     far = wp.vec3(MJ_MAXVAL)
     touch_out[worldid, e] = wp.spatial_vector(far, far)
+    inside_out[worldid, e] = wp.vec4(0.0)
     place = paths.segment_geom[e]
     if place < 0:
         return
@@ -61,15 +67,20 @@ def touch_paths(
     sidesite = int(wp.round(paths.wrap_prm[place]))
     if sidesite >= 0:
         side = poses_in.site_xpos[worldid, sidesite]
-    arc, point0, point1 = wrap(
-        poses_in.site_xpos[worldid, paths.wrap_objid[paths.segment_first[e]]],
-        poses_in.site_xpos[worldid, paths.wrap_objid[paths.segment_last[e]]],
-        poses_in.geom_xpos[worldid, geom],
-        poses_in.geom_xmat[worldid, geom],
-        paths.geom_size[worldid % paths.geom_size.shape[0], geom][0],
-        paths.wrap_type[place],
-        side,
-    )
+    start = poses_in.site_xpos[worldid, paths.wrap_objid[paths.segment_first[e]]]
+    end = poses_in.site_xpos[worldid, paths.wrap_objid[paths.segment_last[e]]]
+    pos = poses_in.geom_xpos[worldid, geom]
+    mat = poses_in.geom_xmat[worldid, geom]
+    radius = paths.geom_size[worldid % paths.geom_size.shape[0], geom][0]
+    kind = paths.wrap_type[place]
+    arc, point0, point1 = wrap(start, end, pos, mat, radius, kind, side)
+    if sidesite >= 0 and wp.length(wp.transpose(mat) @ (side - pos)) < radius:
+        # Inside a geom both points are the same, and there is no arc.
+        if arc >= 0.0:
+            touch_out[worldid, e] = wp.spatial_vector(point0, point1)
+            spot = inside_place(start, end, pos, mat, radius, kind, point0)
+            inside_out[worldid, e] = wp.vec4(spot[0], spot[1], spot[2], 1.0)
+        return
     # A path that only just touches has the rates of a straight one; its arc's length, a square root, has no slope.
     if arc > _LEAST_ARC:
         touch_out[worldid, e] = wp.spatial_vector(point0, point1)
