@@ -4,11 +4,12 @@ import mujoco
 
 from msk_ray.config import PhysicsConfig
 
-_INTEGRATORS = {
+INTEGRATORS = {
     "Euler": mujoco.mjtIntegrator.mjINT_EULER,
     "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
     "RK4": mujoco.mjtIntegrator.mjINT_RK4,
 }
+"""Integrators by the names that `physics.integrator` takes."""
 _CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
 
 
@@ -31,7 +32,7 @@ def apply_options(spec: mujoco.MjSpec, physics: PhysicsConfig, control_timestep:
     option.timestep = control_timestep / physics.resolve_substeps(control_timestep)
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-    option.integrator = _INTEGRATORS["Euler"]
+    option.integrator = INTEGRATORS["Euler"]
     override_options(spec, physics)
 
 
@@ -39,7 +40,7 @@ def override_options(spec: mujoco.MjSpec, physics: PhysicsConfig) -> None:
     """Set the solver and integrator settings of `physics`; those that are null stay as they are."""
     option = spec.option
     if physics.integrator is not None:
-        option.integrator = _INTEGRATORS[physics.integrator]
+        option.integrator = INTEGRATORS[physics.integrator]
     if physics.cone is not None:
         option.cone = _CONES[physics.cone]
     if physics.impratio is not None:

@@ -69,6 +69,11 @@ def parser() -> Parser:
         metavar="MODE",
         help="backward mode (default: %(default)s); fd_jacobian works with any model, an unknown name lists all modes",
     )
+    p.add_argument(
+        "--integrator",
+        choices=("Euler", "implicitfast", "RK4"),
+        help="check the model with this integrator instead of its own, as if its file said so",
+    )
     p.add_argument("--substeps", type=_positive(int), default=1, metavar="N", help="physics steps (default 1)")
     p.add_argument(
         "--states",
@@ -142,6 +147,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     backward = make_backward(args.mode)
     model = load_model(args.model)
+    if args.integrator is not None:
+        from msk_ray.envs.options import INTEGRATORS
+
+        model.opt.integrator = INTEGRATORS[args.integrator]
     states = [kind.strip() for kind in args.states.split(",") if kind.strip()]
     check_request(model, states)
     limits = Limits() if args.forward_tolerance is None else Limits(forward_mismatch=args.forward_tolerance)

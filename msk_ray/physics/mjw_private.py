@@ -16,13 +16,16 @@ from mujoco_warp._src.collision_primitive_core import (
 from mujoco_warp._src.constraint import _contact_kbimp as contact_kbimp
 from mujoco_warp._src.math import (
     inert_vec,
+    lu_factor_6x6,
+    lu_solve_6x6,
     make_frame,
     motion_cross_force,
     quat_sub,
+    quat_to_mat,
     quat_to_vel,
     safe_div,
 )
-from mujoco_warp._src.types import MJ_MAXVAL, ConstraintType, EqType, WrapType, vec5, vec10, vec12
+from mujoco_warp._src.types import MJ_MAXVAL, ConstraintType, EqType, WrapType, mat66, vec5, vec6, vec10, vec12
 from mujoco_warp._src.util_misc import _poly_force as poly_force
 from mujoco_warp._src.util_misc import _poly_force_deriv as poly_force_deriv
 from mujoco_warp._src.util_misc import (
@@ -44,7 +47,10 @@ __all__ = [
     "contact_kbimp",
     "dof_damping_total",
     "inert_vec",
+    "lu_factor_6x6",
+    "lu_solve_6x6",
     "make_frame",
+    "mat66",
     "motion_cross_force",
     "muscle_bias",
     "muscle_dynamics",
@@ -55,6 +61,7 @@ __all__ = [
     "poly_force",
     "poly_force_deriv",
     "quat_sub",
+    "quat_to_mat",
     "quat_to_vel",
     "safe_div",
     "sphere_box",
@@ -62,6 +69,7 @@ __all__ = [
     "sphere_sphere",
     "tendon_damping_total",
     "vec5",
+    "vec6",
     "vec10",
     "vec12",
     "wrap",

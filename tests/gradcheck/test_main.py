@@ -135,6 +135,17 @@ def test_unsupported_model(tmp_path, capsys):
     assert captured.err.count("\n") == 1
 
 
+def test_another_integrator_may_be_tried(tmp_path, capsys):
+    path = tmp_path / "implicit.xml"
+    path.write_text(
+        '<mujoco><option integrator="implicit"/><worldbody><body><joint damping="1"/><geom size=".1"/>'
+        "</body></worldbody></mujoco>"
+    )
+    assert run(main, [str(path), *FAST]) == 2
+    assert 'Write integrator="Euler" or "implicitfast"; --integrator of gradcheck' in capsys.readouterr().err
+    assert run(main, [str(path), *FAST, "--integrator", "implicitfast"]) == 0
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [

@@ -65,6 +65,9 @@ def _tendon(path: str, actuators: str = "", **kw: str) -> mujoco.MjModel:
 _MUSCLE = '<muscle tendon="t" force="60" range=".6 1.1" lengthrange=".3 .7" tausmooth=".2" timeconst=".02 .06"/>'
 _SERVO = '<general tendon="t" gainprm="30" biastype="affine" biasprm="2 -20 -3" gear="1.5"/>'
 _FAST = 'integrator="implicitfast"'
+_WATER = ' density="500" viscosity="2" wind="1 2 -.5"'
+_FREE = """<body pos="1 0 1"><freejoint/><geom type="box" size=".1 .2 .3" pos=".05 .1 0" euler="10 20 30"/>
+<body pos="0 .1 .3"><geom size=".1"/><site name="grip" pos="0 .1 .1"/></body></body>"""
 
 SCENES = {
     "plain": lambda: scene(),
@@ -164,6 +167,14 @@ SCENES = {
         '<motor jointinparent="f" gear="1 2 -1 .5 .3 .2"/></actuator>',
         world='<body pos="1 0 1"><freejoint name="f"/><geom type="box" size=".1 .2 .3"/></body>',
     ),
+    "fast_spinning_free": lambda: _tendon(
+        '<spatial name="t" stiffness="50" springlength=".2"><site site="fixed"/><site site="grip"/></spatial>',
+        '<motor site="grip" gear="3 1 -2 .1 .2 -.3"/>',
+        option=_FAST,
+        world=_FREE,
+    ),
+    "fluid": lambda: scene(option=_WATER, world=_FREE),
+    "fast_spinning_fluid": lambda: scene(option=_FAST + _WATER, world=_FREE),
     "site": lambda: scene(
         '<actuator><general site="s4" gear="3 1 -2 .1 .2 -.3" biastype="affine" biasprm="1 0 -.4"/></actuator>'
     ),
@@ -233,6 +244,9 @@ def test_feature(name, substeps):
             point.qpos[2] = np.float32(point.qpos[2] + (-0.5 if "inside" in name else 1.2))
             wrapped += _wraps(model, point)
         assert wrapped >= 2
+    if "spinning" in name:
+        for point in points:
+            point.qvel[:] *= 8
     worst, kept = compare(model, points, substeps)
     assert kept >= 2
     assert max(worst) < 1e-3

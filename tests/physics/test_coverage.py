@@ -27,13 +27,16 @@ def test_own_models_are_covered():
     [
         (
             '<option integrator="RK4"/><worldbody><body><joint/><geom size=".1"/></body></worldbody>',
-            r'\(integrator RK4\)\. Write integrator="Euler" or "implicitfast" in the model\.',
+            r'\(integrator RK4\)\. Write integrator="Euler" or "implicitfast"; --integrator of gradcheck tries one\.',
         ),
-        ('<option density="1.2"/><worldbody><body><joint/><geom size=".1"/></body></worldbody>', "fluid"),
         (
-            '<option integrator="implicitfast"/><worldbody><body name="ball"><freejoint/><geom size=".1"/></body>'
-            "</worldbody>",
-            "body ball",
+            '<option noslip_iterations="3"/><worldbody><body><joint/><geom size=".1"/></body></worldbody>',
+            r'noslip iterations .*\. Write noslip_iterations="0"; a larger impratio',
+        ),
+        (
+            '<option density="1.2"/><worldbody><body><joint/><geom name="wing" size=".1" fluidshape="ellipsoid"/>'
+            "</body></worldbody>",
+            r'ellipsoid model \(geom wing\)\. Write fluidshape="none"',
         ),
         (
             '<worldbody><body><joint name="j"/><geom size=".1"/></body></worldbody><tendon><fixed name="arm" '

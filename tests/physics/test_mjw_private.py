@@ -25,6 +25,8 @@ SIGNATURES = {
     + DAMPING.format("dof", "dof")
     + ", dofid int -> (float, vec2f)",
     "inert_vec": "i vec10f, v spatial_vectorf -> spatial_vectorf",
+    "lu_factor_6x6": "A_in mat66f -> (mat66f, vec6i, bool)",
+    "lu_solve_6x6": "A_in mat66f, pivot_in vec6i, b_in vec6f -> vec6f",
     "make_frame": "a vec3f -> ?",
     "motion_cross_force": "v spatial_vectorf, f spatial_vectorf -> spatial_vectorf",
     "muscle_bias": "len float, lengthrange vec2f, acc0 float, prm vec10f -> float",
@@ -37,6 +39,7 @@ SIGNATURES = {
     "poly_force": "linear float, poly vec2f, x float, flg_odd int -> float",
     "poly_force_deriv": "linear float, poly vec2f, x float, flg_odd int -> float",
     "quat_sub": "qa quatf, qb quatf -> vec3f",
+    "quat_to_mat": "quat quatf -> mat33f",
     "quat_to_vel": "quat quatf -> vec3f",
     "safe_div": "x Any, y Any -> Any",
     "sphere_box": "sphere_pos vec3f, sphere_radius float, box_pos vec3f, box_rot mat33f, box_size vec3f "
@@ -71,7 +74,7 @@ MEMBERS = {
         "CYLINDER": mujoco.mjtWrap.mjWRAP_CYLINDER,
     },
 }
-LENGTHS = {"vec5": 5, "vec10": 10, "vec12": 12}
+SHAPES = {"vec5": (5,), "vec6": (6,), "vec10": (10,), "vec12": (12,), "mat66": (6, 6)}
 
 
 def spelled(kind: object) -> str:
@@ -98,15 +101,15 @@ def test_members_are_those_of_c_mujoco(name: str) -> None:
     assert {key: int(kind[key]) for key in MEMBERS[name]} == {key: int(v) for key, v in MEMBERS[name].items()}
 
 
-@pytest.mark.parametrize("name", sorted(LENGTHS))
-def test_vectors_are_as_long(name: str) -> None:
+@pytest.mark.parametrize("name", sorted(SHAPES))
+def test_vectors_and_matrices_are_as_large(name: str) -> None:
     kind = getattr(mjw_private, name)
-    assert (kind._shape_, kind._wp_scalar_type_) == ((LENGTHS[name],), wp.float32)
+    assert (kind._shape_, kind._wp_scalar_type_) == (SHAPES[name], wp.float32)
 
 
 def test_every_private_name_is_checked() -> None:
     assert mujoco.mjMAXVAL == mjw_private.MJ_MAXVAL
-    assert sorted([*SIGNATURES, *MEMBERS, *LENGTHS, "MJ_MAXVAL"]) == sorted(mjw_private.__all__)
+    assert sorted([*SIGNATURES, *MEMBERS, *SHAPES, "MJ_MAXVAL"]) == sorted(mjw_private.__all__)
 
 
 def test_private_names_come_from_one_module(root: Path) -> None:

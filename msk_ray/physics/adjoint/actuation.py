@@ -186,7 +186,7 @@ def pull_actuators(
     opt_timestep: wp.array[float],
     clampctrl: bool,
     implicit_all: bool,
-    inertia_address: wp.array2d[int],
+    implicit_address: wp.array2d[int],
     actuators: ActuatorSettings,
     # In:
     live_in: wp.array[int],
@@ -202,8 +202,8 @@ def pull_actuators(
 ) -> None:
     """Φ ∋ -(m·λ) F(len, m·v, act, ctrl) - h κ dF/dv and ḡ·act': gradients of ctrl and act, and those of len and rates.
 
-    With implicit integration κ = Σ m_i m_j μ_i â_j over the pairs that M couples. A tendon's cotangents go to its
-    tendon. For other transmissions whose moment m turns with q, `rate_bar` keeps ∂Φ/∂(m·λ, m·v, m·μ, m·â).
+    With implicit integration κ = Σ m_i m_j μ_i â_j over the pairs that `implicit_address` has. A tendon's cotangents
+    go to its tendon. For other transmissions whose moment m turns with q, `rate_bar` keeps ∂Φ/∂(m·λ, m·v, m·μ, m·â).
     """
     worldid, uid = wp.tid()
     law = ActuatorLaw()
@@ -260,13 +260,15 @@ def pull_actuators(
         law.implicit = 1
         for k in range(start, end):
             i = drive_in.moment_colind[worldid, k]
+            if implicit_address[i, i] < 0:
+                continue
             rate_mu += drive_in.actuator_moment[worldid, k] * multipliers_in.mu[worldid, i]
             rate_smooth += drive_in.actuator_moment[worldid, k] * (
                 state_in.qacc[worldid, i] - multipliers_in.excess[worldid, i]
             )
             for m in range(start, end):
                 j = drive_in.moment_colind[worldid, m]
-                if inertia_address[wp.max(i, j), wp.min(i, j)] >= 0:
+                if implicit_address[wp.max(i, j), wp.min(i, j)] >= 0:
                     smooth = state_in.qacc[worldid, j] - multipliers_in.excess[worldid, j]
                     kappa += (
                         drive_in.actuator_moment[worldid, k]
@@ -337,7 +339,7 @@ class ActuatorForces:
                 m.opt.timestep,
                 settings.clampctrl,
                 settings.implicit_all,
-                work.tables.inertia_address,
+                work.tables.implicit_address,
                 self._settings,
                 work.live,
                 gather(Drive, at.data),

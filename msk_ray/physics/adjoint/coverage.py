@@ -8,6 +8,8 @@ import mujoco
 import numpy as np
 
 from msk_ray.errors import UnsupportedModelError
+from msk_ray.physics.adjoint.tables import lone_free_bodies
+from msk_ray.physics.adjoint.tendon_kinds import branching_tendons, spatial_tendons, tendon_armature
 
 _OBJ = mujoco.mjtObj
 _GEOM = mujoco.mjtGeom
@@ -34,6 +36,8 @@ class Feature:
     """What is approximated or assumed."""
     partly: bool = False
     """Whether some slopes are approximated, as the note says."""
+    instead: str = ""
+    """What to write in the model where it is refused."""
 
 
 def _named(model: mujoco.MjModel, kind: mujoco.mjtObj, word: str, ids: Iterable[int]) -> list[str]:
@@ -106,66 +110,14 @@ def _equality(*kinds: int) -> Finder:
     return _where(_OBJ.mjOBJ_EQUALITY, "equality", lambda m: _among(m.eq_type, kinds))
 
 
-def _spatial_tendons(m: mujoco.MjModel) -> np.ndarray:
-    first = m.wrap_type[m.tendon_adr] if m.ntendon else np.zeros(0)
-    return np.asarray(first != int(mujoco.mjtWrap.mjWRAP_JOINT))
-
-
-def _tendon_armature(m: mujoco.MjModel) -> np.ndarray:
-    """Tendons with armature of their own or of an actuator on them."""
-    has = np.array(m.tendon_armature != 0)
-    geared = getattr(m, "actuator_armature", np.zeros(m.nu))
-    for u in np.flatnonzero(geared):
-        if m.actuator_trntype[u] == int(_TRN.mjTRN_TENDON):
-            has[m.actuator_trnid[u, 0]] = True
-    return has
+def _in_fluid(m: mujoco.MjModel) -> bool:
+    return bool(m.opt.density > 0 or m.opt.viscosity > 0)
 
 
 def _lone_free_bodies(m: mujoco.MjModel) -> list[str]:
-    """Free bodies whose tree has their six dofs only: implicitfast adds their gyroscopic slope, an asymmetric block."""
     if m.opt.integrator != int(_INTEGRATOR.mjINT_IMPLICITFAST):
         return []
-    lone = [
-        int(m.jnt_bodyid[j])
-        for j in np.flatnonzero(m.jnt_type == int(_JNT.mjJNT_FREE))
-        if m.tree_dofnum[m.dof_treeid[m.jnt_dofadr[j]]] == 6
-    ]
-    return _named(m, _OBJ.mjOBJ_BODY, "body", lone)
-
-
-def _branching_tendons(m: mujoco.MjModel) -> list[str]:
-    """Spatial tendons whose force couples dofs that the inertia does not: implicitfast drops those slopes."""
-    if m.opt.integrator != int(_INTEGRATOR.mjINT_IMPLICITFAST):
-        return []
-    found = []
-    for tendon in np.flatnonzero(_spatial_tendons(m)):
-        bodies = {
-            int(owner[m.wrap_objid[place]])
-            for place in range(m.tendon_adr[tendon], m.tendon_adr[tendon] + m.tendon_num[tendon])
-            for kind, owner in (
-                (mujoco.mjtWrap.mjWRAP_SITE, m.site_bodyid),
-                (mujoco.mjtWrap.mjWRAP_SPHERE, m.geom_bodyid),
-                (mujoco.mjtWrap.mjWRAP_CYLINDER, m.geom_bodyid),
-            )
-            if int(m.wrap_type[place]) == int(kind)
-        }
-        if not _one_chain(m, bodies):
-            found.append(int(tendon))
-    return _named(m, _OBJ.mjOBJ_TENDON, "tendon", found)
-
-
-def _one_chain(m: mujoco.MjModel, bodies: set[int]) -> bool:
-    """Whether of any two bodies one carries the other."""
-
-    def carriers(body: int) -> set[int]:
-        out = {body}
-        while body:
-            body = int(m.body_parentid[body])
-            out.add(body)
-        return out
-
-    moving = {int(m.body_weldid[b]) for b in bodies} - {0}
-    return all(a in carriers(b) or b in carriers(a) for a in moving for b in moving)
+    return _named(m, _OBJ.mjOBJ_BODY, "body", lone_free_bodies(m))
 
 
 def colliding_pairs(m: mujoco.MjModel) -> set[tuple[int, int]]:
@@ -280,6 +232,7 @@ FEATURES: tuple[Feature, ...] = (
         "integrators implicit, RK4, discrete",
         False,
         lambda m: [] if m.opt.integrator in _EXACT_INTEGRATORS else [_integrator_name(m)],
+        instead='integrator="Euler" or "implicitfast"; --integrator of gradcheck tries one',
     ),
     Feature(
         "solvers Newton and CG",
@@ -287,7 +240,12 @@ FEATURES: tuple[Feature, ...] = (
         _option(lambda m: m.opt.solver != mujoco.mjtSolver.mjSOL_PGS, "option solver"),
         "as far as the solver has converged: its residual is reported; CG in float32 stops about ten times earlier",
     ),
-    Feature("noslip iterations", False, _option(lambda m: m.opt.noslip_iterations > 0, "option noslip_iterations")),
+    Feature(
+        "noslip iterations",
+        False,
+        _option(lambda m: m.opt.noslip_iterations > 0, "option noslip_iterations"),
+        instead='noslip_iterations="0"; a larger impratio with cone="elliptic" also reduces slip',
+    ),
     Feature(
         "mocap bodies",
         True,
@@ -306,10 +264,12 @@ FEATURES: tuple[Feature, ...] = (
         lambda m: _named(m, _OBJ.mjOBJ_JOINT, "joint", np.unique(m.dof_jntid[m.dof_frictionloss != 0])),
     ),
     Feature("gravity compensation", True, _where(_OBJ.mjOBJ_BODY, "body", lambda m: m.body_gravcomp != 0)),
+    Feature("drag of a fluid, inertia-box model", True, _option(_in_fluid, "option density or viscosity")),
     Feature(
-        "fluid forces (density, viscosity, wind)",
+        "drag of a fluid, ellipsoid model",
         False,
-        _option(lambda m: bool(m.opt.density or m.opt.viscosity or np.any(m.opt.wind)), "option density or viscosity"),
+        _where(_OBJ.mjOBJ_GEOM, "geom", lambda m: (m.geom_fluid[:, 0] > 0) & _in_fluid(m)),
+        instead='fluidshape="none" for the inertia-box model',
     ),
     Feature("contacts, pyramidal and elliptic cones, condim 1, 3, 4, 6", True, _option(lambda m: m.ngeom > 1, "geoms")),
     Feature(
@@ -329,21 +289,29 @@ FEATURES: tuple[Feature, ...] = (
     ),
     Feature("contact with height fields and signed distance fields", False, _pairs(None, _KNOWN_PAIRS)),
     Feature("contact adhesion and surface velocity", False, _odd_surfaces),
-    Feature("fixed tendons", True, _tendon(lambda m: ~_spatial_tendons(m))),
+    Feature("fixed tendons", True, _tendon(lambda m: ~spatial_tendons(m))),
     Feature(
         "spatial tendons: sites, pulleys, sphere and cylinder wrapping, also inside the geom",
         True,
-        _tendon(_spatial_tendons),
+        _tendon(spatial_tendons),
     ),
     Feature("tendon springs and dampers", True, _tendon(lambda m: (m.tendon_stiffness != 0) | (m.tendon_damping != 0))),
     Feature("tendon limits", True, _tendon(lambda m: m.tendon_limited != 0)),
     Feature("tendon friction loss", True, _tendon(lambda m: m.tendon_frictionloss != 0)),
-    Feature("tendon armature", False, _tendon(_tendon_armature)),
+    Feature("tendon armature", False, _tendon(tendon_armature)),
     Feature("tendon bound on actuator force", False, _tendon(lambda m: m.tendon_actfrclimited != 0)),
     Feature(
-        "implicitfast with velocity-dependent force on a spatial tendon between branches", False, _branching_tendons
+        "implicitfast with velocity-dependent force on a spatial tendon between branches",
+        False,
+        _tendon(branching_tendons),
     ),
-    Feature("implicitfast with a free body that has no other joints", False, _lone_free_bodies),
+    Feature(
+        "implicitfast with a free body that has no other joints",
+        True,
+        _lone_free_bodies,
+        "damping by actuators and tendons on it is explicit in mujoco_warp but implicit in C MuJoCo; the gradient is "
+        "mujoco_warp's",
+    ),
     Feature("joint and tendon equalities", True, _equality(_EQ.mjEQ_JOINT, _EQ.mjEQ_TENDON)),
     Feature(
         "connect and weld equalities",
@@ -400,21 +368,24 @@ FEATURES: tuple[Feature, ...] = (
 
 def unsupported(model: mujoco.MjModel) -> dict[str, list[str]]:
     """Elements of `model` by the name of the feature that the adjoint does not differentiate."""
-    found = {feature.name: feature.find(model) for feature in FEATURES if not feature.exact}
-    return {name: elements for name, elements in found.items() if elements}
+    return {feature.name: elements for feature, elements in _refused(model)}
+
+
+def _refused(model: mujoco.MjModel) -> list[tuple[Feature, list[str]]]:
+    found = [(feature, feature.find(model)) for feature in FEATURES if not feature.exact]
+    return [(feature, elements) for feature, elements in found if elements]
 
 
 def check_supported(model: mujoco.MjModel, mode: str) -> None:
     """Raise UnsupportedModelError naming every element that `mode` cannot differentiate, and warn of each one whose
     gradient it only approximates.
     """
-    found = unsupported(model)
+    found = _refused(model)
     if found:
-        lines = [f"{name} ({_few(elements)})" for name, elements in found.items()]
-        integrator = model.opt.integrator not in _EXACT_INTEGRATORS
-        instead = ' Write integrator="Euler" or "implicitfast" in the model.' if integrator else ""
+        lines = [f"{feature.name} ({_few(elements)})" for feature, elements in found]
+        instead = [f" Write {feature.instead}." for feature, _ in found if feature.instead]
         raise UnsupportedModelError(
-            f"{mode} does not differentiate {'; '.join(lines)}.{instead} Finite differences do: "
+            f"{mode} does not differentiate {'; '.join(lines)}.{''.join(instead)} Finite differences do: "
             "physics.backward=fd_jacobian in a config, --mode fd_jacobian of gradcheck, backward=FdJacobian() in Python"
         )
     for feature in FEATURES:

@@ -4,6 +4,7 @@ from typing import Any
 
 import warp as wp
 
+from msk_ray.physics.adjoint.free_bodies import FreeBodySolves
 from msk_ray.physics.adjoint.groups import Substep
 from msk_ray.physics.adjoint.integrate import Integrator
 from msk_ray.physics.adjoint.rows import ConstraintLaws
@@ -184,12 +185,16 @@ class LinearSystems:
         if work.settings.implicit_all:
             self._step = wp.zeros((worlds, work.model.nC), dtype=float)
             self._push = wp.zeros((worlds, nv), dtype=float)
+            alone = work.tables.free_body.size > 0
+            self._free = FreeBodySolves(work, integrator.damping, integrator.rhs) if alone else None
 
     def launch(self, at: Substep) -> None:
         """Launch the matrices and their solves."""
         work, m, d, settings = self._work, self._work.model, at.data, self._work.settings
         if settings.implicit_all:
             implicit_matrix(m, d, self._step)
+            if self._free is not None:
+                self._free.hold(at, self._step)
         wp.launch(
             build_matrices,
             dim=(work.nworld, m.nv, m.nv),
@@ -207,7 +212,7 @@ class LinearSystems:
             outputs=[self._implicit, self._hessian],
         )
         if settings.implicit_all:
-            self._solve_implicit(d)
+            self._solve_implicit(at)
             return
         inputs = [self._implicit, self._hessian, self._integrator.rhs, self._integrator.damping_step, d.qacc]
         outputs = [work.multipliers.mu, work.multipliers.excess, work.multipliers.lam]
@@ -216,12 +221,16 @@ class LinearSystems:
         else:
             wp.launch(solve_serial, dim=work.nworld, inputs=[m.nv, *inputs], outputs=outputs)
 
-    def _solve_implicit(self, d: Any) -> None:
+    def _solve_implicit(self, at: Substep) -> None:
         """μ, a - â and λ where B is a matrix: (M + hB)(a - â) = hB a ,  H λ = h v̄' - hB μ."""
-        found, rhs = self._work.multipliers, self._integrator.rhs
+        d, found, rhs = at.data, self._work.multipliers, self._integrator.rhs
         self._product(d, d.qacc, 1.0)
         self._solve_two(self._implicit, rhs, self._push, [found.mu, found.excess])
+        if self._free is not None:
+            self._free.launch(at)
         self._product(d, found.mu, -1.0)
+        if self._free is not None:
+            self._free.push(at, self._push)
         self._solve_two(self._hessian, self._push, self._push, [found.lam, self._push])
 
     def _product(self, d: Any, x: wp.array, scale: float) -> None:

@@ -19,6 +19,7 @@ from msk_ray.physics.adjoint.applied import AppliedForces
 from msk_ray.physics.adjoint.bodies import Bodies
 from msk_ray.physics.adjoint.contacts import ContactForces
 from msk_ray.physics.adjoint.equality import AnchorRows
+from msk_ray.physics.adjoint.fluid import FluidForces
 from msk_ray.physics.adjoint.groups import Substep
 from msk_ray.physics.adjoint.integrate import Integrator
 from msk_ray.physics.adjoint.joints import TurningSprings
@@ -132,4 +133,6 @@ def _forces(work: Workspace, laws: ConstraintLaws, contacts: int) -> list[_Stage
         stages += [actuators, TurningTransmissions(work, actuators.bars)]
     if work.tables.has_turning_spring:
         stages.append(TurningSprings(work))
+    if work.settings.fluid:
+        stages.append(FluidForces(work))
     return stages

@@ -26,6 +26,10 @@ class Tables:
     """qpos address of a hinge or slide with a spring, else -1. Shape (nv,)."""
     inertia_address: wp.array
     """Place of M_ij (j ≤ i) in the sparse inertia, -1 where it is zero. Shape (nv, nv)."""
+    implicit_address: wp.array
+    """The same, but -1 also for dofs of `free_body`. Shape (nv, nv)."""
+    free_body: wp.array
+    """Bodies that implicitfast integrates with their gyroscopic forces; none with other integrators."""
     segment_tendon: wp.array
     """Tendon of each stretch of path between two neighbouring sites, with or without a geom. Shape (segments,)."""
     segment_first: wp.array
@@ -101,6 +105,15 @@ def _has_scalar_rows(mjm: mujoco.MjModel) -> bool:
     )
 
 
+def lone_free_bodies(mjm: mujoco.MjModel) -> list[int]:
+    """Bodies with a free joint in whose tree nothing else moves."""
+    return [
+        int(mjm.jnt_bodyid[joint])
+        for joint in np.flatnonzero(mjm.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE))
+        if mjm.tree_dofnum[mjm.dof_treeid[mjm.jnt_dofadr[joint]]] == 6
+    ]
+
+
 def build_tables(mjm: mujoco.MjModel, model: Any) -> Tables:
     """Tables for the C model `mjm` and its mujoco_warp copy `model`, on Warp's current device."""
     lastdof = np.full(mjm.nbody, -1, dtype=np.int32)
@@ -128,6 +141,11 @@ def build_tables(mjm: mujoco.MjModel, model: Any) -> Tables:
     for i in range(mjm.nv):
         for k in range(start[i], start[i] + nnz[i]):
             address[i, column[k]] = k
+    free = lone_free_bodies(mjm) if mjm.opt.integrator == int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST) else []
+    implicit = address.copy()
+    for body in free:
+        dofs = slice(mjm.body_dofadr[body], mjm.body_dofadr[body] + 6)
+        implicit[dofs, dofs] = -1
 
     segments = _segments(mjm)
 
@@ -141,6 +159,8 @@ def build_tables(mjm: mujoco.MjModel, model: Any) -> Tables:
         dof_last=ints(last),
         dof_spring_qpos=ints(springs),
         inertia_address=ints(address),
+        implicit_address=ints(implicit),
+        free_body=ints(np.array(free, dtype=np.int32)),
         segment_tendon=ints(segments[:, 0].copy()),
         segment_first=ints(segments[:, 1].copy()),
         segment_geom=ints(segments[:, 2].copy()),

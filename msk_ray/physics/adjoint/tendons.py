@@ -51,7 +51,7 @@ def start_tendons(
     implicit_all: bool,
     tendons: TendonRows,
     passive: PassiveTendons,
-    inertia_address: wp.array2d[int],
+    implicit_address: wp.array2d[int],
     # In:
     state_in: State,
     ten_J_in: wp.array2d[float],
@@ -62,7 +62,7 @@ def start_tendons(
 ) -> None:
     """Starts each tendon's cotangents with those of its spring and damper: Φ ∋ ρ(λ) (k(x) x + c(|ρ(v)|) ρ(v)).
 
-    With implicit integration also Φ ∋ h μᵀ B â where B ∋ d(c ρ)/dρ J Jᵀ on the entries that M has.
+    With implicit integration also Φ ∋ h μᵀ B â where B ∋ d(c ρ)/dρ J Jᵀ on the entries that `implicit_address` has.
     """
     worldid, t = wp.tid()
     rate_v = tendon_rate(tendons, t, ten_J_in[worldid], state_in.qvel[worldid])
@@ -103,16 +103,20 @@ def start_tendons(
         slope = poly_force_deriv(c, bend, rate_v, 1)
         lam_bar += rate_v * (c + bend[0] * speed + bend[1] * speed * speed)
         qvel_bar += rate_l * slope
-        if implicit_all and (c != 0.0 or bend[0] != 0.0 or bend[1] != 0.0):
+        start = tendons.ten_J_rowadr[t]
+        held = bool(True)
+        if tendons.ten_J_rownnz[t] > 0:
+            # A tendon of a lone free body acts on no other dofs.
+            held = implicit_address[tendons.ten_J_colind[start], tendons.ten_J_colind[start]] < 0
+        if implicit_all and not held and (c != 0.0 or bend[0] != 0.0 or bend[1] != 0.0):
             h = opt_timestep[worldid % opt_timestep.shape[0]]
             # κ = Σ J_i J_j μ_i â_j over the pairs that M couples
             kappa = float(0.0)
-            start = tendons.ten_J_rowadr[t]
             for k in range(start, start + tendons.ten_J_rownnz[t]):
                 i = tendons.ten_J_colind[k]
                 for m in range(start, start + tendons.ten_J_rownnz[t]):
                     j = tendons.ten_J_colind[m]
-                    if inertia_address[wp.max(i, j), wp.min(i, j)] >= 0:
+                    if implicit_address[wp.max(i, j), wp.min(i, j)] >= 0:
                         smooth = state_in.qacc[worldid, j] - multipliers_in.excess[worldid, j]
                         kappa += ten_J_in[worldid, k] * ten_J_in[worldid, m] * multipliers_in.mu[worldid, i] * smooth
             qvel_bar += h * kappa * wp.sign(rate_v) * (2.0 * bend[0] + 6.0 * bend[1] * speed)
@@ -173,7 +177,7 @@ class Tendons:
                 settings.implicit_all,
                 work.tendon_rows,
                 self._passive,
-                work.tables.inertia_address,
+                work.tables.implicit_address,
                 at.state,
                 d.ten_J,
                 d.ten_length,

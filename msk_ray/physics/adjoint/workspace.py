@@ -34,6 +34,7 @@ class Settings:
     """Whether the integrator treats joint damping implicitly."""
     implicit_all: bool
     """Whether it treats all damping implicitly."""
+    fluid: bool
     elliptic: bool
     actuation: bool
     clampctrl: bool
@@ -43,12 +44,16 @@ class Settings:
         """Those of a model."""
         disabled, bit = mjm.opt.disableflags, mujoco.mjtDisableBit
         euler = mjm.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+        smooth = bit.mjDSBL_ACTUATION | bit.mjDSBL_SPRING | bit.mjDSBL_DAMPER
+        # With all of these off, mujoco_warp's implicitfast is explicit.
+        implicit = mjm.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST and disabled & smooth != smooth
         return Settings(
             gravity=not disabled & bit.mjDSBL_GRAVITY,
             spring=not disabled & bit.mjDSBL_SPRING,
             damper=not disabled & bit.mjDSBL_DAMPER,
             euler_damping=bool(euler and not disabled & (bit.mjDSBL_EULERDAMP | bit.mjDSBL_DAMPER)),
-            implicit_all=bool(mjm.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST),
+            implicit_all=bool(implicit),
+            fluid=bool(mjm.opt.density > 0 or mjm.opt.viscosity > 0),
             elliptic=bool(mjm.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC),
             actuation=bool(mjm.nu > 0 and not disabled & bit.mjDSBL_ACTUATION),
             clampctrl=not disabled & bit.mjDSBL_CLAMPCTRL,

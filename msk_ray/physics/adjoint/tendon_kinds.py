@@ -1,0 +1,54 @@
+"""Kinds of tendons in a model, each as an array of booleans by tendon."""
+
+import mujoco
+import numpy as np
+
+
+def spatial_tendons(m: mujoco.MjModel) -> np.ndarray:
+    """Tendons over sites and geoms; the others are fixed."""
+    first = m.wrap_type[m.tendon_adr] if m.ntendon else np.zeros(0)
+    return np.asarray(first != int(mujoco.mjtWrap.mjWRAP_JOINT))
+
+
+def tendon_armature(m: mujoco.MjModel) -> np.ndarray:
+    """Tendons with armature of their own or of an actuator on them."""
+    has = np.array(m.tendon_armature != 0)
+    geared = getattr(m, "actuator_armature", np.zeros(m.nu))
+    for u in np.flatnonzero(geared):
+        if m.actuator_trntype[u] == int(mujoco.mjtTrn.mjTRN_TENDON):
+            has[m.actuator_trnid[u, 0]] = True
+    return has
+
+
+def branching_tendons(m: mujoco.MjModel) -> np.ndarray:
+    """Spatial tendons whose force couples dofs that the inertia does not: implicitfast drops those slopes."""
+    found = np.zeros(m.ntendon, dtype=bool)
+    if m.opt.integrator != int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST):
+        return found
+    for tendon in np.flatnonzero(spatial_tendons(m)):
+        bodies = {
+            int(owner[m.wrap_objid[place]])
+            for place in range(m.tendon_adr[tendon], m.tendon_adr[tendon] + m.tendon_num[tendon])
+            for kind, owner in (
+                (mujoco.mjtWrap.mjWRAP_SITE, m.site_bodyid),
+                (mujoco.mjtWrap.mjWRAP_SPHERE, m.geom_bodyid),
+                (mujoco.mjtWrap.mjWRAP_CYLINDER, m.geom_bodyid),
+            )
+            if int(m.wrap_type[place]) == int(kind)
+        }
+        found[tendon] = not _one_chain(m, bodies)
+    return found
+
+
+def _one_chain(m: mujoco.MjModel, bodies: set[int]) -> bool:
+    """Whether of any two bodies one carries the other."""
+
+    def carriers(body: int) -> set[int]:
+        out = {body}
+        while body:
+            body = int(m.body_parentid[body])
+            out.add(body)
+        return out
+
+    moving = {int(m.body_weldid[b]) for b in bodies} - {0}
+    return all(a in carriers(b) or b in carriers(a) for a in moving for b in moving)
