@@ -2,6 +2,7 @@
 
 import random
 import subprocess
+import time
 from pathlib import Path
 
 from fault_campaign.reference import Reference
@@ -43,7 +44,9 @@ def read_only(reference: Reference, scratch: Path, rng: random.Random) -> list[T
     def blow() -> int:
         subprocess.run(["mount", "--bind", str(disk), str(disk)], check=True)
         try:
-            subprocess.run(["mount", "-o", "remount,ro,bind", str(disk)], check=True)
+            # Busy while a process has a file open for writing that it opened through this mount.
+            while subprocess.run(["mount", "-o", "remount,ro,bind", str(disk)], stderr=subprocess.DEVNULL).returncode:
+                time.sleep(0.05)
             return sweep.wait()
         finally:
             # A process on its way out may still have a file of it open.

@@ -16,7 +16,8 @@ def remove_remains(experiment: Experiment) -> None:
     path = experiment.path
     if not path.is_dir() or experiment.lost() is None:
         return
-    if {child.name for child in path.iterdir()} <= {experiment.tune.name}:
+    # A request to stop is written as soon as something is lost: it may have been between two looks.
+    if {child.name for child in path.iterdir()} <= {experiment.tune.name, experiment.stop_file.name}:
         shutil.rmtree(path)
 
 

@@ -167,7 +167,10 @@ class Supervisor(Callback):
         self._stopping = True
         self._saving = set(self._attempts)
         try:
+            self._experiment.check_there()  # Ray may have made another folder in its place, which stays empty
             self._experiment.stop_file.touch()
+        except StorageFailure as failure:
+            self.console.say(f"trials are not asked to stop: {failure}")
         except OSError as error:
             # Then the trials fail on the same disk at their next row, and stop there.
             self.console.say(f"cannot write {self._experiment.stop_file}: {error.strerror}")

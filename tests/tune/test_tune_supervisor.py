@@ -13,6 +13,7 @@ from msk_ray.sweep.space import Space
 from msk_ray.sweep.trials import resolve_trials
 from msk_ray.tune import supervisor
 from msk_ray.tune.console import Console
+from msk_ray.tune.presence import remove_remains
 from msk_ray.tune.supervisor import LONGEST_STEP_S, SHUTDOWN_GRACE_S, Supervisor
 
 
@@ -37,3 +38,36 @@ def test_time_in_which_the_driver_was_frozen_is_not_the_trials(
             clock.now += LONGEST_STEP_S
             driver.on_step_end(step, [])
         assert driver.stopped
+
+
+def test_nothing_is_written_into_a_folder_made_in_place_of_an_experiment(
+    make_space: Callable[..., Space], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    space = make_space()
+    trials = resolve_trials(space)
+    experiment = opening.create(tmp_path / "runs" / "small", space, trials, {})
+    experiment.path.rename(tmp_path / "elsewhere")
+    experiment.tune.mkdir(parents=True)  # as Ray does
+    with listening() as stop, stop.deferred():
+        driver = Supervisor(experiment, lambda config: trials[0], Console(trials, 1), stop, lambda: None, trials)
+        driver.on_trial_start(0, [], SimpleNamespace(config={}))
+        stop.receive(signal.SIGTERM)
+        driver.on_step_end(0, [])
+    assert [child.name for child in experiment.path.iterdir()] == ["tune"]
+    assert "trials are not asked to stop" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("left", [["tune"], ["tune", "stop"], ["stop"]])
+def test_what_was_made_in_place_of_an_experiment_goes(
+    left: list[str], make_space: Callable[..., Space], tmp_path: Path
+) -> None:
+    space = make_space()
+    experiment = opening.create(tmp_path / "runs" / "small", space, resolve_trials(space), {})
+    experiment.path.rename(tmp_path / "elsewhere")
+    for name in left:
+        (experiment.path / name).mkdir(parents=True)
+    remove_remains(experiment)
+    assert not experiment.path.exists()
+    (tmp_path / "elsewhere").rename(experiment.path)
+    remove_remains(experiment)
+    assert experiment.lost() is None
