@@ -21,8 +21,8 @@ DESCRIPTION = """\
 Check gradients of an env step of MODEL.xml against float64 central differences of C MuJoCo.
 
 Every state gets a random cotangent on (qpos', qvel', act') after --substeps physics steps; the gradients with respect
-to ctrl, qpos, qvel and act are compared in tangent space. States where the step has a kink, and states where the Warp
-forward pass itself differs from C MuJoCo, are left out and counted.
+to ctrl, qpos, qvel, act and --parameters are compared in tangent space. States where the step has a kink, and states
+where the Warp forward pass itself differs from C MuJoCo, are left out and counted.
 
   rel_error   |g - g_ref| / |g_ref|    0 is right
   cosine      between g and g_ref      1 is right; separates direction from magnitude
@@ -37,6 +37,7 @@ EXAMPLES = """\
   python -m msk_ray.gradcheck my_robot.xml --substeps 16 --states standing,contact --worlds 20 --tolerance 1e-2
   python -m msk_ray.gradcheck my_robot.xml --mode fd_jacobian --tolerance 5e-2    # a model the adjoint refuses
   python -m msk_ray.gradcheck configs/ant.yaml --substeps 4 --states contact
+  python -m msk_ray.gradcheck my_robot.xml --parameters body_mass,geom_friction --states contact
   python -m msk_ray.gradcheck my_robot.xml --json > gradients.json"""
 
 MANY_EXCLUDED = 0.25
@@ -82,6 +83,13 @@ def parser() -> Parser:
         help="comma-separated: standing, random, contact (in contact during rollouts under random controls; any state "
         "if nothing ever touches), policy (along a smooth rollout) (default: %(default)s)",
     )
+    p.add_argument(
+        "--parameters",
+        default="",
+        metavar="NAMES",
+        help="comma-separated fields of the model whose gradients are compared too, such as body_mass,opt.gravity; "
+        "all for every one that the model has (default: none)",
+    )
     p.add_argument("--worlds", type=_positive(int), default=8, metavar="W", help="states of each kind (default 8)")
     p.add_argument(
         "--tolerance", type=_positive(float), default=1e-2, metavar="T", help="largest rel_error (default: %(default)s)"
@@ -109,6 +117,10 @@ def parser() -> Parser:
     p.add_argument("--njmax", type=_positive(int), metavar="N", help="constraint rows per world (default: likewise)")
     p.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
     return p
+
+
+def _listed(text: str) -> list[str]:
+    return [word.strip() for word in text.split(",") if word.strip()]
 
 
 def load_model(path: Path) -> "mujoco.MjModel":
@@ -142,6 +154,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         raise ConfigError(f"--seed must not be negative, not {args.seed}")
     # torch and Warp take seconds to load; a wrong command line should not wait for them.
     from msk_ray.gradcheck.check import GradientCheck, Limits, check_gradients, check_request
+    from msk_ray.physics.parameters import check_names, names_of
     from msk_ray.simulation import Simulation
     from msk_ray.simulation.modes import make_backward
 
@@ -151,8 +164,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         from msk_ray.envs.options import INTEGRATORS
 
         model.opt.integrator = INTEGRATORS[args.integrator]
-    states = [kind.strip() for kind in args.states.split(",") if kind.strip()]
+    states, parameters = _listed(args.states), _listed(args.parameters)
+    if parameters == ["all"]:
+        parameters = names_of(model)
     check_request(model, states)
+    check_names(model, parameters)
     limits = Limits() if args.forward_tolerance is None else Limits(forward_mismatch=args.forward_tolerance)
     try:
         sim = Simulation(
@@ -165,7 +181,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             njmax=args.njmax,
             tolerance=args.solver_tolerance,
         )
-        result = check_gradients(sim, states=states, seed=args.seed, limits=limits)
+        result = check_gradients(sim, states=states, seed=args.seed, limits=limits, parameters=parameters)
     except UnsupportedModelError as error:
         if args.json:
             empty = GradientCheck(args.mode, args.substeps, args.worlds)
@@ -198,6 +214,7 @@ def as_json(result: "GradientCheck", model: str, tolerance: float, unsupported: 
         "excluded": result.excluded,
         "excluded_kinks": result.kinks,
         "excluded_forward_mismatches": result.forward_mismatches,
+        "excluded_parameter_kinks": result.parameter_kinks,
         "results": [
             {
                 "state": r.state,
@@ -260,6 +277,8 @@ def print_table(result: "GradientCheck", model: str, tolerance: float) -> None:
     console = Console(width=None if sys.stdout.isatty() else 120, soft_wrap=True, highlight=False)
     console.print(table)
     console.print(_excluded(result))
+    if result.parameter_kinks:
+        console.print(f"{result.parameter_kinks} comparisons by a parameter left out, at its kink")
     if result.checked and result.excluded > MANY_EXCLUDED * (result.checked + result.excluded):
         console.print("note: many states were left out; the result only covers the others")
     if result.approximated:

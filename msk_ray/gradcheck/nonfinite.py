@@ -84,6 +84,8 @@ def find_nonfinite(
         gradients: by input, of some cotangent at this state.
     """
     names = element_names(sim.model)
+    parameters = [name for name in gradients if name not in INPUTS]
+    names |= {name: [f"{name}[{k}]" for k in range(gradients[name].size)] for name in parameters}
     lost = [
         names[name][k]
         for name, values in (("qpos", _tangent(sim.model, end.qpos)), ("qvel", end.qvel), ("act", end.act))
@@ -94,13 +96,14 @@ def find_nonfinite(
     if all(np.all(np.isfinite(gradient)) for gradient in gradients.values()):
         return None
     rows = [*names["qpos"], *names["qvel"], *names["act"]]
-    results, inputs = set(), {(name, int(k)) for name in INPUTS for k in np.flatnonzero(~np.isfinite(gradients[name]))}
+    results = set()
+    inputs = {(name, int(k)) for name, g in gradients.items() for k in np.flatnonzero(~np.isfinite(g))}
     # One row of the Jacobian per world.
     for first in range(0, len(rows), sim.nworld):
         cotangents = np.zeros((sim.nworld, len(rows)))
         count = min(sim.nworld, len(rows) - first)
         cotangents[np.arange(count), first + np.arange(count)] = 1.0
-        _, jacobian = simulated_gradients(sim, [point] * sim.nworld, cotangents)
+        _, jacobian = simulated_gradients(sim, [point] * sim.nworld, cotangents, parameters)
         results |= {
             first + k for k in range(count) if not all(np.all(np.isfinite(block[k])) for block in jacobian.values())
         }
@@ -108,7 +111,7 @@ def find_nonfinite(
         kind,
         world,
         tuple(rows[k] for k in sorted(results)) or ("the weighted sum of all results",),
-        tuple(names[name][k] for name in INPUTS for k in range(len(names[name])) if (name, k) in inputs),
+        tuple(names[name][k] for name in gradients for k in range(len(names[name])) if (name, k) in inputs),
     )
 
 

@@ -6,7 +6,7 @@ Axes: R = 2 nv + na rows, the tangent of (qpos', qvel', act'); nu, nv, na as in 
 """
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msk_ray.errors import SimulationError
+from msk_ray.gradcheck.parameters import ParameterField
 
 Array = NDArray[np.float64]
 
 INPUTS = ("ctrl", "qpos", "qvel", "act")
-"""What a step is differentiated with respect to; qpos along tangent directions."""
+"""What a step is differentiated with respect to besides parameters; qpos along tangent directions."""
 
 FINE_STEP, COARSE_STEP = 1e-6, 1e-5
 """The two perturbations [each input's own unit].
@@ -69,13 +70,18 @@ class Linearization:
     which the two central differences agree: one that passes through the state itself.
     """
 
-    def at_kink(self, step_limit: float, side_limit: float) -> bool:
-        """Whether the step is not differentiable here, within the reach of COARSE_STEP."""
+    def kinks(self, step_limit: float, side_limit: float) -> set[str]:
+        """Inputs by which the step is not differentiable here, within the reach of COARSE_STEP."""
         # Written so that a NaN counts as a kink.
-        return not (
-            all(value <= step_limit for value in self.step_disagreement.values())
-            and all(value <= side_limit for value in self.side_disagreement.values())
-        )
+        return {
+            name
+            for name in self.jacobian
+            if not (self.step_disagreement[name] <= step_limit and self.side_disagreement[name] <= side_limit)
+        }
+
+    def at_kink(self, step_limit: float, side_limit: float) -> bool:
+        """Whether the step is not differentiable here by its control or its state."""
+        return not self.kinks(step_limit, side_limit).isdisjoint(INPUTS)
 
     def pull_back(self, cotangent: Array) -> dict[str, Array]:
         """Gradients of ⟨cotangent, (qpos', qvel', act')⟩ by input, for a tangent cotangent of shape (R,)."""
@@ -107,17 +113,21 @@ class Oracle:
     Args:
         model: the compiled model; it is not changed.
         substeps: calls of `mj_step` per env step, under one control.
+        parameters: fields of the model by which steps are differentiated too. They are changed in place: what MuJoCo
+            has computed from them is held fixed.
     """
 
-    def __init__(self, model: mujoco.MjModel, substeps: int) -> None:
+    def __init__(self, model: mujoco.MjModel, substeps: int, parameters: Sequence[str] = ()) -> None:
         self.model = reference_model(model)
         self.substeps = substeps
+        self._fields = {name: ParameterField(self.model, name) for name in parameters}
         self._data = mujoco.MjData(self.model)
 
     @property
     def sizes(self) -> dict[str, int]:
         """Columns of each input."""
-        return {"ctrl": self.model.nu, "qpos": self.model.nv, "qvel": self.model.nv, "act": self.model.na}
+        inputs = {"ctrl": self.model.nu, "qpos": self.model.nv, "qvel": self.model.nv, "act": self.model.na}
+        return inputs | {name: field.columns for name, field in self._fields.items()}
 
     def step(self, point: Point) -> Point:
         """One env step from `point`; a pure function.
@@ -166,7 +176,7 @@ class Oracle:
     def linearize(self, point: Point) -> Linearization:
         """Results and full Jacobian of one env step, extrapolated from central differences with two step sizes.
 
-        Costs 1 + 4·(nu + 2 nv + na) env steps.
+        Costs 1 + 4·(nu + 2 nv + na + elements of parameters) env steps.
 
         Raises:
             SimulationError: the state, or one next to it, diverged.
@@ -193,13 +203,16 @@ class Oracle:
     def _one_sided(self, point: Point, end: Point, name: str, columns: int, amount: float) -> tuple[Array, Array]:
         """Forward and backward difference quotients, each (R, columns)."""
         forward, backward = (
-            np.stack(
-                [
-                    self.difference(end, self.step(self.displaced(point, name, column, signed))) / signed
-                    for column in range(columns)
-                ],
-                axis=1,
-            )
+            np.stack([self._quotient(point, end, name, column, signed) for column in range(columns)], axis=1)
             for signed in (amount, -amount)
         )
         return forward, backward
+
+    def _quotient(self, point: Point, end: Point, name: str, column: int, amount: float) -> Array:
+        """Difference quotient (R,) along one coordinate of an input."""
+        field = self._fields.get(name)
+        if field is None:
+            return self.difference(end, self.step(self.displaced(point, name, column, amount))) / amount
+        amount *= field.scale(column)
+        with field.displaced(column, amount):
+            return self.difference(end, self.step(point)) / amount

@@ -10,8 +10,10 @@ import torch
 from torch import Tensor
 
 from msk_ray.gradcheck.oracle import INPUTS, Array, Point
+from msk_ray.physics.parameters import PARAMETERS
 from msk_ray.simulation import Simulation
 from msk_ray.simulation.backward import StepState
+from msk_ray.simulation.tangent import quat_conjugate, quat_multiply
 
 
 def _stack(sim: Simulation, points: Sequence[Point], name: str) -> Tensor:
@@ -19,29 +21,46 @@ def _stack(sim: Simulation, points: Sequence[Point], name: str) -> Tensor:
     return torch.as_tensor(rows, dtype=torch.float32, device=sim.device).requires_grad_()
 
 
+def _nominal(sim: Simulation, name: str) -> Tensor:
+    """The model's own value of a parameter, one row per world."""
+    value = torch.as_tensor(PARAMETERS[name].value(sim.model), dtype=torch.float32, device=sim.device)
+    return value.expand(sim.nworld, *value.shape).clone().requires_grad_()
+
+
+def _columns(name: str, value: Tensor, gradient: Tensor) -> Tensor:
+    """A parameter's gradient, one row per world; that of a quaternion by its rotations in the local frame."""
+    if PARAMETERS[name].quaternion:
+        gradient = 0.5 * quat_multiply(quat_conjugate(value.detach()), gradient)[..., 1:]
+    return gradient.reshape(len(gradient), -1)
+
+
 def _numpy(tensor: Tensor) -> Array:
     return tensor.detach().cpu().numpy().astype(np.float64)
 
 
 def simulated_gradients(
-    sim: Simulation, points: Sequence[Point], cotangents: Array
+    sim: Simulation, points: Sequence[Point], cotangents: Array, parameters: Sequence[str] = ()
 ) -> tuple[list[Point], dict[str, Array]]:
     """Results of one env step of `sim` from W points, and gradients of ⟨cotangent, results⟩ in tangent coordinates.
 
     Args:
         points: one per world.
         cotangents: tangent cotangents of (qpos', qvel', act'), shape (W, R).
+        parameters: fields of the model whose gradients are wanted too, at the model's own values.
 
     Returns:
-        The results, and by input the gradients, shape (W, columns of that input).
+        The results, and by input and parameter the gradients, shape (W, columns).
     """
     inputs = {name: _stack(sim, points, name) for name in INPUTS}
-    end = sim.step(**inputs)
+    values = {name: _nominal(sim, name) for name in parameters}
+    end = sim.step(inputs["ctrl"], inputs["qpos"], inputs["qvel"], inputs["act"], parameters=values)
     weights = torch.as_tensor(cotangents, dtype=torch.float32, device=sim.device)
     on_qpos, on_qvel, on_act = weights.split([sim.model.nv, sim.model.nv, sim.model.na], dim=1)
     raw = StepState(sim.tangent.lift(end.qpos.detach(), on_qpos), on_qvel, on_act)
-    gradients = dict(zip(inputs, torch.autograd.grad(end, list(inputs.values()), list(raw)), strict=True))
+    found = inputs | values
+    gradients = dict(zip(found, torch.autograd.grad(end, list(found.values()), list(raw)), strict=True))
     gradients["qpos"] = sim.tangent.project(inputs["qpos"].detach(), gradients["qpos"])
+    gradients |= {name: _columns(name, value, gradients[name]) for name, value in values.items()}
     arrays = [_numpy(value) for value in end]
     ends = [Point(point.ctrl, *(array[w] for array in arrays)) for w, point in enumerate(points)]
     return ends, {name: _numpy(value) for name, value in gradients.items()}

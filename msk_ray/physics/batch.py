@@ -1,6 +1,7 @@
 """`nworld` copies of one model, stepped together by an unmodified mujoco_warp."""
 
 import copy
+from collections.abc import Iterable
 from typing import Any
 
 import mujoco
@@ -10,8 +11,9 @@ import warp as wp
 from numpy.typing import NDArray
 
 from msk_ray.errors import UnsupportedModelError
-from msk_ray.physics.capacity import Capacity, default_capacity
+from msk_ray.physics.capacity import Capacity, default_capacity, scalar_rows
 from msk_ray.physics.overflow import LossWatch, cured, loss_error, needed
+from msk_ray.physics.parameters import check_names, open_arrays, structure
 from msk_ray.physics.sealed import ModelWatch, seal
 
 
@@ -59,6 +61,8 @@ class WorldBatch:
         model, data: mujoco_warp's copies on the device. The model's arrays cannot be replaced, as recorded graphs
             would not follow.
         nworld: number of worlds W.
+        parameters: names of the fields of the model that have a value for each world.
+        structure: the MjModel with everything present that these may switch on.
         substeps: physics steps an env step.
         device: the Warp device.
         capacity: contacts and rows per world that fit into `data`.
@@ -83,21 +87,29 @@ class WorldBatch:
         self.mjm = mjm
         self.substeps = substeps
         self.device = wp.get_device(device)
-        with wp.ScopedDevice(self.device):
-            try:
-                model = mjw.put_model(mjm)
-            except (NotImplementedError, ValueError) as error:
-                raise UnsupportedModelError(f"mujoco_warp cannot load the model: {error}") from error
-            if tolerance is not None:
-                # put_model clamps to 1e-6; the adjoint holds at the optimum only, so it may ask for less.
-                model.opt.tolerance = wp.array([tolerance], dtype=float)
-            model.opt.warn_overflow = 0  # read back by `losses`, not printed from kernels
-        seal(model, "batch.model")
-        self._model = model
+        self.parameters: tuple[str, ...] = ()
+        self.structure = mjm
+        self._tolerance = tolerance
+        self._model = self._load(nworld)
         self._watch = ModelWatch(mjm)
         self._given = Capacity(nconmax or 0, njmax or 0)
         start, self._bound = default_capacity(mjm) if not all(self._given) else (self._given, None)
         self._allocate(nworld, Capacity(nconmax or start.contacts, njmax or start.rows))
+
+    def _load(self, nworld: int) -> Any:
+        """mujoco_warp's copy of the model, sealed."""
+        with wp.ScopedDevice(self.device):
+            try:
+                model = mjw.put_model(self.structure)
+            except (NotImplementedError, ValueError) as error:
+                raise UnsupportedModelError(f"mujoco_warp cannot load the model: {error}") from error
+            if self._tolerance is not None:
+                # put_model clamps to 1e-6; the adjoint holds at the optimum only, so it may ask for less.
+                model.opt.tolerance = wp.array([self._tolerance], dtype=float)
+            model.opt.warn_overflow = 0  # read back by `losses`, not printed from kernels
+            open_arrays(self.mjm, model, self.parameters, nworld)
+        seal(model, "batch.model")
+        return model
 
     @property
     def model(self) -> Any:
@@ -108,7 +120,7 @@ class WorldBatch:
         self.nworld = nworld
         self.capacity = capacity
         with wp.ScopedDevice(self.device):
-            self.data = mjw.make_data(self.mjm, nworld=nworld, nconmax=capacity.contacts, njmax=capacity.rows)
+            self.data = mjw.make_data(self.structure, nworld=nworld, nconmax=capacity.contacts, njmax=capacity.rows)
         self.losses = LossWatch(self.data, self.device)
 
     def resized(self, nworld: int, capacity: Capacity | None = None) -> "WorldBatch":
@@ -116,6 +128,26 @@ class WorldBatch:
         self.check_model()
         other = copy.copy(self)
         other._allocate(nworld, capacity or self.capacity)
+        return other
+
+    def with_parameters(self, names: Iterable[str]) -> "WorldBatch":
+        """Another batch of as many worlds, in whose model the named fields have a value for each world too.
+
+        Raises:
+            ConfigError: a name is no parameter, or the model has none of it.
+            UnsupportedModelError: the model uses something with which the parameter cannot be varied.
+        """
+        self.check_model()
+        check_names(self.mjm, names)
+        other = copy.copy(self)
+        other.parameters = tuple(sorted({*self.parameters, *names}))
+        other.structure = structure(self.mjm, other.parameters)
+        other._model = other._load(self.nworld)
+        more = scalar_rows(other.structure) - scalar_rows(self.structure)
+        if self._bound is not None:
+            other._bound = self._bound._replace(rows=self._bound.rows + more)
+        rows = self.capacity.rows + (0 if self._given.rows else more)
+        other._allocate(self.nworld, self.capacity._replace(rows=rows))
         return other
 
     def check_model(self, thorough: bool = False) -> None:

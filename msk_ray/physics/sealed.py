@@ -27,7 +27,7 @@ def seal(holder: Any, path: str) -> None:
     def refuse(_: Any, name: str, *__: Any) -> NoReturn:
         raise ConfigError(
             f"{path}.{name} cannot be replaced: recorded steps go on reading the old one; change the MjModel before "
-            "making the Simulation, which has one set of parameters for all worlds"
+            "making the Simulation, or give its step new values as parameters={...}"
         )
 
     for field in dataclasses.fields(holder):

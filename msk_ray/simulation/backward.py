@@ -5,6 +5,8 @@ Axes: W worlds. `nq, nv, na, nu` as in MuJoCo.
 
 import copy
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
@@ -50,6 +52,21 @@ class InputGradients(NamedTuple):
     """Shape (W, nv)."""
     xfrc_applied: Tensor | None = None
     """Shape (W, nbody, 6)."""
+    parameters: Mapping[str, Tensor] = MappingProxyType({})
+    """Gradients of parameters of the model by name, one row per world."""
+
+    @classmethod
+    def of(cls, found: Mapping[str, Tensor | None], parameters: Mapping[str, Tensor] = MappingProxyType({})) -> Self:
+        """Those of inputs by name; one that is missing is None."""
+        return cls(
+            found.get("ctrl"),
+            found.get("qpos"),
+            found.get("qvel"),
+            found.get("act"),
+            found.get("qfrc_applied"),
+            found.get("xfrc_applied"),
+            parameters,
+        )
 
 
 class Needs(NamedTuple):
@@ -61,6 +78,12 @@ class Needs(NamedTuple):
     act: bool
     qfrc_applied: bool = False
     xfrc_applied: bool = False
+    parameters: tuple[str, ...] = ()
+    """Names of parameters of the model."""
+
+
+INPUTS = ("ctrl", "qpos", "qvel", "act", "qfrc_applied", "xfrc_applied")
+"""What a step is differentiated with respect to besides parameters, in the order of `InputGradients` and `Needs`."""
 
 
 class Backward(ABC):
@@ -74,6 +97,8 @@ class Backward(ABC):
     name: str
     covers_applied: ClassVar[bool] = False
     """Whether it differentiates steps under applied forces, which `record` then gets."""
+    covers_parameters: ClassVar[bool] = False
+    """Whether `vjp` gives gradients of parameters of the model; their recorded values are in the model by then."""
 
     @abstractmethod
     def attach(self, batch: WorldBatch) -> None:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from msk_ray.physics import WorldBatch
-from msk_ray.simulation.backward import Applied, Backward, InputGradients, Needs, StepState
+from msk_ray.simulation.backward import INPUTS, Applied, Backward, InputGradients, Needs, StepState
 from msk_ray.simulation.buffers import device_of
 from msk_ray.simulation.jacobian import state_size
 from msk_ray.simulation.stepper import Stepper
@@ -69,7 +69,7 @@ class FdJacobian(Backward):
     def vjp(self, saved: tuple[Tensor, ...], cotangent: StepState, needs: Needs) -> InputGradients:
         inputs, qpos_end = self._inputs(saved)
         weights = torch.cat((self._tangent.project(qpos_end, cotangent.qpos), *cotangent[1:]), dim=-1)
-        wanted = [name for name, need in needs._asdict().items() if need and self._sizes[name]]
+        wanted = [name for name in INPUTS if getattr(needs, name) and self._sizes[name]]
         columns = self._columns(wanted)
         slopes = torch.empty((len(columns), self._batch.nworld), device=self._device)
         for chunk, changes in self._derivatives(columns, inputs):
@@ -82,12 +82,8 @@ class FdJacobian(Backward):
             gradients["qpos"] = self._tangent.lift(inputs["qpos"], gradients["qpos"])
         if _XFRC in gradients:
             gradients[_XFRC] = gradients[_XFRC].unflatten(-1, (-1, 6))
-        return InputGradients(
-            *(
-                gradients[n] if n in gradients else torch.zeros_like(inputs[n]) if need else None
-                for n, need in needs._asdict().items()
-            )
-        )
+        asked = [name for name in INPUTS if getattr(needs, name)]
+        return InputGradients.of({n: gradients[n] if n in gradients else torch.zeros_like(inputs[n]) for n in asked})
 
     @torch.no_grad()
     def jacobian(

@@ -1,5 +1,7 @@
 """`Simulation`: a batch of worlds whose step is an autograd function of torch tensors."""
 
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import mujoco
@@ -14,6 +16,7 @@ from msk_ray.physics.capacity import Capacity
 from msk_ray.simulation.backward import Applied, Backward, Needs, StepState
 from msk_ray.simulation.jacobian import Linearization
 from msk_ray.simulation.modes import make_backward
+from msk_ray.simulation.parameters import check_values, gradient_of
 from msk_ray.simulation.stepper import Engine, Stepper
 from msk_ray.simulation.tangent import Tangent
 from msk_ray.simulation.tape import TapePerSubstep
@@ -46,31 +49,48 @@ def resolve_device(device: str) -> torch.device:
 
 
 class WarpSimStep(torch.autograd.Function):
-    """(ctrl, qpos, qvel, act, forces) to (qpos, qvel, act) one env step later, differentiable in all of them."""
+    """(ctrl, qpos, qvel, act, parameters, forces) to (qpos, qvel, act) one env step later, differentiable in all."""
 
     @staticmethod
     def forward(
-        ctx: Any, sim: "Simulation", ctrl: Tensor, qpos: Tensor, qvel: Tensor, act: Tensor, *forces: Tensor
+        ctx: Any, sim: "Simulation", names: tuple[str, ...], ctrl: Tensor, *inputs: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        start = StepState(qpos, qvel, act)
-        end, saved = sim.recorded(ctrl, start, Applied(*forces) if forces else None)
+        start, values, forces = StepState(*inputs[:3]), inputs[3 : 3 + len(names)], inputs[3 + len(names) :]
+        parameters = dict(zip(names, values, strict=True))
+        end, saved = sim.recorded(ctrl, start, Applied(*forces) if forces else None, parameters)
         # The engine that computed this step: the simulation may continue with another.
         ctx.engine = sim.engine
-        ctx.save_for_backward(*saved)
+        ctx.names = names
+        ctx.save_for_backward(*values, *saved)
         return end
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, qpos: Tensor, qvel: Tensor, act: Tensor) -> tuple[Tensor | None, ...]:
-        needs = Needs(*ctx.needs_input_grad[1:])
+        count = len(ctx.names)
+        values, saved = ctx.saved_tensors[:count], ctx.saved_tensors[count:]
+        on_state, on_values, on_forces = (
+            ctx.needs_input_grad[k:m] for k, m in ((2, 6), (6, 6 + count), (6 + count, None))
+        )
+        wanted = tuple(name for name, need in zip(ctx.names, on_values, strict=True) if need)
         cotangent = StepState(qpos, qvel, act)
         ctx.engine.batch.check_model()
         ctx.engine.settle()
-        gradients = ctx.engine.backward.vjp(ctx.saved_tensors, cotangent, needs)
+        ctx.engine.load_parameters(dict(zip(ctx.names, values, strict=True)))
+        found = ctx.engine.backward.vjp(saved, cotangent, Needs(*on_state, *on_forces)._replace(parameters=wanted))
         # A linear map takes zero to zero, even in a world whose Jacobian is not finite: 0 × NaN must not leak out.
         used = torch.cat(cotangent, dim=-1).ne(0).any(-1)
-        masked = (None if g is None else torch.where(used.view(-1, *[1] * (g.dim() - 1)), g, 0.0) for g in gradients)
-        return (None, *list(masked)[: len(ctx.needs_input_grad) - 1])
+
+        def masked(g: Tensor | None) -> Tensor | None:
+            return None if g is None else torch.where(used.view(-1, *[1] * (g.dim() - 1)), g, 0.0)
+
+        parameters = (
+            gradient_of(value.shape, found.parameters[name]) if name in wanted else None
+            for name, value in zip(ctx.names, values, strict=True)
+        )
+        states = (masked(g) for g in (found.ctrl, found.qpos, found.qvel, found.act))
+        forces = (masked(g) for g in (found.qfrc_applied, found.xfrc_applied)[: len(on_forces)])
+        return (None, None, *states, *parameters, *forces)
 
 
 class Simulation:
@@ -165,6 +185,7 @@ class Simulation:
         *,
         qfrc_applied: Tensor | None = None,
         xfrc_applied: Tensor | None = None,
+        parameters: Mapping[str, Tensor] | None = None,
     ) -> StepState:
         """Advance all worlds by one env step; a pure, differentiable function of its arguments.
 
@@ -173,6 +194,10 @@ class Simulation:
             qfrc_applied: forces on the degrees of freedom [N, N m], (W, nv), held over the substeps; None for none.
             xfrc_applied: force [N] and torque [N m] on each body at its centre of mass, in world coordinates,
                 (W, nbody, 6), held likewise.
+            parameters: values of fields of the model for this step, by their name in MjModel (body_mass, opt.gravity),
+                each in the field's shape for all worlds, or with a row per world in front. Everything else is as in
+                the model; what MuJoCo has computed from it stays as it is (docs/parameters.md). The first step with
+                another name is recorded again.
 
         Returns:
             New tensors (qpos, qvel, act).
@@ -182,14 +207,14 @@ class Simulation:
             SimulationError: a step lost contacts or constraint rows, and larger buffers were not allowed or would not
                 help. On CUDA it may be an earlier step, whose results are NaN in the affected worlds.
             ConfigError: the MjModel was edited after the simulation was created.
-            UnsupportedModelError: a gradient is needed, and the backward mode does not cover applied forces.
+            UnsupportedModelError: a gradient is needed, and the backward mode does not cover applied forces or
+                parameters; or the model uses something with which a parameter cannot be varied.
         """
-        self._check_inputs(ctrl, qpos, qvel, act)
-        applied = self._applied(qfrc_applied, xfrc_applied)
-        inputs = (ctrl, qpos, qvel, act, *(applied or ()))
+        applied, values = self._checked((ctrl, qpos, qvel, act), qfrc_applied, xfrc_applied, parameters)
+        inputs = (ctrl, qpos, qvel, act, *values.values(), *(applied or ()))
         if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
-            return StepState(*WarpSimStep.apply(self, *inputs))
-        return self.advance(ctrl, StepState(qpos, qvel, act), applied)
+            return StepState(*WarpSimStep.apply(self, tuple(values), *inputs))
+        return self.advance(ctrl, StepState(qpos, qvel, act), applied, values)
 
     @torch.no_grad()
     def linearize(
@@ -201,6 +226,7 @@ class Simulation:
         *,
         qfrc_applied: Tensor | None = None,
         xfrc_applied: Tensor | None = None,
+        parameters: Mapping[str, Tensor] | None = None,
     ) -> Linearization:
         """Jacobians of one env step of every world, in tangent space: x' = end + A δx + B δu to first order.
 
@@ -208,7 +234,7 @@ class Simulation:
         from perturbed copies with fd_jacobian. Clips of gradients do not act on them.
 
         Args:
-            ctrl, qpos, qvel, act, qfrc_applied, xfrc_applied: as for `step`.
+            ctrl, qpos, qvel, act, qfrc_applied, xfrc_applied, parameters: as for `step`.
 
         Returns:
             A (W, 2 nv + na, 2 nv + na), B (W, 2 nv + na, nu) and the state after the step. Entries are ordered as by
@@ -219,11 +245,25 @@ class Simulation:
             SimulationError, UnsupportedModelError: as for `step`.
         """
         self.require_backward()
-        self._check_inputs(ctrl, qpos, qvel, act)
+        applied, values = self._checked((ctrl, qpos, qvel, act), qfrc_applied, xfrc_applied, parameters)
         start = StepState(qpos, qvel, act)
-        end, saved = self.recorded(ctrl, start, self._applied(qfrc_applied, xfrc_applied))
+        end, saved = self.recorded(ctrl, start, applied, values)
         self.engine.settle()
         return Linearization(*self.require_backward().jacobian(saved, start, end, self.tangent), end)
+
+    def open_parameters(self, names: Iterable[str]) -> None:
+        """Let `step` take these parameters. `step` does it itself; call this to have the recording done beforehand.
+
+        Raises:
+            ConfigError: a name is no parameter, or the model has none of it.
+            UnsupportedModelError: the model uses something with which the parameter cannot be varied.
+        """
+        self._stepper.open_parameters(names)
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters that are open."""
+        return self.batch.parameters
 
     def contact_forces(self) -> Tensor:
         """Force of all contacts on every geom in world coordinates [N], shape (W, G, 3).
@@ -237,6 +277,20 @@ class Simulation:
         # Copying into the batch's buffers would broadcast one world to all, and convert dtypes and devices silently.
         for (name, width), value in zip(self._widths, inputs, strict=True):
             self._check_input(name, value, width)
+
+    def _checked(
+        self,
+        inputs: tuple[Tensor, ...],
+        qfrc: Tensor | None,
+        xfrc: Tensor | None,
+        parameters: Mapping[str, Tensor] | None,
+    ) -> tuple[Applied | None, dict[str, Tensor]]:
+        """Applied forces and parameters of a step whose arguments are all in order; opens the parameters."""
+        self._check_inputs(*inputs)
+        values = dict(parameters or {})
+        self.open_parameters(values)
+        check_values(self.model, self.nworld, values, self._place)
+        return self._applied(qfrc, xfrc), values
 
     def _check_input(self, name: str, value: Tensor, *shape: int) -> None:
         if value.shape != (self.nworld, *shape):
@@ -265,20 +319,35 @@ class Simulation:
         self._check_input("xfrc_applied", applied.xfrc, nbody, 6)
         return applied
 
-    def advance(self, ctrl: Tensor, start: StepState, applied: Applied | None = None) -> StepState:
-        """The forward pass alone, outside autograd."""
+    def advance(
+        self,
+        ctrl: Tensor,
+        start: StepState,
+        applied: Applied | None = None,
+        parameters: Mapping[str, Tensor] = MappingProxyType({}),
+    ) -> StepState:
+        """The forward pass alone, outside autograd; `parameters` must be open."""
+        self.engine.load_parameters(parameters)
         return self._stepper.advance(ctrl, start, applied)
 
-    def recorded(self, ctrl: Tensor, start: StepState, applied: Applied | None) -> tuple[StepState, tuple[Tensor, ...]]:
+    def recorded(
+        self, ctrl: Tensor, start: StepState, applied: Applied | None, parameters: Mapping[str, Tensor]
+    ) -> tuple[StepState, tuple[Tensor, ...]]:
         """The forward pass, and what the backward mode needs of it.
 
         Raises:
             ConfigError: the simulation has no backward mode.
-            UnsupportedModelError: the mode does not cover applied forces.
+            UnsupportedModelError: the mode does not cover applied forces, or parameters of which one needs a gradient.
         """
         mode = self.require_backward()
+        varied = [name for name, value in parameters.items() if value.requires_grad]
+        if varied and not mode.covers_parameters:
+            raise UnsupportedModelError(
+                f"backward mode {mode.name} has no gradients of parameters ({', '.join(varied)}): write "
+                f"backward={TapePerSubstep.name!r}"
+            )
         if applied is None:
-            end = self.advance(ctrl, start)
+            end = self.advance(ctrl, start, parameters=parameters)
             # The step may have replaced the mode by one with larger buffers.
             return end, self.require_backward().record(ctrl, start, end)
         if not mode.covers_applied:
@@ -286,7 +355,7 @@ class Simulation:
                 f"backward mode {mode.name} does not differentiate steps with applied forces: write "
                 "backward='tape_per_substep', or leave qfrc_applied and xfrc_applied out"
             )
-        end = self.advance(ctrl, start, applied)
+        end = self.advance(ctrl, start, applied, parameters)
         return end, self.require_backward().record(ctrl, start, end, applied)
 
     @property

@@ -1,5 +1,7 @@
 """Env steps of tensors, on recorded graphs whose buffers grow if a step needs more."""
 
+from collections.abc import Iterable, Mapping
+
 import warp as wp
 from torch import Tensor
 
@@ -8,6 +10,7 @@ from msk_ray.physics.capacity import Capacity
 from msk_ray.physics.touch import ContactForces
 from msk_ray.simulation.backward import Applied, Backward, StepState
 from msk_ray.simulation.buffers import BatchTensors, device_of, stream_of, wait_for
+from msk_ray.simulation.parameters import ParameterTensors
 
 _NEARLY_FULL = 0.75
 """Share of a buffer in use above which it grows between epochs, before a step needs more."""
@@ -26,6 +29,7 @@ class Engine:
         if backward is not None:
             backward.attach(batch)
         self._buffers = BatchTensors(batch)
+        self._parameters = ParameterTensors(batch)
         launches = batch.launch_step if backward is None else lambda: backward.launch_step(batch)
         self._graph = Graph(launches, batch.device)
         batch.losses.read()  # of the start-up, whose state is nobody's
@@ -41,6 +45,10 @@ class Engine:
         self._touch_graph.replay(stream_of(self.device))
         force: Tensor = wp.to_torch(self._touch.force, requires_grad=False)
         return force.clone()
+
+    def load_parameters(self, values: Mapping[str, Tensor]) -> None:
+        """Put the given values of the batch's parameters into its model, and its own values for all others."""
+        self._parameters.load(values)
 
     def advance(self, ctrl: Tensor, start: StepState, applied: Applied | None = None) -> StepState:
         """One env step, even if it lost contacts or rows."""
@@ -109,6 +117,11 @@ class Stepper:
         allowed = batch.growth(wanted)
         if allowed != batch.capacity:
             self._replace(batch.resized(batch.nworld, allowed))
+
+    def open_parameters(self, names: Iterable[str]) -> None:
+        """Let the named fields of the model have a value for each world, from the next step on."""
+        if not set(names) <= set(self.engine.batch.parameters):
+            self._replace(self.engine.batch.with_parameters(names))
 
     def diagnostics(self) -> dict[str, float]:
         """Diagnostics since the last call, the largest if there were several engines; enlarges buffers that are

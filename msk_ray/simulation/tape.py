@@ -17,9 +17,10 @@ from torch import Tensor
 from msk_ray.physics import Graph, WorldBatch
 from msk_ray.physics.adjoint import StepAdjoint
 from msk_ray.physics.adjoint.coverage import check_supported
+from msk_ray.physics.adjoint.parameters import ParameterAdjoint
 from msk_ray.physics.adjoint.residual import ResidualGauge
 from msk_ray.physics.adjoint.stages import recompute_stages
-from msk_ray.simulation.backward import Applied, Backward, InputGradients, Needs, StepState
+from msk_ray.simulation.backward import INPUTS, Applied, Backward, InputGradients, Needs, StepState
 from msk_ray.simulation.buffers import applied_of, device_of, stream_of
 from msk_ray.simulation.jacobian import rows_of, state_size, unit_cotangents
 from msk_ray.simulation.pool import Pool
@@ -53,6 +54,7 @@ class _Tape(Backward):
     """
 
     covers_applied = True
+    covers_parameters = True
 
     def __init__(self, substep_grad_clip: float | None = None, residual_tolerance: float = 1e-3) -> None:
         self.substep_grad_clip = substep_grad_clip
@@ -60,13 +62,13 @@ class _Tape(Backward):
 
     def attach(self, batch: WorldBatch) -> None:
         mjm, worlds = batch.mjm, batch.nworld
-        check_supported(mjm, self.name)
+        check_supported(batch.structure, self.name)
         self._batch = batch
         self._device = device_of(batch)
         self._pulled = 0
         self._warned = False
         with wp.ScopedDevice(batch.device):
-            self._adjoint = StepAdjoint(mjm, batch.model, batch.data)
+            self._adjoint = StepAdjoint(batch.structure, batch.model, batch.data)
             pool = Pool(batch.device)
             self._states: list[dict[str, wp.array]] = [{} for _ in range(batch.substeps)]
             self._last: dict[str, wp.array] = {}
@@ -88,7 +90,8 @@ class _Tape(Backward):
         )
         self._grad_ctrl = wp.to_torch(adjoint.grad_ctrl, requires_grad=False)
         self._applied = applied_of(batch.data)
-        self._graphs: dict[bool, Graph] = {}
+        self._graphs: dict[tuple[bool, tuple[str, ...]], Graph] = {}
+        self._parameters: dict[tuple[str, ...], ParameterAdjoint] = {}
         self._rows: dict[int, TapePerSubstep] = {}
 
     def _prepare(self, pool: Pool) -> None:
@@ -107,37 +110,48 @@ class _Tape(Backward):
     @torch.no_grad()
     def vjp(self, saved: tuple[Tensor, ...], cotangent: StepState, needs: Needs) -> InputGradients:
         ctrl, kept, *forces = saved
-        self.ready(bool(forces))
+        self.ready(bool(forces), needs.parameters)
         self._ctrl.copy_(ctrl)
         self._saved.copy_(kept)
         for view, value in zip(self._applied, forces, strict=False):
             view.copy_(value)
-        gradients = self.pull(cotangent, bool(forces))
+        found = self.pull(cotangent, bool(forces), needs.parameters)
         if forces:
             for view in self._applied:  # the next step may have none
                 view.zero_()
-        return InputGradients(
-            *(g.clone() if need and g is not None else None for g, need in zip(gradients, needs, strict=True))
+        return InputGradients.of(
+            {name: getattr(found, name).clone() for name in INPUTS if getattr(needs, name)},
+            {name: gradient.clone() for name, gradient in found.parameters.items()},
         )
 
-    def ready(self, applied: bool) -> None:
-        """Record the backward pass, of steps with or without applied forces; leaves the checkpoints undefined."""
-        if applied not in self._graphs:
-            self._graphs[applied] = Graph(lambda: self.launch_backward(applied), self._batch.device)
+    def ready(self, applied: bool, names: tuple[str, ...] = ()) -> None:
+        """Record the backward pass of steps with or without applied forces, with the gradients of some parameters.
+
+        It leaves the checkpoints undefined.
+        """
+        if (applied, names) not in self._graphs:
+            if names and names not in self._parameters:
+                self._parameters[names] = ParameterAdjoint(self._adjoint, names)
+            launches = lambda: self.launch_backward(applied, names)  # noqa: E731
+            self._graphs[applied, names] = Graph(launches, self._batch.device)
             self._clipped.zero_()
             self._adjoint.touch_counter.clear()
 
-    def pull(self, cotangent: StepState, applied: bool) -> InputGradients:
+    def pull(self, cotangent: StepState, applied: bool, names: tuple[str, ...] = ()) -> InputGradients:
         """Replay the backward pass of the step whose checkpoints are in place; the result lasts until the next."""
         for view, value in zip(self.cotangent, cotangent, strict=True):
             view.copy_(value)
-        self._graphs[applied].replay(stream_of(self._device))
+        self._graphs[applied, names].replay(stream_of(self._device))
         self._pulled += 1
-        if not applied:
-            return InputGradients(self._grad_ctrl, *self.cotangent)
-        found = self._adjoint.cover_applied()
-        forces = (wp.to_torch(a, requires_grad=False) for a in (found.grad_qfrc, found.grad_xfrc))
-        return InputGradients(self._grad_ctrl, *self.cotangent, *forces)
+        found = InputGradients(self._grad_ctrl, *self.cotangent)
+        if applied:
+            forces = self._adjoint.cover_applied()
+            views = (wp.to_torch(a, requires_grad=False) for a in (forces.grad_qfrc, forces.grad_xfrc))
+            found = found._replace(**dict(zip(("qfrc_applied", "xfrc_applied"), views, strict=True)))
+        if names:
+            arrays = self._parameters[names].gradients
+            found = found._replace(parameters={n: wp.to_torch(a, requires_grad=False) for n, a in arrays.items()})
+        return found
 
     def load(self, ctrl: Tensor, states: Sequence[dict[str, wp.array]], forces: Sequence[Tensor]) -> None:
         """Take the step of a batch of w worlds, W / w copies of each: its control, checkpoints and applied forces."""
@@ -174,8 +188,8 @@ class _Tape(Backward):
             chunk = range(first, min(first + width, size))
             cotangents = unit_cotangents(tangent, end, chunk, width)
             gradients = self._rows[width].pull(StepState(*(part.flatten(0, 1) for part in cotangents)), bool(forces))
-            split = (None if g is None else g.clone().unflatten(0, (width, worlds)) for g in gradients[:4])
-            found.append(rows_of(tangent, start, InputGradients(*split)))
+            split = {n: getattr(gradients, n).clone().unflatten(0, (width, worlds)) for n in INPUTS[:4]}
+            found.append(rows_of(tangent, start, InputGradients.of(split)))
         a, b = (torch.cat(parts)[:size].transpose(0, 1).contiguous() for parts in zip(*found, strict=True))
         return a, b
 
@@ -183,15 +197,17 @@ class _Tape(Backward):
         """Size of the data of one recorded env step, for all worlds together, without its control."""
         return self._saved.numel() * self._saved.element_size()
 
-    def launch_backward(self, with_applied: bool) -> None:
+    def launch_backward(self, with_applied: bool = False, names: tuple[str, ...] = ()) -> None:
         """Launch the pullback of a whole env step: from `cotangent` of its end to the same buffers for its start."""
         applied = self._adjoint.cover_applied() if with_applied else None
-        if applied is not None:
-            applied.start()
+        parameters = self._parameters[names] if names else None
+        for extra in (applied, parameters):
+            if extra is not None:
+                extra.start()
         self._adjoint.start(self._last["qpos"], self._raw_qpos)
         for k in reversed(range(self._batch.substeps)):
             after = self._states[k + 1] if k + 1 < self._batch.substeps else self._last
-            self._adjoint.pull_back(self._stages(k), after["qvel"], applied)
+            self._adjoint.pull_back(self._stages(k), after["qvel"], applied, parameters)
             if self.substep_grad_clip is not None and k > 0:
                 self._adjoint.clip(self.substep_grad_clip, self._clipped)
         self._adjoint.finish(self._states[0]["qpos"], self._raw_qpos)
@@ -334,6 +350,11 @@ class Hybrid(Backward):
     def covers_applied(self) -> bool:  # type: ignore[override]
         """Whether both modes do."""
         return self.state.covers_applied and self.ctrl.covers_applied
+
+    @property
+    def covers_parameters(self) -> bool:  # type: ignore[override]
+        """Whether the mode of the state does."""
+        return self.state.covers_parameters
 
     def record(
         self, ctrl: Tensor, start: StepState, end: StepState, applied: Applied | None = None

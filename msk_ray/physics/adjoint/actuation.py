@@ -172,6 +172,43 @@ class Drive:
     qfrc_actuator: wp.array2d[float]
 
 
+@wp.func
+def actuator_law(worldid: int, uid: int, timestep: float, clampctrl: bool, actuators: ActuatorSettings) -> ActuatorLaw:
+    """The law of one actuator in one world."""
+    law = ActuatorLaw()
+    law.timestep = timestep
+    law.dyntype = actuators.actuator_dyntype[uid]
+    law.gaintype = actuators.actuator_gaintype[uid]
+    law.biastype = actuators.actuator_biastype[uid]
+    law.early = int(actuators.actuator_actearly[uid])
+    law.clamp_act = int(actuators.actuator_actlimited[uid])
+    law.clamp_force = int(actuators.actuator_forcelimited[uid])
+    law.dynprm = actuators.actuator_dynprm[worldid % actuators.actuator_dynprm.shape[0], uid]
+    law.gainprm = actuators.actuator_gainprm[worldid % actuators.actuator_gainprm.shape[0], uid]
+    law.biasprm = actuators.actuator_biasprm[worldid % actuators.actuator_biasprm.shape[0], uid]
+    law.actrange = actuators.actuator_actrange[worldid % actuators.actuator_actrange.shape[0], uid]
+    law.forcerange = actuators.actuator_forcerange[worldid % actuators.actuator_forcerange.shape[0], uid]
+    law.lengthrange = actuators.actuator_lengthrange[worldid % actuators.actuator_lengthrange.shape[0], uid]
+    law.acc0 = actuators.actuator_acc0[worldid % actuators.actuator_acc0.shape[0], uid]
+    source = actuators.actuator_ctrladr[uid]
+    if actuators.actuator_ctrlnum[uid] > 0:
+        law.ctrlrange = actuators.actuator_ctrlrange[worldid % actuators.actuator_ctrlrange.shape[0], source]
+        law.clamp_ctrl = int(actuators.actuator_ctrllimited[source] and clampctrl)
+    return law
+
+
+@wp.func
+def is_held(worldid: int, dof: int, actuators: ActuatorSettings, drive_in: Drive) -> bool:
+    """Whether a dof's joint is at its actuator force limit and passes nothing on."""
+    jnt = actuators.dof_jntid[dof]
+    held = bool(False)
+    if actuators.jnt_actfrclimited[jnt]:
+        bounds = actuators.jnt_actfrcrange[worldid % actuators.jnt_actfrcrange.shape[0], jnt]
+        total = drive_in.qfrc_actuator[worldid, dof]
+        held = total <= bounds[0] or total >= bounds[1]
+    return held
+
+
 @wp.struct
 class ActuatorBars:
     """∂Φ/∂(length), and ∂Φ/∂(m·λ, m·v, m·μ, m·â), (W, U)."""
@@ -206,27 +243,11 @@ def pull_actuators(
     go to its tendon. For other transmissions whose moment m turns with q, `rate_bar` keeps ∂Φ/∂(m·λ, m·v, m·μ, m·â).
     """
     worldid, uid = wp.tid()
-    law = ActuatorLaw()
-    law.timestep = opt_timestep[worldid % opt_timestep.shape[0]]
-    law.dyntype = actuators.actuator_dyntype[uid]
-    law.gaintype = actuators.actuator_gaintype[uid]
-    law.biastype = actuators.actuator_biastype[uid]
-    law.early = int(actuators.actuator_actearly[uid])
-    law.clamp_act = int(actuators.actuator_actlimited[uid])
-    law.clamp_force = int(actuators.actuator_forcelimited[uid])
-    law.dynprm = actuators.actuator_dynprm[worldid % actuators.actuator_dynprm.shape[0], uid]
-    law.gainprm = actuators.actuator_gainprm[worldid % actuators.actuator_gainprm.shape[0], uid]
-    law.biasprm = actuators.actuator_biasprm[worldid % actuators.actuator_biasprm.shape[0], uid]
-    law.actrange = actuators.actuator_actrange[worldid % actuators.actuator_actrange.shape[0], uid]
-    law.forcerange = actuators.actuator_forcerange[worldid % actuators.actuator_forcerange.shape[0], uid]
-    law.lengthrange = actuators.actuator_lengthrange[worldid % actuators.actuator_lengthrange.shape[0], uid]
-    law.acc0 = actuators.actuator_acc0[worldid % actuators.actuator_acc0.shape[0], uid]
+    law = actuator_law(worldid, uid, opt_timestep[worldid % opt_timestep.shape[0]], clampctrl, actuators)
     ctrl = float(0.0)
     source = actuators.actuator_ctrladr[uid]
     if actuators.actuator_ctrlnum[uid] > 0:
         ctrl = drive_in.ctrl[worldid, source]
-        law.ctrlrange = actuators.actuator_ctrlrange[worldid % actuators.actuator_ctrlrange.shape[0], source]
-        law.clamp_ctrl = int(actuators.actuator_ctrllimited[source] and clampctrl)
     act = float(0.0)
     act_weight = float(0.0)
     slot = actuators.actuator_actadr[uid] + actuators.actuator_actnum[uid] - 1
@@ -241,14 +262,7 @@ def pull_actuators(
     for k in range(start, end):
         dof = drive_in.moment_colind[worldid, k]
         velocity += drive_in.actuator_moment[worldid, k] * state_in.qvel[worldid, dof]
-        held = bool(False)
-        jnt = actuators.dof_jntid[dof]
-        if actuators.jnt_actfrclimited[jnt]:
-            # A joint at its actuator force limit passes nothing on.
-            bounds = actuators.jnt_actfrcrange[worldid % actuators.jnt_actfrcrange.shape[0], jnt]
-            total = drive_in.qfrc_actuator[worldid, dof]
-            held = total <= bounds[0] or total >= bounds[1]
-        if not held:
+        if not is_held(worldid, dof, actuators, drive_in):
             rate += drive_in.actuator_moment[worldid, k] * multipliers_in.lam[worldid, dof]
 
     law.implicit = 0

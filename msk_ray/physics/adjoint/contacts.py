@@ -224,10 +224,14 @@ def pull_contacts(
 
 
 class ContactForces:
-    """Launches of the contacts' part of ∂Φ, through their rows and through their geometry."""
+    """Launches of the contacts' part of ∂Φ, through their rows and through their geometry.
+
+    Attributes:
+        count: contacts of all worlds that there is room for.
+    """
 
     def __init__(self, work: Workspace, contacts: int) -> None:
-        self._work, self._contacts = work, contacts
+        self._work, self.count = work, contacts
         mjm = work.mjm
         types = {(int(mjm.geom_type[a]), int(mjm.geom_type[b])) for a, b in colliding_pairs(mjm)}
         self._pull_geometry = pull_geometry_kernel(PairKinds.of(mjm, types))
@@ -239,7 +243,7 @@ class ContactForces:
         work, m, d = self._work, self._work.model, at.data
         wp.launch(
             pull_contacts,
-            dim=self._contacts,
+            dim=self.count,
             inputs=[
                 m.opt.timestep,
                 m.opt.disableflags,
@@ -256,7 +260,7 @@ class ContactForces:
         )
         wp.launch(
             self._pull_geometry,
-            dim=self._contacts,
+            dim=self.count,
             inputs=[
                 self._shapes,
                 work.touch_counter.substep,

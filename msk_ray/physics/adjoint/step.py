@@ -40,6 +40,16 @@ class _Stage(Protocol):
         """Launch its kernels at one substep."""
 
 
+class Watcher(Protocol):
+    """What else is launched in a substep's pullback."""
+
+    def launch_first(self, at: Substep, qvel_next: wp.array) -> None:
+        """Launch its kernels while the cotangents are those of the state after the substep."""
+
+    def launch(self, at: Substep) -> None:
+        """Launch its kernels when the multipliers, and the cotangents of contacts and tendons, are there."""
+
+
 class StepAdjoint:
     """Buffers and launches of one substep's pullback for `nworld` worlds.
 
@@ -48,6 +58,7 @@ class StepAdjoint:
     turns the cotangents below from those of the state after the substep into those of the state before.
 
     Attributes:
+        work, integrator, laws, contacts: the stages' buffers and launches that parameters build on.
         grad_qpos: cotangent of qpos in tangent coordinates, shape (W, nv).
         grad_qvel: shape (W, nv).
         grad_act: shape (W, na).
@@ -59,75 +70,86 @@ class StepAdjoint:
     """
 
     def __init__(self, mjm: mujoco.MjModel, model: Any, data: Any) -> None:
-        work = Workspace(mjm, model, data)
+        self.work = work = Workspace(mjm, model, data)
         self.grad_qpos, self.grad_qvel = work.grad_qpos, work.grad_qvel
         self.grad_act, self.grad_ctrl = work.grad_act, work.grad_ctrl
         self.live, self.touch_counter = work.live, work.touch_counter
         self.inertia_address = work.tables.inertia_address
         self.applied: AppliedForces | None = None
-        self._work = work
         with wp.ScopedDevice(work.device):
-            self._integrator = Integrator(work)
-            self._laws = ConstraintLaws(work)
-            self._systems = LinearSystems(work, self._integrator, self._laws)
-            self._bodies = Bodies(work, self._integrator.damping)
+            self.integrator = Integrator(work)
+            self.laws = ConstraintLaws(work)
+            self.contacts = ContactForces(work, data.naconmax)
+            self._systems = LinearSystems(work, self.integrator, self.laws)
+            self._bodies = Bodies(work, self.integrator.damping)
             self._tendons = Tendons(work) if mjm.ntendon else None
-            self._forces = _forces(work, self._laws, data.naconmax)
+            self._forces = _forces(work, self.laws, self.contacts)
 
     def start(self, qpos: wp.array, raw_qpos: wp.array) -> None:
         """Launch the change of a raw cotangent (W, nq) at `qpos` to tangent coordinates, and find the live worlds.
 
         The cotangents of qvel and act must be in place.
         """
-        self._integrator.start(qpos, raw_qpos)
+        self.integrator.start(qpos, raw_qpos)
         self.touch_counter.start()
 
     def cover_applied(self) -> AppliedForces:
         """Allocate the gradients of applied forces, if they are not yet there."""
         if self.applied is None:
-            with wp.ScopedDevice(self._work.device):
-                self.applied = AppliedForces(self._work)
+            with wp.ScopedDevice(self.work.device):
+                self.applied = AppliedForces(self.work)
         return self.applied
 
     def finish(self, qpos: wp.array, raw_qpos: wp.array) -> None:
         """Launch the change of the tangent gradient at `qpos` to raw coordinates (W, nq)."""
-        self._integrator.finish(qpos, raw_qpos)
+        self.integrator.finish(qpos, raw_qpos)
 
     def clip(self, bound: float, clipped: wp.array) -> None:
         """Launch the bound on each world's state cotangent; `clipped` (W,) counts where it acted."""
-        self._integrator.clip(bound, clipped)
+        self.integrator.clip(bound, clipped)
 
-    def pull_back(self, data: Any, qvel_next: wp.array, applied: AppliedForces | None = None) -> None:
+    def pull_back(
+        self,
+        data: Any,
+        qvel_next: wp.array,
+        applied: AppliedForces | None = None,
+        parameters: Watcher | None = None,
+    ) -> None:
         """Launch the pullback of one substep.
 
         Args:
             data: the stages of the state before it.
             qvel_next: the velocity after it, (W, nv).
             applied: gradients of applied forces, for a step that has some.
+            parameters: gradients of parameters of the model, if some are wanted.
         """
         self.touch_counter.substep += 1
         at = Substep(data)
-        self._integrator.launch(at, qvel_next)
-        self._laws.launch(at)
+        if parameters is not None:
+            parameters.launch_first(at, qvel_next)
+        self.integrator.launch(at, qvel_next)
+        self.laws.launch(at)
         self._systems.launch(at)
         self._bodies.launch_fields(at)
         if self._tendons is not None:
             self._tendons.launch_start(at)
         for stage in self._forces if applied is None else (*self._forces, applied):
             stage.launch(at)
+        if parameters is not None:
+            parameters.launch(at)
         if self._tendons is not None:
             self._tendons.launch_pullback(at)
         self._bodies.launch_sweep(at)
 
 
-def _forces(work: Workspace, laws: ConstraintLaws, contacts: int) -> list[_Stage]:
+def _forces(work: Workspace, laws: ConstraintLaws, contacts: ContactForces) -> list[_Stage]:
     """The stages that a model needs, in their order."""
     stages: list[_Stage] = []
     if np.any(np.isin(work.mjm.eq_type, _ANCHORED)):
         stages.append(AnchorRows(work))
     if work.tables.has_scalar_rows:
         stages.append(ScalarRows(work, laws))
-    stages.append(ContactForces(work, contacts))
+    stages.append(contacts)
     if work.settings.actuation:
         actuators = ActuatorForces(work)
         stages += [actuators, TurningTransmissions(work, actuators.bars)]

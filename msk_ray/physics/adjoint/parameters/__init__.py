@@ -1,0 +1,51 @@
+"""Gradients of a substep by parameters of the model: one file a family, launched only if one of it is asked for."""
+
+from collections.abc import Iterable
+
+import warp as wp
+
+from msk_ray.physics.adjoint.groups import Substep
+from msk_ray.physics.adjoint.parameters.actuators import ActuatorStage
+from msk_ray.physics.adjoint.parameters.base import GradientBuffer, ParameterStage, Parts
+from msk_ray.physics.adjoint.parameters.contacts import MaterialStage
+from msk_ray.physics.adjoint.parameters.inertia import InertiaStage
+from msk_ray.physics.adjoint.parameters.joints import JointStage
+from msk_ray.physics.adjoint.step import StepAdjoint
+from msk_ray.physics.parameters import PARAMETERS
+
+STAGES: tuple[type[ParameterStage], ...] = (InertiaStage, JointStage, MaterialStage, ActuatorStage)
+"""The families, in the order in which they are launched."""
+
+
+class ParameterAdjoint:
+    """Buffers and launches of the gradients of some parameters, beside a `StepAdjoint`.
+
+    Attributes:
+        gradients: by name, of every substep since `start` together, one row per world, in the shape of the model's
+            array; that of a quaternion in raw coordinates.
+    """
+
+    def __init__(self, adjoint: StepAdjoint, names: Iterable[str]) -> None:
+        work = adjoint.work
+        fields = {name: PARAMETERS[name].field for name in names}
+        chosen = [stage for stage in STAGES if not set(fields.values()).isdisjoint(stage.kind.vars)]
+        with wp.ScopedDevice(work.device):
+            self._buffer = GradientBuffer([stage.kind for stage in chosen], work.model, work.nworld)
+            parts = Parts(work, adjoint.integrator, adjoint.laws, adjoint.contacts, self._buffer.timestep)
+            self._stages = [stage(parts, self._buffer.groups[stage.kind]) for stage in chosen]
+        found = {name: getattr(group, name) for kind, group in self._buffer.groups.items() for name in kind.vars}
+        self.gradients: dict[str, wp.array] = {name: found[field] for name, field in fields.items()}
+
+    def start(self) -> None:
+        """Launch the start of an env step's pullback."""
+        self._buffer.clear()
+
+    def launch_first(self, at: Substep, qvel_next: wp.array) -> None:
+        """Launch what comes before the pullback of a substep."""
+        for stage in self._stages:
+            stage.launch_first(at, qvel_next)
+
+    def launch(self, at: Substep) -> None:
+        """Launch what one substep adds, when its cotangents are there."""
+        for stage in self._stages:
+            stage.launch(at)

@@ -1,0 +1,134 @@
+"""Fields of a model whose values a step may take as arguments: one value for all worlds, or one per world.
+
+mujoco_warp reads such a field as `[worldid % shape[0]]`, so an array with a row per world is legal, if it is there
+before launches are recorded. A field is named as in MjModel.
+"""
+
+import copy
+import difflib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from operator import attrgetter
+from typing import Any
+
+import mujoco
+import numpy as np
+import warp as wp
+
+from msk_ray.errors import ConfigError, UnsupportedModelError
+
+_OBJ = mujoco.mjtObj
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One field of MjModel."""
+
+    name: str
+    """As in MjModel: body_mass, opt.gravity."""
+    quaternion: bool = False
+    """Whether its elements are unit quaternions, which are differentiated along rotations in the local frame."""
+    in_use: float | None = None
+    """Value that makes an element count as present where a zero means that it is absent."""
+
+    @property
+    def field(self) -> str:
+        """Name without its section."""
+        return self.name.rpartition(".")[2]
+
+    @property
+    def section(self) -> str:
+        """`opt`, or nothing."""
+        return self.name.rpartition(".")[0]
+
+    def value(self, mjm: mujoco.MjModel) -> np.ndarray:
+        """The field of a model, float64, in MjModel's shape; that of actuators (nu, ...)."""
+        return np.asarray(attrgetter(self.name)(mjm), dtype=np.float64)
+
+    def array(self, model: Any) -> wp.array:
+        """The array of a mujoco_warp.Model."""
+        return attrgetter(self.name)(model)
+
+
+PARAMETERS: dict[str, Parameter] = {
+    p.name: p
+    for p in (
+        *(Parameter(n) for n in ("body_mass", "body_inertia", "body_ipos")),
+        Parameter("body_iquat", quaternion=True),
+        Parameter("opt.gravity"),
+        *(Parameter(n) for n in ("dof_damping", "dof_armature")),
+        Parameter("jnt_stiffness", in_use=1.0),
+        Parameter("qpos_spring"),
+        *(Parameter(n) for n in ("geom_friction", "geom_solref", "geom_solimp")),
+        *(Parameter(n) for n in ("pair_friction", "pair_solref", "pair_solreffriction", "pair_solimp")),
+        *(Parameter(n) for n in ("actuator_gear", "actuator_gainprm", "actuator_biasprm", "actuator_dynprm")),
+    )
+}
+"""Every field that can be a parameter."""
+
+
+def names_of(mjm: mujoco.MjModel) -> list[str]:
+    """Names of the parameters that a model has, except those that it cannot vary."""
+    return [name for name, p in PARAMETERS.items() if p.value(mjm).size and not _obstacle(mjm, name)]
+
+
+def check_names(mjm: mujoco.MjModel, names: Iterable[str]) -> None:
+    """Raise unless every name is a parameter of the model that can be varied.
+
+    Raises:
+        ConfigError: no such parameter, or the model has none of it.
+        UnsupportedModelError: the model uses something with which the parameter cannot be varied.
+    """
+    for name in names:
+        parameter = PARAMETERS.get(name)
+        if parameter is None:
+            near = difflib.get_close_matches(name, PARAMETERS, 1, cutoff=0.5)
+            hint = f"did you mean {near[0]}?" if near else f"write one of {', '.join(PARAMETERS)}"
+            raise ConfigError(f"no parameter {name!r}: {hint}")
+        if not parameter.value(mjm).size:
+            raise ConfigError(f"the model has no {name} that could be a parameter")
+        obstacle = _obstacle(mjm, name)
+        if obstacle:
+            raise UnsupportedModelError(f"parameter {name} is not supported: {obstacle}")
+
+
+def _obstacle(mjm: mujoco.MjModel, name: str) -> str:
+    """Why a parameter cannot be varied in a model, and what to write instead; empty if it can."""
+    if name in ("body_ipos", "body_iquat"):
+        # MuJoCo stores the inertia of such a body's dofs as a diagonal.
+        simple = [int(b) for b in np.flatnonzero(mjm.body_simple) if mjm.body_dofnum[b]]
+        if simple:
+            word = mujoco.mj_id2name(mjm, _OBJ.mjOBJ_BODY, simple[0]) or simple[0]
+            return (
+                f"the inertia of body {word} has no room for terms off its diagonal; shift its <inertial pos> by a "
+                "micrometre from the body's origin"
+            )
+    return ""
+
+
+def structure(mjm: mujoco.MjModel, names: Iterable[str]) -> mujoco.MjModel:
+    """The model with everything present that the named parameters may switch on: springs, friction loss.
+
+    mujoco_warp and the adjoint leave out what a model does not use, and decide it from this one.
+    """
+    used = [PARAMETERS[name] for name in names if PARAMETERS[name].in_use is not None]
+    if not used:
+        return mjm
+    out = copy.copy(mjm)
+    for parameter in used:
+        values = attrgetter(parameter.name)(out)
+        values[values == 0.0] = parameter.in_use
+    return out
+
+
+def open_arrays(mjm: mujoco.MjModel, model: Any, names: Iterable[str], nworld: int) -> None:
+    """Give the named arrays of a mujoco_warp.Model one row per world, with the values of `mjm`."""
+    for name in names:
+        parameter = PARAMETERS[name]
+        old = parameter.array(model)
+        nominal = parameter.value(mjm).astype(np.float32)
+        rows = np.broadcast_to(nominal, (nworld, *nominal.shape)).copy()
+        holder = attrgetter(parameter.section)(model) if parameter.section else model
+        new = wp.array(rows, dtype=old.dtype)
+        assert new.shape == (nworld, *old.shape[1:]), name
+        setattr(holder, parameter.field, new)

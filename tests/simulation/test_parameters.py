@@ -1,0 +1,203 @@
+"""Fields of the model as arguments of a step: one value for all worlds or one per world, with their gradients."""
+
+import copy
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from oracle import relative
+from scenes import ant, cartpole
+from test_adjoint_features import SCENES
+
+from msk_ray.errors import ConfigError, UnsupportedModelError
+from msk_ray.gradcheck import Oracle, check_gradients, make_states
+from msk_ray.gradcheck.pullback import simulated_gradients
+from msk_ray.physics.parameters import PARAMETERS, names_of
+from msk_ray.simulation import Simulation
+
+WORLDS = 3
+
+
+def nominal(model: mujoco.MjModel, name: str) -> torch.Tensor:
+    return torch.as_tensor(PARAMETERS[name].value(model), dtype=torch.float32)
+
+
+def inputs(points) -> list[torch.Tensor]:
+    return [
+        torch.as_tensor(np.stack([getattr(p, n) for p in points]), dtype=torch.float32)
+        for n in ("ctrl", "qpos", "qvel", "act")
+    ]
+
+
+@pytest.fixture(scope="module")
+def model() -> mujoco.MjModel:
+    """An ant whose geoms have frictions of their own: which of two equal ones counts is not differentiable."""
+    out = ant("elliptic")
+    out.geom_friction *= np.linspace(1.0, 1.3, out.ngeom)[:, None]
+    return out
+
+
+@pytest.mark.parametrize(("cone", "substeps"), [("pyramidal", 1), ("elliptic", 16)])
+def test_all_parameters_of_an_ant_in_contact(model, cone, substeps):
+    model = copy.copy(model)
+    model.opt.cone = int(getattr(mujoco.mjtCone, f"mjCONE_{cone.upper()}"))
+    sim = Simulation(model, WORLDS, substeps, tolerance=1e-12)
+    result = check_gradients(sim, states=("contact",), parameters=names_of(model))
+    assert result.checked >= 2
+    for name in names_of(model):
+        errors = [r.rel_error for r in result.of(name)]
+        assert len(errors) >= result.checked - 1, name
+        assert np.median(errors) < (1e-5 if substeps == 1 else 1e-4), name
+        assert max(errors) < 1e-3, name
+
+
+_FEATURES = {
+    "springs": ("springs", ["jnt_stiffness", "qpos_spring", "dof_damping"]),
+    "ball_spring": ("ball_spring", ["jnt_stiffness", "qpos_spring", "body_iquat"]),
+    "gravcomp": ("gravcomp", ["body_mass", "body_ipos", "opt.gravity"]),
+    "servos": ("position", ["actuator_gear", "actuator_gainprm", "actuator_biasprm"]),
+    "muscle": ("muscle", ["actuator_gainprm", "actuator_biasprm", "actuator_dynprm", "actuator_gear"]),
+    "tendon_servo": ("fast_site_tendon", ["actuator_gear", "actuator_gainprm", "actuator_biasprm", "dof_damping"]),
+}
+
+
+@pytest.mark.parametrize("name", _FEATURES)
+def test_parameters_of_a_feature(name):
+    scene, names = _FEATURES[name]
+    model = SCENES[scene]()
+    result = check_gradients(Simulation(model, 4, 2, tolerance=1e-12), states=("random",), parameters=names)
+    assert result.checked >= 3
+    for parameter in names:
+        errors = [r.rel_error for r in result.of(parameter)]
+        assert errors, parameter
+        assert max(errors) < 1e-4, parameter
+
+
+def test_the_page_names_every_parameter(root):
+    page = (root / "docs" / "parameters.md").read_text()
+    table = [line for line in page.splitlines() if line.startswith("| `")]
+    named = {name.strip(" `") for line in table for name in line.split("|")[1].split(",")}
+    assert named == set(PARAMETERS)
+
+
+def test_each_world_has_its_own_values_and_gradients(model):
+    rng = np.random.default_rng(3)
+    names = ["body_mass", "geom_friction", "actuator_gear", "opt.gravity"]
+    points = make_states(model, "contact", WORLDS, 1)
+    factors = {n: 1.0 + 0.2 * rng.random((WORLDS, *nominal(model, n).shape)) for n in names}
+    values = {n: (nominal(model, n) * torch.as_tensor(f, dtype=torch.float32)) for n, f in factors.items()}
+    for value in values.values():
+        value.requires_grad_()
+    sim = Simulation(model, WORLDS, 2, tolerance=1e-12)
+    weights = rng.standard_normal((WORLDS, model.nv)).astype(np.float32)
+    end = sim.step(*inputs(points), parameters=values)
+    (end.qvel * torch.as_tensor(weights)).sum().backward()
+    for world, point in enumerate(points):
+        edited = copy.copy(model)
+        for name in names:
+            row = values[name][world].detach().numpy().astype(float)
+            PARAMETERS[name].value(edited)[...] = row
+        oracle = Oracle(edited, 2, names)
+        line = oracle.linearize(point)
+        assert relative(end.qvel[world].detach().numpy(), line.end.qvel) < 1e-4
+        cotangent = np.concatenate((np.zeros(model.nv), weights[world], np.zeros(model.na)))
+        for name in set(names) - line.kinks(1e-3, 1e-2):
+            found = values[name].grad[world].numpy().ravel()
+            assert relative(found, line.pull_back(cotangent)[name]) < 1e-4, (world, name)
+    # The values of a step do not stay: the next one without them has the model's own.
+    plain = Simulation(model, WORLDS, 2, tolerance=1e-12).step(*inputs(points))
+    assert torch.equal(sim.step(*inputs(points)).qvel, plain.qvel)
+
+
+def test_one_value_for_all_worlds_gets_the_sum(model):
+    points = make_states(model, "contact", WORLDS, 1)
+    grads = []
+    for rows in ((), (WORLDS,)):
+        mass = nominal(model, "body_mass").expand(*rows, -1).clone().requires_grad_()
+        sim = Simulation(model, WORLDS, 2)
+        first = sim.step(*inputs(points), parameters={"body_mass": mass})
+        # A second step at other values, whose gradient is taken first, must not disturb the first.
+        second = sim.step(inputs(points)[0], *first, parameters={"body_mass": 1.5 * mass})
+        second.qvel.sum().backward()
+        grads.append(mass.grad)
+    assert grads[0].shape == (model.nbody,)
+    torch.testing.assert_close(grads[1].sum(0), grads[0], rtol=1e-4, atol=1e-5)
+
+
+def test_both_tapes_agree(model):
+    points = make_states(model, "contact", WORLDS, 1)
+    cotangents = np.random.default_rng(0).standard_normal((WORLDS, 2 * model.nv))
+    names = names_of(model)
+    found = []
+    for mode in ("tape_per_substep", "tape_all"):
+        sim = Simulation(model, WORLDS, 2, mode)
+        found.append(simulated_gradients(sim, points, cotangents, names)[1])
+    for name in names:
+        assert relative(found[0][name], found[1][name]) < 1e-5, name
+
+
+def test_a_world_that_diverged_gets_exactly_zero_if_nothing_flows_back(model):
+    ctrl, qpos, qvel, act = inputs(make_states(model, "contact", WORLDS, 1))
+    qvel[0] = torch.nan
+    mass = nominal(model, "body_mass").expand(WORLDS, -1).clone().requires_grad_()
+    end = Simulation(model, WORLDS, 2).step(ctrl, qpos, qvel, act, parameters={"body_mass": mass})
+    end.qvel[1:].sum().backward()
+    assert torch.all(mass.grad[0] == 0.0)
+    assert torch.all(mass.grad[1:, 1] != 0.0)
+
+
+def test_a_step_without_parameters_launches_what_it_did_before(model):
+    """Parameters that need no gradient, such as random ones in training, add nothing to the pullback."""
+    sim = Simulation(model, WORLDS, 2)
+    ctrl, *state = inputs(make_states(model, "contact", WORLDS, 1))
+    ctrl.requires_grad_()
+    friction = nominal(model, "geom_friction")
+    for parameters in (None, {"geom_friction": friction}):
+        sim.step(ctrl, *state, parameters=parameters).qvel.sum().backward()
+    assert list(sim.backward._parameters) == []
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"body_mas": torch.ones(3)}, "did you mean body_mass"),
+        ({"light": torch.ones(3)}, "write one of body_mass"),
+        ({"pair_friction": torch.ones(0, 5)}, "the model has no pair_friction"),
+        ({"body_mass": torch.ones(4)}, r"shape \(4,\), but this model takes \(3,\)"),
+        ({"body_mass": torch.ones(3).double()}, "float64"),
+    ],
+)
+def test_wrong_values_are_refused(values, message):
+    sim = Simulation(cartpole(), 2, 1)
+    with pytest.raises(ConfigError, match=message):
+        sim.step(torch.zeros(2, 1), *sim.initial_state(), parameters=values)
+
+
+def test_a_mode_without_gradients_of_parameters_says_so():
+    sim = Simulation(cartpole(), 2, 1, "fd_jacobian")
+    mass = torch.ones(3, requires_grad=True)
+    with pytest.raises(UnsupportedModelError, match=r"fd_jacobian has no gradients of parameters \(body_mass\)"):
+        sim.step(torch.zeros(2, 1), *sim.initial_state(), parameters={"body_mass": mass})
+
+
+def test_finite_differences_follow_the_values_of_each_world():
+    start = Simulation(cartpole(), 2, 1).initial_state()
+    gears = torch.zeros(2, 1, 6)
+    gears[:, 0, 0] = torch.tensor([50.0, 150.0])
+    ctrl = torch.full((2, 1), 0.1, requires_grad=True)
+    sim = Simulation(cartpole(), 2, 1, "fd_jacobian")
+    sim.step(ctrl, *start, parameters={"actuator_gear": gears}).qvel.sum().backward()
+    assert ctrl.grad[1] / ctrl.grad[0] == pytest.approx(3.0, rel=1e-3)
+
+
+def test_a_centre_of_mass_that_the_inertia_matrix_cannot_follow_is_refused():
+    lone = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body name="ball"><freejoint/><geom size=".1"/></body></worldbody></mujoco>'
+    )
+    sim = Simulation(lone, 1, 1)
+    with pytest.raises(UnsupportedModelError, match=r"body_ipos is not supported: the inertia of body ball"):
+        sim.open_parameters(["body_ipos"])
+    assert "body_ipos" not in names_of(lone)
+    result = check_gradients(sim, states=("random",), parameters=["body_mass", "body_inertia"])
+    assert result.max_rel_error < 1e-3
