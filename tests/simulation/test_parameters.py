@@ -201,3 +201,39 @@ def test_a_centre_of_mass_that_the_inertia_matrix_cannot_follow_is_refused():
     assert "body_ipos" not in names_of(lone)
     result = check_gradients(sim, states=("random",), parameters=["body_mass", "body_inertia"])
     assert result.max_rel_error < 1e-3
+
+
+def test_forces_from_outside_act_at_the_centre_of_mass_that_is_given(model):
+    """`body_ipos` moves the point at which `xfrc_applied` acts; by differences, as C MuJoCo's step has no such input."""
+    points = make_states(model, "contact", WORLDS, 1)
+    push = torch.as_tensor(np.random.default_rng(4).normal(size=(WORLDS, model.nbody, 6)), dtype=torch.float32)
+    push[:, 0] = 0.0
+    sim = Simulation(model, WORLDS, 1, tolerance=1e-12)
+    ipos = nominal(model, "body_ipos").requires_grad_()
+    qvel = {}
+    for scale in (0.0, 20.0):
+        end = sim.step(*inputs(points), xfrc_applied=scale * push, parameters={"body_ipos": ipos})
+        (gradient,) = torch.autograd.grad(end.qvel[:, :6].sum(), ipos)
+        qvel[scale] = gradient
+        moved = ipos.detach().clone()
+        change = []
+        for sign in (1.0, -1.0):
+            moved[3, 1] = ipos[3, 1].detach() + sign * 1e-2
+            end = sim.step(*inputs(points), xfrc_applied=scale * push, parameters={"body_ipos": moved})
+            change.append(end.qvel[:, :6].sum().item())
+        assert (change[0] - change[1]) / 2e-2 == pytest.approx(gradient[3, 1].item(), rel=2e-2)
+    assert abs(qvel[20.0][3, 1] - qvel[0.0][3, 1]) > 0.1 * abs(qvel[0.0][3, 1])
+
+
+def test_jacobians_are_those_at_the_values_given(model):
+    """`linearize` runs rows as further worlds, each with the values of its own world."""
+    points = make_states(model, "contact", WORLDS, 1)
+    values = {"body_mass": nominal(model, "body_mass") * torch.tensor([[0.8], [1.0], [1.3]])}
+    sim = Simulation(model, WORLDS, 2)
+    found = sim.linearize(*inputs(points), parameters=values)
+    for world in range(WORLDS):
+        alone = Simulation(model, 1, 2).linearize(
+            *(value[world : world + 1] for value in inputs(points)),
+            parameters={"body_mass": values["body_mass"][world]},
+        )
+        torch.testing.assert_close(found.A[world], alone.A[0], rtol=1e-3, atol=1e-3)
