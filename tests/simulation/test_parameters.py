@@ -48,7 +48,7 @@ def test_all_parameters_of_an_ant_in_contact(model, cone, substeps):
     for name in names_of(model):
         errors = [r.rel_error for r in result.of(name)]
         assert len(errors) >= result.checked - 1, name
-        assert np.median(errors) < (1e-5 if substeps == 1 else 1e-4), name
+        assert np.median(errors) < (2e-5 if substeps == 1 else 1e-4), name
         assert max(errors) < 1e-3, name
 
 
@@ -204,7 +204,7 @@ def test_a_centre_of_mass_that_the_inertia_matrix_cannot_follow_is_refused():
 
 
 def test_forces_from_outside_act_at_the_centre_of_mass_that_is_given(model):
-    """`body_ipos` moves the point at which `xfrc_applied` acts; by differences, as C MuJoCo's step has no such input."""
+    """`body_ipos` moves the point at which `xfrc_applied` acts; against differences of the step itself."""
     points = make_states(model, "contact", WORLDS, 1)
     push = torch.as_tensor(np.random.default_rng(4).normal(size=(WORLDS, model.nbody, 6)), dtype=torch.float32)
     push[:, 0] = 0.0

@@ -7,7 +7,7 @@ from the kernel: Warp drops the derivative of a function that another kernel of 
 import warp as wp
 
 from msk_ray.physics.adjoint.rows import vec6
-from msk_ray.physics.mjw_private import contact_kbimp, vec5
+from msk_ray.physics.mjw_private import contact_kbimp, vec5, vec10
 
 wp.set_module_options({"enable_backward": False})
 
@@ -19,6 +19,8 @@ class ContactMotion:
     lam: vec6
     acc: vec6
     vel: vec6
+    offset: vec10
+    """What the adjoint's own J a - aref of each row is beyond that of these rates: their rounding."""
     pos: wp.float32
     """dist - margin."""
     weight: wp.float32
@@ -44,10 +46,11 @@ def edge_score(
     mass: wp.float32,
     lean: wp.float32,
     k: wp.int32,
+    row: wp.int32,
 ) -> wp.float32:
     """One row of a pyramid, ρ = ρ₀ + lean ρ_k, or with k = 0 that of a frictionless contact."""
     lam = motion.lam[0]
-    jar = motion.acc[0] + damping * motion.vel[0] + stiffness * motion.pos
+    jar = motion.acc[0] + damping * motion.vel[0] + stiffness * motion.pos + motion.offset[row]
     if k > 0:
         lam += lean * motion.lam[k]
         jar += lean * (motion.acc[k] + damping * motion.vel[k])
@@ -68,14 +71,14 @@ def cone_score(
 ) -> wp.float32:
     """All rows of an elliptic contact; zones and laws as in `rows.cone_law`."""
     mu = friction[0] * motion.impratio_invsqrt
-    normal = motion.acc[0] + damping * motion.vel[0] + stiffness * motion.pos
+    normal = motion.acc[0] + damping * motion.vel[0] + stiffness * motion.pos + motion.offset[0]
     square = wp.float32(0.0)
     across = wp.float32(0.0)
     stuck = wp.float32(0.0)
     for i in range(1, 6):
         if i < motion.dim:
             phi = friction[i - 1]
-            jar = motion.acc[i] + side_damping * motion.vel[i]
+            jar = motion.acc[i] + side_damping * motion.vel[i] + motion.offset[i]
             square += phi * phi * jar * jar
             across += motion.lam[i] * phi * phi * jar
             # D_i = D₀ (φᵢ / μ)²
@@ -115,11 +118,11 @@ def contact_score(
             side_damping = side[1]
         score = cone_score(motion, friction, stiffness, kbi[1], side_damping, mass)
     elif motion.dim == 1:
-        score = edge_score(motion, stiffness, kbi[1], mass, 0.0, 0)
+        score = edge_score(motion, stiffness, kbi[1], mass, 0.0, 0, 0)
     else:
         share = mass / pyramid_weight(friction[0])
         for k in range(1, 6):
             if k < motion.dim:
-                score += edge_score(motion, stiffness, kbi[1], share, friction[k - 1], k)
-                score += edge_score(motion, stiffness, kbi[1], share, -friction[k - 1], k)
+                score += edge_score(motion, stiffness, kbi[1], share, friction[k - 1], k, 2 * k - 2)
+                score += edge_score(motion, stiffness, kbi[1], share, -friction[k - 1], k, 2 * k - 1)
     return score

@@ -176,7 +176,21 @@ def pull_materials(
     solref = contacts_in.solref[con]
     solimp = contacts_in.solimp[con]
     timestep = opt_timestep[worldid % opt_timestep.shape[0]]
-    imp = contact_kbimp(opt_disableflags, timestep, solref, solimp, motion.pos, False)[2]
+    kbi = contact_kbimp(opt_disableflags, timestep, solref, solimp, motion.pos, False)
+    imp = kbi[2]
+    side_damping = kbi[1]
+    sideways = contacts_in.solreffriction[con]
+    if sideways[0] != 0.0 or sideways[1] != 0.0:
+        side_damping = contact_kbimp(opt_disableflags, timestep, sideways, solimp, motion.pos, False)[1]
+    normal = motion.acc[0] + kbi[1] * motion.vel[0] + kbi[0] * imp * motion.pos
+    for i in range(count):
+        jar = normal
+        if motion.elliptic == 1 and i > 0:
+            jar = motion.acc[i] + side_damping * motion.vel[i]
+        elif motion.elliptic == 0 and motion.dim > 1:
+            k = i / 2 + 1
+            jar += friction[k - 1] * wp.where(i % 2 == 0, 1.0, -1.0) * (motion.acc[k] + kbi[1] * motion.vel[k])
+        motion.offset[i] = laws_in.jar[worldid, first + i] - jar
     motion.weight = imp / ((1.0 - imp) * rows_in.D[worldid, first])
     if motion.elliptic == 0 and motion.dim > 1:
         motion.weight = motion.weight / pyramid_weight(friction[0])
