@@ -94,6 +94,8 @@ def check_names(mjm: mujoco.MjModel, names: Iterable[str]) -> None:
 
 def _obstacle(mjm: mujoco.MjModel, name: str) -> str:
     """Why a parameter cannot be varied in a model, and what to write instead; empty if it can."""
+    if name in ("body_mass", "body_inertia", "body_ipos", "body_iquat") and (mjm.opt.density or mjm.opt.viscosity):
+        return "the drag of a fluid follows the inertia too; set density and viscosity to zero"
     if name in ("body_ipos", "body_iquat"):
         # MuJoCo stores the inertia of such a body's dofs as a diagonal.
         simple = [int(b) for b in np.flatnonzero(mjm.body_simple) if mjm.body_dofnum[b]]

@@ -199,6 +199,10 @@ def test_a_centre_of_mass_that_the_inertia_matrix_cannot_follow_is_refused():
     with pytest.raises(UnsupportedModelError, match=r"body_ipos is not supported: the inertia of body ball"):
         sim.open_parameters(["body_ipos"])
     assert "body_ipos" not in names_of(lone)
+    wet = copy.copy(lone)
+    wet.opt.density = 1.2
+    with pytest.raises(UnsupportedModelError, match="body_mass is not supported: the drag of a fluid"):
+        Simulation(wet, 1, 1).open_parameters(["body_mass"])
     result = check_gradients(sim, states=("random",), parameters=["body_mass", "body_inertia"])
     assert result.max_rel_error < 1e-3
 
