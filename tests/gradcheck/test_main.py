@@ -36,8 +36,8 @@ class NanSlope(TapePerSubstep):
 _ADVANCE = Simulation.advance
 
 
-def _nan_velocity(sim, ctrl, start):
-    end = _ADVANCE(sim, ctrl, start)
+def _nan_velocity(sim, ctrl, start, *rest, **named):
+    end = _ADVANCE(sim, ctrl, start, *rest, **named)
     end.qvel[1, 1] = float("nan")
     return end
 
@@ -204,3 +204,11 @@ def test_help_has_examples(capsys):
     out = capsys.readouterr().out
     assert "examples:" in out
     assert "--substeps 16" in out
+
+
+def test_parameters_are_compared_too(cartpole_file, capsys):
+    assert run(main, [str(cartpole_file), *FAST, "--parameters", "body_mass, actuator_gear"]) == 0
+    rows = [line for line in capsys.readouterr().out.splitlines() if "random" in line]
+    assert all(any(name in row for row in rows) for name in ("body_mass", "actuator_gear"))
+    assert run(main, [str(cartpole_file), *FAST, "--parameters", "bodymass"]) == 2
+    assert "did you mean body_mass?" in capsys.readouterr().err
