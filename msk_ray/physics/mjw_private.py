@@ -15,11 +15,13 @@ from mujoco_warp._src.collision_primitive_core import (
 )
 from mujoco_warp._src.constraint import _contact_kbimp as contact_kbimp
 from mujoco_warp._src.math import (
+    deriv_expmap,
     inert_vec,
     lu_factor_6x6,
     lu_solve_6x6,
     make_frame,
     motion_cross_force,
+    quat_integrate,
     quat_sub,
     quat_to_mat,
     quat_to_vel,
@@ -45,6 +47,7 @@ __all__ = [
     "WrapType",
     "capsule_capsule",
     "contact_kbimp",
+    "deriv_expmap",
     "dof_damping_total",
     "inert_vec",
     "lu_factor_6x6",
@@ -60,6 +63,7 @@ __all__ = [
     "plane_sphere",
     "poly_force",
     "poly_force_deriv",
+    "quat_integrate",
     "quat_sub",
     "quat_to_mat",
     "quat_to_vel",

@@ -94,8 +94,11 @@ def check_names(mjm: mujoco.MjModel, names: Iterable[str]) -> None:
 
 def _obstacle(mjm: mujoco.MjModel, name: str) -> str:
     """Why a parameter cannot be varied in a model, and what to write instead; empty if it can."""
-    if name in ("body_mass", "body_inertia", "body_ipos", "body_iquat") and (mjm.opt.density or mjm.opt.viscosity):
+    inertial = name in ("body_mass", "body_inertia", "body_ipos", "body_iquat")
+    if inertial and (mjm.opt.density or mjm.opt.viscosity):
         return "the drag of a fluid follows the inertia too; set density and viscosity to zero"
+    if inertial and mjm.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST and _has_lone_free_body(mjm):
+        return "implicitfast takes gyroscopic forces of free bodies into its matrix; write integrator='Euler'"
     if name in ("body_ipos", "body_iquat"):
         # MuJoCo stores the inertia of such a body's dofs as a diagonal.
         simple = [int(b) for b in np.flatnonzero(mjm.body_simple) if mjm.body_dofnum[b]]
@@ -106,6 +109,12 @@ def _obstacle(mjm: mujoco.MjModel, name: str) -> str:
                 "micrometre from the body's origin"
             )
     return ""
+
+
+def _has_lone_free_body(mjm: mujoco.MjModel) -> bool:
+    """Whether a free body has a tree of its own six dofs."""
+    free = mjm.jnt_dofadr[mjm.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)]
+    return bool(np.any(mjm.tree_dofnum[mjm.dof_treeid[free]] == 6))
 
 
 def structure(mjm: mujoco.MjModel, names: Iterable[str]) -> mujoco.MjModel:

@@ -7,7 +7,7 @@ import warp as wp
 from msk_ray.physics.adjoint import StepAdjoint
 from msk_ray.physics.adjoint.coverage import check_supported
 from msk_ray.physics.adjoint.integrate import add_into
-from msk_ray.physics.adjoint.stages import recompute_stages
+from msk_ray.physics.adjoint.recomputed import recomputed
 from msk_ray.physics.batch import WorldBatch
 
 
@@ -48,6 +48,7 @@ class TapedStep:
         self._batch = batch
         with wp.ScopedDevice(batch.device):
             self._adjoint = StepAdjoint(batch.mjm, batch.model, batch.data)
+            self._substep = recomputed(self._adjoint)
             self._raw = wp.zeros((batch.nworld, batch.mjm.nq), dtype=float)
 
     def __call__(self, ctrl: wp.array, state: WarpState, tape: wp.Tape | None = None) -> WarpState:
@@ -92,8 +93,7 @@ class TapedStep:
             for saved in reversed(kept):
                 for name, array in saved.items():
                     wp.copy(getattr(data, name), array)
-                recompute_stages(batch.mjm, batch.model, data)
-                adjoint.pull_back(data, qvel_next)
+                self._substep.pull_back(data, qvel_next)
                 qvel_next = saved["qvel"]
             adjoint.finish(kept[0]["qpos"], self._raw)
             found = (adjoint.grad_ctrl, self._raw, adjoint.grad_qvel, adjoint.grad_act)

@@ -10,16 +10,18 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Any
 
+import mujoco
 import torch
 import warp as wp
 from torch import Tensor
 
+from msk_ray.errors import UnsupportedModelError
 from msk_ray.physics import Graph, WorldBatch
 from msk_ray.physics.adjoint import StepAdjoint
 from msk_ray.physics.adjoint.coverage import check_supported
 from msk_ray.physics.adjoint.parameters import ParameterAdjoint
+from msk_ray.physics.adjoint.recomputed import recomputed
 from msk_ray.physics.adjoint.residual import ResidualGauge
-from msk_ray.physics.adjoint.stages import recompute_stages
 from msk_ray.simulation.backward import INPUTS, Applied, Backward, InputGradients, Needs, StepState
 from msk_ray.simulation.buffers import applied_of, device_of, stream_of
 from msk_ray.simulation.jacobian import rows_of, state_size, unit_cotangents
@@ -41,6 +43,11 @@ _KEPT_CONTACT = (
     *("dist", "pos", "frame", "includemargin", "friction", "solref", "solreffriction", "solimp", "dim", "geom"),
     *("efc_address", "worldid", "geomcollisionid"),
 )
+
+
+def _solved(data: Any, mjm: mujoco.MjModel) -> wp.array:
+    """The acceleration that the arrays of `data` belong to; after RK4, those of the last stage."""
+    return data.qacc_warmstart if mjm.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else data.qacc
 
 
 class _Tape(Backward):
@@ -98,8 +105,8 @@ class _Tape(Backward):
         """Claim further arrays in the buffer that is copied out per recorded step."""
 
     @abstractmethod
-    def _stages(self, k: int) -> Any:
-        """Launch what restores the stages before substep k into a mujoco_warp.Data, and return it."""
+    def _pull_back(self, k: int, qvel_next: wp.array, *extras: Any) -> None:
+        """Launch the pullback of substep k; `qvel_next` (W, nv) is the velocity after it."""
 
     def record(
         self, ctrl: Tensor, start: StepState, end: StepState, applied: Applied | None = None
@@ -207,7 +214,7 @@ class _Tape(Backward):
         self._adjoint.start(self._last["qpos"], self._raw_qpos)
         for k in reversed(range(self._batch.substeps)):
             after = self._states[k + 1] if k + 1 < self._batch.substeps else self._last
-            self._adjoint.pull_back(self._stages(k), after["qvel"], applied, parameters)
+            self._pull_back(k, after["qvel"], applied, parameters)
             if self.substep_grad_clip is not None and k > 0:
                 self._adjoint.clip(self.substep_grad_clip, self._clipped)
         self._adjoint.finish(self._states[0]["qpos"], self._raw_qpos)
@@ -246,6 +253,10 @@ class TapePerSubstep(_Tape):
 
     name = "tape_per_substep"
 
+    def attach(self, batch: WorldBatch) -> None:
+        super().attach(batch)
+        self._substep = recomputed(self._adjoint)
+
     def launch_step(self, batch: WorldBatch) -> None:
         data = batch.data
         batch.begin_step()
@@ -254,23 +265,30 @@ class TapePerSubstep(_Tape):
                 wp.copy(state[name], getattr(data, name))
             batch.launch_substep(data)
             wp.copy(state["qacc"], data.qacc)
-            self._gauge.launch(data)
+            self._gauge.launch(data, _solved(data, batch.mjm))
         for name, array in self._last.items():
             wp.copy(array, getattr(data, name))
         batch.end_step(data)
 
-    def _stages(self, k: int) -> Any:
+    def _pull_back(self, k: int, qvel_next: wp.array, *extras: Any) -> None:
         data = self._batch.data
         for name, array in self._states[k].items():
             wp.copy(getattr(data, name), array)
-        recompute_stages(self._batch.mjm, self._batch.model, data)
-        return data
+        self._substep.pull_back(data, qvel_next, *extras)
 
 
 class TapeAll(_Tape):
     """Keeps everything that the adjoint of every substep reads: nothing is recomputed, at the cost of memory."""
 
     name = "tape_all"
+
+    def attach(self, batch: WorldBatch) -> None:
+        if batch.mjm.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+            raise UnsupportedModelError(
+                "tape_all does not differentiate integrator RK4, whose stages mujoco_warp does not keep: write "
+                "physics.backward=tape_per_substep in a config, --mode tape_per_substep of gradcheck"
+            )
+        super().attach(batch)
 
     def _prepare(self, pool: Pool) -> None:
         batch = self._batch
@@ -295,7 +313,7 @@ class TapeAll(_Tape):
                 wp.copy(state[name], getattr(before, name))
             batch.launch_substep(data)
             wp.copy(state["qacc"], data.qacc)
-            self._gauge.launch(data)
+            self._gauge.launch(data, _solved(data, batch.mjm))
             before = data
         for name in ("qpos", "qvel", "act"):
             wp.copy(getattr(batch.data, name), getattr(before, name))
@@ -306,11 +324,11 @@ class TapeAll(_Tape):
     def last_data(self, batch: WorldBatch) -> Any:
         return self._datas[-1]
 
-    def _stages(self, k: int) -> Any:
+    def _pull_back(self, k: int, qvel_next: wp.array, *extras: Any) -> None:
         data = self._datas[k]
         for name, array in self._states[k].items():
             wp.copy(getattr(data, name), array)
-        return data
+        self._adjoint.pull_back(data, qvel_next, *extras)
 
 
 class Hybrid(Backward):

@@ -65,6 +65,7 @@ def _tendon(path: str, actuators: str = "", **kw: str) -> mujoco.MjModel:
 _MUSCLE = '<muscle tendon="t" force="60" range=".6 1.1" lengthrange=".3 .7" tausmooth=".2" timeconst=".02 .06"/>'
 _SERVO = '<general tendon="t" gainprm="30" biastype="affine" biasprm="2 -20 -3" gear="1.5"/>'
 _FAST = 'integrator="implicitfast"'
+_RK4 = 'integrator="RK4"'
 _WATER = ' density="500" viscosity="2" wind="1 2 -.5"'
 _FREE = """<body pos="1 0 1"><freejoint/><geom type="box" size=".1 .2 .3" pos=".05 .1 0" euler="10 20 30"/>
 <body pos="0 .1 .3"><geom size=".1"/><site name="grip" pos="0 .1 .1"/></body></body>"""
@@ -175,6 +176,15 @@ SCENES = {
     ),
     "fluid": lambda: scene(option=_WATER, world=_FREE),
     "fast_spinning_fluid": lambda: scene(option=_FAST + _WATER, world=_FREE),
+    "rk4_spinning_free": lambda: scene(option=_RK4, world=_FREE, a='range="-1 1"', ball='stiffness="4"'),
+    "rk4_spinning_fluid": lambda: scene(option=_RK4 + _WATER, world=_FREE),
+    "rk4_muscle": lambda: _tendon(_SPHERE.format('sidesite="side"'), _MUSCLE, option=_RK4),
+    "rk4_activations": lambda: scene(
+        '<actuator><intvelocity joint="a" kp="20" actrange="-1 .6"/>'
+        '<general joint="c" dyntype="filter" dynprm=".02" gainprm="2" actearly="true" actlimited="true" '
+        'actrange="0 .5"/><general joint="d" dyntype="filter" dynprm=".05" gainprm="3"/></actuator>',
+        option=_RK4,
+    ),
     "site": lambda: scene(
         '<actuator><general site="s4" gear="3 1 -2 .1 .2 -.3" biastype="affine" biasprm="1 0 -.4"/></actuator>'
     ),

@@ -22,12 +22,23 @@ def test_own_models_are_covered():
     assert unsupported(cartpole()) == {}
 
 
+def test_a_model_without_geoms_can_be_looked_at() -> None:
+    body = '<body><joint/><inertial pos="0 0 1" mass="1" diaginertia="1 1 1"/></body>'
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
+    assert unsupported(model) == {}
+
+
 @pytest.mark.parametrize(
     ("xml", "named"),
     [
         (
-            '<option integrator="RK4"/><worldbody><body><joint/><geom size=".1"/></body></worldbody>',
-            r'\(integrator RK4\)\. Write integrator="Euler" or "implicitfast"; --integrator of gradcheck tries one\.',
+            '<option integrator="implicit"/><worldbody><body><joint/><geom size=".1"/></body></worldbody>',
+            r'\(integrator IMPLICIT\)\. Write integrator="Euler" or "implicitfast"; --integrator of gradcheck',
+        ),
+        (
+            '<option integrator="RK4"/><worldbody><body name="a"><joint/><geom size=".1"/></body></worldbody><equality>'
+            '<weld name="w" body1="a"/></equality>',
+            r'RK4 with connect and weld equalities \(equality w\)\. Write integrator="Euler" or "implicitfast"\.',
         ),
         (
             '<option noslip_iterations="3"/><worldbody><body><joint/><geom size=".1"/></body></worldbody>',

@@ -21,6 +21,7 @@ SIGNATURES = {
     "cap2_axis vec3f, cap2_radius float, cap2_half_length float -> (vec2f, mat23f, mat23f)",
     "contact_kbimp": "opt_disableflags int, timestep float, solref vec2f, solimp vec5f, pos_imp float, "
     "is_discrete bool -> vec3f",
+    "deriv_expmap": "expmap vec3f, vel vec3f -> vec3f",
     "dof_damping_total": "jnt_actuatorid array1d[int32], dof_jntid array1d[int32], "
     + DAMPING.format("dof", "dof")
     + ", dofid int -> (float, vec2f)",
@@ -38,6 +39,7 @@ SIGNATURES = {
     "plane_sphere": "plane_normal vec3f, plane_pos vec3f, sphere_pos vec3f, sphere_radius float -> (float, vec3f)",
     "poly_force": "linear float, poly vec2f, x float, flg_odd int -> float",
     "poly_force_deriv": "linear float, poly vec2f, x float, flg_odd int -> float",
+    "quat_integrate": "q quatf, v vec3f, dt float -> quatf",
     "quat_sub": "qa quatf, qb quatf -> vec3f",
     "quat_to_mat": "quat quatf -> mat33f",
     "quat_to_vel": "quat quatf -> vec3f",

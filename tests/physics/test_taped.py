@@ -1,6 +1,8 @@
 """The plain-Warp entry gives the gradient of the torch one."""
 
+import mujoco
 import numpy as np
+import pytest
 import warp as wp
 from oracle import INPUTS, relative, simulate
 from scenes import ant, ant_points, random_weights
@@ -9,8 +11,10 @@ from msk_ray.physics import TapedStep, WarpState, WorldBatch
 from msk_ray.simulation.tape import TapePerSubstep
 
 
-def test_same_gradient_as_through_torch():
+@pytest.mark.parametrize("integrator", [mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtIntegrator.mjINT_RK4])
+def test_same_gradient_as_through_torch(integrator):
     model = ant()
+    model.opt.integrator = integrator
     points = ant_points(model, 3, seed=2)
     weights = random_weights(model, 3, 5)
     _, expected, sim = simulate(model, TapePerSubstep(), points, 4, weights)

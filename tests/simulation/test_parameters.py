@@ -57,6 +57,7 @@ _FEATURES = {
     "ball_spring": ("ball_spring", ["jnt_stiffness", "qpos_spring", "body_iquat"]),
     "gravcomp": ("gravcomp", ["body_mass", "body_ipos", "opt.gravity"]),
     "servos": ("position", ["actuator_gear", "actuator_gainprm", "actuator_biasprm"]),
+    "rk4_muscle": ("rk4_muscle", ["actuator_gainprm", "actuator_dynprm", "dof_damping", "body_mass"]),
     "muscle": ("muscle", ["actuator_gainprm", "actuator_biasprm", "actuator_dynprm", "actuator_gear"]),
     "tendon_servo": ("fast_site_tendon", ["actuator_gear", "actuator_gainprm", "actuator_biasprm", "dof_damping"]),
 }
@@ -201,6 +202,9 @@ def test_a_centre_of_mass_that_the_inertia_matrix_cannot_follow_is_refused():
     assert "body_ipos" not in names_of(lone)
     wet = copy.copy(lone)
     wet.opt.density = 1.2
+    spinning = SCENES["fast_spinning_free"]()
+    with pytest.raises(UnsupportedModelError, match="body_inertia is not supported: implicitfast takes gyroscopic"):
+        Simulation(spinning, 1, 1).open_parameters(["body_inertia"])
     with pytest.raises(UnsupportedModelError, match="body_mass is not supported: the drag of a fluid"):
         Simulation(wet, 1, 1).open_parameters(["body_mass"])
     result = check_gradients(sim, states=("random",), parameters=["body_mass", "body_inertia"])

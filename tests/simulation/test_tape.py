@@ -68,7 +68,9 @@ def test_both_tapes_give_the_same_gradient():
         assert relative(one[name], other[name]) < 1e-6
 
 
-@pytest.mark.parametrize("name", ["fast_muscle", "weld_sites", "pulley", "site", "sparse", "joint_force_limit"])
+@pytest.mark.parametrize(
+    "name", ["fast_muscle", "weld_sites", "pulley", "site", "sparse", "joint_force_limit", "fast_spinning_fluid"]
+)
 def test_both_tapes_agree_on_other_features(name):
     model = SCENES[name]()
     points = random_points(model, 3, seed=9)
@@ -95,8 +97,10 @@ def test_worlds_do_not_touch_each_other():
             assert relative(found[name][world], clean[name][world]) < 1e-6
 
 
-def test_a_zero_cotangent_gives_zeros_even_in_a_diverged_world():
+@pytest.mark.parametrize("integrator", [mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtIntegrator.mjINT_RK4])
+def test_a_zero_cotangent_gives_zeros_even_in_a_diverged_world(integrator):
     model = cartpole()
+    model.opt.integrator = integrator
     points = [float32(np.full(2, np.nan), np.zeros(2), np.zeros(0), np.zeros(1)) for _ in range(2)]
     weights = {n: np.zeros_like(w) for n, w in random_weights(model, 2, 0).items()}
     _, found, _ = simulate(model, TapePerSubstep(), points, 2, weights)
@@ -117,8 +121,10 @@ def test_clip_keeps_direction_and_counts():
     assert sim.diagnostics()["substep_clip_share"] == 0.5
 
 
-def test_residual_is_reported():
+@pytest.mark.parametrize("integrator", [mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtIntegrator.mjINT_RK4])
+def test_residual_is_reported(integrator):
     model = ant()
+    model.opt.integrator = integrator
     points = ant_points(model, 3, seed=4)
     _, _, sim = simulate(model, TapePerSubstep(), points, 2, random_weights(model, 3, 2))
     figures = sim.diagnostics()
@@ -146,11 +152,18 @@ def test_backward_through_two_env_steps():
 
 def test_unsupported_features_are_named():
     model = mujoco.MjModel.from_xml_string(
-        """<mujoco><option integrator="RK4" density="1"/>
+        """<mujoco><option integrator="implicit" noslip_iterations="1"/>
         <worldbody><body><joint name="j" type="slide"/><geom size=".1"/></body></worldbody></mujoco>"""
     )
-    with pytest.raises(UnsupportedModelError, match=r"RK4.*density.*fd_jacobian"):
+    with pytest.raises(UnsupportedModelError, match=r"IMPLICIT.*noslip.*fd_jacobian"):
         Simulation(model, 1, 1, TapePerSubstep(), "cpu")
+
+
+def test_tape_all_refuses_rk4_and_names_the_other_tape():
+    model = cartpole()
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    with pytest.raises(UnsupportedModelError, match=r"write physics\.backward=tape_per_substep"):
+        Simulation(model, 1, 1, TapeAll(), "cpu")
 
 
 def test_hybrid_takes_ctrl_from_one_mode_and_state_from_the_other():

@@ -22,6 +22,7 @@ class ActuatorLaw:
     early: int
     clamp_ctrl: int
     clamp_act: int
+    clamp_next: int
     clamp_force: int
     implicit: int
     dynprm: vec10
@@ -36,8 +37,8 @@ class ActuatorLaw:
 
 
 @wp.func
-def next_activation(law: ActuatorLaw, ctrl: wp.float32, act: wp.float32) -> wp.float32:
-    """act' of a stateful actuator, from the control after its clamp."""
+def free_activation(law: ActuatorLaw, ctrl: wp.float32, act: wp.float32) -> wp.float32:
+    """act' of a stateful actuator before its own clamp, from the control after its clamp."""
     rate = wp.float32(0.0)
     step = law.timestep
     if law.dyntype == DynType.INTEGRATOR:
@@ -49,10 +50,7 @@ def next_activation(law: ActuatorLaw, ctrl: wp.float32, act: wp.float32) -> wp.f
         rate = (ctrl - act) / tau
         if law.dyntype == DynType.FILTEREXACT:
             step = tau * (1.0 - wp.exp(-law.timestep / tau))
-    after = act + step * rate
-    if law.clamp_act == 1:
-        after = wp.clamp(after, law.actrange[0], law.actrange[1])
-    return after
+    return act + step * rate
 
 
 @wp.func
@@ -116,11 +114,17 @@ def actuator_score(
     drive = command
     score = wp.float32(0.0)
     if law.dyntype != DynType.NONE:
-        after = next_activation(law, command, act)
+        free = free_activation(law, command, act)
+        after = free
+        if law.clamp_act == 1:
+            after = wp.clamp(free, law.actrange[0], law.actrange[1])
         drive = act
         if law.early == 1:
             drive = after
-        score = act_weight * after
+        if law.clamp_next == 1:
+            score = act_weight * after
+        else:
+            score = act_weight * free
     if law.implicit == 1:
         score += slope_weight * force_velocity_slope(law, ctrl, drive, length, velocity)
     return score + force_weight * actuator_force(law, drive, length, velocity)
@@ -173,7 +177,9 @@ class Drive:
 
 
 @wp.func
-def actuator_law(worldid: int, uid: int, timestep: float, clampctrl: bool, actuators: ActuatorSettings) -> ActuatorLaw:
+def actuator_law(
+    worldid: int, uid: int, timestep: float, clampctrl: bool, clampact: bool, actuators: ActuatorSettings
+) -> ActuatorLaw:
     """The law of one actuator in one world."""
     law = ActuatorLaw()
     law.timestep = timestep
@@ -182,6 +188,7 @@ def actuator_law(worldid: int, uid: int, timestep: float, clampctrl: bool, actua
     law.biastype = actuators.actuator_biastype[uid]
     law.early = int(actuators.actuator_actearly[uid])
     law.clamp_act = int(actuators.actuator_actlimited[uid])
+    law.clamp_next = int(clampact)
     law.clamp_force = int(actuators.actuator_forcelimited[uid])
     law.dynprm = actuators.actuator_dynprm[worldid % actuators.actuator_dynprm.shape[0], uid]
     law.gainprm = actuators.actuator_gainprm[worldid % actuators.actuator_gainprm.shape[0], uid]
@@ -222,6 +229,7 @@ def pull_actuators(
     # Model:
     opt_timestep: wp.array[float],
     clampctrl: bool,
+    clampact: bool,
     implicit_all: bool,
     implicit_address: wp.array2d[int],
     actuators: ActuatorSettings,
@@ -243,7 +251,8 @@ def pull_actuators(
     go to its tendon. For other transmissions whose moment m turns with q, `rate_bar` keeps ∂Φ/∂(m·λ, m·v, m·μ, m·â).
     """
     worldid, uid = wp.tid()
-    law = actuator_law(worldid, uid, opt_timestep[worldid % opt_timestep.shape[0]], clampctrl, actuators)
+    timestep = opt_timestep[worldid % opt_timestep.shape[0]]
+    law = actuator_law(worldid, uid, timestep, clampctrl, clampact, actuators)
     ctrl = float(0.0)
     source = actuators.actuator_ctrladr[uid]
     if actuators.actuator_ctrlnum[uid] > 0:
@@ -352,6 +361,7 @@ class ActuatorForces:
             inputs=[
                 m.opt.timestep,
                 settings.clampctrl,
+                settings.clampact,
                 settings.implicit_all,
                 work.tables.implicit_address,
                 self._settings,

@@ -176,7 +176,7 @@ def _odd_surfaces(m: mujoco.MjModel) -> list[str]:
     for field in ("geom_adhesion", "geom_surfacevel"):
         values = getattr(m, field, None)
         if values is not None:
-            found |= {int(i) for i in np.flatnonzero(np.any(np.asarray(values).reshape(m.ngeom, -1) != 0, axis=1))}
+            found |= {int(i) for i in np.flatnonzero(np.any(values != 0, axis=tuple(range(1, values.ndim))))}
     return _named(m, _OBJ.mjOBJ_GEOM, "geom", sorted(found))
 
 
@@ -214,7 +214,11 @@ def approximated_types(m: mujoco.MjModel) -> set[tuple[int, int]]:
     return types & _APPROXIMATED_PAIRS
 
 
-_EXACT_INTEGRATORS = (_INTEGRATOR.mjINT_EULER, _INTEGRATOR.mjINT_IMPLICITFAST)
+_EXACT_INTEGRATORS = (_INTEGRATOR.mjINT_EULER, _INTEGRATOR.mjINT_IMPLICITFAST, _INTEGRATOR.mjINT_RK4)
+
+
+def _under_rk4(find: Finder) -> Finder:
+    return lambda m: find(m) if m.opt.integrator == _INTEGRATOR.mjINT_RK4 else []
 
 
 def _integrator_name(model: mujoco.MjModel) -> str:
@@ -229,7 +233,20 @@ FEATURES: tuple[Feature, ...] = (
     Feature("integrator Euler, implicit damping on or off", True, _integrator(_INTEGRATOR.mjINT_EULER)),
     Feature("integrator implicitfast", True, _integrator(_INTEGRATOR.mjINT_IMPLICITFAST)),
     Feature(
-        "integrators implicit, RK4, discrete",
+        "integrator RK4",
+        True,
+        _integrator(_INTEGRATOR.mjINT_RK4),
+        "not with tape_all; the backward pass solves once more for the accelerations of the four stages",
+    ),
+    Feature(
+        "RK4 with connect and weld equalities",
+        False,
+        _under_rk4(_equality(_EQ.mjEQ_CONNECT, _EQ.mjEQ_WELD)),
+        "mujoco_warp 4.0.0 builds these rows of a stage from the velocities of the stage before",
+        instead='integrator="Euler" or "implicitfast"',
+    ),
+    Feature(
+        "integrators implicit, discrete",
         False,
         lambda m: [] if m.opt.integrator in _EXACT_INTEGRATORS else [_integrator_name(m)],
         instead='integrator="Euler" or "implicitfast"; --integrator of gradcheck tries one',

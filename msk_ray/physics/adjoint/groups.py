@@ -4,6 +4,7 @@ Axes: W worlds, nv degrees of freedom, B bodies, T tendons, R constraint rows, C
 array is mujoco_warp's has its name there, so that `gather` finds it.
 """
 
+from collections.abc import Mapping
 from typing import Any
 
 import warp as wp
@@ -201,6 +202,14 @@ def allocate(kind: Any, *shape: int) -> Any:
     group = kind()
     for name, field in kind.vars.items():
         setattr(group, name, wp.zeros(shape, dtype=field.type.dtype))
+    return group
+
+
+def allocate_rows(kind: Any, worlds: int, widths: Mapping[str, int], width: int) -> Any:
+    """The same for arrays (worlds, width), with another width for the fields named in `widths`."""
+    group = kind()
+    for name, field in kind.vars.items():
+        setattr(group, name, wp.zeros((worlds, widths.get(name, width)), dtype=field.type.dtype))
     return group
 
 

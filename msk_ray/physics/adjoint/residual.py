@@ -64,12 +64,12 @@ class ResidualGauge:
         self._nworld = nworld
         self._gap, self._size, self._worst = (wp.zeros(nworld, dtype=float) for _ in range(3))
 
-    def launch(self, data: Any) -> None:
-        """Launch the measurement of the step just made in `data`."""
+    def launch(self, data: Any, qacc: wp.array) -> None:
+        """Launch the measurement of the step just made in `data`, at the acceleration that its solver found."""
         wp.launch(
             residual_squares,
             dim=(self._nworld, self._address.shape[0]),
-            inputs=[self._address, data.M, data.qacc, data.qfrc_smooth, data.qfrc_constraint],
+            inputs=[self._address, data.M, qacc, data.qfrc_smooth, data.qfrc_constraint],
             outputs=[self._gap, self._size],
         )
         wp.launch(residual_share, dim=self._nworld, outputs=[self._gap, self._size, self._worst])

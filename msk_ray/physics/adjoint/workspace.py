@@ -38,6 +38,8 @@ class Settings:
     elliptic: bool
     actuation: bool
     clampctrl: bool
+    clampact: bool
+    """Whether a stage clamps activations after its own substep, which RK4 does only after all stages."""
 
     @staticmethod
     def of(mjm: mujoco.MjModel) -> "Settings":
@@ -57,6 +59,7 @@ class Settings:
             elliptic=bool(mjm.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC),
             actuation=bool(mjm.nu > 0 and not disabled & bit.mjDSBL_ACTUATION),
             clampctrl=not disabled & bit.mjDSBL_CLAMPCTRL,
+            clampact=mjm.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4,
         )
 
 

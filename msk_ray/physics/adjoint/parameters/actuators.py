@@ -179,8 +179,9 @@ def pull_actuator_parameters(
     # Model:
     opt_timestep: wp.array[float],
     clampctrl: bool,
+    clampact: bool,
     implicit_all: bool,
-    inertia_address: wp.array2d[int],
+    implicit_address: wp.array2d[int],
     joints: Joints,
     tendons: TendonRows,
     actuators: ActuatorSettings,
@@ -204,7 +205,7 @@ def pull_actuator_parameters(
     if live_in[worldid] == 0:
         return
     h = opt_timestep[worldid % opt_timestep.shape[0]]
-    law = actuator_law(worldid, uid, h, clampctrl, actuators)
+    law = actuator_law(worldid, uid, h, clampctrl, clampact, actuators)
     ctrl = float(0.0)
     if actuators.actuator_ctrlnum[uid] > 0:
         ctrl = drive_in.ctrl[worldid, actuators.actuator_ctrladr[uid]]
@@ -228,12 +229,12 @@ def pull_actuator_parameters(
         velocity += lever * state_in.qvel[worldid, i]
         if not is_held(worldid, i, actuators, drive_in):
             rate += lever * multipliers_in.lam[worldid, i]
-        rate_mu += lever * multipliers_in.mu[worldid, i]
-        rate_smooth += lever * (state_in.qacc[worldid, i] - multipliers_in.excess[worldid, i])
-        if implicit_all:
+        if implicit_all and implicit_address[i, i] >= 0:
+            rate_mu += lever * multipliers_in.mu[worldid, i]
+            rate_smooth += lever * (state_in.qacc[worldid, i] - multipliers_in.excess[worldid, i])
             for m in range(start, end):
                 j = drive_in.moment_colind[worldid, m]
-                if inertia_address[wp.max(i, j), wp.min(i, j)] >= 0:
+                if implicit_address[wp.max(i, j), wp.min(i, j)] >= 0:
                     smooth = state_in.qacc[worldid, j] - multipliers_in.excess[worldid, j]
                     kappa += lever * drive_in.actuator_moment[worldid, m] * multipliers_in.mu[worldid, i] * smooth
     law.implicit = int(implicit_all)
@@ -299,8 +300,9 @@ class ActuatorStage(ParameterStage):
             inputs=[
                 m.opt.timestep,
                 settings.clampctrl,
+                settings.clampact,
                 settings.implicit_all,
-                work.tables.inertia_address,
+                work.tables.implicit_address,
                 work.joints,
                 work.tendon_rows,
                 self._settings,
