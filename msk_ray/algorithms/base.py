@@ -143,12 +143,13 @@ def algorithm_class(config: Config) -> type[Algorithm]:
 
 
 def simulation_metrics(env: Env[Any]) -> dict[str, float]:
-    """The simulation's diagnostics since the last call, by metric name.
+    """The simulation's diagnostics since the last call, and the range of randomized parameters, by metric name.
 
     Raises:
         SimulationError: contacts or constraint rows were lost to a full buffer.
     """
-    return {
+    drawn = {} if env.randomizer is None else env.randomizer.metrics()
+    return drawn | {
         f"{'grad' if name in _OF_GRADIENTS else 'physics'}/{name}": value
         for name, value in env.sim.diagnostics().items()
     }

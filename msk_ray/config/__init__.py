@@ -23,6 +23,7 @@ from msk_ray.config.load import (
 from msk_ray.config.loggers import logger_paths
 from msk_ray.config.overlay import SET_HELP, combine, flattened, leaves, merge, overlay, parse_override, parse_overrides
 from msk_ray.config.physics import FdConfig, PhysicsConfig
+from msk_ray.config.randomize import Draw, RandomizeConfig
 from msk_ray.config.recorded import current_key, current_values, env_name, first_spelling
 from msk_ray.config.resolve import Registry, resolve, resolve_class
 from msk_ray.config.schema import (
@@ -46,6 +47,7 @@ __all__ = [
     "Config",
     "ContactCurriculum",
     "ContactStart",
+    "Draw",
     "EntropyConfig",
     "EnvSettings",
     "EvaluationConfig",
@@ -54,6 +56,7 @@ __all__ = [
     "NetworkConfig",
     "PhysicsConfig",
     "PpoConfig",
+    "RandomizeConfig",
     "Registry",
     "Reward",
     "ShacConfig",

@@ -4,6 +4,7 @@ from typing import Literal
 
 from pydantic import PositiveFloat, model_validator
 
+from msk_ray.config.randomize import RandomizeConfig
 from msk_ray.config.sections import Count, NonNegative, Section, Text
 
 Vec2 = tuple[float, float]
@@ -99,6 +100,8 @@ class PhysicsConfig(Section):
     use. A given number does not grow."""
     njmax: Count | None = None
     """Constraint rows per world; null as for nconmax."""
+    randomize: RandomizeConfig | None = None
+    """Parameters of the model that are drawn for each world and episode, in training only; null: the model's own."""
 
     @model_validator(mode="after")
     def _friction_direction_needs_ellipse(self) -> "PhysicsConfig":
@@ -108,8 +111,11 @@ class PhysicsConfig(Section):
 
     @classmethod
     def names(cls) -> list[str]:
-        """Every setting of the section, dotted within it."""
-        return [*(name for name in cls.model_fields if name != "fd"), *(f"fd.{name}" for name in FdConfig.model_fields)]
+        """Every setting of the section that some environments do not read, dotted within it."""
+        return [
+            *(name for name in cls.model_fields if name not in ("fd", "randomize")),
+            *(f"fd.{name}" for name in FdConfig.model_fields),
+        ]
 
     def resolve_substeps(self, control_timestep: float) -> int:
         """Physics steps per env step of `control_timestep` [s].

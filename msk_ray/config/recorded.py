@@ -73,6 +73,7 @@ def first_spelling(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 _LATER: dict[tuple[str, str], Any] = {
+    ("physics", "randomize"): None,
     ("trial", "threads"): 1,
     ("trial", "loggers"): ["tensorboard"],
     ("algorithm", "name"): "shac",

@@ -197,6 +197,10 @@ class Config(Section):
         self.algorithm_settings.check(self)
         if self.curriculum is not None:
             self._check_curriculum()
+            if self.physics.randomize is not None and self.physics.randomize.pair_friction is not None:
+                raise ValueError(
+                    "curriculum and physics.randomize.pair_friction both set the friction of pairs; leave one out"
+                )
         return self
 
     def _check_curriculum(self) -> None:

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from msk_ray.config import EnvSettings, PhysicsConfig
+from msk_ray.envs.randomize import Randomizer
 from msk_ray.errors import ConfigError
 from msk_ray.physics.capacity import Capacity
 from msk_ray.simulation import Backward, Simulation, StepState
@@ -66,6 +67,7 @@ class Env(ABC, Generic[SettingsT]):
         state: current state of all worlds; `detach` it to start a new graph.
         generator: source of reset states, on the environment's device; replace it by one on the CPU to draw the same
             states on every device.
+        randomizer: parameters of the model that differ between worlds; None for the model's own.
         ignore_contact_forces: whether contact forces read as 0, for comparisons of gradients, because they carry none.
     """
 
@@ -101,6 +103,10 @@ class Env(ABC, Generic[SettingsT]):
         self.device = self.sim.device
         self.action_size = self.model.nu
         self.generator = torch.Generator(device=self.device).manual_seed(seed)
+        self.randomizer: Randomizer | None = None
+        if physics.randomize is not None:
+            self.randomizer = Randomizer(physics.randomize, self.model, nworld, self.device, seed)
+            self.sim.open_parameters(self.randomizer.parameters)
         self._fresh: list[StepState] = []
         self.ignore_contact_forces = False
         self._reached: StepState | None = None
@@ -174,12 +180,13 @@ class Env(ABC, Generic[SettingsT]):
         self._fresh = [StepState(*parts) for parts in zip(*(t.split(self.nworld) for t in drawn), strict=True)]
 
     def state_dict(self) -> dict[str, Any]:
-        """The state of the worlds, the generator of resets, and the buffer sizes that the simulation has grown to."""
+        """The state of the worlds, their parameters, the generators, and the buffer sizes that the simulation has."""
         state = self.state
         return {
             "env_generator": self.generator.get_state(),
             "env_state": [t.detach().clone() for t in (*state.physics, state.action, state.age)],
             "capacity": tuple(self.sim.capacity),
+            "randomizer": None if self.randomizer is None else self.randomizer.state_dict(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -188,6 +195,8 @@ class Env(ABC, Generic[SettingsT]):
         self.generator.set_state(state["env_generator"].cpu())
         *physics, action, age = state["env_state"]
         self.state = EnvState(StepState(*physics), action, age)
+        if self.randomizer is not None:
+            self.randomizer.load_state_dict(state["randomizer"])
         if "capacity" in state:
             # The buffer sizes that the trial had grown to: the next step may need them.
             self.sim.reserve(Capacity(*state["capacity"]))
@@ -203,7 +212,8 @@ class Env(ABC, Generic[SettingsT]):
         is that of the state before the step, cut from the graph.
         """
         before = self.state.physics
-        after = self.sim.step(self.control(action), *before)
+        parameters = None if self.randomizer is None else self.randomizer.parameters
+        after = self.sim.step(self.control(action), *before, parameters=parameters)
         diverged = ~self._sound(after)
         # `where` sends no cotangent into a diverged world's step, so its gradient cannot reach the batch.
         after = StepState(*(torch.where(diverged[:, None], b.detach(), a) for b, a in zip(before, after, strict=True)))
@@ -298,6 +308,8 @@ class Env(ABC, Generic[SettingsT]):
 
     def _reset_where(self, done: Tensor, reached: EnvState) -> EnvState:
         fresh = self.reset_state()
+        if self.randomizer is not None:
+            self.randomizer.redraw(done)
         physics = StepState(
             *(torch.where(done[:, None], f, r) for f, r in zip(fresh.physics, reached.physics, strict=True))
         )

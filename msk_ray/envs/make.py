@@ -23,9 +23,24 @@ def env_class(config: EnvSettings) -> type[Env[Any]]:
 
 
 def make_env(
-    config: EnvSettings, physics: PhysicsConfig, nworld: int, device: str, seed: int, *, differentiable: bool = True
+    config: EnvSettings,
+    physics: PhysicsConfig,
+    nworld: int,
+    device: str,
+    seed: int,
+    *,
+    differentiable: bool = True,
+    randomize: bool = False,
 ) -> Env[Any]:
     """Build the environment of a config section.
+
+    Args:
+        config, physics: the sections.
+        nworld: number of worlds.
+        device: "cpu" or "cuda:N".
+        seed: of initial states and of randomized parameters.
+        differentiable: whether steps can be differentiated.
+        randomize: whether `physics.randomize` applies, as in training; otherwise the model keeps its own parameters.
 
     Raises:
         ConfigError: as for `env_class`.
@@ -33,4 +48,6 @@ def make_env(
         DeviceError: no such device.
     """
     backward = configured_backward(physics) if differentiable else None
+    if not randomize:
+        physics = physics.model_copy(update={"randomize": None})
     return env_class(config)(config, physics, nworld, device, seed, backward)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from msk_ray.cli import Parser, run
 from msk_ray.errors import CheckpointError, MskRayError
 from msk_ray.evaluate.targets import Kind, Target, best_checkpoint, best_of_trial, find_target
+from msk_ray.evaluate.vary import HELP, parse_vary, vary_text
 from msk_ray.experiment.attempts import read_attempt
 from msk_ray.experiment.checkpoint_file import read_facts
 from msk_ray.experiment.manifest import Experiment
@@ -35,6 +36,7 @@ EXAMPLES = """\
   python -m msk_ray.evaluate runs/demo/trials/1a2b3c4d/checkpoints/epoch_000100.pt
   python -m msk_ray.evaluate ant_lr --physics reference,published,own    # how much of it is the physics?
   python -m msk_ray.evaluate ant_lr --worlds 256 --seeds 0-4             # fresh initial states
+  python -m msk_ray.evaluate runs/mine --vary body_mass=0.8x,1.2x        # how well does it bear other masses?
 
 exit codes: 0 done, 1 a policy could not be evaluated, 2 refused."""
 
@@ -55,6 +57,7 @@ def parser() -> Parser:
         help="comma-separated: reference (the physics of scores), own (that of training), or named ones of the "
         "environment (default: reference)",
     )
+    p.add_argument("--vary", metavar="FIELD=LIST", help=HELP)
     p.add_argument("--device", help="cpu or cuda:N (default: the first GPU, or the CPU if there is none)")
     p.add_argument(
         "--storage", type=Path, default=Path("runs"), metavar="DIR", help="folder of experiments (default: runs/)"
@@ -75,6 +78,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     target = find_target(args.target, args.storage)
     seeds = parse_seeds(args.seeds) if args.seeds is not None else None
     names = [name.strip() for name in args.physics.split(",")]
+    varied = [None, *(parse_vary(args.vary) if args.vary is not None else [])]
     if target.kind is not Kind.EXPERIMENT:
         best_checkpoint(target)  # torch and Warp take seconds to load; a wrong path should not wait for them
 
@@ -84,22 +88,27 @@ def main(argv: Sequence[str] | None = None) -> int:
     device = args.device or default_device()
     resolve_device(device)  # a missing device is not the fault of any trial
     bench = Bench(device)
-    requests = [Request(name, args.worlds, seeds, args.steps) for name in names]
+    requests = [Request(name, args.worlds, seeds, args.steps, value) for name in names for value in varied]
     if target.kind is Kind.EXPERIMENT:
         return evaluate_experiment(Experiment(target.path), bench, requests)
-    return _evaluate_one(target, bench, requests)
+    return _evaluate_one(target, bench, requests, len(varied))
 
 
-def _evaluate_one(target: Target, bench: "Bench", requests: "Sequence[Request]") -> int:
+def _evaluate_one(target: Target, bench: "Bench", requests: "Sequence[Request]", values: int) -> int:
+    """Evaluate one policy; every `values` requests are of one physics, with different values of a parameter."""
     from msk_ray.evaluate.measure import eval_file_of, store_evaluation
     from msk_ray.training import load_policy
 
     path = best_checkpoint(target)
     policy = load_policy(path)
+    entries = []
     for request in requests:
-        entry = bench.evaluate(policy, request)
-        store_evaluation(eval_file_of(path), entry)
-        print(policy_text(entry) + "\n")
+        entries.append(bench.evaluate(policy, request))
+        store_evaluation(eval_file_of(path), entries[-1])
+        if values == 1:
+            print(policy_text(entries[-1]) + "\n")
+        elif len(entries) % values == 0:
+            print(vary_text(entries[-values:]) + "\n")
     print(f"written into {eval_file_of(path)}")
     return 0
 

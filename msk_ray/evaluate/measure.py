@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from msk_ray.config import Config, PhysicsConfig
+from msk_ray.config import Config, PhysicsConfig, RandomizeConfig
 from msk_ray.envs import env_class
 from msk_ray.errors import ConfigError
 from msk_ray.evaluate.targets import trial_folder_of
@@ -37,6 +37,8 @@ class Request:
     worlds: int | None = None
     seeds: tuple[int, ...] | None = None
     steps: int | None = None
+    varied: RandomizeConfig | None = None
+    """Parameters of the model that are other than its own."""
 
 
 def named_physics(config: Config, name: str) -> tuple[str, PhysicsConfig]:
@@ -47,15 +49,16 @@ def named_physics(config: Config, name: str) -> tuple[str, PhysicsConfig]:
     """
     env_type = env_class(config.env)
     variants = config.env.variants
+    trained_on = config.physics.model_copy(update={"randomize": None})
     if name == REFERENCE:
         variant = config.evaluation.variant or (variants[0] if variants else OWN)
-        return variant, env_type.reference_physics(config.physics, config.evaluation.variant)
+        return variant, env_type.reference_physics(trained_on, config.evaluation.variant)
     if name == OWN:
-        return OWN, config.physics
+        return OWN, trained_on
     if name not in variants:
         known = ", ".join((REFERENCE, OWN, *variants))
         raise ConfigError(f"--physics {name!r}: env {config.env.name} has no such physics; write one of {known}")
-    return name, env_type.reference_physics(config.physics, name)
+    return name, env_type.reference_physics(trained_on, name)
 
 
 _WORLDS = ("--worlds", "evaluation.nworld")
@@ -79,11 +82,11 @@ class Bench:
         own = config.evaluation.model_copy(update={k: v for k, v in changes.items() if v is not None})
         config = config.model_copy(update={"evaluation": own})
         settings = env_class(config.env).reference_settings(config.env)
-        key = repr((settings, physics, own.nworld, own.steps, own.seed))
+        key = repr((settings, physics, request.varied, own.nworld, own.steps, own.seed))
         if key not in self._evaluators:
             with named_out_of_memory(self._device, own.nworld, *_WORLDS):
-                self._evaluators[key] = Evaluator(config, self._device, physics)
-        return self._evaluators[key], shown
+                self._evaluators[key] = Evaluator(config, self._device, physics, request.varied)
+        return self._evaluators[key], shown if request.varied is None else f"{shown}, {request.varied}"
 
     def evaluate(self, policy: SavedPolicy, request: Request) -> dict[str, Any]:
         """One entry of `eval.json`: what was evaluated, how, and the results.
@@ -99,7 +102,8 @@ class Bench:
             runs = [evaluator.episodes(policy.on(evaluator.env), seed) for seed in seeds]
         reference = named_physics(policy.config, REFERENCE)[1]
         canonical = (
-            evaluator.env.nworld == own.nworld
+            request.varied is None
+            and evaluator.env.nworld == own.nworld
             and seeds == (own.seed,)
             and request.steps in (None, own.steps or policy.config.env.episode_length)
             and named_physics(policy.config, request.physics)[1] == reference

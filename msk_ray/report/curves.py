@@ -123,9 +123,21 @@ def learning_curves(
         f"{best:.5g}.",
         ("Mean over seeds, band: their range. " if seeds > 1 else "")
         + "A cross ends a trial that was stopped before its time; from there the mean is over those that went on."
-        + more,
+        + more
+        + _randomized([groups[variant] for variant in ranked]),
         draw,
     )
+
+
+def _randomized(groups: Sequence[Sequence[TrialReading]]) -> str:
+    """What is drawn in training and not in evaluation, as a sentence; empty if nothing is."""
+    sections = [trials[0].trial.config.physics.randomize for trials in groups]
+    drawn = [section for section in sections if section is not None]
+    if not drawn:
+        return ""
+    some = f"{len(drawn)} of {len(sections)} variants are" if len(drawn) < len(sections) else "All variants are"
+    kinds = "; or ".join(dict.fromkeys(map(str, drawn)))
+    return f" {some} trained with {kinds}, drawn for every episode; every score is of the model as it is."
 
 
 def _draw_variant(axes: Axes, curves: Sequence[Curve], number: int, label: str) -> None:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from msk_ray.config import Config, PhysicsConfig
+from msk_ray.config import Config, PhysicsConfig, RandomizeConfig
 from msk_ray.envs import env_class, make_env
 from msk_ray.simulation import StepState
 
@@ -60,9 +60,16 @@ class Evaluator:
         config: the trial's config; its `evaluation` section sets worlds, steps and seed.
         device: "cpu" or "cuda:N".
         physics: physics to use instead of the reference.
+        varied: parameters of the model that are other than its own. What training draws does not apply.
     """
 
-    def __init__(self, config: Config, device: str, physics: PhysicsConfig | None = None) -> None:
+    def __init__(
+        self,
+        config: Config,
+        device: str,
+        physics: PhysicsConfig | None = None,
+        varied: RandomizeConfig | None = None,
+    ) -> None:
         e = config.evaluation
         self._seed = e.seed
         env_type = env_class(config.env)
@@ -71,7 +78,8 @@ class Evaluator:
         settings = settings.model_copy(update={"episode_length": steps})
         if physics is None:
             physics = env_type.reference_physics(config.physics, e.variant)
-        self.env = make_env(settings, physics, e.nworld, device, e.seed, differentiable=False)
+        physics = physics.model_copy(update={"randomize": varied})
+        self.env = make_env(settings, physics, e.nworld, device, e.seed, differentiable=False, randomize=True)
         self.env.generator = torch.Generator()
         self.steps = steps
         self._tail = min(steps, math.ceil(1.0 / settings.control_timestep))

@@ -83,6 +83,7 @@ class Trainer:
                 device,
                 config.trial.seed,
                 differentiable=config.algorithm_settings.differentiates,
+                randomize=True,
             )
             self.algorithm = algorithm(config, self.env)
             self.evaluator = Evaluator(config, device)

@@ -101,6 +101,27 @@ def test_an_experiment_is_ranked_and_a_torn_policy_is_named(
     assert shown.count("(half the worlds: 8 of 16)") == 1
 
 
+def test_other_values_of_a_parameter(trial: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    short = ["--steps", "20", "--device", "cpu"]
+    assert run(main, [str(trial), "--vary", "body_mass=1x,3x", *short]) == 0
+    own, once, thrice = entries(trial)
+    assert [e["physics"] for e in (own, once, thrice)] == ["own", "own, body_mass ×1", "own, body_mass ×3"]
+    assert not once["canonical"]
+    assert once["scores"] == pytest.approx(own["scores"], rel=1e-5)
+    assert abs(thrice["score"]["mean"] - own["score"]["mean"]) > 1e-2
+    shown = capsys.readouterr().out
+    assert "of its own" in shown
+    assert "own, body_mass ×3" in shown
+    for text, why in {
+        "body_mas=2x": "write FIELD=VALUE,VALUE with one of geom_friction",
+        "body_mass=2": "only multiples of the model's own; write 2x",
+        "dof_damping=0.1,hot": "is no positive number; write 0.8, or 0.8x",
+        "geom_friction=nan": "is no positive number",
+    }.items():
+        assert run(main, [str(trial), "--vary", text, *short]) == 2
+        assert why in capsys.readouterr().err.splitlines()[-1]
+
+
 def test_physics_by_name(ant_trial: Path) -> None:
     policy = load_policy(ant_trial / "checkpoints" / "best.pt")
     bench = Bench("cpu")

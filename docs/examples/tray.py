@@ -1,0 +1,53 @@
+"""A waiter's task: bring a tray to the middle as fast as the puck on it allows."""
+
+import torch
+from torch import Tensor
+
+from msk_ray import MjcfEnv, Reward, StepState
+
+
+class TrayReward(Reward):
+    near: float = 1.0
+    """Weight of how near the tray is to the middle, from 0 to 1."""
+    centred: float = 1.0
+    """Weight of the squared distance of the puck from the middle of the tray, in halves of its length."""
+    effort: float = 0.02
+    """Weight of the squared action."""
+
+
+class Tray(MjcfEnv):
+    class Settings(MjcfEnv.Settings):
+        distance: float = 2.0
+        """Largest distance of the tray from the middle at the start [m]."""
+        reward: TrayReward = TrayReward()
+
+    reward_names = ("near", "centred", "effort")
+    mjcf = """
+    <mujoco model="tray"><option timestep=".005" cone="elliptic"/>
+      <default><geom friction=".8 .005 .0001"/></default>
+      <worldbody><light pos="0 -2 4" dir="0 .4 -1"/>
+        <camera name="side" pos="0 -5 .6" xyaxes="1 0 0 0 0 1"/>
+        <body name="tray" pos="0 0 .5"><joint name="tray" type="slide" axis="1 0 0" damping=".1"/>
+          <geom name="tray" type="box" size=".25 .2 .02" mass="2" rgba=".5 .35 .2 1"/></body>
+        <body name="puck" pos="0 0 .57"><joint name="puck_x" type="slide" axis="1 0 0"/>
+          <joint name="puck_z" type="slide" axis="0 0 1"/>
+          <geom name="puck" type="sphere" size=".05" mass=".5" rgba=".8 .2 .2 1"/></body></worldbody>
+      <actuator><motor joint="tray" gear="40" ctrlrange="-1 1"/></actuator></mujoco>"""
+
+    def draw_physics(self, count: int) -> StepState:
+        tray = self.config.distance * self.uniform(count, 1)
+        qpos = torch.cat((tray, tray, torch.zeros_like(tray)), dim=-1)
+        return StepState(qpos, torch.zeros_like(qpos), torch.zeros((count, 0), device=self.device))
+
+    def observe(self, state: StepState, action: Tensor) -> Tensor:
+        x, v = state.qpos, state.qvel
+        return torch.stack((x[:, 0], 0.5 * v[:, 0], 4.0 * (x[:, 1] - x[:, 0]), v[:, 1] - v[:, 0]), dim=-1)
+
+    def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+        r = self.config.reward
+        near = 1.0 / (1.0 + (state.qpos[:, 0] / 0.3).square())
+        off = ((state.qpos[:, 1] - state.qpos[:, 0]) / 0.25).square()
+        return torch.stack((r.near * near, -r.centred * off, -r.effort * action.square().sum(-1)), dim=-1)
+
+    def fell(self, state: StepState) -> Tensor:
+        return (state.qpos[:, 1] - state.qpos[:, 0]).abs() > 0.25

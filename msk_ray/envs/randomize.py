@@ -1,0 +1,218 @@
+"""Parameters of the model that differ between worlds and change with every episode.
+
+Axes: W worlds, K numbers that are drawn per world and episode.
+"""
+
+import math
+from collections.abc import Iterable, Mapping
+from operator import attrgetter
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from msk_ray.config import Draw, RandomizeConfig
+from msk_ray.errors import ConfigError
+
+
+class _Field(NamedTuple):
+    """What one setting changes."""
+
+    arrays: tuple[str, ...]
+    """Names of the model's arrays."""
+    element: str | None
+    """Kind of their elements, which have names; None: the array has none."""
+    columns: slice = slice(None)
+    """Entries of an element that change."""
+
+
+_FIELDS = {
+    "geom_friction": _Field(("geom_friction",), "geom", slice(0, 1)),
+    "pair_friction": _Field(("pair_friction",), "pair", slice(0, 2)),
+    "body_mass": _Field(("body_mass", "body_inertia"), "body"),
+    "dof_damping": _Field(("dof_damping",), "joint"),
+    "dof_armature": _Field(("dof_armature",), "joint"),
+    "jnt_stiffness": _Field(("jnt_stiffness",), "joint"),
+    "actuator_gear": _Field(("actuator_gear",), "actuator"),
+    "actuator_gain": _Field(("actuator_gainprm", "actuator_biasprm"), "actuator", slice(0, 3)),
+    "gravity": _Field(("opt.gravity",), None),
+}
+
+
+class Randomizer:
+    """Draws the numbers of a `randomize` section for every world, and turns them into parameters of the model.
+
+    An array is linear in the numbers: const + drawn · slope. A scaled entry has its value in the slope, a replaced one
+    has 1 there, and every other has its value in const.
+
+    Args:
+        config: the section.
+        model: the model, with the values that scales refer to.
+        nworld: number of worlds.
+        device: where the parameters are needed.
+        seed: of a generator of its own, so that initial states are those of a trial without randomization.
+
+    Attributes:
+        parameters: values of fields of the model by name, with a row per world.
+
+    Raises:
+        ConfigError: the model has no such elements, or a number would have no effect.
+    """
+
+    def __init__(
+        self, config: RandomizeConfig, model: mujoco.MjModel, nworld: int, device: torch.device, seed: int
+    ) -> None:
+        self._generator = torch.Generator(device=device).manual_seed(seed)
+        self._device = device
+        chosen = {name: _chosen(model, name, draw) for name, draw in config.drawn.items()}
+        owners = {name: _owners(model, name, rows) for name, rows in chosen.items()}
+        self._widths = {n: len(set(owners[n])) if draw.each else 1 for n, draw in config.drawn.items()}
+        bounds = [_bounds(draw) for name, draw in config.drawn.items() for _ in range(self._widths[name])]
+        self._low, high, log = (self._tensor(part) for part in zip(*bounds, strict=True))
+        self._span, self._log = high - self._low, log.bool()
+        self._linear = self._arrays(config, model, chosen, owners)
+        self._shapes = {name: attrgetter(name)(model).shape for name in self._linear}
+        self._numbers = self._draw(nworld)
+        self.parameters = self._values()
+
+    def redraw(self, ended: Tensor) -> None:
+        """Draw other numbers for the worlds whose episode ended, (W,) bool. Earlier `parameters` stay what they are."""
+        self._numbers = torch.where(ended[:, None], self._draw(len(ended)), self._numbers)
+        self.parameters = self._values()
+
+    def metrics(self) -> dict[str, float]:
+        """Smallest and largest number in use of each setting, by metric name."""
+        found: dict[str, float] = {}
+        for name, part in zip(self._widths, self._numbers.split(list(self._widths.values()), dim=1), strict=True):
+            found |= {f"randomize/{name}_min": float(part.min()), f"randomize/{name}_max": float(part.max())}
+        return found
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """The numbers in use, and the state of their generator."""
+        return {"numbers": self._numbers.clone(), "generator": self._generator.get_state()}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Continue from a `state_dict`."""
+        self._numbers = state["numbers"].to(self._device)
+        self._generator.set_state(state["generator"].cpu())
+        self.parameters = self._values()
+
+    def _draw(self, count: int) -> Tensor:
+        """Numbers of `count` episodes, (count, K)."""
+        uniform = torch.rand((count, len(self._low)), generator=self._generator, device=self._device)
+        drawn = self._low + self._span * uniform
+        return torch.where(self._log, drawn.exp(), drawn)
+
+    def _values(self) -> dict[str, Tensor]:
+        return {
+            name: torch.addmm(const, self._numbers, slope).view(-1, *self._shapes[name])
+            for name, (const, slope) in self._linear.items()
+        }
+
+    def _arrays(
+        self,
+        config: RandomizeConfig,
+        model: mujoco.MjModel,
+        chosen: Mapping[str, list[int]],
+        owners: Mapping[str, list[int]],
+    ) -> dict[str, tuple[Tensor, Tensor]]:
+        """(const (n,), slope (K, n)) of every array with n entries."""
+        linear: dict[str, tuple[Tensor, Tensor]] = {}
+        first = 0
+        for name, draw in config.drawn.items():
+            field = _FIELDS[name]
+            places = {owner: first + (k if draw.each else 0) for k, owner in enumerate(dict.fromkeys(owners[name]))}
+            for array in field.arrays:
+                base = np.array(attrgetter(array)(model), dtype=np.float64)
+                const, slope = base.copy(), np.zeros((len(self._low), *base.shape))
+                for element, owner in zip(chosen[name], owners[name], strict=True):
+                    at = _entries(model, name, element, base.ndim)
+                    const[at] = 0.0
+                    slope[places[owner]][at] = base[at] if draw.mode == "scale" else 1.0
+                linear[array] = self._tensor(const.ravel()), self._tensor(slope.reshape(len(slope), -1))
+            first += self._widths[name]
+        return linear
+
+    def _tensor(self, values: Any) -> Tensor:
+        return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=self._device)
+
+
+def _names(model: mujoco.MjModel, kind: str) -> list[str]:
+    """Names of all elements of a kind; nameless ones by number."""
+    kinds = mujoco.mjtObj
+    of = {
+        "geom": (kinds.mjOBJ_GEOM, model.ngeom),
+        "pair": (kinds.mjOBJ_PAIR, model.npair),
+        "body": (kinds.mjOBJ_BODY, model.nbody),
+        "joint": (kinds.mjOBJ_JOINT, model.njnt),
+        "actuator": (kinds.mjOBJ_ACTUATOR, model.nu),
+    }
+    obj, count = of[kind]
+    return [mujoco.mj_id2name(model, obj, i) or str(i) for i in range(count)]
+
+
+def _bounds(draw: Draw) -> tuple[float, float, bool]:
+    """Bounds of the uniform number that is drawn, and whether it is a logarithm."""
+    log = draw.distribution == "log_uniform"
+    return (math.log(draw.low), math.log(draw.high), True) if log else (draw.low, draw.high, False)
+
+
+def _entries(model: mujoco.MjModel, name: str, element: int, axes: int) -> Any:
+    """Index of the entries of an element that change, in an array of `axes` axes."""
+    if _FIELDS[name].element is None:
+        return slice(None)
+    return element if axes == 1 else (element, _columns(model, name, element))
+
+
+def _columns(model: mujoco.MjModel, name: str, element: int) -> slice:
+    """Entries of an element that change, in an array with several for each."""
+    if name == "actuator_gain" and model.actuator_gaintype[element] == mujoco.mjtGain.mjGAIN_MUSCLE:
+        return slice(2, 4)  # peak force, and the scale that it is computed from if it is not given
+    return _FIELDS[name].columns
+
+
+def _owners(model: mujoco.MjModel, name: str, elements: Iterable[int]) -> list[int]:
+    """The element that each row of a field's arrays belongs to: for dofs their joint."""
+    if name.startswith("dof_"):
+        return [int(model.dof_jntid[dof]) for dof in elements]
+    return list(elements)
+
+
+def _chosen(model: mujoco.MjModel, name: str, draw: Draw) -> list[int]:
+    """Rows of a field's arrays that change.
+
+    Raises:
+        ConfigError: there are none, or no number would have an effect on them.
+    """
+    field, key = _FIELDS[name], f"physics.randomize.{name}"
+    if field.element is None:
+        if draw.only is not None or draw.each:
+            raise ConfigError(f"{key}: it belongs to the whole model; leave out only and each")
+        rows = [0]
+    else:
+        names = _names(model, field.element)
+        unknown = [n for n in draw.only or () if n not in names]
+        if unknown:
+            raise ConfigError(f"{key}.only: the model has no {field.element} {unknown[0]!r}; it has {', '.join(names)}")
+        wanted = {i for i, n in enumerate(names) if draw.only is None or n in draw.only}
+        base = attrgetter(field.arrays[0])(model)
+        rows = [row for row, owner in enumerate(_owners(model, name, range(len(base)))) if owner in wanted]
+        if not rows:
+            raise ConfigError(f"{key}: the model has no {field.element} whose value could be drawn; leave it out")
+    _refuse_without_effect(model, name, draw, rows)
+    return rows
+
+
+def _refuse_without_effect(model: mujoco.MjModel, name: str, draw: Draw, rows: list[int]) -> None:
+    field, key = _FIELDS[name], f"physics.randomize.{name}"
+    base = np.asarray(attrgetter(field.arrays[0])(model))
+    if draw.mode == "scale" and not np.any(base if field.element is None else base[rows]):
+        hint = "leave it out" if type(draw) is not Draw else "write mode: value"
+        raise ConfigError(f"{key}: it is 0 in the model, which a scale does not change; {hint}")
+    masks = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    if name == "geom_friction" and not masks.any():
+        raise ConfigError(
+            f"{key}: the model's contacts are pairs, which have their own friction; write pair_friction instead"
+        )

@@ -1,0 +1,71 @@
+"""`evaluate --vary`: the same policy under several values of a parameter of the model."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from pydantic import ValidationError
+
+from msk_ray.config import RandomizeConfig
+from msk_ray.errors import ConfigError, brief
+from msk_ray.text_table import text_table
+
+HELP = (
+    "evaluate the model's own value and these of a field of the model: geom_friction=0.4,0.8,1.2, or multiples of it: "
+    "body_mass=0.8x,1.2x"
+)
+
+
+def parse_vary(text: str) -> list[RandomizeConfig]:
+    """The values that `--vary` asks for, one section each.
+
+    Raises:
+        ConfigError: there is no such field, or a value is no positive number.
+    """
+    name, equals, values = text.partition("=")
+    known = list(RandomizeConfig.model_fields)
+    if not equals or name not in known:
+        raise ConfigError(f"--vary {brief(text)}: write FIELD=VALUE,VALUE with one of {', '.join(known)}")
+    return [_at(name, value.strip()) for value in values.split(",")]
+
+
+def _at(name: str, value: str) -> RandomizeConfig:
+    scale = value.endswith("x")
+    try:
+        number = float(value.removesuffix("x"))
+    except ValueError:
+        number = math.nan
+    if not (math.isfinite(number) and number > 0.0):
+        raise ConfigError(f"--vary {name}: {brief(value)} is no positive number; write 0.8, or 0.8x for a multiple")
+    try:
+        return RandomizeConfig.model_validate(
+            {name: {"low": number, "high": number, "mode": "scale" if scale else "value"}}
+        )
+    except ValidationError:
+        raise ConfigError(f"--vary {name}: only multiples of the model's own; write {number:g}x") from None
+
+
+def share_of_own(own: float, score: float) -> str:
+    """A score as a share of that under the model's own value."""
+    return f"{score / own:.0%}" if own > 0.0 else "-"
+
+
+def vary_text(entries: Sequence[dict[str, Any]]) -> str:
+    """Evaluations under the model's own value and others, for a terminal.
+
+    Args:
+        entries: of one policy; the first is under the model's own value.
+    """
+    own = entries[0]["score"]["mean"]
+    rows = [
+        (
+            entry["physics"],
+            f"{entry['score']['mean']:.5g}",
+            f"{entry['score']['std']:.3g}",
+            share_of_own(own, entry["score"]["mean"]),
+            f"{entry['length']['mean']:.0f}",
+            f"{entry['fall_rate']:.0%}",
+        )
+        for entry in entries
+    ]
+    return text_table(("physics", "score", "std", "of its own", "length", "fell"), rows, 120)
