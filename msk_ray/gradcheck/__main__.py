@@ -282,12 +282,11 @@ def print_table(result: "GradientCheck", model: str, tolerance: float) -> None:
     if result.checked and result.excluded > MANY_EXCLUDED * (result.checked + result.excluded):
         console.print("note: many states were left out; the result only covers the others")
     if result.approximated:
-        share, count = result.diagnostics["approximated_share"], len(result.approximated)
-        console.print(
-            f"contacts only partly exact: {', '.join(result.approximated[:3])}{' …' if count > 3 else ''} ({count} "
-            f"pair(s) may touch); one touched in {share:.1%} of the substeps",
-            markup=False,
-        )
+        count = len(result.approximated)
+        pairs = f"{', '.join(result.approximated[:3])}{' …' if count > 3 else ''}"
+        console.print(f"contacts only partly exact: {pairs} ({count} pair(s) may touch)", markup=False)
+    if share := result.diagnostics.get("approximated_share", 0.0):
+        console.print(f"contacts without a derivative: that of the nearest law in {share:.1%} of the substeps")
     for lost in result.nonfinite:
         console.print(f"non-finite: {lost}", markup=False)
     verdict = "ok" if result.max_rel_error <= tolerance else "above the tolerance"

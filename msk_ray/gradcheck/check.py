@@ -79,8 +79,7 @@ class GradientCheck:
     diagnostics: dict[str, float] = field(default_factory=dict)
     """Diagnostics of the simulation and its backward mode, the largest over the kinds of state."""
     approximated: list[str] = field(default_factory=list)
-    """Pairs of geoms whose contacts the mode differentiates only in part; `approximated_share` of the diagnostics is
-    the share of the substeps in which one touched."""
+    """Pairs of geoms whose contacts the mode differentiates only in part."""
     nonfinite: list[NonFinite] = field(default_factory=list)
     """States, compared or left out, at which the step or its gradient is not finite."""
 

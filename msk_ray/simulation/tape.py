@@ -232,7 +232,7 @@ class _Tape(Backward):
         return figures
 
     def _approximated_share(self) -> float:
-        """Share of the worlds' substeps whose gradient went through an approximated contact.
+        """Share of the worlds' substeps whose gradient went through a contact without a derivative of its own.
 
         Warns the first time it is above zero.
         """

@@ -28,7 +28,7 @@ def falling(shape: str, ground: str, cone: str = "elliptic", condim: int = 3, op
     top = _SHAPES[shape]
     return tighten(
         mujoco.MjModel.from_xml_string(
-            f"""<mujoco><option timestep=".004" cone="{cone}" {option}/>
+            f"""<mujoco><option timestep=".004" ccd_tolerance="1e-10" cone="{cone}" {option}/>
             <default><geom condim="{condim}" friction=".6 .02 .01" solref=".05 1" solimp=".8 .9 .05 .5 2"/></default>
             {_WEDGE}<worldbody>{below}<body pos="0 0 0"><freejoint/><geom {top}/>
             <geom type="sphere" size=".02" pos=".2 .1 .05" contype="0" conaffinity="0"/></body></worldbody></mujoco>"""
@@ -70,6 +70,7 @@ def landing_points(model: mujoco.MjModel, count: int, on_plane: bool) -> list[Po
         *[("sphere", ground) for ground in ("sphere", "capsule", "cylinder", "box")],
         *[("capsule", ground) for ground in ("capsule", "box")],
         ("box", "box"),
+        *[("mesh", "mesh"), ("mesh", "box"), ("ellipsoid", "mesh")],
     ],
 )
 def test_exact_pairs(shape, ground, substeps):

@@ -9,8 +9,12 @@ import mujoco_warp as mjw
 import numpy as np
 import pytest
 import warp as wp
+from mujoco_warp import GeomType
 
-from msk_ray.physics.adjoint.box_pairs import box_box_wrenches, capsule_box_wrenches
+from msk_ray.physics.adjoint.capsule_box import capsule_box_wrenches
+from msk_ray.physics.adjoint.convex import convex_wrenches, solid_of
+from msk_ray.physics.adjoint.convex_laws import Bars, Seen
+from msk_ray.physics.adjoint.groups import Meshes, Shapes, gather
 
 EPS = 2e-3
 SIZES = {"box": (0.1, 0.07, 0.05), "capsule": (0.04, 0.15, 0.0), "ground": (0.2, 0.15, 0.1)}
@@ -18,12 +22,13 @@ SIZES = {"box": (0.1, 0.07, 0.05), "capsule": (0.04, 0.15, 0.0), "ground": (0.2,
 
 @wp.kernel(enable_backward=False)
 def wrenches(
-    capsule: int,
+    shapes: Shapes,
+    meshes: Meshes,
     native_ccd: int,
+    world: wp.array[int],
     index: wp.array[int],
-    pos: wp.array2d[wp.vec3],
-    mat: wp.array2d[wp.mat33],
-    size: wp.array[wp.vec3],
+    xpos: wp.array2d[wp.vec3],
+    xmat: wp.array2d[wp.mat33],
     dist: wp.array[float],
     point: wp.array[wp.vec3],
     frame: wp.array[wp.mat33],
@@ -33,15 +38,17 @@ def wrenches(
     out: wp.array2d[wp.vec3],
 ):
     i = wp.tid()
-    if capsule == 1:
+    solid1 = solid_of(0, world[i], shapes, meshes, xpos, xmat)
+    solid2 = solid_of(1, world[i], shapes, meshes, xpos, xmat)
+    if solid1.type == GeomType.CAPSULE:
         f1, t1, f2, t2 = capsule_box_wrenches(
             index[i],
-            pos[i, 0],
-            mat[i, 0],
-            size[0],
-            pos[i, 1],
-            mat[i, 1],
-            size[1],
+            solid1.pos,
+            solid1.mat,
+            solid1.size,
+            solid2.pos,
+            solid2.mat,
+            solid2.size,
             dist[i],
             point[i],
             frame[i][0],
@@ -49,26 +56,24 @@ def wrenches(
             pos_bar[i],
             normal_bar[i],
         )
+        out[i, 0] = f1
+        out[i, 1] = t1
+        out[i, 2] = f2
+        out[i, 3] = t2
     else:
-        f1, t1, f2, t2 = box_box_wrenches(
-            native_ccd,
-            pos[i, 0],
-            mat[i, 0],
-            size[0],
-            pos[i, 1],
-            mat[i, 1],
-            size[1],
-            dist[i],
-            point[i],
-            frame[i][0],
-            dist_bar[i],
-            pos_bar[i],
-            normal_bar[i],
-        )
-    out[i, 0] = f1
-    out[i, 1] = t1
-    out[i, 2] = f2
-    out[i, 3] = t2
+        seen = Seen()
+        seen.dist = dist[i]
+        seen.point = point[i]
+        seen.normal = frame[i][0]
+        bars = Bars()
+        bars.dist = dist_bar[i]
+        bars.point = pos_bar[i]
+        bars.normal = normal_bar[i]
+        push, _exact = convex_wrenches(solid1, solid2, meshes, seen, bars, native_ccd, 1)
+        out[i, 0] = push.force1
+        out[i, 1] = push.torque1 + wp.cross(point[i] - solid1.pos, push.force1)
+        out[i, 2] = push.force2
+        out[i, 3] = push.torque2 + wp.cross(point[i] - solid2.pos, push.force2)
 
 
 def two_bodies(shape: str, flag: str, margin: float) -> mujoco.MjModel:
@@ -194,17 +199,18 @@ def test_contact_follows_both_bodies(shape, tilt, flag, margin):
     base = np.array([r[0] for r in rows])
     contact = np.array([r[2] for r in rows], np.float32)
     weight = np.array(weights, np.float32)
-    out = wp.zeros((len(rows), 4), dtype=wp.vec3)
+    out, m = wp.zeros((len(rows), 4), dtype=wp.vec3), mjw.put_model(model)
     wp.launch(
         wrenches,
         dim=len(rows),
         inputs=[
-            int(shape == "capsule"),
+            gather(Shapes, m),
+            gather(Meshes, m),
             int(not flag),
+            wp.array(base, dtype=int),
             wp.array([r[1] for r in rows], dtype=int),
-            wp.array(geom_pos[base], dtype=wp.vec3),
-            wp.array(geom_mat[base].reshape(-1, 2, 3, 3), dtype=wp.mat33),
-            wp.array([SIZES[shape], SIZES["ground"]], dtype=wp.vec3),
+            wp.array(geom_pos, dtype=wp.vec3),
+            wp.array(geom_mat, dtype=wp.mat33),
             wp.array(contact[:, 0], dtype=float),
             wp.array(contact[:, 1:4], dtype=wp.vec3),
             wp.array(contact[:, 4:].reshape(-1, 3, 3), dtype=wp.mat33),

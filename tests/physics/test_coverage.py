@@ -66,16 +66,7 @@ def _body(kind: str, size: str, height: float) -> str:
     return f'<body pos="0 0 {height}"><freejoint/><geom name="{kind}" type="{kind}" size="{size}"/></body>'
 
 
-def test_an_approximate_gradient_is_warned_of_by_name() -> None:
+def test_convex_pairs_are_exact(recwarn: pytest.WarningsRecorder) -> None:
     bodies = _body("cylinder", ".1 .1", 0.1) + _body("ellipsoid", ".1 .1 .05", 0.3)
-    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
-    with pytest.warns(
-        UserWarning, match=r"tape_all is only partly exact for contact of other convex pairs .*ellipsoid"
-    ):
-        check_supported(model, "tape_all")
-
-
-def test_an_exact_gradient_is_not(recwarn: pytest.WarningsRecorder) -> None:
-    bodies = _body("sphere", ".1", 0.1) + _body("box", ".1 .1 .05", 0.3)
     check_supported(mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>"), "tape_all")
     assert not recwarn.list

@@ -83,7 +83,7 @@ ON_PLANE: dict[str, dict[str, Pose]] = {
 }
 """Poses of a shape on the plane."""
 
-EXACT_PAIRS: dict[tuple[str, str], dict[str, Pose]] = {
+PAIRS: dict[tuple[str, str], dict[str, Pose]] = {
     ("sphere", "sphere"): {
         "above": ((0, 0, 0.2), AS_IS),
         "beside": ((0.2 - DEPTH, 0, DEPTH), AS_IS),
@@ -151,10 +151,6 @@ EXACT_PAIRS: dict[tuple[str, str], dict[str, Pose]] = {
         "edges meet": ((0.16 - DEPTH, 0, 0.12), AS_IS),
         "coincident": ((0, 0, DEPTH), AS_IS),
     },
-}
-"""Poses of the second shape, the first at the origin. A pose that does not sit at `DEPTH` already is lowered by it."""
-
-APPROXIMATED_PAIRS: dict[tuple[str, str], dict[str, Pose]] = {
     ("ellipsoid", "sphere"): {"pole": ((0, 0, 0.22), AS_IS), "pole x": ((0.2 - DEPTH, 0, DEPTH), AS_IS)},
     ("ellipsoid", "ellipsoid"): {"pole": ((0, 0, 0.24), AS_IS)},
     ("ellipsoid", "box"): {"pole": ((0, 0, 0.18), AS_IS)},
@@ -170,6 +166,7 @@ APPROXIMATED_PAIRS: dict[tuple[str, str], dict[str, Pose]] = {
     ("mesh", "mesh"): {"flat": ((0, 0, 0.12), AS_IS)},
     ("mesh", "ellipsoid"): {"pole": ((0, 0, 0.18), AS_IS)},
 }
+"""Poses of the second shape, the first at the origin. A pose that does not sit at `DEPTH` already is lowered by it."""
 
 LEFT_OUT = {
     "sphere with sphere: coincident",
@@ -179,8 +176,18 @@ LEFT_OUT = {
     *(f"capsule with capsule: {p}" for p in ("crossed, axes touch", "coincident", "axes overlap")),
     *(f"box with capsule: {p}" for p in ("lying", "diagonal", "end at the edge")),
     *(f"box with box: {p}" for p in ("aligned", "turned by 45", "edges meet", "coincident")),
+    *(f"ellipsoid with {other}: pole" for other in ("box", "cylinder", "ellipsoid")),
+    *(f"cylinder with {other}: {p}" for other in ("box", "cylinder") for p in ("beside", "stacked")),
+    *("mesh with cylinder: stacked", "mesh with ellipsoid: pole", "mesh with mesh: flat"),
 }
-"""Poses that gradcheck leaves out: the normal has no direction there, or the number of contacts changes."""
+"""Poses that gradcheck leaves out: the normal has no direction there, the number of contacts changes, or MuJoCo's
+convex collision stops at another of its approximations of a curved surface."""
+
+LEFT_OUT_WITHOUT_NATIVE = {
+    *(f"{shape} with capsule: {p}" for shape in ("cylinder", "mesh") for p in ("lying", "upright")),
+    *("mesh with box: flat", "mesh with sphere: face", "ellipsoid with capsule: pole"),
+}
+"""Those too where C MuJoCo collides with libccd, which MuJoCo Warp does not have."""
 
 ROUGH = {
     "capsule with capsule: parallel": 2e-3,
@@ -190,6 +197,7 @@ ROUGH = {
     "box with box: turned by 45": 1e-2,
     "box with box: turned by 90": 1e-2,
     "box with box: edge on face": 1e-2,
+    "mesh with box: flat": 1e-2,
 }
 """Where two features end side by side, so that a contact moves with either body: the gradient follows one of them."""
 
@@ -203,7 +211,7 @@ def free_bodies(plane: bool, option: str, flag: str) -> mujoco.MjModel:
         for i in range(1 if plane else 2)
     )
     return mujoco.MjModel.from_xml_string(
-        f"""<mujoco><option timestep=".004" {option}><flag {flag}/></option>
+        f"""<mujoco><option timestep=".004" ccd_tolerance="1e-10" {option}><flag {flag}/></option>
         <default><geom condim="3" friction=".6 .02 .01" solref=".05 1" solimp=".8 .9 .05 .5 2"/></default>
         <asset><mesh name="cube" vertex="{CUBE}"/></asset><worldbody>{ground}{bodies}</worldbody></mujoco>"""
     )
@@ -284,21 +292,14 @@ def test_on_a_plane(cone: str) -> None:
     assert check(model, points, names, [dofs(model, f"{shape}0") for shape, _, _ in cases]) == set()
 
 
-@pytest.mark.filterwarnings("ignore:.*partly exact")
 @pytest.mark.parametrize(("cone", "flag"), [("elliptic", ""), ("pyramidal", 'nativeccd="disable"')])
 def test_in_pairs(cone: str, flag: str) -> None:
-    """Pairs whose gradient is approximated are checked for finite numbers only."""
     model = free_bodies(False, f'cone="{cone}"', flag)
-    cases = [
-        (first, second, name, pose)
-        for table in (EXACT_PAIRS, APPROXIMATED_PAIRS)
-        for (first, second), poses in table.items()
-        for name, pose in poses.items()
-    ]
-    exact = [(first, second) for (first, second), poses in EXACT_PAIRS.items() for _ in poses]
+    cases = [(first, second, name, pose) for (first, second), poses in PAIRS.items() for name, pose in poses.items()]
     points = [placed(model, {f"{a}0": ((0, 0, 0), AS_IS), f"{b}1": lowered(pose)}) for a, b, _, pose in cases]
     names = [f"{a} with {b}: {name}" for a, b, name, _ in cases]
-    assert check(model, points, names, [dofs(model, f"{a}0", f"{b}1") for a, b in exact]) <= LEFT_OUT
+    left_out = check(model, points, names, [dofs(model, f"{a}0", f"{b}1") for a, b, _, _ in cases])
+    assert left_out <= (LEFT_OUT | LEFT_OUT_WITHOUT_NATIVE if flag else LEFT_OUT)
 
 
 BALL = """<body pos="0 0 1"><joint name="j" type="ball" {}/><geom type="capsule" size=".05" fromto="0 0 0 .1 .2 .1"/>

@@ -1,17 +1,18 @@
-"""How often a gradient goes through a contact whose point and frame are approximated, and between which geoms."""
+"""How often a gradient goes through a contact without a derivative of its own, and between which geoms."""
 
 import mujoco
 import numpy as np
 import warp as wp
 
-from msk_ray.physics.adjoint.coverage import approximated_types, geom_pair_name
+from msk_ray.physics.adjoint.coverage import contact_types, geom_pair_name
+from msk_ray.physics.adjoint.pair_laws import CONVEX_PAIRS
 
 _TYPES = wp.constant(int(mujoco.mjtGeom.mjNGEOMTYPES))
 
 
 @wp.struct
 class Touches:
-    """Where `pull_geometry` counts."""
+    """Where `pull_convex` counts."""
 
     last: wp.array[int]
     """Substep counted last, from 1, in the env step that is pulled back, shape (W,)."""
@@ -41,7 +42,7 @@ class TouchCounter:
 
     def __init__(self, mjm: mujoco.MjModel, nworld: int) -> None:
         self._mjm = mjm
-        self.present = bool(approximated_types(mjm))
+        self.present = bool(contact_types(mjm) & CONVEX_PAIRS)
         self.substep = 0
         self.touches = Touches()
         self.touches.last = wp.zeros(nworld if self.present else 0, dtype=int)

@@ -7,6 +7,7 @@ plain field x, along the frame's axes (k < 3), and the relative spin (k ≥ 3). 
 
 import warp as wp
 
+from msk_ray.physics.adjoint.convex import ConvexContacts
 from msk_ray.physics.adjoint.coverage import colliding_pairs
 from msk_ray.physics.adjoint.geometry import PairKinds, pull_geometry_kernel
 from msk_ray.physics.adjoint.groups import (
@@ -22,6 +23,7 @@ from msk_ray.physics.adjoint.groups import (
     allocate,
     gather,
 )
+from msk_ray.physics.adjoint.pair_laws import CONVEX_PAIRS
 from msk_ray.physics.adjoint.rows import cone_law, cone_slope, row_slopes, vec6
 from msk_ray.physics.adjoint.spatial import carried, point_velocity, wrench
 from msk_ray.physics.adjoint.workspace import Workspace
@@ -234,12 +236,13 @@ class ContactForces:
         self._work, self.count = work, contacts
         mjm = work.mjm
         types = {(int(mjm.geom_type[a]), int(mjm.geom_type[b])) for a, b in colliding_pairs(mjm)}
-        self._pull_geometry = pull_geometry_kernel(PairKinds.of(mjm, types))
+        self._pull_geometry = pull_geometry_kernel(PairKinds.of(types))
         self._shapes = gather(Shapes, work.model)
         self._bars = allocate(ContactBars, contacts)
+        self._convex = ConvexContacts(work, contacts) if types & CONVEX_PAIRS else None
 
     def launch(self, at: Substep) -> None:
-        """Launch both."""
+        """Launch all of them."""
         work, m, d = self._work, self._work.model, at.data
         wp.launch(
             pull_contacts,
@@ -263,7 +266,6 @@ class ContactForces:
             dim=self.count,
             inputs=[
                 self._shapes,
-                work.touch_counter.substep,
                 d.nacon,
                 at.contacts,
                 d.geom_xpos,
@@ -271,5 +273,7 @@ class ContactForces:
                 d.subtree_com,
                 self._bars,
             ],
-            outputs=[work.bars.moved, work.touch_counter.touches],
+            outputs=[work.bars.moved],
         )
+        if self._convex is not None:
+            self._convex.launch(at, self._bars)

@@ -184,34 +184,19 @@ def _types(first: Iterable[int], second: Iterable[int]) -> set[tuple[int, int]]:
     return {(int(a), int(b)) for a in first for b in second}
 
 
-_EXACT_PAIRS = (
-    _types(
-        [_GEOM.mjGEOM_PLANE],
-        [
-            *(_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_ELLIPSOID, _GEOM.mjGEOM_CYLINDER),
-            *(_GEOM.mjGEOM_BOX, _GEOM.mjGEOM_MESH),
-        ],
-    )
-    | _types(
-        [_GEOM.mjGEOM_SPHERE], [_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_BOX]
-    )
-    | _types([_GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_BOX], [_GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_BOX])
-)
 _SOLIDS = [
     *(_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_ELLIPSOID, _GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_BOX),
     _GEOM.mjGEOM_MESH,
 ]
-_KNOWN_PAIRS = _EXACT_PAIRS | _types(_SOLIDS, _SOLIDS)
-_APPROXIMATED_PAIRS = _KNOWN_PAIRS - _EXACT_PAIRS
+_EXACT_PAIRS = _types([_GEOM.mjGEOM_PLANE, *_SOLIDS], _SOLIDS)
 _DYN = mujoco.mjtDyn
 
 
-def approximated_types(m: mujoco.MjModel) -> set[tuple[int, int]]:
-    """Geom types, ascending, of the pairs that may touch and whose point and frame are approximated."""
+def contact_types(m: mujoco.MjModel) -> set[tuple[int, int]]:
+    """Geom types, ascending, of the pairs that may touch."""
     if m.opt.disableflags & (mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT):
         return set()
-    types = {(int(m.geom_type[a]), int(m.geom_type[b])) for a, b in colliding_pairs(m)}
-    return types & _APPROXIMATED_PAIRS
+    return {(int(m.geom_type[a]), int(m.geom_type[b])) for a, b in colliding_pairs(m)}
 
 
 _EXACT_INTEGRATORS = (_INTEGRATOR.mjINT_EULER, _INTEGRATOR.mjINT_IMPLICITFAST, _INTEGRATOR.mjINT_RK4)
@@ -290,21 +275,13 @@ FEATURES: tuple[Feature, ...] = (
     ),
     Feature("contacts, pyramidal and elliptic cones, condim 1, 3, 4, 6", True, _option(lambda m: m.ngeom > 1, "geoms")),
     Feature(
-        "contact of a plane with sphere, capsule, ellipsoid, cylinder, box, mesh; sphere with sphere, capsule, "
-        "cylinder, box; capsules and boxes with each other",
+        "contact of plane, sphere, capsule, ellipsoid, cylinder, box, mesh, with each other",
         True,
         _pairs(_EXACT_PAIRS, set()),
+        "contacts without a derivative of their own (parallel edges, a clipped side that another feature found) get "
+        "that of the nearest law; `grad/approximated_share` counts how often",
     ),
-    Feature(
-        "contact of other convex pairs (with cylinders, ellipsoids or meshes)",
-        True,
-        _pairs(_APPROXIMATED_PAIRS, set()),
-        "the distance's slope is exact; point and frame are taken to follow the mean of both bodies. Where such a pair "
-        "touches, gradients were measured off by 1 % to 400 % to qpos, and over 4 to 16 substeps by up to 6 % to qvel "
-        "and 3 % to ctrl; exact where none does, and `grad/approximated_share` counts how often one does",
-        partly=True,
-    ),
-    Feature("contact with height fields and signed distance fields", False, _pairs(None, _KNOWN_PAIRS)),
+    Feature("contact with height fields and signed distance fields", False, _pairs(None, _EXACT_PAIRS)),
     Feature("contact adhesion and surface velocity", False, _odd_surfaces),
     Feature("fixed tendons", True, _tendon(lambda m: ~spatial_tendons(m))),
     Feature(

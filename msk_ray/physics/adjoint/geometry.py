@@ -3,25 +3,21 @@
 Plane against sphere, capsule, box or mesh: the core of the other geom that is nearest the plane (centre, end, corner,
 vertex) is fixed to its body; against a cylinder it also runs around the rim. Sphere against sphere, capsule, cylinder
 or box, capsule against capsule, and plane against ellipsoid: the collision function itself is differentiated
-(`pair_laws`). Boxes against boxes and capsules: the
-law of the features that touch (`box_laws`). Any other pair: the distance moves by n·(relative velocity at the point),
-exactly; the point and the frame are taken to follow the mean of both bodies.
+(`pair_laws`). Capsule against box: the law of the features that touch (`capsule_box`). All others: `convex`.
 """
 
 from functools import cache
 from typing import Any, NamedTuple
 
-import mujoco
 import warp as wp
 from mujoco_warp import GeomType
 
-from msk_ray.physics.adjoint.approximated import Touches, count_touch
-from msk_ray.physics.adjoint.box_pairs import box_box_wrenches, capsule_box_wrenches
-from msk_ray.physics.adjoint.coverage import approximated_types
+from msk_ray.physics.adjoint.capsule_box import capsule_box_wrenches
 from msk_ray.physics.adjoint.groups import ContactBars, Contacts, Shapes
 from msk_ray.physics.adjoint.pair_laws import (
     SCORED_PAIRS,
     ParallelLaw,
+    is_convex_pair,
     is_scored,
     pair_score,
     parallel_law,
@@ -54,32 +50,23 @@ class PairKinds(NamedTuple):
 
     scored: bool
     """A pair that `pair_score` knows."""
-    boxes: bool
-    """Box with box or capsule."""
-    native_ccd: bool
-    """Whether boxes collide by MuJoCo's native convex collision."""
-    approximated: bool
-    """A pair whose point and frame are taken to follow the mean of both bodies."""
+    capsule_box: bool
 
     @classmethod
-    def of(cls, mjm: mujoco.MjModel, types: set[tuple[int, int]]) -> "PairKinds":
+    def of(cls, types: set[tuple[int, int]]) -> "PairKinds":
         """Those of a model whose colliding geometry types (ascending) are `types`."""
-        native = not mjm.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_NATIVECCD
-        approximated = bool(approximated_types(mjm))
-        return cls(bool(types & SCORED_PAIRS), bool(types & BOX_PAIRS), bool(native), approximated)
+        return cls(bool(types & SCORED_PAIRS), (int(GeomType.CAPSULE), int(GeomType.BOX)) in types)
 
 
 @cache
 def pull_geometry_kernel(kinds: PairKinds) -> Any:
     """The kernel for models with these kinds of pairs."""
-    scored, boxes, native_ccd = kinds.scored, kinds.boxes, int(kinds.native_ccd)
-    approximated = kinds.approximated
+    scored, capsule_box = kinds.scored, kinds.capsule_box
 
     @wp.kernel(module="unique", enable_backward=False)
     def pull_geometry(
         # Model:
         shapes: Shapes,
-        substep: int,
         # In:
         nacon_in: wp.array[int],
         contacts_in: Contacts,
@@ -89,7 +76,6 @@ def pull_geometry_kernel(kinds: PairKinds) -> Any:
         contact_bars_in: ContactBars,
         # Out:
         moved_bar_out: wp.array2d[wp.spatial_vector],
-        touches_out: Touches,
     ) -> None:
         """Cotangents of (dist, pos, frame) to wrenches on the two bodies whose displacement moves them."""
         con = wp.tid()
@@ -101,6 +87,8 @@ def pull_geometry_kernel(kinds: PairKinds) -> Any:
         geoms = contacts_in.geom[con]
         type1 = shapes.geom_type[geoms[0]]
         type2 = shapes.geom_type[geoms[1]]
+        if is_convex_pair(type1, type2):
+            return
         body1 = shapes.geom_bodyid[geoms[0]]
         body2 = shapes.geom_bodyid[geoms[1]]
         dist = contacts_in.dist[con]
@@ -171,43 +159,24 @@ def pull_geometry_kernel(kinds: PairKinds) -> Any:
                 force2 = pos2_bar
                 torque1 = turning_torque(mat1, mat1_bar)
                 torque2 = turning_torque(mat2, mat2_bar)
-        if wp.static(boxes):
-            if type2 == GeomType.BOX and (type1 == GeomType.BOX or type1 == GeomType.CAPSULE):
+        if wp.static(capsule_box):
+            if type1 == GeomType.CAPSULE and type2 == GeomType.BOX:
                 known = bool(True)
-                half1 = shapes.geom_size[worldid % shapes.geom_size.shape[0], geoms[0]]
-                half2 = shapes.geom_size[worldid % shapes.geom_size.shape[0], geoms[1]]
-                if type1 == GeomType.CAPSULE:
-                    force1, torque1, force2, torque2 = capsule_box_wrenches(
-                        contacts_in.geomcollisionid[con],
-                        pos1,
-                        mat1,
-                        half1,
-                        pos2,
-                        mat2,
-                        half2,
-                        dist,
-                        point,
-                        normal,
-                        dist_bar,
-                        pos_bar,
-                        normal_bar,
-                    )
-                else:
-                    force1, torque1, force2, torque2 = box_box_wrenches(
-                        wp.static(native_ccd),
-                        pos1,
-                        mat1,
-                        half1,
-                        pos2,
-                        mat2,
-                        half2,
-                        dist,
-                        point,
-                        normal,
-                        dist_bar,
-                        pos_bar,
-                        normal_bar,
-                    )
+                force1, torque1, force2, torque2 = capsule_box_wrenches(
+                    contacts_in.geomcollisionid[con],
+                    pos1,
+                    mat1,
+                    shapes.geom_size[worldid % shapes.geom_size.shape[0], geoms[0]],
+                    pos2,
+                    mat2,
+                    shapes.geom_size[worldid % shapes.geom_size.shape[0], geoms[1]],
+                    dist,
+                    point,
+                    normal,
+                    dist_bar,
+                    pos_bar,
+                    normal_bar,
+                )
         if not known and type1 == GeomType.PLANE:
             # The core of the other geom that is nearest the plane is fixed to its body: a sphere's centre, a capsule's
             # end, a box's corner, a mesh's vertex; a cylinder's rim point also runs around the rim.
@@ -229,28 +198,9 @@ def pull_geometry_kernel(kinds: PairKinds) -> Any:
                 around = rim_torque(normal, column(mat2, 2), core - pos2, force2)
                 torque2 += around
                 torque1 -= around
-        if wp.static(approximated):
-            if not known and type1 != GeomType.PLANE:
-                # dist moves with n·(u₂ - u₁) at the point; point and frame with the mean of both bodies.
-                spin = wp.cross(frame[0], weight[0]) + wp.cross(frame[1], weight[1]) + wp.cross(frame[2], weight[2])
-                force1 = 0.5 * pos_bar - dist_bar * normal
-                force2 = 0.5 * pos_bar + dist_bar * normal
-                torque1 = 0.5 * spin
-                torque2 = 0.5 * spin
-                place1 = point
-                place2 = point
-                # A contact that pushes nothing, or whose world has no cotangent, has none either.
-                if dist_bar != 0.0 or wp.dot(pos_bar, pos_bar) != 0.0:
-                    count_touch(
-                        touches_out, worldid, substep, shapes.geom_type.shape[0], geoms[0], geoms[1], type1, type2
-                    )
         if body1 > 0:
             wp.atomic_add(moved_bar_out, worldid, body1, wrench(force1, torque1, place1 - com1))
         if body2 > 0:
             wp.atomic_add(moved_bar_out, worldid, body2, wrench(force2, torque2, place2 - com2))
 
     return pull_geometry
-
-
-BOX_PAIRS = frozenset({(int(GeomType.BOX), int(GeomType.BOX)), (int(GeomType.CAPSULE), int(GeomType.BOX))})
-"""Those that `box_laws` knows."""

@@ -52,6 +52,22 @@ class Shapes:
 
 
 @wp.struct
+class Meshes:
+    """Convex hulls of meshes as polygons."""
+
+    geom_dataid: wp.array2d[int]
+    mesh_vertadr: wp.array[int]
+    mesh_vertnum: wp.array[int]
+    mesh_vert: wp.array[wp.vec3]
+    mesh_polynum: wp.array[int]
+    mesh_polyadr: wp.array[int]
+    mesh_polynormal: wp.array[wp.vec3]
+    mesh_polyvertadr: wp.array[int]
+    mesh_polyvertnum: wp.array[int]
+    mesh_polyvert: wp.array[int]
+
+
+@wp.struct
 class State:
     """State before the substep, and its acceleration."""
 

@@ -230,6 +230,13 @@ def is_scored(type1: int, type2: int) -> bool:
     return type1 == GeomType.PLANE and type2 == GeomType.ELLIPSOID
 
 
+@wp.func
+def is_convex_pair(type1: int, type2: int) -> bool:
+    """Whether two geoms, types in ascending order, collide by MuJoCo's convex collision, or are boxes."""
+    apart = type1 == GeomType.PLANE or type1 == GeomType.HFIELD or is_scored(type1, type2)
+    return not (apart or (type1 == GeomType.CAPSULE and type2 == GeomType.BOX))
+
+
 SCORED_PAIRS = frozenset(
     {
         *((int(GeomType.SPHERE), int(t)) for t in (GeomType.SPHERE, GeomType.CAPSULE, GeomType.CYLINDER, GeomType.BOX)),
@@ -238,3 +245,13 @@ SCORED_PAIRS = frozenset(
     }
 )
 """Geometry types, ascending, that `pair_score` knows."""
+
+_SOLIDS = [
+    *(GeomType.SPHERE, GeomType.CAPSULE, GeomType.ELLIPSOID, GeomType.CYLINDER, GeomType.BOX, GeomType.MESH),
+]
+CONVEX_PAIRS = frozenset(
+    {(int(a), int(b)) for a in _SOLIDS for b in _SOLIDS if a <= b}
+    - SCORED_PAIRS
+    - {(int(GeomType.CAPSULE), int(GeomType.BOX))}
+)
+"""Those for which `is_convex_pair` holds."""

@@ -63,7 +63,7 @@ class StepAdjoint:
         grad_qvel: shape (W, nv).
         grad_act: shape (W, na).
         grad_ctrl: shape (W, nu); every substep adds to it.
-        touch_counter: how many substeps' gradients went through a contact that is approximated.
+        touch_counter: how many substeps' gradients went through a contact without a derivative of its own.
         live: worlds whose gradient is wanted; the others get exact zeros. Shape (W,), int.
         applied: gradients of applied forces; None until `cover_applied` asks for them.
         inertia_address: place of M_ij (j ≤ i) in the sparse inertia, -1 where it is zero; shape (nv, nv).

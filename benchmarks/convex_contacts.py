@@ -1,4 +1,4 @@
-"""Errors of gradients through approximated contacts, with the pair of geoms resting and sliding."""
+"""Errors of gradients through contacts of convex pairs, with the pair of geoms resting and sliding."""
 
 import argparse
 import statistics
@@ -101,8 +101,8 @@ def main() -> None:
                 rows.append(row(table, thing, sliding, substeps, args.worlds))
                 print(rows[-1], flush=True)
     header = ["table, thing", "contact", "substeps", "approximated_share", "qpos", "qvel", "ctrl", "compared"]
-    title = "Relative error of gradients through approximated contacts, median / largest"
-    publish("approximated_contacts", title, "cpu", markdown_table(header, rows), args.results)
+    title = "Relative error of gradients through contacts of convex pairs, median / largest"
+    publish("convex_contacts", title, "cpu", markdown_table(header, rows), args.results)
 
 
 if __name__ == "__main__":
