@@ -16,6 +16,7 @@ import numpy as np
 import warp as wp
 
 from msk_ray.errors import ConfigError, UnsupportedModelError
+from msk_ray.physics.pairs import candidate_pairs
 
 _OBJ = mujoco.mjtObj
 
@@ -55,16 +56,26 @@ PARAMETERS: dict[str, Parameter] = {
     for p in (
         *(Parameter(n) for n in ("body_mass", "body_inertia", "body_ipos")),
         Parameter("body_iquat", quaternion=True),
-        Parameter("opt.gravity"),
+        *(Parameter(n) for n in ("opt.gravity", "opt.timestep")),
         *(Parameter(n) for n in ("dof_damping", "dof_armature")),
         Parameter("jnt_stiffness", in_use=1.0),
         Parameter("qpos_spring"),
+        Parameter("dof_frictionloss", in_use=1.0),
+        *(Parameter(n) for n in ("dof_solref", "dof_solimp", "jnt_range", "jnt_solref", "jnt_solimp")),
+        *(Parameter(n) for n in ("geom_pos", "geom_size")),
+        Parameter("geom_quat", quaternion=True),
         *(Parameter(n) for n in ("geom_friction", "geom_solref", "geom_solimp")),
         *(Parameter(n) for n in ("pair_friction", "pair_solref", "pair_solreffriction", "pair_solimp")),
         *(Parameter(n) for n in ("actuator_gear", "actuator_gainprm", "actuator_biasprm", "actuator_dynprm")),
+        *(Parameter(n, in_use=1.0) for n in ("tendon_stiffness", "tendon_damping", "tendon_frictionloss")),
+        *(Parameter(n) for n in ("tendon_lengthspring", "tendon_range", "tendon_solref_lim", "tendon_solimp_lim")),
+        *(Parameter(n) for n in ("tendon_solref_fri", "tendon_solimp_fri", "site_pos")),
     )
 }
 """Every field that can be a parameter."""
+
+DERIVED = {"body_mass": ("body_subtreemass",), "geom_size": ("geom_rbound", "geom_aabb")}
+"""Fields that follow a parameter's value: the mass below a body, and bounds outside which nothing collides."""
 
 
 def names_of(mjm: mujoco.MjModel) -> list[str]:
@@ -108,6 +119,15 @@ def _obstacle(mjm: mujoco.MjModel, name: str) -> str:
                 f"the inertia of body {word} has no room for terms off its diagonal; shift its <inertial pos> by a "
                 "micrometre from the body's origin"
             )
+    if name == "site_pos":
+        on_site = (mjm.actuator_trntype == int(mujoco.mjtTrn.mjTRN_SITE)).any()
+        if on_site or (mjm.eq_objtype == int(_OBJ.mjOBJ_SITE)).any():
+            return "only sites on the paths of tendons can move; put the site of an actuator or equality on a body"
+    if name == "geom_size":
+        types = mjm.geom_type[candidate_pairs(mjm, filtered=True)]
+        round_pair = (types == int(mujoco.mjtGeom.mjGEOM_ELLIPSOID)).any(axis=1)
+        if np.any(round_pair & (types != int(mujoco.mjtGeom.mjGEOM_PLANE)).all(axis=1)):
+            return "an ellipsoid may touch something other than a plane; make it a capsule, or exclude the pair"
     return ""
 
 
@@ -133,13 +153,16 @@ def structure(mjm: mujoco.MjModel, names: Iterable[str]) -> mujoco.MjModel:
 
 
 def open_arrays(mjm: mujoco.MjModel, model: Any, names: Iterable[str], nworld: int) -> None:
-    """Give the named arrays of a mujoco_warp.Model one row per world, with the values of `mjm`."""
-    for name in names:
-        parameter = PARAMETERS[name]
-        old = parameter.array(model)
-        nominal = parameter.value(mjm).astype(np.float32)
-        rows = np.broadcast_to(nominal, (nworld, *nominal.shape)).copy()
-        holder = attrgetter(parameter.section)(model) if parameter.section else model
-        new = wp.array(rows, dtype=old.dtype)
-        assert new.shape == (nworld, *old.shape[1:]), name
-        setattr(holder, parameter.field, new)
+    """Give the named arrays of a mujoco_warp.Model one row per world, with the values of `mjm`.
+
+    Arrays that are worked out again for each value, `DERIVED`, get rows too.
+    """
+    fields = [field for name in names for field in (name, *DERIVED.get(name, ()))]
+    for name in fields:
+        section, _, field = name.rpartition(".")
+        holder = attrgetter(section)(model) if section else model
+        old = getattr(holder, field)
+        length = getattr(old.dtype, "_length_", 1)
+        shape = (nworld, *old.shape[1:], length) if length > 1 else (nworld, *old.shape[1:])
+        rows = np.broadcast_to(np.asarray(attrgetter(name)(mjm), np.float32).reshape(shape[1:]), shape)
+        setattr(holder, field, wp.array(np.ascontiguousarray(rows), dtype=old.dtype))

@@ -4,34 +4,79 @@ Axes: W worlds, B bodies, G geoms.
 """
 
 from collections.abc import Mapping
+from functools import cached_property
+from operator import attrgetter
 
 import mujoco
+import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
 
 from msk_ray.errors import ConfigError
 from msk_ray.physics import WorldBatch
-from msk_ray.physics.parameters import PARAMETERS
+from msk_ray.physics.parameters import DERIVED, PARAMETERS
 
 
 class ParameterTensors:
     """Writes values of a batch's parameters into the arrays that recorded steps read."""
 
     def __init__(self, batch: WorldBatch) -> None:
-        device = torch.device(str(batch.device))
+        self._model = batch.mjm
+        self._device = torch.device(str(batch.device))
         self._views: dict[str, Tensor] = {}
         self._nominal: dict[str, Tensor] = {}
         for name in batch.parameters:
-            parameter = PARAMETERS[name]
-            self._views[name] = wp.to_torch(parameter.array(batch.model), requires_grad=False)
-            self._nominal[name] = torch.as_tensor(parameter.value(batch.mjm), dtype=torch.float32, device=device)
+            for field in (name, *DERIVED.get(name, ())):
+                self._views[field] = wp.to_torch(attrgetter(field)(batch.model), requires_grad=False)
+                nominal = torch.as_tensor(np.asarray(attrgetter(field)(batch.mjm)), dtype=torch.float32)
+                self._nominal[field] = nominal.to(self._device)
 
     @torch.no_grad()
     def load(self, values: Mapping[str, Tensor]) -> None:
         """Write `values`, each for all worlds or with a row per world; a parameter without one gets the model's own."""
+        if not self._views:
+            return
+        values = dict(values)
+        if "body_mass" in values:
+            values["body_subtreemass"] = values["body_mass"] @ self._subtrees
+        if "geom_size" in values:
+            values["geom_rbound"], values["geom_aabb"] = self._bounds(values["geom_size"])
         for name, view in self._views.items():
-            view.copy_(values.get(name, self._nominal[name]))
+            value = values.get(name, self._nominal[name])
+            view.copy_(value.view(*value.shape[: value.dim() - self._nominal[name].dim()], *view.shape[1:]))
+
+    @cached_property
+    def _subtrees(self) -> Tensor:
+        """1 where the column's body carries the row's, or is it, else 0; (B, B)."""
+        out = torch.eye(self._model.nbody)
+        for body in range(self._model.nbody - 1, 0, -1):
+            out[:, self._model.body_parentid[body]] += out[:, body]
+        return out.to(self._device)
+
+    def _bounds(self, size: Tensor) -> tuple[Tensor, Tensor]:
+        """Bounding radius (..., G) and box (..., G, 6) of geoms of these sizes, as MuJoCo's compiler finds them."""
+        kinds = mujoco.mjtGeom
+        of = lambda *types: torch.as_tensor(np.isin(self._model.geom_type, types), device=self._device)  # noqa: E731
+        radius, half, third = size.unbind(-1)
+        ball, capsule, cylinder = of(kinds.mjGEOM_SPHERE), of(kinds.mjGEOM_CAPSULE), of(kinds.mjGEOM_CYLINDER)
+        ellipsoid, box = of(kinds.mjGEOM_ELLIPSOID), of(kinds.mjGEOM_BOX)
+        bound = self._nominal["geom_rbound"].expand(radius.shape).clone()
+        for found, value in (
+            (ball, radius),
+            (capsule, radius + half),
+            (cylinder, torch.hypot(radius, half)),
+            (ellipsoid, size.amax(-1)),
+            (box, size.norm(dim=-1)),
+        ):
+            bound = torch.where(found, value, bound)
+        length = torch.where(box | ellipsoid, third, torch.where(cylinder, half, torch.where(capsule, bound, radius)))
+        width = torch.where(box | ellipsoid, half, radius)
+        centre, extent = self._nominal["geom_aabb"].expand(*radius.shape, 6).split(3, -1)
+        known = (ball | capsule | cylinder | ellipsoid | box)[:, None]
+        return bound, torch.cat(
+            (centre, torch.where(known, torch.stack((radius, width, length), dim=-1), extent)), dim=-1
+        )
 
 
 def check_values(model: mujoco.MjModel, nworld: int, values: Mapping[str, Tensor], place: torch.device) -> None:

@@ -233,13 +233,19 @@ class ContactForces:
     """
 
     def __init__(self, work: Workspace, contacts: int) -> None:
-        self._work, self.count = work, contacts
+        self._work, self.count, self._keeps = work, contacts, False
         mjm = work.mjm
         types = {(int(mjm.geom_type[a]), int(mjm.geom_type[b])) for a, b in colliding_pairs(mjm)}
         self._pull_geometry = pull_geometry_kernel(PairKinds.of(types))
         self._shapes = gather(Shapes, work.model)
         self._bars = allocate(ContactBars, contacts)
         self._convex = ConvexContacts(work, contacts) if types & CONVEX_PAIRS else None
+
+    def keep_wrenches(self) -> None:
+        """Let launches recorded from now on write `contact_wrenches` of the workspace."""
+        if not self._keeps:
+            self._keeps = True
+            self._work.contact_wrenches = wp.zeros((self.count, 2), dtype=wp.spatial_vector)
 
     def launch(self, at: Substep) -> None:
         """Launch all of them."""
@@ -273,7 +279,7 @@ class ContactForces:
                 d.subtree_com,
                 self._bars,
             ],
-            outputs=[work.bars.moved],
+            outputs=[work.bars.moved, work.contact_wrenches],
         )
         if self._convex is not None:
             self._convex.launch(at, self._bars)

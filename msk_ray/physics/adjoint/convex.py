@@ -218,6 +218,7 @@ def pull_convex(
     # Out:
     moved_bar_out: wp.array2d[wp.spatial_vector],
     touches_out: Touches,
+    wrenches_out: wp.array2d[wp.spatial_vector],
 ) -> None:
     """Cotangents of (dist, pos, frame) to wrenches on the two bodies whose displacement moves them."""
     con = wp.tid()
@@ -233,6 +234,9 @@ def pull_convex(
     bars = Bars()
     bars.dist = contact_bars_in.dist[con]
     bars.point = contact_bars_in.pos[con]
+    if wrenches_out.shape[0] > 0:
+        wrenches_out[con, 0] = wp.spatial_vector(wp.vec3(0.0), wp.vec3(0.0))
+        wrenches_out[con, 1] = wp.spatial_vector(wp.vec3(0.0), wp.vec3(0.0))
     # A contact that pushes nothing, or whose world has no cotangent, has none either.
     if bars.dist == 0.0 and wp.dot(bars.point, bars.point) == 0.0:
         return
@@ -248,6 +252,9 @@ def pull_convex(
     push, exact = convex_wrenches(solid1, solid2, meshes, seen, bars, native_ccd, multi_ccd)
     if not exact:
         count_touch(touches_out, worldid, substep, shapes.geom_type.shape[0], geoms[0], geoms[1], type1, type2)
+    if wrenches_out.shape[0] > 0:
+        wrenches_out[con, 0] = wrench(push.force1, push.torque1, seen.point - solid1.pos)
+        wrenches_out[con, 1] = wrench(push.force2, push.torque2, seen.point - solid2.pos)
     body1 = shapes.geom_bodyid[geoms[0]]
     body2 = shapes.geom_bodyid[geoms[1]]
     if body1 > 0:
@@ -287,5 +294,5 @@ class ConvexContacts:
                 d.subtree_com,
                 bars,
             ],
-            outputs=[work.bars.moved, work.touch_counter.touches],
+            outputs=[work.bars.moved, work.touch_counter.touches, work.contact_wrenches],
         )

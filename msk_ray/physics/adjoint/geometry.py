@@ -76,6 +76,7 @@ def pull_geometry_kernel(kinds: PairKinds) -> Any:
         contact_bars_in: ContactBars,
         # Out:
         moved_bar_out: wp.array2d[wp.spatial_vector],
+        wrenches_out: wp.array2d[wp.spatial_vector],
     ) -> None:
         """Cotangents of (dist, pos, frame) to wrenches on the two bodies whose displacement moves them."""
         con = wp.tid()
@@ -198,6 +199,9 @@ def pull_geometry_kernel(kinds: PairKinds) -> Any:
                 around = rim_torque(normal, column(mat2, 2), core - pos2, force2)
                 torque2 += around
                 torque1 -= around
+        if wrenches_out.shape[0] > 0:
+            wrenches_out[con, 0] = wrench(force1, torque1, place1 - pos1)
+            wrenches_out[con, 1] = wrench(force2, torque2, place2 - pos2)
         if body1 > 0:
             wp.atomic_add(moved_bar_out, worldid, body1, wrench(force1, torque1, place1 - com1))
         if body2 > 0:

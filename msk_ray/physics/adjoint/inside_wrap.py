@@ -100,6 +100,7 @@ def inside_score(
     point = radius * wp.normalize(plane.end0 + plane.end1)
     if place[2] != 0.0:
         found = wp.vec2(place[0], place[1])
+        found = found * (radius / wp.length(found))  # the circle may grow
         tangent = wp.vec2(-found[1], found[0])
         g = -pull_along(plane.end0, found, tangent) - pull_along(plane.end1, found, tangent)
         # To first order in g, which is zero here but for rounding.

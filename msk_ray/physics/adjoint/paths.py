@@ -244,26 +244,29 @@ def pull_paths(
 
 
 class TendonPaths:
-    """Launches of the tangent points on wrapping geoms, and of what paths give ∂Φ."""
+    """Launches of the tangent points on wrapping geoms, and of what paths give ∂Φ.
+
+    Attributes:
+        paths: stretches of path.
+        touch, inside: as `touch_paths` leaves them, (W, segments).
+    """
 
     def __init__(self, work: Workspace) -> None:
         self._work = work
-        self._paths = gather(Paths, work.tables, work.model)
+        self.paths = gather(Paths, work.tables, work.model)
         shape = (work.nworld, work.tables.segment_tendon.size)
-        self._touch = wp.full(shape, wp.spatial_vector(*([MJ_MAXVAL] * 6)), dtype=wp.spatial_vector)
-        self._inside = wp.zeros(shape, dtype=wp.vec4)
+        self.touch = wp.full(shape, wp.spatial_vector(*([MJ_MAXVAL] * 6)), dtype=wp.spatial_vector)
+        self.inside = wp.zeros(shape, dtype=wp.vec4)
 
     def launch(self, at: Substep) -> None:
         """Launch both."""
         work = self._work
         poses = gather(PathPoses, at.data)
         if work.tables.has_wrapping:
-            wp.launch(
-                touch_paths, dim=self._touch.shape, inputs=[self._paths, poses], outputs=[self._touch, self._inside]
-            )
+            wp.launch(touch_paths, dim=self.touch.shape, inputs=[self.paths, poses], outputs=[self.touch, self.inside])
         wp.launch(
             pull_paths,
-            dim=self._touch.shape,
-            inputs=[self._paths, self._touch, self._inside, poses, at.motion, work.fields, work.tendon_bars],
+            dim=self.touch.shape,
+            inputs=[self.paths, self.touch, self.inside, poses, at.motion, work.fields, work.tendon_bars],
             outputs=[work.bars],
         )

@@ -58,7 +58,7 @@ class StepAdjoint:
     turns the cotangents below from those of the state after the substep into those of the state before.
 
     Attributes:
-        work, integrator, laws, contacts: the stages' buffers and launches that parameters build on.
+        work, integrator, laws, contacts, tendons: the stages' buffers and launches that parameters build on.
         grad_qpos: cotangent of qpos in tangent coordinates, shape (W, nv).
         grad_qvel: shape (W, nv).
         grad_act: shape (W, na).
@@ -82,7 +82,7 @@ class StepAdjoint:
             self.contacts = ContactForces(work, data.naconmax)
             self._systems = LinearSystems(work, self.integrator, self.laws)
             self._bodies = Bodies(work, self.integrator.damping)
-            self._tendons = Tendons(work) if mjm.ntendon else None
+            self.tendons = Tendons(work) if mjm.ntendon else None
             self._forces = _forces(work, self.laws, self.contacts)
 
     def start(self, qpos: wp.array, raw_qpos: wp.array) -> None:
@@ -131,14 +131,14 @@ class StepAdjoint:
         self.laws.launch(at)
         self._systems.launch(at)
         self._bodies.launch_fields(at)
-        if self._tendons is not None:
-            self._tendons.launch_start(at)
+        if self.tendons is not None:
+            self.tendons.launch_start(at)
         for stage in self._forces if applied is None else (*self._forces, applied):
             stage.launch(at)
+        if self.tendons is not None:
+            self.tendons.launch_pullback(at)
         if parameters is not None:
             parameters.launch(at)
-        if self._tendons is not None:
-            self._tendons.launch_pullback(at)
         self._bodies.launch_sweep(at)
 
 

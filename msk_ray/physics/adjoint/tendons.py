@@ -157,12 +157,16 @@ def pull_tendons(
 
 
 class Tendons:
-    """Launches that start the tendons' cotangents and, when all is added to them, pull them back."""
+    """Launches that start the tendons' cotangents and, when all is added to them, pull them back.
+
+    Attributes:
+        paths: those of spatial tendons, if there are any.
+    """
 
     def __init__(self, work: Workspace) -> None:
         self._work = work
         self._passive = gather(PassiveTendons, work.model)
-        self._paths = TendonPaths(work) if work.tables.segment_tendon.size else None
+        self.paths = TendonPaths(work) if work.tables.segment_tendon.size else None
 
     def launch_start(self, at: Substep) -> None:
         """Launch the cotangents that springs and dampers give."""
@@ -195,5 +199,5 @@ class Tendons:
             inputs=[work.tendon_rows, m.tendon_adr, m.wrap_type, d.ten_J, work.tendon_bars],
             outputs=[work.slopes],
         )
-        if self._paths is not None:
-            self._paths.launch(at)
+        if self.paths is not None:
+            self.paths.launch(at)

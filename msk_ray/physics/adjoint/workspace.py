@@ -70,6 +70,8 @@ class Workspace:
         live: worlds whose gradient is wanted, shape (W,), int.
         grad_qpos, grad_qvel, grad_act, grad_ctrl: cotangents, in tangent coordinates.
         multipliers, slopes, fields, bars, tendon_bars, laws: as their groups say.
+        contact_wrenches: slopes of Φ along displacements of both geoms of a contact, as wrenches about their centres,
+            (C, 2); of no size unless they are wanted.
     """
 
     def __init__(self, mjm: mujoco.MjModel, model: Any, data: Any) -> None:
@@ -94,3 +96,4 @@ class Workspace:
             self.bars = allocate(FieldBars, worlds, nbody)
             self.tendon_bars = allocate(TendonBars, worlds, max(mjm.ntendon, 1))
             self.laws = allocate(RowLaws, worlds, self.njmax)
+            self.contact_wrenches = wp.zeros((0, 2), dtype=wp.spatial_vector)

@@ -8,12 +8,20 @@ from msk_ray.physics.adjoint.groups import Substep
 from msk_ray.physics.adjoint.parameters.actuators import ActuatorStage
 from msk_ray.physics.adjoint.parameters.base import GradientBuffer, ParameterStage, Parts
 from msk_ray.physics.adjoint.parameters.contacts import MaterialStage
+from msk_ray.physics.adjoint.parameters.geoms import GeomStage
 from msk_ray.physics.adjoint.parameters.inertia import InertiaStage
 from msk_ray.physics.adjoint.parameters.joints import JointStage
+from msk_ray.physics.adjoint.parameters.paths import PathStage
+from msk_ray.physics.adjoint.parameters.rows import RowStage
+from msk_ray.physics.adjoint.parameters.tendons import TendonStage
+from msk_ray.physics.adjoint.parameters.timestep import TimestepStage
 from msk_ray.physics.adjoint.step import StepAdjoint
 from msk_ray.physics.parameters import PARAMETERS
 
-STAGES: tuple[type[ParameterStage], ...] = (InertiaStage, JointStage, MaterialStage, ActuatorStage)
+STAGES: tuple[type[ParameterStage], ...] = (
+    *(TimestepStage, InertiaStage, JointStage, RowStage, MaterialStage, GeomStage),
+    *(ActuatorStage, TendonStage, PathStage),
+)
 """The families, in the order in which they are launched."""
 
 
@@ -28,11 +36,12 @@ class ParameterAdjoint:
     def __init__(self, adjoint: StepAdjoint, names: Iterable[str]) -> None:
         work = adjoint.work
         fields = {name: PARAMETERS[name].field for name in names}
-        chosen = [stage for stage in STAGES if not set(fields.values()).isdisjoint(stage.kind.vars)]
+        parts = Parts(work, adjoint.integrator, adjoint.laws, adjoint.contacts, adjoint.tendons)
+        chosen = [s for s in STAGES if any(not set(fields.values()).isdisjoint(kind.vars) for kind in s.kinds)]
         with wp.ScopedDevice(work.device):
-            self._buffer = GradientBuffer([stage.kind for stage in chosen], work.model, work.nworld)
-            parts = Parts(work, adjoint.integrator, adjoint.laws, adjoint.contacts, self._buffer.timestep)
-            self._stages = [stage(parts, self._buffer.groups[stage.kind]) for stage in chosen]
+            kinds = dict.fromkeys(kind for stage in chosen for kind in stage.kinds)
+            self._buffer = GradientBuffer(kinds, work.model, work.nworld)
+            self._stages = [stage(parts, self._buffer.groups) for stage in chosen if stage.applies(parts)]
         found = {name: getattr(group, name) for kind, group in self._buffer.groups.items() for name in kind.vars}
         self.gradients: dict[str, wp.array] = {name: found[field] for name, field in fields.items()}
 

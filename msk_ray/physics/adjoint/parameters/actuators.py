@@ -26,7 +26,7 @@ from msk_ray.physics.adjoint.groups import (
     TendonRows,
     gather,
 )
-from msk_ray.physics.adjoint.parameters.base import ParameterStage, Parts
+from msk_ray.physics.adjoint.parameters.base import ParameterStage, Parts, TimestepGradient
 from msk_ray.physics.adjoint.parameters.inertia import rotation
 from msk_ray.physics.adjoint.spatial import point_velocity
 from msk_ray.physics.mjw_private import quat_to_vel, vec10
@@ -198,7 +198,7 @@ def pull_actuator_parameters(
     ten_length_in: wp.array2d[float],
     # Out:
     gradients_out: ActuatorGradients,
-    timestep_out: wp.array[float],
+    timestep_out: TimestepGradient,
 ) -> None:
     """-Φ ∋ (m·λ) F + h κ dF/dv, and ḡ·act': slopes by one actuator's parameters, as in `actuation.pull_actuators`."""
     worldid, uid = wp.tid()
@@ -245,7 +245,7 @@ def pull_actuator_parameters(
     gradients_out.actuator_gainprm[worldid, uid] = gradients_out.actuator_gainprm[worldid, uid] + law_bar.gainprm
     gradients_out.actuator_biasprm[worldid, uid] = gradients_out.actuator_biasprm[worldid, uid] + law_bar.biasprm
     gradients_out.actuator_dynprm[worldid, uid] = gradients_out.actuator_dynprm[worldid, uid] + law_bar.dynprm
-    wp.atomic_add(timestep_out, worldid, law_bar.timestep)
+    wp.atomic_add(timestep_out.timestep, worldid, law_bar.timestep)
 
     kind = actuators.actuator_trntype[uid]
     target = actuators.actuator_trnid[uid][0]
@@ -281,9 +281,9 @@ def pull_actuator_parameters(
 class ActuatorStage(ParameterStage):
     """Launches of the gradients of actuators' parameters."""
 
-    kind = ActuatorGradients
+    kinds = (ActuatorGradients, TimestepGradient)
 
-    def __init__(self, parts: Parts, gradients: Any) -> None:
+    def __init__(self, parts: Parts, gradients: dict[Any, Any]) -> None:
         super().__init__(parts, gradients)
         self._settings = gather(ActuatorSettings, parts.work.model)
         self._act_bar = wp.zeros_like(parts.work.grad_act)
@@ -317,5 +317,5 @@ class ActuatorStage(ParameterStage):
                 d.ten_J,
                 d.ten_length,
             ],
-            outputs=[self.gradients, self.parts.timestep],
+            outputs=self.gradients,
         )

@@ -6,6 +6,7 @@ integration of activations and positions.
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -15,6 +16,7 @@ from msk_ray.physics.adjoint.contacts import ContactForces
 from msk_ray.physics.adjoint.groups import Substep
 from msk_ray.physics.adjoint.integrate import Integrator
 from msk_ray.physics.adjoint.rows import ConstraintLaws
+from msk_ray.physics.adjoint.tendons import Tendons
 from msk_ray.physics.adjoint.workspace import Workspace
 
 wp.set_module_options({"enable_backward": False})
@@ -36,21 +38,34 @@ class Parts:
     integrator: Integrator
     laws: ConstraintLaws
     contacts: ContactForces
-    timestep: wp.array
-    """Gradient of the time step, to which every stage whose law has one adds its part, (W,)."""
+    tendons: Tendons | None
+
+
+@wp.struct
+class TimestepGradient:
+    """Gradient of the time step, (W,), to which every stage whose law has one adds its part."""
+
+    timestep: wp.array[float]
 
 
 class ParameterStage(ABC):
     """The gradients of one family of parameters.
 
     Attributes:
-        kind: group of the gradients; its fields are named as in MjModel, without `opt.`.
+        kinds: groups of the gradients to which it adds; their fields are named as in MjModel, without `opt.`. The stage
+            is launched if a field of any of them is asked for.
     """
 
-    kind: ClassVar[Any]
+    kinds: ClassVar[tuple[Any, ...]]
 
-    def __init__(self, parts: Parts, gradients: Any) -> None:
-        self.parts, self.gradients = parts, gradients
+    def __init__(self, parts: Parts, gradients: dict[Any, Any]) -> None:
+        self.parts = parts
+        self.gradients = [gradients[kind] for kind in self.kinds]
+
+    @classmethod
+    def applies(cls, parts: Parts) -> bool:
+        """Whether the model has anything that it differentiates."""
+        return True
 
     def launch_first(self, at: Substep, qvel_next: wp.array) -> None:  # noqa: B027 - most have nothing to do here
         """Launch what needs the cotangents of the state after the substep, before they are pulled back."""
@@ -65,26 +80,24 @@ class GradientBuffer:
 
     Attributes:
         groups: by kind.
-        timestep: gradient of the time step, (W,).
     """
 
-    def __init__(self, kinds: list[Any], model: Any, nworld: int) -> None:
+    def __init__(self, kinds: Iterable[Any], model: Any, nworld: int) -> None:
+        self.groups = {kind: kind() for kind in kinds}
         spaces = []
-        for kind in kinds:
+        for kind, group in self.groups.items():
             for name, field in kind.vars.items():
                 section = model.opt if hasattr(model.opt, name) else model
-                spaces.append((kind, name, field.type.dtype, (nworld, *getattr(section, name).shape[1:])))
+                spaces.append((group, name, field.type.dtype, (nworld, *getattr(section, name).shape[1:])))
         words = [math.prod(shape) * wp.types.type_size_in_bytes(dtype) // 4 for _, _, dtype, shape in spaces]
-        self._floats = wp.zeros(nworld + sum(words), dtype=float)
-        self.timestep = self._floats[:nworld]
-        self.groups = {kind: kind() for kind in kinds}
-        offset = nworld
-        for (kind, name, dtype, shape), size in zip(spaces, words, strict=True):
+        self._floats = wp.zeros(max(sum(words), 1), dtype=float)
+        offset = 0
+        for (group, name, dtype, shape), size in zip(spaces, words, strict=True):
             part = wp.zeros(shape, dtype=dtype)
             if size:
                 pointer = self._floats.ptr + 4 * offset
                 part = wp.array(ptr=pointer, dtype=dtype, shape=shape, device=self._floats.device, copy=False)
-            setattr(self.groups[kind], name, part)
+            setattr(group, name, part)
             offset += size
 
     def clear(self) -> None:

@@ -6,8 +6,9 @@ from the kernel: Warp drops the derivative of a function that another kernel of 
 
 import warp as wp
 
+from msk_ray.physics.adjoint.parameters.impedance import row_spring
 from msk_ray.physics.adjoint.rows import vec6
-from msk_ray.physics.mjw_private import contact_kbimp, vec5, vec10
+from msk_ray.physics.mjw_private import vec5, vec10
 
 wp.set_module_options({"enable_backward": False})
 
@@ -107,14 +108,14 @@ def contact_score(
     timestep: wp.float32,
 ) -> wp.float32:
     """Σ_r ρ_r(λ) f_r of one contact."""
-    kbi = contact_kbimp(motion.disableflags, timestep, solref, solimp, motion.pos, False)
+    kbi = row_spring(motion.disableflags, timestep, solref, solimp, motion.pos)
     stiffness = kbi[0] * kbi[2]
     mass = kbi[2] / ((1.0 - kbi[2]) * motion.weight)
     score = wp.float32(0.0)
     if motion.elliptic == 1:
         side_damping = kbi[1]
         if solreffriction[0] != 0.0 or solreffriction[1] != 0.0:
-            side = contact_kbimp(motion.disableflags, timestep, solreffriction, solimp, motion.pos, False)
+            side = row_spring(motion.disableflags, timestep, solreffriction, solimp, motion.pos)
             side_damping = side[1]
         score = cone_score(motion, friction, stiffness, kbi[1], side_damping, mass)
     elif motion.dim == 1:

@@ -11,7 +11,7 @@ import warp as wp
 
 from msk_ray.physics.adjoint.contacts import components
 from msk_ray.physics.adjoint.groups import Contacts, Fields, Motion, RowLaws, Rows, Shapes, Substep, gather
-from msk_ray.physics.adjoint.parameters.base import ParameterStage, Parts
+from msk_ray.physics.adjoint.parameters.base import ParameterStage, Parts, TimestepGradient
 from msk_ray.physics.adjoint.parameters.contact_laws import ContactMotion, contact_score, pyramid_weight
 from msk_ray.physics.adjoint.spatial import point_velocity
 from msk_ray.physics.mjw_private import ConstraintType, contact_kbimp, vec5
@@ -127,7 +127,7 @@ def pull_materials(
     fields_in: Fields,
     # Out:
     gradients_out: MaterialGradients,
-    timestep_out: wp.array[float],
+    timestep_out: TimestepGradient,
 ) -> None:
     """-Φ ∋ Σ_r ρ_r(λ) f_r: gradients of one contact's material, and of the time step that bounds its stiffness."""
     con = wp.tid()
@@ -197,7 +197,7 @@ def pull_materials(
     _m, friction_bar, solref_bar, side_bar, solimp_bar, timestep_bar = wp.grad(contact_score)(
         motion, friction, solref, contacts_in.solreffriction[con], solimp, timestep
     )
-    wp.atomic_add(timestep_out, worldid, timestep_bar)
+    wp.atomic_add(timestep_out.timestep, worldid, timestep_bar)
     pair = pair_of[geoms[0], geoms[1]]
     if pair >= 0:
         row = worldid % materials.pair_friction.shape[0]
@@ -217,9 +217,9 @@ def pull_materials(
 class MaterialStage(ParameterStage):
     """Launches of the gradients of friction, solref and solimp of contacts."""
 
-    kind = MaterialGradients
+    kinds = (MaterialGradients, TimestepGradient)
 
-    def __init__(self, parts: Parts, gradients: Any) -> None:
+    def __init__(self, parts: Parts, gradients: dict[Any, Any]) -> None:
         super().__init__(parts, gradients)
         work, mjm = parts.work, parts.work.mjm
         self._shapes, self._materials = gather(Shapes, work.model), gather(Materials, work.model)
@@ -247,5 +247,5 @@ class MaterialStage(ParameterStage):
                 at.motion,
                 work.fields,
             ],
-            outputs=[self.gradients, self.parts.timestep],
+            outputs=self.gradients,
         )

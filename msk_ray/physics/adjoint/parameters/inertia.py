@@ -124,9 +124,9 @@ def pull_inertia(
 class InertiaStage(ParameterStage):
     """Launches of the inertial parameters' gradients."""
 
-    kind = InertiaGradients
+    kinds = (InertiaGradients,)
 
-    def __init__(self, parts: Parts, gradients: Any) -> None:
+    def __init__(self, parts: Parts, gradients: dict[Any, Any]) -> None:
         super().__init__(parts, gradients)
         self._inertias = gather(Inertias, parts.work.model)
 
@@ -145,5 +145,5 @@ class InertiaStage(ParameterStage):
                 at.motion,
                 work.fields,
             ],
-            outputs=[self.gradients],
+            outputs=self.gradients,
         )

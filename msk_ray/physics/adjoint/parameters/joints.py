@@ -133,7 +133,7 @@ def pull_joints(
 class JointStage(ParameterStage):
     """Launches of the gradients of damping, armature and springs."""
 
-    kind = JointGradients
+    kinds = (JointGradients,)
 
     def launch(self, at: Substep) -> None:
         work, m, settings = self.parts.work, self.parts.work.model, self.parts.work.settings
@@ -151,5 +151,5 @@ class JointStage(ParameterStage):
                 at.state,
                 work.multipliers,
             ],
-            outputs=[self.gradients],
+            outputs=self.gradients,
         )
