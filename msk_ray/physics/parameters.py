@@ -119,6 +119,8 @@ def _obstacle(mjm: mujoco.MjModel, name: str) -> str:
                 f"the inertia of body {word} has no room for terms off its diagonal; shift its <inertial pos> by a "
                 "micrometre from the body's origin"
             )
+    if name == "opt.timestep" and mjm.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+        return "RK4 has a time step at every stage; write integrator='Euler' or 'implicitfast'"
     if name == "site_pos":
         on_site = (mjm.actuator_trntype == int(mujoco.mjtTrn.mjTRN_SITE)).any()
         if on_site or (mjm.eq_objtype == int(_OBJ.mjOBJ_SITE)).any():
