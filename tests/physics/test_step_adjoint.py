@@ -49,7 +49,7 @@ def pulled(model, points, poison: bool) -> dict[str, np.ndarray]:
         assert {"lam", "jar", "cacc", "moved", "length", "rhs", "_hessian", "_cacc_sum", "frame"} <= found
         for name, array in buffers(adjoint):
             # Where no tendon, wrap or joint row exists, its buffers are read as they were made.
-            if name not in (*_RESULTS, "_touch", "_dense"):
+            if name not in (*_RESULTS, "touch", "_dense"):
                 wp.copy(array, wp.full(array.shape, array.dtype(np.nan), dtype=array.dtype))
     rng = np.random.default_rng(0)
     for name in ("grad_qpos", "grad_qvel", "grad_act"):
