@@ -32,6 +32,19 @@ def check_state(model: mujoco.MjModel) -> None:
         )
 
 
+def check_ignored(model: mujoco.MjModel) -> None:
+    """Raise UnsupportedModelError where mujoco_warp would step another model than C MuJoCo without a word."""
+    groups = np.asarray(model.actuator_group)
+    # C MuJoCo has a bit for each of 31 groups.
+    off = [u for u in range(len(groups)) if 0 <= groups[u] < 31 and model.opt.disableactuator >> int(groups[u]) & 1]
+    if off:
+        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, off[0]) or off[0]
+        raise UnsupportedModelError(
+            f"actuator {name} is in a group that option actuatorgroupdisable turns off, which mujoco_warp ignores: "
+            "remove such actuators from the model"
+        )
+
+
 def refresh_velocity(mjm: mujoco.MjModel, model: Any, data: Any) -> None:
     """Launch the velocity stage early where constraints are built from it.
 
@@ -84,6 +97,7 @@ class WorldBatch:
         tolerance: float | None = None,
     ) -> None:
         check_state(mjm)
+        check_ignored(mjm)
         self.mjm = mjm
         self.substeps = substeps
         self.device = wp.get_device(device)

@@ -104,6 +104,12 @@ SCENES = {
     ),
     "fixed_tendon": lambda: _tendon(_FIXED.format('stiffness="5" springlength=".1" damping=".6"'), _SERVO),
     "fixed_tendon_limit": lambda: _tendon(_FIXED.format('range="-.1 .1"')),
+    "fixed_tendon_armature": lambda: _tendon(_FIXED.format('armature=".5" damping=".6"') + _FIXED2, _SERVO),
+    "gravcomp_by_actuators": lambda: scene(
+        '<actuator><motor joint="g"/></actuator>',
+        world='<body gravcomp=".7" pos="1 0 1"><joint name="g" actuatorgravcomp="true"/><geom size=".1" pos=".2 0 0"/>'
+        "</body>",
+    ),
     "tendon_friction": lambda: _tendon(_FIXED.format('frictionloss=".2"') + _PATH_P),
     "site_tendon": lambda: _tendon(_PATH.format('stiffness="50" springlength=".2" damping="2"'), _SERVO),
     "site_tendon_limit": lambda: _tendon(_PATH.format('range="0 .25" limited="true"')),

@@ -7,6 +7,7 @@ import pytest
 from scenes import ant, cartpole
 
 from msk_ray.errors import UnsupportedModelError
+from msk_ray.physics import WorldBatch
 from msk_ray.physics.adjoint.coverage import check_supported, table, unsupported
 
 _DOC = Path(__file__).resolve().parents[2] / "docs" / "differentiation.md"
@@ -50,9 +51,14 @@ def test_a_model_without_geoms_can_be_looked_at() -> None:
             r'ellipsoid model \(geom wing\)\. Write fluidshape="none"',
         ),
         (
-            '<worldbody><body><joint name="j"/><geom size=".1"/></body></worldbody><tendon><fixed name="arm" '
-            'armature="1"><joint joint="j" coef="1"/></fixed></tendon>',
-            "tendon arm",
+            '<worldbody><body><joint/><geom size=".1"/><site name="s" pos="1 0 0"/></body><site name="t"/></worldbody>'
+            '<tendon><spatial name="arm" armature="1"><site site="s"/><site site="t"/></spatial></tendon>',
+            r'spatial tendons \(tendon arm\)\. Write armature="0"',
+        ),
+        (
+            '<worldbody><body gravcomp="1"><joint name="j" actuatorgravcomp="true" actuatorfrcrange="-1 1"/>'
+            '<geom size=".1"/></body></worldbody><actuator><motor joint="j"/></actuator>',
+            r'joint or without actuation \(joint j\)\. Write actuatorgravcomp="false"',
         ),
     ],
 )
@@ -60,6 +66,18 @@ def test_what_is_not_covered_is_named(xml, named):
     model = mujoco.MjModel.from_xml_string(f"<mujoco>{xml}</mujoco>")
     with pytest.raises(UnsupportedModelError, match=named):
         check_supported(model, "tape_per_substep")
+
+
+def test_actuators_that_only_c_mujoco_turns_off_are_refused() -> None:
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><option actuatorgroupdisable="2"/><worldbody><body><joint name="j"/><geom size=".1"/></body>'
+        "</worldbody>"
+        '<actuator><motor joint="j"/><motor name="off" joint="j" group="2"/></actuator></mujoco>'
+    )
+    with pytest.raises(UnsupportedModelError, match="actuator off is in a group that option actuatorgroupdisable"):
+        WorldBatch(model, 1, 1, "cpu")
+    model.opt.disableactuator = 0
+    WorldBatch(model, 1, 1, "cpu")
 
 
 def _body(kind: str, size: str, height: float) -> str:

@@ -110,6 +110,13 @@ def _equality(*kinds: int) -> Finder:
     return _where(_OBJ.mjOBJ_EQUALITY, "equality", lambda m: _among(m.eq_type, kinds))
 
 
+def _bounded_gravcomp(m: mujoco.MjModel) -> np.ndarray:
+    """Joints whose actuators carry the weight, but may be held at their limit, or are off."""
+    off = m.nu == 0 or bool(m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_ACTUATION)
+    weight = bool(np.any(m.body_gravcomp != 0))
+    return (m.jnt_actgravcomp != 0) & ((m.jnt_actfrclimited != 0) | off) & weight
+
+
 def _in_fluid(m: mujoco.MjModel) -> bool:
     return bool(m.opt.density > 0 or m.opt.viscosity > 0)
 
@@ -266,6 +273,12 @@ FEATURES: tuple[Feature, ...] = (
         lambda m: _named(m, _OBJ.mjOBJ_JOINT, "joint", np.unique(m.dof_jntid[m.dof_frictionloss != 0])),
     ),
     Feature("gravity compensation", True, _where(_OBJ.mjOBJ_BODY, "body", lambda m: m.body_gravcomp != 0)),
+    Feature(
+        "gravity compensation by actuators, under a force limit of the joint or without actuation",
+        False,
+        _where(_OBJ.mjOBJ_JOINT, "joint", _bounded_gravcomp),
+        instead='actuatorgravcomp="false"',
+    ),
     Feature("drag of a fluid, inertia-box model", True, _option(_in_fluid, "option density or viscosity")),
     Feature(
         "drag of a fluid, ellipsoid model",
@@ -292,7 +305,10 @@ FEATURES: tuple[Feature, ...] = (
     Feature("tendon springs and dampers", True, _tendon(lambda m: (m.tendon_stiffness != 0) | (m.tendon_damping != 0))),
     Feature("tendon limits", True, _tendon(lambda m: m.tendon_limited != 0)),
     Feature("tendon friction loss", True, _tendon(lambda m: m.tendon_frictionloss != 0)),
-    Feature("tendon armature", False, _tendon(tendon_armature)),
+    Feature(
+        "armature of fixed tendons", True, _tendon(lambda m: ~spatial_tendons(m) & np.asarray(m.tendon_armature != 0))
+    ),
+    Feature("armature of spatial tendons", False, _tendon(tendon_armature), instead='armature="0"'),
     Feature("tendon bound on actuator force", False, _tendon(lambda m: m.tendon_actfrclimited != 0)),
     Feature(
         "implicitfast with velocity-dependent force on a spatial tendon between branches",

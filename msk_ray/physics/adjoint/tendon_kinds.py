@@ -11,13 +11,13 @@ def spatial_tendons(m: mujoco.MjModel) -> np.ndarray:
 
 
 def tendon_armature(m: mujoco.MjModel) -> np.ndarray:
-    """Tendons with armature of their own or of an actuator on them."""
+    """Spatial tendons with armature of their own or of an actuator on them, whose inertia turns with the pose."""
     has = np.array(m.tendon_armature != 0)
     geared = getattr(m, "actuator_armature", np.zeros(m.nu))
     for u in np.flatnonzero(geared):
         if m.actuator_trntype[u] == int(mujoco.mjtTrn.mjTRN_TENDON):
             has[m.actuator_trnid[u, 0]] = True
-    return has
+    return has & spatial_tendons(m)
 
 
 def branching_tendons(m: mujoco.MjModel) -> np.ndarray:
