@@ -1,0 +1,183 @@
+"""Every model of some PyPI packages: is its gradient exact, partly exact or refused, and how large is its error?
+
+Reads all MJCF files of the packages named in GROUPS and compiles those that are whole models with degrees of freedom;
+equal models count once. The packages are only needed for their files: `pip install --no-deps gymnasium
+gymnasium-robotics dm-control mjlab robosuite gym-aloha robopianist myo-sim musclemimic-models`. What is not installed
+is named and left out. A model's row is written to --rows as soon as it is known, and a later run goes on from there.
+"""
+
+import argparse
+import hashlib
+import json
+import time
+import warnings
+from collections import Counter
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from record import RESULTS, markdown_table, publish
+
+from msk_ray.errors import MskRayError
+from msk_ray.gradcheck import check_gradients
+from msk_ray.physics.adjoint.coverage import partly_exact, unsupported
+from msk_ray.simulation import Simulation
+
+GROUPS = {
+    "robots": ("gymnasium_robotics", "mjlab", "robosuite", "gym_aloha", "robopianist"),
+    "muscle models": ("myo_sim", "musclemimic_models"),
+    "benchmarks": ("gymnasium", "dm_control", "mujoco_warp"),
+}
+
+
+def files() -> Iterator[tuple[str, str, Path]]:
+    """(group, name, path) of every MJCF file; a package that is not installed is named on the way."""
+    for group, packages in GROUPS.items():
+        for package in packages:
+            found = find_spec(package)
+            if found is None or not found.submodule_search_locations:
+                print(f"{package} is not installed: left out", flush=True)
+                continue
+            root = Path(next(iter(found.submodule_search_locations)))
+            for path in sorted(root.rglob("*.xml")):
+                yield group, f"{package}/{path.relative_to(root)}", path
+
+
+def compiled(path: Path) -> mujoco.MjModel | None:
+    """A file's model with a floor below it, or None for a part of other files or a model that cannot move."""
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        if not any(geom.type == mujoco.mjtGeom.mjGEOM_PLANE for geom in spec.worldbody.geoms):
+            spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[40, 40, 1])
+        model = spec.compile()
+    except (ValueError, mujoco.FatalError):
+        return None
+    return model if model.nv else None
+
+
+def digest(model: mujoco.MjModel) -> str:
+    """The same for models that differ in names only."""
+    parts = (getattr(model, name) for name in ("body_pos", "body_mass", "jnt_axis", "geom_size", "actuator_gear"))
+    return hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in parts)).hexdigest()
+
+
+def errors_at(model: mujoco.MjModel, substeps: int, args: argparse.Namespace) -> dict[str, Any]:
+    """The errors over one number of substeps, or why there are none."""
+    try:
+        sim = Simulation(model, args.worlds, substeps, device=args.device, tolerance=args.solver_tolerance)
+        result = check_gradients(sim, states=args.states)
+    except (MskRayError, mujoco.FatalError) as error:
+        return {"failed": str(error)}
+    return {
+        "worst": max((r.rel_error for r in result.results), default=None),
+        "median": float(np.median([r.rel_error for r in result.results])) if result.results else None,
+        "checked": result.checked,
+        "kinks": result.kinks,
+        "mismatches": result.forward_mismatches,
+        "nonfinite": len(result.nonfinite),
+        "approximated_share": result.diagnostics.get("approximated_share", 0.0),
+    }
+
+
+def row_of(group: str, name: str, model: mujoco.MjModel, args: argparse.Namespace) -> dict[str, Any]:
+    """What is known of one model."""
+    row: dict[str, Any] = {"group": group, "model": name, "nv": model.nv, "digest": digest(model)}
+    refused = sorted(unsupported(model))
+    verdict = "refused" if refused else "partly exact" if partly_exact(model) else "exact"
+    row |= {"verdict": verdict, "refused": refused}
+    if not refused and model.nv <= args.largest:
+        begin = time.process_time()
+        row["errors"] = {str(n): errors_at(model, n, args) for n in args.substeps}
+        row["seconds"] = round(time.process_time() - begin, 1)
+    return row
+
+
+def gather_rows(args: argparse.Namespace) -> list[dict[str, Any]]:
+    """All rows, those written by earlier runs included."""
+    rows = [json.loads(line) for line in args.rows.read_text().splitlines()] if args.rows.exists() else []
+    known = {row["model"] for row in rows}
+    digests = {row["digest"] for row in rows if row["digest"]}
+    for group, name, path in files():
+        if name in known or (args.only and args.only not in name):
+            continue
+        model = compiled(path)
+        if model is None:
+            row: dict[str, Any] = {"group": group, "model": name, "verdict": "no model", "digest": ""}
+        elif digest(model) in digests:
+            row = {"group": group, "model": name, "verdict": "twice", "digest": ""}
+        else:
+            row = row_of(group, name, model, args)
+            digests.add(row["digest"])
+        rows.append(row)
+        with args.rows.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(row) + "\n")
+        print(json.dumps({key: value for key, value in row.items() if key != "digest"}), flush=True)
+    return rows
+
+
+def _worst(row: dict[str, Any], substeps: int) -> str:
+    found = row.get("errors", {}).get(str(substeps))
+    if found is None:
+        return "-"
+    if "failed" in found:
+        return "failed"
+    left_out = found["kinks"] + found["mismatches"]
+    worst = "-" if found["worst"] is None else f"{found['worst']:.0e}"
+    return f"{worst} ({found['checked']} of {found['checked'] + left_out})"
+
+
+def tables(rows: list[dict[str, Any]], substeps: list[int]) -> str:
+    """Shares by group, what is refused and how often, and every model."""
+    models = [row for row in rows if row["verdict"] not in ("no model", "twice")]
+    verdicts = ("exact", "partly exact", "refused")
+    shares = []
+    for group in (*GROUPS, None):
+        own = [row for row in models if group in (row["group"], None)]
+        counts = Counter(row["verdict"] for row in own)
+        cells = [f"{counts[v]} ({counts[v] / max(1, len(own)):.0%})" for v in verdicts]
+        shares.append([group or "all", str(len(own)), *cells])
+    reasons = Counter(reason for row in models for reason in row["refused"])
+    every = [
+        [row["model"], str(row["nv"]), row["verdict"], *(_worst(row, n) for n in substeps), "; ".join(row["refused"])]
+        for row in models
+    ]
+    columns = [f"largest error, {n} substeps (states)" for n in substeps]
+    return "\n\n".join(
+        (
+            markdown_table(["group", "models", *verdicts], shares),
+            markdown_table(["refused for", "models"], [[name, str(count)] for name, count in reasons.most_common()]),
+            markdown_table(["model", "nv", "gradient", *columns, "refused for"], every),
+        )
+    )
+
+
+def main() -> None:
+    """Run the benchmark the command line asks for."""
+    p = argparse.ArgumentParser(description=__doc__)
+    p.add_argument("--rows", type=Path, default=Path("coverage.jsonl"), help="rows known so far (default %(default)s)")
+    p.add_argument("--only", help="models whose name contains this")
+    p.add_argument("--substeps", type=int, nargs="+", default=[1, 4, 16])
+    p.add_argument("--states", nargs="+", default=["standing", "contact"])
+    p.add_argument("--worlds", type=int, default=2, help="states of each kind")
+    p.add_argument("--largest", type=int, default=200, help="degrees of freedom above which no error is measured")
+    p.add_argument("--solver-tolerance", type=float, default=1e-9, help="of Warp's solver (default %(default)s)")
+    p.add_argument("--device", default="cpu")
+    p.add_argument("--results", type=Path, default=RESULTS, help="folder the tables are appended in")
+    args = p.parse_args()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        rows = gather_rows(args)
+    publish(
+        "coverage",
+        "Models of PyPI packages and their gradients",
+        args.device,
+        tables(rows, args.substeps),
+        args.results,
+    )
+
+
+if __name__ == "__main__":
+    main()
