@@ -21,7 +21,7 @@ from msk_ray.physics.adjoint.convex_laws import (
 from msk_ray.physics.adjoint.feet import foot_of, ground_of, unit_of_length
 from msk_ray.physics.adjoint.groups import ContactBars, Contacts, Meshes, Shapes, Substep, gather
 from msk_ray.physics.adjoint.pair_laws import is_convex_pair
-from msk_ray.physics.adjoint.patches import FACE, patch_at
+from msk_ray.physics.adjoint.patches import EDGE, FACE, Patch, patch_at
 from msk_ray.physics.adjoint.solids import (
     Solid,
     face_along,
@@ -29,6 +29,7 @@ from msk_ray.physics.adjoint.solids import (
     face_normal,
     farthest,
     has_corners,
+    looked_at,
     out_of,
 )
 from msk_ray.physics.adjoint.spatial import column, wrench
@@ -46,6 +47,8 @@ _WITNESS_ROUNDING = wp.constant(1.0e-7)
 """Rounding of witness points, in sizes; the normal is the direction between them."""
 _KEPT = wp.constant(2.0e-5)
 """How much nearer, in sizes, a distance from before clipping must come."""
+_UPWARD = wp.constant(1.0e-5)
+"""Sine of the angle below which a contact's normal is a height field's axis."""
 _LOST = wp.constant(1.0e-4)
 """How far, in sizes, the law that comes nearest may miss a contact before the contact counts as approximated."""
 
@@ -69,6 +72,15 @@ def side_by_side(solid1: Solid, solid2: Solid, normal: wp.vec3) -> bool:
     axis2 = column(solid2.mat, 2)
     across = wp.abs(wp.dot(axis1, normal)) < _SLACK and wp.abs(wp.dot(axis2, normal)) < _SLACK
     return long1 and long2 and across and wp.length(wp.cross(axis1, axis2)) < _SLACK
+
+
+@wp.func
+def is_supported(solid: Solid, patch: Patch, normal: wp.vec3, slack: float) -> bool:
+    """Whether the surface around a contact has its normal: convex collision may stop before it finds the way out."""
+    supported = bool(True)
+    if has_corners(solid) and patch.kind == EDGE:
+        supported = wp.abs(wp.dot(patch.run, normal)) < slack
+    return supported
 
 
 @wp.func
@@ -123,13 +135,13 @@ def standing_wrenches(
 
 @wp.func
 def convex_wrenches(
-    solid1: Solid, solid2: Solid, meshes: Meshes, seen: Seen, bars: Bars, native_ccd: int, multi_ccd: int
+    first: Solid, solid2: Solid, meshes: Meshes, seen: Seen, bars: Bars, native_ccd: int, multi_ccd: int
 ) -> tuple[Push, wp.bool]:
     """Forces and torques of one contact, and whether they are exact.
 
     Args:
-        solid1: the first geom.
-        solid2: the second.
+        first: the first geom, a height field or convex.
+        solid2: the second, convex.
         meshes: hulls of meshes.
         seen: the contact.
         bars: its cotangents.
@@ -137,13 +149,17 @@ def convex_wrenches(
         multi_ccd: 1 if convex collision clips faces to find several contacts.
     """
     n = seen.normal
+    solid1 = first
+    field = first.type == GeomType.HFIELD
+    if field:
+        solid1 = looked_at(first, meshes, seen.point - 0.5 * seen.dist * n)
     length = unit_of_length(solid1, solid2)
     slack = wp.min(_SLACK + _WITNESS_ROUNDING * length / wp.max(wp.abs(seen.dist), 1.0e-9), _MOST_SLACK)
     face1, sine1 = face_along(solid1, meshes, n)
     face2, sine2 = face_along(solid2, meshes, -n)
     boxes = solid1.type == GeomType.BOX and solid2.type == GeomType.BOX
     own_boxes = boxes and native_ccd == 0
-    faced1 = has_corners(solid1) or solid1.type == GeomType.CYLINDER
+    faced1 = (has_corners(solid1) and not field) or solid1.type == GeomType.CYLINDER
     faced2 = has_corners(solid2) or solid2.type == GeomType.CYLINDER
     long1 = solid1.type == GeomType.CAPSULE
     long2 = solid2.type == GeomType.CAPSULE
@@ -154,7 +170,9 @@ def convex_wrenches(
     flipped_bars = bars
     flipped_bars.normal = -bars.normal
     push = Push()
-    exact = bool(True)
+    # From within a prism of a height field the way out may lead sideways; MuJoCo then pushes along the field's axis.
+    flat = has_corners(solid1) and has_corners(solid2)
+    exact = not (field and sine1 > slack and wp.length(wp.cross(n, column(solid1.mat, 2))) < _UPWARD)
     miss = float(0.0)
     lying = is_clipped and not own_boxes and lies_on(solid1, solid2, meshes, face1, face2)
     if lying and sine2 < slack:
@@ -168,14 +186,19 @@ def convex_wrenches(
         clip2 = wp.where(lying or own_boxes, face2, -1)
         if patch1.kind == FACE and (patch2.kind != FACE or sine1 <= sine2 + _SLACK):
             push, miss = standing_wrenches(solid1, solid2, meshes, patch1.face, clip2, 0, seen, bars, is_clipped)
+            exact = exact and not (flat and sine1 > slack)
         elif patch2.kind == FACE:
             push, miss = standing_wrenches(
                 solid2, solid1, meshes, patch2.face, clip1, 0, flipped, flipped_bars, is_clipped
             )
             push = swapped(push)
+            exact = exact and not (flat and sine2 > slack)
         else:
-            push, exact = touching_wrenches(patch1, patch2, seen, bars, length)
-            exact = exact and not side_by_side(solid1, solid2, n)
+            # Edges of flat faces meet exactly; curved surfaces only as MuJoCo's tolerance says.
+            tilt = wp.where(flat, slack, _MOST_SLACK)
+            exact = exact and is_supported(solid1, patch1, n, tilt) and is_supported(solid2, patch2, n, tilt)
+            push, regular = touching_wrenches(patch1, patch2, seen, bars, length)
+            exact = exact and regular and not side_by_side(solid1, solid2, n)
     return push, exact and miss < _LOST
 
 

@@ -195,6 +195,7 @@ _SOLIDS = [
     *(_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_ELLIPSOID, _GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_BOX),
     _GEOM.mjGEOM_MESH,
 ]
+_FIELD_PAIRS = _types([_GEOM.mjGEOM_HFIELD], _SOLIDS)
 _EXACT_PAIRS = _types([_GEOM.mjGEOM_PLANE, *_SOLIDS], _SOLIDS)
 _DYN = mujoco.mjtDyn
 
@@ -294,7 +295,14 @@ FEATURES: tuple[Feature, ...] = (
         "contacts without a derivative of their own (parallel edges, a clipped side that another feature found) get "
         "that of the nearest law; `grad/approximated_share` counts how often",
     ),
-    Feature("contact with height fields and signed distance fields", False, _pairs(None, _EXACT_PAIRS)),
+    Feature(
+        "contact of height fields with sphere, capsule, ellipsoid, cylinder, box, mesh",
+        True,
+        _pairs(_FIELD_PAIRS, set()),
+        "exact for each triangle that touches; what lies flat on a triangle, or has sunk into it beyond its sides, has "
+        "no derivative of its own and is counted as above",
+    ),
+    Feature("contact with signed distance fields", False, _pairs(None, _EXACT_PAIRS | _FIELD_PAIRS)),
     Feature("contact adhesion and surface velocity", False, _odd_surfaces),
     Feature("fixed tendons", True, _tendon(lambda m: ~spatial_tendons(m))),
     Feature(

@@ -53,7 +53,7 @@ class Shapes:
 
 @wp.struct
 class Meshes:
-    """Convex hulls of meshes as polygons."""
+    """Convex hulls of meshes as polygons, and height fields."""
 
     geom_dataid: wp.array2d[int]
     mesh_vertadr: wp.array[int]
@@ -65,6 +65,11 @@ class Meshes:
     mesh_polyvertadr: wp.array[int]
     mesh_polyvertnum: wp.array[int]
     mesh_polyvert: wp.array[int]
+    hfield_size: wp.array[wp.vec4]
+    hfield_nrow: wp.array[int]
+    hfield_ncol: wp.array[int]
+    hfield_adr: wp.array[int]
+    hfield_data: wp.array[float]
 
 
 @wp.struct

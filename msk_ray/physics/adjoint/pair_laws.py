@@ -233,7 +233,7 @@ def is_scored(type1: int, type2: int) -> bool:
 @wp.func
 def is_convex_pair(type1: int, type2: int) -> bool:
     """Whether two geoms, types in ascending order, collide by MuJoCo's convex collision, or are boxes."""
-    apart = type1 == GeomType.PLANE or type1 == GeomType.HFIELD or is_scored(type1, type2)
+    apart = type1 == GeomType.PLANE or is_scored(type1, type2)
     return not (apart or (type1 == GeomType.CAPSULE and type2 == GeomType.BOX))
 
 
@@ -250,7 +250,7 @@ _SOLIDS = [
     *(GeomType.SPHERE, GeomType.CAPSULE, GeomType.ELLIPSOID, GeomType.CYLINDER, GeomType.BOX, GeomType.MESH),
 ]
 CONVEX_PAIRS = frozenset(
-    {(int(a), int(b)) for a in _SOLIDS for b in _SOLIDS if a <= b}
+    {(int(a), int(b)) for a in (GeomType.HFIELD, *_SOLIDS) for b in _SOLIDS if a <= b}
     - SCORED_PAIRS
     - {(int(GeomType.CAPSULE), int(GeomType.BOX))}
 )

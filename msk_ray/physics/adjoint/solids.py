@@ -1,20 +1,24 @@
 """Convex geoms as the adjoint of their contacts sees them: pose, size, and the flat faces of those that have any.
 
-A box, a mesh (its convex hull), and the caps of a cylinder, which MuJoCo's convex collision takes as polygons of 16
-corners, all have faces: an outward normal and corners in order around it. Everything here is local to the geom unless
-it says otherwise.
+A box, a mesh (its convex hull), the caps of a cylinder, which MuJoCo's convex collision takes as polygons of 16
+corners, and a height field near a contact have faces: an outward normal and corners in order around it. Everything
+here is local to the geom unless it says otherwise.
 """
 
 import warp as wp
 from mujoco_warp import GeomType
 
 from msk_ray.physics.adjoint.groups import Meshes
+from msk_ray.physics.adjoint.height_fields import WINDOW_FACES, triangle_corner, triangle_normal, window_at
 
 wp.set_module_options({"enable_backward": False})
 
 CAP_CORNERS = wp.constant(16)
 _CAP_STEP = wp.constant(0.39269908169872414)
 """Angle between two corners of a cylinder's cap, π/8."""
+
+_OFF = wp.constant(1.0e-3)
+"""Distance of a point, in sizes, above which it is not on a height field's face."""
 
 
 @wp.struct
@@ -26,14 +30,34 @@ class Solid:
     """Of its centre, in the world [m]."""
     mat: wp.mat33
     size: wp.vec3
+    """MuJoCo's, but of a height field that of a cell [m]."""
     mesh: wp.int32
-    """Index of its mesh, -1 for none."""
+    """Index of its mesh or height field, -1 for none."""
+    row: wp.int32
+    """Of a height field: the first row of the cells that count."""
+    column: wp.int32
+    near: wp.vec3
+    """Of a height field: the point that its faces have to pass."""
 
 
 @wp.func
 def into(solid: Solid, point: wp.vec3) -> wp.vec3:
     """A point of the world in the solid's coordinates."""
     return wp.transpose(solid.mat) @ (point - solid.pos)
+
+
+@wp.func
+def looked_at(field: Solid, meshes: Meshes, point: wp.vec3) -> Solid:
+    """A height field's faces near a point of the world."""
+    solid = field
+    extent = meshes.hfield_size[solid.mesh]
+    width = 2.0 * extent[0] / float(meshes.hfield_ncol[solid.mesh] - 1)
+    solid.size = wp.vec3(width, 2.0 * extent[1] / float(meshes.hfield_nrow[solid.mesh] - 1), 0.0)
+    solid.near = into(solid, point)
+    row, column = window_at(solid.mesh, meshes, solid.near)
+    solid.row = row
+    solid.column = column
+    return solid
 
 
 @wp.func
@@ -45,7 +69,7 @@ def out_of(solid: Solid, point: wp.vec3) -> wp.vec3:
 @wp.func
 def has_corners(solid: Solid) -> bool:
     """Whether its surface consists of flat faces only."""
-    return solid.type == GeomType.BOX or solid.type == GeomType.MESH
+    return solid.type == GeomType.BOX or solid.type == GeomType.MESH or solid.type == GeomType.HFIELD
 
 
 @wp.func
@@ -58,6 +82,8 @@ def face_count(solid: Solid, meshes: Meshes) -> int:
         count = 2
     elif solid.type == GeomType.MESH:
         count = meshes.mesh_polynum[solid.mesh]
+    elif solid.type == GeomType.HFIELD:
+        count = WINDOW_FACES
     return count
 
 
@@ -71,6 +97,8 @@ def face_normal(solid: Solid, meshes: Meshes, face: int) -> wp.vec3:
         normal[2] = wp.where(face == 0, 1.0, -1.0)
     elif solid.type == GeomType.MESH:
         normal = meshes.mesh_polynormal[meshes.mesh_polyadr[solid.mesh] + face]
+    elif solid.type == GeomType.HFIELD:
+        normal = triangle_normal(solid.mesh, solid.row, solid.column, meshes, face)
     return normal
 
 
@@ -82,6 +110,8 @@ def corner_count(solid: Solid, meshes: Meshes, face: int) -> int:
         count = CAP_CORNERS
     elif solid.type == GeomType.MESH:
         count = meshes.mesh_polyvertnum[meshes.mesh_polyadr[solid.mesh] + face]
+    elif solid.type == GeomType.HFIELD:
+        count = 3
     return count
 
 
@@ -103,7 +133,19 @@ def face_corner(solid: Solid, meshes: Meshes, face: int, k: int) -> wp.vec3:
     elif solid.type == GeomType.MESH:
         first = meshes.mesh_polyvertadr[meshes.mesh_polyadr[solid.mesh] + face]
         corner = meshes.mesh_vert[meshes.mesh_vertadr[solid.mesh] + meshes.mesh_polyvert[first + k]]
+    elif solid.type == GeomType.HFIELD:
+        corner = triangle_corner(solid.mesh, solid.row, solid.column, meshes, face, k)
     return corner
+
+
+@wp.func
+def is_off(solid: Solid, meshes: Meshes, face: int, normal: wp.vec3) -> bool:
+    """Whether a face of a height field lies off the point where it is touched; its faces may have equal normals."""
+    off = bool(False)
+    if solid.type == GeomType.HFIELD:
+        height = wp.dot(normal, solid.near - face_corner(solid, meshes, face, 0))
+        off = wp.abs(height) > _OFF * wp.max(solid.size)
+    return off
 
 
 @wp.func
@@ -116,8 +158,9 @@ def face_along(solid: Solid, meshes: Meshes, direction: wp.vec3) -> tuple[wp.int
     best = int(-1)
     cosine = float(0.0)
     for face in range(face_count(solid, meshes)):
-        along = wp.dot(face_normal(solid, meshes, face), local)
-        if along > cosine:
+        normal = face_normal(solid, meshes, face)
+        along = wp.dot(normal, local)
+        if along > cosine and not is_off(solid, meshes, face, normal):
             cosine = along
             best = face
     sine = float(1.0)
@@ -128,7 +171,7 @@ def face_along(solid: Solid, meshes: Meshes, direction: wp.vec3) -> tuple[wp.int
 
 @wp.func
 def farthest(solid: Solid, meshes: Meshes, direction: wp.vec3) -> wp.vec3:
-    """The solid's point that lies farthest along a unit direction, both in the world."""
+    """The solid's point that lies farthest along a unit direction, both in the world; not for height fields."""
     local = wp.transpose(solid.mat) @ direction
     size = solid.size
     point = wp.vec3(0.0)
