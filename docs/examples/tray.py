@@ -9,8 +9,8 @@ from msk_ray import MjcfEnv, Reward, StepState
 class TrayReward(Reward):
     near: float = 1.0
     """Weight of how near the tray is to the middle, from 0 to 1."""
-    centred: float = 1.0
-    """Weight of the squared distance of the puck from the middle of the tray, in halves of its length."""
+    slip: float = 1.5
+    """Weight of the speed of the puck on the tray [s/m]."""
     effort: float = 0.02
     """Weight of the squared action."""
 
@@ -21,7 +21,7 @@ class Tray(MjcfEnv):
         """Largest distance of the tray from the middle at the start [m]."""
         reward: TrayReward = TrayReward()
 
-    reward_names = ("near", "centred", "effort")
+    reward_names = ("near", "slip", "effort")
     mjcf = """
     <mujoco model="tray"><option timestep=".005" cone="elliptic"/>
       <default><geom friction=".8 .005 .0001"/></default>
@@ -35,7 +35,8 @@ class Tray(MjcfEnv):
       <actuator><motor joint="tray" gear="40" ctrlrange="-1 1"/></actuator></mujoco>"""
 
     def draw_physics(self, count: int) -> StepState:
-        tray = self.config.distance * self.uniform(count, 1)
+        side = self.uniform(count, 1)
+        tray = self.config.distance * (0.6 * side.sign() + 0.4 * side)
         qpos = torch.cat((tray, tray, torch.zeros_like(tray)), dim=-1)
         return StepState(qpos, torch.zeros_like(qpos), torch.zeros((count, 0), device=self.device))
 
@@ -46,8 +47,8 @@ class Tray(MjcfEnv):
     def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
         r = self.config.reward
         near = 1.0 / (1.0 + (state.qpos[:, 0] / 0.3).square())
-        off = ((state.qpos[:, 1] - state.qpos[:, 0]) / 0.25).square()
-        return torch.stack((r.near * near, -r.centred * off, -r.effort * action.square().sum(-1)), dim=-1)
+        slip = (state.qvel[:, 1] - state.qvel[:, 0]).square().add(1e-4).sqrt() - 1e-2
+        return torch.stack((r.near * near, -r.slip * slip, -r.effort * action.square().sum(-1)), dim=-1)
 
     def fell(self, state: StepState) -> Tensor:
         return (state.qpos[:, 1] - state.qpos[:, 0]).abs() > 0.25

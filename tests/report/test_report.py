@@ -414,3 +414,17 @@ def test_several_algorithms_are_compared_over_seconds_too(several: bool, tmp_pat
     assert (made.path / "report" / "times.png").is_file() == several
     reading = read_experiment(made, time.time())
     assert [list(x) for x in reading.trials[0].curve_over("seconds")] == [[0.0, 4.0, 8.0], [1.0, 2.0, 3.0]]
+
+
+def test_it_says_which_variants_were_trained_with_drawn_parameters(tmp_path: Path) -> None:
+    (tmp_path / "base.yaml").write_text(dump_yaml({"env": {"name": "cartpole"}, "trial": {"epochs": 4}}))
+    masses = {"body_mass": {"low": 0.5, "high": 2.0}}
+    data = {"question": "?", "base": "base.yaml", "parameters": {"physics.randomize": {"grid": [None, masses]}}}
+    space = parse_space(data, tmp_path / "small.yaml")
+    trials = resolve_trials(space)
+    made = opening.create(tmp_path / "runs" / "e", space, trials, {})
+    for trial in trials:
+        fill(made.trial_folder(trial.id), [0.0, 1.0], Ending(Outcome.FINISHED, "done"))
+    page = page_of(made)
+    assert "1 of 2 variants are trained with body_mass ×0.5 to ×2, drawn for every episode" in page
+    assert "every score is of the model as it is" in page

@@ -9,6 +9,7 @@ from msk_ray.algorithms.shac import Shac
 from msk_ray.algorithms.shac.curriculum import ContactSchedule, between
 from msk_ray.config import ContactCurriculum, ContactStart, parse_config
 from msk_ray.envs import make_env
+from msk_ray.errors import ConfigError
 
 
 def settings(**changes):
@@ -108,3 +109,11 @@ def test_all_that_adapts_goes_on_from_a_checkpoint() -> None:
     assert {k: v for k, v in again.items() if not k.startswith("time/")} == {
         k: v for k, v in expected.items() if not k.startswith("time/")
     }
+
+
+def test_a_curriculum_and_drawn_friction_of_the_same_pairs_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"curriculum and physics\.randomize\.pair_friction both set"):
+        settings(
+            physics={"variant": "matched_hard_friction", "randomize": {"pair_friction": {"low": 0.5, "high": 1.5}}},
+            curriculum={"start": {"friction": 2.0}, "epochs": 2},
+        )
