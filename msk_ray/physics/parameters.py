@@ -16,6 +16,7 @@ import numpy as np
 import warp as wp
 
 from msk_ray.errors import ConfigError, UnsupportedModelError
+from msk_ray.physics.branches import between_sites, lone_free_bodies
 from msk_ray.physics.pairs import candidate_pairs
 
 _OBJ = mujoco.mjtObj
@@ -108,7 +109,7 @@ def _obstacle(mjm: mujoco.MjModel, name: str) -> str:
     inertial = name in ("body_mass", "body_inertia", "body_ipos", "body_iquat")
     if inertial and (mjm.opt.density or mjm.opt.viscosity):
         return "the drag of a fluid follows the inertia too; set density and viscosity to zero"
-    if inertial and mjm.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST and _has_lone_free_body(mjm):
+    if inertial and mjm.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST and lone_free_bodies(mjm):
         return "implicitfast takes gyroscopic forces of free bodies into its matrix; write integrator='Euler'"
     if name in ("body_ipos", "body_iquat"):
         # MuJoCo stores the inertia of such a body's dofs as a diagonal.
@@ -121,8 +122,10 @@ def _obstacle(mjm: mujoco.MjModel, name: str) -> str:
             )
     if name == "opt.timestep" and mjm.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
         return "RK4 has a time step at every stage; write integrator='Euler' or 'implicitfast'"
+    if name == "actuator_gear" and np.any(between_sites(mjm)):
+        return "the gear of an actuator between two sites has no gradient; put it on a joint or tendon"
     if name == "site_pos":
-        on_site = (mjm.actuator_trntype == int(mujoco.mjtTrn.mjTRN_SITE)).any()
+        on_site = (mjm.actuator_trntype == int(mujoco.mjtTrn.mjTRN_SITE)).any() or between_sites(mjm).any()
         if on_site or (mjm.eq_objtype == int(_OBJ.mjOBJ_SITE)).any():
             return "only sites on the paths of tendons can move; put the site of an actuator or equality on a body"
     if name == "geom_size":
@@ -131,12 +134,6 @@ def _obstacle(mjm: mujoco.MjModel, name: str) -> str:
         if np.any(round_pair & (types != int(mujoco.mjtGeom.mjGEOM_PLANE)).all(axis=1)):
             return "an ellipsoid may touch something other than a plane; make it a capsule, or exclude the pair"
     return ""
-
-
-def _has_lone_free_body(mjm: mujoco.MjModel) -> bool:
-    """Whether a free body has a tree of its own six dofs."""
-    free = mjm.jnt_dofadr[mjm.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)]
-    return bool(np.any(mjm.tree_dofnum[mjm.dof_treeid[free]] == 6))
 
 
 def structure(mjm: mujoco.MjModel, names: Iterable[str]) -> mujoco.MjModel:

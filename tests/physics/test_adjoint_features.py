@@ -64,6 +64,8 @@ def _tendon(path: str, actuators: str = "", **kw: str) -> mujoco.MjModel:
 
 _MUSCLE = '<muscle tendon="t" force="60" range=".6 1.1" lengthrange=".3 .7" tausmooth=".2" timeconst=".02 .06"/>'
 _SERVO = '<general tendon="t" gainprm="30" biastype="affine" biasprm="2 -20 -3" gear="1.5"/>'
+_REFSITE = """<actuator><general site="{}" refsite="{}" gear="3 1 -2 .5 .7 -1.3" biastype="affine" biasprm="1 -9 -.4"/>
+</actuator>"""
 _FAST = 'integrator="implicitfast"'
 _RK4 = 'integrator="RK4"'
 _WATER = ' density="500" viscosity="2" wind="1 2 -.5"'
@@ -193,6 +195,13 @@ SCENES = {
     ),
     "site": lambda: scene(
         '<actuator><general site="s4" gear="3 1 -2 .1 .2 -.3" biastype="affine" biasprm="1 0 -.4"/></actuator>'
+    ),
+    "refsite": lambda: scene(_REFSITE.format("s4", "s1")),
+    "refsite_in_another_tree": lambda: scene(_REFSITE.format("s5", "s4")),
+    "fast_refsite": lambda: scene(_REFSITE.format("s4", "s1"), option=_FAST),
+    "slider_crank": lambda: scene(
+        '<actuator><general cranksite="s5" slidersite="s4" cranklength="1.4" gear="2" biastype="affine" '
+        'biasprm="1 -9 -.4"/></actuator>'
     ),
     "fast_site": lambda: scene(
         '<actuator><general site="s4" gear="3 1 -2 .1 .2 -.3" biastype="affine" biasprm="1 0 -.4"/></actuator>',

@@ -42,6 +42,12 @@ def test_a_model_without_geoms_can_be_looked_at() -> None:
             r'RK4 with connect and weld equalities \(equality w\)\. Write integrator="Euler" or "implicitfast"\.',
         ),
         (
+            '<option integrator="implicitfast"/><worldbody><body><joint/><geom size=".1"/><site name="s" pos="1 0 0"/>'
+            '</body><body><joint/><geom size=".1"/><site name="t"/></body></worldbody>'
+            '<actuator><motor name="pull" site="s" refsite="t" gear="1 0 0 0 0 0"/></actuator>',
+            r'sites of different branches \(actuator pull\)\. Write integrator="Euler"',
+        ),
+        (
             '<option noslip_iterations="3"/><worldbody><body><joint/><geom size=".1"/></body></worldbody>',
             r'noslip iterations .*\. Write noslip_iterations="0"; a larger impratio',
         ),

@@ -30,6 +30,7 @@ SIGNATURES = {
     "lu_solve_6x6": "A_in mat66f, pivot_in vec6i, b_in vec6f -> vec6f",
     "make_frame": "a vec3f -> ?",
     "motion_cross_force": "v spatial_vectorf, f spatial_vectorf -> spatial_vectorf",
+    "mul_quat": "u quatf, v quatf -> quatf",
     "muscle_bias": "len float, lengthrange vec2f, acc0 float, prm vec10f -> float",
     "muscle_dynamics": "control float, activation float, prm vec10f -> float",
     "muscle_gain": "len float, vel float, lengthrange vec2f, acc0 float, prm vec10f -> float",

@@ -326,7 +326,7 @@ def pull_actuators(
         wp.atomic_add(tendon_bars_out.mu, worldid, t, gear * rate_bar[2])
         wp.atomic_add(tendon_bars_out.smooth, worldid, t, gear * rate_bar[3])
         return
-    if kind == TrnType.SITE:
+    if kind == TrnType.SITE or kind == TrnType.SLIDERCRANK:
         return
     # Length is the integral of the moment for hinges and slides; where it is not, `transmission` does it.
     straight = bool(False)

@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 
 from msk_ray.errors import UnsupportedModelError
-from msk_ray.physics.adjoint.tables import lone_free_bodies
 from msk_ray.physics.adjoint.tendon_kinds import branching_tendons, spatial_tendons, tendon_armature
+from msk_ray.physics.branches import between_sites, branching_actuators, lone_free_bodies
 
 _OBJ = mujoco.mjtObj
 _GEOM = mujoco.mjtGeom
@@ -91,6 +91,10 @@ def _site_transmission(referred: bool) -> Finder:
     def test(m: mujoco.MjModel) -> np.ndarray:
         return np.asarray((m.actuator_trntype == int(_TRN.mjTRN_SITE)) & ((m.actuator_trnid[:, 1] >= 0) == referred))
 
+    return _where(_OBJ.mjOBJ_ACTUATOR, "actuator", test)
+
+
+def _actuators_at(test: Callable[[mujoco.MjModel], np.ndarray]) -> Finder:
     return _where(_OBJ.mjOBJ_ACTUATOR, "actuator", test)
 
 
@@ -364,16 +368,26 @@ FEATURES: tuple[Feature, ...] = (
     ),
     Feature("transmission to tendons", True, _actuator("actuator_trntype", _TRN.mjTRN_TENDON)),
     Feature("transmission to sites", True, _site_transmission(False)),
-    Feature("transmission to sites with a reference site", False, _site_transmission(True)),
+    Feature("transmission to sites with a reference site, and slider-cranks", True, _actuators_at(between_sites)),
     Feature(
-        "transmission to slider-cranks, bodies (adhesion), SO(3)",
+        "implicitfast with an actuator between sites of different branches",
+        False,
+        _actuators_at(branching_actuators),
+        instead='integrator="Euler"',
+    ),
+    Feature(
+        "transmission to bodies (adhesion), SO(3)",
         False,
         _where(
             _OBJ.mjOBJ_ACTUATOR,
             "actuator",
             lambda m: (
                 ~_among(
-                    m.actuator_trntype, (_TRN.mjTRN_JOINT, _TRN.mjTRN_JOINTINPARENT, _TRN.mjTRN_TENDON, _TRN.mjTRN_SITE)
+                    m.actuator_trntype,
+                    (
+                        *(_TRN.mjTRN_JOINT, _TRN.mjTRN_JOINTINPARENT, _TRN.mjTRN_TENDON, _TRN.mjTRN_SITE),
+                        _TRN.mjTRN_SLIDERCRANK,
+                    ),
                 )
             ),
         ),

@@ -25,10 +25,12 @@ from msk_ray.physics.adjoint.integrate import Integrator
 from msk_ray.physics.adjoint.joints import TurningSprings
 from msk_ray.physics.adjoint.rows import ConstraintLaws
 from msk_ray.physics.adjoint.scalar_rows import ScalarRows
+from msk_ray.physics.adjoint.site_pairs import SitePairForces
 from msk_ray.physics.adjoint.solve import LinearSystems
 from msk_ray.physics.adjoint.tendons import Tendons
 from msk_ray.physics.adjoint.transmission import TurningTransmissions
 from msk_ray.physics.adjoint.workspace import Workspace
+from msk_ray.physics.branches import between_sites
 
 _ANCHORED = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
 
@@ -153,6 +155,8 @@ def _forces(work: Workspace, laws: ConstraintLaws, contacts: ContactForces) -> l
     if work.settings.actuation:
         actuators = ActuatorForces(work)
         stages += [actuators, TurningTransmissions(work, actuators.bars)]
+        if np.any(between_sites(work.mjm)):
+            stages.append(SitePairForces(work, actuators.bars))
     if work.tables.has_turning_spring:
         stages.append(TurningSprings(work))
     if work.settings.fluid:

@@ -7,6 +7,8 @@ import mujoco
 import numpy as np
 import warp as wp
 
+from msk_ray.physics.branches import lone_free_bodies
+
 _ROTATION_OFFSET = {mujoco.mjtJoint.mjJNT_FREE: 3, mujoco.mjtJoint.mjJNT_BALL: 0}
 
 
@@ -45,7 +47,7 @@ class Tables:
     has_turning_transmission: bool
     """Whether an actuator drives a free or ball joint."""
     has_site_transmission: bool
-    """Whether an actuator drives a site."""
+    """Whether an actuator drives a site without a reference site."""
     has_turning_spring: bool
     """Whether a free or ball joint has a spring."""
 
@@ -105,15 +107,6 @@ def _has_scalar_rows(mjm: mujoco.MjModel) -> bool:
     )
 
 
-def lone_free_bodies(mjm: mujoco.MjModel) -> list[int]:
-    """Bodies with a free joint in whose tree nothing else moves."""
-    return [
-        int(mjm.jnt_bodyid[joint])
-        for joint in np.flatnonzero(mjm.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE))
-        if mjm.tree_dofnum[mjm.dof_treeid[mjm.jnt_dofadr[joint]]] == 6
-    ]
-
-
 def build_tables(mjm: mujoco.MjModel, model: Any) -> Tables:
     """Tables for the C model `mjm` and its mujoco_warp copy `model`, on Warp's current device."""
     lastdof = np.full(mjm.nbody, -1, dtype=np.int32)
@@ -168,6 +161,8 @@ def build_tables(mjm: mujoco.MjModel, model: Any) -> Tables:
         has_wrapping=bool(np.any(segments[:, 2] >= 0)),
         has_scalar_rows=_has_scalar_rows(mjm),
         has_turning_transmission=_drives_turning_joint(mjm),
-        has_site_transmission=bool(np.any(mjm.actuator_trntype == int(mujoco.mjtTrn.mjTRN_SITE))),
+        has_site_transmission=bool(
+            np.any((mjm.actuator_trntype == int(mujoco.mjtTrn.mjTRN_SITE)) & (mjm.actuator_trnid[:, 1] < 0))
+        ),
         has_turning_spring=turning,
     )

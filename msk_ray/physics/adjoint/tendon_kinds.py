@@ -3,6 +3,8 @@
 import mujoco
 import numpy as np
 
+from msk_ray.physics.branches import one_chain
+
 
 def spatial_tendons(m: mujoco.MjModel) -> np.ndarray:
     """Tendons over sites and geoms; the others are fixed."""
@@ -36,19 +38,5 @@ def branching_tendons(m: mujoco.MjModel) -> np.ndarray:
             )
             if int(m.wrap_type[place]) == int(kind)
         }
-        found[tendon] = not _one_chain(m, bodies)
+        found[tendon] = not one_chain(m, bodies)
     return found
-
-
-def _one_chain(m: mujoco.MjModel, bodies: set[int]) -> bool:
-    """Whether of any two bodies one carries the other."""
-
-    def carriers(body: int) -> set[int]:
-        out = {body}
-        while body:
-            body = int(m.body_parentid[body])
-            out.add(body)
-        return out
-
-    moving = {int(m.body_weldid[b]) for b in bodies} - {0}
-    return all(a in carriers(b) or b in carriers(a) for a in moving for b in moving)

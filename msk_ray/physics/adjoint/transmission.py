@@ -93,7 +93,7 @@ def pull_sites(
 ) -> None:
     """m·x = F·u(x) + T·ω(x) at the site, with force F and torque T fixed in the site's frame; len = 0."""
     worldid, uid = wp.tid()
-    if transmissions.actuator_trntype[uid] != TrnType.SITE:
+    if transmissions.actuator_trntype[uid] != TrnType.SITE or transmissions.actuator_trnid[uid][1] >= 0:
         return
     site = transmissions.actuator_trnid[uid][0]
     body = site_bodyid[site]

@@ -1,0 +1,53 @@
+"""Which bodies carry which, and what acts between different branches of the tree."""
+
+import mujoco
+import numpy as np
+
+
+def carriers(m: mujoco.MjModel, body: int) -> list[int]:
+    """A body and all that carry it, down to the world."""
+    out = [body]
+    while out[-1]:
+        out.append(int(m.body_parentid[out[-1]]))
+    return out
+
+
+def one_chain(m: mujoco.MjModel, bodies: set[int]) -> bool:
+    """Whether of any two bodies one carries the other; bodies that are fixed to each other count as one."""
+    moving = {int(m.body_weldid[b]) for b in bodies} - {0}
+    return all(a in carriers(m, b) or b in carriers(m, a) for a in moving for b in moving)
+
+
+def lone_free_bodies(m: mujoco.MjModel) -> list[int]:
+    """Bodies with a free joint in whose tree nothing else moves."""
+    return [
+        int(m.jnt_bodyid[joint])
+        for joint in np.flatnonzero(m.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE))
+        if m.tree_dofnum[m.dof_treeid[m.jnt_dofadr[joint]]] == 6
+    ]
+
+
+def between_sites(m: mujoco.MjModel) -> np.ndarray:
+    """Actuators at a site with a reference site, and slider-cranks, as booleans."""
+    crank = m.actuator_trntype == int(mujoco.mjtTrn.mjTRN_SLIDERCRANK)
+    site = m.actuator_trntype == int(mujoco.mjtTrn.mjTRN_SITE)
+    return np.asarray(crank | (site & (m.actuator_trnid[:, 1] >= 0)))
+
+
+def branching_actuators(m: mujoco.MjModel) -> np.ndarray:
+    """Actuators between sites that couple dofs which the inertia does not: implicitfast drops those slopes."""
+    found = np.zeros(m.nu, dtype=bool)
+    if m.opt.integrator == int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST):
+        for u in np.flatnonzero(between_sites(m)):
+            found[u] = not one_chain(m, {int(m.site_bodyid[s]) for s in m.actuator_trnid[u]})
+    return found
+
+
+def common_bodies(m: mujoco.MjModel) -> np.ndarray:
+    """By actuator, the body that carries both its site and its reference site; 0 for others."""
+    out = np.zeros(m.nu, dtype=np.int32)
+    for u in np.flatnonzero(between_sites(m)):
+        if m.actuator_trntype[u] == int(mujoco.mjtTrn.mjTRN_SITE):
+            first, second = (carriers(m, int(m.site_bodyid[s])) for s in m.actuator_trnid[u])
+            out[u] = next(b for b in first if b in second)
+    return out
