@@ -18,6 +18,7 @@ import warp as wp
 from msk_ray.errors import ConfigError, UnsupportedModelError
 from msk_ray.physics.branches import between_sites, lone_free_bodies
 from msk_ray.physics.pairs import candidate_pairs
+from msk_ray.physics.tendon_kinds import between_branches
 
 _OBJ = mujoco.mjtObj
 
@@ -124,6 +125,9 @@ def _obstacle(mjm: mujoco.MjModel, name: str) -> str:
         return "RK4 has a time step at every stage; write integrator='Euler' or 'implicitfast'"
     if name == "actuator_gear" and np.any(between_sites(mjm)):
         return "the gear of an actuator between two sites has no gradient; put it on a joint or tendon"
+    fast = mjm.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    if name in ("tendon_damping", "actuator_gainprm", "actuator_biasprm") and fast and between_branches(mjm).any():
+        return "implicitfast drops slopes of dampers and servos on tendons between branches; write integrator='Euler'"
     if name == "site_pos":
         on_site = (mjm.actuator_trntype == int(mujoco.mjtTrn.mjTRN_SITE)).any() or between_sites(mjm).any()
         if on_site or (mjm.eq_objtype == int(_OBJ.mjOBJ_SITE)).any():

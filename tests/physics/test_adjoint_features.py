@@ -158,6 +158,11 @@ SCENES = {
     "fast_servo": lambda: scene(
         '<actuator><position joint="c" kp="30" kv="2"/><velocity joint="d" kv="3"/></actuator>', option=_FAST
     ),
+    "fast_branching_spring": lambda: _tendon(
+        '<spatial name="t" stiffness="50" springlength=".2"><site site="s4"/><site site="s5"/></spatial>',
+        '<motor tendon="t"/>',
+        option=_FAST,
+    ),
     "fast_fixed_tendon": lambda: _tendon(_FIXED.format('stiffness="5" damping=".6"'), _SERVO, option=_FAST),
     "fast_site_tendon": lambda: _tendon(_PATH.format('damping="2"'), _SERVO, option=_FAST),
     "fast_affine_gain": lambda: scene(

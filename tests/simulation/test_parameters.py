@@ -286,6 +286,8 @@ def test_a_centre_of_mass_that_the_inertia_matrix_cannot_follow_is_refused():
     spinning = SCENES["fast_spinning_free"]()
     with pytest.raises(UnsupportedModelError, match="body_inertia is not supported: implicitfast takes gyroscopic"):
         Simulation(spinning, 1, 1).open_parameters(["body_inertia"])
+    with pytest.raises(UnsupportedModelError, match="tendon_damping is not supported: implicitfast drops slopes"):
+        Simulation(SCENES["fast_branching_spring"](), 1, 1).open_parameters(["tendon_damping"])
     with pytest.raises(UnsupportedModelError, match="actuator_gear is not supported: the gear of an actuator between"):
         Simulation(SCENES["refsite"](), 1, 1).open_parameters(["actuator_gear"])
     with pytest.raises(UnsupportedModelError, match="body_mass is not supported: the drag of a fluid"):

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from msk_ray.physics.adjoint.coverage import contact_types, geom_pair_name
+from msk_ray.physics.adjoint.contact_kinds import contact_types, geom_pair_name
 from msk_ray.physics.adjoint.pair_laws import CONVEX_PAIRS
 
 _TYPES = wp.constant(int(mujoco.mjtGeom.mjNGEOMTYPES))

@@ -7,8 +7,8 @@ plain field x, along the frame's axes (k < 3), and the relative spin (k ≥ 3). 
 
 import warp as wp
 
+from msk_ray.physics.adjoint.contact_kinds import colliding_pairs
 from msk_ray.physics.adjoint.convex import ConvexContacts
-from msk_ray.physics.adjoint.coverage import colliding_pairs
 from msk_ray.physics.adjoint.geometry import PairKinds, pull_geometry_kernel
 from msk_ray.physics.adjoint.groups import (
     ContactBars,
