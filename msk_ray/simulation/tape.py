@@ -349,6 +349,7 @@ class Hybrid(Backward):
         return Hybrid(self.state.fresh(), self.ctrl.fresh())
 
     def attach(self, batch: WorldBatch) -> None:
+        self._splits: dict[int, int] = {}
         self.state.attach(batch)
         self.ctrl.attach(batch)
 
@@ -378,20 +379,27 @@ class Hybrid(Backward):
         self, ctrl: Tensor, start: StepState, end: StepState, applied: Applied | None = None
     ) -> tuple[Tensor, ...]:
         forces = () if applied is None else (applied,)
-        first = self.state.record(ctrl, start, end, *forces)
-        self._split = len(first)
-        return (*first, *self.ctrl.record(ctrl, start, end, *forces))
+        first, second = (mode.record(ctrl, start, end, *forces) for mode in (self.state, self.ctrl))
+        self._splits[len(first) + len(second)] = len(first)
+        return (*first, *second)
+
+    def _split(self, saved: tuple[Tensor, ...]) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+        """What each of the modes has recorded."""
+        first = self._splits[len(saved)]  # steps with and without applied forces differ in length
+        return saved[:first], saved[first:]
 
     def vjp(self, saved: tuple[Tensor, ...], cotangent: StepState, needs: Needs) -> InputGradients:
-        state = self.state.vjp(saved[: self._split], cotangent, needs._replace(ctrl=False))
-        ctrl = self.ctrl.vjp(saved[self._split :], cotangent, Needs(needs.ctrl, False, False, False))
+        first, second = self._split(saved)
+        state = self.state.vjp(first, cotangent, needs._replace(ctrl=False))
+        ctrl = self.ctrl.vjp(second, cotangent, Needs(needs.ctrl, False, False, False))
         return state._replace(ctrl=ctrl.ctrl)
 
     def jacobian(
         self, saved: tuple[Tensor, ...], start: StepState, end: StepState, tangent: Tangent
     ) -> tuple[Tensor, Tensor]:
-        a, _ = self.state.jacobian(saved[: self._split], start, end, tangent)
-        _, b = self.ctrl.jacobian(saved[self._split :], start, end, tangent)
+        first, second = self._split(saved)
+        a, _ = self.state.jacobian(first, start, end, tangent)
+        _, b = self.ctrl.jacobian(second, start, end, tangent)
         return a, b
 
     def diagnostics(self) -> dict[str, float]:

@@ -10,7 +10,7 @@ from oracle import INPUTS, Point, relative, shifted
 from scenes import ant, ant_points, cartpole, random_weights
 
 from msk_ray.errors import ConfigError, UnsupportedModelError
-from msk_ray.simulation import FdJacobian, Simulation, TapeAll, TapePerSubstep
+from msk_ray.simulation import FdJacobian, Hybrid, Simulation, TapeAll, TapePerSubstep
 
 FORCES = ("qfrc_applied", "xfrc_applied")
 
@@ -126,6 +126,20 @@ def test_forces_end_with_their_step():
     driven.qvel.sum().backward()
     assert force.grad is not None
     torch.testing.assert_close(sim.step(ctrl, *start).qvel, plain.qvel, rtol=0, atol=0)
+
+
+def test_steps_with_and_without_forces_are_pulled_back_in_one_pass():
+    """With the state's gradient from one mode and the control's from another, which record different tensors."""
+    gradients = []
+    for mode in (TapePerSubstep(), Hybrid(TapePerSubstep(), FdJacobian())):
+        sim = Simulation(cartpole(), 2, 4, mode, "cpu")
+        ctrl, force = (torch.full((2, n), 0.5, requires_grad=True) for n in (1, 2))
+        between = sim.step(ctrl, *sim.initial_state(), qfrc_applied=force)
+        end = sim.step(ctrl, *between)
+        gradients.append(torch.autograd.grad(end.qvel.square().sum(), (ctrl, force)))
+    for one, other in zip(*gradients, strict=True):
+        assert one.abs().min() > 1e-4
+        torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-3)
 
 
 def test_a_step_is_linearized_under_its_forces():
