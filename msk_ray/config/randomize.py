@@ -48,6 +48,8 @@ class RandomizeConfig(Section):
     """Damping of joints, by the joint's name [N s/m, N m s/rad]."""
     dof_armature: Draw | None = None
     """Rotor inertia of joints, by the joint's name [kg, kg m²]."""
+    dof_frictionloss: Draw | None = None
+    """Dry friction of joints, by the joint's name [N, N m]."""
     jnt_stiffness: Draw | None = None
     """Stiffness of joint springs [N/m, N m/rad]."""
     actuator_gear: Scaling | None = None

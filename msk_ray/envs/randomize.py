@@ -34,6 +34,7 @@ _FIELDS = {
     "body_mass": _Field(("body_mass", "body_inertia"), "body"),
     "dof_damping": _Field(("dof_damping",), "joint"),
     "dof_armature": _Field(("dof_armature",), "joint"),
+    "dof_frictionloss": _Field(("dof_frictionloss",), "joint"),
     "jnt_stiffness": _Field(("jnt_stiffness",), "joint"),
     "actuator_gear": _Field(("actuator_gear",), "actuator"),
     "actuator_gain": _Field(("actuator_gainprm", "actuator_biasprm"), "actuator", slice(0, 3)),

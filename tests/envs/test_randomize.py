@@ -27,6 +27,7 @@ EVERYTHING: dict[str, Any] = {
     "body_mass": {"low": 0.7, "high": 1.4, "each": True},
     "dof_damping": {"low": 0.5, "high": 2.0, "distribution": "log_uniform"},
     "dof_armature": {"low": 0.02, "high": 0.1, "mode": "value", "only": ["hip0", "knee1"]},
+    "dof_frictionloss": {"low": 0.1, "high": 0.5, "mode": "value", "only": ["knee0"]},
     "actuator_gear": {"low": 0.8, "high": 1.2, "each": True},
     "gravity": {"low": 0.9, "high": 1.1},
 }
