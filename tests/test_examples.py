@@ -6,6 +6,9 @@ from pathlib import Path
 
 import matplotlib
 
+from msk_ray.sweep.space import load_space
+from msk_ray.sweep.trials import resolve_trials
+
 EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
 
 
@@ -13,6 +16,7 @@ def run(monkeypatch, capsys, name: str, *arguments: str) -> str:
     """Run an example as its own program, in this process; returns what it printed."""
     matplotlib.use("Agg")
     monkeypatch.setattr(sys, "argv", [name, *arguments])
+    monkeypatch.syspath_prepend(EXAMPLES)
     runpy.run_path(str(EXAMPLES / name), run_name="__main__")
     return capsys.readouterr().out
 
@@ -22,3 +26,23 @@ def test_ilqr(monkeypatch, capsys, tmp_path):
     out = run(monkeypatch, capsys, "ilqr.py", str(picture), "--steps", "20", "--iterations", "10")
     assert "iteration 10: cost" in out
     assert picture.stat().st_size > 10_000
+
+
+def test_friction(monkeypatch, capsys, tmp_path):
+    picture = tmp_path / "friction.png"
+    try:
+        out = run(monkeypatch, capsys, "friction.py", str(picture), "--epochs", "2", "--values", "2")
+    finally:
+        sys.modules.pop("tray", None)
+    assert "friction 0.8, as in the model: worst score" in out
+    assert "friction 0.4 to 1.2, drawn for every episode: worst score" in out
+    assert picture.stat().st_size > 10_000
+
+
+def test_the_space_of_frictions_has_trials_with_and_without(monkeypatch):
+    monkeypatch.syspath_prepend(EXAMPLES)
+    try:
+        trials = resolve_trials(load_space(EXAMPLES / "tray_friction.yaml"))
+    finally:
+        sys.modules.pop("tray", None)
+    assert [trial.config.physics.randomize is None for trial in trials] == [True, False] * 3
