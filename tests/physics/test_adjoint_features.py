@@ -190,7 +190,6 @@ SCENES = {
     "fluid": lambda: scene(option=_WATER, world=_FREE),
     "fast_spinning_fluid": lambda: scene(option=_FAST + _WATER, world=_FREE),
     "rk4_spinning_free": lambda: scene(option=_RK4, world=_FREE, a='range="-1 1"', ball='stiffness="4"'),
-    "rk4_spinning_fluid": lambda: scene(option=_RK4 + _WATER, world=_FREE),
     "rk4_muscle": lambda: _tendon(_SPHERE.format('sidesite="side"'), _MUSCLE, option=_RK4),
     "rk4_activations": lambda: scene(
         '<actuator><intvelocity joint="a" kp="20" actrange="-1 .6"/>'

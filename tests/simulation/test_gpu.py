@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 from scenes import studded_plate
+from test_adjoint_features import SCENES
 
 from msk_ray.config import Config, PhysicsConfig, parse_config
 from msk_ray.envs import make_env
@@ -25,6 +26,19 @@ def test_gradients_of_an_ant_are_those_of_float64(mode: str, variant: str) -> No
     report = check_gradients(Simulation(model, 8, 4, mode, "cuda"), states=("standing", "contact"))
     assert report.checked >= 12
     assert report.max_rel_error <= 1e-2
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("weld_mocap", "sphere_wrap_inside", "cylinder_wrap_inside", "fast_spinning_free", "fast_spinning_fluid"),
+        *("rk4_spinning_free", "rk4_muscle", "rk4_activations", "refsite", "slider_crank"),
+    ],
+)
+def test_gradients_of_a_feature_are_those_of_float64(name: str) -> None:
+    report = check_gradients(Simulation(SCENES[name](), 8, 4, device="cuda", tolerance=1e-9), states=("random",))
+    assert report.checked >= 6
+    assert report.max_rel_error <= 1e-3
 
 
 def rollout(backward: str) -> tuple[torch.Tensor, torch.Tensor]:

@@ -26,10 +26,12 @@ from msk_ray.physics.adjoint.solids import (
     Solid,
     face_along,
     face_corner,
+    face_count,
     face_normal,
     farthest,
     has_corners,
     looked_at,
+    off_face,
     out_of,
 )
 from msk_ray.physics.adjoint.spatial import column, wrench
@@ -47,6 +49,8 @@ _WITNESS_ROUNDING = wp.constant(1.0e-7)
 """Rounding of witness points, in sizes; the normal is the direction between them."""
 _KEPT = wp.constant(2.0e-5)
 """How much nearer, in sizes, a distance from before clipping must come."""
+_TOUCHED = wp.constant(1.0e-3)
+"""Distance from a face, in sizes, within which a contact may be its."""
 _UPWARD = wp.constant(1.0e-5)
 """Sine of the angle below which a contact's normal is a height field's axis."""
 _LOST = wp.constant(1.0e-4)
@@ -54,13 +58,26 @@ _LOST = wp.constant(1.0e-4)
 
 
 @wp.func
-def lies_on(ground: Solid, other: Solid, meshes: Meshes, face: int, other_face: int) -> bool:
-    """Whether two faces look at each other as those of convex collision must for it to clip one against the other."""
-    lying = bool(False)
-    if face >= 0 and other_face >= 0:
-        normal = ground.mat @ face_normal(ground, meshes, face)
-        lying = wp.dot(normal, other.mat @ face_normal(other, meshes, other_face)) < -_LYING
-    return lying
+def clipping_face(below: Solid, above: Solid, other_face: int, meshes: Meshes, seen: Seen) -> int:
+    """The face of the geom below against which one of the geom above was clipped, -1 for none.
+
+    Where the contact is on the side of a face, or over its corner, it is on others too; the law tells which it was.
+    """
+    best = int(-1)
+    least = float(1.0e30)
+    length = unit_of_length(below, above)
+    at = seen.point - 0.5 * seen.dist * seen.normal
+    local = wp.transpose(below.mat) @ (above.mat @ face_normal(above, meshes, other_face))
+    for face in range(face_count(below, meshes)):
+        if wp.dot(face_normal(below, meshes, face), local) < -_LYING:
+            off = off_face(below, meshes, face, at)
+            if off < _TOUCHED * length:
+                ground = ground_of(below, meshes, face, length)
+                _foot, miss = foot_of(above, other_face, ground, meshes, seen, True)
+                if miss + off < least:
+                    least = miss + off
+                    best = face
+    return best
 
 
 @wp.func
@@ -108,6 +125,7 @@ def standing_wrenches(
     # Clipping that leaves one point keeps the distance found before.
     height = wp.dot(ground.normal, foot.place - ground.origin)
     error = wp.abs(height * wp.dot(ground.normal, at.normal) - at.dist)
+    aside = miss - error
     rest = bars
     kept = Push()
     if is_clipped and error > _KEPT * length:
@@ -123,6 +141,7 @@ def standing_wrenches(
             deepest = farthest(below, meshes, -facing)
             other_error = wp.abs(wp.dot(facing, deepest - through) - at.dist)
             if other_error < error - _KEPT * length:
+                error = other_error
                 kept = swapped(height_wrenches(deepest, facing, at, bars.dist))
                 rest.dist = 0.0
     push = flat_wrenches(foot, ground.normal, at, rest, turns_with_other)
@@ -130,7 +149,7 @@ def standing_wrenches(
     push.torque1 += kept.torque1
     push.force2 += kept.force2
     push.torque2 += kept.torque2
-    return push, miss / length
+    return push, wp.where(miss > 0.0, (aside + error) / length, 0.0)
 
 
 @wp.func
@@ -174,16 +193,18 @@ def convex_wrenches(
     flat = has_corners(solid1) and has_corners(solid2)
     exact = not (field and sine1 > slack and wp.length(wp.cross(n, column(solid1.mat, 2))) < _UPWARD)
     miss = float(0.0)
-    lying = is_clipped and not own_boxes and lies_on(solid1, solid2, meshes, face1, face2)
-    if lying and sine2 < slack:
+    below = int(-1)
+    if is_clipped and not own_boxes and face2 >= 0 and sine2 < slack:
+        below = clipping_face(solid1, solid2, face2, meshes, seen)
+    if below >= 0:
         # The second geom's face is clipped against the first's, and gives the normal.
-        push, miss = standing_wrenches(solid1, solid2, meshes, face1, face2, 1, seen, bars, is_clipped)
+        push, miss = standing_wrenches(solid1, solid2, meshes, below, face2, 1, seen, bars, is_clipped)
     else:
         patch1 = patch_at(solid1, meshes, seen.point - 0.5 * seen.dist * n, n, face1, sine1, slack)
         patch2 = patch_at(solid2, meshes, seen.point + 0.5 * seen.dist * n, -n, face2, sine2, slack)
         # Boxes of their own collision are clipped at any angle.
-        clip1 = wp.where(lying or own_boxes, face1, -1)
-        clip2 = wp.where(lying or own_boxes, face2, -1)
+        clip1 = wp.where(own_boxes, face1, -1)
+        clip2 = wp.where(own_boxes, face2, -1)
         if patch1.kind == FACE and (patch2.kind != FACE or sine1 <= sine2 + _SLACK):
             push, miss = standing_wrenches(solid1, solid2, meshes, patch1.face, clip2, 0, seen, bars, is_clipped)
             exact = exact and not (flat and sine1 > slack)

@@ -238,7 +238,8 @@ def ground_of(solid: Solid, meshes: Meshes, face: int, length: float) -> Ground:
     ground.solid = solid
     ground.face = face
     ground.normal = solid.mat @ face_normal(solid, meshes, face)
-    ground.origin = out_of(solid, face_corner(solid, meshes, face, 0))
+    # A mesh's faces are flat up to rounding only: MuJoCo's clipping takes the plane through the last corner.
+    ground.origin = out_of(solid, face_corner(solid, meshes, face, corner_count(solid, meshes, face) - 1))
     ground.length = length
     return ground
 

@@ -170,6 +170,27 @@ def face_along(solid: Solid, meshes: Meshes, direction: wp.vec3) -> tuple[wp.int
 
 
 @wp.func
+def off_face(solid: Solid, meshes: Meshes, face: int, point: wp.vec3) -> float:
+    """How far a point of the world is from a face: off its plane, and beyond its sides."""
+    at = into(solid, point)
+    normal = face_normal(solid, meshes, face)
+    count = corner_count(solid, meshes, face)
+    centre = wp.vec3(0.0)
+    for k in range(count):
+        centre += face_corner(solid, meshes, face, k) / float(count)
+    begin = face_corner(solid, meshes, face, count - 1)
+    off = wp.abs(wp.dot(normal, at - begin))
+    outside = float(0.0)
+    for k in range(count):
+        end = face_corner(solid, meshes, face, k)
+        side = wp.normalize(wp.cross(normal, end - begin))
+        inward = wp.sign(wp.dot(side, centre - begin))
+        outside = wp.max(outside, -inward * wp.dot(side, at - begin))
+        begin = end
+    return off + outside
+
+
+@wp.func
 def farthest(solid: Solid, meshes: Meshes, direction: wp.vec3) -> wp.vec3:
     """The solid's point that lies farthest along a unit direction, both in the world; not for height fields."""
     local = wp.transpose(solid.mat) @ direction
