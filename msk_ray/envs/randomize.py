@@ -72,9 +72,12 @@ class Randomizer:
         self._widths = {n: len(set(owners[n])) if draw.each else 1 for n, draw in config.drawn.items()}
         bounds = [_bounds(draw) for name, draw in config.drawn.items() for _ in range(self._widths[name])]
         self._low, high, log = (self._tensor(part) for part in zip(*bounds, strict=True))
-        self._span, self._log = high - self._low, log.bool()
-        self._linear = self._arrays(config, model, chosen, owners)
-        self._shapes = {name: attrgetter(name)(model).shape for name in self._linear}
+        self._span = high - self._low
+        self._log = log.bool() if log.any() else None
+        linear = self._arrays(config, model, chosen, owners)
+        # All arrays side by side: one product gives them all.
+        self._const, self._slope = (torch.cat(parts, dim=-1) for parts in zip(*linear.values(), strict=True))
+        self._shapes = {name: attrgetter(name)(model).shape for name in linear}
         self._numbers = self._draw(nworld)
         self.parameters = self._values()
 
@@ -103,14 +106,13 @@ class Randomizer:
     def _draw(self, count: int) -> Tensor:
         """Numbers of `count` episodes, (count, K)."""
         uniform = torch.rand((count, len(self._low)), generator=self._generator, device=self._device)
-        drawn = self._low + self._span * uniform
-        return torch.where(self._log, drawn.exp(), drawn)
+        drawn = torch.addcmul(self._low, self._span, uniform)
+        return drawn if self._log is None else torch.where(self._log, drawn.exp(), drawn)
 
     def _values(self) -> dict[str, Tensor]:
-        return {
-            name: torch.addmm(const, self._numbers, slope).view(-1, *self._shapes[name])
-            for name, (const, slope) in self._linear.items()
-        }
+        every = torch.addmm(self._const, self._numbers, self._slope)
+        parts = every.split([math.prod(shape) for shape in self._shapes.values()], dim=1)
+        return {name: part.unflatten(1, shape) for (name, shape), part in zip(self._shapes.items(), parts, strict=True)}
 
     def _arrays(
         self,
