@@ -163,14 +163,11 @@ class _Tape(Backward):
     def load(self, ctrl: Tensor, states: Sequence[dict[str, wp.array]], forces: Sequence[Tensor]) -> None:
         """Take the step of a batch of w worlds, W / w copies of each: its control, checkpoints and applied forces."""
         self.ready(bool(forces))
-        copies = self._batch.nworld // len(ctrl)
-        self._ctrl.copy_(ctrl.repeat(copies, 1))
+        pairs = [(self._ctrl, ctrl), *zip(self._applied, forces, strict=False)]
         for here, there in zip(self.checkpoints, states, strict=True):
-            for name, array in there.items():
-                value = wp.to_torch(array, requires_grad=False)
-                wp.to_torch(here[name], requires_grad=False).copy_(value.repeat(copies, 1))
-        for view, value in zip(self._applied, forces, strict=False):
-            view.copy_(value.repeat(copies, *[1] * (value.dim() - 1)))
+            pairs += [tuple(wp.to_torch(a, requires_grad=False) for a in (here[n], there[n])) for n in there]
+        for view, value in pairs:
+            view.unflatten(0, (-1, len(value))).copy_(value)
 
     @property
     def checkpoints(self) -> list[dict[str, wp.array]]:

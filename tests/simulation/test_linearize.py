@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from oracle import Point, relative, rollout
+from oracle import Point, differences, relative, rollout
 from scenes import ant, ant_points, cartpole
 from test_adjoint_features import SCENES, random_points
 
@@ -48,6 +48,20 @@ def test_an_ant_in_contact_against_mujoco(substeps):
         np.testing.assert_allclose(end.qpos[i], rollout(model, point, substeps).qpos, atol=1e-5)
     print(errors)
     assert np.max(errors) < 1e-4
+
+
+def test_integrators_with_other_checkpoints():
+    for integrator in (mujoco.mjtIntegrator.mjINT_RK4, mujoco.mjtIntegrator.mjINT_IMPLICITFAST):
+        model = cartpole()
+        model.opt.integrator = integrator
+        (point, *_) = cartpole_points()
+        (a, b, _), _ = linearized(model, [point], 2, TapePerSubstep())
+        for row in range(4):  # mjd_transitionFD knows no RK4
+            unit = np.eye(4)[row]
+            weights = {"qpos": unit[:2], "qvel": unit[2:], "act": unit[4:]}
+            expected, _ = differences(model, point, 2, weights)
+            assert relative(a[0, row].numpy(), np.concatenate([expected["qpos"], expected["qvel"]])) < 1e-4
+            assert relative(b[0, row].numpy(), expected["ctrl"]) < 1e-4
 
 
 def test_activations_and_balls_are_ordered_as_by_mujoco():
