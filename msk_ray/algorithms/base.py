@@ -148,7 +148,7 @@ def simulation_metrics(env: Env[Any]) -> dict[str, float]:
     Raises:
         SimulationError: contacts or constraint rows were lost to a full buffer.
     """
-    drawn = {} if env.randomizer is None else env.randomizer.metrics()
+    drawn = {} if env.randomizer is None else env.randomizer.metrics(env.state.numbers)
     return drawn | {
         f"{'grad' if name in _OF_GRADIENTS else 'physics'}/{name}": value
         for name, value in env.sim.diagnostics().items()
@@ -156,19 +156,37 @@ def simulation_metrics(env: Env[Any]) -> dict[str, float]:
 
 
 class Clock:
-    """Measures the seconds between laps, including work queued on the device."""
+    """Measures how long parts of an epoch take on the device, without making the host wait until they are asked for."""
 
     def __init__(self, device: torch.device) -> None:
         self._device = device
-        self._last = self._now()
+        self._names: list[str] = []
+        self._times = [self._now()]
 
-    def _now(self) -> float:
-        if self._device.type == "cuda":
-            torch.cuda.synchronize(self._device)
-        return time.perf_counter()
+    def _now(self) -> "torch.cuda.Event | float":
+        if self._device.type != "cuda":
+            return time.perf_counter()
+        event = torch.cuda.Event(enable_timing=True)
+        event.record(torch.cuda.current_stream(self._device))
+        return event
 
-    def lap(self) -> float:
-        """Seconds since the last lap, or since the clock was created."""
-        now = self._now()
-        elapsed, self._last = now - self._last, now
-        return elapsed
+    def mark(self, name: str) -> None:
+        """A part has ended that began at the mark before, or when the clock was created."""
+        self._names.append(name)
+        self._times.append(self._now())
+
+    def seconds(self) -> dict[str, float]:
+        """Seconds of each part by name; waits until the device has finished the last one."""
+        return {
+            name: self._between(before, after)
+            for name, before, after in zip(self._names, self._times[:-1], self._times[1:], strict=True)
+        }
+
+    @staticmethod
+    def _between(before: "torch.cuda.Event | float", after: "torch.cuda.Event | float") -> float:
+        if isinstance(before, float) or isinstance(after, float):
+            assert isinstance(before, float), "marks of one clock are of one kind"
+            assert isinstance(after, float), "marks of one clock are of one kind"
+            return after - before
+        after.synchronize()
+        return float(before.elapsed_time(after)) * 1e-3

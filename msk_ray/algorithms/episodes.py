@@ -21,11 +21,11 @@ class EpisodeTracker:
         totals = self._return + rewards.cumsum(0)
         lengths = self._length + torch.arange(1, len(rewards) + 1, device=rewards.device)[:, None]
         steps = torch.arange(len(rewards), device=rewards.device)[:, None]
-        last = torch.where(done, steps, -1).amax(0)
+        last = steps.expand_as(done).masked_fill(~done, -1).amax(0)
         ended = last >= 0
         at = last.clamp_min(0)[None]
-        return_at = torch.where(ended, totals.gather(0, at)[0], 0.0)
-        length_at = torch.where(ended, lengths.gather(0, at)[0], 0.0)
+        return_at = totals.gather(0, at)[0].masked_fill(~ended, 0.0)
+        length_at = lengths.gather(0, at)[0].masked_fill(~ended, 0.0)
         self._return = totals[-1] - return_at
         self._length = lengths[-1] - length_at
         count = done.sum()

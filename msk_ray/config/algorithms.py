@@ -12,6 +12,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import (
+    AfterValidator,
     BeforeValidator,
     Discriminator,
     Field,
@@ -146,6 +147,11 @@ class EntropyConfig(Section):
     """Change of log α per epoch and nat of missing entropy."""
 
 
+def _off(value: Any) -> Any:
+    """In YAML, a bare `off` is false."""
+    return "off" if value is False else value
+
+
 class ShacConfig(AlgorithmSettings):
     """Short-Horizon Actor-Critic."""
 
@@ -193,6 +199,9 @@ class ShacConfig(AlgorithmSettings):
     reward_scale: PositiveFloat = 1.0
     max_nonfinite_share: Fraction = 0.05
     """Share of worlds whose gradient may be non-finite in an epoch before the trial stops with an error."""
+    capture: Annotated[Literal["auto", "off", False], AfterValidator(_off)] = "auto"
+    """`auto`: on CUDA, epochs are recorded as graphs and replayed; an environment that makes the host wait for the
+    device runs operation by operation, and a warning says where. `off`: always so, to debug. A CPU has no graphs."""
 
     def env_steps(self, nworld: int, epochs: int) -> int:
         """The sum over epochs of horizon × worlds; an adaptive horizon counts as its `longest`."""

@@ -65,7 +65,7 @@ def first_spelling(settings: Mapping[str, Any]) -> dict[str, Any]:
         env |= env.pop("reward")
     spelt = {**settings, "env": env}
     for (section, key), default in _LATER.items():
-        if spelt[section].get(key) == default:
+        if spelt.get(section, {}).get(key) == default:
             spelt[section] = {name: value for name, value in spelt[section].items() if name != key}
     if not spelt["algorithm"]:
         del spelt["algorithm"]
@@ -77,5 +77,6 @@ _LATER: dict[tuple[str, str], Any] = {
     ("trial", "threads"): 1,
     ("trial", "loggers"): ["tensorboard"],
     ("algorithm", "name"): "shac",
+    ("shac", "capture"): "auto",
 }
 """Settings that the first version did not have, (section, name), with the default that leaves ids unchanged."""

@@ -54,7 +54,12 @@ def _without_truth(section: type[Section]) -> frozenset[str]:
 
 
 def _takes_truth(annotation: Any) -> bool:
-    return annotation in (bool, Any) or any(_takes_truth(part) for part in get_args(annotation))
+    # True and False may also be among a few values, as for a word that YAML reads as one of them.
+    return (
+        annotation in (bool, Any)
+        or isinstance(annotation, bool)
+        or any(_takes_truth(part) for part in get_args(annotation))
+    )
 
 
 class Reward(Section):

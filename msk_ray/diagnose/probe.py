@@ -223,7 +223,10 @@ def _differences(
         return StepState(*(torch.from_numpy(np.stack([getattr(e, n) for e in ends])) for n in StepState._fields))
 
     begin = EnvState(
-        StepState(*(t.double().cpu() for t in start.physics)), start.action.double().cpu(), start.age.cpu()
+        StepState(*(t.double().cpu() for t in start.physics)),
+        start.action.double().cpu(),
+        start.age.cpu(),
+        start.numbers.double().cpu(),
     )
 
     def displaced(direction: np.ndarray) -> Tensor:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from msk_ray.envs.base import Env as Env
     from msk_ray.envs.base import EnvState as EnvState
+    from msk_ray.envs.base import Resets as Resets
     from msk_ray.envs.base import Transition as Transition
     from msk_ray.envs.make import env_class as env_class
     from msk_ray.envs.make import make_env as make_env
@@ -20,6 +21,7 @@ _HOMES = {
     "EnvState": "msk_ray.envs.base",
     "MjcfEnv": "msk_ray.envs.mjcf.env",
     "MjcfSettings": "msk_ray.envs.mjcf.config",
+    "Resets": "msk_ray.envs.base",
     "Transition": "msk_ray.envs.base",
     "env_class": "msk_ray.envs.make",
     "make_env": "msk_ray.envs.make",

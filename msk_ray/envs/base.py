@@ -37,10 +37,21 @@ class EnvState(NamedTuple):
     """Last action, shape (W, A), attached."""
     age: Tensor
     """Env steps since reset, shape (W,), int64."""
+    numbers: Tensor
+    """Numbers that `physics.randomize` has drawn for each world's episode, shape (W, K); K is 0 without it."""
 
     def detach(self) -> "EnvState":
         """The same state, cut from the graph."""
-        return EnvState(StepState(*(t.detach() for t in self.physics)), self.action.detach(), self.age)
+        return EnvState(StepState(*(t.detach() for t in self.physics)), self.action.detach(), self.age, self.numbers)
+
+
+class Resets(NamedTuple):
+    """What the next episodes of worlds begin with; N episodes."""
+
+    physics: StepState
+    """Physical states, each (N, n)."""
+    numbers: Tensor
+    """As in `EnvState`, (N, K)."""
 
 
 class Transition(NamedTuple):
@@ -75,6 +86,8 @@ class Env(ABC, Generic[SettingsT]):
     obs_size: int
     reward_names: ClassVar[tuple[str, ...]]
     """Names of the T parts of the reward."""
+    begin_epoch_in_place: ClassVar[bool] = False
+    """Whether `begin_epoch`, where a class has its own, only changes the contents of tensors."""
     Settings: ClassVar[type[EnvSettings]]
     """Its section of the configuration, which also lists its named physics and the physics settings it reads."""
 
@@ -105,9 +118,9 @@ class Env(ABC, Generic[SettingsT]):
         self.generator = torch.Generator(device=self.device).manual_seed(seed)
         self.randomizer: Randomizer | None = None
         if physics.randomize is not None:
-            self.randomizer = Randomizer(physics.randomize, self.model, nworld, self.device, seed)
+            self.randomizer = Randomizer(physics.randomize, self.model, self.device, seed)
             self.sim.open_parameters(self.randomizer.parameters)
-        self._fresh: list[StepState] = []
+        self._fresh: list[Resets] = []
         self.ignore_contact_forces = False
         self._reached: StepState | None = None
         self._measured: dict[str, tuple[StepState, bool, Any]] = {}
@@ -136,7 +149,11 @@ class Env(ABC, Generic[SettingsT]):
         """Create constants on the device: copying one there in every step would make the host wait for the GPU."""
 
     def begin_epoch(self, epoch: int) -> None:
-        """Called before each training epoch, counted from 0: change here what depends on the progress of training."""
+        """Called before each training epoch, counted from 0: change here what depends on the progress of training.
+
+        Keep what changes in tensors, change them in place and set `begin_epoch_in_place`: a recorded epoch reads
+        tensors again each time, but a number only once.
+        """
 
     def control(self, action: Tensor) -> Tensor:
         """Controls (W, nu) of the model for actions (W, A) in the current state."""
@@ -168,16 +185,38 @@ class Env(ABC, Generic[SettingsT]):
 
     def reset_state(self) -> EnvState:
         """Fresh initial states of all worlds."""
+        fresh = self._fresh.pop() if self._fresh else self.draw_resets(1)
         return EnvState(
-            self._fresh.pop() if self._fresh else self.draw_physics(self.nworld),
+            fresh.physics,
             torch.zeros((self.nworld, self.action_size), device=self.device),
             torch.zeros(self.nworld, dtype=torch.int64, device=self.device),
+            fresh.numbers,
         )
 
-    def stock_resets(self, steps: int) -> None:
-        """Draw the initial states that the next `steps` env steps may need, all at once."""
-        drawn = self.draw_physics(steps * self.nworld)
-        self._fresh = [StepState(*parts) for parts in zip(*(t.split(self.nworld) for t in drawn), strict=True)]
+    def release_graph(self) -> None:
+        """Cut the state from the graph, and forget everything else that would keep the graph in memory."""
+        self.state = self.state.detach()
+        self._reached = None
+        self._measured = {}
+
+    def draw_resets(self, steps: int) -> Resets:
+        """What the episodes that may begin in the next `steps` env steps begin with, one step after the other."""
+        count = steps * self.nworld
+        if self.randomizer is None:
+            return Resets(self.draw_physics(count), torch.zeros((count, 0), device=self.device))
+        return Resets(self.draw_physics(count), self.randomizer.draw(count))
+
+    def stock_resets(self, drawn: Resets | None) -> None:
+        """Take resets from those drawn by `draw_resets`; None: draw each when it is needed."""
+        self._fresh = []
+        if drawn is not None:
+            *physics, numbers = (t.split(self.nworld) for t in (*drawn.physics, drawn.numbers))
+            self._fresh = [Resets(StepState(*p), n) for *p, n in zip(*physics, numbers, strict=True)]
+
+    @property
+    def parameters(self) -> dict[str, Tensor] | None:
+        """Values of the model's fields that differ between worlds, by name; None for the model's own."""
+        return None if self.randomizer is None else self.randomizer.values(self.state.numbers)
 
     def state_dict(self) -> dict[str, Any]:
         """The state of the worlds, their parameters, the generators, and the buffer sizes that the simulation has."""
@@ -186,7 +225,9 @@ class Env(ABC, Generic[SettingsT]):
             "env_generator": self.generator.get_state(),
             "env_state": [t.detach().clone() for t in (*state.physics, state.action, state.age)],
             "capacity": tuple(self.sim.capacity),
-            "randomizer": None if self.randomizer is None else self.randomizer.state_dict(),
+            "randomizer": None
+            if self.randomizer is None
+            else {"numbers": state.numbers.clone(), "generator": self.randomizer.generator.get_state()},
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -194,9 +235,12 @@ class Env(ABC, Generic[SettingsT]):
         # The state of a generator is a host tensor on every device.
         self.generator.set_state(state["env_generator"].cpu())
         *physics, action, age = state["env_state"]
-        self.state = EnvState(StepState(*physics), action, age)
+        numbers = torch.zeros((self.nworld, 0), device=self.device)
         if self.randomizer is not None:
-            self.randomizer.load_state_dict(state["randomizer"])
+            drawn = state["randomizer"]
+            numbers = drawn["numbers"].to(self.device)
+            self.randomizer.generator.set_state(drawn["generator"].cpu())
+        self.state = EnvState(StepState(*physics), action, age, numbers)
         if "capacity" in state:
             # The buffer sizes that the trial had grown to: the next step may need them.
             self.sim.reserve(Capacity(*state["capacity"]))
@@ -212,8 +256,7 @@ class Env(ABC, Generic[SettingsT]):
         is that of the state before the step, cut from the graph.
         """
         before = self.state.physics
-        parameters = None if self.randomizer is None else self.randomizer.parameters
-        after = self.sim.step(self.control(action), *before, parameters=parameters)
+        after = self.sim.step(self.control(action), *before, parameters=self.parameters)
         diverged = ~self._sound(after)
         # `where` sends no cotangent into a diverged world's step, so its gradient cannot reach the batch.
         after = StepState(*(torch.where(diverged[:, None], b.detach(), a) for b, a in zip(before, after, strict=True)))
@@ -232,11 +275,11 @@ class Env(ABC, Generic[SettingsT]):
                 "with torch from state, frames, tendons and action, without .detach(), .item() or numpy",
                 stacklevel=2,
             )
-        reward = torch.where(diverged, 0.0, terms.sum(-1))
+        reward = terms.sum(-1).masked_fill(diverged, 0.0)
         age = self.state.age + 1
         terminated = diverged | self.fell(after)
         truncated = (age >= self.config.episode_length) & ~terminated
-        reached = EnvState(after, action, age)
+        reached = EnvState(after, action, age, self.state.numbers)
         self.state = self._reset_where(terminated | truncated, reached) if auto_reset else reached
         return Transition(reward, terms.detach(), obs, terminated, truncated, diverged)
 
@@ -276,7 +319,7 @@ class Env(ABC, Generic[SettingsT]):
             )
         force = self._once("contact_forces", state, self.sim.contact_forces)
         chosen = force[:, self._kinematics.indices("geom", geom)]
-        return torch.where(self._diverged.view(-1, *[1] * (chosen.dim() - 1)), 0.0, chosen)
+        return chosen.masked_fill(self._diverged.view(-1, *[1] * (chosen.dim() - 1)), 0.0)
 
     def _once(self, what: str, state: StepState, measure: Callable[[], Any]) -> Any:
         """The result of `measure` for `state`, cached until another state is asked for."""
@@ -308,8 +351,6 @@ class Env(ABC, Generic[SettingsT]):
 
     def _reset_where(self, done: Tensor, reached: EnvState) -> EnvState:
         fresh = self.reset_state()
-        if self.randomizer is not None:
-            self.randomizer.redraw(done)
         physics = StepState(
             *(torch.where(done[:, None], f, r) for f, r in zip(fresh.physics, reached.physics, strict=True))
         )
@@ -317,6 +358,7 @@ class Env(ABC, Generic[SettingsT]):
             physics,
             torch.where(done[:, None], fresh.action, reached.action),
             torch.where(done, fresh.age, reached.age),
+            torch.where(done[:, None], fresh.numbers, reached.numbers),
         )
 
     @torch.no_grad()

@@ -51,21 +51,19 @@ class Randomizer:
     Args:
         config: the section.
         model: the model, with the values that scales refer to.
-        nworld: number of worlds.
         device: where the parameters are needed.
         seed: of a generator of its own, so that initial states are those of a trial without randomization.
 
     Attributes:
-        parameters: values of fields of the model by name, with a row per world.
+        generator: source of the numbers.
+        parameters: names of the fields of the model that it sets.
 
     Raises:
         ConfigError: the model has no such elements, or a number would have no effect.
     """
 
-    def __init__(
-        self, config: RandomizeConfig, model: mujoco.MjModel, nworld: int, device: torch.device, seed: int
-    ) -> None:
-        self._generator = torch.Generator(device=device).manual_seed(seed)
+    def __init__(self, config: RandomizeConfig, model: mujoco.MjModel, device: torch.device, seed: int) -> None:
+        self.generator = torch.Generator(device=device).manual_seed(seed)
         self._device = device
         chosen = {name: _chosen(model, name, draw) for name, draw in config.drawn.items()}
         owners = {name: _owners(model, name, rows) for name, rows in chosen.items()}
@@ -78,39 +76,24 @@ class Randomizer:
         # All arrays side by side: one product gives them all.
         self._const, self._slope = (torch.cat(parts, dim=-1) for parts in zip(*linear.values(), strict=True))
         self._shapes = {name: attrgetter(name)(model).shape for name in linear}
-        self._numbers = self._draw(nworld)
-        self.parameters = self._values()
+        self.parameters = tuple(self._shapes)
 
-    def redraw(self, ended: Tensor) -> None:
-        """Draw other numbers for the worlds whose episode ended, (W,) bool. Earlier `parameters` stay what they are."""
-        self._numbers = torch.where(ended[:, None], self._draw(len(ended)), self._numbers)
-        self.parameters = self._values()
-
-    def metrics(self) -> dict[str, float]:
-        """Smallest and largest number in use of each setting, by metric name."""
-        found: dict[str, float] = {}
-        for name, part in zip(self._widths, self._numbers.split(list(self._widths.values()), dim=1), strict=True):
-            found |= {f"randomize/{name}_min": float(part.min()), f"randomize/{name}_max": float(part.max())}
-        return found
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """The numbers in use, and the state of their generator."""
-        return {"numbers": self._numbers.clone(), "generator": self._generator.get_state()}
-
-    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Continue from a `state_dict`."""
-        self._numbers = state["numbers"].to(self._device)
-        self._generator.set_state(state["generator"].cpu())
-        self.parameters = self._values()
-
-    def _draw(self, count: int) -> Tensor:
+    def draw(self, count: int) -> Tensor:
         """Numbers of `count` episodes, (count, K)."""
-        uniform = torch.rand((count, len(self._low)), generator=self._generator, device=self._device)
+        uniform = torch.rand((count, len(self._low)), generator=self.generator, device=self._device)
         drawn = torch.addcmul(self._low, self._span, uniform)
         return drawn if self._log is None else torch.where(self._log, drawn.exp(), drawn)
 
-    def _values(self) -> dict[str, Tensor]:
-        every = torch.addmm(self._const, self._numbers, self._slope)
+    def metrics(self, numbers: Tensor) -> dict[str, float]:
+        """Smallest and largest of the numbers (W, K) of each setting, by metric name."""
+        found: dict[str, float] = {}
+        for name, part in zip(self._widths, numbers.split(list(self._widths.values()), dim=1), strict=True):
+            found |= {f"randomize/{name}_min": float(part.min()), f"randomize/{name}_max": float(part.max())}
+        return found
+
+    def values(self, numbers: Tensor) -> dict[str, Tensor]:
+        """Values of fields of the model by name, with a row for each of the W worlds with the numbers (W, K)."""
+        every = torch.addmm(self._const, numbers, self._slope)
         parts = every.split([math.prod(shape) for shape in self._shapes.values()], dim=1)
         return {name: part.unflatten(1, shape) for (name, shape), part in zip(self._shapes.items(), parts, strict=True)}
 

@@ -6,7 +6,7 @@ import warp as wp
 wp.config.log_level = wp.LOG_WARNING
 
 from msk_ray.physics.batch import WorldBatch  # noqa: E402
-from msk_ray.physics.graph import Graph  # noqa: E402
+from msk_ray.physics.graph import Graph, joined_stream, joining_capture, without_collecting  # noqa: E402
 from msk_ray.physics.taped import TapedStep, WarpState  # noqa: E402
 
-__all__ = ["Graph", "TapedStep", "WarpState", "WorldBatch"]
+__all__ = ["Graph", "TapedStep", "WarpState", "WorldBatch", "joined_stream", "joining_capture", "without_collecting"]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from msk_ray.errors import UnsupportedModelError
 from msk_ray.physics.capacity import Capacity, default_capacity, scalar_rows
+from msk_ray.physics.graph import joined_stream
 from msk_ray.physics.overflow import LossWatch, cured, loss_error, needed
 from msk_ray.physics.parameters import check_names, open_arrays, structure
 from msk_ray.physics.sealed import ModelWatch, seal
@@ -80,6 +81,9 @@ class WorldBatch:
         device: the Warp device.
         capacity: contacts and rows per world that fit into `data`.
         losses: what steps lost to full buffers; check it between steps.
+        unrolled_iterations: the solver's iteration limit in steps that are recorded into another library's capture.
+            There the loop is unrolled, so that each iteration costs time even where no world needs it. None: the
+            model's limit.
 
     Raises:
         UnsupportedModelError: mujoco_warp cannot load the model, or it has state outside (qpos, qvel, act).
@@ -105,6 +109,7 @@ class WorldBatch:
         self.structure = mjm
         self._tolerance = tolerance
         self._model = self._load(nworld)
+        self.unrolled_iterations: int | None = None
         self._watch = ModelWatch(mjm)
         self._given = Capacity(nconmax or 0, njmax or 0)
         start, self._bound = default_capacity(mjm) if not all(self._given) else (self._given, None)
@@ -217,8 +222,19 @@ class WorldBatch:
 
     def launch_substep(self, data: Any) -> None:
         """Launch one physics step on `data`, this batch's own or another of the same model and size."""
-        refresh_velocity(self.mjm, self.model, data)
-        mjw.step(self.model, data)
+        model = self._unrolled() if joined_stream() is not None else self.model
+        refresh_velocity(self.mjm, model, data)
+        mjw.step(model, data)
+
+    def _unrolled(self) -> Any:
+        """The model with loops of a fixed length instead of conditional graph nodes; the same arrays."""
+        model, options = copy.copy(self.model), copy.copy(self.model.opt)
+        limit = min(self.unrolled_iterations or options.iterations, options.iterations)
+        # The seal is not for these copies, which no recorded graph reads.
+        object.__setattr__(options, "graph_conditional", False)
+        object.__setattr__(options, "iterations", limit)
+        object.__setattr__(model, "opt", options)
+        return model
 
     def set_contact_pairs(self, fields: dict[str, NDArray[np.float64]]) -> None:
         """Change what contact pairs are made of, from the next step on; recorded graphs follow.

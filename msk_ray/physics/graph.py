@@ -1,9 +1,59 @@
 """A fixed sequence of Warp launches, recorded once and replayed."""
 
-from collections.abc import Callable
+import gc
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import warp as wp
+
+_outer: list[wp.Stream] = []
+"""The stream of the capture that another library has begun, while there is one."""
+
+
+@contextmanager
+def without_collecting() -> Iterator[None]:
+    """No garbage is collected: a capture fails if CUDA graphs among it are given back."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+@contextmanager
+def joining_capture(stream: wp.Stream) -> Iterator[list[Any]]:
+    """Within a capture that another library has begun on `stream`: graphs that are replayed become part of it.
+
+    Args:
+        stream: the capturing stream, on which all replays must be requested.
+
+    Yields:
+        What has to be kept for as long as the captured graph lives.
+    """
+    kept: list[Any] = []
+    wp.capture_begin(stream=stream, external=True)
+    _outer.append(stream)
+    try:
+        yield kept
+    except BaseException:
+        _outer.pop()
+        with suppress(RuntimeError):  # the capture is invalid already, which the first error says
+            wp.capture_end(stream=stream)
+        raise
+    else:
+        _outer.pop()
+        kept.append(wp.capture_end(stream=stream))
+
+
+def joined_stream() -> wp.Stream | None:
+    """The stream of another library's capture, which may hold no conditional nodes, while launches become part of it.
+
+    There may be no other wp.Stream of the same CUDA stream: when that one goes, Warp forgets the capture.
+    """
+    return _outer[-1] if _outer else None
 
 
 class Graph:
@@ -19,13 +69,19 @@ class Graph:
 
     def __init__(self, launches: Callable[[], None], device: wp.Device) -> None:
         self._device = device
-        with wp.ScopedDevice(device):
+        self._launches = launches
+        with wp.ScopedDevice(device), without_collecting():
             launches()
             wp.synchronize_device(device)
             with wp.ScopedCapture(device=device) as capture:
                 launches()
         self._graph = capture.graph
 
-    def replay(self, stream: Any = None) -> None:
-        """Run the recorded launches, on `stream` (a `wp.Stream`) if the device is CUDA."""
-        wp.capture_launch(self._graph, stream=stream if self._device.is_cuda else None)
+    def replay(self, stream: wp.Stream | None = None) -> None:
+        """Run the recorded launches, on `stream` if the device is CUDA; within another capture, issue them into it."""
+        if joined_stream() is not None:
+            # A graph launched into a capture would be a child graph, which may hold no conditional nodes either.
+            with wp.ScopedDevice(self._device), wp.ScopedStream(stream, sync_enter=False):
+                self._launches()
+        else:
+            wp.capture_launch(self._graph, stream=stream if self._device.is_cuda else None)

@@ -93,13 +93,14 @@ class LossWatch:
     def read(self) -> tuple[int, float, Capacity]:
         """Since the last read: bits of what was lost, share of worlds at a solver limit, and the most room in use.
 
-        Waits for the device, and forgets what it returns.
+        Waits for the steps, and forgets what it returns.
         """
         bits = np.array(self._data.overflow.numpy())  # a copy: on CPU, numpy() is a view
         contacts, rows = (int(n) for n in self._peaks.numpy())
         self._data.overflow.zero_()
         self._peaks.zero_()
-        wp.synchronize_device(self._device)
+        if self._device.is_cuda:
+            wp.synchronize_stream(self._device.stream)  # not the device: other streams may be at work
         self._heard_view[0] = 0
         lost = int(np.bitwise_or.reduce(bits)) & LOST_BITS
         limited = float(np.mean((bits & ITERATION_BITS) != 0))

@@ -6,7 +6,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from msk_ray.physics import WorldBatch
+from msk_ray.physics import WorldBatch, joined_stream
 from msk_ray.simulation.backward import Applied, StepState
 
 
@@ -25,7 +25,7 @@ def stream_of(device: torch.device) -> wp.Stream | None:
     """The Warp view of torch's current stream, so that both libraries' work stays in one order."""
     if device.type != "cuda":
         return None
-    return wp.stream_from_torch(torch.cuda.current_stream(device))
+    return joined_stream() or wp.stream_from_torch(torch.cuda.current_stream(device))
 
 
 def applied_of(data: Any) -> Applied:

@@ -265,6 +265,14 @@ class Simulation:
         """Names of the parameters that are open."""
         return self.batch.parameters
 
+    def settle(self) -> None:
+        """Wait for all steps so far.
+
+        Raises:
+            SimulationError: one of them lost contacts or constraint rows.
+        """
+        self.engine.settle()
+
     def contact_forces(self) -> Tensor:
         """Force of all contacts on every geom in world coordinates [N], shape (W, G, 3).
 

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping
 import warp as wp
 from torch import Tensor
 
-from msk_ray.physics import Graph, WorldBatch
+from msk_ray.physics import Graph, WorldBatch, joined_stream
 from msk_ray.physics.capacity import Capacity
 from msk_ray.physics.touch import ContactForces
 from msk_ray.simulation.backward import Applied, Backward, StepState
@@ -58,7 +58,12 @@ class Engine:
         return self._buffers.read()
 
     def settle(self) -> None:
-        """Raise SimulationError if any step so far lost something. Waits for the device, once after each step."""
+        """Raise SimulationError if any step so far lost something. Waits for the device, once after each step.
+
+        While steps are being captured, none has run yet, and nothing can be known.
+        """
+        if joined_stream() is not None:
+            return
         if self._unseen:
             wait_for(self.device)
             self._unseen = False

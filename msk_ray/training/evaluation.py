@@ -115,12 +115,12 @@ class Evaluator:
                 on_step(env.state.physics, control)
             transition = env.step(action, auto_reset=False)
             outcome = env.outcome_terms(env.state.physics)
-            score += torch.where(alive, transition.reward, 0.0)
+            score += transition.reward.masked_fill(~alive, 0.0)
             length += alive
-            terms += torch.where(alive[:, None], transition.terms, 0.0)
+            terms += transition.terms.masked_fill(~alive[:, None], 0.0)
             _accumulate(outcomes, outcome, alive)
             if step >= self.steps - self._tail:
-                tail.append({name: torch.where(alive, value, 0.0) for name, value in outcome.items()})
+                tail.append({name: value.masked_fill(~alive, 0.0) for name, value in outcome.items()})
             fell |= alive & transition.terminated & ~transition.diverged
             diverged |= alive & transition.diverged
             alive &= ~transition.terminated
@@ -160,4 +160,4 @@ class Evaluator:
 
 def _accumulate(totals: dict[str, Tensor], values: dict[str, Tensor], alive: Tensor) -> None:
     for name, value in values.items():
-        totals[name] = totals.get(name, torch.zeros_like(value)) + torch.where(alive, value, 0.0)
+        totals[name] = totals.get(name, torch.zeros_like(value)) + value.masked_fill(~alive, 0.0)

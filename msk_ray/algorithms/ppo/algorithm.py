@@ -105,7 +105,7 @@ class Ppo(Algorithm):
         clock = Clock(self.env.device)
         try:
             rewards, done, diverged = self._collect()
-            rollout_s = clock.lap()
+            clock.mark("rollout")
             values = self.ppo.storage.values.mean()
             losses = self.ppo.update()
         except (RuntimeError, ValueError):
@@ -113,7 +113,7 @@ class Ppo(Algorithm):
             self._check("weights", self._weights())
             raise
         self._check("losses and weights", [*losses.values(), *self._weights()])
-        learning_s = clock.lap()
+        clock.mark("learning")
         metrics = {
             "train/actor_loss": losses["surrogate"],
             "train/critic_loss": losses["value"],
@@ -127,8 +127,7 @@ class Ppo(Algorithm):
         numbers = {name: float(value) for name, value in metrics.items()}
         numbers |= {
             "train/actor_lr": self.ppo.learning_rate,
-            "time/rollout_s": rollout_s,
-            "time/learning_s": learning_s,
+            **{f"time/{part}_s": seconds for part, seconds in clock.seconds().items()},
             **simulation_metrics(self.env),
         }
         return EpochResult(self.settings.steps * self.env.nworld, numbers)
@@ -154,7 +153,7 @@ class Ppo(Algorithm):
         """Fill rsl_rl's storage; rewards (H, W), ends of episodes (H, W) bool, and how many worlds diverged."""
         env, ppo = self.env, self.ppo
         env.state = env.state.detach()
-        env.stock_resets(self.settings.steps)
+        env.stock_resets(env.draw_resets(self.settings.steps))
         rewards, ends = [], []
         diverged = torch.zeros((), dtype=torch.int64, device=env.device)
         obs = self._observe()

@@ -2,6 +2,8 @@
 
 import math
 
+import torch
+
 from msk_ray.config import EntropyConfig
 
 
@@ -9,13 +11,24 @@ class EntropyBonus:
     """The coefficient α of −log π in the reward, constant or adapted to hold a target entropy.
 
     Attributes:
-        coefficient: the current α [reward per nat].
+        weight: the current α [reward per nat], a scalar on the device that changes in place.
     """
 
-    def __init__(self, config: EntropyConfig, action_size: int) -> None:
+    def __init__(self, config: EntropyConfig, action_size: int, device: torch.device | str = "cpu") -> None:
         self._config = config
         self._action_size = action_size
-        self.coefficient = config.coefficient
+        self._coefficient = config.coefficient
+        self.weight = torch.tensor(config.coefficient, device=device)
+
+    @property
+    def coefficient(self) -> float:
+        """The current α [reward per nat]."""
+        return self._coefficient
+
+    @coefficient.setter
+    def coefficient(self, value: float) -> None:
+        self._coefficient = value
+        self.weight.fill_(value)
 
     def adapt(self, entropy: float) -> None:
         """Update with an epoch's mean entropy of the policy [nat]: log α += rate (target − entropy), by dual ascent.

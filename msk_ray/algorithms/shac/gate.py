@@ -21,7 +21,7 @@ class Norms(NamedTuple):
 
 
 class CotangentStatistics(NamedTuple):
-    """What a gate measured in one backward pass."""
+    """A summary of what a gate measured in one backward pass."""
 
     nonfinite_share: Tensor
     """Share of worlds with a cotangent that was not finite, a scalar on the device."""
@@ -40,6 +40,26 @@ class CotangentStatistics(NamedTuple):
             "grad/clipped_share": self.norms.clipped_share,
             **found,
         }
+
+
+class CotangentRecord(NamedTuple):
+    """What a gate measured in one backward pass, on the device."""
+
+    nonfinite_share: Tensor
+    """Share of worlds with a cotangent that was not finite, a scalar."""
+    lengths: Tensor
+    """Norms of all state cotangents, (N,)."""
+    bound: float | None
+    """Largest norm let through."""
+
+    def statistics(self, unit: float) -> CotangentStatistics:
+        """Norms in units of `unit`, over worlds and steps; waits for the device."""
+        finite = self.lengths[self.lengths.isfinite()]
+        if not finite.numel():
+            return CotangentStatistics(self.nonfinite_share, None)
+        median, p90 = torch.quantile(finite, torch.tensor([0.5, 0.9], device=finite.device)) / unit
+        clipped = finite.new_zeros(()) if self.bound is None else (self.lengths > self.bound).float().mean()
+        return CotangentStatistics(self.nonfinite_share, Norms(median, p90, finite.max() / unit, clipped_share=clipped))
 
 
 class CotangentGate:
@@ -75,7 +95,7 @@ class CotangentGate:
         """The cotangent (W, A) let through."""
         finite = cotangent.isfinite().all(-1)
         self._nonfinite |= ~finite
-        return torch.where(finite[:, None], cotangent, 0.0)
+        return cotangent.masked_fill(~finite[:, None], 0.0)
 
     def pull(self, cotangent: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
         """The cotangents let through, each (W, n)."""
@@ -84,20 +104,12 @@ class CotangentGate:
         self._nonfinite |= ~finite
         self._norms.append(norm)
         scale = torch.ones_like(norm) if self.bound is None else (self.bound / norm).clamp(max=1.0)
-        return tuple(torch.where(finite[:, None], scale[:, None] * g, 0.0) for g in cotangent)
+        return tuple((scale[:, None] * g).masked_fill(~finite[:, None], 0.0) for g in cotangent)
 
-    def statistics(self, unit: float) -> "CotangentStatistics":
-        """Norms in units of `unit`, over worlds and steps."""
-        lost = self._nonfinite.float().mean()
-        norms = torch.cat(self._norms) if self._norms else torch.zeros(0)
-        finite = norms[norms.isfinite()]
-        if not finite.numel():
-            return CotangentStatistics(lost, None)
-        quantiles = torch.quantile(finite, torch.tensor([0.5, 0.9], device=norms.device))
-        clipped = (norms > self.bound).float().mean() if self.bound is not None else norms.new_zeros(())
-        return CotangentStatistics(
-            lost, Norms(quantiles[0] / unit, quantiles[1] / unit, finite.max() / unit, clipped_share=clipped)
-        )
+    def record(self) -> CotangentRecord:
+        """What was measured."""
+        lengths = torch.cat(self._norms) if self._norms else torch.zeros(0, device=self._nonfinite.device)
+        return CotangentRecord(self._nonfinite.float().mean(), lengths, self.bound)
 
 
 class _Gate(torch.autograd.Function):

@@ -13,7 +13,7 @@ def discounts(done: Tensor, gamma: float) -> Tensor:
     horizon = done.shape[0]
     steps = torch.arange(horizon, device=done.device)[:, None]
     # First step of the episode that step t belongs to: one past the latest done before t.
-    starts = torch.cummax(torch.where(done, steps + 1, 0), dim=0).values
+    starts = torch.cummax((steps + 1).expand_as(done).masked_fill(~done, 0), dim=0).values
     first = torch.cat((torch.zeros_like(starts[:1]), starts[:-1]))
     return gamma ** (steps - first).to(torch.get_default_dtype())
 
@@ -29,7 +29,7 @@ def actor_loss(rewards: Tensor, next_values: Tensor, terminated: Tensor, done: T
     end = done.clone()
     end[-1] = True
     bootstrap = end & ~terminated
-    total = (weight * rewards).sum() + gamma * torch.where(bootstrap, weight * next_values, 0.0).sum()
+    total = (weight * rewards).sum() + gamma * (weight * next_values).masked_fill(~bootstrap, 0.0).sum()
     return -total / rewards.numel()
 
 
@@ -40,7 +40,7 @@ def td_lambda_targets(
 
     The recursion of SHAC equation 7 (exponentially averaged k-step returns); a terminated state has value 0.
     """
-    values = torch.where(terminated, 0.0, next_values)
+    values = next_values.masked_fill(terminated, 0.0)
     targets = torch.empty_like(rewards)
     following = values[-1]
     for t in range(rewards.shape[0] - 1, -1, -1):
@@ -52,4 +52,4 @@ def td_lambda_targets(
 
 def one_step_targets(rewards: Tensor, next_values: Tensor, terminated: Tensor, gamma: float) -> Tensor:
     """Critic targets (H, W): r + γ V(s'), where a terminated state has value 0."""
-    return rewards + gamma * torch.where(terminated, 0.0, next_values)
+    return rewards + gamma * next_values.masked_fill(terminated, 0.0)

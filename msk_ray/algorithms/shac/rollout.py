@@ -40,13 +40,13 @@ def collect(
     state_bptt: bool,
     with_neg_log_prob: bool = False,
 ) -> Rollout:
-    """Roll the policy out for as many steps as `noise` (H, W, A) has, from the current state of the worlds.
+    """Roll the policy out for as many steps as `noise` (H, W, A) has, from the current state of the worlds, which have
+    a stock of resets.
 
     A new graph starts at the first state. If `state_bptt` is false, a new one starts at every state, so that an
     action's gradient comes only from its own step. `normalizer` is held fixed during the rollout.
     """
     env.state = env.state.detach()
-    env.stock_resets(len(noise))
     raw, reached, rewards, terminated, done, diverged = [], [], [], [], [], []
     neg_log_probs = []
     normalize = normalizer.normalize if normalizer is not None else lambda x: x

@@ -66,7 +66,7 @@ class MuscleCurves:
         half = 0.5
         curve = torch.where(length <= rising, half * start.square(), 1.0 - half * below.square())
         beyond = torch.where(length <= falling, 1.0 - half * above.square(), half * end.square())
-        return torch.where(outside, 0.0, torch.where(length <= 1.0, curve, beyond))
+        return torch.where(length <= 1.0, curve, beyond).masked_fill(outside, 0.0)
 
     def rate_curve(self, rate: Tensor) -> Tensor:
         """Active force against rate, 1 at rest, 0 at the largest shortening speed."""

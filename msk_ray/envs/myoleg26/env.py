@@ -28,6 +28,7 @@ class MyoLeg26(LegEnv[MyoLeg26Settings]):
     """
 
     Settings = MyoLeg26Settings
+    begin_epoch_in_place = True
 
     @classmethod
     def build_model(cls, config: MyoLeg26Settings, physics: PhysicsConfig) -> mujoco.MjModel:
@@ -53,7 +54,8 @@ class MyoLeg26(LegEnv[MyoLeg26Settings]):
         self._starts = StepState(
             *(self._tensor([getattr(key, part) for key in keys]) for part in ("qpos", "qvel", "act"))
         )
-        self._assist_share = self.config.assist.share if self.config.assist.epochs else 0.0
+        share = self.config.assist.share if self.config.assist.epochs else 0.0
+        self._assist_share = torch.tensor(share, device=self.device)
         mass = float(model.body_subtreemass[0])
         a = self.config.assist
         # Critical damping: c = 2 √(k m).
@@ -70,7 +72,7 @@ class MyoLeg26(LegEnv[MyoLeg26Settings]):
 
     def begin_epoch(self, epoch: int) -> None:
         a = self.config.assist
-        self._assist_share = a.share * max(0.0, 1.0 - epoch / a.epochs) if a.epochs else 0.0
+        self._assist_share.fill_(a.share * max(0.0, 1.0 - epoch / a.epochs) if a.epochs else 0.0)
 
     def control(self, action: Tensor) -> Tensor:
         excitation = super().control(action)

@@ -209,20 +209,22 @@ def scaled_jacobian(
         scaled_out[worldid, row, dof] = laws_in.slope[worldid, row] * jacobian_in[worldid, row, dof]
         return
     con = rows_in.id[worldid, row]
-    first = contacts_in.efc_address[con, 0]
+    if row != contacts_in.efc_address[con, 0]:
+        return  # the thread of the contact's first row writes all of them
     dim = contacts_in.dim[con]
     jar = vec6()
     mass = vec6()
     column = vec6()
     for i in range(dim):
-        jar[i] = laws_in.jar[worldid, first + i]
-        mass[i] = rows_in.D[worldid, first + i]
-        column[i] = jacobian_in[worldid, first + i, dof]
+        jar[i] = laws_in.jar[worldid, row + i]
+        mass[i] = rows_in.D[worldid, row + i]
+        column[i] = jacobian_in[worldid, row + i, dof]
     friction = contacts_in.friction[con]
     mu = friction[0] * opt_impratio_invsqrt[worldid % opt_impratio_invsqrt.shape[0]]
     cone = cone_law(jar, mass, friction, mu, dim)
     product = cone_slope(cone, mass, friction, dim, column)
-    scaled_out[worldid, row, dof] = product[row - first]
+    for i in range(dim):
+        scaled_out[worldid, row + i, dof] = product[i]
 
 
 class ConstraintLaws:

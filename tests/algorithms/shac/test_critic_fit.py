@@ -11,7 +11,8 @@ def fit(passes: int, grad_norm: float | None = 1.0) -> tuple[Critic, float]:
     critic = Critic(CriticConfig(hidden=(32,), count=2), 3, torch.Generator().manual_seed(0))
     generator = torch.Generator().manual_seed(1)
     obs = torch.randn(256, 3, generator=generator)
-    loss = CriticFit(critic, 1e-2, (0.9, 0.99), grad_norm).run(obs, obs[:, 0] ** 2, passes, 4, generator)
+    fit = CriticFit(critic, 1e-2, (0.9, 0.99), grad_norm)
+    loss = fit.run(obs, obs[:, 0] ** 2, fit.draw_orders(256, passes, generator), 4)
     return critic, float(loss)
 
 
@@ -27,7 +28,22 @@ def test_the_first_adam_step_is_the_learning_rate_long() -> None:
     critic = Critic(CriticConfig(hidden=(), layer_norm=False), 1, torch.Generator().manual_seed(0))
     before = [p.detach().clone() for p in critic.parameters()]
     obs = torch.ones(4, 1)
-    CriticFit(critic, 0.125, (0.9, 0.999), None).run(obs, torch.full((4,), 100.0), 1, 1, torch.Generator())
+    order = torch.arange(4)[None]
+    CriticFit(critic, 0.125, (0.9, 0.999), None).run(obs, torch.full((4,), 100.0), order, 1)
     # With bias correction Adam's first step is the rate in the direction of each entry's sign.
     moved = [(p - b).item() for p, b in zip(critic.parameters(), before, strict=True)]
     assert torch.allclose(torch.tensor(moved), torch.tensor([0.125, 0.125]), atol=1e-5)
+
+
+def test_each_pass_sees_every_row_once_and_drops_what_fills_no_minibatch() -> None:
+    critic = Critic(CriticConfig(hidden=(8,)), 1, torch.Generator().manual_seed(0))
+    fit = CriticFit(critic, 1e-9, (0.9, 0.99), None)
+    orders = fit.draw_orders(7, 3, torch.Generator().manual_seed(0))
+    assert [sorted(order.tolist()) for order in orders] == [list(range(7))] * 3
+    assert len({tuple(order.tolist()) for order in orders}) == 3
+    obs = torch.randn(7, 1, generator=torch.Generator().manual_seed(2))
+    targets = torch.arange(7.0)
+    # At a rate that changes nothing, the last pass's loss is that of its first six rows.
+    used = orders[-1][:6]
+    expected = (critic(obs[used]) - targets[used]).square().mean()
+    assert torch.isclose(fit.run(obs, targets, orders, 2), expected, rtol=1e-4)

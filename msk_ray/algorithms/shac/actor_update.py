@@ -1,0 +1,195 @@
+"""The part of an epoch that changes the actor. The host looks at nothing in it, so that it can be recorded."""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from msk_ray.algorithms.shac import returns
+from msk_ray.algorithms.shac.entropy import EntropyBonus
+from msk_ray.algorithms.shac.gate import CotangentGate, CotangentRecord
+from msk_ray.algorithms.shac.half_batch_cosine import HalfBatchCosine
+from msk_ray.algorithms.shac.optimizer import RateAdam
+from msk_ray.algorithms.shac.rollout import Rollout, collect
+from msk_ray.config import ShacConfig
+from msk_ray.envs import Env, EnvState, Resets
+from msk_ray.networks import Critic, PolicyNetwork, RunningMeanStd
+from msk_ray.simulation import StepState
+
+
+class EpochInputs(NamedTuple):
+    """What an epoch starts from and draws; H horizon, W worlds."""
+
+    state: EnvState
+    resets: Resets
+    """What the worlds whose episodes end go on with, H·W of them."""
+    noise: Tensor
+    """Standard normal numbers of the actions, (H, W, A)."""
+
+    def tensors(self) -> list[Tensor]:
+        """All tensors in a fixed order."""
+        physics, *others = self.state
+        return [*physics, *others, *self.resets.physics, self.resets.numbers, self.noise]
+
+    def copies(self) -> "EpochInputs":
+        """The same in memory of its own."""
+        physics, *others = self.state
+        return EpochInputs(
+            EnvState(StepState(*(t.clone() for t in physics)), *(t.clone() for t in others)),
+            Resets(StepState(*(t.clone() for t in self.resets.physics)), self.resets.numbers.clone()),
+            self.noise.clone(),
+        )
+
+
+@dataclass(frozen=True)
+class Rolled:
+    """A rollout with its graph, before anything was learned from it."""
+
+    rollout: Rollout
+    state: EnvState
+    """Of the worlds after it."""
+    gate: CotangentGate
+    halves: HalfBatchCosine
+
+
+@dataclass(frozen=True)
+class ActorOutcome:
+    """The results of one epoch, all detached, on the device."""
+
+    state: EnvState
+    obs: Tensor
+    """Normalised observations for the critic, (H·W, O)."""
+    targets: Tensor
+    """The critic's targets for them, (H·W,)."""
+    rewards: Tensor
+    """Shape (H, W)."""
+    done: Tensor
+    """Shape (H, W) bool."""
+    cotangents: CotangentRecord
+    metrics: dict[str, Tensor]
+    """Scalars by metric name."""
+
+
+class ActorUpdate:
+    """Rollout, loss, backward pass and the actor's step.
+
+    Args:
+        settings: those of SHAC.
+        env: the worlds.
+        network: the policy.
+        target_critic: values of the states reached.
+        return_statistics: statistics of the discounted return, or None if rewards are not divided by it.
+        entropy: the bonus for the policy's entropy, or None.
+        optimizer: the actor's.
+
+    Attributes:
+        discounted: the running discounted return of each world, (W,), which `return_statistics` are of.
+    """
+
+    def __init__(
+        self,
+        settings: ShacConfig,
+        env: Env[Any],
+        network: PolicyNetwork,
+        target_critic: Critic,
+        return_statistics: RunningMeanStd | None,
+        entropy: EntropyBonus | None,
+        optimizer: RateAdam,
+    ) -> None:
+        self._settings = settings
+        self._env = env
+        self._actor, self._normalizer = network.actor, network.normalizer
+        self._target_critic = target_critic
+        self._return_statistics = return_statistics
+        self._entropy = entropy
+        self._optimizer = optimizer
+        self.discounted = torch.zeros(env.nworld, device=env.device)
+
+    def roll(self, inputs: EpochInputs) -> Rolled:
+        """Roll the policy out over as many env steps as there is noise."""
+        env, c = self._env, self._settings
+        # A cotangent of norm 1/(H·W) is what a reward of one in one world sends back through the mean loss.
+        bound = None if c.state_grad_clip is None else c.state_grad_clip / (len(inputs.noise) * env.nworld)
+        gate = CotangentGate(bound, env.nworld, env.device)
+        halves = HalfBatchCosine(self._actor)
+        env.state = inputs.state
+        env.stock_resets(inputs.resets)
+        with halves.watching():
+            rollout = collect(
+                env,
+                self._actor,
+                self._normalizer,
+                inputs.noise,
+                gate,
+                state_bptt=c.state_bptt,
+                with_neg_log_prob=self._entropy is not None,
+            )
+        return Rolled(rollout, env.state.detach(), gate, halves)
+
+    def learn(self, rolled: Rolled) -> ActorOutcome:
+        """Take the actor's step along the rollout's gradient, and update the statistics.
+
+        The step is left out where more worlds than `max_nonfinite_share` had a gradient that was not finite, or the
+        policy's gradient is not finite: the metrics say so.
+        """
+        c, rollout = self._settings, rolled.rollout
+        loss, next_values, rewards = self._loss(rollout)
+        self._optimizer.optimizer.zero_grad()
+        loss.backward()
+        cotangents = rolled.gate.record()
+        limit = float("inf") if c.actor_grad_norm is None else c.actor_grad_norm
+        norm = nn.utils.clip_grad_norm_(self._actor.parameters(), limit)
+        failed = (cotangents.nonfinite_share > c.max_nonfinite_share) | ~norm.isfinite()
+        self._optimizer.step(skip=failed)
+        values = next_values.detach()
+        if c.critic_method == "td-lambda":
+            targets = returns.td_lambda_targets(rewards, values, rollout.terminated, rollout.done, c.gamma, c.lam)
+        else:
+            targets = returns.one_step_targets(rewards, values, rollout.terminated, c.gamma)
+        obs = rollout.obs
+        if self._normalizer is not None:
+            obs = self._normalizer.normalize(rollout.obs)
+            self._normalizer.update(rollout.obs.flatten(0, 1))
+        detached = rollout.rewards.detach()
+        metrics = {
+            "train/actor_loss": loss.detach(),
+            "train/reward": detached.mean(),
+            "train/value": values.mean(),
+            "train/diverged": rollout.diverged.sum(),
+            "grad/actor_norm": norm,
+            "grad/halves_cosine": rolled.halves.cosine(),
+        }
+        if self._actor.log_std is not None:
+            metrics["train/std"] = self._actor.log_std.detach().exp().mean()
+        if rollout.neg_log_prob is not None:
+            metrics["train/entropy"] = rollout.neg_log_prob.detach().mean()
+        return ActorOutcome(
+            rolled.state, obs.flatten(0, 1), targets.flatten(), detached, rollout.done, cotangents, metrics
+        )
+
+    def _loss(self, rollout: Rollout) -> tuple[Tensor, Tensor, Tensor]:
+        """The actor's loss, attached values of the states reached (H, W), and detached rewards for the critic."""
+        c = self._settings
+        rewards = c.reward_scale * rollout.rewards
+        if self._entropy is not None:
+            assert rollout.neg_log_prob is not None
+            rewards = rewards + self._entropy.weight * rollout.neg_log_prob
+        std: Tensor | float = 1.0
+        if self._return_statistics is not None:
+            std = torch.sqrt(self._return_statistics.var + 1e-6)
+            self._update_return_statistics(self._return_statistics, rewards.detach(), rollout.done)
+            rewards = rewards / std
+        next_values = self._target_critic.value(rollout.next_obs)
+        # The loss is scaled back so that the learning rate means the same with and without normalised returns.
+        loss = std * returns.actor_loss(rewards, next_values, rollout.terminated, rollout.done, c.gamma)
+        return loss, next_values, rewards.detach()
+
+    def _update_return_statistics(self, statistics: RunningMeanStd, rewards: Tensor, done: Tensor) -> None:
+        running, total = [], self.discounted
+        for reward, ended in zip(rewards, done, strict=True):
+            total = total * self._settings.gamma + reward
+            running.append(total)
+            total = total.masked_fill(ended, 0.0)
+        self.discounted.copy_(total)  # in place: a recorded epoch reads this memory
+        statistics.update(torch.stack(running).flatten())

@@ -1,0 +1,270 @@
+"""How an epoch's work is run: operation by operation, or as recorded CUDA graphs."""
+
+import traceback
+import warnings
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from msk_ray.algorithms.base import Clock
+from msk_ray.algorithms.shac.actor_update import ActorOutcome, ActorUpdate, EpochInputs, Rolled
+from msk_ray.envs import Env
+from msk_ray.simulation.capture import Recording, fill
+from msk_ray.simulation.stepper import Engine
+
+FitCritic = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""Observations (N, O), targets (N,) and orders (passes, N) to the loss; moves the target critic too."""
+_MOST_HORIZONS = 3
+"""Recordings kept, one for each horizon: each holds the memory of a whole epoch."""
+_FEWEST_ITERATIONS = 8
+"""Solver iterations unrolled at first."""
+_MOST_ITERATIONS = 48
+"""Beyond this many, unrolled iterations cost more than recording saves."""
+_LIMITED_SHARE = 0.01
+"""Share of worlds that may reach the number of unrolled iterations before it grows."""
+
+
+class EagerRunner:
+    """Runs an epoch's work operation by operation.
+
+    Attributes:
+        recorded: whether the last epoch was replayed from a recording.
+        last_loss: the critic's loss, as far as it is known; None before the first fit.
+    """
+
+    recorded = False
+
+    def __init__(self, actor: ActorUpdate, fit_critic: FitCritic, env: Env[Any]) -> None:
+        self._actor = actor
+        self._fit_critic = fit_critic
+        self._env = env
+        self._device = env.device
+        self._clock = Clock(env.device)
+        self.last_loss: Tensor | None = None
+
+    def run_actor(self, inputs: EpochInputs) -> ActorOutcome:
+        """The rollout, and the actor's step along its gradient."""
+        self._clock = Clock(self._device)
+        rolled = self._actor.roll(inputs)
+        self._clock.mark("rollout")
+        outcome = self._actor.learn(rolled)
+        self._clock.mark("backward")
+        self._env.release_graph()
+        return outcome
+
+    def run_critic(self, obs: Tensor, targets: Tensor, orders: Tensor) -> None:
+        """Fit the critic."""
+        self.last_loss = self._fit_critic(obs, targets, orders)
+        self._clock.mark("critic")
+
+    def join(self) -> None:
+        """Let what follows on the current stream wait for all work that was started."""
+
+    def seconds(self) -> dict[str, float]:
+        """How long the parts of the last epoch took [s], by name; waits for them."""
+        return self._clock.seconds()
+
+    def adapt(self, limited: float) -> None:
+        """Take note of the share of worlds that reached a limit of the solver in the last epoch."""
+
+
+@dataclass
+class _Epoch:
+    """A recorded epoch of one horizon."""
+
+    inputs: EpochInputs
+    roll: Recording[Rolled]
+    learn: Recording[ActorOutcome]
+
+
+@dataclass
+class _Fit:
+    """A recorded fit of the critic."""
+
+    inputs: tuple[Tensor, ...]
+    work: Recording[Tensor]
+
+
+@dataclass
+class _Recordings:
+    """Everything recorded with one engine of the simulation."""
+
+    engine: Engine
+    epochs: OrderedDict[int, _Epoch] = field(default_factory=OrderedDict)
+    """By horizon, the one used last at the end."""
+    warm: set[int] = field(default_factory=set)
+    """Horizons that have run eagerly, so that every kernel and buffer exists."""
+
+
+class RecordedRunner(EagerRunner):
+    """Replays recorded epochs, one recording for each horizon; the critic is fitted beside the next rollout.
+
+    The first epoch of a horizon runs eagerly. The target critic is needed only at the end of a rollout, so that the fit
+    has that long: the mathematics are those of one after the other. `last_loss` is the loss of the fit before.
+
+    Work that cannot be recorded, because an environment waits for the device, runs eagerly from then on; a warning says
+    why and where.
+
+    Args:
+        env: the worlds.
+    """
+
+    def __init__(self, actor: ActorUpdate, fit_critic: FitCritic, env: Env[Any]) -> None:
+        super().__init__(actor, fit_critic, env)
+        self._kept = _Recordings(env.sim.engine)
+        self._fits: dict[tuple[torch.Size, ...], _Fit | None] = {}
+        self._recording = torch.cuda.Stream(env.device)
+        self._side = torch.cuda.Stream(env.device)
+        self._fitted = torch.cuda.Event()
+        self._fit_clock: Clock | None = None
+        self._fit_s: float | None = None
+        self._newest_loss: Tensor | None = None
+        self._refused = False
+        own = type(env).begin_epoch is not Env.begin_epoch and not env.begin_epoch_in_place
+        if own:
+            self._refuse(
+                f"{type(env).__qualname__}.begin_epoch may change numbers: keep them in tensors that it changes in "
+                "place, and set begin_epoch_in_place"
+            )
+
+    def run_actor(self, inputs: EpochInputs) -> ActorOutcome:
+        epoch = self._epoch(inputs)
+        self.recorded = epoch is not None
+        if epoch is None:
+            self.join()
+            return super().run_actor(inputs)
+        self._clock = Clock(self._device)
+        fill(epoch.inputs.tensors(), inputs.tensors())
+        epoch.roll.replay()
+        self._clock.mark("rollout")
+        self.join()
+        outcome = epoch.learn.replay()
+        self._clock.mark("backward")
+        self._env.state = outcome.state
+        return outcome
+
+    def run_critic(self, obs: Tensor, targets: Tensor, orders: Tensor) -> None:
+        # The fit before has ended: the actor's work waited for it.
+        self._note_fit()
+        inputs = (obs, targets, orders)
+        fit = self._fit(inputs)
+        if fit is None:
+            clock = Clock(self._device)
+            self._newest_loss = self._fit_critic(*inputs)
+            clock.mark("critic")
+        else:
+            fill(fit.inputs, inputs)
+            self._side.wait_stream(torch.cuda.current_stream(self._device))
+            with torch.cuda.stream(self._side):
+                clock = Clock(self._device)
+                self._newest_loss = fit.work.replay()
+                clock.mark("critic")
+                self._fitted.record()
+        self._fit_clock = clock
+
+    def join(self) -> None:
+        torch.cuda.current_stream(self._device).wait_event(self._fitted)
+
+    def seconds(self) -> dict[str, float]:
+        return super().seconds() | ({} if self._fit_s is None else {"critic": self._fit_s})
+
+    def adapt(self, limited: float) -> None:
+        batch = self._env.sim.batch
+        unrolled = batch.unrolled_iterations
+        if not self.recorded or limited <= _LIMITED_SHARE or unrolled is None:
+            return
+        if unrolled >= int(batch.mjm.opt.iterations):
+            return  # the model's own limit
+        batch.unrolled_iterations = unrolled + unrolled // 2
+        self._kept.epochs.clear()
+        if batch.unrolled_iterations > _MOST_ITERATIONS:
+            self._refuse(f"the constraint solver needs more than {_MOST_ITERATIONS} iterations in some worlds")
+
+    def _attempt(self, record: Callable[[], _Epoch]) -> _Epoch | None:
+        try:
+            return record()
+        except RuntimeError as error:
+            first = _first(error)
+            self._refuse(f"{_place(first)} cannot be recorded ({str(first).splitlines()[0]})")
+            torch.cuda.empty_cache()
+            return None
+
+    def _refuse(self, why: str) -> None:
+        self._refused = True
+        self._kept.epochs.clear()
+        warnings.warn(f"epochs run operation by operation, not as recorded graphs: {why}", stacklevel=2)
+
+    def _note_fit(self) -> None:
+        """Keep loss and time of the fit that has ended, before the next one replaces them."""
+        if self._newest_loss is not None:
+            self.last_loss = self._newest_loss.clone()
+        if self._fit_clock is not None:
+            self._fit_s = self._fit_clock.seconds()["critic"]
+
+    def _epoch(self, inputs: EpochInputs) -> _Epoch | None:
+        """The recording of an epoch with this horizon; None if it has to run eagerly."""
+        if self._refused:
+            return None
+        engine, horizon = self._env.sim.engine, len(inputs.noise)
+        if self._kept.engine is not engine:
+            self._kept = _Recordings(engine)  # recordings step the buffers of the engine they were made with
+        kept = self._kept
+        if horizon in kept.epochs:
+            kept.epochs.move_to_end(horizon)
+            return kept.epochs[horizon]
+        if horizon not in kept.warm:
+            kept.warm.add(horizon)
+            return None
+        while len(kept.epochs) >= _MOST_HORIZONS:
+            kept.epochs.popitem(last=False)
+        epoch = self._attempt(lambda: self._record_epoch(inputs))
+        if epoch is not None:
+            kept.epochs[horizon] = epoch
+        return epoch
+
+    def _record_epoch(self, inputs: EpochInputs) -> _Epoch:
+        batch = self._env.sim.batch
+        if batch.unrolled_iterations is None:
+            batch.unrolled_iterations = _FEWEST_ITERATIONS
+        buffers = inputs.copies()
+        before = self._env.state
+        try:
+            roll = Recording(lambda: self._actor.roll(buffers), self._recording)
+            learn = Recording(lambda: self._actor.learn(roll.result), self._recording, pool=roll.pool)
+        finally:
+            self._env.state = before
+            self._env.stock_resets(None)  # those of the recording are in its memory
+            self._env.release_graph()
+        return _Epoch(buffers, roll, learn)
+
+    def _fit(self, inputs: tuple[Tensor, ...]) -> _Fit | None:
+        """The recording of a fit of this size; None if it has to run eagerly."""
+        shapes = tuple(t.shape for t in inputs)
+        if shapes not in self._fits:
+            self._fits[shapes] = None
+            return None
+        if self._fits[shapes] is None:
+            buffers = tuple(t.clone() for t in inputs)
+            work = Recording(lambda: self._fit_critic(*buffers), self._side)
+            self._fits[shapes] = _Fit(buffers, work)
+        return self._fits[shapes]
+
+
+def _first(error: BaseException) -> BaseException:
+    """The error that made the capture invalid, which ends in another one."""
+    while error.__context__ is not None:
+        error = error.__context__
+    return error
+
+
+def _place(error: BaseException) -> str:
+    """File and line in which the work was when recording it failed: the innermost outside torch and Warp."""
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [f for f in frames if not {"torch", "warp", "mujoco_warp"} & set(Path(f.filename).parts)]
+    frame = (own or frames)[-1]
+    return f"{Path(frame.filename).name}:{frame.lineno}"

@@ -1,0 +1,47 @@
+"""Adam whose state is restored in the same memory."""
+
+import copy
+
+import pytest
+import torch
+from torch import nn
+
+from msk_ray.algorithms.shac.optimizer import RateAdam
+
+
+def stepped(parameter: nn.Parameter, adam: RateAdam, gradients: list[float]) -> None:
+    for gradient in gradients:
+        parameter.grad = torch.full_like(parameter, gradient)
+        adam.step()
+
+
+def test_a_restored_optimiser_goes_on_as_before_and_in_the_same_memory() -> None:
+    parameter = nn.Parameter(torch.zeros(3))
+    adam = RateAdam([parameter], 0.1, (0.9, 0.99))
+    stepped(parameter, adam, [1.0, 2.0])
+    state, weights = copy.deepcopy(adam.state_dict()), parameter.detach().clone()
+    moments = list(adam.optimizer.state[parameter].values())
+    stepped(parameter, adam, [3.0, -1.0])
+    expected = parameter.detach().clone()
+    adam.load_state_dict(state)
+    with torch.no_grad():
+        parameter.copy_(weights)
+    assert all(a is b for a, b in zip(adam.optimizer.state[parameter].values(), moments, strict=True))
+    stepped(parameter, adam, [3.0, -1.0])
+    assert torch.equal(parameter, expected)
+    # A fresh one too, which has no moments yet.
+    other = nn.Parameter(weights.clone())
+    fresh = RateAdam([other], 0.5, (0.9, 0.99))
+    fresh.load_state_dict(state)
+    fresh.set_rate(0.1)
+    stepped(other, fresh, [3.0, -1.0])
+    assert torch.equal(other, expected)
+
+
+@pytest.mark.parametrize(("skip", "moved"), [(True, 0.0), (False, -0.1)])
+def test_a_step_is_left_out_if_asked(skip: bool, moved: float) -> None:
+    parameter = nn.Parameter(torch.zeros(1))
+    adam = RateAdam([parameter], 0.1, (0.9, 0.99))
+    parameter.grad = torch.ones(1)
+    adam.step(skip=torch.tensor(skip))
+    assert parameter.item() == pytest.approx(moved, abs=1e-6)
