@@ -278,7 +278,7 @@ def print_table(result: "GradientCheck", model: str, tolerance: float) -> None:
     console.print(table)
     console.print(_excluded(result))
     if result.parameter_kinks:
-        console.print(f"{result.parameter_kinks} comparisons by a parameter left out, at its kink")
+        console.print(f"{result.parameter_kinks} elements of parameters left out at a kink of their own")
     if result.checked and result.excluded > MANY_EXCLUDED * (result.checked + result.excluded):
         console.print("note: many states were left out; the result only covers the others")
     if result.approximated:

@@ -28,6 +28,11 @@ Above the rounding of float64 by enough that the fine one still has eight digits
 reach across a kink that float32 rounding of the state could cross.
 """
 
+_COLUMN_STEPS, _COLUMN_SIDES = 1e-3, 1e-2
+"""Disagreements above which the step is not differentiable by an element of a parameter."""
+_SMALL_COLUMN = 1e-3
+"""Share of the largest column below which an element's derivative is not judged by itself."""
+
 _DIVERGED = (
     mujoco.mjtWarning.mjWARN_BADQPOS,
     mujoco.mjtWarning.mjWARN_BADQVEL,
@@ -70,18 +75,17 @@ class Linearization:
     which the two central differences agree: one that passes through the state itself.
     """
 
-    def kinks(self, step_limit: float, side_limit: float) -> set[str]:
-        """Inputs by which the step is not differentiable here, within the reach of COARSE_STEP."""
-        # Written so that a NaN counts as a kink.
-        return {
-            name
-            for name in self.jacobian
-            if not (self.step_disagreement[name] <= step_limit and self.side_disagreement[name] <= side_limit)
-        }
+    bent: Mapping[str, NDArray[np.bool_]]
+    """By parameter, the elements by which the step is not differentiable here, (columns of it,)."""
 
     def at_kink(self, step_limit: float, side_limit: float) -> bool:
-        """Whether the step is not differentiable here by its control or its state."""
-        return not self.kinks(step_limit, side_limit).isdisjoint(INPUTS)
+        """Whether the step is not differentiable here by its control or its state, within the reach of COARSE_STEP."""
+        # Written so that a NaN counts as a kink.
+        return not all(
+            self.step_disagreement[name] <= step_limit and self.side_disagreement[name] <= side_limit
+            for name in INPUTS
+            if name in self.jacobian
+        )
 
     def pull_back(self, cotangent: Array) -> dict[str, Array]:
         """Gradients of ⟨cotangent, (qpos', qvel', act')⟩ by input, for a tangent cotangent of shape (R,)."""
@@ -105,6 +109,17 @@ def reference_model(model: mujoco.MjModel) -> mujoco.MjModel:
     # divergence into a plausible state.
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_WARMSTART | mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     return reference
+
+
+def _bent(fine: Array, steps: Array, sides: Array) -> NDArray[np.bool_]:
+    """Columns of a parameter's derivative (R, columns) that depend on the size or the side of the difference."""
+    size = np.linalg.norm(fine, axis=0)
+    # Beside a large column, a small one is rounding.
+    scale = np.maximum(size, _SMALL_COLUMN * size.max(initial=0.0)) + np.finfo(float).tiny
+    smooth = (np.linalg.norm(steps, axis=0) <= _COLUMN_STEPS * scale) & (
+        np.linalg.norm(sides, axis=0) <= _COLUMN_SIDES * scale
+    )
+    return np.asarray(~smooth)
 
 
 class Oracle:
@@ -185,6 +200,7 @@ class Oracle:
         jacobian: dict[str, Array] = {}
         steps: dict[str, float] = {}
         sides: dict[str, float] = {}
+        bent: dict[str, NDArray[np.bool_]] = {}
         for name, columns in self.sizes.items():
             if columns == 0:
                 continue
@@ -198,7 +214,9 @@ class Oracle:
             jacobian[name] = fine + (fine - coarse) / (ratio - 1.0)
             steps[name] = float(np.linalg.norm(fine - coarse)) / scale
             sides[name] = float(np.linalg.norm(forward - backward)) / scale
-        return Linearization(end, jacobian, steps, sides)
+            if name in self._fields:
+                bent[name] = _bent(fine, fine - coarse, forward - backward)
+        return Linearization(end, jacobian, steps, sides, bent)
 
     def _one_sided(self, point: Point, end: Point, name: str, columns: int, amount: float) -> tuple[Array, Array]:
         """Forward and backward difference quotients, each (R, columns)."""
