@@ -46,6 +46,8 @@ def test_the_space_of_frictions_has_trials_with_and_without(monkeypatch):
     finally:
         sys.modules.pop("tray", None)
     assert [trial.config.physics.randomize is None for trial in trials] == [True, False] * 3
+
+
 def test_sysid(monkeypatch, capsys, tmp_path):
     picture = tmp_path / "arm.png"
     sizes = ("--trajectories", "2", "--steps", "12", "--iterations", "2")
