@@ -13,7 +13,7 @@ from msk_ray.config import ALGORITHMS, AlgorithmSettings, Config, check_installe
 from msk_ray.envs import Env
 from msk_ray.errors import ConfigError
 
-_OF_GRADIENTS = frozenset({"approximated_share"})
+_OF_GRADIENTS = frozenset({"approximated_share", "reached_share"})
 """Diagnostics of the simulation that concern its gradients; the others concern its physics."""
 
 

@@ -74,6 +74,7 @@ def first_spelling(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 _LATER: dict[tuple[str, str], Any] = {
     ("physics", "randomize"): None,
+    ("physics", "contact_reach"): None,
     ("trial", "threads"): 1,
     ("trial", "loggers"): ["tensorboard"],
     ("algorithm", "name"): "shac",

@@ -14,6 +14,7 @@ from msk_ray.errors import UnsupportedModelError
 from msk_ray.physics.capacity import Capacity, default_capacity, scalar_rows
 from msk_ray.physics.graph import joined_stream
 from msk_ray.physics.overflow import LossWatch, cured, loss_error, needed
+from msk_ray.physics.pairs import widened
 from msk_ray.physics.parameters import check_names, open_arrays, structure
 from msk_ray.physics.sealed import ModelWatch, seal
 
@@ -69,6 +70,7 @@ class WorldBatch:
         nconmax, njmax: contacts and constraint rows a world. By default a bound from the geometry where that is small,
             else what a short probe in C MuJoCo needed and half as much again.
         tolerance: solver tolerance, below mujoco_warp's floor of 1e-6 if wanted.
+        contact_reach: distance [m] within which contacts are found before they touch, without any force.
 
     Attributes:
         mjm: the C MuJoCo model.
@@ -99,6 +101,7 @@ class WorldBatch:
         nconmax: int | None = None,
         njmax: int | None = None,
         tolerance: float | None = None,
+        contact_reach: float = 0.0,
     ) -> None:
         check_state(mjm)
         check_ignored(mjm)
@@ -106,14 +109,19 @@ class WorldBatch:
         self.substeps = substeps
         self.device = wp.get_device(device)
         self.parameters: tuple[str, ...] = ()
-        self.structure = mjm
+        self._reach = contact_reach
+        self.structure = self._structure()
         self._tolerance = tolerance
         self._model = self._load(nworld)
         self.unrolled_iterations: int | None = None
         self._watch = ModelWatch(mjm)
         self._given = Capacity(nconmax or 0, njmax or 0)
-        start, self._bound = default_capacity(mjm) if not all(self._given) else (self._given, None)
+        start, self._bound = default_capacity(self.structure) if not all(self._given) else (self._given, None)
         self._allocate(nworld, Capacity(nconmax or start.contacts, njmax or start.rows))
+
+    def _structure(self) -> mujoco.MjModel:
+        model = structure(self.mjm, self.parameters)
+        return widened(model, self._reach) if self._reach > 0.0 else model
 
     def _load(self, nworld: int) -> Any:
         """mujoco_warp's copy of the model, sealed."""
@@ -160,7 +168,7 @@ class WorldBatch:
         check_names(self.mjm, names)
         other = copy.copy(self)
         other.parameters = tuple(sorted({*self.parameters, *names}))
-        other.structure = structure(self.mjm, other.parameters)
+        other.structure = other._structure()
         other._model = other._load(self.nworld)
         more = scalar_rows(other.structure) - scalar_rows(self.structure)
         if self._bound is not None:

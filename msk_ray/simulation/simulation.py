@@ -139,10 +139,18 @@ class Simulation:
         self.tangent = Tangent(model, self.device)
         self._widths = (("ctrl", model.nu), ("qpos", model.nq), ("qvel", model.nv), ("act", model.na))
         self._place = torch.empty(0, device=self.device).device
-        self._stepper = Stepper(
-            WorldBatch(model, nworld, substeps, str(self.device), nconmax=nconmax, njmax=njmax, tolerance=tolerance),
-            make_backward(backward) if isinstance(backward, str) else backward,
+        mode = make_backward(backward) if isinstance(backward, str) else backward
+        batch = WorldBatch(
+            model,
+            nworld,
+            substeps,
+            str(self.device),
+            nconmax=nconmax,
+            njmax=njmax,
+            tolerance=tolerance,
+            contact_reach=mode.contact_reach if mode is not None else 0.0,
         )
+        self._stepper = Stepper(batch, mode)
 
     @property
     def engine(self) -> Engine:

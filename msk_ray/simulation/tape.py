@@ -58,13 +58,21 @@ class _Tape(Backward):
             cotangent's own units; the direction is kept. None for no bound.
         residual_tolerance: a world is counted as unconverged where the solver left more than this share of its
             forces unbalanced, |Ma - τ - Jᵀf| / |(Ma, τ, Jᵀf)|.
+        contact_reach: distance [m] within which two geoms that do not touch yet get a gradient all the same, as if a
+            contact began there; None for none. The step itself stays as it is.
     """
 
     covers_applied = True
     covers_parameters = True
 
-    def __init__(self, substep_grad_clip: float | None = None, residual_tolerance: float = 1e-3) -> None:
+    def __init__(
+        self,
+        substep_grad_clip: float | None = None,
+        residual_tolerance: float = 1e-3,
+        contact_reach: float | None = None,
+    ) -> None:
         self.substep_grad_clip = substep_grad_clip
+        self.contact_reach = contact_reach or 0.0
         self.residual_tolerance = residual_tolerance
 
     def attach(self, batch: WorldBatch) -> None:
@@ -75,7 +83,7 @@ class _Tape(Backward):
         self._pulled = 0
         self._warned = False
         with wp.ScopedDevice(batch.device):
-            self._adjoint = StepAdjoint(batch.structure, batch.model, batch.data)
+            self._adjoint = StepAdjoint(batch.structure, batch.model, batch.data, self.contact_reach)
             pool = Pool(batch.device)
             self._states: list[dict[str, wp.array]] = [{} for _ in range(batch.substeps)]
             self._last: dict[str, wp.array] = {}
@@ -184,7 +192,7 @@ class _Tape(Backward):
         size, worlds = state_size(end), self._batch.nworld
         width = max(1, min(size, JACOBIAN_WORLDS // worlds))
         if width not in self._rows:
-            self._rows[width] = TapePerSubstep()
+            self._rows[width] = TapePerSubstep(contact_reach=self.contact_reach)
             self._rows[width].attach(self._batch.resized(width * worlds))
         self._rows[width].load(ctrl, self.checkpoints, forces)
         found = []
@@ -225,8 +233,14 @@ class _Tape(Backward):
         if self._adjoint.touch_counter.present:
             of_rows = [rows.diagnostics()["approximated_share"] for rows in self._rows.values()]
             figures["approximated_share"] = max([self._approximated_share(), *of_rows])
+        if self._adjoint.contacts.reached is not None:
+            figures["reached_share"] = self._adjoint.contacts.reached.read() / self._substeps_pulled()
         self._pulled = 0
         return figures
+
+    def _substeps_pulled(self) -> int:
+        """Substeps of all worlds that were pulled back since the last look."""
+        return max(1, self._pulled) * self._batch.substeps * self._batch.nworld
 
     def _approximated_share(self) -> float:
         """Share of the worlds' substeps whose gradient went through a contact without a derivative of its own.
@@ -234,7 +248,7 @@ class _Tape(Backward):
         Warns the first time it is above zero.
         """
         count, pairs = self._adjoint.touch_counter.read()
-        share = count / (max(1, self._pulled) * self._batch.substeps * self._batch.nworld)
+        share = count / self._substeps_pulled()
         if count and not self._warned:
             self._warned = True
             warnings.warn(
@@ -341,6 +355,7 @@ class Hybrid(Backward):
     def __init__(self, state: Backward, ctrl: Backward) -> None:
         self.state = state
         self.ctrl = ctrl
+        self.contact_reach = state.contact_reach
 
     def fresh(self) -> "Hybrid":
         return Hybrid(self.state.fresh(), self.ctrl.fresh())

@@ -24,6 +24,7 @@ from msk_ray.physics.adjoint.groups import (
     gather,
 )
 from msk_ray.physics.adjoint.pair_laws import CONVEX_PAIRS
+from msk_ray.physics.adjoint.reach import ReachedContacts
 from msk_ray.physics.adjoint.rows import cone_law, cone_slope, row_slopes, vec6
 from msk_ray.physics.adjoint.spatial import carried, point_velocity, wrench
 from msk_ray.physics.adjoint.workspace import Workspace
@@ -230,10 +231,12 @@ class ContactForces:
 
     Attributes:
         count: contacts of all worlds that there is room for.
+        reached: launches for contacts before they touch, None without a reach.
     """
 
-    def __init__(self, work: Workspace, contacts: int) -> None:
+    def __init__(self, work: Workspace, contacts: int, reach: float) -> None:
         self._work, self.count, self._keeps = work, contacts, False
+        self.reached = ReachedContacts(work, contacts, reach) if reach > 0.0 else None
         mjm = work.mjm
         types = {(int(mjm.geom_type[a]), int(mjm.geom_type[b])) for a, b in colliding_pairs(mjm)}
         self._pull_geometry = pull_geometry_kernel(PairKinds.of(types))
@@ -267,6 +270,8 @@ class ContactForces:
             ],
             outputs=[work.bars, self._bars],
         )
+        if self.reached is not None:
+            self.reached.launch(at, self._bars)
         wp.launch(
             self._pull_geometry,
             dim=self.count,

@@ -82,7 +82,7 @@ def pull_geometry_kernel(kinds: PairKinds) -> Any:
         con = wp.tid()
         if con >= wp.min(nacon_in[0], contacts_in.dist.shape[0]):
             return
-        if contacts_in.efc_address[con, 0] < 0:
+        if contacts_in.efc_address[con, 0] < 0 and contact_bars_in.dist[con] == 0.0:
             return
         worldid = contacts_in.worldid[con]
         geoms = contacts_in.geom[con]
