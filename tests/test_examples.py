@@ -54,3 +54,10 @@ def test_sysid(monkeypatch, capsys, tmp_path):
     out = run(monkeypatch, capsys, "sysid.py", str(picture), *sizes)
     assert "exact derivatives: mean squared residual" in out
     assert picture.stat().st_size > 10_000
+
+
+def test_muscle_fit(monkeypatch, capsys, tmp_path):
+    picture = tmp_path / "muscle.png"
+    out = run(monkeypatch, capsys, "muscle_fit.py", str(picture), "--angles", "5", "--iterations", "2")
+    assert "iteration 2: root mean square of the residual" in out
+    assert picture.stat().st_size > 10_000
