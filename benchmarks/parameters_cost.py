@@ -23,7 +23,7 @@ def values_of(model: mujoco.MjModel, names: list[str], worlds: int | None, devic
     """The model's own values, one for all worlds or with a row per world, whose gradients are wanted."""
     values = {n: torch.as_tensor(PARAMETERS[n].value(model), dtype=torch.float32, device=device) for n in names}
     rows = () if worlds is None else (worlds,)
-    return {n: v.expand(*rows, *v.shape).clone().requires_grad_() for n, v in values.items()}
+    return {n: v.expand((*rows, *v.shape)).clone().requires_grad_() for n, v in values.items()}
 
 
 def milliseconds(sim: Simulation, values: dict[str, Tensor], steps: int) -> tuple[float, float]:
