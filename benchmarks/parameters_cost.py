@@ -10,7 +10,6 @@ from pathlib import Path
 
 import mujoco
 import torch
-import warp as wp
 from parameters import MODELS
 from record import RESULTS, markdown_table, publish
 from torch import Tensor
@@ -51,7 +50,7 @@ def used_bytes(device: torch.device) -> int:
     """Memory in use on a GPU, by everyone; 0 on CPU."""
     if device.type != "cuda":
         return 0
-    wp.synchronize_device(str(device))
+    torch.cuda.synchronize(device)
     torch.cuda.empty_cache()
     free, total = torch.cuda.mem_get_info(device)
     return int(total - free)
