@@ -20,7 +20,7 @@ from msk_ray.simulation.stepper import Engine
 FitCritic = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Observations (N, O), targets (N,) and orders (passes, N) to the loss; moves the target critic too."""
 _MOST_HORIZONS = 3
-"""Recordings kept, one for each horizon: each holds the memory of a whole epoch."""
+"""Recordings kept of epochs, and of fits, one for each horizon: each holds the memory of all its work."""
 _FEWEST_ITERATIONS = 8
 """Solver iterations unrolled at first."""
 _MOST_ITERATIONS = 48
@@ -249,6 +249,9 @@ class RecordedRunner(EagerRunner):
             self._fits[shapes] = None
             return None
         if self._fits[shapes] is None:
+            recorded = [known for known, fit in self._fits.items() if fit is not None]
+            for oldest in recorded[: len(recorded) + 1 - _MOST_HORIZONS]:
+                del self._fits[oldest]
             buffers = tuple(t.clone() for t in inputs)
             work = Recording(lambda: self._fit_critic(*buffers), self._side)
             self._fits[shapes] = _Fit(buffers, work)
