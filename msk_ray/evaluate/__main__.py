@@ -96,11 +96,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _evaluate_one(target: Target, bench: "Bench", requests: "Sequence[Request]", values: int) -> int:
     """Evaluate one policy; every `values` requests are of one physics, with different values of a parameter."""
-    from msk_ray.evaluate.measure import eval_file_of, store_evaluation
+    from msk_ray.evaluate.measure import check_varied, eval_file_of, store_evaluation
     from msk_ray.training import load_policy
 
     path = best_checkpoint(target)
     policy = load_policy(path)
+    for request in requests:
+        check_varied(policy.config, request)
     entries = []
     for request in requests:
         entries.append(bench.evaluate(policy, request))
@@ -153,10 +155,13 @@ def evaluate_experiment(experiment: Experiment, bench: "Bench", requests: "Seque
     Returns:
         The exit code: 1 if a policy could not be evaluated.
     """
-    from msk_ray.evaluate.measure import EVAL_FILE, FORMAT, eval_file_of, store_evaluation
+    from msk_ray.evaluate.measure import EVAL_FILE, FORMAT, check_varied, eval_file_of, store_evaluation
     from msk_ray.training import load_policy
 
     trials = experiment.trials()
+    for request in requests:
+        for trial in trials[:1]:
+            check_varied(trial.config, request)
     rankings: list[list[dict[str, Any]]] = []
     failed: dict[str, str] = {}
     untrained: dict[str, str] = {}

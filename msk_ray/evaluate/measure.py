@@ -12,6 +12,7 @@ from torch import Tensor
 
 from msk_ray.config import Config, PhysicsConfig, RandomizeConfig
 from msk_ray.envs import env_class
+from msk_ray.envs.randomize import Randomizer
 from msk_ray.errors import ConfigError
 from msk_ray.evaluate.targets import trial_folder_of
 from msk_ray.experiment.damage import DamagedFile, field, is_number, number, read_object
@@ -59,6 +60,18 @@ def named_physics(config: Config, name: str) -> tuple[str, PhysicsConfig]:
         known = ", ".join((REFERENCE, OWN, *variants))
         raise ConfigError(f"--physics {name!r}: env {config.env.name} has no such physics; write one of {known}")
     return name, env_type.reference_physics(trained_on, name)
+
+
+def check_varied(config: Config, request: Request) -> None:
+    """Raise ConfigError if the model of a trial does not have what a request varies. Runs nothing."""
+    if request.varied is None:
+        return
+    _, physics = named_physics(config, request.physics)
+    model = env_class(config.env).build_model(config.env, physics)
+    try:
+        Randomizer(request.varied, model, torch.device("cpu"), 0)
+    except ConfigError as error:
+        raise ConfigError(f"--vary {str(error).removeprefix('physics.randomize.')}") from None
 
 
 _WORLDS = ("--worlds", "evaluation.nworld")

@@ -103,6 +103,8 @@ def test_an_experiment_is_ranked_and_a_torn_policy_is_named(
 
 def test_other_values_of_a_parameter(trial: Path, capsys: pytest.CaptureFixture[str]) -> None:
     short = ["--steps", "20", "--device", "cpu"]
+    assert run(main, [str(trial), "--vary", "jnt_stiffness=2x", *short]) == 2
+    assert entries(trial) == [], "refused before anything is run"
     assert run(main, [str(trial), "--vary", "body_mass=1x,3x", *short]) == 0
     own, once, thrice = entries(trial)
     assert [e["physics"] for e in (own, once, thrice)] == ["own", "own, body_mass ×1", "own, body_mass ×3"]
@@ -117,9 +119,23 @@ def test_other_values_of_a_parameter(trial: Path, capsys: pytest.CaptureFixture[
         "body_mass=2": "only multiples of the model's own; write 2x",
         "dof_damping=0.1,hot": "is no positive number; write 0.8, or 0.8x",
         "geom_friction=nan": "is no positive number",
+        "jnt_stiffness=2x": "--vary jnt_stiffness: it is 0 in the model",
     }.items():
         assert run(main, [str(trial), "--vary", text, *short]) == 2
         assert why in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_an_experiment_is_ranked_under_each_value(
+    sweep: Experiment, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(sweep.path, tmp_path / "small")
+    common = ["small", "--storage", str(tmp_path), "--steps", "5", "--worlds", "2", "--device", "cpu"]
+    assert run(main, [*common, "--vary", "pair_friction=2x"]) == 2
+    assert "--vary pair_friction: the model has no pair" in capsys.readouterr().err
+    assert run(main, [*common, "--vary", "body_mass=3x"]) == 0
+    rankings = json.loads((tmp_path / "small" / "eval.json").read_text())["rankings"]
+    assert [ranking["physics"] for ranking in rankings] == ["own", "own, body_mass ×3"]
+    assert all(len(ranking["ranking"]) == 4 for ranking in rankings)
 
 
 def test_physics_by_name(ant_trial: Path) -> None:
