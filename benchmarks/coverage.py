@@ -74,9 +74,12 @@ def errors_at(model: mujoco.MjModel, substeps: int, args: argparse.Namespace) ->
     out: dict[str, Any] = {"checked": 0, "kinks": 0, "mismatches": 0, "nonfinite": 0, "approximated_share": 0.0}
     errors: list[float] = []
     failed: list[str] = []
+    try:
+        sim = Simulation(model, args.worlds, substeps, device=args.device, tolerance=args.solver_tolerance)
+    except MskRayError as error:
+        return out | {"worst": None, "median": None, "failed": [str(error)]}
     for kind in args.states:
         try:
-            sim = Simulation(model, args.worlds, substeps, device=args.device, tolerance=args.solver_tolerance)
             result = check_gradients(sim, states=[kind])
         except (MskRayError, mujoco.FatalError) as error:
             failed.append(f"{kind}: {error}")
