@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import mujoco
+import numpy as np
 
 _HEAD = """
 <mujoco>
@@ -110,10 +111,26 @@ def muscle_arms(arms: int = 4) -> mujoco.MjModel:
     )
 
 
+def heap(shape: str) -> mujoco.MjModel:
+    """Six free bodies dropped into a tray of boxes: boxes, or meshes of 400 corners."""
+    spread = np.random.default_rng(0).normal(size=(400, 3))
+    corners = " ".join(f"{x:.5f}" for x in (0.1 * spread / np.linalg.norm(spread, axis=1)[:, None]).ravel())
+    geom = {"box": 'type="box" size=".1 .08 .06"', "mesh": 'type="mesh" mesh="pebble"'}[shape]
+    bodies = "".join(f'<body pos="{0.01 * k} 0 {0.2 + 0.22 * k}"><freejoint/><geom {geom}/></body>' for k in range(6))
+    return mujoco.MjModel.from_xml_string(
+        f"""<mujoco><option timestep=".002" cone="elliptic"/><asset><mesh name="pebble" vertex="{corners}"/></asset>
+        <worldbody><geom type="box" size=".5 .5 .05"/><geom type="box" size=".05 .5 .3" pos=".3 0 .3"/>
+        <geom type="box" size=".05 .5 .3" pos="-.3 0 .3"/><geom type="box" size=".5 .05 .3" pos="0 .3 .3"/>
+        <geom type="box" size=".5 .05 .3" pos="0 -.3 .3"/>{bodies}</worldbody></mujoco>"""
+    )
+
+
 MODELS: dict[str, Callable[[], mujoco.MjModel]] = {
     "cartpole": cartpole,
     "ant": ant,
     "ant_elliptic": lambda: ant("elliptic"),
     "biped": biped,
     "muscle_arms": muscle_arms,
+    "heap_of_boxes": lambda: heap("box"),
+    "heap_of_meshes": lambda: heap("mesh"),
 }

@@ -125,8 +125,13 @@ def cornered_foot(
     height = seen.dist / wp.dot(ground.normal, seen.normal)
     at = seen.point - 0.5 * seen.dist * seen.normal
     above = at + height * ground.normal
-    for step in range(2):  # corners first, then edges
-        for face in range(face_count(other, meshes)):
+    first = int(0)
+    last = face_count(other, meshes)
+    if other_face >= 0:
+        first = other_face
+        last = other_face + 1
+    for step in range(wp.where(is_clipped, 2, 1)):  # corners first, then edges
+        for face in range(first, last):
             normal = other.mat @ face_normal(other, meshes, face)
             begin = out_of(other, face_corner(other, meshes, face, 0))
             looks = (
@@ -142,7 +147,7 @@ def cornered_foot(
                         if miss < least - rounding:
                             least = miss
                             best = fixed_foot(begin, wp.mat33())
-                    elif is_clipped:
+                    else:
                         run = wp.normalize(end - begin)
                         aside = tangential(ground.normal) @ (at - begin)
                         flat_run = tangential(ground.normal) @ run
