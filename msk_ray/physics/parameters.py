@@ -128,6 +128,11 @@ def _obstacle(mjm: mujoco.MjModel, name: str) -> str:
     fast = mjm.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     if name in ("tendon_damping", "actuator_gainprm", "actuator_biasprm") and fast and between_branches(mjm).any():
         return "implicitfast drops slopes of dampers and servos on tendons between branches; write integrator='Euler'"
+    if name == "pair_solreffriction":
+        without = np.flatnonzero(~np.any(mjm.pair_solreffriction, axis=1))
+        if without.size:
+            word = mujoco.mj_id2name(mjm, _OBJ.mjOBJ_PAIR, int(without[0])) or without[0]
+            return f"pair {word} has none of its own and follows solref; write its solreffriction in the model"
     if name == "site_pos":
         on_site = (mjm.actuator_trntype == int(mujoco.mjtTrn.mjTRN_SITE)).any() or between_sites(mjm).any()
         if on_site or (mjm.eq_objtype == int(_OBJ.mjOBJ_SITE)).any():

@@ -44,7 +44,8 @@ class ParameterTensors:
             values["geom_rbound"], values["geom_aabb"] = self._bounds(values["geom_size"])
         for name, view in self._views.items():
             value = values.get(name, self._nominal[name])
-            view.copy_(value.view(*value.shape[: value.dim() - self._nominal[name].dim()], *view.shape[1:]))
+            rows = value.shape[: value.dim() - self._nominal[name].dim()]
+            view.copy_(value.reshape((*rows, *view.shape[1:])))
 
     @cached_property
     def _subtrees(self) -> Tensor:
