@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV   ?= .venv
 RUN    := $(VENV)/bin/python
 STAMP  := $(VENV)/.installed
-WORKERS ?= 6
+WORKERS ?= 4
 
 .PHONY: help env demo test check unit gpu-test bench clean
 

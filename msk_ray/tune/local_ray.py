@@ -14,10 +14,12 @@ import ray
 from ray._private import ray_constants
 
 import msk_ray
-from msk_ray.errors import StorageError
+from msk_ray.errors import ClusterLost, StorageError
 
 TOKEN_FILE = Path(".ray") / "auth_token"
 """Where Ray keeps the token of local sessions, relative to the home folder."""
+STARTS = 3
+"""How often Ray's daemons are started before giving up."""
 
 
 def start_local(dashboard: bool | None, options: Mapping[str, Any]) -> Any:
@@ -32,6 +34,7 @@ def start_local(dashboard: bool | None, options: Mapping[str, Any]) -> Any:
 
     Raises:
         StorageError: its token cannot be stored.
+        ClusterLost: its daemons do not start, because the machine is too busy.
     """
     # Workers must import the package this process runs, wherever it was started from.
     package = str(Path(msk_ray.__file__).resolve().parent.parent)
@@ -41,9 +44,23 @@ def start_local(dashboard: bool | None, options: Mapping[str, Any]) -> Any:
     programs = [*os.environ.get("PATH", os.defpath).split(os.pathsep), str(Path(sys.executable).parent)]
     os.environ["PATH"] = os.pathsep.join(dict.fromkeys(programs))
     make_token_private()
-    with loopback_only():
-        # By default Ray would join any cluster whose address a `ray start` on this machine has left behind.
-        return ray.init("local", include_dashboard=dashboard, dashboard_host="127.0.0.1", **options)
+    timed_out: Exception | None = None
+    for _ in range(STARTS):
+        if timed_out is not None:
+            print("Ray's daemons did not start within 30 s on this busy machine; starting them again ...", flush=True)
+        try:
+            with loopback_only():
+                # By default Ray would join any cluster whose address a `ray start` on this machine has left behind.
+                return ray.init("local", include_dashboard=dashboard, dashboard_host="127.0.0.1", **options)
+        except Exception as error:
+            # Ray has no class of its own for this, and no setting for how long it waits. What it has started ends with
+            # this process.
+            if "node timed out during startup" not in str(error):
+                raise
+            timed_out = error
+    raise ClusterLost(
+        f"Ray's daemons did not start within 30 s, {STARTS} times: this machine is too busy; try again later"
+    ) from timed_out
 
 
 @contextmanager

@@ -22,8 +22,11 @@ def folder(tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for name, text in found:
         (tmp_path / name).write_text(text)
     monkeypatch.syspath_prepend(tmp_path)
+    other = sys.modules.pop("hopper", None)  # the one of this folder, which another test has imported
     yield tmp_path
     sys.modules.pop("hopper", None)
+    if other is not None:
+        sys.modules["hopper"] = other
 
 
 def test_the_files_of_the_page_make_an_environment_with_gradients_and_a_sweep(folder: Path) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from msk_ray.errors import StorageError
+from msk_ray.errors import ClusterLost, StorageError
 from msk_ray.tune import local_ray
 
 SESSION = """
@@ -163,3 +163,44 @@ def test_the_way_in(home: Path, monkeypatch: pytest.MonkeyPatch, variables: dict
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
     assert local_ray.way_in() == line.replace("HOME", str(home))
+
+
+class Starts:
+    """Stands for `ray.init`: it fails a number of times."""
+
+    def __init__(self, failures: int, message: str) -> None:
+        self.failures, self.message, self.calls = failures, message, 0
+
+    def __call__(self, *args: object, **options: object) -> str:
+        self.calls += 1
+        if self.calls <= self.failures:
+            raise Exception(self.message)
+        return "context"
+
+
+TIMED_OUT = "The current node timed out during startup. This could happen because the GCS has become overloaded."
+
+
+def test_daemons_that_are_too_slow_are_started_again(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(local_ray, "make_token_private", lambda: None)
+    starts = Starts(2, TIMED_OUT)
+    monkeypatch.setattr(local_ray.ray, "init", starts)
+    assert local_ray.start_local(False, {}) == "context"
+    assert starts.calls == 3
+    assert capsys.readouterr().out.count("starting them again") == 2
+
+
+@pytest.mark.parametrize(
+    ("message", "error", "calls"), [(TIMED_OUT, ClusterLost, local_ray.STARTS), ("something else", Exception, 1)]
+)
+def test_what_does_not_start_is_an_error(
+    message: str, error: type[Exception], calls: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(local_ray, "make_token_private", lambda: None)
+    starts = Starts(100, message)
+    monkeypatch.setattr(local_ray.ray, "init", starts)
+    with pytest.raises(error):
+        local_ray.start_local(False, {})
+    assert starts.calls == calls
