@@ -76,7 +76,7 @@ def landing_points(model: mujoco.MjModel, count: int, on_plane: bool) -> list[Po
         *[("capsule", ground) for ground in ("capsule", "box")],
         ("box", "box"),
         *[(shape, "hills") for shape in ("sphere", "capsule")],
-        *[("mesh", "mesh"), ("mesh", "box"), ("ellipsoid", "mesh")],
+        *[("mesh", "mesh"), ("mesh", "box"), ("ellipsoid", "mesh"), ("capsule", "mesh")],
     ],
 )
 def test_exact_pairs(shape, ground, substeps):

@@ -13,6 +13,7 @@ from msk_ray.physics.adjoint.convex_laws import (
     Bars,
     Push,
     Seen,
+    added,
     flat_wrenches,
     height_wrenches,
     swapped,
@@ -22,6 +23,7 @@ from msk_ray.physics.adjoint.feet import foot_of, ground_of, unit_of_length
 from msk_ray.physics.adjoint.groups import ContactBars, Contacts, Meshes, Shapes, Substep, gather
 from msk_ray.physics.adjoint.pair_laws import is_convex_pair
 from msk_ray.physics.adjoint.patches import EDGE, FACE, Patch, patch_at
+from msk_ray.physics.adjoint.side_lines import first_normal, line_wrenches, side_offset
 from msk_ray.physics.adjoint.solids import (
     Solid,
     face_along,
@@ -145,10 +147,13 @@ def standing_wrenches(
                 kept = swapped(height_wrenches(deepest, facing, at, bars.dist))
                 rest.dist = 0.0
     push = flat_wrenches(foot, ground.normal, at, rest, turns_with_other)
-    push.force1 += kept.force1
-    push.torque1 += kept.torque1
-    push.force2 += kept.force2
-    push.torque2 += kept.torque2
+    if foot.line == 1:
+        normal = first_normal(above, side_offset(above, foot.place), ground.normal)
+        line, known = line_wrenches(below, above, meshes, normal, at, push.force2, length)
+        push = added(push, line)
+        if not known:
+            aside = length
+    push = added(push, kept)
     return push, wp.where(miss > 0.0, (aside + error) / length, 0.0)
 
 

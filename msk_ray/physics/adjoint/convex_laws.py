@@ -49,6 +49,17 @@ class Push:
 
 
 @wp.func
+def added(push: Push, other: Push) -> Push:
+    """The sum of two pushes on the same geoms, about the same point."""
+    out = Push()
+    out.force1 = push.force1 + other.force1
+    out.torque1 = push.torque1 + other.torque1
+    out.force2 = push.force2 + other.force2
+    out.torque2 = push.torque2 + other.torque2
+    return out
+
+
+@wp.func
 def swapped(push: Push) -> Push:
     """The push with the two geoms exchanged."""
     out = Push()
@@ -176,6 +187,8 @@ class Foot:
     """B [m]."""
     slide: wp.mat33
     """T: along the geom, so that v stays on a plane or a line of the face's body."""
+    line: wp.int32
+    """1: v is on a capsule's side, at an offset from the axis that another feature than the face has set."""
 
 
 @wp.func

@@ -12,6 +12,7 @@ from mujoco_warp import GeomType
 from msk_ray.physics.adjoint.convex_laws import Foot, Seen
 from msk_ray.physics.adjoint.groups import Meshes
 from msk_ray.physics.adjoint.patches import ellipsoid_bend, rim_bend, tangential
+from msk_ray.physics.adjoint.side_lines import side_offset
 from msk_ray.physics.adjoint.solids import (
     Solid,
     corner_count,
@@ -32,6 +33,8 @@ _PARALLEL = wp.constant(1.0e-4)
 """Sine of an angle below which two directions do not cross."""
 _NEAR = wp.constant(1.0e-2)
 """Distance, in sizes, beyond which an edge or a side plane has nothing to do with a contact."""
+_BY_OTHERS = wp.constant(2.0e-4)
+"""How far a capsule's side line may be from the one that the face's normal gives, in radii."""
 _UPRIGHT = wp.constant(2.5e-4)
 """Tilt of a cylinder below which its rim points are fixed to it: there float32 cannot tell which one is lowest."""
 
@@ -184,6 +187,14 @@ def long_foot(other: Solid, ground: Ground, meshes: Meshes, seen: Seen, is_clipp
         bend = wp.mat33()
         if wp.length(across) > _UPRIGHT:
             bend = rim_bend(radius, axis, down)
+    line = int(0)
+    if other.type == GeomType.CAPSULE and is_clipped:
+        height = seen.dist / wp.dot(ground.normal, seen.normal)
+        offset = side_offset(other, seen.point - 0.5 * seen.dist * seen.normal + height * ground.normal)
+        if wp.length(offset - across) > _BY_OTHERS:
+            line = 1
+            side = radius * offset
+            bend = wp.mat33()
     for end in range(2):
         centre = other.pos + axis * wp.where(end == 0, other.size[1], -other.size[1])
         if other.type == GeomType.CAPSULE:
@@ -194,12 +205,14 @@ def long_foot(other: Solid, ground: Ground, meshes: Meshes, seen: Seen, is_clipp
                 best = foot
         if other.type == GeomType.CYLINDER or is_clipped:
             foot = fixed_foot(centre + side, bend)
+            foot.line = line
             miss = miss_of(foot.place, ground, seen)
             if miss < least - rounding:
                 least = miss
                 best = foot
     if is_clipped:
         foot, miss = cut_foot(other.pos + side, axis, bend, ground, meshes, seen)
+        foot.line = line
         if miss < least - rounding:
             least = miss
             best = foot

@@ -17,6 +17,8 @@ CAP_CORNERS = wp.constant(16)
 _CAP_STEP = wp.constant(0.39269908169872414)
 """Angle between two corners of a cylinder's cap, π/8."""
 
+_TIED = wp.constant(1.0e-4)
+"""Difference of two corners' places along a direction, in sizes, below which they tie."""
 _OFF = wp.constant(1.0e-3)
 """Distance of a point, in sizes, above which it is not on a height field's face."""
 
@@ -217,6 +219,33 @@ def farthest(solid: Solid, meshes: Meshes, direction: wp.vec3) -> wp.vec3:
                 reach = along
                 point = meshes.mesh_vert[first + k]
     return out_of(solid, point)
+
+
+@wp.func
+def tied_corner(solid: Solid, meshes: Meshes, direction: wp.vec3, corner: wp.vec3) -> tuple[wp.bool, wp.vec3]:
+    """The corner of a box or mesh that lies as far along a direction as its farthest one does, if there is another."""
+    found = bool(False)
+    other = wp.vec3(0.0)
+    least = float(_TIED * scale(solid))
+    count = int(0)
+    if solid.type == GeomType.BOX:
+        count = 8
+    elif solid.type == GeomType.MESH:
+        count = meshes.mesh_vertnum[solid.mesh]
+    for k in range(count):
+        point = wp.vec3(0.0)
+        if solid.type == GeomType.BOX:
+            for i in range(3):
+                point[i] = wp.where((k >> i) & 1 == 0, solid.size[i], -solid.size[i])
+        else:
+            point = meshes.mesh_vert[meshes.mesh_vertadr[solid.mesh] + k]
+        point = out_of(solid, point)
+        below = wp.dot(direction, corner - point)
+        if below < least and wp.length(point - corner) > _TIED * scale(solid):
+            found = bool(True)
+            least = below
+            other = point
+    return found, other
 
 
 @wp.func
