@@ -217,7 +217,7 @@ FEATURES: tuple[Feature, ...] = (
         "contact of plane, sphere, capsule, ellipsoid, cylinder, box, mesh, with each other",
         True,
         pairs_of(EXACT_PAIRS, set()),
-        "contacts without a derivative of their own (parallel edges, a clipped side that another feature found) get "
+        "contacts without a derivative of their own (parallel edges, the side of a cylinder clipped by a face) get "
         "that of the nearest law; `grad/approximated_share` counts how often",
     ),
     Feature(
