@@ -10,6 +10,7 @@ from msk_ray.physics.adjoint.parameters.base import ParameterStage, Parts, Times
 from msk_ray.physics.adjoint.parameters.row_laws import FRICTION, ONE_SIDED, TWO_SIDED, RowMotion, row_score
 from msk_ray.physics.adjoint.scalar_rows import RowSettings
 from msk_ray.physics.adjoint.tendons import tendon_rate
+from msk_ray.physics.capacity import scalar_rows
 from msk_ray.physics.mjw_private import ConstraintType, EqType, contact_kbimp, vec5
 
 wp.set_module_options({"enable_backward": False})
@@ -242,12 +243,14 @@ class RowStage(ParameterStage):
         super().__init__(parts, gradients)
         self._settings = gather(RowSettings, parts.work.model)
         self._ranges, self._losses = gather(RowRanges, parts.work.model), gather(Losses, parts.work.model)
+        # These rows come before those of contacts.
+        self._rows = min(scalar_rows(parts.work.mjm), parts.work.njmax)
 
     def launch(self, at: Substep) -> None:
         work, m, d = self.parts.work, self.parts.work.model, at.data
         wp.launch(
             pull_row_parameters,
-            dim=(work.nworld, work.njmax),
+            dim=(work.nworld, self._rows),
             inputs=[
                 m.opt.timestep,
                 m.opt.disableflags,
