@@ -15,9 +15,9 @@ _INERTIAL = ("body_mass", "body_inertia", "dof_armature")
 _TYPICAL = 0.1
 """An element is displaced in proportion to itself, but at least to this share of the largest in its place."""
 
-_LOSSES = ("dof_frictionloss", "tendon_frictionloss")
-_ABSENT_LOSS = 100.0
-"""Scale of a friction loss that is zero: C MuJoCo's solver does not resolve one of 1e-6."""
+_ABSENT = 100.0
+"""Scale of a spring, damper or friction loss that is zero in the whole model: one of 1e-6 drowns in the rounding of a
+step, and in what C MuJoCo's solver resolves."""
 
 
 class ParameterField:
@@ -36,7 +36,7 @@ class ParameterField:
         if name == "opt.gravity":
             self._values = values[None, :]
         largest = np.abs(self._values).max(axis=0, initial=0.0)
-        unset = _ABSENT_LOSS if name in _LOSSES else 1.0
+        unset = 1.0 if PARAMETERS[name].in_use is None else _ABSENT
         self._scale = np.maximum(np.abs(self._values), np.where(largest > 0.0, _TYPICAL * largest, unset))
         for shortcut in (model.body_sameframe, model.geom_sameframe, model.site_sameframe):
             shortcut[:] = 0
