@@ -11,10 +11,8 @@ from msk_ray.envs.myoleg26.config import MyoLeg26Settings
 from msk_ray.envs.myoleg26.model import CURVE, WINDOW, build_myoleg26
 from msk_ray.envs.myoleg26.moment_arms import PUBLISHED, moment_arms
 from msk_ray.envs.myoleg26.terrain import Terrain
-from msk_ray.errors import UnsupportedModelError
 from msk_ray.physics.adjoint.coverage import check_supported
 from msk_ray.simulation import Simulation
-from msk_ray.simulation.fd_jacobian import FdJacobian
 
 MIRROR = np.array([1, 1, -1, 1, -1, -1], dtype=float)
 """Pelvis coordinates in a mirror at its plane of symmetry."""
@@ -177,12 +175,11 @@ def test_ground_from_primitives_is_differentiable_and_where_it_says(kind: str) -
         assert model.geom(int(geom[0])).name.startswith("floor")
 
 
-def test_a_height_field_raises_by_name_and_works_by_finite_differences() -> None:
+@pytest.mark.parametrize("mode", ["tape_per_substep", "fd_jacobian"])
+def test_a_height_field_is_differentiated(mode: str) -> None:
     config = MyoLeg26Settings.model_validate({"name": "myoleg26", "terrain": {"kind": "height_field"}})
     model = build_myoleg26(config, PhysicsConfig())
-    with pytest.raises(UnsupportedModelError, match=r"height fields.*floor.*fd_jacobian"):
-        check_supported(model, "tape_per_substep")
-    sim = Simulation(model, 1, 1, FdJacobian(), "cpu")
+    sim = Simulation(model, 1, 1, mode, "cpu")
     key = model.key("stand")
     qpos, qvel, act = (torch.tensor(v[None], dtype=torch.float32) for v in (key.qpos, key.qvel, key.act))
     ctrl = torch.full((1, 26), 0.1, requires_grad=True)

@@ -177,10 +177,8 @@ def test_same_seed_same_report(cartpole):
 def test_lost_contacts_of_the_perturbed_copies_are_an_error():
     """Every copy of every world needs its room, not only the worlds that are stepped."""
     model = mujoco.MjModel.from_xml_string(ant_xml("elliptic"))
-    backward = FdJacobian()
-    sim = Simulation(model, 1, 1, backward, "cpu", njmax=4)
     # Lifted far off the ground, the world itself fits; its copies, moved by 1 m, do not.
-    backward.eps["qpos"] = 1.0
+    sim = Simulation(model, 1, 1, FdJacobian(eps_qpos=1.0), "cpu", njmax=4)
     start = sim.initial_state()
     qpos = start.qpos.clone()
     qpos[:, 2] = 1.2
