@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from msk_ray.errors import UnsupportedModelError
+from msk_ray.errors import ConfigError, UnsupportedModelError
 from msk_ray.physics.capacity import Capacity, default_capacity, scalar_rows
 from msk_ray.physics.graph import joined_stream
 from msk_ray.physics.overflow import LossWatch, cured, loss_error, needed
@@ -252,7 +252,16 @@ class WorldBatch:
         Args:
             fields: of solref (P, 2), solreffriction (P, 2), solimp (P, 5), friction (P, 5), those that change, for the
                 P pairs in the model's order.
+
+        Raises:
+            ConfigError: one of them is an open parameter, whose value is an argument of the step.
         """
+        varied = [name for name in fields if f"pair_{name}" in self.parameters]
+        if varied:
+            raise ConfigError(
+                f"pair_{varied[0]} is a parameter of this simulation's steps, which write it: give step the value "
+                f"as parameters={{'pair_{varied[0]}': ...}}"
+            )
         for name, value in fields.items():
             array = getattr(self.model, f"pair_{name}")
             # In place: a recorded graph reads this memory.

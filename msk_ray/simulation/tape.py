@@ -107,6 +107,7 @@ class _Tape(Backward):
         self._applied = applied_of(batch.data)
         self._graphs: dict[tuple[bool, tuple[str, ...]], Graph] = {}
         self._parameters: dict[tuple[str, ...], ParameterAdjoint] = {}
+        self._slopes: dict[tuple[str, ...], dict[str, Tensor]] = {}
         self._rows: dict[int, TapePerSubstep] = {}
 
     def _prepare(self, pool: Pool) -> None:
@@ -146,7 +147,9 @@ class _Tape(Backward):
         """
         if (applied, names) not in self._graphs:
             if names and names not in self._parameters:
-                self._parameters[names] = ParameterAdjoint(self._adjoint, names)
+                self._parameters[names] = parameters = ParameterAdjoint(self._adjoint, names)
+                views = {n: wp.to_torch(array, requires_grad=False) for n, array in parameters.gradients.items()}
+                self._slopes[names] = views
             launches = lambda: self.launch_backward(applied, names)  # noqa: E731
             self._graphs[applied, names] = Graph(launches, self._batch.device)
             self._clipped.zero_()
@@ -164,8 +167,7 @@ class _Tape(Backward):
             views = (wp.to_torch(a, requires_grad=False) for a in (forces.grad_qfrc, forces.grad_xfrc))
             found = found._replace(**dict(zip(("qfrc_applied", "xfrc_applied"), views, strict=True)))
         if names:
-            arrays = self._parameters[names].gradients
-            found = found._replace(parameters={n: wp.to_torch(a, requires_grad=False) for n, a in arrays.items()})
+            found = found._replace(parameters=self._slopes[names])
         return found
 
     def load(self, ctrl: Tensor, states: Sequence[dict[str, wp.array]], forces: Sequence[Tensor]) -> None:

@@ -354,3 +354,16 @@ def test_friction_of_a_pair_that_follows_its_normal_is_no_parameter():
     )
     with pytest.raises(UnsupportedModelError, match="pair p has none of its own and follows solref"):
         Simulation(model, 1, 1).open_parameters(["pair_solreffriction"])
+
+
+def test_pairs_that_are_parameters_are_not_set_behind_the_back_of_a_step():
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><geom name="a" type="plane" size="1 1 1"/>
+        <body><freejoint/><geom name="b" size=".1"/></body></worldbody>
+        <contact><pair geom1="a" geom2="b"/></contact></mujoco>"""
+    )
+    sim = Simulation(model, 1, 1)
+    sim.open_parameters(["pair_friction"])
+    sim.batch.set_contact_pairs({"solref": np.array([[0.05, 1.0]])})
+    with pytest.raises(ConfigError, match="pair_friction is a parameter of this simulation's steps"):
+        sim.batch.set_contact_pairs({"friction": np.ones((1, 5))})
