@@ -7,6 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from msk_ray.cli import run
+from msk_ray.train import main
+
 
 def train(root: Path, cwd: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     environment = os.environ | {"PYTHONPATH": str(root)}
@@ -29,15 +32,21 @@ def train(root: Path, cwd: Path, *arguments: str) -> subprocess.CompletedProcess
         (["--logdir", "/proc/nowhere"], "cannot write to /proc/nowhere"),
     ],
 )
-def test_bad_input_is_one_line(root: Path, tmp_path: Path, arguments: list[str], message: str) -> None:
+def test_bad_input_is_one_line(
+    root: Path,
+    tmp_path: Path,
+    arguments: list[str],
+    message: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     (tmp_path / "configs").mkdir()
+    monkeypatch.chdir(tmp_path)
     base = [] if "--config" in arguments else ["--config", str(root / "configs" / "cartpole.yaml")]
-    result = train(root, tmp_path, *base, *arguments)
-    assert result.returncode == 2
-    errors = [line for line in result.stderr.splitlines() if not line.startswith("Warp ")]
-    assert len(errors) == 1, result.stderr
-    assert errors[0].startswith("error: ")
-    assert message in errors[0]
+    assert run(main, [*base, *arguments]) == 2
+    (error,) = capsys.readouterr().err.splitlines()
+    assert error.startswith("error: ")
+    assert message in error
     assert not list(tmp_path.rglob("metrics.jsonl"))
 
 
