@@ -20,6 +20,7 @@ from msk_ray.physics import Graph, WorldBatch
 from msk_ray.physics.adjoint import StepAdjoint
 from msk_ray.physics.adjoint.coverage import check_supported
 from msk_ray.physics.adjoint.parameters import ParameterAdjoint
+from msk_ray.physics.adjoint.pull_counter import PullCounter
 from msk_ray.physics.adjoint.recomputed import recomputed
 from msk_ray.physics.adjoint.residual import ResidualGauge
 from msk_ray.simulation.backward import INPUTS, Applied, Backward, InputGradients, Needs, StepState
@@ -80,7 +81,7 @@ class _Tape(Backward):
         check_supported(batch.structure, self.name)
         self._batch = batch
         self._device = device_of(batch)
-        self._pulled = 0
+        self._pulled = PullCounter(batch.device)
         self._warned = False
         with wp.ScopedDevice(batch.device):
             self._adjoint = StepAdjoint(batch.structure, batch.model, batch.data, self.contact_reach)
@@ -153,6 +154,7 @@ class _Tape(Backward):
             launches = lambda: self.launch_backward(applied, names)  # noqa: E731
             self._graphs[applied, names] = Graph(launches, self._batch.device)
             self._clipped.zero_()
+            self._pulled.clear()
             self._adjoint.touch_counter.clear()
 
     def pull(self, cotangent: StepState, applied: bool, names: tuple[str, ...] = ()) -> InputGradients:
@@ -160,7 +162,6 @@ class _Tape(Backward):
         for view, value in zip(self.cotangent, cotangent, strict=True):
             view.copy_(value)
         self._graphs[applied, names].replay(stream_of(self._device))
-        self._pulled += 1
         found = InputGradients(self._grad_ctrl, *self.cotangent)
         if applied:
             forces = self._adjoint.cover_applied()
@@ -225,32 +226,41 @@ class _Tape(Backward):
             if self.substep_grad_clip is not None and k > 0:
                 self._adjoint.clip(self.substep_grad_clip, self._clipped)
         self._adjoint.finish(self._states[0]["qpos"], self._raw_qpos)
+        if self._counts:
+            self._pulled.launch()
 
     def diagnostics(self) -> dict[str, float]:
         figures = self._gauge.read(self.residual_tolerance)
+        if not self._counts:
+            return figures
+        pulled = self._pulled.read()
         if self.substep_grad_clip is not None:
-            between = max(1, self._pulled * (self._batch.substeps - 1)) * self._batch.nworld
+            between = max(1, pulled * (self._batch.substeps - 1)) * self._batch.nworld
             figures["substep_clip_share"] = float(self._clipped.numpy().sum()) / between
             self._clipped.zero_()
+        substeps = max(1, pulled) * self._batch.substeps * self._batch.nworld
         if self._adjoint.touch_counter.present:
             of_rows = [rows.diagnostics()["approximated_share"] for rows in self._rows.values()]
-            figures["approximated_share"] = max([self._approximated_share(), *of_rows])
+            figures["approximated_share"] = max([self._approximated_share(substeps), *of_rows])
         if self._adjoint.contacts.reached is not None:
-            figures["reached_share"] = self._adjoint.contacts.reached.read() / self._substeps_pulled()
-        self._pulled = 0
+            figures["reached_share"] = self._adjoint.contacts.reached.read() / substeps
         return figures
 
-    def _substeps_pulled(self) -> int:
-        """Substeps of all worlds that were pulled back since the last look."""
-        return max(1, self._pulled) * self._batch.substeps * self._batch.nworld
+    @property
+    def _counts(self) -> bool:
+        """Whether anything is reported as a share of the substeps that were pulled back."""
+        adjoint = self._adjoint
+        return (
+            self.substep_grad_clip is not None or adjoint.touch_counter.present or adjoint.contacts.reached is not None
+        )
 
-    def _approximated_share(self) -> float:
-        """Share of the worlds' substeps whose gradient went through a contact without a derivative of its own.
+    def _approximated_share(self, substeps: int) -> float:
+        """Share of all worlds' substeps whose gradient went through a contact without a derivative of its own.
 
         Warns the first time it is above zero.
         """
         count, pairs = self._adjoint.touch_counter.read()
-        share = count / self._substeps_pulled()
+        share = count / substeps
         if count and not self._warned:
             self._warned = True
             warnings.warn(

@@ -150,3 +150,14 @@ def test_a_step_that_loses_rows_is_reported(tmp_path: Path) -> None:
     trainer = make(settings, tmp_path)
     with pytest.raises(SimulationError, match=r"physics\.njmax"):
         run_epochs(trainer, 40)
+
+
+def test_shares_are_of_all_steps_of_an_epoch(tmp_path: Path) -> None:
+    """Fails, with the horizon instead of 1, where Python counts the steps that a recording replays."""
+    settings = {**ANT, "physics": {"variant": "matched", "substep_grad_clip": 1e-12}}
+    trainer = make(settings, tmp_path)
+    rows = [trainer.run_epoch() for _ in range(4)]
+    assert [row["train/recorded"] for row in rows] == [0.0, 1.0, 1.0, 1.0]
+    assert [row["physics/substep_clip_share"] for row in rows] == pytest.approx(
+        [rows[0]["physics/substep_clip_share"]] * 4
+    )
