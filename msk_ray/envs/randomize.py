@@ -42,6 +42,10 @@ _FIELDS = {
 }
 
 
+_STREAM = 1
+"""Sets the seed of the numbers apart from others that are made from the same."""
+
+
 class Randomizer:
     """Draws the numbers of a `randomize` section for every world, and turns them into parameters of the model.
 
@@ -52,7 +56,8 @@ class Randomizer:
         config: the section.
         model: the model, with the values that scales refer to.
         device: where the parameters are needed.
-        seed: of a generator of its own, so that initial states are those of a trial without randomization.
+        seed: the environment's; the generator is another one, with another seed made from this, so that initial states
+            are those of a trial without randomization and tell nothing of the numbers.
 
     Attributes:
         generator: source of the numbers.
@@ -63,7 +68,9 @@ class Randomizer:
     """
 
     def __init__(self, config: RandomizeConfig, model: mujoco.MjModel, device: torch.device, seed: int) -> None:
-        self.generator = torch.Generator(device=device).manual_seed(seed)
+        # With the seed of the generator of initial states, the numbers would be the very ones these are drawn from.
+        own = int(np.random.SeedSequence((seed, _STREAM)).generate_state(1)[0])
+        self.generator = torch.Generator(device=device).manual_seed(own)
         self._device = device
         chosen = {name: _chosen(model, name, draw) for name, draw in config.drawn.items()}
         owners = {name: _owners(model, name, rows) for name, rows in chosen.items()}

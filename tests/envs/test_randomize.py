@@ -63,6 +63,14 @@ def test_values_are_drawn_where_the_section_says() -> None:
     assert found["opt.gravity"][:, 2].max() < -8.8
 
 
+def test_numbers_are_not_those_that_initial_states_are_drawn_from() -> None:
+    """Fails where both generators have one seed: a policy that sees where it starts would know its friction."""
+    made = randomizer(ant(), seed=3, geom_friction={"low": 1e-9, "high": 1.0})
+    states = torch.rand((500, 1), generator=torch.Generator().manual_seed(3))
+    both = torch.cat((made.draw(500), states), dim=1).T
+    assert abs(float(torch.corrcoef(both)[0, 1])) < 0.2
+
+
 def test_a_muscle_is_stronger_by_its_force_not_by_its_range() -> None:
     model = mujoco.MjModel.from_xml_string(
         """<mujoco><worldbody><body><joint name="j" range="-57 57"/><geom size=".1"/></body></worldbody><actuator>
