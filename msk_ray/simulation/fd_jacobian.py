@@ -55,8 +55,7 @@ class FdJacobian(Backward):
         self._batch = batch
         m = batch.mjm
         self._sizes = {"ctrl": m.nu, "qpos": m.nv, "qvel": m.nv, "act": m.na, _QFRC: m.nv, _XFRC: 6 * m.nbody}
-        push = self.eps_applied * float(m.body_mass.sum()) * 9.81
-        self._eps = {**self.eps, _QFRC: push, _XFRC: push}
+        self._weight = float(m.body_mass.sum()) * 9.81
         self._device = device_of(batch)
         self._tangent = Tangent(batch.mjm, self._device)
 
@@ -131,9 +130,10 @@ class FdJacobian(Backward):
         steps = torch.ones(len(chunk), 1, 1, device=self._device)
         for k, (name, i) in enumerate(chunk):
             target = deltas if name == "qpos" else spread[name]
-            target[0, k, :, i] += self._eps[name]
-            target[1, k, :, i] -= self._eps[name]
-            steps[k] = 2.0 * self._eps[name]
+            eps = self.eps[name] if name in self.eps else self.eps_applied * self._weight
+            target[0, k, :, i] += eps
+            target[1, k, :, i] -= eps
+            steps[k] = 2.0 * eps
         if any(name == "qpos" for name, _ in chunk):
             spread["qpos"] = self._tangent.integrate(spread["qpos"], deltas)
         ctrl, qpos, qvel, act, *forces = (value.flatten(0, 2) for value in spread.values())

@@ -9,6 +9,7 @@ import mujoco_warp as mjw
 import numpy as np
 import pytest
 import warp as wp
+from displacements import displaced, turned
 from mujoco_warp import GeomType
 
 from msk_ray.physics.adjoint.capsule_box import capsule_box_wrenches
@@ -87,16 +88,6 @@ def two_bodies(shape: str, flag: str, margin: float) -> mujoco.MjModel:
     )
 
 
-def turned(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Quaternion after a rotation by a vector in the world's frame."""
-    angle = float(np.linalg.norm(vector))
-    turn = np.zeros(4)
-    mujoco.mju_axisAngle2Quat(turn, vector / max(angle, 1e-12), angle)
-    out = np.zeros(4)
-    mujoco.mju_mulQuat(out, turn, quat)
-    return out
-
-
 def touching(model: mujoco.MjModel, shape: str, tilt: float, rng: np.random.Generator) -> np.ndarray:
     """A pose in which the upper body has been lowered onto the lower one until it touches, tilted a little."""
     data = mujoco.MjData(model)
@@ -144,24 +135,6 @@ def contacts(model: mujoco.MjModel, poses: np.ndarray) -> tuple[list[dict[int, n
     return found, d.geom_xpos.numpy(), d.geom_xmat.numpy()
 
 
-def displaced(pose: np.ndarray) -> np.ndarray:
-    """The pose, then both signs of each of 12 displacements: (force 1, torque 1, force 2, torque 2) read them off."""
-    poses = [pose]
-    for address in (0, 7):
-        for turn in (False, True):
-            for k in range(3):
-                for sign in (1, -1):
-                    moved = pose.copy()
-                    step = np.zeros(3)
-                    step[k] = sign * EPS
-                    if turn:
-                        moved[address + 3 : address + 7] = turned(moved[address + 3 : address + 7], step)
-                    else:
-                        moved[address : address + 3] += step
-                    poses.append(moved)
-    return np.array(poses)
-
-
 @pytest.mark.parametrize(
     ("shape", "tilt", "flag", "margin"),
     [
@@ -179,7 +152,7 @@ def test_contact_follows_both_bodies(shape, tilt, flag, margin):
     rng = np.random.default_rng(1)
     model = two_bodies(shape, flag, margin)
     poses = [touching(model, shape, tilt, rng) for _ in range(24)]
-    found, geom_pos, geom_mat = contacts(model, np.concatenate([displaced(p) for p in poses]))
+    found, geom_pos, geom_mat = contacts(model, np.array([moved for p in poses for moved in (p, *displaced(p, EPS))]))
     rows, differences, weights = [], [], []
     for i in range(len(poses)):
         worlds = found[25 * i : 25 * (i + 1)]

@@ -12,6 +12,7 @@ import mujoco_warp as mjw
 import numpy as np
 import pytest
 import warp as wp
+from displacements import displaced, turned
 
 from msk_ray.physics.adjoint.convex import convex_wrenches, solid_of
 from msk_ray.physics.adjoint.convex_laws import Bars, Seen
@@ -88,15 +89,6 @@ def two_bodies(first: str, second: str, flag: str = "", margin: float = 0.0) -> 
     return model
 
 
-def turned(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Quaternion after a rotation by a vector in the world's frame."""
-    angle = float(np.linalg.norm(vector))
-    turn, out = np.zeros(4), np.zeros(4)
-    mujoco.mju_axisAngle2Quat(turn, vector / max(angle, 1e-12), angle)
-    mujoco.mju_mulQuat(out, turn, quat)
-    return out
-
-
 class Step(NamedTuple):
     """A displacement for differences, and the second difference per displacement above which a kink lies in them."""
 
@@ -122,24 +114,6 @@ def contacts(data: mujoco.MjData, qpos: np.ndarray) -> list[Contact]:
     mujoco.mj_kinematics(data.model, data)
     mujoco.mj_collision(data.model, data)
     return [Contact(c.dist, c.pos.copy(), c.frame[:3].copy()) for c in data.contact]
-
-
-def displaced(qpos: np.ndarray, size: float) -> list[np.ndarray]:
-    """Both signs of each of 12 displacements: (force 1, torque 1, force 2, torque 2) read them off."""
-    poses = []
-    for address in (0, 7):
-        for turn in (False, True):
-            for k in range(3):
-                for sign in (1, -1):
-                    moved = qpos.copy()
-                    step = np.zeros(3)
-                    step[k] = sign * size
-                    if turn:
-                        moved[address + 3 : address + 7] = turned(moved[address + 3 : address + 7], step)
-                    else:
-                        moved[address : address + 3] += step
-                    poses.append(moved)
-    return poses
 
 
 def slopes(

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,9 +10,7 @@ from pathlib import Path
 import pytest
 import stub_trainer
 from ray import cloudpickle
-from stub_trainer import (
-    StubTrainer,
-)
+from stub_trainer import StubTrainer
 
 from msk_ray.experiment.results import TrialRecord, read_records
 from msk_ray.sweep import opening
@@ -48,11 +47,21 @@ def go(space: Space, path: Path, resume: bool = False) -> tuple[bool, list[Trial
     return completed, read_records(experiment)
 
 
+def interrupted(space: Space, path: Path) -> list[TrialRecord]:
+    """A sweep that is asked to stop, by a signal, once a trial has begun to train."""
+    timer = threading.Thread(target=_terminate_when, args=(path,))
+    timer.start()
+    completed, records = go(space, path)
+    timer.join()
+    assert not completed
+    return records
+
+
 def outcomes(records: list[TrialRecord]) -> list[str | None]:
     return [record.ending and str(record.ending.outcome) for record in records]
 
 
-def terminate_when(path: Path) -> None:
+def _terminate_when(path: Path) -> None:
     """SIGTERM to this process once a trial has begun to train."""
     while not list(path.glob("trials/*/checkpoints/epoch_000004.pt")):
         if (path / "summary.json").exists():

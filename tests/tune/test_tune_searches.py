@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from stub_runs import go, outcomes, terminate_when
+from stub_runs import go, interrupted, outcomes
 from stub_trainer import (
     StubTrainer,
 )
@@ -37,11 +37,7 @@ def test_asha_stops_the_bad_ones_and_a_stop_request_is_resumable(
         overrides={"trial.epochs": 60},
     )
     path = tmp_path / "runs" / "asha"
-    timer = threading.Thread(target=terminate_when, args=(path,))
-    timer.start()
-    completed, records = go(space, path)
-    timer.join()
-    assert not completed
+    records = interrupted(space, path)
     assert None in outcomes(records)
     completed, records = go(space, path, resume=True)
     assert completed
@@ -94,11 +90,7 @@ def test_optuna_goes_on_where_it_was(make_space: Any, tmp_path: Path) -> None:
         overrides={"trial.epochs": 100},
     )
     path = tmp_path / "runs" / "optuna"
-    timer = threading.Thread(target=terminate_when, args=(path,))
-    timer.start()
-    completed, before = go(space, path)
-    timer.join()
-    assert not completed
+    before = interrupted(space, path)
     assert None in outcomes(before)
     # As after a driver that was killed: the manifest does not know the trials yet.
     Experiment(path).set_trials([])
@@ -124,11 +116,7 @@ def test_a_population_goes_on_where_it_was(make_space: Any, tmp_path: Path) -> N
         overrides={"evaluation.interval": 20, "trial.epochs": 100},
     )
     path = tmp_path / "runs" / "pbt"
-    timer = threading.Thread(target=terminate_when, args=(path,))
-    timer.start()
-    completed, before = go(space, path)
-    timer.join()
-    assert not completed
+    before = interrupted(space, path)
     reached = [record.epochs_done for record in before]
     completed, after = go(space, path, resume=True)
     assert completed

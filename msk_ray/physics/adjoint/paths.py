@@ -60,6 +60,18 @@ class Twists:
 
 
 @wp.func
+def rates_of(worldid: int, t: int, share: float, tendon_bars_in: TendonBars) -> Rates:
+    """Those of a tendon on a stretch of path that has this share of its length."""
+    out = Rates()
+    out.lam = share * tendon_bars_in.lam[worldid, t]
+    out.qacc = share * tendon_bars_in.qacc[worldid, t]
+    out.qvel = share * tendon_bars_in.qvel[worldid, t]
+    out.mu = share * tendon_bars_in.mu[worldid, t]
+    out.smooth = share * tendon_bars_in.smooth[worldid, t]
+    return out
+
+
+@wp.func
 def weigh(rates: Rates, fields: Twists) -> wp.spatial_vectorf:
     """Σ_x ρ̄(x) V(x): one field that carries all that a direction's cotangent needs."""
     out = rates.lam * fields.lam + rates.qacc * fields.qacc + rates.qvel * fields.qvel
@@ -143,13 +155,7 @@ def pull_paths(
     worldid, e = wp.tid()
     t = paths.segment_tendon[e]
     first = paths.segment_first[e]
-    share = paths.wrap_pulley_scale[first]
-    rates = Rates()
-    rates.lam = share * tendon_bars_in.lam[worldid, t]
-    rates.qacc = share * tendon_bars_in.qacc[worldid, t]
-    rates.qvel = share * tendon_bars_in.qvel[worldid, t]
-    rates.mu = share * tendon_bars_in.mu[worldid, t]
-    rates.smooth = share * tendon_bars_in.smooth[worldid, t]
+    rates = rates_of(worldid, t, paths.wrap_pulley_scale[first], tendon_bars_in)
     site0 = paths.wrap_objid[first]
     site1 = paths.wrap_objid[paths.segment_last[e]]
     body0 = paths.site_bodyid[site0]

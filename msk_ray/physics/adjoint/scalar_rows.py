@@ -93,6 +93,40 @@ class RowSettings:
     eq_data: wp.array2d[vec12]
 
 
+@wp.struct
+class RowSpring:
+    """Solver parameters of a row; `known` is false for rows of contacts."""
+
+    known: bool
+    solref: wp.vec2
+    solimp: vec5
+
+
+@wp.func
+def row_spring(worldid: int, kind: int, ident: int, settings: RowSettings) -> RowSpring:
+    """Solver parameters of the limit, friction loss or equality `ident` that makes a row."""
+    out = RowSpring()
+    out.known = True
+    if kind == ConstraintType.LIMIT_JOINT:
+        out.solref = settings.jnt_solref[worldid % settings.jnt_solref.shape[0], ident]
+        out.solimp = settings.jnt_solimp[worldid % settings.jnt_solimp.shape[0], ident]
+    elif kind == ConstraintType.FRICTION_DOF:
+        out.solref = settings.dof_solref[worldid % settings.dof_solref.shape[0], ident]
+        out.solimp = settings.dof_solimp[worldid % settings.dof_solimp.shape[0], ident]
+    elif kind == ConstraintType.LIMIT_TENDON:
+        out.solref = settings.tendon_solref_lim[worldid % settings.tendon_solref_lim.shape[0], ident]
+        out.solimp = settings.tendon_solimp_lim[worldid % settings.tendon_solimp_lim.shape[0], ident]
+    elif kind == ConstraintType.FRICTION_TENDON:
+        out.solref = settings.tendon_solref_fri[worldid % settings.tendon_solref_fri.shape[0], ident]
+        out.solimp = settings.tendon_solimp_fri[worldid % settings.tendon_solimp_fri.shape[0], ident]
+    elif kind == ConstraintType.EQUALITY:
+        out.solref = settings.eq_solref[worldid % settings.eq_solref.shape[0], ident]
+        out.solimp = settings.eq_solimp[worldid % settings.eq_solimp.shape[0], ident]
+    else:
+        out.known = False
+    return out
+
+
 @wp.kernel
 def pull_rows(
     # Model:
@@ -124,30 +158,16 @@ def pull_rows(
     if s == 0.0 and f == 0.0:
         return
     ident = rows_in.id[worldid, row]
-    solref = wp.vec2(0.0)
-    solimp = vec5()
-    if kind == ConstraintType.LIMIT_JOINT:
-        solref = settings.jnt_solref[worldid % settings.jnt_solref.shape[0], ident]
-        solimp = settings.jnt_solimp[worldid % settings.jnt_solimp.shape[0], ident]
-    elif kind == ConstraintType.FRICTION_DOF:
-        solref = settings.dof_solref[worldid % settings.dof_solref.shape[0], ident]
-        solimp = settings.dof_solimp[worldid % settings.dof_solimp.shape[0], ident]
-    elif kind == ConstraintType.LIMIT_TENDON:
-        solref = settings.tendon_solref_lim[worldid % settings.tendon_solref_lim.shape[0], ident]
-        solimp = settings.tendon_solimp_lim[worldid % settings.tendon_solimp_lim.shape[0], ident]
-    elif kind == ConstraintType.FRICTION_TENDON:
-        solref = settings.tendon_solref_fri[worldid % settings.tendon_solref_fri.shape[0], ident]
-        solimp = settings.tendon_solimp_fri[worldid % settings.tendon_solimp_fri.shape[0], ident]
-    elif kind == ConstraintType.EQUALITY:
+    if kind == ConstraintType.EQUALITY:
         if settings.eq_type[ident] != EqType.JOINT and settings.eq_type[ident] != EqType.TENDON:
             return
-        solref = settings.eq_solref[worldid % settings.eq_solref.shape[0], ident]
-        solimp = settings.eq_solimp[worldid % settings.eq_solimp.shape[0], ident]
-    else:
+    spring = row_spring(worldid, kind, ident, settings)
+    if not spring.known:
         return
 
     pos = rows_in.pos[worldid, row] - rows_in.margin[worldid, row]
-    slopes = row_slopes(opt_disableflags, opt_timestep[worldid % opt_timestep.shape[0]], solref, solimp, pos)
+    timestep = opt_timestep[worldid % opt_timestep.shape[0]]
+    slopes = row_slopes(opt_disableflags, timestep, spring.solref, spring.solimp, pos)
     rate = float(0.0)
     for j in range(lam_in.shape[1]):
         rate += jacobian_in[worldid, row, j] * lam_in[worldid, j]

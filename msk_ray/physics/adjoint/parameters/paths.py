@@ -13,7 +13,7 @@ from msk_ray.physics.adjoint.groups import Fields, Motion, Substep, TendonBars, 
 from msk_ray.physics.adjoint.inside_wrap import inside_score
 from msk_ray.physics.adjoint.parameters.base import ParameterStage, Parts, quat_gradient
 from msk_ray.physics.adjoint.parameters.geoms import GeomGradients
-from msk_ray.physics.adjoint.paths import Rates, Twists, fields_of, segment_turn, weigh, wrap_score
+from msk_ray.physics.adjoint.paths import Rates, Twists, fields_of, rates_of, segment_turn, weigh, wrap_score
 from msk_ray.physics.adjoint.spatial import point_velocity, turning_torque
 from msk_ray.physics.adjoint.wrapping import PathPoses, Paths
 from msk_ray.physics.mjw_private import MJ_MAXVAL, WrapType
@@ -88,12 +88,7 @@ def pull_path_parameters(
     first = paths.segment_first[e]
     share = paths.wrap_pulley_scale[first]
     pull = share * tendon_bars_in.length[worldid, t]
-    rates = Rates()
-    rates.lam = share * tendon_bars_in.lam[worldid, t]
-    rates.qacc = share * tendon_bars_in.qacc[worldid, t]
-    rates.qvel = share * tendon_bars_in.qvel[worldid, t]
-    rates.mu = share * tendon_bars_in.mu[worldid, t]
-    rates.smooth = share * tendon_bars_in.smooth[worldid, t]
+    rates = rates_of(worldid, t, share, tendon_bars_in)
     site0 = paths.wrap_objid[first]
     site1 = paths.wrap_objid[paths.segment_last[e]]
     body0 = paths.site_bodyid[site0]

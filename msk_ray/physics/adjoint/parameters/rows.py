@@ -8,7 +8,7 @@ from mujoco_warp import DisableBit, JointType
 from msk_ray.physics.adjoint.groups import Joints, RowLaws, Rows, State, Substep, TendonRows, gather
 from msk_ray.physics.adjoint.parameters.base import ParameterStage, Parts, TimestepGradient
 from msk_ray.physics.adjoint.parameters.row_laws import FRICTION, ONE_SIDED, TWO_SIDED, RowMotion, row_score
-from msk_ray.physics.adjoint.scalar_rows import RowSettings
+from msk_ray.physics.adjoint.scalar_rows import RowSettings, row_spring
 from msk_ray.physics.adjoint.tendons import tendon_rate
 from msk_ray.physics.capacity import scalar_rows
 from msk_ray.physics.mjw_private import ConstraintType, EqType, contact_kbimp, vec5
@@ -95,31 +95,18 @@ def pull_row_parameters(
     ident = rows_in.id[worldid, row]
     motion = RowMotion()
     motion.law = ONE_SIDED
-    solref = wp.vec2(0.0)
-    solimp = vec5()
+    spring = row_spring(worldid, kind, ident, settings)
+    if not spring.known:
+        return
+    solref = spring.solref
+    solimp = spring.solimp
     shared = bool(False)
-    if kind == ConstraintType.LIMIT_JOINT:
-        solref = settings.jnt_solref[worldid % settings.jnt_solref.shape[0], ident]
-        solimp = settings.jnt_solimp[worldid % settings.jnt_solimp.shape[0], ident]
-    elif kind == ConstraintType.FRICTION_DOF:
+    if kind == ConstraintType.FRICTION_DOF or kind == ConstraintType.FRICTION_TENDON:
         motion.law = FRICTION
-        solref = settings.dof_solref[worldid % settings.dof_solref.shape[0], ident]
-        solimp = settings.dof_solimp[worldid % settings.dof_solimp.shape[0], ident]
-    elif kind == ConstraintType.LIMIT_TENDON:
-        solref = settings.tendon_solref_lim[worldid % settings.tendon_solref_lim.shape[0], ident]
-        solimp = settings.tendon_solimp_lim[worldid % settings.tendon_solimp_lim.shape[0], ident]
-    elif kind == ConstraintType.FRICTION_TENDON:
-        motion.law = FRICTION
-        solref = settings.tendon_solref_fri[worldid % settings.tendon_solref_fri.shape[0], ident]
-        solimp = settings.tendon_solimp_fri[worldid % settings.tendon_solimp_fri.shape[0], ident]
     elif kind == ConstraintType.EQUALITY:
         motion.law = TWO_SIDED
-        solref = settings.eq_solref[worldid % settings.eq_solref.shape[0], ident]
-        solimp = settings.eq_solimp[worldid % settings.eq_solimp.shape[0], ident]
         # The rows of a connect or weld share one impedance.
         shared = settings.eq_type[ident] != EqType.JOINT and settings.eq_type[ident] != EqType.TENDON
-    else:
-        return
 
     for j in range(lam_in.shape[1]):
         motion.lam += jacobian_in[worldid, row, j] * lam_in[worldid, j]
