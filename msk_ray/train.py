@@ -41,7 +41,7 @@ checkpoints/ with the newest two and best.pt, the trained policy with the highes
 evaluation, the untrained policy)."""
 
 EXAMPLES = """\
-  python -m msk_ray.train --config configs/cartpole.yaml
+  python -m msk_ray.train --config cartpole
   python -m msk_ray.train --config configs/ant.yaml --device cuda:0 --seed 1 --set shac.horizon=32
   python -m msk_ray.train --config configs/ant.yaml --set 'shac.horizon={start: 8, end: 32, epochs: 100}'
   python -m msk_ray.train --config configs/cartpole.yaml --set algorithm.name=ppo
@@ -52,7 +52,9 @@ EXAMPLES = """\
 def parser() -> Parser:
     """The command line."""
     p = Parser("python -m msk_ray.train", DESCRIPTION, EXAMPLES)
-    p.add_argument("--config", type=Path, required=True, metavar="FILE", help="a YAML file, such as one of configs/")
+    p.add_argument(
+        "--config", type=Path, required=True, metavar="NAME|FILE", help="a config file, or a name in configs/"
+    )
     p.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help=SET_HELP)
     p.add_argument("--seed", type=int, help="same as --set trial.seed=N")
     p.add_argument("--device", help="cpu or cuda:N (default: the first GPU, or the CPU if there is none)")
@@ -133,7 +135,7 @@ def train(
     To continue an interrupted call from its last checkpoint, repeat it with `resume`.
 
     Example:
-        >>> trained = msk_ray.train(msk_ray.load_config("configs/cartpole.yaml"), "runs/mine")
+        >>> trained = msk_ray.train(msk_ray.load_config("cartpole"), "runs/mine")
         >>> policy = msk_ray.load_policy(trained.best_checkpoint)
 
     Args:

@@ -16,6 +16,7 @@ from msk_ray.config.schema import RECORDED, Config
 from msk_ray.config.unread import unread_settings
 from msk_ray.config.yaml_text import read_yaml
 from msk_ray.errors import ConfigError, brief, shortened
+from msk_ray.shipped import CONFIGS, find_shipped, is_name, shipped_names
 
 
 def parse_config(data: Mapping[str, Any], source: str = "config") -> Config:
@@ -67,14 +68,31 @@ def read_config(path: Path) -> dict[str, Any]:
     return merge(current_settings(base, name), current_settings(data, name))
 
 
+def find_config(path: str | Path) -> Path:
+    """The file of a config's path, or of its name in `configs/` of the current folder or of the package; a path to no
+    file is returned as it is, for `read_config` to describe.
+
+    Raises:
+        ConfigError: there is none of that name; the message lists the known ones.
+    """
+    found = find_shipped(path, CONFIGS, ".yaml")
+    if found is None and is_name(path):
+        known = ", ".join(shipped_names(CONFIGS, ".yaml"))
+        raise ConfigError(f"unknown config {brief(str(path))}; known: {known}, or give a path to a .yaml file")
+    return Path(path) if found is None else found
+
+
 def load_config(path: str | Path, overrides: Iterable[str] = ()) -> Config:
     """Read a config file and apply "a.b=value" overrides to it.
 
+    Args:
+        path: a file, or the name of one in `configs/` of the current folder or of the package.
+
     Raises:
-        ConfigError: as for `read_config`, `parse_override`, `parse_config` and `refuse_ignored`.
+        ConfigError: as for `find_config`, `read_config`, `parse_override`, `parse_config` and `refuse_ignored`.
     """
     values = parse_overrides(overrides)
-    config = parse_config(overlay(read_config(Path(path)), values), str(path))
+    config = parse_config(overlay(read_config(find_config(path)), values), str(path))
     refuse_ignored(values, [config], "--set")
     return config
 

@@ -131,14 +131,14 @@ def load_model(path: Path) -> "mujoco.MjModel":
     """
     import mujoco
 
-    if not path.is_file():
-        raise ConfigError(f"no model file {path}")
     if path.suffix in (".yaml", ".yml"):
         from msk_ray.config import load_config
         from msk_ray.envs import env_class
 
         config = load_config(path)
         return env_class(config.env).build_model(config.env, config.physics)
+    if not path.is_file():
+        raise ConfigError(f"no model file {path}")
     try:
         if path.suffix == ".mjb":
             return mujoco.MjModel.from_binary_path(str(path))

@@ -8,10 +8,10 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, SerializeAsAny, ValidationError
 
-import msk_ray
 from msk_ray.config import current_values, describe_fault, env_name, read_config, read_yaml
 from msk_ray.config.sections import Count, Section, Text, Whole
 from msk_ray.errors import ConfigError, brief
+from msk_ray.shipped import CONFIGS, SPACES, find_shipped, is_name, shipped_names
 from msk_ray.sweep.operators import Operator, Range, parse_operator
 from msk_ray.sweep.rules.early_stopping import SchedulerSpec
 from msk_ray.sweep.rules.no_scheduler import NoScheduler
@@ -58,7 +58,7 @@ class SpaceFile(Section):
     question: Text
     """The question that the experiment answers."""
     base: Text
-    """Config file, relative to the space file, the working directory, or the folder that holds `configs/`."""
+    """Config file: relative to the space file or its parent folder, or as `load_config` finds it."""
     overrides: dict[str, Any] = Field(default_factory=dict)
     """Dotted config keys set in every trial."""
     parameters: dict[str, Any] = Field(default_factory=dict)
@@ -108,22 +108,18 @@ class Space(Section):
 
 
 def find_space(name: str) -> Path:
-    """The file of a space's name or path: as given, in `tune_spaces/` of the current folder, or next to the package.
+    """The file of a space's path, or of its name in `tune_spaces/` of the current folder or of the package.
 
     Raises:
         ConfigError: there is none; the message lists the known spaces.
     """
-    folders = [Path.cwd() / "tune_spaces", _repository() / "tune_spaces"]
-    if name.endswith((".yaml", ".yml")) or "/" in name:
-        path = Path(name)
-        if not path.is_file():
-            raise ConfigError(f"no such space file: {name}")
-        return path.resolve()
-    for folder in folders:
-        if (folder / f"{name}.yaml").is_file():
-            return (folder / f"{name}.yaml").resolve()
-    known = sorted({path.stem for folder in folders for path in folder.glob("*.yaml")})
-    raise ConfigError(f"unknown space {name!r}; known: {', '.join(known) or 'none'}, or give a path to a .yaml file")
+    path = find_shipped(name, SPACES, ".yaml")
+    if path is not None:
+        return path
+    if not is_name(name):
+        raise ConfigError(f"no such space file: {name}")
+    known = ", ".join(shipped_names(SPACES, ".yaml"))
+    raise ConfigError(f"unknown space {name!r}; known: {known}, or give a path to a .yaml file")
 
 
 def load_space(path: Path) -> Space:
@@ -271,13 +267,11 @@ def _check_combination(file: SpaceFile, parameters: Mapping[str, Operator], seed
 
 
 def _find_base(base: str, space_path: Path) -> Path:
-    candidates = [space_path.parent / base, Path.cwd() / base, space_path.parent.parent / base, _repository() / base]
-    for candidate in candidates:
+    beside, cwd, above = space_path.parent / base, Path.cwd() / base, space_path.parent.parent / base
+    for candidate in (beside, cwd, above):
         if candidate.is_file():
             return candidate.resolve()
-    raise ConfigError(f"base: no such config file: {base}")
-
-
-def _repository() -> Path:
-    """The folder that contains the package; in a checkout also `configs/` and `tune_spaces/`."""
-    return Path(msk_ray.__file__).resolve().parent.parent
+    shipped = find_shipped(base, CONFIGS, ".yaml")
+    if shipped is None:
+        raise ConfigError(f"base: no such config file: {base}")
+    return shipped
