@@ -1,9 +1,10 @@
 """Every model of some PyPI packages: is its gradient exact, partly exact or refused, and how large is its error?
 
 Reads all MJCF files of the packages named in GROUPS and compiles those that are whole models with degrees of freedom;
-equal models count once. The packages are only needed for their files: `pip install --no-deps gymnasium
-gymnasium-robotics dm-control mjlab robosuite gym-aloha robopianist myo-sim musclemimic-models`. What is not installed
-is named and left out. A model's row is written to --rows as soon as it is known, and a later run goes on from there.
+myo_sim also composes models in Python, which are read from its registry. Equal models count once. The packages are only
+needed for their files: `pip install --no-deps gymnasium gymnasium-robotics dm-control mjlab robosuite gym-aloha
+robopianist myo-sim musclemimic-models`. What is not installed is named and left out. A model's row is written to --rows
+as soon as it is known, and a later run goes on from there.
 
 Convex collision runs at a tolerance of 1e-10, so that the errors are those of the gradient: at MuJoCo's default of 1e-6
 C MuJoCo's normals on curved surfaces are off by up to 5e-3 rad, and its differences with them.
@@ -15,10 +16,12 @@ import json
 import time
 import warnings
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import mujoco_warp as mjw
@@ -37,8 +40,16 @@ GROUPS = {
 }
 
 
-def files() -> Iterator[tuple[str, str, Path]]:
-    """(group, name, path) of every MJCF file; a package that is not installed is named on the way."""
+class Source(NamedTuple):
+    """Where a model is from; `load` gives its MjSpec, and raises ValueError for a part of other files."""
+
+    group: str
+    name: str
+    load: Callable[[], mujoco.MjSpec]
+
+
+def sources() -> Iterator[Source]:
+    """Every MJCF file and composed model; a package that is not installed is named on the way."""
     for group, packages in GROUPS.items():
         for package in packages:
             found = find_spec(package)
@@ -47,13 +58,18 @@ def files() -> Iterator[tuple[str, str, Path]]:
                 continue
             root = Path(next(iter(found.submodule_search_locations)))
             for path in sorted(root.rglob("*.xml")):
-                yield group, f"{package}/{path.relative_to(root)}", path
+                name = f"{package}/{path.relative_to(root)}"
+                yield Source(group, name, partial(mujoco.MjSpec.from_file, str(path)))
+            if package == "myo_sim":
+                load_spec = import_module("myo_sim").load_spec
+                for name in sorted(import_module("myo_sim.build.compose").MODEL_REGISTRY):
+                    yield Source(group, f"myo_sim.load_spec({name!r})", partial(load_spec, name))
 
 
-def compiled(path: Path) -> mujoco.MjModel | None:
-    """A file's model with a floor below it, or None for a part of other files or a model that cannot move."""
+def compiled(source: Source) -> mujoco.MjModel | None:
+    """A source's model with a floor below it, or None for a part of other files or a model that cannot move."""
     try:
-        spec = mujoco.MjSpec.from_file(str(path))
+        spec = source.load()
         if not any(geom.type == mujoco.mjtGeom.mjGEOM_PLANE for geom in spec.worldbody.geoms):
             spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[40, 40, 1])
         spec.option.ccd_tolerance = 1e-10
@@ -125,10 +141,11 @@ def gather_rows(args: argparse.Namespace) -> list[dict[str, Any]]:
     rows = [json.loads(line) for line in args.rows.read_text().splitlines()] if args.rows.exists() else []
     known = {row["model"] for row in rows}
     digests = {row["digest"] for row in rows if row["digest"]}
-    for group, name, path in files():
+    for source in sources():
+        group, name, _ = source
         if name in known or (args.only and args.only not in name):
             continue
-        model = compiled(path)
+        model = compiled(source)
         if model is None:
             row: dict[str, Any] = {"group": group, "model": name, "verdict": "no model", "digest": ""}
         elif digest(model) in digests:
