@@ -14,6 +14,9 @@ ENVIRONMENTS = Registry(
     {
         "cartpole": "msk_ray.envs.cartpole.env:CartPole",
         "ant": "msk_ray.envs.ant.env:Ant",
+        "hopper": "msk_ray.envs.hopper.env:Hopper",
+        "cheetah": "msk_ray.envs.cheetah.env:Cheetah",
+        "humanoid": "msk_ray.envs.humanoid.env:Humanoid",
         "myoleg26": "msk_ray.envs.myoleg26.env:MyoLeg26",
         "myoleg": "msk_ray.envs.myoleg.env:MyoLeg",
     },
@@ -25,6 +28,9 @@ SETTINGS = Registry(
     {
         "cartpole": "msk_ray.envs.cartpole.config:CartPoleSettings",
         "ant": "msk_ray.envs.ant.config:AntSettings",
+        "hopper": "msk_ray.envs.hopper.config:HopperSettings",
+        "cheetah": "msk_ray.envs.cheetah.config:CheetahSettings",
+        "humanoid": "msk_ray.envs.humanoid.config:HumanoidSettings",
         "myoleg26": "msk_ray.envs.myoleg26.config:MyoLeg26Settings",
         "myoleg": "msk_ray.envs.myoleg.config:MyoLegSettings",
     },

@@ -55,7 +55,8 @@ class PhysicsConfig(Section):
     """How the model is built, stepped and differentiated. Fields left null keep the variant's value."""
 
     variant: Text | None = None
-    """Named physics of the environment: for ant `published`, `matched` or `matched_hard_friction`."""
+    """Named physics of the environment: for hopper, cheetah and humanoid `published` or `matched`, for ant also
+    `matched_hard_friction`."""
     backward: Literal["tape_per_substep", "tape_all", "fd_jacobian", "hybrid"] = "tape_per_substep"
     """Backward mode of the step. `tape_*` are exact; `fd_jacobian` differentiates any model by finite differences;
     `hybrid` takes the state's gradient from the tape and the control's from finite differences, for diagnosis."""

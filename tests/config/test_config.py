@@ -37,8 +37,9 @@ def test_a_config_survives_a_round_trip() -> None:
         ({**CARTPOLE, "physics": {"friction": 0.5}}, "physics.friction: env cartpole does not read it; leave it out"),
         ({"env": {"name": "ant"}, "physics": {"cone": "pyramidal", "solreffriction": [1, 1]}}, "cone: elliptic"),
         (
-            {"env": {"name": "hopper"}},
-            "env.name: unknown name 'hopper'; write cartpole, ant, myoleg26, myoleg or package.module:Class",
+            {"env": {"name": "swimmer"}},
+            "env.name: unknown name 'swimmer'; write cartpole, ant, hopper, cheetah, humanoid, myoleg26, myoleg or "
+            "package.module:Class",
         ),
         ({**CARTPOLE, "shac": {"critic_batches": 7}}, "critic_batches 7 must divide"),
         ({}, "env: missing"),

@@ -14,7 +14,7 @@ from msk_ray.errors import ConfigError
 from msk_ray.simulation.modes import BACKWARD_MODES, configured_backward
 
 VALUES: dict[str, Any] = {
-    "variant": "matched_hard_friction",
+    "variant": "published",
     "substep_grad_clip": 5.0,
     "contact_reach": 0.02,
     "substeps": 7,
@@ -46,6 +46,9 @@ REFUSED = {
     "cartpole": {"variant", "tolerance", "iterations", "ls_iterations", "cone", "impratio", "solref", "solimp"}
     | {"friction", "solreffriction", "solref_limit", "solimp_limit", "nconmax", "njmax", "fd.eps_act"},
     "ant": {"fd.eps_act"},
+    "hopper": {"fd.eps_act"},
+    "cheetah": {"fd.eps_act"},
+    "humanoid": {"fd.eps_act", "gear"},
     "myoleg26": {"variant", "gear"},
     "myoleg": {"variant", "gear", "solref", "solimp", "friction", "solreffriction", "solref_limit", "solimp_limit"}
     | {"joint_damping", "armature"},

@@ -46,7 +46,7 @@ def _other(value: Any) -> Any:
     return value
 
 
-@pytest.mark.parametrize("name", ["cartpole", "ant", "myoleg26", "myoleg"])
+@pytest.mark.parametrize("name", ["cartpole", "ant", "hopper", "cheetah", "humanoid", "myoleg26", "myoleg"])
 def test_only_the_reward_is_reset(name: str) -> None:
     default = parse_config({"env": {"name": name}}).env
     env = env_class(default)

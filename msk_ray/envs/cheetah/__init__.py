@@ -1,0 +1,1 @@
+"""A planar body on two legs with six motors, in two named physics."""

@@ -1,0 +1,53 @@
+"""Cheetah along +x; reward, observation and reset as in SHAC's experiments (arXiv:2204.07137)."""
+
+import mujoco
+import torch
+from torch import Tensor
+
+from msk_ray.config import PhysicsConfig
+from msk_ray.envs.base import Env
+from msk_ray.envs.cheetah.config import CheetahSettings
+from msk_ray.envs.cheetah.model import build_cheetah
+from msk_ray.simulation import StepState
+
+_START_HEIGHT = -0.2
+
+
+class Cheetah(Env[CheetahSettings]):
+    """Observation (17), in this order; source: `envs/cheetah.py` of github.com/NVlabs/DiffRL.
+
+    ====== ==================================================================
+    0      torso height above 1 m [m]
+    1      pitch [rad]
+    2-7    joint angles: thigh, shin and foot of the hind, then fore leg [rad]
+    8, 9   torso velocity along x and z [m/s]
+    10     pitch rate [rad/s]
+    11-16  joint velocities [rad/s]
+    ====== ==================================================================
+    """
+
+    obs_size = 17
+    Settings = CheetahSettings
+    reward_names = ("forward_vel", "action")
+
+    @classmethod
+    def build_model(cls, config: CheetahSettings, physics: PhysicsConfig) -> mujoco.MjModel:
+        return build_cheetah(config, physics)
+
+    def prepare(self) -> None:
+        self._start = torch.zeros(9, device=self.device)
+        self._start[1] = _START_HEIGHT
+
+    def draw_physics(self, count: int) -> StepState:
+        qpos, qvel = self._start + 0.1 * self.uniform(count, 9), 0.25 * self.uniform(count, 9)
+        return StepState(qpos, qvel, torch.zeros((count, 0), device=self.device))
+
+    def observe(self, state: StepState, action: Tensor) -> Tensor:
+        return torch.cat((state.qpos[:, 1:], state.qvel), dim=-1)
+
+    def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+        r = self.config.reward
+        return torch.stack((r.forward_vel * obs[:, 8], -r.action_penalty * action.square().sum(-1)), dim=-1)
+
+    def outcome_terms(self, state: StepState) -> dict[str, Tensor]:
+        return {"vx": state.qvel[:, 0]}

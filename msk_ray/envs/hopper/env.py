@@ -1,0 +1,67 @@
+"""Hopper along +x; reward, observation, reset and termination as in SHAC's experiments (arXiv:2204.07137)."""
+
+import math
+
+import mujoco
+import torch
+from torch import Tensor
+
+from msk_ray.config import PhysicsConfig
+from msk_ray.envs.base import Env
+from msk_ray.envs.hopper.config import HopperSettings
+from msk_ray.envs.hopper.model import build_hopper
+from msk_ray.simulation import StepState
+
+_FULL_ANGLE = math.pi / 6
+_TOP = 0.3
+_BOTTOM = -1.0
+
+
+class Hopper(Env[HopperSettings]):
+    """Observation (11), in this order; source: `envs/hopper.py` of github.com/NVlabs/DiffRL.
+
+    ===== ===================================================
+    0     torso height above 1.25 m [m]
+    1     pitch [rad]
+    2-4   joint angles: thigh, leg, foot [rad]
+    5, 6  torso velocity along x and z [m/s]
+    7     pitch rate [rad/s]
+    8-10  joint velocities [rad/s]
+    ===== ===================================================
+    """
+
+    obs_size = 11
+    Settings = HopperSettings
+    reward_names = ("forward_vel", "height", "upright", "action")
+
+    @classmethod
+    def build_model(cls, config: HopperSettings, physics: PhysicsConfig) -> mujoco.MjModel:
+        return build_hopper(config, physics)
+
+    def draw_physics(self, count: int) -> StepState:
+        qpos, qvel = 0.05 * self.uniform(count, 6), 0.05 * self.uniform(count, 6)
+        return StepState(qpos, qvel, torch.zeros((count, 0), device=self.device))
+
+    def observe(self, state: StepState, action: Tensor) -> Tensor:
+        return torch.cat((state.qpos[:, 1:], state.qvel), dim=-1)
+
+    def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+        r = self.config.reward
+        above = (obs[:, 0] - r.full_height).clamp(_BOTTOM, _TOP)
+        return torch.stack(
+            (
+                r.forward_vel * obs[:, 5],
+                torch.where(above < 0.0, -r.drop * above.square(), r.height * above),
+                r.upright * (1.0 - (obs[:, 1] / _FULL_ANGLE).square()),
+                -r.action_penalty * action.square().sum(-1),
+            ),
+            dim=-1,
+        )
+
+    def fell(self, state: StepState) -> Tensor:
+        if not self.config.early_termination:
+            return super().fell(state)
+        return state.qpos[:, 1] < self.config.termination_height
+
+    def outcome_terms(self, state: StepState) -> dict[str, Tensor]:
+        return {"vx": state.qvel[:, 0]}

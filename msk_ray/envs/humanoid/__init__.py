@@ -1,0 +1,1 @@
+"""A walker on two legs with 21 motors, in two named physics."""
