@@ -38,7 +38,7 @@ Train one policy, by SHAC or another algorithm: one trial, in this process, with
 
 Writes into the log folder: config.yaml (every setting), metrics.jsonl (one row per epoch), TensorBoard events and
 checkpoints/ with the newest two and best.pt, the trained policy with the highest evaluation score (until the first
-evaluation, the untrained policy)."""
+score, the untrained policy)."""
 
 EXAMPLES = """\
   python -m msk_ray.train --config cartpole
@@ -61,6 +61,11 @@ def parser() -> Parser:
     p.add_argument("--logdir", type=Path, metavar="DIR", help="log folder (default: runs/train/CONFIG_seedN)")
     p.add_argument(
         "--resume", action="store_true", help="continue from the newest complete checkpoint in the log folder"
+    )
+    p.add_argument(
+        "--score-at-once",
+        action="store_true",
+        help="score each policy when it is due; on a GPU, several are otherwise scored together, which takes less time",
     )
     p.add_argument(
         "--force",
@@ -128,6 +133,7 @@ def train(
     *,
     resume: bool = False,
     force: bool = False,
+    score_at_once: bool = False,
     on_epoch: Callable[[dict[str, float]], None] | None = None,
 ) -> Trained:
     """Train one policy in this process, like the command, but without printing.
@@ -144,6 +150,8 @@ def train(
         device: cpu or cuda:N; by default the first GPU, or the CPU if there is none.
         resume: continue from the newest complete checkpoint in `logdir`.
         force: take over the folder although its owner seems to be running.
+        score_at_once: score each policy when it is due. Otherwise, on a GPU, several are scored together, at most two
+            minutes later, and their scores are then added to their rows in `metrics.jsonl`.
         on_epoch: called with each epoch's row of metrics.
 
     Raises:
@@ -156,7 +164,7 @@ def train(
     folder = Path(logdir)
     _check_logdir(folder, resume)
     with owned(folder.resolve(), force) as ownership:
-        trainer = _trainer(config, ownership.folder, _choose_device(device), resume)
+        trainer = _trainer(config, ownership.folder, _choose_device(device), resume, score_at_once)
         if resume:
             for fault in trainer.restore_latest()[1]:
                 warnings.warn(f"skipped: {fault}", stacklevel=2)
@@ -180,10 +188,10 @@ def _choose_device(asked: str | None) -> str:
     return asked or ("cuda:0" if torch.cuda.is_available() else "cpu")
 
 
-def _trainer(config: Config, logdir: Path, device: str, resume: bool) -> "Trainer":
+def _trainer(config: Config, logdir: Path, device: str, resume: bool, score_at_once: bool) -> "Trainer":
     """A trainer of the trial in `logdir`, at its start."""
     # torch and Warp take seconds to load; a wrong command line should not wait for them.
-    from msk_ray.training import Trainer
+    from msk_ray.training import MOST_TOGETHER, Trainer
     from msk_ray.training.checkpoint import newest_valid_checkpoint
 
     if resume:
@@ -192,7 +200,7 @@ def _trainer(config: Config, logdir: Path, device: str, resume: bool) -> "Traine
             raise CheckpointError(
                 f"--resume: no checkpoint in {logdir} is complete ({faults[0]}); choose another --logdir to start again"
             )
-    return Trainer(config, logdir, device)
+    return Trainer(config, logdir, device, 1 if score_at_once or device == "cpu" else MOST_TOGETHER)
 
 
 def _train(
@@ -206,12 +214,14 @@ def _train(
         f"{config.env.name}: {config.trial.epochs} epochs, {config.env.nworld} worlds, on {device}; log folder {logdir}"
     )
     print("preparing kernels (a first run compiles them, up to a minute) ...", flush=True)
-    trainer = _trainer(config, logdir, device, args.resume)
+    trainer = _trainer(config, logdir, device, args.resume, args.score_at_once)
     if args.resume:
         path, faults = trainer.restore_latest()
         for fault in faults:
             print(f"skipped: {printable(fault)}")
         print(f"resumed from {path}" if path else "no complete checkpoint yet: starting from the beginning")
+    if trainer.together > 1:
+        print(f"policies are scored {trainer.together} at a time, after two minutes at most (or --score-at-once)")
     progress = ProgressLine(config.trial.epochs, trainer.epoch)
     with stop.deferred():
         while not trainer.finished and not stop:
@@ -221,6 +231,7 @@ def _train(
         if not trainer.finished:
             ownership.check()
             trainer.save()
+            trainer.score_waiting()
             trainer.close()
             assert stop.signal is not None
             command = printable(resume_command)

@@ -201,7 +201,10 @@ class Env(ABC, Generic[SettingsT]):
 
     def draw_resets(self, steps: int) -> Resets:
         """What the episodes that may begin in the next `steps` env steps begin with, one step after the other."""
-        count = steps * self.nworld
+        return self.draw_episodes(steps * self.nworld)
+
+    def draw_episodes(self, count: int) -> Resets:
+        """What `count` episodes begin with."""
         if self.randomizer is None:
             return Resets(self.draw_physics(count), torch.zeros((count, 0), device=self.device))
         return Resets(self.draw_physics(count), self.randomizer.draw(count))

@@ -15,6 +15,7 @@ The consequences of a damaged file:
 | `env.json` | the file, a field | versions and command are unknown |
 | `eval.json` | the file, an entry | refused: remove it to have it written again |
 | a checkpoint | the file | skipped in favour of the one before; `best.pt` is refused when it is needed |
+| `unscored_*.pt` | the file | its policy gets no score; a resumed trial says so |
 
 `summary.json`, `table.md` and the report are written and never read.
 """

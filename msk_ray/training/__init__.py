@@ -4,9 +4,10 @@ from msk_ray.experiment.metrics import read_metrics
 from msk_ray.training.checkpoint import newest_valid_checkpoint, read_checkpoint
 from msk_ray.training.evaluation import Evaluator
 from msk_ray.training.policy import SavedPolicy, load_policy
-from msk_ray.training.trainer import Trainer, precompile
+from msk_ray.training.trainer import MOST_TOGETHER, Trainer, precompile
 
 __all__ = [
+    "MOST_TOGETHER",
     "Evaluator",
     "SavedPolicy",
     "Trainer",

@@ -12,6 +12,7 @@ from msk_ray.experiment.checkpoint_file import read_checkpoint_file, remove_chec
 
 _EPOCH_NAME = re.compile(r"epoch_(\d+)\.pt")
 _POLICY_NAME = re.compile(r"policy_(\d+)\.pt")
+_UNSCORED_NAME = re.compile(r"unscored_(\d+)\.pt")
 
 
 def write_checkpoint(path: Path, state: dict[str, Any], facts: dict[str, Any]) -> Path:
@@ -74,6 +75,16 @@ def milestones(folder: Path) -> list[tuple[int, Path]]:
 def milestone_path(folder: Path, epoch: int) -> Path:
     """Where the policy of an epoch is kept."""
     return folder / f"policy_{epoch:06d}.pt"
+
+
+def unscored_checkpoints(folder: Path) -> list[tuple[int, Path]]:
+    """States of a trial whose policies wait for their scores, as (epoch, path), oldest first."""
+    return _numbered(folder, _UNSCORED_NAME)
+
+
+def unscored_path(folder: Path, epoch: int) -> Path:
+    """Where the state of an epoch waits for the score of its policy."""
+    return folder / f"unscored_{epoch:06d}.pt"
 
 
 def _numbered(folder: Path, name: re.Pattern[str]) -> list[tuple[int, Path]]:

@@ -1,17 +1,18 @@
 """Deterministic evaluation on fixed seeds: the canonical score."""
 
 import math
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from msk_ray.config import Config, PhysicsConfig, RandomizeConfig
-from msk_ray.envs import env_class, make_env
+from msk_ray.envs import Env, env_class, make_env
+from msk_ray.envs.base import Resets, Transition
 from msk_ray.simulation import StepState
+from msk_ray.training.policy_group import Policy, PolicyGroup
 
-Policy = Callable[[Tensor], Tensor]
 OnStep = Callable[[StepState, Tensor], None]
 _CHECK_EVERY = 25
 """Env steps between looks at whether any world still runs."""
@@ -37,19 +38,27 @@ class Episodes(NamedTuple):
 
     def cpu(self) -> "Episodes":
         """The same on the CPU."""
+        return self._mapped(Tensor.cpu)
+
+    def worlds(self, chosen: slice, *, success: bool) -> "Episodes":
+        """Those of some worlds; without their success if that is not wanted."""
+        part = self._mapped(lambda value: value[chosen])
+        return part if success else part._replace(success=None)
+
+    def _mapped(self, change: Callable[[Tensor], Tensor]) -> "Episodes":
         return self._replace(
-            score=self.score.cpu(),
-            length=self.length.cpu(),
-            fell=self.fell.cpu(),
-            diverged=self.diverged.cpu(),
-            terms=self.terms.cpu(),
-            outcomes={name: value.cpu() for name, value in self.outcomes.items()},
-            success=None if self.success is None else self.success.cpu(),
+            score=change(self.score),
+            length=change(self.length),
+            fell=change(self.fell),
+            diverged=change(self.diverged),
+            terms=change(self.terms),
+            outcomes={name: change(value) for name, value in self.outcomes.items()},
+            success=None if self.success is None else change(self.success),
         )
 
 
 class Evaluator:
-    """Runs a policy from the same initial states every time, under reference rewards and reference physics.
+    """Runs policies from the same initial states every time, under reference rewards and reference physics.
 
     The score is R_ref: the return of each world's first episode under the environment's default reward weights,
     whatever weights the trial trains on, and under the physics of `evaluation.variant` (the environment's reference if
@@ -61,6 +70,7 @@ class Evaluator:
         device: "cpu" or "cuda:N".
         physics: physics to use instead of the reference.
         varied: parameters of the model that are other than its own. What training draws does not apply.
+        policies: number of policies that can be run at the same time, each in `evaluation.nworld` worlds of its own.
     """
 
     def __init__(
@@ -69,6 +79,7 @@ class Evaluator:
         device: str,
         physics: PhysicsConfig | None = None,
         varied: RandomizeConfig | None = None,
+        policies: int = 1,
     ) -> None:
         e = config.evaluation
         self._seed = e.seed
@@ -79,12 +90,14 @@ class Evaluator:
         if physics is None:
             physics = env_type.reference_physics(config.physics, e.variant)
         physics = physics.model_copy(update={"randomize": varied})
-        self.env = make_env(settings, physics, e.nworld, device, e.seed, differentiable=False, randomize=True)
+        nworld = policies * e.nworld
+        self.env = make_env(settings, physics, nworld, device, e.seed, differentiable=False, randomize=True)
         self.env.generator = torch.Generator()
         self.steps = steps
+        self._policies = policies
+        self._worlds = e.nworld
         self._tail = min(steps, math.ceil(1.0 / settings.control_timestep))
 
-    @torch.no_grad()
     def episodes(self, policy: Policy, seed: int | None = None, on_step: OnStep | None = None) -> Episodes:
         """Run every world's first episode.
 
@@ -97,16 +110,32 @@ class Evaluator:
         Raises:
             SimulationError: contacts or constraint rows were lost to a full buffer.
         """
+        return self._episodes([policy], seed, on_step)[0]
+
+    def run(self, policies: Sequence[Policy]) -> list[dict[str, float]]:
+        """Evaluate policies from raw observations (W, O) to actions (W, A). Each gets the figures that it gets alone.
+
+        Returns:
+            For each its `score` and the standard deviation over worlds, mean episode `length`, `fall_rate`,
+            `diverged_rate`, mean return of each reward term, step means of the environment's outcome terms, and
+            `success_rate` where the environment defines success.
+
+        Raises:
+            SimulationError: as for `episodes`.
+        """
+        at_once = (policies[first : first + self._policies] for first in range(0, len(policies), self._policies))
+        return [self._figures(episodes) for some in at_once for episodes in self._episodes(some)]
+
+    @torch.no_grad()
+    def _episodes(
+        self, policies: Sequence[Policy], seed: int | None = None, on_step: OnStep | None = None
+    ) -> list[Episodes]:
+        """The episodes of each of at most as many policies as there is room for."""
         env = self.env
         env.generator.manual_seed(self._seed if seed is None else seed)
-        env.state = env.reset_state()
-        zeros = torch.zeros(env.nworld, device=env.device)
-        alive = torch.ones(env.nworld, dtype=torch.bool, device=env.device)
-        score, length = zeros.clone(), zeros.clone()
-        fell, diverged = ~alive, ~alive
-        terms = torch.zeros((env.nworld, len(env.reward_names)), device=env.device)
-        outcomes: dict[str, Tensor] = {}
-        tail: list[dict[str, Tensor]] = []
+        self._reset()
+        policy = PolicyGroup(policies, self._worlds, env)
+        record = _Record(env, len(policies), self._worlds, self.steps - self._tail)
         control = torch.zeros((env.nworld, env.model.nu), device=env.device)
         for step in range(self.steps):
             action = policy(env.observation())
@@ -114,36 +143,22 @@ class Evaluator:
                 control = env.control(action)
                 on_step(env.state.physics, control)
             transition = env.step(action, auto_reset=False)
-            outcome = env.outcome_terms(env.state.physics)
-            score += transition.reward.masked_fill(~alive, 0.0)
-            length += alive
-            terms += transition.terms.masked_fill(~alive[:, None], 0.0)
-            _accumulate(outcomes, outcome, alive)
-            if step >= self.steps - self._tail:
-                tail.append({name: value.masked_fill(~alive, 0.0) for name, value in outcome.items()})
-            fell |= alive & transition.terminated & ~transition.diverged
-            diverged |= alive & transition.diverged
-            alive &= ~transition.terminated
-            if step % _CHECK_EVERY == 0 and not alive.any():
+            record.add(step, transition, env.outcome_terms(env.state.physics))
+            if step % _CHECK_EVERY == 0 and step < self.steps - 1 and record.all_ended():
                 break
         if on_step is not None:
             on_step(env.state.physics, control)
         env.sim.diagnostics()  # raises if contacts were lost
-        success = None
-        if tail and len(tail) == self._tail:
-            met = env.success({name: torch.stack([t[name] for t in tail]) for name in tail[0]})
-            success = None if met is None else met & alive
-        return Episodes(score, length, fell, diverged, terms, outcomes, success)
+        return record.episodes()
 
-    def run(self, policy: Policy) -> dict[str, float]:
-        """Evaluate a policy from raw observations (W, O) to actions (W, A).
+    def _reset(self) -> None:
+        """Put the worlds of every policy into the same initial states."""
+        drawn = self.env.draw_episodes(self._worlds)
+        *physics, numbers = (t.repeat(self._policies, 1) for t in (*drawn.physics, drawn.numbers))
+        self.env.stock_resets(Resets(StepState(*physics), numbers))
+        self.env.state = self.env.reset_state()
 
-        Returns:
-            `score` and its standard deviation over worlds, mean episode `length`, `fall_rate`, `diverged_rate`, mean
-            return of each reward term, step means of the environment's outcome terms, and `success_rate` where the
-            environment defines success.
-        """
-        e = self.episodes(policy)
+    def _figures(self, e: Episodes) -> dict[str, float]:
         figures = {
             "score": e.score.mean(),
             "score_std": e.score.std() if len(e.score) > 1 else torch.zeros(()),
@@ -158,6 +173,56 @@ class Evaluator:
         return {name: float(value) for name, value in figures.items()}
 
 
-def _accumulate(totals: dict[str, Tensor], values: dict[str, Tensor], alive: Tensor) -> None:
-    for name, value in values.items():
-        totals[name] = totals.get(name, torch.zeros_like(value)) + value.masked_fill(~alive, 0.0)
+class _Record:
+    """What happens in the first episodes of all worlds.
+
+    Args:
+        env: the worlds.
+        policies: number of policies; worlds beyond theirs are left out.
+        worlds: worlds of each.
+        tail_from: env step from which on outcome terms are kept for `Env.success`.
+    """
+
+    def __init__(self, env: Env[Any], policies: int, worlds: int, tail_from: int) -> None:
+        zeros = torch.zeros(env.nworld, device=env.device)
+        self._env = env
+        self._parts = [slice(k * worlds, (k + 1) * worlds) for k in range(policies)]
+        self._tail_from = tail_from
+        self._alive = torch.arange(env.nworld, device=env.device) < policies * worlds
+        self._score, self._length = zeros.clone(), zeros.clone()
+        self._fell, self._diverged = torch.zeros_like(self._alive), torch.zeros_like(self._alive)
+        self._terms = torch.zeros((env.nworld, len(env.reward_names)), device=env.device)
+        self._outcomes: dict[str, Tensor] = {}
+        self._tail: list[dict[str, Tensor]] = []
+        self._ended = [False] * policies
+        """Whether all episodes of a policy were seen to have ended before the last step."""
+
+    def add(self, step: int, transition: Transition, outcome: dict[str, Tensor]) -> None:
+        """Count an env step in the worlds whose episode has not ended."""
+        alive = self._alive
+        counted = {name: value.masked_fill(~alive, 0.0) for name, value in outcome.items()}
+        self._score += transition.reward.masked_fill(~alive, 0.0)
+        self._length += alive
+        self._terms += transition.terms.masked_fill(~alive[:, None], 0.0)
+        for name, value in counted.items():
+            self._outcomes[name] = self._outcomes.get(name, torch.zeros_like(value)) + value
+        if step >= self._tail_from:
+            self._tail.append(counted)
+        self._fell |= alive & transition.terminated & ~transition.diverged
+        self._diverged |= alive & transition.diverged
+        alive &= ~transition.terminated
+
+    def all_ended(self) -> bool:
+        """Look which policies have ended all their episodes; waits for the device."""
+        running = torch.stack([self._alive[part].any() for part in self._parts]).tolist()
+        self._ended = [ended or not runs for ended, runs in zip(self._ended, running, strict=True)]
+        return all(self._ended)
+
+    def episodes(self) -> list[Episodes]:
+        """The episodes of each policy."""
+        success = None
+        if self._tail and not all(self._ended):
+            met = self._env.success({name: torch.stack([t[name] for t in self._tail]) for name in self._tail[0]})
+            success = None if met is None else met & self._alive
+        whole = Episodes(self._score, self._length, self._fell, self._diverged, self._terms, self._outcomes, success)
+        return [whole.worlds(part, success=not end) for part, end in zip(self._parts, self._ended, strict=True)]

@@ -12,7 +12,7 @@ from msk_ray.config import Config, parse_recorded
 from msk_ray.envs import Env
 from msk_ray.errors import CheckpointError
 from msk_ray.training.checkpoint import load_checkpoint
-from msk_ray.training.evaluation import Policy
+from msk_ray.training.policy_group import Policy
 
 
 @dataclass(frozen=True)

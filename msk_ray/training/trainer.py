@@ -2,18 +2,22 @@
 
 import math
 import time
-from collections.abc import Collection
+import warnings
+from collections.abc import Callable, Collection
 from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+import torch
 
 from msk_ray.algorithms import algorithm_class
 from msk_ray.config import Config, dump_yaml, overlay, parse_config, parse_recorded
 from msk_ray.envs import make_env
-from msk_ray.errors import CheckpointError, StorageError
+from msk_ray.errors import CheckpointError, SimulationError, StorageError
 from msk_ray.experiment.damage import Damage, describe_damages
 from msk_ray.experiment.layout import METRICS_FILE
-from msk_ray.experiment.metrics import SCORE, read_metrics
+from msk_ray.experiment.metrics import SCORE, read_metrics, read_rows
 from msk_ray.files import remove_stale, write_bytes
 from msk_ray.training.checkpoint import (
     epoch_checkpoints,
@@ -21,12 +25,16 @@ from msk_ray.training.checkpoint import (
     newest_valid_checkpoint,
     prune_checkpoints,
     read_checkpoint,
+    unscored_path,
     write_checkpoint,
 )
 from msk_ray.training.evaluation import Evaluator
 from msk_ray.training.loggers import TrialLog
 from msk_ray.training.memory import named_out_of_memory
+from msk_ray.training.policy import SavedPolicy
+from msk_ray.training.policy_group import Policy
 from msk_ray.training.threads import use_threads
+from msk_ray.training.unscored import UnscoredPolicies
 
 # Settings that may differ between a checkpoint and the trial that continues from it.
 _EXTENDABLE = {
@@ -35,6 +43,10 @@ _EXTENDABLE = {
 }
 _MILESTONES = 8
 """Number of policies saved during training in addition to the first, for `visualize --progression`."""
+MOST_TOGETHER = 32
+"""Policies scored together on a GPU."""
+_LONGEST_WAIT_S = 120.0
+"""How long a policy waits for others to be scored with [s]."""
 
 
 class Trainer:
@@ -45,17 +57,26 @@ class Trainer:
     eighth of training the policy (`policy_*.pt`). Call `run_epoch` until `finished`; call `restore_latest` first to
     continue from the newest complete checkpoint, which on CPU gives exactly the metrics of an uninterrupted run.
 
+    Args:
+        config: every setting.
+        logdir: the folder.
+        device: "cpu" or "cuda:N".
+        together: number of policies to score at the same time. On a GPU, 16 take hardly longer than one. A policy then
+            waits until there are that many, or two minutes have passed, or training ends; until then its row has no
+            score. Scores and best.pt are the same in the end. A logger that takes rows only once makes it 1.
+
     Attributes:
         env: the worlds used for training.
         algorithm: the algorithm that trains in them.
         epoch: number of epochs done.
         best_score: highest evaluation score of the trained policy so far, -inf before the first; that of `best.pt`.
+        together: number of policies that are scored at the same time.
 
     Raises:
         ConfigError, DeviceError, UnsupportedModelError, StorageError, SimulationError: as their messages say.
     """
 
-    def __init__(self, config: Config, logdir: Path, device: str) -> None:
+    def __init__(self, config: Config, logdir: Path, device: str, together: int = 1) -> None:
         algorithm = algorithm_class(config)
         self._log = TrialLog(logdir, config)
         self.config = config
@@ -74,6 +95,8 @@ class Trainer:
             # Otherwise the file describes what those were trained under, until one of them is resumed.
             self._write_config()
         self._device = device
+        self.together = min(together, self._evaluations) if self._log.takes_late else 1
+        self._unscored = UnscoredPolicies(self.checkpoints)
         use_threads(config)
         with self._memory():
             self.env = make_env(
@@ -86,8 +109,9 @@ class Trainer:
                 randomize=True,
             )
             self.algorithm = algorithm(config, self.env)
-            self.evaluator = Evaluator(config, device)
+            self.evaluator = Evaluator(config, device, policies=self.together)
         self._damages: tuple[Damage, ...] = ()
+        self._unreadable: list[str] = []
 
     @property
     def checkpoints(self) -> Path:
@@ -104,12 +128,17 @@ class Trainer:
         """Whether all epochs are done."""
         return self.epoch >= self.config.trial.epochs
 
+    @property
+    def _evaluations(self) -> int:
+        """Number of evaluations in the trial: before training, at intervals, and at its end."""
+        return 1 + math.ceil(self.config.trial.epochs / self.config.evaluation.interval)
+
     def run_epoch(self) -> dict[str, float]:
         """Train one epoch, evaluate and checkpoint when due, and write one row of metrics.
 
         Returns:
             The row: `epoch`, `env_steps`, `seconds` of training so far, `env_steps_per_s`, `train/*`, `grad/*`,
-            `time/*`, `physics/*`, and on evaluation epochs `eval/*`.
+            `time/*`, `physics/*`, and on evaluation epochs `eval/*`, unless the policy waits for its score.
 
         Raises:
             SimulationError: the gradient or the physics failed, or the device ran out of memory; the last checkpoint
@@ -118,26 +147,23 @@ class Trainer:
                 fit.
         """
         with self._memory():
-            return self._run_epoch()
-
-    def _memory(self) -> AbstractContextManager[None]:
-        length = self.config.algorithm_settings.length
-        other = [] if length is None else [f"{self.config.algorithm_section}.{length}"]
-        return named_out_of_memory(self._device, self.config.env.nworld, "env.nworld", *other)
-
-    def _run_epoch(self) -> dict[str, float]:
-        if self.epoch == 0:
-            self._start_from(self.config.trial.start_from)
-            self._evaluate_initial()
+            if self.epoch == 0:
+                self._begin()
         started = time.perf_counter()
-        self.env.begin_epoch(self.epoch)
-        result = self.algorithm.update(self.epoch)
+        try:
+            with self._memory():
+                self.env.begin_epoch(self.epoch)
+                result = self.algorithm.update(self.epoch)
+        except SimulationError:
+            self._score_despite_failure()
+            raise
         self.epoch += 1
         self.env_steps += result.env_steps
         elapsed = time.perf_counter() - started
         metrics = dict(result.metrics)
         if self.epoch % self.config.evaluation.interval == 0 or self.finished:
-            metrics |= self._evaluate()
+            with self._memory():
+                metrics |= self._evaluate()
         self._seconds += time.perf_counter() - started
         row = self._row(metrics | {"env_steps_per_s": result.env_steps / elapsed})
         self._log.write(row)
@@ -145,10 +171,26 @@ class Trainer:
             self.save()
         return row
 
+    def score_waiting(self) -> None:
+        """Score the policies that wait for it, for example because training stops here.
+
+        Raises:
+            SimulationError: as for `run_epoch`.
+        """
+        started = time.perf_counter()
+        with self._memory():
+            self._score_others([])
+        self._seconds += time.perf_counter() - started
+
+    def _memory(self) -> AbstractContextManager[None]:
+        length = self.config.algorithm_settings.length
+        other = [] if length is None else [f"{self.config.algorithm_section}.{length}"]
+        return named_out_of_memory(self._device, self.config.env.nworld, "env.nworld", *other)
+
     def save(self) -> Path:
         """Write a checkpoint of everything and return its path; an existing one is kept."""
         path = self.checkpoints / f"epoch_{self.epoch:06d}.pt"
-        self._write(path)
+        write_checkpoint(path, self._state(), {"epoch": self.epoch, "best_score": _finite(self.best_score)})
         prune_checkpoints(self.checkpoints, self.config.trial.keep_checkpoints)
         return path
 
@@ -180,17 +222,20 @@ class Trainer:
         self.epoch, self.env_steps = state["epoch"], state["env_steps"]
         self._seconds = state["seconds"]
         self._damages = self._log.rewind(self.epoch)
-        self.best_score = self._trained_best(state["best_score"])
-
-    def _trained_best(self, recorded: float) -> float:
-        """A checkpoint's best score; -inf if it is the score of the untrained policy, which older versions counted.
-
-        Then `best.pt` is the untrained policy, and the next evaluation replaces it.
-        """
         rows = read_metrics(self.logdir / METRICS_FILE)
+        self._unreadable = self._unscored.rewind(self.epoch, {row["epoch"] for row in rows if SCORE in row})
+        self.best_score = self._trained_best(state["best_score"], rows)
+
+    @staticmethod
+    def _trained_best(recorded: float, rows: list[dict[str, Any]]) -> float:
+        """The best score so far: a checkpoint's, or that of a policy that got its score after the checkpoint.
+
+        Older versions counted the score of the untrained policy. Then `best.pt` is the untrained policy, and the next
+        evaluation replaces it.
+        """
         untrained = [row.get(SCORE) for row in rows if row["epoch"] == 0]
-        trained = [row.get(SCORE) for row in rows if row["epoch"] > 0]
-        return -math.inf if recorded in untrained and recorded not in trained else recorded
+        trained = [row[SCORE] for row in rows if row["epoch"] > 0 and row.get(SCORE) is not None]
+        return -math.inf if recorded in untrained and recorded not in trained else max([recorded, *trained])
 
     def restore_latest(self) -> tuple[Path | None, list[str]]:
         """Continue from the newest complete checkpoint, or from the start if there is none.
@@ -205,7 +250,8 @@ class Trainer:
             self._write_config()
             # An attempt that died before its first checkpoint may have left rows, the last of them incomplete.
             self._damages = self._log.rewind(-1)
-        return path, [*faults, *describe_damages(self._damages, self.logdir)]
+            self._unscored.rewind(-1, ())
+        return path, [*faults, *self._unreadable, *describe_damages(self._damages, self.logdir)]
 
     def _write_config(self) -> None:
         write_bytes(self.logdir / "config.yaml", dump_yaml(self.config.as_dict()).encode())
@@ -227,48 +273,100 @@ class Trainer:
                 "algorithm and networks"
             ) from error
 
-    def _evaluate_initial(self) -> None:
+    def _begin(self) -> None:
+        """Everything before the first epoch. The untrained policy is there to look at; it has no score in `best.pt`, so
+        that any trained policy replaces it."""
+        self._start_from(self.config.trial.start_from)
+        write_checkpoint(self.best_checkpoint, self._state(), {"epoch": 0, "best_score": None})
         self._log.write(self._row(self._evaluate()))
 
     def _evaluate(self) -> dict[str, float]:
+        """Score the policy, with those that wait, or let it wait too. Returns what is known for its row."""
         started = time.perf_counter()
-        figures = self.evaluator.run(self.algorithm.policy)
-        if self.epoch == 0:
-            # Only to look at; it has no score, so that any trained policy replaces it.
-            self._write(self.best_checkpoint)
-        elif figures["score"] > self.best_score:
-            self.best_score = figures["score"]
-            self._write(self.best_checkpoint)
-        if self._at_milestone():
-            self._write_policy(figures["score"])
+        full = len(self._unscored.epochs) + 1 >= self.together
+        if full or self.finished or self._unscored.waited_s >= _LONGEST_WAIT_S:
+            figures, others_s = self._score_others([self.algorithm.policy])
+            metrics = self._record(self.epoch, figures[0], self._state)
+            return metrics | {"time/evaluation_s": time.perf_counter() - started - others_s}
+        self._unscored.add(self._state())
+        return {"time/evaluation_s": time.perf_counter() - started}
+
+    def _score_others(self, own: list[Policy]) -> tuple[list[dict[str, float]], float]:
+        """Score policies together with all that wait, and write the rows of the latter once more, with their scores.
+
+        Returns:
+            The figures of `own`, and the seconds that the evaluation of the others is counted with.
+        """
+        started = time.perf_counter()
+        waiting = list(self._unscored.epochs)
+        policies = [*map(self._waiting_policy, waiting), *own]
+        if not policies:
+            return [], 0.0
+        if waiting:
+            # It has not had as many steps as training to learn how large its buffers have to be.
+            self.evaluator.env.sim.reserve(self.env.sim.capacity)
+        figures = self.evaluator.run(policies)
+        each_s = (time.perf_counter() - started) / len(policies)
+        rows = {int(row["epoch"]): row for row in read_rows(self.logdir)} if waiting else {}
+        for epoch, found in zip(waiting, figures, strict=False):
+            late = self._record(epoch, found, partial(self._unscored.state, epoch))
+            waited_s = rows[epoch].get("time/evaluation_s", 0.0) if epoch in rows else 0.0
+            row = rows.get(epoch) or {
+                key: self._unscored.state(epoch)[key] for key in ("epoch", "env_steps", "seconds")
+            }
+            self._log.write_late(row, late | {"time/evaluation_s": waited_s + each_s})
+            self._unscored.remove(epoch)
+        return figures[len(waiting) :], each_s * len(waiting)
+
+    def _waiting_policy(self, epoch: int) -> Policy:
+        state, path = self._unscored.state(epoch), unscored_path(self.checkpoints, epoch)
+        saved = SavedPolicy(path, self.config, epoch, state["env_steps"], "", state["algorithm"]["modules"])
+        cuda = [self.env.device] if self.env.device.type == "cuda" else []
+        with torch.random.fork_rng(cuda):  # new networks draw weights, which training must not notice
+            return saved.on(self.evaluator.env)
+
+    def _score_despite_failure(self) -> None:
+        """Training has failed; the policies before that get their scores all the same."""
+        try:
+            self.score_waiting()
+        except SimulationError as error:
+            warnings.warn(f"policies of epochs {self._unscored.epochs} have no score: {error}", stacklevel=2)
+
+    def _record(self, epoch: int, figures: dict[str, float], state: Callable[[], dict[str, Any]]) -> dict[str, float]:
+        """Keep the policy of an epoch if it is the best or a milestone. Returns the metrics of its evaluation."""
+        score = figures["score"]
+        if epoch > 0 and score > self.best_score:
+            self.best_score = score
+            facts = {"epoch": epoch, "best_score": score}
+            write_checkpoint(self.best_checkpoint, state() | {"best_score": score}, facts)
+        if self._at_milestone(epoch):
+            self._write_policy(state(), score)
         row = {f"eval/{name}": value for name, value in figures.items()}
         if math.isfinite(self.best_score):
             row["eval/best_score"] = self.best_score
-        return row | {"time/evaluation_s": time.perf_counter() - started}
+        return row
 
-    def _at_milestone(self) -> bool:
-        """Whether this evaluation is the first one after another eighth of the trial, or the one before training.
+    def _at_milestone(self, epoch: int) -> bool:
+        """Whether an evaluation is the first one after another eighth of the trial, or the one before training.
 
         This depends only on the epoch, so that a resumed trial saves the same ones.
         """
-        epochs, previous = self.config.trial.epochs, self.epoch - self.config.evaluation.interval
-        return self.epoch == 0 or _MILESTONES * self.epoch // epochs > _MILESTONES * previous // epochs
+        epochs, previous = self.config.trial.epochs, epoch - self.config.evaluation.interval
+        return epoch == 0 or _MILESTONES * epoch // epochs > _MILESTONES * previous // epochs
 
-    def _write_policy(self, score: float) -> None:
-        state = {
-            "config": self.config.as_dict(),
-            "epoch": self.epoch,
-            "env_steps": self.env_steps,
-            "algorithm": {"modules": self.algorithm.policy_state_dict()},
-        }
-        facts = {"epoch": self.epoch, "score": _finite(score)}
-        write_checkpoint(milestone_path(self.checkpoints, self.epoch), state, facts)
+    def _write_policy(self, state: dict[str, Any], score: float) -> None:
+        parts = self.algorithm.policy_modules(self.algorithm.network)
+        modules = {name: value for name, value in state["algorithm"]["modules"].items() if name in parts}
+        policy = {**{key: state[key] for key in ("config", "epoch", "env_steps")}, "algorithm": {"modules": modules}}
+        facts = {"epoch": state["epoch"], "score": _finite(score)}
+        write_checkpoint(milestone_path(self.checkpoints, state["epoch"]), policy, facts)
 
     def _row(self, metrics: dict[str, float]) -> dict[str, float]:
         return {"epoch": self.epoch, "env_steps": self.env_steps, "seconds": self._seconds, **metrics}
 
-    def _write(self, path: Path) -> None:
-        state = {
+    def _state(self) -> dict[str, Any]:
+        """Everything needed to continue from here."""
+        return {
             "config": self.config.as_dict(),
             "epoch": self.epoch,
             "env_steps": self.env_steps,
@@ -276,7 +374,6 @@ class Trainer:
             "best_score": self.best_score,
             "algorithm": self.algorithm.state_dict(),
         }
-        write_checkpoint(path, state, {"epoch": self.epoch, "best_score": _finite(self.best_score)})
 
 
 def precompile(config: Config, device: str, logdir: Path) -> None:

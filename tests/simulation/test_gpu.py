@@ -1,5 +1,6 @@
 """What must hold on a CUDA device; run with `pytest -m gpu`."""
 
+import warnings
 from pathlib import Path
 
 import pytest
@@ -7,6 +8,7 @@ import torch
 from scenes import studded_plate
 from test_adjoint_features import SCENES
 
+from msk_ray.algorithms import algorithm_class
 from msk_ray.config import Config, PhysicsConfig, parse_config
 from msk_ray.envs import make_env
 from msk_ray.envs.ant.config import AntSettings
@@ -14,7 +16,7 @@ from msk_ray.envs.ant.model import build_ant
 from msk_ray.errors import SimulationError
 from msk_ray.gradcheck import check_gradients
 from msk_ray.simulation import Simulation, TapePerSubstep
-from msk_ray.training import Trainer, read_metrics
+from msk_ray.training import Evaluator, Trainer, read_metrics
 
 pytestmark = pytest.mark.gpu
 
@@ -129,3 +131,39 @@ def test_default_room_is_enough_on_a_gpu_and_grows_between_epochs() -> None:
     again = sim.step(**start)
     assert torch.allclose(again.qvel, end.qvel, atol=1e-5)
     again.qvel.sum().backward()
+
+
+def test_policies_scored_together_get_the_scores_of_each_alone() -> None:
+    """Few steps, because a GPU's sums differ from run to run, and an ant's motion amplifies that."""
+    config = parse_config({"env": {"name": "ant"}, "evaluation": {"nworld": 16, "steps": 20}})
+    alone, together = Evaluator(config, "cuda"), Evaluator(config, "cuda", policies=5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # one says that the policies could not be recorded
+        networks = []
+        for seed in range(4):
+            other = config.model_copy(update={"trial": config.trial.model_copy(update={"seed": seed})})
+            made = algorithm_class(other).policy_network(other, alone.env.obs_size, alone.env.action_size)
+            networks.append(made.cuda())
+        found = together.run(networks)
+    for figures, network in zip(found, networks, strict=True):
+        (expected,) = alone.run([network])
+        assert figures == pytest.approx(expected, rel=1e-3, abs=1e-3)
+    assert len({round(figures["score"], 3) for figures in found}) == 4
+
+
+def test_a_trial_that_scores_policies_together_has_all_scores(tmp_path: Path) -> None:
+    config = parse_config(
+        {
+            "env": {"name": "ant", "nworld": 16},
+            "shac": {"horizon": 4, "critic_iterations": 2},
+            "evaluation": {"nworld": 4, "steps": 60, "interval": 2},
+            "trial": {"epochs": 9, "checkpoint_interval": 4},
+        }
+    )
+    trainer = Trainer(config, tmp_path, "cuda", 10)
+    while not trainer.finished:
+        trainer.run_epoch()
+    trainer.close()
+    rows = read_metrics(tmp_path / "metrics.jsonl")
+    assert [row["epoch"] for row in rows if "eval/score" in row] == [0, 2, 4, 6, 8, 9]
+    assert trainer.best_score == max(row["eval/score"] for row in rows[1:] if "eval/score" in row)

@@ -52,7 +52,7 @@ def test_the_untrained_policy_is_kept_without_a_score_until_a_trained_one_has_on
     tiny_cartpole: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Here training makes it worse: 0 untrained, then -2, -4 and -6."""
-    monkeypatch.setattr(Evaluator, "run", lambda self, policy: {"score": -float(trainer.epoch)})
+    monkeypatch.setattr(Evaluator, "run", lambda self, policies: [{"score": -float(trainer.epoch)}])
     trainer = Trainer(tiny_cartpole, tmp_path, "cpu")
     trainer.run_epoch()
     assert trainer.best_score == -math.inf
@@ -71,7 +71,7 @@ def test_a_checkpoint_that_counts_the_untrained_policy_goes_on_without_it(
     tiny_cartpole: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As older versions wrote it: the best score is the untrained policy's, which no trained one has reached."""
-    monkeypatch.setattr(Evaluator, "run", lambda self, policy: {"score": -float(trainer.epoch)})
+    monkeypatch.setattr(Evaluator, "run", lambda self, policies: [{"score": -float(trainer.epoch)}])
     trainer = Trainer(tiny_cartpole, tmp_path, "cpu")
     for _ in range(4):
         trainer.run_epoch()

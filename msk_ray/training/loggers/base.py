@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 
 class Logger(ABC):
@@ -16,6 +16,10 @@ class Logger(ABC):
         folder: the trial's folder.
     """
 
+    takes_late: ClassVar[bool] = False
+    """Whether `write_late` is there. If a logger of a trial has none, each policy is scored before its row is written,
+    which on a GPU takes longer than scoring several together."""
+
     def __init__(self, folder: Path) -> None:
         """Do not open anything yet: a trial that cannot be resumed leaves its folder unchanged."""
         self.folder = folder
@@ -23,6 +27,10 @@ class Logger(ABC):
     @abstractmethod
     def write(self, row: dict[str, float]) -> None:
         """Log a row: `epoch`, `env_steps`, `seconds` and metrics such as `eval/score`, all of them finite."""
+
+    def write_late(self, row: dict[str, float]) -> None:
+        """Log figures of an earlier row that are known only now: its `epoch`, and `eval/score` and others."""
+        raise NotImplementedError
 
     def config(self, settings: dict[str, Any]) -> None:  # noqa: B027  # a logger may do without
         """Log the trial's settings, nested as in config.yaml; called once before the first row."""

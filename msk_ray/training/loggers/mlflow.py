@@ -3,12 +3,13 @@
 import os
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from mlflow.entities import Metric, Param
 from mlflow.tracking import MlflowClient
 
 from msk_ray.config import flattened
+from msk_ray.experiment.metrics import SCORE
 from msk_ray.files import write_text
 from msk_ray.training.loggers.base import Logger
 from msk_ray.training.loggers.run_name import run_name
@@ -26,12 +27,15 @@ class MLflow(Logger):
     same run, in which repeated rows keep their first values.
     """
 
+    takes_late: ClassVar[bool] = True
+
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
         self._settings: dict[str, Any] = {}
         self._client: MlflowClient | None = None
         self._run = ""
         self._last = -1
+        self._last_scored = -1
 
     def config(self, settings: dict[str, Any]) -> None:
         """Keep the settings for the run that the first row opens."""
@@ -41,12 +45,22 @@ class MLflow(Logger):
         """Log a row."""
         if self._client is None:
             self._client = self._open()
+        if row["epoch"] > self._last:
+            self._log(self._client, row)
+            self._last = int(row["epoch"])
+
+    def write_late(self, row: dict[str, float]) -> None:
+        """Log figures of an earlier row, at its epoch."""
+        if self._client is None:
+            self._client = self._open()
+        if row["epoch"] > self._last_scored:
+            self._log(self._client, row)
+            self._last_scored = int(row["epoch"])
+
+    def _log(self, client: MlflowClient, row: dict[str, float]) -> None:
         epoch, now = int(row["epoch"]), int(1000 * time.time())
-        if epoch <= self._last:
-            return
         metrics = [Metric(name, value, now, epoch) for name, value in row.items() if name != "epoch"]
-        self._client.log_batch(self._run, metrics=metrics)
-        self._last = epoch
+        client.log_batch(self._run, metrics=metrics)
 
     def close(self) -> None:
         """Mark the run as no longer being written."""
@@ -59,7 +73,10 @@ class MLflow(Logger):
         path = self.folder / RUN_FILE
         if path.is_file():
             self._run = path.read_text(encoding="utf-8").strip()
-            self._last = max((m.step for m in client.get_metric_history(self._run, "env_steps")), default=-1)
+            self._last, self._last_scored = (
+                max((m.step for m in client.get_metric_history(self._run, name)), default=-1)
+                for name in ("env_steps", SCORE)
+            )
             client.update_run(self._run, status="RUNNING")
             return client
         experiment, trial = run_name(self.folder)

@@ -1,6 +1,7 @@
 """TensorBoard's event files in a trial's folder."""
 
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from torch.utils.tensorboard import SummaryWriter
@@ -29,6 +30,8 @@ def board_tag(name: str) -> str:
 class TensorBoard(Logger):
     """One chart per metric over epochs; rows that a resumed trial repeats are hidden."""
 
+    takes_late: ClassVar[bool] = True
+
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
         self._board: SummaryWriter | None = None
@@ -44,6 +47,10 @@ class TensorBoard(Logger):
         for name, value in row.items():
             if name != "epoch":
                 self._board.add_scalar(board_tag(name), value, int(row["epoch"]))
+
+    def write_late(self, row: dict[str, float]) -> None:
+        """Log figures of an earlier row, at its epoch."""
+        self.write(row)
 
     def close(self) -> None:
         """Flush and close the file."""

@@ -27,6 +27,11 @@ class TrialLog:
         self._loggers = {name: kind(folder) for name, kind in zip(config.trial.loggers, classes, strict=True)}
         self._told = False
 
+    @property
+    def takes_late(self) -> bool:
+        """Whether figures can be added to rows that have been written."""
+        return all(logger.takes_late for logger in self._loggers.values())
+
     def rewind(self, epoch: int) -> tuple[Damage, ...]:
         """Drop rows after `epoch`, which a resumed trial will write again, and damaged lines.
 
@@ -49,11 +54,20 @@ class TrialLog:
             LoggerError: a logger failed. The row is in `metrics.jsonl`, and the other loggers have it.
         """
         self._lines.write(row)
-        if not self._told:
-            self._told = True
-            self._each(lambda logger: logger.config(self._settings))
-        finite = {name: value for name, value in row.items() if math.isfinite(value)}
+        self._tell()
+        finite = _finite(row)
         self._each(lambda logger: logger.write(dict(finite)))
+
+    def write_late(self, row: dict[str, float], late: dict[str, float]) -> None:
+        """Add figures to a row that has been written; in `metrics.jsonl` the whole row comes again and replaces it.
+
+        Raises:
+            StorageFailure, LoggerError: as for `write`.
+        """
+        self._lines.write(row | late)
+        self._tell()
+        finite = _finite({"epoch": row["epoch"], **late})
+        self._each(lambda logger: logger.write_late(dict(finite)))
 
     def close(self) -> None:
         """Have every logger write out everything that is still buffered.
@@ -62,6 +76,11 @@ class TrialLog:
             StorageFailure, LoggerError: as for `write`; the rows are in `metrics.jsonl` in any case.
         """
         self._each(lambda logger: logger.close())
+
+    def _tell(self) -> None:
+        if not self._told:
+            self._told = True
+            self._each(lambda logger: logger.config(self._settings))
 
     def _each(self, call: Callable[[Logger], None]) -> None:
         first: Exception | None = None
@@ -74,6 +93,10 @@ class TrialLog:
                 first = first or fault
         if first is not None:
             raise first
+
+
+def _finite(row: dict[str, float]) -> dict[str, float]:
+    return {name: value for name, value in row.items() if math.isfinite(value)}
 
 
 def _named(name: str, error: Exception) -> Exception:

@@ -87,6 +87,23 @@ def test_tensorboard_hides_what_a_resumed_trial_does_again(tmp_path: Path) -> No
     assert charts(tmp_path)["a"] == [(3, 2.0)]
 
 
+def test_figures_known_later_are_added_to_their_row(tmp_path: Path) -> None:
+    log = TrialLog(tmp_path, config("tensorboard"))
+    assert log.takes_late
+    for epoch in range(3):
+        log.write(row(epoch, a=1.0, seconds=1.0))
+    for epoch in (0, 2):
+        log.write_late(row(epoch, a=1.0, seconds=1.0), {"eval/score": 10.0 * epoch, "eval/nothing": math.nan})
+    log.close()
+    found = charts(tmp_path)
+    assert found["eval/score"] == [(0, 0.0), (2, 20.0)]
+    assert [step for step, _ in found["a"]] == [0, 1, 2]
+    assert "eval/nothing" not in found
+    assert [r.get("eval/score") for r in read_metrics(tmp_path / "metrics.jsonl")] == [0.0, None, 20.0]
+    assert all(r["a"] == 1.0 for r in read_metrics(tmp_path / "metrics.jsonl"))
+    assert not TrialLog(tmp_path / "other", config("tensorboard", "wandb")).takes_late
+
+
 def test_a_picture_in_tensorboard(tmp_path: Path) -> None:
     log_image(tmp_path / "film", "film/evaluation", np.zeros((4, 6, 3), np.uint8), 7)
     events = EventAccumulator(str(tmp_path / "film")).Reload()
@@ -242,9 +259,15 @@ def test_mlflow_in_a_local_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     folder = tmp_path / "sweep" / "trials" / "0a1b2c3d"
     folder.mkdir(parents=True)
     resumed(folder, "mlflow")
+    third = TrialLog(folder, config("mlflow"))
+    third.rewind(3)
+    third.write(row(4))
+    third.write_late(row(3), {"eval/score": 31.0})  # it has a score already
+    third.write_late(row(4), {"eval/score": 40.0})
+    third.close()
     client = MlflowClient(store)
     (run,) = client.search_runs([client.get_experiment_by_name("sweep").experiment_id])
     assert (run.info.run_name, run.info.status) == ("0a1b2c3d", "FINISHED")
     assert run.data.params["env.name"] == "cartpole"
     history = client.get_metric_history(run.info.run_id, "eval/score")
-    assert [(m.step, m.value) for m in history] == [(0, 0.0), (1, 10.0), (2, 20.0), (3, 30.0)]
+    assert [(m.step, m.value) for m in history] == [(0, 0.0), (1, 10.0), (2, 20.0), (3, 30.0), (4, 40.0)]
