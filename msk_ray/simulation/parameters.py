@@ -26,6 +26,8 @@ class ParameterTensors:
         self._device = torch.device(str(batch.device))
         self._views: dict[str, Tensor] = {}
         self._nominal: dict[str, Tensor] = {}
+        self._loaded: dict[str, tuple[Tensor, int]] = {}
+        self._replayed = False
         for name in batch.parameters:
             for field in (name, *DERIVED.get(name, ())):
                 self._views[field] = wp.to_torch(attrgetter(field)(batch.model), requires_grad=False)
@@ -37,6 +39,9 @@ class ParameterTensors:
         """Write `values`, each for all worlds or with a row per world; a parameter without one gets the model's own."""
         if not self._views:
             return
+        self._replayed |= _recording(self._device)
+        # Held, so that no other tensor gets the memory of one of them.
+        self._loaded = {name: (value.detach(), value._version) for name, value in values.items()}
         values = dict(values)
         if "body_mass" in values:
             values["body_subtreemass"] = values["body_mass"] @ self._subtrees
@@ -47,6 +52,24 @@ class ParameterTensors:
             rows = value.shape[: value.dim() - self._nominal[name].dim()]
             view.copy_(value.reshape((*rows, *view.shape[1:])))
 
+    def restore(self, values: Mapping[str, Tensor]) -> None:
+        """Write `values` if other ones, or changed ones, were written last.
+
+        It always writes them once a graph has recorded a write: a replay may have written others since.
+        """
+        if self._replayed or _recording(self._device) or not self._holds(values):
+            self.load(values)
+
+    def _holds(self, values: Mapping[str, Tensor]) -> bool:
+        if self._loaded.keys() != values.keys():
+            return False
+        return all(
+            value._version == version
+            and value.data_ptr() == kept.data_ptr()
+            and (value.shape, value.stride()) == (kept.shape, kept.stride())
+            for value, (kept, version) in ((values[name], self._loaded[name]) for name in values)
+        )
+
     @cached_property
     def _subtrees(self) -> Tensor:
         """1 where the column's body carries the row's, or is it, else 0; (B, B)."""
@@ -55,13 +78,19 @@ class ParameterTensors:
             out[:, self._model.body_parentid[body]] += out[:, body]
         return out.to(self._device)
 
+    @cached_property
+    def _kinds(self) -> list[Tensor]:
+        """Which geoms are spheres, capsules, cylinders, ellipsoids and boxes, each (G,)."""
+        kinds = mujoco.mjtGeom
+        solids = (kinds.mjGEOM_SPHERE, kinds.mjGEOM_CAPSULE, kinds.mjGEOM_CYLINDER, kinds.mjGEOM_ELLIPSOID)
+        return [
+            torch.as_tensor(self._model.geom_type == kind, device=self._device) for kind in (*solids, kinds.mjGEOM_BOX)
+        ]
+
     def _bounds(self, size: Tensor) -> tuple[Tensor, Tensor]:
         """Bounding radius (..., G) and box (..., G, 6) of geoms of these sizes, as MuJoCo's compiler finds them."""
-        kinds = mujoco.mjtGeom
-        of = lambda *types: torch.as_tensor(np.isin(self._model.geom_type, types), device=self._device)  # noqa: E731
         radius, half, third = size.unbind(-1)
-        ball, capsule, cylinder = of(kinds.mjGEOM_SPHERE), of(kinds.mjGEOM_CAPSULE), of(kinds.mjGEOM_CYLINDER)
-        ellipsoid, box = of(kinds.mjGEOM_ELLIPSOID), of(kinds.mjGEOM_BOX)
+        ball, capsule, cylinder, ellipsoid, box = self._kinds
         bound = self._nominal["geom_rbound"].expand(radius.shape).clone()
         for found, value in (
             (ball, radius),
@@ -80,6 +109,10 @@ class ParameterTensors:
         )
 
 
+def _recording(device: torch.device) -> bool:
+    return device.type == "cuda" and torch.cuda.is_current_stream_capturing()
+
+
 def check_values(model: mujoco.MjModel, nworld: int, values: Mapping[str, Tensor], place: torch.device) -> None:
     """Raise ConfigError where a value has another shape, dtype or device than the model's field of that name."""
     for name, value in values.items():
@@ -95,8 +128,3 @@ def check_values(model: mujoco.MjModel, nworld: int, values: Mapping[str, Tensor
             raise ConfigError(
                 f"step: parameter {name} is on {value.device}, the simulation on {place}: write .to({str(place)!r})"
             )
-
-
-def gradient_of(value_shape: torch.Size, gradient: Tensor) -> Tensor:
-    """The gradient of a value from those of each world, (W, ...): their sum where one value was for all worlds."""
-    return gradient if gradient.shape == value_shape else gradient.sum(0)

@@ -16,7 +16,7 @@ from msk_ray.physics.capacity import Capacity
 from msk_ray.simulation.backward import Applied, Backward, Needs, StepState
 from msk_ray.simulation.jacobian import Linearization
 from msk_ray.simulation.modes import make_backward
-from msk_ray.simulation.parameters import check_values, gradient_of
+from msk_ray.simulation.parameters import check_values
 from msk_ray.simulation.stepper import Engine, Stepper
 from msk_ray.simulation.tangent import Tangent
 from msk_ray.simulation.tape import TapePerSubstep
@@ -76,7 +76,7 @@ class WarpSimStep(torch.autograd.Function):
         cotangent = StepState(qpos, qvel, act)
         ctx.engine.batch.check_model()
         ctx.engine.settle()
-        ctx.engine.load_parameters(dict(zip(ctx.names, values, strict=True)))
+        ctx.engine.restore_parameters(dict(zip(ctx.names, values, strict=True)))
         found = ctx.engine.backward.vjp(saved, cotangent, Needs(*on_state, *on_forces)._replace(parameters=wanted))
         # A linear map takes zero to zero, even in a world whose Jacobian is not finite: 0 × NaN must not leak out.
         used = torch.cat(cotangent, dim=-1).ne(0).any(-1)
@@ -85,7 +85,7 @@ class WarpSimStep(torch.autograd.Function):
             return None if g is None else torch.where(used.view(-1, *[1] * (g.dim() - 1)), g, 0.0)
 
         parameters = (
-            gradient_of(value.shape, found.parameters[name]) if name in wanted else None
+            found.parameters.of_value(name, value.shape) if found.parameters and name in wanted else None
             for name, value in zip(ctx.names, values, strict=True)
         )
         states = (masked(g) for g in (found.ctrl, found.qpos, found.qvel, found.act))

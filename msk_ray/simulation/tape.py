@@ -23,7 +23,16 @@ from msk_ray.physics.adjoint.parameters import ParameterAdjoint
 from msk_ray.physics.adjoint.pull_counter import PullCounter
 from msk_ray.physics.adjoint.recomputed import recomputed
 from msk_ray.physics.adjoint.residual import ResidualGauge
-from msk_ray.simulation.backward import INPUTS, Applied, Backward, InputGradients, Needs, StepState
+from msk_ray.physics.parameters import PARAMETERS
+from msk_ray.simulation.backward import (
+    INPUTS,
+    Applied,
+    Backward,
+    InputGradients,
+    Needs,
+    ParameterGradients,
+    StepState,
+)
 from msk_ray.simulation.buffers import applied_of, device_of, stream_of
 from msk_ray.simulation.jacobian import rows_of, state_size, unit_cotangents
 from msk_ray.simulation.pool import Pool
@@ -108,7 +117,7 @@ class _Tape(Backward):
         self._applied = applied_of(batch.data)
         self._graphs: dict[tuple[bool, tuple[str, ...]], Graph] = {}
         self._parameters: dict[tuple[str, ...], ParameterAdjoint] = {}
-        self._slopes: dict[tuple[str, ...], dict[str, Tensor]] = {}
+        self._slopes: dict[tuple[str, ...], ParameterGradients] = {}
         self._rows: dict[int, TapePerSubstep] = {}
 
     def _prepare(self, pool: Pool) -> None:
@@ -138,7 +147,7 @@ class _Tape(Backward):
                 view.zero_()
         return InputGradients.of(
             {name: getattr(found, name).clone() for name in INPUTS if getattr(needs, name)},
-            {name: gradient.clone() for name, gradient in found.parameters.items()},
+            found.parameters.clone() if found.parameters else None,
         )
 
     def ready(self, applied: bool, names: tuple[str, ...] = ()) -> None:
@@ -149,8 +158,10 @@ class _Tape(Backward):
         if (applied, names) not in self._graphs:
             if names and names not in self._parameters:
                 self._parameters[names] = parameters = ParameterAdjoint(self._adjoint, names)
-                views = {n: wp.to_torch(array, requires_grad=False) for n, array in parameters.gradients.items()}
-                self._slopes[names] = views
+                rows = wp.to_torch(parameters.rows, requires_grad=False)
+                mjm = self._batch.mjm
+                places = {n: (parameters.columns[n], torch.Size(PARAMETERS[n].value(mjm).shape)) for n in names}
+                self._slopes[names] = ParameterGradients(rows, places)
             launches = lambda: self.launch_backward(applied, names)  # noqa: E731
             self._graphs[applied, names] = Graph(launches, self._batch.device)
             self._clipped.zero_()

@@ -191,8 +191,10 @@ def cone_slope(cone: Cone, mass: vec6, friction: vec5, dim: int, x: vec6) -> vec
 @wp.kernel
 def scaled_jacobian(
     # Model:
+    nv: int,
     opt_impratio_invsqrt: wp.array[float],
     # In:
+    lanes: int,
     nefc_in: wp.array[int],
     rows_in: Rows,
     jacobian_in: wp.array3d[float],
@@ -201,30 +203,33 @@ def scaled_jacobian(
     # Out:
     scaled_out: wp.array3d[float],
 ) -> None:
-    """S J, one thread a (row, dof); needed for elliptic cones only, whose S couples the rows of a contact."""
-    worldid, row, dof = wp.tid()
+    """S J, `lanes` threads a row; needed for elliptic cones only, whose S couples the rows of a contact."""
+    worldid, row, lane = wp.tid()
     if row >= wp.min(nefc_in[worldid], laws_in.jar.shape[1]):
         return
     if rows_in.type[worldid, row] != ConstraintType.CONTACT_ELLIPTIC:
-        scaled_out[worldid, row, dof] = laws_in.slope[worldid, row] * jacobian_in[worldid, row, dof]
+        for dof in range(lane, nv, lanes):
+            scaled_out[worldid, row, dof] = laws_in.slope[worldid, row] * jacobian_in[worldid, row, dof]
         return
     con = rows_in.id[worldid, row]
     if row != contacts_in.efc_address[con, 0]:
-        return  # the thread of the contact's first row writes all of them
+        return  # the threads of the contact's first row write all of them
     dim = contacts_in.dim[con]
     jar = vec6()
     mass = vec6()
-    column = vec6()
     for i in range(dim):
         jar[i] = laws_in.jar[worldid, row + i]
         mass[i] = rows_in.D[worldid, row + i]
-        column[i] = jacobian_in[worldid, row + i, dof]
     friction = contacts_in.friction[con]
     mu = friction[0] * opt_impratio_invsqrt[worldid % opt_impratio_invsqrt.shape[0]]
     cone = cone_law(jar, mass, friction, mu, dim)
-    product = cone_slope(cone, mass, friction, dim, column)
-    for i in range(dim):
-        scaled_out[worldid, row + i, dof] = product[i]
+    for dof in range(lane, nv, lanes):
+        column = vec6()
+        for i in range(dim):
+            column[i] = jacobian_in[worldid, row + i, dof]
+        product = cone_slope(cone, mass, friction, dim, column)
+        for i in range(dim):
+            scaled_out[worldid, row + i, dof] = product[i]
 
 
 class ConstraintLaws:
@@ -262,9 +267,11 @@ class ConstraintLaws:
             outputs=[work.laws],
         )
         if work.settings.elliptic:
+            # A thread of a CPU costs more than the work of a dof.
+            lanes = m.nv if work.device.is_cuda else 1
             wp.launch(
                 scaled_jacobian,
-                dim=(work.nworld, work.njmax, m.nv),
-                inputs=[m.opt.impratio_invsqrt, d.nefc, at.rows, jacobian, work.laws, at.contacts],
+                dim=(work.nworld, work.njmax, lanes),
+                inputs=[m.nv, m.opt.impratio_invsqrt, lanes, d.nefc, at.rows, jacobian, work.laws, at.contacts],
                 outputs=[self.scaled],
             )

@@ -19,6 +19,7 @@ from msk_ray.physics.adjoint.groups import (
 from msk_ray.physics.adjoint.rows import ConstraintLaws, row_slopes
 from msk_ray.physics.adjoint.tendons import tendon_rate
 from msk_ray.physics.adjoint.workspace import Workspace
+from msk_ray.physics.capacity import scalar_rows
 from msk_ray.physics.mjw_private import ConstraintType, EqType, vec5, vec12
 
 wp.set_module_options({"enable_backward": False})
@@ -255,19 +256,25 @@ def pull_rows(
                 wp.atomic_add(tendon_bars_out.length, worldid, second, -bend2 * mixed)
 
 
+def foremost_rows(work: Workspace) -> int:
+    """How many rows may not be contacts'; those of contacts come after them."""
+    return min(scalar_rows(work.mjm), work.njmax)
+
+
 class ScalarRows:
     """Launches of what the rows of joints, tendons and their equalities give ∂Φ."""
 
     def __init__(self, work: Workspace, laws: ConstraintLaws) -> None:
         self._work, self._laws = work, laws
         self._settings = gather(RowSettings, work.model)
+        self._rows = foremost_rows(work)
 
     def launch(self, at: Substep) -> None:
         """Launch the pullback of these rows."""
         work, m, d = self._work, self._work.model, at.data
         wp.launch(
             pull_rows,
-            dim=(work.nworld, work.njmax),
+            dim=(work.nworld, self._rows),
             inputs=[
                 m.opt.timestep,
                 m.opt.disableflags,

@@ -29,8 +29,9 @@ class ParameterAdjoint:
     """Buffers and launches of the gradients of some parameters, beside a `StepAdjoint`.
 
     Attributes:
-        gradients: by name, of every substep since `start` together, one row per world, in the shape of the model's
-            array; that of a quaternion in raw coordinates.
+        rows: gradients of every substep since `start` together, (W, numbers of a world); those of quaternions in raw
+            coordinates.
+        columns: by name, where a parameter's are in a row.
     """
 
     def __init__(self, adjoint: StepAdjoint, names: Iterable[str]) -> None:
@@ -42,8 +43,8 @@ class ParameterAdjoint:
             kinds = dict.fromkeys(kind for stage in chosen for kind in stage.kinds)
             self._buffer = GradientBuffer(kinds, work.model, work.nworld)
             self._stages = [stage(parts, self._buffer.groups) for stage in chosen if stage.applies(parts)]
-        found = {name: getattr(group, name) for kind, group in self._buffer.groups.items() for name in kind.vars}
-        self.gradients: dict[str, wp.array] = {name: found[field] for name, field in fields.items()}
+        self.rows: wp.array = self._buffer.rows
+        self.columns = {name: self._buffer.columns[field] for name, field in fields.items()}
 
     def start(self) -> None:
         """Launch the start of an env step's pullback."""

@@ -76,30 +76,45 @@ class ParameterStage(ABC):
 
 
 class GradientBuffer:
-    """Gradients of several groups in one stretch of memory, which one launch clears.
+    """Gradients of several groups in one array with a row per world, so that one launch clears, copies or sums them.
 
     Attributes:
-        groups: by kind.
+        groups: by kind; their arrays are views of columns of `rows`.
+        rows: shape (W, numbers of a world).
+        columns: where each field is in a row.
     """
 
     def __init__(self, kinds: Iterable[Any], model: Any, nworld: int) -> None:
         self.groups = {kind: kind() for kind in kinds}
-        spaces = []
+        self.columns: dict[str, slice] = {}
+        places = []
+        width = 0
         for kind, group in self.groups.items():
             for name, field in kind.vars.items():
                 section = model.opt if hasattr(model.opt, name) else model
-                spaces.append((group, name, field.type.dtype, (nworld, *getattr(section, name).shape[1:])))
-        words = [math.prod(shape) * wp.types.type_size_in_bytes(dtype) // 4 for _, _, dtype, shape in spaces]
-        self._floats = wp.zeros(max(sum(words), 1), dtype=float)
-        offset = 0
-        for (group, name, dtype, shape), size in zip(spaces, words, strict=True):
-            part = wp.zeros(shape, dtype=dtype)
-            if size:
-                pointer = self._floats.ptr + 4 * offset
-                part = wp.array(ptr=pointer, dtype=dtype, shape=shape, device=self._floats.device, copy=False)
+                shape = getattr(section, name).shape[1:]
+                dtype = field.type.dtype
+                size = math.prod(shape) * wp.types.type_size_in_bytes(dtype) // 4
+                self.columns[name] = slice(width, width + size)
+                places.append((group, name, dtype, shape))
+                width += size
+        self.rows = wp.zeros((nworld, width), dtype=float)
+        for group, name, dtype, shape in places:
+            strides = [wp.types.type_size_in_bytes(dtype)]
+            for length in reversed(shape[1:]):
+                strides.insert(0, strides[0] * length)
+            part = wp.zeros((nworld, *shape), dtype=dtype)
+            if part.size:
+                part = wp.array(
+                    ptr=self.rows.ptr + 4 * self.columns[name].start,
+                    dtype=dtype,
+                    shape=(nworld, *shape),
+                    strides=(4 * width, *strides[: len(shape)]),
+                    device=self.rows.device,
+                    copy=False,
+                )
             setattr(group, name, part)
-            offset += size
 
     def clear(self) -> None:
         """Launch the start of new sums."""
-        self._floats.zero_()
+        self.rows.zero_()

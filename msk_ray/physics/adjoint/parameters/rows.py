@@ -8,9 +8,8 @@ from mujoco_warp import DisableBit, JointType
 from msk_ray.physics.adjoint.groups import Joints, RowLaws, Rows, State, Substep, TendonRows, gather
 from msk_ray.physics.adjoint.parameters.base import ParameterStage, Parts, TimestepGradient
 from msk_ray.physics.adjoint.parameters.row_laws import FRICTION, ONE_SIDED, TWO_SIDED, RowMotion, row_score
-from msk_ray.physics.adjoint.scalar_rows import RowSettings, row_spring
+from msk_ray.physics.adjoint.scalar_rows import RowSettings, foremost_rows, row_spring
 from msk_ray.physics.adjoint.tendons import tendon_rate
-from msk_ray.physics.capacity import scalar_rows
 from msk_ray.physics.mjw_private import ConstraintType, EqType, contact_kbimp, vec5
 
 wp.set_module_options({"enable_backward": False})
@@ -73,6 +72,8 @@ def pull_row_parameters(
     settings: RowSettings,
     ranges: RowRanges,
     # In:
+    rows: int,
+    lanes: int,
     live_in: wp.array[int],
     nefc_in: wp.array[int],
     rows_in: Rows,
@@ -85,85 +86,86 @@ def pull_row_parameters(
     gradients_out: RowGradients,
     timestep_out: TimestepGradient,
 ) -> None:
-    """-Φ ∋ ρ(λ) f(jar): slopes by the parameters of one row that is no contact's."""
-    worldid, row = wp.tid()
-    if live_in[worldid] == 0 or row >= wp.min(nefc_in[worldid], laws_in.slope.shape[1]):
+    """-Φ ∋ ρ(λ) f(jar): slopes by the parameters of the rows that are no contact's, `lanes` threads a world."""
+    worldid, lane = wp.tid()
+    if live_in[worldid] == 0:
         return
-    kind = rows_in.type[worldid, row]
-    if laws_in.slope[worldid, row] == 0.0 and laws_in.force[worldid, row] == 0.0:
-        return
-    ident = rows_in.id[worldid, row]
-    motion = RowMotion()
-    motion.law = ONE_SIDED
-    spring = row_spring(worldid, kind, ident, settings)
-    if not spring.known:
-        return
-    solref = spring.solref
-    solimp = spring.solimp
-    shared = bool(False)
-    if kind == ConstraintType.FRICTION_DOF or kind == ConstraintType.FRICTION_TENDON:
-        motion.law = FRICTION
-    elif kind == ConstraintType.EQUALITY:
-        motion.law = TWO_SIDED
-        # The rows of a connect or weld share one impedance.
-        shared = settings.eq_type[ident] != EqType.JOINT and settings.eq_type[ident] != EqType.TENDON
+    for row in range(lane, wp.min(nefc_in[worldid], rows), lanes):
+        kind = rows_in.type[worldid, row]
+        if laws_in.slope[worldid, row] == 0.0 and laws_in.force[worldid, row] == 0.0:
+            continue
+        ident = rows_in.id[worldid, row]
+        motion = RowMotion()
+        motion.law = ONE_SIDED
+        spring = row_spring(worldid, kind, ident, settings)
+        if not spring.known:
+            continue
+        solref = spring.solref
+        solimp = spring.solimp
+        shared = bool(False)
+        if kind == ConstraintType.FRICTION_DOF or kind == ConstraintType.FRICTION_TENDON:
+            motion.law = FRICTION
+        elif kind == ConstraintType.EQUALITY:
+            motion.law = TWO_SIDED
+            # The rows of a connect or weld share one impedance.
+            shared = settings.eq_type[ident] != EqType.JOINT and settings.eq_type[ident] != EqType.TENDON
 
-    for j in range(lam_in.shape[1]):
-        motion.lam += jacobian_in[worldid, row, j] * lam_in[worldid, j]
-        motion.vel += jacobian_in[worldid, row, j] * state_in.qvel[worldid, j]
-    timestep = opt_timestep[worldid % opt_timestep.shape[0]]
-    aref = rows_in.aref[worldid, row]
-    if shared:
-        y = laws_in.slope[worldid, row] * motion.lam
-        step = bounded_step_slope(opt_disableflags, timestep, solref, solimp, motion.vel, aref)
-        wp.atomic_sub(timestep_out.timestep, worldid, y * step)
-        return
-    pos = rows_in.pos[worldid, row] - rows_in.margin[worldid, row]
-    kbi = contact_kbimp(opt_disableflags, timestep, solref, solimp, pos, False)
-    motion.disableflags = opt_disableflags
-    motion.weight = kbi[2] / ((1.0 - kbi[2]) * rows_in.D[worldid, row])
-    motion.rest = laws_in.jar[worldid, row] - kbi[1] * motion.vel
-    if motion.law != FRICTION:
-        motion.rest -= kbi[0] * kbi[2] * pos
-    loss = rows_in.frictionloss[worldid, row]
-    _m, solref_bar, solimp_bar, pos_bar, loss_bar, timestep_bar = wp.grad(row_score)(
-        motion, solref, solimp, pos, loss, timestep
-    )
-    wp.atomic_add(timestep_out.timestep, worldid, timestep_bar)
-    if kind == ConstraintType.LIMIT_JOINT:
-        wp.atomic_add(gradients_out.jnt_solref, worldid, ident, solref_bar)
-        wp.atomic_add(gradients_out.jnt_solimp, worldid, ident, solimp_bar)
-        bounds = ranges.jnt_range[worldid % ranges.jnt_range.shape[0], ident]
-        bar = wp.vec2(0.0)
-        if joints.jnt_type[ident] == JointType.BALL:
-            # pos = max(range) - angle
-            if bounds[0] > bounds[1]:
-                bar[0] = pos_bar
+        for j in range(lam_in.shape[1]):
+            motion.lam += jacobian_in[worldid, row, j] * lam_in[worldid, j]
+            motion.vel += jacobian_in[worldid, row, j] * state_in.qvel[worldid, j]
+        timestep = opt_timestep[worldid % opt_timestep.shape[0]]
+        aref = rows_in.aref[worldid, row]
+        if shared:
+            y = laws_in.slope[worldid, row] * motion.lam
+            step = bounded_step_slope(opt_disableflags, timestep, solref, solimp, motion.vel, aref)
+            wp.atomic_sub(timestep_out.timestep, worldid, y * step)
+            continue
+        pos = rows_in.pos[worldid, row] - rows_in.margin[worldid, row]
+        kbi = contact_kbimp(opt_disableflags, timestep, solref, solimp, pos, False)
+        motion.disableflags = opt_disableflags
+        motion.weight = kbi[2] / ((1.0 - kbi[2]) * rows_in.D[worldid, row])
+        motion.rest = laws_in.jar[worldid, row] - kbi[1] * motion.vel
+        if motion.law != FRICTION:
+            motion.rest -= kbi[0] * kbi[2] * pos
+        loss = rows_in.frictionloss[worldid, row]
+        _m, solref_bar, solimp_bar, pos_bar, loss_bar, timestep_bar = wp.grad(row_score)(
+            motion, solref, solimp, pos, loss, timestep
+        )
+        wp.atomic_add(timestep_out.timestep, worldid, timestep_bar)
+        if kind == ConstraintType.LIMIT_JOINT:
+            wp.atomic_add(gradients_out.jnt_solref, worldid, ident, solref_bar)
+            wp.atomic_add(gradients_out.jnt_solimp, worldid, ident, solimp_bar)
+            bounds = ranges.jnt_range[worldid % ranges.jnt_range.shape[0], ident]
+            bar = wp.vec2(0.0)
+            if joints.jnt_type[ident] == JointType.BALL:
+                # pos = max(range) - angle
+                if bounds[0] > bounds[1]:
+                    bar[0] = pos_bar
+                else:
+                    bar[1] = pos_bar
+            elif jacobian_in[worldid, row, joints.jnt_dofadr[ident]] > 0.0:
+                # pos = q - lower, or upper - q
+                bar[0] = -pos_bar
             else:
                 bar[1] = pos_bar
-        elif jacobian_in[worldid, row, joints.jnt_dofadr[ident]] > 0.0:
-            # pos = q - lower, or upper - q
-            bar[0] = -pos_bar
-        else:
-            bar[1] = pos_bar
-        wp.atomic_add(gradients_out.jnt_range, worldid, ident, bar)
-    elif kind == ConstraintType.FRICTION_DOF:
-        wp.atomic_add(gradients_out.dof_solref, worldid, ident, solref_bar)
-        wp.atomic_add(gradients_out.dof_solimp, worldid, ident, solimp_bar)
-        wp.atomic_add(gradients_out.dof_frictionloss, worldid, ident, loss_bar)
-    elif kind == ConstraintType.LIMIT_TENDON:
-        wp.atomic_add(gradients_out.tendon_solref_lim, worldid, ident, solref_bar)
-        wp.atomic_add(gradients_out.tendon_solimp_lim, worldid, ident, solimp_bar)
-        reach = settings.tendon_range[worldid % settings.tendon_range.shape[0], ident]
-        length = ten_length_in[worldid, ident]
-        bar = wp.vec2(0.0, pos_bar)
-        if length - reach[0] < reach[1] - length:
-            bar = wp.vec2(-pos_bar, 0.0)
-        wp.atomic_add(gradients_out.tendon_range, worldid, ident, bar)
-    elif kind == ConstraintType.FRICTION_TENDON:
-        wp.atomic_add(gradients_out.tendon_solref_fri, worldid, ident, solref_bar)
-        wp.atomic_add(gradients_out.tendon_solimp_fri, worldid, ident, solimp_bar)
-        wp.atomic_add(gradients_out.tendon_frictionloss, worldid, ident, loss_bar)
+            wp.atomic_add(gradients_out.jnt_range, worldid, ident, bar)
+        elif kind == ConstraintType.FRICTION_DOF:
+            wp.atomic_add(gradients_out.dof_solref, worldid, ident, solref_bar)
+            wp.atomic_add(gradients_out.dof_solimp, worldid, ident, solimp_bar)
+            wp.atomic_add(gradients_out.dof_frictionloss, worldid, ident, loss_bar)
+        elif kind == ConstraintType.LIMIT_TENDON:
+            wp.atomic_add(gradients_out.tendon_solref_lim, worldid, ident, solref_bar)
+            wp.atomic_add(gradients_out.tendon_solimp_lim, worldid, ident, solimp_bar)
+            reach = settings.tendon_range[worldid % settings.tendon_range.shape[0], ident]
+            length = ten_length_in[worldid, ident]
+            bar = wp.vec2(0.0, pos_bar)
+            if length - reach[0] < reach[1] - length:
+                bar = wp.vec2(-pos_bar, 0.0)
+            wp.atomic_add(gradients_out.tendon_range, worldid, ident, bar)
+        elif kind == ConstraintType.FRICTION_TENDON:
+            wp.atomic_add(gradients_out.tendon_solref_fri, worldid, ident, solref_bar)
+            wp.atomic_add(gradients_out.tendon_solimp_fri, worldid, ident, solimp_bar)
+            wp.atomic_add(gradients_out.tendon_frictionloss, worldid, ident, loss_bar)
 
 
 @wp.kernel
@@ -230,20 +232,23 @@ class RowStage(ParameterStage):
         super().__init__(parts, gradients)
         self._settings = gather(RowSettings, parts.work.model)
         self._ranges, self._losses = gather(RowRanges, parts.work.model), gather(Losses, parts.work.model)
-        # These rows come before those of contacts.
-        self._rows = min(scalar_rows(parts.work.mjm), parts.work.njmax)
+        self._rows = foremost_rows(parts.work)
 
     def launch(self, at: Substep) -> None:
         work, m, d = self.parts.work, self.parts.work.model, at.data
+        # A thread of a CPU costs more than the work of a row.
+        lanes = max(self._rows, 1) if work.device.is_cuda else 1
         wp.launch(
             pull_row_parameters,
-            dim=(work.nworld, self._rows),
+            dim=(work.nworld, lanes),
             inputs=[
                 m.opt.timestep,
                 m.opt.disableflags,
                 work.joints,
                 self._settings,
                 self._ranges,
+                self._rows,
+                lanes,
                 work.live,
                 d.nefc,
                 at.rows,
