@@ -2,16 +2,17 @@
 
 from msk_ray.config.algorithms import (
     ALGORITHMS,
-    AdaptiveHorizon,
     AlgorithmConfig,
     AlgorithmSettings,
     EntropyConfig,
-    HorizonSchedule,
+    ExplorationSchedule,
+    PerturbedCopies,
     PpoConfig,
     ShacConfig,
     check_installed,
 )
 from msk_ray.config.environments import ENVIRONMENTS, settings_class
+from msk_ray.config.horizons import AdaptiveHorizon, ContactHorizon, HorizonSchedule
 from msk_ray.config.load import (
     describe_fault,
     load_config,
@@ -46,14 +47,17 @@ __all__ = [
     "AlgorithmSettings",
     "Config",
     "ContactCurriculum",
+    "ContactHorizon",
     "ContactStart",
     "Draw",
     "EntropyConfig",
     "EnvSettings",
     "EvaluationConfig",
+    "ExplorationSchedule",
     "FdConfig",
     "HorizonSchedule",
     "NetworkConfig",
+    "PerturbedCopies",
     "PhysicsConfig",
     "PpoConfig",
     "RandomizeConfig",

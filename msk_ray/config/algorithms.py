@@ -14,15 +14,14 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from pydantic import (
     AfterValidator,
     BeforeValidator,
-    Discriminator,
     Field,
     PositiveFloat,
     SerializeAsAny,
-    Tag,
     ValidationInfo,
     model_validator,
 )
 
+from msk_ray.config.horizons import AdaptiveHorizon, ContactHorizon, Horizon, HorizonSchedule
 from msk_ray.config.physics import GRADIENTS
 from msk_ray.config.resolve import Registry, resolve
 from msk_ray.config.sections import Count, Fraction, NonNegative, Section, Text
@@ -82,60 +81,6 @@ class AlgorithmSettings(Section):
         return {}
 
 
-class HorizonSchedule(Section):
-    """Rollout length by epoch: `start` at epoch 0, `end` from epoch `epochs` on, linear between."""
-
-    start: Count
-    end: Count
-    epochs: Count
-
-    def at(self, epoch: int) -> int:
-        """Env steps at `epoch`, counted from 0."""
-        progress = min(1.0, epoch / self.epochs)
-        return round(self.start + (self.end - self.start) * progress)
-
-
-class AdaptiveHorizon(Section):
-    """Rollout length that follows the gradient: longer while cotangents stay small, shorter when they grow.
-
-    After each epoch H ← H (target / p90)^rate within bounds, where p90 is the 90th percentile of the state cotangents'
-    norms in units of reward. Adaptive horizons are the idea of AHAC (Georgiev et al. 2024, arXiv:2405.17784), which
-    follows a constraint on contact forces; this one follows the cotangents themselves.
-    """
-
-    start: Count
-    shortest: Count = 4
-    longest: Count = 64
-    target: PositiveFloat
-    """Target for the 90th percentile of the cotangent norms, before any bound [reward]."""
-    rate: Annotated[float, Field(gt=0.0, le=1.0)] = 0.1
-
-    @model_validator(mode="after")
-    def _bounds(self) -> AdaptiveHorizon:
-        if not self.shortest <= self.start <= self.longest:
-            raise ValueError(
-                f"adaptive horizon: start {self.start} must be between shortest {self.shortest} and longest "
-                f"{self.longest}"
-            )
-        return self
-
-
-def _kind_of_horizon(value: Any) -> str:
-    if isinstance(value, dict):
-        return "adaptive" if "target" in value else "schedule"
-    if isinstance(value, AdaptiveHorizon):
-        return "adaptive"
-    return "schedule" if isinstance(value, HorizonSchedule) else "constant"
-
-
-Horizon = Annotated[
-    Annotated[Count, Tag("constant")]
-    | Annotated[HorizonSchedule, Tag("schedule")]
-    | Annotated[AdaptiveHorizon, Tag("adaptive")],
-    Discriminator(_kind_of_horizon),
-]
-
-
 class EntropyConfig(Section):
     """Bonus α for the policy's entropy, as in SAPO (Xing et al. 2024, arXiv:2412.12089); values become soft values."""
 
@@ -145,6 +90,46 @@ class EntropyConfig(Section):
     """Entropy per action dimension [nat] to which α is adapted; null keeps α. Uniform actions have ln 2 = 0.69."""
     rate: PositiveFloat = 5e-3
     """Change of log α per epoch and nat of missing entropy."""
+    normalize: bool = False
+    """Pay α for (H + |T|) / 2|T| in place of the entropy H, where T is the target of all action dimensions together: 0
+    at T = −|T|, as in SAPO, so that α does not depend on the number of actions."""
+
+    @model_validator(mode="after")
+    def _normalized_by_something(self) -> EntropyConfig:
+        if self.normalize and not self.target:
+            raise ValueError("entropy.normalize divides by the target: write a target other than 0")
+        return self
+
+
+class ExplorationSchedule(Section):
+    """Factor on the standard deviation of actions: `start` at epoch 0, `end` from epoch `epochs` on, linear between.
+
+    The deviation itself is learned all the while.
+    """
+
+    start: NonNegative
+    end: NonNegative
+    epochs: Count
+
+    def at(self, epoch: int) -> float:
+        """The factor at `epoch`, counted from 0."""
+        return self.start + (self.end - self.start) * min(1.0, epoch / self.epochs)
+
+
+class PerturbedCopies(Section):
+    """Average the gradient over perturbed copies of a state: it is that of a smoothed return.
+
+    Worlds are in groups of `count`. At the beginning of an epoch, the first of each group goes on where it was, and the
+    others take its state with a uniform perturbation; the group's mean is the gradient of randomized smoothing (Suh et
+    al. 2022, arXiv:2202.00817). So W worlds hold W / `count` episodes.
+    """
+
+    count: Annotated[int, Field(ge=2, lt=2**31)]
+    """Worlds of a group; must divide env.nworld."""
+    qpos: NonNegative = 0.01
+    """Largest perturbation of positions along each degree of freedom [m, rad]."""
+    qvel: NonNegative = 0.05
+    """Largest perturbation of velocities [m/s, rad/s]."""
 
 
 def _off(value: Any) -> Any:
@@ -158,8 +143,8 @@ class ShacConfig(AlgorithmSettings):
     length: ClassVar[str | None] = "horizon"
 
     horizon: Horizon = 32
-    """Env steps H of a rollout through which the gradient flows: constant, {start, end, epochs}, or adapted to the
-    gradient by {start, target}."""
+    """Env steps H of a rollout through which the gradient flows: constant, {start, end, epochs}, adapted to the
+    gradient by {start, target}, or to contact by {start, contact}."""
     gamma: Fraction = 0.99
     """Discount."""
     lam: Fraction = 0.95
@@ -167,7 +152,10 @@ class ShacConfig(AlgorithmSettings):
     critic_method: Literal["td-lambda", "one-step"] = "td-lambda"
     """Targets of the critic."""
     critic_iterations: Count = 16
-    """Passes over the rollout per epoch."""
+    """Passes over the rollout per epoch; with `critic_tolerance`, the largest number of them."""
+    critic_tolerance: PositiveFloat | None = None
+    """Stop the passes where the loss changes by less than this share of itself a pass, on average over the last four,
+    as AHAC does by an absolute number; null: all passes. A recorded fit computes all, and leaves out their steps."""
     critic_batches: Count = 4
     """Minibatches a pass."""
     target_critic_alpha: Fraction = 0.2
@@ -179,6 +167,8 @@ class ShacConfig(AlgorithmSettings):
     final_lr: PositiveFloat = 1e-5
     betas: tuple[Fraction, Fraction] = (0.7, 0.95)
     """Adam's moment decays."""
+    weight_decay: NonNegative = 0.0
+    """Decoupled weight decay of AdamW, for actor and critic; 0: Adam. SAPO has 0.01."""
     actor_grad_norm: PositiveFloat | None = 1.0
     """Norm to which the actor's gradient is clipped; null: no clipping."""
     critic_grad_norm: PositiveFloat | None = 1.0
@@ -192,6 +182,13 @@ class ShacConfig(AlgorithmSettings):
     """
     entropy: EntropyConfig | None = None
     """Bonus for the policy's entropy; null: none."""
+    actor_value: Literal["smaller", "mean"] = "smaller"
+    """Which of two critics' values counts in the actor's loss; the critic's targets always use the smaller, and SAPO
+    the mean for the actor."""
+    exploration: ExplorationSchedule | None = None
+    """Factor on the standard deviation of the actions by epoch; null: 1."""
+    copies: PerturbedCopies | None = None
+    """Average the gradient over perturbed copies of each state; null: every world has a state of its own."""
     normalize_obs: bool = True
     """Normalise observations by their running mean and variance."""
     normalize_return: bool = False
@@ -204,20 +201,20 @@ class ShacConfig(AlgorithmSettings):
     device runs operation by operation, and a warning says where. `off`: always so, to debug. A CPU has no graphs."""
 
     def env_steps(self, nworld: int, epochs: int) -> int:
-        """The sum over epochs of horizon × worlds; an adaptive horizon counts as its `longest`."""
+        """The sum over epochs of horizon × worlds; a horizon that follows something counts as its `longest`."""
         horizon = self.horizon
         if isinstance(horizon, HorizonSchedule):
             return nworld * sum(horizon.at(epoch) for epoch in range(epochs))
-        return nworld * epochs * (horizon.longest if isinstance(horizon, AdaptiveHorizon) else horizon)
+        return nworld * epochs * (horizon if isinstance(horizon, int) else horizon.longest)
 
     def shortened(self, epochs: int) -> dict[str, Any]:
         """A quarter of the horizon, and two passes of one batch for the critic."""
         horizon: Any = self.horizon
         if isinstance(horizon, int):
             horizon = _quarter(horizon)
-        elif isinstance(horizon, AdaptiveHorizon):
+        elif isinstance(horizon, AdaptiveHorizon | ContactHorizon):
             lengths = {name: _quarter(getattr(horizon, name)) for name in ("start", "shortest", "longest")}
-            horizon = {**lengths, "target": horizon.target, "rate": horizon.rate}
+            horizon = {**horizon.model_dump(), **lengths}
         else:
             horizon = {"start": _quarter(horizon.start), "end": _quarter(horizon.end), "epochs": epochs - 1}
         return {"horizon": horizon, "critic_batches": 1, "critic_iterations": min(self.critic_iterations, 2)}
@@ -227,7 +224,7 @@ class ShacConfig(AlgorithmSettings):
         return {"horizon": 2, "critic_iterations": 1, "critic_batches": 1}
 
     def check(self, config: Config) -> None:
-        """Refuse critic batches that do not divide a rollout, and a bonus for the entropy of a policy without one."""
+        """Refuse critic batches that do not divide a rollout, and settings that others leave without meaning."""
         horizon, nworld = self.horizon, config.env.nworld
         if isinstance(horizon, HorizonSchedule):
             shortest = min(horizon.start, horizon.end)
@@ -240,6 +237,17 @@ class ShacConfig(AlgorithmSettings):
             )
         if self.entropy is not None and not config.actor.stochastic:
             raise ValueError("shac.entropy needs a stochastic policy: write actor.stochastic: true")
+        if self.exploration is not None:
+            if not config.actor.stochastic:
+                raise ValueError("shac.exploration needs a stochastic policy: write actor.stochastic: true")
+            if self.entropy is not None:
+                raise ValueError("shac.exploration changes the noise that shac.entropy measures: leave one out")
+        if self.actor_value == "mean" and config.critic.count == 1:
+            raise ValueError("shac.actor_value: mean is of two critics: write critic.count: 2")
+        if self.copies is not None and nworld % self.copies.count:
+            raise ValueError(f"shac.copies.count {self.copies.count} must divide env.nworld ({nworld})")
+        if isinstance(horizon, ContactHorizon) and "cone" not in config.env.reads_physics:
+            raise ValueError(f"shac.horizon.contact: {config.env.name} has no contacts; write a number")
 
     def unread(self) -> dict[str, str]:
         """Settings that another one switches off."""
@@ -260,7 +268,14 @@ class PpoConfig(AlgorithmSettings):
 
     differentiates: ClassVar[bool] = False
     reads_not: ClassVar[frozenset[str]] = frozenset(
-        ("actor.layer_norm", "actor.log_std", "actor.output_gain", "critic.layer_norm", "critic.count")
+        (
+            "actor.layer_norm",
+            "actor.log_std",
+            "actor.state_std",
+            "actor.output_gain",
+            "critic.layer_norm",
+            "critic.count",
+        )
     )
     packages: ClassVar[Mapping[str, str]] = {"rsl_rl": "msk-ray[ppo]"}
     length: ClassVar[str | None] = "steps"

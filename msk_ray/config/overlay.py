@@ -9,7 +9,7 @@ import copy
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-from msk_ray.config.algorithms import AdaptiveHorizon, HorizonSchedule
+from msk_ray.config.horizons import AdaptiveHorizon, ContactHorizon, HorizonSchedule
 from msk_ray.config.yaml_text import MAX_DEPTH, parse_yaml
 from msk_ray.errors import ConfigError, brief, shortened
 
@@ -103,7 +103,12 @@ def _laid_over(path: list[str], old: Any, new: Any) -> Any:
     return result | {key: _laid_over([*path, str(key)], old.get(key), value) for key, value in new.items()}
 
 
-_HORIZONS = (set(HorizonSchedule.model_fields), set(AdaptiveHorizon.model_fields))
+_HORIZONS = {
+    "target": set(AdaptiveHorizon.model_fields),
+    "contact": set(ContactHorizon.model_fields),
+    "epochs": set(HorizonSchedule.model_fields),
+}
+"""Settings of each kind of horizon, by the one that tells it from the others."""
 
 
 def _another_kind(path: list[str], old: Mapping[str, Any], new: Mapping[str, Any]) -> bool:
@@ -111,7 +116,6 @@ def _another_kind(path: list[str], old: Mapping[str, Any], new: Mapping[str, Any
     if path in (["env"], ["algorithm"]):
         return "name" in new and "name" in old and new["name"] != old["name"]
     if path == ["shac", "horizon"]:
-        schedule, adaptive = _HORIZONS
-        own, other = (adaptive, schedule) if "target" in old else (schedule, adaptive)
-        return bool(set(new) & (other - own))
+        own = next((fields for name, fields in _HORIZONS.items() if name in old), _HORIZONS["epochs"])
+        return any(set(new) & (fields - own) for fields in _HORIZONS.values())
     return False

@@ -64,20 +64,37 @@ def first_spelling(settings: Mapping[str, Any]) -> dict[str, Any]:
     if env["name"] in _ONCE_FLAT:
         env |= env.pop("reward")
     spelt = {**settings, "env": env}
-    for (section, key), default in _LATER.items():
-        if spelt.get(section, {}).get(key) == default:
-            spelt[section] = {name: value for name, value in spelt[section].items() if name != key}
+    for path, default in _LATER.items():
+        spelt = _without(spelt, path, default)
     if not spelt["algorithm"]:
         del spelt["algorithm"]
     return spelt
 
 
-_LATER: dict[tuple[str, str], Any] = {
+def _without(settings: Mapping[str, Any], path: tuple[str, ...], default: Any) -> dict[str, Any]:
+    """`settings` without the one at `path`, if it has that value."""
+    name, *rest = path
+    found = dict(settings)
+    if rest and isinstance(found.get(name), Mapping):
+        found[name] = _without(found[name], tuple(rest), default)
+    elif not rest and name in found and found[name] == default:
+        del found[name]
+    return found
+
+
+_LATER: dict[tuple[str, ...], Any] = {
     ("physics", "randomize"): None,
     ("physics", "contact_reach"): None,
     ("trial", "threads"): 1,
     ("trial", "loggers"): ["tensorboard"],
     ("algorithm", "name"): "shac",
     ("shac", "capture"): "auto",
+    ("shac", "critic_tolerance"): None,
+    ("shac", "entropy", "normalize"): False,
+    ("shac", "weight_decay"): 0.0,
+    ("shac", "actor_value"): "smaller",
+    ("shac", "exploration"): None,
+    ("shac", "copies"): None,
+    ("actor", "state_std"): False,
 }
-"""Settings that the first version did not have, (section, name), with the default that leaves ids unchanged."""
+"""Settings that the first version did not have, as (section, name), with the default that leaves ids unchanged."""

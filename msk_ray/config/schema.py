@@ -81,9 +81,11 @@ class ActorConfig(NetworkConfig):
     """Policy network. Its output is squashed by tanh."""
 
     stochastic: bool = True
-    """Gaussian with state-independent standard deviation; False is deterministic."""
+    """Gaussian; False is deterministic."""
     log_std: float = -1.0
     """Initial log standard deviation, before tanh."""
+    state_std: bool = False
+    """Let the standard deviation depend on the observation, as in SAPO; False learns one for all states."""
     output_gain: PositiveFloat = 1.0
     """Gain of the last layer's initial weights; a small gain starts near action 0 for every observation."""
 

@@ -41,7 +41,7 @@ def _unread(config: Config) -> dict[str, str]:
     own = config.algorithm_settings.unread()
     unread |= {f"{section}.{name}": f"nothing reads it while {section}.{why};" for name, why in own.items()}
     if not config.actor.stochastic:
-        unread["actor.log_std"] = _while("actor.stochastic", "false")
+        unread |= dict.fromkeys(("actor.log_std", "actor.state_std"), _while("actor.stochastic", "false"))
     return unread
 
 

@@ -76,18 +76,31 @@ def test_what_is_said_last_holds() -> None:
     assert overlay({}, parse_overrides(["a.b={x: 1}", "a.b.x=2", "a.b={x: 5}"])) == {"a": {"b": {"x": 5}}}
 
 
+_ENTROPY = {"coefficient": 0.02, "target": 0.5, "rate": 5e-3, "normalize": False}
 CASES: list[tuple[list[str], str, Any]] = [
-    (["shac.entropy={target: 0.5}"], "entropy", {"coefficient": 0.02, "target": 0.5, "rate": 5e-3}),
+    (["shac.entropy={target: 0.5}"], "entropy", _ENTROPY),
     (
         ["shac.entropy={target: 0.5}", "shac.entropy={rate: 0.1}"],
         "entropy",
-        {"coefficient": 0.02, "target": 0.5, "rate": 0.1},
+        _ENTROPY | {"rate": 0.1},
     ),
-    (["shac={entropy: {target: 0.5}}"], "entropy", {"coefficient": 0.02, "target": 0.5, "rate": 5e-3}),
+    (
+        ["shac={entropy: {target: 0.5}}"],
+        "entropy",
+        {"coefficient": 0.02, "target": 0.5, "rate": 5e-3, "normalize": False},
+    ),
     (["shac.entropy=null"], "entropy", None),
-    (["shac.horizon={start: 4}"], "horizon", {"start": 4, "shortest": 4, "longest": 32, "target": 60.0, "rate": 0.1}),
+    (
+        ["shac.horizon={start: 4}"],
+        "horizon",
+        {"start": 4, "shortest": 4, "longest": 32, "target": 60.0, "rate": 0.1},
+    ),
     (["shac.horizon={start: 4, end: 16, epochs: 50}"], "horizon", SCHEDULE),
-    (["shac.horizon.longest=16"], "horizon", {"start": 8, "shortest": 4, "longest": 16, "target": 60.0, "rate": 0.1}),
+    (
+        ["shac.horizon.longest=16"],
+        "horizon",
+        {"start": 8, "shortest": 4, "longest": 16, "target": 60.0, "rate": 0.1},
+    ),
     (["shac.horizon=16"], "horizon", 16),
 ]
 

@@ -34,6 +34,28 @@ def test_a_deterministic_actor_has_no_noise_scale() -> None:
     assert torch.equal(actor(obs, torch.randn(5, 2)), actor(obs))
 
 
+def test_a_noise_scale_that_depends_on_the_observation_starts_the_same_everywhere() -> None:
+    actor = Actor(ActorConfig(hidden=(8,), log_std=-0.5, state_std=True), 4, 2, torch.Generator().manual_seed(0))
+    plain = Actor(ActorConfig(hidden=(8,), log_std=-0.5), 4, 2, torch.Generator().manual_seed(0))
+    obs, noise = 0.5 * torch.randn(6, 4), 0.5 * torch.randn(6, 2)
+    assert torch.equal(actor.std(obs), plain.std(obs).expand(6, 2))
+    assert torch.equal(actor(obs, noise), plain(obs, noise))
+    assert torch.equal(actor(obs), plain(obs))
+    assert actor.log_std is None
+    torch.nn.init.normal_(actor.log_std_layer.weight, std=0.1)
+    std = actor.std(obs)
+    assert std.std(0).min() > 0
+    action, neg_log_prob = actor.sample(obs, noise)
+    assert torch.equal(action, actor(obs, noise))
+    squashed = torch.distributions.TransformedDistribution(
+        torch.distributions.Normal(actor.mean(obs), std), [torch.distributions.transforms.TanhTransform()]
+    )
+    torch.testing.assert_close(neg_log_prob, -squashed.log_prob(action).sum(-1), rtol=1e-3, atol=1e-4)
+    torch.nn.init.constant_(actor.log_std_layer.bias, 9.0)
+    torch.nn.init.zeros_(actor.log_std_layer.weight)
+    assert actor.std(obs).log().max().item() == 2.0, "SAPO's bound"
+
+
 def test_the_smaller_of_two_critics_is_used() -> None:
     critic = Critic(CriticConfig(hidden=(8,), count=2), 4, torch.Generator().manual_seed(0))
     obs = torch.randn(7, 4)

@@ -12,7 +12,7 @@ from msk_ray.algorithms.shac.gate import CotangentGate, CotangentRecord
 from msk_ray.algorithms.shac.half_batch_cosine import HalfBatchCosine
 from msk_ray.algorithms.shac.optimizer import RateAdam
 from msk_ray.algorithms.shac.rollout import Rollout, collect
-from msk_ray.config import ShacConfig
+from msk_ray.config import ContactHorizon, ShacConfig
 from msk_ray.envs import Env, EnvState, Resets
 from msk_ray.networks import Critic, PolicyNetwork, RunningMeanStd
 from msk_ray.simulation import StepState
@@ -124,6 +124,7 @@ class ActorUpdate:
                 gate,
                 state_bptt=c.state_bptt,
                 with_neg_log_prob=self._entropy is not None,
+                with_contact=isinstance(c.horizon, ContactHorizon),
             )
         return Rolled(rollout, env.state.detach(), gate, halves)
 
@@ -160,8 +161,12 @@ class ActorUpdate:
             "grad/actor_norm": norm,
             "grad/halves_cosine": rolled.halves.cosine(),
         }
-        if self._actor.log_std is not None:
-            metrics["train/std"] = self._actor.log_std.detach().exp().mean()
+        std = self._actor.std(obs)
+        if std is not None:
+            metrics["train/std"] = std.detach().mean()
+        if rollout.contact is not None:
+            weight = float(self._env.model.body_mass.sum() * -self._env.model.opt.gravity[2])
+            metrics["train/contact"] = (rollout.contact / weight).square().mean().sqrt()
         if rollout.neg_log_prob is not None:
             metrics["train/entropy"] = rollout.neg_log_prob.detach().mean()
         return ActorOutcome(
@@ -169,20 +174,22 @@ class ActorUpdate:
         )
 
     def _loss(self, rollout: Rollout) -> tuple[Tensor, Tensor, Tensor]:
-        """The actor's loss, attached values of the states reached (H, W), and detached rewards for the critic."""
+        """The actor's loss, values of the states reached (H, W) and detached rewards, both for the critic's targets."""
         c = self._settings
         rewards = c.reward_scale * rollout.rewards
         if self._entropy is not None:
             assert rollout.neg_log_prob is not None
-            rewards = rewards + self._entropy.weight * rollout.neg_log_prob
+            rewards = rewards + self._entropy.bonus(rollout.neg_log_prob)
         std: Tensor | float = 1.0
         if self._return_statistics is not None:
             std = torch.sqrt(self._return_statistics.var + 1e-6)
             self._update_return_statistics(self._return_statistics, rewards.detach(), rollout.done)
             rewards = rewards / std
-        next_values = self._target_critic.value(rollout.next_obs)
+        each = self._target_critic(rollout.next_obs)
+        next_values = each.amin(0)
+        in_loss = each.mean(0) if c.actor_value == "mean" else next_values
         # The loss is scaled back so that the learning rate means the same with and without normalised returns.
-        loss = std * returns.actor_loss(rewards, next_values, rollout.terminated, rollout.done, c.gamma)
+        loss = std * returns.actor_loss(rewards, in_loss, rollout.terminated, rollout.done, c.gamma)
         return loss, next_values, rewards.detach()
 
     def _update_return_statistics(self, statistics: RunningMeanStd, rewards: Tensor, done: Tensor) -> None:

@@ -11,14 +11,15 @@ from torch import Tensor, nn
 from msk_ray.algorithms.base import Algorithm, EpochResult, simulation_metrics
 from msk_ray.algorithms.episodes import EpisodeTracker
 from msk_ray.algorithms.shac.actor_update import ActorUpdate, EpochInputs
+from msk_ray.algorithms.shac.copies import from_first, spread
 from msk_ray.algorithms.shac.critic_fit import CriticFit
 from msk_ray.algorithms.shac.curriculum import ContactSchedule
 from msk_ray.algorithms.shac.entropy import EntropyBonus
-from msk_ray.algorithms.shac.gate import Norms
+from msk_ray.algorithms.shac.horizon import RolloutLength
 from msk_ray.algorithms.shac.optimizer import RateAdam
 from msk_ray.algorithms.shac.runner import EagerRunner, RecordedRunner
-from msk_ray.algorithms.shac.schedules import adapted_horizon, horizon_at, learning_rate_at
-from msk_ray.config import AdaptiveHorizon, Config, ShacConfig
+from msk_ray.algorithms.shac.schedules import learning_rate_at
+from msk_ray.config import Config, ShacConfig
 from msk_ray.envs import Env
 from msk_ray.errors import Failure, SimulationError
 from msk_ray.networks import Actor, Critic, PolicyNetwork, RunningMeanStd
@@ -45,11 +46,19 @@ class Shac(Algorithm):
         self.critic = Critic(config.critic, env.obs_size, init).to(device)
         self.target_critic = copy.deepcopy(self.critic).requires_grad_(False)
         self.return_statistics = RunningMeanStd(()).to(device) if c.normalize_return else None
-        self.actor_optimizer = RateAdam(self.actor.parameters(), c.actor_lr, c.betas)
-        self.critic_fit = CriticFit(self.critic, c.critic_lr, c.betas, c.critic_grad_norm)
+        self.actor_optimizer = RateAdam(self.actor.parameters(), c.actor_lr, c.betas, c.weight_decay)
+        self.critic_fit = CriticFit(
+            self.critic,
+            c.critic_lr,
+            c.betas,
+            c.critic_grad_norm,
+            weight_decay=c.weight_decay,
+            tolerance=c.critic_tolerance,
+        )
         self.noise_generator = torch.Generator(device=device).manual_seed(config.trial.seed + 1)
-        self.episodes = EpisodeTracker(env.nworld, device)
-        self._horizon = float(c.horizon.start) if isinstance(c.horizon, AdaptiveHorizon) else None
+        self._group = 1 if c.copies is None else c.copies.count
+        self.episodes = EpisodeTracker(env.nworld // self._group, device)
+        self._horizon = RolloutLength(c.horizon)
         self._entropy = EntropyBonus(c.entropy, env.action_size, device) if c.entropy is not None else None
         self._contacts = ContactSchedule(config.curriculum, env) if config.curriculum is not None else None
         self._actor_update = ActorUpdate(
@@ -89,10 +98,10 @@ class Shac(Algorithm):
                 physics ran out of buffer space.
         """
         c = self.settings
-        horizon = self._horizon_now(epoch)
+        horizon = self._horizon.at(epoch)
         actor_lr = self._rate(c.actor_lr, epoch)
         self.actor_optimizer.set_rate(actor_lr)
-        outcome = self._runner.run_actor(self._draw(horizon))
+        outcome = self._runner.run_actor(self._draw(horizon, epoch))
         # The fit before reads its rate until it ends, which the actor's work has waited for.
         self.critic_fit.optimizer.set_rate(self._rate(c.critic_lr, epoch))
         orders = self.critic_fit.draw_orders(outcome.targets.numel(), c.critic_iterations, self.noise_generator)
@@ -100,15 +109,19 @@ class Shac(Algorithm):
         seconds = self._runner.seconds()
         self.env.sim.settle()
         cotangents = outcome.cotangents.statistics(1.0 / (horizon * self.env.nworld))
-        metrics = {**outcome.metrics, **cotangents.metrics(), **self.episodes.update(outcome.rewards, outcome.done)}
+        # Copies have no episodes of their own.
+        firsts = (outcome.rewards[:, :: self._group], outcome.done[:, :: self._group])
+        metrics = {**outcome.metrics, **cotangents.metrics(), **self.episodes.update(*firsts)}
         if self._runner.last_loss is not None:
             metrics["train/critic_loss"] = self._runner.last_loss
         # One transfer: reading each number would make the host wait as many times.
         values = torch.stack([value.float() for value in metrics.values()]).tolist()
         numbers = dict(zip(metrics, values, strict=True))
         self._check_gradient(numbers["grad/nonfinite_share"], numbers["grad/actor_norm"])
-        numbers |= self._adapt(numbers["train/reward"], numbers.get("train/entropy"), cotangents.norms)
+        self._horizon.follow(cotangents.norms, numbers.get("train/contact"))
+        numbers |= self._adapt(numbers["train/reward"], numbers.get("train/entropy"))
         numbers |= {
+            **({} if c.exploration is None else {"train/exploration": c.exploration.at(epoch)}),
             "train/horizon": float(horizon),
             "train/actor_lr": actor_lr,
             "train/recorded": float(self._runner.recorded),
@@ -129,7 +142,7 @@ class Shac(Algorithm):
             "noise_generator": self.noise_generator.get_state(),
             "episodes": self.episodes.state_dict(),
             "discounted": self._actor_update.discounted.clone(),
-            "horizon": self._horizon,
+            **self._horizon.state_dict(),
             "entropy_coefficient": None if self._entropy is None else self._entropy.coefficient,
             "curriculum": None if self._contacts is None else self._contacts.progress,
         }
@@ -145,45 +158,39 @@ class Shac(Algorithm):
         self.noise_generator.set_state(state["noise_generator"].cpu())
         self.episodes.load_state_dict(state["episodes"])
         self._actor_update.discounted.copy_(state["discounted"])
-        self._horizon = state.get("horizon")
+        self._horizon.load_state_dict(state)
         if self._entropy is not None:
             self._entropy.coefficient = state["entropy_coefficient"]
         if self._contacts is not None:
             self._contacts.set_progress(state["curriculum"])
-
-    def _horizon_now(self, epoch: int) -> int:
-        configured = self.settings.horizon
-        if isinstance(configured, AdaptiveHorizon):
-            assert self._horizon is not None
-            return round(self._horizon)
-        return horizon_at(configured, epoch)
 
     def _rate(self, rate: float, epoch: int) -> float:
         """The learning rate at an epoch that was `rate` at the first."""
         c = self.settings
         return learning_rate_at(rate, c.final_lr, c.lr_schedule, epoch, self.config.trial.epochs)
 
-    def _draw(self, horizon: int) -> EpochInputs:
-        env = self.env
+    def _draw(self, horizon: int, epoch: int) -> EpochInputs:
+        env, c = self.env, self.settings
         noise = torch.randn((horizon, env.nworld, env.action_size), generator=self.noise_generator, device=env.device)
-        return EpochInputs(env.state.detach(), env.draw_resets(horizon), noise)
+        if c.exploration is not None:
+            noise *= c.exploration.at(epoch)
+        state = env.state.detach()
+        if c.copies is not None:
+            state = spread(state, c.copies, env, self.noise_generator)
+            self._actor_update.discounted.copy_(from_first(self._actor_update.discounted, self._group))
+        return EpochInputs(state, env.draw_resets(horizon), noise)
 
-    def _adapt(self, reward: float, entropy: float | None, norms: Norms | None) -> dict[str, float]:
-        """Advance horizon, entropy bonus and contacts after an epoch.
+    def _adapt(self, reward: float, entropy: float | None) -> dict[str, float]:
+        """Advance entropy bonus and contacts after an epoch.
 
         Args:
             reward: the epoch's mean reward per env step.
             entropy: its mean entropy of the policy [nat], if there is a bonus for it.
-            norms: norms of its state cotangents.
 
         Returns:
             Their values before, by metric name.
         """
         stood: dict[str, float] = {}
-        if isinstance(self.settings.horizon, AdaptiveHorizon):
-            assert self._horizon is not None
-            p90 = math.nan if norms is None else float(norms.p90)
-            self._horizon = adapted_horizon(self.settings.horizon, self._horizon, p90)
         if self._entropy is not None:
             assert entropy is not None
             stood["train/entropy_coefficient"] = self._entropy.coefficient

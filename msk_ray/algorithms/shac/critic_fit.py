@@ -6,6 +6,9 @@ from torch import Tensor, nn
 from msk_ray.algorithms.shac.optimizer import RateAdam
 from msk_ray.networks import Critic
 
+_WINDOW = 4
+"""Changes of the loss from pass to pass that count together."""
+
 
 class CriticFit:
     """Adam on the mean squared error, with each network's gradient norm bounded.
@@ -15,17 +18,27 @@ class CriticFit:
         learning_rate: initial rate; `optimizer.set_rate` changes it.
         betas: Adam's moment decays.
         grad_norm: bound on each network's gradient norm; None for no bound.
+        weight_decay: decoupled weight decay; 0 for none.
+        tolerance: change of the loss a pass, relative to it, below which no further step is taken; None: all steps.
 
     Attributes:
         optimizer: the critic's.
     """
 
     def __init__(
-        self, critic: Critic, learning_rate: float, betas: tuple[float, float], grad_norm: float | None
+        self,
+        critic: Critic,
+        learning_rate: float,
+        betas: tuple[float, float],
+        grad_norm: float | None,
+        *,
+        weight_decay: float = 0.0,
+        tolerance: float | None = None,
     ) -> None:
         self._critic = critic
         self._grad_norm = grad_norm
-        self.optimizer = RateAdam(critic.parameters(), learning_rate, betas)
+        self._tolerance = tolerance
+        self.optimizer = RateAdam(critic.parameters(), learning_rate, betas, weight_decay)
 
     def draw_orders(self, rows: int, passes: int, generator: torch.Generator) -> Tensor:
         """A random order of the rows for each pass, (passes, rows)."""
@@ -34,22 +47,40 @@ class CriticFit:
     def run(self, obs: Tensor, targets: Tensor, orders: Tensor, batches: int) -> Tensor:
         """Pass over rows obs (N, O) and targets (N,) in each of the orders (passes, N), in `batches` minibatches.
 
-        Rows that do not fill a minibatch are left out of a pass. Returns the mean loss of the last pass.
+        Rows that do not fill a minibatch are left out of a pass. Returns the mean loss of the last pass made.
         """
         size = obs.shape[0] // batches
-        losses: list[Tensor] = []
+        passes: list[Tensor] = []
+        settled: Tensor | None = None
         for order in orders:
             losses = [
-                self._step(obs[picked], targets[picked]) for picked in order[: batches * size].view(batches, size)
+                self._step(obs[picked], targets[picked], settled)
+                for picked in order[: batches * size].view(batches, size)
             ]
-        return torch.stack(losses).mean()
+            passes.append(torch.stack(losses).mean())
+            if self._tolerance is not None:
+                settled = self._settled(passes, settled)
+                # A recorded fit cannot ask: there, the passes left change nothing.
+                if settled.device.type == "cpu" and settled:
+                    break
+        return passes[-1]
 
-    def _step(self, obs: Tensor, targets: Tensor) -> Tensor:
+    def _settled(self, passes: list[Tensor], before: Tensor | None) -> Tensor:
+        """Whether the loss has stopped changing, a bool scalar on the device; once it has, it stays so."""
+        assert self._tolerance is not None
+        if len(passes) <= _WINDOW:
+            return torch.zeros((), dtype=torch.bool, device=passes[-1].device)
+        # The mean of the last changes is that between their ends.
+        change = (passes[-1] - passes[-1 - _WINDOW]).abs() / _WINDOW
+        settled = change < self._tolerance * passes[-1]
+        return settled if before is None else settled | before
+
+    def _step(self, obs: Tensor, targets: Tensor, skip: Tensor | None) -> Tensor:
         loss = (self._critic(obs) - targets).square().mean()
         self.optimizer.optimizer.zero_grad()
         loss.backward()
         if self._grad_norm is not None:
             for member in self._critic.members:
                 nn.utils.clip_grad_norm_(member.parameters(), self._grad_norm)
-        self.optimizer.step()
+        self.optimizer.step(skip)
         return loss.detach()

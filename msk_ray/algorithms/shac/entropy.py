@@ -3,6 +3,7 @@
 import math
 
 import torch
+from torch import Tensor
 
 from msk_ray.config import EntropyConfig
 
@@ -29,6 +30,14 @@ class EntropyBonus:
     def coefficient(self, value: float) -> None:
         self._coefficient = value
         self.weight.fill_(value)
+
+    def bonus(self, neg_log_prob: Tensor) -> Tensor:
+        """Rewards for −log π of the actions taken [nat], of the same shape."""
+        if not self._config.normalize:
+            return self.weight * neg_log_prob
+        assert self._config.target is not None
+        whole = abs(self._config.target) * self._action_size
+        return self.weight * ((neg_log_prob + whole) / (2.0 * whole))
 
     def adapt(self, entropy: float) -> None:
         """Update with an epoch's mean entropy of the policy [nat]: log α += rate (target − entropy), by dual ascent.

@@ -17,18 +17,25 @@ class RateAdam:
         parameters: what to optimise, all on one device.
         rate: initial learning rate.
         betas: moment decays.
+        weight_decay: decoupled weight decay; 0 for none.
 
     Attributes:
-        optimizer: torch's optimiser.
+        optimizer: torch's optimiser, Adam or AdamW.
     """
 
-    def __init__(self, parameters: Iterable[nn.Parameter], rate: float, betas: tuple[float, float]) -> None:
+    def __init__(
+        self, parameters: Iterable[nn.Parameter], rate: float, betas: tuple[float, float], weight_decay: float = 0.0
+    ) -> None:
         found = list(parameters)
         self._on_cuda = found[0].device.type == "cuda"
         # A recorded graph reads the rate from memory; a number would be fixed in it.
         self._rate: Tensor | float = torch.tensor(rate, device=found[0].device) if self._on_cuda else rate
         self._own: dict[str, Any] = {"lr": self._rate, "fused": self._on_cuda, "capturable": self._on_cuda}
-        self.optimizer = torch.optim.Adam(found, betas=betas, **self._own)
+        self.optimizer: torch.optim.Optimizer = (
+            torch.optim.AdamW(found, betas=betas, weight_decay=weight_decay, **self._own)
+            if weight_decay > 0.0
+            else torch.optim.Adam(found, betas=betas, **self._own)
+        )
 
     def set_rate(self, rate: float) -> None:
         """Use this learning rate from the next step on."""
@@ -44,12 +51,11 @@ class RateAdam:
         Args:
             skip: a bool scalar; True leaves parameters and moments as they are. On CUDA the host does not wait for it.
         """
-        if skip is None:
+        if self._on_cuda:
+            # How torch's GradScaler skips a step.
+            self.optimizer.found_inf = None if skip is None else skip.float()  # type: ignore[attr-defined]
             self.optimizer.step()
-        elif self._on_cuda:
-            self.optimizer.found_inf = skip.float()  # type: ignore[attr-defined] # how torch's GradScaler skips a step
-            self.optimizer.step()
-        elif not skip:
+        elif skip is None or not skip:
             self.optimizer.step()
 
     def state_dict(self) -> dict[str, Any]:

@@ -28,6 +28,8 @@ class Rollout:
     """Shape (H, W) bool."""
     neg_log_prob: Tensor | None
     """−log π of the actions taken [nat], attached, shape (H, W); None if not requested."""
+    contact: Tensor | None
+    """Summed magnitude of the contact forces at the end of each step [N], shape (H, W); None if not requested."""
 
 
 def collect(
@@ -39,6 +41,7 @@ def collect(
     *,
     state_bptt: bool,
     with_neg_log_prob: bool = False,
+    with_contact: bool = False,
 ) -> Rollout:
     """Roll the policy out for as many steps as `noise` (H, W, A) has, from the current state of the worlds, which have
     a stock of resets.
@@ -48,7 +51,7 @@ def collect(
     """
     env.state = env.state.detach()
     raw, reached, rewards, terminated, done, diverged = [], [], [], [], [], []
-    neg_log_probs = []
+    neg_log_probs, contacts = [], []
     normalize = normalizer.normalize if normalizer is not None else lambda x: x
     for step_noise in noise:
         env.state = env.state._replace(physics=gate(env.state.physics)) if state_bptt else env.state.detach()
@@ -59,6 +62,10 @@ def collect(
         else:
             action = actor(normalize(obs), step_noise)
         transition = env.step(gate.screen(action))
+        if with_contact:
+            # Of the last substep, so before the next step; each contact acts on two geoms. A diverged world has none.
+            force = 0.5 * env.sim.contact_forces().norm(dim=-1).sum(-1)
+            contacts.append(force.masked_fill(transition.diverged, 0.0))
         raw.append(obs.detach())
         reached.append(normalize(transition.obs))
         rewards.append(transition.reward)
@@ -73,4 +80,5 @@ def collect(
         torch.stack(done),
         torch.stack(diverged),
         torch.stack(neg_log_probs) if neg_log_probs else None,
+        torch.stack(contacts) if contacts else None,
     )

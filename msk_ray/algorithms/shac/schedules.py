@@ -2,7 +2,7 @@
 
 import math
 
-from msk_ray.config import AdaptiveHorizon, HorizonSchedule
+from msk_ray.config import AdaptiveHorizon, ContactHorizon, HorizonSchedule
 
 
 def horizon_at(schedule: int | HorizonSchedule, epoch: int) -> int:
@@ -24,3 +24,12 @@ def adapted_horizon(config: AdaptiveHorizon, horizon: float, cotangent: float) -
     """
     ratio = config.target / cotangent if math.isfinite(cotangent) and cotangent > 0.0 else 0.5
     return min(max(horizon * ratio**config.rate, config.shortest), config.longest)
+
+
+def contact_horizon(config: ContactHorizon, horizon: float, multiplier: float, contact: float) -> tuple[float, float]:
+    """Horizon and multiplier after an epoch at `horizon` (not rounded) with this contact force [weight of the body].
+
+    φ ← φ + rate (contact / config.contact − 1) within ±1, then H ← H (1 − rate·φ) within bounds.
+    """
+    multiplier = min(max(multiplier + config.rate * (contact / config.contact - 1.0), -1.0), 1.0)
+    return min(max(horizon * (1.0 - config.rate * multiplier), config.shortest), config.longest), multiplier

@@ -47,3 +47,28 @@ def test_each_pass_sees_every_row_once_and_drops_what_fills_no_minibatch() -> No
     used = orders[-1][:6]
     expected = (critic(obs[used]) - targets[used]).square().mean()
     assert torch.isclose(fit.run(obs, targets, orders, 2), expected, rtol=1e-4)
+
+
+def test_a_fit_that_has_settled_takes_no_further_steps() -> None:
+    obs = torch.randn(64, 3, generator=torch.Generator().manual_seed(1))
+    weights = {}
+    for name, tolerance, passes in (("settled", 1e9, 20), ("five", None, 5), ("all", 1e-12, 20), ("plain", None, 20)):
+        critic = Critic(CriticConfig(hidden=(8,)), 3, torch.Generator().manual_seed(0))
+        fit = CriticFit(critic, 1e-2, (0.9, 0.99), 1.0, tolerance=tolerance)
+        orders = torch.arange(64).repeat(passes, 1)
+        fit.run(obs, obs[:, 0], orders, 4)
+        weights[name] = torch.nn.utils.parameters_to_vector(critic.parameters())
+    # Four changes are five passes.
+    assert torch.equal(weights["settled"], weights["five"])
+    assert torch.equal(weights["all"], weights["plain"])
+    assert not torch.equal(weights["five"], weights["plain"])
+
+
+def test_weight_decay_by_hand() -> None:
+    critic = Critic(CriticConfig(hidden=(), layer_norm=False), 1, torch.Generator().manual_seed(0))
+    before = [p.detach().clone() for p in critic.parameters()]
+    fit = CriticFit(critic, 0.125, (0.9, 0.999), None, weight_decay=0.5)
+    fit.run(torch.ones(4, 1), torch.full((4,), 100.0), torch.arange(4)[None], 1)
+    # Adam's step of the rate, after a shrinkage by rate · decay = 1/16.
+    for parameter, start in zip(critic.parameters(), before, strict=True):
+        assert torch.allclose(parameter, 15 / 16 * start + 0.125, atol=1e-5)

@@ -28,6 +28,16 @@ def test_neg_log_prob_is_finite_where_the_action_saturates() -> None:
     assert float(neg_log_prob.detach()) == pytest.approx(expected, rel=1e-3)
 
 
+def test_a_normalized_bonus_by_hand() -> None:
+    bonus = EntropyBonus(EntropyConfig(coefficient=0.5, target=-0.5, normalize=True), 4)
+    # |T| = 2: (−2 + 2) / 4 = 0, (2 + 2) / 4 = 1, (0 + 2) / 4 = 1/2
+    assert bonus.bonus(torch.tensor([-2.0, 2.0, 0.0])).tolist() == [0.0, 0.5, 0.25]
+    plain = EntropyBonus(EntropyConfig(coefficient=0.5, target=-0.5), 4)
+    assert plain.bonus(torch.tensor([-2.0, 3.0])).tolist() == [-1.0, 1.5]
+    with pytest.raises(ValueError, match="write a target other than 0"):
+        EntropyConfig(normalize=True)
+
+
 def test_the_bonus_is_constant_without_a_target_and_rises_while_entropy_is_missing() -> None:
     fixed = EntropyBonus(EntropyConfig(coefficient=0.1), 2)
     fixed.adapt(-50.0)

@@ -22,6 +22,21 @@ ANT = {
     "evaluation": {"interval": 1000, "nworld": 2, "steps": 2},
     "trial": {"epochs": 1000, "checkpoint_interval": 1000, "loggers": []},
 }
+OPTIONS = {
+    **ANT,
+    "actor": {"state_std": True},
+    "critic": {"count": 2},
+    "shac": {
+        **ANT["shac"],
+        "critic_iterations": 6,
+        "critic_tolerance": 0.05,
+        "weight_decay": 0.01,
+        "actor_value": "mean",
+        "entropy": {"target": -0.5, "normalize": True},
+        "copies": {"count": 2},
+        "horizon": {"start": 4, "shortest": 4, "longest": 4, "contact": 1.0},
+    },
+}
 CARTPOLE = {**ANT, "env": {"name": "cartpole", "nworld": 64}, "physics": {}}
 
 
@@ -52,7 +67,7 @@ def after(epochs: int, trainer: Trainer, state: dict[str, Any]) -> tuple[torch.T
     return weights(trainer), row
 
 
-@pytest.mark.parametrize("settings", [ANT, CARTPOLE], ids=["ant", "cartpole"])
+@pytest.mark.parametrize("settings", [ANT, CARTPOLE, OPTIONS], ids=["ant", "cartpole", "options"])
 def test_a_recorded_epoch_equals_one_operation_by_operation(settings: dict[str, Any], tmp_path: Path) -> None:
     recorded, eager = make(settings, tmp_path / "a"), make(settings, tmp_path / "b", capture="off")
     for trainer in (recorded, eager):

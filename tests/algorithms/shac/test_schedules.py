@@ -4,8 +4,8 @@ import math
 
 import pytest
 
-from msk_ray.algorithms.shac.schedules import adapted_horizon, horizon_at, learning_rate_at
-from msk_ray.config import AdaptiveHorizon, HorizonSchedule
+from msk_ray.algorithms.shac.schedules import adapted_horizon, contact_horizon, horizon_at, learning_rate_at
+from msk_ray.config import AdaptiveHorizon, ContactHorizon, ExplorationSchedule, HorizonSchedule
 
 
 def test_horizon_grows_linearly_then_stays() -> None:
@@ -27,3 +27,19 @@ def test_an_adaptive_horizon_follows_the_cotangents_within_bounds():
     assert adapted_horizon(adaptive, 16.0, 4.9) == pytest.approx(16.0 * (10 / 4.9) ** 0.5)
     assert adapted_horizon(adaptive, 16.0, 1e-6) == 32
     assert adapted_horizon(adaptive, 16.0, math.nan) == pytest.approx(16.0 / 2**0.5)
+
+
+def test_a_horizon_that_follows_contact_by_hand() -> None:
+    config = ContactHorizon(start=16, shortest=8, longest=32, contact=2.0, rate=0.5)
+    # φ = 0.5 (3/2 − 1) = 1/4, then 1/4 + 0.5 (1/2 − 1) = 0; H = 16 (1 − 1/8) = 14
+    horizon, multiplier = contact_horizon(config, 16.0, 0.0, 3.0)
+    assert (horizon, multiplier) == (14.0, 0.25)
+    assert contact_horizon(config, horizon, multiplier, 1.0) == (14.0, 0.0)
+    assert contact_horizon(config, 16.0, -1.0, 0.0) == (24.0, -1.0)
+    assert contact_horizon(config, 9.0, 1.0, 99.0) == (8.0, 1.0)
+    assert contact_horizon(config, 30.0, -1.0, 0.0) == (32.0, -1.0)
+
+
+def test_exploration_fades_linearly_then_stays() -> None:
+    schedule = ExplorationSchedule(start=2.0, end=0.0, epochs=4)
+    assert [schedule.at(epoch) for epoch in (0, 1, 4, 9)] == [2.0, 1.5, 0.0, 0.0]

@@ -1,0 +1,84 @@
+"""How long rollouts are: constant, by schedule, or following what a trial measures."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from pydantic import Discriminator, Field, PositiveFloat, Tag, model_validator
+
+from msk_ray.config.sections import Count, Section
+
+
+class HorizonSchedule(Section):
+    """Rollout length by epoch: `start` at epoch 0, `end` from epoch `epochs` on, linear between."""
+
+    start: Count
+    end: Count
+    epochs: Count
+
+    def at(self, epoch: int) -> int:
+        """Env steps at `epoch`, counted from 0."""
+        progress = min(1.0, epoch / self.epochs)
+        return round(self.start + (self.end - self.start) * progress)
+
+
+class _BoundedHorizon(Section):
+    start: Count
+    shortest: Count = 4
+    longest: Count = 64
+
+    @model_validator(mode="after")
+    def _bounds(self) -> _BoundedHorizon:
+        if not self.shortest <= self.start <= self.longest:
+            raise ValueError(
+                f"adaptive horizon: start {self.start} must be between shortest {self.shortest} and longest "
+                f"{self.longest}"
+            )
+        return self
+
+
+class AdaptiveHorizon(_BoundedHorizon):
+    """Rollout length that follows the gradient: longer while cotangents stay small, shorter when they grow.
+
+    After each epoch H ← H (target / p90)^rate within bounds, where p90 is the 90th percentile of the state cotangents'
+    norms in units of reward. Adaptive horizons are the idea of AHAC (Georgiev et al. 2024, arXiv:2405.17784), which
+    follows a constraint on contact forces; this one follows the cotangents themselves.
+    """
+
+    target: PositiveFloat
+    """Target for the 90th percentile of the cotangent norms, before any bound [reward]."""
+    rate: Annotated[float, Field(gt=0.0, le=1.0)] = 0.1
+
+
+class ContactHorizon(_BoundedHorizon):
+    """Rollout length that follows contact, as AHAC's does: longer while contact forces stay below `contact`.
+
+    After each epoch φ ← φ + rate (c / contact − 1), within ±1, and H ← H (1 − rate·φ) within bounds, where c is the
+    root mean square, over worlds and steps, of the force of all contacts. φ is AHAC's multiplier of the constraint on
+    contact (Georgiev et al. 2024, arXiv:2405.17784), which its code keeps equal for all steps of a rollout. AHAC
+    divides forces by accelerations; here the mean square tells impacts from standing, because the mean force of any
+    gait is the body's weight.
+    """
+
+    contact: PositiveFloat
+    """Contact force c above which rollouts become shorter [weight of the body]; a body at rest has 1."""
+    rate: Annotated[float, Field(gt=0.0, le=1.0)] = 0.1
+
+
+def _kind_of_horizon(value: Any) -> str:
+    if isinstance(value, dict):
+        return "adaptive" if "target" in value else "contact" if "contact" in value else "schedule"
+    if isinstance(value, AdaptiveHorizon):
+        return "adaptive"
+    if isinstance(value, ContactHorizon):
+        return "contact"
+    return "schedule" if isinstance(value, HorizonSchedule) else "constant"
+
+
+Horizon = Annotated[
+    Annotated[Count, Tag("constant")]
+    | Annotated[HorizonSchedule, Tag("schedule")]
+    | Annotated[AdaptiveHorizon, Tag("adaptive")]
+    | Annotated[ContactHorizon, Tag("contact")],
+    Discriminator(_kind_of_horizon),
+]
