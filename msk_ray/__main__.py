@@ -12,6 +12,7 @@ COMMANDS = {
     "tune": ("msk_ray.tune.__main__", "run a search space as a Ray Tune experiment"),
     "evaluate": ("msk_ray.evaluate.__main__", "evaluate policies: fixed seeds, no noise, every reward term"),
     "visualize": ("msk_ray.visualize.__main__", "watch a policy: viewer, video, frames, film strip"),
+    "export": ("msk_ray.export.__main__", "write a policy as ONNX or TorchScript, with its model and description"),
     "gait": ("msk_ray.gait.__main__", "measure how a leg policy walks, compared with people"),
     "report": ("msk_ray.report.__main__", "write an experiment's report: curves, tables, the best policy"),
     "status": ("msk_ray.status", "show the progress of experiments, read from their files"),

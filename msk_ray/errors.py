@@ -39,6 +39,10 @@ class CheckpointError(MskRayError):
     """A checkpoint is missing, incomplete, or belongs to another configuration."""
 
 
+class ExportError(MskRayError):
+    """An exported policy does not compute what its checkpoint does."""
+
+
 class StorageError(MskRayError):
     """A folder cannot be written, or already holds something else."""
 

@@ -44,5 +44,10 @@ def shipped_names(folder: str, suffix: str) -> list[str]:
     return sorted({path.stem for place in _places(folder) for path in place.glob(f"*{suffix}")})
 
 
+def is_shipped(path: Path) -> bool:
+    """Whether a file belongs to the package, so that nothing may be written beside it."""
+    return any(path.resolve().is_relative_to(shipped_folder() / folder) for folder in (CONFIGS, SPACES, POLICIES))
+
+
 def _places(folder: str) -> tuple[Path, Path]:
     return Path.cwd() / folder, shipped_folder() / folder

@@ -47,7 +47,9 @@ def test_training_gives_the_best_policy(tiny_cartpole: msk_ray.Config, tmp_path:
     assert [row["epoch"] for row in rows] == [1, 2, 3, 4, 5, 6]
     assert trained.epochs == 6
     assert trained.best_score == max(row["eval/score"] for row in rows if "eval/score" in row)
-    assert msk_ray.load_policy(trained.best_checkpoint).config == tiny_cartpole
+    policy = msk_ray.load_policy(trained.best_checkpoint)
+    assert policy.config == tiny_cartpole
+    assert policy.sizes == (5, 1)
 
 
 def test_the_readme_example_runs(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -61,8 +61,8 @@ def test_the_source_distribution_builds_the_same_wheel(wheel: Path, root: Path, 
     again = _build(source, "wheel", tmp_path / "again")
     with zipfile.ZipFile(wheel) as first, zipfile.ZipFile(again) as second:
         assert first.namelist() == second.namelist()
-        for folder in ("configs", "tune_spaces"):
-            for path in (root / folder).rglob("*.yaml"):
+        for folder in ("configs", "tune_spaces", "policies"):
+            for path in (p for p in (root / folder).rglob("*") if p.suffix in (".yaml", ".pt")):
                 assert f"msk_ray/_data/{path.relative_to(root)}" in first.namelist()
 
 

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from msk_ray.config import EnvSettings, PhysicsConfig
+from msk_ray.envs.layout import Entry
 from msk_ray.envs.randomize import Randomizer
 from msk_ray.errors import ConfigError
 from msk_ray.physics.capacity import Capacity
@@ -174,6 +175,17 @@ class Env(ABC, Generic[SettingsT]):
     def fell(self, state: StepState) -> Tensor:
         """Worlds (W,) bool whose episode ends by itself in `state`."""
         return torch.zeros(self.nworld, dtype=torch.bool, device=self.device)
+
+    def observation_layout(self) -> list[Entry] | None:
+        """Name and unit of each of the O entries of an observation, for those who use a policy elsewhere; None if the
+        environment does not say."""
+        return None
+
+    def action_names(self) -> list[str] | None:
+        """Name of each of the A entries of an action; None if they are not the model's actuators, one by one."""
+        if self.action_size != self.model.nu:
+            return None
+        return [self.model.actuator(i).name or f"actuator_{i}" for i in range(self.model.nu)]
 
     def outcome_terms(self, state: StepState) -> dict[str, Tensor]:
         """Further quantities per world (W,) that the evaluation averages over an episode."""

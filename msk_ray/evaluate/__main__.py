@@ -15,6 +15,7 @@ from msk_ray.experiment.attempts import read_attempt
 from msk_ray.experiment.checkpoint_file import read_facts
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.files import write_json
+from msk_ray.shipped import is_shipped
 from msk_ray.sweep.space import parse_seeds
 from msk_ray.text import printable
 from msk_ray.text_table import text_table
@@ -26,9 +27,9 @@ DESCRIPTION = """\
 Evaluate a policy: without noise, from fixed initial states, under the environment's default reward weights.
 
 Prints score, speed, falls, episode length and every reward term with its spread over episodes, and stores them in the
-trial's eval.json. For an experiment it evaluates the best policy of each trial, ranks them, and writes the ranking into
-the experiment's eval.json. Without options the score is the one by which trials are ranked (eval/score), to the last
-digit on the same device."""
+trial's eval.json (those of a policy of policies/ are only printed). For an experiment it evaluates the best policy of
+each trial, ranks them, and writes the ranking into the experiment's eval.json. Without options the score is the one by
+which trials are ranked (eval/score), to the last digit on the same device."""
 
 EXAMPLES = """\
   python -m msk_ray.evaluate runs/demo                                   # every trial's best policy, ranked
@@ -106,12 +107,14 @@ def _evaluate_one(target: Target, bench: "Bench", requests: "Sequence[Request]",
     entries = []
     for request in requests:
         entries.append(bench.evaluate(policy, request))
-        store_evaluation(eval_file_of(path), entries[-1])
+        if not is_shipped(path):
+            store_evaluation(eval_file_of(path), entries[-1])
         if values == 1:
             print(policy_text(entries[-1]) + "\n")
         elif len(entries) % values == 0:
             print(vary_text(entries[-values:]) + "\n")
-    print(f"written into {eval_file_of(path)}")
+    if not is_shipped(path):
+        print(f"written into {eval_file_of(path)}")
     return 0
 
 

@@ -10,6 +10,7 @@ from msk_ray.experiment import layout
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.results import best_record, read_records
 from msk_ray.experiment.trial_status import find_experiments
+from msk_ray.shipped import POLICIES, find_shipped, shipped_names
 
 
 class Kind(StrEnum):
@@ -30,7 +31,8 @@ class Target:
 
 
 def find_target(text: str, storage: Path) -> Target:
-    """The checkpoint, trial or experiment at a path, or the experiment of that name in `storage`.
+    """The checkpoint, trial or experiment at a path, the experiment of that name in `storage`, or the policy of that
+    name in `policies/`.
 
     Raises:
         StorageError: there is none.
@@ -42,12 +44,18 @@ def find_target(text: str, storage: Path) -> Target:
             return Target(Kind.CHECKPOINT, path.resolve())
         if path.is_dir():
             return Target(_kind_of(path), path.resolve())
+    if (policy := find_shipped(text, POLICIES, ".pt")) is not None:
+        return Target(Kind.CHECKPOINT, policy)
     names = [path.name for path in find_experiments(storage)]
     near = difflib.get_close_matches(text, names, n=1)
     if near:
         hint = f"did you mean {near[0]!r}?"
     else:
-        hint = f"{storage} holds {', '.join(names[-5:]) or 'no experiment'}; give a .pt file, a trial's folder or one"
+        trained = ", ".join(shipped_names(POLICIES, ".pt"))
+        hint = (
+            f"{storage} holds {', '.join(names[-5:]) or 'no experiment'}, policies/ {trained}; give a .pt file, a "
+            "trial's folder or one of these"
+        )
     raise StorageError(f"no checkpoint, trial or experiment {text!r}; {hint}")
 
 

@@ -1,9 +1,11 @@
 """A policy read from a checkpoint, without the means to train it."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -14,10 +16,23 @@ from msk_ray.errors import CheckpointError
 from msk_ray.training.checkpoint import load_checkpoint
 from msk_ray.training.policy_group import Policy
 
+Batch = TypeVar("Batch", Tensor, np.ndarray)
+
+
+class Sizes(NamedTuple):
+    """How many numbers go into a policy, and come out of it."""
+
+    obs: int
+    action: int
+
 
 @dataclass(frozen=True)
 class SavedPolicy:
-    """The deterministic policy of a checkpoint and the trial it comes from."""
+    """The deterministic policy of a checkpoint and the trial it comes from.
+
+    It can be called: `policy(obs)` gives actions (..., A) in [-1, 1] for raw observations (..., O), without gradients,
+    as a tensor for a tensor and as an array for an array.
+    """
 
     path: Path
     config: Config
@@ -27,6 +42,41 @@ class SavedPolicy:
     """Hash of the checkpoint's content, which identifies evaluations and pictures."""
     modules: dict[str, Any]
     """States of the policy's modules, by name; in a trial's full checkpoint, all modules of its algorithm."""
+    sizes: Sizes | None = None
+    """Sizes of observation and action; None if neither the checkpoint nor its weights say."""
+
+    @torch.no_grad()
+    def __call__(self, obs: Batch) -> Batch:
+        """Actions (..., A) for raw observations (..., O).
+
+        Raises:
+            CheckpointError: the checkpoint does not say its sizes, or the observations have another size.
+            ConfigError: its algorithm is not found, or not installed.
+        """
+        size = self.standalone_sizes.obs
+        if obs.shape[-1] != size:
+            raise CheckpointError(f"{self.path} takes observations of size {size}, not {obs.shape[-1]}")
+        given = torch.as_tensor(obs, dtype=torch.float32)
+        action: Tensor = self._standalone.to(given.device)(given)
+        return action if isinstance(obs, Tensor) else action.numpy()
+
+    @property
+    def standalone_sizes(self) -> Sizes:
+        """Sizes of observation and action.
+
+        Raises:
+            CheckpointError: the checkpoint does not say them.
+        """
+        if self.sizes is None:
+            raise CheckpointError(
+                f"{self.path} was written before checkpoints said the sizes of observation and action, and its weights "
+                "do not show them: use `on(env)`"
+            )
+        return self.sizes
+
+    @cached_property
+    def _standalone(self) -> nn.Module:
+        return self._network(self.standalone_sizes)
 
     def network(self, env: Env[Any]) -> nn.Module:
         """The policy's network on an environment's device.
@@ -35,8 +85,11 @@ class SavedPolicy:
             CheckpointError: it was trained on other observations or actions.
             ConfigError: its algorithm is not found, or not installed.
         """
+        return self._network(Sizes(env.obs_size, env.action_size)).to(env.device)
+
+    def _network(self, sizes: Sizes) -> nn.Module:
         algorithm = algorithm_class(self.config)
-        network = algorithm.policy_network(self.config, env.obs_size, env.action_size)
+        network = algorithm.policy_network(self.config, *sizes)
         try:
             for name, module in algorithm.policy_modules(network).items():
                 module.load_state_dict(self.modules[name])
@@ -46,7 +99,7 @@ class SavedPolicy:
                 f"{self.path} does not fit env {self.config.env.name} as it is now ({what}): use the commit it was "
                 "written with"
             ) from error
-        return network.to(env.device)
+        return network
 
     def on(self, env: Env[Any]) -> Policy:
         """The policy on an environment's device: raw observations (W, O) to actions (W, A), without gradients.
@@ -83,4 +136,13 @@ def load_policy(path: str | Path) -> SavedPolicy:
     except (KeyError, TypeError) as error:
         raise CheckpointError(f"{path} holds no policy: {error} is missing") from error
     settings = parse_recorded(config, f"{path}: its settings")
-    return SavedPolicy(path, settings, epoch, env_steps, facts["sha256"], modules)
+    sizes = Sizes(*state["sizes"]) if "sizes" in state else _sizes_of(modules)
+    return SavedPolicy(path, settings, epoch, env_steps, facts["sha256"], modules, sizes)
+
+
+def _sizes_of(modules: dict[str, Any]) -> Sizes | None:
+    """The sizes in a checkpoint of a version that did not record them: those of the first and last linear layer of our
+    algorithms' `actor`, or of `policy`, the name that others have without saying."""
+    actor = modules.get("actor", modules.get("policy", {}))
+    weights = [value for name, value in actor.items() if name.endswith(".weight") and value.dim() == 2]
+    return Sizes(weights[0].shape[1], weights[-1].shape[0]) if weights else None

@@ -357,7 +357,8 @@ class Trainer:
     def _write_policy(self, state: dict[str, Any], score: float) -> None:
         parts = self.algorithm.policy_modules(self.algorithm.network)
         modules = {name: value for name, value in state["algorithm"]["modules"].items() if name in parts}
-        policy = {**{key: state[key] for key in ("config", "epoch", "env_steps")}, "algorithm": {"modules": modules}}
+        facts_of_policy = {key: state[key] for key in ("config", "epoch", "env_steps", "sizes")}
+        policy = {**facts_of_policy, "algorithm": {"modules": modules}}
         facts = {"epoch": state["epoch"], "score": _finite(score)}
         write_checkpoint(milestone_path(self.checkpoints, state["epoch"]), policy, facts)
 
@@ -372,6 +373,7 @@ class Trainer:
             "env_steps": self.env_steps,
             "seconds": self._seconds,
             "best_score": self.best_score,
+            "sizes": (self.env.obs_size, self.env.action_size),
             "algorithm": self.algorithm.state_dict(),
         }
 

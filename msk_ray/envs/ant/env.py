@@ -10,6 +10,7 @@ from msk_ray.config import PhysicsConfig
 from msk_ray.envs.ant.config import AntSettings
 from msk_ray.envs.ant.model import STAND_HEIGHT, STAND_JOINTS, build_ant
 from msk_ray.envs.base import Env
+from msk_ray.envs.layout import Entry, entries, floating_body
 from msk_ray.simulation import StepState
 from msk_ray.simulation.tangent import quat_exp, quat_multiply, quat_rotate
 
@@ -75,6 +76,13 @@ class Ant(Env[AntSettings]):
             ),
             dim=-1,
         )
+
+    def observation_layout(self) -> list[Entry]:
+        return [
+            *floating_body(self.model),
+            *entries(("up_cosine", "forward_cosine")),
+            *entries(f"last_action_{i}" for i in range(self.action_size)),
+        ]
 
     def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
         terms = torch.addmm(self._offset, obs, self._linear)

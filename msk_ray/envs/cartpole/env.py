@@ -10,6 +10,7 @@ from msk_ray.config import PhysicsConfig
 from msk_ray.envs.base import Env, wrap_angle
 from msk_ray.envs.cartpole.config import CartPoleSettings
 from msk_ray.envs.cartpole.model import build_cartpole
+from msk_ray.envs.layout import Entry, entries
 from msk_ray.simulation import StepState
 
 UPRIGHT_ANGLE = 0.3
@@ -51,6 +52,14 @@ class CartPole(Env[CartPoleSettings]):
         x, angle = state.qpos.unbind(-1)
         speed, rate = state.qvel.unbind(-1)
         return torch.stack((x, speed, torch.sin(angle), torch.cos(angle), rate), dim=-1)
+
+    def observation_layout(self) -> list[Entry]:
+        return [
+            Entry("cart_position", "m"),
+            Entry("cart_velocity", "m/s"),
+            *entries(("pole_angle_sin", "pole_angle_cos")),
+            Entry("pole_rate", "rad/s"),
+        ]
 
     def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
         x, angle = state.qpos.unbind(-1)

@@ -8,6 +8,7 @@ from msk_ray.config import PhysicsConfig
 from msk_ray.envs.base import Env
 from msk_ray.envs.cheetah.config import CheetahSettings
 from msk_ray.envs.cheetah.model import build_cheetah
+from msk_ray.envs.layout import Entry, planar_body
 from msk_ray.simulation import StepState
 
 _START_HEIGHT = -0.2
@@ -44,6 +45,9 @@ class Cheetah(Env[CheetahSettings]):
 
     def observe(self, state: StepState, action: Tensor) -> Tensor:
         return torch.cat((state.qpos[:, 1:], state.qvel), dim=-1)
+
+    def observation_layout(self) -> list[Entry]:
+        return planar_body(self.model)
 
     def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
         r = self.config.reward

@@ -10,6 +10,7 @@ from msk_ray.config import PhysicsConfig
 from msk_ray.envs.base import Env
 from msk_ray.envs.hopper.config import HopperSettings
 from msk_ray.envs.hopper.model import build_hopper
+from msk_ray.envs.layout import Entry, planar_body
 from msk_ray.simulation import StepState
 
 _FULL_ANGLE = math.pi / 6
@@ -44,6 +45,9 @@ class Hopper(Env[HopperSettings]):
 
     def observe(self, state: StepState, action: Tensor) -> Tensor:
         return torch.cat((state.qpos[:, 1:], state.qvel), dim=-1)
+
+    def observation_layout(self) -> list[Entry]:
+        return planar_body(self.model)
 
     def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
         r = self.config.reward

@@ -10,6 +10,7 @@ from msk_ray.config import PhysicsConfig
 from msk_ray.envs.base import Env
 from msk_ray.envs.humanoid.config import HumanoidSettings
 from msk_ray.envs.humanoid.model import START_HEIGHT, build_humanoid
+from msk_ray.envs.layout import Entry, entries, floating_body
 from msk_ray.simulation import StepState
 from msk_ray.simulation.tangent import quat_exp, quat_rotate
 
@@ -74,6 +75,13 @@ class Humanoid(Env[HumanoidSettings]):
             ),
             dim=-1,
         )
+
+    def observation_layout(self) -> list[Entry]:
+        return [
+            *floating_body(self.model),
+            *entries(("up_cosine", "heading_cosine")),
+            *entries(f"last_action_{i}" for i in range(self.action_size)),
+        ]
 
     def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
         r = self.config.reward

@@ -13,6 +13,7 @@ from torch import Tensor
 from msk_ray.config import PhysicsConfig
 from msk_ray.config.physics import CONTACTS, LIMITS
 from msk_ray.envs.base import Env
+from msk_ray.envs.layout import Entry, entries
 from msk_ray.envs.legs.config import LegSettings
 from msk_ray.envs.legs.muscles import MuscleCurves
 from msk_ray.simulation import StepState
@@ -124,6 +125,34 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
     @abstractmethod
     def root(self, state: StepState) -> Root:
         """The pelvis in the world."""
+
+    @abstractmethod
+    def pose_layout(self) -> list[Entry]:
+        """Names and units of `Root.pose`."""
+
+    def observation_layout(self) -> list[Entry]:
+        muscles, hinges = self.action_names(), [self.model.joint(j).name for j in self.hinges]
+
+        def each(names: list[str], what: str, unit: str = "") -> list[Entry]:
+            return entries((f"{name}_{what}" for name in names), unit)
+
+        return [
+            Entry("pelvis_height", "m"),
+            *self.pose_layout(),
+            *entries((f"pelvis_velocity_{axis}" for axis in ("forward", "left", "up")), "m/s"),
+            *entries((f"pelvis_angular_velocity_{axis}" for axis in ("forward", "left", "up")), "rad/s"),
+            *each(hinges, "angle", "rad"),
+            *each(hinges, "rate", "10 rad/s"),
+            *each(muscles, "activation"),
+            *each(muscles, "fibre_length", "optimal lengths"),
+            *each(muscles, "fibre_rate", "largest shortening speeds"),
+            *each(muscles, "force", "peak isometric forces"),
+            *each(muscles, "last_action"),
+            Entry("target_speed", "m/s"),
+        ]
+
+    def action_names(self) -> list[str]:
+        return [self.model.actuator(int(i)).name for i in self.curves.actuators]
 
     hinges: list[int]
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
+from msk_ray.envs.layout import Entry, entries
 from msk_ray.envs.legs.env import LegEnv, Root
 from msk_ray.envs.myoleg.config import MyoLegSettings
 from msk_ray.envs.myoleg.model import Couplings, build_myoleg, find_model, ground_height
@@ -80,6 +81,10 @@ class MyoLeg(LegEnv[MyoLegSettings]):
         qvel[:, self._dependent_dofs] = (c * slopes).sum(-1) * qvel[:, self._driving_dofs]
         act = torch.full((count, self.model.na), _START_ACTIVATION, device=self.device)
         return StepState(qpos, qvel, act)
+
+    def pose_layout(self) -> list[Entry]:
+        axes = (f"pelvis_{axis}_axis_{part}" for axis in ("forward", "up") for part in ("forward", "left", "up"))
+        return [Entry("pelvis_left_of_line", "m"), *entries(axes)]
 
     def root(self, state: StepState) -> Root:
         q, v = state.qpos, state.qvel

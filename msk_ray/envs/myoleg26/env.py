@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
+from msk_ray.envs.layout import Entry
 from msk_ray.envs.legs.env import LegEnv, Root
 from msk_ray.envs.myoleg26.config import AssistConfig, MyoLeg26Settings
 from msk_ray.envs.myoleg26.model import SIDES, build_myoleg26
@@ -103,6 +104,11 @@ class MyoLeg26(LegEnv[MyoLeg26Settings]):
         if self._plane:
             return self._slope * x
         return self._levels[torch.bucketize(x.detach(), self._edges)]
+
+    def pose_layout(self) -> list[Entry]:
+        joints = self.model.jnt_qposadr.tolist()
+        names = [self.model.joint(joints.index(place)).name for place in range(2, 6)]
+        return [Entry(name, unit) for name, unit in zip(names, ("m", "rad", "rad", "rad"), strict=True)]
 
     def root(self, state: StepState) -> Root:
         q, v = state.qpos, state.qvel

@@ -1,0 +1,83 @@
+"""`python -m msk_ray.export`: take a policy along."""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from msk_ray.cli import Parser, run
+from msk_ray.errors import ConfigError
+from msk_ray.evaluate.targets import best_checkpoint, find_target
+from msk_ray.files import make_folder
+
+DESCRIPTION = """\
+Export a policy for programs that do not have msk_ray: as ONNX, as TorchScript, or both.
+
+The network takes raw observations (batch, O), float32, and returns `action` (batch, A) in [-1, 1] and `ctrl` (batch,
+nu), the controls of the model; normalisation and squashing are inside. `ctrl` is left out where controls depend on more
+than the action. Each file is compared with the checkpoint's policy on 1000 observations, and not written if one of them
+differs by more than 1e-5.
+
+Beside p.onnx stand p.json (order and units of observation and action, control period, joints, origin) and p.mjb, the
+model, which MuJoCo of the same version loads (mujoco.MjModel.from_binary_path)."""
+
+EXAMPLES = """\
+  python -m msk_ray.export runs/demo --onnx policy.onnx                     # the best policy of an experiment
+  python -m msk_ray.export runs/train/ant_seed0 --onnx ant.onnx --torchscript ant.pt
+  python -m msk_ray.export cartpole --torchscript cartpole.pt               # one of policies/
+
+exit codes: 0 done, 2 refused."""
+
+
+def parser() -> Parser:
+    """The command line."""
+    p = Parser("python -m msk_ray.export", DESCRIPTION, EXAMPLES)
+    p.add_argument(
+        "target", metavar="CHECKPOINT|TRIAL|EXPERIMENT", help="a .pt file, a folder, or a name; its best policy"
+    )
+    p.add_argument("--onnx", type=Path, metavar="FILE", help="an .onnx file; needs msk-ray[export]")
+    p.add_argument("--torchscript", type=Path, metavar="FILE", help="a .pt file")
+    p.add_argument(
+        "--physics",
+        default="reference",
+        metavar="NAME",
+        help="physics of the model: reference (that of scores), own (that of training), or a named one",
+    )
+    p.add_argument(
+        "--storage", type=Path, default=Path("runs"), metavar="DIR", help="folder of experiments (default: runs/)"
+    )
+    return p
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    args = parser().parse_args(argv)
+    checkpoint = best_checkpoint(find_target(args.target, args.storage))
+    wanted = {"onnx": args.onnx, "torchscript": args.torchscript}
+    paths = {kind: path for kind, path in wanted.items() if path is not None}
+    _check_paths(paths, checkpoint)
+    # torch and Warp take seconds to load; a wrong command line should not wait for them.
+    from msk_ray.export.write import export
+
+    if "onnx" in paths:
+        from msk_ray.export.network import check_packages
+
+        check_packages()
+    for line in export(checkpoint, paths, args.physics):
+        print(line, flush=True)
+    return 0
+
+
+def _check_paths(paths: dict[str, Path], checkpoint: Path) -> None:
+    if not paths:
+        raise ConfigError("nothing to write: give --onnx FILE, --torchscript FILE, or both")
+    for kind, path in paths.items():
+        suffix = {"onnx": ".onnx", "torchscript": ".pt"}[kind]
+        if path.suffix != suffix:
+            raise ConfigError(f"--{kind} {path}: write a name that ends in {suffix}")
+        if path.resolve() == checkpoint:
+            raise ConfigError(f"--{kind} {path}: this is the checkpoint itself; write another name")
+        make_folder(path.parent)
+
+
+if __name__ == "__main__":
+    sys.exit(run(main))

@@ -1,0 +1,67 @@
+"""Write a policy, its description and its model."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from msk_ray.envs import env_class, make_env
+from msk_ray.evaluate.measure import named_physics
+from msk_ray.export.description import describe
+from msk_ray.export.network import (
+    CHECKED,
+    WORLDS,
+    PolicyToControl,
+    largest_difference,
+    observations,
+    to_onnx,
+    to_torchscript,
+)
+from msk_ray.files import write_bytes, write_json
+from msk_ray.training import load_policy
+
+_WRITERS = {"onnx": to_onnx, "torchscript": to_torchscript}
+
+
+def export(checkpoint: Path, paths: Mapping[str, Path], physics: str) -> Iterator[str]:
+    """Write the policy of a checkpoint to each of `paths`, by kind (`onnx`, `torchscript`), with a .json and an .mjb of
+    the same name beside it. Yields a line on each file.
+
+    Args:
+        physics: of the model: `reference`, `own`, or a named one of the environment.
+
+    Raises:
+        ExportError: an exported policy differs from the checkpoint's; nothing is written.
+        ConfigError, CheckpointError, UnsupportedModelError, StorageFailure: as their messages say.
+    """
+    saved = load_policy(checkpoint)
+    shown, chosen = named_physics(saved.config, physics)
+    settings = env_class(saved.config.env).reference_settings(saved.config.env)
+    seed = saved.config.evaluation.seed
+    env = make_env(settings, chosen, WORLDS, "cpu", seed, differentiable=False)
+    policy = PolicyToControl(saved.network(env), env).eval().requires_grad_(False)
+    obs = observations(env, seed)
+    made = {}
+    for kind in paths:
+        payload, runner = _WRITERS[kind](policy, obs)
+        made[kind] = payload, largest_difference(policy, runner, obs)
+    descriptions: dict[Path, dict[str, str]] = {}
+    for kind, path in paths.items():
+        payload, difference = made[kind]
+        write_bytes(path, payload)
+        yield f"{path}: {len(payload)} bytes, differs by at most {difference:.0e} on {CHECKED} observations"
+        descriptions.setdefault(path.with_suffix(".json"), {})[kind] = path.name
+    for path, files in descriptions.items():
+        model = path.with_suffix(".mjb")
+        write_bytes(model, model_bytes(env.model))
+        yield f"{model}: the model under {shown} physics, for MuJoCo {mujoco.__version__}"
+        write_json(path, describe(saved, policy, env, shown, {**files, "model": model.name}))
+        yield f"{path}: observation, action, periods"
+
+
+def model_bytes(model: mujoco.MjModel) -> bytes:
+    """A model in MuJoCo's binary format."""
+    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return buffer.tobytes()
