@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from msk_ray.gradcheck import Limits, Oracle, Point
+from msk_ray.gradcheck import Limits, Oracle, Point, check_gradients
 from msk_ray.gradcheck.check import forward_mismatch
 from msk_ray.gradcheck.pullback import simulated_gradients
 from msk_ray.simulation import Simulation, TapePerSubstep
@@ -377,3 +377,25 @@ def test_features_at_rest(name: str) -> None:
     )
     left_out = check(model, [rest], [name], [range(model.nv)])
     assert not (compared and left_out)
+
+
+LINKS = """
+<mujoco>
+  <default><geom type="capsule" size=".01"/><joint type="ball" damping=".005"/></default>
+  <worldbody>
+    <geom fromto="0 0 0 0 0 .1"/>
+    <body pos="0 0 .1">
+      <joint/>
+      <geom fromto="0 0 0 0 .1 .1"/>
+      <body pos="0 .1 .1"><joint/><geom fromto="0 0 0 0 .1 0"/></body>
+    </body>
+  </worldbody>
+</mujoco>"""
+
+
+def test_capsules_that_share_an_end_have_no_slope_of_a_normal_that_is_rounding() -> None:
+    """Links drawn from joint to joint, of which the first belongs to the world and collides with the second."""
+    sim = Simulation(mujoco.MjModel.from_xml_string(LINKS), 4, 1, tolerance=1e-9)
+    check = check_gradients(sim, states=["standing", "contact"])
+    assert check.checked == 8
+    assert check.max_rel_error < 1e-3

@@ -17,6 +17,7 @@ from msk_ray.physics.adjoint.groups import ContactBars, Contacts, Shapes
 from msk_ray.physics.adjoint.pair_laws import (
     SCORED_PAIRS,
     ParallelLaw,
+    cores_coincide,
     is_convex_pair,
     is_scored,
     pair_score,
@@ -142,6 +143,8 @@ def pull_geometry_kernel(kinds: PairKinds) -> Any:
                         column(mat2, 2),
                         size2[1],
                     )
+                if cores_coincide(type1, type2, pos1, size1, pos2, size2, dist):
+                    normal_bar = zero
                 _t1, _t2, pos1_bar, mat1_bar, _s1, pos2_bar, mat2_bar, _s2, _l, _d, _p, _n = wp.grad(pair_score)(
                     type1,
                     type2,

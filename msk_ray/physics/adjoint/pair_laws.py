@@ -28,6 +28,8 @@ _PARALLEL = wp.constant(1.0e-8)
 """Squared sine below which MuJoCo Warp takes two capsules as parallel."""
 _SAME_END = wp.constant(1.0e-5)
 """Share of a capsule's length within which two ends lie side by side: float32 cannot tell which one is inside."""
+_COINCIDENT = wp.constant(2.0e-6)
+"""Distance, as a share of the size of the numbers it is computed from, that is their rounding in float32."""
 _LEAST_TILT = wp.constant(2.5e-4)
 """Sine of a cylinder's tilt below which its rim points are fixed to it: there float32 takes axis·normal as 1.
 
@@ -72,6 +74,23 @@ def parallel_law(
             law.end1 = wp.where(place1 < 0.0, -half1, half1)
             law.kind = BOTH_ENDS
     return law
+
+
+@wp.func
+def cores_coincide(
+    type1: int, type2: int, pos1: wp.vec3, size1: wp.vec3, pos2: wp.vec3, size2: wp.vec3, dist: float
+) -> bool:
+    """Whether the nearest points of the axes or centres of two spheres or capsules are one point, up to rounding.
+
+    Links drawn as capsules from joint to joint share it, and collide where the first one belongs to the world. The
+    normal is then that of rounding, and its slope, which grows as one over the distance, that of nothing.
+    """
+    if type1 != GeomType.SPHERE and type1 != GeomType.CAPSULE:
+        return False
+    if type2 != GeomType.SPHERE and type2 != GeomType.CAPSULE:
+        return False
+    extent = wp.max(wp.length(pos1), wp.length(pos2)) + size1[0] + size1[1] + size2[0] + size2[1]
+    return wp.abs(dist + size1[0] + size2[0]) < _COINCIDENT * extent
 
 
 @wp.func
