@@ -23,7 +23,10 @@ MAX_SEEDS = 100_000
 
 
 class AblateSpec(Section):
-    """One factor at a time: the baseline, and each variant merged into it. Keys are dotted config keys."""
+    """One factor at a time: the baseline, and each variant merged into it. Keys are dotted config keys.
+
+    Grids beside it repeat all of them for each of their points.
+    """
 
     baseline: dict[str, Any] = Field(default_factory=dict)
     variants: Annotated[dict[str, dict[str, Any]], Field(min_length=1)]
@@ -244,7 +247,7 @@ def _check_count(file: SpaceFile, parameters: Mapping[str, Operator]) -> None:
     """Refuse a space with more than `max_trials` trials, counted before any is created."""
     seeds = sum(last - first + 1 for first, last in _seed_ranges(file.seeds))
     grids = [len(op.levels) for op in parameters.values() if op.enumerated]
-    variants = len(file.ablate.variants) + 1 if file.ablate is not None else file.samples * math.prod(grids)
+    variants = math.prod(grids) * (file.samples if file.ablate is None else len(file.ablate.variants) + 1)
     if variants * seeds > file.max_trials:
         raise ConfigError(
             f"{variants} variants × {seeds} seeds are {variants * seeds} trials, more than max_trials "
@@ -257,8 +260,8 @@ def _check_combination(file: SpaceFile, parameters: Mapping[str, Operator], seed
     sampled = {key: op for key, op in parameters.items() if not op.enumerated}
     if "trial.seed" in parameters:
         raise ConfigError("parameters.trial.seed: seeds have a section of their own; write seeds: 0-4")
-    if file.ablate is not None and parameters:
-        raise ConfigError("ablate varies one factor at a time; drop parameters, or write the factors as grids there")
+    if file.ablate is not None and (sampled or file.searches):
+        raise ConfigError("ablate varies one factor at a time: beside it write only grids, and search: random")
     if file.samples > 1 and not sampled:
         raise ConfigError("samples: nothing is drawn; give a parameter choice, uniform, loguniform or randint")
     if file.searches:

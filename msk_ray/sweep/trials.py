@@ -124,7 +124,11 @@ def check_algorithms_read(space: Space, configs: Iterable[Config]) -> None:
 def _variants(space: Space) -> Iterator[tuple[dict[str, str], dict[str, Any]]]:
     """(labels, values) of every variant, seeds apart."""
     if space.file.ablate is not None:
-        yield from _ablations(space)
+        for point in grid_points(space.grids):
+            labels = {key: level.label for key, level in point.items()}
+            values = {key: level.value for key, level in point.items()}
+            for label, changes in _ablations(space):
+                yield {**labels, **label}, {**values, **changes}
         return
     rng = random.Random(space.file.sample_seed)
     # The draw is the outer loop: more samples append trials and leave the earlier ones as they are.
@@ -157,6 +161,12 @@ def _check_collisions(space: Space) -> None:
             other = owner.setdefault(leaf, key)
             if other != key:
                 raise ConfigError(f"{space.name}: parameters {other!r} and {key!r} both set {leaf}")
+    if space.file.ablate is None:
+        return
+    for name, changes in _ablations(space):
+        for leaf in sorted({leaf for key, value in changes.items() for leaf, _ in leaves(key, value)}):
+            if leaf in owner:
+                raise ConfigError(f"{space.name}: parameter {owner[leaf]!r} and {name['variant']!r} both set {leaf}")
 
 
 def find_trial(trials: list[Trial], text: str) -> Trial:

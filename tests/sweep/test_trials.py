@@ -52,6 +52,24 @@ def test_ablation_changes_one_factor_at_a_time(make_space: Any) -> None:
     ]
 
 
+def test_grids_repeat_an_ablation(make_space: Any) -> None:
+    ablate = {"variants": {"far": {"shac.gamma": 0.999}}}
+    grid = {"shac.horizon": {"grid": [4, 8]}}
+    trials = resolve_trials(make_space(parameters=grid, ablate=ablate))
+    assert [(t.variant, t.config.shac.horizon, t.config.shac.gamma) for t in trials] == [
+        ("horizon=4, baseline", 4, 0.99),
+        ("horizon=4, far", 4, 0.999),
+        ("horizon=8, baseline", 8, 0.99),
+        ("horizon=8, far", 8, 0.999),
+    ]
+    with pytest.raises(ConfigError, match=r"'shac\.horizon' and 'far' both set shac\.horizon"):
+        resolve_trials(make_space(parameters=grid, ablate={"variants": {"far": {"shac.horizon": 16}}}))
+    with pytest.raises(ConfigError, match="beside it write only grids"):
+        make_space(parameters={"shac.gamma": {"uniform": [0.9, 0.99]}}, ablate=ablate)
+    with pytest.raises(ConfigError, match="4 variants × 1 seeds are 4 trials"):
+        make_space(parameters=grid, ablate=ablate, max_trials=3)
+
+
 def test_a_mapping_is_laid_over_a_section_and_replaces_a_number() -> None:
     settings = {"shac": {"horizon": 32, "gamma": 0.9}}
     assert overlay(settings, {"shac": {"gamma": 0.5}})["shac"] == {"horizon": 32, "gamma": 0.5}
