@@ -267,11 +267,18 @@ class ConstraintLaws:
             outputs=[work.laws],
         )
         if work.settings.elliptic:
-            # A thread of a CPU costs more than the work of a dof.
-            lanes = m.nv if work.device.is_cuda else 1
             wp.launch(
                 scaled_jacobian,
-                dim=(work.nworld, work.njmax, lanes),
-                inputs=[m.nv, m.opt.impratio_invsqrt, lanes, d.nefc, at.rows, jacobian, work.laws, at.contacts],
+                dim=(work.nworld, work.njmax, work.lanes(m.nv)),
+                inputs=[
+                    m.nv,
+                    m.opt.impratio_invsqrt,
+                    work.lanes(m.nv),
+                    d.nefc,
+                    at.rows,
+                    jacobian,
+                    work.laws,
+                    at.contacts,
+                ],
                 outputs=[self.scaled],
             )

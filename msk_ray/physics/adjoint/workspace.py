@@ -97,3 +97,10 @@ class Workspace:
             self.tendon_bars = allocate(TendonBars, worlds, max(mjm.ntendon, 1))
             self.laws = allocate(RowLaws, worlds, self.njmax)
             self.contact_wrenches = wp.zeros((0, 2), dtype=wp.spatial_vector)
+
+    def lanes(self, count: int) -> int:
+        """Threads that share `count` elements of a world: one each on a GPU, one in all on a CPU.
+
+        A CPU runs threads one after the other, and passing each its arguments takes longer than a small element.
+        """
+        return max(count, 1) if self.device.is_cuda else 1

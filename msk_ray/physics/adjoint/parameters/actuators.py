@@ -186,6 +186,8 @@ def pull_actuator_parameters(
     tendons: TendonRows,
     actuators: ActuatorSettings,
     # In:
+    count: int,
+    lanes: int,
     live_in: wp.array[int],
     act_bar_in: wp.array2d[float],
     drive_in: Drive,
@@ -201,81 +203,82 @@ def pull_actuator_parameters(
     timestep_out: TimestepGradient,
 ) -> None:
     """-Φ ∋ (m·λ) F + h κ dF/dv, and ḡ·act': slopes by one actuator's parameters, as in `actuation.pull_actuators`."""
-    worldid, uid = wp.tid()
+    worldid, lane = wp.tid()
     if live_in[worldid] == 0:
         return
-    h = opt_timestep[worldid % opt_timestep.shape[0]]
-    law = actuator_law(worldid, uid, h, clampctrl, clampact, actuators)
-    ctrl = float(0.0)
-    if actuators.actuator_ctrlnum[uid] > 0:
-        ctrl = drive_in.ctrl[worldid, actuators.actuator_ctrladr[uid]]
-    act = float(0.0)
-    act_weight = float(0.0)
-    if law.dyntype != DynType.NONE:
-        slot = actuators.actuator_actadr[uid] + actuators.actuator_actnum[uid] - 1
-        act = drive_in.act[worldid, slot]
-        act_weight = act_bar_in[worldid, slot]
+    for uid in range(lane, count, lanes):
+        h = opt_timestep[worldid % opt_timestep.shape[0]]
+        law = actuator_law(worldid, uid, h, clampctrl, clampact, actuators)
+        ctrl = float(0.0)
+        if actuators.actuator_ctrlnum[uid] > 0:
+            ctrl = drive_in.ctrl[worldid, actuators.actuator_ctrladr[uid]]
+        act = float(0.0)
+        act_weight = float(0.0)
+        if law.dyntype != DynType.NONE:
+            slot = actuators.actuator_actadr[uid] + actuators.actuator_actnum[uid] - 1
+            act = drive_in.act[worldid, slot]
+            act_weight = act_bar_in[worldid, slot]
 
-    start = drive_in.moment_rowadr[worldid, uid]
-    end = start + drive_in.moment_rownnz[worldid, uid]
-    rate = float(0.0)
-    velocity = float(0.0)
-    rate_mu = float(0.0)
-    rate_smooth = float(0.0)
-    kappa = float(0.0)
-    for k in range(start, end):
-        i = drive_in.moment_colind[worldid, k]
-        lever = drive_in.actuator_moment[worldid, k]
-        velocity += lever * state_in.qvel[worldid, i]
-        if not is_held(worldid, i, actuators, drive_in):
-            rate += lever * multipliers_in.lam[worldid, i]
-        if implicit_all and implicit_address[i, i] >= 0:
-            rate_mu += lever * multipliers_in.mu[worldid, i]
-            rate_smooth += lever * (state_in.qacc[worldid, i] - multipliers_in.excess[worldid, i])
-            for m in range(start, end):
-                j = drive_in.moment_colind[worldid, m]
-                if implicit_address[wp.max(i, j), wp.min(i, j)] >= 0:
-                    smooth = state_in.qacc[worldid, j] - multipliers_in.excess[worldid, j]
-                    kappa += lever * drive_in.actuator_moment[worldid, m] * multipliers_in.mu[worldid, i] * smooth
-    law.implicit = int(implicit_all)
-    length = drive_in.actuator_length[worldid, uid]
-    law_bar, _c, _a, length_slope, velocity_slope, _w, force, slope = wp.grad(actuator_score)(
-        law, ctrl, act, length, velocity, act_weight, rate, h * kappa
-    )
-    gradients_out.actuator_gainprm[worldid, uid] = gradients_out.actuator_gainprm[worldid, uid] + law_bar.gainprm
-    gradients_out.actuator_biasprm[worldid, uid] = gradients_out.actuator_biasprm[worldid, uid] + law_bar.biasprm
-    gradients_out.actuator_dynprm[worldid, uid] = gradients_out.actuator_dynprm[worldid, uid] + law_bar.dynprm
-    wp.atomic_add(timestep_out.timestep, worldid, law_bar.timestep)
+        start = drive_in.moment_rowadr[worldid, uid]
+        end = start + drive_in.moment_rownnz[worldid, uid]
+        rate = float(0.0)
+        velocity = float(0.0)
+        rate_mu = float(0.0)
+        rate_smooth = float(0.0)
+        kappa = float(0.0)
+        for k in range(start, end):
+            i = drive_in.moment_colind[worldid, k]
+            lever = drive_in.actuator_moment[worldid, k]
+            velocity += lever * state_in.qvel[worldid, i]
+            if not is_held(worldid, i, actuators, drive_in):
+                rate += lever * multipliers_in.lam[worldid, i]
+            if implicit_all and implicit_address[i, i] >= 0:
+                rate_mu += lever * multipliers_in.mu[worldid, i]
+                rate_smooth += lever * (state_in.qacc[worldid, i] - multipliers_in.excess[worldid, i])
+                for m in range(start, end):
+                    j = drive_in.moment_colind[worldid, m]
+                    if implicit_address[wp.max(i, j), wp.min(i, j)] >= 0:
+                        smooth = state_in.qacc[worldid, j] - multipliers_in.excess[worldid, j]
+                        kappa += lever * drive_in.actuator_moment[worldid, m] * multipliers_in.mu[worldid, i] * smooth
+        law.implicit = int(implicit_all)
+        length = drive_in.actuator_length[worldid, uid]
+        law_bar, _c, _a, length_slope, velocity_slope, _w, force, slope = wp.grad(actuator_score)(
+            law, ctrl, act, length, velocity, act_weight, rate, h * kappa
+        )
+        gradients_out.actuator_gainprm[worldid, uid] = gradients_out.actuator_gainprm[worldid, uid] + law_bar.gainprm
+        gradients_out.actuator_biasprm[worldid, uid] = gradients_out.actuator_biasprm[worldid, uid] + law_bar.biasprm
+        gradients_out.actuator_dynprm[worldid, uid] = gradients_out.actuator_dynprm[worldid, uid] + law_bar.dynprm
+        wp.atomic_add(timestep_out.timestep, worldid, law_bar.timestep)
 
-    kind = actuators.actuator_trntype[uid]
-    target = actuators.actuator_trnid[uid][0]
-    rates = GearRates()
-    if kind == TrnType.TENDON:
-        rates = gear_rates_of_tendon(
-            worldid, target, tendons, actuators, drive_in, state_in, multipliers_in, ten_J_in, ten_length_in
-        )
-    elif kind == TrnType.SITE:
-        rates = gear_rates_of_site(worldid, target, levers_in, motion_in, fields_in)
-    else:
-        rates = gear_rates_of_joint(
-            worldid,
-            target,
-            kind == TrnType.JOINTINPARENT,
-            joints,
-            actuators,
-            drive_in,
-            state_in,
-            multipliers_in,
-        )
-    gear_bar = force * rates.lam + velocity_slope * rates.vel + length_slope * rates.length
-    if implicit_all:
-        gear = actuators.actuator_gear[worldid % actuators.actuator_gear.shape[0], uid][0]
-        if kind == TrnType.TENDON and gear != 0.0:
-            # κ counts pairs that M couples, and is quadratic in the one gear
-            gear_bar[0] += 2.0 * h * slope * kappa / gear
-        elif kind != TrnType.TENDON:
-            gear_bar += h * slope * (rate_smooth * rates.mu + rate_mu * rates.smooth)
-    gradients_out.actuator_gear[worldid, uid] = gradients_out.actuator_gear[worldid, uid] + gear_bar
+        kind = actuators.actuator_trntype[uid]
+        target = actuators.actuator_trnid[uid][0]
+        rates = GearRates()
+        if kind == TrnType.TENDON:
+            rates = gear_rates_of_tendon(
+                worldid, target, tendons, actuators, drive_in, state_in, multipliers_in, ten_J_in, ten_length_in
+            )
+        elif kind == TrnType.SITE:
+            rates = gear_rates_of_site(worldid, target, levers_in, motion_in, fields_in)
+        else:
+            rates = gear_rates_of_joint(
+                worldid,
+                target,
+                kind == TrnType.JOINTINPARENT,
+                joints,
+                actuators,
+                drive_in,
+                state_in,
+                multipliers_in,
+            )
+        gear_bar = force * rates.lam + velocity_slope * rates.vel + length_slope * rates.length
+        if implicit_all:
+            gear = actuators.actuator_gear[worldid % actuators.actuator_gear.shape[0], uid][0]
+            if kind == TrnType.TENDON and gear != 0.0:
+                # κ counts pairs that M couples, and is quadratic in the one gear
+                gear_bar[0] += 2.0 * h * slope * kappa / gear
+            elif kind != TrnType.TENDON:
+                gear_bar += h * slope * (rate_smooth * rates.mu + rate_mu * rates.smooth)
+        gradients_out.actuator_gear[worldid, uid] = gradients_out.actuator_gear[worldid, uid] + gear_bar
 
 
 class ActuatorStage(ParameterStage):
@@ -296,7 +299,7 @@ class ActuatorStage(ParameterStage):
         work, m, d, settings = self.parts.work, self.parts.work.model, at.data, self.parts.work.settings
         wp.launch(
             pull_actuator_parameters,
-            dim=(work.nworld, m.nactuator),
+            dim=(work.nworld, work.lanes(m.nactuator)),
             inputs=[
                 m.opt.timestep,
                 settings.clampctrl,
@@ -306,6 +309,8 @@ class ActuatorStage(ParameterStage):
                 work.joints,
                 work.tendon_rows,
                 self._settings,
+                m.nactuator,
+                work.lanes(m.nactuator),
                 work.live,
                 self._act_bar,
                 gather(Drive, d),

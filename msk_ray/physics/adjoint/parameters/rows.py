@@ -72,7 +72,7 @@ def pull_row_parameters(
     settings: RowSettings,
     ranges: RowRanges,
     # In:
-    rows: int,
+    count: int,
     lanes: int,
     live_in: wp.array[int],
     nefc_in: wp.array[int],
@@ -90,7 +90,7 @@ def pull_row_parameters(
     worldid, lane = wp.tid()
     if live_in[worldid] == 0:
         return
-    for row in range(lane, wp.min(nefc_in[worldid], rows), lanes):
+    for row in range(lane, wp.min(nefc_in[worldid], count), lanes):
         kind = rows_in.type[worldid, row]
         if laws_in.slope[worldid, row] == 0.0 and laws_in.force[worldid, row] == 0.0:
             continue
@@ -178,6 +178,8 @@ def pull_absent_friction(
     losses: Losses,
     tendons: TendonRows,
     # In:
+    count: int,
+    lanes: int,
     live_in: wp.array[int],
     state_in: State,
     lam_in: wp.array2d[float],
@@ -186,41 +188,42 @@ def pull_absent_friction(
     gradients_out: RowGradients,
 ) -> None:
     """A dof or tendon without friction loss has no row, but a slope: f = -loss sign(ρ(a) + b ρ(v)) for small ones."""
-    worldid, place = wp.tid()
+    worldid, lane = wp.tid()
     if live_in[worldid] == 0:
         return
-    loss = float(0.0)
-    lam = float(0.0)
-    acc = float(0.0)
-    vel = float(0.0)
-    solref = wp.vec2(0.0)
-    solimp = vec5()
-    t = place - nv
-    if t < 0:
-        loss = losses.dof_frictionloss[worldid % losses.dof_frictionloss.shape[0], place]
-        lam = lam_in[worldid, place]
-        acc = state_in.qacc[worldid, place]
-        vel = state_in.qvel[worldid, place]
-        solref = settings.dof_solref[worldid % settings.dof_solref.shape[0], place]
-        solimp = settings.dof_solimp[worldid % settings.dof_solimp.shape[0], place]
-    else:
-        loss = losses.tendon_frictionloss[worldid % losses.tendon_frictionloss.shape[0], t]
-        lam = tendon_rate(tendons, t, ten_J_in[worldid], lam_in[worldid])
-        acc = tendon_rate(tendons, t, ten_J_in[worldid], state_in.qacc[worldid])
-        vel = tendon_rate(tendons, t, ten_J_in[worldid], state_in.qvel[worldid])
-        solref = settings.tendon_solref_fri[worldid % settings.tendon_solref_fri.shape[0], t]
-        solimp = settings.tendon_solimp_fri[worldid % settings.tendon_solimp_fri.shape[0], t]
-    if loss > 0.0:
-        return
-    timestep = opt_timestep[worldid % opt_timestep.shape[0]]
-    jar = acc + contact_kbimp(opt_disableflags, timestep, solref, solimp, 0.0, False)[1] * vel
-    slope = float(0.0)
-    if jar != 0.0:
-        slope = -lam * wp.sign(jar)
-    if t < 0:
-        gradients_out.dof_frictionloss[worldid, place] = gradients_out.dof_frictionloss[worldid, place] + slope
-    else:
-        gradients_out.tendon_frictionloss[worldid, t] = gradients_out.tendon_frictionloss[worldid, t] + slope
+    for place in range(lane, count, lanes):
+        loss = float(0.0)
+        lam = float(0.0)
+        acc = float(0.0)
+        vel = float(0.0)
+        solref = wp.vec2(0.0)
+        solimp = vec5()
+        t = place - nv
+        if t < 0:
+            loss = losses.dof_frictionloss[worldid % losses.dof_frictionloss.shape[0], place]
+            lam = lam_in[worldid, place]
+            acc = state_in.qacc[worldid, place]
+            vel = state_in.qvel[worldid, place]
+            solref = settings.dof_solref[worldid % settings.dof_solref.shape[0], place]
+            solimp = settings.dof_solimp[worldid % settings.dof_solimp.shape[0], place]
+        else:
+            loss = losses.tendon_frictionloss[worldid % losses.tendon_frictionloss.shape[0], t]
+            lam = tendon_rate(tendons, t, ten_J_in[worldid], lam_in[worldid])
+            acc = tendon_rate(tendons, t, ten_J_in[worldid], state_in.qacc[worldid])
+            vel = tendon_rate(tendons, t, ten_J_in[worldid], state_in.qvel[worldid])
+            solref = settings.tendon_solref_fri[worldid % settings.tendon_solref_fri.shape[0], t]
+            solimp = settings.tendon_solimp_fri[worldid % settings.tendon_solimp_fri.shape[0], t]
+        if loss > 0.0:
+            continue
+        timestep = opt_timestep[worldid % opt_timestep.shape[0]]
+        jar = acc + contact_kbimp(opt_disableflags, timestep, solref, solimp, 0.0, False)[1] * vel
+        slope = float(0.0)
+        if jar != 0.0:
+            slope = -lam * wp.sign(jar)
+        if t < 0:
+            gradients_out.dof_frictionloss[worldid, place] = gradients_out.dof_frictionloss[worldid, place] + slope
+        else:
+            gradients_out.tendon_frictionloss[worldid, t] = gradients_out.tendon_frictionloss[worldid, t] + slope
 
 
 class RowStage(ParameterStage):
@@ -236,11 +239,9 @@ class RowStage(ParameterStage):
 
     def launch(self, at: Substep) -> None:
         work, m, d = self.parts.work, self.parts.work.model, at.data
-        # A thread of a CPU costs more than the work of a row.
-        lanes = max(self._rows, 1) if work.device.is_cuda else 1
         wp.launch(
             pull_row_parameters,
-            dim=(work.nworld, lanes),
+            dim=(work.nworld, work.lanes(self._rows)),
             inputs=[
                 m.opt.timestep,
                 m.opt.disableflags,
@@ -248,7 +249,7 @@ class RowStage(ParameterStage):
                 self._settings,
                 self._ranges,
                 self._rows,
-                lanes,
+                work.lanes(self._rows),
                 work.live,
                 d.nefc,
                 at.rows,
@@ -262,7 +263,7 @@ class RowStage(ParameterStage):
         )
         wp.launch(
             pull_absent_friction,
-            dim=(work.nworld, m.nv + m.ntendon),
+            dim=(work.nworld, work.lanes(m.nv + m.ntendon)),
             inputs=[
                 m.nv,
                 m.opt.timestep,
@@ -270,6 +271,8 @@ class RowStage(ParameterStage):
                 self._settings,
                 self._losses,
                 work.tendon_rows,
+                m.nv + m.ntendon,
+                work.lanes(m.nv + m.ntendon),
                 work.live,
                 at.state,
                 work.multipliers.lam,
