@@ -68,7 +68,7 @@ def drive(arguments: list[str]) -> int:
     from msk_ray.cli import run
     from msk_ray.tune.__main__ import main as tune_main
 
-    driver.Plan = functools.partial(driver.Plan, trainer_class=TimedTrainer)  # type: ignore[assignment,misc]
+    driver.Plan = functools.partial(driver.Plan, make_trainer=TimedTrainer)  # type: ignore[assignment,misc]
     return run(tune_main, arguments)
 
 

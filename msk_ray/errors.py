@@ -85,6 +85,12 @@ def storage_failure(error: BaseException) -> StorageFailure | None:
     return None
 
 
+class RankLost(MskRayError):
+    """A process of a trial that has several died. The trial continues from its last checkpoint."""
+
+    exit_code = 75  # EX_TEMPFAIL
+
+
 class UnsupportedModelError(MskRayError):
     """A model feature cannot be differentiated by the chosen backward mode."""
 

@@ -31,7 +31,7 @@ from msk_ray.signals import RESUMABLE, StopRequest, listening
 from msk_ray.text import printable
 
 if TYPE_CHECKING:
-    from msk_ray.training import Trainer
+    from msk_ray.training import ParallelTrainer, Trainer
 
 DESCRIPTION = """\
 Train one policy, by SHAC or another algorithm: one trial, in this process, without Ray.
@@ -147,7 +147,7 @@ def train(
     Args:
         config: every setting, from `load_config`.
         logdir: folder of the trial.
-        device: cpu or cuda:N; by default the first GPU, or the CPU if there is none.
+        device: cpu or cuda:N, the first of `trial.gpus`; by default the first GPU, or the CPU if there is none.
         resume: continue from the newest complete checkpoint in `logdir`.
         force: take over the folder although its owner seems to be running.
         score_at_once: score each policy when it is due. Otherwise, on a GPU, several are scored together, at most two
@@ -157,6 +157,7 @@ def train(
     Raises:
         StorageError: the folder holds another trial, belongs to another process, or cannot be written.
         CheckpointError: with `resume`, no checkpoint is complete or the newest has other settings.
+        RankLost: one of the processes of a trial with several GPUs has died; repeat the call with `resume`.
         DeviceError, UnsupportedModelError, SimulationError: as their messages say.
     """
     if not isinstance(config, Config):
@@ -188,10 +189,12 @@ def _choose_device(asked: str | None) -> str:
     return asked or ("cuda:0" if torch.cuda.is_available() else "cpu")
 
 
-def _trainer(config: Config, logdir: Path, device: str, resume: bool, score_at_once: bool) -> "Trainer":
+def _trainer(
+    config: Config, logdir: Path, device: str, resume: bool, score_at_once: bool
+) -> "Trainer | ParallelTrainer":
     """A trainer of the trial in `logdir`, at its start."""
     # torch and Warp take seconds to load; a wrong command line should not wait for them.
-    from msk_ray.training import MOST_TOGETHER, Trainer
+    from msk_ray.training import MOST_TOGETHER, make_trainer
     from msk_ray.training.checkpoint import newest_valid_checkpoint
 
     if resume:
@@ -200,7 +203,7 @@ def _trainer(config: Config, logdir: Path, device: str, resume: bool, score_at_o
             raise CheckpointError(
                 f"--resume: no checkpoint in {logdir} is complete ({faults[0]}); choose another --logdir to start again"
             )
-    return Trainer(config, logdir, device, 1 if score_at_once or device == "cpu" else MOST_TOGETHER)
+    return make_trainer(config, logdir, device, 1 if score_at_once or device == "cpu" else MOST_TOGETHER)
 
 
 def _train(
@@ -210,8 +213,10 @@ def _train(
     from msk_ray.progress import ProgressLine
 
     logdir = ownership.folder
+    gpus = config.trial.gpus
+    place = device if gpus == 1 else f"{gpus} {'CPU processes' if device == 'cpu' else f'GPUs, the first {device}'}"
     print(
-        f"{config.env.name}: {config.trial.epochs} epochs, {config.env.nworld} worlds, on {device}; log folder {logdir}"
+        f"{config.env.name}: {config.trial.epochs} epochs, {config.env.nworld} worlds, on {place}; log folder {logdir}"
     )
     print("preparing kernels (a first run compiles them, up to a minute) ...", flush=True)
     trainer = _trainer(config, logdir, device, args.resume, args.score_at_once)

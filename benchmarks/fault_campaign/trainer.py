@@ -82,6 +82,6 @@ def drive(arguments: list[str]) -> int:
 
     # Trials' processes need not find this module.
     cloudpickle.register_pickle_by_value(sys.modules[__name__])
-    driver.Plan = functools.partial(driver.Plan, trainer_class=FaultyTrainer)  # type: ignore[assignment,misc]
+    driver.Plan = functools.partial(driver.Plan, make_trainer=FaultyTrainer)  # type: ignore[assignment,misc]
     session.ray_session = functools.partial(session.ray_session, dashboard=False)
     return run(tune_main, arguments)

@@ -1,5 +1,6 @@
 """The interface between the trainer and an algorithm."""
 
+import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -16,6 +17,9 @@ from msk_ray.errors import ConfigError
 _OF_GRADIENTS = frozenset({"approximated_share", "reached_share"})
 """Diagnostics of the simulation that concern its gradients; the others concern its physics."""
 
+_LARGEST = ("_max", "/contacts_share", "/rows_share", "fd_solver_limit_share")
+"""How the names of diagnostics end that are the largest of a world or step, not a mean over worlds."""
+
 
 @dataclass(frozen=True)
 class EpochResult:
@@ -29,6 +33,9 @@ class EpochResult:
 
 class Algorithm(ABC):
     """Learns a policy for one environment, epoch by epoch.
+
+    With settings that are `parallel`, it may run in several processes at the same time, each with an environment of its
+    own share of the worlds, whose `group` they use to learn the same.
 
     A subclass needs `policy_network` and `update`; its settings, if it has any, are `Settings`. A resumed trial draws
     the same numbers from torch's global generator again.
@@ -145,14 +152,27 @@ def algorithm_class(config: Config) -> type[Algorithm]:
 def simulation_metrics(env: Env[Any]) -> dict[str, float]:
     """The simulation's diagnostics since the last call, and the range of randomized parameters, by metric name.
 
+    In a group, of all processes, each of which has to call it.
+
     Raises:
         SimulationError: contacts or constraint rows were lost to a full buffer.
     """
     drawn = {} if env.randomizer is None else env.randomizer.metrics(env.state.numbers)
-    return drawn | {
+    found = drawn | {
         f"{'grad' if name in _OF_GRADIENTS else 'physics'}/{name}": value
         for name, value in env.sim.diagnostics().items()
     }
+    every = env.group.collect(found)
+    return {name: _of_all(name, [figures[name] for figures in every]) for name in found}
+
+
+def _of_all(name: str, values: list[float]) -> float:
+    """A diagnostic of all worlds from those of equal parts of them; NaN if one of these is."""
+    if any(math.isnan(value) for value in values):
+        return math.nan
+    if name.endswith("_min"):
+        return min(values)
+    return max(values) if name.endswith(_LARGEST) else sum(values) / len(values)
 
 
 class Clock:

@@ -49,6 +49,8 @@ class AlgorithmSettings(Section):
     """Optional modules that it needs, and what to install for each."""
     length: ClassVar[str | None] = None
     """Its setting for the number of env steps that a world takes in an epoch."""
+    parallel: ClassVar[bool] = False
+    """Whether several processes can train one trial (`trial.gpus`)."""
 
     def env_steps(self, nworld: int, epochs: int) -> int:
         """The largest number of env steps that a number of epochs of W worlds can take.
@@ -141,6 +143,7 @@ class ShacConfig(AlgorithmSettings):
     """Short-Horizon Actor-Critic."""
 
     length: ClassVar[str | None] = "horizon"
+    parallel: ClassVar[bool] = True
 
     horizon: Horizon = 32
     """Env steps H of a rollout through which the gradient flows: constant, {start, end, epochs}, adapted to the
@@ -230,9 +233,11 @@ class ShacConfig(AlgorithmSettings):
             shortest = min(horizon.start, horizon.end)
         else:
             shortest = horizon if isinstance(horizon, int) else horizon.shortest
-        if (shortest * nworld) % self.critic_batches:
+        gpus = config.trial.gpus
+        also = f" × trial.gpus {gpus}" if gpus > 1 else ""
+        if (shortest * nworld) % (self.critic_batches * gpus):
             raise ValueError(
-                f"shac.critic_batches {self.critic_batches} must divide shac.horizon × env.nworld "
+                f"shac.critic_batches {self.critic_batches}{also} must divide shac.horizon × env.nworld "
                 f"({shortest} × {nworld})"
             )
         if self.entropy is not None and not config.actor.stochastic:
@@ -244,8 +249,8 @@ class ShacConfig(AlgorithmSettings):
                 raise ValueError("shac.exploration changes the noise that shac.entropy measures: leave one out")
         if self.actor_value == "mean" and config.critic.count == 1:
             raise ValueError("shac.actor_value: mean is of two critics: write critic.count: 2")
-        if self.copies is not None and nworld % self.copies.count:
-            raise ValueError(f"shac.copies.count {self.copies.count} must divide env.nworld ({nworld})")
+        if self.copies is not None and nworld // gpus % self.copies.count:
+            raise ValueError(f"shac.copies.count {self.copies.count}{also} must divide env.nworld ({nworld})")
         if isinstance(horizon, ContactHorizon) and "cone" not in config.env.reads_physics:
             raise ValueError(f"shac.horizon.contact: {config.env.name} has no contacts; write a number")
 

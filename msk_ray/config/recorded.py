@@ -86,6 +86,7 @@ _LATER: dict[tuple[str, ...], Any] = {
     ("physics", "randomize"): None,
     ("physics", "contact_reach"): None,
     ("trial", "threads"): 1,
+    ("trial", "gpus"): 1,
     ("trial", "loggers"): ["tensorboard"],
     ("algorithm", "name"): "shac",
     ("shac", "capture"): "auto",

@@ -127,6 +127,9 @@ class TrialConfig(Section):
     threads: Count = 1
     """Number of CPU threads of torch. Sums, and so the results of a trial, depend on it; therefore it comes from this
     setting, never from the machine. Networks of a few hundred units gain nothing from more than one."""
+    gpus: Annotated[int, Field(ge=1, le=64)] = 1
+    """Number of GPUs, all of one host, that the worlds are spread over, with a process for each; on the CPU, of
+    processes. It must divide `env.nworld`, and changes results only by rounding."""
 
     @field_validator("loggers")
     @classmethod
@@ -196,6 +199,7 @@ class Config(Section):
     @model_validator(mode="after")
     def _consistent(self) -> "Config":
         self.physics.resolve_substeps(self.env.control_timestep)
+        self._check_gpus()
         self.algorithm_settings.check(self)
         if self.curriculum is not None:
             self._check_curriculum()
@@ -204,6 +208,18 @@ class Config(Section):
                     "curriculum and physics.randomize.pair_friction both set the friction of pairs; leave one out"
                 )
         return self
+
+    def _check_gpus(self) -> None:
+        gpus, nworld = self.trial.gpus, self.env.nworld
+        if gpus > 1 and not self.algorithm_settings.parallel:
+            raise ValueError(
+                f"trial.gpus {gpus}: {self.algorithm.name} trains in one process; write trial.gpus: 1, or "
+                "algorithm.name: shac"
+            )
+        if nworld % gpus:
+            raise ValueError(
+                f"trial.gpus {gpus} must divide env.nworld {nworld}: write {nworld // gpus * gpus or gpus}"
+            )
 
     def _check_curriculum(self) -> None:
         if "cone" not in self.env.reads_physics:

@@ -18,6 +18,7 @@ from msk_ray.config import EnvSettings, PhysicsConfig
 from msk_ray.envs.layout import Entry
 from msk_ray.envs.randomize import Randomizer
 from msk_ray.errors import ConfigError
+from msk_ray.group import ALONE, Group
 from msk_ray.physics.capacity import Capacity
 from msk_ray.simulation import Backward, Simulation, StepState
 from msk_ray.simulation.kinematics import Frames, Kinematics, Names
@@ -81,8 +82,10 @@ class Env(ABC, Generic[SettingsT]):
             states on every device.
         randomizer: parameters of the model that differ between worlds; None for the model's own.
         ignore_contact_forces: whether contact forces read as 0, for comparisons of gradients, because they carry none.
+        group: the processes that the trial's worlds are spread over; here are those of this one.
     """
 
+    group: Group = ALONE
     action_size: int
     obs_size: int
     reward_names: ClassVar[tuple[str, ...]]
@@ -212,14 +215,31 @@ class Env(ABC, Generic[SettingsT]):
         self._measured = {}
 
     def draw_resets(self, steps: int) -> Resets:
-        """What the episodes that may begin in the next `steps` env steps begin with, one step after the other."""
-        return self.draw_episodes(steps * self.nworld)
+        """What the episodes that may begin in the next `steps` env steps begin with, one step after the other.
+
+        In a group, every process draws for all worlds, and keeps what its own begin with.
+        """
+        worlds = self.nworld * self.group.size
+        drawn = self.draw_episodes(steps * worlds)
+
+        def own(values: Tensor) -> Tensor:
+            return self.group.own(values.unflatten(0, (steps, worlds)), dim=1).flatten(0, 1)
+
+        return Resets(StepState(*map(own, drawn.physics)), own(drawn.numbers))
 
     def draw_episodes(self, count: int) -> Resets:
         """What `count` episodes begin with."""
         if self.randomizer is None:
             return Resets(self.draw_physics(count), torch.zeros((count, 0), device=self.device))
         return Resets(self.draw_physics(count), self.randomizer.draw(count))
+
+    def join(self, group: Group) -> None:
+        """Become the worlds of one process of a group, each of which has as many, in their initial states."""
+        self.group = group
+        self.generator.manual_seed(self.generator.initial_seed())
+        if self.randomizer is not None:
+            self.randomizer.generator.manual_seed(self.randomizer.generator.initial_seed())
+        self.state = self.reset_state()
 
     def stock_resets(self, drawn: Resets | None) -> None:
         """Take resets from those drawn by `draw_resets`; None: draw each when it is needed."""
@@ -234,26 +254,29 @@ class Env(ABC, Generic[SettingsT]):
         return None if self.randomizer is None else self.randomizer.values(self.state.numbers)
 
     def state_dict(self) -> dict[str, Any]:
-        """The state of the worlds, their parameters, the generators, and the buffer sizes that the simulation has."""
-        state = self.state
+        """The state of the worlds, their parameters, the generators, and the buffer sizes that the simulation has.
+
+        In a group, of the worlds of all processes, each of which has to call it.
+        """
+        state, gather = self.state, self.group.gather
         return {
             "env_generator": self.generator.get_state(),
-            "env_state": [t.detach().clone() for t in (*state.physics, state.action, state.age)],
-            "capacity": tuple(self.sim.capacity),
+            "env_state": [gather(t.detach()).clone() for t in (*state.physics, state.action, state.age)],
+            "capacity": tuple(map(max, zip(*self.group.collect(tuple(self.sim.capacity)), strict=True))),
             "randomizer": None
             if self.randomizer is None
-            else {"numbers": state.numbers.clone(), "generator": self.randomizer.generator.get_state()},
+            else {"numbers": gather(state.numbers).clone(), "generator": self.randomizer.generator.get_state()},
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a `state_dict`."""
         # The state of a generator is a host tensor on every device.
         self.generator.set_state(state["env_generator"].cpu())
-        *physics, action, age = state["env_state"]
+        *physics, action, age = map(self.group.own, state["env_state"])
         numbers = torch.zeros((self.nworld, 0), device=self.device)
         if self.randomizer is not None:
             drawn = state["randomizer"]
-            numbers = drawn["numbers"].to(self.device)
+            numbers = self.group.own(drawn["numbers"].to(self.device))
             self.randomizer.generator.set_state(drawn["generator"].cpu())
         self.state = EnvState(StepState(*physics), action, age, numbers)
         if "capacity" in state:

@@ -3,7 +3,7 @@
 from msk_ray.simulation.backward import Backward, InputGradients, StepState
 from msk_ray.simulation.fd_jacobian import FdJacobian
 from msk_ray.simulation.jacobian import Linearization
-from msk_ray.simulation.simulation import Simulation, WarpSimStep
+from msk_ray.simulation.simulation import Simulation, WarpSimStep, use_device
 from msk_ray.simulation.tape import Hybrid, TapeAll, TapePerSubstep
 
 __all__ = [
@@ -17,4 +17,5 @@ __all__ = [
     "TapeAll",
     "TapePerSubstep",
     "WarpSimStep",
+    "use_device",
 ]

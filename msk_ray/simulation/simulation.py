@@ -48,6 +48,18 @@ def resolve_device(device: str) -> torch.device:
     return torch.device("cuda", resolved.index or 0)
 
 
+def use_device(device: str) -> None:
+    """Make a device the default of torch and Warp in this process, which then leaves other GPUs alone.
+
+    Raises:
+        DeviceError: there is no such device.
+    """
+    found = resolve_device(device)
+    if found.type == "cuda":
+        torch.cuda.set_device(found)
+        wp.set_device(str(found))
+
+
 class WarpSimStep(torch.autograd.Function):
     """(ctrl, qpos, qvel, act, parameters, forces) to (qpos, qvel, act) one env step later, differentiable in all."""
 

@@ -67,7 +67,7 @@ def shorten(config: Config) -> dict[str, Any]:
     return {
         "trial.epochs": min(config.trial.epochs, EPOCHS),
         "trial.checkpoint_interval": 1,
-        "env.nworld": min(config.env.nworld, WORLDS),
+        "env.nworld": min(config.env.nworld, max(1, WORLDS // config.trial.gpus) * config.trial.gpus),
         **{f"{config.algorithm_section}.{key}": value for key, value in own.items()},
         "evaluation.interval": 1,
         "evaluation.nworld": min(config.evaluation.nworld, EVALUATION_WORLDS),

@@ -13,12 +13,12 @@ import torch
 
 from msk_ray.algorithms import algorithm_class
 from msk_ray.config import Config, dump_yaml, overlay, parse_config, parse_recorded
-from msk_ray.envs import make_env
-from msk_ray.errors import CheckpointError, SimulationError, StorageError
+from msk_ray.errors import CheckpointError, ConfigError, SimulationError, StorageError
 from msk_ray.experiment.damage import Damage, describe_damages
 from msk_ray.experiment.layout import METRICS_FILE
 from msk_ray.experiment.metrics import SCORE, read_metrics, read_rows
 from msk_ray.files import remove_stale, write_bytes
+from msk_ray.group import ALONE, Group
 from msk_ray.training.checkpoint import (
     epoch_checkpoints,
     milestone_path,
@@ -29,16 +29,15 @@ from msk_ray.training.checkpoint import (
     write_checkpoint,
 )
 from msk_ray.training.evaluation import Evaluator
+from msk_ray.training.learner import load_state, make_algorithm, naming_memory, start_from
 from msk_ray.training.loggers import TrialLog
-from msk_ray.training.memory import named_out_of_memory
 from msk_ray.training.policy import SavedPolicy
 from msk_ray.training.policy_group import Policy
-from msk_ray.training.threads import use_threads
 from msk_ray.training.unscored import UnscoredPolicies
 
 # Settings that may differ between a checkpoint and the trial that continues from it.
 _EXTENDABLE = {
-    "trial": {"epochs", "checkpoint_interval", "keep_checkpoints", "loggers"},
+    "trial": {"epochs", "checkpoint_interval", "keep_checkpoints", "loggers", "gpus"},
     "physics": {"nconmax", "njmax"},  # buffer sizes, which an error may ask for; results do not depend on them
 }
 _MILESTONES = 8
@@ -64,9 +63,11 @@ class Trainer:
         together: number of policies to score at the same time. On a GPU, 16 take hardly longer than one. A policy then
             waits until there are that many, or two minutes have passed, or training ends; until then its row has no
             score. Scores and best.pt are the same in the end. A logger that takes rows only once makes it 1.
+        group: the processes that train the trial, of which this is the first; it tells the others, which `follow`, what
+            they all take part in. `make_trainer` starts them.
 
     Attributes:
-        env: the worlds used for training.
+        env: the worlds used for training in this process.
         algorithm: the algorithm that trains in them.
         epoch: number of epochs done.
         best_score: highest evaluation score of the trained policy so far, -inf before the first; that of `best.pt`.
@@ -76,9 +77,15 @@ class Trainer:
         ConfigError, DeviceError, UnsupportedModelError, StorageError, SimulationError: as their messages say.
     """
 
-    def __init__(self, config: Config, logdir: Path, device: str, together: int = 1) -> None:
-        algorithm = algorithm_class(config)
+    def __init__(self, config: Config, logdir: Path, device: str, together: int = 1, group: Group = ALONE) -> None:
+        if config.trial.gpus != group.size:
+            raise ConfigError(
+                f"trial.gpus {config.trial.gpus}: a Trainer is one process; start this trial with msk_ray.train or "
+                "msk_ray.training.make_trainer"
+            )
+        algorithm_class(config)  # one that cannot be found is reported before anything is written
         self._log = TrialLog(logdir, config)
+        self._group = group
         self.config = config
         self.logdir = logdir
         self.epoch = 0
@@ -97,18 +104,9 @@ class Trainer:
         self._device = device
         self.together = min(together, self._evaluations) if self._log.takes_late else 1
         self._unscored = UnscoredPolicies(self.checkpoints)
-        use_threads(config)
         with self._memory():
-            self.env = make_env(
-                config.env,
-                config.physics,
-                config.env.nworld,
-                device,
-                config.trial.seed,
-                differentiable=config.algorithm_settings.differentiates,
-                randomize=True,
-            )
-            self.algorithm = algorithm(config, self.env)
+            self.algorithm = make_algorithm(config, device, group)
+            self.env = self.algorithm.env
             self.evaluator = Evaluator(config, device, policies=self.together)
         self._damages: tuple[Damage, ...] = ()
         self._unreadable: list[str] = []
@@ -152,6 +150,7 @@ class Trainer:
         started = time.perf_counter()
         try:
             with self._memory():
+                self._group.tell("update", self.epoch)
                 self.env.begin_epoch(self.epoch)
                 result = self.algorithm.update(self.epoch)
         except SimulationError:
@@ -183,9 +182,7 @@ class Trainer:
         self._seconds += time.perf_counter() - started
 
     def _memory(self) -> AbstractContextManager[None]:
-        length = self.config.algorithm_settings.length
-        other = [] if length is None else [f"{self.config.algorithm_section}.{length}"]
-        return named_out_of_memory(self._device, self.config.env.nworld, "env.nworld", *other)
+        return naming_memory(self.config, self._device)
 
     def save(self) -> Path:
         """Write a checkpoint of everything and return its path; an existing one is kept."""
@@ -205,9 +202,8 @@ class Trainer:
             CheckpointError: it is missing, incomplete, or was written under other settings.
         """
         state = _expect(path, read_checkpoint(path))
-        difference = _first_difference(
-            parse_recorded(state["config"], f"{path}: its settings").as_dict(), self.config.as_dict(), changed
-        )
+        recorded = parse_recorded(state["config"], f"{path}: its settings")
+        difference = _first_difference(recorded.as_dict(), self.config.as_dict(), changed)
         if difference:
             raise CheckpointError(
                 f"{path} was written under other settings: {difference}; use those, or start another trial"
@@ -217,8 +213,15 @@ class Trainer:
                 f"{path} has {state['epoch']} epochs already: set trial.epochs to the new total, not "
                 f"{self.config.trial.epochs}"
             )
+        before, now = recorded.trial.gpus, self.config.trial.gpus
+        if before != now:
+            warnings.warn(
+                f"{path.name} was written with trial.gpus {before}, now {now}: the same to rounding, not to the bit",
+                stacklevel=2,
+            )
         self._write_config()
-        self.algorithm.load_state_dict(_to_device(state["algorithm"], self.env.device))
+        self._group.tell("load", str(path))
+        load_state(self.algorithm, state)
         self.epoch, self.env_steps = state["epoch"], state["env_steps"]
         self._seconds = state["seconds"]
         self._damages = self._log.rewind(self.epoch)
@@ -261,17 +264,9 @@ class Trainer:
         self._log.close()
 
     def _start_from(self, path: str | None) -> None:
-        if path is None:
-            return
-        state = read_checkpoint(Path(path))
-        try:
-            self.algorithm.start_from(_to_device(state["algorithm"]["modules"], self.env.device))
-        except (KeyError, TypeError, RuntimeError) as error:
-            what = str(error).splitlines()[-1].strip()
-            raise CheckpointError(
-                f"trial.start_from: {path} does not fit this trial ({what}): give a checkpoint of the same env, "
-                "algorithm and networks"
-            ) from error
+        if path is not None:
+            self._group.tell("start_from", path)
+            start_from(self.algorithm, path)
 
     def _begin(self) -> None:
         """Everything before the first epoch. The untrained policy is there to look at; it has no score in `best.pt`, so
@@ -367,6 +362,7 @@ class Trainer:
 
     def _state(self) -> dict[str, Any]:
         """Everything needed to continue from here."""
+        self._group.tell("state_dict")
         return {
             "config": self.config.as_dict(),
             "epoch": self.epoch,
@@ -391,6 +387,7 @@ def precompile(config: Config, device: str, logdir: Path) -> None:
         "evaluation.steps": 1,
         "evaluation.nworld": 2,
         "trial.epochs": 1,
+        "trial.gpus": 1,
         "trial.start_from": None,
         "trial.loggers": [],
     }
@@ -429,12 +426,3 @@ def _first_difference(
         elif before != after:
             return f"{prefix}{key} was {before!r}, now {after!r}"
     return None
-
-
-def _to_device(value: Any, device: Any) -> Any:
-    """Nested containers with every tensor moved to a device."""
-    if isinstance(value, dict):
-        return {k: _to_device(v, device) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_to_device(v, device) for v in value]
-    return value.to(device) if hasattr(value, "to") else value

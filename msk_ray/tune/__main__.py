@@ -30,7 +30,7 @@ from msk_ray.sweep.space import Space, parse_space, read_space
 from msk_ray.sweep.trials import find_trial, resolve_trials
 from msk_ray.text import printable, printable_lines
 from msk_ray.text_table import text_table
-from msk_ray.tune.devices import check_threads
+from msk_ray.tune.devices import Placement, check_threads, processes_of
 from msk_ray.tune.options import Options, read_options
 
 
@@ -59,10 +59,18 @@ def _resolve(space: Space) -> list[Trial]:
     """The space's trials; none for a search, whose settings are checked as far as they are known."""
     if space.file.searches:
         check_threads(extreme_configs(space), space.file.resources)
+        if "trial.gpus" in space.sampled:
+            raise ConfigError("trial.gpus: all trials of an experiment have as many GPUs each; write one number")
         return []
     trials = resolve_trials(space)
     check_threads((trial.config for trial in trials), space.file.resources)
+    _processes(space, trials)
     return trials
+
+
+def _processes(space: Space, trials: list[Trial]) -> int:
+    """`trial.gpus` of all trials; there are none if a search suggests them."""
+    return processes_of([trial.config for trial in trials] or extreme_configs(space))
 
 
 def _read_space(options: Options, extension: Mapping[str, Any]) -> Space:
@@ -117,7 +125,7 @@ def _rows(trials: Sequence[Trial]) -> list[tuple[str, ...]]:
 def _debug(options: Options, space: Space, trial: Trial) -> int:
     """Run one trial in this process, in a separate folder."""
     from msk_ray.experiment.results import read_record
-    from msk_ray.training import Trainer
+    from msk_ray.training import make_trainer
     from msk_ray.tune.devices import local_gpus
     from msk_ray.tune.trial_run import Hooks, run_trial
 
@@ -131,7 +139,7 @@ def _debug(options: Options, space: Space, trial: Trial) -> int:
             f"epoch {e.epoch}/{trial.epochs}  score {e.score:.5g}", flush=True
         )
     )
-    ending = run_trial(trial, folder, device, space.file.stop, Trainer, hooks)
+    ending = run_trial(trial, folder, device, space.file.stop, make_trainer, hooks)
     assert ending is not None  # nobody pauses it
     print(f"{ending.outcome}: {printable(ending.why)}")
     return 1 if read_record(trial, folder).errored else 0
@@ -153,8 +161,13 @@ def _run(
         from msk_ray.tune.devices import choose_placement, local_gpus
         from msk_ray.tune.finish import finish, write_report
 
+        resources, processes = space.file.resources, _processes(space, trials)
+
+        def place(gpus: int) -> Placement:
+            return choose_placement(resources, options.gpus_per_trial, options.cpu, gpus, processes)
+
         if options.address is None:
-            placement = choose_placement(space.file.resources, options.gpus_per_trial, options.cpu, local_gpus())
+            placement = place(local_gpus())
         if not options.going_on:
             ownership = stack.enter_context(own(path, new=True, force=options.force))
             experiment = opening.create(path, space, trials, options.as_data())
@@ -162,12 +175,10 @@ def _run(
         try:
             with session.ray_session(options.address):
                 if options.address is not None:
-                    placement = choose_placement(
-                        space.file.resources, options.gpus_per_trial, options.cpu, session.cluster_gpus()
-                    )
+                    placement = place(session.cluster_gpus(processes))
                 if not placement.gpus and not options.cpu:
                     print("no GPU found: trials run on CPU cores")
-                limit = options.max_concurrent or space.file.resources.max_concurrent
+                limit = options.max_concurrent or resources.max_concurrent
                 plan = driver.Plan(experiment, space, trials, placement, limit, ownership=ownership)
                 completed = driver.run_trials(plan)
             ownership.check(now=True)

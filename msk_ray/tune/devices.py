@@ -35,14 +35,17 @@ class Placement:
         return fitting if limit is None else min(fitting, limit)
 
 
-def choose_placement(resources: ResourcesSpec, gpus_per_trial: float | None, cpu: bool, gpus: int) -> Placement:
+def choose_placement(
+    resources: ResourcesSpec, gpus_per_trial: float | None, cpu: bool, gpus: int, processes: int = 1
+) -> Placement:
     """Where trials run.
 
     Args:
         resources: the space's section.
         gpus_per_trial: what the command line requests explicitly.
         cpu: whether it requests CPUs.
-        gpus: number of GPUs available.
+        gpus: number of GPUs available, where a trial has several of one host.
+        processes: `trial.gpus` of the trials.
 
     Raises:
         ConfigError: the request makes no sense.
@@ -55,12 +58,35 @@ def choose_placement(resources: ResourcesSpec, gpus_per_trial: float | None, cpu
             raise ConfigError(f"--gpus-per-trial {gpus_per_trial:g}: write 1, 2, ... or a share such as 0.5")
         if gpus == 0:
             raise DeviceError(f"--gpus-per-trial {gpus_per_trial:g}: there is no GPU; pass --cpu to run on CPUs")
+    cpus = processes * resources.cpus_per_trial
     if cpu or gpus == 0:
-        return Placement(0.0, resources.cpus_per_trial)
+        return Placement(0.0, cpus)
     wanted = resources.gpus_per_trial if gpus_per_trial is None else gpus_per_trial
+    if gpus_per_trial is None and wanted == 1.0:
+        wanted = float(processes)
     if wanted > gpus:
         raise DeviceError(f"{wanted:g} GPUs per trial requested, but there are {gpus}")
-    return Placement(wanted, resources.cpus_per_trial)
+    if wanted != processes and max(wanted, processes) > 1:
+        raise ConfigError(
+            f"{wanted:g} GPUs per trial, but trial.gpus is {processes}: leave out --gpus-per-trial and "
+            "resources.gpus_per_trial, and set trial.gpus alone"
+        )
+    return Placement(wanted, cpus)
+
+
+def processes_of(configs: Iterable[Config]) -> int:
+    """`trial.gpus` of an experiment's trials.
+
+    Raises:
+        ConfigError: it is not the same in all of them.
+    """
+    found = sorted({config.trial.gpus for config in configs})
+    if len(found) > 1:
+        raise ConfigError(
+            f"trial.gpus is {' and '.join(map(str, found))}: trials of one experiment have as many GPUs each; start an "
+            "experiment for each number"
+        )
+    return found[0] if found else 1
 
 
 def check_threads(configs: Iterable[Config], resources: ResourcesSpec) -> None:

@@ -40,7 +40,7 @@ from msk_ray.sweep.search import search_class
 from msk_ray.sweep.search_trials import SearchTrial, recover
 from msk_ray.sweep.space import Space
 from msk_ray.sweep.trials import base_settings
-from msk_ray.training import Trainer, precompile
+from msk_ray.training import make_trainer, precompile
 from msk_ray.tune.console import Console
 from msk_ray.tune.devices import Placement
 from msk_ray.tune.gauges import StateGauge
@@ -50,7 +50,7 @@ from msk_ray.tune.queue import Identify, Suggestions, TrialList
 from msk_ray.tune.schedulers import METRIC, Population, PruningScheduler
 from msk_ray.tune.supervisor import Supervisor
 from msk_ray.tune.trainable import Job, make_trainable
-from msk_ray.tune.trial_run import TrainerLike
+from msk_ray.tune.trial_run import MakeTrainer
 from msk_ray.tune.worker_prestart import WorkerPrestart, nodes_for
 
 Precompile = Callable[[Config, str, Path], None]
@@ -66,7 +66,7 @@ class Plan:
     """All trials of the experiment, including those that have ended; empty if a search suggests them."""
     placement: Placement
     max_concurrent: int | None
-    trainer_class: type[TrainerLike] = Trainer
+    make_trainer: MakeTrainer = make_trainer
     precompile: Precompile | None = precompile
     """Compiles a config's kernels on a node before trials start; None if there is nothing to compile."""
     prestart: bool = True
@@ -111,7 +111,7 @@ def run_trials(plan: Plan) -> bool:
         {trial.id: trial for trial in plan.trials},
         plan.placement.device,
         plan.placement.gpus,
-        plan.trainer_class,
+        plan.make_trainer,
         None if plan.ownership is None else plan.ownership.owner.token,
     )
     if plan.precompile is not None:

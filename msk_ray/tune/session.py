@@ -69,6 +69,7 @@ def _init(address: str | None, dashboard: bool | None, common: dict[str, Any]) -
         ) from error
 
 
-def cluster_gpus() -> int:
-    """GPUs of all nodes of the Ray session."""
-    return int(ray.cluster_resources().get("GPU", 0))
+def cluster_gpus(processes: int = 1) -> int:
+    """GPUs that the Ray session has for trials; those of the largest node for trials of several processes."""
+    of_nodes = [int(node["Resources"].get("GPU", 0)) for node in ray.nodes() if node["Alive"]]
+    return max(of_nodes, default=0) if processes > 1 else sum(of_nodes)

@@ -2,7 +2,6 @@
 
 import faulthandler
 import json
-import math
 import os
 import platform
 import shutil
@@ -23,7 +22,7 @@ from msk_ray.errors import OwnershipLost, storage_failure
 from msk_ray.experiment.attempts import read_attempt
 from msk_ray.experiment.layout import DEVICE_FILE, HANG_FILE, OUTPUT_FILE
 from msk_ray.experiment.manifest import Experiment
-from msk_ray.experiment.metrics import Evaluation, evaluations_of, read_rows
+from msk_ray.experiment.metrics import Evaluation
 from msk_ray.experiment.ownership import acquire_for
 from msk_ray.experiment.trial import Trial
 from msk_ray.files import write_text
@@ -33,7 +32,7 @@ from msk_ray.tune.devices import wait_for_memory
 from msk_ray.tune.gauges import TrialGauges
 from msk_ray.tune.hparams import log_hparams
 from msk_ray.tune.schedulers import BEST, METRIC
-from msk_ray.tune.trial_run import Hooks, TrainerLike, run_trial
+from msk_ray.tune.trial_run import Handed, Hooks, MakeTrainer, TrainerLike, run_trial
 
 MEMORY_LIMIT_S = 60.0
 """How long a trial waits for the memory of its GPU [s]."""
@@ -51,7 +50,7 @@ class Job:
     device: str
     gpus: float
     """GPUs per trial, 0 on CPU."""
-    trainer_class: type[TrainerLike]
+    make_trainer: MakeTrainer
     owner: str | None = None
     """Token of the experiment's owner; None if it has none."""
 
@@ -131,9 +130,9 @@ def make_trainable(job: Job, resources: dict[str, float]) -> type[tune.Trainable
                 folder,
                 job.device,
                 job.space.file.stop,
-                _exchanging(job, folder) if job.population else job.trainer_class,
+                job.make_trainer,
                 hooks,
-                _handed_checkpoint(Path(scratch)) if job.population else None,
+                _handed_checkpoint(job, Path(scratch)) if job.population else None,
                 job.space.file.resources.halve_worlds_on_oom,
             )
 
@@ -211,27 +210,13 @@ def _figures(evaluation: Evaluation, ended: bool, best: float, attempt: int) -> 
     }
 
 
-def _handed_checkpoint(scratch: Path) -> Path | None:
+def _handed_checkpoint(job: Job, scratch: Path) -> Handed | None:
     """The checkpoint that Ray gives to this trial, if any: its own after a crash, or a better member's."""
     handed = tune.get_checkpoint()
     if handed is None:
         return None
     handed.to_directory(str(scratch))
-    return next(iter(sorted(scratch.glob("epoch_*.pt"))))
-
-
-def _exchanging(job: Job, folder: Path) -> type[TrainerLike]:
-    """A trainer that accepts a checkpoint of another member of the population."""
-    moving = {*job.space.sampled, "trial.seed"}
-
-    class Exchanging(job.trainer_class):  # type: ignore[name-defined]
-        def restore(self, path: Path) -> None:
-            super().restore(path, changed=moving)
-            # best.pt belongs to this trial; with a better member's best score it would never be replaced.
-            own = [e.score for e in evaluations_of(read_rows(folder)) if math.isfinite(e.score)]
-            self.best_score = max(own, default=-math.inf)
-
-    return Exchanging
+    return Handed(min(scratch.glob("epoch_*.pt")), frozenset((*job.space.sampled, "trial.seed")))
 
 
 def _redirect_output(path: Path) -> None:
@@ -287,17 +272,20 @@ def _watchdog(folder: Path, limit_s: float | None) -> Iterator[_Watch]:
 
 
 def _wait_for_gpu(share: float) -> None:
-    """Wait until a process that had this GPU before has given its memory back."""
+    """Wait until a process that had a GPU of this trial before has given its memory back."""
     import torch
 
     def free_share() -> float:
-        free, total = torch.cuda.mem_get_info(0)
-        return free / total
+        shares = []
+        for device in range(torch.cuda.device_count()):
+            free, total = torch.cuda.mem_get_info(device)
+            shares.append(free / total)
+        return min(shares)
 
     left = wait_for_memory(min(share, 1.0), free_share, MEMORY_LIMIT_S)
     if left is not None:
         print(
-            f"the GPU has only {left:.0%} of its memory free after {MEMORY_LIMIT_S:.0f} s: what else is using it?",
+            f"a GPU has only {left:.0%} of its memory free after {MEMORY_LIMIT_S:.0f} s: what else is using it?",
             flush=True,
         )
 

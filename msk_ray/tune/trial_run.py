@@ -1,13 +1,14 @@
 """Run one trial from its current state to its end. Independent of Ray, so it can be stepped through in a debugger."""
 
+import math
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
 from msk_ray.config import Config
-from msk_ray.errors import ConfigError, Failure, MskRayError, SimulationError, StorageFailure
+from msk_ray.errors import ConfigError, Failure, MskRayError, RankLost, SimulationError, StorageFailure
 from msk_ray.experiment.attempts import FIRST, Attempt, load_attempt, read_attempt
 from msk_ray.experiment.damage import DamagedFile
 from msk_ray.experiment.layout import ABANDONED, ERROR_FILE
@@ -25,8 +26,6 @@ class TrainerLike(Protocol):
     epoch: int
     best_score: float
 
-    def __init__(self, config: Config, logdir: Path, device: str) -> None: ...
-
     @property
     def finished(self) -> bool: ...
 
@@ -34,11 +33,24 @@ class TrainerLike(Protocol):
 
     def save(self) -> Path: ...
 
-    def restore(self, path: Path) -> None: ...
+    def restore(self, path: Path, changed: Collection[str]) -> None: ...
 
     def restore_latest(self) -> tuple[Path | None, list[str]]: ...
 
     def close(self) -> None: ...
+
+
+MakeTrainer = Callable[[Config, Path, str], TrainerLike]
+"""Makes the trainer of a config, in a folder, on a device."""
+
+
+@dataclass(frozen=True)
+class Handed:
+    """A checkpoint that a trial of a population is given, perhaps by a better member."""
+
+    path: Path
+    changed: frozenset[str]
+    """Dotted settings that may differ from those it was written under."""
 
 
 @dataclass(frozen=True)
@@ -58,14 +70,14 @@ def run_trial(
     folder: Path,
     device: str,
     stop: StopSpec,
-    trainer_class: type[TrainerLike],
+    make_trainer: MakeTrainer,
     hooks: Hooks,
-    checkpoint: Path | None = None,
+    handed: Handed | None = None,
     may_halve: bool = False,
 ) -> Ending | None:
     """Train until the trial ends, at its last epoch or by one of its own rules.
 
-    Continues from the newest complete checkpoint in `folder`, or from `checkpoint` if one is given. The ending is
+    Continues from the newest complete checkpoint in `folder`, or from the one that is handed to it. The ending is
     written to `folder`, which must exist: a trial whose folder was moved does not start again.
 
     Args:
@@ -78,6 +90,7 @@ def run_trial(
 
     Raises:
         StorageFailure: the disk is full, or the disk or folder is gone; the trial can continue once it is back.
+        RankLost: one of the trial's processes has died; the trial may be retried.
         Exception: anything that is neither a failed simulation nor an error that the user can fix. Its traceback is
             written to `error.txt`, and the trial may be retried.
     """
@@ -98,14 +111,14 @@ def run_trial(
         attempt = _attempt_in(folder).begin(folder)
         if attempt.reduced is not None:
             print(attempt, flush=True)
-        ending = _train(attempt.effective(trial), folder, device, stop, trainer_class, hooks, checkpoint)
+        ending = _train(attempt.effective(trial), folder, device, stop, make_trainer, hooks, handed)
     except SimulationError as error:
         if error.failure is Failure.OUT_OF_MEMORY:
             ending = _out_of_memory(trial, folder, str(error), attempt, may_halve)
         else:
             ending = Ending(Outcome(error.failure.value), str(error))
-    except StorageFailure:
-        # The disk failed, not the trial: it has not ended, and continues once there is space.
+    except (StorageFailure, RankLost):
+        # The trial has not ended: it continues once the disk has space, or in new processes.
         raise
     except MskRayError as error:
         ending = Ending(Outcome.ERROR, str(error))
@@ -147,19 +160,22 @@ def _train(
     folder: Path,
     device: str,
     stop: StopSpec,
-    trainer_class: type[TrainerLike],
+    make_trainer: MakeTrainer,
     hooks: Hooks,
-    checkpoint: Path | None,
+    handed: Handed | None,
 ) -> Ending | None:
-    trainer = trainer_class(trial.config, folder, device)
+    trainer = make_trainer(trial.config, folder, device)
     try:
         note = str(read_attempt(folder))
         if note:
             # For anyone who reads only these settings.
             settings = folder / "config.yaml"
             write_text(settings, f"# {note} asked for\n{settings.read_text(encoding='utf-8')}")
-        if checkpoint is not None:
-            trainer.restore(checkpoint)
+        if handed is not None:
+            trainer.restore(handed.path, handed.changed)
+            # best.pt belongs to this trial; with a better member's best score it would never be replaced.
+            own = [e.score for e in evaluations_of(read_rows(folder)) if math.isfinite(e.score)]
+            trainer.best_score = max(own, default=-math.inf)
         else:
             path, faults = trainer.restore_latest()
             for fault in faults:

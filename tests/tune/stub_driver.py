@@ -34,7 +34,7 @@ if __name__ == "__main__":
     cloudpickle.register_pickle_by_value(stub_trainer)
     precompile = compile_for_ever if "STUB_COMPILES" in os.environ else None
     driver.Plan = functools.partial(  # type: ignore[assignment,misc]
-        driver.Plan, trainer_class=StubTrainer, precompile=precompile, prestart=False
+        driver.Plan, make_trainer=StubTrainer, precompile=precompile, prestart=False
     )
     session.ray_session = functools.partial(
         session.ray_session, dashboard=None if os.environ.get("STUB_DASHBOARD") else False, trials=False

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from msk_ray.cli import run
-from msk_ray.config import dump_yaml
+from msk_ray.config import Config, dump_yaml
 from msk_ray.errors import ConfigError, DeviceError, StorageError
 from msk_ray.experiment.manifest import Experiment, check_name
 from msk_ray.experiment.outcomes import Ending, Outcome, read_ending, write_ending
@@ -21,11 +21,12 @@ from msk_ray.files import make_folder
 from msk_ray.nvidia_smi import ask_driver
 from msk_ray.status import main as status
 from msk_ray.sweep import opening
+from msk_ray.sweep.smoke import shorten
 from msk_ray.sweep.space import ResourcesSpec
 from msk_ray.sweep.trials import resolve_trials
 from msk_ray.text_table import text_table
 from msk_ray.tune.__main__ import main as tune
-from msk_ray.tune.devices import Placement, choose_placement, wait_for_memory
+from msk_ray.tune.devices import Placement, choose_placement, processes_of, wait_for_memory
 from msk_ray.tune.finish import finish, write_report
 
 
@@ -174,6 +175,28 @@ def test_placement() -> None:
             choose_placement(resources, wrong, cpu=False, gpus=4)
     with pytest.raises(ConfigError, match="exclude"):
         choose_placement(resources, 1.0, cpu=True, gpus=4)
+
+
+def test_placement_of_trials_of_several_gpus() -> None:
+    resources = ResourcesSpec(cpus_per_trial=2)
+    assert choose_placement(resources, None, cpu=False, gpus=4, processes=2) == Placement(2.0, 4)
+    assert choose_placement(resources, 2.0, cpu=False, gpus=4, processes=2) == Placement(2.0, 4)
+    assert choose_placement(resources, None, cpu=True, gpus=4, processes=2) == Placement(0.0, 4)
+    with pytest.raises(DeviceError, match="4 GPUs per trial requested, but there are 2"):
+        choose_placement(resources, None, cpu=False, gpus=2, processes=4)
+    for asked, processes in ((2.0, 1), (0.5, 2), (1.0, 2)):
+        with pytest.raises(ConfigError, match=rf"{asked:g} GPUs per trial, but trial\.gpus is {processes}: leave out"):
+            choose_placement(ResourcesSpec(), asked, cpu=False, gpus=4, processes=processes)
+
+
+def test_trials_of_one_experiment_have_as_many_gpus_each(tiny_cartpole: Config) -> None:
+    two = tiny_cartpole.model_copy(update={"trial": tiny_cartpole.trial.model_copy(update={"gpus": 2})})
+    assert processes_of([two, two]) == 2
+    with pytest.raises(ConfigError, match=r"trial\.gpus is 1 and 2"):
+        processes_of([tiny_cartpole, two])
+    assert shorten(two)["env.nworld"] == 8
+    three = two.model_copy(update={"trial": two.trial.model_copy(update={"gpus": 3})})
+    assert shorten(three)["env.nworld"] == 6
 
 
 def test_the_memory_of_a_dead_trial_is_waited_for() -> None:

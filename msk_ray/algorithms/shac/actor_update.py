@@ -55,9 +55,10 @@ class Rolled:
 
 @dataclass(frozen=True)
 class ActorOutcome:
-    """The results of one epoch, all detached, on the device."""
+    """The results of one epoch, all detached, on the device; of all worlds of the group, but for the state."""
 
     state: EnvState
+    """Of this process's worlds."""
     obs: Tensor
     """Normalised observations for the critic, (H·W, O)."""
     targets: Tensor
@@ -84,7 +85,7 @@ class ActorUpdate:
         optimizer: the actor's.
 
     Attributes:
-        discounted: the running discounted return of each world, (W,), which `return_statistics` are of.
+        discounted: the running discounted return of each world of the group, which `return_statistics` are of.
     """
 
     def __init__(
@@ -104,7 +105,8 @@ class ActorUpdate:
         self._return_statistics = return_statistics
         self._entropy = entropy
         self._optimizer = optimizer
-        self.discounted = torch.zeros(env.nworld, device=env.device)
+        self._group = env.group
+        self.discounted = torch.zeros(env.nworld * env.group.size, device=env.device)
 
     def roll(self, inputs: EpochInputs) -> Rolled:
         """Roll the policy out over as many env steps as there is noise."""
@@ -112,7 +114,7 @@ class ActorUpdate:
         # A cotangent of norm 1/(H·W) is what a reward of one in one world sends back through the mean loss.
         bound = None if c.state_grad_clip is None else c.state_grad_clip / (len(inputs.noise) * env.nworld)
         gate = CotangentGate(bound, env.nworld, env.device)
-        halves = HalfBatchCosine(self._actor)
+        halves = HalfBatchCosine(self._actor, self._group)
         env.state = inputs.state
         env.stock_resets(inputs.resets)
         with halves.watching():
@@ -133,12 +135,16 @@ class ActorUpdate:
 
         The step is left out where more worlds than `max_nonfinite_share` had a gradient that was not finite, or the
         policy's gradient is not finite: the metrics say so.
+
+        Outside a group `gather` and `mean` change nothing. In one, each process sent back the gradient of the mean over
+        its own worlds, of which there are as many everywhere.
         """
-        c, rollout = self._settings, rolled.rollout
+        c, rollout, gather = self._settings, rolled.rollout, self._group.gather
         loss, next_values, rewards = self._loss(rollout)
         self._optimizer.optimizer.zero_grad()
         loss.backward()
-        cotangents = rolled.gate.record()
+        self._group.mean([p.grad for p in self._actor.parameters() if p.grad is not None])
+        cotangents = rolled.gate.record(self._group)
         limit = float("inf") if c.actor_grad_norm is None else c.actor_grad_norm
         norm = nn.utils.clip_grad_norm_(self._actor.parameters(), limit)
         failed = (cotangents.nonfinite_share > c.max_nonfinite_share) | ~norm.isfinite()
@@ -148,16 +154,19 @@ class ActorUpdate:
             targets = returns.td_lambda_targets(rewards, values, rollout.terminated, rollout.done, c.gamma, c.lam)
         else:
             targets = returns.one_step_targets(rewards, values, rollout.terminated, c.gamma)
-        obs = rollout.obs
+        raw = obs = gather(rollout.obs, dim=1)
         if self._normalizer is not None:
-            obs = self._normalizer.normalize(rollout.obs)
-            self._normalizer.update(rollout.obs.flatten(0, 1))
-        detached = rollout.rewards.detach()
+            obs = self._normalizer.normalize(raw)
+            self._normalizer.update(raw.flatten(0, 1))
+        detached = gather(rollout.rewards.detach(), dim=1)
+        means = {"train/actor_loss": loss.detach(), "train/value": values.mean()}
+        if rollout.neg_log_prob is not None:
+            means["train/entropy"] = rollout.neg_log_prob.detach().mean()
+        self._group.mean(list(means.values()))
         metrics = {
-            "train/actor_loss": loss.detach(),
+            **means,
             "train/reward": detached.mean(),
-            "train/value": values.mean(),
-            "train/diverged": rollout.diverged.sum(),
+            "train/diverged": gather(rollout.diverged, dim=1).sum(),
             "grad/actor_norm": norm,
             "grad/halves_cosine": rolled.halves.cosine(),
         }
@@ -166,11 +175,15 @@ class ActorUpdate:
             metrics["train/std"] = std.detach().mean()
         if rollout.contact is not None:
             weight = float(self._env.model.body_mass.sum() * -self._env.model.opt.gravity[2])
-            metrics["train/contact"] = (rollout.contact / weight).square().mean().sqrt()
-        if rollout.neg_log_prob is not None:
-            metrics["train/entropy"] = rollout.neg_log_prob.detach().mean()
+            metrics["train/contact"] = (gather(rollout.contact, dim=1) / weight).square().mean().sqrt()
         return ActorOutcome(
-            rolled.state, obs.flatten(0, 1), targets.flatten(), detached, rollout.done, cotangents, metrics
+            rolled.state,
+            obs.flatten(0, 1),
+            gather(targets, dim=1).flatten(),
+            detached,
+            gather(rollout.done, dim=1),
+            cotangents,
+            metrics,
         )
 
     def _loss(self, rollout: Rollout) -> tuple[Tensor, Tensor, Tensor]:
@@ -194,6 +207,7 @@ class ActorUpdate:
 
     def _update_return_statistics(self, statistics: RunningMeanStd, rewards: Tensor, done: Tensor) -> None:
         running, total = [], self.discounted
+        rewards, done = (self._group.gather(of_worlds, dim=1) for of_worlds in (rewards, done))
         for reward, ended in zip(rewards, done, strict=True):
             total = total * self._settings.gamma + reward
             running.append(total)

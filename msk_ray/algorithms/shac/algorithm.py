@@ -54,10 +54,12 @@ class Shac(Algorithm):
             c.critic_grad_norm,
             weight_decay=c.weight_decay,
             tolerance=c.critic_tolerance,
+            group=env.group,
         )
         self.noise_generator = torch.Generator(device=device).manual_seed(config.trial.seed + 1)
-        self._group = 1 if c.copies is None else c.copies.count
-        self.episodes = EpisodeTracker(env.nworld // self._group, device)
+        self._worlds = env.nworld * env.group.size
+        self._copies = 1 if c.copies is None else c.copies.count
+        self.episodes = EpisodeTracker(self._worlds // self._copies, device)
         self._horizon = RolloutLength(c.horizon)
         self._entropy = EntropyBonus(c.entropy, env.action_size, device) if c.entropy is not None else None
         self._contacts = ContactSchedule(config.curriculum, env) if config.curriculum is not None else None
@@ -110,7 +112,7 @@ class Shac(Algorithm):
         self.env.sim.settle()
         cotangents = outcome.cotangents.statistics(1.0 / (horizon * self.env.nworld))
         # Copies have no episodes of their own.
-        firsts = (outcome.rewards[:, :: self._group], outcome.done[:, :: self._group])
+        firsts = (outcome.rewards[:, :: self._copies], outcome.done[:, :: self._copies])
         metrics = {**outcome.metrics, **cotangents.metrics(), **self.episodes.update(*firsts)}
         if self._runner.last_loss is not None:
             metrics["train/critic_loss"] = self._runner.last_loss
@@ -129,7 +131,7 @@ class Shac(Algorithm):
             **simulation_metrics(self.env),
         }
         self._runner.adapt(numbers["physics/solver_limit_share"])
-        return EpochResult(horizon * self.env.nworld, numbers)
+        return EpochResult(horizon * self._worlds, numbers)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that a later `load_state_dict` needs to continue exactly, including the environment's state."""
@@ -171,14 +173,14 @@ class Shac(Algorithm):
 
     def _draw(self, horizon: int, epoch: int) -> EpochInputs:
         env, c = self.env, self.settings
-        noise = torch.randn((horizon, env.nworld, env.action_size), generator=self.noise_generator, device=env.device)
+        noise = torch.randn((horizon, self._worlds, env.action_size), generator=self.noise_generator, device=env.device)
         if c.exploration is not None:
             noise *= c.exploration.at(epoch)
         state = env.state.detach()
         if c.copies is not None:
             state = spread(state, c.copies, env, self.noise_generator)
-            self._actor_update.discounted.copy_(from_first(self._actor_update.discounted, self._group))
-        return EpochInputs(state, env.draw_resets(horizon), noise)
+            self._actor_update.discounted.copy_(from_first(self._actor_update.discounted, self._copies))
+        return EpochInputs(state, env.draw_resets(horizon), env.group.own(noise, dim=1))
 
     def _adapt(self, reward: float, entropy: float | None) -> dict[str, float]:
         """Advance entropy bonus and contacts after an epoch.

@@ -24,10 +24,10 @@ def spread(state: EnvState, config: PerturbedCopies, env: Env[Any], generator: t
         StepState(*(from_first(t, config.count) for t in state.physics)),
         *(from_first(t, config.count) for t in state[1:]),
     )
-    shape = (env.nworld, env.model.nv)
+    shape = (env.group.size * env.nworld, env.model.nv)
     copied = (torch.arange(env.nworld, device=env.device) % config.count > 0)[:, None]
     shifts = [
-        (2.0 * torch.rand(shape, generator=generator, device=env.device) - 1.0) * copied * size
+        (2.0 * env.group.own(torch.rand(shape, generator=generator, device=env.device)) - 1.0) * copied * size
         for size in (config.qpos, config.qvel)
     ]
     moved = env.sim.tangent.integrate(physics.qpos, shifts[0])

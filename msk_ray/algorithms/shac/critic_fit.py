@@ -4,6 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from msk_ray.algorithms.shac.optimizer import RateAdam
+from msk_ray.group import ALONE, Group
 from msk_ray.networks import Critic
 
 _WINDOW = 4
@@ -20,6 +21,7 @@ class CriticFit:
         grad_norm: bound on each network's gradient norm; None for no bound.
         weight_decay: decoupled weight decay; 0 for none.
         tolerance: change of the loss a pass, relative to it, below which no further step is taken; None: all steps.
+        group: the processes that fit it together, each with its share of every minibatch.
 
     Attributes:
         optimizer: the critic's.
@@ -34,10 +36,12 @@ class CriticFit:
         *,
         weight_decay: float = 0.0,
         tolerance: float | None = None,
+        group: Group = ALONE,
     ) -> None:
         self._critic = critic
         self._grad_norm = grad_norm
         self._tolerance = tolerance
+        self._group = group
         self.optimizer = RateAdam(critic.parameters(), learning_rate, betas, weight_decay)
 
     def draw_orders(self, rows: int, passes: int, generator: torch.Generator) -> Tensor:
@@ -47,16 +51,15 @@ class CriticFit:
     def run(self, obs: Tensor, targets: Tensor, orders: Tensor, batches: int) -> Tensor:
         """Pass over rows obs (N, O) and targets (N,) in each of the orders (passes, N), in `batches` minibatches.
 
-        Rows that do not fill a minibatch are left out of a pass. Returns the mean loss of the last pass made.
+        Rows that do not fill a minibatch are left out of a pass. In a group, all processes are given the same rows and
+        orders. Returns the mean loss of the last pass made.
         """
-        size = obs.shape[0] // batches
+        size = self._group.size * (obs.shape[0] // (batches * self._group.size))
         passes: list[Tensor] = []
         settled: Tensor | None = None
         for order in orders:
-            losses = [
-                self._step(obs[picked], targets[picked], settled)
-                for picked in order[: batches * size].view(batches, size)
-            ]
+            minibatches = self._group.own(order[: batches * size].view(batches, size), dim=1)
+            losses = [self._step(obs[picked], targets[picked], settled) for picked in minibatches]
             passes.append(torch.stack(losses).mean())
             if self._tolerance is not None:
                 settled = self._settled(passes, settled)
@@ -79,8 +82,10 @@ class CriticFit:
         loss = (self._critic(obs) - targets).square().mean()
         self.optimizer.optimizer.zero_grad()
         loss.backward()
+        mean = loss.detach()
+        self._group.mean([mean, *(p.grad for p in self._critic.parameters() if p.grad is not None)])
         if self._grad_norm is not None:
             for member in self._critic.members:
                 nn.utils.clip_grad_norm_(member.parameters(), self._grad_norm)
         self.optimizer.step(skip)
-        return loss.detach()
+        return mean

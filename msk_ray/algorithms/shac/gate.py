@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from msk_ray.group import ALONE, Group
 from msk_ray.simulation import StepState
 
 
@@ -106,10 +107,12 @@ class CotangentGate:
         scale = torch.ones_like(norm) if self.bound is None else (self.bound / norm).clamp(max=1.0)
         return tuple((scale[:, None] * g).masked_fill(~finite[:, None], 0.0) for g in cotangent)
 
-    def record(self) -> CotangentRecord:
-        """What was measured."""
-        lengths = torch.cat(self._norms) if self._norms else torch.zeros(0, device=self._nonfinite.device)
-        return CotangentRecord(self._nonfinite.float().mean(), lengths, self.bound)
+    def record(self, group: Group = ALONE) -> CotangentRecord:
+        """What was measured, in the worlds of all processes."""
+        lengths = group.gather(torch.cat(self._norms)) if self._norms else torch.zeros(0, device=self._nonfinite.device)
+        nonfinite_share = self._nonfinite.float().mean()
+        group.mean([nonfinite_share])
+        return CotangentRecord(nonfinite_share, lengths, self.bound)
 
 
 class _Gate(torch.autograd.Function):

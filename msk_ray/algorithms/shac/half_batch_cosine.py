@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from msk_ray.group import ALONE, Group
+
 
 class HalfBatchCosine:
     """Splits the gradient of one backward pass into the parts of the two halves of the worlds.
@@ -18,9 +20,11 @@ class HalfBatchCosine:
 
     Args:
         network: its linear layers are observed; inputs have shape (W, n) with the worlds first.
+        group: the processes that the worlds are spread over.
     """
 
-    def __init__(self, network: nn.Module) -> None:
+    def __init__(self, network: nn.Module, group: Group = ALONE) -> None:
+        self._group = group
         self._layers = [m for m in network.modules() if isinstance(m, nn.Linear)]
         self._inputs: dict[nn.Module, list[Tensor]] = {m: [] for m in self._layers}
         self._cotangents: dict[nn.Module, dict[int, Tensor]] = {m: {} for m in self._layers}
@@ -41,20 +45,28 @@ class HalfBatchCosine:
         With noise of equal size in both halves, |signal|² : |noise|² of the whole gradient is 2c : (1 − c).
         Call it after the backward pass. NaN where a half's gradient is zero, or for fewer than two worlds.
         """
-        products = []
+        halves = []
         for layer in self._layers:
             cotangents = self._cotangents[layer]
             steps = sorted(cotangents)
             inputs = torch.stack([self._inputs[layer][i] for i in steps])
             outputs = torch.stack([cotangents[i] for i in steps])
-            half = inputs.shape[1] // 2
-            a, b = (
-                outputs[:, part].flatten(0, 1).T @ inputs[:, part].flatten(0, 1)
-                for part in (slice(0, half), slice(half, 2 * half))
+            halves.append(
+                [
+                    outputs[:, part].flatten(0, 1).T @ inputs[:, part].flatten(0, 1)
+                    for part in self._parts(inputs.shape[1])
+                ]
             )
-            products.append(torch.stack([(a * b).sum(), a.square().sum(), b.square().sum()]))
+        self._group.mean([gradient for of_layer in halves for gradient in of_layer])  # their length does not matter
+        products = [torch.stack([(a * b).sum(), a.square().sum(), b.square().sum()]) for a, b in halves]
         ab, aa, bb = torch.stack(products).sum(0)
         return ab * torch.rsqrt(aa * bb)
+
+    def _parts(self, nworld: int) -> tuple[slice, slice]:
+        """Which of this process's worlds belong to either half of all worlds."""
+        first, half = self._group.rank * nworld, self._group.size * nworld // 2
+        middle, end = (min(max(bound - first, 0), nworld) for bound in (half, 2 * half))
+        return slice(0, middle), slice(middle, end)
 
     def _saw(self, layer: nn.Module, inputs: tuple[Any, ...], output: Tensor) -> None:
         if output.requires_grad:

@@ -108,7 +108,8 @@ class RecordedRunner(EagerRunner):
     has that long: the mathematics are those of one after the other. `last_loss` is the loss of the fit before.
 
     Work that cannot be recorded, because an environment waits for the device, runs eagerly from then on; a warning says
-    why and where.
+    why and where. In a group, all processes record and replay the same, because recordings contain collective
+    operations, which have to be recorded everywhere or nowhere; while the critic is fitted, nothing else uses them.
 
     Args:
         env: the worlds.
@@ -116,6 +117,7 @@ class RecordedRunner(EagerRunner):
 
     def __init__(self, actor: ActorUpdate, fit_critic: FitCritic, env: Env[Any]) -> None:
         super().__init__(actor, fit_critic, env)
+        self._group = env.group
         self._kept = _Recordings(env.sim.engine)
         self._fits: dict[tuple[torch.Size, ...], _Fit | None] = {}
         self._recording = torch.cuda.Stream(env.device)
@@ -176,23 +178,33 @@ class RecordedRunner(EagerRunner):
     def adapt(self, limited: float) -> None:
         batch = self._env.sim.batch
         unrolled = batch.unrolled_iterations
-        if not self.recorded or limited <= _LIMITED_SHARE or unrolled is None:
+        # `recorded` and `limited` are the same in all processes.
+        if not self.recorded or limited <= _LIMITED_SHARE:
             return
-        if unrolled >= int(batch.mjm.opt.iterations):
-            return  # the model's own limit
-        batch.unrolled_iterations = unrolled + unrolled // 2
+        # Below the model's own limit; a batch with larger buffers has none yet.
+        more = unrolled is not None and unrolled < int(batch.mjm.opt.iterations)
+        if not self._group.any(more):
+            return
+        if more:
+            assert unrolled is not None
+            batch.unrolled_iterations = unrolled + unrolled // 2
         self._kept.epochs.clear()
-        if batch.unrolled_iterations > _MOST_ITERATIONS:
+        if self._group.any((batch.unrolled_iterations or 0) > _MOST_ITERATIONS):
             self._refuse(f"the constraint solver needs more than {_MOST_ITERATIONS} iterations in some worlds")
 
     def _attempt(self, record: Callable[[], _Epoch]) -> _Epoch | None:
+        epoch, why = None, ""
         try:
-            return record()
+            epoch = record()
         except RuntimeError as error:
             first = _first(error)
-            self._refuse(f"{_place(first)} cannot be recorded ({str(first).splitlines()[0]})")
-            torch.cuda.empty_cache()
-            return None
+            why = f"{_place(first)} cannot be recorded ({str(first).splitlines()[0]})"
+        every = self._group.collect(why)
+        if not any(every):
+            return epoch
+        self._refuse(next(filter(None, every)))
+        torch.cuda.empty_cache()
+        return None
 
     def _refuse(self, why: str) -> None:
         self._refused = True
@@ -211,7 +223,7 @@ class RecordedRunner(EagerRunner):
         if self._refused:
             return None
         engine, horizon = self._env.sim.engine, len(inputs.noise)
-        if self._kept.engine is not engine:
+        if self._group.any(self._kept.engine is not engine):
             self._kept = _Recordings(engine)  # recordings step the buffers of the engine they were made with
         kept = self._kept
         if horizon in kept.epochs:

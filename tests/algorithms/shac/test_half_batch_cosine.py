@@ -1,6 +1,8 @@
+import pytest
 import torch
 
 from msk_ray.algorithms.shac.half_batch_cosine import HalfBatchCosine
+from msk_ray.group import Group
 
 
 def network() -> torch.nn.Sequential:
@@ -36,3 +38,17 @@ def test_equal_worlds_agree_and_opposite_ones_do_not() -> None:
             out = net(torch.ones(4, 3))
         (out * torch.tensor([1.0, 1.0, sign, sign])[:, None]).sum().backward()
         torch.testing.assert_close(watch.cosine(), torch.tensor(cosine))
+
+
+@pytest.mark.parametrize(("nworld", "size"), [(4, 2), (4, 3), (1, 5), (3, 3)])
+def test_the_halves_are_of_the_worlds_of_all_processes(nworld: int, size: int) -> None:
+    """As many as one process would put into each; of an odd number the last is left out."""
+    halves: tuple[list[int], list[int]] = ([], [])
+    for rank in range(size):
+        group = Group()
+        group.rank, group.size = rank, size
+        own = range(rank * nworld, (rank + 1) * nworld)
+        for half, part in zip(halves, HalfBatchCosine(network(), group)._parts(nworld), strict=True):
+            half.extend(own[part])
+    half = nworld * size // 2
+    assert halves == (list(range(half)), list(range(half, 2 * half)))

@@ -1,0 +1,101 @@
+"""The worlds and the algorithm of a trial, in the process that leads it and in those that follow."""
+
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+from msk_ray.algorithms import Algorithm, algorithm_class
+from msk_ray.config import Config
+from msk_ray.envs import make_env
+from msk_ray.errors import CheckpointError
+from msk_ray.group import ALONE, Group
+from msk_ray.training.checkpoint import read_checkpoint
+from msk_ray.training.memory import named_out_of_memory
+from msk_ray.training.threads import use_threads
+
+
+def make_algorithm(config: Config, device: str, group: Group = ALONE) -> Algorithm:
+    """The algorithm of a trial, at its start, in the worlds of this process.
+
+    Raises:
+        ConfigError, DeviceError, UnsupportedModelError: as their messages say.
+    """
+    algorithm = algorithm_class(config)
+    use_threads(config)
+    env = make_env(
+        config.env,
+        config.physics,
+        config.env.nworld // group.size,
+        device,
+        config.trial.seed,
+        differentiable=config.algorithm_settings.differentiates,
+        randomize=True,
+    )
+    if group.size > 1:
+        env.join(group)
+    return algorithm(config, env)
+
+
+def naming_memory(config: Config, device: str) -> AbstractContextManager[None]:
+    """Name the settings to lower where the memory of the device does not suffice for a trial."""
+    length = config.algorithm_settings.length
+    other = [] if length is None else [f"{config.algorithm_section}.{length}"]
+    worlds = config.env.nworld // config.trial.gpus
+    return named_out_of_memory(device, worlds, "env.nworld", *other)
+
+
+def start_from(algorithm: Algorithm, path: str) -> None:
+    """Give an algorithm the networks and statistics of another trial's checkpoint.
+
+    Raises:
+        CheckpointError: it is missing, incomplete, or does not fit.
+    """
+    state = read_checkpoint(Path(path))
+    try:
+        algorithm.start_from(_to_device(state["algorithm"]["modules"], algorithm.env.device))
+    except (KeyError, TypeError, RuntimeError) as error:
+        what = str(error).splitlines()[-1].strip()
+        raise CheckpointError(
+            f"trial.start_from: {path} does not fit this trial ({what}): give a checkpoint of the same env, algorithm "
+            "and networks"
+        ) from error
+
+
+def load_state(algorithm: Algorithm, checkpoint: Mapping[str, Any]) -> None:
+    """Let an algorithm continue from a trial's checkpoint."""
+    algorithm.load_state_dict(_to_device(checkpoint["algorithm"], algorithm.env.device))
+
+
+def _to_device(value: Any, device: Any) -> Any:
+    """Nested containers with every tensor moved to a device."""
+    if isinstance(value, dict):
+        return {k: _to_device(v, device) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_to_device(v, device) for v in value]
+    return value.to(device) if hasattr(value, "to") else value
+
+
+def follow(config: Config, device: str, group: Group) -> None:
+    """Train this process's share of a trial's worlds as the group's first process tells it to, until the last order.
+
+    The first process runs a `Trainer`, and tells of every call in which all processes take part.
+
+    Raises:
+        ConfigError, DeviceError, UnsupportedModelError, SimulationError, CheckpointError: as their messages say.
+    """
+    with naming_memory(config, device):
+        algorithm = make_algorithm(config, device, group)
+        while order := group.told():
+            match order:
+                case ("start_from", path):
+                    start_from(algorithm, path)
+                case ("load", path):
+                    load_state(algorithm, read_checkpoint(Path(path)))
+                case ("update", epoch):
+                    algorithm.env.begin_epoch(epoch)
+                    algorithm.update(epoch)
+                case ("state_dict",):
+                    algorithm.state_dict()  # takes part in gathering it
+                case _:
+                    raise AssertionError(f"unknown order {order}")
