@@ -1,0 +1,69 @@
+"""A simulation of one world in C MuJoCo, in float64, in the place of one in MuJoCo Warp."""
+
+from collections.abc import Mapping
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from msk_ray.errors import UnsupportedModelError
+from msk_ray.simulation import Simulation, StepState
+
+
+class CSimulation(Simulation):
+    """`step` and `contact_forces` of one world on the CPU, without gradients. The rest is that of a `Simulation`.
+
+    A step continues in float64 where the one before ended, if it is given the state that that one returned.
+
+    Attributes:
+        data: MuJoCo's state, as the last step left it.
+    """
+
+    def __init__(self, model: mujoco.MjModel, substeps: int) -> None:
+        super().__init__(model, 1, substeps, None, "cpu")
+        self.data = mujoco.MjData(model)
+
+    def step(
+        self,
+        ctrl: Tensor,
+        qpos: Tensor,
+        qvel: Tensor,
+        act: Tensor,
+        *,
+        qfrc_applied: Tensor | None = None,
+        xfrc_applied: Tensor | None = None,
+        parameters: Mapping[str, Tensor] | None = None,
+    ) -> StepState:
+        """Advance the world by one env step; shapes as for `Simulation.step` with W = 1.
+
+        Raises:
+            UnsupportedModelError: forces or parameters are given.
+        """
+        if qfrc_applied is not None or xfrc_applied is not None or parameters is not None:
+            raise UnsupportedModelError("a step in C MuJoCo takes no applied forces or parameters: use Simulation")
+        data, given = self.data, StepState(qpos, qvel, act)
+        if not all(torch.equal(old, new) for old, new in zip(self._state(), given, strict=True)):
+            mujoco.mj_resetData(self.model, data)
+            data.qpos[:], data.qvel[:], data.act[:] = (part[0].numpy() for part in given)
+        data.ctrl[:] = ctrl[0].numpy()
+        mujoco.mj_step(self.model, data, self.substeps)
+        return self._state()
+
+    def _state(self) -> StepState:
+        parts = (self.data.qpos, self.data.qvel, self.data.act)
+        return StepState(*(torch.tensor(part, dtype=torch.float32)[None] for part in parts))
+
+    def contact_forces(self) -> Tensor:
+        """Force of all contacts on every geom in world coordinates [N], shape (1, G, 3), in the last substep of the
+        last step."""
+        forces = np.zeros((self.model.ngeom, 3))
+        wrench = np.zeros(6)
+        for index, contact in enumerate(self.data.contact):
+            mujoco.mj_contactForce(self.model, self.data, index, wrench)
+            # Rows of the frame are the axes; the force is that of the first geom on the second.
+            force = contact.frame.reshape(3, 3).T @ wrench[:3]
+            for geom, sign in zip(contact.geom, (-1.0, 1.0), strict=True):
+                if geom >= 0:
+                    forces[geom] += sign * force
+        return torch.tensor(forces, dtype=torch.float32)[None]
