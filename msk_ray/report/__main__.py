@@ -65,7 +65,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         check_folder(experiment)
     folder = (args.out or experiments[0].path / "report").resolve()
     now = time.time()
-    readings = [read_experiment(experiment, now) for experiment in experiments]
+    whole = [read_experiment(experiment, now) for experiment in experiments]
+    readings = [part for reading in whole for part in reading.parts()]
     make_folder(folder)
     sections = []
     for number, reading in enumerate(readings):
@@ -77,9 +78,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         for n, reading in enumerate(readings)
     ]
     sections = [replace(section, best=best) for section, best in zip(sections, bests, strict=True)]
-    command = "python -m msk_ray.report " + " ".join(reading.name for reading in readings)
+    command = "python -m msk_ray.report " + " ".join(reading.name for reading in whole)
     page = write_page(sections, together, folder, now, command)
-    for reading in readings:
+    for reading in whole:
         for note in reading.notes:
             print(printable(f"{reading.name}: {note}"))
     print(printable(f"report       {page}"))

@@ -114,11 +114,17 @@ def make_section(reading: Reading, folder: Path, prefix: str, baseline: str | No
 
 
 def compare(readings: Sequence[Reading]) -> Picture | None:
-    """Learning curves of several experiments together; None if none was evaluated."""
+    """Learning curves of several experiments together; None if none was evaluated, or scores cannot be compared."""
+    if _several_environments(readings):
+        return None
     groups = {
         f"{reading.name}: {variant}": trials for reading in readings for variant, trials in reading.variants.items()
     }
     return learning_curves(groups, None, "together")
+
+
+def _several_environments(readings: Sequence[Reading]) -> bool:
+    return len({name for reading in readings for name in reading.environments}) > 1
 
 
 def write_page(sections: Sequence[Section], together: Picture | None, folder: Path, now: float, command: str) -> Path:
@@ -143,6 +149,7 @@ def write_page(sections: Sequence[Section], together: Picture | None, folder: Pa
     text = environment.get_template("report.html.j2").render(
         sections=sections,
         together=together,
+        comparable=not _several_environments([section.reading for section in sections]),
         written=time.strftime("%Y-%m-%d %H:%M %Z", time.localtime(now)),
         command=command,
         version=__version__,

@@ -5,7 +5,7 @@ What cannot be read is named in `notes`, or in its trial, and does not hide the 
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property
 from pathlib import Path
@@ -175,10 +175,12 @@ class Reading:
     space_text: str = ""
     notes: tuple[str, ...] = ()
     """What is missing or broken."""
+    part: str = ""
+    """Environment of all its trials, if it is one of several parts of the experiment."""
 
     @property
     def name(self) -> str:
-        return self.experiment.name
+        return f"{self.experiment.name}: {self.part}" if self.part else self.experiment.name
 
     @property
     def condition(self) -> Condition:
@@ -209,6 +211,20 @@ class Reading:
     def algorithms(self) -> set[str]:
         """Names of the algorithms that trials run."""
         return {trial.trial.config.algorithm.name for trial in self.trials}
+
+    @property
+    def environments(self) -> list[str]:
+        """Names of the environments that trials run in, in the order of the experiment."""
+        return list(dict.fromkeys(trial.trial.config.env.name for trial in self.trials))
+
+    def parts(self) -> list["Reading"]:
+        """One reading for each environment, whose scores alone can be compared; itself if there is only one."""
+        if len(self.environments) < 2:
+            return [self]
+        return [
+            replace(self, part=name, trials=tuple(t for t in self.trials if t.trial.config.env.name == name))
+            for name in self.environments
+        ]
 
     @property
     def reduced(self) -> list[TrialReading]:
