@@ -4,6 +4,8 @@ VENV   ?= .venv
 RUN    := $(VENV)/bin/python
 STAMP  := $(VENV)/.installed
 WORKERS ?= 4
+# Whatever people read; tests misspell on purpose.
+PROSE   := README.md CONTRIBUTING.md Makefile benchmarks cluster configs docs msk_ray policies tune_spaces
 
 .PHONY: help env demo test check unit gpu-test bench clean
 
@@ -24,9 +26,10 @@ demo: env            ## a real small Ray Tune sweep (GPU if there is one), endin
 
 test: check unit     ## everything that CI runs
 
-check: env           ## formatting, lint, layers and types
+check: env           ## formatting, lint, spelling, layers and types
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/ruff check .
+	$(VENV)/bin/codespell $(PROSE)
 	$(VENV)/bin/lint-imports
 	$(VENV)/bin/mypy
 
