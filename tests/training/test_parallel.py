@@ -112,21 +112,19 @@ def test_a_killed_process_ends_the_trial_with_its_name_and_nothing_stays(two: Re
 
 
 def test_a_process_does_not_outlive_the_one_that_started_it(launcher: Launcher) -> None:
-    ours, theirs = Pipe()  # stays open: the end of the pipe is not what it notices
-    start = (
-        "import os, subprocess, sys, time\n"
-        f"p = subprocess.Popen([sys.executable, '-m', 'msk_ray.rank', '{theirs.fileno()}', str(os.getpid())],"
-        f" pass_fds=[{theirs.fileno()}])\n"
-        "print(p.pid, flush=True)\n"
+    child = (
+        "import os, sys, time\n"
+        "from msk_ray.rank import end_with_parent\n"
+        "end_with_parent(int(sys.argv[1]))\n"
+        "print(os.getpid(), flush=True)\n"
         "time.sleep(3600)"
     )
-    parent = launcher.start([sys.executable, "-c", start], stdout=subprocess.PIPE, pass_fds=[theirs.fileno()])
+    start = f"import os, subprocess, sys\nsubprocess.Popen([sys.executable, '-c', {child!r}, str(os.getpid())]).wait()"
+    parent = launcher.start([sys.executable, "-c", start], stdout=subprocess.PIPE)
     assert parent.stdout is not None
     pid = int(parent.stdout.readline())
     parent.kill()
     wait_until(lambda: not stat_of(pid))
-    ours.close()
-    theirs.close()
 
 
 class Speaker:
