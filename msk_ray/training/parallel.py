@@ -209,9 +209,8 @@ class ParallelTrainer:
                     return report.result
                 silent.remove(rank)
                 if not isinstance(report, _Answer):
-                    failures[rank.number] = None if report is None else report.error
-                    failed = report is not None and isinstance(report.error, SimulationError)
-                    deadline = min(deadline, time.monotonic() + (_SCORING_S if failed else _PATIENCE_S))
+                    error = failures[rank.number] = None if report is None else report.error
+                    deadline = min(deadline, time.monotonic() + _patience(rank.number, error))
         raise self._reason(failures)
 
     def _reason(self, failures: dict[int, Exception | None]) -> Exception:
@@ -337,6 +336,13 @@ def _devices(first: str, count: int) -> list[str]:
             "--device cpu"
         )
     return [f"cuda:{start + rank}" for rank in range(count)]
+
+
+def _patience(number: int, error: Exception | None) -> float:
+    """How long to wait for what the others say of the failure of a process [s]."""
+    if number == 0 and isinstance(error, MskRayError):
+        return 0.0  # this is the reason, whatever they say
+    return _SCORING_S if isinstance(error, SimulationError) else _PATIENCE_S
 
 
 def _in_rank(error: MskRayError, number: int) -> MskRayError:

@@ -207,6 +207,22 @@ def test_the_reason_is_what_failed_first_and_not_what_follows_from_it(
     trainer.close()
 
 
+@pytest.mark.parametrize("said", [{0: OVERFLOW}, {1: OVERFLOW, 0: OVERFLOW}, {1: None, 0: LOST, 2: LOST}])
+def test_nobody_is_waited_for_who_could_say_nothing_more(
+    said: dict[int, Exception | None], speakers: list[Speaker], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    for patience in ("_PATIENCE_S", "_SCORING_S"):
+        monkeypatch.setattr(parallel, patience, 3600.0)
+    trainer = trainer_of(speakers, monkeypatch, tmp_path)
+    for number, error in said.items():
+        if error is None:
+            speakers[number].other.close()
+        else:
+            speakers[number].other.send(_Failure(error))
+    with pytest.raises(RankLost if None in said.values() else SimulationError):
+        trainer.run_epoch()
+
+
 def test_an_error_that_cannot_be_sent_is_said_in_words() -> None:
     class Local(Exception):
         pass
