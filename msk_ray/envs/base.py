@@ -297,7 +297,7 @@ class Env(ABC, Generic[SettingsT]):
         after = self.sim.step(self.control(action), *before, parameters=self.parameters)
         diverged = ~self._sound(after)
         # `where` sends no cotangent into a diverged world's step, so its gradient cannot reach the batch.
-        after = StepState(*(torch.where(diverged[:, None], b.detach(), a) for b, a in zip(before, after, strict=True)))
+        after = StepState(*(_where(diverged, b.detach(), a) for b, a in zip(before, after, strict=True)))
         self._reached, self._diverged = after, diverged
         obs = self.observe(after, action)
         terms = self.reward_terms(after, action, obs)
@@ -389,20 +389,22 @@ class Env(ABC, Generic[SettingsT]):
 
     def _reset_where(self, done: Tensor, reached: EnvState) -> EnvState:
         fresh = self.reset_state()
-        physics = StepState(
-            *(torch.where(done[:, None], f, r) for f, r in zip(fresh.physics, reached.physics, strict=True))
-        )
         return EnvState(
-            physics,
-            torch.where(done[:, None], fresh.action, reached.action),
+            StepState(*(_where(done, f, r) for f, r in zip(fresh.physics, reached.physics, strict=True))),
+            _where(done, fresh.action, reached.action),
             torch.where(done, fresh.age, reached.age),
-            torch.where(done[:, None], fresh.numbers, reached.numbers),
+            _where(done, fresh.numbers, reached.numbers),
         )
 
     @torch.no_grad()
     def _sound(self, state: StepState) -> Tensor:
         # NaN compares false, so one comparison finds both non-finite and absurd values.
         return (torch.cat(state, dim=-1).abs() < _ABSURD).all(-1)
+
+
+def _where(worlds: Tensor, chosen: Tensor, others: Tensor) -> Tensor:
+    """Rows (W, n) of `chosen` in the given worlds (W,), else of `others`."""
+    return torch.where(worlds[:, None], chosen, others) if others.shape[1] else others
 
 
 def wrap_angle(angle: Tensor) -> Tensor:

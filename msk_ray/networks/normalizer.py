@@ -1,5 +1,7 @@
 """Running mean and variance."""
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 
@@ -35,4 +37,9 @@ class RunningMeanStd(nn.Module):
 
     def normalize(self, x: Tensor) -> Tensor:
         """(x − mean) / std."""
-        return (x - self.mean) * torch.rsqrt(self.var + _EPSILON)
+        return self.fixed()(x)
+
+    def fixed(self) -> Callable[[Tensor], Tensor]:
+        """`normalize` with the statistics that there are now, for many calls until the next `update`."""
+        scale = torch.rsqrt(self.var + _EPSILON)
+        return lambda x: (x - self.mean) * scale

@@ -91,10 +91,10 @@ class WarpSimStep(torch.autograd.Function):
         ctx.engine.restore_parameters(dict(zip(ctx.names, values, strict=True)))
         found = ctx.engine.backward.vjp(saved, cotangent, Needs(*on_state, *on_forces)._replace(parameters=wanted))
         # A linear map takes zero to zero, even in a world whose Jacobian is not finite: 0 × NaN must not leak out.
-        used = torch.cat(cotangent, dim=-1).ne(0).any(-1)
+        unused = torch.cat(cotangent, dim=-1).eq(0).all(-1)
 
         def masked(g: Tensor | None) -> Tensor | None:
-            return None if g is None else torch.where(used.view(-1, *[1] * (g.dim() - 1)), g, 0.0)
+            return g if g is None or not g.numel() else g.masked_fill(unused.view(-1, *[1] * (g.dim() - 1)), 0.0)
 
         parameters = (
             found.parameters.of_value(name, value.shape) if found.parameters and name in wanted else None

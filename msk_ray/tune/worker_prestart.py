@@ -16,8 +16,8 @@ from ray.tune import Callback
 
 from msk_ray.tune.devices import Placement
 
-MODULES = ("msk_ray.training", "msk_ray.tune.trainable", "torch._dynamo")
-"""What a trial's process imports; torch would import the last one with its first optimizer, which takes two seconds."""
+MODULES = ("msk_ray.training", "msk_ray.tune.trainable")
+"""What a trial's process imports."""
 KEEP_S = 24 * 3600
 """How long Ray keeps an unused process [s]; unused processes end with the driver."""
 _CALL_LIMIT_S = 10.0

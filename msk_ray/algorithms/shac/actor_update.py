@@ -141,7 +141,7 @@ class ActorUpdate:
         """
         c, rollout, gather = self._settings, rolled.rollout, self._group.gather
         loss, next_values, rewards = self._loss(rollout)
-        self._optimizer.optimizer.zero_grad()
+        self._optimizer.zero_grad()
         loss.backward()
         self._group.mean([p.grad for p in self._actor.parameters() if p.grad is not None])
         cotangents = rolled.gate.record(self._group)

@@ -42,6 +42,7 @@ class CriticFit:
         self._grad_norm = grad_norm
         self._tolerance = tolerance
         self._group = group
+        self._members = [list(member.parameters()) for member in critic.members]
         self.optimizer = RateAdam(critic.parameters(), learning_rate, betas, weight_decay)
 
     def draw_orders(self, rows: int, passes: int, generator: torch.Generator) -> Tensor:
@@ -80,12 +81,12 @@ class CriticFit:
 
     def _step(self, obs: Tensor, targets: Tensor, skip: Tensor | None) -> Tensor:
         loss = (self._critic(obs) - targets).square().mean()
-        self.optimizer.optimizer.zero_grad()
+        self.optimizer.zero_grad()
         loss.backward()
         mean = loss.detach()
         self._group.mean([mean, *(p.grad for p in self._critic.parameters() if p.grad is not None)])
         if self._grad_norm is not None:
-            for member in self._critic.members:
-                nn.utils.clip_grad_norm_(member.parameters(), self._grad_norm)
+            for parameters in self._members:
+                nn.utils.clip_grad_norm_(parameters, self._grad_norm)
         self.optimizer.step(skip)
         return mean

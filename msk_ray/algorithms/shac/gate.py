@@ -100,12 +100,14 @@ class CotangentGate:
 
     def pull(self, cotangent: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
         """The cotangents let through, each (W, n)."""
-        norm = torch.cat(cotangent, dim=-1).norm(dim=-1)
-        finite = norm.isfinite()
-        self._nonfinite |= ~finite
+        whole = torch.cat(cotangent, dim=-1)
+        norm = whole.norm(dim=-1)
+        lost = ~norm.isfinite()
+        self._nonfinite |= lost
         self._norms.append(norm)
-        scale = torch.ones_like(norm) if self.bound is None else (self.bound / norm).clamp(max=1.0)
-        return tuple((scale[:, None] * g).masked_fill(~finite[:, None], 0.0) for g in cotangent)
+        if self.bound is not None:
+            whole = (self.bound / norm).clamp(max=1.0)[:, None] * whole
+        return whole.masked_fill(lost[:, None], 0.0).split([g.shape[-1] for g in cotangent], dim=-1)
 
     def record(self, group: Group = ALONE) -> CotangentRecord:
         """What was measured, in the worlds of all processes."""

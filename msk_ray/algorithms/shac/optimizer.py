@@ -1,4 +1,4 @@
-"""Adam, in the form that suits its device."""
+"""Adam whose state stays in the same memory."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -6,71 +6,85 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+_EPSILON = 1e-8
+
 
 class RateAdam:
-    """Adam whose learning rate changes during training.
+    """Adam (Kingma and Ba 2015, arXiv:1412.6980), or AdamW, whose learning rate changes during training.
 
-    On CUDA all its parameters are one kernel, and step count and rate live on the device, so that a recorded graph
-    follows them.
+    One kernel steps all parameters. Step count and rate live on their device, so that a recorded graph follows them.
+    It does what `torch.optim.AdamW(fused=True)` does, without that class: its first instance imports torch's compiler,
+    which takes seconds.
 
     Args:
         parameters: what to optimise, all on one device.
         rate: initial learning rate.
         betas: moment decays.
-        weight_decay: decoupled weight decay; 0 for none.
-
-    Attributes:
-        optimizer: torch's optimiser, Adam or AdamW.
+        weight_decay: decoupled weight decay (Loshchilov and Hutter 2019, arXiv:1711.05101); 0 for none.
     """
 
     def __init__(
         self, parameters: Iterable[nn.Parameter], rate: float, betas: tuple[float, float], weight_decay: float = 0.0
     ) -> None:
-        found = list(parameters)
-        self._on_cuda = found[0].device.type == "cuda"
-        # A recorded graph reads the rate from memory; a number would be fixed in it.
-        self._rate: Tensor | float = torch.tensor(rate, device=found[0].device) if self._on_cuda else rate
-        self._own: dict[str, Any] = {"lr": self._rate, "fused": self._on_cuda, "capturable": self._on_cuda}
-        self.optimizer: torch.optim.Optimizer = (
-            torch.optim.AdamW(found, betas=betas, weight_decay=weight_decay, **self._own)
-            if weight_decay > 0.0
-            else torch.optim.Adam(found, betas=betas, **self._own)
+        self._parameters = list(parameters)
+        self._betas = betas
+        self._weight_decay = weight_decay
+        device = self._parameters[0].device
+        self._rate = torch.tensor(rate, device=device)
+        self._count = torch.zeros((), device=device)
+        self._means, self._squares = (
+            [torch.zeros_like(parameter, requires_grad=False) for parameter in self._parameters] for _ in range(2)
         )
 
     def set_rate(self, rate: float) -> None:
         """Use this learning rate from the next step on."""
-        for group in self.optimizer.param_groups:
-            if isinstance(self._rate, Tensor):
-                self._rate.fill_(rate)
-            else:
-                group["lr"] = rate
+        self._rate.fill_(rate)
 
+    def zero_grad(self) -> None:
+        """Forget the gradients."""
+        for parameter in self._parameters:
+            parameter.grad = None
+
+    @torch.no_grad()
     def step(self, skip: Tensor | None = None) -> None:
-        """Take a step with the present gradients.
+        """Take a step with the present gradients; parameters without one stay as they are.
 
         Args:
-            skip: a bool scalar; True leaves parameters and moments as they are. On CUDA the host does not wait for it.
+            skip: a bool scalar; True leaves parameters and moments as they are. The host does not wait for it.
         """
-        if self._on_cuda:
-            # How torch's GradScaler skips a step.
-            self.optimizer.found_inf = None if skip is None else skip.float()  # type: ignore[attr-defined]
-            self.optimizer.step()
-        elif skip is None or not skip:
-            self.optimizer.step()
+        gradients = {k: p.grad for k, p in enumerate(self._parameters) if p.grad is not None}
+        skipped = None if skip is None else skip.float()
+        self._count += 1 if skipped is None else 1 - skipped
+        torch._fused_adamw_(
+            [self._parameters[k] for k in gradients],
+            list(gradients.values()),
+            [self._means[k] for k in gradients],
+            [self._squares[k] for k in gradients],
+            [],
+            [self._count] * len(gradients),
+            lr=self._rate,
+            beta1=self._betas[0],
+            beta2=self._betas[1],
+            weight_decay=self._weight_decay,
+            eps=_EPSILON,
+            amsgrad=False,
+            maximize=False,
+            grad_scale=None,
+            found_inf=skipped,
+        )
 
     def state_dict(self) -> dict[str, Any]:
-        """State of torch's optimiser."""
-        return self.optimizer.state_dict()
+        """Step count and moments by the parameters' numbers, as torch's optimisers write them."""
+        moments = enumerate(zip(self._means, self._squares, strict=True))
+        return {"state": {k: {"step": self._count, "exp_avg": mean, "exp_avg_sq": sq} for k, (mean, sq) in moments}}
 
+    @torch.no_grad()
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from a state, also one written on another device."""
-        before = dict(self.optimizer.state)
-        self.optimizer.load_state_dict(dict(state))
-        for group in self.optimizer.param_groups:
-            group.update(self._own)
-        for parameter, loaded in self.optimizer.state.items():
-            if self._on_cuda:
-                loaded["step"] = loaded["step"].to(parameter.device)
-            # In the same memory as before, which recorded graphs read and write.
-            for name, kept in before.get(parameter, {}).items():
-                loaded[name] = kept.copy_(loaded[name])
+        """Continue from a state, also one of torch's Adam, or written on another device."""
+        unused = {"step": 0.0, "exp_avg": 0.0, "exp_avg_sq": 0.0}  # torch's have no entry before the first step
+        for k, (mean, square) in enumerate(zip(self._means, self._squares, strict=True)):
+            loaded = state["state"].get(k, unused)
+            mean.copy_(torch.as_tensor(loaded["exp_avg"]))
+            square.copy_(torch.as_tensor(loaded["exp_avg_sq"]))
+            if k == 0:
+                self._count.copy_(torch.as_tensor(loaded["step"]))

@@ -52,7 +52,7 @@ def collect(
     env.state = env.state.detach()
     raw, reached, rewards, terminated, done, diverged = [], [], [], [], [], []
     neg_log_probs, contacts = [], []
-    normalize = normalizer.normalize if normalizer is not None else lambda x: x
+    normalize = normalizer.fixed() if normalizer is not None else lambda x: x
     for step_noise in noise:
         env.state = env.state._replace(physics=gate(env.state.physics)) if state_bptt else env.state.detach()
         obs = env.observation()
@@ -67,14 +67,14 @@ def collect(
             force = 0.5 * env.sim.contact_forces().norm(dim=-1).sum(-1)
             contacts.append(force.masked_fill(transition.diverged, 0.0))
         raw.append(obs.detach())
-        reached.append(normalize(transition.obs))
+        reached.append(transition.obs)
         rewards.append(transition.reward)
         terminated.append(transition.terminated)
         done.append(transition.terminated | transition.truncated)
         diverged.append(transition.diverged)
     return Rollout(
         torch.stack(raw),
-        torch.stack(reached),
+        normalize(torch.stack(reached)),
         torch.stack(rewards),
         torch.stack(terminated),
         torch.stack(done),

@@ -20,13 +20,13 @@ def test_a_restored_optimiser_goes_on_as_before_and_in_the_same_memory() -> None
     adam = RateAdam([parameter], 0.1, (0.9, 0.99))
     stepped(parameter, adam, [1.0, 2.0])
     state, weights = copy.deepcopy(adam.state_dict()), parameter.detach().clone()
-    moments = list(adam.optimizer.state[parameter].values())
+    memory = [value.data_ptr() for value in adam.state_dict()["state"][0].values()]
     stepped(parameter, adam, [3.0, -1.0])
     expected = parameter.detach().clone()
     adam.load_state_dict(state)
     with torch.no_grad():
         parameter.copy_(weights)
-    assert all(a is b for a, b in zip(adam.optimizer.state[parameter].values(), moments, strict=True))
+    assert [value.data_ptr() for value in adam.state_dict()["state"][0].values()] == memory
     stepped(parameter, adam, [3.0, -1.0])
     assert torch.equal(parameter, expected)
     # A fresh one too, which has no moments yet.
@@ -36,6 +36,25 @@ def test_a_restored_optimiser_goes_on_as_before_and_in_the_same_memory() -> None
     fresh.set_rate(0.1)
     stepped(other, fresh, [3.0, -1.0])
     assert torch.equal(other, expected)
+
+
+@pytest.mark.parametrize("decay", [0.0, 0.5])
+def test_it_does_what_torchs_adam_does_and_goes_on_from_its_state(decay: float) -> None:
+    """Also from a state before the first step, which has no entries."""
+    theirs, ours = (nn.Parameter(torch.linspace(-1.0, 1.0, 5)) for _ in range(2))
+    torchs = torch.optim.AdamW([theirs], 0.1, (0.7, 0.95), weight_decay=decay)
+    for step in range(6):
+        if step in (0, 3):
+            adam = RateAdam([ours], 0.1, (0.7, 0.95), decay)
+            adam.load_state_dict(copy.deepcopy(torchs.state_dict()))
+        gradient = torch.sin(torch.arange(5.0) + step)
+        theirs.grad, ours.grad = gradient.clone(), gradient.clone()
+        torchs.step()
+        adam.step(skip=torch.tensor(False))
+        torch.testing.assert_close(ours, theirs, rtol=1e-6, atol=1e-7)
+    adam.zero_grad()
+    adam.step()
+    torch.testing.assert_close(ours, theirs, rtol=1e-6, atol=1e-7)
 
 
 @pytest.mark.parametrize(("skip", "moved"), [(True, 0.0), (False, -0.1)])
