@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from msk_ray.config import ALGORITHMS, AlgorithmSettings, Config, check_installed, resolve_class
 from msk_ray.envs import Env
 from msk_ray.errors import ConfigError
+from msk_ray.group import Group
 
 _OF_GRADIENTS = frozenset({"approximated_share", "reached_share"})
 """Diagnostics of the simulation that concern its gradients; the others concern its physics."""
@@ -96,9 +97,17 @@ class Algorithm(ABC):
         return {name: module.state_dict() for name, module in self.policy_modules(self.network).items()}
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that a later `load_state_dict` needs to continue exactly, including the environment's state."""
+        """Everything that a later `load_state_dict` needs to continue exactly, including the environment's state.
+
+        In a group, every process has to call it.
+
+        Raises:
+            RuntimeError: the processes of the group hold different modules.
+        """
+        modules = {name: module.state_dict() for name, module in self.modules().items()}
+        _check_equal(modules, self.env.group)
         state = {
-            "modules": {name: module.state_dict() for name, module in self.modules().items()},
+            "modules": modules,
             "torch_generator": torch.get_rng_state(),
             **self.env.state_dict(),
         }
@@ -131,6 +140,24 @@ class Algorithm(ABC):
         for name, module in self.modules().items():
             if name in modules or name in needed:
                 module.load_state_dict(modules[name])
+
+
+def _check_equal(modules: Mapping[str, Mapping[str, Tensor]], group: Group) -> None:
+    if group.size == 1:
+        return
+    # Equal bits have equal sums; NaN would not equal itself.
+    sums = {
+        f"{name}.{key}": float(value.double().sum()).hex()
+        for name, state in modules.items()
+        for key, value in state.items()
+    }
+    for rank, others in enumerate(group.collect(sums)):
+        for name, value in others.items():
+            if value != sums[name]:
+                raise RuntimeError(
+                    f"{name} of process {rank} of the trial is not that of process {group.rank}: their gradients or "
+                    "statistics were not averaged, or their GPUs are not of one kind"
+                )
 
 
 def algorithm_class(config: Config) -> type[Algorithm]:

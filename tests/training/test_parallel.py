@@ -17,7 +17,7 @@ from processes import Launcher, wait_until
 
 from msk_ray.config import Config, parse_config
 from msk_ray.errors import ConfigError, DeviceError, Failure, RankLost, SimulationError
-from msk_ray.group import PeerLost
+from msk_ray.group import Group, PeerLost
 from msk_ray.training import ParallelTrainer, Trainer, make_trainer, parallel, read_checkpoint
 from msk_ray.training.parallel import _Answer, _Failure, _Rank
 
@@ -125,6 +125,26 @@ def test_a_process_does_not_outlive_the_one_that_started_it(launcher: Launcher) 
     pid = int(parent.stdout.readline())
     parent.kill()
     wait_until(lambda: not stat_of(pid))
+
+
+class Astray(Group):
+    """Two processes of which the other has changed one module by a bit."""
+
+    size = 2
+
+    def __init__(self, changed: str) -> None:
+        self._changed = changed
+
+    def collect(self, value: Any) -> list[Any]:
+        return [value, {**value, self._changed: "0x0.0p+0"}] if isinstance(value, dict) else [value, value]
+
+
+def test_processes_whose_networks_differ_are_not_saved(tmp_path: Path) -> None:
+    trainer = Trainer(config_of(1), tmp_path, "cpu")
+    trainer.env.group = Astray("critic.members.1.0.weight")
+    with pytest.raises(RuntimeError, match=r"^critic\.members\.1\.0\.weight of process 1 .* not averaged"):
+        trainer.algorithm.state_dict()
+    trainer.close()
 
 
 class Speaker:
