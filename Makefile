@@ -7,7 +7,7 @@ WORKERS ?= 4
 # Whatever people read; tests misspell on purpose.
 PROSE   := README.md CONTRIBUTING.md Makefile benchmarks cluster configs docs msk_ray policies tune_spaces
 
-.PHONY: help env demo test check unit gpu-test bench clean
+.PHONY: help env demo test check unit gpu-test site bench clean
 
 help:                ## this list
 	@grep -hE '^[a-z-]+: .*##|^[a-z-]+:  *##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 14
@@ -38,6 +38,9 @@ unit: env            ## the tests that need no GPU, in as many processes as WORK
 
 gpu-test: env        ## the tests that need a CUDA device
 	$(RUN) -m pytest -m gpu
+
+site: env            ## the documentation site, in build/site
+	NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --strict --quiet --config-file docs/site/mkdocs.yml
 
 bench: env           ## speed tables of this machine, appended to benchmarks/results/
 	$(RUN) benchmarks/epoch.py

@@ -1,5 +1,6 @@
 """The examples of the documentation run, in tiny size."""
 
+import re
 import runpy
 import sys
 from pathlib import Path
@@ -46,6 +47,16 @@ def test_the_space_of_frictions_has_trials_with_and_without(monkeypatch):
     finally:
         sys.modules.pop("tray", None)
     assert [trial.config.physics.randomize is None for trial in trials] == [True, False] * 3
+
+
+def test_bouncing_ball(monkeypatch, capsys, tmp_path):
+    picture = tmp_path / "ball.png"
+    out = run(monkeypatch, capsys, "bouncing_ball.py", str(picture), "--worlds", "13")
+    slopes = re.findall(r"mean slope ([\d.]+) by the backward pass, ([\d.]+) from end to end", out)
+    (hard, wide), (soft, same) = [(float(a), float(b)) for a, b in slopes]
+    assert hard > 1.8 * wide
+    assert abs(soft - same) < 0.03 * same
+    assert picture.stat().st_size > 10_000
 
 
 def test_sysid(monkeypatch, capsys, tmp_path):
