@@ -19,6 +19,7 @@ ENVIRONMENTS = Registry(
         "humanoid": "msk_ray.envs.humanoid.env:Humanoid",
         "myoleg26": "msk_ray.envs.myoleg26.env:MyoLeg26",
         "myoleg": "msk_ray.envs.myoleg.env:MyoLeg",
+        "myosuite_walk": "msk_ray.envs.myosuite_walk.env:MyoSuiteWalk",
     },
 )
 """Classes of environments."""
@@ -33,6 +34,7 @@ SETTINGS = Registry(
         "humanoid": "msk_ray.envs.humanoid.config:HumanoidSettings",
         "myoleg26": "msk_ray.envs.myoleg26.config:MyoLeg26Settings",
         "myoleg": "msk_ray.envs.myoleg.config:MyoLegSettings",
+        "myosuite_walk": "msk_ray.envs.myosuite_walk.config:MyoSuiteWalkSettings",
     },
 )
 """Settings that can be imported without their environment, which loads torch. A name that is only in `ENVIRONMENTS`

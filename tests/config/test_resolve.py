@@ -80,7 +80,7 @@ def test_the_settings_of_an_import_path_are_checked_and_kept_whole(outside: Path
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        (None, "env.name: missing; write cartpole, ant, hopper, cheetah, humanoid, myoleg26, myoleg or package.module"),
+        (None, "env.name: missing; write cartpole, ant, hopper, cheetah, humanoid, myoleg26, myoleg, myosuite_walk or"),
         (3, "env.name: 3 is no name; write cartpole"),
         ("antt", "env.name: unknown name 'antt'; did you mean 'ant'?"),
         ("outside_walker:", "env.name: write package.module:Class, not 'outside_walker:'"),
@@ -145,7 +145,8 @@ def test_a_name_of_the_package_cannot_be_taken(outside: Path) -> None:
 def test_reading_a_config_of_ours_loads_neither_torch_nor_warp() -> None:
     code = (
         "import sys; from msk_ray.config import parse_config\n"
-        "for name in ('cartpole', 'ant', 'myoleg26', 'myoleg'): parse_config({'env': {'name': name}})\n"
+        "names = ('cartpole', 'ant', 'myoleg26', 'myoleg', 'myosuite_walk')\n"
+        "for name in names: parse_config({'env': {'name': name}})\n"
         "print(sorted({'torch', 'warp', 'mujoco', 'ray'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

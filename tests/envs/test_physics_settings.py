@@ -1,6 +1,7 @@
 """A setting of the physics section does something, or is refused: in every environment, with every backward mode."""
 
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -53,6 +54,7 @@ REFUSED = {
     "myoleg": {"variant", "gear", "solref", "solimp", "friction", "solreffriction", "solref_limit", "solimp_limit"}
     | {"joint_damping", "armature"},
 }
+REFUSED["myosuite_walk"] = REFUSED["myoleg"]
 """What each environment does not read whatever the backward mode."""
 STATE_EPS = {"fd.eps_qpos", "fd.eps_qvel", "fd.eps_act"}
 UNREAD_BY = {
@@ -63,6 +65,7 @@ UNREAD_BY = {
 }
 
 
+WALK = str(Path(__file__).parents[1] / "fixtures" / "myosuite_walk" / "myolegs.xml")
 LEGS = """<mujoco><worldbody><geom type="plane" size="1 1 1"/><body name="root" pos="0 0 .8"><freejoint/>
 <geom size=".1" mass="1"/>
 <body><joint name="hip_flexion_r"/><geom size=".1" mass="1"/></body>
@@ -81,6 +84,8 @@ def _settings(env: str, backward: str, legs: str) -> dict[str, Any]:
     settings: dict[str, Any] = {"env": {"name": env, "control_timestep": 0.02}, "physics": {"backward": backward}}
     if env == "myoleg":
         settings["env"] |= {"model": legs}
+    if env == "myosuite_walk":
+        settings["env"] |= {"model": WALK}
     return settings
 
 
@@ -96,8 +101,8 @@ def _model(env: str, field: str | None, legs: str) -> bytes:
 
 
 def _value(env: str, field: str) -> Any:
-    # This model has MuJoCo's default cone.
-    return "elliptic" if (env, field) == ("myoleg", "cone") else VALUES[field]
+    # These models have MuJoCo's default cone.
+    return "elliptic" if field == "cone" and env in ("myoleg", "myosuite_walk") else VALUES[field]
 
 
 def _backward(config: Config) -> list[tuple[Any, ...]]:

@@ -134,9 +134,10 @@ def test_a_layout_of_another_length_is_refused(env: CartPole) -> None:
         describe(msk_ray.load_policy(CHECKPOINT), policy, mislaid, "own", {})
 
 
-@pytest.mark.parametrize("name", ["cartpole", "ant", "hopper", "cheetah", "humanoid", "myoleg26"])
+@pytest.mark.parametrize("name", ["cartpole", "ant", "hopper", "cheetah", "humanoid", "myoleg26", "myosuite_walk"])
 def test_layouts_name_the_entries_of_observations(name: str) -> None:
-    config = load_config(name)
+    model = Path(__file__).parents[1] / "fixtures" / "myosuite_walk" / "myolegs.xml"
+    config = load_config(name, [f"env.model={model}"] if name == "myosuite_walk" else [])
     env = make_env(config.env, config.physics, 1, "cpu", 0, differentiable=False)
     names = [entry.name for entry in env.observation_layout() or ()]
     assert len(names) == len(set(names)) == env.obs_size

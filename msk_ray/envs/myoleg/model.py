@@ -56,7 +56,7 @@ def find_model(model: str | None, source: str = "auto") -> Source:
         path = Path(model)
         if not path.is_file():
             raise ConfigError(f"env.model: no file {model}; write a path, {' or '.join(PACKAGED_MODELS)}")
-        return Source("file", "", model, lambda: _spec_of(path))
+        return Source("file", "", model, lambda: spec_of_file(path))
     name = model or PACKAGED_MODELS[0]
     finders = {"myosuite2": _myosuite2, "myosuite3": _myosuite3, "myo_sim": _myo_sim}
     asked = list(finders) if source == "auto" else [source]
@@ -68,7 +68,7 @@ def find_model(model: str | None, source: str = "auto") -> Source:
     raise ConfigError(f"env.model: {looked} a model {name}; {INSTALL}")
 
 
-def _package(name: str) -> tuple[Path, str] | None:
+def package_folder(name: str) -> tuple[Path, str] | None:
     """Folder and version of an installed package, without importing it."""
     found = importlib.util.find_spec(name)
     if found is None or not found.submodule_search_locations:
@@ -80,7 +80,12 @@ def _package(name: str) -> tuple[Path, str] | None:
     return Path(found.submodule_search_locations[0]), version
 
 
-def _spec_of(path: Path) -> mujoco.MjSpec:
+def spec_of_file(path: Path) -> mujoco.MjSpec:
+    """The model in an MJCF file.
+
+    Raises:
+        ConfigError: MuJoCo cannot load it.
+    """
     try:
         return mujoco.MjSpec.from_file(str(path))
     except (ValueError, mujoco.FatalError) as error:
@@ -88,15 +93,15 @@ def _spec_of(path: Path) -> mujoco.MjSpec:
 
 
 def _myosuite2(name: str) -> Source | None:
-    package = _package("myosuite")
+    package = package_folder("myosuite")
     if package is None:
         return None
     path = package[0] / _V2_FILE / f"{name}.xml"
-    return Source("myosuite2", package[1], name, lambda: _spec_of(path)) if path.is_file() else None
+    return Source("myosuite2", package[1], name, lambda: spec_of_file(path)) if path.is_file() else None
 
 
 def _myosuite3(name: str) -> Source | None:
-    package = _package("myosuite")
+    package = package_folder("myosuite")
     if package is None or name != "myolegs" or not (package[0] / _V3_FILE).is_file():
         return None
 
@@ -112,7 +117,7 @@ def _myosuite3(name: str) -> Source | None:
 
 
 def _myo_sim(name: str) -> Source | None:
-    package = _package("myo_sim")
+    package = package_folder("myo_sim")
     if package is None:
         return None
 

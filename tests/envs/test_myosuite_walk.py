@@ -1,0 +1,165 @@
+"""`myosuite_walk` against recorded steps of MyoSuite's own environment, and its gradients against float64 C MuJoCo."""
+
+import importlib.util
+from importlib.machinery import ModuleSpec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from msk_ray.config import PhysicsConfig, load_config
+from msk_ray.envs import make_env
+from msk_ray.envs.base import EnvState
+from msk_ray.envs.myosuite_walk.config import MyoSuiteWalkReward, MyoSuiteWalkSettings
+from msk_ray.envs.myosuite_walk.env import MyoSuiteWalk
+from msk_ray.envs.myosuite_walk.model import KEYFRAMES, build_myosuite_walk, find_file
+from msk_ray.errors import ConfigError
+from msk_ray.gradcheck import check_gradients
+from msk_ray.simulation import Simulation, StepState
+from msk_ray.training import Trainer
+
+RECORDED = Path(__file__).parents[1] / "fixtures" / "myosuite_walk"
+MODEL = str(RECORDED / "myolegs.xml")
+
+
+def settings(**changes: Any) -> MyoSuiteWalkSettings:
+    return MyoSuiteWalkSettings(name="myosuite_walk", model=MODEL, **changes)
+
+
+def make(nworld: int, seed: int = 0, **changes: Any) -> MyoSuiteWalk:
+    env = make_env(settings(**changes), PhysicsConfig(), nworld, "cpu", seed, differentiable=False)
+    assert isinstance(env, MyoSuiteWalk)
+    return env
+
+
+def test_episodes_are_those_of_myosuite() -> None:
+    """100 random steps in four episodes, free-running from their initial states: contact, muscles, falls, phase."""
+    recorded = np.load(RECORDED / "steps.npz")
+    steps = {name: torch.as_tensor(recorded[name]) for name in recorded if name != "versions"}
+    starts = torch.nonzero(steps["age"] == 0).flatten()
+    lengths = torch.diff(torch.cat((starts, torch.tensor([100])))).tolist()
+    env = make(len(starts), smoothing=0.0)
+    physics = StepState(*(steps[name][starts] for name in ("qpos", "qvel", "act")))
+    none = torch.zeros(len(starts), 0)
+    env.state = EnvState(physics, torch.zeros(len(starts), 80), torch.zeros(len(starts), dtype=torch.long), none)
+    seen = 0
+    for step in range(max(lengths)):
+        running = [w for w, length in enumerate(lengths) if step < length]
+        at = (starts + step).clamp_max(99)
+        torch.testing.assert_close(env.observation()[running], steps["obs_before"][at[running]], atol=1e-3, rtol=0.0)
+        found = env.step(steps["action"][at], auto_reset=False)
+        for ours, theirs in ((found.obs, "obs"), (found.reward, "reward"), (found.terms, "terms")):
+            torch.testing.assert_close(ours[running], steps[theirs][at[running]], atol=1e-3, rtol=0.0)
+        assert torch.equal(found.terminated[running], steps["terminated"][at[running]])
+        seen += len(running)
+    assert seen == 100
+    assert steps["terminated"].sum() >= 2
+
+
+def test_resets_are_those_of_myosuite() -> None:
+    steps = np.load(RECORDED / "steps.npz")
+    env = make(2)
+    assert env.state.physics.qpos.numpy() == pytest.approx(np.stack([steps["qpos"][0]] * 2), abs=1e-6)
+    assert env.state.physics.qvel.numpy() == pytest.approx(np.stack([steps["qvel"][0]] * 2), abs=1e-6)
+    assert not env.state.physics.act.any()
+    knee = env.model.joint("knee_angle_r").qposadr[0]
+    drawn = make(1, reset="random").draw_physics(4000)
+    bent = drawn.qpos[:, knee] > 0.6
+    assert 0.45 < bent.float().mean() < 0.55, "as often the mirror image"
+    noise = drawn.qpos[bent] - torch.tensor(env.model.key(KEYFRAMES[2]).qpos, dtype=torch.float32)
+    assert noise[:, 2].abs().max() < 1e-6, "except the height"
+    spread = noise.std(0)
+    assert spread[[0, 1, *range(3, 35)]].numpy() == pytest.approx(0.02, rel=0.1), "the quaternion has noise too"
+    fixed = make(1, reset="random", stochastic_reset=False).draw_physics(3).qpos
+    assert torch.equal(fixed, env.draw_physics(3).qpos)
+    standing = make(1, reset="none").draw_physics(1)
+    assert standing.qpos[0, 2].item() == pytest.approx(0.92)
+    assert not standing.qvel.any()
+
+
+def test_gradients_of_a_step() -> None:
+    model = build_myosuite_walk(settings(), PhysicsConfig())
+    assert model.opt.timestep == pytest.approx(1e-3)
+    assert set(model.actuator_dynprm[:, 2]) == {0.2}
+    report = check_gradients(Simulation(model, 2, 10, tolerance=1e-9), states=("standing", "policy"))
+    assert report.checked >= 2
+    assert {r.input for r in report.results} == {"ctrl", "qpos", "qvel", "act"}
+    assert report.max_rel_error <= 1e-3
+
+
+def test_reward_and_observation_have_the_gradient_of_their_own_values() -> None:
+    env = make(1)
+    rng = np.random.default_rng(3)
+    parts = [part[0].numpy().astype(float) for part in env.state.physics]
+    parts[0][7:] += 0.05 * rng.normal(size=28)
+    parts[1] += 0.5 * rng.normal(size=34)
+    parts[2][:] = rng.uniform(0.1, 0.9, size=80)
+    action = torch.zeros(1, 80)
+    weights = torch.tensor(rng.normal(size=env.obs_size), dtype=torch.float32)
+
+    def value(arrays: list[torch.Tensor]) -> torch.Tensor:
+        state = StepState(*arrays)
+        obs = env.observe(state, action)
+        return (obs * weights).sum() + env.reward_terms(state, action, obs).sum()
+
+    inputs = [torch.tensor(p[None], dtype=torch.float32, requires_grad=True) for p in parts]
+    gradients = torch.autograd.grad(value(inputs), inputs)
+    for which, gradient in enumerate(gradients):
+        direction = rng.normal(size=parts[which].shape)
+        if which == 0:
+            direction[3:7] -= parts[0][3:7] * (direction[3:7] @ parts[0][3:7])  # along the sphere of unit quaternions
+        direction = torch.tensor(direction, dtype=torch.float32)
+        ends = []
+        for sign in (1, -1):
+            moved = [torch.tensor(p[None], dtype=torch.float32) for p in parts]
+            moved[which] = moved[which] + sign * 1e-3 * direction
+            with torch.no_grad():
+                ends.append(float(value(moved)))
+        slope = float((gradient[0] * direction).sum())
+        assert slope == pytest.approx((ends[0] - ends[1]) / 2e-3, rel=1e-2, abs=2e-2)
+
+
+def test_scores_are_without_what_makes_training_easier() -> None:
+    trained = settings(reset="random", smoothing=0.4, reward=MyoSuiteWalkReward(done=-10.0))
+    assert MyoSuiteWalk.reference_settings(trained) == settings(reset="random", smoothing=0.0)
+    physics = PhysicsConfig(cone="elliptic", substeps=5, njmax=300)
+    model = build_myosuite_walk(settings(smoothing=0.0), MyoSuiteWalk.reference_physics(physics, None))
+    assert (model.opt.timestep, int(model.opt.cone), set(model.actuator_dynprm[:, 2])) == (1e-3, 0, {0.0})
+
+
+def test_the_config_trains(root: Path, tmp_path: Path) -> None:
+    small = (f"env.model={MODEL}", "env.nworld=2", "shac.horizon=2", "trial.epochs=1", "actor.hidden=[8]")
+    rest = ("critic.hidden=[8]", "evaluation.nworld=2", "evaluation.steps=2", "evaluation.interval=1")
+    trainer = Trainer(load_config(root / "configs" / "myosuite_walk.yaml", [*small, *rest]), tmp_path, "cpu")
+    before = torch.cat([p.detach().flatten().clone() for p in trainer.algorithm.actor.parameters()])
+    trainer.run_epoch()
+    after = torch.cat([p.detach().flatten() for p in trainer.algorithm.actor.parameters()])
+    trainer.close()
+    assert after.isfinite().all()
+    assert not torch.equal(before, after)
+
+
+def test_a_model_that_is_not_myosuites_is_refused_on_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    install = "pip install --no-deps myosuite==2.12.2"
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match=f"MyoSuite 2.12 is not installed: {install}"):
+        find_file(None)
+    spec = ModuleSpec("myosuite", None, is_package=True)
+    spec.submodule_search_locations = [str(tmp_path)]
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: spec)
+    monkeypatch.setattr("importlib.metadata.version", lambda name: "3.0.0")
+    with pytest.raises(ConfigError, match=f"the task of MyoSuite 2.12, but 3.0.0 is installed: {install}"):
+        find_file(None)
+    with pytest.raises(ConfigError, match=f"no file gone.xml; {install}"):
+        find_file("gone.xml")
+    text = Path(MODEL).read_text()
+    for old, new, why in (
+        ("<keyframe>", "<keyframe><key/>", "has 5 keyframes, not MyoSuite's 4"),
+        ('name="hip_rotation_l"', 'name="hip_turn_l"', "has no hip_rotation_l"),
+    ):
+        path = tmp_path / "other.xml"
+        path.write_text(text.replace(old, new))
+        with pytest.raises(ConfigError, match=why):
+            build_myosuite_walk(settings().model_copy(update={"model": str(path)}), PhysicsConfig())
