@@ -4,13 +4,17 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import pytest
-from needs import need_drawing
 
 from msk_ray import __main__ as commands
+from msk_ray.visualize import __main__ as visualize
 
 TINY = (
     *("env.nworld=4", "shac.critic_iterations=1", "shac.critic_batches=1", "actor.hidden=[8]", "critic.hidden=[8]"),
@@ -50,37 +54,73 @@ def test_it_loads_nothing_from_elsewhere(site: Path) -> None:
     assert not re.search(r"url\(['\"]?https?:|@import", styles)
 
 
+@pytest.fixture(scope="module")
+def address(site: Path) -> Iterator[str]:
+    """Where the site is served."""
+
+    class Quiet(SimpleHTTPRequestHandler):
+        def log_message(self, *_: object) -> None:
+            """Nothing."""
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(site)))
+    thread = Thread(target=server.serve_forever)
+    thread.start()
+    yield f"http://127.0.0.1:{server.server_port}"
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+@pytest.mark.parametrize("width", [1280, 375])
+def test_a_browser_finds_no_fault_and_scrolls_down_only(address: str, browser: Any, width: int) -> None:
+    page = browser.new_page(viewport={"width": width, "height": 900})
+    faults: list[str] = []
+    page.on("console", lambda message: faults.append(message.text) if message.type in ("error", "warning") else None)
+    page.on(
+        "request", lambda request: None if request.url.startswith((address, "data:")) else faults.append(request.url)
+    )
+    page.on("response", lambda response: faults.append(response.url) if response.status >= 400 else None)
+    for name in ("index", "api"):
+        page.goto(f"{address}/{name}.html")
+        assert page.evaluate("document.documentElement.scrollWidth") <= width, name
+        assert page.locator("h1").count() == 1
+    assert not faults
+    page.close()
+
+
 def _commands(page: Path) -> list[list[str]]:
     lines = re.findall(r"^    msk-ray (.*?)(?:  +#.*)?$", page.read_text(), re.MULTILINE)
     return [line.split() for line in lines]
 
 
 def _smaller(words: list[str]) -> list[str]:
-    """A command of the tour in tiny sizes."""
+    """A command of the tour in tiny sizes, without pictures and sweeps, which have tests of their own."""
     options: dict[str, list[str]] = {
         "train": [word for setting in TINY for word in ("--set", setting)],
         "visualize": ["--steps", "5", "--device", "cpu"],
         "evaluate": ["--worlds", "2", "--steps", "5", "--device", "cpu"],
-        # Sweeps are run by tests of their own.
         "tune": [] if "--dry-run" in words else ["--dry-run"],
         "export": [],
     }
-    small = ["--size", "64x48"] if "--video" in words or "--strip" in words else []
-    return [*words, *options[words[0]], *small]
+    drawn = {"--video", "--strip"} & set(words)
+    if drawn:
+        words = [*words[: words.index(drawn.pop())], "--no-render"]
+    return [*words, *options[words[0]]]
 
 
 def test_the_commands_of_the_tour_run(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    need_drawing()
     monkeypatch.chdir(tmp_path)
     found = _commands(root / "docs" / "tour.md")
     assert [words[0] for words in found] == [
         *("visualize", "visualize", "train", "evaluate", "visualize", "train", "tune", "tune", "export"),
     ]
     for words in found:
+        if words[0] == "visualize":
+            visualize.parser().parse_args(words[1:])  # its options exist
         assert commands.main(_smaller(words)) == 0, (words, capsys.readouterr().err)
-    for name in ("swing.mp4", "mine.png", "mine.pt", "mine.json"):
+    for name in ("mine.pt", "mine.json", "mine.mjb"):
         assert (tmp_path / name).stat().st_size > 100
 
 

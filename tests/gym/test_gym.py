@@ -1,5 +1,6 @@
 """Gymnasium's interfaces: its own checks, the same physics and rewards, and an algorithm from elsewhere that learns."""
 
+import importlib.util
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
+import msk_ray.gym
 from msk_ray.config import Config, load_config, overlay, parse_config
 from msk_ray.envs import make_env
 from msk_ray.errors import ConfigError
@@ -146,6 +148,12 @@ def test_a_step_goes_on_in_float64_where_the_last_one_ended() -> None:
 def test_what_cannot_be_is_refused(make: Any, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         make()
+
+
+def test_without_gymnasium_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match=r"needs gymnasium: pip install 'msk-ray\[gym\]'"):
+        importlib.reload(msk_ray.gym)
 
 
 def test_actions_of_another_shape_are_refused(batched: BatchedEnv[np.ndarray]) -> None:
