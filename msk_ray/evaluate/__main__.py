@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from msk_ray.cli import Parser, run
-from msk_ray.errors import CheckpointError, MskRayError
+from msk_ray.errors import CheckpointError, ConfigError, MskRayError
+from msk_ray.evaluate.apart import PYTHON, find_python
 from msk_ray.evaluate.targets import Kind, Target, best_checkpoint, best_of_trial, find_target
 from msk_ray.evaluate.vary import HELP, parse_vary, vary_text
 from msk_ray.experiment.attempts import read_attempt
@@ -22,6 +23,7 @@ from msk_ray.text_table import text_table
 
 if TYPE_CHECKING:
     from msk_ray.evaluate.measure import Bench, Request
+    from msk_ray.evaluate.myosuite import MyoSuiteBench
 
 DESCRIPTION = """\
 Evaluate a policy: without noise, from fixed initial states, under the environment's default reward weights.
@@ -38,6 +40,7 @@ EXAMPLES = """\
   python -m msk_ray.evaluate ant_lr --physics reference,published,own    # how much of it is the physics?
   python -m msk_ray.evaluate ant_lr --worlds 256 --seeds 0-4             # fresh initial states
   python -m msk_ray.evaluate runs/mine --vary body_mass=0.8x,1.2x        # how well does it bear other masses?
+  python -m msk_ray.evaluate runs/train/myosuite_walk_seed0 --in myosuite   # in MyoSuite's own environment
 
 exit codes: 0 done, 1 a policy could not be evaluated, 2 refused."""
 
@@ -53,12 +56,24 @@ def parser() -> Parser:
     p.add_argument("--steps", type=positive, metavar="N", help="maximum env steps per episode")
     p.add_argument(
         "--physics",
-        default="reference",
         metavar="LIST",
         help="comma-separated: reference (the physics of scores), own (that of training), or named ones of the "
         "environment (default: reference)",
     )
     p.add_argument("--vary", metavar="FIELD=LIST", help=HELP)
+    p.add_argument(
+        "--in",
+        dest="elsewhere",
+        choices=("myosuite",),
+        help="evaluate a policy of env myosuite_walk in the unmodified CPU environment of MyoSuite 2.12: 20 episodes "
+        "with its own resets and 20 with random ones",
+    )
+    p.add_argument(
+        "--python",
+        type=Path,
+        metavar="FILE",
+        help=f"the Python that has MyoSuite, for --in (default: {PYTHON})",
+    )
     p.add_argument("--device", help="cpu or cuda:N (default: the first GPU, or the CPU if there is none)")
     p.add_argument(
         "--storage", type=Path, default=Path("runs"), metavar="DIR", help="folder of experiments (default: runs/)"
@@ -78,24 +93,47 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser().parse_args(argv)
     target = find_target(args.target, args.storage)
     seeds = parse_seeds(args.seeds) if args.seeds is not None else None
-    names = [name.strip() for name in args.physics.split(",")]
+    names = [name.strip() for name in (args.physics or "reference").split(",")]
     varied = [None, *(parse_vary(args.vary) if args.vary is not None else [])]
+    python = _python_apart(args)
     if target.kind is not Kind.EXPERIMENT:
         best_checkpoint(target)  # torch and Warp take seconds to load; a wrong path should not wait for them
 
-    from msk_ray.evaluate.measure import Bench, Request, default_device
-    from msk_ray.simulation.simulation import resolve_device
+    from msk_ray.evaluate import measure, myosuite
 
-    device = args.device or default_device()
-    resolve_device(device)  # a missing device is not the fault of any trial
-    bench = Bench(device)
-    requests = [Request(name, args.worlds, seeds, args.steps, value) for name in names for value in varied]
+    bench: Bench | MyoSuiteBench
+    if python is not None:
+        bench = myosuite.MyoSuiteBench(python)
+        requests = myosuite.requests(args.worlds, seeds, args.steps)
+    else:
+        from msk_ray.simulation.simulation import resolve_device
+
+        device = args.device or measure.default_device()
+        resolve_device(device)  # a missing device is not the fault of any trial
+        bench = measure.Bench(device)
+        requests = [measure.Request(name, args.worlds, seeds, args.steps, v) for name in names for v in varied]
     if target.kind is Kind.EXPERIMENT:
         return evaluate_experiment(Experiment(target.path), bench, requests)
     return _evaluate_one(target, bench, requests, len(varied))
 
 
-def _evaluate_one(target: Target, bench: "Bench", requests: "Sequence[Request]", values: int) -> int:
+def _python_apart(args: argparse.Namespace) -> Path | None:
+    """The Python in which policies are evaluated; None: this one.
+
+    Raises:
+        ConfigError: there is none, or an option does not apply there.
+    """
+    if args.elsewhere is None:
+        if args.python is not None:
+            raise ConfigError("--python: only --in myosuite reads it; leave it out")
+        return None
+    for option in ("physics", "vary", "device"):
+        if getattr(args, option) is not None:
+            raise ConfigError(f"--{option}: --in {args.elsewhere} has its own physics, on the CPU; leave it out")
+    return find_python(args.python)
+
+
+def _evaluate_one(target: Target, bench: "Bench | MyoSuiteBench", requests: "Sequence[Request]", values: int) -> int:
     """Evaluate one policy; every `values` requests are of one physics, with different values of a parameter."""
     from msk_ray.evaluate.measure import check_varied, eval_file_of, store_evaluation
     from msk_ray.training import load_policy
@@ -149,7 +187,7 @@ def figure_rows(entry: dict[str, Any]) -> list[tuple[str, dict[str, float]]]:
     ]
 
 
-def evaluate_experiment(experiment: Experiment, bench: "Bench", requests: "Sequence[Request]") -> int:
+def evaluate_experiment(experiment: Experiment, bench: "Bench | MyoSuiteBench", requests: "Sequence[Request]") -> int:
     """Evaluate the best policy of each trial, store the results in its folder, and rank the trials.
 
     A trial whose policy cannot be evaluated is listed and does not stop the others. A trial that has only its untrained

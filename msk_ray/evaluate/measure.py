@@ -26,7 +26,7 @@ from msk_ray.training.threads import use_threads
 
 FORMAT = 1
 REFERENCE, OWN = "reference", "own"
-_PACKAGES = ("msk-ray", "torch", "warp-lang", "mujoco", "mujoco-warp")
+PACKAGES = ("msk-ray", "torch", "warp-lang", "mujoco", "mujoco-warp")
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ class Bench:
             "scores": [round(float(s), 6) for run in runs for s in run.score],
             "score_by_seed": {str(seed): float(run.score.mean()) for seed, run in zip(seeds, runs, strict=True)},
             "device": device_name(self._device),
-            "packages": installed_versions(_PACKAGES),
+            "packages": installed_versions(PACKAGES),
             "python": platform.python_version(),
             "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         }
