@@ -93,6 +93,8 @@ class BatchedEnv(VectorEnv[Array, Array, Array], Generic[Array]):
                 f"({self.num_envs}, {self.env.action_size})"
             )
         transition = self.env.step(given.clamp(-1.0, 1.0))
+        # On a GPU a lost contact is only known once the step has ended; until then its worlds would look diverged.
+        self.env.sim.settle()
         done = transition.terminated | transition.truncated
         infos = {
             "final_obs": self._array(transition.obs),

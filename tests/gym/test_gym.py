@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 import msk_ray.gym
 from msk_ray.config import Config, load_config, overlay, parse_config
 from msk_ray.envs import make_env
-from msk_ray.errors import ConfigError
+from msk_ray.errors import ConfigError, SimulationError
 from msk_ray.gym import BatchedEnv, SingleEnv
 from msk_ray.gym.c_simulation import CSimulation
 from msk_ray.gym.stable_baselines import StableBaselinesEnv
@@ -159,6 +159,34 @@ def test_without_gymnasium_it_says_what_to_install(monkeypatch: pytest.MonkeyPat
 def test_actions_of_another_shape_are_refused(batched: BatchedEnv[np.ndarray]) -> None:
     with pytest.raises(ConfigError, match=r"actions have shape \(4,\), but 4 worlds take \(4, 1\)"):
         batched.step(np.zeros(4, np.float32))
+
+
+def _fall(env: BatchedEnv[Any], action: Any) -> None:
+    """A second in which an ant comes down."""
+    for _ in range(60):
+        env.step(action)
+
+
+def test_lost_contacts_are_an_error() -> None:
+    config = load_config("ant", ["physics.nconmax=1", "physics.njmax=4"])
+    env: BatchedEnv[np.ndarray] = BatchedEnv(config, 1)
+    env.reset(seed=0)
+    with pytest.raises(SimulationError, match=r"physics\.n(con|j)max"):
+        _fall(env, np.zeros((1, 8), np.float32))
+
+
+@pytest.mark.gpu
+def test_tensors_stay_on_the_gpu_and_lost_contacts_are_an_error_there() -> None:
+    env: BatchedEnv[torch.Tensor] = BatchedEnv("ant", 4, "cuda", arrays="torch")
+    obs, _ = env.reset(seed=0)
+    obs, reward, terminated, *_ = env.step(torch.zeros(4, 8, device="cuda"))
+    assert {t.device.type for t in (obs, reward, terminated)} == {"cuda"}
+    tight: BatchedEnv[torch.Tensor] = BatchedEnv(
+        load_config("ant", ["physics.nconmax=1", "physics.njmax=4"]), 1, "cuda", arrays="torch"
+    )
+    tight.reset(seed=0)
+    with pytest.raises(SimulationError, match=r"physics\.n(con|j)max"):
+        _fall(tight, torch.zeros(1, 8, device="cuda"))
 
 
 def test_an_environment_from_outside(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
