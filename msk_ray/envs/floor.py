@@ -1,15 +1,17 @@
 """Contact with the floor and joint limits of the bodies of DiffRL's suite, hard or as in dflex.
 
-dflex (Xu et al. 2022, arXiv:2204.07137; `dflex/dflex/sim.py` of github.com/NVlabs/DiffRL, `eval_rigid_contacts_art` and
-`jcalc_tau`) pushes a point at depth c out of the floor with k_e·c, and slows it along the floor with k_f·|v|, up to
-μ·k_e·c. A joint beyond its range is pushed back by k_l per rad; its damper d_l acts at every angle.
+dflex (Xu et al. 2022, arXiv:2204.07137; `eval_rigid_contacts_art` and `jcalc_tau` in `dflex/dflex/sim.py` of
+github.com/NVlabs/DiffRL) pushes a point at depth c out of the floor with k_e·c, damps its approach with k_d·c·|v|, and
+slows it along the floor with k_f·|v|, up to μ·k_e·c. A joint beyond its range is pushed back by k_l per rad; its damper
+d_l acts at every angle.
 
-MuJoCo's constraint force in place (no acceleration along the row) is D (d·k·c − b·v), with D = d / ((1 − d) A) for the
-impedance d and the inverse inertia A that MuJoCo assumes for the row (see "constraint model" in its documentation). A
-depends on the body, so that every pair of a geom with the floor has its own k = k_e / (d D) and friction damping
-b = k_f / D, and every joint its own k = k_l / (d D). Then the floor gives way under a weight as dflex's does, and
-friction is viscous up to the same speed. What differs: contact is critically damped, where dflex damps in proportion to
-the depth; a limit damps by d_l once more; and an impedance of 0.9 resists acceleration too.
+MuJoCo's constraint force is D (d·k·c − b·v − a), with D = d / ((1 − d) A) for the impedance d, the inverse inertia A
+that MuJoCo assumes for the row, and the acceleration a along it (see "constraint model" in its documentation). A
+depends on the body, so that every pair of a geom with the floor has its own k = k_e / (d D), and its own dampings
+k_d·(1 cm) / D and k_f / D, and every joint its own k = k_l / (d D). A small impedance leaves little of the inertia D;
+what remains are dflex's springs and dampers, but for the damping of the approach, which here neither grows with depth
+nor ends when the point leaves. Light bodies have as much impedance as keeps their friction stable at the time step.
+`benchmarks/dflex_floor.py` scores policies under both.
 """
 
 from collections.abc import Mapping
@@ -23,9 +25,10 @@ from msk_ray.config.physics import Vec2, Vec5
 from msk_ray.config.sections import EnvSettings
 from msk_ray.envs.options import add_sky, apply_options
 
-_IMPEDANCE = 0.9
-_CONSTANT: Vec5 = (_IMPEDANCE, _IMPEDANCE, 0.01, 0.5, 2.0)
-"""An impedance that does not depend on the depth."""
+_IMPEDANCE = 0.2
+"""The smallest."""
+_DEPTH = 0.01
+"""Depth [m] at which the damping of the approach is that of dflex."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +52,8 @@ class SpringContacts:
 
     stiffness: float
     """k_e of a contact [N/m]."""
+    damping: float
+    """k_d of a contact, per depth [N s/m²]."""
     friction_damping: float
     """k_f of a contact [N s/m]."""
     friction: float
@@ -77,11 +82,9 @@ def compile_on_floor(
             pair.margin, pair.solref, pair.solimp = contacts.margin, list(contacts.solref), list(contacts.solimp)
             sliding = contacts.frictions.get(name, contacts.friction)
         else:
-            pair.solimp, sliding = list(_CONSTANT), contacts.friction
+            sliding = contacts.friction
         pair.friction = [sliding, sliding, 0.005, 0.0001, 0.0001]
     for joint in _actuated(spec):
-        if isinstance(contacts, SpringContacts):
-            joint.solimp_limit = list(_CONSTANT)
         if physics.joint_damping is not None:
             joint.damping[0] = physics.joint_damping
         if physics.armature is not None:
@@ -118,19 +121,28 @@ def _actuated(spec: mujoco.MjSpec) -> list[mujoco.MjsJoint]:
 def _match(spec: mujoco.MjSpec, contacts: SpringContacts) -> None:
     """Give every pair and limit the reference that has the springs and dampers of `contacts` in place."""
     model = spec.compile()
-    slack = (1.0 - _IMPEDANCE) / _IMPEDANCE  # 1 / D = slack · A
     elliptic = model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
     for pair in spec.pairs:
-        inverse = slack * model.body_invweight0[model.geom(pair.geomname2).bodyid[0], 0]
-        # MuJoCo's references: k = 1 / (d τ)² and b = 2 / (d τ) for a damping ratio of one.
-        pair.solref = [1.0 / np.sqrt(_IMPEDANCE * contacts.stiffness * inverse), 1.0]
+        mobility = model.body_invweight0[model.geom(pair.geomname2).bodyid[0], 0]  # A
+        # MuJoCo holds friction's time constant, 2 / ((1 − d) k_f A), above two time steps.
+        impedance = max(_IMPEDANCE, 1.0 - 1.0 / (model.opt.timestep * contacts.friction_damping * mobility))
+        inverse = (1.0 - impedance) / impedance * mobility  # 1 / D
+        # Its references are b = 2 / (d τ), and k = 1 / (d τ r)² = (b / 2r)² for the damping ratio r.
+        stiffness, damping = contacts.stiffness * inverse / impedance, _DEPTH * contacts.damping * inverse
+        pair.solref = [2.0 / (impedance * damping), damping / (2.0 * np.sqrt(stiffness))]
+        pair.solimp = _constant(impedance)
         if elliptic:  # the pyramid has no friction directions of its own
-            pair.solreffriction = [2.0 / (_IMPEDANCE * contacts.friction_damping * inverse), 1.0]
+            pair.solreffriction = [2.0 / (impedance * contacts.friction_damping * inverse), 1.0]
     for joint in _actuated(spec):
-        inverse = slack * model.dof_invweight0[model.joint(joint.name).dofadr[0]]
-        # Two negative numbers are -k d² and -b d.
-        stiffness, damping = contacts.limit_stiffness * inverse, contacts.limit_damping * inverse
-        joint.solref_limit = [-stiffness * _IMPEDANCE, -damping * _IMPEDANCE]
+        inverse = (1.0 - _IMPEDANCE) / _IMPEDANCE * model.dof_invweight0[model.joint(joint.name).dofadr[0]]
+        # Two numbers that are not positive are -k d² and -b d; the joint has dflex's damper already.
+        joint.solref_limit = [-contacts.limit_stiffness * inverse * _IMPEDANCE, 0.0]
+        joint.solimp_limit = _constant(_IMPEDANCE)
+
+
+def _constant(impedance: float) -> list[float]:
+    """An impedance that does not depend on the depth."""
+    return [impedance, impedance, 0.01, 0.5, 2.0]
 
 
 def _override(spec: mujoco.MjSpec, physics: PhysicsConfig) -> None:

@@ -19,8 +19,9 @@ from msk_ray.simulation import Simulation, StepState
 
 SIZES = {"hopper": (6, 6, 3, 4), "cheetah": (9, 9, 6, 8), "humanoid": (28, 27, 21, 19)}
 """nq, nv, nu and pairs with the floor."""
-GROUND = {"hopper": (2e4, 1e3, 0.9), "cheetah": (2e4, 1e3, 1.0), "humanoid": (2e4, 1e3, 0.75)}
-"""dflex's contact: stiffness [N/m], friction damping [N s/m], friction coefficient (envs/*.py of NVlabs/DiffRL)."""
+GROUND = {"hopper": (2e4, 1e3, 1e3, 0.9), "cheetah": (2e4, 1e3, 1e3, 1.0), "humanoid": (2e4, 5e3, 1e3, 0.75)}
+"""dflex's contact: stiffness [N/m], damping per depth [N s/m²], friction damping [N s/m], friction coefficient
+(envs/*.py of NVlabs/DiffRL)."""
 
 
 def model_of(name: str, **physics: Any) -> mujoco.MjModel:
@@ -134,20 +135,21 @@ def test_measures_of_the_sources() -> None:
 
 @pytest.mark.parametrize("name", sorted(SIZES))
 def test_a_foot_pressed_into_the_floor_is_pushed_as_in_dflex(name: str) -> None:
-    """D (d k c − b v) in place: k_e·c up, −k_f·v along the floor, and 1000 N m/rad from a limit."""
-    stiffness, damping, friction = GROUND[name]
+    """D (d k c − b v): k_e·c and −k_d·(1 cm)·v up, −k_f·v along the floor, and 1000 N m/rad from a limit."""
+    stiffness, damping, viscosity, friction = GROUND[name]
     model = model_of(name)
     assert set(model.pair_friction[:, 0]) == {friction}
     data = pressed(model, 0.005)
     data.qvel[0] = 0.02
+    data.qvel[2 if model.nq > model.nv else 1] = -0.5
     mujoco.mj_forward(model, data)
     force = data.efc_D * data.efc_aref
     assert data.ncon >= 1
     for contact in data.contact:
         row = contact.efc_address
-        assert force[row] == pytest.approx(-stiffness * contact.dist, rel=1e-6)
+        assert force[row] == pytest.approx(-stiffness * contact.dist + 0.01 * damping * 0.5, rel=1e-6)
         along = contact.frame.reshape(3, 3)[1:, 0]
-        assert force[row + 1 : row + 3] == pytest.approx(-damping * 0.02 * along, abs=1e-6)
+        assert force[row + 1 : row + 3] == pytest.approx(-viscosity * 0.02 * along, abs=1e-6)
     last = model.njnt - 1
     data.qvel[:] = 0.0
     data.qpos[model.jnt_qposadr[last]] = model.jnt_range[last, 1] + 0.1

@@ -51,7 +51,7 @@ _MJCF = f"""
 """
 
 _CONTACTS: dict[str, HardContacts | SpringContacts] = {
-    "matched": SpringContacts(stiffness=2e4, friction_damping=1e3, friction=0.9),
+    "matched": SpringContacts(stiffness=2e4, damping=1e3, friction_damping=1e3, friction=0.9),
     "published": HardContacts(
         (0.02, 1.0), (0.8, 0.8, 0.01, 0.5, 2.0), friction=1.0, frictions={"foot": 2.0}, margin=0.001
     ),

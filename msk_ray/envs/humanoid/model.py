@@ -102,7 +102,7 @@ _BODY = """
 """
 
 _CONTACTS: dict[str, HardContacts | SpringContacts] = {
-    "matched": SpringContacts(stiffness=2e4, friction_damping=1e3, friction=0.75),
+    "matched": SpringContacts(stiffness=2e4, damping=5e3, friction_damping=1e3, friction=0.75),
     # A mean of the floor's and the body's, as MuJoCo mixes them.
     "published": HardContacts((0.0175, 1.0), (0.9, 0.97, 0.002, 0.5, 2.0), friction=1.0),
 }
