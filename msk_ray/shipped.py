@@ -23,12 +23,14 @@ def find_shipped(name: str | Path, folder: str, suffix: str) -> Path | None:
     """The file of a path or a name; None if there is none.
 
     Args:
-        name: a path, relative to the current folder or to `shipped_folder()`; or the name of a file of `folder`
-            without its suffix.
+        name: a path, relative to the current folder or, below `folder`, to `shipped_folder()`; or the name of a file of
+            `folder` without its suffix.
         folder: one of `CONFIGS`, `SPACES` and `POLICIES`.
         suffix: of the files in it, such as ".yaml".
     """
-    candidates = [Path(name), shipped_folder() / name]
+    candidates = [Path(name)]
+    if Path(name).parts[:1] == (folder,):
+        candidates.append(shipped_folder() / name)
     if is_name(name):
         candidates += [place / f"{name}{suffix}" for place in _places(folder)]
     return next((path.resolve() for path in candidates if path.is_file()), None)

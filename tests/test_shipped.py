@@ -77,6 +77,10 @@ def test_configs_and_spaces_are_found_from_anywhere(monkeypatch: pytest.MonkeyPa
     monkeypatch.chdir(tmp_path)
     assert load_config("cartpole") == load_config("configs/cartpole.yaml")
     assert load_space(find_space("ant_ablate")).base_path.name == "ant.yaml"
+    assert shipped.find_shipped("policies/cartpole.pt", "policies", ".pt") == shipped.find_shipped(
+        "cartpole", "policies", ".pt"
+    )
+    assert shipped.find_shipped("README.md", "policies", ".pt") is None, "not everything beside the package"
     with pytest.raises(ConfigError, match=r"unknown config 'cartpol'; known: ant, .*cartpole.*or give a path"):
         load_config("cartpol")
 
