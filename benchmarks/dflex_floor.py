@@ -44,6 +44,7 @@ class Law:
 
 
 LAWS = {
+    "ant": Law(4e4, 1e4, 3e3, 0.75),
     "hopper": Law(2e4, 1e3, 1e3, 0.9),
     "cheetah": Law(2e4, 1e3, 1e3, 1.0),
     "humanoid": Law(2e4, 5e3, 1e3, 0.75),
