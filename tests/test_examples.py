@@ -46,7 +46,7 @@ def test_the_space_of_frictions_has_trials_with_and_without(monkeypatch):
         trials = resolve_trials(load_space(EXAMPLES / "tray_friction.yaml"))
     finally:
         sys.modules.pop("tray", None)
-    assert [trial.config.physics.randomize is None for trial in trials] == [True, False] * 3
+    assert [trial.config.physics.randomize is None for trial in trials] == [True, False] * 5
 
 
 def test_bouncing_ball(monkeypatch, capsys, tmp_path):
