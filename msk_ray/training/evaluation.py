@@ -11,7 +11,7 @@ from msk_ray.config import Config, PhysicsConfig, RandomizeConfig
 from msk_ray.envs import Env, env_class, make_env
 from msk_ray.envs.base import Resets, Transition
 from msk_ray.simulation import StepState
-from msk_ray.training.policy_group import Policy, PolicyGroup
+from msk_ray.training.policy_group import Policy, PolicyGroup, streams_for
 
 OnStep = Callable[[StepState, Tensor], None]
 _CHECK_EVERY = 25
@@ -95,6 +95,7 @@ class Evaluator:
         self.env.generator = torch.Generator()
         self.steps = steps
         self._policies = policies
+        self._streams = streams_for(self.env.device) if policies > 1 else []
         self._worlds = e.nworld
         self._tail = min(steps, math.ceil(1.0 / settings.control_timestep))
 
@@ -134,7 +135,7 @@ class Evaluator:
         env = self.env
         env.generator.manual_seed(self._seed if seed is None else seed)
         self._reset()
-        policy = PolicyGroup(policies, self._worlds, env)
+        policy = PolicyGroup(policies, self._worlds, env, self._streams)
         record = _Record(env, len(policies), self._worlds, self.steps - self._tail)
         control = torch.zeros((env.nworld, env.model.nu), device=env.device)
         for step in range(self.steps):

@@ -12,7 +12,16 @@ from msk_ray.simulation.capture import Recording, fill
 
 Policy = Callable[[Tensor], Tensor]
 """Raw observations (W, O) to actions (W, A)."""
-_SIDE_STREAMS = 8
+_STREAMS = 5
+"""One on which a group is recorded, and others on which its policies run."""
+
+
+def streams_for(device: torch.device) -> list[torch.cuda.Stream]:
+    """CUDA streams for groups of policies, none on another device.
+
+    Make them once: cuBLAS keeps a workspace for each stream that it was used on.
+    """
+    return [torch.cuda.Stream(device) for _ in range(_STREAMS)] if device.type == "cuda" else []
 
 
 class PolicyGroup:
@@ -25,18 +34,22 @@ class PolicyGroup:
         policies: they must not change while the group is used.
         worlds: number of worlds of each.
         env: the worlds, at least `worlds` for each policy.
+        streams: those of `streams_for` the device, which no other group uses at the same time.
     """
 
-    def __init__(self, policies: Sequence[Policy], worlds: int, env: Env[Any]) -> None:
+    def __init__(
+        self, policies: Sequence[Policy], worlds: int, env: Env[Any], streams: Sequence[torch.cuda.Stream]
+    ) -> None:
         self._policies = policies
         self._worlds = worlds
         self._idle = torch.zeros((env.nworld - len(policies) * worlds, env.action_size), device=env.device)
-        self._records = env.device.type == "cuda" and len(policies) > 1
+        self._streams = streams
+        self._records = bool(streams) and len(policies) > 1
         self._recording: Recording[Tensor] | None = None
         self._obs: Tensor | None = None
         if self._records:
-            self._main = torch.cuda.Stream(env.device)
-            self._sides = [torch.cuda.Stream(env.device) for _ in range(min(_SIDE_STREAMS, len(policies)))]
+            # torch hands out the same streams again after 32: a recording that still runs may share a workspace.
+            torch.cuda.synchronize(env.device)
 
     def __call__(self, obs: Tensor) -> Tensor:
         if not self._records:
@@ -56,20 +69,20 @@ class PolicyGroup:
         return torch.cat([*actions, self._idle])
 
     def _act_side_by_side(self, obs: Tensor) -> Tensor:
-        main = torch.cuda.current_stream(obs.device)
-        for side in self._sides:
+        main, sides = torch.cuda.current_stream(obs.device), self._streams[1:]
+        for side in sides:
             side.wait_stream(main)
         actions = []
         for k, policy in enumerate(self._policies):
-            with torch.cuda.stream(self._sides[k % len(self._sides)]):
+            with torch.cuda.stream(sides[k % len(sides)]):
                 actions.append(policy(obs[k * self._worlds : (k + 1) * self._worlds]))
-        for side in self._sides:
+        for side in sides:
             main.wait_stream(side)
         return torch.cat([*actions, self._idle])
 
     def _record(self, obs: Tensor) -> None:
         try:
-            self._recording = Recording(lambda: self._act_side_by_side(obs), self._main)
+            self._recording = Recording(lambda: self._act_side_by_side(obs), self._streams[0])
         except RuntimeError as error:
             self._records = False
             torch.cuda.empty_cache()
