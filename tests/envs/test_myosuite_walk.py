@@ -28,22 +28,23 @@ def settings(**changes: Any) -> MyoSuiteWalkSettings:
     return MyoSuiteWalkSettings(name="myosuite_walk", model=MODEL, **changes)
 
 
-def make(nworld: int, seed: int = 0, **changes: Any) -> MyoSuiteWalk:
-    env = make_env(settings(**changes), PhysicsConfig(), nworld, "cpu", seed, differentiable=False)
+def make(nworld: int, device: str = "cpu", **changes: Any) -> MyoSuiteWalk:
+    env = make_env(settings(**changes), PhysicsConfig(), nworld, device, 0, differentiable=False)
     assert isinstance(env, MyoSuiteWalk)
     return env
 
 
-def test_episodes_are_those_of_myosuite() -> None:
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=pytest.mark.gpu)])
+def test_episodes_are_those_of_myosuite(device: str) -> None:
     """100 random steps in four episodes, free-running from their initial states: contact, muscles, falls, phase."""
     recorded = np.load(RECORDED / "steps.npz")
-    steps = {name: torch.as_tensor(recorded[name]) for name in recorded if name != "versions"}
+    steps = {name: torch.as_tensor(recorded[name], device=device) for name in recorded if name != "versions"}
     starts = torch.nonzero(steps["age"] == 0).flatten()
-    lengths = torch.diff(torch.cat((starts, torch.tensor([100])))).tolist()
-    env = make(len(starts), smoothing=0.0)
+    lengths = torch.diff(starts, append=torch.tensor([100], device=device)).tolist()
+    env = make(len(starts), device, smoothing=0.0)
     physics = StepState(*(steps[name][starts] for name in ("qpos", "qvel", "act")))
-    none = torch.zeros(len(starts), 0)
-    env.state = EnvState(physics, torch.zeros(len(starts), 80), torch.zeros(len(starts), dtype=torch.long), none)
+    none = torch.zeros((len(starts), 0), device=device)
+    env.state = EnvState(physics, torch.zeros_like(steps["action"][starts]), torch.zeros_like(starts), none)
     seen = 0
     for step in range(max(lengths)):
         running = [w for w, length in enumerate(lengths) if step < length]
