@@ -18,6 +18,8 @@ $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit("msk_ray needs Python 3.11 or newer: make PYTHON=python3.12 ...") if sys.version_info < (3, 11) else None'
 	$(PYTHON) -m venv $(VENV)
 	$(RUN) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	# Its models, for tests: MyoSuite itself needs an older MuJoCo.
+	$(RUN) -m pip install --quiet --disable-pip-version-check --no-deps --upgrade --target $(VENV)/share/myosuite myosuite==2.12.2
 	touch $@
 
 demo: env            ## a real small Ray Tune sweep (GPU if there is one), ending in its table and report

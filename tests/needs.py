@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from pathlib import Path
 
 import pytest
 
@@ -24,6 +25,11 @@ def need_drawing() -> str:
         return headless_backend()
     except DeviceError as error:
         return _missing(str(error))
+
+
+def need_file(path: Path, command: str) -> Path:
+    """`path`, if the file is there; `command` makes it."""
+    return path if path.is_file() else Path(_missing(f"there is no {path}: {command}"))
 
 
 def _missing(why: str) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from myosuite_model import walk_model
 
 from msk_ray.config import PhysicsConfig, load_config
 from msk_ray.envs import make_env
@@ -21,11 +22,10 @@ from msk_ray.simulation import Simulation, StepState
 from msk_ray.training import Trainer
 
 RECORDED = Path(__file__).parents[1] / "fixtures" / "myosuite_walk"
-MODEL = str(RECORDED / "myolegs.xml")
 
 
 def settings(**changes: Any) -> MyoSuiteWalkSettings:
-    return MyoSuiteWalkSettings(name="myosuite_walk", model=MODEL, **changes)
+    return MyoSuiteWalkSettings(name="myosuite_walk", model=walk_model(), **changes)
 
 
 def make(nworld: int, device: str = "cpu", **changes: Any) -> MyoSuiteWalk:
@@ -131,7 +131,7 @@ def test_scores_are_without_what_makes_training_easier() -> None:
 
 
 def test_the_config_trains(root: Path, tmp_path: Path) -> None:
-    small = (f"env.model={MODEL}", "env.nworld=2", "shac.horizon=2", "trial.epochs=1", "actor.hidden=[8]")
+    small = (f"env.model={walk_model()}", "env.nworld=2", "shac.horizon=2", "trial.epochs=1", "actor.hidden=[8]")
     rest = ("critic.hidden=[8]", "evaluation.nworld=2", "evaluation.steps=2", "evaluation.interval=1")
     trainer = Trainer(load_config(root / "configs" / "myosuite_walk.yaml", [*small, *rest]), tmp_path, "cpu")
     before = torch.cat([p.detach().flatten().clone() for p in trainer.algorithm.actor.parameters()])
@@ -155,7 +155,7 @@ def test_a_model_that_is_not_myosuites_is_refused_on_one_line(tmp_path: Path, mo
         find_file(None)
     with pytest.raises(ConfigError, match=f"no file gone.xml; {install}"):
         find_file("gone.xml")
-    text = Path(MODEL).read_text()
+    text = Path(walk_model()).read_text()
     for old, new, why in (
         ("<keyframe>", "<keyframe><key/>", "has 5 keyframes, not MyoSuite's 4"),
         ('name="hip_rotation_l"', 'name="hip_turn_l"', "has no hip_rotation_l"),

@@ -1,12 +1,12 @@
 """A setting of the physics section does something, or is refused: in every environment, with every backward mode."""
 
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
+from myosuite_model import walk_model
 
 from msk_ray.config import Config, PhysicsConfig, overlay, parse_config
 from msk_ray.config.physics import FdConfig
@@ -65,7 +65,6 @@ UNREAD_BY = {
 }
 
 
-WALK = str(Path(__file__).parents[1] / "fixtures" / "myosuite_walk" / "myolegs.xml")
 LEGS = """<mujoco><worldbody><geom type="plane" size="1 1 1"/><body name="root" pos="0 0 .8"><freejoint/>
 <geom size=".1" mass="1"/>
 <body><joint name="hip_flexion_r"/><geom size=".1" mass="1"/></body>
@@ -85,7 +84,7 @@ def _settings(env: str, backward: str, legs: str) -> dict[str, Any]:
     if env == "myoleg":
         settings["env"] |= {"model": legs}
     if env == "myosuite_walk":
-        settings["env"] |= {"model": WALK}
+        settings["env"] |= {"model": walk_model()}
     return settings
 
 

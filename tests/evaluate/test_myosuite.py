@@ -7,14 +7,13 @@ from typing import Any
 
 import pytest
 import torch
+from myosuite_model import walk_model
 
 from msk_ray.cli import run
 from msk_ray.config import load_config
 from msk_ray.evaluate.__main__ import main
 from msk_ray.evaluate.measure import read_evaluations
 from msk_ray.training import Trainer
-
-MODEL = Path(__file__).parents[1] / "fixtures" / "myosuite_walk" / "myolegs.xml"
 
 # Episodes without end (init), or of 3 steps that end with a fall (random). A step's reward is its number plus the seed.
 STAND_IN = """
@@ -53,7 +52,7 @@ gym = types.SimpleNamespace(make=Env)
 @pytest.fixture(scope="module")
 def trial(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of an untrained policy."""
-    small = (f"env.model={MODEL}", "env.nworld=2", "shac.horizon=2", "actor.hidden=[8]", "critic.hidden=[8]")
+    small = (f"env.model={walk_model()}", "env.nworld=2", "shac.horizon=2", "actor.hidden=[8]", "critic.hidden=[8]")
     config = load_config("myosuite_walk", [*small, "evaluation.nworld=1"])
     folder = tmp_path_factory.mktemp("walk") / "trial"
     trainer = Trainer(config, folder, "cpu")

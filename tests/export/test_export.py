@@ -11,6 +11,7 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
+from myosuite_model import walk_model
 
 import msk_ray
 from msk_ray.cli import run
@@ -155,8 +156,7 @@ def test_without_onnx_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.parametrize("name", ["cartpole", "ant", "cheetah", "myoleg26", "myosuite_walk"])
 def test_layouts_name_the_entries_of_observations(name: str) -> None:
-    model = Path(__file__).parents[1] / "fixtures" / "myosuite_walk" / "myolegs.xml"
-    config = load_config(name, [f"env.model={model}"] if name == "myosuite_walk" else [])
+    config = load_config(name, [f"env.model={walk_model()}"] if name == "myosuite_walk" else [])
     env = make_env(config.env, config.physics, 1, "cpu", 0, differentiable=False)
     names = [entry.name for entry in env.observation_layout() or ()]
     assert len(names) == len(set(names)) == env.obs_size
