@@ -191,10 +191,16 @@ def test_a_real_trainer_leaves_one_curve(
     tiny_settings: dict[str, Any], make_space: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Crowded(Trainer):
-        def _run_epoch(self) -> dict[str, float]:
-            if self.epoch == 3 and self.env.nworld > 4:
-                raise RuntimeError("Failed to allocate 8589934592 bytes on device 'cuda:0'")
-            return super()._run_epoch()
+        def __init__(self, *args: Any, **kwargs: Any) -> None:
+            super().__init__(*args, **kwargs)
+            update = self.algorithm.update
+
+            def crowded(epoch: int) -> Any:
+                if epoch == 3 and self.env.nworld > 4:
+                    raise RuntimeError("Failed to allocate 8589934592 bytes on device 'cuda:0'")
+                return update(epoch)
+
+            monkeypatch.setattr(self.algorithm, "update", crowded)
 
     (tmp_path / "base.yaml").write_text(dump_yaml(tiny_settings))
     (trial,) = resolve_trials(make_space(parameters={}))
