@@ -9,6 +9,7 @@ import pytest
 from needs import need_program
 from processes import Launcher
 
+from msk_ray import signals
 from msk_ray.config import Config, dump_yaml, load_config, parse_config
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.sweep import opening
@@ -48,6 +49,16 @@ def hangup() -> Iterator[None]:
     before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     yield
     signal.signal(signal.SIGHUP, before)
+
+
+@pytest.fixture(autouse=True)
+def signals_as_before(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """What a program that a test runs in this process makes of signals for good ends with the test."""
+    before = {number: signal.getsignal(number) for number in signals.NUMBERS}
+    monkeypatch.setattr(signals, "_current", None)
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture(autouse=True)

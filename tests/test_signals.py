@@ -7,7 +7,8 @@ import sys
 
 import pytest
 
-from msk_ray.signals import NUMBERS, RESUMABLE, listening
+from msk_ray.__main__ import main
+from msk_ray.signals import NUMBERS, RESUMABLE, current, listening
 
 
 @pytest.mark.parametrize("number", NUMBERS)
@@ -88,3 +89,16 @@ def test_from_the_first_line_to_the_last(body: str, code: int, output: str) -> N
     assert (done.returncode, done.stdout) == (code, "")
     assert done.stderr.endswith(output)
     assert "Traceback" not in done.stderr
+
+
+def test_a_program_run_in_this_process_takes_no_signal_for_good() -> None:
+    """Which `signals_as_before` of conftest.py sees to; the next test fails without it."""
+    with pytest.raises(SystemExit) as ended:
+        main(["train", "--help"])
+    assert ended.value.code == 0
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_IGN
+
+
+def test_after_it_signals_do_what_they_did_before() -> None:
+    assert current() is None
+    assert signal.getsignal(signal.SIGTERM) is not signal.SIG_IGN
