@@ -23,7 +23,7 @@ import numpy as np
 from msk_ray.config import PhysicsConfig
 from msk_ray.config.physics import Vec2, Vec5
 from msk_ray.config.sections import EnvSettings
-from msk_ray.envs.options import add_sky, apply_options
+from msk_ray.envs.options import add_grid, add_sky, apply_options
 
 _IMPEDANCE = 0.2
 """The smallest."""
@@ -96,20 +96,10 @@ def compile_on_floor(
 
 
 def _add_floor(spec: mujoco.MjSpec) -> None:
-    spec.add_texture(
-        name="grid",
-        type=mujoco.mjtTexture.mjTEXTURE_2D,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
-        rgb1=[0.25, 0.3, 0.35],
-        rgb2=[0.32, 0.38, 0.44],
-        width=256,
-        height=256,
-    )
-    material = spec.add_material(name="grid", texrepeat=[1, 1], texuniform=True)
-    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "grid"
+    grid = add_grid(spec)
     plane = mujoco.mjtGeom.mjGEOM_PLANE
     spec.worldbody.add_geom(
-        name="floor", type=plane, size=[0, 0, 1], material="grid", contype=0, conaffinity=0, pos=[0, 0, 0]
+        name="floor", type=plane, size=[0, 0, 1], material=grid, contype=0, conaffinity=0, pos=[0, 0, 0]
     )
 
 

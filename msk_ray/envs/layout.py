@@ -35,18 +35,3 @@ def floating_body(model: mujoco.MjModel) -> list[Entry]:
         *entries((f"{name}_angle" for name in hinges), "rad"),
         *entries((f"{name}_rate" for name in hinges), "10 rad/s"),
     ]
-
-
-def planar_body(model: mujoco.MjModel) -> list[Entry]:
-    """Coordinates of a body in a plane, all but the first, and the velocities of all; joints slide or turn."""
-    slides = model.jnt_type == int(mujoco.mjtJoint.mjJNT_SLIDE)
-    names = [model.joint(i).name for i in range(model.njnt)]
-    places = [
-        Entry(f"{name}_position", "m") if slide else Entry(f"{name}_angle", "rad")
-        for name, slide in zip(names, slides, strict=True)
-    ]
-    rates = [
-        Entry(f"{name}_velocity", "m/s") if slide else Entry(f"{name}_rate", "rad/s")
-        for name, slide in zip(names, slides, strict=True)
-    ]
-    return [*places[1:], *rates]

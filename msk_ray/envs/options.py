@@ -26,6 +26,22 @@ def add_sky(spec: mujoco.MjSpec) -> None:
     )
 
 
+def add_grid(spec: mujoco.MjSpec) -> str:
+    """A chequered material for the ground. Returns its name."""
+    spec.add_texture(
+        name="grid",
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=[0.25, 0.3, 0.35],
+        rgb2=[0.32, 0.38, 0.44],
+        width=256,
+        height=256,
+    )
+    material = spec.add_material(name="grid", texrepeat=[1, 1], texuniform=True)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "grid"
+    return "grid"
+
+
 def apply_options(spec: mujoco.MjSpec, physics: PhysicsConfig, control_timestep: float) -> None:
     """Set timestep, solver and cone of `spec`: Newton, dense Jacobians and Euler, then what `physics` says."""
     option = spec.option

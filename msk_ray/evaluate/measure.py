@@ -5,7 +5,7 @@ import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -26,7 +26,7 @@ from msk_ray.training.threads import use_threads
 
 FORMAT = 1
 REFERENCE, OWN = "reference", "own"
-PACKAGES = ("msk-ray", "torch", "warp-lang", "mujoco", "mujoco-warp")
+_PACKAGES = ("msk-ray", "torch", "warp-lang", "mujoco", "mujoco-warp")
 
 
 @dataclass(frozen=True)
@@ -121,24 +121,41 @@ class Bench:
             and request.steps in (None, own.steps or policy.config.env.episode_length)
             and named_physics(policy.config, request.physics)[1] == reference
         )
-        return {
-            "checkpoint": policy.path.name,
-            "sha256": policy.sha256,
-            "epoch": policy.epoch,
-            "env_steps": policy.env_steps,
-            "physics": physics,
-            "canonical": canonical,
-            "worlds": evaluator.env.nworld,
-            "seeds": list(seeds),
-            "steps": evaluator.steps,
-            **figures(runs, evaluator.env.reward_names),
-            "scores": [round(float(s), 6) for run in runs for s in run.score],
-            "score_by_seed": {str(seed): float(run.score.mean()) for seed, run in zip(seeds, runs, strict=True)},
-            "device": device_name(self._device),
-            "packages": installed_versions(PACKAGES),
-            "python": platform.python_version(),
-            "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        }
+        made = Made(physics, canonical, evaluator.env.nworld, seeds, evaluator.steps, device_name(self._device))
+        return entry_of(policy, made, runs, evaluator.env.reward_names)
+
+
+class Made(NamedTuple):
+    """How an evaluation was made, by the names of `eval.json`."""
+
+    physics: str
+    canonical: bool
+    """Whether its score is comparable with `eval/score`."""
+    worlds: int
+    seeds: Sequence[int]
+    steps: int
+    device: str
+
+
+def entry_of(policy: SavedPolicy, made: Made, runs: Sequence[Episodes], reward_names: Sequence[str]) -> dict[str, Any]:
+    """One entry of `eval.json`: what was evaluated, how, and the results of one run for each seed."""
+    how = made._asdict()
+    device = how.pop("device")
+    return {
+        "checkpoint": policy.path.name,
+        "sha256": policy.sha256,
+        "epoch": policy.epoch,
+        "env_steps": policy.env_steps,
+        **how,
+        "seeds": list(made.seeds),
+        **figures(runs, reward_names),
+        "scores": [round(float(s), 6) for run in runs for s in run.score],
+        "score_by_seed": {str(seed): float(run.score.mean()) for seed, run in zip(made.seeds, runs, strict=True)},
+        "device": device,
+        "packages": installed_versions(_PACKAGES),
+        "python": platform.python_version(),
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    }
 
 
 def figures(runs: Sequence[Episodes], reward_names: Sequence[str]) -> dict[str, Any]:

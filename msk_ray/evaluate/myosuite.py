@@ -3,9 +3,7 @@
 MyoSuite 2.12 needs MuJoCo 3.6 and msk_ray 4.0, so one environment cannot hold both.
 """
 
-import datetime
 import json
-import platform
 import subprocess
 import tempfile
 from collections.abc import Sequence
@@ -22,8 +20,7 @@ from msk_ray.envs.myosuite_walk.config import MyoSuiteWalkSettings
 from msk_ray.errors import ConfigError, SimulationError
 from msk_ray.evaluate import myosuite_worker as worker
 from msk_ray.evaluate.apart import INSTALL
-from msk_ray.evaluate.measure import PACKAGES, Request, figures
-from msk_ray.experiment.versions import installed_versions
+from msk_ray.evaluate.measure import Made, Request, entry_of
 from msk_ray.training import SavedPolicy
 from msk_ray.training.evaluation import Episodes
 from msk_ray.training.threads import use_threads
@@ -88,25 +85,8 @@ class MyoSuiteBench:
             with _Worker(self._python, {**asked, "episodes": request.worlds, "steps": request.steps}) as running:
                 runs.append(running.episodes(policy, request.worlds, request.steps))
                 versions = running.versions
-        return {
-            "checkpoint": policy.path.name,
-            "sha256": policy.sha256,
-            "epoch": policy.epoch,
-            "env_steps": policy.env_steps,
-            "physics": request.physics,
-            "canonical": False,
-            "worlds": request.worlds,
-            "seeds": list(seeds),
-            "steps": request.steps,
-            **figures(runs, worker.TERMS),
-            "scores": [round(float(s), 6) for run in runs for s in run.score],
-            "score_by_seed": {str(seed): float(run.score.mean()) for seed, run in zip(seeds, runs, strict=True)},
-            "device": "cpu",
-            "packages": installed_versions(PACKAGES),
-            "myosuite": versions,
-            "python": platform.python_version(),
-            "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        }
+        made = Made(request.physics, False, request.worlds, seeds, request.steps, "cpu")
+        return entry_of(policy, made, runs, worker.TERMS) | {"myosuite": versions}
 
 
 class _Worker(AbstractContextManager["_Worker"]):

@@ -30,6 +30,7 @@ from msk_ray.group import PeerLost, ProcessGroup
 from msk_ray.signals import NUMBERS
 from msk_ray.simulation import use_device
 from msk_ray.training.learner import follow
+from msk_ray.training.place import Place
 from msk_ray.training.trainer import Trainer
 
 _PATIENCE_S = 5.0
@@ -91,7 +92,7 @@ class _Failure:
     error: Exception
 
 
-class ParallelTrainer:
+class ParallelTrainer(Place):
     """A `Trainer` in `trial.gpus` processes, each with its GPU and an equal part of the worlds.
 
     Every error ends all of them; the trial continues from its newest checkpoint in another trainer. Call `close` at the
@@ -109,9 +110,7 @@ class ParallelTrainer:
     """
 
     def __init__(self, config: Config, logdir: Path, device: str, together: int = 1) -> None:
-        self.config = config
-        self.logdir = logdir
-        self.epoch = 0
+        super().__init__(config, logdir)
         self._best_score = -math.inf
         devices = _devices(device, config.trial.gpus)
         self._scratch = tempfile.TemporaryDirectory(prefix="msk_ray_")
@@ -126,21 +125,6 @@ class ParallelTrainer:
         except BaseException:
             self._end()
             raise
-
-    @property
-    def checkpoints(self) -> Path:
-        """Folder of the checkpoints."""
-        return self.logdir / "checkpoints"
-
-    @property
-    def best_checkpoint(self) -> Path:
-        """Checkpoint of the policy with the best evaluation score."""
-        return self.checkpoints / "best.pt"
-
-    @property
-    def finished(self) -> bool:
-        """Whether all epochs are done."""
-        return self.epoch >= self.config.trial.epochs
 
     @property
     def best_score(self) -> float:

@@ -31,6 +31,7 @@ from msk_ray.training.checkpoint import (
 from msk_ray.training.evaluation import Evaluator
 from msk_ray.training.learner import load_state, make_algorithm, naming_memory, start_from
 from msk_ray.training.loggers import TrialLog
+from msk_ray.training.place import Place
 from msk_ray.training.policy import SavedPolicy
 from msk_ray.training.policy_group import Policy
 from msk_ray.training.unscored import UnscoredPolicies
@@ -48,7 +49,7 @@ _LONGEST_WAIT_S = 120.0
 """How long a policy waits for others to be scored with [s]."""
 
 
-class Trainer:
+class Trainer(Place):
     """One trial in this process.
 
     Writes `config.yaml`, `metrics.jsonl`, `checkpoints/` and the files of its loggers under `logdir`. The checkpoints
@@ -84,11 +85,9 @@ class Trainer:
                 "msk_ray.training.make_trainer"
             )
         algorithm_class(config)  # one that cannot be found is reported before anything is written
+        super().__init__(config, logdir)
         self._log = TrialLog(logdir, config)
         self._group = group
-        self.config = config
-        self.logdir = logdir
-        self.epoch = 0
         self.env_steps = 0
         self.best_score = -math.inf
         self._seconds = 0.0
@@ -110,21 +109,6 @@ class Trainer:
             self.evaluator = Evaluator(config, device, policies=self.together)
         self._damages: tuple[Damage, ...] = ()
         self._unreadable: list[str] = []
-
-    @property
-    def checkpoints(self) -> Path:
-        """Folder of the checkpoints."""
-        return self.logdir / "checkpoints"
-
-    @property
-    def best_checkpoint(self) -> Path:
-        """Checkpoint of the policy with the best evaluation score."""
-        return self.checkpoints / "best.pt"
-
-    @property
-    def finished(self) -> bool:
-        """Whether all epochs are done."""
-        return self.epoch >= self.config.trial.epochs
 
     @property
     def _evaluations(self) -> int:
@@ -305,10 +289,11 @@ class Trainer:
         rows = {int(row["epoch"]): row for row in read_rows(self.logdir)} if waiting else {}
         for epoch, found in zip(waiting, figures, strict=False):
             late = self._record(epoch, found, partial(self._unscored.state, epoch))
-            waited_s = rows[epoch].get("time/evaluation_s", 0.0) if epoch in rows else 0.0
-            row = rows.get(epoch) or {
-                key: self._unscored.state(epoch)[key] for key in ("epoch", "env_steps", "seconds")
-            }
+            row = rows.get(epoch)
+            if row is None:
+                state = self._unscored.state(epoch)
+                row = {key: state[key] for key in ("epoch", "env_steps", "seconds")}
+            waited_s = row.get("time/evaluation_s", 0.0)
             self._log.write_late(row, late | {"time/evaluation_s": waited_s + each_s})
             self._unscored.remove(epoch)
         return figures[len(waiting) :], each_s * len(waiting)

@@ -178,6 +178,15 @@ def speakers(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Speaker]]:
         speaker.other.close()
 
 
+def report(speakers: list[Speaker], said: dict[int, Exception | None]) -> None:
+    """Processes send their errors, or die where there is none, in this order."""
+    for number, error in said.items():
+        if error is None:
+            speakers[number].other.close()
+        else:
+            speakers[number].other.send(_Failure(error))
+
+
 def trainer_of(speakers: list[Speaker], monkeypatch: pytest.MonkeyPatch, folder: Path) -> ParallelTrainer:
     """A trainer whose processes are made up, after its start."""
     waiting = iter(speakers)
@@ -212,11 +221,7 @@ def test_the_reason_is_what_failed_first_and_not_what_follows_from_it(
 ) -> None:
     """Those who say nothing wait for the others, inside a GPU where no exception reaches them."""
     trainer = trainer_of(speakers, monkeypatch, tmp_path)
-    for number, error in said.items():
-        if error is None:
-            speakers[number].other.close()
-        else:
-            speakers[number].other.send(_Failure(error))
+    report(speakers, said)
     with pytest.raises(kind, match=message) as caught:
         trainer.run_epoch()
     if isinstance(caught.value, SimulationError):
@@ -234,11 +239,7 @@ def test_nobody_is_waited_for_who_could_say_nothing_more(
     for patience in ("_PATIENCE_S", "_SCORING_S"):
         monkeypatch.setattr(parallel, patience, 3600.0)
     trainer = trainer_of(speakers, monkeypatch, tmp_path)
-    for number, error in said.items():
-        if error is None:
-            speakers[number].other.close()
-        else:
-            speakers[number].other.send(_Failure(error))
+    report(speakers, said)
     with pytest.raises(RankLost if None in said.values() else SimulationError):
         trainer.run_epoch()
 

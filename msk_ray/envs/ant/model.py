@@ -12,7 +12,7 @@ import numpy as np
 
 from msk_ray.config import PhysicsConfig
 from msk_ray.envs.ant.config import AntSettings
-from msk_ray.envs.options import add_sky, apply_options
+from msk_ray.envs.options import add_grid, add_sky, apply_options
 
 STAND_HEIGHT = 0.75
 STAND_JOINTS = (0.0, 1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0)
@@ -112,19 +112,9 @@ def build_ant(env: AntSettings, physics: PhysicsConfig) -> mujoco.MjModel:
     apply_options(spec, physics.model_copy(update={"cone": p.cone}), env.control_timestep)
     add_sky(spec)
     world = spec.worldbody
-    spec.add_texture(
-        name="grid",
-        type=mujoco.mjtTexture.mjTEXTURE_2D,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
-        rgb1=[0.25, 0.3, 0.35],
-        rgb2=[0.32, 0.38, 0.44],
-        width=256,
-        height=256,
-    )
-    material = spec.add_material(name="grid", texrepeat=[1, 1], texuniform=True)
-    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "grid"
+    grid = add_grid(spec)
     ground = {"contype": 0, "conaffinity": 0}
-    world.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], material="grid", **ground)
+    world.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], material=grid, **ground)
 
     torso = world.add_body(name="torso", pos=[0, 0, STAND_HEIGHT])
     # Camera and light follow: shadows are cast only within a few metres of the light.

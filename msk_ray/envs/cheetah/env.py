@@ -5,16 +5,15 @@ import torch
 from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
-from msk_ray.envs.base import Env
 from msk_ray.envs.cheetah.config import CheetahSettings
 from msk_ray.envs.cheetah.model import build_cheetah
-from msk_ray.envs.layout import Entry, planar_body
+from msk_ray.envs.planar import PlanarBody
 from msk_ray.simulation import StepState
 
 _START_HEIGHT = -0.2
 
 
-class Cheetah(Env[CheetahSettings]):
+class Cheetah(PlanarBody[CheetahSettings]):
     """Observation (17), in this order; source: `envs/cheetah.py` of github.com/NVlabs/DiffRL.
 
     ====== ==================================================================
@@ -43,15 +42,6 @@ class Cheetah(Env[CheetahSettings]):
         qpos, qvel = self._start + 0.1 * self.uniform(count, 9), 0.25 * self.uniform(count, 9)
         return StepState(qpos, qvel, torch.zeros((count, 0), device=self.device))
 
-    def observe(self, state: StepState, action: Tensor) -> Tensor:
-        return torch.cat((state.qpos[:, 1:], state.qvel), dim=-1)
-
-    def observation_layout(self) -> list[Entry]:
-        return planar_body(self.model)
-
     def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
         r = self.config.reward
         return torch.stack((r.forward_vel * obs[:, 8], -r.action_penalty * action.square().sum(-1)), dim=-1)
-
-    def outcome_terms(self, state: StepState) -> dict[str, Tensor]:
-        return {"vx": state.qvel[:, 0]}

@@ -7,10 +7,9 @@ import torch
 from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
-from msk_ray.envs.base import Env
 from msk_ray.envs.hopper.config import HopperSettings
 from msk_ray.envs.hopper.model import build_hopper
-from msk_ray.envs.layout import Entry, planar_body
+from msk_ray.envs.planar import PlanarBody
 from msk_ray.simulation import StepState
 
 _FULL_ANGLE = math.pi / 6
@@ -18,7 +17,7 @@ _TOP = 0.3
 _BOTTOM = -1.0
 
 
-class Hopper(Env[HopperSettings]):
+class Hopper(PlanarBody[HopperSettings]):
     """Observation (11), in this order; source: `envs/hopper.py` of github.com/NVlabs/DiffRL.
 
     ===== ===================================================
@@ -43,12 +42,6 @@ class Hopper(Env[HopperSettings]):
         qpos, qvel = 0.05 * self.uniform(count, 6), 0.05 * self.uniform(count, 6)
         return StepState(qpos, qvel, torch.zeros((count, 0), device=self.device))
 
-    def observe(self, state: StepState, action: Tensor) -> Tensor:
-        return torch.cat((state.qpos[:, 1:], state.qvel), dim=-1)
-
-    def observation_layout(self) -> list[Entry]:
-        return planar_body(self.model)
-
     def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
         r = self.config.reward
         above = (obs[:, 0] - r.full_height).clamp(_BOTTOM, _TOP)
@@ -66,6 +59,3 @@ class Hopper(Env[HopperSettings]):
         if not self.config.early_termination:
             return super().fell(state)
         return state.qpos[:, 1] < self.config.termination_height
-
-    def outcome_terms(self, state: StepState) -> dict[str, Tensor]:
-        return {"vx": state.qvel[:, 0]}

@@ -25,7 +25,7 @@ from msk_ray.envs.myoleg26 import tables
 from msk_ray.envs.myoleg26.config import MyoLeg26Settings
 from msk_ray.envs.myoleg26.poses import add_keyframes
 from msk_ray.envs.myoleg26.terrain import Terrain
-from msk_ray.envs.options import add_sky, apply_options
+from msk_ray.envs.options import add_grid, add_sky, apply_options
 
 SIDES = ("r", "l")
 CURVE = (0.0, 2.0)
@@ -166,19 +166,9 @@ def _body_spec(env: MyoLeg26Settings, p: PhysicsConfig) -> mujoco.MjSpec:
     spec.compiler.degree = False
     apply_options(spec, p, env.control_timestep)
     add_sky(spec)
-    spec.add_texture(
-        name="grid",
-        type=mujoco.mjtTexture.mjTEXTURE_2D,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
-        rgb1=[0.25, 0.3, 0.35],
-        rgb2=[0.32, 0.38, 0.44],
-        width=256,
-        height=256,
-    )
-    material = spec.add_material(name="grid", texrepeat=[1, 1], texuniform=True)
-    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "grid"
+    grid = add_grid(spec)
     world = spec.worldbody
-    ground = Terrain(env.terrain).add_to(spec, "grid")
+    ground = Terrain(env.terrain).add_to(spec, grid)
 
     # x forward, y up, z right in the body; x forward, z up in the world.
     half = float(np.sqrt(0.5))
