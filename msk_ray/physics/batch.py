@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from msk_ray.errors import ConfigError, UnsupportedModelError
 from msk_ray.physics.capacity import Capacity, default_capacity, scalar_rows
 from msk_ray.physics.graph import joined_stream
+from msk_ray.physics.iterations import IterationWatch
 from msk_ray.physics.overflow import LossWatch, cured, loss_error, needed
 from msk_ray.physics.pairs import widened
 from msk_ray.physics.parameters import check_names, open_arrays, structure
@@ -83,9 +84,10 @@ class WorldBatch:
         device: the Warp device.
         capacity: contacts and rows per world that fit into `data`.
         losses: what steps lost to full buffers; check it between steps.
-        unrolled_iterations: the solver's iteration limit in steps that are recorded into another library's capture.
-            There the loop is unrolled, so that each iteration costs time even where no world needs it. None: the
-            model's limit.
+        iterations: how many iterations the solver took in each substep.
+        unrolled_iterations: the solver's iteration limit in each substep of steps that are recorded into another
+            library's capture. There the loop is unrolled, so that each iteration costs time even where no world needs
+            it. None: the model's limit.
 
     Raises:
         UnsupportedModelError: mujoco_warp cannot load the model, or it has state outside (qpos, qvel, act).
@@ -113,7 +115,7 @@ class WorldBatch:
         self.structure = self._structure()
         self._tolerance = tolerance
         self._model = self._load(nworld)
-        self.unrolled_iterations: int | None = None
+        self.unrolled_iterations: tuple[int, ...] | None = None
         self._watch = ModelWatch(mjm)
         self._given = Capacity(nconmax or 0, njmax or 0)
         start, self._bound = default_capacity(self.structure) if not all(self._given) else (self._given, None)
@@ -149,6 +151,7 @@ class WorldBatch:
         with wp.ScopedDevice(self.device):
             self.data = mjw.make_data(self.structure, nworld=nworld, nconmax=capacity.contacts, njmax=capacity.rows)
         self.losses = LossWatch(self.data, self.device)
+        self.iterations = IterationWatch(self.substeps, nworld, self.device)
 
     def resized(self, nworld: int, capacity: Capacity | None = None) -> "WorldBatch":
         """Another batch of the same model, which both share, with `nworld` worlds."""
@@ -217,8 +220,8 @@ class WorldBatch:
     def launch_step(self) -> None:
         """Launch one env step on the current contents of data.{ctrl, qpos, qvel, act}."""
         self.begin_step()
-        for _ in range(self.substeps):
-            self.launch_substep(self.data)
+        for k in range(self.substeps):
+            self.launch_substep(self.data, k)
         self.end_step(self.data)
 
     def end_step(self, data: Any) -> None:
@@ -228,16 +231,19 @@ class WorldBatch:
         """
         self.losses.launch(data)
 
-    def launch_substep(self, data: Any) -> None:
-        """Launch one physics step on `data`, this batch's own or another of the same model and size."""
-        model = self._unrolled() if joined_stream() is not None else self.model
+    def launch_substep(self, data: Any, k: int) -> None:
+        """Launch substep k of an env step on `data`, this batch's own or another of the same model and size."""
+        model = self._unrolled(k) if joined_stream() is not None else self.model
         refresh_velocity(self.mjm, model, data)
         mjw.step(model, data)
+        self.iterations.launch(data, k)
 
-    def _unrolled(self) -> Any:
-        """The model with loops of a fixed length instead of conditional graph nodes; the same arrays."""
+    def _unrolled(self, k: int) -> Any:
+        """The model with loops of a fixed length in substep k instead of conditional graph nodes; the same arrays."""
         model, options = copy.copy(self.model), copy.copy(self.model.opt)
-        limit = min(self.unrolled_iterations or options.iterations, options.iterations)
+        limit = int(options.iterations)
+        if self.unrolled_iterations is not None:
+            limit = min(self.unrolled_iterations[k], limit)
         # The seal is not for these copies, which no recorded graph reads.
         object.__setattr__(options, "graph_conditional", False)
         object.__setattr__(options, "iterations", limit)

@@ -62,9 +62,9 @@ class TapedStep:
             for name, array in state._asdict().items():
                 wp.copy(getattr(data, name), array)
             batch.begin_step()
-            for _ in range(batch.substeps):
+            for k in range(batch.substeps):
                 saved = {name: wp.clone(getattr(data, name), requires_grad=False) for name in ("qpos", "qvel", "act")}
-                batch.launch_substep(data)
+                batch.launch_substep(data, k)
                 saved["qacc"] = wp.clone(data.qacc, requires_grad=False)
                 kept.append(saved)
             batch.end_step(data)

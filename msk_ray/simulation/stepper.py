@@ -32,7 +32,8 @@ class Engine:
         self._parameters = ParameterTensors(batch)
         launches = batch.launch_step if backward is None else lambda: backward.launch_step(batch)
         self._graph = Graph(launches, batch.device)
-        batch.losses.read()  # of the start-up, whose state is nobody's
+        for watch in (batch.losses, batch.iterations):
+            watch.read()  # of the start-up, whose state is nobody's
         self._unseen = False
         self._touch: ContactForces | None = None
 

@@ -294,10 +294,10 @@ class TapePerSubstep(_Tape):
     def launch_step(self, batch: WorldBatch) -> None:
         data = batch.data
         batch.begin_step()
-        for state in self._states:
+        for k, state in enumerate(self._states):
             for name in ("qpos", "qvel", "act"):
                 wp.copy(state[name], getattr(data, name))
-            batch.launch_substep(data)
+            batch.launch_substep(data, k)
             wp.copy(state["qacc"], data.qacc)
             self._gauge.launch(data, _solved(data, batch.mjm))
         for name, array in self._last.items():
@@ -340,12 +340,12 @@ class TapeAll(_Tape):
     def launch_step(self, batch: WorldBatch) -> None:
         before = batch.data
         batch.begin_step()
-        for state, data in zip(self._states, self._datas, strict=True):
+        for k, (state, data) in enumerate(zip(self._states, self._datas, strict=True)):
             for name in ("qpos", "qvel", "act", "qacc_warmstart", "time"):
                 wp.copy(getattr(data, name), getattr(before, name))
             for name in ("qpos", "qvel", "act"):
                 wp.copy(state[name], getattr(before, name))
-            batch.launch_substep(data)
+            batch.launch_substep(data, k)
             wp.copy(state["qacc"], data.qacc)
             self._gauge.launch(data, _solved(data, batch.mjm))
             before = data

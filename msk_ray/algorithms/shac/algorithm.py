@@ -130,7 +130,7 @@ class Shac(Algorithm):
             **{f"time/{part}_s": value for part, value in seconds.items()},
             **simulation_metrics(self.env),
         }
-        self._runner.adapt(numbers["physics/solver_limit_share"])
+        self._runner.adapt()
         return EpochResult(horizon * self._worlds, numbers)
 
     def state_dict(self) -> dict[str, Any]:

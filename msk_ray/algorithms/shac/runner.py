@@ -14,6 +14,7 @@ from torch import Tensor
 from msk_ray.algorithms.base import Clock
 from msk_ray.algorithms.shac.actor_update import ActorOutcome, ActorUpdate, EpochInputs, Rolled
 from msk_ray.envs import Env
+from msk_ray.physics.iterations import limits_for, reached
 from msk_ray.simulation.capture import Recording, fill
 from msk_ray.simulation.stepper import Engine
 
@@ -21,12 +22,12 @@ FitCritic = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Observations (N, O), targets (N,) and orders (passes, N) to the loss; moves the target critic too."""
 _MOST_HORIZONS = 3
 """Recordings kept of epochs, and of fits, one for each horizon: each holds the memory of all its work."""
-_FEWEST_ITERATIONS = 8
-"""Solver iterations unrolled at first."""
-_MOST_ITERATIONS = 48
-"""Beyond this many, unrolled iterations cost more than recording saves."""
+_RARE_SHARE = 3e-3
+"""Share of a substep's worlds that may need as many solver iterations as are unrolled there, or more, at first."""
 _LIMITED_SHARE = 0.01
-"""Share of worlds that may reach the number of unrolled iterations before it grows."""
+"""Share of them that may do so before more are unrolled."""
+_MOST_ITERATIONS = 48
+"""Beyond this many in a substep, unrolled iterations cost more than recording saves."""
 
 
 class EagerRunner:
@@ -69,8 +70,8 @@ class EagerRunner:
         """How long the parts of the last epoch took [s], by name; waits for them."""
         return self._clock.seconds()
 
-    def adapt(self, limited: float) -> None:
-        """Take note of the share of worlds that reached a limit of the solver in the last epoch."""
+    def adapt(self) -> None:
+        """Take note of how many iterations the solver took in the last epoch; waits for it."""
 
 
 @dataclass
@@ -175,21 +176,24 @@ class RecordedRunner(EagerRunner):
     def seconds(self) -> dict[str, float]:
         return super().seconds() | ({} if self._fit_s is None else {"critic": self._fit_s})
 
-    def adapt(self, limited: float) -> None:
+    def adapt(self) -> None:
+        if self._refused:
+            return
         batch = self._env.sim.batch
-        unrolled = batch.unrolled_iterations
-        # `recorded` and `limited` are the same in all processes.
-        if not self.recorded or limited <= _LIMITED_SHARE:
-            return
-        # Below the model's own limit; a batch with larger buffers has none yet.
-        more = unrolled is not None and unrolled < int(batch.mjm.opt.iterations)
-        if not self._group.any(more):
-            return
-        if more:
-            assert unrolled is not None
-            batch.unrolled_iterations = unrolled + unrolled // 2
-        self._kept.epochs.clear()
-        if self._group.any((batch.unrolled_iterations or 0) > _MOST_ITERATIONS):
+        # Empty, if a batch with larger buffers has just taken the place of the one that the epoch ran in.
+        counts = batch.iterations.read()
+        before, most = batch.unrolled_iterations, int(batch.mjm.opt.iterations)
+        limits = before or (1,) * batch.substeps
+        if self.recorded:
+            shares = reached(counts, limits)
+            wanted = [n + (n + 3) // 4 if s > _LIMITED_SHARE else n for n, s in zip(limits, shares, strict=True)]
+        else:
+            wanted = [max(pair) for pair in zip(limits, limits_for(counts, _RARE_SHARE), strict=True)]
+        batch.unrolled_iterations = tuple(min(n, most) for n in wanted)
+        # `recorded` is the same in all processes.
+        if self.recorded and self._group.any(batch.unrolled_iterations != before):
+            self._kept.epochs.clear()
+        if self._group.any(max(batch.unrolled_iterations) > _MOST_ITERATIONS):
             self._refuse(f"the constraint solver needs more than {_MOST_ITERATIONS} iterations in some worlds")
 
     def _attempt(self, record: Callable[[], _Epoch]) -> _Epoch | None:
@@ -240,9 +244,6 @@ class RecordedRunner(EagerRunner):
         return epoch
 
     def _record_epoch(self, inputs: EpochInputs) -> _Epoch:
-        batch = self._env.sim.batch
-        if batch.unrolled_iterations is None:
-            batch.unrolled_iterations = _FEWEST_ITERATIONS
         buffers = inputs.copies()
         before = self._env.state
         try:

@@ -7,6 +7,7 @@ import warnings
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -26,11 +27,19 @@ class Two(Group):
         return [value, self._other]
 
 
-def runner_of(other: Any, engine: str = "engine", unrolled: int | None = 8) -> RecordedRunner:
-    """A runner that has recorded an epoch of horizon 2, as far as decisions need it."""
+def runner_of(
+    other: Any, engine: str = "engine", unrolled: tuple[int, ...] | None = (8, 5), counts: Any = None
+) -> RecordedRunner:
+    """A runner that has recorded an epoch of horizon 2, as far as decisions need it; `counts` are its solver's."""
     runner = object.__new__(RecordedRunner)
     runner._group = Two(other)
-    batch = SimpleNamespace(unrolled_iterations=unrolled, mjm=SimpleNamespace(opt=SimpleNamespace(iterations=100)))
+    counts = np.zeros((2, 128), int) if counts is None else counts
+    batch = SimpleNamespace(
+        unrolled_iterations=unrolled,
+        substeps=2,
+        iterations=SimpleNamespace(read=lambda: counts),
+        mjm=SimpleNamespace(opt=SimpleNamespace(iterations=100)),
+    )
     runner._env = SimpleNamespace(sim=SimpleNamespace(engine=engine, batch=batch))  # type: ignore[assignment]
     runner._kept = _Recordings("engine", warm={2})  # type: ignore[arg-type]
     runner._kept.epochs[2] = "recorded"  # type: ignore[assignment]
@@ -76,23 +85,51 @@ def test_recordings_end_everywhere_when_buffers_have_grown_anywhere(engine: str,
     assert runner._kept.warm == {2}
 
 
+def worlds(*by_substep: dict[int, int]) -> Any:
+    """World counts by substep and iterations, from those that are not 0."""
+    counts = np.zeros((len(by_substep), 128), int)
+    for row, found in zip(counts, by_substep, strict=True):
+        for iterations, number in found.items():
+            row[iterations] = number
+    return counts
+
+
 @pytest.mark.parametrize(
-    ("unrolled", "other", "after", "kept"),
-    [(8, True, 12, False), (None, True, None, False), (100, True, 100, False), (100, False, 100, True)],
+    ("unrolled", "second", "other", "after", "kept"),
+    [
+        ((8, 5), {3: 980, 5: 20}, False, (8, 7), False),
+        ((8, 5), {3: 995, 5: 5}, False, (8, 5), True),
+        ((8, 5), {3: 995, 5: 5}, True, (8, 5), False),
+        ((8, 100), {100: 1000}, False, (8, 100), True),
+        (None, {}, True, (1, 1), False),
+    ],
+    ids=["2 %", "half a percent", "another process has more", "the model's limit", "larger buffers"],
 )
-def test_recordings_end_everywhere_when_one_process_unrolls_more_iterations(
-    unrolled: int | None, other: bool, after: int | None, kept: bool
+def test_where_too_many_worlds_reach_the_unrolled_iterations_all_processes_record_once_more(
+    unrolled: tuple[int, ...] | None, second: dict[int, int], other: bool, after: tuple[int, ...], kept: bool
 ) -> None:
-    """A process whose batch has just grown has none yet, and one at the model's limit needs no more."""
-    runner = runner_of(other, unrolled=unrolled)
+    """Each substep has a number of its own, which nothing else changes."""
+    runner = runner_of(other, unrolled=unrolled, counts=worlds({7: 1000} if second else {}, second))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the other also says that it has too many
-        runner.adapt(0.5)
+        warnings.simplefilter("ignore")  # more than 48 are too many
+        runner.adapt()
     assert runner._env.sim.batch.unrolled_iterations == after
-    assert bool(runner._kept.epochs) is kept
+    if max(after) <= 48:
+        assert bool(runner._kept.epochs) is kept
 
 
-def test_few_worlds_at_the_limit_change_nothing() -> None:
-    runner = runner_of(True)
-    runner.adapt(0.005)
-    assert runner._kept.epochs
+def test_an_epoch_operation_by_operation_says_how_many_iterations_to_unroll() -> None:
+    """In the first substep 2 of 1000 worlds take 9 or more, which is rare, and 12 take 8 or more."""
+    counts = worlds({0: 500, 7: 488, 8: 10, 11: 2}, {2: 1000})
+    runner = runner_of(False, unrolled=(1, 6), counts=counts)
+    runner.recorded = False
+    runner.adapt()
+    assert runner._env.sim.batch.unrolled_iterations == (9, 6)
+
+
+def test_a_solver_that_takes_very_many_iterations_is_not_unrolled() -> None:
+    runner = runner_of(False, unrolled=None, counts=worlds({60: 1000}, {2: 1000}))
+    runner.recorded = False
+    with pytest.warns(UserWarning, match="more than 48 iterations"):
+        runner.adapt()
+    assert runner._epoch(INPUTS) is None
