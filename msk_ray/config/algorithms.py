@@ -161,6 +161,9 @@ class ShacConfig(AlgorithmSettings):
     as AHAC does by an absolute number; null: all passes. A recorded fit computes all, and leaves out their steps."""
     critic_batches: Count = 4
     """Minibatches a pass."""
+    critic_products: Literal["float32", "tf32"] = "float32"
+    """Numbers that the matrix products of the critic's fit multiply; `tf32` has 10 bits of mantissa, for which recent
+    GPUs have faster units. Sums, and everything else, are in float32."""
     target_critic_alpha: Fraction = 0.2
     """target ← α·target + (1 − α)·critic after each epoch."""
     actor_lr: PositiveFloat = 2e-3

@@ -24,7 +24,7 @@ GRADIENTS = frozenset(
     )
 )
 """Settings of how steps are differentiated."""
-SOLVING = frozenset(("tolerance", "iterations", "ls_iterations", "cone", "impratio", "nconmax", "njmax"))
+SOLVING = frozenset(("tolerance", "iterations", "ls_iterations", "jacobian", "cone", "impratio", "nconmax", "njmax"))
 """Those of the constraint solver, which a model without contacts and limits does not need."""
 CONTACTS = frozenset(("solref", "solimp", "friction", "solreffriction"))
 """Those of contacts, in models that declare their own."""
@@ -76,6 +76,9 @@ class PhysicsConfig(Section):
     """Constraint solver iteration limit."""
     ls_iterations: Count | None = None
     """Line search iteration limit."""
+    jacobian: Literal["dense", "sparse"] | None = None
+    """How mujoco_warp stores the Jacobian of the constraints; the results differ by rounding, and time and memory on a
+    GPU with the model."""
     integrator: Literal["Euler", "implicitfast", "RK4"] | None = None
     cone: Literal["pyramidal", "elliptic"] | None = None
     """Friction cone. The pyramid's edges make contact gradients explode over long horizons; the ellipse has none."""

@@ -136,6 +136,7 @@ class WorldBatch:
                 # put_model clamps to 1e-6; the adjoint holds at the optimum only, so it may ask for less.
                 model.opt.tolerance = wp.array([self._tolerance], dtype=float)
             model.opt.warn_overflow = 0  # read back by `losses`, not printed from kernels
+            model.ncam = model.nlight = 0  # nothing looks: two launches less a substep
             open_arrays(self.mjm, model, self.parameters, nworld)
         seal(model, "batch.model")
         return model

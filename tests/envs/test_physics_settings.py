@@ -23,6 +23,7 @@ VALUES: dict[str, Any] = {
     "tolerance": 1e-9,
     "iterations": 7,
     "ls_iterations": 3,
+    "jacobian": "sparse",
     "integrator": "RK4",
     "cone": "pyramidal",
     "impratio": 3.0,
@@ -44,7 +45,17 @@ VALUES: dict[str, Any] = {
     "fd.max_worlds": 64,
 }
 REFUSED = {
-    "cartpole": {"variant", "tolerance", "iterations", "ls_iterations", "cone", "impratio", "solref", "solimp"}
+    "cartpole": {
+        "variant",
+        "tolerance",
+        "iterations",
+        "ls_iterations",
+        "jacobian",
+        "cone",
+        "impratio",
+        "solref",
+        "solimp",
+    }
     | {"friction", "solreffriction", "solref_limit", "solimp_limit", "nconmax", "njmax", "fd.eps_act"},
     "ant": {"fd.eps_act"},
     "hopper": {"fd.eps_act"},

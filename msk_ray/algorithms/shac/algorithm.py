@@ -54,6 +54,7 @@ class Shac(Algorithm):
             c.critic_grad_norm,
             weight_decay=c.weight_decay,
             tolerance=c.critic_tolerance,
+            tf32=c.critic_products == "tf32",
             group=env.group,
         )
         self.noise_generator = torch.Generator(device=device).manual_seed(config.trial.seed + 1)

@@ -1,9 +1,13 @@
 """Fit the critic to its targets, one minibatch at a time."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import torch
 from torch import Tensor, nn
 
 from msk_ray.algorithms.shac.optimizer import RateAdam
+from msk_ray.errors import ConfigError
 from msk_ray.group import ALONE, Group
 from msk_ray.networks import Critic
 
@@ -21,10 +25,14 @@ class CriticFit:
         grad_norm: bound on each network's gradient norm; None for no bound.
         weight_decay: decoupled weight decay; 0 for none.
         tolerance: change of the loss a pass, relative to it, below which no further step is taken; None: all steps.
+        tf32: whether matrix products multiply numbers of 10 bits of mantissa.
         group: the processes that fit it together, each with its share of every minibatch.
 
     Attributes:
         optimizer: the critic's.
+
+    Raises:
+        ConfigError: tf32 on a device that has none.
     """
 
     def __init__(
@@ -36,11 +44,16 @@ class CriticFit:
         *,
         weight_decay: float = 0.0,
         tolerance: float | None = None,
+        tf32: bool = False,
         group: Group = ALONE,
     ) -> None:
+        device = next(critic.parameters()).device
+        if tf32 and (device.type != "cuda" or torch.cuda.get_device_capability(device) < (8, 0)):
+            raise ConfigError(f"shac.critic_products: {device.type} has no tf32 here: write float32")
         self._critic = critic
         self._grad_norm = grad_norm
         self._tolerance = tolerance
+        self._tf32 = tf32
         self._group = group
         self._members = [list(member.parameters()) for member in critic.members]
         self.optimizer = RateAdam(critic.parameters(), learning_rate, betas, weight_decay)
@@ -60,7 +73,8 @@ class CriticFit:
         settled: Tensor | None = None
         for order in orders:
             minibatches = self._group.own(order[: batches * size].view(batches, size), dim=1)
-            losses = [self._step(obs[picked], targets[picked], settled) for picked in minibatches]
+            with _products(self._tf32):
+                losses = [self._step(obs[picked], targets[picked], settled) for picked in minibatches]
             passes.append(torch.stack(losses).mean())
             if self._tolerance is not None:
                 settled = self._settled(passes, settled)
@@ -90,3 +104,14 @@ class CriticFit:
                 nn.utils.clip_grad_norm_(parameters, self._grad_norm)
         self.optimizer.step(skip)
         return mean
+
+
+@contextmanager
+def _products(tf32: bool) -> Iterator[None]:
+    """Within, torch's products of float32 matrices on a GPU round their factors to TF32, or do not."""
+    before = torch.backends.cuda.matmul.allow_tf32
+    torch.backends.cuda.matmul.allow_tf32 = tf32
+    try:
+        yield
+    finally:
+        torch.backends.cuda.matmul.allow_tf32 = before

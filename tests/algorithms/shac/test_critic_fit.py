@@ -1,9 +1,11 @@
 """The critic fits what it is given."""
 
+import pytest
 import torch
 
 from msk_ray.algorithms.shac.critic_fit import CriticFit
 from msk_ray.config.schema import CriticConfig
+from msk_ray.errors import ConfigError
 from msk_ray.networks import Critic
 
 
@@ -72,3 +74,24 @@ def test_weight_decay_by_hand() -> None:
     # Adam's step of the rate, after a shrinkage by rate · decay = 1/16.
     for parameter, start in zip(critic.parameters(), before, strict=True):
         assert torch.allclose(parameter, 15 / 16 * start + 0.125, atol=1e-5)
+
+
+def test_tf32_is_refused_on_a_cpu() -> None:
+    critic = Critic(CriticConfig(hidden=(8,)), 1, torch.Generator().manual_seed(0))
+    with pytest.raises(ConfigError, match=r"shac\.critic_products: cpu has no tf32 here: write float32"):
+        CriticFit(critic, 1e-3, (0.9, 0.99), None, tf32=True)
+
+
+@pytest.mark.gpu
+def test_tf32_rounds_the_factors_of_products_in_the_fit_alone() -> None:
+    """One step from the same start: the losses differ, by less than the 2⁻¹⁰ of the factors makes of them."""
+    generator = torch.Generator().manual_seed(0)
+    obs = torch.randn(512, 64, generator=generator).cuda()
+    losses = []
+    for tf32 in (False, True):
+        critic = Critic(CriticConfig(hidden=(256,)), 64, torch.Generator().manual_seed(1)).cuda()
+        fit = CriticFit(critic, 1e-3, (0.9, 0.99), None, tf32=tf32)
+        losses.append(float(fit.run(obs, obs[:, 0], torch.arange(512, device="cuda")[None], 1)))
+        assert not torch.backends.cuda.matmul.allow_tf32
+    assert losses[0] != losses[1]
+    assert abs(losses[0] - losses[1]) < 1e-2 * losses[0]
