@@ -184,7 +184,7 @@ def simulation_metrics(env: Env[Any]) -> dict[str, float]:
     Raises:
         SimulationError: contacts or constraint rows were lost to a full buffer.
     """
-    drawn = {} if env.randomizer is None else env.randomizer.metrics(env.state.numbers)
+    drawn = {} if env.randomizer is None else env.randomizer.metrics(env.state.numbers[:, : env.randomizer.size])
     found = drawn | {
         f"{'grad' if name in _OF_GRADIENTS else 'physics'}/{name}": value
         for name, value in env.sim.diagnostics().items()

@@ -99,5 +99,14 @@ _LATER: dict[tuple[str, ...], Any] = {
     ("shac", "exploration"): None,
     ("shac", "copies"): None,
     ("actor", "state_std"): False,
+    ("env", "speed_range"): None,
+    ("env", "clock"): False,
+    ("env", "symmetric"): False,
+    ("env", "tracking"): {"start": 1.0, "end": 1.0, "epochs": 0},
+    **{("env", name): 0.0 for name in ("metabolic", "fatigue", "head", "impact", "footfall", "clearance")},
+    **{("env", name): 0.0 for name in ("track", "track_rate")},
+    ("env", "clearance_height"): 0.01,
+    ("env", "track_scale"): 0.15,
+    ("env", "track_rate_scale"): 2.0,
 }
 """Settings that the first version did not have, as (section, name), with the default that leaves ids unchanged."""

@@ -40,7 +40,7 @@ class EnvState(NamedTuple):
     age: Tensor
     """Env steps since reset, shape (W,), int64."""
     numbers: Tensor
-    """Numbers that `physics.randomize` has drawn for each world's episode, shape (W, K); K is 0 without it."""
+    """Numbers drawn for each world's episode, shape (W, K + T): K by `physics.randomize`, then T of the task."""
 
     def detach(self) -> "EnvState":
         """The same state, cut from the graph."""
@@ -53,7 +53,7 @@ class Resets(NamedTuple):
     physics: StepState
     """Physical states, each (N, n)."""
     numbers: Tensor
-    """As in `EnvState`, (N, K)."""
+    """As in `EnvState`, (N, K + T)."""
 
 
 class Transition(NamedTuple):
@@ -88,7 +88,7 @@ class Env(ABC, Generic[SettingsT]):
     group: Group = ALONE
     action_size: int
     obs_size: int
-    reward_names: ClassVar[tuple[str, ...]]
+    reward_names: tuple[str, ...]
     """Names of the T parts of the reward."""
     begin_epoch_in_place: ClassVar[bool] = False
     """Whether `begin_epoch`, where a class has its own, only changes the contents of tensors."""
@@ -229,9 +229,15 @@ class Env(ABC, Generic[SettingsT]):
 
     def draw_episodes(self, count: int) -> Resets:
         """What `count` episodes begin with."""
+        physics, task = self.draw_start(count)
         if self.randomizer is None:
-            return Resets(self.draw_physics(count), torch.zeros((count, 0), device=self.device))
-        return Resets(self.draw_physics(count), self.randomizer.draw(count))
+            return Resets(physics, task)
+        return Resets(physics, torch.cat((self.randomizer.draw(count), task), dim=-1))
+
+    def draw_start(self, count: int) -> tuple[StepState, Tensor]:
+        """Initial physical states of `count` episodes, and the T numbers of the task of each, (count, T), such as a
+        speed to walk at."""
+        return self.draw_physics(count), torch.zeros((count, 0), device=self.device)
 
     def join(self, group: Group) -> None:
         """Become the worlds of one process of a group, each of which has as many, in their initial states."""
@@ -251,7 +257,16 @@ class Env(ABC, Generic[SettingsT]):
     @property
     def parameters(self) -> dict[str, Tensor] | None:
         """Values of the model's fields that differ between worlds, by name; None for the model's own."""
-        return None if self.randomizer is None else self.randomizer.values(self.state.numbers)
+        return None if self.randomizer is None else self.randomizer.values(self._split(self.state.numbers)[0])
+
+    def task_numbers(self, numbers: Tensor) -> Tensor:
+        """The T columns of the task in `EnvState.numbers`, (W, T)."""
+        return self._split(numbers)[1]
+
+    def _split(self, numbers: Tensor) -> tuple[Tensor, Tensor]:
+        """Columns of the randomizer (W, K) and of the task (W, T)."""
+        drawn = 0 if self.randomizer is None else self.randomizer.size
+        return numbers[:, :drawn], numbers[:, drawn:]
 
     def state_dict(self) -> dict[str, Any]:
         """The state of the worlds, their parameters, the generators, and the buffer sizes that the simulation has.
@@ -259,13 +274,15 @@ class Env(ABC, Generic[SettingsT]):
         In a group, of the worlds of all processes, each of which has to call it.
         """
         state, gather = self.state, self.group.gather
+        drawn, task = self._split(state.numbers)
         return {
             "env_generator": self.generator.get_state(),
             "env_state": [gather(t.detach()).clone() for t in (*state.physics, state.action, state.age)],
             "capacity": tuple(map(max, zip(*self.group.collect(tuple(self.sim.capacity)), strict=True))),
             "randomizer": None
             if self.randomizer is None
-            else {"numbers": gather(state.numbers).clone(), "generator": self.randomizer.generator.get_state()},
+            else {"numbers": gather(drawn).clone(), "generator": self.randomizer.generator.get_state()},
+            **({"env_task": gather(task).clone()} if task.shape[1] else {}),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -273,12 +290,15 @@ class Env(ABC, Generic[SettingsT]):
         # The state of a generator is a host tensor on every device.
         self.generator.set_state(state["env_generator"].cpu())
         *physics, action, age = map(self.group.own, state["env_state"])
-        numbers = torch.zeros((self.nworld, 0), device=self.device)
+        numbers = []
         if self.randomizer is not None:
             drawn = state["randomizer"]
-            numbers = self.group.own(drawn["numbers"].to(self.device))
+            numbers.append(self.group.own(drawn["numbers"].to(self.device)))
             self.randomizer.generator.set_state(drawn["generator"].cpu())
-        self.state = EnvState(StepState(*physics), action, age, numbers)
+        if "env_task" in state:
+            numbers.append(self.group.own(state["env_task"].to(self.device)))
+        empty = torch.zeros((self.nworld, 0), device=self.device)
+        self.state = EnvState(StepState(*physics), action, age, torch.cat([empty, *numbers], dim=-1))
         if "capacity" in state:
             # The buffer sizes that the trial had grown to: the next step may need them.
             self.sim.reserve(Capacity(*state["capacity"]))

@@ -62,6 +62,7 @@ class Randomizer:
     Attributes:
         generator: source of the numbers.
         parameters: names of the fields of the model that it sets.
+        size: K.
 
     Raises:
         ConfigError: the model has no such elements, or a number would have no effect.
@@ -78,6 +79,7 @@ class Randomizer:
         bounds = [_bounds(draw) for name, draw in config.drawn.items() for _ in range(self._widths[name])]
         self._low, high, log = (self._tensor(part) for part in zip(*bounds, strict=True))
         self._span = high - self._low
+        self.size = len(self._low)
         self._log = log.bool() if log.any() else None
         linear = self._arrays(config, model, chosen, owners)
         # All arrays side by side: one product gives them all.

@@ -44,9 +44,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser().parse_args(argv)
     path = best_checkpoint(find_target(args.target, args.storage))
 
+    from msk_ray.envs.legs.gait.body import analyse, check_legs
+    from msk_ray.envs.legs.gait.measure import measure
     from msk_ray.evaluate.measure import Bench, Request, default_device
-    from msk_ray.gait.body import analyse, check_legs
-    from msk_ray.gait.measure import measure
     from msk_ray.gait.picture import draw
     from msk_ray.training import load_policy
     from msk_ray.visualize.episodes import record

@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.patches import Rectangle
 
-from msk_ray.gait.human import LANDMARKS
+from msk_ray.envs.legs.gait.ranges import LANDMARKS
 
 _PANELS = {
     "hip_flexion": "hip flexion [°]",

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from msk_ray.gait import cycles
-from msk_ray.gait.body import CURVES, Episode
-from msk_ray.gait.human import LANDMARKS, MEASURES
-from msk_ray.gait.measure import measure
+from msk_ray.envs.legs.gait import cycles
+from msk_ray.envs.legs.gait.body import CURVES, Episode
+from msk_ray.envs.legs.gait.measure import measure
+from msk_ray.envs.legs.gait.ranges import LANDMARKS, MEASURES
 
 STEP = 0.02
 """Seconds between samples."""

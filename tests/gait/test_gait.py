@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from msk_ray.config import Config, PhysicsConfig, parse_config
+from msk_ray.envs.legs.gait.body import analyse
 from msk_ray.envs.myoleg26.config import MyoLeg26Settings
 from msk_ray.envs.myoleg26.model import build_myoleg26
 from msk_ray.errors import ConfigError
 from msk_ray.gait.__main__ import main
-from msk_ray.gait.body import analyse
 from msk_ray.training import Trainer
 
 

@@ -2,9 +2,12 @@
 
 from typing import Annotated
 
-from pydantic import Field, PositiveFloat
+from pydantic import Field, PositiveFloat, model_validator
 
-from msk_ray.config.sections import Count, EnvSettings, NonNegative, Reward
+from msk_ray.config.sections import Count, EnvSettings, NonNegative, Reward, Section, Whole
+
+CLOCKED = ("footfall", "clearance", "track", "track_rate")
+"""Weights of terms that need the clock."""
 
 
 class LegReward(Reward):
@@ -48,6 +51,48 @@ class LegReward(Reward):
     """Largest angle between the hips' flexions [rad]: 2 asin(step length / (2 leg length)) for 0.67 m and 0.9 m."""
     cadence: PositiveFloat = 112.0
     """Steps per minute, about as many as people take at 1.25 m/s [1/min]."""
+    metabolic: NonNegative = 0.0
+    """Weight of the metabolic power of all muscles per kg of body mass, without that of rest [kg/W]; walking people
+    have about 3 W/kg. The model is that of Bhargava et al. 2004 (`msk_ray/envs/legs/metabolic.py`)."""
+    fatigue: NonNegative = 0.0
+    """Weight of the mean cubed activation."""
+    head: NonNegative = 0.0
+    """Weight of the squared speed of the head up and to the side [s²/m²]; it moves with pelvis and trunk, 0.65 m above
+    the pelvis."""
+    impact: NonNegative = 0.0
+    """Weight of the squared downward speed of heels and toes close to the ground [s²/m²]. (Contact forces carry no
+    gradient.)"""
+    footfall: NonNegative = 0.0
+    """Weight of the speed of heel and toes while the clock wants them on the ground: in people the heel is down until
+    40 % of the cycle, the toes from 10 to 60 %. Needs `env.clock`."""
+    clearance: NonNegative = 0.0
+    """Weight of ((clearance_height - height) / clearance_height)² of heel and toes below that height while the clock
+    wants the foot in the air. Needs `env.clock`."""
+    clearance_height: PositiveFloat = 0.01
+    """Height above their place in standing that feet should have in swing [m]; people's toes clear the ground by 1 to 2
+    cm."""
+    track: NonNegative = 0.0
+    """Weight of √(1 + mean (Δq / track_scale)²) - 1, where Δq is how far hip flexion, knee and ankle of both legs are
+    from the mean of people at the clock's phase. Needs `env.clock`."""
+    track_scale: PositiveFloat = 0.15
+    """Distance from the reference beyond which the term above grows linearly [rad]."""
+    track_rate: NonNegative = 0.0
+    """The same for their rates. Needs `env.clock`."""
+    track_rate_scale: PositiveFloat = 2.0
+    """Scale of the term above [rad/s]."""
+
+
+class TrackingSchedule(Section):
+    """Factor on the weights `track` and `track_rate`: `start` at epoch 0, `end` from epoch `epochs` on."""
+
+    start: NonNegative = 1.0
+    end: NonNegative = 1.0
+    epochs: Whole = 0
+    """Epochs of the change, which is linear; 0: `end` from the beginning."""
+
+    def at(self, epoch: int) -> float:
+        """The factor at `epoch`, counted from 0."""
+        return self.end if epoch >= self.epochs else self.start + (self.end - self.start) * epoch / self.epochs
 
 
 class LegSettings(EnvSettings):
@@ -57,6 +102,17 @@ class LegSettings(EnvSettings):
     control_timestep: PositiveFloat = 0.02
     target_speed: NonNegative = 1.25
     """Target forward speed [m/s]; 0 means standing."""
+    speed_range: tuple[PositiveFloat, PositiveFloat] | None = None
+    """Smallest and largest target speed [m/s]: every episode of training draws one, scores are at `target_speed`; null:
+    that one always."""
+    clock: bool = False
+    """Observe cos and sin of the phase of the right leg's gait cycle. It turns at the cadence of people at the target
+    speed; the left leg is half a turn behind."""
+    symmetric: bool = False
+    """One half of the cycle is the mirror image of the other: while the clock is in its second half, the policy
+    observes the legs with right and left exchanged, and so are its actions. Needs `env.clock`."""
+    tracking: TrackingSchedule = TrackingSchedule()
+    """Schedule of the terms that track people's motion."""
     min_height: float = 0.65
     """Pelvis height above the ground, as a share of the standing height, below which an episode ends."""
     min_upright: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.5
@@ -69,8 +125,38 @@ class LegSettings(EnvSettings):
     """Mean speed over the episode from which walking counts as a success [m/s]."""
     reward: LegReward = LegReward()
 
+    @model_validator(mode="after")
+    def _clock_and_speeds(self) -> "LegSettings":
+        weighed = [f"env.reward.{name}" for name in CLOCKED if getattr(self.reward, name) > 0.0]
+        if not self.clock and (weighed or self.symmetric):
+            raise ValueError(f"{(weighed or ['env.symmetric'])[0]} needs the phase of the walk: write env.clock: true")
+        if self.clock and self.target_speed == 0.0:
+            raise ValueError("env.clock is that of a walk: write an env.target_speed above 0")
+        if self.speed_range is not None:
+            if self.speed_range[0] > self.speed_range[1]:
+                raise ValueError("env.speed_range: write the smaller speed first")
+            if self.target_speed == 0.0:
+                raise ValueError("env.speed_range is for walking: write an env.target_speed above 0")
+        return self
+
     def unread(self) -> dict[str, str]:
         unread = {}
+        r = self.reward
+        for name, weight in (
+            ("clearance_height", "clearance"),
+            ("track_scale", "track"),
+            ("track_rate_scale", "track_rate"),
+        ):
+            if getattr(r, weight) == 0.0:
+                unread[f"reward.{name}"] = f"env.reward.{weight} is 0"
+        if r.track == r.track_rate == 0.0:
+            for name in ("start", "end", "epochs"):
+                unread[f"tracking.{name}"] = "env.reward.track and track_rate are 0"
+        elif not self.tracking.epochs:
+            unread["tracking.start"] = "env.tracking.epochs is 0"
+        if self.clock and r.stride > 0.0:
+            for name in ("stride_angle", "cadence"):
+                unread[f"reward.{name}"] = "env.clock gives people's cadence and step length"
         if not self.early_termination:
             unread["min_height"] = "env.early_termination is false"
         if self.target_speed == 0.0:

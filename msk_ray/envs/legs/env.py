@@ -5,8 +5,10 @@ Axes: W worlds, U muscles, N hinges of the legs.
 
 import math
 from abc import abstractmethod
-from typing import Generic, NamedTuple, TypeVar
+from collections.abc import Callable
+from typing import ClassVar, Generic, NamedTuple, TypeVar
 
+import mujoco
 import torch
 from torch import Tensor
 
@@ -14,8 +16,13 @@ from msk_ray.config import PhysicsConfig
 from msk_ray.config.physics import CONTACTS, LIMITS
 from msk_ray.envs.base import Env
 from msk_ray.envs.layout import Entry, entries
+from msk_ray.envs.legs import terms as costs
 from msk_ray.envs.legs.config import LegSettings
+from msk_ray.envs.legs.gait.body import SIDES, world_axes
+from msk_ray.envs.legs.metabolic import Fibres, muscle_masses, power
+from msk_ray.envs.legs.mirror import Mirror, check_mirrored, other_side
 from msk_ray.envs.legs.muscles import MuscleCurves
+from msk_ray.envs.legs.reference import Reference
 from msk_ray.simulation import StepState
 
 AnyLegSettings = TypeVar("AnyLegSettings", bound=LegSettings)
@@ -26,6 +33,12 @@ _TRUNK_LEVER = 0.18
 _LIMIT_MARGIN = 0.05
 """Distance from a joint limit at which the penalty starts [rad]."""
 _LIMIT_UNIT = 0.1
+_HEAD_LEVER = 0.65
+"""Height of the head above the pelvis [m]."""
+_LEG_LENGTH = 0.9
+"""Leg whose steps have the length of people's [m]."""
+_FOOT = ("calcn", "toes")
+"""Bodies whose origins are the heel and the joint of the toes."""
 _VELOCITY_SCALE = 0.1
 """Scale of joint velocities in the observation [s/rad]."""
 
@@ -49,14 +62,14 @@ class Root(NamedTuple):
     """Angular velocity [rad/s], (W, 3)."""
 
 
-def stride_error(angles: Tensor, rates: Tensor, amplitude: float, rate: float) -> Tensor:
+def stride_error(angles: Tensor, rates: Tensor, amplitude: float | Tensor, rate: float | Tensor) -> Tensor:
     """(r - 1)², shape (W,), of the angle d between both hips as a pendulum: r² = (d/A)² + (d'/(Aω))².
 
     Args:
         angles: right and left hip flexion [rad], (W, 2).
         rates: their velocities [rad/s], (W, 2).
-        amplitude: A [rad].
-        rate: ω [rad/s].
+        amplitude: A [rad], of all worlds or (W, 1).
+        rate: ω [rad/s], of all worlds or (W,).
     """
     swing = torch.stack((angles[:, 0] - angles[:, 1], (rates[:, 0] - rates[:, 1]) / rate), dim=-1) / amplitude
     # The square root has no slope where the legs stand still together.
@@ -78,18 +91,26 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
     U       muscle forces [peak isometric forces]
     U       last action
     1       target speed [m/s]
+    2       with `clock`: cos and sin of the right leg's phase
     ======= ===================================================================
 
     All entries carry gradients: lengths and rates have exact ones, forces are computed from them.
 
     Actions are squashed into excitations by the logistic curve that maps action 0 to the excitation of standing
     (at least `rest_excitation`) and ±1 to 0 and 1, with a slope that is never zero.
+
+    With `clock` or `speed_range`, the numbers of an episode's task are its target speed [m/s] and the phase [turns] it
+    starts with. With `symmetric`, observations and actions are those of the mirrored body while the phase is in its
+    second half; the phase that is observed is then that of the left leg.
     """
 
-    reward_names = (
+    begin_epoch_in_place = True
+    reward_names: tuple[str, ...] = (
         *("forward_vel", "progress", "upright", "heading", "height", "alive", "effort", "joint_limit"),
         *("smoothness", "capture", "sway", "symmetry", "stride"),
     )
+    pose_signs: ClassVar[tuple[float, ...]]
+    """Signs of the mirror image of `Root.pose`."""
     stand_height: float
     """Pelvis height of the standing pose [m]."""
 
@@ -112,11 +133,60 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
         flexions = [self.model.joint(f"hip_flexion_{s}") for s in "rl"]
         self._flexion_dofs = self._index([joint.dofadr[0] for joint in flexions])
         self._flexion_qpos = self._index([joint.qposadr[0] for joint in flexions])
+        self.reference = Reference(self.model, self.device)
+        self._tasked = self.config.clock or self.config.speed_range is not None
+        self._tracking_share = torch.tensor(self.config.tracking.at(0), device=self.device)
+        self._prepare_terms()
+        self._mirror: Mirror | None = None
+        self._mirror_action: Mirror | None = None
+        if self.config.symmetric:
+            self._prepare_mirror()
         with torch.no_grad():
-            state = self.draw_physics(self.nworld)
-            self.obs_size = self.observe(state, torch.zeros((self.nworld, self.action_size), device=self.device)).shape[
-                -1
-            ]
+            state, task = self.draw_start(self.nworld)
+            still = torch.zeros((self.nworld, self.action_size), device=self.device)
+            self.obs_size = self._observed(state, still, task, torch.zeros_like(state.qpos[:, 0])).shape[-1]
+
+    def _prepare_terms(self) -> None:
+        """The terms whose weight is not zero, which come after those that are always there, and what they need."""
+        further: dict[str, Callable[[StepState, Tensor], Tensor]] = {
+            "metabolic": lambda state, action: self.metabolic_power(state, action) / self._mass,
+            "fatigue": lambda state, action: state.act.pow(3).mean(-1),
+            "head": lambda state, action: self._head_speed(state)[:, 1:].square().sum(-1),
+            "impact": lambda state, action: costs.impact(*self._foot_motion(state)[:2]),
+            "footfall": lambda state, action: self._footfall(state),
+            "clearance": lambda state, action: self._clearance(state),
+            "track": lambda state, action: self._tracking(state)[0],
+            "track_rate": lambda state, action: self._tracking(state)[1],
+        }
+        self._further = {name: term for name, term in further.items() if getattr(self.config.reward, name) > 0.0}
+        self.reward_names = (*LegEnv.reward_names, *self._further)
+        self._mass = float(self.model.body_subtreemass[0])
+        self._masses = muscle_masses(self.curves.peak, self.curves.optimum)
+        self._track_qpos = self._index(self.model.jnt_qposadr[self.reference.joints])
+        self._track_dofs = self._index(self.model.jnt_dofadr[self.reference.joints])
+        self._feet = [f"{body}_{side}" for side in SIDES for body in _FOOT]
+        axes = world_axes(self.model)
+        data = mujoco.MjData(self.model)
+        mujoco.mj_resetDataKeyframe(self.model, data, self.model.key("stand").id)
+        mujoco.mj_kinematics(self.model, data)
+        pelvis = data.body("pelvis").xpos
+        drops = [self.stand_height + (data.body(name).xpos - pelvis) @ axes[2] for name in self._feet]
+        self._foot_heights = torch.tensor(drops, dtype=torch.float32, device=self.device)
+        self._up = torch.tensor(axes[2], dtype=torch.float32, device=self.device)
+
+    def _prepare_mirror(self) -> None:
+        check_mirrored(self.model, self.hinges, world_axes(self.model))
+        hinges = other_side([self.model.joint(j).name for j in self.hinges])
+        muscles = other_side(self.action_names())
+        own = list(range(len(self.pose_signs)))
+        spin = ([0, 1, 2], [-1.0, 1.0, -1.0])
+        parts = [([0], [1.0]), (own, self.pose_signs), ([0, 1, 2], [1.0, -1.0, 1.0]), spin]
+        parts += [(hinges, [1.0] * len(hinges))] * 2
+        parts += [(muscles, [1.0] * len(muscles))] * 5
+        # The target speed, and the clock, which the exchange of sides turns by half a cycle.
+        parts += [([0], [1.0]), ([0, 1], [-1.0, -1.0])]
+        self._mirror = Mirror(parts, self.device)
+        self._mirror_action = Mirror(parts[-3:-2], self.device)
 
     @abstractmethod
     def prepare_model(self) -> None:
@@ -149,6 +219,7 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
             *each(muscles, "force", "peak isometric forces"),
             *each(muscles, "last_action"),
             Entry("target_speed", "m/s"),
+            *entries(f"clock_{part}" for part in (("cos", "sin") if self.config.clock else ())),
         ]
 
     def action_names(self) -> list[str]:
@@ -168,15 +239,65 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
         return share / (share + self._odds * (1.0 - share))
 
     def control(self, action: Tensor) -> Tensor:
-        return self.excitation(action)
+        return self.excitation(self._own_sides(action, self.state.age))
+
+    def begin_epoch(self, epoch: int) -> None:
+        self._tracking_share.fill_(self.config.tracking.at(epoch))
+
+    def draw_start(self, count: int) -> tuple[StepState, Tensor]:
+        if not self._tasked:
+            return super().draw_start(count)
+        speed = torch.full((count,), self.config.target_speed, device=self.device)
+        if self.config.speed_range is not None:
+            low, high = self.config.speed_range
+            speed = low + (high - low) * (0.5 + 0.5 * self.uniform(count, 1)[:, 0])
+        phase = 0.5 + 0.5 * self.uniform(count, 1)[:, 0]
+        return self.draw_phase(phase, speed), torch.stack((speed, phase), dim=-1)
+
+    def draw_phase(self, phase: Tensor, speed: Tensor) -> StepState:
+        """Initial states of episodes that start at these phases [turns] and target speeds [m/s], each (N,)."""
+        return self.draw_physics(len(phase))
+
+    def phase(self, numbers: Tensor, age: Tensor) -> Tensor:
+        """Phase of the right leg [turns] after `age` env steps, (W,), for `EnvState.numbers`."""
+        return self._phase(self.task_numbers(numbers), age)
+
+    def _phase(self, task: Tensor, age: Tensor) -> Tensor:
+        speed, start = task[:, 0], task[:, 1]
+        return start + age * self.config.control_timestep * self.reference.pace.strides_per_second(speed)
+
+    def _exchanged(self, task: Tensor, age: Tensor) -> Tensor:
+        """Worlds (W,) bool whose sides the policy sees exchanged."""
+        return torch.remainder(self._phase(task, age), 1.0) >= 0.5
+
+    def _own_sides(self, action: Tensor, age: Tensor) -> Tensor:
+        """Actions (W, A), which were chosen at `age`, for the body as it is."""
+        if self._mirror_action is None:
+            return action
+        return self._mirror_action.where(self._exchanged(self.task_numbers(self.state.numbers), age), action)
+
+    def observation(self) -> Tensor:
+        state = self.state
+        # The last action was chosen one step before.
+        action = self._own_sides(state.action, state.age - 1)
+        return self._observed(state.physics, action, self.task_numbers(state.numbers), state.age)
 
     def observe(self, state: StepState, action: Tensor) -> Tensor:
+        action = self._own_sides(action, self.state.age)
+        return self._observed(state, action, self.task_numbers(self.state.numbers), self.state.age + 1)
+
+    def _observed(self, state: StepState, action: Tensor, task: Tensor, age: Tensor) -> Tensor:
+        """Observation (W, O) of a state at an age, after an action for the body as it is."""
         root = self.root(state)
         length, rate = self.tendons(state)
         length, rate = self.curves.normalised(length[:, self.curves.tendons], rate[:, self.curves.tendons])
         force = self.curves.force(state.act, length, rate)
-        speed = torch.full_like(root.height, self.config.target_speed)
-        return torch.cat(
+        speed = task[:, 0] if self._tasked else torch.full_like(root.height, self.config.target_speed)
+        clock = []
+        if self.config.clock:
+            angle = math.tau * self._phase(task, age)
+            clock = [torch.stack((torch.cos(angle), torch.sin(angle)), dim=-1).to(root.height.dtype)]
+        obs = torch.cat(
             (
                 (root.height - self.stand_height)[:, None],
                 root.pose,
@@ -190,18 +311,31 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
                 force,
                 action,
                 speed[:, None],
+                *clock,
             ),
             dim=-1,
         )
+        return obs if self._mirror is None else self._mirror.where(self._exchanged(task, age), obs)
 
     def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
         c, r = self.config, self.config.reward
+        # A number where it is the same for all, so that nothing is computed for each world.
+        target: float | Tensor = c.target_speed
+        amplitude: float | Tensor = r.stride_angle
+        turn: float | Tensor = math.tau * r.cadence / 120.0
+        if self._tasked:
+            target = self.task_numbers(self.state.numbers)[:, 0]
+        if c.clock and isinstance(target, Tensor):
+            pace = self.reference.pace
+            amplitude = pace.hip_swing(target, _LEG_LENGTH)[:, None]
+            turn = math.tau * pace.strides_per_second(target)
         root = self.root(state)
         speed = root.velocity[:, 0]
         low, high = self._limits
         angles = state.qpos[:, self._hinge_qpos]
         overshoot = (torch.relu(low - angles) + torch.relu(angles - high)) / _LIMIT_UNIT
-        change = action - self.state.action
+        age = self.state.age
+        change = self._own_sides(action, age) - self._own_sides(self.state.action, age - 1)
         # The trunk is half of the body: the centre of mass moves with its lean.
         place = root.place + _TRUNK_LEVER * (root.up[:, :2] - self._upright[:2])
         velocity = root.velocity + _TRUNK_LEVER * torch.linalg.cross(root.spin, root.up)
@@ -211,8 +345,8 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
         flexion_rates = state.qvel[:, self._flexion_dofs]
         flexions = state.qpos[:, self._flexion_qpos]
         terms = (
-            r.forward_vel * torch.exp(-((speed - c.target_speed) / r.speed_scale).square()),
-            r.progress * speed.clamp_max(c.target_speed),
+            r.forward_vel * torch.exp(-((speed - target) / r.speed_scale).square()),
+            r.progress * (torch.minimum(speed, target) if isinstance(target, Tensor) else speed.clamp_max(target)),
             r.upright * root.up[:, 2],
             r.heading * root.heading,
             -r.height * torch.relu(self.stand_height - root.height).square(),
@@ -223,9 +357,59 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
             -r.capture * capture,
             -r.sway * root.spin.square().sum(-1),
             -r.symmetry * flexion_rates.sum(-1).square(),
-            -r.stride * stride_error(flexions, flexion_rates, r.stride_angle, math.tau * r.cadence / 120.0),
+            -r.stride * stride_error(flexions, flexion_rates, amplitude, turn),
+            *(-getattr(r, name) * term(state, action) for name, term in self._further.items()),
         )
         return torch.stack(terms, dim=-1)
+
+    def metabolic_power(self, state: StepState, action: Tensor) -> Tensor:
+        """Metabolic power of all muscles [W], (W,), without that of rest, after actions (W, A)."""
+        length, rate = self.tendons(state)
+        rate = rate[:, self.curves.tendons]
+        length, relative = self.curves.normalised(length[:, self.curves.tendons], rate)
+        isometric = state.act * self.curves.length_curve(length) * self.curves.peak
+        force = isometric * self.curves.rate_curve(relative)
+        excitation = self.excitation(self._own_sides(action, self.state.age))
+        return power(Fibres(excitation, state.act, length, rate, force, isometric), self._masses).sum(-1)
+
+    def _head_speed(self, state: StepState) -> Tensor:
+        """Velocity of the head [m/s], (W, 3): forward, left, up."""
+        root = self.root(state)
+        return root.velocity + _HEAD_LEVER * torch.linalg.cross(root.spin, root.up)
+
+    def _foot_motion(self, state: StepState) -> tuple[Tensor, Tensor, Tensor]:
+        """Heel and toes of the right foot, then of the left: heights above their place in standing [m], upward
+        velocities [m/s], each (W, 4), and velocities [m/s], (W, 4, 3)."""
+        frames, root = self.frames(state), self.root(state)
+        above = ((frames.position(self._feet) - frames.position("pelvis")[:, None]) * self._up).sum(-1)
+        velocity = frames.velocity(self._feet)
+        return root.height[:, None] + above - self._foot_heights, (velocity * self._up).sum(-1), velocity
+
+    def _leg_phases(self) -> tuple[Tensor, Tensor]:
+        """Phases [turns] of the right and the left leg in the state that a step leads to, each (W,)."""
+        phase = self.phase(self.state.numbers, self.state.age + 1)
+        return phase, phase + 0.5
+
+    def _footfall(self, state: StepState) -> Tensor:
+        _, _, velocity = self._foot_motion(state)
+        right, left = self._leg_phases()
+        first = costs.sliding(right, velocity[:, 0], velocity[:, 1])
+        return first + costs.sliding(left, velocity[:, 2], velocity[:, 3])
+
+    def _clearance(self, state: StepState) -> Tensor:
+        heights, _, _ = self._foot_motion(state)
+        right, left = self._leg_phases()
+        wanted = self.config.reward.clearance_height
+        return costs.dragging(right, heights[:, :2], wanted) + costs.dragging(left, heights[:, 2:], wanted)
+
+    def _tracking(self, state: StepState) -> tuple[Tensor, Tensor]:
+        """Costs (W,) of the distance from people's joint angles and of that from their rates."""
+        r = self.config.reward
+        speed = self.task_numbers(self.state.numbers)[:, 0]
+        angles, rates = self.reference(self._leg_phases()[0], speed)
+        apart = costs.deviation(state.qpos[:, self._track_qpos], angles, r.track_scale)
+        rates_apart = costs.deviation(state.qvel[:, self._track_dofs], rates, r.track_rate_scale)
+        return self._tracking_share * apart, self._tracking_share * rates_apart
 
     def fell(self, state: StepState) -> Tensor:
         if not self.config.early_termination:
@@ -249,6 +433,12 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
             return standing
         seconds = self.config.episode_length * self.config.control_timestep
         return standing & (tail["distance"][-1] >= self.config.success_speed * seconds)
+
+    @classmethod
+    def reference_settings(cls, config: AnyLegSettings) -> AnyLegSettings:
+        """The reference reward at `target_speed`."""
+        # The tracking schedule has a meaning only beside the weights that the reference reward does not have.
+        return super().reference_settings(config).model_copy(update={"speed_range": None})
 
     @classmethod
     def reference_physics(cls, physics: PhysicsConfig, variant: str | None) -> PhysicsConfig:

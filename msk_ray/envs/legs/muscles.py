@@ -18,6 +18,7 @@ class MuscleCurves:
         actuators: indices of the muscles among the actuators, shape (U,).
         tendons: index of each muscle's tendon, shape (U,).
         peak: largest isometric force [N], shape (U,).
+        optimum: optimal fibre length [m], shape (U,).
 
     Raises:
         UnsupportedModelError: a muscle is not driven through a tendon of gear 1.
@@ -40,7 +41,7 @@ class MuscleCurves:
         # A negative force means scale / (acceleration per unit force) instead.
         peak = np.where(prm[:, 2] < 0, prm[:, 3] / model.actuator_acc0[found], prm[:, 2])
         self.peak = tensor(peak)
-        self._optimum = tensor(optimum)
+        self.optimum = tensor(optimum)
         self._offset = tensor(prm[:, 0] - ranges[:, 0] / optimum)
         self._lower, self._upper = tensor(prm[:, 4]), tensor(prm[:, 5])
         self._speed = tensor(optimum * prm[:, 6])
@@ -48,7 +49,7 @@ class MuscleCurves:
 
     def normalised(self, length: Tensor, rate: Tensor) -> tuple[Tensor, Tensor]:
         """Fibre length [optimal lengths] and rate [largest shortening speeds] of paths (W, U) [m], [m/s]."""
-        return self._offset + length / self._optimum, rate / self._speed
+        return self._offset + length / self.optimum, rate / self._speed
 
     def force(self, activation: Tensor, length: Tensor, rate: Tensor) -> Tensor:
         """Pull (W, U), in peak isometric forces, at normalised length and rate: a FL(l) FV(v) + FP(l)."""

@@ -10,6 +10,7 @@ from torch import Tensor
 from msk_ray.config import PhysicsConfig
 from msk_ray.envs.layout import Entry, entries
 from msk_ray.envs.legs.env import LegEnv, Root
+from msk_ray.envs.legs.gait.body import world_axes
 from msk_ray.envs.myoleg.config import MyoLegSettings
 from msk_ray.envs.myoleg.model import Couplings, build_myoleg, find_model, ground_height
 from msk_ray.simulation import StepState
@@ -28,6 +29,7 @@ class MyoLeg(LegEnv[MyoLegSettings]):
     """
 
     Settings = MyoLegSettings
+    pose_signs = (-1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0)
 
     @classmethod
     def build_model(cls, config: MyoLegSettings, physics: PhysicsConfig) -> mujoco.MjModel:
@@ -103,15 +105,3 @@ class MyoLeg(LegEnv[MyoLegSettings]):
             velocity=v[:, :3] @ self._axes.T,
             spin=spin,
         )
-
-
-def world_axes(model: mujoco.MjModel) -> np.ndarray:
-    """Forward (heel to toes of the standing pose, level), left and up (against gravity), rows in the world, (3, 3)."""
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, model.key("stand").id)
-    mujoco.mj_kinematics(model, data)
-    up = -model.opt.gravity / np.linalg.norm(model.opt.gravity)
-    feet = sum(data.body(f"toes_{side}").xpos - data.body(f"calcn_{side}").xpos for side in "rl")
-    forward = feet - (feet @ up) * up
-    forward = forward / np.linalg.norm(forward)
-    return np.stack((forward, np.cross(up, forward), up))

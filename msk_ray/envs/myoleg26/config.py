@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from pydantic import PositiveFloat
+from pydantic import PositiveFloat, model_validator
 
 from msk_ray.config.physics import ACTIVATION, CONTACTS, JOINTS, LIMITS, SOLVING, STEPPING
 from msk_ray.config.sections import Fraction, NonNegative, Section, Whole
@@ -64,11 +64,20 @@ class MyoLeg26Settings(LegSettings):
 
     terrain: TerrainConfig = TerrainConfig()
     assist: AssistConfig = AssistConfig()
-    reset: Literal["stand", "walk", "mixed"] = "stand"
-    """Initial states near the standing keyframe, the two walking ones, or all three with equal probability."""
+    reset: Literal["stand", "walk", "mixed", "cycle"] = "stand"
+    """Initial states near the standing keyframe, the two walking ones, or all three with equal probability; `cycle`:
+    near people's posture and speed at the clock's phase (`env.clock`), anywhere in the gait cycle."""
     reset_noise: NonNegative = 0.02
     """Spread of initial joint angles [rad]; velocities, including those of the pelvis, have five times that spread per
     second, which moves the capture point by 3 cm, so that the policy can still balance without a step."""
+
+    @model_validator(mode="after")
+    def _starts_with_the_clock(self) -> "MyoLeg26Settings":
+        if self.reset == "cycle" and not self.clock:
+            raise ValueError("env.reset: cycle starts at the clock's phase: write env.clock: true")
+        if self.reset in ("walk", "mixed") and self.clock:
+            raise ValueError(f"env.reset: {self.reset} has no phase for env.clock: write env.reset: cycle or stand")
+        return self
 
     def unread(self) -> dict[str, str]:
         unread = super().unread()

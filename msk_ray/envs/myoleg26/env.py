@@ -12,6 +12,7 @@ from msk_ray.envs.layout import Entry
 from msk_ray.envs.legs.env import LegEnv, Root
 from msk_ray.envs.myoleg26.config import AssistConfig, MyoLeg26Settings
 from msk_ray.envs.myoleg26.model import SIDES, build_myoleg26
+from msk_ray.envs.myoleg26.poses import cycle_states
 from msk_ray.envs.myoleg26.tables import JOINTS
 from msk_ray.envs.myoleg26.terrain import Terrain
 from msk_ray.simulation import StepState
@@ -29,7 +30,7 @@ class MyoLeg26(LegEnv[MyoLeg26Settings]):
     """
 
     Settings = MyoLeg26Settings
-    begin_epoch_in_place = True
+    pose_signs = (-1.0, 1.0, -1.0, -1.0)
 
     @classmethod
     def build_model(cls, config: MyoLeg26Settings, physics: PhysicsConfig) -> mujoco.MjModel:
@@ -51,10 +52,13 @@ class MyoLeg26(LegEnv[MyoLeg26Settings]):
         self._ranges = tuple(self._tensor(bound) for bound in model.jnt_range[self.hinges].T)
         names = {"stand": ["stand"], "walk": ["walk_left", "walk_right"]}
         names["mixed"] = names["stand"] + names["walk"]
+        names["cycle"] = names["stand"]
         keys = [model.key(name) for name in names[self.config.reset]]
         self._starts = StepState(
             *(self._tensor([getattr(key, part) for key in keys]) for part in ("qpos", "qvel", "act"))
         )
+        if self.config.reset == "cycle":
+            self._cycle = StepState(*map(self._tensor, cycle_states(model)))
         share = self.config.assist.share if self.config.assist.epochs else 0.0
         self._assist_share = torch.tensor(share, device=self.device)
         mass = float(model.body_subtreemass[0])
@@ -72,6 +76,7 @@ class MyoLeg26(LegEnv[MyoLeg26Settings]):
         return torch.as_tensor(np.array(values), dtype=torch.float32, device=self.device)
 
     def begin_epoch(self, epoch: int) -> None:
+        super().begin_epoch(epoch)
         a = self.config.assist
         self._assist_share.fill_(a.share * max(0.0, 1.0 - epoch / a.epochs) if a.epochs else 0.0)
 
@@ -84,14 +89,29 @@ class MyoLeg26(LegEnv[MyoLeg26Settings]):
         return torch.cat((excitation, self._assist_share * force), dim=-1)
 
     def draw_physics(self, count: int) -> StepState:
-        noise = self.config.reset_noise
         if len(self._starts.qpos) > 1 and self.config.stochastic_reset:
             source = self.generator.device
             pick = torch.randint(len(self._starts.qpos), (count,), generator=self.generator, device=source)
             pick = pick.to(self.device)
         else:
             pick = torch.zeros(count, dtype=torch.long, device=self.device)
-        qpos, qvel, act = (part[pick].clone() for part in self._starts)
+        return self._near(StepState(*(part[pick].clone() for part in self._starts)))
+
+    def draw_phase(self, phase: Tensor, speed: Tensor) -> StepState:
+        if self.config.reset != "cycle":
+            return super().draw_phase(phase, speed)
+        count = len(self._cycle.qpos)
+        qpos, qvel, act = (part[(phase * count).round().long() % count].clone() for part in self._cycle)
+        # The table is for one stride per second at rest.
+        qvel *= self.reference.pace.strides_per_second(speed)[:, None]
+        qvel[:, 0] += speed
+        return self._near(StepState(qpos, qvel, act))
+
+    def _near(self, start: StepState) -> StepState:
+        """These initial states with noise."""
+        noise = self.config.reset_noise
+        qpos, qvel, act = start
+        count = len(qpos)
         # Positions stay, because a foot must not start inside the ground. Noise goes on hinges, including the pelvis's.
         qpos[:, 3:] += noise * self.uniform(count, self.model.nq - 3)
         qpos[:, 6:] = qpos[:, 6:].clamp(*self._ranges)

@@ -10,6 +10,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from msk_ray.envs.legs.reference import people_angles
+from msk_ray.envs.legs.terms import TOES_DOWN
 from msk_ray.envs.myoleg26.tables import OUTLINE
 
 WALKING_SPEED: Final = 1.25
@@ -46,6 +48,34 @@ def add_keyframes(spec: mujoco.MjSpec) -> None:
         data = _double_support(model, leading, trailing)
         name = "walk_left" if leading == "l" else "walk_right"
         spec.add_key(name=name, qpos=data.qpos, qvel=_rolling(model, data, leading, trailing), act=act, ctrl=ctrl)
+
+
+def cycle_states(model: mujoco.MjModel) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """qpos (N, nq) and qvel (N, nv) of legs that take one stride a second on the spot, and act (N, na), at N equal
+    distances of the gait cycle of people, from the right foot's strike on.
+
+    Angles are those of `people_angles`. The trunk is upright, toes stay level while their foot is on the ground and
+    pitched, and the lowest point of the soles touches the ground. The feet are on the spot: add a forward speed.
+    """
+    angles = people_angles()[:, :-1]
+    count = angles.shape[1]
+    hip, knee, ankle = angles
+    pitch = hip - knee + ankle
+    toes = np.where(np.arange(count) < 100 * TOES_DOWN[1], np.clip(-pitch, 0.0, None), 0.0)
+    names = ("hip_flexion", "knee_angle", "ankle_angle", "mtp_angle")
+    right = np.stack((hip, -knee, ankle, toes))
+    legs = {"r": right, "l": np.roll(right, count // 2, axis=1)}
+    qpos = np.zeros((count, model.nq))
+    for k in range(count):
+        data = _posed(model, {}, *(dict(zip(names, legs[side][:, k], strict=True)) for side in "rl"))
+        qpos[k] = data.qpos
+        qpos[k, _address(model, "pelvis_ty")] -= _lowest(model, data, "rl") + _PRESSED
+    low, high = model.jnt_range[model.jnt_limited.astype(bool)].T
+    limited = model.jnt_qposadr[model.jnt_limited.astype(bool)]
+    qpos[:, limited] = qpos[:, limited].clip(low, high)
+    around = np.concatenate((qpos[-1:], qpos, qpos[:1]))
+    qvel = (around[2:] - around[:-2]) * (count / 2.0)
+    return qpos, qvel, np.full((count, model.na), REST_ACTIVATION)
 
 
 def holding_activations(model: mujoco.MjModel, qpos: NDArray[np.float64]) -> NDArray[np.float64]:

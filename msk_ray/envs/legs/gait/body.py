@@ -9,14 +9,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from msk_ray.envs.myoleg.env import world_axes
 from msk_ray.errors import ConfigError
 
 Array = NDArray[np.float64]
 SIDES = ("r", "l")
 CURVES = ("hip_flexion", "knee_flexion", "ankle_dorsiflexion", "vertical_force", "forward_force")
 """Curves over a gait cycle: angles [°], forces [body weights]."""
-_JOINTS = {"hip_flexion": "hip_flexion", "knee_flexion": "knee_angle", "ankle_dorsiflexion": "ankle_angle"}
+JOINTS = {"hip_flexion": "hip_flexion", "knee_flexion": "knee_angle", "ankle_dorsiflexion": "ankle_angle"}
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,7 @@ def analyse(model: mujoco.MjModel, qpos: Array, qvel: Array, act: Array, timeste
     """
     check_legs(model)
     axes = world_axes(model)
-    angles = {name: _angles(model, joint, qpos) for name, joint in _JOINTS.items()}
+    angles = {name: _angles(model, joint, qpos) for name, joint in JOINTS.items()}
     owners = {side: _carried_by(model, model.body(f"talus_{side}").id) for side in SIDES}
     weight = float(np.linalg.norm(model.opt.gravity) * model.body_subtreemass[0])
     muscles = np.flatnonzero(model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_MUSCLE))
@@ -79,7 +78,7 @@ def check_legs(model: mujoco.MjModel) -> None:
         for side in SIDES:
             for body in ("calcn", "toes", "talus"):
                 model.body(f"{body}_{side}")
-            for joint in _JOINTS.values():
+            for joint in JOINTS.values():
                 model.joint(f"{joint}_{side}")
         model.body("pelvis")
     except KeyError as error:
@@ -112,9 +111,25 @@ def _angles(model: mujoco.MjModel, joint: str, qpos: Array) -> dict[str, Array]:
     """Angles [°] of a joint by side, each (T,), positive in flexion: knees flex towards the longer end of their
     range."""
     found = {}
+    sign = flexion_sign(model, joint)
     for side in SIDES:
-        entry = model.joint(f"{joint}_{side}")
-        lower, upper = entry.range
-        sign = -1.0 if joint == "knee_angle" and abs(lower) > abs(upper) else 1.0
-        found[side] = sign * np.rad2deg(qpos[:, entry.qposadr[0]])
+        found[side] = sign * np.rad2deg(qpos[:, model.joint(f"{joint}_{side}").qposadr[0]])
     return found
+
+
+def flexion_sign(model: mujoco.MjModel, joint: str) -> float:
+    """1 where a joint's angle grows in flexion, else -1: knees flex towards the longer end of their range."""
+    lower, upper = model.joint(f"{joint}_r").range
+    return -1.0 if joint == "knee_angle" and abs(lower) > abs(upper) else 1.0
+
+
+def world_axes(model: mujoco.MjModel) -> Array:
+    """Forward (heel to toes of the standing pose, level), left and up (against gravity), rows in the world, (3, 3)."""
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.key("stand").id)
+    mujoco.mj_kinematics(model, data)
+    up = -model.opt.gravity / np.linalg.norm(model.opt.gravity)
+    feet = sum(data.body(f"toes_{side}").xpos - data.body(f"calcn_{side}").xpos for side in SIDES)
+    forward = feet - (feet @ up) * up
+    forward = forward / np.linalg.norm(forward)
+    return np.stack((forward, np.cross(up, forward), up))

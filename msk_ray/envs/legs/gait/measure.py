@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from msk_ray.gait.body import CURVES, SIDES, Array, Episode
-from msk_ray.gait.cycles import (
+from msk_ray.envs.legs.gait.body import CURVES, SIDES, Array, Episode
+from msk_ray.envs.legs.gait.cycles import (
     Stride,
     cadence,
     extremum,
@@ -17,7 +17,7 @@ from msk_ray.gait.cycles import (
     strides,
     symmetry_index,
 )
-from msk_ray.gait.human import LANDMARKS, MEASURES
+from msk_ray.envs.legs.gait.ranges import LANDMARKS, MEASURES
 
 SETTLING = 1.0
 """Start of an episode that is left out [s], so that the settled gait is measured."""

@@ -1,0 +1,100 @@
+"""The mirror image of what a policy observes and does: right and left exchanged.
+
+Axes: O observation, A action.
+"""
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from msk_ray.errors import UnsupportedModelError
+
+_TOLERANCE = 2e-3
+"""Largest distance between a body and the mirror image of its counterpart [m]."""
+_SAMPLES = 4
+
+
+class Mirror:
+    """Exchanges sides: `y = x[:, places] * signs`.
+
+    Args:
+        parts: places within each part of a row, and their signs, in order.
+        device: where the rows are.
+    """
+
+    def __init__(self, parts: Sequence[tuple[Sequence[int], Sequence[float]]], device: torch.device) -> None:
+        places: list[int] = []
+        signs: list[float] = []
+        first = 0
+        for order, part_signs in parts:
+            places += [first + place for place in order]
+            signs += part_signs
+            first += len(order)
+        self.places = torch.tensor(places, device=device)
+        self.signs = torch.tensor(signs, dtype=torch.float32, device=device)
+
+    def __call__(self, rows: Tensor) -> Tensor:
+        """The mirror image of rows (W, n)."""
+        return rows[:, self.places] * self.signs
+
+    def where(self, chosen: Tensor, rows: Tensor) -> Tensor:
+        """Rows (W, n), mirrored in the chosen worlds (W,)."""
+        return torch.where(chosen[:, None], self(rows), rows)
+
+
+def other_side(names: Sequence[str]) -> list[int]:
+    """For each name its counterpart's place in the list; names end in _r or _l, others are their own.
+
+    Raises:
+        UnsupportedModelError: there is no counterpart.
+    """
+    found = []
+    for name in names:
+        swapped = name[:-1] + {"r": "l", "l": "r"}[name[-1]] if name.endswith(("_r", "_l")) else name
+        if swapped not in names:
+            raise UnsupportedModelError(
+                f"env.symmetric: {name} has no counterpart {swapped}: write env.symmetric: false"
+            )
+        found.append(list(names).index(swapped))
+    return found
+
+
+def check_mirrored(model: mujoco.MjModel, hinges: Sequence[int], axes: np.ndarray) -> None:
+    """Check that angles exchanged between the sides give the mirror image of the legs, in a few poses.
+
+    Args:
+        model: with a keyframe `stand`.
+        hinges: joints of the legs.
+        axes: forward, left and up, rows in the world, (3, 3).
+
+    Raises:
+        UnsupportedModelError: they do not.
+    """
+    names = [model.joint(j).name for j in hinges]
+    places = other_side(names)
+    every = [model.body(b).name for b in range(model.nbody)]
+    own = [name for name in every if name[:-1] + {"r": "l", "l": "r"}.get(name[-1:], "") in every]
+    other = [own.index(name[:-1] + {"r": "l", "l": "r"}[name[-1]]) for name in own]
+    bodies = [every.index(name) for name in own]
+    pelvis = model.body("pelvis").id
+    rng = np.random.default_rng(0)
+    addresses = model.jnt_qposadr[list(hinges)]
+    low, high = model.jnt_range[list(hinges)].T
+    for _ in range(_SAMPLES):
+        angles = low + (high - low) * rng.uniform(0.3, 0.7, len(hinges))
+        seen = []
+        for values in (angles, angles[places]):
+            data = mujoco.MjData(model)
+            mujoco.mj_resetDataKeyframe(model, data, model.key("stand").id)
+            data.qpos[addresses] = values
+            mujoco.mj_kinematics(model, data)
+            seen.append((data.xpos[bodies] - data.xpos[pelvis]) @ axes.T)
+        error = np.abs(seen[1][other] * [1.0, -1.0, 1.0] - seen[0]).max()
+        if error > _TOLERANCE:
+            raise UnsupportedModelError(
+                f"env.symmetric: the legs of this model are no mirror images ({error * 1000:.0f} mm apart): write "
+                "env.symmetric: false"
+            )

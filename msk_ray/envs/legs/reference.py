@@ -1,0 +1,79 @@
+"""The motion of people as a reference: joint angles and rates by phase and speed, from measured means.
+
+Hip flexion is measured against a pelvis whose plane is tilted forward by 9° in people who stand upright; a model's
+pelvis is upright then, so that mean is subtracted. The zero of the measured ankle is a choice: here it is the one with
+which the foot is level, on average, while it is flat on the ground (10 to 30 % of the cycle).
+"""
+
+import math
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from msk_ray.envs.legs.clock import fourier, polynomial, series
+from msk_ray.envs.legs.gait.body import JOINTS, SIDES, flexion_sign
+from msk_ray.envs.legs.gait.people import curve, pace_polynomials
+
+MEASURED_AT = 1.25
+"""Speed at which the measured angles are taken to hold [m/s]; hips swing in proportion to the step length."""
+_FLAT = slice(10, 31)
+
+
+def people_angles() -> np.ndarray:
+    """Hip flexion, knee flexion and ankle dorsiflexion [rad] of a model with an upright pelvis, (3, 101)."""
+    hip, knee, ankle = (curve(name).mean for name in JOINTS)
+    hip = hip - curve("pelvis_tilt").mean.mean()
+    pitch = hip - knee + ankle  # of the foot, toes up
+    return np.deg2rad(np.stack((hip, knee, ankle - pitch[_FLAT].mean())))
+
+
+class Reference:
+    """Angles of hip, knee and ankle of both legs in a model.
+
+    Attributes:
+        joints: their ids, right leg first, (6,).
+        coefficients: of the curves of the right leg, in the model's signs, (3, 2, K).
+    """
+
+    def __init__(self, model: mujoco.MjModel, device: torch.device) -> None:
+        self.joints = [model.joint(f"{joint}_{side}").id for side in SIDES for joint in JOINTS.values()]
+        signs = np.array([flexion_sign(model, joint) for joint in JOINTS.values()])
+        curves = signs[:, None] * people_angles()
+        self.coefficients = torch.tensor(np.stack([fourier(c) for c in curves]), dtype=torch.float32, device=device)
+        cadence, step = (torch.tensor(c, dtype=torch.float32, device=device) for c in pace_polynomials())
+        self.pace = Pace(cadence, step)
+        self._step_here = float(np.polyval(pace_polynomials()[1], MEASURED_AT))
+
+    def __call__(self, phase: Tensor, speed: Tensor) -> tuple[Tensor, Tensor]:
+        """Angles [rad] and rates [rad/s], each (W, 6), at the right leg's phases (W,) [turns] and speeds (W,) [m/s]."""
+        both = torch.stack((phase, phase + 0.5), dim=-1)
+        angle, slope = series(self.coefficients.to(phase.dtype), both)
+        swing = (self.pace.step_length(speed) / self._step_here)[:, None]
+        mean = self.coefficients[0, 0, 0]
+        hip, hip_slope = mean + swing * (angle[..., 0] - mean), swing * slope[..., 0]
+        angle = torch.cat((hip[..., None], angle[..., 1:]), dim=-1)
+        slope = torch.cat((hip_slope[..., None], slope[..., 1:]), dim=-1)
+        rate = slope * self.pace.strides_per_second(speed)[:, None, None]
+        return angle.flatten(1), rate.flatten(1)
+
+
+class Pace(NamedTuple):
+    """Cadence and step length of people as polynomials of the speed [m/s]."""
+
+    cadence_polynomial: Tensor
+    step_polynomial: Tensor
+
+    def strides_per_second(self, speed: Tensor) -> Tensor:
+        """Gait cycles per second [1/s], (W,)."""
+        return polynomial(self.cadence_polynomial, speed) / 120.0
+
+    def step_length(self, speed: Tensor) -> Tensor:
+        """Step length [m], (W,)."""
+        return polynomial(self.step_polynomial, speed)
+
+    def hip_swing(self, speed: Tensor, leg: float) -> Tensor:
+        """Largest angle between both hips [rad], (W,), of legs of this length [m] that take such steps."""
+        return 2.0 * torch.asin((self.step_length(speed) / (2.0 * leg)).clamp(0.0, math.sin(1.0)))

@@ -1,0 +1,62 @@
+"""Costs of a walk, as pure functions. W worlds, U muscles, F points of the feet."""
+
+import torch
+from torch import Tensor
+
+from msk_ray.envs.legs.clock import window
+
+HEEL_DOWN = (0.02, 0.40)
+"""Phases of the own leg between which the heel stands on the ground [turns], with flanks inside. These and the next two
+are those at which the feet of `people_angles` move by less than 0.3 m/s, or are 1 cm above the ground."""
+TOES_DOWN = (0.10, 0.60)
+"""The same of the toes."""
+SWING = (0.64, 0.92)
+"""The same of the swing."""
+_SLIDING = 0.3
+"""Speed of a foot that should stand beyond which its cost grows linearly [m/s]."""
+_NEAR = 0.03
+"""Height above the ground at which an approaching foot counts 1/e [m]."""
+
+
+def soft(squares: Tensor) -> Tensor:
+    """√(1 + x²) − 1 of squares x²: half of it while small, then |x|."""
+    return torch.sqrt(1.0 + squares) - 1.0
+
+
+def sliding(phase: Tensor, heel: Tensor, toes: Tensor) -> Tensor:
+    """Cost (W,) of a foot that moves while it should stand.
+
+    Args:
+        phase: of its leg [turns], (W,).
+        heel, toes: their velocities [m/s], (W, 3).
+    """
+    down = window(phase, *HEEL_DOWN), window(phase, *TOES_DOWN)
+    speeds = ((velocity / _SLIDING).square().sum(-1) for velocity in (heel, toes))
+    return sum((on * soft(speed) for on, speed in zip(down, speeds, strict=True)), torch.zeros_like(phase))
+
+
+def dragging(phase: Tensor, heights: Tensor, clearance: float) -> Tensor:
+    """Cost (W,) of a foot that is too low in its swing: the mean of (missing height / clearance)².
+
+    Args:
+        phase: of its leg [turns], (W,).
+        heights: of heel and toes above their place in standing [m], (W, 2).
+        clearance: height that is asked for [m].
+    """
+    missing = torch.relu(clearance - heights) / clearance
+    return window(phase, *SWING) * missing.square().mean(-1)
+
+
+def impact(heights: Tensor, fall: Tensor) -> Tensor:
+    """Cost (W,) of points of the feet that come down [m²/s²]: Σ v² e^(-h/3 cm) over those moving down.
+
+    Args:
+        heights: above the ground [m], (W, F).
+        fall: upward velocities [m/s], (W, F).
+    """
+    return (torch.relu(-fall).square() * torch.exp(-heights.clamp_min(0.0) / _NEAR)).sum(-1)
+
+
+def deviation(values: Tensor, reference: Tensor, scale: float) -> Tensor:
+    """Cost (W,) of values (W, n) apart from a reference: √(1 + mean ((x - r)/scale)²) - 1."""
+    return soft(((values - reference) / scale).square().mean(-1))
