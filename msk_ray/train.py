@@ -24,9 +24,11 @@ from typing import TYPE_CHECKING
 from msk_ray.cli import TERMINAL_LOG, Parser, outliving, run, typed_command
 from msk_ray.config import SET_HELP, Config, load_config
 from msk_ray.errors import CheckpointError, ConfigError, StorageError
+from msk_ray.experiment.environment import environment
+from msk_ray.experiment.layout import ENVIRONMENT_FILE
 from msk_ray.experiment.metrics import SCORE, read_rows
 from msk_ray.experiment.ownership import Ownership, owned
-from msk_ray.files import check_writable, make_folder
+from msk_ray.files import check_writable, make_folder, write_json
 from msk_ray.signals import RESUMABLE, StopRequest, listening
 from msk_ray.text import printable
 
@@ -36,9 +38,9 @@ if TYPE_CHECKING:
 DESCRIPTION = """\
 Train one policy, by SHAC or another algorithm: one trial, in this process, without Ray.
 
-Writes into the log folder: config.yaml (every setting), metrics.jsonl (one row per epoch), TensorBoard events and
-checkpoints/ with the newest two and best.pt, the trained policy with the highest evaluation score (until the first
-score, the untrained policy)."""
+Writes into the log folder: config.yaml (every setting), env.json (command, commit, versions, device), metrics.jsonl
+(one row per epoch), TensorBoard events and checkpoints/ with the newest two and best.pt, the trained policy with the
+highest evaluation score (until the first score, the untrained policy)."""
 
 EXAMPLES = """\
   python -m msk_ray.train --config cartpole
@@ -194,6 +196,7 @@ def _trainer(
 ) -> "Trainer | ParallelTrainer":
     """A trainer of the trial in `logdir`, at its start."""
     # torch and Warp take seconds to load; a wrong command line should not wait for them.
+    from msk_ray.evaluate.measure import device_name
     from msk_ray.training import MOST_TOGETHER, make_trainer
     from msk_ray.training.checkpoint import newest_valid_checkpoint
 
@@ -203,7 +206,10 @@ def _trainer(
             raise CheckpointError(
                 f"--resume: no checkpoint in {logdir} is complete ({faults[0]}); choose another --logdir to start again"
             )
-    return make_trainer(config, logdir, device, 1 if score_at_once or device == "cpu" else MOST_TOGETHER)
+    trainer = make_trainer(config, logdir, device, 1 if score_at_once or device == "cpu" else MOST_TOGETHER)
+    if not resume:
+        write_json(logdir / ENVIRONMENT_FILE, environment(device_name(device)))
+    return trainer
 
 
 def _train(

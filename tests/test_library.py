@@ -12,6 +12,7 @@ from scenes import cartpole
 
 import msk_ray
 from msk_ray.errors import ConfigError, StorageError
+from msk_ray.experiment.environment import read_environment
 
 
 def test_importing_loads_neither_torch_nor_warp() -> None:
@@ -50,6 +51,10 @@ def test_training_gives_the_best_policy(tiny_cartpole: msk_ray.Config, tmp_path:
     policy = msk_ray.load_policy(trained.best_checkpoint)
     assert policy.config == tiny_cartpole
     assert policy.sizes == (5, 1)
+    ran_with, damages = read_environment(tmp_path / "mine" / "env.json")
+    assert not damages
+    assert ran_with["device"] == "cpu"
+    assert ran_with["command"]
 
 
 def test_the_readme_example_runs(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

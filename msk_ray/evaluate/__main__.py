@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from msk_ray.cli import Parser, run
 from msk_ray.errors import CheckpointError, ConfigError, MskRayError
+from msk_ray.evaluate import zoo
 from msk_ray.evaluate.apart import PYTHON, find_python
 from msk_ray.evaluate.targets import Kind, Target, best_checkpoint, best_of_trial, find_target
 from msk_ray.evaluate.vary import HELP, parse_vary, vary_text
@@ -31,7 +32,8 @@ Evaluate a policy: without noise, from fixed initial states, under the environme
 Prints score, speed, falls, episode length and every reward term with its spread over episodes, and stores them in the
 trial's eval.json (those of a policy of policies/ are only printed). For an experiment it evaluates the best policy of
 each trial, ranks them, and writes the ranking into the experiment's eval.json. Without options the score is the one by
-which trials are ranked (eval/score), to the last digit on the same device."""
+which trials are ranked (eval/score), to the last digit on the same device. For policies/, or another folder that export
+--zoo wrote, it evaluates each policy as recorded there and prints the table of its README."""
 
 EXAMPLES = """\
   python -m msk_ray.evaluate runs/demo                                   # every trial's best policy, ranked
@@ -41,15 +43,16 @@ EXAMPLES = """\
   python -m msk_ray.evaluate ant_lr --worlds 256 --seeds 0-4             # fresh initial states
   python -m msk_ray.evaluate runs/mine --vary body_mass=0.8x,1.2x        # how well does it bear other masses?
   python -m msk_ray.evaluate runs/train/myosuite_walk_seed0 --in myosuite   # in MyoSuite's own environment
+  python -m msk_ray.evaluate policies/                                   # the trained policies: are their scores true?
 
-exit codes: 0 done, 1 a policy could not be evaluated, 2 refused."""
+exit codes: 0 done, 1 a policy could not be evaluated, or one of a zoo does not score what is recorded, 2 refused."""
 
 
 def parser() -> Parser:
     """The command line."""
     p = Parser("python -m msk_ray.evaluate", DESCRIPTION, EXAMPLES)
     p.add_argument(
-        "target", metavar="CHECKPOINT|TRIAL|EXPERIMENT", help="a .pt file, a folder, or an experiment's name"
+        "target", metavar="CHECKPOINT|TRIAL|EXPERIMENT|ZOO", help="a .pt file, a folder, or an experiment's name"
     )
     p.add_argument("--worlds", type=positive, metavar="W", help="episodes per seed (default: the trial's, 64)")
     p.add_argument("--seeds", metavar="LIST", help="seeds of the initial states, such as 0-4 (default: the trial's)")
@@ -96,6 +99,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     names = [name.strip() for name in (args.physics or "reference").split(",")]
     varied = [None, *(parse_vary(args.vary) if args.vary is not None else [])]
     python = _python_apart(args)
+    if target.kind is Kind.ZOO:
+        return _evaluate_zoo(target, args)
     if target.kind is not Kind.EXPERIMENT:
         best_checkpoint(target)  # torch and Warp take seconds to load; a wrong path should not wait for them
 
@@ -115,6 +120,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     if target.kind is Kind.EXPERIMENT:
         return evaluate_experiment(Experiment(target.path), bench, requests)
     return _evaluate_one(target, bench, requests, len(varied))
+
+
+def _evaluate_zoo(target: Target, args: argparse.Namespace) -> int:
+    """Evaluate the policies of a zoo, each as its entry says."""
+    for option in ("worlds", "seeds", "steps", "physics", "vary", "elsewhere", "python"):
+        if getattr(args, option) is not None:
+            shown = "in" if option == "elsewhere" else option
+            raise ConfigError(f"--{shown}: the policies of {target.path} are evaluated as recorded there; leave it out")
+    zoo.read_zoo(target.path)  # torch and Warp take seconds to load; a damaged entry should not wait for them
+
+    from msk_ray.evaluate import measure
+    from msk_ray.simulation.simulation import resolve_device
+
+    device = args.device or measure.default_device()
+    resolve_device(device)
+    return zoo.evaluate_zoo(target.path, measure.Bench(device))
 
 
 def _python_apart(args: argparse.Namespace) -> Path | None:

@@ -10,7 +10,7 @@ from msk_ray.experiment import layout
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.results import best_record, read_records
 from msk_ray.experiment.trial_status import find_experiments
-from msk_ray.shipped import POLICIES, find_shipped, shipped_names
+from msk_ray.shipped import POLICIES, find_shipped, shipped_folder, shipped_names
 
 
 class Kind(StrEnum):
@@ -19,6 +19,8 @@ class Kind(StrEnum):
     CHECKPOINT = "checkpoint"
     TRIAL = "trial"
     EXPERIMENT = "experiment"
+    ZOO = "zoo"
+    """A folder of policies, each a .pt file with a .yaml beside it."""
 
 
 @dataclass(frozen=True)
@@ -31,13 +33,14 @@ class Target:
 
 
 def find_target(text: str, storage: Path) -> Target:
-    """The checkpoint, trial or experiment at a path, the experiment of that name in `storage`, or the policy of that
-    name in `policies/`.
+    """The checkpoint, trial or experiment at a path, the experiment of that name in `storage`, the policy of that name
+    in `policies/`, or all of `policies/`.
 
     Raises:
         StorageError: there is none.
     """
-    for path in (storage / text, Path(text)):
+    shipped = [shipped_folder() / POLICIES] if Path(text) == Path(POLICIES) else []
+    for path in (storage / text, Path(text), *shipped):
         if path.is_file():
             if path.suffix != ".pt":
                 raise StorageError(f"{path} is not a checkpoint: give a .pt file, a trial's folder or an experiment")
@@ -79,6 +82,9 @@ def best_checkpoint(target: Target) -> Path:
     """
     if target.kind is Kind.CHECKPOINT:
         return target.path
+    if target.kind is Kind.ZOO:
+        names = ", ".join(sorted(path.name for path in target.path.glob("*.pt")))
+        raise CheckpointError(f"{target.path} holds several policies; give one of them: {names}")
     return best_of_trial(best_trial_folder(target))
 
 
@@ -127,5 +133,7 @@ def _kind_of(path: Path) -> Kind:
         return Kind.TRIAL
     if path.name == "checkpoints":
         raise StorageError(f"{path}: give one of its .pt files, or the trial's folder above it")
+    if any(path.glob("*.pt")):
+        return Kind.ZOO
     # An experiment that died before its first file is an empty folder; its reader says what is wrong with it.
     return Kind.EXPERIMENT

@@ -1,4 +1,4 @@
-"""What an experiment ran with: versions, command, and the machine it was started on."""
+"""What an experiment, or a trial on its own, ran with: versions, command, and the machine it was started on."""
 
 import os
 import platform
@@ -23,6 +23,7 @@ _ENVIRONMENT = {
     "driver": str,
     "packages": dict,
     "commit": str,
+    "device": str,
 }
 
 
@@ -55,8 +56,12 @@ def read_environment(path: Path) -> tuple[dict[str, Any], list[Damage]]:
         return {}, [error.damage]
 
 
-def environment() -> dict[str, Any]:
-    """What the experiment ran with: versions, command, and the machine it was started on."""
+def environment(device: str | None = None) -> dict[str, Any]:
+    """What the experiment ran with: versions, command, and the machine it was started on.
+
+    Args:
+        device: model of the GPU of a trial on its own, or `cpu`; the trials of an experiment each record theirs.
+    """
     driver = ask_driver()
     return {
         "command": sys.argv,
@@ -68,6 +73,7 @@ def environment() -> dict[str, Any]:
         "driver": driver.driver,
         "packages": installed_versions(_PACKAGES),
         "commit": _commit(),
+        **({} if device is None else {"device": device}),
     }
 
 

@@ -1,5 +1,6 @@
 """`python -m msk_ray.export`: take a policy along."""
 
+import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,6 +9,7 @@ from msk_ray.cli import Parser, run
 from msk_ray.errors import ConfigError
 from msk_ray.evaluate.targets import best_checkpoint, find_target
 from msk_ray.files import make_folder
+from msk_ray.sweep.space import parse_seeds
 
 DESCRIPTION = """\
 Export a policy for programs that do not have msk_ray: as ONNX, as TorchScript, or both.
@@ -18,12 +20,17 @@ than the action. Each file is compared with the checkpoint's policy on 1000 obse
 differs by more than 1e-5.
 
 Beside p.onnx stand p.json (order and units of observation and action, control period, joints, origin) and p.mjb, the
-model, which MuJoCo of the same version loads (mujoco.MjModel.from_binary_path)."""
+model, which MuJoCo of the same version loads (mujoco.MjModel.from_binary_path).
+
+--zoo keeps the policy itself, for evaluate, visualize and export: NAME.pt without the means to train it, and NAME.yaml
+with its settings, its score over --seeds, the commit, the command and the GPU. The table in the folder's README.md is
+renewed."""
 
 EXAMPLES = """\
   python -m msk_ray.export runs/demo --onnx policy.onnx                     # the best policy of an experiment
   python -m msk_ray.export runs/train/ant_seed0 --onnx ant.onnx --torchscript ant.pt
   python -m msk_ray.export cartpole --torchscript cartpole.pt               # one of policies/
+  python -m msk_ray.export runs/train/ant_seed0 --zoo policies/ant          # for others to use
 
 exit codes: 0 done, 2 refused."""
 
@@ -38,13 +45,22 @@ def parser() -> Parser:
     p.add_argument("--torchscript", type=Path, metavar="FILE", help="a .pt file")
     p.add_argument(
         "--physics",
-        default="reference",
         metavar="NAME",
-        help="physics of the model: reference (that of scores), own (that of training), or a named one",
+        help="physics of the model: reference (that of scores), own (that of training), or a named one (default: "
+        "reference)",
     )
     p.add_argument(
         "--storage", type=Path, default=Path("runs"), metavar="DIR", help="folder of experiments (default: runs/)"
     )
+    zoo = p.add_argument_group("a policy for others to use")
+    zoo.add_argument("--zoo", type=Path, metavar="FOLDER/NAME", help="write FOLDER/NAME.pt and FOLDER/NAME.yaml")
+    zoo.add_argument(
+        "--seeds", metavar="LIST", help="seeds of the initial states that it is scored from (default: 0-4)"
+    )
+    zoo.add_argument("--device", help="for its score: cpu or cuda:N (default: the first GPU, or the CPU)")
+    zoo.add_argument("--command", metavar="TEXT", help="how it was trained, if its trial does not say")
+    zoo.add_argument("--commit", metavar="HASH", help="with which commit")
+    zoo.add_argument("--machine", metavar="TEXT", help="on what, such as '1 × NVIDIA H200'")
     return p
 
 
@@ -54,6 +70,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     checkpoint = best_checkpoint(find_target(args.target, args.storage))
     wanted = {"onnx": args.onnx, "torchscript": args.torchscript}
     paths = {kind: path for kind, path in wanted.items() if path is not None}
+    if args.zoo is not None:
+        return _add_to_zoo(args, checkpoint, bool(paths))
+    given = [name for name in _ZOO_OPTIONS if getattr(args, name) is not None]
+    if given:
+        raise ConfigError(f"--{given[0]}: only --zoo reads it; leave it out")
     _check_paths(paths, checkpoint)
     # torch and Warp take seconds to load; a wrong command line should not wait for them.
     from msk_ray.export.write import export
@@ -62,14 +83,37 @@ def main(argv: Sequence[str] | None = None) -> int:
         from msk_ray.export.network import check_packages
 
         check_packages()
-    for line in export(checkpoint, paths, args.physics):
+    for line in export(checkpoint, paths, args.physics or REFERENCE):
+        print(line, flush=True)
+    return 0
+
+
+REFERENCE = "reference"
+_ZOO_OPTIONS = ("seeds", "device", "command", "commit", "machine")
+
+
+def _add_to_zoo(args: argparse.Namespace, checkpoint: Path, files: bool) -> int:
+    if files or args.physics is not None:
+        raise ConfigError("--zoo scores under reference physics and writes no other files: leave the other options out")
+    if args.zoo.suffix or args.zoo.name in ("", ".."):
+        raise ConfigError(f"--zoo {args.zoo}: write FOLDER/NAME, without a suffix")
+    seeds = parse_seeds(args.seeds or "0-4")
+    make_folder(args.zoo.parent)
+    from msk_ray.evaluate.measure import default_device
+    from msk_ray.export.zoo import Origin, add_to_zoo
+    from msk_ray.simulation.simulation import resolve_device
+
+    device = args.device or default_device()
+    resolve_device(device)
+    given = Origin(args.command, args.commit, args.machine)
+    for line in add_to_zoo(checkpoint, args.zoo, given, seeds, device):
         print(line, flush=True)
     return 0
 
 
 def _check_paths(paths: dict[str, Path], checkpoint: Path) -> None:
     if not paths:
-        raise ConfigError("nothing to write: give --onnx FILE, --torchscript FILE, or both")
+        raise ConfigError("nothing to write: give --onnx FILE, --torchscript FILE or both, or --zoo FOLDER/NAME")
     for kind, path in paths.items():
         suffix = {"onnx": ".onnx", "torchscript": ".pt"}[kind]
         if path.suffix != suffix:

@@ -2,11 +2,12 @@
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 
-from msk_ray.envs import env_class, make_env
+from msk_ray.envs import Env, env_class, make_env
 from msk_ray.evaluate.measure import named_physics
 from msk_ray.export.description import describe
 from msk_ray.export.network import (
@@ -19,7 +20,7 @@ from msk_ray.export.network import (
     to_torchscript,
 )
 from msk_ray.files import write_bytes, write_json
-from msk_ray.training import load_policy
+from msk_ray.training import SavedPolicy, load_policy
 
 _WRITERS = {"onnx": to_onnx, "torchscript": to_torchscript}
 
@@ -36,12 +37,8 @@ def export(checkpoint: Path, paths: Mapping[str, Path], physics: str) -> Iterato
         ConfigError, CheckpointError, UnsupportedModelError, StorageFailure: as their messages say.
     """
     saved = load_policy(checkpoint)
-    shown, chosen = named_physics(saved.config, physics)
-    settings = env_class(saved.config.env).reference_settings(saved.config.env)
-    seed = saved.config.evaluation.seed
-    env = make_env(settings, chosen, WORLDS, "cpu", seed, differentiable=False)
-    policy = PolicyToControl(saved.network(env), env).eval().requires_grad_(False)
-    obs = observations(env, seed)
+    policy, env, shown = policy_to_control(saved, physics)
+    obs = observations(env, saved.config.evaluation.seed)
     made = {}
     for kind in paths:
         payload, runner = _WRITERS[kind](policy, obs)
@@ -58,6 +55,18 @@ def export(checkpoint: Path, paths: Mapping[str, Path], physics: str) -> Iterato
         yield f"{model}: the model under {shown} physics, for MuJoCo {mujoco.__version__}"
         write_json(path, describe(saved, policy, env, shown, {**files, "model": model.name}))
         yield f"{path}: observation, action, periods"
+
+
+def policy_to_control(saved: SavedPolicy, physics: str) -> tuple[PolicyToControl, Env[Any], str]:
+    """The network to export, the environment that it acts in, on the CPU, and the name of its physics.
+
+    Raises:
+        ConfigError, CheckpointError, UnsupportedModelError: as their messages say.
+    """
+    shown, chosen = named_physics(saved.config, physics)
+    settings = env_class(saved.config.env).reference_settings(saved.config.env)
+    env = make_env(settings, chosen, WORLDS, "cpu", saved.config.evaluation.seed, differentiable=False)
+    return PolicyToControl(saved.network(env), env).eval().requires_grad_(False), env, shown
 
 
 def model_bytes(model: mujoco.MjModel) -> bytes:

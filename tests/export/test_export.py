@@ -26,12 +26,10 @@ from msk_ray.export import network
 from msk_ray.export.__main__ import main
 from msk_ray.export.description import describe
 from msk_ray.export.network import PolicyToControl, largest_difference
-from msk_ray.export.write import export
 from msk_ray.shipped import shipped_folder
 from msk_ray.simulation import StepState
 
 CHECKPOINT = shipped_folder() / "policies" / "cartpole.pt"
-POLICIES = sorted(CHECKPOINT.parent.glob("*.pt"))
 
 
 @pytest.fixture(scope="module")
@@ -40,17 +38,6 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("exported")
     assert run(main, ["cartpole", "--onnx", str(folder / "p.onnx"), "--torchscript", str(folder / "q.pt")]) == 0
     return folder / "p.onnx"
-
-
-@pytest.mark.parametrize("path", POLICIES, ids=lambda path: path.stem)
-def test_every_trained_policy_is_listed_exported_and_run(path: Path, root: Path, tmp_path: Path) -> None:
-    assert path.stat().st_size <= 1_000_000
-    assert f"| `{path.name}` |" in (root / "policies" / "README.md").read_text()
-    # What differs by more than 1e-5 is refused.
-    assert "differs by at most" in next(export(path, {"onnx": tmp_path / "p.onnx"}, "reference"))
-    entry = Bench("cpu").evaluate(msk_ray.load_policy(path), Request(worlds=2, steps=10))
-    assert entry["length"]["mean"] > 1
-    assert entry["diverged_rate"] == 0.0
 
 
 @pytest.fixture(scope="module")
