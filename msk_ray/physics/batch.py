@@ -14,6 +14,8 @@ from msk_ray.errors import ConfigError, UnsupportedModelError
 from msk_ray.physics.capacity import Capacity, default_capacity, scalar_rows
 from msk_ray.physics.graph import joined_stream
 from msk_ray.physics.iterations import IterationWatch
+from msk_ray.physics.ordered import OrderedStages, check_ordered, dense
+from msk_ray.physics.ordered.stages import PackageStages, Stages, with_options
 from msk_ray.physics.overflow import LossWatch, cured, loss_error, needed
 from msk_ray.physics.pairs import widened
 from msk_ray.physics.parameters import check_names, open_arrays, structure
@@ -72,6 +74,7 @@ class WorldBatch:
             else what a short probe in C MuJoCo needed and half as much again.
         tolerance: solver tolerance, below mujoco_warp's floor of 1e-6 if wanted.
         contact_reach: distance [m] within which contacts are found before they touch, without any force.
+        ordered: add everything up in a fixed order, so that a GPU repeats a step bit for bit; the Jacobian is dense.
 
     Attributes:
         mjm: the C MuJoCo model.
@@ -82,6 +85,7 @@ class WorldBatch:
         structure: the MjModel with everything present that these may switch on.
         substeps: physics steps an env step.
         device: the Warp device.
+        stages: launches of a step and of its parts.
         capacity: contacts and rows per world that fit into `data`.
         losses: what steps lost to full buffers; check it between steps.
         iterations: how many iterations the solver took in each substep.
@@ -104,14 +108,19 @@ class WorldBatch:
         njmax: int | None = None,
         tolerance: float | None = None,
         contact_reach: float = 0.0,
+        ordered: bool = False,
     ) -> None:
         check_state(mjm)
         check_ignored(mjm)
+        if ordered:
+            check_ordered(mjm)
         self.mjm = mjm
         self.substeps = substeps
         self.device = wp.get_device(device)
         self.parameters: tuple[str, ...] = ()
         self._reach = contact_reach
+        self.ordered = ordered
+        self.stages: Stages = PackageStages()
         self.structure = self._structure()
         self._tolerance = tolerance
         self._model = self._load(nworld)
@@ -123,6 +132,8 @@ class WorldBatch:
 
     def _structure(self) -> mujoco.MjModel:
         model = structure(self.mjm, self.parameters)
+        if self.ordered:
+            model = dense(model)
         return widened(model, self._reach) if self._reach > 0.0 else model
 
     def _load(self, nworld: int) -> Any:
@@ -138,6 +149,8 @@ class WorldBatch:
             model.opt.warn_overflow = 0  # read back by `losses`, not printed from kernels
             model.ncam = model.nlight = 0  # nothing looks: two launches less a substep
             open_arrays(self.mjm, model, self.parameters, nworld)
+            if self.ordered:
+                self.stages = OrderedStages(model)
         seal(model, "batch.model")
         return model
 
@@ -236,20 +249,15 @@ class WorldBatch:
         """Launch substep k of an env step on `data`, this batch's own or another of the same model and size."""
         model = self._unrolled(k) if joined_stream() is not None else self.model
         refresh_velocity(self.mjm, model, data)
-        mjw.step(model, data)
+        self.stages.step(model, data)
         self.iterations.launch(data, k)
 
     def _unrolled(self, k: int) -> Any:
         """The model with loops of a fixed length in substep k instead of conditional graph nodes; the same arrays."""
-        model, options = copy.copy(self.model), copy.copy(self.model.opt)
-        limit = int(options.iterations)
+        limit = int(self.model.opt.iterations)
         if self.unrolled_iterations is not None:
             limit = min(self.unrolled_iterations[k], limit)
-        # The seal is not for these copies, which no recorded graph reads.
-        object.__setattr__(options, "graph_conditional", False)
-        object.__setattr__(options, "iterations", limit)
-        object.__setattr__(model, "opt", options)
-        return model
+        return with_options(self.model, graph_conditional=False, iterations=limit)
 
     def set_contact_pairs(self, fields: dict[str, NDArray[np.float64]]) -> None:
         """Change what contact pairs are made of, from the next step on; recorded graphs follow.

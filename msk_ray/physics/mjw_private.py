@@ -28,7 +28,32 @@ from mujoco_warp._src.math import (
     quat_to_vel,
     safe_div,
 )
-from mujoco_warp._src.types import MJ_MAXVAL, ConstraintType, EqType, WrapType, mat66, vec5, vec6, vec10, vec12
+from mujoco_warp._src.smooth import skip_qacc_smooth
+from mujoco_warp._src.solver import _BLOCK_CHOLESKY_DIM as BLOCK_CHOLESKY_DIM
+from mujoco_warp._src.solver import _cholesky_factorize_solve as cholesky_factorize_solve
+from mujoco_warp._src.solver import _create_solver_context as create_solver_context
+from mujoco_warp._src.solver import _linesearch as linesearch
+from mujoco_warp._src.solver import _padding_h as padding_h
+from mujoco_warp._src.solver import _solve_done as solve_done
+from mujoco_warp._src.solver import _solve_init_dof as solve_init_dof
+from mujoco_warp._src.solver import _update_constraint as update_constraint
+from mujoco_warp._src.solver import _update_gradient_JTDAJ_dense_tiled as update_gradient_JTDAJ_dense_tiled
+from mujoco_warp._src.solver import _update_gradient_zero_grad_dot as update_gradient_zero_grad_dot
+from mujoco_warp._src.solver import init_context
+from mujoco_warp._src.types import (
+    MJ_MAXVAL,
+    MJ_MINVAL,
+    TILE_SIZE_JTDAJ_DENSE,
+    ConstraintState,
+    ConstraintType,
+    EqType,
+    WrapType,
+    mat66,
+    vec5,
+    vec6,
+    vec10,
+    vec12,
+)
 from mujoco_warp._src.util_misc import _poly_force as poly_force
 from mujoco_warp._src.util_misc import _poly_force_deriv as poly_force_deriv
 from mujoco_warp._src.util_misc import (
@@ -42,15 +67,23 @@ from mujoco_warp._src.util_misc import (
 )
 
 __all__ = [
+    "BLOCK_CHOLESKY_DIM",
     "MJ_MAXVAL",
+    "MJ_MINVAL",
+    "TILE_SIZE_JTDAJ_DENSE",
+    "ConstraintState",
     "ConstraintType",
     "EqType",
     "WrapType",
     "capsule_capsule",
+    "cholesky_factorize_solve",
     "contact_kbimp",
+    "create_solver_context",
     "deriv_expmap",
     "dof_damping_total",
     "inert_vec",
+    "init_context",
+    "linesearch",
     "lu_factor_6x6",
     "lu_solve_6x6",
     "make_frame",
@@ -61,6 +94,7 @@ __all__ = [
     "muscle_dynamics",
     "muscle_gain",
     "muscle_gain_vel_deriv",
+    "padding_h",
     "plane_ellipsoid",
     "plane_sphere",
     "poly_force",
@@ -70,10 +104,16 @@ __all__ = [
     "quat_to_mat",
     "quat_to_vel",
     "safe_div",
+    "skip_qacc_smooth",
+    "solve_done",
+    "solve_init_dof",
     "sphere_box",
     "sphere_capsule",
     "sphere_sphere",
     "tendon_damping_total",
+    "update_constraint",
+    "update_gradient_JTDAJ_dense_tiled",
+    "update_gradient_zero_grad_dot",
     "vec5",
     "vec6",
     "vec10",

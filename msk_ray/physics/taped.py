@@ -47,7 +47,7 @@ class TapedStep:
         check_supported(batch.mjm, "TapedStep")
         self._batch = batch
         with wp.ScopedDevice(batch.device):
-            self._adjoint = StepAdjoint(batch.mjm, batch.model, batch.data)
+            self._adjoint = StepAdjoint(batch.mjm, batch.model, batch.data, stages=batch.stages)
             self._substep = recomputed(self._adjoint)
             self._raw = wp.zeros((batch.nworld, batch.mjm.nq), dtype=float)
 

@@ -93,7 +93,7 @@ class _Tape(Backward):
         self._pulled = PullCounter(batch.device)
         self._warned = False
         with wp.ScopedDevice(batch.device):
-            self._adjoint = StepAdjoint(batch.structure, batch.model, batch.data, self.contact_reach)
+            self._adjoint = StepAdjoint(batch.structure, batch.model, batch.data, self.contact_reach, batch.stages)
             pool = Pool(batch.device)
             self._states: list[dict[str, wp.array]] = [{} for _ in range(batch.substeps)]
             self._last: dict[str, wp.array] = {}

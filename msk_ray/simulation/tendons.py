@@ -43,7 +43,7 @@ class Tendons:
             raise UnsupportedModelError("the model has no tendons whose lengths could be observed")
         self._device = torch.device(str(batch.device))
         self._data = batch.data
-        self._adjoint = TendonAdjoint(batch.mjm, batch.model, batch.data)
+        self._adjoint = TendonAdjoint(batch.mjm, batch.model, batch.data, batch.stages)
         self._raw = wp.zeros((batch.nworld, batch.mjm.nq), dtype=float, device=batch.device)
 
         def view(array: wp.array) -> Tensor:

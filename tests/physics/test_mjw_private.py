@@ -2,6 +2,7 @@
 
 import inspect
 import re
+from hashlib import blake2b
 from pathlib import Path
 from typing import get_args, get_origin
 
@@ -63,8 +64,10 @@ MEMBERS = {
         "FRICTION_TENDON": mujoco.mjtConstraint.mjCNSTR_FRICTION_TENDON,
         "LIMIT_JOINT": mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT,
         "LIMIT_TENDON": mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON,
+        "CONTACT_FRICTIONLESS": mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS,
         "CONTACT_ELLIPTIC": mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC,
     },
+    "ConstraintState": {"CONE": mujoco.mjtConstraintState.mjCNSTRSTATE_CONE},
     "EqType": {
         "CONNECT": mujoco.mjtEq.mjEQ_CONNECT,
         "WELD": mujoco.mjtEq.mjEQ_WELD,
@@ -76,6 +79,26 @@ MEMBERS = {
         "SPHERE": mujoco.mjtWrap.mjWRAP_SPHERE,
         "CYLINDER": mujoco.mjtWrap.mjWRAP_CYLINDER,
     },
+}
+# Functions and kernels of the Newton solver, around which `physics.ordered.solve` is built: all of their text counts.
+SOURCES: dict[str, str] = {
+    "cholesky_factorize_solve": "2a5ee35790e5f9c4",
+    "create_solver_context": "e10a84bfd7dfcf18",
+    "init_context": "f6184b56c9f0a494",
+    "linesearch": "7502603d6db16da8",
+    "padding_h": "0f9a31a6658b93cb",
+    "skip_qacc_smooth": "f6203dd679cfb96f",
+    "solve_done": "4dc564de5f7ede40",
+    "solve_init_dof": "b7e4ec537f9f8f3b",
+    "update_constraint": "f1c7bfe90dff1ce3",
+    "update_gradient_JTDAJ_dense_tiled": "e48b8eb0af0fb8e8",
+    "update_gradient_zero_grad_dot": "82b87977f3aa34ff",
+}
+NUMBERS = {
+    "BLOCK_CHOLESKY_DIM": 32,
+    "MJ_MAXVAL": mujoco.mjMAXVAL,
+    "MJ_MINVAL": mujoco.mjMINVAL,
+    "TILE_SIZE_JTDAJ_DENSE": 16,
 }
 SHAPES = {"vec5": (5,), "vec6": (6,), "vec10": (10,), "vec12": (12,), "mat66": (6, 6)}
 
@@ -110,9 +133,24 @@ def test_vectors_and_matrices_are_as_large(name: str) -> None:
     assert (kind._shape_, kind._wp_scalar_type_) == (SHAPES[name], wp.float32)
 
 
+@pytest.mark.parametrize("name", sorted(NUMBERS))
+def test_numbers_are_what_they_were(name: str) -> None:
+    assert getattr(mjw_private, name) == NUMBERS[name]
+
+
+@pytest.mark.parametrize("name", sorted(SOURCES))
+def test_the_solver_reads_as_it_did(name: str) -> None:
+    assert text_digest(getattr(mjw_private, name)) == SOURCES[name]
+
+
+def text_digest(thing: object) -> str:
+    """A digest of a function's or kernel's source text."""
+    function = inspect.unwrap(getattr(thing, "func", thing))
+    return blake2b(inspect.getsource(function).encode(), digest_size=8).hexdigest()
+
+
 def test_every_private_name_is_checked() -> None:
-    assert mujoco.mjMAXVAL == mjw_private.MJ_MAXVAL
-    assert sorted([*SIGNATURES, *MEMBERS, *SHAPES, "MJ_MAXVAL"]) == sorted(mjw_private.__all__)
+    assert sorted([*SIGNATURES, *MEMBERS, *SHAPES, *SOURCES, *NUMBERS]) == sorted(mjw_private.__all__)
 
 
 def test_private_names_come_from_one_module(root: Path) -> None:

@@ -57,7 +57,7 @@ def pulled(model, points, poison: bool) -> dict[str, np.ndarray]:
         array.assign(rng.normal(size=array.shape).astype(np.float32))
     for name, array in before.items():
         wp.copy(getattr(data, name), array)
-    recompute_stages(model, batch.model, data)
+    recompute_stages(model, batch.model, data, batch.stages)
     adjoint.pull_back(data, qvel_next)
     return {name: np.array(getattr(adjoint, name).numpy()) for name in _RESULTS[1:]}
 

@@ -224,8 +224,10 @@ class ActuatorBars:
     rate: wp.array2d[wp.vec4]
 
 
-@wp.kernel
-def pull_actuators(
+@wp.func
+def pull_actuators_of(
+    worldid: int,
+    uid: int,
     # Model:
     opt_timestep: wp.array[float],
     clampctrl: bool,
@@ -250,7 +252,6 @@ def pull_actuators(
     With implicit integration κ = Σ m_i m_j μ_i â_j over the pairs that `implicit_address` has. A tendon's cotangents
     go to its tendon. For other transmissions whose moment m turns with q, `rate_bar` keeps ∂Φ/∂(m·λ, m·v, m·μ, m·â).
     """
-    worldid, uid = wp.tid()
     timestep = opt_timestep[worldid % opt_timestep.shape[0]]
     law = actuator_law(worldid, uid, timestep, clampctrl, clampact, actuators)
     ctrl = float(0.0)
@@ -340,6 +341,53 @@ def pull_actuators(
             wp.atomic_add(slopes_out.qpos, worldid, dof, -length_slope * drive_in.actuator_moment[worldid, k])
 
 
+@wp.kernel
+def pull_actuators(
+    lanes: int,
+    count: int,
+    # Model:
+    opt_timestep: wp.array[float],
+    clampctrl: bool,
+    clampact: bool,
+    implicit_all: bool,
+    implicit_address: wp.array2d[int],
+    actuators: ActuatorSettings,
+    # In:
+    live_in: wp.array[int],
+    drive_in: Drive,
+    state_in: State,
+    multipliers_in: Multipliers,
+    # Out:
+    grad_act_out: wp.array2d[float],
+    grad_ctrl_out: wp.array2d[float],
+    slopes_out: DofSlopes,
+    tendon_bars_out: TendonBars,
+    actuator_bars_out: ActuatorBars,
+) -> None:
+    """All actuators of a world, in the order of each thread."""
+    worldid, lane = wp.tid()
+    for uid in range(lane, count, lanes):
+        pull_actuators_of(
+            worldid,
+            uid,
+            opt_timestep,
+            clampctrl,
+            clampact,
+            implicit_all,
+            implicit_address,
+            actuators,
+            live_in,
+            drive_in,
+            state_in,
+            multipliers_in,
+            grad_act_out,
+            grad_ctrl_out,
+            slopes_out,
+            tendon_bars_out,
+            actuator_bars_out,
+        )
+
+
 class ActuatorForces:
     """Launches of what actuators give ∂Φ, and of the gradients of controls and activations.
 
@@ -357,8 +405,10 @@ class ActuatorForces:
         work, m, settings = self._work, self._work.model, self._work.settings
         wp.launch(
             pull_actuators,
-            dim=(work.nworld, m.nactuator),
+            dim=(work.nworld, work.lanes(m.nactuator)),
             inputs=[
+                work.lanes(m.nactuator),
+                m.nactuator,
                 m.opt.timestep,
                 settings.clampctrl,
                 settings.clampact,

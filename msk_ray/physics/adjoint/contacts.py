@@ -27,6 +27,7 @@ from msk_ray.physics.adjoint.pair_laws import CONVEX_PAIRS
 from msk_ray.physics.adjoint.reach import ReachedContacts
 from msk_ray.physics.adjoint.rows import cone_law, cone_slope, row_slopes, vec6
 from msk_ray.physics.adjoint.spatial import carried, point_velocity, wrench
+from msk_ray.physics.adjoint.turns import contacts_end
 from msk_ray.physics.adjoint.workspace import Workspace
 from msk_ray.physics.mjw_private import ConstraintType
 
@@ -60,15 +61,15 @@ def frame_weight(frame: wp.mat33, weight: vec6, slide: wp.vec3, spin: wp.vec3) -
     return out
 
 
-@wp.kernel
-def pull_contacts(
+@wp.func
+def pull_contacts_of(
+    con: int,
     # Model:
     opt_timestep: wp.array[float],
     opt_disableflags: int,
     opt_impratio_invsqrt: wp.array[float],
     shapes: Shapes,
     # In:
-    nacon_in: wp.array[int],
     rows_in: Rows,
     laws_in: RowLaws,
     contacts_in: Contacts,
@@ -79,9 +80,6 @@ def pull_contacts(
     contact_bars_out: ContactBars,
 ) -> None:
     """Φ ∋ -Σ_r ρ_r(λ) f_r(ρ(a) - aref): wrenches on both bodies, and cotangents of (dist, pos, frame)."""
-    con = wp.tid()
-    if con >= wp.min(nacon_in[0], contacts_in.dist.shape[0]):
-        return
     contact_bars_out.dist[con] = 0.0
     contact_bars_out.pos[con] = wp.vec3(0.0)
     contact_bars_out.frame[con] = wp.mat33()
@@ -226,6 +224,44 @@ def pull_contacts(
             wp.atomic_add(bars_out.moved, worldid, body, moved)
 
 
+@wp.kernel
+def pull_contacts(
+    in_turn: bool,
+    # Model:
+    opt_timestep: wp.array[float],
+    opt_disableflags: int,
+    opt_impratio_invsqrt: wp.array[float],
+    shapes: Shapes,
+    # In:
+    nacon_in: wp.array[int],
+    rows_in: Rows,
+    laws_in: RowLaws,
+    contacts_in: Contacts,
+    motion_in: Motion,
+    fields_in: Fields,
+    # Out:
+    bars_out: FieldBars,
+    contact_bars_out: ContactBars,
+) -> None:
+    """All contacts of a thread, in their order."""
+    first = wp.tid()
+    for con in range(first, contacts_end(first, in_turn, nacon_in[0], contacts_in.worldid)):
+        pull_contacts_of(
+            con,
+            opt_timestep,
+            opt_disableflags,
+            opt_impratio_invsqrt,
+            shapes,
+            rows_in,
+            laws_in,
+            contacts_in,
+            motion_in,
+            fields_in,
+            bars_out,
+            contact_bars_out,
+        )
+
+
 class ContactForces:
     """Launches of the contacts' part of ∂Φ, through their rows and through their geometry.
 
@@ -257,6 +293,7 @@ class ContactForces:
             pull_contacts,
             dim=self.count,
             inputs=[
+                work.stages.ordered,
                 m.opt.timestep,
                 m.opt.disableflags,
                 m.opt.impratio_invsqrt,
@@ -276,6 +313,7 @@ class ContactForces:
             self._pull_geometry,
             dim=self.count,
             inputs=[
+                work.stages.ordered,
                 self._shapes,
                 d.nacon,
                 at.contacts,

@@ -37,6 +37,7 @@ from msk_ray.physics.adjoint.solids import (
     out_of,
 )
 from msk_ray.physics.adjoint.spatial import column, wrench
+from msk_ray.physics.adjoint.turns import contacts_end
 from msk_ray.physics.adjoint.workspace import Workspace
 from msk_ray.physics.mjw_private import make_frame
 
@@ -249,8 +250,9 @@ def framed(normal: wp.vec3, weight: wp.mat33) -> wp.float32:
     return wp.dot(weight[0], frame[0]) + wp.dot(weight[1], frame[1]) + wp.dot(weight[2], frame[2])
 
 
-@wp.kernel
-def pull_convex(
+@wp.func
+def pull_convex_of(
+    con: int,
     # Model:
     shapes: Shapes,
     meshes: Meshes,
@@ -258,7 +260,6 @@ def pull_convex(
     multi_ccd: int,
     substep: int,
     # In:
-    nacon_in: wp.array[int],
     contacts_in: Contacts,
     geom_xpos_in: wp.array2d[wp.vec3],
     geom_xmat_in: wp.array2d[wp.mat33],
@@ -270,9 +271,6 @@ def pull_convex(
     wrenches_out: wp.array2d[wp.spatial_vector],
 ) -> None:
     """Cotangents of (dist, pos, frame) to wrenches on the two bodies whose displacement moves them."""
-    con = wp.tid()
-    if con >= wp.min(nacon_in[0], contacts_in.dist.shape[0]):
-        return
     if contacts_in.efc_address[con, 0] < 0 and contact_bars_in.dist[con] == 0.0:
         return
     geoms = contacts_in.geom[con]
@@ -314,6 +312,48 @@ def pull_convex(
         wp.atomic_add(moved_bar_out, worldid, body2, wrench(push.force2, push.torque2, arm))
 
 
+@wp.kernel
+def pull_convex(
+    in_turn: bool,
+    # Model:
+    shapes: Shapes,
+    meshes: Meshes,
+    native_ccd: int,
+    multi_ccd: int,
+    substep: int,
+    # In:
+    nacon_in: wp.array[int],
+    contacts_in: Contacts,
+    geom_xpos_in: wp.array2d[wp.vec3],
+    geom_xmat_in: wp.array2d[wp.mat33],
+    subtree_com_in: wp.array2d[wp.vec3],
+    contact_bars_in: ContactBars,
+    # Out:
+    moved_bar_out: wp.array2d[wp.spatial_vector],
+    touches_out: Touches,
+    wrenches_out: wp.array2d[wp.spatial_vector],
+) -> None:
+    """All contacts of a thread, in their order."""
+    first = wp.tid()
+    for con in range(first, contacts_end(first, in_turn, nacon_in[0], contacts_in.worldid)):
+        pull_convex_of(
+            con,
+            shapes,
+            meshes,
+            native_ccd,
+            multi_ccd,
+            substep,
+            contacts_in,
+            geom_xpos_in,
+            geom_xmat_in,
+            subtree_com_in,
+            contact_bars_in,
+            moved_bar_out,
+            touches_out,
+            wrenches_out,
+        )
+
+
 class ConvexContacts:
     """Launches of the part of ∂Φ that goes through the geometry of convex pairs."""
 
@@ -331,6 +371,7 @@ class ConvexContacts:
             pull_convex,
             dim=self._contacts,
             inputs=[
+                work.stages.ordered,
                 self._shapes,
                 self._meshes,
                 self._native_ccd,

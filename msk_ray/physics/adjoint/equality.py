@@ -110,8 +110,10 @@ class AnchorPoses:
     site_xpos: wp.array2d[wp.vec3]
 
 
-@wp.kernel
-def pull_anchors(
+@wp.func
+def pull_anchors_of(
+    worldid: int,
+    row: int,
     # Model:
     opt_timestep: wp.array[float],
     opt_disableflags: int,
@@ -127,7 +129,6 @@ def pull_anchors(
     bars_out: FieldBars,
 ) -> None:
     """Φ ∋ -ρ(λ)·f(jar): one thread a row; that of an equality's first row does all three or six."""
-    worldid, row = wp.tid()
     if row + 2 >= wp.min(nefc_in[worldid], laws_in.slope.shape[1]):
         return
     if rows_in.type[worldid, row] != ConstraintType.EQUALITY:
@@ -277,6 +278,43 @@ def pull_anchors(
             wp.atomic_add(bars_out.moved, worldid, body, total + wrench(moved, torque, arm))
 
 
+@wp.kernel
+def pull_anchors(
+    lanes: int,
+    count: int,
+    # Model:
+    opt_timestep: wp.array[float],
+    opt_disableflags: int,
+    anchors: Anchors,
+    # In:
+    nefc_in: wp.array[int],
+    rows_in: Rows,
+    laws_in: RowLaws,
+    poses_in: AnchorPoses,
+    motion_in: Motion,
+    fields_in: Fields,
+    # Out:
+    bars_out: FieldBars,
+) -> None:
+    """All rows of a world, in the order of each thread."""
+    worldid, lane = wp.tid()
+    for row in range(lane, count, lanes):
+        pull_anchors_of(
+            worldid,
+            row,
+            opt_timestep,
+            opt_disableflags,
+            anchors,
+            nefc_in,
+            rows_in,
+            laws_in,
+            poses_in,
+            motion_in,
+            fields_in,
+            bars_out,
+        )
+
+
 class AnchorRows:
     """Launches of what connect and weld equalities give ∂Φ."""
 
@@ -290,8 +328,10 @@ class AnchorRows:
         poses = gather(AnchorPoses, d)
         wp.launch(
             pull_anchors,
-            dim=(work.nworld, work.njmax),
+            dim=(work.nworld, work.lanes(work.njmax)),
             inputs=[
+                work.lanes(work.njmax),
+                work.njmax,
                 m.opt.timestep,
                 m.opt.disableflags,
                 self._anchors,

@@ -25,6 +25,7 @@ from msk_ray.physics.adjoint.pair_laws import (
     rim_torque,
 )
 from msk_ray.physics.adjoint.spatial import column, turning_torque, wrench
+from msk_ray.physics.adjoint.turns import contacts_end
 from msk_ray.physics.mjw_private import make_frame
 
 wp.set_module_options({"enable_backward": False})
@@ -64,12 +65,12 @@ def pull_geometry_kernel(kinds: PairKinds) -> Any:
     """The kernel for models with these kinds of pairs."""
     scored, capsule_box = kinds.scored, kinds.capsule_box
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def pull_geometry(
+    @wp.func
+    def pull_geometry_of(
+        con: int,
         # Model:
         shapes: Shapes,
         # In:
-        nacon_in: wp.array[int],
         contacts_in: Contacts,
         geom_xpos_in: wp.array2d[wp.vec3],
         geom_xmat_in: wp.array2d[wp.mat33],
@@ -80,9 +81,6 @@ def pull_geometry_kernel(kinds: PairKinds) -> Any:
         wrenches_out: wp.array2d[wp.spatial_vector],
     ) -> None:
         """Cotangents of (dist, pos, frame) to wrenches on the two bodies whose displacement moves them."""
-        con = wp.tid()
-        if con >= wp.min(nacon_in[0], contacts_in.dist.shape[0]):
-            return
         if contacts_in.efc_address[con, 0] < 0 and contact_bars_in.dist[con] == 0.0:
             return
         worldid = contacts_in.worldid[con]
@@ -209,5 +207,36 @@ def pull_geometry_kernel(kinds: PairKinds) -> Any:
             wp.atomic_add(moved_bar_out, worldid, body1, wrench(force1, torque1, place1 - com1))
         if body2 > 0:
             wp.atomic_add(moved_bar_out, worldid, body2, wrench(force2, torque2, place2 - com2))
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def pull_geometry(
+        in_turn: bool,
+        # Model:
+        shapes: Shapes,
+        # In:
+        nacon_in: wp.array[int],
+        contacts_in: Contacts,
+        geom_xpos_in: wp.array2d[wp.vec3],
+        geom_xmat_in: wp.array2d[wp.mat33],
+        subtree_com_in: wp.array2d[wp.vec3],
+        contact_bars_in: ContactBars,
+        # Out:
+        moved_bar_out: wp.array2d[wp.spatial_vector],
+        wrenches_out: wp.array2d[wp.spatial_vector],
+    ) -> None:
+        """All contacts of a thread, in their order."""
+        first = wp.tid()
+        for con in range(first, contacts_end(first, in_turn, nacon_in[0], contacts_in.worldid)):
+            pull_geometry_of(
+                con,
+                shapes,
+                contacts_in,
+                geom_xpos_in,
+                geom_xmat_in,
+                subtree_com_in,
+                contact_bars_in,
+                moved_bar_out,
+                wrenches_out,
+            )
 
     return pull_geometry

@@ -137,8 +137,10 @@ def fields_of(
     return out
 
 
-@wp.kernel
-def pull_paths(
+@wp.func
+def pull_paths_of(
+    worldid: int,
+    e: int,
     # Model:
     paths: Paths,
     # In:
@@ -152,7 +154,6 @@ def pull_paths(
     bars_out: FieldBars,
 ) -> None:
     """How J x of a spatial tendon turns with q: one thread a stretch of path between two sites, geom or not."""
-    worldid, e = wp.tid()
     t = paths.segment_tendon[e]
     first = paths.segment_first[e]
     rates = rates_of(worldid, t, paths.wrap_pulley_scale[first], tendon_bars_in)
@@ -249,6 +250,28 @@ def pull_paths(
             wp.atomic_add(bars_out.moved, worldid, owner, wrench(side_bar, zero, arm))
 
 
+@wp.kernel
+def pull_paths(
+    lanes: int,
+    count: int,
+    # Model:
+    paths: Paths,
+    # In:
+    touch_in: wp.array2d[wp.spatial_vector],
+    inside_in: wp.array2d[wp.vec4],
+    poses_in: PathPoses,
+    motion_in: Motion,
+    fields_in: Fields,
+    tendon_bars_in: TendonBars,
+    # Out:
+    bars_out: FieldBars,
+) -> None:
+    """All elements of paths of a world, in the order of each thread."""
+    worldid, lane = wp.tid()
+    for e in range(lane, count, lanes):
+        pull_paths_of(worldid, e, paths, touch_in, inside_in, poses_in, motion_in, fields_in, tendon_bars_in, bars_out)
+
+
 class TendonPaths:
     """Launches of the tangent points on wrapping geoms, and of what paths give ∂Φ.
 
@@ -272,7 +295,17 @@ class TendonPaths:
             wp.launch(touch_paths, dim=self.touch.shape, inputs=[self.paths, poses], outputs=[self.touch, self.inside])
         wp.launch(
             pull_paths,
-            dim=self.touch.shape,
-            inputs=[self.paths, self.touch, self.inside, poses, at.motion, work.fields, work.tendon_bars],
+            dim=(work.nworld, work.lanes(self.touch.shape[1])),
+            inputs=[
+                work.lanes(self.touch.shape[1]),
+                self.touch.shape[1],
+                self.paths,
+                self.touch,
+                self.inside,
+                poses,
+                at.motion,
+                work.fields,
+                work.tendon_bars,
+            ],
             outputs=[work.bars],
         )

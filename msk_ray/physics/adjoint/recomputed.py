@@ -32,7 +32,7 @@ class SingleStage:
     def pull_back(self, data: Any, qvel_next: wp.array, *extras: Any) -> None:
         """Launch it."""
         work = self._adjoint.work
-        recompute_stages(work.mjm, work.model, data)
+        recompute_stages(work.mjm, work.model, data, work.stages)
         self._adjoint.pull_back(data, qvel_next, *extras)
 
 

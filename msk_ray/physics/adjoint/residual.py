@@ -18,10 +18,10 @@ def residual_squares(
     smooth_in: wp.array2d[float],
     constraint_in: wp.array2d[float],
     # Out:
-    gap_out: wp.array[float],
-    size_out: wp.array[float],
+    gap_out: wp.array2d[float],
+    size_out: wp.array2d[float],
 ) -> None:
-    """Adds one dof's (Ma - τ - Jᵀf)² to its world's gap, and (Ma)² + τ² + (Jᵀf)² to its size."""
+    """Every dof's (Ma - τ - Jᵀf)², and (Ma)² + τ² + (Jᵀf)²."""
     worldid, i = wp.tid()
     product = float(0.0)
     for j in range(inertia_address.shape[0]):
@@ -31,24 +31,28 @@ def residual_squares(
     tau = smooth_in[worldid, i]
     push = constraint_in[worldid, i]
     r = product - tau - push
-    wp.atomic_add(gap_out, worldid, r * r)
-    wp.atomic_add(size_out, worldid, product * product + tau * tau + push * push)
+    gap_out[worldid, i] = r * r
+    size_out[worldid, i] = product * product + tau * tau + push * push
 
 
 @wp.kernel
 def residual_share(
+    # In:
+    gap_in: wp.array2d[float],
+    size_in: wp.array2d[float],
     # Out:
-    gap_out: wp.array[float],
-    size_out: wp.array[float],
     worst_out: wp.array[float],
 ) -> None:
-    """Keeps the largest √(gap/size) of each world and clears both for the next step; NaN stays NaN."""
+    """Keeps the largest √(gap/size) of each world, both added up over its dofs; NaN stays NaN."""
     worldid = wp.tid()
-    share = wp.sqrt(gap_out[worldid] / (size_out[worldid] + 1.0e-12))
+    gap = float(0.0)
+    size = float(0.0)
+    for i in range(gap_in.shape[1]):
+        gap += gap_in[worldid, i]
+        size += size_in[worldid, i]
+    share = wp.sqrt(gap / (size + 1.0e-12))
     if not (share <= worst_out[worldid]):
         worst_out[worldid] = share
-    gap_out[worldid] = 0.0
-    size_out[worldid] = 0.0
 
 
 class ResidualGauge:
@@ -62,7 +66,9 @@ class ResidualGauge:
     def __init__(self, inertia_address: wp.array, nworld: int) -> None:
         self._address = inertia_address
         self._nworld = nworld
-        self._gap, self._size, self._worst = (wp.zeros(nworld, dtype=float) for _ in range(3))
+        shape = (nworld, inertia_address.shape[0])
+        self._gap, self._size = (wp.zeros(shape, dtype=float) for _ in range(2))
+        self._worst = wp.zeros(nworld, dtype=float)
 
     def launch(self, data: Any, qacc: wp.array) -> None:
         """Launch the measurement of the step just made in `data`, at the acceleration that its solver found."""
@@ -72,7 +78,7 @@ class ResidualGauge:
             inputs=[self._address, data.M, qacc, data.qfrc_smooth, data.qfrc_constraint],
             outputs=[self._gap, self._size],
         )
-        wp.launch(residual_share, dim=self._nworld, outputs=[self._gap, self._size, self._worst])
+        wp.launch(residual_share, dim=self._nworld, inputs=[self._gap, self._size], outputs=[self._worst])
 
     def read(self, tolerance: float) -> dict[str, float]:
         """Largest and mean share over worlds, and the share of worlds past `tolerance` (solver_unconverged)."""

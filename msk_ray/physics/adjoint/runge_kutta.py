@@ -290,7 +290,7 @@ class RungeKutta:
         for k in reversed(range(4)):
             if k < 3:
                 self._stages.restore(k, data)
-                recompute_stages(work.mjm, m, data)
+                recompute_stages(work.mjm, m, data, work.stages)
             wp.launch(
                 enter_stage,
                 dim=shape,

@@ -128,8 +128,10 @@ def row_spring(worldid: int, kind: int, ident: int, settings: RowSettings) -> Ro
     return out
 
 
-@wp.kernel
-def pull_rows(
+@wp.func
+def pull_rows_of(
+    worldid: int,
+    row: int,
     # Model:
     opt_timestep: wp.array[float],
     opt_disableflags: int,
@@ -150,7 +152,6 @@ def pull_rows(
     tendon_bars_out: TendonBars,
 ) -> None:
     """Φ ∋ -ρ(λ) f(ρ(a) + b ρ(v) + k imp pos) of every row that joints and tendons make; f also moves with D(pos)."""
-    worldid, row = wp.tid()
     if row >= wp.min(nefc_in[worldid], laws_in.slope.shape[1]):
         return
     kind = rows_in.type[worldid, row]
@@ -256,6 +257,53 @@ def pull_rows(
                 wp.atomic_add(tendon_bars_out.length, worldid, second, -bend2 * mixed)
 
 
+@wp.kernel
+def pull_rows(
+    lanes: int,
+    count: int,
+    # Model:
+    opt_timestep: wp.array[float],
+    opt_disableflags: int,
+    joints: Joints,
+    tendons: TendonRows,
+    settings: RowSettings,
+    # In:
+    nefc_in: wp.array[int],
+    rows_in: Rows,
+    jacobian_in: wp.array3d[float],
+    laws_in: RowLaws,
+    state_in: State,
+    lam_in: wp.array2d[float],
+    ten_J_in: wp.array2d[float],
+    ten_length_in: wp.array2d[float],
+    # Out:
+    slopes_out: DofSlopes,
+    tendon_bars_out: TendonBars,
+) -> None:
+    """All rows of a world, in the order of each thread."""
+    worldid, lane = wp.tid()
+    for row in range(lane, count, lanes):
+        pull_rows_of(
+            worldid,
+            row,
+            opt_timestep,
+            opt_disableflags,
+            joints,
+            tendons,
+            settings,
+            nefc_in,
+            rows_in,
+            jacobian_in,
+            laws_in,
+            state_in,
+            lam_in,
+            ten_J_in,
+            ten_length_in,
+            slopes_out,
+            tendon_bars_out,
+        )
+
+
 def foremost_rows(work: Workspace) -> int:
     """How many rows may not be contacts'; those of contacts come after them."""
     return min(scalar_rows(work.mjm), work.njmax)
@@ -274,8 +322,10 @@ class ScalarRows:
         work, m, d = self._work, self._work.model, at.data
         wp.launch(
             pull_rows,
-            dim=(work.nworld, self._rows),
+            dim=(work.nworld, work.lanes(self._rows)),
             inputs=[
+                work.lanes(self._rows),
+                self._rows,
                 m.opt.timestep,
                 m.opt.disableflags,
                 work.joints,

@@ -124,8 +124,10 @@ def push_load(
         wp.atomic_add(bars_out.moved, worldid, body, carried(total, load) + moved)
 
 
-@wp.kernel
-def pull_site_pairs(
+@wp.func
+def pull_site_pairs_of(
+    worldid: int,
+    uid: int,
     # Model:
     pairs: SitePairs,
     # In:
@@ -137,7 +139,6 @@ def pull_site_pairs(
     bars_out: FieldBars,
 ) -> None:
     """What length and rates of an actuator between two sites give both bodies."""
-    worldid, uid = wp.tid()
     kind = pairs.actuator_trntype[uid]
     site = pairs.actuator_trnid[uid][0]
     other_site = pairs.actuator_trnid[uid][1]
@@ -179,6 +180,26 @@ def pull_site_pairs(
     push_load(common, worldid, rates, common_load, common_field, wp.spatial_vector(), bars_out)
 
 
+@wp.kernel
+def pull_site_pairs(
+    lanes: int,
+    count: int,
+    # Model:
+    pairs: SitePairs,
+    # In:
+    poses_in: SitePoses,
+    motion_in: Motion,
+    actuator_bars_in: ActuatorBars,
+    fields_in: Fields,
+    # Out:
+    bars_out: FieldBars,
+) -> None:
+    """All actuators of a world, in the order of each thread."""
+    worldid, lane = wp.tid()
+    for uid in range(lane, count, lanes):
+        pull_site_pairs_of(worldid, uid, pairs, poses_in, motion_in, actuator_bars_in, fields_in, bars_out)
+
+
 class _CommonBodies:
     """The body that carries both sites of each actuator and whose motion it does not feel, shape (nu,)."""
 
@@ -202,7 +223,15 @@ class SitePairForces:
         work = self._work
         wp.launch(
             pull_site_pairs,
-            dim=(work.nworld, work.model.nactuator),
-            inputs=[self._pairs, gather(SitePoses, at.data), at.motion, self._bars, work.fields],
+            dim=(work.nworld, work.lanes(work.model.nactuator)),
+            inputs=[
+                work.lanes(work.model.nactuator),
+                work.model.nactuator,
+                self._pairs,
+                gather(SitePoses, at.data),
+                at.motion,
+                self._bars,
+                work.fields,
+            ],
             outputs=[work.bars],
         )

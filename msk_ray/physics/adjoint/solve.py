@@ -2,13 +2,13 @@
 
 from typing import Any
 
+import mujoco_warp as mjw
 import warp as wp
 
 from msk_ray.physics.adjoint.free_bodies import FreeBodySolves
 from msk_ray.physics.adjoint.groups import Substep
 from msk_ray.physics.adjoint.integrate import Integrator
 from msk_ray.physics.adjoint.rows import ConstraintLaws
-from msk_ray.physics.adjoint.stages import implicit_matrix
 from msk_ray.physics.adjoint.tiles import solve_tiled, solve_two_tiled
 from msk_ray.physics.adjoint.workspace import Workspace
 
@@ -192,7 +192,8 @@ class LinearSystems:
         """Launch the matrices and their solves."""
         work, m, d, settings = self._work, self._work.model, at.data, self._work.settings
         if settings.implicit_all:
-            implicit_matrix(m, d, self._step)
+            # M - h ∂τ/∂v of the implicitfast integrator, in the sparse layout of M
+            mjw.deriv_smooth_vel(work.stages.summing(m), d, self._step)
             if self._free is not None:
                 self._free.hold(at, self._step)
         wp.launch(

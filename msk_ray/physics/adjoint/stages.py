@@ -5,24 +5,19 @@ from typing import Any
 import mujoco
 import mujoco_warp as mjw
 import numpy as np
-from mujoco_warp import deriv_smooth_vel
 
 from msk_ray.physics.batch import refresh_velocity
+from msk_ray.physics.ordered.stages import Stages
 
 
-def recompute_stages(mjm: mujoco.MjModel, model: Any, data: Any) -> None:
+def recompute_stages(mjm: mujoco.MjModel, model: Any, data: Any, stages: Stages) -> None:
     """Launch the position and velocity stages of the state in `data`."""
     refresh_velocity(mjm, model, data)
-    mjw.fwd_position(model, data, factorize=False)
+    stages.position(model, data)
     implicit = mjm.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     if implicit or np.any(mjm.jnt_actfrclimited):
         # The implicit matrix needs actuator forces, and joints at their actuator force limit are known by the total.
-        mjw.fwd_velocity(model, data)
-        mjw.fwd_actuation(model, data)
+        mjw.fwd_velocity(stages.summing(model), data)
+        mjw.fwd_actuation(stages.summing(model), data)
     else:
         mjw.com_vel(model, data)
-
-
-def implicit_matrix(model: Any, data: Any, out: Any) -> None:
-    """Launch M - h ∂τ/∂v of the implicitfast integrator into `out`, in the sparse layout of M."""
-    deriv_smooth_vel(model, data, out)

@@ -31,6 +31,7 @@ from msk_ray.physics.adjoint.tendons import Tendons
 from msk_ray.physics.adjoint.transmission import TurningTransmissions
 from msk_ray.physics.adjoint.workspace import Workspace
 from msk_ray.physics.branches import between_sites
+from msk_ray.physics.ordered.stages import PackageStages, Stages
 
 _ANCHORED = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
 
@@ -60,7 +61,8 @@ class StepAdjoint:
     turns the cotangents below from those of the state after the substep into those of the state before.
 
     `reach` is the distance [m] within which contacts get a gradient before they touch, as `adjoint.reach` says; the
-    model then has to find them (`physics.pairs.widened`).
+    model then has to find them (`physics.pairs.widened`). `stages` are those of the batch, mujoco_warp's own by
+    default.
 
     Attributes:
         work, integrator, laws, contacts, tendons: the stages' buffers and launches that parameters build on.
@@ -74,8 +76,10 @@ class StepAdjoint:
         inertia_address: place of M_ij (j ≤ i) in the sparse inertia, -1 where it is zero; shape (nv, nv).
     """
 
-    def __init__(self, mjm: mujoco.MjModel, model: Any, data: Any, reach: float = 0.0) -> None:
-        self.work = work = Workspace(mjm, model, data)
+    def __init__(
+        self, mjm: mujoco.MjModel, model: Any, data: Any, reach: float = 0.0, stages: Stages | None = None
+    ) -> None:
+        self.work = work = Workspace(mjm, model, data, stages or PackageStages())
         self.grad_qpos, self.grad_qvel = work.grad_qpos, work.grad_qvel
         self.grad_act, self.grad_ctrl = work.grad_act, work.grad_ctrl
         self.live, self.touch_counter = work.live, work.touch_counter

@@ -14,6 +14,7 @@ from msk_ray.physics.adjoint.groups import Substep, TendonRows
 from msk_ray.physics.adjoint.integrate import Integrator
 from msk_ray.physics.adjoint.tendons import Tendons, tendon_rate
 from msk_ray.physics.adjoint.workspace import Workspace
+from msk_ray.physics.ordered.stages import Stages
 
 
 @wp.kernel(enable_backward=False)
@@ -55,8 +56,8 @@ class TendonAdjoint:
         grad_qpos, grad_qvel: what they pull back to, in tangent coordinates, shape (W, nv).
     """
 
-    def __init__(self, mjm: Any, model: Any, data: Any) -> None:
-        self._work = work = Workspace(mjm, model, data)
+    def __init__(self, mjm: Any, model: Any, data: Any, stages: Stages) -> None:
+        self._work = work = Workspace(mjm, model, data, stages)
         with wp.ScopedDevice(work.device):
             self._integrator = Integrator(work)
             self._bodies = Bodies(work, self._integrator.damping)
@@ -71,7 +72,7 @@ class TendonAdjoint:
         m = self._work.model
         mjw.kinematics(m, data)
         mjw.com_pos(m, data)
-        mjw.tendon(m, data)
+        mjw.tendon(self._work.stages.summing(m), data)
         wp.launch(
             tendon_rates,
             dim=self.rate.shape,

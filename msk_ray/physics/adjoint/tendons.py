@@ -135,6 +135,9 @@ def start_tendons(
 
 @wp.kernel
 def pull_tendons(
+    lanes: int,
+    count: int,
+    width: int,
     # Model:
     tendons: TendonRows,
     tendon_adr: wp.array[int],
@@ -146,14 +149,17 @@ def pull_tendons(
     slopes_out: DofSlopes,
 ) -> None:
     """∂Φ/∂q ∋ J l̄, and for fixed tendons ∂Φ/∂v ∋ J ρ̄(v); spatial ones give that to their bodies."""
-    worldid, t, k = wp.tid()
-    if k >= tendons.ten_J_rownnz[t]:
-        return
-    place = tendons.ten_J_rowadr[t] + k
-    j = ten_J_in[worldid, place]
-    wp.atomic_add(slopes_out.qpos, worldid, tendons.ten_J_colind[place], j * tendon_bars_in.length[worldid, t])
-    if wrap_type[tendon_adr[t]] == WrapType.JOINT:
-        wp.atomic_add(slopes_out.qvel, worldid, tendons.ten_J_colind[place], j * tendon_bars_in.qvel[worldid, t])
+    worldid, lane = wp.tid()
+    for entry in range(lane, count * width, lanes):
+        t = entry // width
+        k = entry % width
+        if k < tendons.ten_J_rownnz[t]:
+            place = tendons.ten_J_rowadr[t] + k
+            dof = tendons.ten_J_colind[place]
+            j = ten_J_in[worldid, place]
+            wp.atomic_add(slopes_out.qpos, worldid, dof, j * tendon_bars_in.length[worldid, t])
+            if wrap_type[tendon_adr[t]] == WrapType.JOINT:
+                wp.atomic_add(slopes_out.qvel, worldid, dof, j * tendon_bars_in.qvel[worldid, t])
 
 
 class Tendons:
@@ -193,10 +199,20 @@ class Tendons:
     def launch_pullback(self, at: Substep) -> None:
         """Launch what the cotangents give to dofs and bodies."""
         work, m, d = self._work, self._work.model, at.data
+        lanes = work.lanes(m.ntendon * m.max_ten_J_rownnz)
         wp.launch(
             pull_tendons,
-            dim=(work.nworld, m.ntendon, m.max_ten_J_rownnz),
-            inputs=[work.tendon_rows, m.tendon_adr, m.wrap_type, d.ten_J, work.tendon_bars],
+            dim=(work.nworld, lanes),
+            inputs=[
+                lanes,
+                m.ntendon,
+                m.max_ten_J_rownnz,
+                work.tendon_rows,
+                m.tendon_adr,
+                m.wrap_type,
+                d.ten_J,
+                work.tendon_bars,
+            ],
             outputs=[work.slopes],
         )
         if self.paths is not None:

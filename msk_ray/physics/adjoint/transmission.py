@@ -22,8 +22,10 @@ class Transmissions:
     actuator_gear: wp.array2d[wp.spatial_vector]
 
 
-@wp.kernel
-def pull_turning_joints(
+@wp.func
+def pull_turning_joints_of(
+    worldid: int,
+    uid: int,
     # Model:
     joints: Joints,
     transmissions: Transmissions,
@@ -37,7 +39,6 @@ def pull_turning_joints(
     phi_qpos_out: wp.array2d[float],
 ) -> None:
     """len = gear·log(q) of a ball joint; in the parent's frame the moment is m = R(q)ᵀ gear."""
-    worldid, uid = wp.tid()
     kind = transmissions.actuator_trntype[uid]
     if kind != TrnType.JOINT and kind != TrnType.JOINTINPARENT:
         return
@@ -77,7 +78,42 @@ def pull_turning_joints(
 
 
 @wp.kernel
-def pull_sites(
+def pull_turning_joints(
+    lanes: int,
+    count: int,
+    # Model:
+    joints: Joints,
+    transmissions: Transmissions,
+    # In:
+    state_in: State,
+    multipliers_in: Multipliers,
+    moment_rowadr_in: wp.array2d[int],
+    moment_in: wp.array2d[float],
+    actuator_bars_in: ActuatorBars,
+    # Out:
+    phi_qpos_out: wp.array2d[float],
+) -> None:
+    """All actuators of a world, in the order of each thread."""
+    worldid, lane = wp.tid()
+    for uid in range(lane, count, lanes):
+        pull_turning_joints_of(
+            worldid,
+            uid,
+            joints,
+            transmissions,
+            state_in,
+            multipliers_in,
+            moment_rowadr_in,
+            moment_in,
+            actuator_bars_in,
+            phi_qpos_out,
+        )
+
+
+@wp.func
+def pull_sites_of(
+    worldid: int,
+    uid: int,
     # Model:
     body_rootid: wp.array[int],
     site_bodyid: wp.array[int],
@@ -92,7 +128,6 @@ def pull_sites(
     bars_out: FieldBars,
 ) -> None:
     """m·x = F·u(x) + T·ω(x) at the site, with force F and torque T fixed in the site's frame; len = 0."""
-    worldid, uid = wp.tid()
     if transmissions.actuator_trntype[uid] != TrnType.SITE or transmissions.actuator_trnid[uid][1] >= 0:
         return
     site = transmissions.actuator_trnid[uid][0]
@@ -121,6 +156,41 @@ def pull_sites(
     wp.atomic_add(bars_out.moved, worldid, body, carried(total, load) + wrench(wp.cross(force, spin), turn, arm))
 
 
+@wp.kernel
+def pull_sites(
+    lanes: int,
+    count: int,
+    # Model:
+    body_rootid: wp.array[int],
+    site_bodyid: wp.array[int],
+    transmissions: Transmissions,
+    # In:
+    site_xpos_in: wp.array2d[wp.vec3],
+    site_xmat_in: wp.array2d[wp.mat33],
+    motion_in: Motion,
+    actuator_bars_in: ActuatorBars,
+    fields_in: Fields,
+    # Out:
+    bars_out: FieldBars,
+) -> None:
+    """All actuators of a world, in the order of each thread."""
+    worldid, lane = wp.tid()
+    for uid in range(lane, count, lanes):
+        pull_sites_of(
+            worldid,
+            uid,
+            body_rootid,
+            site_bodyid,
+            transmissions,
+            site_xpos_in,
+            site_xmat_in,
+            motion_in,
+            actuator_bars_in,
+            fields_in,
+            bars_out,
+        )
+
+
 class TurningTransmissions:
     """Launches of what the turning of moments gives ∂Φ."""
 
@@ -134,8 +204,10 @@ class TurningTransmissions:
         if work.tables.has_turning_transmission:
             wp.launch(
                 pull_turning_joints,
-                dim=(work.nworld, m.nactuator),
+                dim=(work.nworld, work.lanes(m.nactuator)),
                 inputs=[
+                    work.lanes(m.nactuator),
+                    m.nactuator,
                     work.joints,
                     self._transmissions,
                     at.state,
@@ -149,8 +221,10 @@ class TurningTransmissions:
         if work.tables.has_site_transmission:
             wp.launch(
                 pull_sites,
-                dim=(work.nworld, m.nactuator),
+                dim=(work.nworld, work.lanes(m.nactuator)),
                 inputs=[
+                    work.lanes(m.nactuator),
+                    m.nactuator,
                     m.body_rootid,
                     m.site_bodyid,
                     self._transmissions,

@@ -21,6 +21,7 @@ from msk_ray.physics.adjoint.groups import (
     gather,
 )
 from msk_ray.physics.adjoint.tables import build_tables
+from msk_ray.physics.ordered.stages import Stages
 
 
 @dataclass(frozen=True)
@@ -72,10 +73,12 @@ class Workspace:
         multipliers, slopes, fields, bars, tendon_bars, laws: as their groups say.
         contact_wrenches: slopes of Φ along displacements of both geoms of a contact, as wrenches about their centres,
             (C, 2); of no size unless they are wanted.
+        stages: launches of the stages of a step.
     """
 
-    def __init__(self, mjm: mujoco.MjModel, model: Any, data: Any) -> None:
+    def __init__(self, mjm: mujoco.MjModel, model: Any, data: Any, stages: Stages) -> None:
         self.mjm = mjm
+        self.stages = stages
         self.model = model
         self.device = data.qpos.device
         self.nworld = data.nworld
@@ -99,8 +102,9 @@ class Workspace:
             self.contact_wrenches = wp.zeros((0, 2), dtype=wp.spatial_vector)
 
     def lanes(self, count: int) -> int:
-        """Threads that share `count` elements of a world: one each on a GPU, one in all on a CPU.
+        """Threads that share `count` elements of a world: one each on a GPU; one on a CPU, and for a fixed order.
 
         A CPU runs threads one after the other, and passing each its arguments takes longer than a small element.
+        Elements of one thread are added up in their order.
         """
-        return max(count, 1) if self.device.is_cuda else 1
+        return max(count, 1) if self.device.is_cuda and not self.stages.ordered else 1

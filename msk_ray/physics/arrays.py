@@ -1,0 +1,36 @@
+"""Groups of arrays that kernels take together: found in what holds them, or allocated."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import warp as wp
+
+
+def gather(kind: Any, *holders: Any) -> Any:
+    """A group of the arrays that `holders` have under the names of its fields; the first holder that has one counts.
+
+    Raises:
+        AttributeError: no holder has a field.
+        TypeError: an array has another dtype or number of axes.
+    """
+    group = kind()
+    for name in kind.vars:
+        holder = next((h for h in holders if hasattr(h, name)), holders[-1])
+        setattr(group, name, getattr(holder, name))
+    return group
+
+
+def allocate(kind: Any, *shape: int) -> Any:
+    """A group whose fields are arrays of zeros on the current device."""
+    group = kind()
+    for name, field in kind.vars.items():
+        setattr(group, name, wp.zeros(shape, dtype=field.type.dtype))
+    return group
+
+
+def allocate_rows(kind: Any, worlds: int, widths: Mapping[str, int], width: int) -> Any:
+    """The same for arrays (worlds, width), with another width for the fields named in `widths`."""
+    group = kind()
+    for name, field in kind.vars.items():
+        setattr(group, name, wp.zeros((worlds, widths.get(name, width)), dtype=field.type.dtype))
+    return group

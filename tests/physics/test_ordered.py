@@ -1,0 +1,182 @@
+"""Steps and pullbacks whose contacts and rows come in any order are the same to the last bit."""
+
+from collections.abc import Callable
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from msk_ray.errors import UnsupportedModelError
+from msk_ray.physics import WorldBatch
+from msk_ray.physics.arrays import gather
+from msk_ray.physics.ordered.contacts import ContactFields, ContactOrder
+from msk_ray.physics.ordered.rows import RowFields, RowOrder
+from msk_ray.simulation import TapePerSubstep
+
+WORLDS = 3
+TEXT = """
+<mujoco>
+  <option timestep="0.005" cone="{cone}" jacobian="{jacobian}"/>
+  <default><geom condim="3" friction="0.8 0.1 0.1"/></default>
+  <worldbody>
+    <geom type="plane" size="5 5 1"/>
+    <body pos="0 0 0.3"><freejoint/><geom type="sphere" size="0.2"/>
+      <body pos="0.25 0 -0.1"><joint name="a" axis="0 1 0" limited="true" range="-5 5" frictionloss="0.1"/>
+        <geom type="capsule" size="0.05" fromto="0 0 0 0.3 0 -0.1"/></body>
+      <body pos="-0.25 0 -0.1"><joint name="b" axis="0 1 0" limited="true" range="-5 5" frictionloss="0.1"/>
+        <geom type="capsule" size="0.05" fromto="0 0 0 -0.3 0 -0.1"/></body>
+    </body>
+    <body pos="0.1 0.35 0.2"><freejoint/><geom type="sphere" size="0.21"/></body>
+  </worldbody>
+  <equality><joint joint1="a" joint2="b" solref="0.05 1"/></equality>
+  <tendon><fixed name="t"><joint joint="a" coef="1"/><joint joint="b" coef="-0.5"/></fixed></tendon>
+  <actuator><motor joint="a"/><motor joint="b"/><motor tendon="t"/></actuator>
+</mujoco>
+"""
+
+
+def model(cone: str, jacobian: str = "dense") -> mujoco.MjModel:
+    """Two bodies that lie on the floor and on each other, with rows of every kind."""
+    return mujoco.MjModel.from_xml_string(TEXT.format(cone=cone, jacobian=jacobian))
+
+
+def shuffled(monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
+    """Let contacts, and blocks of rows of one kind, come in an order that `seed` draws, as where threads race."""
+    rng = np.random.default_rng(seed)
+    sort_contacts, sort_rows = ContactOrder.launch, RowOrder.launch
+
+    def permute(arrays: list[Any], order: np.ndarray, world: int | None = None) -> None:
+        for array in arrays:
+            values = array.numpy().copy()
+            part = values if world is None else values[world]
+            part[: len(order)] = part[order]
+            array.assign(values)
+
+    def contacts(self: ContactOrder, data: Any) -> None:
+        fields = gather(ContactFields, data.contact)
+        permute([getattr(fields, n) for n in ContactFields.vars], rng.permutation(int(data.nacon.numpy()[0])))
+        sort_contacts(self, data)
+
+    def rows(self: RowOrder, data: Any) -> None:
+        for world in range(data.nworld):
+            count = int(data.nefc.numpy()[world])
+            kinds, ids = (getattr(data.efc, n).numpy()[world, :count] for n in ("type", "id"))
+            blocks: dict[tuple[int, int], list[int]] = {}
+            for row in range(count):
+                blocks.setdefault((min(int(kinds[row]), 5), int(ids[row])), []).append(row)
+            keys = [
+                k
+                for kind in sorted({k for k, _ in blocks})
+                for k in rng.permutation([b for b in blocks if b[0] == kind])
+            ]
+            order = np.array([row for key in keys for row in blocks[tuple(int(x) for x in key)]], dtype=int)
+            permute([getattr(data.efc, n) for n in (*RowFields.vars, "J")], order, world)
+            place = {int(old): new for new, old in enumerate(order)}
+            address, owner = data.contact.efc_address.numpy().copy(), data.contact.worldid.numpy()
+            for con in range(int(data.nacon.numpy()[0])):
+                if owner[con] == world:
+                    address[con] = [place[a] if a >= 0 else a for a in address[con]]
+            data.contact.efc_address.assign(address)
+        sort_rows(self, data)
+
+    monkeypatch.setattr(ContactOrder, "launch", contacts)
+    monkeypatch.setattr(RowOrder, "launch", rows)
+
+
+def start(batch: WorldBatch) -> None:
+    """Put states into the batch that touch and slide."""
+    rng = np.random.default_rng(0)
+    data, mjm = batch.data, batch.mjm
+    qpos = np.tile(mjm.qpos0, (WORLDS, 1))
+    qpos[:, [2, 11]] -= 0.102, 0.0
+    data.qpos.assign(qpos.astype(np.float32))
+    data.qvel.assign(rng.normal(size=(WORLDS, mjm.nv)).astype(np.float32))
+    data.ctrl.assign(rng.normal(size=(WORLDS, mjm.nu)).astype(np.float32))
+
+
+def stepped(batch: WorldBatch, steps: int = 6) -> list[bytes]:
+    """The bits of the state after some steps, and of what a pullback through the last one gives."""
+    start(batch)
+    data = batch.data
+    for _ in range(steps):
+        batch.launch_substep(data, 0)
+    tape = TapePerSubstep()
+    tape.attach(batch)
+    start(batch)
+    for _ in range(steps):
+        batch.launch_substep(data, 0)
+    tape.launch_step(batch)
+    assert min(data.nefc.numpy()) >= 8
+    generator = torch.Generator().manual_seed(0)
+    for view in tape.cotangent:
+        view.copy_(torch.randn(view.shape, generator=generator))
+    tape.launch_backward()
+    arrays = [data.qpos, data.qvel, data.qacc, data.efc.force, data.contact.dist]
+    gradients = [view.numpy() for view in tape.cotangent]
+    return [np.array(a.numpy()).tobytes() for a in arrays] + [g.tobytes() for g in gradients]
+
+
+@pytest.fixture(params=["elliptic", "pyramidal"], scope="module")
+def cone(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+def test_any_order_of_contacts_and_rows_gives_the_same_bits(cone: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def bits() -> list[bytes]:
+        with wp.ScopedDevice("cpu"):
+            return stepped(WorldBatch(model(cone), WORLDS, 1, "cpu", ordered=True))
+
+    plain = bits()
+    for seed in (1, 2):
+        with monkeypatch.context() as patch:
+            shuffled(patch, seed)
+            assert bits() == plain
+
+
+def test_a_shuffle_matters_where_nothing_is_sorted(monkeypatch: pytest.MonkeyPatch) -> None:
+    for kind in (ContactOrder, RowOrder):
+        monkeypatch.setattr(kind, "launch", lambda self, data: None)
+
+    def run(seed: int) -> list[bytes]:
+        with monkeypatch.context() as patch:
+            shuffled(patch, seed)
+            return stepped(WorldBatch(model("elliptic"), WORLDS, 1, "cpu", ordered=True))
+
+    assert run(1) != run(2)
+
+
+def test_the_ordered_step_is_that_of_the_package(cone: str) -> None:
+    def run(ordered: bool) -> list[np.ndarray]:
+        batch = WorldBatch(model(cone), WORLDS, 1, "cpu", ordered=ordered)
+        start(batch)
+        for _ in range(10):
+            batch.launch_substep(batch.data, 0)
+        return [np.array(a.numpy()) for a in (batch.data.qpos, batch.data.qvel, batch.data.qacc)]
+
+    for ours, theirs in zip(run(True), run(False), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=2e-4, atol=2e-4)
+
+
+def test_a_sparse_jacobian_is_made_dense() -> None:
+    mjm = model("elliptic", "sparse")
+    batch = WorldBatch(mjm, 1, 1, "cpu", ordered=True)
+    assert not batch.model.is_sparse
+    assert mjm.opt.jacobian == mujoco.mjtJacobian.mjJAC_SPARSE
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda m: setattr(m.opt, "integrator", mujoco.mjtIntegrator.mjINT_RK4), "RK4"),
+        (lambda m: setattr(m.opt, "solver", mujoco.mjtSolver.mjSOL_CG), "solver"),
+        (lambda m: setattr(m.opt, "noslip_iterations", 2), "noslip"),
+    ],
+)
+def test_what_has_no_order_is_refused(change: Callable[[mujoco.MjModel], None], named: str) -> None:
+    mjm = model("elliptic")
+    change(mjm)
+    with pytest.raises(UnsupportedModelError, match=f"{named}.*trial.deterministic=false"):
+        WorldBatch(mjm, 1, 1, "cpu", ordered=True)
