@@ -101,6 +101,11 @@ def resolve_ant_physics(physics: PhysicsConfig) -> AntPhysics:
 
 
 def build_ant(env: AntSettings, physics: PhysicsConfig) -> mujoco.MjModel:
+    """The model that `ant_spec` describes."""
+    return ant_spec(env, physics).compile()
+
+
+def ant_spec(env: AntSettings, physics: PhysicsConfig) -> mujoco.MjSpec:
     """Free torso and 8 hinges (hip, ankle of the legs at +x+y, -x+y, -x-y, +x-y), 8 motors in the same order.
 
     All contacts are explicit pairs of a geom with the floor, so that friction can be softened independently.
@@ -160,4 +165,4 @@ def build_ant(env: AntSettings, physics: PhysicsConfig) -> mujoco.MjModel:
         pair.solreffriction = list(p.solreffriction)
     stand = np.concatenate([[0, 0, STAND_HEIGHT, 1, 0, 0, 0], STAND_JOINTS])
     spec.add_key(name="stand", qpos=stand)
-    return spec.compile()
+    return spec
