@@ -6,7 +6,7 @@ Axes: W worlds, O observation, A action.
 import math
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
@@ -86,6 +86,8 @@ class Env(ABC, Generic[SettingsT]):
     """
 
     group: Group = ALONE
+    recorded_worlds: int = 0
+    """Worlds of every evaluation whose states `trajectory_figures` is given."""
     action_size: int
     obs_size: int
     reward_names: tuple[str, ...]
@@ -192,6 +194,14 @@ class Env(ABC, Generic[SettingsT]):
 
     def outcome_terms(self, state: StepState) -> dict[str, Tensor]:
         """Further quantities per world (W,) that the evaluation averages over an episode."""
+        return {}
+
+    def trajectory_figures(self, trajectories: Sequence[StepState]) -> dict[str, float]:
+        """Further figures of an evaluation, by name, from every state of `recorded_worlds` episodes.
+
+        Args:
+            trajectories: the states of each episode from its first to its last, on the CPU, (T, n) each.
+        """
         return {}
 
     def success(self, tail: dict[str, Tensor]) -> Tensor | None:

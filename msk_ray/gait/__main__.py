@@ -1,34 +1,45 @@
 """`python -m msk_ray.gait`: how does a policy walk, compared with people?"""
 
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from msk_ray.cli import Parser, run
+from msk_ray.errors import ConfigError, brief
 from msk_ray.evaluate.__main__ import positive
 from msk_ray.evaluate.targets import best_checkpoint, find_target, trial_folder_of
 from msk_ray.files import write_json
+from msk_ray.shipped import is_shipped
 from msk_ray.text_table import text_table
 
 DESCRIPTION = """\
 Measure the gait of a policy of a leg environment (myoleg26, myoleg): speed, cadence, step length, duty factor, joint
-angles and ground reaction over the gait cycle, symmetry, cost and falls, compared with the range of healthy adults.
+angles and ground reaction over the gait cycle, symmetry, cost and falls, compared with healthy people, and the gait
+distance, one number for all of it (about 1 for a healthy person, 10 for one who does not walk).
 
 Episodes are those of the evaluation: without noise or assistance, from fixed initial states. Their first second is
-left out. Writes gait.json and gait.png into the trial's folder or that of --out."""
+left out. Writes gait.json and gait.png into the trial's folder or that of --out, and adds the gait to its eval.json.
+Several policies are compared in one table; with --speeds, each is told these speeds one after the other."""
 
 EXAMPLES = """\
   python -m msk_ray.gait runs/train/myoleg26_seed0
-  python -m msk_ray.gait myoleg26_reward --worlds 64 --out gait/          # the best trial of an experiment"""
+  python -m msk_ray.gait myoleg26_reward --worlds 64 --out gait/          # the best trial of an experiment
+  python -m msk_ray.gait runs/a runs/b/checkpoints/epoch_000400.pt        # side by side
+  python -m msk_ray.gait runs/train/fast_seed0 --speeds 0.7,1,1.25,1.6    # a policy that is told its speed"""
 
 
 def parser() -> Parser:
     """The command line."""
     p = Parser("python -m msk_ray.gait", DESCRIPTION, EXAMPLES)
     p.add_argument(
-        "target", metavar="CHECKPOINT|TRIAL|EXPERIMENT", help="the policy to measure: itself, or the best one"
+        "targets",
+        nargs="+",
+        metavar="CHECKPOINT|TRIAL|EXPERIMENT",
+        help="the policies to measure: themselves, or the best ones",
     )
+    p.add_argument("--speeds", metavar="LIST", help="target speeds [m/s], such as 0.7,1.25 (default: the trial's)")
     p.add_argument("--worlds", type=positive, default=16, metavar="W", help="episodes (default: %(default)s)")
     p.add_argument("--steps", type=positive, metavar="N", help="maximum env steps per episode")
     p.add_argument("--out", type=Path, metavar="DIR", help="folder to write to (default: the trial's)")
@@ -42,33 +53,77 @@ def parser() -> Parser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
-    path = best_checkpoint(find_target(args.target, args.storage))
+    paths = [best_checkpoint(find_target(target, args.storage)) for target in args.targets]
+    speeds: list[float | None] = [None] if args.speeds is None else [*_speeds(args.speeds)]
 
-    from msk_ray.envs.legs.gait.body import analyse, check_legs
-    from msk_ray.envs.legs.gait.measure import measure
-    from msk_ray.evaluate.measure import Bench, Request, default_device
+    from msk_ray.evaluate.measure import Bench, Request, default_device, eval_file_of, store_evaluation
     from msk_ray.gait.picture import draw
+    from msk_ray.gait.walk import at_target_speed, walk
     from msk_ray.training import load_policy
-    from msk_ray.visualize.episodes import record
 
-    policy = load_policy(path)
     bench = Bench(args.device or default_device())
     request = Request(worlds=args.worlds, steps=args.steps)
-    check_legs(bench.evaluator(policy.config, request)[0].env.model)
-    recording = record(bench, policy, request)
-    episodes = []
-    for world in range(recording.count):
-        states = recording.world(world)
-        episodes.append(analyse(recording.model, states.qpos, states.qvel, states.act, recording.timestep))
-    gait = measure(episodes, recording.episodes.fell.tolist())
-    out = args.out or trial_folder_of(path)
-    out.mkdir(parents=True, exist_ok=True)
-    entry = {"checkpoint": path.name, "epoch": policy.epoch, "physics": recording.physics, **gait}
-    write_json(out / "gait.json", entry)
-    draw(gait, f"{path.name}, epoch {policy.epoch}", out / "gait.png")
-    print(gait_text(gait))
-    print(f"written into {out / 'gait.json'} and {out / 'gait.png'}")
+    rows: list[tuple[str, dict[str, Any]]] = []
+    for path in paths:
+        policy = load_policy(path)
+        for speed in speeds:
+            found = walk(bench, policy if speed is None else at_target_speed(policy, speed), request)
+            gait, suffix = found.gait, "" if speed is None else f"_{speed:g}"
+            out = args.out or trial_folder_of(path)
+            out.mkdir(parents=True, exist_ok=True)
+            name = f"gait{suffix}" if len(paths) == 1 or args.out is None else f"gait_{len(rows)}{suffix}"
+            facts = {"checkpoint": path.name, "epoch": policy.epoch, "physics": found.entry["physics"]}
+            write_json(out / f"{name}.json", facts | gait)
+            draw(gait, f"{path.name}, epoch {policy.epoch}", out / f"{name}.png")
+            if speed is None and not is_shipped(path):
+                store_evaluation(eval_file_of(path), found.entry)
+            if len(paths) == len(speeds) == 1:
+                print(gait_text(gait))
+            print(f"written into {out / name}.json and {out / name}.png")
+            rows.append((f"{trial_folder_of(path).name}/{path.name}{suffix}", gait))
+    if len(rows) > 1:
+        print(side_by_side(rows))
     return 0
+
+
+def _speeds(text: str) -> list[float]:
+    """The speeds that `--speeds` asks for.
+
+    Raises:
+        ConfigError: one is no positive number.
+    """
+    try:
+        found = [float(part) for part in text.split(",")]
+    except ValueError:
+        found = [math.nan]
+    if not all(math.isfinite(speed) and speed > 0.0 for speed in found):
+        raise ConfigError(f"--speeds {brief(text)}: write positive numbers, such as 0.7,1.25")
+    return found
+
+
+def side_by_side(rows: Sequence[tuple[str, dict[str, Any]]]) -> str:
+    """Gaits of several policies or speeds, one a row."""
+    header = ("policy", "distance", "speed", "cadence", "step", "duty", "asymmetry", "cost", "fell", *_JOINTS)
+    table = []
+    for name, gait in rows:
+        values = {key: entry["value"] for key, entry in gait["measures"].items()}
+        shown = [gait["gait_distance"], values["speed"], values["cadence"], values["step_length"]]
+        shown += [values["duty_factor"], values["symmetry_step_length"], gait["costs"]["cost_of_transport"]]
+        inside = [gait["people"].get(curve, {}).get(_inside(curve)) for curve in _JOINTS.values()]
+        cells = ["-" if value is None else f"{value:.3g}" for value in shown]
+        shares = ["-" if value is None else f"{value:.0%}" for value in (gait["falls"], *inside)]
+        table.append((name, *cells, *shares))
+    return text_table(header, table, 160) + "\nhip to force: share of the cycle inside the mean ± 2 SD of people"
+
+
+_JOINTS = {"hip": "hip_flexion", "knee": "knee_flexion", "ankle": "ankle_dorsiflexion", "force": "vertical_force"}
+
+
+def _inside(curve: str) -> str:
+    """The share that is shown for a curve: without its mean where the zero differs between models."""
+    from msk_ray.envs.legs.gait.compare import CENTRED  # torch takes seconds to load
+
+    return "within_centred" if curve in CENTRED else "within"
 
 
 def gait_text(gait: dict[str, Any]) -> str:
@@ -78,11 +133,23 @@ def gait_text(gait: dict[str, Any]) -> str:
         value = "-" if entry["value"] is None else f"{entry['value']:.4g}"
         within = {None: "-", True: "yes", False: "no"}[entry["within"]]
         rows.append((name, value, "{:g} to {:g}".format(*entry["human"]), entry["unit"], within))
+    for name, entry in gait["at_speed"].items():
+        value = "-" if entry["value"] is None else f"{entry['value']:.4g}"
+        within = {None: "-", True: "yes", False: "no"}[entry["within"]]
+        rows.append((f"{name} at this speed", value, "{:.4g} to {:.4g}".format(*entry["people"]), "", within))
+    for name, found in gait["people"].items():
+        for part in ("rmse", "rmse_centred", "correlation", "within", "within_centred"):
+            if found[part] is not None:
+                rows.append((f"{name} {part.replace('_', ' ')}", f"{found[part]:.3g}", "", "", ""))
+    for name, value in gait["timing"].items():
+        rows.append((f"{name} correlation with emg", "-" if value is None else f"{value:.3g}", "", "", ""))
     for name, value in gait["costs"].items():
         rows.append((name, "-" if value is None else f"{value:.4g}", "", "", ""))
     falls = "-" if gait["falls"] is None else f"{gait['falls']:.0%}"
     return (
         text_table(("measure", "policy", "people", "unit", "within"), rows, 120)
+        + f"\ngait distance {gait['gait_distance']:.3g}: "
+        + ", ".join(f"{name} {value:.2g}" for name, value in gait["gait_distance_parts"].items())
         + f"\n{gait['strides']} strides in {gait['episodes']} episodes, {falls} of which ended in a fall"
     )
 

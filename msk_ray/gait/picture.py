@@ -11,6 +11,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.patches import Rectangle
 
+from msk_ray.envs.legs.gait.compare import BAND
+from msk_ray.envs.legs.gait.people import curve, envelope
 from msk_ray.envs.legs.gait.ranges import LANDMARKS
 
 _PANELS = {
@@ -24,26 +26,51 @@ _COLOURS = {"r": "tab:red", "l": "tab:blue"}
 
 
 def draw(gait: dict[str, Any], title: str, path: Path) -> None:
-    """Write a PNG of the result of `measure`."""
-    figure, axes = plt.subplots(2, 3, figsize=(13, 7), constrained_layout=True)
-    phase = np.arange(101)
-    for axis, (name, label) in zip(axes.flat, _PANELS.items(), strict=False):
+    """Write a PNG of the result of `measure`: curves of both legs over the mean ± 2 SD of people, and measures."""
+    muscles = [name for name, by_side in gait["activations"].items() if by_side["r"] or by_side["l"]]
+    figure, axes = plt.subplots(3 if muscles else 2, 4 if muscles else 3, figsize=(16, 10), constrained_layout=True)
+    panels = list(axes.flat)
+    for name, label in _PANELS.items():
+        axis = panels.pop(0)
+        people = curve(name)
+        _band(axis, people.mean - BAND * people.sd, people.mean + BAND * people.sd)
         for landmark in LANDMARKS.values():
             if landmark.curve == name:
                 _box(axis, landmark.phase, landmark.range.least, landmark.range.most)
-        for side, colour in _COLOURS.items():
-            curve = gait["curves"][name][side]
-            if curve is not None:
-                mean, std = np.array(curve["mean"]), np.array(curve["std"])
-                axis.plot(phase, mean, color=colour, label="right" if side == "r" else "left")
-                axis.fill_between(phase, mean - std, mean + std, color=colour, alpha=0.2, linewidth=0)
+        _sides(axis, gait["curves"][name])
         axis.set(xlabel="gait cycle from foot strike [%]", ylabel=label, xlim=(0, 100))
     if gait["strides"]:
         axes.flat[0].legend(frameon=False)
-    _table(axes.flat[-1], gait)
-    figure.suptitle(f"{title}: {gait['strides']} strides in {gait['episodes']} episodes; green: healthy adults")
+    for name in muscles:
+        axis = panels.pop(0)
+        _sides(axis, gait["activations"][name])
+        measured = envelope(name).mean
+        # The unit of an electromyogram is not that of an activation: it is drawn to the height of the policy's.
+        height = max(max(side["mean"]) for side in gait["activations"][name].values() if side)
+        _band(axis, np.zeros(101), measured / measured.max() * height)
+        axis.set(xlabel="gait cycle from foot strike [%]", ylabel=f"activation, {name}", xlim=(0, 100))
+    _table(panels[-1], gait)
+    for axis in panels[:-1]:
+        axis.axis("off")
+    strides = f"{gait['strides']} strides in {gait['episodes']} episodes"
+    figure.suptitle(f"{title}: {strides}; green: people, mean ± 2 SD (boxes: ranges of textbooks; muscles: timing)")
     figure.savefig(path, dpi=110)
     plt.close(figure)
+
+
+def _sides(axis: Any, by_side: dict[str, Any]) -> None:
+    """Mean curves of both legs with their spread over strides."""
+    phase = np.arange(101)
+    for side, colour in _COLOURS.items():
+        found = by_side[side]
+        if found is not None:
+            mean, std = np.array(found["mean"]), np.array(found["std"])
+            axis.plot(phase, mean, color=colour, label="right" if side == "r" else "left")
+            axis.fill_between(phase, mean - std, mean + std, color=colour, alpha=0.2, linewidth=0)
+
+
+def _band(axis: Any, low: Any, high: Any) -> None:
+    axis.fill_between(np.arange(101), low, high, color="tab:green", alpha=0.15, linewidth=0)
 
 
 def _box(axis: Any, phase: tuple[float, float], least: float, most: float) -> None:
@@ -54,7 +81,7 @@ def _box(axis: Any, phase: tuple[float, float], least: float, most: float) -> No
 
 def _table(axis: Any, gait: dict[str, Any]) -> None:
     axis.axis("off")
-    rows = []
+    rows = [["gait distance", f"{gait['gait_distance']:.3g}", "about 1", "SD of people"]]
     for name, entry in gait["measures"].items():
         value = "–" if entry["value"] is None else f"{entry['value']:.3g}"
         low, high = entry["human"]

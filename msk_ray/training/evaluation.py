@@ -10,6 +10,7 @@ from torch import Tensor
 from msk_ray.config import Config, PhysicsConfig, RandomizeConfig
 from msk_ray.envs import Env, env_class, make_env
 from msk_ray.envs.base import Resets, Transition
+from msk_ray.errors import ConfigError
 from msk_ray.simulation import StepState
 from msk_ray.training.policy_group import Policy, PolicyGroup, streams_for
 
@@ -92,6 +93,11 @@ class Evaluator:
         physics = physics.model_copy(update={"randomize": varied})
         nworld = policies * e.nworld
         self.env = make_env(settings, physics, nworld, device, e.seed, differentiable=False, randomize=True)
+        if self.env.recorded_worlds > e.nworld:
+            raise ConfigError(
+                f"env {config.env.name} records {self.env.recorded_worlds} worlds of every evaluation, which has "
+                f"{e.nworld}: raise evaluation.nworld"
+            )
         self.env.generator = torch.Generator()
         self.steps = steps
         self._policies = policies
@@ -119,13 +125,37 @@ class Evaluator:
         Returns:
             For each its `score` and the standard deviation over worlds, mean episode `length`, `fall_rate`,
             `diverged_rate`, mean return of each reward term, step means of the environment's outcome terms, and
-            `success_rate` where the environment defines success.
+            `success_rate` where the environment defines success, and its `trajectory_figures` if it records worlds.
 
         Raises:
             SimulationError: as for `episodes`.
         """
         at_once = (policies[first : first + self._policies] for first in range(0, len(policies), self._policies))
-        return [self._figures(episodes) for some in at_once for episodes in self._episodes(some)]
+        return [figures for some in at_once for figures in self._run(some)]
+
+    def _run(self, policies: Sequence[Policy]) -> list[dict[str, float]]:
+        """The figures of each of at most as many policies as there is room for."""
+        recorded = self.env.recorded_worlds
+        if not recorded:
+            return [self._figures(episodes) for episodes in self._episodes(policies)]
+        states: list[StepState] = []
+        first = torch.arange(recorded, device=self.env.device)
+        chosen = torch.cat([first + k * self._worlds for k in range(len(policies))])
+
+        def keep(state: StepState, control: Tensor) -> None:
+            states.append(StepState(*(part[chosen] for part in state)))
+
+        found = self._episodes(policies, on_step=keep)
+        kept = StepState(*(torch.stack(parts).cpu() for parts in zip(*states, strict=True)))
+        figures = []
+        for k, episodes in enumerate(found):
+            lengths = [int(length) for length in episodes.length[:recorded]]
+            trajectories = [
+                StepState(*(part[: length + 1, k * recorded + world] for part in kept))
+                for world, length in enumerate(lengths)
+            ]
+            figures.append(self._figures(episodes) | self.env.trajectory_figures(trajectories))
+        return figures
 
     @torch.no_grad()
     def _episodes(

@@ -10,8 +10,8 @@ import torch
 from msk_ray.config import PhysicsConfig, parse_config
 from msk_ray.envs import make_env
 from msk_ray.envs.legs.config import LegReward
-from msk_ray.envs.legs.env import stride_error
 from msk_ray.envs.legs.muscles import MuscleCurves
+from msk_ray.envs.legs.terms import stride_error
 from msk_ray.envs.myoleg26.config import MyoLeg26Settings
 from msk_ray.envs.myoleg26.env import MyoLeg26
 from msk_ray.errors import ConfigError

@@ -81,7 +81,9 @@ def walking(limp: float = 0.0, seconds: float = 6.0) -> Episode:
         for name in ("knee_flexion", "ankle_dorsiflexion", "forward_force"):
             curves[name][side] = np.zeros(len(time))
     activation = np.full((len(time), 4), 0.5)
-    return Episode(STEP, 700.0, forward, feet, curves, activation, np.full(len(time), 84.0))
+    muscles = {"tibant": {side: np.cos(2 * np.pi * time) for side in "rl"}}
+    power = np.full(len(time), 84.0)
+    return Episode(STEP, 700.0, forward, feet, curves, activation, power, 2.0 * power, muscles)
 
 
 def test_a_synthetic_walk_measures_what_it_was_made_of() -> None:
@@ -107,6 +109,8 @@ def test_a_synthetic_walk_measures_what_it_was_made_of() -> None:
     # 4 muscles × 0.25 / 1.2 m/s, and 84 W over 700 N × 1.2 m/s
     assert found["costs"]["activation_per_metre"] == pytest.approx(1.0 / 1.2, rel=0.01)
     assert found["costs"]["work_per_metre"] == pytest.approx(0.1, rel=0.01)
+    # 168 W for muscles and 1.2 W/kg at rest, over 700 N × 1.2 m/s
+    assert found["costs"]["cost_of_transport"] == pytest.approx((168.0 + 1.2 * 700 / 9.81) / 840.0, rel=0.01)
     assert found["falls"] == 0.0
 
 

@@ -6,9 +6,13 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+import torch
 
 from msk_ray.config import Config, PhysicsConfig, parse_config
+from msk_ray.envs import make_env
 from msk_ray.envs.legs.gait.body import analyse
+from msk_ray.envs.legs.gait.measure import measure
+from msk_ray.envs.legs.gait.people import curve
 from msk_ray.envs.myoleg26.config import MyoLeg26Settings
 from msk_ray.envs.myoleg26.model import build_myoleg26
 from msk_ray.errors import ConfigError
@@ -64,7 +68,7 @@ def test_a_model_without_legs_is_refused() -> None:
 def test_the_command_writes_json_and_a_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = parse_config(
         {
-            "env": {"name": "myoleg26", "nworld": 4, "target_speed": 0.0},
+            "env": {"name": "myoleg26", "nworld": 4, "target_speed": 0.0, "gait_worlds": 1},
             "shac": {"horizon": 2, "critic_iterations": 1, "critic_batches": 1},
             "actor": {"hidden": [8]},
             "critic": {"hidden": [8]},
@@ -73,14 +77,46 @@ def test_the_command_writes_json_and_a_picture(tmp_path: Path, capsys: pytest.Ca
         }
     )
     trainer = Trainer(config, tmp_path / "trial", "cpu")
-    trainer.run_epoch()
+    row = trainer.run_epoch()
     trainer.close()
+    assert row["eval/gait_distance"] == 10.0, "nobody walks in five steps"
     assert main([str(tmp_path / "trial"), "--worlds", "2", "--steps", "80", "--device", "cpu"]) == 0
     gait = json.loads((tmp_path / "trial" / "gait.json").read_text())
     assert gait["episodes"] == 2
     assert set(gait["measures"]) >= {"speed", "cadence", "step_length", "duty_factor"}
     assert (tmp_path / "trial" / "gait.png").stat().st_size > 10_000
     assert "of which ended in a fall" in capsys.readouterr().out
+    (entry,) = json.loads((tmp_path / "trial" / "eval.json").read_text())["evaluations"]
+    assert entry["gait"]["gait_distance"] == gait["gait_distance"]
+    assert "curves" not in entry["gait"]
+    more = [str(tmp_path / "trial"), "--worlds", "1", "--steps", "5", "--device", "cpu", "--speeds", "0.5,1.25"]
+    assert main(more) == 0
+    assert (tmp_path / "trial" / "gait_0.5.json").is_file()
+    assert len([line for line in capsys.readouterr().out.splitlines() if "best.pt_" in line]) == 2
+    with pytest.raises(ConfigError, match="write positive numbers"):
+        main([str(tmp_path / "trial"), "--speeds", "0.5,-1"])
+
+
+def test_people_on_the_legs_of_the_model_are_close_to_people(model: mujoco.MjModel) -> None:
+    """The measured angles, played back by the clock with the measured force, come back as they were measured."""
+    env = make_env(
+        MyoLeg26Settings(name="myoleg26", clock=True, reset="cycle", stochastic_reset=False),
+        PhysicsConfig(), 1, "cpu", 0, differentiable=False,
+    )  # fmt: skip
+    time = 0.02 * torch.arange(250)
+    phase = time * env.reference.pace.strides_per_second(torch.tensor([1.25]))
+    states = env.draw_phase(phase % 1.0, torch.full_like(phase, 1.25))
+    states.qpos[:, 0] = 1.25 * time
+    episode = analyse(model, *(part.double().numpy() for part in states), 0.02)
+    for side, ahead in (("r", 0.0), ("l", 0.5)):
+        at = 100.0 * np.remainder(phase.numpy() + ahead, 1.0)
+        episode.curves["vertical_force"][side] = np.interp(at, np.arange(101), curve("vertical_force").mean)
+    found = measure([episode], [False])
+    assert found["gait_distance"] < 0.7
+    for name in ("hip_flexion", "knee_flexion", "ankle_dorsiflexion"):
+        assert found["people"][name]["within_centred"] == 1.0
+        assert found["people"][name]["correlation"] > 0.98
+    assert found["measures"]["cadence"]["value"] == pytest.approx(116.8, abs=1.5)
 
 
 def test_another_environment_is_refused(tmp_path: Path, tiny_cartpole: Config) -> None:

@@ -111,6 +111,9 @@ class LegSettings(EnvSettings):
     symmetric: bool = False
     """One half of the cycle is the mirror image of the other: while the clock is in its second half, the policy
     observes the legs with right and left exchanged, and so are its actions. Needs `env.clock`."""
+    gait_worlds: Whole = 0
+    """Worlds of every evaluation during training whose gait is compared with people's (`eval/gait_distance`, `cadence`,
+    `step_length`, `duty_factor`, `asymmetry`, `cost_of_transport`), by C MuJoCo: about 0.02 s each; 0: none."""
     tracking: TrackingSchedule = TrackingSchedule()
     """Schedule of the terms that track people's motion."""
     min_height: float = 0.65

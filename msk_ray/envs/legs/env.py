@@ -5,7 +5,7 @@ Axes: W worlds, U muscles, N hinges of the legs.
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import ClassVar, Generic, NamedTuple, TypeVar
 
 import mujoco
@@ -18,7 +18,8 @@ from msk_ray.envs.base import Env
 from msk_ray.envs.layout import Entry, entries
 from msk_ray.envs.legs import terms as costs
 from msk_ray.envs.legs.config import LegSettings
-from msk_ray.envs.legs.gait.body import SIDES, world_axes
+from msk_ray.envs.legs.gait.body import SIDES, analyse, world_axes
+from msk_ray.envs.legs.gait.measure import measure, summary
 from msk_ray.envs.legs.metabolic import Fibres, muscle_masses, power
 from msk_ray.envs.legs.mirror import Mirror, check_mirrored, other_side
 from msk_ray.envs.legs.muscles import MuscleCurves
@@ -60,21 +61,6 @@ class Root(NamedTuple):
     """Velocity [m/s], (W, 3)."""
     spin: Tensor
     """Angular velocity [rad/s], (W, 3)."""
-
-
-def stride_error(angles: Tensor, rates: Tensor, amplitude: float | Tensor, rate: float | Tensor) -> Tensor:
-    """(r - 1)², shape (W,), of the angle d between both hips as a pendulum: r² = (d/A)² + (d'/(Aω))².
-
-    Args:
-        angles: right and left hip flexion [rad], (W, 2).
-        rates: their velocities [rad/s], (W, 2).
-        amplitude: A [rad], of all worlds or (W, 1).
-        rate: ω [rad/s], of all worlds or (W,).
-    """
-    swing = torch.stack((angles[:, 0] - angles[:, 1], (rates[:, 0] - rates[:, 1]) / rate), dim=-1) / amplitude
-    # The square root has no slope where the legs stand still together.
-    radius = torch.sqrt(swing.square().sum(-1) + 1e-4)
-    return (radius - 1.0).square()
 
 
 class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
@@ -136,6 +122,7 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
         self.reference = Reference(self.model, self.device)
         self._tasked = self.config.clock or self.config.speed_range is not None
         self._tracking_share = torch.tensor(self.config.tracking.at(0), device=self.device)
+        self.recorded_worlds = self.config.gait_worlds
         self._prepare_terms()
         self._mirror: Mirror | None = None
         self._mirror_action: Mirror | None = None
@@ -357,7 +344,7 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
             -r.capture * capture,
             -r.sway * root.spin.square().sum(-1),
             -r.symmetry * flexion_rates.sum(-1).square(),
-            -r.stride * stride_error(flexions, flexion_rates, amplitude, turn),
+            -r.stride * costs.stride_error(flexions, flexion_rates, amplitude, turn),
             *(-getattr(r, name) * term(state, action) for name, term in self._further.items()),
         )
         return torch.stack(terms, dim=-1)
@@ -425,6 +412,13 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
             "activation": state.act.square().mean(-1),
             "distance": root.place[:, 0],
         }
+
+    def trajectory_figures(self, trajectories: Sequence[StepState]) -> dict[str, float]:
+        found = []
+        for states in trajectories:
+            qpos, qvel, act = (part.double().numpy() for part in states)
+            found.append(analyse(self.model, qpos, qvel, act, self.config.control_timestep))
+        return summary(measure(found, []))
 
     def success(self, tail: dict[str, Tensor]) -> Tensor | None:
         """Upright at the end and, when walking, with a mean speed of at least `success_speed` over the episode."""

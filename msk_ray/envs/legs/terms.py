@@ -60,3 +60,18 @@ def impact(heights: Tensor, fall: Tensor) -> Tensor:
 def deviation(values: Tensor, reference: Tensor, scale: float) -> Tensor:
     """Cost (W,) of values (W, n) apart from a reference: √(1 + mean ((x - r)/scale)²) - 1."""
     return soft(((values - reference) / scale).square().mean(-1))
+
+
+def stride_error(angles: Tensor, rates: Tensor, amplitude: float | Tensor, rate: float | Tensor) -> Tensor:
+    """(r - 1)², shape (W,), of the angle d between both hips as a pendulum: r² = (d/A)² + (d'/(Aω))².
+
+    Args:
+        angles: right and left hip flexion [rad], (W, 2).
+        rates: their velocities [rad/s], (W, 2).
+        amplitude: A [rad], of all worlds or (W, 1).
+        rate: ω [rad/s], of all worlds or (W,).
+    """
+    swing = torch.stack((angles[:, 0] - angles[:, 1], (rates[:, 0] - rates[:, 1]) / rate), dim=-1) / amplitude
+    # The square root has no slope where the legs stand still together.
+    radius = torch.sqrt(swing.square().sum(-1) + 1e-4)
+    return (radius - 1.0).square()

@@ -7,8 +7,12 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from msk_ray.envs.legs.gait.people import ALIASES
+from msk_ray.envs.legs.metabolic import Fibres, muscle_masses, power
+from msk_ray.envs.legs.muscles import MuscleCurves
 from msk_ray.errors import ConfigError
 
 Array = NDArray[np.float64]
@@ -36,6 +40,10 @@ class Episode:
     """Activations, shape (T, U)."""
     muscle_power: Array
     """Power that muscles deliver [W], without the power they absorb, shape (T,)."""
+    metabolic_power: Array
+    """Metabolic power of muscles [W], without that of rest, shape (T,). Excitation is taken to be the activation."""
+    muscles: dict[str, dict[str, Array]]
+    """Activations of the muscles of `people.EMG` that the model has, by name and side, each (T,)."""
 
 
 def analyse(model: mujoco.MjModel, qpos: Array, qvel: Array, act: Array, timestep: float) -> Episode:
@@ -54,21 +62,50 @@ def analyse(model: mujoco.MjModel, qpos: Array, qvel: Array, act: Array, timeste
     count = len(qpos)
     feet = {side: np.zeros(count) for side in SIDES}
     forces = {side: np.zeros((count, 3)) for side in SIDES}
-    forward, power = np.zeros(count), np.zeros(count)
+    forward, given_power = np.zeros(count), np.zeros(count)
+    lengths, rates = np.zeros((count, model.ntendon)), np.zeros((count, model.ntendon))
     for t in range(count):
         data.qpos[:], data.qvel[:], data.act[:] = qpos[t], qvel[t], act[t]
         mujoco.mj_forward(model, data)
         forward[t] = data.body("pelvis").xpos @ axes[0]
+        lengths[t], rates[t] = data.ten_length, data.ten_velocity
         for side in SIDES:
             feet[side][t] = data.body(f"calcn_{side}").xpos @ axes[0]
             forces[side][t] = axes @ ground_reaction(model, data, owners[side]) / weight
         # A muscle's force is negative where it pulls, its velocity where it shortens.
         given = data.actuator_force[muscles] * data.actuator_velocity[muscles]
-        power[t] = np.maximum(given, 0.0).sum()
+        given_power[t] = np.maximum(given, 0.0).sum()
     curves = dict(angles)
     curves["vertical_force"] = {side: forces[side][:, 2] for side in SIDES}
     curves["forward_force"] = {side: forces[side][:, 0] for side in SIDES}
-    return Episode(timestep, weight, forward, feet, curves, act, power)
+    heat = metabolic_power(model, act, lengths, rates)
+    return Episode(timestep, weight, forward, feet, curves, act, given_power, heat, _activations(model, act))
+
+
+def metabolic_power(model: mujoco.MjModel, act: Array, lengths: Array, rates: Array) -> Array:
+    """Metabolic power of all muscles [W], (T,), with activations (T, U) on paths (T, ntendon) [m], [m/s]."""
+    curves = MuscleCurves(model, torch.device("cpu"))
+    activation, path, rate = (torch.from_numpy(values).float() for values in (act, lengths, rates))
+    path, rate = path[:, curves.tendons], rate[:, curves.tendons]
+    length, relative = curves.normalised(path, rate)
+    isometric = activation * curves.length_curve(length) * curves.peak
+    force = isometric * curves.rate_curve(relative)
+    masses = muscle_masses(curves.peak, curves.optimum)
+    found: Array = (
+        power(Fibres(activation, activation, length, rate, force, isometric), masses).sum(-1).double().numpy()
+    )
+    return found
+
+
+def _activations(model: mujoco.MjModel, act: Array) -> dict[str, dict[str, Array]]:
+    muscles = np.flatnonzero(model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_MUSCLE))
+    columns = {model.actuator(int(i)).name: k for k, i in enumerate(muscles)}
+    found = {}
+    for name, aliases in ALIASES.items():
+        known = [alias for alias in aliases if all(f"{alias}_{side}" in columns for side in SIDES)]
+        if known:
+            found[name] = {side: act[:, columns[f"{known[0]}_{side}"]] for side in SIDES}
+    return found
 
 
 def check_legs(model: mujoco.MjModel) -> None:

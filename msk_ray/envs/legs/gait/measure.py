@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from msk_ray.envs.legs.gait.body import CURVES, SIDES, Array, Episode
+from msk_ray.envs.legs.gait.compare import at_speed, difference, gait_distance, timing
 from msk_ray.envs.legs.gait.cycles import (
     Stride,
     cadence,
@@ -17,7 +18,9 @@ from msk_ray.envs.legs.gait.cycles import (
     strides,
     symmetry_index,
 )
+from msk_ray.envs.legs.gait.people import EMG
 from msk_ray.envs.legs.gait.ranges import LANDMARKS, MEASURES
+from msk_ray.envs.legs.metabolic import BASAL
 
 SETTLING = 1.0
 """Start of an episode that is left out [s], so that the settled gait is measured."""
@@ -33,14 +36,19 @@ def measure(episodes: Sequence[Episode], fell: Sequence[bool]) -> dict[str, Any]
     Returns:
         `measures`: value, human range, unit, source and whether the value is in the range, for speed, cadence, step
         length, duty factor and symmetry. `landmarks`: the same for points of the curves. `curves`: mean and standard
-        deviation over strides at each percent of the cycle, by side. `costs`, `falls`, `strides`, `episodes`.
+        deviation over strides at each percent of the cycle, by side. `people`: how the mean of both sides differs from
+        people's, by curve (`compare.Difference`). `at_speed`: cadence and step length beside people's at that speed.
+        `gait_distance` and `gait_distance_parts` (`compare.gait_distance`). `activations`: as `curves`, of muscles
+        whose electromyogram is known, and `timing`, their correlation with it. `costs`, `falls`, `strides`, `episodes`.
     """
     values: dict[str, list[float]] = {"speed": [], "cadence": []}
     sided: dict[str, dict[str, list[float]]] = {
         name: {side: [] for side in SIDES} for name in ("step_length", "duty_factor")
     }
     curves: dict[str, dict[str, list[Array]]] = {name: {side: [] for side in SIDES} for name in CURVES}
-    costs: dict[str, list[float]] = {"mean_squared_activation": [], "activation_per_metre": [], "work_per_metre": []}
+    names = ("mean_squared_activation", "activation_per_metre", "work_per_metre", "cost_of_transport")
+    costs: dict[str, list[float]] = {name: [] for name in names}
+    muscles: dict[str, dict[str, list[Array]]] = {name: {side: [] for side in SIDES} for name in EMG}
     count = 0
     for episode in episodes:
         start = round(SETTLING / episode.timestep)
@@ -65,13 +73,24 @@ def measure(episodes: Sequence[Episode], fell: Sequence[bool]) -> dict[str, Any]
             sided["duty_factor"][side] += [stride.duty for stride in found]
             for name in CURVES:
                 curves[name][side] += [over_cycle(episode.curves[name][side][start:], stride) for stride in found]
+            for name, activations in episode.muscles.items():
+                muscles[name][side] += [over_cycle(activations[side][start:], stride) for stride in found]
     measures = {name: _mean(found) for name, found in values.items()}
     for name, by_side in sided.items():
         measures[name] = _mean(by_side["r"] + by_side["l"])
         right, left = _mean(by_side["r"]), _mean(by_side["l"])
         both = right is not None and left is not None
         measures[f"symmetry_{name}"] = symmetry_index(right or 0.0, left or 0.0) if both else None
+    beside = at_speed(measures["speed"], measures["cadence"], measures["step_length"])
+    differences = {name: difference(name, mean[0]) for name, mean in _both_sides(curves).items()}
+    distance, parts = gait_distance(differences, beside, measures["duty_factor"], measures["symmetry_step_length"])
     return {
+        "gait_distance": distance,
+        "gait_distance_parts": parts,
+        "people": {name: found._asdict() for name, found in differences.items()},
+        "at_speed": beside,
+        "activations": _mean_curves(muscles),
+        "timing": {name: timing(name, mean[0]) for name, mean in _both_sides(muscles).items()},
         "measures": {name: _beside(measures[name], limits) for name, limits in MEASURES.items()},
         "by_side": {name: {side: _mean(found) for side, found in by.items()} for name, by in sided.items()},
         "landmarks": _landmarks(curves),
@@ -82,6 +101,23 @@ def measure(episodes: Sequence[Episode], fell: Sequence[bool]) -> dict[str, Any]
         "strides": count,
         "episodes": len(episodes),
     }
+
+
+def summary(gait: dict[str, Any]) -> dict[str, float]:
+    """The figures of a `measure` that are followed during training; without those that were not measured."""
+    values = {
+        "gait_distance": gait["gait_distance"],
+        **{name: gait["measures"][name]["value"] for name in ("cadence", "step_length", "duty_factor")},
+        "asymmetry": gait["measures"]["symmetry_step_length"]["value"],
+        "cost_of_transport": gait["costs"]["cost_of_transport"],
+    }
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _both_sides(curves: dict[str, dict[str, list[Array]]]) -> dict[str, tuple[Array, Array]]:
+    """Mean and standard deviation over the strides of both legs, of the curves that have any."""
+    means = {name: mean_curve(by_side["r"] + by_side["l"]) for name, by_side in curves.items()}
+    return {name: mean for name, mean in means.items() if mean is not None}
 
 
 def _least(timestep: float) -> int:
@@ -97,6 +133,10 @@ def _add_costs(costs: dict[str, list[float]], episode: Episode, start: int, dist
         costs["activation_per_metre"].append(float(squared.sum()) * episode.timestep / distance)
         work = float(episode.muscle_power[start:].sum()) * episode.timestep
         costs["work_per_metre"].append(work / (episode.weight * distance))
+        # Gross metabolic energy over weight and distance (no unit).
+        energy = float(episode.metabolic_power[start:].sum()) * episode.timestep
+        rest = BASAL * episode.weight / 9.81 * (len(squared) * episode.timestep)
+        costs["cost_of_transport"].append((energy + rest) / (episode.weight * distance))
 
 
 def _mean(values: Sequence[float]) -> float | None:

@@ -57,6 +57,13 @@ EMG: Final = {
     "gastroc": "medial_gastrocnemius",
 }
 """Muscles of myoleg26 whose electromyogram was measured, and the name of its column."""
+ALIASES: Final = {
+    "rectfem": ("rectfem", "recfem"),
+    "hamstrings": ("hamstrings", "semimem"),
+    "tibant": ("tibant",),
+    "gastroc": ("gastroc", "gasmed"),
+}
+"""Names that a muscle of `EMG` has in models: the first there is counts."""
 
 
 @cache
