@@ -3,6 +3,7 @@
 import argparse
 import difflib
 import gc
+import shlex
 import shutil
 import sys
 import time
@@ -240,7 +241,8 @@ def _list(storage: Path) -> int:
 
     paths = find_experiments(storage)
     if not paths:
-        raise StorageError(f"no experiment in {storage}: start one with python -m msk_ray.tune, or give its --storage")
+        command = shlex.join(["python", "-m", "msk_ray.tune", "--storage", str(storage)])
+        raise StorageError(f"no experiment in {storage}: start one with {command}, or give another --storage")
     table = Table(box=box.SIMPLE_HEAD, width=_width(), pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
     for heading in ("experiment", "trials", "best"):
         table.add_column(heading, no_wrap=True)

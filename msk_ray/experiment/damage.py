@@ -13,6 +13,7 @@ The consequences of a damaged file:
 | `params.json` | the file | `--resume` is refused: the search's choice is unknown; remove the trial's folder |
 | `manifest.json` | the file | refused, except by `report`, which shows what the trials' folders hold |
 | `env.json` | the file, a field | versions and command are unknown |
+| `notes.json` | the file | notes are not shown, and none is written until it is repaired or removed |
 | `eval.json` | the file, an entry | refused: remove it to have it written again |
 | a checkpoint | the file | skipped in favour of the one before; `best.pt` is refused when it is needed |
 | `unscored_*.pt` | the file | its policy gets no score; a resumed trial says so |

@@ -8,6 +8,8 @@ ENVIRONMENT_FILE = "env.json"
 SCHEDULER_LOG_FILE = "reports.jsonl"
 SUMMARY_FILE = "summary.json"
 """Written by a driver, with the table, when it ends normally."""
+NOTES_FILE = "notes.json"
+"""What people have written about trials."""
 STOP_FILE = "stop"
 """While this file is in the experiment's folder, trials save themselves and end at their next epoch."""
 

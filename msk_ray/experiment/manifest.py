@@ -9,6 +9,7 @@ runs/<experiment>/
     trials/<id>/      config.yaml, metrics.jsonl, checkpoints/, outcome.json, output.log, eval.json; halved.json and
                       abandoned/ if it was restarted with half its worlds
     summary.json, table.md, eval.json, report/
+    notes.json        what people have written about trials in the dashboard
 """
 
 import contextlib

@@ -1,5 +1,6 @@
 """The result of an experiment as a table, a list and plain data."""
 
+import shlex
 import statistics
 from collections.abc import Sequence
 from pathlib import Path
@@ -59,10 +60,14 @@ def summary(name: str, question: str, records: Sequence[TrialRecord]) -> dict[st
     }
 
 
-def table_document(name: str, question: str, records: Sequence[TrialRecord]) -> str:
-    """The results of an experiment as Markdown."""
+def table_document(experiment: Path, question: str, records: Sequence[TrialRecord]) -> str:
+    """The results of an experiment as Markdown.
+
+    Args:
+        experiment: its folder.
+    """
     parts = [
-        f"# {markdown_text(name)}\n",
+        f"# {markdown_text(experiment.name)}\n",
         f"{markdown_text(question)}\n" if question else "",
         markdown(HEADER, result_rows(records)),
     ]
@@ -81,7 +86,8 @@ def table_document(name: str, question: str, records: Sequence[TrialRecord]) -> 
         parts.append(f"Best policy: `{_relative(best)}` ({variant}, seed {best.trial.seed}{half}).\n")
     if (note := reduced_note(records)) is not None:
         parts.append(f"{note}\n")
-    parts.append(f"Curves and more: [report](report/index.html), by `python -m msk_ray.report {name}`.\n")
+    command = shlex.join(["python", "-m", "msk_ray.report", experiment.name, "--storage", str(experiment.parent)])
+    parts.append(f"Curves and more: [report](report/index.html), by `{command}`.\n")
     return "\n".join(part for part in parts if part)
 
 

@@ -1,5 +1,6 @@
 """`python -m msk_ray.report`: the results of an experiment on one page, read from its files."""
 
+import shlex
 import sys
 import time
 from collections.abc import Sequence
@@ -9,9 +10,10 @@ from pathlib import Path
 from msk_ray.cli import Parser, run
 from msk_ray.errors import ConfigError
 from msk_ray.evaluate.targets import find_experiment
+from msk_ray.experiment.manifest import Experiment
 from msk_ray.files import make_folder
 from msk_ray.report.best import Best, look_at_best
-from msk_ray.report.page import compare, make_section, write_page
+from msk_ray.report.page import compare, make_section, places_of, write_page
 from msk_ray.report.reading import Condition, Reading, check_folder, read_experiment
 from msk_ray.text import printable
 
@@ -21,7 +23,7 @@ confidence intervals, the effect of each parameter, which trial stopped when and
 outcome, the best policy with its evaluation and film strip, and the command that repeats the experiment.
 
 It only reads files, so it works while the sweep runs and after it has died, and says what is missing. Writes
-EXPERIMENT/report/index.html and every picture as PNG beside it."""
+EXPERIMENT/report/index.html and every figure as PNG beside it."""
 
 EXAMPLES = """\
   python -m msk_ray.report demo                            # runs/demo/report/index.html
@@ -68,23 +70,33 @@ def main(argv: Sequence[str] | None = None) -> int:
     whole = [read_experiment(experiment, now) for experiment in experiments]
     readings = [part for reading in whole for part in reading.parts()]
     make_folder(folder)
-    sections = []
-    for number, reading in enumerate(readings):
-        prefix = f"{number + 1}_" if len(readings) > 1 else ""
-        sections.append(make_section(reading, folder, prefix, args.baseline, None))
-    together = compare(readings) if len(readings) > 1 else None
+    places = places_of(readings)
+    prefixes = [f"{number}_" if len(readings) > 1 else "" for number in range(1, len(readings) + 1)]
+    sections = [
+        make_section(reading, folder, prefix, args.baseline, places)
+        for reading, prefix in zip(readings, prefixes, strict=True)
+    ]
+    together = compare(readings, places) if len(readings) > 1 else None
     bests = [
-        _best(reading, folder, f"{n + 1}_" if len(readings) > 1 else "", args.best, args.device)
-        for n, reading in enumerate(readings)
+        _best(reading, folder, prefix, args.best, args.device)
+        for reading, prefix in zip(readings, prefixes, strict=True)
     ]
     sections = [replace(section, best=best) for section, best in zip(sections, bests, strict=True)]
-    command = "python -m msk_ray.report " + " ".join(reading.name for reading in whole)
-    page = write_page(sections, together, folder, now, command)
+    page = write_page(sections, together, folder, now, command_of(experiments, args.storage))
     for reading in whole:
-        for note in reading.notes:
-            print(printable(f"{reading.name}: {note}"))
+        for warning in reading.warnings:
+            print(printable(f"{reading.name}: {warning}"))
     print(printable(f"report       {page}"))
     return 0
+
+
+def command_of(experiments: Sequence[Experiment], storage: Path) -> str:
+    """The command that writes the page of these experiments."""
+    if all(experiment.path.parent == storage.resolve() for experiment in experiments):
+        words = [*(experiment.name for experiment in experiments), "--storage", str(storage)]
+    else:
+        words = [str(experiment.path) for experiment in experiments]
+    return shlex.join(["python", "-m", "msk_ray.report", *words])
 
 
 def _best(reading: Reading, folder: Path, prefix: str, mode: str, device: str | None) -> Best | None:

@@ -31,8 +31,8 @@ class Best:
     strip_text: str = ""
     narrow_strip: Path | None = None
     """The same frames in rows of two, for a phone."""
-    notes: tuple[str, ...] = field(default=())
-    """What is missing, and why."""
+    missing: tuple[str, ...] = field(default=())
+    """What cannot be shown, and why."""
 
 
 def look_at_best(trial: TrialReading, folder: Path, prefix: str, make: bool, device: str | None) -> Best:
@@ -44,7 +44,7 @@ def look_at_best(trial: TrialReading, folder: Path, prefix: str, make: bool, dev
         make: evaluate and draw what does not exist yet; otherwise only show what exists.
         device: device of the simulation; None: the first GPU, or the CPU.
     """
-    notes: list[str] = []
+    missing: list[str] = []
     try:
         path = best_of_trial(trial.folder)
         # Loads torch, for which a report without simulation should not wait.
@@ -53,9 +53,9 @@ def look_at_best(trial: TrialReading, folder: Path, prefix: str, make: bool, dev
         facts = read_facts(path)
         sha = facts["sha256"]
     except (MskRayError, KeyError) as error:
-        return Best(trial, notes=(f"There is no policy to look at: {explain(error)}.",))
+        return Best(trial, missing=(f"There is no policy to look at: {explain(error)}.",))
     if facts.get("epoch") == 0:
-        notes.append(
+        missing.append(
             "Its best.pt is the untrained policy, which an older version kept because no trained one scored higher; "
             "the following is about that policy."
         )
@@ -66,7 +66,7 @@ def look_at_best(trial: TrialReading, folder: Path, prefix: str, make: bool, dev
             _evaluate(path, device)
             entries = _own(read_evaluations(trial.folder / EVAL_FILE), sha)
     except (MskRayError, OSError) as error:
-        notes.append(f"It could not be evaluated: {explain(error)}.")
+        missing.append(f"It could not be evaluated: {explain(error)}.")
     strip = folder / f"{prefix}{STRIP}.png"
     text = strip_text(strip, sha)
     if text is None and make:
@@ -74,12 +74,12 @@ def look_at_best(trial: TrialReading, folder: Path, prefix: str, make: bool, dev
             _draw(path, strip, sha, device)
             text = strip_text(strip, sha)
         except (MskRayError, OSError) as error:
-            notes.append(f"Its film strip could not be drawn: {explain(error)}.")
+            missing.append(f"Its film strip could not be drawn: {explain(error)}.")
     elif text is None:
-        notes.append("Its film strip has not been drawn yet: add --best always.")
+        missing.append("Its film strip has not been drawn yet: add --best always.")
     if text is None:
-        return Best(trial, tuple(entries), notes=tuple(notes))
-    return Best(trial, tuple(entries), strip, text, narrow_strip(strip), tuple(notes))
+        return Best(trial, tuple(entries), missing=tuple(missing))
+    return Best(trial, tuple(entries), strip, text, narrow_strip(strip), tuple(missing))
 
 
 def narrow_strip(strip: Path) -> Path:

@@ -2,6 +2,9 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,10 +16,23 @@ from matplotlib.ticker import ScalarFormatter
 from msk_ray.errors import ConfigError
 from msk_ray.experiment.layout import SPACE_FILE
 from msk_ray.experiment.outcomes import Outcome
-from msk_ray.report.pictures import DASHES, GREY, PALETTE, POINTS, Picture, picture, shorten, steps_axis, thin_peaks
+from msk_ray.report.pictures import (
+    DASHES,
+    GREY,
+    PALETTE,
+    POINTS,
+    Picture,
+    plain,
+    points_each,
+    shorten,
+    steps_axis,
+    thin_evenly,
+    thin_peaks,
+)
 from msk_ray.report.reading import Reading, TrialReading
 from msk_ray.sweep.budget import extreme_configs, longest_budget
 from msk_ray.sweep.space import recorded_space
+from msk_ray.text import printable
 
 NAMED = 8
 """Number of variants that are drawn in their own colour."""
@@ -68,10 +84,17 @@ _OVER = {
 """Column of the metrics → the picture's title, the axis' name, and what to know about it."""
 
 Curve = tuple[np.ndarray, np.ndarray]
+Places = Mapping[Path, int]
+"""Folder of a trial → its position in the page's list of trials."""
 
 
 def learning_curves(
-    groups: Mapping[str, Sequence[TrialReading]], baseline: str | None, name: str, *, over: str = "env_steps"
+    groups: Mapping[str, Sequence[TrialReading]],
+    baseline: str | None,
+    name: str,
+    places: Places,
+    *,
+    over: str = "env_steps",
 ) -> Picture | None:
     """Score over training, a line a variant and a band over its seeds; None if no trained policy has a score.
 
@@ -79,6 +102,7 @@ def learning_curves(
         groups: trials by variant.
         baseline: the variant that is drawn whatever its rank.
         name: the picture's.
+        places: trials' positions in the page's list.
         over: the x axis, `env_steps` or `seconds`.
     """
     means = {v: float(np.mean(scores)) for v, trials in groups.items() if (scores := _best_scores(trials))}
@@ -89,20 +113,29 @@ def learning_curves(
         return None
     named = ranked[:NAMED] + ([baseline] if baseline in ranked[NAMED:] else [])
     rest = [v for v in ranked if v not in named]
+    floor = _floor([curve for own in curves.values() for curve in own])
+    ended = {
+        t.folder: t.curve_over(over)
+        for variant in ranked
+        for t in groups[variant]
+        if t.ending is not None and t.ending.outcome in _STOPPED and len(t.curve[0])
+    }
 
-    def draw(figure: Figure, narrow: bool) -> None:
+    def draw(figure: Figure) -> None:
         axes = figure.add_subplot()
         for variant in rest:
             steps, mean, *_ = _mean_and_range(curves[variant])
             axes.plot(steps, mean, color=GREY, linewidth=0.7, alpha=0.6, zorder=1)
         for number, variant in enumerate(named):
-            _draw_variant(axes, curves[variant], number, shorten(variant, 34 if narrow else 44))
+            _draw_variant(axes, curves[variant], number, shorten(variant, 44))
             for trial in groups[variant]:
-                if trial.ending is not None and trial.ending.outcome in _STOPPED and len(trial.curve[0]):
-                    x, y = trial.curve_over(over)
+                if trial.folder in ended:
+                    x, y = ended[trial.folder]
                     axes.plot(x[-1], y[-1], "x", color=_colour(number), markersize=7, markeredgewidth=2)
-        _limit_below(axes, [curve for own in curves.values() for curve in own])
         steps_axis(axes)
+        if floor is not None:
+            axes.set_ylim(bottom=floor.at)
+            axes.text(0.01, 0.01, floor.text, transform=axes.transAxes, fontsize=8, color="#a03000")
         if over == "seconds":
             axes.xaxis.set_major_formatter(ScalarFormatter())  # "100m" would be read as minutes
         axes.set_xlabel(axis)
@@ -112,12 +145,36 @@ def learning_curves(
         if rest:
             handles.append(Line2D([], [], color=GREY, linewidth=0.7))
             labels.append(f"{len(rest)} more")
-        place = {"loc": "outside lower center"} if narrow else {"loc": "outside right upper"}
-        figure.legend(handles, labels, fontsize=8, title="best first", title_fontsize=8, **place)
+        figure.legend(handles, labels, fontsize=8, title="best first", title_fontsize=8, loc="outside right upper")
+
+    def lines() -> dict[str, Any]:
+        shown = [(v, t) for v in ranked for t in groups[v] if len(t.curve[0])]
+        count = points_each(len(shown))
+        return {
+            "kind": "curves",
+            "x": axis,
+            "y": "evaluation score",
+            "floor": None if floor is None else {"at": floor.at, "text": floor.text},
+            "variants": [
+                {
+                    "name": printable(variant),
+                    "colour": _colour(named.index(variant)) if variant in named else None,
+                    "dash": DASHES[named.index(variant) // len(PALETTE)] if variant in named else "-",
+                    "trials": [places[t.folder] for t in groups[variant] if len(t.curve[0])],
+                    # A single seed is its own mean.
+                    "mean": _mean_lines(curves[variant]) if variant in named and len(curves[variant]) > 1 else None,
+                }
+                for variant in ranked
+            ],
+            "lines": [
+                [places[t.folder], *map(plain, thin_evenly(*t.curve_over(over), count)), t.folder in ended]
+                for _, t in shown
+            ],
+        }
 
     seeds = max(len(own) for own in curves.values())
     best = means[ranked[0]]
-    return picture(
+    return Picture(
         name,
         title,
         f"Evaluation score over {axis} of {len(ranked)} variants; the best is {ranked[0]} with a mean best score of "
@@ -126,6 +183,7 @@ def learning_curves(
         + "A cross ends a trial that was stopped before its time; from there the mean is over those that went on."
         + more
         + _randomized([groups[variant] for variant in ranked]),
+        lines(),
         draw,
     )
 
@@ -160,12 +218,30 @@ def _mean_and_range(curves: Sequence[Curve]) -> tuple[np.ndarray, np.ndarray, np
     return steps, np.nanmean(values, 0), np.nanmin(values, 0), np.nanmax(values, 0)
 
 
-def _limit_below(axes: Axes, curves: Sequence[Curve]) -> None:
-    """Let the axis reach down to the worst first or best score: a policy that falls apart may leave it."""
+def _mean_lines(curves: Sequence[Curve]) -> list[list[float | None]]:
+    """Steps, mean, minimum and maximum for a chart."""
+    return [plain(line) for line in _mean_and_range(curves)]
+
+
+@dataclass(frozen=True)
+class Floor:
+    """Where an axis of scores ends although curves go lower."""
+
+    at: float
+    text: str
+    """How many do, and how far."""
+
+
+def _floor(curves: Sequence[Curve]) -> Floor | None:
+    """The axis reaches down to the worst first or best score: policies that fall apart leave it. None if none does."""
     scores = [score for _, y in curves for score in (y[0], y.max())]
     bottom = min(scores) - 0.1 * (max(scores) - min(scores))
-    if max(scores) > min(scores) and bottom > axes.get_ylim()[0]:
-        axes.set_ylim(bottom=bottom)
+    lowest = [float(y.min()) for _, y in curves]
+    left = sum(low < bottom for low in lowest)
+    if max(scores) == min(scores) or not left:
+        return None
+    trials = "1 trial goes" if left == 1 else f"{left} trials go"
+    return Floor(float(bottom), f"▼ {trials} below this axis, down to {min(lowest):.4g}")
 
 
 def _best_scores(trials: Sequence[TrialReading]) -> list[float]:
@@ -176,7 +252,7 @@ def _colour(number: int) -> str:
     return PALETTE[number % len(PALETTE)]
 
 
-def gradient_health(reading: Reading, name: str) -> Picture | None:
+def gradient_health(reading: Reading, name: str, places: Places) -> Picture | None:
     """Norms, clipping and failures of gradients over training; None if no trial recorded any."""
     recorded = [metric for metric in HEALTH if any(_health_curve(t, metric) for t in reading.trials)]
     if not recorded:
@@ -191,9 +267,8 @@ def gradient_health(reading: Reading, name: str) -> Picture | None:
     zero = [metric for metric in zero if metric not in present]
     best = reading.best
 
-    def draw(figure: Figure, narrow: bool) -> None:
-        columns = 1 if narrow else 2
-        grid = figure.subplots(math.ceil(len(present) / columns), columns, squeeze=False).ravel()
+    def draw(figure: Figure) -> None:
+        grid = figure.subplots(math.ceil(len(present) / 2), 2, squeeze=False).ravel()
         for axes in grid[len(present) :]:
             axes.set_axis_off()
         for axes, metric in zip(grid, present, strict=False):
@@ -206,8 +281,28 @@ def gradient_health(reading: Reading, name: str) -> Picture | None:
             handles.append(Line2D([], [], color="#0072B2", linewidth=2, label="the best trial"))
         figure.legend(handles=handles, loc="outside upper center", ncols=3, fontsize=8)
 
+    def lines() -> dict[str, Any]:
+        count = points_each(len(present) * len(reading.trials))
+        return {
+            "kind": "health",
+            "best": None if best is None else places[best.folder],
+            "failed": [places[t.folder] for t in reading.trials if t.failed],
+            "metrics": [
+                {
+                    "title": HEALTH[metric][0],
+                    "log": HEALTH[metric][1],
+                    "lines": [
+                        [places[t.folder], *map(plain, thin_peaks(*curve, count))]
+                        for t in reading.trials
+                        if (curve := _health_curve(t, metric)) is not None
+                    ],
+                }
+                for metric in present
+            ],
+        }
+
     rows = math.ceil(len(present) / 2)
-    return picture(
+    return Picture(
         name,
         "Gradient health",
         f"{len(present)} measures of gradients and physics over env steps, a line a trial: "
@@ -215,9 +310,9 @@ def gradient_health(reading: Reading, name: str) -> Picture | None:
         (f"Zero throughout: {', '.join(HEALTH[m][0] for m in zero)}. " if zero else "")
         + "Of many points the largest of each stretch is drawn: peaks are not lost. A cotangent is in units of reward: "
         "1 is what one reward would send back.",
+        lines(),
         draw,
         (9.0, 1.0 + 2.3 * rows),
-        (4.2, 1.0 + 2.2 * len(present)),
     )
 
 
@@ -258,7 +353,7 @@ def _draw_health(axes: Axes, reading: Reading, metric: str) -> None:
     axes.grid(alpha=0.3)
 
 
-def stopping_map(reading: Reading, name: str) -> Picture | None:
+def stopping_map(reading: Reading, name: str, places: Places) -> Picture | None:
     """A bar a trial, as long as it ran, its end marked by how it ended; None if none has begun."""
     begun = [trial for trial in reading.trials if trial.epochs_done]
     if not begun:
@@ -267,7 +362,7 @@ def stopping_map(reading: Reading, name: str) -> Picture | None:
     seeds = len(reading.seeds) > 1
     lines, unknown = rung_steps(reading)
 
-    def draw(figure: Figure, narrow: bool) -> None:
+    def draw(figure: Figure) -> None:
         axes = figure.add_subplot()
         for place, trial in enumerate(ordered):
             colour, marker = _LOOK.get(trial.outcome, (GREY, "."))
@@ -281,8 +376,7 @@ def stopping_map(reading: Reading, name: str) -> Picture | None:
         axes.set_ylim(len(ordered) - 0.4, -0.6)
         if len(ordered) <= LABELLED:
             labels = [t.trial.variant + (f", seed {t.trial.seed}" if seeds else "") for t in ordered]
-            names = [t.trial.id if narrow else shorten(label, 48) for t, label in zip(ordered, labels, strict=True)]
-            axes.set_yticks(range(len(ordered)), names, fontsize=7)
+            axes.set_yticks(range(len(ordered)), [shorten(label, 48) for label in labels], fontsize=7)
         else:
             axes.set_ylabel("trials, the best score first")
         steps_axis(axes)
@@ -293,22 +387,27 @@ def stopping_map(reading: Reading, name: str) -> Picture | None:
         ]
         if lines:
             handles.append(Line2D([], [], color="black", linestyle=":", label="rung of asha"))
-        figure.legend(handles=handles, loc="outside upper center", ncols=2 if narrow else 5, fontsize=8)
+        figure.legend(handles=handles, loc="outside upper center", ncols=5, fontsize=8)
 
     counts: dict[str, int] = {}
     for trial in ordered:
         counts[trial.outcome] = counts.get(trial.outcome, 0) + 1
     height = 1.6 + (0.24 * len(ordered) if len(ordered) <= LABELLED else min(9.0, 0.04 * len(ordered)))
-    return picture(
+    return Picture(
         name,
         "Which trial stopped when",
         f"{len(ordered)} trials as bars of env steps, the best score on top: "
         + ", ".join(f"{n} {outcome}" for outcome, n in counts.items())
         + ".",
         f"The best score on top. {unknown}Why each one stopped is in the table of trials.",
+        {
+            "kind": "stops",
+            "bars": [[places[t.folder], float(t.columns["env_steps"][-1])] for t in ordered],
+            "outcomes": {o: _LOOK.get(o, (GREY, "."))[0] for o in counts},
+            "rungs": lines,
+        },
         draw,
         (9.0, height),
-        (4.2, max(3.0, height)),
     )
 
 

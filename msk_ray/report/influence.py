@@ -1,7 +1,8 @@
 """Pictures of the effect of parameters on the score: ranked effects, and all trials over all parameters."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,10 @@ from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 
 from msk_ray.experiment.trial import short_key
-from msk_ray.report.pictures import GREY, PALETTE, Picture, picture, shorten
+from msk_ray.report.pictures import GREY, PALETTE, Picture, plain, shorten
 from msk_ray.report.reading import Reading, TrialReading
 from msk_ray.report.statistics import LEAST, Effect, Scored, effects, mean_interval
+from msk_ray.text import printable
 
 PANELS = 4
 """Number of parameters whose levels are drawn."""
@@ -30,9 +32,18 @@ _DECADES = 30.0
 """Numbers whose largest is more than this many times the smallest are drawn on a logarithmic axis."""
 
 
-def ranked_effects(reading: Reading) -> list[Effect]:
-    """Effects of the experiment's parameters on the best score, the largest first."""
-    return effects([Scored(t.trial.changed, t.trial.values, t.trial.seed, t.score, t.cut) for t in reading.trials])
+def ranked_effects(reading: Reading, places: Mapping[Path, int]) -> list[Effect]:
+    """Effects of the experiment's parameters on the best score, the largest first.
+
+    Args:
+        places: trials' positions in the page's list.
+    """
+    return effects(
+        [
+            Scored(t.trial.changed, t.trial.values, t.trial.seed, t.score, t.cut, places[t.folder])
+            for t in reading.trials
+        ]
+    )
 
 
 def parameter_effects(found: Sequence[Effect], name: str) -> Picture | None:
@@ -43,23 +54,19 @@ def parameter_effects(found: Sequence[Effect], name: str) -> Picture | None:
     panels = drawn[:PANELS]
     shares = any(effect.share is not None for effect in drawn)
 
-    def draw(figure: Figure, narrow: bool) -> None:
+    def draw(figure: Figure) -> None:
         rows = 2 if len(panels) > 2 else 1
-        if narrow:
-            parts: Any = figure.subfigures(2, 1, height_ratios=(0.6 + 0.3 * len(drawn), 2.0 * len(panels)))
-            grid = parts[1].subplots(len(panels), 1, squeeze=False).ravel()
-        else:
-            parts = figure.subfigures(1, 2, width_ratios=(1.0, 1.6))
-            grid = parts[1].subplots(rows, math.ceil(len(panels) / rows), squeeze=False).ravel()
-            for axes in grid[len(panels) :]:
-                axes.set_axis_off()
+        parts: Any = figure.subfigures(1, 2, width_ratios=(1.0, 1.6))
+        grid = parts[1].subplots(rows, math.ceil(len(panels) / rows), squeeze=False).ravel()
+        for axes in grid[len(panels) :]:
+            axes.set_axis_off()
         _draw_ranking(parts[0].add_subplot(), drawn, shares)
         for axes, effect in zip(grid, panels, strict=False):
             _draw_levels(axes, effect)
 
     first = drawn[0]
     share = "" if first.share is None else f", {max(0.0, first.share):.0%} of the variance"
-    return picture(
+    return Picture(
         name,
         "What the parameters do",
         f"{len(drawn)} parameters ranked by their effect on the best score. First: {first.factor}{share}, "
@@ -73,9 +80,22 @@ def parameter_effects(found: Sequence[Effect], name: str) -> Picture | None:
         )
         + _too_few_words(found)
         + (_CUT_WORDS if any(trial.cut for level in first.trials.values() for trial in level) else ""),
+        {
+            "kind": "effects",
+            "x": "share of variance (ω²)" if shares else "spread of mean scores",
+            "ranking": [
+                {
+                    "name": short_key(e.factor),
+                    "value": plain([max(0.0, e.share or 0.0) if shares else e.spread or 0.0])[0],
+                    "text": _share_text(e) if shares else f"{e.spread:.3g}",
+                    "seed": e.factor == "seed",
+                }
+                for e in drawn
+            ],
+            "panels": [_levels_chart(effect) for effect in panels],
+        },
         draw,
         (9.0, 5.4),
-        (4.2, 1.2 + 0.3 * len(drawn) + 2.2 * len(panels)),
     )
 
 
@@ -113,7 +133,8 @@ def _share_text(effect: Effect) -> str:
     return f"{effect.share:.2f}" if effect.share > 0.0 else "≤ 0"
 
 
-def _draw_levels(axes: Axes, effect: Effect) -> None:
+def _drawn_levels(effect: Effect) -> tuple[str, list[tuple[str, list[Scored]]]]:
+    """A parameter's name, and its levels with their trials; of many, the best and the worst."""
     levels = [(level, effect.scored(level)) for level in effect.levels]
     title = short_key(effect.factor)
     if len(levels) > LEVELS:
@@ -121,6 +142,28 @@ def _draw_levels(axes: Axes, effect: Effect) -> None:
         ordered = sorted(levels, key=lambda level: -float(np.mean(effect.levels[level[0]])))
         title += f" (best and worst of {len(levels)})"
         levels = [*ordered[: LEVELS // 2], *ordered[-LEVELS // 2 :]]
+    return title, levels
+
+
+def _levels_chart(effect: Effect) -> dict[str, Any]:
+    title, levels = _drawn_levels(effect)
+    shown = []
+    for label, trials in levels:
+        scores = effect.levels[label]
+        interval = mean_interval(scores)
+        shown.append(
+            {
+                "label": printable(label),
+                "mean": plain([float(np.mean(scores))])[0],
+                "interval": None if interval is None else plain([interval.low, interval.high]),
+                "points": [[t.place, plain([score])[0], t.cut] for t, score in zip(trials, scores, strict=True)],
+            }
+        )
+    return {"title": title, "levels": shown}
+
+
+def _draw_levels(axes: Axes, effect: Effect) -> None:
+    title, levels = _drawn_levels(effect)
     jitter = np.random.default_rng(0)
     for place, (label, trials) in enumerate(levels):
         scores = effect.levels[label]
@@ -142,7 +185,9 @@ def _draw_levels(axes: Axes, effect: Effect) -> None:
     axes.grid(alpha=0.3, axis="y")
 
 
-def parallel_coordinates(reading: Reading, found: Sequence[Effect], name: str) -> Picture | None:
+def parallel_coordinates(
+    reading: Reading, found: Sequence[Effect], name: str, places: Mapping[Path, int]
+) -> Picture | None:
     """One line per trial through its parameters to its score; None with fewer than two trials or no parameter."""
     factors = [effect.factor for effect in found if effect.factor != "seed" and effect.spread is not None][:AXES]
     trials = [t for t in reading.trials if t.score is not None and all(f in t.trial.changed for f in factors)]
@@ -154,77 +199,79 @@ def parallel_coordinates(reading: Reading, found: Sequence[Effect], name: str) -
     heights = np.column_stack([*(places for places, _ in columns), (scores - low) / (high - low or 1.0)])
     norm = Normalize(low, high)
 
-    def draw(figure: Figure, narrow: bool) -> None:
+    def draw(figure: Figure) -> None:
         axes = figure.add_subplot()
         # Without its lightest part, which is hard to see on white.
         ways = ListedColormap(colormaps["viridis"](np.linspace(0.0, 0.88, 256)))
         x = np.arange(heights.shape[1])
-        if narrow:
-            axes.set_ylim(heights.shape[1] - 0.6, -0.4)
         for row in np.argsort(scores):
-            along = (heights[row], x) if narrow else (x, heights[row])
-            axes.plot(*along, color=ways(norm(scores[row])), linewidth=1.0, alpha=0.75)
+            axes.plot(x, heights[row], color=ways(norm(scores[row])), linewidth=1.0, alpha=0.75)
         ticks = [labels for _, labels in columns] + [[(0.0, f"{low:.4g}"), (1.0, f"{high:.4g}")]]
+        box = {"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.6}
         for place, own in enumerate(ticks):
-            if narrow:
-                axes.axhline(place, color="black", linewidth=0.8)
-            else:
-                axes.axvline(place, color="black", linewidth=0.8)
+            axes.axvline(place, color="black", linewidth=0.8)
             for height, label in own:
-                spot = (height, place + 0.16) if narrow else (place + 0.03, height)
-                box = {"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.6}
-                ha = ("left" if height < 0.1 else "right" if height > 0.9 else "center") if narrow else "left"
-                axes.text(*spot, shorten(label, 16), fontsize=7, ha=ha, va="center", bbox=box)
-        names = [shorten(short_key(f), 18) for f in factors] + ["best score"]
-        if narrow:
-            axes.set_yticks(x, names, fontsize=8)
-            axes.set_xticks([])
-            axes.set_xlim(-0.03, 1.03)
-        else:
-            axes.set_xticks(x, names, fontsize=8)
-            axes.set_yticks([])
-            axes.set_xlim(-0.05, x[-1] + 0.35)
+                axes.text(place + 0.03, height, shorten(label, 16), fontsize=7, ha="left", va="center", bbox=box)
+        axes.set_xticks(x, [shorten(short_key(f), 18) for f in factors] + ["best score"], fontsize=8)
+        axes.set_yticks([])
+        axes.set_xlim(-0.05, x[-1] + 0.35)
         for side in axes.spines.values():
             side.set_visible(False)
         if high > low:
-            bar = figure.colorbar(
-                ScalarMappable(norm, ways),
-                ax=axes,
-                orientation="horizontal" if narrow else "vertical",
-                shrink=0.8,
-                pad=0.02,
-            )
+            bar = figure.colorbar(ScalarMappable(norm, ways), ax=axes, shrink=0.8, pad=0.02)
             bar.set_label("best score", fontsize=8)
             bar.ax.tick_params(labelsize=7)
 
     best = trials[int(np.argmax(scores))]
-    return picture(
+    return Picture(
         name,
         "All trials over all parameters",
         f"Parallel coordinates of {len(trials)} trials over {', '.join(short_key(f) for f in factors)} and the best "
         f"score; the best has {best.trial.variant}.",
         "Each line is a trial, coloured by its best score. Numbers that span a factor of 30 are on a logarithmic axis.",
+        {
+            "kind": "parallel",
+            "axes": [_axis_chart(factor, trials) for factor in factors],
+            "trials": [[places[t.folder], plain([t.score or 0.0])[0]] for t in trials],
+        },
         draw,
         (9.0, 4.6),
-        (4.2, 1.4 + 1.0 * heights.shape[1]),
     )
+
+
+def _numbers(factor: str, trials: Sequence[TrialReading]) -> tuple[list[float] | None, bool]:
+    """The trials' values of a parameter whose values are numbers, and whether its axis is logarithmic; None if it has
+    levels instead."""
+    values = [trial.trial.values.get(factor) for trial in trials]
+    if not all(_is_number(value) for value in values) or len(set(values)) < 2:
+        return None, False
+    numbers = [float(value) for value in values if value is not None]
+    return numbers, min(numbers) > 0.0 and max(numbers) > _DECADES * min(numbers)
+
+
+def _axis_chart(factor: str, trials: Sequence[TrialReading]) -> dict[str, Any]:
+    numbers, logarithmic = _numbers(factor, trials)
+    name = short_key(factor)
+    if numbers is not None:
+        return {"name": name, "log": logarithmic, "values": plain(numbers)}
+    labels = [printable(trial.trial.changed[factor]) for trial in trials]
+    levels = list(dict.fromkeys(labels))
+    return {"name": name, "levels": levels, "values": [levels.index(label) for label in labels]}
 
 
 def _coordinate(factor: str, trials: Sequence[TrialReading]) -> tuple[np.ndarray, list[tuple[float, str]]]:
     """Heights (N,) from 0 to 1 of the trials on a parameter's axis, and the axis' labels as (height, text)."""
-    values = [trial.trial.values.get(factor) for trial in trials]
-    labels = [trial.trial.changed[factor] for trial in trials]
-    if all(_is_number(value) for value in values) and len(set(values)) > 1:
-        numbers = np.array(values, dtype=float)
-        if numbers.min() > 0.0 and numbers.max() > _DECADES * numbers.min():
-            numbers = np.log10(numbers)
+    own, logarithmic = _numbers(factor, trials)
+    if own is not None:
+        numbers = np.log10(own) if logarithmic else np.array(own)
         heights = (numbers - numbers.min()) / (numbers.max() - numbers.min())
-        texts = [f"{value:.4g}" for value in values]
+        texts = [f"{value:.4g}" for value in own]
         marks = dict(zip(heights.round(6).tolist(), texts, strict=True))
         chosen = sorted(marks)
         if len(chosen) > 6:
             chosen = [chosen[round(share * (len(chosen) - 1))] for share in (0.0, 0.25, 0.5, 0.75, 1.0)]
         return heights, [(height, marks[height]) for height in dict.fromkeys(chosen)]
+    labels = [trial.trial.changed[factor] for trial in trials]
     levels = list(dict.fromkeys(labels))
     places = {label: place / max(1, len(levels) - 1) for place, label in enumerate(levels)}
     shown = levels if len(levels) <= 12 else []

@@ -1,14 +1,17 @@
-"""The page: one self-contained HTML file, with its pictures as separate files too."""
+"""The page: one self-contained HTML file, with its figures as PNG beside it."""
 
 import base64
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import orjson
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
 
 from msk_ray import __version__
 from msk_ray.cli import typed_command
@@ -21,9 +24,11 @@ from msk_ray.report.influence import parallel_coordinates, parameter_effects, ra
 from msk_ray.report.pictures import Picture, format_steps
 from msk_ray.report.reading import Condition, Reading, TrialReading
 from msk_ray.report.tables import baseline_of, failures, outcome_counts, outcome_figures, variant_rows
+from msk_ray.text import printable
 
 PAGE = "index.html"
-_FILES = ("config.yaml", "metrics.jsonl", "output.log", "error.txt", "eval.json", "checkpoints/best.pt")
+FILES = ("config.yaml", "metrics.jsonl", "output.log", "error.txt", "eval.json", "checkpoints/best.pt")
+"""Files of a trial that the page links to."""
 _WORDS = {
     Condition.RUNNING: "Trials are still running: this is the state at the time above.",
     Condition.INTERRUPTED: "It has not ended, but no trial has written anything for some time: it was stopped or has "
@@ -45,6 +50,8 @@ class Section:
     pictures: dict[str, Picture]
     folder: Path
     """Folder of the page; links are relative to it."""
+    places: Mapping[Path, int]
+    """Trials' positions in the page's list."""
 
     @property
     def words(self) -> str:
@@ -68,7 +75,7 @@ class Section:
 
     def files(self, trial: TrialReading) -> list[tuple[str, str]]:
         """(name, link) of a trial's existing files."""
-        return [(Path(name).stem, self.link(trial.folder / name)) for name in _FILES if (trial.folder / name).is_file()]
+        return [(Path(name).stem, self.link(trial.folder / name)) for name in FILES if (trial.folder / name).is_file()]
 
     def devices(self) -> dict[str, int]:
         """Kinds of devices, and how many trials ran on each."""
@@ -89,53 +96,113 @@ class Section:
         return typed_command([str(word) for word in argv])
 
 
-def make_section(reading: Reading, folder: Path, prefix: str, baseline: str | None, best: Best | None) -> Section:
-    """Draw an experiment's pictures.
+def places_of(readings: Sequence[Reading]) -> dict[Path, int]:
+    """Positions of all trials, by their folders, in the page's list of trials."""
+    return {trial.folder: place for place, trial in enumerate(t for reading in readings for t in reading.trials)}
+
+
+def make_section(
+    reading: Reading, folder: Path, prefix: str, baseline: str | None, places: Mapping[Path, int]
+) -> Section:
+    """Make an experiment's figures.
+
+    Args:
+        folder: of the page; links are relative to it.
+        prefix: of the figures' names.
+        baseline: the variant that others are compared with; None: see `baseline_of`.
+        places: trials' positions in the page's list.
 
     Raises:
         ConfigError: there is no variant with the requested name.
     """
     chosen = baseline_of(reading, baseline)
-    found = ranked_effects(reading)
+    found = ranked_effects(reading, places)
     several = len(reading.algorithms) > 1
-    times = learning_curves(reading.variants, chosen, f"{prefix}times", over="seconds") if several else None
-    drawn = {
-        "curves": learning_curves(reading.variants, chosen, f"{prefix}curves"),
+    times = learning_curves(reading.variants, chosen, f"{prefix}times", places, over="seconds") if several else None
+    made = {
+        "curves": learning_curves(reading.variants, chosen, f"{prefix}curves", places),
         # An env step of one algorithm costs another time than one of another.
         "times": times,
         "effects": parameter_effects(found, f"{prefix}effects"),
-        "parallel": parallel_coordinates(reading, found, f"{prefix}parallel"),
-        "stops": stopping_map(reading, f"{prefix}stops"),
-        "health": gradient_health(reading, f"{prefix}health"),
+        "parallel": parallel_coordinates(reading, found, f"{prefix}parallel", places),
+        "stops": stopping_map(reading, f"{prefix}stops", places),
+        "health": gradient_health(reading, f"{prefix}health", places),
     }
-    pictures = {key: picture for key, picture in drawn.items() if picture is not None}
+    pictures = {key: picture for key, picture in made.items() if picture is not None}
     slug = "".join(c if c.isalnum() else "-" for c in reading.name)
-    return Section(reading, slug, chosen, best, pictures, folder)
+    return Section(reading, slug, chosen, None, pictures, folder, places)
 
 
-def compare(readings: Sequence[Reading]) -> Picture | None:
+def compare(readings: Sequence[Reading], places: Mapping[Path, int]) -> Picture | None:
     """Learning curves of several experiments together; None if none was evaluated, or scores cannot be compared."""
     if _several_environments(readings):
         return None
     groups = {
         f"{reading.name}: {variant}": trials for reading in readings for variant, trials in reading.variants.items()
     }
-    return learning_curves(groups, None, "together")
+    return learning_curves(groups, None, "together", places)
 
 
 def _several_environments(readings: Sequence[Reading]) -> bool:
     return len({name for reading in readings for name in reading.environments}) > 1
 
 
-def write_page(sections: Sequence[Section], together: Picture | None, folder: Path, now: float, command: str) -> Path:
-    """Write the page and its pictures.
+@dataclass(frozen=True)
+class Live:
+    """What the page of the dashboard has in addition to a file's."""
 
-    Returns:
-        The page's path.
+    refresh: float
+    """Seconds between its questions whether something has changed."""
+    version: str
+    """Of the content: the page is fetched again when there is another one."""
+    may_write: bool
+    """Whether notes can be written."""
+    films: Mapping[str, str]
+    """Slug of a section → link to its film, or text that says why there is none, which has spaces."""
+    plots: str
+    """Link to Optuna's plots; empty if there is nothing to plot."""
 
-    Raises:
-        StorageFailure: the folder cannot be written.
+
+def render_page(
+    sections: Sequence[Section], together: Picture | None, now: float, command: str, live: Live | None = None
+) -> str:
+    """The page as HTML.
+
+    Args:
+        together: the figure of all sections.
+        now: seconds since the epoch.
+        command: what wrote it.
+        live: given by the dashboard, which serves styles and scripts as files of their own.
     """
+    pictures = [picture for section in sections for picture in section.pictures.values()]
+    if together is not None:
+        pictures.append(together)
+    trials = [
+        [section.reading.name, t.trial.id, printable(t.trial.variant), t.trial.seed, t.outcome, t.score]
+        for section in sections
+        for t in section.reading.trials
+    ]
+    data = {"trials": trials, "figures": {picture.name: picture.chart for picture in pictures}}
+    return (
+        _templates()
+        .get_template("report.html.j2")
+        .render(
+            sections=sections,
+            together=together,
+            comparable=not _several_environments([section.reading for section in sections]),
+            written=time.strftime("%Y-%m-%d %H:%M:%S %Z", time.localtime(now)),
+            command=command,
+            version=__version__,
+            strip_uri=lambda path: _uri(path.read_bytes()),
+            live=live,
+            # Inside a script element, only "</script" and "<!--" would end or change it.
+            data=Markup(orjson.dumps(data).decode().replace("<", "\\u003c")),
+        )
+    )
+
+
+@cache
+def _templates() -> Environment:
     environment = Environment(
         loader=PackageLoader("msk_ray.report", "page"),
         autoescape=True,
@@ -144,25 +211,28 @@ def write_page(sections: Sequence[Section], together: Picture | None, folder: Pa
         undefined=StrictUndefined,
     )
     environment.filters.update(
-        number=_number, signed=_signed, percent=_percent, duration=format_duration, steps=format_steps, uri=_uri
+        number=_number, signed=_signed, percent=_percent, duration=format_duration, steps=format_steps
     )
-    text = environment.get_template("report.html.j2").render(
-        sections=sections,
-        together=together,
-        comparable=not _several_environments([section.reading for section in sections]),
-        written=time.strftime("%Y-%m-%d %H:%M %Z", time.localtime(now)),
-        command=command,
-        version=__version__,
-        strip_uri=lambda path: _uri(path.read_bytes()),
-    )
+    return environment
+
+
+def write_page(sections: Sequence[Section], together: Picture | None, folder: Path, now: float, command: str) -> Path:
+    """Write the page, and its figures as PNG.
+
+    Returns:
+        The page's path.
+
+    Raises:
+        StorageFailure: the folder cannot be written.
+    """
     pictures = [picture for section in sections for picture in section.pictures.values()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for picture in [*pictures, *([together] if together is not None else [])]:
-            (folder / f"{picture.name}.png").write_bytes(picture.wide)
+            (folder / f"{picture.name}.png").write_bytes(picture.png())
     except OSError as error:
         raise StorageFailure(f"cannot write {folder}: {error.strerror or error}") from error
-    write_text(folder / PAGE, text)
+    write_text(folder / PAGE, render_page(sections, together, now, command))
     return folder / PAGE
 
 

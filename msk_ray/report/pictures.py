@@ -1,9 +1,10 @@
-"""Pictures of the page: each drawn twice with matplotlib, for a wide screen or paper and for a phone."""
+"""Figures of the report: each as data, from which the page draws a chart, and as a PNG for papers."""
 
 import io
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,8 +13,8 @@ from matplotlib.ticker import EngFormatter
 
 from msk_ray.text import printable
 
-Draw = Callable[[Figure, bool], None]
-"""Draws into an empty figure; told whether it is the narrow one."""
+Draw = Callable[[Figure], None]
+"""Draws into an empty figure."""
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8B5A2B", "#4B0082")
 """Colours that can be distinguished with any colour vision (Okabe and Ito 2008, with two added at the end)."""
@@ -21,12 +22,15 @@ DASHES = ("-", "--", "-.", ":")
 GREY = "#9a9a9a"
 POINTS = 300
 """Maximum number of points of a drawn curve."""
-_WIDE_DPI, _NARROW_DPI = 120, 150
+CHART_POINTS = 60_000
+"""About how many points of all its lines together a chart has: more would make the page large and slow."""
+_LEAST_POINTS = 12
+_DPI = 120
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure of the page."""
+    """A figure of the report."""
 
     name: str
     """Name of its file without suffix."""
@@ -34,38 +38,46 @@ class Picture:
     alt: str
     """Description of what it shows."""
     caption: str
-    wide: bytes
-    """PNG."""
-    narrow: bytes | None
-    """PNG for screens up to 600 pixels; None: the wide one."""
+    chart: Mapping[str, Any]
+    """What the page draws, as plain data: its `kind`, and the fields that `page/charts.js` reads for this kind. Trials
+    are named by their position in the page's list of trials."""
+    draw: Draw
+    """Draws the same with matplotlib."""
+    size: tuple[float, float] = (9.0, 5.0)
+    """Width and height of the PNG [inches]."""
+
+    def png(self) -> bytes:
+        """The figure as PNG."""
+        figure = Figure(figsize=self.size, layout="constrained")
+        self.draw(figure)
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png", dpi=_DPI)
+        return buffer.getvalue()
 
 
-def picture(
-    name: str,
-    title: str,
-    alt: str,
-    caption: str,
-    draw: Draw,
-    wide: tuple[float, float] = (9.0, 5.0),
-    narrow: tuple[float, float] = (4.2, 4.6),
-) -> Picture:
-    """Draw a picture in both sizes [inches]."""
-    return Picture(name, title, alt, caption, _png(draw, wide, False), _png(draw, narrow, True))
+def points_each(lines: int) -> int:
+    """How many points each of a chart's lines may have."""
+    return max(_LEAST_POINTS, min(POINTS, CHART_POINTS // max(1, lines)))
 
 
-def _png(draw: Draw, size: tuple[float, float], narrow: bool) -> bytes:
-    figure = Figure(figsize=size, layout="constrained")
-    draw(figure, narrow)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=_NARROW_DPI if narrow else _WIDE_DPI)
-    return buffer.getvalue()
+def plain(values: Iterable[float]) -> list[float | None]:
+    """Numbers with five digits for a chart; None for what is not finite."""
+    return [float(f"{value:.5g}") if math.isfinite(value) else None for value in values]
 
 
-def thin_peaks(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A curve (N,) over `x` with at most POINTS points: the largest value of each stretch, at its position."""
-    if len(x) <= POINTS:
+def thin_evenly(x: np.ndarray, y: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """At most `count` + 2 points of a curve (N,): evenly spaced ones with both ends, and the extremes of `y`."""
+    if len(x) <= count:
         return x, y
-    stretch = math.ceil(len(x) / POINTS)
+    keep = np.unique([*np.linspace(0, len(x) - 1, count).round().astype(int), int(np.argmax(y)), int(np.argmin(y))])
+    return x[keep], y[keep]
+
+
+def thin_peaks(x: np.ndarray, y: np.ndarray, count: int = POINTS) -> tuple[np.ndarray, np.ndarray]:
+    """A curve (N,) over `x` with at most `count` points: the largest value of each stretch, at its position."""
+    if len(x) <= count:
+        return x, y
+    stretch = math.ceil(len(x) / count)
     padded = np.full(stretch * math.ceil(len(x) / stretch), -np.inf)
     padded[: len(y)] = np.where(np.isnan(y), -np.inf, y)
     blocks = padded.reshape(-1, stretch)

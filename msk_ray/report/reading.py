@@ -1,6 +1,6 @@
 """Read an experiment from its files, in any condition: running, finished, crashed, half-written, empty.
 
-What cannot be read is named in `notes`, or in its trial, and does not hide the rest.
+What cannot be read is named in `warnings`, or in its trial, and does not hide the rest.
 """
 
 import math
@@ -19,22 +19,29 @@ from msk_ray.experiment.attempts import FIRST, Attempt
 from msk_ray.experiment.damage import Damage, count_damages, describe_damages
 from msk_ray.experiment.environment import read_environment
 from msk_ray.experiment.layout import (
+    DEVICE_FILE,
     ENVIRONMENT_FILE,
     ERROR_FILE,
+    HALVED_FILE,
     MANIFEST_FILE,
+    METRICS_FILE,
+    OUTCOME_FILE,
     OUTPUT_FILE,
     SPACE_FILE,
     best_checkpoint,
 )
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import SCORE
+from msk_ray.experiment.notes import read_notes
 from msk_ray.experiment.outcomes import Ending
 from msk_ray.experiment.results import unlisted_trials
-from msk_ray.experiment.snapshot import State, TrialReader
+from msk_ray.experiment.snapshot import State, TrialReader, file_stamp
 from msk_ray.experiment.trial import Trial
 from msk_ray.sweep.space import SpaceFile, read_file
 
 _TAIL_LINES = 12
+_READ = (METRICS_FILE, OUTCOME_FILE, HALVED_FILE, DEVICE_FILE)
+"""The files of a trial that its reading is made of."""
 _NOTED = 10
 """Number of damaged files that are named; the others are counted."""
 
@@ -61,12 +68,14 @@ class TrialReading:
     """Every metric by name, shape (E,); NaN where an epoch has no finite value."""
     state: State
     ending: Ending | None = None
-    note: str = ""
+    fault: str = ""
     """What is wrong with its files."""
     device: str = ""
     """GPU model, or cpu; empty if it was not recorded."""
     attempt: Attempt = FIRST
     """The scores of one with fewer worlds do not compare with the others'."""
+    note: str = ""
+    """What its owner has written about it."""
 
     @property
     def epochs_done(self) -> int:
@@ -140,7 +149,7 @@ class TrialReading:
 
     @property
     def why(self) -> str:
-        parts = (self.attempt, self.ending and self.ending.why, self.note)
+        parts = (self.attempt, self.ending and self.ending.why, self.fault)
         return "; ".join(str(part) for part in parts if str(part or ""))
 
     @property
@@ -173,7 +182,7 @@ class Reading:
     environment: dict[str, Any] = field(default_factory=dict)
     space: SpaceFile | None = None
     space_text: str = ""
-    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     """What is missing or broken."""
     part: str = ""
     """Environment of all its trials, if it is one of several parts of the experiment."""
@@ -242,42 +251,88 @@ def read_experiment(experiment: Experiment, now: float) -> Reading:
     Args:
         now: seconds since the epoch, to tell running trials from silent ones.
     """
-    notes: list[str] = []
-    manifest: Mapping[str, Any] = {}
-    trials: list[Trial] = []
-    if not any(experiment.path.iterdir()):
-        notes.append("The folder is empty.")
-    else:
-        try:
-            manifest = experiment.manifest()
-            trials = experiment.trials()
-        except MskRayError as error:
-            notes.append(f"Which trials were planned is not known: {explain(error)}.")
-    text, space = _read_space(experiment.path / SPACE_FILE, notes)
-    environment, damages = _read_environment(experiment.path, notes)
-    listed = {trial.id for trial in trials}
-    unlisted, unreadable = unlisted_trials(experiment, listed, list(space.parameters) if space else [])
-    notes += [f"A trial is left out: {line}." for line in describe_damages(unreadable, experiment.path)]
-    reader = TrialReader()
-    readings = []
-    for trial in [*trials, *unlisted]:
-        reading, found = _read_trial(reader, trial, experiment.trial_folder(trial.id), now)
-        readings.append(reading)
-        damages += found
-    if damages:
-        lines = describe_damages(damages, experiment.path)
-        more = f"; and {len(lines) - _NOTED} more files" if len(lines) > _NOTED else ""
-        notes.append(f"Skipped: {count_damages(damages)}. {'; '.join(lines[:_NOTED])}{more}.")
-    return Reading(
-        experiment,
-        str(manifest.get("question") or (space.question.strip() if space else "")),
-        str(manifest.get("created", "")),
-        tuple(readings),
-        environment,
-        space,
-        text,
-        tuple(notes),
-    )
+    return ExperimentReader(experiment).read(now)
+
+
+class ExperimentReader:
+    """Reads an experiment again and again; what has not changed is not read twice."""
+
+    def __init__(self, experiment: Experiment) -> None:
+        self.experiment = experiment
+        self._reader = TrialReader()
+        self._planned: tuple[Any, list[Trial]] | None = None
+        self._unlisted: tuple[Any, tuple[list[Trial], list[Damage]]] | None = None
+        self._seen: dict[Path, tuple[Any, TrialReading, tuple[Damage, ...]]] = {}
+
+    def read(self, now: float) -> Reading:
+        """The experiment at `now` [s since the epoch]; no content of it makes this fail."""
+        experiment = self.experiment
+        warnings: list[str] = []
+        manifest: Mapping[str, Any] = {}
+        trials: list[Trial] = []
+        if not any(experiment.path.iterdir()):
+            warnings.append("The folder is empty.")
+        else:
+            try:
+                manifest = experiment.manifest()
+                trials = self._plan()
+            except MskRayError as error:
+                warnings.append(f"Which trials were planned is not known: {explain(error)}.")
+        text, space = _read_space(experiment.path / SPACE_FILE, warnings)
+        environment, damages = _read_environment(experiment.path, warnings)
+        notes, damaged = read_notes(experiment.path)
+        damages += damaged
+        unlisted, unreadable = self._others({trial.id for trial in trials}, list(space.parameters) if space else [])
+        warnings += [f"A trial is left out: {line}." for line in describe_damages(unreadable, experiment.path)]
+        readings = []
+        for trial in [*trials, *unlisted]:
+            reading, found = self._trial(trial, notes.get(trial.id, ""), now)
+            readings.append(reading)
+            damages += found
+        if damages:
+            lines = describe_damages(damages, experiment.path)
+            more = f"; and {len(lines) - _NOTED} more files" if len(lines) > _NOTED else ""
+            warnings.append(f"Skipped: {count_damages(damages)}. {'; '.join(lines[:_NOTED])}{more}.")
+        return Reading(
+            experiment,
+            str(manifest.get("question") or (space.question.strip() if space else "")),
+            str(manifest.get("created", "")),
+            tuple(readings),
+            environment,
+            space,
+            text,
+            tuple(warnings),
+        )
+
+    def _plan(self) -> list[Trial]:
+        stamp = file_stamp(self.experiment.path / MANIFEST_FILE)
+        if self._planned is None or self._planned[0] != stamp:
+            self._planned = stamp, self.experiment.trials()
+        return self._planned[1]
+
+    def _others(self, listed: set[str], parameters: list[str]) -> tuple[list[Trial], list[Damage]]:
+        root = self.experiment.path / "trials"
+        folders = sorted(path for path in root.iterdir() if path.name not in listed) if root.is_dir() else []
+        key = (len(listed), parameters, [(path.name, file_stamp(path / "config.yaml")) for path in folders])
+        if self._unlisted is None or self._unlisted[0] != key:
+            self._unlisted = key, unlisted_trials(self.experiment, listed, parameters)
+        return self._unlisted[1]
+
+    def _trial(self, trial: Trial, note: str, now: float) -> tuple[TrialReading, tuple[Damage, ...]]:
+        folder = self.experiment.trial_folder(trial.id)
+        # With the planned trial itself: `--extend` gives it more epochs.
+        key = (trial, note, [file_stamp(folder / name) for name in _READ])
+        seen = self._seen.get(folder)
+        # Whether a trial that has not ended is running depends on the time too.
+        if seen is not None and seen[0] == key and seen[1].state is State.ENDED:
+            return seen[1:]
+        reading, damages = _read_trial(self._reader, trial, folder, now)
+        if seen is not None and seen[0] == key and seen[1].state is reading.state:
+            reading = seen[1]
+        else:
+            reading = replace(reading, note=note)
+        self._seen[folder] = key, reading, damages
+        return reading, damages
 
 
 def explain(error: Exception) -> str:
@@ -288,10 +343,10 @@ def explain(error: Exception) -> str:
 
 def _read_trial(reader: TrialReader, trial: Trial, folder: Path, now: float) -> tuple[TrialReading, tuple[Damage, ...]]:
     seen = reader.read(folder, now)
-    note = "; ".join(describe_damages(seen.damages, folder))
+    fault = "; ".join(describe_damages(seen.damages, folder))
     columns = columns_of(seen.rows)
     return TrialReading(
-        trial, folder, columns, seen.state, seen.ending, note, seen.device.name, seen.attempt
+        trial, folder, columns, seen.state, seen.ending, fault, seen.device.name, seen.attempt
     ), seen.damages
 
 
@@ -305,21 +360,21 @@ def columns_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
     return {name: np.array([row.get(name, math.nan) for row in rows], dtype=float) for name in names}
 
 
-def _read_space(path: Path, notes: list[str]) -> tuple[str, SpaceFile | None]:
+def _read_space(path: Path, warnings: list[str]) -> tuple[str, SpaceFile | None]:
     if not path.is_file():
-        notes.append("space.yaml is missing.")
+        warnings.append("space.yaml is missing.")
         return "", None
     try:
         text = path.read_text(encoding="utf-8")
         return text, read_file(read_yaml(path), "space.yaml", recorded=True)
     except (MskRayError, OSError, ValueError) as error:
-        notes.append(f"space.yaml cannot be read: {explain(error)}.")
+        warnings.append(f"space.yaml cannot be read: {explain(error)}.")
     return "", None
 
 
-def _read_environment(folder: Path, notes: list[str]) -> tuple[dict[str, Any], list[Damage]]:
+def _read_environment(folder: Path, warnings: list[str]) -> tuple[dict[str, Any], list[Damage]]:
     if not (folder / ENVIRONMENT_FILE).is_file():
-        notes.append("env.json is missing: versions and command are not known.")
+        warnings.append("env.json is missing: versions and command are not known.")
         return {}, []
     return read_environment(folder / ENVIRONMENT_FILE)
 

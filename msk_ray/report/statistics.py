@@ -74,6 +74,8 @@ class Scored:
     score: float | None
     cut: bool = False
     """It ended early: the score might still have risen."""
+    place: int = 0
+    """Its position in the list of whoever asks."""
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """The results at the end of an experiment: a table on the terminal, summary.json, table.md, and the report."""
 
+import shlex
 import shutil
 import subprocess
 import sys
@@ -28,7 +29,7 @@ def finish(experiment: Experiment) -> int:
     records = read_records(experiment)
     width = max(100, shutil.get_terminal_size((160, 24)).columns)
     write_json(experiment.path / SUMMARY_FILE, summary(experiment.name, manifest.get("question") or "", records))
-    write_text(experiment.path / "table.md", table_document(experiment.name, manifest.get("question") or "", records))
+    write_text(experiment.path / "table.md", table_document(experiment.path, manifest.get("question") or "", records))
     print("\n" + text_table(HEADER, result_rows(records), width))
     if len({record.trial.seed for record in records}) > 1:
         header = ("variant", "seeds", "mean score", "std", "min", "max")
@@ -58,4 +59,7 @@ def write_report(experiment: Experiment) -> None:
     command = [sys.executable, "-m", "msk_ray.report", str(experiment.path)]
     code = subprocess.run(command).returncode
     if code:
-        print(f"no report (exit code {code}); to try again: python -m msk_ray.report {experiment.path}", flush=True)
+        again = shlex.join(
+            ["python", "-m", "msk_ray.report", experiment.name, "--storage", str(experiment.path.parent)]
+        )
+        print(printable(f"no report (exit code {code}); to try again: {again}"), flush=True)

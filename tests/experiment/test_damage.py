@@ -184,7 +184,7 @@ def test_a_damaged_file_takes_down_neither_status_nor_report_nor_table(
         path = made.path / file if (made.path / file).exists() else made.trial_folder(victim) / file
         path.write_bytes(KINDS[kind](path.read_bytes(), random.Random(f"{file} {kind} {seed}")))
         reading = read_experiment(made, time.time())
-        assert all("\n" not in note for note in reading.notes)
+        assert all("\n" not in note for note in reading.warnings)
         made.resume_command()
         if name == "manifest.json":
             with contextlib.suppress(MskRayError):  # what is still a manifest may be one of other trials
@@ -197,7 +197,7 @@ def test_a_damaged_file_takes_down_neither_status_nor_report_nor_table(
         intact = [trial for trial in reading.trials if trial.trial.id != victim]
         assert [(t.score, t.state, t.note) for t in intact] == [(8.0, State.ENDED, "")] * 2
         summary(made.name, "", records)
-        table_document(made.name, "", records)
+        table_document(made.path, "", records)
         best = {standing.id: standing.progress.best for standing in standings if standing.id != victim}
         assert list(best.values()) == [8.0, 8.0]
         shutil.rmtree(made.path)

@@ -1,5 +1,6 @@
 """The report of experiments in every condition, and what its tables and curves say."""
 
+import hashlib
 import json
 import os
 import shutil
@@ -7,21 +8,26 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
 from msk_ray.cli import run
 from msk_ray.config import dump_yaml
+from msk_ray.errors import ConfigError
+from msk_ray.experiment import snapshot
 from msk_ray.experiment.attempts import Attempt, Reduced
 from msk_ray.experiment.checkpoint_file import write_checkpoint_file
+from msk_ray.experiment.damage import DamagedFile
 from msk_ray.experiment.manifest import Experiment
+from msk_ray.experiment.notes import load_notes, write_note
 from msk_ray.experiment.outcomes import Ending, Outcome, write_ending
 from msk_ray.report.__main__ import main
-from msk_ray.report.curves import rung_steps
+from msk_ray.report.curves import learning_curves, rung_steps
 from msk_ray.report.influence import ranked_effects
-from msk_ray.report.page import make_section
-from msk_ray.report.pictures import picture, shorten
-from msk_ray.report.reading import Condition, read_experiment
+from msk_ray.report.page import make_section, places_of
+from msk_ray.report.pictures import Picture, shorten, thin_evenly
+from msk_ray.report.reading import Condition, ExperimentReader, read_experiment
 from msk_ray.report.tables import failures, variant_rows
 from msk_ray.sweep import opening
 from msk_ray.sweep.space import parse_space
@@ -76,7 +82,7 @@ def page_of(experiment: Experiment, *arguments: str) -> str:
 def test_tables_by_hand(experiment: Experiment) -> None:
     reading = read_experiment(experiment, time.time())
     assert reading.condition is Condition.FINISHED
-    assert reading.notes == ()
+    assert reading.warnings == ()
     rows = variant_rows(reading, "baseline")
     assert [(r.variant, r.mean, r.difference, r.verdict) for r in rows] == [
         ("fast", 32.0, 21.0, "better"),
@@ -146,7 +152,7 @@ def test_nothing_is_told_from_untrained_policies(experiment: Experiment) -> None
             fill(experiment.trial_folder(trial.id), [-9145.6], Ending(Outcome.STOPPED_ASHA, "behind"))
     reading = read_experiment(experiment, time.time())
     assert [trial.score for trial in reading.trials if trial.ending and trial.ending.cut] == [None] * 4
-    effects = {effect.factor: effect for effect in ranked_effects(reading)}
+    effects = {effect.factor: effect for effect in ranked_effects(reading, places_of([reading]))}
     variant = effects["variant"]
     assert (variant.share, variant.spread, variant.too_few) == (None, None, "fast has none, and 1 more")
     rows = {row.variant: row for row in variant_rows(reading, "baseline")}
@@ -196,6 +202,79 @@ def test_the_page_says_it_all_and_takes_nothing_for_markup(experiment: Experimen
         assert (experiment.path / "report" / f"{name}.png").stat().st_size > 5000
 
 
+def test_an_axis_says_what_leaves_it(experiment: Experiment) -> None:
+    """Policies that fall apart would press all other curves together at the top."""
+    reading = read_experiment(experiment, time.time())
+    places = places_of([reading])
+    whole = learning_curves(reading.variants, None, "x", places)
+    assert whole is not None
+    assert whole.chart["floor"] is None
+    fill(reading.trials[0].folder, [0.0, 34.0, -5000.0], Ending(Outcome.FINISHED, "all 4 epochs done"))
+    cut = learning_curves(read_experiment(experiment, time.time()).variants, None, "x", places)
+    assert cut is not None
+    # First and best scores lie between 0 and 34: a tenth of that is left below them.
+    assert cut.chart["floor"] == {
+        "at": pytest.approx(-3.4),
+        "text": "▼ 1 trial goes below this axis, down to -5000",
+    }
+
+
+def test_charts_have_the_numbers_of_their_trials(experiment: Experiment) -> None:
+    reading = read_experiment(experiment, time.time())
+    section = make_section(reading, experiment.path / "report", "", None, places_of([reading]))
+    charts = {name: picture.chart for name, picture in section.pictures.items()}
+    fast = next(v for v in charts["curves"]["variants"] if v["name"] == "fast")
+    assert fast["mean"] == [[0.0, 200.0, 400.0], [0.0, 32.0, 31.0], [0.0, 30.0, 29.0], [0.0, 34.0, 33.0]]
+    lines = {line[0]: line[1:] for line in charts["curves"]["lines"]}
+    ids = [trial.trial.id for trial in reading.trials]
+    second = next(t for t in reading.trials if (t.trial.variant, t.trial.seed) == ("fast", 1))
+    assert lines[ids.index(second.trial.id)] == [[0.0, 200.0, 400.0], [0.0, 34.0, 33.0], False]
+    levels = {level["label"]: level for level in charts["effects"]["panels"][0]["levels"]}
+    assert levels["fast"]["mean"] == 32.0
+    assert [point[1:] for point in levels["fast"]["points"]] == [[30.0, False], [34.0, False]]
+    assert charts["parallel"]["axes"][0]["levels"] == ["baseline", "fast", "deep"]
+    assert [bar[1] for bar in charts["stops"]["bars"]] == [400.0] * 5 + [200.0]
+
+
+def test_a_long_curve_keeps_its_ends_and_extremes() -> None:
+    y = np.zeros(1000)
+    y[400], y[700] = 5.0, -5.0
+    x, thin = thin_evenly(np.arange(1000.0), y, 10)
+    assert (x[0], x[-1], len(x)) == (0.0, 999.0, 12)
+    assert (thin.max(), thin.min()) == (5.0, -5.0)
+
+
+def test_only_what_has_changed_is_read_again(experiment: Experiment, monkeypatch: pytest.MonkeyPatch) -> None:
+    reader = ExperimentReader(experiment)
+    before = reader.read(time.time())
+    read: list[Path] = []
+    load = snapshot.load_metrics
+    monkeypatch.setattr(snapshot, "load_metrics", lambda path: read.append(path) or load(path))
+    monkeypatch.setattr(Experiment, "trials", lambda _: pytest.fail("its manifest has not changed"))
+    changed = before.trials[2].folder
+    fill(changed, [0.0, 99.0], Ending(Outcome.FINISHED, "done"))
+    write_note(experiment.path, before.trials[3].trial.id, "  look at this\n")
+    after = reader.read(time.time())
+    assert read == [changed / "metrics.jsonl"]
+    assert (after.trials[2].score, after.trials[3].note) == (99.0, "look at this")
+    assert [a is b for a, b in zip(before.trials, after.trials, strict=True)] == [True] * 2 + [False] * 2 + [True] * 2
+    monkeypatch.undo()
+    assert '<td class="wide note">look at this</td>' in page_of(experiment)
+
+
+def test_notes_are_removed_when_empty_and_never_written_over_what_is_not_understood(experiment: Experiment) -> None:
+    write_note(experiment.path, "a", "first")
+    write_note(experiment.path, "b", "second")
+    write_note(experiment.path, "a", " ")
+    assert load_notes(experiment.path) == {"b": "second"}
+    with pytest.raises(ConfigError, match="at most 2000 characters"):
+        write_note(experiment.path, "b", "x" * 2001)
+    (experiment.path / "notes.json").write_text('{"trials": 3}')
+    with pytest.raises(DamagedFile, match="trials is a whole number"):
+        write_note(experiment.path, "b", "third")
+    assert "notes.json: trials is a whole number" in page_of(experiment)
+
+
 def test_half_the_worlds_are_said_wherever_a_score_is(experiment: Experiment) -> None:
     assert "half the worlds" not in page_of(experiment)
     best = read_experiment(experiment, time.time()).best
@@ -223,8 +302,9 @@ def test_command_and_files(experiment: Experiment) -> None:
     page = page_of(experiment)
     assert "git checkout abc\npython -m msk_ray.tune --space &#39;a b&#39;" in page
     assert "changes that were not committed" in page
-    assert "<dt>GPUs there</dt><dd>A, B (driver 570)</dd>" in page
-    section = make_section(read_experiment(experiment, 0.0), experiment.path / "report", "", None, None)
+    assert "<dt>GPUs there:</dt> <dd>A, B (driver 570)</dd>" in page
+    reading = read_experiment(experiment, 0.0)
+    section = make_section(reading, experiment.path / "report", "", None, places_of([reading]))
     links = [link for trial in section.reading.trials for _, link in section.files(trial)]
     assert len(links) == 7  # six metrics and an output
     assert all((experiment.path / "report" / link).is_file() for link in links)
@@ -335,6 +415,7 @@ def test_several_side_by_side(experiment: Experiment, tmp_path: Path) -> None:
     out = tmp_path / "both"
     assert run(main, ["e", "other", "--storage", str(tmp_path / "runs"), "--out", str(out)]) == 0
     page = (out / "index.html").read_text()
+    assert f"python -m msk_ray.report e other --storage {tmp_path / 'runs'}<" in page
     assert "Side by side" in page
     assert page.count('<section id="') == 3
     assert (out / "together.png").is_file()
@@ -392,10 +473,10 @@ def test_rungs_of_a_search_are_drawn_where_trials_were_judged(tmp_path: Path) ->
 def test_a_dollar_in_a_label_is_no_formula() -> None:
     """Between two of them, matplotlib would read TeX, and fail where it is none."""
 
-    def draw(figure: Figure, narrow: bool) -> None:
+    def draw(figure: Figure) -> None:
         figure.suptitle(shorten("cost $\\frac$ \x1b[1m", 40))
 
-    assert picture("x", "", "", "", draw).wide
+    assert Picture("x", "", "", "", {}, draw).png()
     assert shorten("a$b\n", 40) == "a\\$b\\n"
 
 
@@ -428,3 +509,9 @@ def test_it_says_which_variants_were_trained_with_drawn_parameters(tmp_path: Pat
     page = page_of(made)
     assert "1 of 2 variants are trained with body_mass ×0.5 to ×2, drawn for every episode" in page
     assert "every score is of the model as it is" in page
+
+
+def test_the_bundled_library_is_the_documented_one(root: Path) -> None:
+    folder = root / "msk_ray" / "report" / "page" / "echarts"
+    digest = hashlib.sha256((folder / "echarts.min.js").read_bytes()).hexdigest()
+    assert digest in (folder / "README.md").read_text()

@@ -69,11 +69,11 @@ def test_records_and_tables(experiment: Experiment, tmp_path: Path) -> None:
     # Rate 0.01: best scores 5 and 7, mean 6, deviation √2.
     assert variant_rows(records)[0] == ("actor_lr=0.01", "2", "6", "1.414", "5", "7")
     assert [row[1] for row in variant_rows(records)] == ["2", "1 (1 before the end)"]
-    document = table_document("e", "Which?", records)
+    document = table_document(Path("e"), "Which?", records)
     assert "number 2 of 2 \\| rung" in document
     assert f"trials/{records[2].trial.id}/checkpoints/best.pt" in document
     assert "count with their best score so far" in document
-    whole = table_document("e", "Which?", [records[0], records[2]])
+    whole = table_document(Path("e"), "Which?", [records[0], records[2]])
     assert "before the" not in whole
     facts = json.loads(json.dumps(summary("e", "Which?", records), allow_nan=False))
     assert facts["best"]["id"] == records[2].trial.id
