@@ -119,6 +119,13 @@ def evaluations_of(rows: Sequence[Mapping[str, float]]) -> list[Evaluation]:
     return [evaluation for evaluation in found if evaluation is not None]
 
 
+def last_figures(rows: Sequence[Mapping[str, float]], names: Sequence[str]) -> tuple[float, ...] | None:
+    """These metrics of the last evaluation of a trained policy; None if one of them is missing there or not finite."""
+    evaluated = [row for row in rows if Evaluation.from_row(row) is not None]
+    values = tuple(evaluated[-1].get(name, math.nan) for name in names) if evaluated else (math.nan,)
+    return values if all(map(math.isfinite, values)) else None
+
+
 @dataclass(frozen=True)
 class TrialProgress:
     """A summary of a trial's rows of metrics."""

@@ -4,7 +4,7 @@ import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, SerializeAsAny, ValidationError
 
@@ -77,6 +77,8 @@ class SpaceFile(Section):
     """Seed of those draws."""
     search: Text = "random"
     """`random` resolves all trials in advance; otherwise the search that suggests them, by name or import path."""
+    objectives: dict[Text, Literal["minimize", "maximize"]] = Field(default_factory=dict)
+    """What a search looks for instead of the highest score: metrics of the last evaluation, such as eval/fall_rate."""
     scheduler: Annotated[SerializeAsAny[SchedulerSpec], BeforeValidator(read_scheduler)] = NoScheduler()
     stop: StopSpec = StopSpec()
     resources: ResourcesSpec = ResourcesSpec()
@@ -264,6 +266,8 @@ def _check_combination(file: SpaceFile, parameters: Mapping[str, Operator], seed
         raise ConfigError("ablate varies one factor at a time: beside it write only grids, and search: random")
     if file.samples > 1 and not sampled:
         raise ConfigError("samples: nothing is drawn; give a parameter choice, uniform, loguniform or randint")
+    if file.objectives and not (file.searches and search_class(file.search).several_objectives):
+        raise ConfigError(f"objectives: search: {file.search} looks for none; write search: optuna, or leave them out")
     if file.searches:
         search_class(file.search).check(parameters, seeds)
     file.scheduler.check(file, [key for key, op in sampled.items() if isinstance(op, Range)])

@@ -25,6 +25,7 @@ from msk_ray.experiment.attempts import read_attempt
 from msk_ray.experiment.damage import describe_damages
 from msk_ray.experiment.layout import SCHEDULER_LOG_FILE
 from msk_ray.experiment.manifest import Experiment
+from msk_ray.experiment.metrics import last_figures
 from msk_ray.experiment.outcomes import read_ending, write_ending
 from msk_ray.experiment.ownership import Ownership
 from msk_ray.experiment.results import read_record
@@ -250,13 +251,19 @@ def _suggestions(plan: Plan, made_up: list[SearchTrial], identify: Identify) -> 
         if record.ending is None:
             begun.append(made.params)
         else:
-            scored.append((made.params, None if record.best is None else record.best.score))
+            scored.append((made.params, record))
     file = plan.space.file
     # With the original seed, the original draws would be repeated.
-    search = search_class(file.search)(plan.space.sampled, file.sample_seed + len(made_up))
-    for params, score in scored:
-        search.tell(params, score)
-    return Suggestions(plan.experiment, identify, search, begun, file.samples - len(scored))
+    seed = file.sample_seed + len(made_up)
+    given = (file.objectives,) if file.objectives else ()
+    search = search_class(file.search)(plan.space.sampled, seed, *given)
+    for params, record in scored:
+        if file.objectives:
+            search.tell_objectives(params, last_figures(record.snapshot.rows, list(file.objectives)))
+        else:
+            search.tell(params, None if record.best is None else record.best.score)
+    left = file.samples - len(scored)
+    return Suggestions(plan.experiment, identify, search, begun, left, tuple(file.objectives))
 
 
 class _OwnNode(Callback):

@@ -6,6 +6,7 @@ is handed to Tune again.
 """
 
 import copy
+import logging
 import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -15,9 +16,12 @@ from ray.tune.search import BasicVariantGenerator, Searcher
 
 from msk_ray.experiment.attempts import read_attempt
 from msk_ray.experiment.manifest import Experiment
+from msk_ray.experiment.metrics import last_figures, read_rows
 from msk_ray.experiment.outcomes import read_ending
 from msk_ray.sweep.search import Search
 from msk_ray.tune.schedulers import BEST, METRIC
+
+_log = logging.getLogger(__name__)
 
 Identify = Callable[[Mapping[str, Any]], str]
 """The id of the trial that a Tune config stands for."""
@@ -106,7 +110,7 @@ class TrialList(BasicVariantGenerator):
 
 
 class Suggestions(Searcher):
-    """What a search suggests; it is told the best score of each trial that has ended."""
+    """What a search suggests; it is told the best score of each trial that has ended, or its objectives."""
 
     def __init__(
         self,
@@ -115,6 +119,7 @@ class Suggestions(Searcher):
         search: Search,
         begun: Sequence[Mapping[str, Any]],
         samples: int,
+        objectives: Sequence[str] = (),
     ) -> None:
         """
         Args:
@@ -123,9 +128,11 @@ class Suggestions(Searcher):
             search: already told the results of the trials that have ended.
             begun: earlier suggestions whose trials have not ended: they are tried first.
             samples: trials to run, including those already started.
+            objectives: metrics that the search is told instead of the best score, if there are any.
         """
         super().__init__(metric=METRIC, mode="max")
         self._runs = _Runs(experiment, identify)
+        self._experiment, self._identify, self._objectives = experiment, identify, objectives
         self._search = search
         self._begun = deque(begun)
         self._left = samples
@@ -152,7 +159,13 @@ class Suggestions(Searcher):
             self.on_trial_result(trial_id, result)
         best = self._best.pop(trial_id, None)
         config = self._runs.ended(trial_id)
-        if config is not None:
+        if config is not None and self._objectives:
+            folder = self._experiment.trial_folder(self._identify(config))
+            values = last_figures(read_rows(folder), self._objectives)
+            if values is None:
+                _log.warning("%s: the search learns nothing from it, as no evaluation gave all objectives", folder.name)
+            self._search.tell_objectives(config["params"], values)
+        elif config is not None:
             self._search.tell(config["params"], best)
 
     def save(self, checkpoint_path: str) -> None:

@@ -97,6 +97,8 @@ def test_a_mapping_is_laid_over_a_section_and_replaces_a_number() -> None:
         ({"scheduler": {"kind": "asha", "grace": 2}}, "scheduler.grace"),
         ({"samples": 3}, "nothing is drawn"),
         ({"search": "optuna"}, "optuna cannot enumerate"),
+        ({"objectives": {"eval/length": "maximize"}}, "search: random looks for none; write search: optuna"),
+        ({"search": "optuna", "objectives": {"eval/length": "up"}}, "objectives"),
         ({"scheduler": {"kind": "pbt"}}, "pbt needs a parameter with a range"),
         ({"scheduler": {"kind": "asha", "time_attr": "seconds"}}, "needs stop.wall_time_s"),
     ],

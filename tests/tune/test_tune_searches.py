@@ -20,6 +20,7 @@ from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import read_rows
 from msk_ray.experiment.results import read_records
 from msk_ray.sweep import opening
+from msk_ray.sweep.search.tpe import OptunaSearch
 from msk_ray.sweep.search_trials import recover
 from msk_ray.sweep.trials import resolve_trials
 from msk_ray.tune import driver, worker_prestart
@@ -67,18 +68,29 @@ def test_population_stays_in_its_range(make_space: Any, tmp_path: Path) -> None:
     assert all(1e-4 <= rate <= 1e-2 for rate in after)
 
 
-def test_optuna_trials_enter_the_manifest(make_space: Any, tmp_path: Path) -> None:
+def test_optuna_trials_enter_the_manifest(make_space: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("optuna")
     space = make_space(
         parameters={"shac.actor_lr": {"loguniform": [1e-3, 1e-2]}, "shac.horizon": {"choice": [8, 16]}},
         samples=3,
         search="optuna",
+        objectives={"eval/score": "maximize", "seconds": "minimize"},
         overrides={"trial.epochs": 4},
     )
+    told: list[Any] = []
+    own = OptunaSearch.tell_objectives
+
+    def tell(self: OptunaSearch, params: Any, values: Any) -> None:
+        told.append(values)
+        own(self, params, values)
+
+    monkeypatch.setattr(OptunaSearch, "tell_objectives", tell)
     completed, records = go(space, tmp_path / "runs" / "optuna")
     assert completed
     assert len(records) >= 2
     assert set(outcomes(records)) == {"finished"}
+    last = [read_rows(record.folder)[-1] for record in records]
+    assert sorted(told) == sorted((row["eval/score"], row["seconds"]) for row in last)
 
 
 def test_optuna_goes_on_where_it_was(make_space: Any, tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """The base of searches: a search suggests a trial's values, and is told the result."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, ClassVar
 
 from msk_ray.errors import ConfigError
@@ -17,6 +17,9 @@ class Search(ABC):
 
     name: ClassVar[str] = ""
     """Name in messages; by default that of the class."""
+    several_objectives: ClassVar[bool] = False
+    """Whether it takes `objectives` instead of the score: it is then made with them as a third argument, metric →
+    `minimize` or `maximize`, and told by `tell_objectives`."""
 
     def __init__(self, parameters: Mapping[str, Operator], seed: int) -> None:
         """
@@ -42,6 +45,15 @@ class Search(ABC):
             params: its values, suggested in this run of the experiment or an earlier one.
             score: its best score; None if it has none.
         """
+
+    def tell_objectives(self, params: Mapping[str, Any], values: Sequence[float] | None) -> None:
+        """Take the result of a trial into account, where the space has several objectives.
+
+        Args:
+            params: as for `tell`.
+            values: at its last evaluation, one for each objective, in order; None if it has none.
+        """
+        raise NotImplementedError  # only of a search with `several_objectives`
 
     @classmethod
     def check(cls, parameters: Mapping[str, Operator], seeds: Collection[int]) -> None:

@@ -1,6 +1,6 @@
 """Optuna's tree-structured Parzen estimator."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from msk_ray.errors import ConfigError
@@ -9,11 +9,15 @@ from msk_ray.sweep.search.base import Search
 
 
 class OptunaSearch(Search):
-    """Suggests values that resemble the better half of those tried."""
+    """Suggests values that resemble the better half of those tried; with several objectives, those that no other trial
+    beats in all of them count as best."""
 
     name = "optuna"
+    several_objectives = True
 
-    def __init__(self, parameters: Mapping[str, Operator], seed: int) -> None:
+    def __init__(
+        self, parameters: Mapping[str, Operator], seed: int, objectives: Mapping[str, str] | None = None
+    ) -> None:
         super().__init__(parameters, seed)
         try:
             import optuna
@@ -21,7 +25,8 @@ class OptunaSearch(Search):
             raise ConfigError("search: optuna needs the optuna package: pip install optuna") from None
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         self._distributions = {key: _distribution(key, op) for key, op in self.parameters.items()}
-        self._study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=seed), direction="maximize")
+        directions = [*objectives.values()] if objectives else ["maximize"]
+        self._study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=seed), directions=directions)
         self._open: list[Any] = []
 
     def ask(self) -> dict[str, Any]:
@@ -30,14 +35,17 @@ class OptunaSearch(Search):
         return dict(trial.params)
 
     def tell(self, params: Mapping[str, Any], score: float | None) -> None:
+        self.tell_objectives(params, None if score is None else (score,))
+
+    def tell_objectives(self, params: Mapping[str, Any], values: Sequence[float] | None) -> None:
         from optuna.trial import TrialState, create_trial
 
         asked = next((trial for trial in self._open if trial.params == params), None)
         if asked is not None:
             self._open.remove(asked)
-            self._study.tell(asked, score, state=TrialState.FAIL if score is None else None)
-        elif score is not None:
-            done = create_trial(params=dict(params), distributions=self._distributions, value=score)
+            self._study.tell(asked, values, state=TrialState.FAIL if values is None else None)
+        elif values is not None:
+            done = create_trial(params=dict(params), distributions=self._distributions, values=list(values))
             self._study.add_trial(done)
 
 
