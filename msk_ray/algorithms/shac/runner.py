@@ -22,9 +22,11 @@ FitCritic = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Observations (N, O), targets (N,) and orders (passes, N) to the loss; moves the target critic too."""
 _MOST_HORIZONS = 3
 """Recordings kept of epochs, and of fits, one for each horizon: each holds the memory of all its work."""
-_RARE_SHARE = 3e-3
+_FEWEST_ITERATIONS = 6
+"""Solver iterations unrolled in a substep where worlds need fewer: the first epochs may hardly touch the ground."""
+_RARE_SHARE = 1e-3
 """Share of a substep's worlds that may need as many solver iterations as are unrolled there, or more, at first."""
-_LIMITED_SHARE = 0.01
+_LIMITED_SHARE = 3e-3
 """Share of them that may do so before more are unrolled."""
 _MOST_ITERATIONS = 48
 """Beyond this many in a substep, unrolled iterations cost more than recording saves."""
@@ -183,7 +185,7 @@ class RecordedRunner(EagerRunner):
         # Empty, if a batch with larger buffers has just taken the place of the one that the epoch ran in.
         counts = batch.iterations.read()
         before, most = batch.unrolled_iterations, int(batch.mjm.opt.iterations)
-        limits = before or (1,) * batch.substeps
+        limits = before or (_FEWEST_ITERATIONS,) * batch.substeps
         if self.recorded:
             shares = reached(counts, limits)
             wanted = [n + (n + 3) // 4 if s > _LIMITED_SHARE else n for n, s in zip(limits, shares, strict=True)]
