@@ -4,13 +4,13 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from msk_ray.algorithms.shac import returns
 from msk_ray.algorithms.shac.entropy import EntropyBonus
 from msk_ray.algorithms.shac.gate import CotangentGate, CotangentRecord
 from msk_ray.algorithms.shac.half_batch_cosine import HalfBatchCosine
-from msk_ray.algorithms.shac.optimizer import RateAdam
+from msk_ray.algorithms.shac.optimizer import RateAdam, clip_gradients
 from msk_ray.algorithms.shac.rollout import Rollout, collect
 from msk_ray.config import ContactHorizon, ShacConfig
 from msk_ray.envs import Env, EnvState, Resets
@@ -146,7 +146,7 @@ class ActorUpdate:
         self._group.mean([p.grad for p in self._actor.parameters() if p.grad is not None])
         cotangents = rolled.gate.record(self._group)
         limit = float("inf") if c.actor_grad_norm is None else c.actor_grad_norm
-        norm = nn.utils.clip_grad_norm_(self._actor.parameters(), limit)
+        norm = clip_gradients(list(self._actor.parameters()), limit)
         failed = (cotangents.nonfinite_share > c.max_nonfinite_share) | ~norm.isfinite()
         self._optimizer.step(skip=failed)
         values = next_values.detach()

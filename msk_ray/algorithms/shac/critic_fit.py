@@ -4,9 +4,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from msk_ray.algorithms.shac.optimizer import RateAdam
+from msk_ray.algorithms.shac.optimizer import RateAdam, clip_gradients
 from msk_ray.errors import ConfigError
 from msk_ray.group import ALONE, Group
 from msk_ray.networks import Critic
@@ -101,7 +101,7 @@ class CriticFit:
         self._group.mean([mean, *(p.grad for p in self._critic.parameters() if p.grad is not None)])
         if self._grad_norm is not None:
             for parameters in self._members:
-                nn.utils.clip_grad_norm_(parameters, self._grad_norm)
+                clip_gradients(parameters, self._grad_norm)
         self.optimizer.step(skip)
         return mean
 

@@ -1,12 +1,36 @@
 """Adam whose state stays in the same memory."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 _EPSILON = 1e-8
+_PIECE = 2048
+"""Elements of a parameter that are stepped together on a GPU. Torch's fused kernel has a block of threads for each
+tensor, or each 65536 elements of one, so that for three layers nearly all of the GPU would be idle."""
+_NORM_EPSILON = 1e-6
+
+
+def clip_gradients(parameters: Sequence[nn.Parameter], limit: float) -> Tensor:
+    """Bound the joint norm of the gradients, in place, and return it as it was; infinity for no bound."""
+    if parameters[0].device.type == "cpu":
+        return nn.utils.clip_grad_norm_(parameters, limit)
+    return clip_flat(parameters, limit)
+
+
+@torch.no_grad()
+def clip_flat(parameters: Sequence[nn.Parameter], limit: float) -> Tensor:
+    """The same with all gradients in one tensor, which takes few kernels; their values differ by rounding."""
+    used = [parameter for parameter in parameters if parameter.grad is not None]
+    flat = torch.cat([parameter.grad.flatten() for parameter in used if parameter.grad is not None])
+    norm = torch.linalg.vector_norm(flat)
+    if limit < float("inf"):
+        flat.mul_((limit / (norm + _NORM_EPSILON)).clamp_max(1.0))
+    for parameter, part in zip(used, flat.split([parameter.numel() for parameter in used]), strict=True):
+        parameter.grad = part.view_as(parameter)
+    return norm
 
 
 class RateAdam:
@@ -30,6 +54,7 @@ class RateAdam:
         self._betas = betas
         self._weight_decay = weight_decay
         device = self._parameters[0].device
+        self._piece = None if device.type == "cpu" else _PIECE
         self._rate = torch.tensor(rate, device=device)
         self._count = torch.zeros((), device=device)
         self._means, self._squares = (
@@ -55,13 +80,16 @@ class RateAdam:
         gradients = {k: p.grad for k, p in enumerate(self._parameters) if p.grad is not None}
         skipped = None if skip is None else skip.float()
         self._count += 1 if skipped is None else 1 - skipped
+        stepped, means, squares = (
+            self._pieces(values[k] for k in gradients) for values in (self._parameters, self._means, self._squares)
+        )
         torch._fused_adamw_(
-            [self._parameters[k] for k in gradients],
-            list(gradients.values()),
-            [self._means[k] for k in gradients],
-            [self._squares[k] for k in gradients],
+            stepped,
+            self._pieces(gradient.contiguous() for gradient in gradients.values()),
+            means,
+            squares,
             [],
-            [self._count] * len(gradients),
+            [self._count] * len(stepped),
             lr=self._rate,
             beta1=self._betas[0],
             beta2=self._betas[1],
@@ -72,6 +100,12 @@ class RateAdam:
             grad_scale=None,
             found_inf=skipped,
         )
+
+    def _pieces(self, tensors: Iterable[Tensor]) -> list[Tensor]:
+        """The tensors, or views of their parts."""
+        if self._piece is None:
+            return list(tensors)
+        return [part for tensor in tensors for part in tensor.view(-1).split(self._piece)]
 
     def state_dict(self) -> dict[str, Any]:
         """Step count and moments by the parameters' numbers, as torch's optimisers write them."""

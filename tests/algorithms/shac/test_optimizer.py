@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from msk_ray.algorithms.shac.optimizer import RateAdam
+from msk_ray.algorithms.shac.optimizer import RateAdam, clip_flat
 
 
 def stepped(parameter: nn.Parameter, adam: RateAdam, gradients: list[float]) -> None:
@@ -64,3 +64,30 @@ def test_a_step_is_left_out_if_asked(skip: bool, moved: float) -> None:
     parameter.grad = torch.ones(1)
     adam.step(skip=torch.tensor(skip))
     assert parameter.item() == pytest.approx(moved, abs=1e-6)
+
+
+def test_pieces_of_parameters_are_stepped_like_the_whole() -> None:
+    """As on a GPU, where each piece has a block of threads of its own."""
+    whole, parts = ([nn.Parameter(torch.linspace(-1.0, 1.0, 6).view(2, 3)), nn.Parameter(torch.ones(1))] for _ in "ab")
+    adams = [RateAdam(parameters, 0.1, (0.7, 0.95), 0.1) for parameters in (whole, parts)]
+    adams[1]._piece = 4
+    for step in range(3):
+        for parameters, adam in zip((whole, parts), adams, strict=True):
+            parameters[0].grad = torch.cos(torch.arange(6.0) + step).view(3, 2).T
+            parameters[1].grad = None if step == 1 else torch.ones(1)
+            adam.step(skip=torch.tensor(step == 2))
+    assert all(torch.equal(a, b) for a, b in zip(whole, parts, strict=True))
+
+
+@pytest.mark.parametrize("limit", [0.5, 100.0, float("inf")])
+def test_gradients_clipped_in_one_tensor_are_those_that_torch_clips(limit: float) -> None:
+    """The third parameter has none."""
+    theirs, ours = ([nn.Parameter(torch.zeros(size)) for size in ((2, 3), (4,), (1,))] for _ in "ab")
+    for parameters in (theirs, ours):
+        parameters[0].grad = torch.arange(6.0).view(3, 2).T
+        parameters[1].grad = torch.tensor([0.5, -2.0, 0.0, 1.0])
+    expected = nn.utils.clip_grad_norm_(theirs, limit)
+    assert torch.isclose(clip_flat(ours, limit), expected)
+    for a, b in zip(ours[:2], theirs[:2], strict=True):
+        torch.testing.assert_close(a.grad, b.grad)
+    assert ours[2].grad is None
