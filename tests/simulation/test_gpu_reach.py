@@ -10,6 +10,7 @@ from oracle import INPUTS
 from scenes import ant, ant_points
 
 from msk_ray.config import parse_config
+from msk_ray.physics.parameters import PARAMETERS, names_of
 from msk_ray.simulation import Simulation
 from msk_ray.training import Trainer
 
@@ -42,6 +43,31 @@ def test_jacobians_and_forces_are_those_of_the_cpu() -> None:
     for name, value in there.items():
         assert (here[name] - value).norm() <= 1e-3 * value.norm(), name
     assert (there["A"] - there["A of the model's own friction"]).norm() > 1e-3 * there["A"].norm()
+
+
+def of_all_parameters(device: str) -> dict[str, torch.Tensor]:
+    """Gradients of all parameters of an ant in contact, whose stages share several CUDA streams."""
+    model = ant("elliptic")
+    points = ant_points(model, 6, seed=2)
+    sim = Simulation(model, 6, 4, device=device, tolerance=1e-9)
+    inputs = [
+        torch.tensor(np.stack([getattr(p, n) for p in points]), dtype=torch.float32, device=device) for n in INPUTS
+    ]
+    values = {}
+    for name in names_of(model):
+        value = torch.as_tensor(PARAMETERS[name].value(model), dtype=torch.float32, device=device)
+        values[name] = value.expand(6, *value.shape).clone().requires_grad_()
+    end = sim.step(*inputs, parameters=values)
+    end = sim.step(inputs[0], *end, parameters=values)
+    (end.qvel.square().sum() + end.qpos.square().sum()).backward()
+    return {name: value.grad.cpu() for name, value in values.items() if value.grad is not None}
+
+
+def test_gradients_of_parameters_are_those_of_the_cpu() -> None:
+    here, there = of_all_parameters("cuda"), of_all_parameters("cpu")
+    assert here.keys() == there.keys()
+    for name, value in there.items():
+        assert (here[name] - value).norm() <= 2e-3 * value.norm() + 1e-6, name
 
 
 def test_a_trial_with_drawn_parameters_trains(tmp_path: Path) -> None:

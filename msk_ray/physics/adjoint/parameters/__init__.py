@@ -1,5 +1,6 @@
 """Gradients of a substep by parameters of the model: one file a family, launched only if one of it is asked for."""
 
+import itertools
 from collections.abc import Iterable
 
 import warp as wp
@@ -23,6 +24,9 @@ STAGES: tuple[type[ParameterStage], ...] = (
     *(ActuatorStage, TendonStage, PathStage),
 )
 """The families, in the order in which they are launched."""
+_LANES = 3
+"""CUDA streams beside the main one that the families share: each fills a small part of a GPU, and none reads what
+another writes."""
 
 
 class ParameterAdjoint:
@@ -43,6 +47,8 @@ class ParameterAdjoint:
             kinds = dict.fromkeys(kind for stage in chosen for kind in stage.kinds)
             self._buffer = GradientBuffer(kinds, work.model, work.nworld)
             self._stages = [stage(parts, self._buffer.groups) for stage in chosen if stage.applies(parts)]
+            self._lanes = [wp.Stream(work.device) for _ in range(_LANES)] if work.device.is_cuda else []
+        self._device = work.device
         self.rows: wp.array = self._buffer.rows
         self.columns = {name: self._buffer.columns[field] for name, field in fields.items()}
 
@@ -56,6 +62,16 @@ class ParameterAdjoint:
             stage.launch_first(at, qvel_next)
 
     def launch(self, at: Substep) -> None:
-        """Launch what one substep adds, when its cotangents are there."""
-        for stage in self._stages:
-            stage.launch(at)
+        """Launch what one substep adds, when its cotangents are there; what is launched after it waits for all."""
+        if not self._lanes:
+            for stage in self._stages:
+                stage.launch(at)
+            return
+        main = wp.get_stream(self._device)
+        for lane in self._lanes:
+            lane.wait_stream(main)
+        for stage, lane in zip(self._stages, itertools.cycle((main, *self._lanes))):
+            with wp.ScopedStream(lane, sync_enter=False):
+                stage.launch(at)
+        for lane in self._lanes:
+            main.wait_stream(lane)
