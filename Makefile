@@ -7,7 +7,7 @@ WORKERS ?= 4
 # Whatever people read; tests misspell on purpose.
 PROSE   := README.md CONTRIBUTING.md Makefile benchmarks cluster configs docs msk_ray policies tune_spaces
 
-.PHONY: help env demo test check unit gpu-test site bench clean
+.PHONY: help env demo test check unit gpu-test site notebooks bench clean
 
 help:                ## this list
 	@grep -hE '^[a-z-]+: .*##|^[a-z-]+:  *##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 14
@@ -43,6 +43,9 @@ gpu-test: env        ## the tests that need a CUDA device
 
 site: env            ## the documentation site, in build/site
 	NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --strict --quiet --config-file docs/site/mkdocs.yml
+
+notebooks: env       ## run the tutorials and write their outputs, docs/tutorials/*.ipynb
+	$(RUN) docs/site/notebooks.py
 
 bench: env           ## speed tables of this machine, appended to benchmarks/results/
 	$(RUN) benchmarks/epoch.py

@@ -1,5 +1,7 @@
-"""Pages of the site that stand elsewhere in the repository, and links to what is no page of it."""
+"""Pages of the site that stand elsewhere in the repository or are notebooks, and links to what is no page of it."""
 
+import base64
+import json
 import posixpath
 import re
 from pathlib import Path
@@ -12,11 +14,12 @@ from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = "benchmarks/results"
+TUTORIALS = "docs/tutorials"
 _LINK = re.compile(r"(\]\()(?!https?://|mailto:|#)([^)#\s]+)(#[^)\s]*)?(\))")
 
 
 def _pages() -> dict[str, str]:
-    """Files of the repository outside docs/ that become pages, by their path in it."""
+    """Files of the repository that become pages, other than those of docs/ that are ones, by their path in it."""
     fixed = {
         "README.md": "index.md",
         "CONTRIBUTING.md": "contributing.md",
@@ -24,7 +27,12 @@ def _pages() -> dict[str, str]:
         "policies/README.md": "policies.md",
     }
     results = sorted((ROOT / RESULTS).glob("*.md"))
-    return fixed | {f"{RESULTS}/{path.name}": f"benchmarks/{path.name}" for path in results}
+    notebooks = sorted((ROOT / TUTORIALS).glob("*.ipynb"))
+    return {
+        **fixed,
+        **{f"{RESULTS}/{path.name}": f"benchmarks/{path.name}" for path in results},
+        **{f"{TUTORIALS}/{path.name}": f"tutorials/{path.stem}.md" for path in notebooks},
+    }
 
 
 PAGES = _pages()
@@ -42,8 +50,49 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages."""
     for source, page in PAGES.items():
-        files.append(File.generated(config, page, content=(ROOT / source).read_text(encoding="utf-8")))
+        text = (ROOT / source).read_text(encoding="utf-8")
+        pictures: dict[str, bytes] = {}
+        if source.endswith(".ipynb"):
+            text, pictures = page_of(json.loads(text), page.removesuffix(".md"))
+        files.append(File.generated(config, page, content=text))
+        for path, content in pictures.items():
+            files.append(File.generated(config, path, content=content))
     return files
+
+
+def page_of(notebook: dict[str, Any], path: str) -> tuple[str, dict[str, bytes]]:
+    """The Markdown of an executed notebook, and its pictures by their paths in the site.
+
+    Args:
+        notebook: the content of an .ipynb file.
+        path: of the page in the site, without a suffix.
+
+    Raises:
+        ValueError: a cell has not been executed, or has an output that is neither text nor a picture.
+    """
+    name = posixpath.basename(path)
+    parts, pictures = [], {}
+    for cell in notebook["cells"]:
+        source = "".join(cell["source"])
+        if cell["cell_type"] == "markdown":
+            parts.append(source)
+            continue
+        if cell["execution_count"] is None:
+            raise ValueError(f"{path}: a cell has not been executed; make notebooks")
+        parts.append(f"```python\n{source}\n```")
+        for output in cell["outputs"]:
+            if output["output_type"] == "stream":
+                parts.append(f"```text\n{''.join(output['text']).rstrip()}\n```")
+            elif "image/png" in output.get("data", {}):
+                picture = f"{path}_{len(pictures)}.png"
+                pictures[picture] = base64.b64decode(output["data"]["image/png"])
+                parts.append(f"![What the cell above draws]({name}_{len(pictures) - 1}.png)")
+            else:
+                raise ValueError(f"{path}: an output that is neither text nor a picture: {output}")
+    source = f"[{name}.py]({name}.py), [{name}.ipynb]({name}.ipynb)"
+    # Below the heading, which is the first line.
+    heading, _, rest = parts[0].partition("\n")
+    return "\n\n".join([f"{heading}\n\n*As a notebook: {source}*\n{rest}", *parts[1:]]) + "\n", pictures
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:

@@ -43,7 +43,7 @@ def parser() -> Parser:
     p.add_argument("target", nargs="?", metavar="CHECKPOINT|TRIAL|EXPERIMENT", help="what to watch")
     what = p.add_argument_group("instead of the viewer")
     what.add_argument("--no-render", action="store_true", help="statistics of the episodes, no pictures")
-    what.add_argument("--video", type=Path, metavar="FILE", help="an .mp4")
+    what.add_argument("--video", type=Path, metavar="FILE", help="an .mp4, .mkv, .mov or .gif")
     what.add_argument("--save-frames", type=Path, metavar="DIR", help="numbered .png files")
     what.add_argument("--strip", type=Path, metavar="FILE", help="frames side by side, evenly spaced over an episode")
     what.add_argument(

@@ -11,11 +11,13 @@ from PIL import Image, ImageDraw, ImageFont
 from msk_ray.errors import ConfigError, StorageFailure
 
 _GAP = 4
+_COLOURS = 96
+"""Of a GIF."""
 _INK, _PAPER = (20, 20, 20), (255, 255, 255)
 
 
 def write_video(frames: Iterable[np.ndarray], path: Path, fps: float) -> int:
-    """Encode frames (h, w, 3), uint8, as H.264 that browsers play; h and w even.
+    """Encode frames (h, w, 3), uint8, as H.264 that browsers play, or as a GIF that repeats itself; h and w even.
 
     Returns:
         How many frames.
@@ -23,6 +25,8 @@ def write_video(frames: Iterable[np.ndarray], path: Path, fps: float) -> int:
     Raises:
         StorageFailure: the file cannot be written.
     """
+    if path.suffix == ".gif":
+        return _write_gif(frames, path, fps)
     count = 0
     stream = None
     try:
@@ -43,14 +47,30 @@ def write_video(frames: Iterable[np.ndarray], path: Path, fps: float) -> int:
     return count
 
 
+def _write_gif(frames: Iterable[np.ndarray], path: Path, fps: float) -> int:
+    shots = list(frames)
+    if not shots:
+        return 0
+    # One palette, made from some of the frames, and no dither: what does not change then takes no space.
+    some = np.concatenate(shots[:: max(1, len(shots) // 8)])
+    palette = Image.fromarray(some).quantize(_COLOURS)
+    first, *others = [Image.fromarray(shot).quantize(palette=palette, dither=Image.Dither.NONE) for shot in shots]
+    duration = 10 * max(2, round(100 / fps))  # a GIF counts in 10 ms
+    try:
+        first.save(path, save_all=True, append_images=others, duration=duration, loop=0, optimize=True)
+    except OSError as error:
+        raise StorageFailure(f"cannot write {path}: {error.strerror or error}") from error
+    return len(shots)
+
+
 def check_video_path(path: Path) -> None:
     """Refuse a file name whose suffix has no container format, before anything is computed.
 
     Raises:
         ConfigError: the message names the suffixes that work.
     """
-    if path.suffix not in (".mp4", ".mkv", ".mov"):
-        raise ConfigError(f"--video {path}: write a name that ends in .mp4, .mkv or .mov")
+    if path.suffix not in (".mp4", ".mkv", ".mov", ".gif"):
+        raise ConfigError(f"--video {path}: write a name that ends in .mp4, .mkv, .mov or .gif")
 
 
 def write_frames(frames: Iterable[np.ndarray], folder: Path) -> int:

@@ -22,6 +22,7 @@ from msk_ray.training import load_policy
 from msk_ray.visualize import render
 from msk_ray.visualize.__main__ import main
 from msk_ray.visualize.episodes import record
+from msk_ray.visualize.film import write_video
 from msk_ray.visualize.look import ACTIVE, RELAXED, Look, muscle_tendons
 from msk_ray.visualize.render import States, View, frames, headless_backend
 
@@ -86,6 +87,15 @@ def test_video_and_strip(target: Path, tmp_path: Path, drawing: str, capsys: pyt
     assert np.ptp(left) > 50
     assert not np.array_equal(left, right)
     assert "frames in" in capsys.readouterr().out
+
+
+def test_a_gif_repeats_and_keeps_time(tmp_path: Path) -> None:
+    frames = [np.full((16, 32, 3), level, np.uint8) for level in (0, 120, 240)]
+    assert write_video(iter(frames), tmp_path / "a.gif", 20.0) == 3
+    with Image.open(tmp_path / "a.gif") as image:
+        assert (image.n_frames, image.size, image.info["loop"], image.info["duration"]) == (3, (32, 16), 0, 50)
+        image.seek(2)
+        assert np.abs(np.asarray(image.convert("RGB")).astype(int) - 240).max() <= 3, "in a colour of the last one"
 
 
 def test_frames_progression_and_tensorboard(sweep: Experiment, tmp_path: Path, drawing: str) -> None:
@@ -183,7 +193,7 @@ def test_a_drawing_process_that_dies_is_reported(drawing: str) -> None:
         ([], "name one thing to watch"),
         (["small"], "there is no display: add --video"),
         (["small", "--no-render", "--video", "a.mp4"], "--no-render draws nothing"),
-        (["small", "--video", "a.gif"], "ends in .mp4"),
+        (["small", "--video", "a.webm"], "ends in .mp4"),
         (["small", "--tensorboard", "--no-render"], "needs --strip"),
         (["small", "--no-render", "--fps", "0"], "must be above 0"),
         (["small", "--progression", "small"], "name one thing to watch"),
