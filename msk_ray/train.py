@@ -196,9 +196,9 @@ def _trainer(
 ) -> "Trainer | ParallelTrainer":
     """A trainer of the trial in `logdir`, at its start."""
     # torch and Warp take seconds to load; a wrong command line should not wait for them.
-    from msk_ray.evaluate.measure import device_name
     from msk_ray.training import MOST_TOGETHER, make_trainer
     from msk_ray.training.checkpoint import newest_valid_checkpoint
+    from msk_ray.training.machine import device_name
 
     if resume:
         newest, faults = newest_valid_checkpoint(logdir / "checkpoints")
@@ -208,7 +208,8 @@ def _trainer(
             )
     trainer = make_trainer(config, logdir, device, 1 if score_at_once or device == "cpu" else MOST_TOGETHER)
     if not resume:
-        write_json(logdir / ENVIRONMENT_FILE, environment(device_name(device)))
+        facts = environment(device_name(device)) | {"deterministic": config.trial.deterministic}
+        write_json(logdir / ENVIRONMENT_FILE, facts)
     return trainer
 
 

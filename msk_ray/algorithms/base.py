@@ -14,6 +14,7 @@ from msk_ray.config import ALGORITHMS, AlgorithmSettings, Config, check_installe
 from msk_ray.envs import Env
 from msk_ray.errors import ConfigError
 from msk_ray.group import Group
+from msk_ray.networks import parameter_hash
 
 _OF_GRADIENTS = frozenset({"approximated_share", "reached_share"})
 """Diagnostics of the simulation that concern its gradients; the others concern its physics."""
@@ -49,6 +50,8 @@ class Algorithm(ABC):
     """
 
     Settings: ClassVar[type[AlgorithmSettings]] = AlgorithmSettings
+    draws_apart: ClassVar[bool] = False
+    """Whether first weights, noise and minibatches come from generators of their own where `trial.seeds` names them."""
 
     def __init__(self, config: Config, env: Env[Any], network: nn.Module | None = None) -> None:
         """
@@ -57,7 +60,13 @@ class Algorithm(ABC):
             env: the worlds to train in.
             network: the policy; None creates a new `policy_network`.
         """
-        torch.manual_seed(config.trial.seed)
+        seeds = config.trial.seeds
+        if not self.draws_apart and (config.trial.noise_apart or seeds.policy is not None):
+            raise ConfigError(
+                f"trial.seeds: {config.algorithm.name} draws everything but states from one generator: write "
+                "trial.seeds.states alone"
+            )
+        torch.manual_seed(config.trial.seed_of("policy"))
         self.config = config
         self.settings: Any = config.algorithm_settings
         self.env = env
@@ -95,6 +104,10 @@ class Algorithm(ABC):
     def policy_state_dict(self) -> dict[str, Any]:
         """State of the modules that `policy` uses, by module name."""
         return {name: module.state_dict() for name, module in self.policy_modules(self.network).items()}
+
+    def parameter_hash(self) -> str:
+        """Digest of everything that is saved as a module: 32 hexadecimal digits."""
+        return parameter_hash({name: module.state_dict() for name, module in self.modules().items()})
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that a later `load_state_dict` needs to continue exactly, including the environment's state.

@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from pydantic import PositiveFloat, model_validator
+from pydantic import PositiveFloat, PrivateAttr, model_validator
 
 from msk_ray.config.randomize import RandomizeConfig
 from msk_ray.config.sections import Count, NonNegative, Section, Text
@@ -112,6 +112,19 @@ class PhysicsConfig(Section):
     """Constraint rows per world; null as for nconmax."""
     randomize: RandomizeConfig | None = None
     """Parameters of the model that are drawn for each world and episode, in training only; null: the model's own."""
+
+    _ordered: bool = PrivateAttr(default=False)
+
+    @property
+    def ordered(self) -> bool:
+        """Whether sums have a fixed order, which `trial.deterministic` decides."""
+        return self._ordered
+
+    def in_order(self, ordered: bool) -> "PhysicsConfig":
+        """The same settings with sums in a fixed order, or not."""
+        changed = self.model_copy()
+        changed._ordered = ordered
+        return changed
 
     @model_validator(mode="after")
     def _friction_direction_needs_ellipse(self) -> "PhysicsConfig":

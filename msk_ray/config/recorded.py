@@ -86,6 +86,8 @@ _LATER: dict[tuple[str, ...], Any] = {
     ("physics", "randomize"): None,
     ("physics", "contact_reach"): None,
     ("physics", "jacobian"): None,
+    ("trial", "seeds"): dict.fromkeys(("policy", "states", "noise", "minibatches")),
+    ("trial", "deterministic"): False,
     ("trial", "threads"): 1,
     ("trial", "gpus"): 1,
     ("trial", "loggers"): ["tensorboard"],

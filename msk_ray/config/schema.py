@@ -110,11 +110,33 @@ class EvaluationConfig(Section):
     """Physics of the score; null: the env's reference physics."""
 
 
+Seed = Annotated[int, Field(ge=0, lt=2**31)]
+
+
+class SeedsConfig(Section):
+    """Seeds of parts of a trial, so that one can be varied and the others held. What is null has `trial.seed`.
+
+    Noise and minibatches come from one generator until one of them is given: then each has its own.
+    """
+
+    policy: Seed | None = None
+    """First weights of all networks."""
+    states: Seed | None = None
+    """Initial states of episodes, and numbers that `physics.randomize` draws."""
+    noise: Seed | None = None
+    """Exploration: noise of actions, and perturbed copies."""
+    minibatches: Seed | None = None
+    """Which rows each minibatch has."""
+
+
 class TrialConfig(Section):
     """Length, seed, and saving of a trial."""
 
     epochs: Count = 500
-    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    seed: Seed = 0
+    seeds: SeedsConfig = SeedsConfig()
+    deterministic: bool = False
+    """Add everything up in a fixed order, so that a GPU repeats the trial bit for bit (docs/repeat.md)."""
     start_from: Text | None = None
     """Checkpoint of another trial, such as a best.pt, from whose networks and observation statistics this one starts;
     null starts from random networks. Optimisers and worlds are new either way."""
@@ -130,6 +152,16 @@ class TrialConfig(Section):
     gpus: Annotated[int, Field(ge=1, le=64)] = 1
     """Number of GPUs, all of one host, that the worlds are spread over, with a process for each; on the CPU, of
     processes. It must divide `env.nworld`, and changes results only by rounding."""
+
+    def seed_of(self, part: Literal["policy", "states", "noise", "minibatches"]) -> int:
+        """The seed of a part of the trial."""
+        own: int | None = getattr(self.seeds, part)
+        return self.seed if own is None else own
+
+    @property
+    def noise_apart(self) -> bool:
+        """Whether noise and minibatches come from generators of their own."""
+        return self.seeds.noise is not None or self.seeds.minibatches is not None
 
     @field_validator("loggers")
     @classmethod
@@ -200,6 +232,7 @@ class Config(Section):
     def _consistent(self) -> "Config":
         self.physics.resolve_substeps(self.env.control_timestep)
         self._check_gpus()
+        self._check_deterministic()
         self.algorithm_settings.check(self)
         if self.curriculum is not None:
             self._check_curriculum()
@@ -208,6 +241,21 @@ class Config(Section):
                     "curriculum and physics.randomize.pair_friction both set the friction of pairs; leave one out"
                 )
         return self
+
+    def _check_deterministic(self) -> None:
+        if not self.trial.deterministic:
+            return
+        wrong = {
+            "trial.gpus": (self.trial.gpus > 1, "1"),
+            "physics.jacobian": (self.physics.jacobian == "sparse", "dense"),
+            "physics.integrator": (self.physics.integrator == "RK4", "Euler or implicitfast"),
+        }
+        for key, (found, write) in wrong.items():
+            if found:
+                raise ValueError(
+                    f"trial.deterministic: with this {key} sums have no fixed order; write {key}: {write}, or "
+                    "trial.deterministic: false"
+                )
 
     def _check_gpus(self) -> None:
         gpus, nworld = self.trial.gpus, self.env.nworld

@@ -118,6 +118,7 @@ class Env(ABC, Generic[SettingsT]):
             nconmax=physics.nconmax,
             njmax=physics.njmax,
             tolerance=physics.tolerance,
+            ordered=physics.ordered,
         )
         self.device = self.sim.device
         self.action_size = self.model.nu

@@ -31,6 +31,7 @@ def make_env(
     *,
     differentiable: bool = True,
     randomize: bool = False,
+    deterministic: bool = False,
 ) -> Env[Any]:
     """Build the environment of a config section.
 
@@ -41,6 +42,7 @@ def make_env(
         seed: of initial states and of randomized parameters.
         differentiable: whether steps can be differentiated.
         randomize: whether `physics.randomize` applies, as in training; otherwise the model keeps its own parameters.
+        deterministic: whether sums of the physics have a fixed order.
 
     Raises:
         ConfigError: as for `env_class`.
@@ -50,4 +52,4 @@ def make_env(
     backward = configured_backward(physics) if differentiable else None
     if not randomize:
         physics = physics.model_copy(update={"randomize": None})
-    return env_class(config)(config, physics, nworld, device, seed, backward)
+    return env_class(config)(config, physics.in_order(deterministic), nworld, device, seed, backward)

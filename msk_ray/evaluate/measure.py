@@ -21,6 +21,7 @@ from msk_ray.experiment.versions import installed_versions
 from msk_ray.files import write_json
 from msk_ray.training import Evaluator, SavedPolicy
 from msk_ray.training.evaluation import Episodes
+from msk_ray.training.machine import device_name
 from msk_ray.training.memory import named_out_of_memory
 from msk_ray.training.threads import use_threads
 
@@ -193,11 +194,6 @@ def spread(values: Tensor) -> dict[str, float]:
         "min": float(values.min()),
         "max": float(values.max()),
     }
-
-
-def device_name(device: str) -> str:
-    """`cpu`, or a GPU's model."""
-    return str(torch.cuda.get_device_name(device)) if device.startswith("cuda") else "cpu"
 
 
 def default_device() -> str:

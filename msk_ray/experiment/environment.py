@@ -24,6 +24,7 @@ _ENVIRONMENT = {
     "packages": dict,
     "commit": str,
     "device": str,
+    "deterministic": bool,
 }
 
 

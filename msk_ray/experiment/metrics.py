@@ -12,6 +12,8 @@ from msk_ray.experiment.layout import METRICS_FILE
 
 SCORE = "eval/score"
 """The canonical evaluation metric, by which trials are ranked; higher is better."""
+HASH = "hash/parameters"
+"""The first 48 bits of the digest of the trial's weights and statistics when it was evaluated, as a whole number."""
 EPOCH_LIMIT = 10**9
 """No trial has this many epochs."""
 RECENT = 10

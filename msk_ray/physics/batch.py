@@ -90,8 +90,8 @@ class WorldBatch:
         losses: what steps lost to full buffers; check it between steps.
         iterations: how many iterations the solver took in each substep.
         unrolled_iterations: the solver's iteration limit in each substep of steps that are recorded into another
-            library's capture. There the loop is unrolled, so that each iteration costs time even where no world needs
-            it. None: the model's limit.
+            library's capture, and of all steps in a fixed order. In a capture the loop is unrolled, so that each
+            iteration costs time even where no world needs it. None: the model's limit.
 
     Raises:
         UnsupportedModelError: mujoco_warp cannot load the model, or it has state outside (qpos, qvel, act).
@@ -247,17 +247,20 @@ class WorldBatch:
 
     def launch_substep(self, data: Any, k: int) -> None:
         """Launch substep k of an env step on `data`, this batch's own or another of the same model and size."""
-        model = self._unrolled(k) if joined_stream() is not None else self.model
+        captured = joined_stream() is not None
+        # In a fixed order, what is recorded and what is not have to stop at the same iteration.
+        model = self._limited(k, conditional=not captured) if captured or self.ordered else self.model
         refresh_velocity(self.mjm, model, data)
         self.stages.step(model, data)
         self.iterations.launch(data, k)
 
-    def _unrolled(self, k: int) -> Any:
-        """The model with loops of a fixed length in substep k instead of conditional graph nodes; the same arrays."""
+    def _limited(self, k: int, conditional: bool) -> Any:
+        """The model with the iteration limit of substep k, with or without conditional graph nodes; the same arrays."""
         limit = int(self.model.opt.iterations)
         if self.unrolled_iterations is not None:
             limit = min(self.unrolled_iterations[k], limit)
-        return with_options(self.model, graph_conditional=False, iterations=limit)
+        conditional = conditional and bool(self.model.opt.graph_conditional)
+        return with_options(self.model, graph_conditional=conditional, iterations=limit)
 
     def set_contact_pairs(self, fields: dict[str, NDArray[np.float64]]) -> None:
         """Change what contact pairs are made of, from the next step on; recorded graphs follow.

@@ -118,6 +118,7 @@ class Simulation:
         nconmax, njmax: contacts and constraint rows per world. By default a bound from the geometry if that is small,
             otherwise 1.5 times what a short probe in C MuJoCo needed, which grows with use.
         tolerance: solver tolerance, which may be below mujoco_warp's floor of 1e-6.
+        ordered: add everything up in a fixed order, so that a GPU repeats steps and gradients bit for bit.
 
     The model must not be edited while the simulation exists; if it was, the next step or backward pass raises an error.
 
@@ -137,6 +138,7 @@ class Simulation:
         nconmax: int | None = None,
         njmax: int | None = None,
         tolerance: float | None = None,
+        ordered: bool = False,
     ) -> None:
         if nworld < 1 or substeps < 1:
             raise ConfigError(f"nworld and substeps must be at least 1, not {nworld} and {substeps}")
@@ -161,6 +163,7 @@ class Simulation:
             njmax=njmax,
             tolerance=tolerance,
             contact_reach=mode.contact_reach if mode is not None else 0.0,
+            ordered=ordered,
         )
         self._stepper = Stepper(batch, mode)
 

@@ -30,12 +30,17 @@ class Engine:
             backward.attach(batch)
         self._buffers = BatchTensors(batch)
         self._parameters = ParameterTensors(batch)
-        launches = batch.launch_step if backward is None else lambda: backward.launch_step(batch)
-        self._graph = Graph(launches, batch.device)
-        for watch in (batch.losses, batch.iterations):
-            watch.read()  # of the start-up, whose state is nobody's
+        self._launches = batch.launch_step if backward is None else lambda: backward.launch_step(batch)
+        self._record()
         self._unseen = False
         self._touch: ContactForces | None = None
+
+    def _record(self) -> None:
+        """Record the step, which runs once for that."""
+        self._graph = Graph(self._launches, self.batch.device)
+        self._limits = self.batch.unrolled_iterations
+        for watch in (self.batch.losses, self.batch.iterations):
+            watch.read()  # of that run, whose state is nobody's
 
     def contact_forces(self) -> Tensor:
         """Force of the contacts on every geom [N] in the last substep of the last step, (W, G, 3)."""
@@ -60,6 +65,9 @@ class Engine:
 
     def advance(self, ctrl: Tensor, start: StepState, applied: Applied | None = None) -> StepState:
         """One env step, even if it lost contacts or rows."""
+        if self.batch.ordered and self._limits != self.batch.unrolled_iterations and joined_stream() is None:
+            self.settle()
+            self._record()
         self._buffers.load(ctrl, start, applied)
         self._graph.replay(stream_of(self.device))
         self._unseen = True

@@ -156,6 +156,11 @@ class _Tape(Backward):
         It leaves the checkpoints undefined.
         """
         if (applied, names) not in self._graphs:
+            if names and self._batch.ordered:
+                raise UnsupportedModelError(
+                    f"gradients of {', '.join(names)} have no fixed order on a GPU: make the Simulation with "
+                    "ordered=False"
+                )
             if names and names not in self._parameters:
                 self._parameters[names] = parameters = ParameterAdjoint(self._adjoint, names)
                 rows = wp.to_torch(parameters.rows, requires_grad=False)

@@ -9,6 +9,7 @@ import torch
 
 from msk_ray.errors import CheckpointError
 from msk_ray.experiment.checkpoint_file import read_checkpoint_file, remove_checkpoint_file, write_checkpoint_file
+from msk_ray.networks import parameter_hash
 
 _EPOCH_NAME = re.compile(r"epoch_(\d+)\.pt")
 _POLICY_NAME = re.compile(r"policy_(\d+)\.pt")
@@ -17,11 +18,13 @@ _UNSCORED_NAME = re.compile(r"unscored_(\d+)\.pt")
 
 def write_checkpoint(path: Path, state: dict[str, Any], facts: dict[str, Any]) -> Path:
     """Write `state` to `path`, with `facts` such as the epoch that can be read without it; an existing file is replaced
-    as a whole.
+    as a whole. The digest of all modules of a trial, `parameters`, is one of the facts.
 
     Raises:
         StorageFailure: the disk is full or gone; an existing file is left unchanged.
     """
+    if "algorithm" in state:
+        facts = facts | {"parameters": parameter_hash(state["algorithm"]["modules"])}
     buffer = io.BytesIO()
     torch.save(state, buffer)
     write_checkpoint_file(path, buffer.getvalue(), facts)
@@ -59,6 +62,12 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     if "algorithm" not in state and "shac" in state:
         # As versions wrote it that knew no other algorithm.
         state["algorithm"] = state.pop("shac")
+    # Older checkpoints have no digest.
+    if "parameters" in facts and parameter_hash(state["algorithm"]["modules"]) != facts["parameters"]:
+        raise CheckpointError(
+            f"{path} is damaged: its weights are not those of which it says {facts['parameters']!r:.40}; use an older "
+            f"one of {path.parent}"
+        )
     return facts, state
 
 

@@ -92,7 +92,16 @@ class Evaluator:
             physics = env_type.reference_physics(config.physics, e.variant)
         physics = physics.model_copy(update={"randomize": varied})
         nworld = policies * e.nworld
-        self.env = make_env(settings, physics, nworld, device, e.seed, differentiable=False, randomize=True)
+        self.env = make_env(
+            settings,
+            physics,
+            nworld,
+            device,
+            e.seed,
+            differentiable=False,
+            randomize=True,
+            deterministic=config.trial.deterministic,
+        )
         if self.env.recorded_worlds > e.nworld:
             raise ConfigError(
                 f"env {config.env.name} records {self.env.recorded_worlds} worlds of every evaluation, which has "

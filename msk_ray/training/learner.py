@@ -11,6 +11,7 @@ from msk_ray.envs import make_env
 from msk_ray.errors import CheckpointError
 from msk_ray.group import ALONE, Group
 from msk_ray.training.checkpoint import read_checkpoint
+from msk_ray.training.determinism import use_determinism
 from msk_ray.training.memory import named_out_of_memory
 from msk_ray.training.threads import use_threads
 
@@ -23,14 +24,16 @@ def make_algorithm(config: Config, device: str, group: Group = ALONE) -> Algorit
     """
     algorithm = algorithm_class(config)
     use_threads(config)
+    use_determinism(config, device)
     env = make_env(
         config.env,
         config.physics,
         config.env.nworld // group.size,
         device,
-        config.trial.seed,
+        config.trial.seed_of("states"),
         differentiable=config.algorithm_settings.differentiates,
         randomize=True,
+        deterministic=config.trial.deterministic,
     )
     if group.size > 1:
         env.join(group)

@@ -16,9 +16,10 @@ from msk_ray.config import Config, dump_yaml, overlay, parse_config, parse_recor
 from msk_ray.errors import CheckpointError, ConfigError, SimulationError, StorageError
 from msk_ray.experiment.damage import Damage, describe_damages
 from msk_ray.experiment.layout import METRICS_FILE
-from msk_ray.experiment.metrics import SCORE, read_metrics, read_rows
+from msk_ray.experiment.metrics import HASH, SCORE, read_metrics, read_rows
 from msk_ray.files import remove_stale, write_bytes
 from msk_ray.group import ALONE, Group
+from msk_ray.networks import as_number, parameter_hash
 from msk_ray.training.checkpoint import (
     epoch_checkpoints,
     milestone_path,
@@ -31,6 +32,7 @@ from msk_ray.training.checkpoint import (
 from msk_ray.training.evaluation import Evaluator
 from msk_ray.training.learner import load_state, make_algorithm, naming_memory, start_from
 from msk_ray.training.loggers import TrialLog
+from msk_ray.training.machine import machine_differences, record_machine
 from msk_ray.training.place import Place
 from msk_ray.training.policy import SavedPolicy
 from msk_ray.training.policy_group import Policy
@@ -100,6 +102,7 @@ class Trainer(Place):
         if not epoch_checkpoints(self.checkpoints):
             # Otherwise the file describes what those were trained under, until one of them is resumed.
             self._write_config()
+            record_machine(logdir, device, config.trial.deterministic)
         self._device = device
         self.together = min(together, self._evaluations) if self._log.takes_late else 1
         self._unscored = UnscoredPolicies(self.checkpoints)
@@ -203,6 +206,8 @@ class Trainer(Place):
                 f"{path.name} was written with trial.gpus {before}, now {now}: the same to rounding, not to the bit",
                 stacklevel=2,
             )
+        if moved := machine_differences(self.logdir, self._device):
+            warnings.warn(f"{path.name} is of another machine, so bits will differ: {moved}", stacklevel=2)
         self._write_config()
         self._group.tell("load", str(path))
         load_state(self.algorithm, state)
@@ -265,7 +270,7 @@ class Trainer(Place):
         full = len(self._unscored.epochs) + 1 >= self.together
         if full or self.finished or self._unscored.waited_s >= _LONGEST_WAIT_S:
             figures, others_s = self._score_others([self.algorithm.policy])
-            metrics = self._record(self.epoch, figures[0], self._state)
+            metrics = self._record(self.epoch, figures[0], self._state, self.algorithm.parameter_hash())
             return metrics | {"time/evaluation_s": time.perf_counter() - started - others_s}
         self._unscored.add(self._state())
         return {"time/evaluation_s": time.perf_counter() - started}
@@ -288,7 +293,8 @@ class Trainer(Place):
         each_s = (time.perf_counter() - started) / len(policies)
         rows = {int(row["epoch"]): row for row in read_rows(self.logdir)} if waiting else {}
         for epoch, found in zip(waiting, figures, strict=False):
-            late = self._record(epoch, found, partial(self._unscored.state, epoch))
+            modules = self._unscored.state(epoch)["algorithm"]["modules"]
+            late = self._record(epoch, found, partial(self._unscored.state, epoch), parameter_hash(modules))
             row = rows.get(epoch)
             if row is None:
                 state = self._unscored.state(epoch)
@@ -312,8 +318,17 @@ class Trainer(Place):
         except SimulationError as error:
             warnings.warn(f"policies of epochs {self._unscored.epochs} have no score: {error}", stacklevel=2)
 
-    def _record(self, epoch: int, figures: dict[str, float], state: Callable[[], dict[str, Any]]) -> dict[str, float]:
-        """Keep the policy of an epoch if it is the best or a milestone. Returns the metrics of its evaluation."""
+    def _record(
+        self, epoch: int, figures: dict[str, float], state: Callable[[], dict[str, Any]], parameters: str
+    ) -> dict[str, float]:
+        """Keep the policy of an epoch if it is the best or a milestone. Returns the metrics of its evaluation.
+
+        Args:
+            epoch: the policy's.
+            figures: what its evaluation found.
+            state: everything needed to continue from there.
+            parameters: digest of the trial's modules then.
+        """
         score = figures["score"]
         if epoch > 0 and score > self.best_score:
             self.best_score = score
@@ -321,7 +336,7 @@ class Trainer(Place):
             write_checkpoint(self.best_checkpoint, state() | {"best_score": score}, facts)
         if self._at_milestone(epoch):
             self._write_policy(state(), score)
-        row = {f"eval/{name}": value for name, value in figures.items()}
+        row = {f"eval/{name}": value for name, value in figures.items()} | {HASH: as_number(parameters)}
         if math.isfinite(self.best_score):
             row["eval/best_score"] = self.best_score
         return row

@@ -90,11 +90,12 @@ def start(batch: WorldBatch) -> None:
     """Put states into the batch that touch and slide."""
     rng = np.random.default_rng(0)
     data, mjm = batch.data, batch.mjm
-    qpos = np.tile(mjm.qpos0, (WORLDS, 1))
+    worlds = batch.nworld
+    qpos = np.tile(mjm.qpos0, (worlds, 1))
     qpos[:, [2, 11]] -= 0.102, 0.0
     data.qpos.assign(qpos.astype(np.float32))
-    data.qvel.assign(rng.normal(size=(WORLDS, mjm.nv)).astype(np.float32))
-    data.ctrl.assign(rng.normal(size=(WORLDS, mjm.nu)).astype(np.float32))
+    data.qvel.assign(rng.normal(size=(worlds, mjm.nv)).astype(np.float32))
+    data.ctrl.assign(rng.normal(size=(worlds, mjm.nu)).astype(np.float32))
 
 
 def stepped(batch: WorldBatch, steps: int = 6) -> list[bytes]:
@@ -113,9 +114,12 @@ def stepped(batch: WorldBatch, steps: int = 6) -> list[bytes]:
     generator = torch.Generator().manual_seed(0)
     for view in tape.cotangent:
         view.copy_(torch.randn(view.shape, generator=generator))
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
     tape.launch_backward()
+    wp.synchronize()
     arrays = [data.qpos, data.qvel, data.qacc, data.efc.force, data.contact.dist]
-    gradients = [view.numpy() for view in tape.cotangent]
+    gradients = [view.cpu().numpy() for view in tape.cotangent]
     return [np.array(a.numpy()).tobytes() for a in arrays] + [g.tobytes() for g in gradients]
 
 
@@ -158,6 +162,17 @@ def test_the_ordered_step_is_that_of_the_package(cone: str) -> None:
 
     for ours, theirs in zip(run(True), run(False), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=2e-4, atol=2e-4)
+
+
+@pytest.mark.gpu
+def test_a_gpu_repeats_steps_and_their_gradients(cone: str) -> None:
+    worlds = 2048
+
+    def run() -> list[bytes]:
+        with wp.ScopedDevice("cuda:0"):
+            return stepped(WorldBatch(model(cone), worlds, 1, "cuda:0", ordered=True), steps=30)
+
+    assert run() == run()
 
 
 def test_a_sparse_jacobian_is_made_dense() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor, nn
 
 from msk_ray.algorithms.base import Algorithm, Clock, EpochResult, simulation_metrics
 from msk_ray.algorithms.episodes import EpisodeTracker
+from msk_ray.algorithms.streams import GlobalStreams
 from msk_ray.config import Config, NetworkConfig, PpoConfig
 from msk_ray.envs import Env
 from msk_ray.errors import Failure, SimulationError
@@ -38,10 +40,12 @@ class GaussianPolicy(nn.Module):
 class Ppo(Algorithm):
     """Actor, critic and optimiser of rsl_rl's PPO, trained in one environment, with actions clamped to [-1, 1].
 
-    Noise and minibatches are drawn from torch's global generators.
+    Noise and minibatches are drawn from torch's global generators, from streams of their own where `trial.seeds` names
+    one of them or the policy.
     """
 
     Settings = PpoConfig
+    draws_apart = True
     settings: PpoConfig
     network: GaussianPolicy
 
@@ -73,6 +77,14 @@ class Ppo(Algorithm):
         )
         self.ppo.train_mode()
         self.episodes = EpisodeTracker(env.nworld, env.device)
+        trial = config.trial
+        self._streams = (
+            GlobalStreams(
+                {"noise": trial.seed_of("noise") + 1, "minibatches": trial.seed_of("minibatches") + 2}, env.device
+            )
+            if trial.noise_apart or trial.seeds.policy is not None
+            else None
+        )
 
     @classmethod
     def policy_network(cls, config: Config, obs_size: int, action_size: int) -> GaussianPolicy:
@@ -104,10 +116,12 @@ class Ppo(Algorithm):
         """
         clock = Clock(self.env.device)
         try:
-            rewards, done, diverged = self._collect()
+            with self._drawing("noise"):
+                rewards, done, diverged = self._collect()
             clock.mark("rollout")
             values = self.ppo.storage.values.mean()
-            losses = self.ppo.update()
+            with self._drawing("minibatches"):
+                losses = self.ppo.update()
         except (RuntimeError, ValueError):
             # What torch raises for a standard deviation that is NaN, for one.
             self._check("weights", self._weights())
@@ -139,6 +153,7 @@ class Ppo(Algorithm):
             "optimizer": self.ppo.optimizer.state_dict(),
             "learning_rate": self.ppo.learning_rate,
             "episodes": self.episodes.state_dict(),
+            **({} if self._streams is None else {"streams": self._streams.state_dict()}),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -147,6 +162,11 @@ class Ppo(Algorithm):
         self.ppo.optimizer.load_state_dict(state["optimizer"])
         self.ppo.learning_rate = state["learning_rate"]
         self.episodes.load_state_dict(state["episodes"])
+        if self._streams is not None:
+            self._streams.load_state_dict(state["streams"])
+
+    def _drawing(self, what: str) -> AbstractContextManager[None]:
+        return nullcontext() if self._streams is None else self._streams.drawing(what)
 
     @torch.no_grad()
     def _collect(self) -> tuple[Tensor, Tensor, Tensor]:

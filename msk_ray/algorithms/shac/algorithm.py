@@ -5,6 +5,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -24,6 +25,9 @@ from msk_ray.envs import Env
 from msk_ray.errors import Failure, SimulationError
 from msk_ray.networks import Actor, Critic, PolicyNetwork, RunningMeanStd
 
+_MINIBATCHES = 1
+"""What makes the seed of the minibatches' generator another one than that of others of the same number."""
+
 
 class Shac(Algorithm):
     """Actor, critic, their optimisers and the statistics they need, trained in one environment.
@@ -35,10 +39,11 @@ class Shac(Algorithm):
 
     Settings = ShacConfig
     settings: ShacConfig
+    draws_apart = True
     network: PolicyNetwork
 
     def __init__(self, config: Config, env: Env[Any]) -> None:
-        init = torch.Generator().manual_seed(config.trial.seed)
+        init = torch.Generator().manual_seed(config.trial.seed_of("policy"))
         super().__init__(config, env, _network(config, env.obs_size, env.action_size, init))
         c = self.settings
         device = env.device
@@ -57,7 +62,11 @@ class Shac(Algorithm):
             tf32=c.critic_products == "tf32",
             group=env.group,
         )
-        self.noise_generator = torch.Generator(device=device).manual_seed(config.trial.seed + 1)
+        self.noise_generator = torch.Generator(device=device).manual_seed(config.trial.seed_of("noise") + 1)
+        self.minibatch_generator = self.noise_generator
+        if config.trial.noise_apart:
+            own = np.random.SeedSequence((config.trial.seed_of("minibatches"), _MINIBATCHES)).generate_state(1)
+            self.minibatch_generator = torch.Generator(device=device).manual_seed(int(own[0]))
         self._worlds = env.nworld * env.group.size
         self._copies = 1 if c.copies is None else c.copies.count
         self.episodes = EpisodeTracker(self._worlds // self._copies, device)
@@ -76,7 +85,7 @@ class Shac(Algorithm):
     @classmethod
     def policy_network(cls, config: Config, obs_size: int, action_size: int) -> PolicyNetwork:
         """An untrained actor drawn from the trial's seed, with statistics that leave observations unchanged."""
-        return _network(config, obs_size, action_size, torch.Generator().manual_seed(config.trial.seed))
+        return _network(config, obs_size, action_size, torch.Generator().manual_seed(config.trial.seed_of("policy")))
 
     @classmethod
     def policy_modules(cls, network: nn.Module) -> dict[str, nn.Module]:
@@ -107,7 +116,7 @@ class Shac(Algorithm):
         outcome = self._runner.run_actor(self._draw(horizon, epoch))
         # The fit before reads its rate until it ends, which the actor's work has waited for.
         self.critic_fit.optimizer.set_rate(self._rate(c.critic_lr, epoch))
-        orders = self.critic_fit.draw_orders(outcome.targets.numel(), c.critic_iterations, self.noise_generator)
+        orders = self.critic_fit.draw_orders(outcome.targets.numel(), c.critic_iterations, self.minibatch_generator)
         self._runner.run_critic(outcome.obs, outcome.targets, orders)
         seconds = self._runner.seconds()
         self.env.sim.settle()
@@ -134,6 +143,11 @@ class Shac(Algorithm):
         self._runner.adapt()
         return EpochResult(horizon * self._worlds, numbers)
 
+    def parameter_hash(self) -> str:
+        """Digest of policy, critics and statistics, once the critic's fit has ended."""
+        self._runner.join()
+        return super().parameter_hash()
+
     def state_dict(self) -> dict[str, Any]:
         """Everything that a later `load_state_dict` needs to continue exactly, including the environment's state."""
         self._runner.join()
@@ -143,11 +157,13 @@ class Shac(Algorithm):
             "critic_optimizer": self.critic_fit.optimizer.state_dict(),
             "critic_loss": self._runner.last_loss,
             "noise_generator": self.noise_generator.get_state(),
+            **({"minibatch_generator": self.minibatch_generator.get_state()} if self._apart else {}),
             "episodes": self.episodes.state_dict(),
             "discounted": self._actor_update.discounted.clone(),
             **self._horizon.state_dict(),
             "entropy_coefficient": None if self._entropy is None else self._entropy.coefficient,
             "curriculum": None if self._contacts is None else self._contacts.progress,
+            **({"iterations": self.env.sim.batch.unrolled_iterations} if self.env.sim.batch.ordered else {}),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -159,6 +175,8 @@ class Shac(Algorithm):
         self._runner.last_loss = state.get("critic_loss")
         # Generator states are host tensors on every device.
         self.noise_generator.set_state(state["noise_generator"].cpu())
+        if self._apart:
+            self.minibatch_generator.set_state(state["minibatch_generator"].cpu())
         self.episodes.load_state_dict(state["episodes"])
         self._actor_update.discounted.copy_(state["discounted"])
         self._horizon.load_state_dict(state)
@@ -166,6 +184,12 @@ class Shac(Algorithm):
             self._entropy.coefficient = state["entropy_coefficient"]
         if self._contacts is not None:
             self._contacts.set_progress(state["curriculum"])
+        if self.env.sim.batch.ordered:
+            self.env.sim.batch.unrolled_iterations = state["iterations"]
+
+    @property
+    def _apart(self) -> bool:
+        return self.minibatch_generator is not self.noise_generator
 
     def _rate(self, rate: float, epoch: int) -> float:
         """The learning rate at an epoch that was `rate` at the first."""

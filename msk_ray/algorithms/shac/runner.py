@@ -31,6 +31,8 @@ _LIMITED_SHARE = 3e-3
 _MOST_ITERATIONS = 48
 """Beyond this many in a substep, unrolled iterations cost more than recording saves."""
 
+_TOO_MANY = f"the constraint solver needs more than {_MOST_ITERATIONS} iterations in some worlds"
+
 
 class EagerRunner:
     """Runs an epoch's work operation by operation.
@@ -186,7 +188,12 @@ class RecordedRunner(EagerRunner):
         counts = batch.iterations.read()
         before, most = batch.unrolled_iterations, int(batch.mjm.opt.iterations)
         limits = before or (_FEWEST_ITERATIONS,) * batch.substeps
-        if self.recorded:
+        # A trial that is resumed starts with an epoch that is not recorded, and must adapt as if it were.
+        resumed = batch.ordered and before is not None
+        if resumed and max(limits) > _MOST_ITERATIONS:
+            self._refuse(_TOO_MANY)
+            return
+        if self.recorded or resumed:
             shares = reached(counts, limits)
             wanted = [n + (n + 3) // 4 if s > _LIMITED_SHARE else n for n, s in zip(limits, shares, strict=True)]
         else:
@@ -196,7 +203,7 @@ class RecordedRunner(EagerRunner):
         if self.recorded and self._group.any(batch.unrolled_iterations != before):
             self._kept.epochs.clear()
         if self._group.any(max(batch.unrolled_iterations) > _MOST_ITERATIONS):
-            self._refuse(f"the constraint solver needs more than {_MOST_ITERATIONS} iterations in some worlds")
+            self._refuse(_TOO_MANY)
 
     def _attempt(self, record: Callable[[], _Epoch]) -> _Epoch | None:
         epoch, why = None, ""
