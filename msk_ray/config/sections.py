@@ -1,5 +1,6 @@
 """The base classes and types of all groups of settings."""
 
+from collections.abc import Mapping
 from functools import cache
 from typing import Annotated, Any, ClassVar, get_args
 
@@ -76,6 +77,9 @@ class EnvSettings(Section):
     """The named physics whose friction cone is a pyramid unless `physics.cone` says otherwise."""
     reads_physics: ClassVar[frozenset[str]]
     """Settings of the physics section that it reads, dotted if nested, such as `fd.eps_act`; others are refused."""
+
+    conditions: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
+    """Harder circumstances that policies can be evaluated under, by name: dotted settings of the config."""
 
     name: Text
     """The environment: a short name, or package.module:Class."""

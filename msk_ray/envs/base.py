@@ -166,6 +166,10 @@ class Env(ABC, Generic[SettingsT]):
         """Controls (W, nu) of the model for actions (W, A) in the current state."""
         return action
 
+    def disturbed(self, state: StepState) -> StepState:
+        """The current state as a step begins with it, for example after a push."""
+        return state
+
     @abstractmethod
     def draw_physics(self, count: int) -> StepState:
         """`count` initial physical states, drawn with `uniform`."""
@@ -324,7 +328,7 @@ class Env(ABC, Generic[SettingsT]):
         A world whose physics exceeded all bounds gets no reward for the step and counts as terminated; its observation
         is that of the state before the step, cut from the graph.
         """
-        before = self.state.physics
+        before = self.disturbed(self.state.physics)
         after = self.sim.step(self.control(action), *before, parameters=self.parameters)
         diverged = ~self._sound(after)
         # `where` sends no cotangent into a diverged world's step, so its gradient cannot reach the batch.

@@ -4,6 +4,7 @@ import argparse
 import shutil
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,6 +43,7 @@ EXAMPLES = """\
   python -m msk_ray.evaluate ant_lr --physics reference,published,own    # how much of it is the physics?
   python -m msk_ray.evaluate ant_lr --worlds 256 --seeds 0-4             # fresh initial states
   python -m msk_ray.evaluate runs/mine --vary body_mass=0.8x,1.2x        # how well does it bear other masses?
+  python -m msk_ray.evaluate runs/train/myoleg26_seed0 --with push,uphill,rough,weak   # how robust is it?
   python -m msk_ray.evaluate runs/train/myosuite_walk_seed0 --in myosuite   # in MyoSuite's own environment
   python -m msk_ray.evaluate policies/                                   # the trained policies: are their scores true?
 
@@ -64,6 +66,13 @@ def parser() -> Parser:
         "environment (default: reference)",
     )
     p.add_argument("--vary", metavar="FIELD=LIST", help=HELP)
+    p.add_argument(
+        "--with",
+        dest="conditions",
+        metavar="LIST",
+        help="comma-separated circumstances that the environment knows, beside its own: for legs push, weak, and on "
+        "myoleg26 uphill, downhill, rough",
+    )
     p.add_argument(
         "--in",
         dest="elsewhere",
@@ -99,6 +108,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     names = [name.strip() for name in (args.physics or "reference").split(",")]
     varied = [None, *(parse_vary(args.vary) if args.vary is not None else [])]
     python = _python_apart(args)
+    if args.vary is not None and args.conditions is not None:
+        raise ConfigError("--with: it is for the model's own values; leave --vary out")
     if target.kind is Kind.ZOO:
         return _evaluate_zoo(target, args)
     if target.kind is not Kind.EXPERIMENT:
@@ -117,6 +128,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         resolve_device(device)  # a missing device is not the fault of any trial
         bench = measure.Bench(device)
         requests = [measure.Request(name, args.worlds, seeds, args.steps, v) for name in names for v in varied]
+        if args.conditions is not None:
+            under = [None, *(condition.strip() for condition in args.conditions.split(","))]
+            requests = [replace(request, condition=condition) for request in requests for condition in under]
+            varied = under
     if target.kind is Kind.EXPERIMENT:
         return evaluate_experiment(Experiment(target.path), bench, requests)
     return _evaluate_one(target, bench, requests, len(varied))
@@ -148,8 +163,9 @@ def _python_apart(args: argparse.Namespace) -> Path | None:
         if args.python is not None:
             raise ConfigError("--python: only --in myosuite reads it; leave it out")
         return None
-    for option in ("physics", "vary", "device"):
+    for option in ("physics", "vary", "device", "conditions"):
         if getattr(args, option) is not None:
+            option = {"conditions": "with"}.get(option, option)
             raise ConfigError(f"--{option}: --in {args.elsewhere} has its own physics, on the CPU; leave it out")
     return find_python(args.python)
 

@@ -3,14 +3,14 @@
 import datetime
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from msk_ray.config import Config, PhysicsConfig, RandomizeConfig
+from msk_ray.config import Config, PhysicsConfig, RandomizeConfig, overlay, parse_config
 from msk_ray.envs import env_class
 from msk_ray.envs.randomize import Randomizer
 from msk_ray.errors import ConfigError
@@ -41,6 +41,24 @@ class Request:
     steps: int | None = None
     varied: RandomizeConfig | None = None
     """Parameters of the model that are other than its own."""
+    condition: str | None = None
+    """Harder circumstances, one of the environment's `conditions`."""
+
+
+def under_condition(config: Config, name: str) -> tuple[Config, RandomizeConfig | None]:
+    """A config under one of its environment's conditions, and parameters of the model that belong to it.
+
+    Raises:
+        ConfigError: the environment has no such condition.
+    """
+    known = config.env.conditions
+    if name not in known:
+        listed = ", ".join(known) or "none"
+        raise ConfigError(f"--with {name}: env {config.env.name} has {listed}; write one of these, or leave it out")
+    values = {key: value for key, value in known[name].items() if key != "physics.randomize"}
+    harder = parse_config(overlay(config.as_dict(), values)) if values else config
+    varied = known[name].get("physics.randomize")
+    return harder, None if varied is None else RandomizeConfig.model_validate(varied)
 
 
 def named_physics(config: Config, name: str) -> tuple[str, PhysicsConfig]:
@@ -109,7 +127,13 @@ class Bench:
             MskRayError: as for `evaluator`, or the checkpoint does not fit its environment.
         """
         use_threads(policy.config)
-        evaluator, physics = self.evaluator(policy.config, request)
+        asked, config = request, policy.config
+        if request.condition is not None:
+            config, varied = under_condition(config, request.condition)
+            asked = replace(request, varied=varied)
+        evaluator, physics = self.evaluator(config, asked)
+        if request.condition is not None:
+            physics = f"{physics.partition(',')[0]}, {request.condition}"
         own = policy.config.evaluation
         seeds = request.seeds or (own.seed,)
         with named_out_of_memory(self._device, evaluator.env.nworld, *_WORLDS):
@@ -117,6 +141,7 @@ class Bench:
         reference = named_physics(policy.config, REFERENCE)[1]
         canonical = (
             request.varied is None
+            and request.condition is None
             and evaluator.env.nworld == own.nworld
             and seeds == (own.seed,)
             and request.steps in (None, own.steps or policy.config.env.episode_length)

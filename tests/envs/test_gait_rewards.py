@@ -15,6 +15,7 @@ from msk_ray.envs.legs import terms
 from msk_ray.envs.legs.clock import fourier, series, window
 from msk_ray.envs.legs.config import LegReward
 from msk_ray.envs.legs.metabolic import Fibres, muscle_masses, power
+from msk_ray.envs.legs.push import pushes
 from msk_ray.envs.legs.reference import people_angles
 from msk_ray.envs.myoleg26.config import MyoLeg26Settings
 from msk_ray.envs.myoleg26.env import MyoLeg26
@@ -225,3 +226,20 @@ def test_metabolic_power_of_standing_is_that_of_its_muscles(env: MyoLeg26) -> No
     assert ((heat > 0.5) & (heat < 4.0)).all()
     harder = env.metabolic_power(still._replace(act=torch.full_like(still.act, 0.5)), action) / env._mass
     assert (harder > heat + 5.0).all()
+
+
+def test_pushes_change_the_speed_when_they_are_due() -> None:
+    size = pushes(torch.tensor([0, 100, 150, 200]), 100, 0.5)
+    assert size.norm(dim=-1).tolist() == pytest.approx([0.0, 0.5, 0.0, 0.5])
+    assert size[1].tolist() != size[3].tolist()
+    env = make(2, push={"speed": 0.4, "interval": 0.06}, stochastic_reset=False)
+    state = env.state.physics
+    assert env.disturbed(state) is not state
+    torch.testing.assert_close(env.disturbed(state).qvel, state.qvel)
+    env.state = env.state._replace(age=torch.tensor([3, 4]))
+    pushed = env.disturbed(state).qvel - state.qvel
+    assert pushed[1].abs().max() == 0.0
+    # forward, up, right: a push is level, and (forward, left) as its direction says
+    forward, left = pushes(torch.tensor([3, 4]), 3, 0.4)[0].tolist()
+    assert pushed[0, :3].tolist() == pytest.approx([forward, 0.0, -left])
+    assert pushed[0, 3:].abs().max() == 0.0

@@ -16,6 +16,7 @@ from msk_ray.envs.legs.gait.people import curve
 from msk_ray.envs.myoleg26.config import MyoLeg26Settings
 from msk_ray.envs.myoleg26.model import build_myoleg26
 from msk_ray.errors import ConfigError
+from msk_ray.evaluate.__main__ import main as evaluate
 from msk_ray.gait.__main__ import main
 from msk_ray.training import Trainer
 
@@ -93,6 +94,14 @@ def test_the_command_writes_json_and_a_picture(tmp_path: Path, capsys: pytest.Ca
     assert main(more) == 0
     assert (tmp_path / "trial" / "gait_0.5.json").is_file()
     assert len([line for line in capsys.readouterr().out.splitlines() if "best.pt_" in line]) == 2
+    shorter = ["--worlds", "2", "--steps", "10", "--device", "cpu"]
+    assert evaluate([str(tmp_path / "trial"), *shorter, "--with", "push,weak"]) == 0
+    told = capsys.readouterr().out
+    assert all(f"own, {name}" in told for name in ("push", "weak"))
+    stored = json.loads((tmp_path / "trial" / "eval.json").read_text())["evaluations"]
+    assert {entry["physics"] for entry in stored} == {"own", "own, push", "own, weak"}
+    with pytest.raises(ConfigError, match="has push, weak, uphill, downhill, rough; write one of these"):
+        evaluate([str(tmp_path / "trial"), *shorter, "--with", "ice"])
     with pytest.raises(ConfigError, match="write positive numbers"):
         main([str(tmp_path / "trial"), "--speeds", "0.5,-1"])
 

@@ -1,6 +1,7 @@
 """The settings shared by muscle-driven legs."""
 
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar
 
 from pydantic import Field, PositiveFloat, model_validator
 
@@ -95,8 +96,22 @@ class TrackingSchedule(Section):
         return self.end if epoch >= self.epochs else self.start + (self.end - self.start) * epoch / self.epochs
 
 
+class PushConfig(Section):
+    """Pushes of the pelvis, which change its speed at once."""
+
+    speed: NonNegative = 0.0
+    """Change of the pelvis's horizontal velocity [m/s]; 0: no pushes."""
+    interval: PositiveFloat = 2.0
+    """Time between pushes [s]; their directions go around by 137.5° from one to the next and from world to world."""
+
+
 class LegSettings(EnvSettings):
     """The settings shared by muscle-driven legs."""
+
+    conditions: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "push": {"env.push": {"speed": 0.3}},
+        "weak": {"physics.randomize": {"actuator_gain": {"low": 0.5, "high": 0.5}}},
+    }
 
     episode_length: Count = 500
     control_timestep: PositiveFloat = 0.02
@@ -114,6 +129,7 @@ class LegSettings(EnvSettings):
     gait_worlds: Whole = 0
     """Worlds of every evaluation during training whose gait is compared with people's (`eval/gait_distance`, `cadence`,
     `step_length`, `duty_factor`, `asymmetry`, `cost_of_transport`), by C MuJoCo: about 0.02 s each; 0: none."""
+    push: PushConfig = PushConfig()
     tracking: TrackingSchedule = TrackingSchedule()
     """Schedule of the terms that track people's motion."""
     min_height: float = 0.65
@@ -145,6 +161,8 @@ class LegSettings(EnvSettings):
     def unread(self) -> dict[str, str]:
         unread = {}
         r = self.reward
+        if self.push.speed == 0.0:
+            unread["push.interval"] = "env.push.speed is 0"
         for name, weight in (
             ("clearance_height", "clearance"),
             ("track_scale", "track"),

@@ -21,8 +21,9 @@ from msk_ray.envs.legs.config import LegSettings
 from msk_ray.envs.legs.gait.body import SIDES, analyse, world_axes
 from msk_ray.envs.legs.gait.measure import measure, summary
 from msk_ray.envs.legs.metabolic import Fibres, muscle_masses, power
-from msk_ray.envs.legs.mirror import Mirror, check_mirrored, other_side
+from msk_ray.envs.legs.mirror import Mirror, check_mirrored, leg_mirrors
 from msk_ray.envs.legs.muscles import MuscleCurves
+from msk_ray.envs.legs.push import pushes
 from msk_ray.envs.legs.reference import Reference
 from msk_ray.simulation import StepState
 
@@ -160,20 +161,16 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
         drops = [self.stand_height + (data.body(name).xpos - pelvis) @ axes[2] for name in self._feet]
         self._foot_heights = torch.tensor(drops, dtype=torch.float32, device=self.device)
         self._up = torch.tensor(axes[2], dtype=torch.float32, device=self.device)
+        with torch.no_grad():
+            # The first three dofs move the pelvis without turning it: what they are for a speed forward, and left.
+            rest = torch.tensor(self.model.key("stand").qpos, dtype=torch.float32, device=self.device).repeat(3, 1)
+            units = torch.eye(3, self.model.nv, device=self.device)
+            self._slides = self.root(StepState(rest, units, rest[:, :0])).velocity.T[:2]
 
     def _prepare_mirror(self) -> None:
         check_mirrored(self.model, self.hinges, world_axes(self.model))
-        hinges = other_side([self.model.joint(j).name for j in self.hinges])
-        muscles = other_side(self.action_names())
-        own = list(range(len(self.pose_signs)))
-        spin = ([0, 1, 2], [-1.0, 1.0, -1.0])
-        parts = [([0], [1.0]), (own, self.pose_signs), ([0, 1, 2], [1.0, -1.0, 1.0]), spin]
-        parts += [(hinges, [1.0] * len(hinges))] * 2
-        parts += [(muscles, [1.0] * len(muscles))] * 5
-        # The target speed, and the clock, which the exchange of sides turns by half a cycle.
-        parts += [([0], [1.0]), ([0, 1], [-1.0, -1.0])]
-        self._mirror = Mirror(parts, self.device)
-        self._mirror_action = Mirror(parts[-3:-2], self.device)
+        hinges = [self.model.joint(j).name for j in self.hinges]
+        self._mirror, self._mirror_action = leg_mirrors(self.pose_signs, hinges, self.action_names(), self.device)
 
     @abstractmethod
     def prepare_model(self) -> None:
@@ -230,6 +227,15 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
 
     def begin_epoch(self, epoch: int) -> None:
         self._tracking_share.fill_(self.config.tracking.at(epoch))
+
+    def disturbed(self, state: StepState) -> StepState:
+        push = self.config.push
+        if push.speed == 0.0:
+            return state
+        every = max(1, round(push.interval / self.config.control_timestep))
+        change = pushes(self.state.age, every, push.speed)
+        moved = state.qvel[:, :3] + change[:, :1] * self._slides[0] + change[:, 1:] * self._slides[1]
+        return state._replace(qvel=torch.cat((moved, state.qvel[:, 3:]), dim=-1))
 
     def draw_start(self, count: int) -> tuple[StepState, Tensor]:
         if not self._tasked:

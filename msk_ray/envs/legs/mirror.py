@@ -62,6 +62,32 @@ def other_side(names: Sequence[str]) -> list[int]:
     return found
 
 
+def leg_mirrors(
+    pose_signs: Sequence[float], hinges: Sequence[str], muscles: Sequence[str], device: torch.device
+) -> tuple[Mirror, Mirror]:
+    """The mirror images of a leg environment's observations and actions.
+
+    Args:
+        pose_signs: of the pose of the pelvis.
+        hinges: names of the joints of the legs.
+        muscles: names of the actions.
+        device: where they are needed.
+
+    Raises:
+        UnsupportedModelError: a joint or a muscle has no counterpart.
+    """
+    sides, pulls = other_side(hinges), other_side(muscles)
+    vector = [0, 1, 2]
+    parts: list[tuple[Sequence[int], Sequence[float]]] = [([0], [1.0]), (range(len(pose_signs)), pose_signs)]
+    # A velocity's left is reversed; of an angular velocity everything else is.
+    parts += [(vector, [1.0, -1.0, 1.0]), (vector, [-1.0, 1.0, -1.0])]
+    parts += [(sides, [1.0] * len(sides))] * 2
+    parts += [(pulls, [1.0] * len(pulls))] * 5
+    # The target speed, and the clock, which the exchange of sides turns by half a cycle.
+    parts += [([0], [1.0]), ([0, 1], [-1.0, -1.0])]
+    return Mirror(parts, device), Mirror([(pulls, [1.0] * len(pulls))], device)
+
+
 def check_mirrored(model: mujoco.MjModel, hinges: Sequence[int], axes: np.ndarray) -> None:
     """Check that angles exchanged between the sides give the mirror image of the legs, in a few poses.
 

@@ -1,6 +1,7 @@
 """The settings of the two legs with 26 muscles."""
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal
 
 from pydantic import PositiveFloat, model_validator
 
@@ -61,6 +62,14 @@ class MyoLeg26Settings(LegSettings):
     """Two legs under one trunk, 13 Hill-type muscles each."""
 
     reads_physics = STEPPING | SOLVING | CONTACTS | LIMITS | JOINTS | ACTIVATION
+
+    conditions: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        **LegSettings.conditions,
+        "uphill": {"env.terrain": {"kind": "slope", "slope": 0.05}},
+        "downhill": {"env.terrain": {"kind": "slope", "slope": -0.05}},
+        "rough": {"env.terrain": {"kind": "rough", "roughness": 0.02}},
+        "weak": {"physics.randomize": {"actuator_gain": {"low": 0.5, "high": 0.5, "only": ["gastroc_r", "soleus_r"]}}},
+    }
 
     terrain: TerrainConfig = TerrainConfig()
     assist: AssistConfig = AssistConfig()

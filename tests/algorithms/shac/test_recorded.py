@@ -38,6 +38,20 @@ OPTIONS = {
         "horizon": {"start": 4, "shortest": 4, "longest": 4, "contact": 1.0},
     },
 }
+_WEIGHTS = ("metabolic", "fatigue", "head", "impact", "footfall", "clearance", "track", "track_rate")
+LEGS = {
+    **ANT,
+    "env": {
+        "name": "myoleg26",
+        "nworld": 64,
+        "clock": True,
+        "symmetric": True,
+        "reset": "cycle",
+        "speed_range": [1.0, 1.5],
+        "reward": dict.fromkeys(_WEIGHTS, 0.1),
+    },
+    "physics": {},
+}
 CARTPOLE = {**ANT, "env": {"name": "cartpole", "nworld": 64}, "physics": {}}
 
 
@@ -75,7 +89,7 @@ def after(epochs: int, trainer: Trainer, state: dict[str, Any]) -> tuple[torch.T
 
 
 @pytest.mark.usefixtures("uncut")
-@pytest.mark.parametrize("settings", [ANT, CARTPOLE, OPTIONS], ids=["ant", "cartpole", "options"])
+@pytest.mark.parametrize("settings", [ANT, CARTPOLE, OPTIONS, LEGS], ids=["ant", "cartpole", "options", "legs"])
 def test_a_recorded_epoch_equals_one_operation_by_operation(settings: dict[str, Any], tmp_path: Path) -> None:
     recorded, eager = make(settings, tmp_path / "a"), make(settings, tmp_path / "b", capture="off")
     for trainer in (recorded, eager):
