@@ -143,12 +143,9 @@ def test_reward_by_hand(env: MyoLeg26) -> None:
         v_pelvis_tz=0.5, v_pelvis_list=2.0, v_hip_flexion_r=1.0, v_hip_flexion_l=2.0,
     )  # fmt: skip
     state.act.fill_(0.5)
-    config = env.config
-    env.config = config.model_copy(update={"reward": LegReward(symmetry=0.1, progress=0.5, stride=0.5)})
-    try:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(env, "_weights", env.weights(LegReward(symmetry=0.1, progress=0.5, stride=0.5)))
         found = terms(env, state, torch.full((2, 26), 0.5))
-    finally:
-        env.config = config
     # 0.5 m/s to the right, and a trunk that turns rightward by 2 rad/s
     lateral = (0.5 + 0.18 * 2.0) * math.sqrt(env.stand_height / 9.81)
     assert found == pytest.approx(

@@ -6,7 +6,7 @@ Axes: W worlds, U muscles, N hinges of the legs.
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from typing import ClassVar, Generic, NamedTuple, TypeVar
+from typing import ClassVar, Generic, TypeVar
 
 import mujoco
 import torch
@@ -17,14 +17,15 @@ from msk_ray.config.physics import CONTACTS, LIMITS
 from msk_ray.envs.base import Env
 from msk_ray.envs.layout import Entry, entries
 from msk_ray.envs.legs import terms as costs
-from msk_ray.envs.legs.config import LegSettings
+from msk_ray.envs.legs.config import LegReward, LegSettings
 from msk_ray.envs.legs.gait.body import SIDES, analyse, world_axes
 from msk_ray.envs.legs.gait.measure import measure, summary
 from msk_ray.envs.legs.metabolic import Fibres, muscle_masses, power
 from msk_ray.envs.legs.mirror import Mirror, check_mirrored, leg_mirrors
-from msk_ray.envs.legs.muscles import MuscleCurves
+from msk_ray.envs.legs.muscles import MuscleCurves, columns
 from msk_ray.envs.legs.push import pushes
 from msk_ray.envs.legs.reference import Reference
+from msk_ray.envs.legs.root import Root
 from msk_ray.simulation import StepState
 
 AnyLegSettings = TypeVar("AnyLegSettings", bound=LegSettings)
@@ -41,27 +42,10 @@ _LEG_LENGTH = 0.9
 """Leg whose steps have the length of people's [m]."""
 _FOOT = ("calcn", "toes")
 """Bodies whose origins are the heel and the joint of the toes."""
+_GAINS = frozenset(("forward_vel", "progress", "upright", "heading", "alive"))
+"""The terms of the reward that are no costs."""
 _VELOCITY_SCALE = 0.1
 """Scale of joint velocities in the observation [s/rad]."""
-
-
-class Root(NamedTuple):
-    """The pelvis in the world, each (W,) or (W, k), world frame: x forward, y left, z up."""
-
-    height: Tensor
-    """Height above the ground [m]."""
-    up: Tensor
-    """The trunk's up axis, (W, 3)."""
-    heading: Tensor
-    """Cosine between the pelvis's forward axis and +x."""
-    place: Tensor
-    """Forward and to the left of the start [m], (W, 2)."""
-    pose: Tensor
-    """Position and orientation in the observation (W, k)."""
-    velocity: Tensor
-    """Velocity [m/s], (W, 3)."""
-    spin: Tensor
-    """Angular velocity [rad/s], (W, 3)."""
 
 
 class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
@@ -108,8 +92,8 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
         held = torch.tensor(self.model.key("stand").ctrl, dtype=torch.float32, device=self.device)
         rest = held[self.curves.actuators].clamp_min(self.config.rest_excitation)
         self._odds = (1.0 - rest) / rest
-        self._hinge_qpos = self._index(self.model.jnt_qposadr[self.hinges])
-        self._hinge_dofs = self._index(self.model.jnt_dofadr[self.hinges])
+        self._hinge_qpos = columns(self.model.jnt_qposadr[self.hinges], self.device)
+        self._hinge_dofs = columns(self.model.jnt_dofadr[self.hinges], self.device)
         with torch.no_grad():
             stand = torch.tensor(self.model.key("stand").qpos, dtype=torch.float32, device=self.device)[None]
             still = torch.zeros((1, self.model.nv), device=self.device)
@@ -118,8 +102,8 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
         ranges = torch.tensor(self.model.jnt_range[self.hinges], dtype=torch.float32, device=self.device)
         self._limits = ranges[:, 0] + _LIMIT_MARGIN, ranges[:, 1] - _LIMIT_MARGIN
         flexions = [self.model.joint(f"hip_flexion_{s}") for s in "rl"]
-        self._flexion_dofs = self._index([joint.dofadr[0] for joint in flexions])
-        self._flexion_qpos = self._index([joint.qposadr[0] for joint in flexions])
+        self._flexion_dofs = columns([joint.dofadr[0] for joint in flexions], self.device)
+        self._flexion_qpos = columns([joint.qposadr[0] for joint in flexions], self.device)
         self.reference = Reference(self.model, self.device)
         self._tasked = self.config.clock or self.config.speed_range is not None
         self._tracking_share = torch.tensor(self.config.tracking.at(0), device=self.device)
@@ -147,11 +131,13 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
             "track_rate": lambda state, action: self._tracking(state)[1],
         }
         self._further = {name: term for name, term in further.items() if getattr(self.config.reward, name) > 0.0}
-        self.reward_names = (*LegEnv.reward_names, *self._further)
+        common = LegEnv.reward_names
+        self.reward_names = (*common, *self._further, *type(self).reward_names[len(common) :])
+        self._weights = self.weights(self.config.reward)
         self._mass = float(self.model.body_subtreemass[0])
         self._masses = muscle_masses(self.curves.peak, self.curves.optimum)
-        self._track_qpos = self._index(self.model.jnt_qposadr[self.reference.joints])
-        self._track_dofs = self._index(self.model.jnt_dofadr[self.reference.joints])
+        self._track_qpos = columns(self.model.jnt_qposadr[self.reference.joints], self.device)
+        self._track_dofs = columns(self.model.jnt_dofadr[self.reference.joints], self.device)
         self._feet = [f"{body}_{side}" for side in SIDES for body in _FOOT]
         axes = world_axes(self.model)
         data = mujoco.MjData(self.model)
@@ -167,6 +153,11 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
             units = torch.eye(3, self.model.nv, device=self.device)
             self._slides = self.root(StepState(rest, units, rest[:, :0])).velocity.T[:2]
 
+    def weights(self, reward: LegReward) -> Tensor:
+        """Weights of the terms, negative for costs."""
+        signed = [getattr(reward, n) * (1.0 if n in _GAINS else -1.0) for n in (*LegEnv.reward_names, *self._further)]
+        return torch.tensor(signed, device=self.device)
+
     def _prepare_mirror(self) -> None:
         check_mirrored(self.model, self.hinges, world_axes(self.model))
         hinges = [self.model.joint(j).name for j in self.hinges]
@@ -174,11 +165,16 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
 
     @abstractmethod
     def prepare_model(self) -> None:
-        """Set `hinges` (joint ids of the legs), `stand_height` and what `root` needs."""
+        """Set `hinges` (joint ids of the legs), `stand_height` and what `measure_root` needs."""
 
     @abstractmethod
+    def measure_root(self, state: StepState) -> Root:
+        """The pelvis in the world, as `root` gives it."""
+
     def root(self, state: StepState) -> Root:
-        """The pelvis in the world."""
+        """The pelvis in the world, computed once per state."""
+        found: Root = self._once("root", state, lambda: self.measure_root(state))
+        return found
 
     @abstractmethod
     def pose_layout(self) -> list[Entry]:
@@ -210,9 +206,6 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
         return [self.model.actuator(int(i)).name for i in self.curves.actuators]
 
     hinges: list[int]
-
-    def _index(self, values: object) -> Tensor:
-        return torch.as_tensor(values, dtype=torch.long, device=self.device)
 
     def excitation(self, action: Tensor) -> Tensor:
         """Excitations (W, U) in [0, 1] of actions (W, U) in [-1, 1]: s/(s + k(1 - s)), s = (1 + a)/2.
@@ -323,37 +316,37 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
             amplitude = pace.hip_swing(target, _LEG_LENGTH)[:, None]
             turn = math.tau * pace.strides_per_second(target)
         root = self.root(state)
-        speed = root.velocity[:, 0]
+        (speed, _, _), (_, _, upright) = root.velocity.unbind(-1), root.up.unbind(-1)
         low, high = self._limits
         angles = state.qpos[:, self._hinge_qpos]
-        overshoot = (torch.relu(low - angles) + torch.relu(angles - high)) / _LIMIT_UNIT
+        # At most one side of a range is exceeded.
+        overshoot = torch.maximum(low - angles, angles - high).clamp_min(0.0) / _LIMIT_UNIT
         age = self.state.age
         change = self._own_sides(action, age) - self._own_sides(self.state.action, age - 1)
         # The trunk is half of the body: the centre of mass moves with its lean.
-        place = root.place + _TRUNK_LEVER * (root.up[:, :2] - self._upright[:2])
         velocity = root.velocity + _TRUNK_LEVER * torch.linalg.cross(root.spin, root.up)
-        place = place + velocity[:, :2] * self._pendulum_time
+        place = root.place + (velocity * self._pendulum_time + _TRUNK_LEVER * (root.up - self._upright))[:, :2]
         distance = place if c.target_speed == 0.0 else place[:, 1:]
         capture = torch.sqrt(1.0 + (distance / r.capture_scale).square().sum(-1)) - 1.0
         flexion_rates = state.qvel[:, self._flexion_dofs]
         flexions = state.qpos[:, self._flexion_qpos]
         terms = (
-            r.forward_vel * torch.exp(-((speed - target) / r.speed_scale).square()),
-            r.progress * (torch.minimum(speed, target) if isinstance(target, Tensor) else speed.clamp_max(target)),
-            r.upright * root.up[:, 2],
-            r.heading * root.heading,
-            -r.height * torch.relu(self.stand_height - root.height).square(),
-            torch.full_like(speed, r.alive),
-            -r.effort * state.act.square().mean(-1),
-            -r.joint_limit * overshoot.square().sum(-1),
-            -r.smoothness * change.square().mean(-1),
-            -r.capture * capture,
-            -r.sway * root.spin.square().sum(-1),
-            -r.symmetry * flexion_rates.sum(-1).square(),
-            -r.stride * costs.stride_error(flexions, flexion_rates, amplitude, turn),
-            *(-getattr(r, name) * term(state, action) for name, term in self._further.items()),
+            torch.exp(-((speed - target) / r.speed_scale).square()),
+            torch.minimum(speed, target) if isinstance(target, Tensor) else speed.clamp_max(target),
+            upright,
+            root.heading,
+            torch.relu(self.stand_height - root.height).square(),
+            torch.ones_like(speed),
+            state.act.square().mean(-1),
+            overshoot.square().sum(-1),
+            change.square().mean(-1),
+            capture,
+            root.spin.square().sum(-1),
+            flexion_rates.sum(-1).square(),
+            costs.stride_error(flexions, flexion_rates, amplitude, turn),
+            *(term(state, action) for term in self._further.values()),
         )
-        return torch.stack(terms, dim=-1)
+        return torch.stack(terms, dim=-1) * self._weights
 
     def metabolic_power(self, state: StepState, action: Tensor) -> Tensor:
         """Metabolic power of all muscles [W], (W,), without that of rest, after actions (W, A)."""

@@ -71,7 +71,8 @@ def stride_error(angles: Tensor, rates: Tensor, amplitude: float | Tensor, rate:
         amplitude: A [rad], of all worlds or (W, 1).
         rate: ω [rad/s], of all worlds or (W,).
     """
-    swing = torch.stack((angles[:, 0] - angles[:, 1], (rates[:, 0] - rates[:, 1]) / rate), dim=-1) / amplitude
+    (right, left), (right_rate, left_rate) = angles.unbind(-1), rates.unbind(-1)
+    swing = torch.stack((right - left, (right_rate - left_rate) / rate), dim=-1) / amplitude
     # The square root has no slope where the legs stand still together.
     radius = torch.sqrt(swing.square().sum(-1) + 1e-4)
     return (radius - 1.0).square()

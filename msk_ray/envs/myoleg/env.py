@@ -9,8 +9,10 @@ from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
 from msk_ray.envs.layout import Entry, entries
-from msk_ray.envs.legs.env import LegEnv, Root
+from msk_ray.envs.legs.env import LegEnv
 from msk_ray.envs.legs.gait.body import world_axes
+from msk_ray.envs.legs.muscles import columns
+from msk_ray.envs.legs.root import Root
 from msk_ray.envs.myoleg.config import MyoLegSettings
 from msk_ray.envs.myoleg.model import Couplings, build_myoleg, find_model, ground_height
 from msk_ray.simulation import StepState
@@ -60,9 +62,12 @@ class MyoLeg(LegEnv[MyoLegSettings]):
         self._axes, self._local = tensor(axes), tensor(local)
         self._stand = tensor(stand)
         self._ranges = tuple(tensor(bound) for bound in model.jnt_range[self.hinges].T)
-        self._dependent, self._driving = self._index(couplings.dependent), self._index(couplings.driving)
-        self._dependent_dofs = self._index(couplings.dependent_dofs)
-        self._driving_dofs = self._index(couplings.driving_dofs)
+        self._dependent, self._driving = (
+            columns(couplings.dependent, self.device),
+            columns(couplings.driving, self.device),
+        )
+        self._dependent_dofs = columns(couplings.dependent_dofs, self.device)
+        self._driving_dofs = columns(couplings.driving_dofs, self.device)
         self._reference, self._driving_reference = tensor(couplings.reference), tensor(couplings.driving_reference)
         self._coefficients = tensor(couplings.coefficients)
 
@@ -88,7 +93,7 @@ class MyoLeg(LegEnv[MyoLegSettings]):
         axes = (f"pelvis_{axis}_axis_{part}" for axis in ("forward", "up") for part in ("forward", "left", "up"))
         return [Entry("pelvis_left_of_line", "m"), *entries(axes)]
 
-    def root(self, state: StepState) -> Root:
+    def measure_root(self, state: StepState) -> Root:
         q, v = state.qpos, state.qvel
         orientation = q[:, 3:7]
         # Rows of `_axes` are forward, left and up of the world.

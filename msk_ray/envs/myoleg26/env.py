@@ -9,7 +9,8 @@ from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
 from msk_ray.envs.layout import Entry
-from msk_ray.envs.legs.env import LegEnv, Root
+from msk_ray.envs.legs.env import LegEnv
+from msk_ray.envs.legs.root import Root
 from msk_ray.envs.myoleg26.config import AssistConfig, MyoLeg26Settings
 from msk_ray.envs.myoleg26.model import SIDES, build_myoleg26
 from msk_ray.envs.myoleg26.poses import cycle_states
@@ -130,24 +131,25 @@ class MyoLeg26(LegEnv[MyoLeg26Settings]):
         names = [self.model.joint(joints.index(place)).name for place in range(2, 6)]
         return [Entry(name, unit) for name, unit in zip(names, ("m", "rad", "rad", "rad"), strict=True)]
 
-    def root(self, state: StepState) -> Root:
-        q, v = state.qpos, state.qvel
-        tilt, lean, turn = q[:, 3], q[:, 4], q[:, 5]
-        sin_tilt, cos_tilt = torch.sin(tilt), torch.cos(tilt)
-        sin_lean, cos_lean = torch.sin(lean), torch.cos(lean)
+    def measure_root(self, state: StepState) -> Root:
+        # Taken apart at once: the gradients of columns taken one by one would be added up one by one.
+        x, height, right, *_ = state.qpos[:, :6].unbind(-1)
+        forward, upward, rightward, tilting, leaning, turning = state.qvel[:, :6].unbind(-1)
+        angles = state.qpos[:, 3:6]
+        sin_tilt, sin_lean, sin_turn = torch.sin(angles).unbind(-1)
+        cos_tilt, cos_lean, cos_turn = torch.cos(angles).unbind(-1)
         # R = Rz(tilt) Rx(list) Ry(rotation) in axes x forward, y up, z right.
-        up = torch.stack((-sin_tilt * cos_lean, -sin_lean, cos_tilt * cos_lean), dim=-1)
-        heading = cos_tilt * torch.cos(turn) - sin_tilt * sin_lean * torch.sin(turn)
+        back, rise = sin_tilt * cos_lean, cos_tilt * cos_lean
         # ω = ẑ tilt' + Rz x̂ list' + Rz Rx ŷ rotation', in the same axes; the world's are x, -z, y.
-        spin_x = cos_tilt * v[:, 4] - sin_tilt * cos_lean * v[:, 5]
-        spin_y = sin_tilt * v[:, 4] + up[:, 2] * v[:, 5]
-        spin_z = v[:, 3] + sin_lean * v[:, 5]
+        spin_x = torch.addcmul(cos_tilt * leaning, back, turning, value=-1.0)
+        spin_y = torch.addcmul(sin_tilt * leaning, rise, turning)
+        spin_z = torch.addcmul(tilting, sin_lean, turning)
         return Root(
-            height=q[:, 1] - self.ground_height(q[:, 0]),
-            up=up,
-            heading=heading,
-            place=torch.stack((q[:, 0], -q[:, 2]), dim=-1),
-            pose=q[:, 2:6],
-            velocity=torch.stack((v[:, 0], -v[:, 2], v[:, 1]), dim=-1),
+            height=height - self.ground_height(x),
+            up=torch.stack((-back, -sin_lean, rise), dim=-1),
+            heading=torch.addcmul(cos_tilt * cos_turn, sin_tilt * sin_lean, sin_turn, value=-1.0),
+            place=torch.stack((x, -right), dim=-1),
+            pose=state.qpos[:, 2:6],
+            velocity=torch.stack((forward, -rightward, upward), dim=-1),
             spin=torch.stack((spin_x, -spin_z, spin_y), dim=-1),
         )
