@@ -7,7 +7,7 @@ WORKERS ?= 4
 # Whatever people read; tests misspell on purpose.
 PROSE   := README.md CONTRIBUTING.md Makefile benchmarks cluster configs docs msk_ray policies tune_spaces
 
-.PHONY: help env demo test check unit gpu-test site notebooks bench clean
+.PHONY: help env demo test test-fast test-all check unit gpu-test site notebooks bench clean
 
 help:                ## this list
 	@grep -hE '^[a-z-]+: .*##|^[a-z-]+:  *##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 14
@@ -27,6 +27,12 @@ demo: env            ## a real small Ray Tune sweep (GPU if there is one), endin
 	$(RUN) -m msk_ray.tune --space cartpole_smoke --name demo
 
 test: check unit     ## everything that CI runs
+
+test-fast: env       ## the short tests, before every commit: two minutes on two cores
+	$(RUN) -m pytest -n 2 --dist loadfile -m 'not gpu and not slow and not long'
+
+test-all: check      ## `test`, and tests that take long and repeat a shorter one with other values
+	$(RUN) -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder -m 'not gpu'
 
 check: env           ## formatting, lint, spelling, layers and types
 	$(VENV)/bin/ruff format --check .

@@ -1,8 +1,10 @@
-"""What some tests need beyond Python packages: without it they fail in CI and are skipped, with a reason, elsewhere."""
+"""What some tests need beyond Python packages: without it they fail in CI and are skipped, with a reason, elsewhere.
+And what takes too long to run always."""
 
 import os
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -25,6 +27,11 @@ def need_drawing() -> str:
         return headless_backend()
     except DeviceError as error:
         return _missing(str(error))
+
+
+def slow(*values: object) -> list[Any]:
+    """Values of a parameter that only `make test-all` tries: others go through the same code."""
+    return [pytest.param(value, marks=pytest.mark.slow) for value in values]
 
 
 def need_file(path: Path, command: str) -> Path:

@@ -6,9 +6,12 @@ import sys
 from pathlib import Path
 
 import matplotlib
+import pytest
 
 from msk_ray.sweep.space import load_space
 from msk_ray.sweep.trials import resolve_trials
+
+pytestmark = pytest.mark.long
 
 EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
 

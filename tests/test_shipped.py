@@ -15,6 +15,8 @@ from msk_ray.config import load_config
 from msk_ray.errors import ConfigError
 from msk_ray.sweep.space import find_space, load_space
 
+pytestmark = pytest.mark.long
+
 
 def _build(source: Path, target: str, place: Path) -> Path:
     command = [sys.executable, "-m", "hatchling", "build", "-t", target, "-d", str(place)]

@@ -10,6 +10,8 @@ import pytest
 from msk_ray.cli import run
 from msk_ray.train import main
 
+pytestmark = pytest.mark.long
+
 
 def train(root: Path, cwd: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     environment = os.environ | {"PYTHONPATH": str(root)}

@@ -9,11 +9,13 @@ import signal
 import stat
 import subprocess
 import tempfile
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from processes import wait_until
+
+pytestmark = pytest.mark.long
 
 PAUSE = """
         if [ "$PAUSE_AT" = {name} ]; then
@@ -69,15 +71,6 @@ FAKES = {
         if [ -n "$DRIVER_EXITS" ]; then exit "$DRIVER_EXITS"; fi
         while true; do /bin/sleep 0.02; done""",
 }
-LIMIT_S = 120.0
-"""Far more than anything here takes on a busy machine."""
-
-
-def until(condition: Callable[[], object], what: str) -> None:
-    deadline = time.monotonic() + LIMIT_S
-    while not condition():
-        assert time.monotonic() < deadline, what
-        time.sleep(0.02)
 
 
 @pytest.fixture
@@ -136,7 +129,7 @@ class Job:
 
     def end(self, process: "subprocess.Popen[str]") -> tuple[int, str]:
         """Exit code and output of one that is about to end."""
-        output, _ = process.communicate(timeout=LIMIT_S)
+        output, _ = process.communicate()
         return process.returncode, output
 
     def lines(self, beginning: str) -> list[str]:
@@ -144,7 +137,7 @@ class Job:
         return [line for line in text.splitlines() if line.startswith(beginning)]
 
     def wait_for(self, line: str, count: int = 1) -> None:
-        until(lambda: len(self.lines(line)) >= count, f"no {line!r}")
+        wait_until(lambda: len(self.lines(line)) >= count)
 
     def left_over(self) -> list[str]:
         """What the job left in the project's folder."""

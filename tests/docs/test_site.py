@@ -16,6 +16,8 @@ import pytest
 from msk_ray import __main__ as commands
 from msk_ray.visualize import __main__ as visualize
 
+pytestmark = pytest.mark.long
+
 TINY = (
     *("env.nworld=4", "shac.critic_iterations=1", "shac.critic_batches=1", "actor.hidden=[8]", "critic.hidden=[8]"),
     *("trial.epochs=2", "evaluation.interval=1", "evaluation.nworld=2", "evaluation.steps=10"),

@@ -11,6 +11,8 @@ import pytest
 
 from msk_ray.experiment.manifest import Experiment
 
+pytestmark = pytest.mark.long
+
 TUTORIALS = Path(__file__).resolve().parents[2] / "docs" / "tutorials"
 SOURCES = sorted(TUTORIALS.glob("*.py"))
 LARGEST = 400_000

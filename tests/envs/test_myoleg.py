@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from needs import slow
 
 from msk_ray.config import PhysicsConfig
 from msk_ray.envs import make_env
@@ -18,6 +19,8 @@ from msk_ray.envs.myoleg.model import SUBSTEPS, Couplings, build_myoleg, find_mo
 from msk_ray.errors import ConfigError
 from msk_ray.gradcheck import check_chain, check_gradients, make_states
 from msk_ray.simulation import Simulation, TapePerSubstep
+
+pytestmark = pytest.mark.long
 
 needs_myo_sim = pytest.mark.skipif(
     importlib.util.find_spec("myo_sim") is None, reason="myo_sim is not installed: pip install myo-sim"
@@ -112,7 +115,7 @@ def legs26() -> mujoco.MjModel:
 
 @needs_myo_sim
 @pytest.mark.parametrize("name", ["myolegs26", "myolegs"])
-@pytest.mark.parametrize("substeps", [1, 8])
+@pytest.mark.parametrize("substeps", [1, *slow(8)])
 def test_gradients_of_a_step(name: str, substeps: int) -> None:
     model = build_myoleg(MyoLegSettings(name="myoleg", model=name, source="myo_sim"), PhysicsConfig())
     if name == "myolegs":
@@ -123,6 +126,7 @@ def test_gradients_of_a_step(name: str, substeps: int) -> None:
 
 
 @needs_myo_sim
+@pytest.mark.slow  # as of myoleg26, whose model is ours
 def test_gradients_through_eight_control_steps(legs26: mujoco.MjModel) -> None:
     points = [*make_states(legs26, "standing", 1, 0), *make_states(legs26, "policy", 4, 0)[:1]]
     for result in check_chain(legs26, TapePerSubstep(), points, (8,), substeps=SUBSTEPS):

@@ -13,6 +13,8 @@ from msk_ray.envs.myoleg26.model import SUBSTEPS, build_myoleg26
 from msk_ray.gradcheck import check_chain, check_gradients, make_states
 from msk_ray.simulation import Simulation, TapePerSubstep
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def model() -> mujoco.MjModel:

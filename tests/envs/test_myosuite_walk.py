@@ -21,6 +21,8 @@ from msk_ray.gradcheck import check_gradients
 from msk_ray.simulation import Simulation, StepState
 from msk_ray.training import Trainer
 
+pytestmark = pytest.mark.long
+
 RECORDED = Path(__file__).parents[1] / "fixtures" / "myosuite_walk"
 
 

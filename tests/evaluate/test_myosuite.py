@@ -15,6 +15,8 @@ from msk_ray.evaluate.__main__ import main
 from msk_ray.evaluate.measure import read_evaluations
 from msk_ray.training import Trainer
 
+pytestmark = pytest.mark.long
+
 # Episodes without end (init), or of 3 steps that end with a fall (random). A step's reward is its number plus the seed.
 STAND_IN = """
 import types

@@ -29,6 +29,8 @@ from msk_ray.export.network import PolicyToControl, largest_difference
 from msk_ray.shipped import shipped_folder
 from msk_ray.simulation import StepState
 
+pytestmark = pytest.mark.long
+
 CHECKPOINT = shipped_folder() / "policies" / "cartpole.pt"
 
 

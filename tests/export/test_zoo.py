@@ -24,6 +24,8 @@ from msk_ray.export.write import export as export_files
 from msk_ray.shipped import shipped_folder
 from msk_ray.visualize.__main__ import main as visualize
 
+pytestmark = pytest.mark.long
+
 SHIPPED = shipped_folder() / "policies"
 SECONDS = 3.0
 """How long each trained policy acts here."""

@@ -11,6 +11,8 @@ from msk_ray.gradcheck.__main__ import main
 from msk_ray.simulation import Simulation, TapePerSubstep
 from msk_ray.simulation.modes import BACKWARD_MODES
 
+pytestmark = pytest.mark.long
+
 FAST = ["--worlds", "2", "--states", "random"]
 UNSUPPORTED = """
 <mujoco><option noslip_iterations="2"/><worldbody>

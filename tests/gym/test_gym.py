@@ -20,6 +20,8 @@ from msk_ray.gym import BatchedEnv, SingleEnv
 from msk_ray.gym.c_simulation import CSimulation
 from msk_ray.gym.stable_baselines import StableBaselinesEnv
 
+pytestmark = pytest.mark.long
+
 
 def _cartpole(**changes: Any) -> Config:
     return parse_config(overlay(load_config("cartpole").as_dict(), changes))

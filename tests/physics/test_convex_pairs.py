@@ -18,6 +18,8 @@ from msk_ray.physics.adjoint.convex import convex_wrenches, solid_of
 from msk_ray.physics.adjoint.convex_laws import Bars, Seen
 from msk_ray.physics.adjoint.groups import Meshes, Shapes, gather
 
+pytestmark = pytest.mark.long
+
 CURVED_SHAPES = {"ellipsoid", "cylinder", "capsule"}
 SHAPES = {
     "hfield": 'type="hfield" hfield="hills"',

@@ -16,6 +16,8 @@ from msk_ray.gradcheck.check import forward_mismatch
 from msk_ray.gradcheck.pullback import simulated_gradients
 from msk_ray.simulation import Simulation, TapePerSubstep
 
+pytestmark = pytest.mark.long
+
 EPS = 1e-6
 DEPTH = 1e-3
 """How deep every pair of geometries penetrates [m]."""

@@ -12,6 +12,8 @@ from msk_ray.envs import make_env
 from msk_ray.sweep.space import load_space
 from msk_ray.sweep.trials import resolve_trials
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture
 def folder(tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch) -> Path:

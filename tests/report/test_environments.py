@@ -4,6 +4,8 @@ import json
 import time
 from pathlib import Path
 
+import pytest
+
 from msk_ray.config import dump_yaml
 from msk_ray.experiment.outcomes import Ending, Outcome, write_ending
 from msk_ray.report.__main__ import main
@@ -12,6 +14,8 @@ from msk_ray.report.tables import baseline_of, variant_rows
 from msk_ray.sweep import opening
 from msk_ray.sweep.space import parse_space
 from msk_ray.sweep.trials import resolve_trials
+
+pytestmark = pytest.mark.long
 
 
 def test_each_environment_is_a_part_of_the_page(tmp_path: Path) -> None:

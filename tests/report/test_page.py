@@ -16,6 +16,8 @@ from msk_ray.experiment.results import best_record, read_records
 from msk_ray.report.__main__ import main
 from msk_ray.report.best import strip_text
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def reported(sweep: Experiment, tmp_path_factory: pytest.TempPathFactory) -> Experiment:

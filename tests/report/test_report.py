@@ -33,6 +33,8 @@ from msk_ray.sweep import opening
 from msk_ray.sweep.space import parse_space
 from msk_ray.sweep.trials import base_settings, make_trial, resolve_trials
 
+pytestmark = pytest.mark.long
+
 
 def row(epoch: int, score: float | None = None) -> dict[str, Any]:
     base = {"epoch": epoch, "env_steps": 100 * epoch, "seconds": 2.0 * epoch, "env_steps_per_s": 50.0}

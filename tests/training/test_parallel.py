@@ -21,6 +21,8 @@ from msk_ray.group import Group, PeerLost
 from msk_ray.training import ParallelTrainer, Trainer, make_trainer, parallel, read_checkpoint
 from msk_ray.training.parallel import _Answer, _Failure, _Rank
 
+pytestmark = pytest.mark.long
+
 SETTINGS: dict[str, Any] = {
     "env": {"name": "cartpole", "nworld": 8, "episode_length": 10},
     "physics": {"randomize": {"dof_damping": {"low": 0.5, "high": 2.0, "mode": "value"}}},

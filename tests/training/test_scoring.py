@@ -16,6 +16,8 @@ from msk_ray.training import Evaluator, Trainer, read_metrics
 from msk_ray.training.checkpoint import milestones, read_checkpoint, unscored_checkpoints
 from msk_ray.training.policy_group import Policy
 
+pytestmark = pytest.mark.long
+
 
 def tiny() -> dict[str, Any]:
     """A trial with evaluations after epochs 0, 2, 4 and 6."""

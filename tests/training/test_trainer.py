@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 import yaml
+from needs import slow
 from processes import Launcher, catches, wait_until
 
 from msk_ray.config import Config, parse_config
@@ -159,6 +160,7 @@ def rows_in(metrics: Path) -> int:
     return len(metrics.read_text().splitlines()) if metrics.exists() else 0
 
 
+@pytest.mark.long
 def test_killing_the_train_command_loses_nothing(
     root: Path, tiny_cartpole: Config, tmp_path: Path, launcher: Launcher
 ) -> None:
@@ -176,7 +178,8 @@ def test_killing_the_train_command_loses_nothing(
     assert comparable(read_metrics(metrics)) == comparable(whole)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP])
+@pytest.mark.long
+@pytest.mark.parametrize("number", [signal.SIGTERM, *slow(signal.SIGUSR1, signal.SIGHUP)])
 def test_a_signal_saves_and_says_resumable(
     number: signal.Signals, root: Path, tiny_cartpole: Config, tmp_path: Path, launcher: Launcher
 ) -> None:

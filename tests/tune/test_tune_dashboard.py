@@ -20,6 +20,8 @@ from msk_ray.signals import RESUMABLE
 from msk_ray.sweep.trials import resolve_trials
 from msk_ray.tune.trainable import in_frame_named
 
+pytestmark = pytest.mark.long
+
 LIMIT_MS = 300_000
 """How long a page may take on a busy machine [ms]; only a failure takes so long."""
 

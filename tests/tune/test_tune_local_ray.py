@@ -12,6 +12,8 @@ import pytest
 from msk_ray.errors import ClusterLost, StorageError
 from msk_ray.tune import local_ray
 
+pytestmark = pytest.mark.long
+
 SESSION = """
 import ipaddress, json, os, shutil, sys
 import ray, psutil

@@ -20,6 +20,8 @@ from msk_ray.experiment.metrics import read_rows
 from msk_ray.experiment.results import read_records
 from msk_ray.signals import RESUMABLE
 
+pytestmark = pytest.mark.long
+
 EPOCHS = 20
 HANG_S = 10.0
 

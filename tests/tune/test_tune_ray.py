@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from needs import slow
 from stub_runs import go, outcomes
 from stub_trainer import (
     BEHAVIOUR,
@@ -34,7 +35,7 @@ from msk_ray.sweep.trials import resolve_trials
 from msk_ray.tune import driver
 from msk_ray.tune.trial_run import Hooks, run_trial
 
-pytestmark = pytest.mark.usefixtures("stub_session")
+pytestmark = [pytest.mark.usefixtures("stub_session"), pytest.mark.long]
 
 
 def test_faults_are_named_and_killed_or_hung_trials_go_on(
@@ -103,7 +104,7 @@ def gone(path: Path, what: str, before: threading.Event) -> None:
     source.rename(path.parent / "elsewhere")
 
 
-@pytest.mark.parametrize("what", ["experiment", "manifest", "trial"])
+@pytest.mark.parametrize("what", ["experiment", *slow("manifest", "trial")])
 def test_what_has_gone_stops_the_sweep_and_is_not_made_again(
     what: str, make_space: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -39,6 +39,8 @@ from msk_ray.tune import driver
 from msk_ray.tune.trial_run import Hooks, run_trial
 from msk_ray.visualize import __main__ as visualize
 
+pytestmark = pytest.mark.long
+
 RECORDED = Path(__file__).parents[1] / "fixtures" / "recorded"
 CONFIGS = sorted((RECORDED / "configs").glob("*.yaml"))
 

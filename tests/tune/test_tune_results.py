@@ -29,6 +29,8 @@ from msk_ray.tune.__main__ import main as tune
 from msk_ray.tune.devices import Placement, choose_placement, processes_of, wait_for_memory
 from msk_ray.tune.finish import finish, write_report
 
+pytestmark = pytest.mark.long
+
 
 def fill(experiment: Experiment, trial_id: str, scores: list[float | None], ending: Ending | None) -> None:
     """Metrics with an evaluation every second epoch, one of them written twice."""

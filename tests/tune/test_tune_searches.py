@@ -26,7 +26,7 @@ from msk_ray.sweep.trials import resolve_trials
 from msk_ray.tune import driver, worker_prestart
 from msk_ray.tune.devices import Placement
 
-pytestmark = pytest.mark.usefixtures("stub_session")
+pytestmark = [pytest.mark.usefixtures("stub_session"), pytest.mark.long]
 
 
 def test_asha_stops_the_bad_ones_and_a_stop_request_is_resumable(

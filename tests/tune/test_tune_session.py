@@ -12,6 +12,8 @@ import pytest
 
 from msk_ray.tune.options import parser
 
+pytestmark = pytest.mark.long
+
 ABSENT = "127.0.0.1:1"
 """Nobody listens there."""
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from needs import slow
 from processes import Launcher, catches, members_of, wait_until
 from stub_trainer import HELD_AT
 
@@ -20,6 +21,8 @@ from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.results import read_records
 from msk_ray.signals import NUMBERS, RESUMABLE, listening
 from msk_ray.tune import interrupts
+
+pytestmark = pytest.mark.long
 
 Start = Callable[..., "subprocess.Popen[str]"]
 
@@ -54,7 +57,7 @@ def held(experiment: Experiment) -> bool:
     return len(list(experiment.path.glob(f"trials/*/checkpoints/epoch_{HELD_AT:06d}.pt"))) == 2
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGUSR1])
+@pytest.mark.parametrize("number", [signal.SIGTERM, *slow(signal.SIGUSR1)])
 def test_a_signal_to_the_whole_group_lets_trials_save_themselves(
     number: signal.Signals, start: Start, experiment: Experiment, tmp_path: Path
 ) -> None:

@@ -26,6 +26,8 @@ from msk_ray.visualize.film import write_video
 from msk_ray.visualize.look import ACTIVE, RELAXED, Look, muscle_tendons
 from msk_ray.visualize.render import States, View, frames, headless_backend
 
+pytestmark = pytest.mark.long
+
 MUSCLE = """
 <mujoco>
   <option gravity="0 0 0"/>

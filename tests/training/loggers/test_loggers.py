@@ -21,6 +21,8 @@ from msk_ray.training import Trainer, precompile
 from msk_ray.training.loggers import TrialLog
 from msk_ray.training.loggers.tensorboard import board_tag, log_image
 
+pytestmark = pytest.mark.long
+
 OUTSIDE = """
 from msk_ray import Logger
 class Heard(Logger):
