@@ -89,7 +89,8 @@ def job(tmp_path: Path, root: Path) -> Iterator["Job"]:
     for process in made.started:
         with contextlib.suppress(ProcessLookupError):  # all of it has ended
             os.killpg(process.pid, signal.SIGKILL)
-        process.communicate()
+        if process.stdout is not None and not process.stdout.closed:  # its output has not been read
+            process.communicate()
     shutil.rmtree(made.disk)
 
 
