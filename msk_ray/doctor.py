@@ -18,7 +18,8 @@ from pathlib import Path
 
 import msk_ray
 from msk_ray.cli import Parser, run
-from msk_ray.errors import MskRayError, StorageError
+from msk_ray.config import SET_HELP
+from msk_ray.errors import ConfigError, MskRayError, StorageError
 from msk_ray.files import make_folder
 from msk_ray.nvidia_smi import ask_driver
 
@@ -30,7 +31,8 @@ Each line says ok, or what to fix. Exit code: 0 if there is nothing to fix, 1 ot
 EXAMPLES = """\
   python -m msk_ray.doctor
   python -m msk_ray.doctor --device cuda:1 --storage /shared/runs
-  python -m msk_ray.doctor --device cpu          # do not use the GPUs"""
+  python -m msk_ray.doctor --device cpu          # do not use the GPUs
+  python -m msk_ray.doctor --repeat ant --set trial.deterministic=true      # does this trial repeat bit for bit?"""
 
 RAY_LIMIT_S = 90.0
 """Ray starts within seconds; on a loaded machine with a cold disk it may take ten times as long."""
@@ -81,12 +83,27 @@ def parser() -> Parser:
     p.add_argument(
         "--storage", type=Path, default=Path("runs"), metavar="DIR", help="folder of experiments (default: runs/)"
     )
+    p.add_argument(
+        "--repeat", metavar="CONFIG", help="only this: train a trial twice and say where the two runs begin to differ"
+    )
+    p.add_argument("--epochs", type=int, metavar="N", help="epochs to train with --repeat (default: 3)")
+    p.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help=SET_HELP)
     return p
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
+    if args.repeat is not None:
+        return _report(
+            [
+                lambda: [
+                    check_repeat(args.repeat, args.overrides, args.device, 3 if args.epochs is None else args.epochs)
+                ]
+            ]
+        )
+    if args.epochs is not None or args.overrides:
+        raise ConfigError("--epochs and --set go with --repeat CONFIG")
     checks: list[Callable[[], list[Finding]]] = [
         check_python,
         check_packages,
@@ -96,6 +113,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         lambda: [check_ray()],
         lambda: [check_storage(args.storage)],
     ]
+    return _report(checks)
+
+
+def _report(checks: list[Callable[[], list[Finding]]]) -> int:
     broken = 0
     for check in checks:
         # Print each line as soon as it is known: kernels may take a minute to compile.
@@ -107,6 +128,30 @@ def main(argv: Sequence[str] | None = None) -> int:
             break
     print(f"{broken} problem(s) to fix" if broken else "all checks passed")
     return 1 if broken else 0
+
+
+def check_repeat(name: str, overrides: Sequence[str], device: str | None, epochs: int) -> Finding:
+    """Whether a trial does the same twice, to the last bit; if not, where it begins to differ."""
+    from msk_ray.config import load_config
+    from msk_ray.repeat import compare
+
+    if epochs < 1:
+        raise ConfigError(f"--epochs {epochs}: write 1 or more")
+    config = load_config(name, overrides)
+    if config.trial.gpus > 1:
+        raise ConfigError("--repeat compares trials of one process: write --set trial.gpus=1")
+    place = device or _first_device()
+    found, count = compare(config, place, epochs)
+    if found is None:
+        return Finding("repeat", f"{epochs} epochs on {place} twice: {count} tensors are equal to the last bit")
+    cure = "" if config.trial.deterministic or place == "cpu" else "; write trial.deterministic: true"
+    return Finding("repeat", f"two runs on {place} differ first {found}{cure}", True)
+
+
+def _first_device() -> str:
+    import torch
+
+    return "cuda:0" if torch.cuda.is_available() else "cpu"
 
 
 def check_python() -> list[Finding]:

@@ -3,11 +3,13 @@
 import os
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from msk_ray import doctor
+from msk_ray import doctor, repeat
 from msk_ray.cli import run
+from msk_ray.config import dump_yaml
 from msk_ray.doctor import GpuFacts, check_ray, check_storage, gpu_findings, main, package_findings
 
 NO_GPU = GpuFacts(None, 0, None, "12.8", 0, (12, 9), 0, None)
@@ -139,3 +141,48 @@ def test_without_its_packages_it_says_so_and_stops(
         "FIX   packages  no_such_module_here cannot be imported: nothing else was checked",
         "1 problem(s) to fix",
     ]
+
+
+@pytest.fixture
+def small_trial(tmp_path: Path, tiny_settings: dict[str, Any]) -> str:
+    path = tmp_path / "small.yaml"
+    path.write_text(dump_yaml(tiny_settings))
+    return str(path)
+
+
+def test_a_trial_that_repeats(small_trial: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--repeat", small_trial, "--device", "cpu", "--epochs", "2"]) == 0
+    assert "2 epochs on cpu twice: " in capsys.readouterr().out
+
+
+def test_a_trial_that_does_not_repeat(
+    small_trial: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs = iter(
+        [
+            [(0, "worlds", "qpos", "a"), (1, "rollout", "rewards", "b"), (1, "rollout", "qpos", "c")],
+            [(0, "worlds", "qpos", "a"), (1, "rollout", "rewards", "x"), (1, "rollout", "qpos", "y")],
+        ]
+    )
+    monkeypatch.setattr(repeat, "run_once", lambda *_: next(runs))
+    assert main(["--repeat", small_trial, "--device", "cuda:0"]) == 1
+    line = capsys.readouterr().out.splitlines()[0]
+    assert line.startswith("FIX")
+    assert "differ first in epoch 1, stage rollout: rewards, qpos; write trial.deterministic: true" in line
+
+
+def test_where_two_runs_begin_to_differ() -> None:
+    one: list[repeat.Noted] = [(0, "worlds", "qpos", "a"), (1, "draws", "noise", "b"), (1, "rollout", "rewards", "c")]
+    assert repeat.first_difference(one, list(one)) is None
+    other = [*one[:2], (1, "rollout", "rewards", "d")]
+    assert repeat.first_difference(one, other) == repeat.Difference(1, "rollout", ("rewards",))
+    assert str(repeat.first_difference(one, one[:2])) == "in epoch 1, stage rollout: rewards"
+    assert str(repeat.first_difference([], one)) == "before the first epoch, stage worlds: qpos"
+
+
+def test_options_of_repeat_are_not_ignored(small_trial: str, capsys: pytest.CaptureFixture[str]) -> None:
+    for words in (["--epochs", "3"], ["--set", "trial.seed=1"]):
+        assert run(main, words) != 0
+        assert "go with --repeat" in capsys.readouterr().err
+    assert run(main, ["--repeat", small_trial, "--epochs", "0"]) != 0
+    assert run(main, ["--repeat", small_trial, "--set", "trial.gpus=2"]) != 0

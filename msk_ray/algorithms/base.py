@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
+from msk_ray.algorithms.witness import Witness
 from msk_ray.config import ALGORITHMS, AlgorithmSettings, Config, check_installed, resolve_class
 from msk_ray.envs import Env
 from msk_ray.errors import ConfigError
@@ -47,8 +48,10 @@ class Algorithm(ABC):
         settings: the algorithm's part of it, of type `Settings`.
         env: the worlds it trains in.
         network: the policy, on the environment's device.
+        witness: notes what every stage of an epoch computes, if that is wanted.
     """
 
+    witness: Witness | None = None
     Settings: ClassVar[type[AlgorithmSettings]] = AlgorithmSettings
     draws_apart: ClassVar[bool] = False
     """Whether first weights, noise and minibatches come from generators of their own where `trial.seeds` names them."""
@@ -104,6 +107,16 @@ class Algorithm(ABC):
     def policy_state_dict(self) -> dict[str, Any]:
         """State of the modules that `policy` uses, by module name."""
         return {name: module.state_dict() for name, module in self.policy_modules(self.network).items()}
+
+    def note_state(self) -> None:
+        """Let the witness, if there is one, note the worlds and everything that is saved as a module."""
+        if self.witness is None:
+            return
+        physics, action, age, numbers = self.env.state.detach()
+        self.witness.note("worlds", {**physics._asdict(), "action": action, "age": age, "numbers": numbers})
+        for name, module in self.modules().items():
+            states = {key: value for key, value in module.state_dict().items() if isinstance(value, Tensor)}
+            self.witness.note(f"module {name}", states)
 
     def parameter_hash(self) -> str:
         """Digest of everything that is saved as a module: 32 hexadecimal digits."""

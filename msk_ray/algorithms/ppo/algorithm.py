@@ -119,6 +119,9 @@ class Ppo(Algorithm):
             with self._drawing("noise"):
                 rewards, done, diverged = self._collect()
             clock.mark("rollout")
+            if self.witness is not None:
+                storage = self.ppo.storage
+                self.witness.note("rollout", {**storage.observations, "rewards": rewards, "actions": storage.actions})
             values = self.ppo.storage.values.mean()
             with self._drawing("minibatches"):
                 losses = self.ppo.update()

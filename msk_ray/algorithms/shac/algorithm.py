@@ -113,7 +113,15 @@ class Shac(Algorithm):
         horizon = self._horizon.at(epoch)
         actor_lr = self._rate(c.actor_lr, epoch)
         self.actor_optimizer.set_rate(actor_lr)
-        outcome = self._runner.run_actor(self._draw(horizon, epoch))
+        inputs = self._draw(horizon, epoch)
+        if self.witness is not None:
+            self.witness.note("draws", {"noise": inputs.noise, **inputs.state.physics._asdict()})
+        outcome = self._runner.run_actor(inputs)
+        if self.witness is not None:
+            rolled = {"observations": outcome.obs, "rewards": outcome.rewards, "ends of episodes": outcome.done}
+            self.witness.note("rollout", {**rolled, **outcome.state.physics._asdict()})
+            self.witness.note("values", {"targets of the critic": outcome.targets})
+            self.witness.note("gradients", {"policy": torch.cat([p.flatten() for p in self.actor.parameters()])})
         # The fit before reads its rate until it ends, which the actor's work has waited for.
         self.critic_fit.optimizer.set_rate(self._rate(c.critic_lr, epoch))
         orders = self.critic_fit.draw_orders(outcome.targets.numel(), c.critic_iterations, self.minibatch_generator)
@@ -142,6 +150,11 @@ class Shac(Algorithm):
         }
         self._runner.adapt()
         return EpochResult(horizon * self._worlds, numbers)
+
+    def note_state(self) -> None:
+        """Let the witness, if there is one, note worlds and modules, once the critic's fit has ended."""
+        self._runner.join()
+        super().note_state()
 
     def parameter_hash(self) -> str:
         """Digest of policy, critics and statistics, once the critic's fit has ended."""

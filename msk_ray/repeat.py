@@ -1,0 +1,108 @@
+"""Whether a trial repeats: train it twice, each time in a fresh process, and compare every tensor by its bits."""
+
+import itertools
+import json
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from msk_ray.config import Config, dump_yaml, overlay, parse_config
+from msk_ray.errors import MskRayError, SimulationError
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Where two runs part."""
+
+    epoch: int
+    """Counted from 1; 0 is the start."""
+    stage: str
+    tensors: tuple[str, ...]
+    """Tensors of that stage that differ."""
+
+    def __str__(self) -> str:
+        where = "before the first epoch" if self.epoch == 0 else f"in epoch {self.epoch}"
+        return f"{where}, stage {self.stage}: {', '.join(self.tensors)}"
+
+
+Noted = tuple[int, str, str, str]
+"""Epoch, stage, tensor and digest."""
+
+
+def first_difference(first: list[Noted], second: list[Noted]) -> Difference | None:
+    """The first stage in which two runs differ, None if they are the same to the last bit."""
+    for a, b in itertools.zip_longest(first, second):
+        if a != b:
+            epoch, stage = (a or b)[:2]
+            ours, theirs = ({n: d for e, s, n, d in run if (e, s) == (epoch, stage)} for run in (first, second))
+            names = [n for n in {**ours, **theirs} if ours.get(n) != theirs.get(n)]
+            return Difference(epoch, stage, tuple(names))
+    return None
+
+
+def compare(config: Config, device: str, epochs: int) -> tuple[Difference | None, int]:
+    """Train the first epochs of a trial twice.
+
+    Args:
+        config: the trial.
+        device: cpu or cuda:N.
+        epochs: how many.
+
+    Returns:
+        The first difference, and the number of tensors compared.
+
+    Raises:
+        SimulationError: the trial fails.
+    """
+    first, second = (run_once(config, device, epochs) for _ in range(2))
+    return first_difference(first, second), len(first)
+
+
+def run_once(config: Config, device: str, epochs: int) -> list[Noted]:
+    """What a process notes that trains the first epochs of a trial.
+
+    Raises:
+        SimulationError: it fails.
+    """
+    changed = {
+        "trial.epochs": max(epochs, config.trial.epochs),
+        "trial.checkpoint_interval": epochs + 1,
+        "trial.loggers": [],
+    }
+    whole = parse_config(overlay(config.as_dict(), changed), "a repeated trial")
+    with tempfile.TemporaryDirectory(prefix="repeat_") as scratch:
+        path, out = Path(scratch) / "config.yaml", Path(scratch) / "noted.json"
+        path.write_text(dump_yaml(whole.as_dict()))
+        command = [sys.executable, "-m", "msk_ray.repeat", str(path), device, str(epochs), str(out)]
+        done = subprocess.run(command, capture_output=True, text=True)
+        if done.returncode or not out.exists():
+            last = (done.stderr.strip().splitlines() or ["without a word"])[-1]
+            raise SimulationError(f"the trial failed: {last}")
+        return [(int(e), str(s), str(n), str(d)) for e, s, n, d in json.loads(out.read_text())]
+
+
+def _train(path: Path, device: str, epochs: int, out: Path) -> None:
+    """Train here, and write what was noted."""
+    from msk_ray.algorithms.witness import Witness
+    from msk_ray.config import load_config
+    from msk_ray.training import Trainer
+
+    witness = Witness()
+    trainer = Trainer(load_config(path), out.parent / "trial", device)
+    trainer.algorithm.witness = witness
+    trainer.algorithm.note_state()
+    for epoch in range(1, epochs + 1):
+        witness.epoch = epoch
+        trainer.run_epoch()
+        trainer.algorithm.note_state()
+    trainer.close()
+    out.write_text(json.dumps(witness.noted))
+
+
+if __name__ == "__main__":
+    try:
+        _train(Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]), Path(sys.argv[4]))
+    except MskRayError as error:
+        sys.exit(" ".join(str(error).split()))
