@@ -12,10 +12,12 @@ from msk_ray.cli import Parser, run
 from msk_ray.errors import CheckpointError, ConfigError, MskRayError
 from msk_ray.evaluate import zoo
 from msk_ray.evaluate.apart import PYTHON, find_python
+from msk_ray.evaluate.stored import FORMAT, eval_file_of, store_evaluation
 from msk_ray.evaluate.targets import Kind, Target, best_checkpoint, best_of_trial, find_target
 from msk_ray.evaluate.vary import HELP, parse_vary, vary_text
 from msk_ray.experiment.attempts import read_attempt
 from msk_ray.experiment.checkpoint_file import read_facts
+from msk_ray.experiment.layout import EVAL_FILE
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.files import write_json
 from msk_ray.shipped import is_shipped
@@ -172,7 +174,7 @@ def _python_apart(args: argparse.Namespace) -> Path | None:
 
 def _evaluate_one(target: Target, bench: "Bench | MyoSuiteBench", requests: "Sequence[Request]", values: int) -> int:
     """Evaluate one policy; every `values` requests are of one physics, with different values of a parameter."""
-    from msk_ray.evaluate.measure import check_varied, eval_file_of, store_evaluation
+    from msk_ray.evaluate.measure import check_varied
     from msk_ray.training import load_policy
 
     path = best_checkpoint(target)
@@ -233,7 +235,7 @@ def evaluate_experiment(experiment: Experiment, bench: "Bench | MyoSuiteBench", 
     Returns:
         The exit code: 1 if a policy could not be evaluated.
     """
-    from msk_ray.evaluate.measure import EVAL_FILE, FORMAT, check_varied, eval_file_of, store_evaluation
+    from msk_ray.evaluate.measure import check_varied
     from msk_ray.training import load_policy
 
     trials = experiment.trials()

@@ -9,6 +9,7 @@ from typing import Any
 from msk_ray.cli import Parser, run
 from msk_ray.errors import ConfigError, brief
 from msk_ray.evaluate.__main__ import positive
+from msk_ray.evaluate.stored import eval_file_of, store_evaluation
 from msk_ray.evaluate.targets import best_checkpoint, find_target, trial_folder_of
 from msk_ray.files import write_json
 from msk_ray.shipped import is_shipped
@@ -56,7 +57,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     paths = [best_checkpoint(find_target(target, args.storage)) for target in args.targets]
     speeds: list[float | None] = [None] if args.speeds is None else [*_speeds(args.speeds)]
 
-    from msk_ray.evaluate.measure import Bench, Request, default_device, eval_file_of, store_evaluation
+    from msk_ray.evaluate.measure import Bench, Request, default_device
     from msk_ray.gait.picture import draw
     from msk_ray.gait.walk import at_target_speed, walk
     from msk_ray.training import load_policy

@@ -1,6 +1,5 @@
 """`python -m msk_ray.report`: the results of an experiment on one page, read from its files."""
 
-import shlex
 import sys
 import time
 from collections.abc import Sequence
@@ -10,10 +9,9 @@ from pathlib import Path
 from msk_ray.cli import Parser, run
 from msk_ray.errors import ConfigError
 from msk_ray.evaluate.targets import find_experiment
-from msk_ray.experiment.manifest import Experiment
 from msk_ray.files import make_folder
 from msk_ray.report.best import Best, look_at_best
-from msk_ray.report.page import compare, make_section, places_of, write_page
+from msk_ray.report.page import command_of, compare, make_section, places_of, write_page
 from msk_ray.report.reading import Condition, Reading, check_folder, read_experiment
 from msk_ray.text import printable
 
@@ -88,15 +86,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(printable(f"{reading.name}: {warning}"))
     print(printable(f"report       {page}"))
     return 0
-
-
-def command_of(experiments: Sequence[Experiment], storage: Path) -> str:
-    """The command that writes the page of these experiments."""
-    if all(experiment.path.parent == storage.resolve() for experiment in experiments):
-        words = [*(experiment.name for experiment in experiments), "--storage", str(storage)]
-    else:
-        words = [str(experiment.path) for experiment in experiments]
-    return shlex.join(["python", "-m", "msk_ray.report", *words])
 
 
 def _best(reading: Reading, folder: Path, prefix: str, mode: str, device: str | None) -> Best | None:

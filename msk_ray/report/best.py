@@ -1,16 +1,18 @@
 """The best policy of an experiment: its evaluation and its film strip, made once for each checkpoint and stored."""
 
 import io
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from PIL import Image, PngImagePlugin
 
 from msk_ray.errors import CheckpointError, MskRayError
+from msk_ray.evaluate.stored import eval_file_of, read_evaluations, store_evaluation
 from msk_ray.evaluate.targets import best_of_trial
 from msk_ray.experiment.checkpoint_file import read_facts
+from msk_ray.experiment.layout import EVAL_FILE
 from msk_ray.files import write_bytes
 from msk_ray.report.reading import TrialReading, explain
 
@@ -25,6 +27,8 @@ class Best:
     """What is known of the best trial's best policy."""
 
     trial: TrialReading
+    sha: str | None = None
+    """Of the policy's checkpoint; None if there is none that can be read."""
     evaluations: tuple[Mapping[str, Any], ...] = ()
     """Entries of its `eval.json` that belong to this checkpoint, the canonical one first."""
     strip: Path | None = None
@@ -44,13 +48,37 @@ def look_at_best(trial: TrialReading, folder: Path, prefix: str, make: bool, dev
         make: evaluate and draw what does not exist yet; otherwise only show what exists.
         device: device of the simulation; None: the first GPU, or the CPU.
     """
-    missing: list[str] = []
-    try:
-        path = best_of_trial(trial.folder)
-        # Loads torch, for which a report without simulation should not wait.
-        from msk_ray.evaluate.measure import EVAL_FILE, read_evaluations
+    found = stored_best(trial, [folder / f"{prefix}{STRIP}.png"])
+    if found.sha is None:
+        return found
+    path, strip = best_of_trial(trial.folder), folder / f"{prefix}{STRIP}.png"
+    missing = []
+    if make:
+        try:
+            if not any(entry["canonical"] for entry in found.evaluations):
+                _evaluate(path, device)
+        except (MskRayError, OSError) as error:
+            missing.append(f"It could not be evaluated: {explain(error)}.")
+        try:
+            if found.strip is None:
+                _draw(path, strip, found.sha, device)
+        except (MskRayError, OSError) as error:
+            missing.append(f"Its film strip could not be drawn: {explain(error)}.")
+        found = stored_best(trial, [strip])
+    elif found.strip is None:
+        missing.append("Its film strip has not been drawn yet: add --best always.")
+    return replace(found, missing=(*found.missing, *missing))
 
-        facts = read_facts(path)
+
+def stored_best(trial: TrialReading, strips: Sequence[Path]) -> Best:
+    """What is on disk about a trial's best policy.
+
+    Args:
+        strips: film strips, of which that of this policy is taken.
+    """
+    missing = []
+    try:
+        facts = read_facts(best_of_trial(trial.folder))
         sha = facts["sha256"]
     except (MskRayError, KeyError) as error:
         return Best(trial, missing=(f"There is no policy to look at: {explain(error)}.",))
@@ -62,24 +90,13 @@ def look_at_best(trial: TrialReading, folder: Path, prefix: str, make: bool, dev
     entries: list[dict[str, Any]] = []
     try:
         entries = _own(read_evaluations(trial.folder / EVAL_FILE), sha)
-        if make and not any(entry["canonical"] for entry in entries):
-            _evaluate(path, device)
-            entries = _own(read_evaluations(trial.folder / EVAL_FILE), sha)
-    except (MskRayError, OSError) as error:
-        missing.append(f"It could not be evaluated: {explain(error)}.")
-    strip = folder / f"{prefix}{STRIP}.png"
-    text = strip_text(strip, sha)
-    if text is None and make:
-        try:
-            _draw(path, strip, sha, device)
-            text = strip_text(strip, sha)
-        except (MskRayError, OSError) as error:
-            missing.append(f"Its film strip could not be drawn: {explain(error)}.")
-    elif text is None:
-        missing.append("Its film strip has not been drawn yet: add --best always.")
-    if text is None:
-        return Best(trial, tuple(entries), missing=tuple(missing))
-    return Best(trial, tuple(entries), strip, text, narrow_strip(strip), tuple(missing))
+    except MskRayError as error:
+        missing.append(f"Its evaluations cannot be read: {explain(error)}.")
+    for strip in strips:
+        text = strip_text(strip, sha)
+        if text is not None:
+            return Best(trial, sha, tuple(entries), strip, text, narrow_strip(strip), tuple(missing))
+    return Best(trial, sha, tuple(entries), missing=tuple(missing))
 
 
 def narrow_strip(strip: Path) -> Path:
@@ -104,7 +121,7 @@ def _own(entries: list[dict[str, Any]], sha: str) -> list[dict[str, Any]]:
 
 
 def _evaluate(path: Path, device: str | None) -> None:
-    from msk_ray.evaluate.measure import Bench, Request, default_device, eval_file_of, store_evaluation
+    from msk_ray.evaluate.measure import Bench, Request, default_device
     from msk_ray.training import load_policy
 
     policy = load_policy(path)

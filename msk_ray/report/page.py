@@ -2,12 +2,14 @@
 
 import base64
 import os
+import shlex
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import orjson
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -16,6 +18,7 @@ from markupsafe import Markup
 from msk_ray import __version__
 from msk_ray.cli import typed_command
 from msk_ray.errors import StorageFailure
+from msk_ray.experiment.manifest import Experiment
 from msk_ray.files import write_text
 from msk_ray.progress import format_duration
 from msk_ray.report.best import Best
@@ -86,7 +89,7 @@ class Section:
         return counts
 
     def link(self, path: Path) -> str:
-        return Path(os.path.relpath(path, self.folder)).as_posix()
+        return quote(Path(os.path.relpath(path, self.folder)).as_posix())
 
     def command(self) -> str:
         """The command line that was run, as a user would type it."""
@@ -141,6 +144,15 @@ def compare(readings: Sequence[Reading], places: Mapping[Path, int]) -> Picture 
         f"{reading.name}: {variant}": trials for reading in readings for variant, trials in reading.variants.items()
     }
     return learning_curves(groups, None, "together", places)
+
+
+def command_of(experiments: Sequence[Experiment], storage: Path) -> str:
+    """The command that writes the page of these experiments."""
+    if all(experiment.path.parent == storage.resolve() for experiment in experiments):
+        words = [*(experiment.name for experiment in experiments), "--storage", str(storage)]
+    else:
+        words = [str(experiment.path) for experiment in experiments]
+    return shlex.join(["python", "-m", "msk_ray.report", *words])
 
 
 def _several_environments(readings: Sequence[Reading]) -> bool:

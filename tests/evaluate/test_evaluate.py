@@ -12,7 +12,8 @@ import torch
 from msk_ray.cli import run
 from msk_ray.errors import CheckpointError
 from msk_ray.evaluate.__main__ import main
-from msk_ray.evaluate.measure import Bench, Request, figures, read_evaluations, store_evaluation
+from msk_ray.evaluate.measure import Bench, Request, figures
+from msk_ray.evaluate.stored import read_evaluations, store_evaluation
 from msk_ray.experiment.attempts import Attempt, Reduced
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.results import best_record, read_records

@@ -12,7 +12,7 @@ from myosuite_model import walk_model
 from msk_ray.cli import run
 from msk_ray.config import load_config
 from msk_ray.evaluate.__main__ import main
-from msk_ray.evaluate.measure import read_evaluations
+from msk_ray.evaluate.stored import read_evaluations
 from msk_ray.training import Trainer
 
 pytestmark = pytest.mark.long

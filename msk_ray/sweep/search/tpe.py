@@ -24,7 +24,7 @@ class OptunaSearch(Search):
         except ImportError:
             raise ConfigError("search: optuna needs the optuna package: pip install optuna") from None
         optuna.logging.set_verbosity(optuna.logging.ERROR)
-        self._distributions = {key: _distribution(key, op) for key, op in self.parameters.items()}
+        self._distributions = {key: distribution(key, op) for key, op in self.parameters.items()}
         directions = [*objectives.values()] if objectives else ["maximize"]
         self._study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=seed), directions=directions)
         self._open: list[Any] = []
@@ -49,7 +49,12 @@ class OptunaSearch(Search):
             self._study.add_trial(done)
 
 
-def _distribution(key: str, op: Operator) -> Any:
+def distribution(key: str, op: Operator) -> Any:
+    """Optuna's distribution of a parameter; listed values are known by their labels.
+
+    Raises:
+        ConfigError: it is of another kind than a list or a range.
+    """
     from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
     if isinstance(op, Listed):

@@ -1,0 +1,1 @@
+"""The live page: experiments served on this machine while their trials run."""

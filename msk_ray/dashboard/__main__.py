@@ -1,0 +1,143 @@
+"""`python -m msk_ray.dashboard`: the experiments of a storage folder as live pages in a browser."""
+
+import argparse
+import asyncio
+import contextlib
+import ipaddress
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from aiohttp import web
+
+from msk_ray.cli import Parser, run
+from msk_ray.dashboard.app import make_app
+from msk_ray.dashboard.films import Films
+from msk_ray.dashboard.guard import Access
+from msk_ray.dashboard.library import Library
+from msk_ray.errors import ConfigError, StorageError
+from msk_ray.experiment.layout import MANIFEST_FILE, SPACE_FILE
+from msk_ray.text import printable
+
+DESCRIPTION = """\
+Serve the report of every experiment in a folder as a page that follows its trials while they run: curves, effects,
+stops, gradients, failures and trials as in the report, a film of the best policy so far, several experiments side by
+side, notes on trials, and Optuna's plots (with the extra msk-ray[dashboard]).
+
+It reads the experiments' files and never touches the sweep. Only this machine can reach it, unless --host says
+otherwise; others can then read everything in the folder, and write notes only with --allow-notes. From another machine,
+an ssh tunnel is safer: ssh -L 8321:127.0.0.1:8321 HOST."""
+
+EXAMPLES = """\
+  python -m msk_ray.dashboard                       # the experiments in runs/, at http://127.0.0.1:8321/
+  python -m msk_ray.dashboard /shared/runs --port 0 --refresh 30
+  python -m msk_ray.dashboard --host 0.0.0.0        # for the network, read-only"""
+
+
+def parser() -> Parser:
+    """The command line."""
+    p = Parser("python -m msk_ray.dashboard", DESCRIPTION, EXAMPLES)
+    p.add_argument(
+        "storage", nargs="?", type=Path, default=Path("runs"), metavar="STORAGE", help="folder of experiments (runs/)"
+    )
+    p.add_argument("--host", default="127.0.0.1", metavar="ADDRESS", help="address to listen on (default: %(default)s)")
+    p.add_argument(
+        "--port", type=_port, default=8321, metavar="N", help="port (default: %(default)s; 0: any that is free)"
+    )
+    p.add_argument(
+        "--refresh", type=_seconds, default=5.0, metavar="S", help="seconds between looks at the files (default: 5)"
+    )
+    p.add_argument(
+        "--no-films",
+        action="store_true",
+        help="do not simulate and film the best policies, which takes one CPU core at low priority now and then",
+    )
+    p.add_argument("--allow-notes", action="store_true", help="with --host: whoever reaches it may write notes")
+    p.add_argument(
+        "--allow-host",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="a name under which a proxy, or the network, reaches it; addresses need none",
+    )
+    return p
+
+
+def _port(text: str) -> int:
+    if not text.isdigit() or int(text) > 65535:
+        raise argparse.ArgumentTypeError(f"must be a whole number from 0 to 65535, not {text}")
+    return int(text)
+
+
+def _seconds(text: str) -> float:
+    value = float(text)
+    if not 0.1 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"at least 0.1, not {text}")
+    return value
+
+
+_seconds.__name__ = "number"  # argparse names it where the text is none
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    args = parser().parse_args(argv)
+    if not args.storage.is_dir():
+        raise StorageError(f"no folder {args.storage}: give the folder of your experiments")
+    if (args.storage / MANIFEST_FILE).exists() or (args.storage / SPACE_FILE).exists():
+        raise StorageError(
+            f"{args.storage} is an experiment: give the folder above it, {args.storage.resolve().parent}"
+        )
+    local = _is_loopback(args.host)
+    if args.allow_notes and local and not args.allow_host:
+        raise ConfigError("--allow-notes: notes can be written from this machine anyway; leave it out")
+    names = tuple(name.lower() for name in args.allow_host)
+    access = Access(local, names, args.allow_notes or (local and not names))
+    films = None if args.no_films else Films()
+    try:
+        asyncio.run(_serve(Library(args.storage, args.refresh, access.may_write, films), access, args.host, args.port))
+    finally:
+        if films is not None:
+            films.close()
+    return 0
+
+
+def _is_loopback(host: str) -> bool:
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        raise ConfigError(f"--host {host}: write an address of this machine, such as 127.0.0.1 or 0.0.0.0") from None
+
+
+async def _serve(library: Library, access: Access, host: str, port: int) -> None:
+    """Answer until the process is asked to stop."""
+    stop = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    runner = web.AppRunner(make_app(library, access), access_log=None, shutdown_timeout=1.0)
+    await runner.setup()
+    try:
+        site = web.TCPSite(runner, host, port)
+        try:
+            await site.start()
+        except OSError as error:
+            why = error.strerror or str(error)
+            raise ConfigError(f"cannot listen on {host} port {port}: {why}; write another --port, or 0") from None
+        shown = next(iter(runner.addresses))
+        address = f"[{shown[0]}]" if ":" in shown[0] else shown[0]
+        notes = "" if access.may_write else ", read-only"
+        print(
+            printable(f"dashboard    http://{address}:{shown[1]}/ ({library.storage}{notes}); Ctrl-C ends it"),
+            flush=True,
+        )
+        await stop.wait()
+    finally:
+        with contextlib.suppress(asyncio.CancelledError):
+            await runner.cleanup()
+
+
+if __name__ == "__main__":
+    sys.exit(run(main))

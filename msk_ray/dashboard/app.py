@@ -1,0 +1,153 @@
+"""The addresses of the dashboard and what they answer."""
+
+import asyncio
+from collections.abc import Sequence
+from functools import cache
+from importlib.resources import files
+from typing import Any
+from urllib.parse import quote, urlencode
+
+from aiohttp import web
+
+from msk_ray.dashboard.guard import Access, guard, set_headers
+from msk_ray.dashboard.library import Library, Unknown
+from msk_ray.dashboard.plots import plotly_library
+from msk_ray.errors import ConfigError, MskRayError
+from msk_ray.experiment.notes import write_note
+from msk_ray.report.page import FILES
+
+_LARGEST = 64 * 1024
+"""Bytes of a request's body."""
+_REPORT, _DASHBOARD = "msk_ray.report", "msk_ray.dashboard"
+_STATIC = {
+    "style.css": (_REPORT, "page/style.css"),
+    "echarts.js": (_REPORT, "page/echarts/echarts.min.js"),
+    "charts.js": (_REPORT, "page/charts.js"),
+    "script.js": (_REPORT, "page/script.js"),
+    "live.js": (_DASHBOARD, "page/live.js"),
+    "plots.js": (_DASHBOARD, "page/plots.js"),
+}
+
+
+def make_app(library: Library, access: Access) -> web.Application:
+    """The server's application."""
+    app = web.Application(middlewares=[guard(access), _errors], client_max_size=_LARGEST)
+    app.on_response_prepare.append(set_headers)
+    pages = _Pages(library)
+    app.add_routes(
+        [
+            web.get("/", pages.index),
+            web.get("/version", pages.index_version),
+            web.get("/compare", pages.compare),
+            web.get("/static/{file}", pages.static),
+            web.get("/e/{name}", pages.slash),
+            web.get("/e/{name}/", pages.experiment),
+            web.get("/e/{name}/version", pages.version),
+            web.get("/e/{name}/plots", pages.plots),
+            web.get("/e/{name}/report/{file}", pages.report_file),
+            web.get("/e/{name}/trials/{trial}/{file:.+}", pages.trial_file),
+            web.post("/e/{name}/trials/{trial}/note", pages.note),
+        ]
+    )
+    return app
+
+
+@web.middleware
+async def _errors(request: web.Request, handler: Any) -> web.StreamResponse:
+    """What went wrong, in words; anything unexpected is logged by aiohttp and answered with 500."""
+    try:
+        found: web.StreamResponse = await handler(request)
+    except Unknown as error:
+        raise web.HTTPNotFound(text=f"{error}\n") from None
+    except ConfigError as error:
+        raise web.HTTPBadRequest(text=f"{error}\n") from None
+    except MskRayError as error:
+        raise web.HTTPConflict(text=f"{error}\n") from None
+    return found
+
+
+class _Pages:
+    """The handlers. What reads files does so in a thread, so that other requests are answered meanwhile."""
+
+    def __init__(self, library: Library) -> None:
+        self._library = library
+
+    async def index(self, request: web.Request) -> web.Response:
+        return _html((await asyncio.to_thread(self._library.index)).html)
+
+    async def index_version(self, request: web.Request) -> web.Response:
+        return web.json_response({"version": (await asyncio.to_thread(self._library.index)).version})
+
+    async def compare(self, request: web.Request) -> web.Response:
+        names = request.query.getall("e", [])
+        if not names:
+            raise web.HTTPFound("/")
+        others = urlencode([("with", name) for name in names[1:]])
+        raise web.HTTPFound(f"/e/{quote(names[0], safe='')}/{f'?{others}' if others else ''}")
+
+    async def slash(self, request: web.Request) -> web.Response:
+        raise web.HTTPFound(f"/e/{quote(request.match_info['name'], safe='')}/")
+
+    async def experiment(self, request: web.Request) -> web.Response:
+        return _html((await asyncio.to_thread(self._library.page, _names(request))).html)
+
+    async def version(self, request: web.Request) -> web.Response:
+        return web.json_response({"version": (await asyncio.to_thread(self._library.page, _names(request))).version})
+
+    async def plots(self, request: web.Request) -> web.Response:
+        return _html(await asyncio.to_thread(self._library.plots, request.match_info["name"]))
+
+    async def report_file(self, request: web.Request) -> web.StreamResponse:
+        name, file = request.match_info["name"], request.match_info["file"]
+        return web.FileResponse(await asyncio.to_thread(self._library.report_file, name, file))
+
+    async def trial_file(self, request: web.Request) -> web.StreamResponse:
+        name, trial, file = (request.match_info[part] for part in ("name", "trial", "file"))
+        if file not in FILES:
+            raise Unknown(f"no file {file} of a trial; there are {', '.join(FILES)}")
+        path = await asyncio.to_thread(self._library.trial_folder, name, trial) / file
+        if not path.is_file():
+            raise Unknown(f"trial {trial} has no {file}")
+        if path.suffix == ".pt":
+            attached = {"Content-Disposition": f'attachment; filename="{trial}_{path.name}"'}
+            return web.FileResponse(path, headers={**attached, "Content-Type": "application/octet-stream"})
+        # Never as a page: its text may come from anywhere.
+        return web.FileResponse(path, headers={"Content-Type": "text/plain; charset=utf-8"})
+
+    async def note(self, request: web.Request) -> web.Response:
+        name, trial = request.match_info["name"], request.match_info["trial"]
+        try:
+            data = await request.json()
+        except ValueError:
+            raise web.HTTPBadRequest(text="not JSON\n") from None
+        text = data.get("text") if isinstance(data, dict) else None
+        if not isinstance(text, str):
+            raise web.HTTPBadRequest(text='write {"text": "..."}\n')
+        await asyncio.to_thread(self._library.write, write_note, name, trial, text)
+        return web.json_response({})
+
+    async def static(self, request: web.Request) -> web.Response:
+        name = request.match_info["file"]
+        kept = {"Cache-Control": "private, max-age=600"}
+        if name == "plotly.js":
+            return web.Response(
+                text=await asyncio.to_thread(plotly_library), content_type="text/javascript", headers=kept
+            )
+        if name not in _STATIC:
+            raise web.HTTPNotFound
+        kind = "text/css" if name.endswith(".css") else "text/javascript"
+        return web.Response(text=_static(name), content_type=kind, headers=kept)
+
+
+@cache
+def _static(name: str) -> str:
+    package, path = _STATIC[name]
+    return files(package).joinpath(path).read_text(encoding="utf-8")
+
+
+def _names(request: web.Request) -> Sequence[str]:
+    return list(dict.fromkeys([request.match_info["name"], *request.query.getall("with", [])]))
+
+
+def _html(text: str) -> web.Response:
+    return web.Response(text=text, content_type="text/html")

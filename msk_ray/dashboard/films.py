@@ -1,0 +1,119 @@
+"""Films of the best policies so far, made one at a time by `python -m msk_ray.visualize` in the background."""
+
+import os
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+from msk_ray.errors import MskRayError
+from msk_ray.experiment.manifest import Experiment
+from msk_ray.experiment.snapshot import file_stamp
+from msk_ray.files import make_folder
+
+FOLDER = "report"
+"""Subfolder of an experiment, as that of its report."""
+PREFIX = "film_"
+_SIZE, _FPS = "480x360", "25"
+
+
+class Films:
+    """Makes films of checkpoints. One of an older checkpoint is removed once the newer one has its own."""
+
+    def __init__(self) -> None:
+        self._condition = threading.Condition()
+        self._wanted: dict[tuple[Path, str], tuple[Path, Path]] = {}
+        self._failed: dict[Path, str] = {}
+        self._process: subprocess.Popen[str] | None = None
+        self._closed = False
+        self._thread = threading.Thread(target=self._work, name="films", daemon=True)
+        self._thread.start()
+
+    def of(self, experiment: Experiment, part: str, checkpoint: Path) -> str:
+        """The film of a checkpoint as a path relative to the experiment; or why there is none yet, in words.
+
+        Args:
+            part: the environment, where an experiment has several.
+        """
+        stamp = file_stamp(checkpoint)
+        if stamp is None:
+            return "There is no film: the checkpoint is missing."
+        kind = "".join(c if c.isalnum() else "-" for c in part) or "best"
+        film = experiment.path / FOLDER / f"{PREFIX}{kind}_{stamp[0]:x}.mp4"
+        if film.is_file():
+            return f"{FOLDER}/{film.name}"
+        with self._condition:
+            if film in self._failed:
+                return f"There is no film: {self._failed[film]}"
+            self._wanted[experiment.path, kind] = (checkpoint, film)
+            self._condition.notify()
+        return "A film of the best policy is being made."
+
+    def close(self) -> None:
+        """End the process at work, if there is one."""
+        with self._condition:
+            self._closed = True
+            self._wanted.clear()
+            self._condition.notify()
+            if self._process is not None:
+                self._process.terminate()
+        self._thread.join()
+
+    def _work(self) -> None:
+        while True:
+            with self._condition:
+                self._condition.wait_for(lambda: self._closed or self._wanted)
+                if self._closed:
+                    return
+                wish = next(iter(self._wanted))
+                checkpoint, film = self._wanted[wish]
+            why = self._make(checkpoint, film)
+            with self._condition:
+                if why is not None:
+                    self._failed[film] = why
+                # A newer checkpoint of the same may have been asked for meanwhile.
+                if self._wanted.get(wish) == (checkpoint, film):
+                    del self._wanted[wish]
+
+    def _make(self, checkpoint: Path, film: Path) -> str | None:
+        """Make a film; why it could not be made, on one line, or None."""
+        # ".part" before the suffix, which names the format.
+        part = film.with_name(f".{film.stem}.{os.getpid()}.part.mp4")
+        try:
+            make_folder(film.parent)
+        except MskRayError as error:
+            return str(error)
+        # GPUs are for the trials.
+        environment = os.environ | {"CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"}
+        with self._condition:
+            if self._closed:
+                return None
+            self._process = subprocess.Popen(
+                ["nice", "-n", "10", *command_for(checkpoint, part)],
+                env=environment,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                text=True,
+            )
+        errors = self._process.communicate()[1].strip().splitlines()
+        code = self._process.returncode
+        with self._condition:
+            self._process = None
+        try:
+            if code or not part.is_file():
+                return errors[-1].removeprefix("error: ") if errors else f"exit code {code}"
+            part.replace(film)
+            for old in film.parent.glob(f"{film.stem.rpartition('_')[0]}_*.mp4"):
+                if old != film:
+                    old.unlink(missing_ok=True)
+        except OSError as error:
+            return f"cannot write {film}: {error.strerror or error}"
+        finally:
+            part.unlink(missing_ok=True)
+        return None
+
+
+def command_for(checkpoint: Path, film: Path) -> list[str]:
+    """The command that makes a film."""
+    words = ["-m", "msk_ray.visualize", str(checkpoint), "--video", str(film), "--size", _SIZE, "--fps", _FPS]
+    return [sys.executable, *words, "--device", "cpu"]

@@ -1,0 +1,86 @@
+"""Who may ask the dashboard for what. Every answer passes here."""
+
+import ipaddress
+from dataclasses import dataclass
+
+from aiohttp import web
+from aiohttp.typedefs import Handler, Middleware
+
+_HEADERS = {
+    # Everything comes from the server itself; ECharts and Plotly write styles into their elements.
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; "
+    "img-src 'self' data: blob:; media-src 'self'; connect-src 'self'; form-action 'self'; base-uri 'none'; "
+    "frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+}
+
+
+@dataclass(frozen=True)
+class Access:
+    """What the command line allows."""
+
+    local: bool
+    """Whether it listens to this machine only."""
+    names: tuple[str, ...]
+    """Further names under which it is reached, in lower case."""
+    may_write: bool
+    """Whether notes may be written."""
+
+    def knows(self, host: str) -> bool:
+        """Whether a request with this Host header was meant for this server.
+
+        A web site of somebody else may resolve its own name to this machine's address (DNS rebinding): the browser then
+        sends that name. Addresses and `localhost` cannot be taken over like this.
+        """
+        name = _name_of(host)
+        if name == "localhost" or name in self.names:
+            return True
+        try:
+            address = ipaddress.ip_address(name)
+        except ValueError:
+            return False
+        return address.is_loopback or not self.local
+
+
+def _name_of(host: str) -> str:
+    """The name in a Host header: without the port, brackets and a final dot, in lower case."""
+    if host.startswith("["):
+        return host[1:].partition("]")[0]
+    return host.rpartition(":")[0].lower().rstrip(".") if ":" in host else host.lower().rstrip(".")
+
+
+def guard(access: Access) -> Middleware:
+    """A middleware that refuses requests for another server, and writing that is not allowed or from elsewhere."""
+
+    @web.middleware
+    async def check(request: web.Request, handler: Handler) -> web.StreamResponse:
+        host = request.headers.get("Host", "")
+        if not access.knows(host):
+            name = _name_of(host) or "NAME"
+            raise web.HTTPMisdirectedRequest(
+                text=f"not known by this name; use its address, or start it with --allow-host {name}\n"
+            )
+        if request.method not in ("GET", "HEAD"):
+            _check_writing(request, host, access)
+        return await handler(request)
+
+    return check
+
+
+def _check_writing(request: web.Request, host: str, access: Access) -> None:
+    if not access.may_write:
+        raise web.HTTPForbidden(text="read-only: start it with --allow-notes\n")
+    # A page of another site may send requests here too, with its own Origin; a form cannot send JSON.
+    if request.headers.get("Origin") not in (f"http://{host}", f"https://{host}"):
+        raise web.HTTPForbidden(text="not from a page of this dashboard\n")
+    if request.content_type != "application/json":
+        raise web.HTTPUnsupportedMediaType(text="write application/json\n")
+
+
+async def set_headers(request: web.Request, response: web.StreamResponse) -> None:
+    """Headers of every answer, refusals included."""
+    response.headers.update(_HEADERS)
+    response.headers.setdefault("Cache-Control", "no-store")
