@@ -30,6 +30,7 @@ LEVERS = {
     "tape_all": ["physics.backward=tape_all"],
     "sparse": ["physics.jacobian=sparse"],
     "tf32": ["shac.critic_products=tf32"],
+    "fused": ["shac.critic_kernels=fused"],
     "iterations": ["physics.iterations=5"],
     "substeps": ["physics.substeps=2"],
     "batches": ["shac.critic_batches=2"],
@@ -37,7 +38,7 @@ LEVERS = {
     "eager": ["shac.capture=off"],
 }
 """Settings by the name of the lever. The last five change what is learned, or are there to compare with."""
-TOGETHER = ["rows", "tape_all", "tf32"]
+TOGETHER = ["rows", "tape_all", "tf32", "fused"]
 """Levers that change results by rounding only."""
 PARTS = ("rollout", "backward", "critic")
 HEALTH = ("physics/solver_limit_share", "physics/solver_unconverged_share", "physics/rows_share")

@@ -164,6 +164,9 @@ class ShacConfig(AlgorithmSettings):
     critic_products: Literal["float32", "tf32"] = "float32"
     """Numbers that the matrix products of the critic's fit multiply; `tf32` has 10 bits of mantissa, for which recent
     GPUs have faster units. Sums, and everything else, are in float32."""
+    critic_kernels: Literal["torch", "fused"] = "torch"
+    """`fused`: activation and norm of a layer are one kernel forward and two back in the critic's fit, where torch has
+    four and nine; the results differ by rounding. For elu with layer_norm."""
     target_critic_alpha: Fraction = 0.2
     """target ← α·target + (1 − α)·critic after each epoch."""
     actor_lr: PositiveFloat = 2e-3
@@ -252,6 +255,8 @@ class ShacConfig(AlgorithmSettings):
                 raise ValueError("shac.exploration changes the noise that shac.entropy measures: leave one out")
         if self.actor_value == "mean" and config.critic.count == 1:
             raise ValueError("shac.actor_value: mean is of two critics: write critic.count: 2")
+        if self.critic_kernels == "fused" and not (config.critic.activation == "elu" and config.critic.layer_norm):
+            raise ValueError("shac.critic_kernels: fused is for elu with layer_norm: write torch")
         if self.copies is not None and nworld // gpus % self.copies.count:
             raise ValueError(f"shac.copies.count {self.copies.count}{also} must divide env.nworld ({nworld})")
         if isinstance(horizon, ContactHorizon) and "cone" not in config.env.reads_physics:

@@ -95,6 +95,7 @@ _LATER: dict[tuple[str, ...], Any] = {
     ("shac", "capture"): "auto",
     ("shac", "critic_tolerance"): None,
     ("shac", "critic_products"): "float32",
+    ("shac", "critic_kernels"): "torch",
     ("shac", "entropy", "normalize"): False,
     ("shac", "weight_decay"): 0.0,
     ("shac", "actor_value"): "smaller",

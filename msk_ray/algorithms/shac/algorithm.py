@@ -60,6 +60,7 @@ class Shac(Algorithm):
             weight_decay=c.weight_decay,
             tolerance=c.critic_tolerance,
             tf32=c.critic_products == "tf32",
+            fused=c.critic_kernels == "fused",
             group=env.group,
         )
         self.noise_generator = torch.Generator(device=device).manual_seed(config.trial.seed_of("noise") + 1)

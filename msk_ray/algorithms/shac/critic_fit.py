@@ -26,6 +26,7 @@ class CriticFit:
         weight_decay: decoupled weight decay; 0 for none.
         tolerance: change of the loss a pass, relative to it, below which no further step is taken; None: all steps.
         tf32: whether matrix products multiply numbers of 10 bits of mantissa.
+        fused: whether hidden layers take few kernels; they must be ELU and LayerNorm.
         group: the processes that fit it together, each with its share of every minibatch.
 
     Attributes:
@@ -45,12 +46,14 @@ class CriticFit:
         weight_decay: float = 0.0,
         tolerance: float | None = None,
         tf32: bool = False,
+        fused: bool = False,
         group: Group = ALONE,
     ) -> None:
         device = next(critic.parameters()).device
         if tf32 and (device.type != "cuda" or torch.cuda.get_device_capability(device) < (8, 0)):
             raise ConfigError(f"shac.critic_products: {device.type} has no tf32 here: write float32")
         self._critic = critic
+        self._values = critic.fused if fused else critic
         self._grad_norm = grad_norm
         self._tolerance = tolerance
         self._tf32 = tf32
@@ -94,7 +97,7 @@ class CriticFit:
         return settled if before is None else settled | before
 
     def _step(self, obs: Tensor, targets: Tensor, skip: Tensor | None) -> Tensor:
-        loss = (self._critic(obs) - targets).square().mean()
+        loss = (self._values(obs) - targets).square().mean()
         self.optimizer.zero_grad()
         loss.backward()
         mean = loss.detach()

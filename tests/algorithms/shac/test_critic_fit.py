@@ -95,3 +95,16 @@ def test_tf32_rounds_the_factors_of_products_in_the_fit_alone() -> None:
         assert not torch.backends.cuda.matmul.allow_tf32
     assert losses[0] != losses[1]
     assert abs(losses[0] - losses[1]) < 1e-2 * losses[0]
+
+
+def test_fused_layers_fit_alike() -> None:
+    """Ten steps from the same start."""
+    obs = torch.randn(64, 3, generator=torch.Generator().manual_seed(0))
+    orders = torch.arange(64).expand(10, 64)
+    fitted = []
+    for fused in (False, True):
+        critic = Critic(CriticConfig(hidden=(16, 8), count=2), 3, torch.Generator().manual_seed(1))
+        loss = CriticFit(critic, 1e-2, (0.9, 0.99), 1.0, fused=fused).run(obs, obs[:, 0], orders, 1)
+        fitted.append((critic(obs), loss))
+    torch.testing.assert_close(*fitted, rtol=1e-3, atol=1e-4)
+    assert not torch.equal(fitted[0][0], fitted[1][0])

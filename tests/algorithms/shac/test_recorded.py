@@ -52,6 +52,7 @@ LEGS = {
     },
     "physics": {},
 }
+FUSED = {**ANT, "shac": {**ANT["shac"], "critic_kernels": "fused"}}
 CARTPOLE = {**ANT, "env": {"name": "cartpole", "nworld": 64}, "physics": {}}
 
 
