@@ -8,6 +8,7 @@ is equal.
 """
 
 import argparse
+import copy
 import dataclasses
 import time
 from collections.abc import Callable
@@ -304,18 +305,17 @@ def variants(scene: Scene) -> dict[str, tuple[WorldBatch, Launch]]:
 
         return launch
 
-    def ours(plain: bool) -> Launch:
-        if plain:
-            stages_plain = OrderedStages.__new__(OrderedStages)
-            stages_plain.__dict__ |= stages.__dict__ | {"_atomic": ordered.model}
-            return lambda: stages_plain.step(ordered.model, ordered.data)
-        return lambda: stages.step(ordered.model, ordered.data)
+    def ours(flags: int) -> Launch:
+        chosen = copy.copy(stages)
+        chosen._atomic = _with_flags(ordered.model, flags)
+        return lambda: chosen.step(ordered.model, ordered.data)
 
     fixed = {"graph_conditional": False, "iterations": min(ITERATIONS, int(package.model.opt.iterations))}
     return {
         "package": (package, stepped(0)),
-        "ordered": (ordered, ours(plain=False)),
-        "ordered without atomics' flag": (ordered, ours(plain=True)),
+        "ordered": (ordered, lambda: stages.step(ordered.model, ordered.data)),
+        "ordered, flag none": (ordered, ours(FLAGS["none"])),
+        "ordered, flag atomics": (ordered, ours(FLAGS["atomics"])),
         "sorted contacts and rows": (ordered, sorted_step(0)),
         "package, fixed iterations": (package, stepped(0, **fixed)),
         "package, flag contacts": (package, stepped(FLAGS["contacts"], **fixed)),

@@ -1,5 +1,7 @@
 """Returns and lengths of complete training episodes, which span many rollouts."""
 
+from itertools import accumulate
+
 import torch
 from torch import Tensor
 
@@ -18,7 +20,7 @@ class EpisodeTracker:
             Mean return and length of the episodes that ended in it, and their number; only the number if none did.
         """
         # With C the running total, episodes of a world that ended in the rollout sum to C at its last end.
-        totals = self._return + rewards.cumsum(0)
+        totals = self._return + _running_sum(rewards)
         lengths = self._length + torch.arange(1, len(rewards) + 1, device=rewards.device)[:, None]
         steps = torch.arange(len(rewards), device=rewards.device)[:, None]
         last = steps.expand_as(done).masked_fill(~done, -1).amax(0)
@@ -44,3 +46,10 @@ class EpisodeTracker:
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Continue from a `state_dict`."""
         self._return, self._length = state["return"], state["length"]
+
+
+def _running_sum(values: Tensor) -> Tensor:
+    """Sums over the first axis up to each place."""
+    if values.is_cuda and torch.are_deterministic_algorithms_enabled():
+        return torch.stack(list(accumulate(values)))  # torch's own has no fixed order there
+    return values.cumsum(0)

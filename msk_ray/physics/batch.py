@@ -150,7 +150,7 @@ class WorldBatch:
             model.ncam = model.nlight = 0  # nothing looks: two launches less a substep
             open_arrays(self.mjm, model, self.parameters, nworld)
             if self.ordered:
-                self.stages = OrderedStages(model)
+                self.stages = OrderedStages(self.structure, model)
         seal(model, "batch.model")
         return model
 

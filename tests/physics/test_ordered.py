@@ -16,6 +16,7 @@ from msk_ray.physics import WorldBatch
 from msk_ray.physics.arrays import gather
 from msk_ray.physics.ordered.contacts import ContactFields, ContactOrder
 from msk_ray.physics.ordered.rows import RowFields, RowOrder
+from msk_ray.physics.ordered.stages import sums_race
 from msk_ray.simulation import TapePerSubstep
 
 WORLDS = 3
@@ -184,6 +185,24 @@ def test_the_example_finds_nothing_unordered_on_a_cpu(root: Path, capsys: pytest
     lines = capsys.readouterr().out.splitlines()
     assert "contacts: up to 0 of 32768 contacts differ" in lines
     assert "constraint rows: up to 0 of 4096 worlds differ" in lines
+
+
+@pytest.mark.parametrize(
+    ("change", "races"),
+    [
+        (lambda text: text, True),  # a fixed tendon, and a motor that pulls it
+        (
+            lambda text: text.replace('<motor tendon="t"/>', "").replace("<fixed", "<!--").replace("</fixed>", "-->"),
+            False,
+        ),
+        (lambda text: text.replace('<motor tendon="t"/>', '<motor joint="a"/>'), True),
+    ],
+)
+def test_atomics_get_an_order_where_threads_meet(change: Callable[[str], str], races: bool) -> None:
+    mjm = mujoco.MjModel.from_xml_string(change(TEXT).format(cone="elliptic", jacobian="dense"))
+    batch = WorldBatch(mjm, 1, 1, "cpu", ordered=True)
+    assert sums_race(mjm, batch.model) is races
+    assert bool(batch.stages.summing(batch.model).opt.deterministic) is races
 
 
 def test_a_sparse_jacobian_is_made_dense() -> None:

@@ -66,6 +66,23 @@ def check_ordered(mjm: mujoco.MjModel) -> None:
         )
 
 
+def sums_race(mjm: mujoco.MjModel, model: Any) -> bool:
+    """Whether several threads add to one number in a stage of mujoco_warp that the state depends on, the solver aside.
+
+    A number to which one thread adds once, after it was set to zero, needs no order.
+    """
+    joints = mjm.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
+    single = bool(np.all(joints)) and len(set(mjm.actuator_trnid[:, 0])) == mjm.nu
+    return bool(
+        mjm.ntendon
+        or not single
+        or np.any(mjm.body_gravcomp)
+        or mjm.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER
+        # J v of a row is added up in parts. For twice as many, the inertia is factored over the tree, too.
+        or model.nv_pad > model.block_dim.contact_jac_tiled
+    )
+
+
 def dense(mjm: mujoco.MjModel) -> mujoco.MjModel:
     """The model with a dense Jacobian, for which alone the solver's sums have an order."""
     if mjm.opt.jacobian == mujoco.mjtJacobian.mjJAC_DENSE:
@@ -89,17 +106,19 @@ class OrderedStages:
     """The same step with every sum in a fixed order.
 
     Args:
-        model: mujoco_warp's model, with a dense Jacobian, before it is sealed. Contacts are sorted by its public hook
-            `callback.contactfilter`, which ends collision detection.
+        mjm: the MjModel.
+        model: mujoco_warp's model of it, with a dense Jacobian, before it is sealed. Contacts are sorted by its public
+            hook `callback.contactfilter`, which ends collision detection.
     """
 
     ordered = True
 
-    def __init__(self, model: Any) -> None:
+    def __init__(self, mjm: mujoco.MjModel, model: Any) -> None:
         assert not model.is_sparse, "only dense Jacobians have ordered rows"
         model.callback.contactfilter = self.sort_contacts
         self._atomic, opt = copy.copy(model), copy.copy(model.opt)
-        opt.deterministic = int(mjw.DeterminismType.ATOMICS)
+        if sums_race(mjm, model):
+            opt.deterministic = int(mjw.DeterminismType.ATOMICS)
         self._atomic.opt = opt
         self._contacts: dict[tuple[int, int], ContactOrder] = {}
         self._rows: dict[tuple[int, int], RowOrder] = {}
