@@ -66,6 +66,8 @@ def first_spelling(settings: Mapping[str, Any]) -> dict[str, Any]:
     spelt = {**settings, "env": env}
     for path, default in _LATER.items():
         spelt = _without(spelt, path, default)
+    for path, default in _LATER_OF.get(env["name"], {}).items():
+        spelt = _without(spelt, path, default)
     if not spelt["algorithm"]:
         del spelt["algorithm"]
     return spelt
@@ -115,3 +117,9 @@ _LATER: dict[tuple[str, ...], Any] = {
     ("env", "track_rate_scale"): 2.0,
 }
 """Settings that the first version did not have, as (section, name), with the default that leaves ids unchanged."""
+
+_NO_ASSISTANCE = {"epochs": 0, "share": 1.0, "balance": 800.0, "lateral": 800.0, "support": 0.0}
+_LATER_OF: dict[str, dict[tuple[str, ...], Any]] = {
+    "myoleg": {("env", "assist"): _NO_ASSISTANCE, ("env", "reset"): "stand"},
+}
+"""The same of one environment, by its name, where others had a setting of that name from the first."""

@@ -170,6 +170,10 @@ class Env(ABC, Generic[SettingsT]):
         """The current state as a step begins with it, for example after a push."""
         return state
 
+    def applied_force(self, state: StepState) -> Tensor | None:
+        """Forces on the degrees of freedom during the step from `state` [N, N m], (W, nv); None for none."""
+        return None
+
     @abstractmethod
     def draw_physics(self, count: int) -> StepState:
         """`count` initial physical states, drawn with `uniform`."""
@@ -202,11 +206,7 @@ class Env(ABC, Generic[SettingsT]):
         return {}
 
     def trajectory_figures(self, trajectories: Sequence[StepState]) -> dict[str, float]:
-        """Further figures of an evaluation, by name, from every state of `recorded_worlds` episodes.
-
-        Args:
-            trajectories: the states of each episode from its first to its last, on the CPU, (T, n) each.
-        """
+        """Further figures of an evaluation, by name, from all states of `recorded_worlds` episodes, (T, n), on CPU."""
         return {}
 
     def success(self, tail: dict[str, Tensor]) -> Tensor | None:
@@ -329,7 +329,8 @@ class Env(ABC, Generic[SettingsT]):
         is that of the state before the step, cut from the graph.
         """
         before = self.disturbed(self.state.physics)
-        after = self.sim.step(self.control(action), *before, parameters=self.parameters)
+        control, force = self.control(action), self.applied_force(before)
+        after = self.sim.step(control, *before, qfrc_applied=force, parameters=self.parameters)
         diverged = ~self._sound(after)
         # `where` sends no cotangent into a diverged world's step, so its gradient cannot reach the batch.
         after = StepState(*(_where(diverged, b.detach(), a) for b, a in zip(before, after, strict=True)))

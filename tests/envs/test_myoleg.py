@@ -18,7 +18,8 @@ from msk_ray.envs.myoleg.env import MyoLeg
 from msk_ray.envs.myoleg.model import SUBSTEPS, Couplings, build_myoleg, find_model
 from msk_ray.errors import ConfigError
 from msk_ray.gradcheck import check_chain, check_gradients, make_states
-from msk_ray.simulation import Simulation, TapePerSubstep
+from msk_ray.simulation import Simulation, StepState, TapePerSubstep
+from msk_ray.simulation.tangent import quat_exp, quat_multiply, quat_rotate
 
 pytestmark = pytest.mark.long
 
@@ -181,3 +182,39 @@ def test_environment_resets_walks_and_measures_as_its_body_does(legs26: mujoco.M
     transition = env.step(torch.zeros(8, 26))
     assert transition.obs.shape == (8, env.obs_size)
     assert transition.reward.isfinite().all()
+
+
+@needs_myo_sim
+def test_people_step_on_80_muscles_and_springs_right_the_pelvis() -> None:
+    """The measured angles on an installed model: feet stand still at 1.25 m/s in mid-stance, and steps are long."""
+    settings = {"clock": True, "symmetric": True, "reset": "cycle", "reset_noise": 0.0, "assist": {"epochs": 10}}
+    config = MyoLegSettings.model_validate({"name": "myoleg", "source": "myo_sim", **settings})
+    env = make_env(config, PhysicsConfig(), 2, "cpu", 0, differentiable=False)
+    model, axes = env.model, world_axes(env.model)
+    speed = torch.full((3,), 1.25)
+    start = env.draw_phase(torch.tensor([0.0, 0.26, 0.5]), speed)
+    data = mujoco.MjData(model)
+    apart = []
+    for k in range(3):
+        data.qpos[:], data.qvel[:] = start.qpos[k].numpy(), start.qvel[k].numpy()
+        mujoco.mj_forward(model, data)
+        apart.append((data.body("calcn_r").xpos - data.body("calcn_l").xpos) @ axes[0])
+        velocity = np.zeros(6)
+        body = model.body("toes_r").id
+        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, body, velocity, 0)
+        if k == 1:
+            assert np.linalg.norm(velocity[3:]) < 0.2
+    assert apart[0] == pytest.approx(0.64, abs=0.03)
+    assert apart[2] == pytest.approx(-apart[0], abs=0.02)
+    # Leaning forward by 0.1 rad, against 800 N m/rad; 1 cm aside, against 800 N/m
+    lean = quat_exp(torch.tensor(0.1 * axes[1], dtype=torch.float32))
+    state = StepState(*(part[:1].clone() for part in env.state.physics))
+    state.qpos[0, 3:7] = quat_multiply(lean, torch.tensor(model.key("stand").qpos[3:7], dtype=torch.float32))
+    state.qpos[0, :3] += torch.tensor(0.01 * axes[1], dtype=torch.float32)
+    force = env.applied_force(state._replace(qvel=torch.zeros_like(state.qvel)))
+    torque = quat_rotate(state.qpos[:, 3:7], force[:, 3:6])[0].numpy() @ axes.T
+    assert torque == pytest.approx([0.0, -80.0, 0.0], abs=0.01)
+    assert force[0, :3].numpy() @ axes.T == pytest.approx([0.0, -8.0, 0.0], abs=0.01)
+    env.begin_epoch(10)
+    assert not env.applied_force(state).any()
+    assert MyoLeg.reference_settings(config).assist.epochs == 0

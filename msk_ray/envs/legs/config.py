@@ -5,8 +5,10 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import Field, PositiveFloat, model_validator
 
-from msk_ray.config.sections import Count, EnvSettings, NonNegative, Reward, Section, Whole
+from msk_ray.config.sections import Count, EnvSettings, Fraction, NonNegative, Reward, Section, Whole
 
+FURTHER = ("metabolic", "fatigue", "head", "impact", "footfall", "clearance", "track", "track_rate")
+"""Weights of terms that are there only where they are not zero."""
 CLOCKED = ("footfall", "clearance", "track", "track_rate")
 """Weights of terms that need the clock."""
 
@@ -96,6 +98,29 @@ class TrackingSchedule(Section):
         return self.end if epoch >= self.epochs else self.start + (self.end - self.start) * epoch / self.epochs
 
 
+class AssistConfig(Section):
+    """Springs and dampers that hold the pelvis up during training, annealed linearly to zero.
+
+    Evaluation never uses them.
+    """
+
+    epochs: Whole = 0
+    """Epochs until they are gone; 0: none at all."""
+    share: Fraction = 1.0
+    """Share of the stiffness below, at epoch 0."""
+    balance: NonNegative = 800.0
+    """Righting torque of tilt and list [N m/rad]; that of rotation is smaller in proportion to its inertia. Critically
+    damped."""
+    lateral: NonNegative = 800.0
+    """Force towards the walking line [N/m]. Critically damped."""
+    support: Fraction = 0.0
+    """Share of the body's weight that is carried."""
+
+    def at(self, epoch: int) -> float:
+        """Share of the stiffness at `epoch`, counted from 0."""
+        return self.share * max(0.0, 1.0 - epoch / self.epochs) if self.epochs else 0.0
+
+
 class PushConfig(Section):
     """Pushes of the pelvis, which change its speed at once."""
 
@@ -129,6 +154,7 @@ class LegSettings(EnvSettings):
     gait_worlds: Whole = 0
     """Worlds of every evaluation during training whose gait is compared with people's (`eval/gait_distance`, `cadence`,
     `step_length`, `duty_factor`, `asymmetry`, `cost_of_transport`), by C MuJoCo: about 0.02 s each; 0: none."""
+    assist: AssistConfig = AssistConfig()
     push: PushConfig = PushConfig()
     tracking: TrackingSchedule = TrackingSchedule()
     """Schedule of the terms that track people's motion."""
@@ -161,6 +187,9 @@ class LegSettings(EnvSettings):
     def unread(self) -> dict[str, str]:
         unread = {}
         r = self.reward
+        if not self.assist.epochs:
+            for name in ("share", "balance", "lateral", "support"):
+                unread[f"assist.{name}"] = "env.assist.epochs is 0"
         if self.push.speed == 0.0:
             unread["push.interval"] = "env.push.speed is 0"
         for name, weight in (

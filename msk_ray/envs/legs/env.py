@@ -5,7 +5,7 @@ Axes: W worlds, U muscles, N hinges of the legs.
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import ClassVar, Generic, TypeVar
 
 import mujoco
@@ -17,7 +17,7 @@ from msk_ray.config.physics import CONTACTS, LIMITS
 from msk_ray.envs.base import Env
 from msk_ray.envs.layout import Entry, entries
 from msk_ray.envs.legs import terms as costs
-from msk_ray.envs.legs.config import LegReward, LegSettings
+from msk_ray.envs.legs.config import FURTHER, AssistConfig, LegReward, LegSettings
 from msk_ray.envs.legs.gait.body import SIDES, analyse, world_axes
 from msk_ray.envs.legs.gait.measure import measure, summary
 from msk_ray.envs.legs.metabolic import Fibres, muscle_masses, power
@@ -104,9 +104,9 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
         flexions = [self.model.joint(f"hip_flexion_{s}") for s in "rl"]
         self._flexion_dofs = columns([joint.dofadr[0] for joint in flexions], self.device)
         self._flexion_qpos = columns([joint.qposadr[0] for joint in flexions], self.device)
-        self.reference = Reference(self.model, self.device)
         self._tasked = self.config.clock or self.config.speed_range is not None
         self._tracking_share = torch.tensor(self.config.tracking.at(0), device=self.device)
+        self._assist_share = torch.tensor(self.config.assist.at(0), device=self.device)
         self.recorded_worlds = self.config.gait_worlds
         self._prepare_terms()
         self._mirror: Mirror | None = None
@@ -120,38 +120,33 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
 
     def _prepare_terms(self) -> None:
         """The terms whose weight is not zero, which come after those that are always there, and what they need."""
-        further: dict[str, Callable[[StepState, Tensor], Tensor]] = {
-            "metabolic": lambda state, action: self.metabolic_power(state, action) / self._mass,
-            "fatigue": lambda state, action: state.act.pow(3).mean(-1),
-            "head": lambda state, action: self._head_speed(state)[:, 1:].square().sum(-1),
-            "impact": lambda state, action: costs.impact(*self._foot_motion(state)[:2]),
-            "footfall": lambda state, action: self._footfall(state),
-            "clearance": lambda state, action: self._clearance(state),
-            "track": lambda state, action: self._tracking(state)[0],
-            "track_rate": lambda state, action: self._tracking(state)[1],
-        }
-        self._further = {name: term for name, term in further.items() if getattr(self.config.reward, name) > 0.0}
+        self._further = [name for name in FURTHER if getattr(self.config.reward, name) > 0.0]
         common = LegEnv.reward_names
         self.reward_names = (*common, *self._further, *type(self).reward_names[len(common) :])
         self._weights = self.weights(self.config.reward)
         self._mass = float(self.model.body_subtreemass[0])
         self._masses = muscle_masses(self.curves.peak, self.curves.optimum)
-        self._track_qpos = columns(self.model.jnt_qposadr[self.reference.joints], self.device)
-        self._track_dofs = columns(self.model.jnt_dofadr[self.reference.joints], self.device)
-        self._feet = [f"{body}_{side}" for side in SIDES for body in _FOOT]
-        axes = world_axes(self.model)
-        data = mujoco.MjData(self.model)
-        mujoco.mj_resetDataKeyframe(self.model, data, self.model.key("stand").id)
-        mujoco.mj_kinematics(self.model, data)
-        pelvis = data.body("pelvis").xpos
-        drops = [self.stand_height + (data.body(name).xpos - pelvis) @ axes[2] for name in self._feet]
-        self._foot_heights = torch.tensor(drops, dtype=torch.float32, device=self.device)
-        self._up = torch.tensor(axes[2], dtype=torch.float32, device=self.device)
+        if self._tasked:
+            self.reference = Reference(self.model, self.device)
+            self._track_qpos = columns(self.model.jnt_qposadr[self.reference.joints], self.device)
+            self._track_dofs = columns(self.model.jnt_dofadr[self.reference.joints], self.device)
         with torch.no_grad():
             # The first three dofs move the pelvis without turning it: what they are for a speed forward, and left.
             rest = torch.tensor(self.model.key("stand").qpos, dtype=torch.float32, device=self.device).repeat(3, 1)
             units = torch.eye(3, self.model.nv, device=self.device)
             self._slides = self.root(StepState(rest, units, rest[:, :0])).velocity.T[:2]
+        if {"impact", "footfall", "clearance"} & set(self._further):
+            self._prepare_feet()
+
+    def _prepare_feet(self) -> None:
+        self._feet = [f"{body}_{side}" for side in SIDES for body in _FOOT]
+        axes = world_axes(self.model)
+        data = mujoco.MjData(self.model)
+        mujoco.mj_resetDataKeyframe(self.model, data, self.model.key("stand").id)
+        mujoco.mj_kinematics(self.model, data)
+        above = [(data.body(name).xpos - data.body("pelvis").xpos) @ axes[2] for name in self._feet]
+        self._foot_heights = self.stand_height + torch.tensor(above, dtype=torch.float32, device=self.device)
+        self._up = torch.tensor(axes[2], dtype=torch.float32, device=self.device)
 
     def weights(self, reward: LegReward) -> Tensor:
         """Weights of the terms, negative for costs."""
@@ -220,6 +215,7 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
 
     def begin_epoch(self, epoch: int) -> None:
         self._tracking_share.fill_(self.config.tracking.at(epoch))
+        self._assist_share.fill_(self.config.assist.at(epoch))
 
     def disturbed(self, state: StepState) -> StepState:
         push = self.config.push
@@ -344,9 +340,27 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
             root.spin.square().sum(-1),
             flexion_rates.sum(-1).square(),
             costs.stride_error(flexions, flexion_rates, amplitude, turn),
-            *(term(state, action) for term in self._further.values()),
+            *(self._further_cost(name, state, action) for name in self._further),
         )
         return torch.stack(terms, dim=-1) * self._weights
+
+    def _further_cost(self, name: str, state: StepState, action: Tensor) -> Tensor:
+        """One of the terms of `FURTHER`, without its weight, (W,)."""
+        match name:
+            case "metabolic":
+                return self.metabolic_power(state, action) / self._mass
+            case "fatigue":
+                return state.act.pow(3).mean(-1)
+            case "head":
+                return self._head_speed(state)[:, 1:].square().sum(-1)
+            case "impact":
+                return costs.impact(*self._foot_motion(state)[:2])
+            case "footfall":
+                return self._footfall(state)
+            case "clearance":
+                return self._clearance(state)
+            case _:
+                return self._tracking(state)[("track", "track_rate").index(name)]
 
     def metabolic_power(self, state: StepState, action: Tensor) -> Tensor:
         """Metabolic power of all muscles [W], (W,), without that of rest, after actions (W, A)."""
@@ -377,14 +391,12 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
         return phase, phase + 0.5
 
     def _footfall(self, state: StepState) -> Tensor:
-        _, _, velocity = self._foot_motion(state)
-        right, left = self._leg_phases()
+        velocity, (right, left) = self._foot_motion(state)[2], self._leg_phases()
         first = costs.sliding(right, velocity[:, 0], velocity[:, 1])
         return first + costs.sliding(left, velocity[:, 2], velocity[:, 3])
 
     def _clearance(self, state: StepState) -> Tensor:
-        heights, _, _ = self._foot_motion(state)
-        right, left = self._leg_phases()
+        heights, (right, left) = self._foot_motion(state)[0], self._leg_phases()
         wanted = self.config.reward.clearance_height
         return costs.dragging(right, heights[:, :2], wanted) + costs.dragging(left, heights[:, 2:], wanted)
 
@@ -429,9 +441,8 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
 
     @classmethod
     def reference_settings(cls, config: AnyLegSettings) -> AnyLegSettings:
-        """The reference reward at `target_speed`."""
-        # The tracking schedule has a meaning only beside the weights that the reference reward does not have.
-        return super().reference_settings(config).model_copy(update={"speed_range": None})
+        """The reference reward at `target_speed`, without assistance."""
+        return super().reference_settings(config).model_copy(update={"speed_range": None, "assist": AssistConfig()})
 
     @classmethod
     def reference_physics(cls, physics: PhysicsConfig, variant: str | None) -> PhysicsConfig:

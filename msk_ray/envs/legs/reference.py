@@ -16,6 +16,7 @@ from torch import Tensor
 from msk_ray.envs.legs.clock import fourier, polynomial, series
 from msk_ray.envs.legs.gait.body import JOINTS, SIDES, flexion_sign
 from msk_ray.envs.legs.gait.people import curve, pace_polynomials
+from msk_ray.envs.legs.terms import SWING
 
 MEASURED_AT = 1.25
 """Speed at which the measured angles are taken to hold [m/s]; hips swing in proportion to the step length."""
@@ -28,6 +29,13 @@ def people_angles() -> np.ndarray:
     hip = hip - curve("pelvis_tilt").mean.mean()
     pitch = hip - knee + ankle  # of the foot, toes up
     return np.deg2rad(np.stack((hip, knee, ankle - pitch[_FLAT].mean())))
+
+
+def level_toes() -> np.ndarray:
+    """Extension of the toes [rad] that keeps them level until the swing while their foot is pitched down, (101,)."""
+    hip, knee, ankle = people_angles()
+    on_ground = np.arange(101) < 100 * SWING[0]
+    return np.where(on_ground, np.clip(knee - hip - ankle, 0.0, None), 0.0)
 
 
 class Reference:

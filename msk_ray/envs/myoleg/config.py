@@ -2,6 +2,8 @@
 
 from typing import Literal
 
+from pydantic import model_validator
+
 from msk_ray.config.physics import ACTIVATION, SOLVING, STEPPING
 from msk_ray.config.sections import NonNegative, Text
 from msk_ray.envs.legs.config import LegSettings
@@ -17,8 +19,17 @@ class MyoLegSettings(LegSettings):
     """Path of an MJCF file, or `myolegs` (80 muscles) or `myolegs26`; null: `myolegs`."""
     source: Literal["auto", "myosuite2", "myosuite3", "myo_sim"] = "auto"
     """Package of the model; `auto`: the first that is installed, in this order."""
+    reset: Literal["stand", "cycle"] = "stand"
+    """Initial states near the standing pose; `cycle`: near people's posture and speed at the clock's phase
+    (`env.clock`), anywhere in the gait cycle."""
     reset_noise: NonNegative = 0.01
     """Spread of initial joint angles [rad]; coupled joints follow those they are coupled to."""
+
+    @model_validator(mode="after")
+    def _starts_with_the_clock(self) -> "MyoLegSettings":
+        if self.reset == "cycle" and not self.clock:
+            raise ValueError("env.reset: cycle starts at the clock's phase: write env.clock: true")
+        return self
 
     def unread(self) -> dict[str, str]:
         unread = super().unread()

@@ -1,6 +1,7 @@
 """`myoleg` standing or walking the way its toes point."""
 
 import logging
+import math
 
 import mujoco
 import numpy as np
@@ -14,11 +15,13 @@ from msk_ray.envs.legs.gait.body import world_axes
 from msk_ray.envs.legs.muscles import columns
 from msk_ray.envs.legs.root import Root
 from msk_ray.envs.myoleg.config import MyoLegSettings
-from msk_ray.envs.myoleg.model import Couplings, build_myoleg, find_model, ground_height
+from msk_ray.envs.myoleg.model import Couplings, build_myoleg, cycle_states, find_model, ground_height
 from msk_ray.simulation import StepState
-from msk_ray.simulation.tangent import quat_rotate
+from msk_ray.simulation.tangent import quat_conjugate, quat_log, quat_multiply, quat_rotate
 
 _START_ACTIVATION = 0.05
+_TRUNK_INERTIA = (7.0, 7.0, 0.85)
+"""About the forward, left and up axes of the pelvis [kg m²], as in myoleg26: what the assistance turns."""
 _log = logging.getLogger(__name__)
 
 
@@ -71,14 +74,52 @@ class MyoLeg(LegEnv[MyoLegSettings]):
         self._reference, self._driving_reference = tensor(couplings.reference), tensor(couplings.driving_reference)
         self._coefficients = tensor(couplings.coefficients)
 
+        if self.config.reset == "cycle":
+            self._cycle = tuple(map(tensor, cycle_states(model)))
+        a = self.config.assist
+        # Righting torques about the forward, left and up axes of the pelvis.
+        stiffness = [a.balance * inertia / _TRUNK_INERTIA[0] for inertia in _TRUNK_INERTIA]
+        self._righting = tensor(stiffness)
+        self._turning = tensor([2.0 * math.sqrt(k * i) for k, i in zip(stiffness, _TRUNK_INERTIA, strict=True)])
+        mass = float(model.body_subtreemass[0])
+        self._lateral_damping = 2.0 * math.sqrt(a.lateral * mass)
+        self._lift = a.support * mass * float(np.linalg.norm(model.opt.gravity))
+        self._rest = float(stand[:3] @ axes[1])
+
+    def applied_force(self, state: StepState) -> Tensor | None:
+        a = self.config.assist
+        if not a.epochs:
+            return None
+        q, v = state.qpos, state.qvel
+        left, up = self._axes[1], self._axes[2]
+        aside, drift = (q[:, :3] * left).sum(-1) - self._rest, (v[:, :3] * left).sum(-1)
+        push = -(a.lateral * aside + self._lateral_damping * drift)
+        # Forces on a free joint's rotation are in the body's frame, as its velocity is.
+        error = quat_multiply(quat_conjugate(self._stand[3:7].expand(len(q), 4)), q[:, 3:7])
+        along, spin = quat_log(error) @ self._local.T, v[:, 3:6] @ self._local.T
+        torque = -(self._righting * along + self._turning * spin) @ self._local
+        root = torch.cat((push[:, None] * left + self._lift * up, torque), dim=-1)
+        return self._assist_share * torch.nn.functional.pad(root, (0, v.shape[1] - 6))
+
     def draw_physics(self, count: int) -> StepState:
-        noise = self.config.reset_noise
-        qpos = self._stand.repeat(count, 1)
-        qvel = torch.zeros((count, self.model.nv), device=self.device)
+        return self._near(self._stand.repeat(count, 1), torch.zeros((count, self.model.nv), device=self.device))
+
+    def draw_phase(self, phase: Tensor, speed: Tensor) -> StepState:
+        if self.config.reset != "cycle":
+            return super().draw_phase(phase, speed)
+        count = len(self._cycle[0])
+        qpos, qvel = (part[(phase * count).round().long() % count].clone() for part in self._cycle)
+        qvel *= self.reference.pace.strides_per_second(speed)[:, None]
+        qvel[:, :3] += speed[:, None] * self._axes[0]
+        return self._near(qpos, qvel)
+
+    def _near(self, qpos: Tensor, qvel: Tensor) -> StepState:
+        """These initial states with noise."""
+        noise, count = self.config.reset_noise, len(qpos)
         angles = qpos[:, self._hinge_qpos] + noise * self.uniform(count, len(self.hinges))
         qpos[:, self._hinge_qpos] = angles.clamp(*self._ranges)
         qpos[:, 2] += 0.2 * noise * (1.0 + self.uniform(count, 1)[:, 0])
-        qvel[:, self._hinge_dofs] = 10.0 * noise * self.uniform(count, len(self.hinges))
+        qvel[:, self._hinge_dofs] += 10.0 * noise * self.uniform(count, len(self.hinges))
         # Coupled joints follow those they are coupled to, in position and velocity.
         offset = qpos[:, self._driving] - self._driving_reference
         c = self._coefficients

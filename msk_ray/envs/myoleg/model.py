@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msk_ray.config import PhysicsConfig
+from msk_ray.envs.legs.gait.body import JOINTS, flexion_sign
+from msk_ray.envs.legs.reference import level_toes, people_angles
 from msk_ray.envs.myoleg.config import PACKAGED_MODELS, MyoLegSettings
 from msk_ray.envs.options import apply_options
 from msk_ray.errors import ConfigError
@@ -24,6 +26,8 @@ SUBSTEPS: Final = 10
 """Physics steps of a control step of 20 ms: 2 ms each, as the models' own."""
 SMOOTHING: Final = 0.2
 """Width, in excitation, of the blend between activation and deactivation; a hard switch has no slope."""
+CYCLE_STATES: Final = 50
+"""Initial states over the gait cycle."""
 _SINKING: Final = 5e-4
 """Depth to which the lowest point of the standing pose enters the ground [m]."""
 _V2_FILE: Final = Path("simhive/myo_sim/leg")
@@ -221,8 +225,16 @@ def standing_pose(model: mujoco.MjModel) -> NDArray[np.float64]:
     Raises:
         ConfigError: it touches nothing over two metres.
     """
-    data = mujoco.MjData(model)
-    pose = Couplings(model).satisfied(model.qpos0)
+    return lowered(model, Couplings(model).satisfied(model.qpos0))
+
+
+def lowered(model: mujoco.MjModel, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A pose (nq,) at the height at which it touches the ground.
+
+    Raises:
+        ConfigError: it touches nothing over two metres.
+    """
+    data, pose = mujoco.MjData(model), pose.copy()
 
     def touches(height: float) -> bool:
         data.qpos[:] = pose
@@ -239,3 +251,37 @@ def standing_pose(model: mujoco.MjModel) -> NDArray[np.float64]:
         above, below = (above, middle) if touches(middle) else (middle, below)
     pose[2] = above
     return pose
+
+
+def cycle_states(model: mujoco.MjModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """qpos (N, nq) and qvel (N, nv) of legs that take one stride a second on the spot, at N equal distances of the gait
+    cycle of people, from the right foot's strike on.
+
+    Hips, knees and ankles are those of `people_angles`, toes on the ground are level, and everything else is as in
+    standing. The lowest point touches the ground.
+    """
+    toes, couplings = level_toes(), Couplings(model)
+
+    def posed(toe_sign: float, phases: list[int]) -> NDArray[np.float64]:
+        poses = np.repeat(model.key("stand").qpos[None], len(phases), axis=0)
+        for side, ahead in (("r", 0), ("l", 50)):
+            at = [(phase + ahead) % 100 for phase in phases]
+            angles = {
+                name: flexion_sign(model, name) * a[at]
+                for name, a in zip(JOINTS.values(), people_angles(), strict=True)
+            }
+            for joint, values in (angles | {"mtp_angle": toe_sign * toes[at]}).items():
+                entry = model.joint(f"{joint}_{side}")
+                poses[:, entry.qposadr[0]] = values.clip(*entry.range)
+        return np.stack([lowered(model, couplings.satisfied(pose)) for pose in poses])
+
+    # Toes that bend the wrong way lift the body when the heel has left the ground.
+    toe_sign = min((1.0, -1.0), key=lambda sign: float(posed(sign, [54])[0, 2]))
+    qpos = posed(toe_sign, list(range(0, 100, 100 // CYCLE_STATES)))
+    around = np.concatenate((qpos[-1:], qpos, qpos[:1]))
+    slopes = (around[2:] - around[:-2]) * (CYCLE_STATES / 2.0)
+    qvel = np.zeros((CYCLE_STATES, model.nv))
+    qvel[:, :3] = slopes[:, :3]
+    # Behind the free root, every joint is a hinge or a slide.
+    qvel[:, model.jnt_dofadr[1:]] = slopes[:, model.jnt_qposadr[1:]]
+    return qpos, qvel

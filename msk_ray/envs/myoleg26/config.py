@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import PositiveFloat, model_validator
 
 from msk_ray.config.physics import ACTIVATION, CONTACTS, JOINTS, LIMITS, SOLVING, STEPPING
-from msk_ray.config.sections import Fraction, NonNegative, Section, Whole
+from msk_ray.config.sections import NonNegative, Section, Whole
 from msk_ray.envs.legs.config import LegSettings
 
 
@@ -39,25 +39,6 @@ _TERRAIN_READS: dict[str, tuple[str, ...]] = {
 """The settings that each kind of ground reads."""
 
 
-class AssistConfig(Section):
-    """Springs and dampers that hold the pelvis up during training, annealed linearly to zero.
-
-    Evaluation never uses them.
-    """
-
-    epochs: Whole = 0
-    """Epochs until they are gone; 0: none at all."""
-    share: Fraction = 1.0
-    """Share of the stiffness below, at epoch 0."""
-    balance: NonNegative = 800.0
-    """Righting torque of tilt and list [N m/rad]; that of rotation is smaller in proportion to its inertia. Critically
-    damped."""
-    lateral: NonNegative = 800.0
-    """Force towards the walking line [N/m]. Critically damped."""
-    support: Fraction = 0.0
-    """Share of the body's weight that is carried."""
-
-
 class MyoLeg26Settings(LegSettings):
     """Two legs under one trunk, 13 Hill-type muscles each."""
 
@@ -72,7 +53,6 @@ class MyoLeg26Settings(LegSettings):
     }
 
     terrain: TerrainConfig = TerrainConfig()
-    assist: AssistConfig = AssistConfig()
     reset: Literal["stand", "walk", "mixed", "cycle"] = "stand"
     """Initial states near the standing keyframe, the two walking ones, or all three with equal probability; `cycle`:
     near people's posture and speed at the clock's phase (`env.clock`), anywhere in the gait cycle."""
@@ -94,7 +74,4 @@ class MyoLeg26Settings(LegSettings):
         for name in TerrainConfig.model_fields:
             if name != "kind" and name not in reads:
                 unread[f"terrain.{name}"] = f"env.terrain.kind is {self.terrain.kind}"
-        if not self.assist.epochs:
-            for name in ("share", "balance", "lateral", "support"):
-                unread[f"assist.{name}"] = "env.assist.epochs is 0"
         return unread

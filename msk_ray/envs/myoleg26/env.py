@@ -11,7 +11,7 @@ from msk_ray.config import PhysicsConfig
 from msk_ray.envs.layout import Entry
 from msk_ray.envs.legs.env import LegEnv
 from msk_ray.envs.legs.root import Root
-from msk_ray.envs.myoleg26.config import AssistConfig, MyoLeg26Settings
+from msk_ray.envs.myoleg26.config import MyoLeg26Settings
 from msk_ray.envs.myoleg26.model import SIDES, build_myoleg26
 from msk_ray.envs.myoleg26.poses import cycle_states
 from msk_ray.envs.myoleg26.tables import JOINTS
@@ -37,10 +37,6 @@ class MyoLeg26(LegEnv[MyoLeg26Settings]):
     def build_model(cls, config: MyoLeg26Settings, physics: PhysicsConfig) -> mujoco.MjModel:
         return build_myoleg26(config, physics)
 
-    @classmethod
-    def reference_settings(cls, config: MyoLeg26Settings) -> MyoLeg26Settings:
-        return super().reference_settings(config).model_copy(update={"assist": AssistConfig(epochs=0)})
-
     def prepare_model(self) -> None:
         model = self.model
         self.hinges = [model.joint(f"{hinge.name}_{side}").id for side in SIDES for hinge in JOINTS]
@@ -60,8 +56,6 @@ class MyoLeg26(LegEnv[MyoLeg26Settings]):
         )
         if self.config.reset == "cycle":
             self._cycle = StepState(*map(self._tensor, cycle_states(model)))
-        share = self.config.assist.share if self.config.assist.epochs else 0.0
-        self._assist_share = torch.tensor(share, device=self.device)
         mass = float(model.body_subtreemass[0])
         a = self.config.assist
         # Critical damping: c = 2 √(k m).
@@ -75,11 +69,6 @@ class MyoLeg26(LegEnv[MyoLeg26Settings]):
 
     def _tensor(self, values: object) -> Tensor:
         return torch.as_tensor(np.array(values), dtype=torch.float32, device=self.device)
-
-    def begin_epoch(self, epoch: int) -> None:
-        super().begin_epoch(epoch)
-        a = self.config.assist
-        self._assist_share.fill_(a.share * max(0.0, 1.0 - epoch / a.epochs) if a.epochs else 0.0)
 
     def control(self, action: Tensor) -> Tensor:
         excitation = super().control(action)

@@ -10,8 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from msk_ray.envs.legs.reference import people_angles
-from msk_ray.envs.legs.terms import TOES_DOWN
+from msk_ray.envs.legs.reference import level_toes, people_angles
 from msk_ray.envs.myoleg26.tables import OUTLINE
 
 WALKING_SPEED: Final = 1.25
@@ -57,11 +56,8 @@ def cycle_states(model: mujoco.MjModel) -> tuple[NDArray[np.float64], NDArray[np
     Angles are those of `people_angles`. The trunk is upright, toes stay level while their foot is on the ground and
     pitched, and the lowest point of the soles touches the ground. The feet are on the spot: add a forward speed.
     """
-    angles = people_angles()[:, :-1]
-    count = angles.shape[1]
-    hip, knee, ankle = angles
-    pitch = hip - knee + ankle
-    toes = np.where(np.arange(count) < 100 * TOES_DOWN[1], np.clip(-pitch, 0.0, None), 0.0)
+    hip, knee, ankle = people_angles()[:, :-1]
+    count, toes = len(hip), level_toes()[:-1]
     names = ("hip_flexion", "knee_angle", "ankle_angle", "mtp_angle")
     right = np.stack((hip, -knee, ankle, toes))
     legs = {"r": right, "l": np.roll(right, count // 2, axis=1)}
