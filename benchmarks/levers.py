@@ -13,6 +13,7 @@ import argparse
 import statistics
 import tempfile
 import time
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -86,7 +87,7 @@ def main() -> None:
 
 
 def measure(worlds: int, settings: list[str], args: argparse.Namespace) -> dict[str, float]:
-    """Mean duration of an epoch [s], medians of its parts [s], and how the solver and its buffers fared."""
+    """Medians of the durations of epochs and their parts [s], and how the solver and its buffers fared."""
     epochs = WARM_UP + args.epochs
     rare = ["evaluation.nworld=1", "evaluation.steps=1", f"evaluation.interval={epochs}"]
     config = load_config(
@@ -96,17 +97,16 @@ def measure(worlds: int, settings: list[str], args: argparse.Namespace) -> dict[
     marks: list[float] = []
 
     def on_epoch(row: dict[str, Any]) -> None:
-        if row["epoch"] in (WARM_UP, epochs - 1):
-            if args.device != "cpu":
-                torch.cuda.synchronize()
+        # An epoch ends by reading its metrics, which waits for all but the fit of the critic.
+        if WARM_UP <= row["epoch"] < epochs:
             marks.append(time.perf_counter())
 
     with tempfile.TemporaryDirectory() as folder:
         train(config, Path(folder) / "trial", args.device, on_epoch=on_epoch)
         rows = [row for row in read_rows(Path(folder) / "trial") if WARM_UP < row["epoch"] < epochs]
     found = {part: statistics.median(row.get(f"time/{part}_s", 0.0) for row in rows) for part in PARTS}
-    # The last epoch is left out: the final evaluation and checkpoint follow it.
-    found["epoch"] = (marks[1] - marks[0]) / (args.epochs - 1)
+    # The median, because some epochs are recorded once more. The last is left out: the final evaluation follows it.
+    found["epoch"] = statistics.median(after - before for before, after in pairwise(marks))
     return found | {key: float(rows[-1].get(key, 0.0)) for key in HEALTH}
 
 

@@ -93,47 +93,61 @@ def segment_turn(start: wp.vec3, end: wp.vec3, slide: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def push_point(
+def end_wrench(arm: wp.vec3, direction: wp.vec3, turn: wp.vec3, rates: Rates, fields: Twists) -> wp.spatial_vectorf:
+    """What one end of a segment pulls back to its own body's displacement.
+
+    The velocity of the end changes with its place as ω × dp ⇒ p̄ ∋ direction × Σ ρ̄ ω.
+    """
+    zero = wp.vec3(0.0)
+    total = weigh(rates, fields)
+    place = turn + wp.cross(direction, wp.spatial_top(total))
+    return carried(total, wrench(direction, zero, arm)) + wrench(place, zero, arm)
+
+
+@wp.func
+def push_body(
     body: int,
     worldid: int,
-    arm: wp.vec3,
-    direction: wp.vec3,
-    turn: wp.vec3,
+    along: wp.spatial_vectorf,
+    moved: wp.spatial_vectorf,
     rates: Rates,
-    fields: Twists,
     bars_out: FieldBars,
 ) -> None:
-    """Adds what one end of a segment gives its body: rates ρ̄(x) along `direction`, and the end's own cotangent."""
+    """Adds what a segment gives one of its bodies: rates ρ̄(x) along a wrench, and the cotangent of its displacement.
+
+    What all tendons have as zero is left out, because atomic additions take most of the time.
+    """
     if body > 0:
-        zero = wp.vec3(0.0)
-        along = wrench(direction, zero, arm)
-        total = weigh(rates, fields)
-        wp.atomic_add(bars_out.lam, worldid, body, rates.lam * along)
+        if rates.lam != 0.0:
+            wp.atomic_add(bars_out.lam, worldid, body, rates.lam * along)
         # â = a - (a - â): its cotangent goes to both fields
-        wp.atomic_add(bars_out.qacc, worldid, body, (rates.qacc + rates.smooth) * along)
-        wp.atomic_add(bars_out.qvel, worldid, body, rates.qvel * along)
+        if rates.qacc != 0.0 or rates.smooth != 0.0:
+            wp.atomic_add(bars_out.qacc, worldid, body, (rates.qacc + rates.smooth) * along)
+        if rates.qvel != 0.0:
+            wp.atomic_add(bars_out.qvel, worldid, body, rates.qvel * along)
         if rates.mu != 0.0 or rates.smooth != 0.0:
             wp.atomic_add(bars_out.mu, worldid, body, rates.mu * along)
             wp.atomic_add(bars_out.excess, worldid, body, -rates.smooth * along)
-        # The velocity of the end changes with its place as ω × dp ⇒ p̄ ∋ direction × Σ ρ̄ ω
-        place = turn + wp.cross(direction, wp.spatial_top(total))
-        wp.atomic_add(bars_out.moved, worldid, body, carried(total, along) + wrench(place, zero, arm))
+        wp.atomic_add(bars_out.moved, worldid, body, moved)
 
 
 @wp.func
 def fields_of(
     body: int,
     worldid: int,
+    rates: Rates,
     fields_in: Fields,
     cvel_in: wp.array2d[wp.spatial_vector],
 ) -> Twists:
-    """Fields of one body."""
+    """Those fields of one body that the rates are not zero for."""
     out = Twists()
     out.lam = fields_in.lam[worldid, body]
-    out.qacc = fields_in.qacc[worldid, body]
     out.qvel = cvel_in[worldid, body]
-    out.mu = fields_in.mu[worldid, body]
-    out.smooth = out.qacc - fields_in.excess[worldid, body]
+    if rates.qacc != 0.0 or rates.smooth != 0.0:
+        out.qacc = fields_in.qacc[worldid, body]
+        out.smooth = out.qacc - fields_in.excess[worldid, body]
+    if rates.mu != 0.0:
+        out.mu = fields_in.mu[worldid, body]
     return out
 
 
@@ -156,17 +170,21 @@ def pull_paths_of(
     """How J x of a spatial tendon turns with q: one thread a stretch of path between two sites, geom or not."""
     t = paths.segment_tendon[e]
     first = paths.segment_first[e]
-    rates = rates_of(worldid, t, paths.wrap_pulley_scale[first], tendon_bars_in)
     site0 = paths.wrap_objid[first]
     site1 = paths.wrap_objid[paths.segment_last[e]]
     body0 = paths.site_bodyid[site0]
     body1 = paths.site_bodyid[site1]
+    touch = touch_in[worldid, e]
+    straight = touch[0] >= MJ_MAXVAL
+    if straight and body0 == body1:
+        return  # it turns with its body
+    rates = rates_of(worldid, t, paths.wrap_pulley_scale[first], tendon_bars_in)
+    f0 = fields_of(body0, worldid, rates, fields_in, motion_in.cvel)
+    f1 = fields_of(body1, worldid, rates, fields_in, motion_in.cvel)
     start = poses_in.site_xpos[worldid, site0]
     end = poses_in.site_xpos[worldid, site1]
     com0 = motion_in.subtree_com[worldid, paths.body_rootid[body0]]
     com1 = motion_in.subtree_com[worldid, paths.body_rootid[body1]]
-    f0 = fields_of(body0, worldid, fields_in, motion_in.cvel)
-    f1 = fields_of(body1, worldid, fields_in, motion_in.cvel)
 
     place = paths.segment_geom[e]
     geom = int(0)
@@ -180,40 +198,51 @@ def pull_paths_of(
         sidesite = int(wp.round(paths.wrap_prm[place]))
         if sidesite >= 0:
             side = poses_in.site_xpos[worldid, sidesite]
-    touch0 = wp.spatial_top(touch_in[worldid, e])
-    touch1 = wp.spatial_bottom(touch_in[worldid, e])
-    if touch_in[worldid, e][0] >= MJ_MAXVAL:
-        if body0 == body1:
-            return
+    zero = wp.vec3(0.0)
+    if straight:
         n = wp.normalize(end - start)
         slide = point_velocity(weigh(rates, f1), end - com1) - point_velocity(weigh(rates, f0), start - com0)
         turn = segment_turn(start, end, slide)
-        push_point(body0, worldid, start - com0, -n, -turn, rates, f0, bars_out)
-        push_point(body1, worldid, end - com1, n, turn, rates, f1, bars_out)
+        moved0 = end_wrench(start - com0, -n, -turn, rates, f0)
+        moved1 = end_wrench(end - com1, n, turn, rates, f1)
+        push_body(body0, worldid, wrench(-n, zero, start - com0), moved0, rates, bars_out)
+        push_body(body1, worldid, wrench(n, zero, end - com1), moved1, rates, bars_out)
         return
 
+    touch0 = wp.spatial_top(touch)
+    touch1 = wp.spatial_bottom(touch)
     body = paths.geom_bodyid[geom]
     com = motion_in.subtree_com[worldid, paths.body_rootid[body]]
-    fg = fields_of(body, worldid, fields_in, motion_in.cvel)
+    fg = fields_of(body, worldid, rates, fields_in, motion_in.cvel)
     total = weigh(rates, fg)
-    zero = wp.vec3(0.0)
+    spin = wp.spatial_top(total)
+    along0 = wp.spatial_vectorf()
+    along1 = wp.spatial_vectorf()
+    along = wp.spatial_vectorf()
+    moved0 = wp.spatial_vectorf()
+    moved1 = wp.spatial_vectorf()
+    moved = wp.spatial_vectorf()
     touch0_bar = zero
     touch1_bar = zero
     if body0 != body:
         n = wp.normalize(touch0 - start)
         slide = point_velocity(total, touch0 - com) - point_velocity(weigh(rates, f0), start - com0)
         turn = segment_turn(start, touch0, slide)
-        push_point(body0, worldid, start - com0, -n, -turn, rates, f0, bars_out)
+        along0 = wrench(-n, zero, start - com0)
+        moved0 = end_wrench(start - com0, -n, -turn, rates, f0)
         # The tangent point's displacement is not the geom's: its cotangent goes through the wrap below.
-        touch0_bar = turn + wp.cross(n, wp.spatial_top(total))
-        push_point(body, worldid, touch0 - com, n, -wp.cross(n, wp.spatial_top(total)), rates, fg, bars_out)
+        touch0_bar = turn + wp.cross(n, spin)
+        along += wrench(n, zero, touch0 - com)
+        moved += end_wrench(touch0 - com, n, -wp.cross(n, spin), rates, fg)
     if body1 != body:
         n = wp.normalize(end - touch1)
         slide = point_velocity(weigh(rates, f1), end - com1) - point_velocity(total, touch1 - com)
         turn = segment_turn(touch1, end, slide)
-        push_point(body1, worldid, end - com1, n, turn, rates, f1, bars_out)
-        touch1_bar = -turn - wp.cross(n, wp.spatial_top(total))
-        push_point(body, worldid, touch1 - com, -n, wp.cross(n, wp.spatial_top(total)), rates, fg, bars_out)
+        along1 = wrench(n, zero, end - com1)
+        moved1 = end_wrench(end - com1, n, turn, rates, f1)
+        touch1_bar = -turn - wp.cross(n, spin)
+        along += wrench(-n, zero, touch1 - com)
+        moved += end_wrench(touch1 - com, -n, wp.cross(n, spin), rates, fg)
     mat = poses_in.geom_xmat[worldid, geom]
     pos = poses_in.geom_xpos[worldid, geom]
     start_bar = zero
@@ -236,12 +265,9 @@ def pull_paths_of(
         column = wp.vec3(mat[0, k], mat[1, k], mat[2, k])
         column_bar = wp.vec3(mat_bar[0, k], mat_bar[1, k], mat_bar[2, k])
         torque += wp.cross(column, column_bar)
-    if body0 > 0:
-        wp.atomic_add(bars_out.moved, worldid, body0, wrench(start_bar, zero, start - com0))
-    if body1 > 0:
-        wp.atomic_add(bars_out.moved, worldid, body1, wrench(end_bar, zero, end - com1))
-    if body > 0:
-        wp.atomic_add(bars_out.moved, worldid, body, wrench(pos_bar, torque, pos - com))
+    push_body(body0, worldid, along0, moved0 + wrench(start_bar, zero, start - com0), rates, bars_out)
+    push_body(body1, worldid, along1, moved1 + wrench(end_bar, zero, end - com1), rates, bars_out)
+    push_body(body, worldid, along, moved + wrench(pos_bar, torque, pos - com), rates, bars_out)
     sidesite = int(wp.round(paths.wrap_prm[place]))
     if sidesite >= 0:
         owner = paths.site_bodyid[sidesite]

@@ -97,8 +97,8 @@ def pull_path_parameters(
     end = poses_in.site_xpos[worldid, site1]
     com0 = motion_in.subtree_com[worldid, paths.body_rootid[body0]]
     com1 = motion_in.subtree_com[worldid, paths.body_rootid[body1]]
-    f0 = fields_of(body0, worldid, fields_in, motion_in.cvel)
-    f1 = fields_of(body1, worldid, fields_in, motion_in.cvel)
+    f0 = fields_of(body0, worldid, rates, fields_in, motion_in.cvel)
+    f1 = fields_of(body1, worldid, rates, fields_in, motion_in.cvel)
     if touch_in[worldid, e][0] >= MJ_MAXVAL:
         n = wp.normalize(end - start)
         slide = point_velocity(weigh(rates, f1), end - com1) - point_velocity(weigh(rates, f0), start - com0)
@@ -120,7 +120,7 @@ def pull_path_parameters(
     com = motion_in.subtree_com[worldid, paths.body_rootid[body]]
     pos = poses_in.geom_xpos[worldid, geom]
     mat = poses_in.geom_xmat[worldid, geom]
-    total = weigh(rates, fields_of(body, worldid, fields_in, motion_in.cvel))
+    total = weigh(rates, fields_of(body, worldid, rates, fields_in, motion_in.cvel))
     touch0 = wp.spatial_top(touch_in[worldid, e])
     touch1 = wp.spatial_bottom(touch_in[worldid, e])
     n0 = wp.normalize(touch0 - start)
