@@ -14,7 +14,7 @@ from typing import BinaryIO
 import mujoco
 import numpy as np
 
-from msk_ray.visualize.look import Look, default_camera
+from msk_ray.visualize.look import Look, add_background, default_camera, fit_arrows, has_sky
 
 PROBE = """<mujoco><worldbody><light pos="0 0 3"/><geom type="box" size="1 1 1" rgba="1 0 0 1"/></worldbody></mujoco>"""
 
@@ -45,6 +45,7 @@ def draw(
     option = mujoco.MjvOption()
     look.switch_on(option)
     view: str | mujoco.MjvCamera = camera or default_camera(model)
+    sky, far = has_sky(model), float(model.vis.map.zfar * model.stat.extent)
     with mujoco.Renderer(model, height, width) as renderer:
         for number in range(len(states["qpos"])):
             for field, values in states.items():
@@ -53,7 +54,14 @@ def draw(
             mujoco.mj_forward(model, data)
             look.colour(data.act)
             renderer.update_scene(data, view, option)
-            out.write(renderer.render().tobytes())
+            fit_arrows(renderer.scene, width / height)
+            frame = renderer.render()
+            if not sky:
+                # Drawn twice: where the depth is that of nothing, there is sky.
+                renderer.enable_depth_rendering()
+                frame = add_background(frame, renderer.render(), far)
+                renderer.disable_depth_rendering()
+            out.write(frame.tobytes())
             out.flush()
 
 

@@ -52,6 +52,8 @@ RESTING = """
 </mujoco>
 """
 
+SKY = """<asset><texture type="skybox" builtin="flat" rgb1="1 1 0" rgb2="1 1 0" width="8" height="48"/></asset>"""
+
 
 @pytest.fixture
 def drawing() -> str:
@@ -164,6 +166,36 @@ def test_contact_forces_are_drawn(drawing: str) -> None:
     arrows = [((f[..., 0] > f[..., 1] + 60) & (f[..., 2] > f[..., 1] + 20)).sum() for f in (resting, flying)]
     assert arrows[0] > 10
     assert arrows[1] == 0
+
+
+def test_arrows_end_within_the_picture(drawing: str) -> None:
+    """A box that hits the ground at 3 m/s pushes with many times its weight: its arrows would leave the picture."""
+    model = mujoco.MjModel.from_xml_string(RESTING)
+    qpos = np.array([[0, 0, 0.02, 1, 0, 0, 0]], dtype=float)
+    falling = np.array([[0, 0, -3.0, 0, 0, 0]])
+    (frame,) = frames(States(model, qpos, falling, np.zeros((1, 0)), np.zeros((1, 0))), View(320, 240))
+    red, green, blue = frame.astype(int).transpose(2, 0, 1)
+    cut = (red > green + 60) & (green > blue + 60)
+    rows = np.flatnonzero(cut.any(1))
+    assert cut.sum() > 50
+    # Up to the point of an arrow whose tip is 3 % of half the height away from the edge, and not beyond.
+    assert 2 <= rows.min() <= 24
+
+
+def test_models_without_sky_or_light_are_drawn_on_a_bright_day(drawing: str) -> None:
+    dark = RESTING.replace('<light pos="0 -2 2" dir="0 1 -1"/>', "")
+    body = np.array([[0, 0, 0.5, 1, 0, 0, 0]], dtype=float)
+    shots = []
+    for text in (dark, RESTING.replace("<worldbody>", SKY + "<worldbody>")):
+        model = mujoco.MjModel.from_xml_string(text)
+        (frame,) = frames(States(model, body, np.zeros((1, 6)), np.zeros((1, 0)), np.zeros((1, 0))), View(160, 120))
+        shots.append(frame.astype(int))
+    made, own = shots
+    assert made[3, 3].min() > 200, "bright at the top"
+    assert made[3, 3].sum() > made[50, 3].sum(), "and darker towards the horizon"
+    assert own[3, 3, 0] > 200 > 50 > own[3, 3, 2], "a model's own sky stays"
+    # The box in the middle is lit, although the model has no light.
+    assert made[48, 80].min() > 90
 
 
 def test_without_opengl_the_packages_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
