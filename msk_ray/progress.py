@@ -3,6 +3,8 @@
 import sys
 import time
 
+from msk_ray.text import printable
+
 
 class ProgressLine:
     """Shows epoch, speed, scores and time left: updated in place on a terminal, a line every ten seconds elsewhere."""
@@ -37,6 +39,39 @@ class ProgressLine:
         """End the line."""
         if self._terminal:
             print()
+
+
+COMPILING = "kernels that are not in Warp's cache are compiled first: up to a minute or two on a CPU"
+
+
+def announce(text: str) -> None:
+    """Say what a command is about to do; the next lines may take a while."""
+    print(f"{printable(text)} ...", flush=True)
+
+
+class Pace:
+    """Says how far a command is and how long the rest takes: after two seconds of work, then every ten."""
+
+    FIRST_S, EVERY_S = 2.0, 10.0
+
+    def __init__(self, unit: str, total: int) -> None:
+        """
+        Args:
+            unit: what is counted, in the plural.
+            total: how many there are.
+        """
+        self._unit, self._total = unit, total
+        self._start = time.monotonic()
+        self._due = self._start + self.FIRST_S
+
+    def __call__(self, done: int) -> None:
+        """Tell it that so many are done."""
+        now = time.monotonic()
+        if now < self._due or not 0 < done < self._total:
+            return
+        self._due = now + self.EVERY_S
+        left = (now - self._start) / done * (self._total - done)
+        print(f"  {done} of {self._total} {self._unit}, about {format_duration(left)} left", flush=True)
 
 
 def format_duration(seconds: float) -> str:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 
 from msk_ray.cli import Parser, run
 from msk_ray.config import SET_HELP
-from msk_ray.errors import ConfigError, StorageError
+from msk_ray.errors import CheckpointError, ConfigError, StorageError
+from msk_ray.progress import COMPILING, Pace, announce
 
 if TYPE_CHECKING:
     from msk_ray.diagnose.probe import Quality
@@ -61,10 +62,20 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise ConfigError(f"--{name} must be at least 1, not {getattr(args, name)}")
     if min(args.horizons) < 1:
         raise ConfigError(f"--horizons must be at least 1, not {min(args.horizons)}")
+    if args.seed < 0:
+        raise ConfigError(f"--seed must not be negative, not {args.seed}")
+    if args.subject.suffix == ".pt" and not args.subject.is_file():
+        raise CheckpointError(f"no checkpoint {args.subject}")
+    announce(
+        f"comparing policy gradients of {args.subject} with float64 differences on {args.device}: {args.worlds} worlds "
+        f"of each kind of state, horizons {', '.join(map(str, args.horizons))}, {args.directions} directions; "
+        f"{COMPILING}"
+    )
 
     # torch and Warp take seconds to load; a wrong command line should not wait for them.
     from msk_ray.diagnose.picture import draw
     from msk_ray.diagnose.probe import probe, read_subject
+    from msk_ray.simulation.simulation import resolve_device
 
     subject = read_subject(args.subject, args.overrides)
     known = subject.config.env.variants
@@ -74,6 +85,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 f"env {subject.config.env.name} has no physics named {name!r}; "
                 + (f"write {', '.join(known)}" if known else "leave out --variants")
             )
+    resolve_device(args.device)
     states = args.states or (("reset", "standing") if subject.saved is None else ("reset", "standing", "gait"))
     name = args.subject.stem if subject.saved is None else f"{args.subject.parent.parent.name}_{args.subject.stem}"
     output = args.output or Path("runs") / "diagnose" / name
@@ -86,6 +98,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(f"{'physics':24}{'from':10}{'horizon':>8}{'cosine: median, least':>24}{'norm ratio':>20}{'cotangent':>12}")
     chosen: Sequence[str | None] = args.variants or known or (None,)
     group: list[Quality] = []
+    pace = Pace("comparisons", len(chosen) * len(states) * len(args.horizons) * args.worlds)
     found = probe(
         subject,
         chosen,
@@ -99,6 +112,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for row in found:
         rows.append(row)
         group.append(row)
+        pace(len(rows))
         if len(group) == args.worlds:
             print("".join(_cells(group)), flush=True)
             group = []

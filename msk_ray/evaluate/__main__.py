@@ -20,6 +20,7 @@ from msk_ray.experiment.checkpoint_file import read_facts
 from msk_ray.experiment.layout import EVAL_FILE
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.files import write_json
+from msk_ray.progress import COMPILING, announce
 from msk_ray.shipped import is_shipped
 from msk_ray.sweep.space import parse_seeds
 from msk_ray.text import printable
@@ -116,6 +117,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _evaluate_zoo(target, args)
     if target.kind is not Kind.EXPERIMENT:
         best_checkpoint(target)  # torch and Warp take seconds to load; a wrong path should not wait for them
+    announce(f"evaluating {_what(target)}; {COMPILING}")
 
     from msk_ray.evaluate import measure, myosuite
 
@@ -128,7 +130,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         device = args.device or measure.default_device()
         resolve_device(device)  # a missing device is not the fault of any trial
-        bench = measure.Bench(device)
+        bench = measure.Bench(device, tell=True)
         requests = [measure.Request(name, args.worlds, seeds, args.steps, v) for name in names for v in varied]
         if args.conditions is not None:
             under = [None, *(condition.strip() for condition in args.conditions.split(","))]
@@ -146,13 +148,20 @@ def _evaluate_zoo(target: Target, args: argparse.Namespace) -> int:
             shown = "in" if option == "elsewhere" else option
             raise ConfigError(f"--{shown}: the policies of {target.path} are evaluated as recorded there; leave it out")
     zoo.read_zoo(target.path)  # torch and Warp take seconds to load; a damaged entry should not wait for them
+    announce(f"evaluating the policies of {target.path} as recorded there; {COMPILING}")
 
     from msk_ray.evaluate import measure
     from msk_ray.simulation.simulation import resolve_device
 
     device = args.device or measure.default_device()
     resolve_device(device)
-    return zoo.evaluate_zoo(target.path, measure.Bench(device))
+    return zoo.evaluate_zoo(target.path, measure.Bench(device, tell=True))
+
+
+def _what(target: Target) -> str:
+    if target.kind is not Kind.EXPERIMENT:
+        return str(best_checkpoint(target))
+    return f"the best policy of each of the {len(Experiment(target.path).trials())} trials of {target.path}"
 
 
 def _python_apart(args: argparse.Namespace) -> Path | None:
@@ -174,13 +183,12 @@ def _python_apart(args: argparse.Namespace) -> Path | None:
 
 def _evaluate_one(target: Target, bench: "Bench | MyoSuiteBench", requests: "Sequence[Request]", values: int) -> int:
     """Evaluate one policy; every `values` requests are of one physics, with different values of a parameter."""
-    from msk_ray.evaluate.measure import check_varied
     from msk_ray.training import load_policy
 
     path = best_checkpoint(target)
     policy = load_policy(path)
     for request in requests:
-        check_varied(policy.config, request)
+        bench.check(policy.config, request)
     entries = []
     for request in requests:
         entries.append(bench.evaluate(policy, request))
@@ -235,13 +243,12 @@ def evaluate_experiment(experiment: Experiment, bench: "Bench | MyoSuiteBench", 
     Returns:
         The exit code: 1 if a policy could not be evaluated.
     """
-    from msk_ray.evaluate.measure import check_varied
     from msk_ray.training import load_policy
 
     trials = experiment.trials()
     for request in requests:
         for trial in trials[:1]:
-            check_varied(trial.config, request)
+            bench.check(trial.config, request)
     rankings: list[list[dict[str, Any]]] = []
     failed: dict[str, str] = {}
     untrained: dict[str, str] = {}

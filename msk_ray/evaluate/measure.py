@@ -14,6 +14,7 @@ from msk_ray.envs import env_class
 from msk_ray.envs.randomize import Randomizer
 from msk_ray.errors import ConfigError
 from msk_ray.experiment.versions import installed_versions
+from msk_ray.progress import Pace
 from msk_ray.training import Evaluator, SavedPolicy
 from msk_ray.training.evaluation import Episodes
 from msk_ray.training.machine import device_name
@@ -75,26 +76,20 @@ def named_physics(config: Config, name: str) -> tuple[str, PhysicsConfig]:
     return name, env_type.reference_physics(trained_on, name)
 
 
-def check_varied(config: Config, request: Request) -> None:
-    """Raise ConfigError if the model of a trial does not have what a request varies. Runs nothing."""
-    if request.varied is None:
-        return
-    _, physics = named_physics(config, request.physics)
-    model = env_class(config.env).build_model(config.env, physics)
-    try:
-        Randomizer(request.varied, model, torch.device("cpu"), 0)
-    except ConfigError as error:
-        raise ConfigError(f"--vary {str(error).removeprefix('physics.randomize.')}") from None
-
-
 _WORLDS = ("--worlds", "evaluation.nworld")
 
 
 class Bench:
     """Evaluates policies on one device; trials of equal environment, physics and size share one simulation."""
 
-    def __init__(self, device: str) -> None:
+    def __init__(self, device: str, tell: bool = False) -> None:
+        """
+        Args:
+            device: "cpu" or "cuda:N".
+            tell: whether to print how far it is while it works.
+        """
         self._device = device
+        self._tell = tell
         self._evaluators: dict[str, Evaluator] = {}
 
     def evaluator(self, config: Config, request: Request) -> tuple[Evaluator, str]:
@@ -114,6 +109,22 @@ class Bench:
                 self._evaluators[key] = Evaluator(config, self._device, physics, request.varied)
         return self._evaluators[key], shown if request.varied is None else f"{shown}, {request.varied}"
 
+    def check(self, config: Config, request: Request) -> None:
+        """Raise ConfigError if a trial does not have the physics of a request, or its model not what the request
+        varies. Runs nothing."""
+        _, physics = named_physics(config, request.physics)
+        if request.varied is None:
+            return
+        model = env_class(config.env).build_model(config.env, physics)
+        try:
+            Randomizer(request.varied, model, torch.device("cpu"), 0)
+        except ConfigError as error:
+            raise ConfigError(f"--vary {str(error).removeprefix('physics.randomize.')}") from None
+
+    def pace(self, steps: int) -> Pace | None:
+        """What says how far an episode of so many env steps is; None if nothing is to be printed."""
+        return Pace("env steps at most", steps) if self._tell else None
+
     def evaluate(self, policy: SavedPolicy, request: Request) -> dict[str, Any]:
         """One entry of `eval.json`: what was evaluated, how, and the results.
 
@@ -131,7 +142,9 @@ class Bench:
         own = policy.config.evaluation
         seeds = request.seeds or (own.seed,)
         with named_out_of_memory(self._device, evaluator.env.nworld, *_WORLDS):
-            runs = [evaluator.episodes(policy.on(evaluator.env), seed) for seed in seeds]
+            runs = [
+                evaluator.episodes(policy.on(evaluator.env), seed, pace=self.pace(evaluator.steps)) for seed in seeds
+            ]
         reference = named_physics(policy.config, REFERENCE)[1]
         canonical = (
             request.varied is None

@@ -66,6 +66,10 @@ class MyoSuiteBench:
     def __init__(self, python: Path) -> None:
         self._python = python.absolute()  # not resolved: a virtual environment's is a link to another
 
+    def check(self, config: Config, request: Request) -> None:
+        """Raise ConfigError if a trial's policy does not act in this environment. Runs nothing."""
+        check_policy(config)
+
     def evaluate(self, policy: SavedPolicy, request: Request) -> dict[str, Any]:
         """One entry of `eval.json`: what was evaluated, how, and the results. `request` is one of `requests`.
 

@@ -1,10 +1,14 @@
 """Check gradients of a model against float64 central differences of C MuJoCo."""
 
-from msk_ray.gradcheck.chain import ChainComparison, check_chain
-from msk_ray.gradcheck.check import Comparison, GradientCheck, Limits, check_gradients
-from msk_ray.gradcheck.nonfinite import NonFinite
-from msk_ray.gradcheck.oracle import Linearization, Oracle, Point
-from msk_ray.gradcheck.states import STATE_KINDS, make_states
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from msk_ray.gradcheck.chain import ChainComparison, check_chain
+    from msk_ray.gradcheck.check import Comparison, GradientCheck, Limits, check_gradients
+    from msk_ray.gradcheck.nonfinite import NonFinite
+    from msk_ray.gradcheck.oracle import Linearization, Oracle, Point
+    from msk_ray.gradcheck.states import STATE_KINDS, make_states
 
 __all__ = [
     "STATE_KINDS",
@@ -20,3 +24,21 @@ __all__ = [
     "check_gradients",
     "make_states",
 ]
+
+_HOMES = {
+    "chain": ("ChainComparison", "check_chain"),
+    "check": ("Comparison", "GradientCheck", "Limits", "check_gradients"),
+    "nonfinite": ("NonFinite",),
+    "oracle": ("Linearization", "Oracle", "Point"),
+    "states": ("STATE_KINDS", "make_states"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Names are loaded where they are first used: the command says what it does before torch is there."""
+    for home, names in _HOMES.items():
+        if name in names:
+            found = getattr(import_module(f"{__name__}.{home}"), name)
+            globals()[name] = found
+            return found
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from msk_ray.cli import Parser, run
 from msk_ray.errors import ConfigError, UnsupportedModelError
+from msk_ray.progress import COMPILING, Pace, announce
 
 if TYPE_CHECKING:
     import mujoco
@@ -127,7 +128,7 @@ def load_model(path: Path) -> "mujoco.MjModel":
     """Compile a model file.
 
     Raises:
-        ConfigError: there is no such file, or MuJoCo does not accept it.
+        ConfigError: MuJoCo does not accept it.
     """
     import mujoco
 
@@ -137,8 +138,6 @@ def load_model(path: Path) -> "mujoco.MjModel":
 
         config = load_config(path)
         return env_class(config.env).build_model(config.env, config.physics)
-    if not path.is_file():
-        raise ConfigError(f"no model file {path}")
     try:
         if path.suffix == ".mjb":
             return mujoco.MjModel.from_binary_path(str(path))
@@ -152,6 +151,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser().parse_args(argv)
     if args.seed < 0:
         raise ConfigError(f"--seed must not be negative, not {args.seed}")
+    if args.model.suffix not in (".yaml", ".yml") and not args.model.is_file():
+        raise ConfigError(f"no model file {args.model}")
+    states, parameters = _listed(args.states), _listed(args.parameters)
+    if not args.json:
+        kinds = ", ".join(states)
+        announce(
+            f"checking gradients of {args.model} on {args.device}: {args.worlds} states each of {kinds}, "
+            f"{args.substeps} substep(s), by {args.mode}; {COMPILING}"
+        )
     # torch and Warp take seconds to load; a wrong command line should not wait for them.
     from msk_ray.gradcheck.check import GradientCheck, Limits, check_gradients, check_request
     from msk_ray.physics.parameters import check_names, names_of
@@ -164,7 +172,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         from msk_ray.envs.options import INTEGRATORS
 
         model.opt.integrator = INTEGRATORS[args.integrator]
-    states, parameters = _listed(args.states), _listed(args.parameters)
     if parameters == ["all"]:
         parameters = names_of(model)
     check_request(model, states)
@@ -181,7 +188,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             njmax=args.njmax,
             tolerance=args.solver_tolerance,
         )
-        result = check_gradients(sim, states=states, seed=args.seed, limits=limits, parameters=parameters)
+        pace = None if args.json else Pace("states", args.worlds * len(set(states)))
+        result = check_gradients(sim, states=states, seed=args.seed, limits=limits, parameters=parameters, pace=pace)
     except UnsupportedModelError as error:
         if args.json:
             empty = GradientCheck(args.mode, args.substeps, args.worlds)

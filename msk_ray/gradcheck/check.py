@@ -4,7 +4,7 @@ Axes: W worlds of one kind of state, R = 2 nv + na rows, the tangent of (qpos', 
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import mujoco
@@ -150,6 +150,7 @@ def check_gradients(
     seed: int = 0,
     limits: Limits | None = None,
     parameters: Sequence[str] = (),
+    pace: Callable[[int], None] | None = None,
 ) -> GradientCheck:
     """Compare gradients of one env step of `sim` with float64 central differences of C MuJoCo.
 
@@ -161,6 +162,7 @@ def check_gradients(
         seed: seed of the states and cotangents.
         limits: what counts as a kink and as a forward mismatch.
         parameters: fields of the model whose gradients are compared too, at the model's own values.
+        pace: told after each state how many are done.
 
     Returns:
         The comparisons; if every state was excluded there are none, and `max_rel_error` is infinite.
@@ -178,6 +180,7 @@ def check_gradients(
     check_names(model, parameters)
     oracle, limits = Oracle(model, substeps, parameters), limits or Limits()
     result = GradientCheck(sim.backward.name, substeps, worlds)
+    done = 0
     for kind in dict.fromkeys(states):
         points = make_states(model, kind, worlds, seed)
         rng = np.random.default_rng([seed, list(STATE_KINDS).index(kind), 1])
@@ -200,6 +203,9 @@ def check_gradients(
                 result.checked += 1
                 result.parameter_kinks += int(sum(bent.sum() for bent in reference.bent.values()))
                 result.results += _comparisons(kind, world, reference, cotangents[world], own)
+            done += 1
+            if pace is not None:
+                pace(done)
     if "approximated_share" in result.diagnostics:
         result.approximated = partly_exact(model)
     return result

@@ -5,6 +5,10 @@ import warp as wp
 # Before anything initialises Warp: a line for each of some thirty modules loaded would bury what a user wants to see.
 wp.config.log_level = wp.LOG_WARNING
 
+from msk_ray.physics.no_gpu import start_quietly  # noqa: E402
+
+start_quietly()
+
 from msk_ray.physics.batch import WorldBatch  # noqa: E402
 from msk_ray.physics.graph import Graph, joined_stream, joining_capture, without_collecting  # noqa: E402
 from msk_ray.physics.taped import TapedStep, WarpState  # noqa: E402

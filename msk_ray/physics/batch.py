@@ -142,7 +142,7 @@ class WorldBatch:
             try:
                 model = mjw.put_model(self.structure)
             except (NotImplementedError, ValueError) as error:
-                raise UnsupportedModelError(f"mujoco_warp cannot load the model: {error}") from error
+                raise UnsupportedModelError(f"mujoco_warp cannot load the model: {error}{_advice(error)}") from error
             if self._tolerance is not None:
                 # put_model clamps to 1e-6; the adjoint holds at the optimum only, so it may ask for less.
                 model.opt.tolerance = wp.array([self._tolerance], dtype=float)
@@ -284,3 +284,15 @@ class WorldBatch:
             array = getattr(self.model, f"pair_{name}")
             # In place: a recorded graph reads this memory.
             array.assign(np.asarray(value, np.float32).reshape(*array.shape, -1))
+
+
+_ADVICE = {
+    "mjSOL_PGS": 'write solver="Newton", or "CG", in the <option> of the model',
+    "mjINT_": 'write integrator="Euler", "implicitfast" or "RK4" in the <option> of the model',
+}
+
+
+def _advice(error: Exception) -> str:
+    """What to write instead of an option that mujoco_warp does not have."""
+    text = str(error)
+    return next((f" {advice}" for name, advice in _ADVICE.items() if name in text), "")

@@ -114,7 +114,13 @@ class Evaluator:
         self._worlds = e.nworld
         self._tail = min(steps, math.ceil(1.0 / settings.control_timestep))
 
-    def episodes(self, policy: Policy, seed: int | None = None, on_step: OnStep | None = None) -> Episodes:
+    def episodes(
+        self,
+        policy: Policy,
+        seed: int | None = None,
+        on_step: OnStep | None = None,
+        pace: Callable[[int], None] | None = None,
+    ) -> Episodes:
         """Run every world's first episode.
 
         Args:
@@ -122,11 +128,12 @@ class Evaluator:
             seed: seed of the initial states; None: `evaluation.seed`.
             on_step: called with the physical state before each env step and the controls (W, nu) of that step, and
                 once more at the end with the last state and the controls that led to it.
+            pace: told after each env step how many are done.
 
         Raises:
             SimulationError: contacts or constraint rows were lost to a full buffer.
         """
-        return self._episodes([policy], seed, on_step)[0]
+        return self._episodes([policy], seed, on_step, pace)[0]
 
     def run(self, policies: Sequence[Policy]) -> list[dict[str, float]]:
         """Evaluate policies from raw observations (W, O) to actions (W, A). Each gets the figures that it gets alone.
@@ -168,7 +175,11 @@ class Evaluator:
 
     @torch.no_grad()
     def _episodes(
-        self, policies: Sequence[Policy], seed: int | None = None, on_step: OnStep | None = None
+        self,
+        policies: Sequence[Policy],
+        seed: int | None = None,
+        on_step: OnStep | None = None,
+        pace: Callable[[int], None] | None = None,
     ) -> list[Episodes]:
         """The episodes of each of at most as many policies as there is room for."""
         env = self.env
@@ -184,6 +195,8 @@ class Evaluator:
                 on_step(env.state.physics, control)
             transition = env.step(action, auto_reset=False)
             record.add(step, transition, env.outcome_terms(env.state.physics))
+            if pace is not None:
+                pace(step + 1)
             if step % _CHECK_EVERY == 0 and step < self.steps - 1 and record.all_ended():
                 break
         if on_step is not None:

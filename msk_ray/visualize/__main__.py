@@ -11,6 +11,8 @@ from msk_ray.cli import Parser, run
 from msk_ray.errors import CheckpointError, ConfigError
 from msk_ray.evaluate.__main__ import positive
 from msk_ray.evaluate.targets import Target, best_checkpoint, best_trial_folder, find_target, trial_folder_of
+from msk_ray.files import make_folder
+from msk_ray.progress import COMPILING, announce
 from msk_ray.text_table import text_table
 
 if TYPE_CHECKING:
@@ -94,11 +96,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
     target = _check(args)
+    announce(f"running {_what(args, target)}; {COMPILING}")
     from msk_ray.evaluate.measure import Bench, Request, default_device
+    from msk_ray.simulation.simulation import resolve_device
     from msk_ray.training import load_policy
 
     seeds = None if args.seed is None else (args.seed,)
-    bench = Bench(args.device or default_device())
+    device = args.device or default_device()
+    resolve_device(device)
+    bench = Bench(device, tell=True)
     if args.progression is not None:
         return _progression(args, target, bench, Request(args.physics, 1, seeds, args.steps))
     policy = load_policy(best_checkpoint(target))
@@ -112,9 +118,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"{done} episodes")
         return 0
     from msk_ray.visualize.episodes import record
+    from msk_ray.visualize.render import check_camera
 
     count = args.episodes or (10 if args.no_render else 1)
-    recording = record(bench, policy, Request(args.physics, count, seeds, args.steps))
+    request = Request(args.physics, count, seeds, args.steps)
+    if drawing:
+        check_camera(bench.evaluator(policy.config, request)[0].env.model, args.camera)
+    recording = record(bench, policy, request)
     print(f"{policy.path}, epoch {policy.epoch}, under {recording.physics} physics")
     print(episode_table(recording))
     if drawing:
@@ -138,10 +148,7 @@ def _check(args: argparse.Namespace) -> Target:
         )
     if args.tensorboard and not args.strip:
         raise ConfigError("--tensorboard needs --strip FILE")
-    if args.video is not None:
-        from msk_ray.visualize.film import check_video_path
-
-        check_video_path(args.video)
+    _check_files(args)
     if drawing:
         from msk_ray.visualize.render import headless_backend
 
@@ -151,6 +158,30 @@ def _check(args: argparse.Namespace) -> Target:
 
         check_display()
     return target
+
+
+def _check_files(args: argparse.Namespace) -> None:
+    """Refuse files that could not be written at the end."""
+    from msk_ray.visualize.film import check_image_path, check_video_path
+
+    if args.video is not None:
+        check_video_path(args.video)
+        make_folder(args.video.parent)
+    if args.strip is not None:
+        check_image_path(args.strip)
+        make_folder(args.strip.parent)
+    if args.save_frames is not None:
+        make_folder(args.save_frames)
+
+
+def _what(args: argparse.Namespace, target: Target) -> str:
+    """The episodes that the command line asks for."""
+    if args.progression is not None:
+        return f"an episode of each policy that {best_trial_folder(target)} saved during training"
+    count = args.episodes or (10 if args.no_render else 1)
+    watched = not (args.no_render or args.video or args.save_frames or args.strip)
+    number = "episodes" if watched else "1 episode" if count == 1 else f"{count} episodes at once"
+    return f"{number} of {best_checkpoint(target)}"
 
 
 def episode_table(recording: "Recording") -> str:

@@ -70,7 +70,7 @@ def record(bench: Bench, policy: SavedPolicy, request: Request) -> Recording:
         controls.append(control.cpu())
 
     seed = request.seeds[0] if request.seeds else None
-    episodes = evaluator.episodes(policy.on(evaluator.env), seed, keep)
+    episodes = evaluator.episodes(policy.on(evaluator.env), seed, keep, bench.pace(evaluator.steps))
     return Recording(
         episodes.cpu(),
         physics,

@@ -73,6 +73,16 @@ def check_video_path(path: Path) -> None:
         raise ConfigError(f"--video {path}: write a name that ends in .mp4, .mkv, .mov or .gif")
 
 
+def check_image_path(path: Path) -> None:
+    """Refuse a file name whose suffix has no picture format, before anything is computed.
+
+    Raises:
+        ConfigError: the message names the suffixes that work.
+    """
+    if path.suffix.lower() not in (".png", ".jpg", ".jpeg", ".webp"):
+        raise ConfigError(f"--strip {path}: write a name that ends in .png, .jpg or .webp")
+
+
 def write_frames(frames: Iterable[np.ndarray], folder: Path) -> int:
     """Write frames as frame_000000.png and so on.
 

@@ -95,7 +95,7 @@ def frames(states: States, view: View) -> Iterator[np.ndarray]:
         DeviceError: no OpenGL platform works, or the drawing process failed.
     """
     backend = headless_backend()
-    _check_camera(states.model, view.camera)
+    check_camera(states.model, view.camera)
     with tempfile.TemporaryDirectory() as scratch, (Path(scratch) / "errors").open("w+b") as errors:
         model, arrays = Path(scratch) / "model.mjb", Path(scratch) / "states.npz"
         mujoco.mj_saveModel(states.model, str(model))
@@ -124,7 +124,8 @@ def frames(states: States, view: View) -> Iterator[np.ndarray]:
             process.wait()
 
 
-def _check_camera(model: mujoco.MjModel, camera: str) -> None:
+def check_camera(model: mujoco.MjModel, camera: str) -> None:
+    """Raise DeviceError if a model has no camera of this name; it has a default one, without a name."""
     names = [model.camera(number).name for number in range(model.ncam)]
     if camera and camera not in names:
         raise DeviceError(f"--camera {camera!r}: the model has {', '.join(names) or 'no cameras'}")
