@@ -21,6 +21,8 @@ from msk_ray.simulation import Simulation
 from msk_ray.training import Trainer
 from msk_ray.training.evaluation import Evaluator
 
+pytestmark = pytest.mark.long
+
 EVERYTHING: dict[str, Any] = {
     "geom_friction": {"low": 0.4, "high": 1.2, "mode": "value"},
     "body_mass": {"low": 0.7, "high": 1.4, "each": True},

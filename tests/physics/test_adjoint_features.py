@@ -261,7 +261,7 @@ def _wraps(model: mujoco.MjModel, point: Point) -> bool:
     return model.ntendon == 0 or bool(np.any(data.wrap_obj >= 0))
 
 
-@pytest.mark.parametrize("substeps", [1, 8])
+@pytest.mark.parametrize("substeps", [1, pytest.param(8, marks=pytest.mark.long)])
 @pytest.mark.parametrize("name", sorted(SCENES))
 def test_feature(name, substeps):
     model = SCENES[name]()

@@ -23,6 +23,8 @@ from msk_ray.training.checkpoint import epoch_checkpoints, read_checkpoint
 from msk_ray.training.policy import load_policy
 from msk_ray.training.threads import use_threads
 
+pytestmark = pytest.mark.long
+
 
 def without_clocks(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     timed = ("seconds", "env_steps_per_s")
