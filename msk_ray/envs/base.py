@@ -21,7 +21,7 @@ from msk_ray.errors import ConfigError
 from msk_ray.group import ALONE, Group
 from msk_ray.physics.capacity import Capacity
 from msk_ray.simulation import Backward, Simulation, StepState
-from msk_ray.simulation.kinematics import Frames, Kinematics, Names
+from msk_ray.simulation.kinematics import Frames, Kinematics, Names, as_named
 from msk_ray.simulation.tendons import Tendons
 
 SettingsT = TypeVar("SettingsT", bound=EnvSettings)
@@ -392,7 +392,7 @@ class Env(ABC, Generic[SettingsT]):
                 "reward_terms, fell or outcome_terms, not in observe"
             )
         force = self._once("contact_forces", state, self.sim.contact_forces)
-        chosen = force[:, self._kinematics.indices("geom", geom)]
+        chosen = as_named(force[:, self._kinematics.indices("geom", geom)], geom)
         return chosen.masked_fill(self._diverged.view(-1, *[1] * (chosen.dim() - 1)), 0.0)
 
     def _once(self, what: str, state: StepState, measure: Callable[[], Any]) -> Any:

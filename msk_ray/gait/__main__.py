@@ -1,5 +1,6 @@
 """`python -m msk_ray.gait`: how does a policy walk, compared with people?"""
 
+import argparse
 import math
 import sys
 from collections.abc import Sequence
@@ -27,6 +28,7 @@ Several policies are compared in one table; with --speeds, each is told these sp
 EXAMPLES = """\
   python -m msk_ray.gait runs/train/myoleg26_seed0
   python -m msk_ray.gait myoleg26_reward --worlds 64 --out gait/          # the best trial of an experiment
+  python -m msk_ray.gait runs/train/myoleg26_seed0 --film stride.gif       # beside people's, as stick figures
   python -m msk_ray.gait runs/a runs/b/checkpoints/epoch_000400.pt        # side by side
   python -m msk_ray.gait runs/train/fast_seed0 --speeds 0.7,1,1.25,1.6    # a policy that is told its speed"""
 
@@ -41,6 +43,12 @@ def parser() -> Parser:
         help="the policies to measure: themselves, or the best ones",
     )
     p.add_argument("--speeds", metavar="LIST", help="target speeds [m/s], such as 0.7,1.25 (default: the trial's)")
+    p.add_argument(
+        "--film",
+        type=Path,
+        metavar="FILE",
+        help="draw a stride from the side beside people's: a .gif, .mp4, .mkv or .mov",
+    )
     p.add_argument("--worlds", type=positive, default=16, metavar="W", help="episodes (default: %(default)s)")
     p.add_argument("--steps", type=positive, metavar="N", help="maximum env steps per episode")
     p.add_argument("--out", type=Path, metavar="DIR", help="folder to write to (default: the trial's)")
@@ -55,6 +63,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
     paths = [best_checkpoint(find_target(target, args.storage)) for target in args.targets]
+    if args.film is not None:
+        _check_film(args)
     speeds: list[float | None] = [None] if args.speeds is None else [*_speeds(args.speeds)]
 
     from msk_ray.evaluate.measure import Bench, Request, default_device
@@ -81,10 +91,26 @@ def main(argv: Sequence[str] | None = None) -> int:
             if len(paths) == len(speeds) == 1:
                 print(gait_text(gait))
             print(f"written into {out / name}.json and {out / name}.png")
+            if args.film is not None:
+                from msk_ray.gait.stick import figures, film, one_stride
+
+                stride, seconds = one_stride(found.episodes, found.qpos)
+                model, people = found.env.model, found.env.people_poses()
+                film(figures(model, stride), figures(model, people), seconds, args.film)
+                print(f"written into {args.film}")
             rows.append((f"{trial_folder_of(path).name}/{path.name}{suffix}", gait))
     if len(rows) > 1:
         print(side_by_side(rows))
     return 0
+
+
+def _check_film(args: argparse.Namespace) -> None:
+    """Refuse a film that cannot be made, before anything is computed."""
+    from msk_ray.visualize.film import check_video_path
+
+    check_video_path(args.film)
+    if len(args.targets) > 1 or args.speeds is not None:
+        raise ConfigError("--film draws one stride: name one policy, and leave --speeds out")
 
 
 def _speeds(text: str) -> list[float]:

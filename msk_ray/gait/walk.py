@@ -4,7 +4,8 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 from msk_ray.envs.legs.config import LegSettings
-from msk_ray.envs.legs.gait.body import analyse, check_legs
+from msk_ray.envs.legs.env import LegEnv
+from msk_ray.envs.legs.gait.body import Array, Episode, analyse, check_legs
 from msk_ray.envs.legs.gait.measure import measure
 from msk_ray.errors import ConfigError
 from msk_ray.evaluate.measure import Bench, Made, Request, device_name, entry_of
@@ -22,6 +23,10 @@ class Walk(NamedTuple):
     """Result of `measure`."""
     entry: dict[str, Any]
     """An entry of `eval.json`, with the gait's figures under `gait`."""
+    episodes: list[Episode]
+    qpos: list[Array]
+    """Positions of each episode, (T, nq)."""
+    env: LegEnv[Any]
 
 
 def at_target_speed(policy: SavedPolicy, speed: float) -> SavedPolicy:
@@ -45,11 +50,14 @@ def walk(bench: Bench, policy: SavedPolicy, request: Request) -> Walk:
         MskRayError: as for `record`.
     """
     evaluator = bench.evaluator(policy.config, request)[0]
-    check_legs(evaluator.env.model)
+    env = evaluator.env
+    check_legs(env.model)
+    assert isinstance(env, LegEnv)
     recording = record(bench, policy, request)
-    episodes = []
+    episodes, positions = [], []
     for world in range(recording.count):
         states = recording.world(world)
+        positions.append(states.qpos)
         episodes.append(analyse(recording.model, states.qpos, states.qvel, states.act, recording.timestep))
     gait = measure(episodes, recording.episodes.fell.tolist())
     seeds = request.seeds or (policy.config.evaluation.seed,)
@@ -57,4 +65,4 @@ def walk(bench: Bench, policy: SavedPolicy, request: Request) -> Walk:
         recording.physics, False, recording.count, seeds[:1], evaluator.steps, device_name(str(evaluator.env.device))
     )
     entry = entry_of(policy, made, [recording.episodes], evaluator.env.reward_names)
-    return Walk(gait, entry | {"gait": {name: gait[name] for name in _KEPT}})
+    return Walk(gait, entry | {"gait": {name: gait[name] for name in _KEPT}}, episodes, positions, env)

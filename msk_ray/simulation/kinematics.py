@@ -23,6 +23,14 @@ Names = str | int | Sequence[str | int]
 """One name or id, which drops the axis n of the result, or several."""
 
 
+def as_named(values: Tensor, names: Names) -> Tensor:
+    """Values (W, n, ·) of what was named, without the axis n for one name.
+
+    Reading one element by its id on the device would make the host wait, so that no epoch could be recorded.
+    """
+    return values.squeeze(1) if isinstance(names, str | int) else values
+
+
 class _Walk(torch.autograd.Function):
     """(qpos, qvel) to the frames of all bodies, differentiable once in both."""
 
@@ -109,7 +117,7 @@ class Kinematics:
         return grad_qpos.clone(), grad_qvel.clone()
 
     def indices(self, kind: str, names: Names) -> Tensor:
-        """Ids of bodies, sites or geoms by name or id: shape () for one, (n,) for several.
+        """Ids of bodies, sites or geoms by name or id, (n,); n is 1 for one.
 
         Args:
             kind: `body`, `site` or `geom`.
@@ -120,7 +128,8 @@ class Kinematics:
         """
         key = (kind, names if isinstance(names, str | int) else tuple(names))
         if key not in self._found:
-            ids = self._id(kind, names) if isinstance(names, str | int) else [self._id(kind, name) for name in names]
+            several = [names] if isinstance(names, str | int) else names
+            ids = [self._id(kind, name) for name in several]
             self._found[key] = torch.tensor(ids, device=self._device)
         return self._found[key]
 
@@ -188,19 +197,19 @@ class Frames:
 
     def position(self, body: Names) -> Tensor:
         """Origin of bodies [m], (W, 3) or (W, n, 3)."""
-        return self._pos[:, self._kinematics.indices("body", body)]
+        return as_named(self._pos[:, self._kinematics.indices("body", body)], body)
 
     def orientation(self, body: Names) -> Tensor:
         """Orientation of bodies as unit quaternions (w, x, y, z), (W, 4) or (W, n, 4)."""
-        return self._quat[:, self._kinematics.indices("body", body)]
+        return as_named(self._quat[:, self._kinematics.indices("body", body)], body)
 
     def velocity(self, body: Names) -> Tensor:
         """Velocity of bodies' origins [m/s], (W, 3) or (W, n, 3)."""
-        return self._linvel[:, self._kinematics.indices("body", body)]
+        return as_named(self._linvel[:, self._kinematics.indices("body", body)], body)
 
     def angular_velocity(self, body: Names) -> Tensor:
         """Angular velocity of bodies [rad/s], (W, 3) or (W, n, 3)."""
-        return self._angvel[:, self._kinematics.indices("body", body)]
+        return as_named(self._angvel[:, self._kinematics.indices("body", body)], body)
 
     def axis(self, body: Names, axis: int) -> Tensor:
         """Direction of axis 0, 1 or 2 (x, y, z) of bodies, unit vectors (W, 3) or (W, n, 3)."""
@@ -218,7 +227,7 @@ class Frames:
         ids = self._kinematics.indices("site", site)
         body, _, quat = self._kinematics.place("site")
         own = self._quat[:, body[ids]]
-        return quat_multiply(own, quat[ids].expand_as(own))
+        return as_named(quat_multiply(own, quat[ids].expand_as(own)), site)
 
     def site_velocity(self, site: Names) -> Tensor:
         """Velocity of sites [m/s], (W, 3) or (W, n, 3)."""
@@ -244,14 +253,14 @@ class Frames:
         """Angular momentum of the subtrees of bodies about their centres of mass [kg m²/s], (W, 3) or (W, n, 3)."""
         c = self._kinematics.constants
         ids = self._kinematics.indices("body", body)
-        members = c.subtree[ids]
+        members = c.subtree[ids]  # (n, B)
         position, velocity = self._centers
         axes = quat_multiply(self._quat, c.axes.expand_as(self._quat))
         spin = quat_rotate(torch.cat((axes[..., :1], -axes[..., 1:]), -1), self._angvel)
         own = quat_rotate(axes, c.inertia * spin)
         about = own + c.mass[:, None] * torch.linalg.cross(position, velocity)
-        total = torch.einsum("...b,wbk->w...k", members, about)
-        mass = (members @ c.mass)[..., None]
+        total = as_named(torch.einsum("nb,wbk->wnk", members, about), body)
+        mass = as_named((members @ c.mass)[None, :, None], body)
         # Σ m r × v about the origin is that about the centre of mass plus M c × v_c.
         return total - mass * torch.linalg.cross(self.center_of_mass(body), self.com_velocity(body))
 
@@ -264,7 +273,7 @@ class Frames:
     def _subtree(self, values: Tensor, body: Names) -> Tensor:
         c = self._kinematics.constants
         weights = c.subtree[self._kinematics.indices("body", body)] * c.mass
-        return torch.einsum("...b,wbk->w...k", weights / weights.sum(-1, keepdim=True), values)
+        return as_named(torch.einsum("nb,wbk->wnk", weights / weights.sum(-1, keepdim=True), values), body)
 
     def _point(self, kind: str, names: Names) -> tuple[Tensor, Tensor]:
         ids = self._kinematics.indices(kind, names)
@@ -272,4 +281,5 @@ class Frames:
         at = body[ids]
         quat = self._quat[:, at]
         arm = quat_rotate(quat, pos[ids].expand(*quat.shape[:-1], 3))
-        return self._pos[:, at] + arm, self._linvel[:, at] + torch.linalg.cross(self._angvel[:, at], arm)
+        velocity = self._linvel[:, at] + torch.linalg.cross(self._angvel[:, at], arm)
+        return as_named(self._pos[:, at] + arm, names), as_named(velocity, names)

@@ -47,6 +47,8 @@ def test_steps_and_cadence_by_hand() -> None:
     assert cycles.cadence(right, left, 0.1) == pytest.approx(150.0)
     assert cycles.cadence(right, np.zeros(10, dtype=bool), 1.0) == pytest.approx(7.5)
     assert cycles.cadence(np.zeros(10, dtype=bool), np.zeros(10, dtype=bool), 1.0) is None
+    hop = np.array([0, 0, 1, 1], dtype=bool)
+    assert cycles.cadence(hop, hop, 0.1) is None, "both feet come down at once, once"
 
 
 def test_symmetry_by_hand() -> None:

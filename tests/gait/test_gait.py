@@ -1,12 +1,14 @@
 """From states to series: forces, angles and power of the 26-muscle model; and the command."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from msk_ray.config import Config, PhysicsConfig, parse_config
 from msk_ray.envs import make_env
@@ -18,6 +20,7 @@ from msk_ray.envs.myoleg26.model import build_myoleg26
 from msk_ray.errors import ConfigError
 from msk_ray.evaluate.__main__ import main as evaluate
 from msk_ray.gait.__main__ import main
+from msk_ray.gait.stick import figures, film, one_stride
 from msk_ray.training import Trainer
 
 
@@ -106,7 +109,7 @@ def test_the_command_writes_json_and_a_picture(tmp_path: Path, capsys: pytest.Ca
         main([str(tmp_path / "trial"), "--speeds", "0.5,-1"])
 
 
-def test_people_on_the_legs_of_the_model_are_close_to_people(model: mujoco.MjModel) -> None:
+def test_people_on_the_legs_of_the_model_are_close_to_people(model: mujoco.MjModel, tmp_path: Path) -> None:
     """The measured angles, played back by the clock with the measured force, come back as they were measured."""
     env = make_env(
         MyoLeg26Settings(name="myoleg26", clock=True, reset="cycle", stochastic_reset=False),
@@ -126,6 +129,21 @@ def test_people_on_the_legs_of_the_model_are_close_to_people(model: mujoco.MjMod
         assert found["people"][name]["within_centred"] == 1.0
         assert found["people"][name]["correlation"] > 0.98
     assert found["measures"]["cadence"]["value"] == pytest.approx(116.8, abs=1.5)
+    # One of these strides as stick figures is one of people's.
+    stride, seconds = one_stride([episode], [states.qpos.double().numpy()])
+    assert seconds == pytest.approx(120.0 / 116.8, abs=0.02)
+    own, people = figures(model, stride), figures(model, env.people_poses())
+    assert own.shape == (len(stride), 3, 5, 2)
+    for k in (0, 12, 25, 40):
+        assert np.abs(own[k] - people[round(2.0 * k / seconds) % 100]).max() < 0.05
+    right, left, trunk = own[0]
+    assert right[3, 0] - left[3, 0] == pytest.approx(0.64, abs=0.03), "the right heel is ahead"
+    assert trunk[1, 1] - trunk[0, 1] == pytest.approx(0.5, abs=0.01)
+    assert film(own, people, seconds, tmp_path / "stride.gif") == 30
+    with Image.open(tmp_path / "stride.gif") as picture:
+        assert picture.n_frames > 20
+    with pytest.raises(ConfigError, match="takes no stride to draw"):
+        one_stride([replace(episode, curves={"vertical_force": {"r": np.ones(250)}})], [stride])
 
 
 def test_another_environment_is_refused(tmp_path: Path, tiny_cartpole: Config) -> None:

@@ -9,7 +9,9 @@ from collections.abc import Sequence
 from typing import ClassVar, Generic, TypeVar
 
 import mujoco
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
@@ -20,7 +22,7 @@ from msk_ray.envs.legs import terms as costs
 from msk_ray.envs.legs.config import FURTHER, AssistConfig, LegReward, LegSettings
 from msk_ray.envs.legs.gait.body import SIDES, analyse, world_axes
 from msk_ray.envs.legs.gait.measure import measure, summary
-from msk_ray.envs.legs.metabolic import Fibres, muscle_masses, power
+from msk_ray.envs.legs.metabolic import muscle_masses, total_power
 from msk_ray.envs.legs.mirror import Mirror, check_mirrored, leg_mirrors
 from msk_ray.envs.legs.muscles import MuscleCurves, columns
 from msk_ray.envs.legs.push import pushes
@@ -170,6 +172,10 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
         """The pelvis in the world, computed once per state."""
         found: Root = self._once("root", state, lambda: self.measure_root(state))
         return found
+
+    @abstractmethod
+    def people_poses(self) -> NDArray[np.float64]:
+        """qpos (N, nq) of people at equal distances of the gait cycle, from the right foot's strike on."""
 
     @abstractmethod
     def pose_layout(self) -> list[Entry]:
@@ -364,13 +370,8 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
 
     def metabolic_power(self, state: StepState, action: Tensor) -> Tensor:
         """Metabolic power of all muscles [W], (W,), without that of rest, after actions (W, A)."""
-        length, rate = self.tendons(state)
-        rate = rate[:, self.curves.tendons]
-        length, relative = self.curves.normalised(length[:, self.curves.tendons], rate)
-        isometric = state.act * self.curves.length_curve(length) * self.curves.peak
-        force = isometric * self.curves.rate_curve(relative)
         excitation = self.excitation(self._own_sides(action, self.state.age))
-        return power(Fibres(excitation, state.act, length, rate, force, isometric), self._masses).sum(-1)
+        return total_power(self.curves, self._masses, excitation, state.act, *self.tendons(state))
 
     def _head_speed(self, state: StepState) -> Tensor:
         """Velocity of the head [m/s], (W, 3): forward, left, up."""

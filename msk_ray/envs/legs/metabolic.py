@@ -10,6 +10,8 @@ from typing import Final, NamedTuple
 import torch
 from torch import Tensor
 
+from msk_ray.envs.legs.muscles import MuscleCurves
+
 ACTIVATION: Final = (40.0, 133.0)
 """Activation heat of slow and fast fibres [W/kg] (their table 1)."""
 MAINTENANCE: Final = (74.0, 111.0)
@@ -67,6 +69,24 @@ def power(fibres: Fibres, masses: Tensor) -> Tensor:
     # −α v: shortening gives off heat, stretching takes it up.
     heat = activation + maintenance - heat_per_metre * fibres.rate
     return torch.maximum(heat, masses) - fibres.force * fibres.rate
+
+
+def total_power(
+    curves: MuscleCurves, masses: Tensor, excitation: Tensor, activation: Tensor, length: Tensor, rate: Tensor
+) -> Tensor:
+    """Metabolic power of all muscles [W], (W,).
+
+    Args:
+        curves: of the model's muscles.
+        masses: of the muscles [kg], (U,).
+        excitation, activation: of the muscles, (W, U).
+        length, rate: of all the model's tendons [m], [m/s], (W, ntendon).
+    """
+    rate = rate[:, curves.tendons]
+    length, relative = curves.normalised(length[:, curves.tendons], rate)
+    isometric = activation * curves.length_curve(length) * curves.peak
+    force = isometric * curves.rate_curve(relative)
+    return power(Fibres(excitation, activation, length, rate, force, isometric), masses).sum(-1)
 
 
 def _length_dependence(length: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ import math
 import mujoco
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
@@ -129,6 +130,9 @@ class MyoLeg(LegEnv[MyoLegSettings]):
         qvel[:, self._dependent_dofs] = (c * slopes).sum(-1) * qvel[:, self._driving_dofs]
         act = torch.full((count, self.model.na), _START_ACTIVATION, device=self.device)
         return StepState(qpos, qvel, act)
+
+    def people_poses(self) -> NDArray[np.float64]:
+        return cycle_states(self.model)[0]
 
     def pose_layout(self) -> list[Entry]:
         axes = (f"pelvis_{axis}_axis_{part}" for axis in ("forward", "up") for part in ("forward", "left", "up"))

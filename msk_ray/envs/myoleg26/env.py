@@ -5,6 +5,7 @@ import math
 import mujoco
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
@@ -114,6 +115,9 @@ class MyoLeg26(LegEnv[MyoLeg26Settings]):
         if self._plane:
             return self._slope * x
         return self._levels[torch.bucketize(x.detach(), self._edges)]
+
+    def people_poses(self) -> NDArray[np.float64]:
+        return cycle_states(self.model)[0]
 
     def pose_layout(self) -> list[Entry]:
         joints = self.model.jnt_qposadr.tolist()

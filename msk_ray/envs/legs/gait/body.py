@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from msk_ray.envs.legs.gait.people import ALIASES
-from msk_ray.envs.legs.metabolic import Fibres, muscle_masses, power
+from msk_ray.envs.legs.metabolic import muscle_masses, total_power
 from msk_ray.envs.legs.muscles import MuscleCurves
 from msk_ray.errors import ConfigError
 
@@ -86,14 +86,8 @@ def metabolic_power(model: mujoco.MjModel, act: Array, lengths: Array, rates: Ar
     """Metabolic power of all muscles [W], (T,), with activations (T, U) on paths (T, ntendon) [m], [m/s]."""
     curves = MuscleCurves(model, torch.device("cpu"))
     activation, path, rate = (torch.from_numpy(values).float() for values in (act, lengths, rates))
-    path, rate = path[:, curves.tendons], rate[:, curves.tendons]
-    length, relative = curves.normalised(path, rate)
-    isometric = activation * curves.length_curve(length) * curves.peak
-    force = isometric * curves.rate_curve(relative)
     masses = muscle_masses(curves.peak, curves.optimum)
-    found: Array = (
-        power(Fibres(activation, activation, length, rate, force, isometric), masses).sum(-1).double().numpy()
-    )
+    found: Array = total_power(curves, masses, activation, activation, path, rate).double().numpy()
     return found
 
 

@@ -86,9 +86,9 @@ def step_lengths(contact: Flags, own: Array, other: Array) -> Array:
 
 
 def cadence(right: Flags, left: Flags, timestep: float) -> float | None:
-    """Steps per minute between the first strike of any foot and the last; None with fewer than two strikes."""
+    """Steps per minute between the first strike of any foot and the last; None with no time between them."""
     at = np.sort(np.concatenate((strikes(right), strikes(left))))
-    if len(at) < 2:
+    if len(at) < 2 or at[0] == at[-1]:
         return None
     return 60.0 * (len(at) - 1) / float((at[-1] - at[0]) * timestep)
 
