@@ -308,6 +308,8 @@ def variants(scene: Scene) -> dict[str, tuple[WorldBatch, Launch]]:
     def ours(flags: int) -> Launch:
         chosen = copy.copy(stages)
         chosen._atomic = _with_flags(ordered.model, flags)
+        if flags:
+            chosen.racing = frozenset(("kinematics", "inertia", "velocity", "actuation", "acceleration", "integration"))
         return lambda: chosen.step(ordered.model, ordered.data)
 
     fixed = {"graph_conditional": False, "iterations": min(ITERATIONS, int(package.model.opt.iterations))}

@@ -6,6 +6,7 @@ from typing import Any, Protocol
 import mujoco
 import mujoco_warp as mjw
 import numpy as np
+import warp as wp
 
 from msk_ray.errors import UnsupportedModelError
 from msk_ray.physics.ordered.contacts import ContactOrder
@@ -66,21 +67,53 @@ def check_ordered(mjm: mujoco.MjModel) -> None:
         )
 
 
-def sums_race(mjm: mujoco.MjModel, model: Any) -> bool:
-    """Whether several threads add to one number in a stage of mujoco_warp that the state depends on, the solver aside.
+def racing(mjm: mujoco.MjModel, model: Any) -> frozenset[str]:
+    """Stages of mujoco_warp in which several threads add to one number that the state depends on, the solver aside.
 
-    A number to which one thread adds once, after it was set to zero, needs no order.
+    A number to which one thread adds once, after it was set to zero, needs no order, and neither do zeros.
     """
-    joints = mjm.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
-    single = bool(np.all(joints)) and len(set(mjm.actuator_trnid[:, 0])) == mjm.nu
-    return bool(
-        mjm.ntendon
-        or not single
-        or np.any(mjm.body_gravcomp)
-        or mjm.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER
-        # J v of a row is added up in parts. For twice as many, the inertia is factored over the tree, too.
-        or model.nv_pad > model.block_dim.contact_jac_tiled
-    )
+    trees = np.asarray(mjm.tree_dofnum)
+    found = {
+        "kinematics": mjm.ntendon > 0,
+        "inertia": bool(np.any(mjm.tendon_armature)),
+        # J v of a row is added up in parts.
+        "constraint": model.nv_pad > model.block_dim.contact_jac_tiled,
+        "velocity": bool(np.any(mjm.body_gravcomp))
+        or any(np.any(getattr(mjm, f"tendon_{name}", 0)) for name in _TENDON_FORCES),
+        "actuation": bool(np.any(mjm.jnt_actfrclimited) or np.any(mjm.jnt_actgravcomp))
+        or bool(np.any(mjm.tendon_actfrclimited)),
+        # The inertia of a larger tree is factored over its branches.
+        "acceleration": len(trees) > 0 and int(trees.max()) > _DENSE_TREE,
+        "integration": mjm.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER,
+    }
+    return frozenset(name for name, races in found.items() if races)
+
+
+_TENDON_FORCES = ("stiffness", "stiffnesspoly", "damping", "dampingpoly", "armature")
+_DENSE_TREE = 64
+"""Degrees of freedom of a tree up to which mujoco_warp factors its inertia as one dense block."""
+
+
+@wp.kernel(enable_backward=False)
+def sum_actuators(
+    # In:
+    rownnz_in: wp.array2d[int],
+    rowadr_in: wp.array2d[int],
+    colind_in: wp.array2d[int],
+    moment_in: wp.array2d[float],
+    force_in: wp.array2d[float],
+    # Out:
+    qfrc_actuator_out: wp.array2d[float],
+) -> None:
+    """Generalised force of all actuators on a dof, in their order."""
+    worldid, dof = wp.tid()
+    total = float(0.0)
+    for u in range(force_in.shape[1]):
+        first = rowadr_in[worldid, u]
+        for k in range(first, first + rownnz_in[worldid, u]):
+            if colind_in[worldid, k] == dof:
+                total += moment_in[worldid, k] * force_in[worldid, u]
+    qfrc_actuator_out[worldid, dof] = total
 
 
 def dense(mjm: mujoco.MjModel) -> mujoco.MjModel:
@@ -116,9 +149,13 @@ class OrderedStages:
     def __init__(self, mjm: mujoco.MjModel, model: Any) -> None:
         assert not model.is_sparse, "only dense Jacobians have ordered rows"
         model.callback.contactfilter = self.sort_contacts
+        self.racing = racing(mjm, model)
+        joints = mjm.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
+        single = bool(np.all(joints)) and len(set(mjm.actuator_trnid[:, 0])) == mjm.nu
+        off = bool(mjm.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_ACTUATION)
+        self._sums_actuators = not single and not off and "actuation" not in self.racing
         self._atomic, opt = copy.copy(model), copy.copy(model.opt)
-        if sums_race(mjm, model):
-            opt.deterministic = int(mjw.DeterminismType.ATOMICS)
+        opt.deterministic = int(mjw.DeterminismType.ATOMICS)
         self._atomic.opt = opt
         self._contacts: dict[tuple[int, int], ContactOrder] = {}
         self._rows: dict[tuple[int, int], RowOrder] = {}
@@ -139,34 +176,54 @@ class OrderedStages:
 
     def position(self, model: Any, data: Any) -> None:
         """Launch the position stage, and the sort of its rows."""
-        mjw.fwd_position(self._atomic, data, factorize=False)
+        if "inertia" in self.racing:
+            mjw.fwd_position(self._atomic, data, factorize=False)
+        else:
+            mjw.fwd_kinematics(self._of("kinematics", model), data)
+            mjw.crb(model, data)
+            if model.opt.run_collision_detection:
+                mjw.collision(model, data)
+            mjw.make_constraint(self._of("constraint", model), data)
+            mjw.transmission(model, data)
         if data.njmax:
             self.sort_rows(data)
 
     def summing(self, model: Any) -> Any:
         """A model whose sums through atomics Warp adds up in a fixed order."""
-        return self._atomic
+        return self._atomic if self.racing else model
+
+    def _of(self, stage: str, model: Any) -> Any:
+        return self._atomic if stage in self.racing else model
 
     def step(self, model: Any, data: Any) -> None:
         """Launch one physics step: `mujoco_warp.step`, stage by stage."""
-        atomic = self._atomic
         self.position(model, data)
         data.sensordata.zero_()
-        mjw.sensor_pos(atomic, data)
+        mjw.sensor_pos(model, data)
         data.energy.zero_()
-        mjw.fwd_velocity(atomic, data)
-        mjw.sensor_vel(atomic, data)
-        mjw.fwd_actuation(atomic, data)
-        mjw.fwd_acceleration(atomic, data, factorize=True)
+        mjw.fwd_velocity(self._of("velocity", model), data)
+        mjw.sensor_vel(model, data)
+        mjw.fwd_actuation(self._of("actuation", model), data)
+        if self._sums_actuators:
+            wp.launch(
+                sum_actuators,
+                dim=(data.nworld, model.nv),
+                inputs=[
+                    *(data.moment_rownnz, data.moment_rowadr, data.moment_colind, data.actuator_moment),
+                    data.actuator_force,
+                ],
+                outputs=[data.qfrc_actuator],
+            )
+        mjw.fwd_acceleration(self._of("acceleration", model), data, factorize=True)
         # For many degrees of freedom the solver adds rows up in parts.
         many = model.nv > _ROW_DOFS
         fixed = {"graph_conditional": False, "iterations": model.opt.iterations}
-        solve(with_options(atomic, **fixed) if many else model, data)
-        mjw.sensor_acc(atomic, data)
+        solve(with_options(self._atomic, **fixed) if many else model, data)
+        mjw.sensor_acc(model, data)
         if model.opt.integrator == mjw.IntegratorType.EULER:
-            mjw.euler(atomic, data)
+            mjw.euler(self._of("acceleration", model), data)
         else:
-            mjw.implicit(atomic, data)
+            mjw.implicit(self._of("integration", model), data)
 
 
 _ROW_DOFS = 50
