@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import threading
+from dataclasses import dataclass
 from pathlib import Path
 
 from msk_ray.errors import MskRayError
@@ -15,6 +16,16 @@ FOLDER = "report"
 """Subfolder of an experiment, as that of its report."""
 PREFIX = "film_"
 _SIZE, _FPS = "480x360", "25"
+
+
+@dataclass(frozen=True)
+class Film:
+    """What there is to show of a policy."""
+
+    link: str
+    """Path relative to the experiment; empty if there is no film."""
+    words: str
+    """What it shows, or why there is none."""
 
 
 class Films:
@@ -29,25 +40,30 @@ class Films:
         self._thread = threading.Thread(target=self._work, name="films", daemon=True)
         self._thread.start()
 
-    def of(self, experiment: Experiment, part: str, checkpoint: Path) -> str:
-        """The film of a checkpoint as a path relative to the experiment; or why there is none yet, in words.
+    def of(self, experiment: Experiment, part: str, checkpoint: Path) -> Film:
+        """The film of a checkpoint, or of an earlier one while it is made.
 
         Args:
             part: the environment, where an experiment has several.
         """
         stamp = file_stamp(checkpoint)
         if stamp is None:
-            return "There is no film: the checkpoint is missing."
+            return Film("", "There is no film: the checkpoint is missing.")
         kind = "".join(c if c.isalnum() else "-" for c in part) or "best"
-        film = experiment.path / FOLDER / f"{PREFIX}{kind}_{stamp[0]:x}.mp4"
+        folder = experiment.path / FOLDER
+        film = folder / f"{PREFIX}{kind}_{stamp[0]:x}.mp4"
         if film.is_file():
-            return f"{FOLDER}/{film.name}"
+            return Film(f"{FOLDER}/{film.name}", "An episode of the best policy so far.")
+        earlier = next(folder.glob(f"{PREFIX}{kind}_*.mp4"), None)
+        link = "" if earlier is None else f"{FOLDER}/{earlier.name}"
         with self._condition:
             if film in self._failed:
-                return f"There is no film: {self._failed[film]}"
+                words = f"There is no film of the best policy: {self._failed[film]}"
+                return Film(link, f"{words}; this is an earlier one." if link else words)
             self._wanted[experiment.path, kind] = (checkpoint, film)
             self._condition.notify()
-        return "A film of the best policy is being made."
+        words = "A film of the best policy is being made"
+        return Film(link, f"{words}; this is an earlier one." if link else f"{words}.")
 
     def close(self) -> None:
         """End the process at work, if there is one."""

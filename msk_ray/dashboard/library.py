@@ -13,7 +13,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from msk_ray import __version__
-from msk_ray.dashboard.films import FOLDER, PREFIX, Films
+from msk_ray.dashboard.films import FOLDER, PREFIX, Film, Films
 from msk_ray.dashboard.plots import can_plot, figures
 from msk_ray.errors import ConfigError, MskRayError
 from msk_ray.experiment.layout import EVAL_FILE
@@ -200,7 +200,7 @@ class Library:
         told = [(r.question, r.created, r.space_text, r.environment, r.warnings, r.condition) for r in readings]
         return (told, evaluated, drawn, [self._film(part) for part in parts]), trials
 
-    def _film(self, part: Reading) -> str | None:
+    def _film(self, part: Reading) -> Film | None:
         best = part.best
         if self._films is None or best is None or best.best_checkpoint is None:
             return None
@@ -212,7 +212,7 @@ class Library:
         places = places_of(readings)
         folder = experiments[0].path
         sections: list[Section] = []
-        films: dict[str, str] = {}
+        films: dict[str, tuple[str, str]] = {}
         for number, reading in enumerate(readings, start=1):
             prefix = f"{number}_" if len(readings) > 1 else ""
             section = make_section(reading, folder, prefix, None, places)
@@ -222,7 +222,8 @@ class Library:
             sections.append(section)
             film = self._film(reading)
             if film is not None:
-                films[section.slug] = film if " " in film else section.link(reading.experiment.path / film)
+                link = section.link(reading.experiment.path / film.link) if film.link else ""
+                films[section.slug] = link, film.words
         plots = "plots" if len(whole) == 1 and can_plot(whole[0]) else ""
         live = Live(self._refresh, version, self._may_write, films, plots)
         together = compare(readings, places) if len(readings) > 1 else None

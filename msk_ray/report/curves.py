@@ -241,7 +241,7 @@ def _floor(curves: Sequence[Curve]) -> Floor | None:
     if max(scores) == min(scores) or not left:
         return None
     trials = "1 trial goes" if left == 1 else f"{left} trials go"
-    return Floor(float(bottom), f"▼ {trials} below this axis, down to {min(lowest):.4g}")
+    return Floor(float(f"{bottom:.3g}"), f"▼ {trials} below this axis, down to {min(lowest):.4g}")
 
 
 def _best_scores(trials: Sequence[TrialReading]) -> list[float]:

@@ -169,8 +169,8 @@ class Live:
     """Of the content: the page is fetched again when there is another one."""
     may_write: bool
     """Whether notes can be written."""
-    films: Mapping[str, str]
-    """Slug of a section → link to its film, or text that says why there is none, which has spaces."""
+    films: Mapping[str, tuple[str, str]]
+    """Slug of a section → link to its film, empty if there is none, and what it shows or why there is none."""
     plots: str
     """Link to Optuna's plots; empty if there is nothing to plot."""
 

@@ -299,18 +299,26 @@ def test_a_film_is_made_once_for_each_checkpoint(experiment: Experiment, monkeyp
     monkeypatch.setattr(films, "command_for", lambda source, out: [sys.executable, "-c", code, str(source), str(out)])
     maker = Films()
     try:
-        assert maker.of(experiment, "", checkpoint) == "A film of the best policy is being made."
-        wait_until(lambda: " " not in maker.of(experiment, "", checkpoint))
-        first = experiment.path / maker.of(experiment, "", checkpoint)
+
+        def look() -> films.Film:
+            return maker.of(experiment, "", checkpoint)
+
+        assert look() == films.Film("", "A film of the best policy is being made.")
+        wait_until(lambda: "so far" in look().words)
+        first = experiment.path / look().link
         assert first.read_bytes() == b"policy"
         checkpoint.write_bytes(b"better")
-        wait_until(lambda: " " not in maker.of(experiment, "", checkpoint))
-        second = experiment.path / maker.of(experiment, "", checkpoint)
+        # Until the new one is there, the old one is shown, and called so.
+        meanwhile = look()
+        assert (meanwhile.link, "earlier" in meanwhile.words) == (f"report/{first.name}", True)
+        wait_until(lambda: "so far" in look().words)
+        second = experiment.path / look().link
         wait_until(lambda: list(second.parent.iterdir()) == [second])
         failing = [sys.executable, "-c", "import sys; sys.exit('error: no such thing')"]
         monkeypatch.setattr(films, "command_for", lambda source, out: failing)
         checkpoint.write_bytes(b"worse!")
-        wait_until(lambda: maker.of(experiment, "", checkpoint) == "There is no film: no such thing")
+        wait_until(lambda: "being made" not in look().words)
+        assert look().words == "There is no film of the best policy: no such thing; this is an earlier one."
     finally:
         maker.close()
 
