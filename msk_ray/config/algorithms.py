@@ -166,7 +166,7 @@ class ShacConfig(AlgorithmSettings):
     GPUs have faster units. Sums, and everything else, are in float32."""
     critic_kernels: Literal["torch", "fused"] = "torch"
     """`fused`: activation and norm of a layer are one kernel forward and two back in the critic's fit, where torch has
-    four and nine; the results differ by rounding. For elu with layer_norm."""
+    four and nine; the results differ by rounding. For elu with layer_norm, on a GPU: on a CPU it is slower."""
     target_critic_alpha: Fraction = 0.2
     """target ← α·target + (1 − α)·critic after each epoch."""
     actor_lr: PositiveFloat = 2e-3

@@ -52,14 +52,15 @@ class CriticFit:
         device = next(critic.parameters()).device
         if tf32 and (device.type != "cuda" or torch.cuda.get_device_capability(device) < (8, 0)):
             raise ConfigError(f"shac.critic_products: {device.type} has no tf32 here: write float32")
-        self._critic = critic
         self._values = critic.fused if fused else critic
         self._grad_norm = grad_norm
         self._tolerance = tolerance
         self._tf32 = tf32
         self._group = group
+        # Kept, because a module looks for its parameters everywhere below it each time.
         self._members = [list(member.parameters()) for member in critic.members]
-        self.optimizer = RateAdam(critic.parameters(), learning_rate, betas, weight_decay)
+        self._parameters = [parameter for member in self._members for parameter in member]
+        self.optimizer = RateAdam(self._parameters, learning_rate, betas, weight_decay)
 
     def draw_orders(self, rows: int, passes: int, generator: torch.Generator) -> Tensor:
         """A random order of the rows for each pass, (passes, rows)."""
@@ -101,7 +102,7 @@ class CriticFit:
         self.optimizer.zero_grad()
         loss.backward()
         mean = loss.detach()
-        self._group.mean([mean, *(p.grad for p in self._critic.parameters() if p.grad is not None)])
+        self._group.mean([mean, *(p.grad for p in self._parameters if p.grad is not None)])
         if self._grad_norm is not None:
             for parameters in self._members:
                 clip_gradients(parameters, self._grad_norm)
