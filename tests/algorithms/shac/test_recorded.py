@@ -90,7 +90,9 @@ def after(epochs: int, trainer: Trainer, state: dict[str, Any]) -> tuple[torch.T
 
 
 @pytest.mark.usefixtures("uncut")
-@pytest.mark.parametrize("settings", [ANT, CARTPOLE, OPTIONS, LEGS], ids=["ant", "cartpole", "options", "legs"])
+@pytest.mark.parametrize(
+    "settings", [ANT, CARTPOLE, OPTIONS, LEGS, FUSED], ids=["ant", "cartpole", "options", "legs", "fused"]
+)
 def test_a_recorded_epoch_equals_one_operation_by_operation(settings: dict[str, Any], tmp_path: Path) -> None:
     recorded, eager = make(settings, tmp_path / "a"), make(settings, tmp_path / "b", capture="off")
     for trainer in (recorded, eager):
@@ -208,11 +210,14 @@ def test_a_step_that_loses_rows_is_reported(tmp_path: Path) -> None:
 
 
 def test_shares_are_of_all_steps_of_an_epoch(tmp_path: Path) -> None:
-    """Fails, with the horizon instead of 1, where Python counts the steps that a recording replays."""
+    """Fails, with four times the share, where Python counts the steps that a recording replays.
+
+    The share is that of the states of an epoch, of which one in four to five has no gradient to clip, and not the same
+    ones in the next.
+    """
     settings = {**ANT, "physics": {"variant": "matched", "substep_grad_clip": 1e-12}}
     trainer = make(settings, tmp_path)
     rows = [trainer.run_epoch() for _ in range(4)]
     assert [row["train/recorded"] for row in rows] == [0.0, 1.0, 1.0, 1.0]
-    assert [row["physics/substep_clip_share"] for row in rows] == pytest.approx(
-        [rows[0]["physics/substep_clip_share"]] * 4
-    )
+    first, *others = (row["physics/substep_clip_share"] for row in rows)
+    assert others == pytest.approx([first] * 3, rel=0.2)

@@ -1,0 +1,64 @@
+"""An env step that a CUDA graph can record: the host waits for no value, and makes no tensor of its own."""
+
+from typing import Any
+
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from msk_ray.config import parse_config
+from msk_ray.envs import make_env
+
+_LEG_TERMS = ("metabolic", "fatigue", "head", "impact", "footfall", "clearance", "track", "track_rate")
+ENVIRONMENTS: dict[str, dict[str, Any]] = {
+    "ant": {"name": "ant"},
+    "hopper": {"name": "hopper"},
+    "legs": {
+        "name": "myoleg26",
+        "clock": True,
+        "symmetric": True,
+        "reset": "cycle",
+        "speed_range": [1.0, 1.5],
+        "reward": dict.fromkeys(_LEG_TERMS, 0.1),
+    },
+}
+
+
+class Watch(TorchDispatchMode):
+    """Notes operations that read a value on the host, or that make a tensor of Python's numbers."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: list[str] = []
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func.overloadpacket in (torch.ops.aten._local_scalar_dense, torch.ops.aten.lift_fresh):
+            self.seen.append(str(func))
+        return func(*args, **(kwargs or {}))
+
+
+def step(env: Any, action: torch.Tensor) -> None:
+    env.state = env.state.detach()
+    action = action + 1e-3 * env.observation().sum(-1, keepdim=True)
+    env.step(torch.tanh(action)).reward.sum().backward()
+
+
+def test_the_watch_sees_an_index_without_axes_and_a_constant() -> None:
+    at = torch.ones((), dtype=torch.long)
+    with Watch() as watch:
+        torch.zeros(3, 2)[:, at]
+        torch.tensor([1.0])
+    assert watch.seen == ["aten._local_scalar_dense.default", "aten.lift_fresh.default"]
+
+
+@pytest.mark.parametrize("name", list(ENVIRONMENTS))
+def test_nothing_waits_in_an_env_step_and_its_gradient(name: str) -> None:
+    """After one that has made what is made at the first use. Resets are drawn before, as for a recorded epoch."""
+    config = parse_config({"env": {**ENVIRONMENTS[name], "nworld": 2}})
+    env = make_env(config.env, config.physics, 2, "cpu", 0)
+    action = torch.zeros((2, env.action_size), requires_grad=True)
+    step(env, action)
+    env.stock_resets(env.draw_resets(1))
+    with Watch() as watch:
+        step(env, action)
+    assert watch.seen == []
