@@ -35,7 +35,7 @@ from msk_ray.experiment.metrics import SCORE
 from msk_ray.experiment.notes import read_notes
 from msk_ray.experiment.outcomes import Ending
 from msk_ray.experiment.results import unlisted_trials
-from msk_ray.experiment.snapshot import State, TrialReader, file_stamp
+from msk_ray.experiment.snapshot import State, TrialReader, TrialSnapshot, file_stamp
 from msk_ray.experiment.trial import Trial
 from msk_ray.sweep.space import SpaceFile, read_file
 
@@ -323,16 +323,17 @@ class ExperimentReader:
         # With the planned trial itself: `--extend` gives it more epochs.
         key = (trial, note, [file_stamp(folder / name) for name in _READ])
         seen = self._seen.get(folder)
-        # Whether a trial that has not ended is running depends on the time too.
         if seen is not None and seen[0] == key and seen[1].state is State.ENDED:
             return seen[1:]
-        reading, damages = _read_trial(self._reader, trial, folder, now)
-        if seen is not None and seen[0] == key and seen[1].state is reading.state:
-            reading = seen[1]
+        found = self._reader.read(folder, now)
+        if seen is not None and seen[0] == key:
+            # Whether a trial that has not ended is running depends on the time too.
+            same = seen[1].state is found.state
+            reading = seen[1] if same else replace(seen[1], state=found.state)
         else:
-            reading = replace(reading, note=note)
-        self._seen[folder] = key, reading, damages
-        return reading, damages
+            reading = _reading_of(trial, found, note)
+        self._seen[folder] = key, reading, found.damages
+        return reading, found.damages
 
 
 def explain(error: Exception) -> str:
@@ -341,13 +342,11 @@ def explain(error: Exception) -> str:
     return text if isinstance(error, MskRayError) else f"{type(error).__name__}: {text}"
 
 
-def _read_trial(reader: TrialReader, trial: Trial, folder: Path, now: float) -> tuple[TrialReading, tuple[Damage, ...]]:
-    seen = reader.read(folder, now)
-    fault = "; ".join(describe_damages(seen.damages, folder))
+def _reading_of(trial: Trial, seen: TrialSnapshot, note: str) -> TrialReading:
+    fault = "; ".join(describe_damages(seen.damages, seen.folder))
     columns = columns_of(seen.rows)
-    return TrialReading(
-        trial, folder, columns, seen.state, seen.ending, fault, seen.device.name, seen.attempt
-    ), seen.damages
+    device, attempt = seen.device.name, seen.attempt
+    return TrialReading(trial, seen.folder, columns, seen.state, seen.ending, fault, device, attempt, note)
 
 
 def columns_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
