@@ -51,3 +51,9 @@ def common_bodies(m: mujoco.MjModel) -> np.ndarray:
             first, second = (carriers(m, int(m.site_bodyid[s])) for s in m.actuator_trnid[u])
             out[u] = next(b for b in first if b in second)
     return out
+
+
+def motors_apart(mjm: mujoco.MjModel) -> bool:
+    """Whether every actuator drives a joint of its own."""
+    joints = np.all(mjm.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT))
+    return bool(joints) and len(set(mjm.actuator_trnid[:, 0])) == len(mjm.actuator_trnid)

@@ -5,6 +5,7 @@ from mujoco_warp import BiasType, DynType, GainType, JointType, TrnType
 
 from msk_ray.physics.adjoint.groups import DofSlopes, Multipliers, State, Substep, TendonBars, allocate, gather
 from msk_ray.physics.adjoint.workspace import Workspace
+from msk_ray.physics.branches import motors_apart
 from msk_ray.physics.mjw_private import muscle_bias, muscle_dynamics, muscle_gain, muscle_gain_vel_deriv, vec10
 
 wp.set_module_options({"enable_backward": False})
@@ -399,15 +400,16 @@ class ActuatorForces:
         self._work = work
         self._settings = gather(ActuatorSettings, work.model)
         self.bars = allocate(ActuatorBars, work.nworld, work.model.nactuator)
+        self._lanes = work.lanes(work.model.nactuator, meet=not motors_apart(work.mjm))
 
     def launch(self, at: Substep) -> None:
         """Launch the pullback of all actuators."""
         work, m, settings = self._work, self._work.model, self._work.settings
         wp.launch(
             pull_actuators,
-            dim=(work.nworld, work.lanes(m.nactuator)),
+            dim=(work.nworld, self._lanes),
             inputs=[
-                work.lanes(m.nactuator),
+                self._lanes,
                 m.nactuator,
                 m.opt.timestep,
                 settings.clampctrl,

@@ -271,7 +271,7 @@ class ConstraintLaws:
             outputs=[work.laws],
         )
         if work.settings.elliptic:
-            lanes = work.lanes(_LANES)
+            lanes = work.lanes(_LANES, meet=False)
             wp.launch(
                 scaled_jacobian,
                 dim=(work.nworld, work.njmax, lanes),

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import warp as wp
 from mujoco_warp import JointType
 
@@ -316,15 +317,19 @@ class ScalarRows:
         self._work, self._laws = work, laws
         self._settings = gather(RowSettings, work.model)
         self._rows = foremost_rows(work)
+        mjm = work.mjm
+        # Limits of joints alone are rows of different dofs.
+        meet = bool(mjm.neq or mjm.ntendon or np.any(mjm.dof_frictionloss))
+        self._lanes = work.lanes(self._rows, meet=meet)
 
     def launch(self, at: Substep) -> None:
         """Launch the pullback of these rows."""
         work, m, d = self._work, self._work.model, at.data
         wp.launch(
             pull_rows,
-            dim=(work.nworld, work.lanes(self._rows)),
+            dim=(work.nworld, self._lanes),
             inputs=[
-                work.lanes(self._rows),
+                self._lanes,
                 self._rows,
                 m.opt.timestep,
                 m.opt.disableflags,

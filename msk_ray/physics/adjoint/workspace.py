@@ -101,10 +101,15 @@ class Workspace:
             self.laws = allocate(RowLaws, worlds, self.njmax)
             self.contact_wrenches = wp.zeros((0, 2), dtype=wp.spatial_vector)
 
-    def lanes(self, count: int) -> int:
+    def lanes(self, count: int, meet: bool = True) -> int:
         """Threads that share `count` elements of a world: one each on a GPU; one on a CPU, and for a fixed order.
 
         A CPU runs threads one after the other, and passing each its arguments takes longer than a small element.
         Elements of one thread are added up in their order.
+
+        Args:
+            count: number of elements.
+            meet: whether several of them may add to one number.
         """
-        return max(count, 1) if self.device.is_cuda and not self.stages.ordered else 1
+        in_turn = meet and self.stages.ordered
+        return max(count, 1) if self.device.is_cuda and not in_turn else 1

@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from msk_ray.errors import UnsupportedModelError
+from msk_ray.physics.branches import motors_apart
 from msk_ray.physics.ordered.contacts import ContactOrder
 from msk_ray.physics.ordered.rows import RowOrder
 from msk_ray.physics.ordered.solve import solve
@@ -150,10 +151,8 @@ class OrderedStages:
         assert not model.is_sparse, "only dense Jacobians have ordered rows"
         model.callback.contactfilter = self.sort_contacts
         self.racing = racing(mjm, model)
-        joints = mjm.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
-        single = bool(np.all(joints)) and len(set(mjm.actuator_trnid[:, 0])) == mjm.nu
         off = bool(mjm.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_ACTUATION)
-        self._sums_actuators = not single and not off and "actuation" not in self.racing
+        self._sums_actuators = not motors_apart(mjm) and not off and "actuation" not in self.racing
         self._atomic, opt = copy.copy(model), copy.copy(model.opt)
         opt.deterministic = int(mjw.DeterminismType.ATOMICS)
         self._atomic.opt = opt
