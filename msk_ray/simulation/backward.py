@@ -5,8 +5,7 @@ Axes: W worlds. `nq, nv, na, nu` as in MuJoCo.
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
-from functools import cached_property
+from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
@@ -37,41 +36,6 @@ class Applied(NamedTuple):
     """Force [N] and torque [N m] on every body at its centre of mass, in world coordinates, shape (W, nbody, 6)."""
 
 
-class ParameterGradients(Mapping[str, Tensor]):
-    """Gradients of parameters of the model by name, (W, ...): columns of one tensor.
-
-    Args:
-        rows: shape (W, N).
-        places: where each parameter is in a row, and the shape of its value.
-    """
-
-    def __init__(self, rows: Tensor, places: Mapping[str, tuple[slice, torch.Size]]) -> None:
-        self._rows, self._places = rows, places
-
-    def __getitem__(self, name: str) -> Tensor:
-        columns, shape = self._places[name]
-        return self._rows[:, columns].view(-1, *shape)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._places)
-
-    def __len__(self) -> int:
-        return len(self._places)
-
-    def clone(self) -> "ParameterGradients":
-        """A copy, for gradients that the next backward pass overwrites."""
-        return ParameterGradients(self._rows.clone(), self._places)
-
-    @cached_property
-    def _sums(self) -> Tensor:
-        return self._rows.sum(0)
-
-    def of_value(self, name: str, shape: torch.Size) -> Tensor:
-        """The gradient of a value of this shape: a row per world or, where all worlds share the value, their sum."""
-        columns, own = self._places[name]
-        return self._sums[columns].view(own) if shape == own else self[name]
-
-
 class InputGradients(NamedTuple):
     """Gradients with respect to the inputs of an env step; None where none was requested."""
 
@@ -87,11 +51,11 @@ class InputGradients(NamedTuple):
     """Shape (W, nv)."""
     xfrc_applied: Tensor | None = None
     """Shape (W, nbody, 6)."""
-    parameters: ParameterGradients | None = None
-    """Those of parameters of the model."""
+    parameters: Tensor | None = None
+    """Those of parameters of the model side by side, in the order in which they were asked for, shape (W, N)."""
 
     @classmethod
-    def of(cls, found: Mapping[str, Tensor | None], parameters: ParameterGradients | None = None) -> Self:
+    def of(cls, found: Mapping[str, Tensor | None], parameters: Tensor | None = None) -> Self:
         """Those of inputs by name; one that is missing is None."""
         return cls(
             found.get("ctrl"),

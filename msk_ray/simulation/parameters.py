@@ -26,7 +26,7 @@ class ParameterTensors:
         self._device = torch.device(str(batch.device))
         self._views: dict[str, Tensor] = {}
         self._nominal: dict[str, Tensor] = {}
-        self._loaded: dict[str, tuple[Tensor, int]] = {}
+        self._loaded: dict[str, tuple[Tensor, int]] | None = None
         self._replayed = False
         for name in batch.parameters:
             for field in (name, *DERIVED.get(name, ())):
@@ -52,7 +52,7 @@ class ParameterTensors:
             rows = value.shape[: value.dim() - self._nominal[name].dim()]
             view.copy_(value.reshape((*rows, *view.shape[1:])))
 
-    def restore(self, values: Mapping[str, Tensor]) -> None:
+    def hold(self, values: Mapping[str, Tensor]) -> None:
         """Write `values` if other ones, or changed ones, were written last.
 
         It always writes them once a graph has recorded a write: a replay may have written others since.
@@ -61,13 +61,13 @@ class ParameterTensors:
             self.load(values)
 
     def _holds(self, values: Mapping[str, Tensor]) -> bool:
-        if self._loaded.keys() != values.keys():
+        if self._loaded is None or self._loaded.keys() != values.keys():
             return False
         return all(
             value._version == version
             and value.data_ptr() == kept.data_ptr()
             and (value.shape, value.stride()) == (kept.shape, kept.stride())
-            for value, (kept, version) in ((values[name], self._loaded[name]) for name in values)
+            for value, (kept, version) in ((value, self._loaded[name]) for name, value in values.items())
         )
 
     @cached_property

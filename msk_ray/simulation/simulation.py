@@ -14,6 +14,7 @@ from msk_ray.errors import ConfigError, DeviceError, UnsupportedModelError
 from msk_ray.physics import WorldBatch
 from msk_ray.physics.capacity import Capacity
 from msk_ray.simulation.backward import Applied, Backward, Needs, StepState
+from msk_ray.simulation.bundles import Bundles, StepParameters
 from msk_ray.simulation.jacobian import Linearization
 from msk_ray.simulation.modes import make_backward
 from msk_ray.simulation.parameters import check_values
@@ -61,19 +62,21 @@ def use_device(device: str) -> None:
 
 
 class WarpSimStep(torch.autograd.Function):
-    """(ctrl, qpos, qvel, act, parameters, forces) to (qpos, qvel, act) one env step later, differentiable in all."""
+    """(ctrl, qpos, qvel, act, bundle of parameters, forces) to (qpos, qvel, act) one env step later, differentiable in
+    all.
+    """
 
     @staticmethod
     def forward(
-        ctx: Any, sim: "Simulation", names: tuple[str, ...], ctrl: Tensor, *inputs: Tensor
+        ctx: Any, sim: "Simulation", parameters: StepParameters, ctrl: Tensor, *inputs: Any
     ) -> tuple[Tensor, Tensor, Tensor]:
-        start, values, forces = StepState(*inputs[:3]), inputs[3 : 3 + len(names)], inputs[3 + len(names) :]
-        parameters = dict(zip(names, values, strict=True))
+        start, forces = StepState(*inputs[:3]), inputs[4:]
         end, saved = sim.recorded(ctrl, start, Applied(*forces) if forces else None, parameters)
         # The engine that computed this step: the simulation may continue with another.
         ctx.engine = sim.engine
-        ctx.names = names
-        ctx.save_for_backward(*values, *saved)
+        ctx.names, ctx.wanted = tuple(parameters.values), parameters.wanted
+        ctx.bundle = parameters.bundle  # alive for the steps that follow with the same values
+        ctx.save_for_backward(*parameters.values.values(), *saved)
         return end
 
     @staticmethod
@@ -81,14 +84,12 @@ class WarpSimStep(torch.autograd.Function):
     def backward(ctx: Any, qpos: Tensor, qvel: Tensor, act: Tensor) -> tuple[Tensor | None, ...]:
         count = len(ctx.names)
         values, saved = ctx.saved_tensors[:count], ctx.saved_tensors[count:]
-        on_state, on_values, on_forces = (
-            ctx.needs_input_grad[k:m] for k, m in ((2, 6), (6, 6 + count), (6 + count, None))
-        )
-        wanted = tuple(name for name, need in zip(ctx.names, on_values, strict=True) if need)
+        on_state, on_bundle, on_forces = (ctx.needs_input_grad[k:m] for k, m in ((2, 6), (6, 7), (7, None)))
+        wanted = ctx.wanted if any(on_bundle) else ()
         cotangent = StepState(qpos, qvel, act)
         ctx.engine.batch.check_model()
         ctx.engine.settle()
-        ctx.engine.restore_parameters(dict(zip(ctx.names, values, strict=True)))
+        ctx.engine.have_parameters(dict(zip(ctx.names, values, strict=True)))
         found = ctx.engine.backward.vjp(saved, cotangent, Needs(*on_state, *on_forces)._replace(parameters=wanted))
         # A linear map takes zero to zero, even in a world whose Jacobian is not finite: 0 × NaN must not leak out.
         unused = torch.cat(cotangent, dim=-1).eq(0).all(-1)
@@ -96,13 +97,9 @@ class WarpSimStep(torch.autograd.Function):
         def masked(g: Tensor | None) -> Tensor | None:
             return g if g is None or not g.numel() else g.masked_fill(unused.view(-1, *[1] * (g.dim() - 1)), 0.0)
 
-        parameters = (
-            found.parameters.of_value(name, value.shape) if found.parameters and name in wanted else None
-            for name, value in zip(ctx.names, values, strict=True)
-        )
         states = (masked(g) for g in (found.ctrl, found.qpos, found.qvel, found.act))
         forces = (masked(g) for g in (found.qfrc_applied, found.xfrc_applied)[: len(on_forces)])
-        return (None, None, *states, *parameters, *forces)
+        return (None, None, *states, found.parameters, *forces)
 
 
 class Simulation:
@@ -151,6 +148,7 @@ class Simulation:
         self.nworld = nworld
         self.substeps = substeps
         self.tangent = Tangent(model, self.device)
+        self._bundles = Bundles(model, nworld)
         self._widths = (("ctrl", model.nu), ("qpos", model.nq), ("qvel", model.nv), ("act", model.na))
         self._place = torch.empty(0, device=self.device).device
         mode = make_backward(backward) if isinstance(backward, str) else backward
@@ -234,10 +232,11 @@ class Simulation:
                 parameters; or the model uses something with which a parameter cannot be varied.
         """
         applied, values = self._checked((ctrl, qpos, qvel, act), qfrc_applied, xfrc_applied, parameters)
-        inputs = (ctrl, qpos, qvel, act, *values.values(), *(applied or ()))
-        if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
-            return StepState(*WarpSimStep.apply(self, tuple(values), *inputs))
-        return self.advance(ctrl, StepState(qpos, qvel, act), applied, values)
+        given = self._bundles.of(values)
+        inputs = (ctrl, qpos, qvel, act, given.bundle, *(applied or ()))
+        if torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs):
+            return StepState(*WarpSimStep.apply(self, given, *inputs))
+        return self.advance(ctrl, StepState(qpos, qvel, act), applied, given.values)
 
     @torch.no_grad()
     def linearize(
@@ -270,7 +269,7 @@ class Simulation:
         self.require_backward()
         applied, values = self._checked((ctrl, qpos, qvel, act), qfrc_applied, xfrc_applied, parameters)
         start = StepState(qpos, qvel, act)
-        end, saved = self.recorded(ctrl, start, applied, values)
+        end, saved = self.recorded(ctrl, start, applied, self._bundles.of(values))
         self.engine.settle()
         return Linearization(*self.require_backward().jacobian(saved, start, end, self.tangent), end)
 
@@ -358,11 +357,11 @@ class Simulation:
         parameters: Mapping[str, Tensor] = MappingProxyType({}),
     ) -> StepState:
         """The forward pass alone, outside autograd; `parameters` must be open."""
-        self.engine.load_parameters(parameters)
+        self.engine.have_parameters(parameters)
         return self._stepper.advance(ctrl, start, applied)
 
     def recorded(
-        self, ctrl: Tensor, start: StepState, applied: Applied | None, parameters: Mapping[str, Tensor]
+        self, ctrl: Tensor, start: StepState, applied: Applied | None, parameters: StepParameters
     ) -> tuple[StepState, tuple[Tensor, ...]]:
         """The forward pass, and what the backward mode needs of it.
 
@@ -371,14 +370,13 @@ class Simulation:
             UnsupportedModelError: the mode does not cover applied forces, or parameters of which one needs a gradient.
         """
         mode = self.require_backward()
-        varied = [name for name, value in parameters.items() if value.requires_grad]
-        if varied and not mode.covers_parameters:
+        if parameters.wanted and not mode.covers_parameters:
             raise UnsupportedModelError(
-                f"backward mode {mode.name} has no gradients of parameters ({', '.join(varied)}): write "
+                f"backward mode {mode.name} has no gradients of parameters ({', '.join(parameters.wanted)}): write "
                 f"backward={TapePerSubstep.name!r}"
             )
         if applied is None:
-            end = self.advance(ctrl, start, parameters=parameters)
+            end = self.advance(ctrl, start, parameters=parameters.values)
             # The step may have replaced the mode by one with larger buffers.
             return end, self.require_backward().record(ctrl, start, end)
         if not mode.covers_applied:
@@ -386,7 +384,7 @@ class Simulation:
                 f"backward mode {mode.name} does not differentiate steps with applied forces: write "
                 "backward='tape_per_substep', or leave qfrc_applied and xfrc_applied out"
             )
-        end = self.advance(ctrl, start, applied, parameters)
+        end = self.advance(ctrl, start, applied, parameters.values)
         return end, self.require_backward().record(ctrl, start, end, applied)
 
     @property

@@ -52,16 +52,13 @@ class Engine:
         force: Tensor = wp.to_torch(self._touch.force, requires_grad=False)
         return force.clone()
 
-    def load_parameters(self, values: Mapping[str, Tensor]) -> None:
-        """Put the given values of the batch's parameters into its model, and its own values for all others."""
-        self._parameters.load(values)
-
-    def restore_parameters(self, values: Mapping[str, Tensor]) -> None:
-        """Have these values in the batch's model, as `load_parameters` does, if they are not in it since the last step.
+    def have_parameters(self, values: Mapping[str, Tensor]) -> None:
+        """Put these values of the batch's parameters into its model, and its own values for all others, unless they
+        were the last that were put there.
 
         A change that leaves no trace in a tensor's version is not seen, as in everything that autograd keeps.
         """
-        self._parameters.restore(values)
+        self._parameters.hold(values)
 
     def advance(self, ctrl: Tensor, start: StepState, applied: Applied | None = None) -> StepState:
         """One env step, even if it lost contacts or rows."""

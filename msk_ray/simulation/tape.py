@@ -23,14 +23,12 @@ from msk_ray.physics.adjoint.parameters import ParameterAdjoint
 from msk_ray.physics.adjoint.pull_counter import PullCounter
 from msk_ray.physics.adjoint.recomputed import recomputed
 from msk_ray.physics.adjoint.residual import ResidualGauge
-from msk_ray.physics.parameters import PARAMETERS
 from msk_ray.simulation.backward import (
     INPUTS,
     Applied,
     Backward,
     InputGradients,
     Needs,
-    ParameterGradients,
     StepState,
 )
 from msk_ray.simulation.buffers import applied_of, device_of, stream_of
@@ -117,7 +115,7 @@ class _Tape(Backward):
         self._applied = applied_of(batch.data)
         self._graphs: dict[tuple[bool, tuple[str, ...]], Graph] = {}
         self._parameters: dict[tuple[str, ...], ParameterAdjoint] = {}
-        self._slopes: dict[tuple[str, ...], ParameterGradients] = {}
+        self._columns: dict[tuple[str, ...], Tensor] = {}
         self._rows: dict[int, TapePerSubstep] = {}
 
     def _prepare(self, pool: Pool) -> None:
@@ -147,7 +145,7 @@ class _Tape(Backward):
                 view.zero_()
         return InputGradients.of(
             {name: getattr(found, name).clone() for name in INPUTS if getattr(needs, name)},
-            found.parameters.clone() if found.parameters else None,
+            found.parameters,
         )
 
     def ready(self, applied: bool, names: tuple[str, ...] = ()) -> None:
@@ -163,10 +161,8 @@ class _Tape(Backward):
                 )
             if names and names not in self._parameters:
                 self._parameters[names] = parameters = ParameterAdjoint(self._adjoint, names)
-                rows = wp.to_torch(parameters.rows, requires_grad=False)
-                mjm = self._batch.mjm
-                places = {n: (parameters.columns[n], torch.Size(PARAMETERS[n].value(mjm).shape)) for n in names}
-                self._slopes[names] = ParameterGradients(rows, places)
+                columns = [torch.arange(c.start, c.stop) for c in (parameters.columns[n] for n in names)]
+                self._columns[names] = torch.cat(columns).to(self._device)
             launches = lambda: self.launch_backward(applied, names)  # noqa: E731
             self._graphs[applied, names] = Graph(launches, self._batch.device)
             self._clipped.zero_()
@@ -184,7 +180,8 @@ class _Tape(Backward):
             views = (wp.to_torch(a, requires_grad=False) for a in (forces.grad_qfrc, forces.grad_xfrc))
             found = found._replace(**dict(zip(("qfrc_applied", "xfrc_applied"), views, strict=True)))
         if names:
-            found = found._replace(parameters=self._slopes[names])
+            rows = wp.to_torch(self._parameters[names].rows, requires_grad=False)
+            found = found._replace(parameters=rows.index_select(1, self._columns[names]))
         return found
 
     def load(self, ctrl: Tensor, states: Sequence[dict[str, wp.array]], forces: Sequence[Tensor]) -> None:

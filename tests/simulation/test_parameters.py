@@ -221,6 +221,38 @@ def test_one_value_for_all_worlds_gets_the_sum(model, name):
     torch.testing.assert_close(grads[1].sum(0), grads[0], rtol=1e-4, atol=1e-5 * float(grads[0].abs().max()))
 
 
+def test_steps_that_share_values_give_the_sum_of_their_gradients(model):
+    """They share one tensor on the way into autograd: a second rollout, and values changed in place, included."""
+    points = make_states(model, "contact", WORLDS, 0)
+    values = {
+        "body_mass": nominal(model, "body_mass").requires_grad_(),
+        "geom_friction": nominal(model, "geom_friction").repeat(WORLDS, 1, 1).requires_grad_(),
+        "dof_damping": nominal(model, "dof_damping"),
+    }
+    leaves = [values["body_mass"], values["geom_friction"]]
+    sim = Simulation(model, WORLDS, 1)
+
+    def rollout(given):
+        ctrl, *state = inputs(points)
+        seen = []
+        for parameters in given:
+            state = sim.step(ctrl, *state, parameters=parameters)
+            seen.append(state.qvel)
+        return torch.autograd.grad(torch.stack(seen).square().sum(), leaves)
+
+    # Views of the same leaves, made anew for each step, cannot share anything.
+    apart = rollout([{**values, "body_mass": leaves[0] * 1.0, "geom_friction": leaves[1] * 1.0} for _ in range(3)])
+    for found in (rollout([values] * 3), rollout([values] * 3)):
+        for a, b in zip(found, apart, strict=True):
+            torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-6 * float(b.abs().max()))
+    with torch.no_grad():
+        leaves[0] *= 1.5
+    heavier = rollout([values] * 3)[0]
+    assert (heavier - apart[0]).norm() > 1e-2 * apart[0].norm()
+    expected = rollout([{**values, "body_mass": leaves[0] * 1.0} for _ in range(3)])[0]
+    torch.testing.assert_close(heavier, expected, rtol=1e-5, atol=1e-6 * float(expected.abs().max()))
+
+
 def test_both_tapes_agree(model):
     points = make_states(model, "contact", WORLDS, 1)
     cotangents = np.random.default_rng(0).standard_normal((WORLDS, 2 * model.nv))
