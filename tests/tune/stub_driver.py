@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import stub_trainer
+from lean_ray import lean_ray
 from ray import cloudpickle
 from stub_trainer import StubTrainer
 
@@ -36,7 +37,7 @@ if __name__ == "__main__":
     driver.Plan = functools.partial(  # type: ignore[assignment,misc]
         driver.Plan, make_trainer=StubTrainer, precompile=precompile, prestart=False
     )
-    session.ray_session = functools.partial(
-        session.ray_session, dashboard=None if os.environ.get("STUB_DASHBOARD") else False, trials=False
-    )
-    sys.exit(run(main))
+    shown = bool(os.environ.get("STUB_DASHBOARD"))
+    session.ray_session = functools.partial(session.ray_session, dashboard=None if shown else False, trials=False)
+    with lean_ray(dashboard=shown):
+        sys.exit(run(main))

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import stub_trainer
+from lean_ray import lean_ray
 from ray import cloudpickle
 from stub_trainer import StubTrainer
 
@@ -29,7 +30,7 @@ def stub_session() -> Iterator[None]:
     handlers = {
         number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP)
     }
-    with ray_session(None, dashboard=False, trials=False):  # stubs need none of what trials import
+    with lean_ray(), ray_session(None, dashboard=False, trials=False):  # stubs need none of what trials import
         yield
     for number, handler in handlers.items():
         signal.signal(number, handler)
