@@ -143,7 +143,7 @@ def check_repeat(name: str, overrides: Sequence[str], device: str | None, epochs
     place = device or _first_device()
     found, count = compare(config, place, epochs)
     if found is None:
-        return Finding("repeat", f"{epochs} epochs on {place} twice: {count} tensors are equal to the last bit")
+        return Finding("repeat", f"{epochs} epoch(s) on {place} twice: {count} tensors are equal to the last bit")
     cure = "" if config.trial.deterministic or place == "cpu" else "; write trial.deterministic: true"
     return Finding("repeat", f"two runs on {place} differ first {found}{cure}", True)
 

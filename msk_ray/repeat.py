@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -43,7 +44,7 @@ def first_difference(first: list[Noted], second: list[Noted]) -> Difference | No
 
 
 def compare(config: Config, device: str, epochs: int) -> tuple[Difference | None, int]:
-    """Train the first epochs of a trial twice.
+    """Train the first epochs of a trial twice, with other numbers of threads offered, which must not matter.
 
     Args:
         config: the trial.
@@ -56,12 +57,12 @@ def compare(config: Config, device: str, epochs: int) -> tuple[Difference | None
     Raises:
         SimulationError: the trial fails.
     """
-    first, second = (run_once(config, device, epochs) for _ in range(2))
+    first, second = (run_once(config, device, epochs, threads) for threads in (1, 3))
     return first_difference(first, second), len(first)
 
 
-def run_once(config: Config, device: str, epochs: int) -> list[Noted]:
-    """What a process notes that trains the first epochs of a trial.
+def run_once(config: Config, device: str, epochs: int, threads: int) -> list[Noted]:
+    """What a process notes that trains the first epochs of a trial, where OMP_NUM_THREADS offers so many threads.
 
     Raises:
         SimulationError: it fails.
@@ -76,7 +77,8 @@ def run_once(config: Config, device: str, epochs: int) -> list[Noted]:
         path, out = Path(scratch) / "config.yaml", Path(scratch) / "noted.json"
         path.write_text(dump_yaml(whole.as_dict()))
         command = [sys.executable, "-m", "msk_ray.repeat", str(path), device, str(epochs), str(out)]
-        done = subprocess.run(command, capture_output=True, text=True)
+        offered = os.environ | {"OMP_NUM_THREADS": str(threads)}
+        done = subprocess.run(command, capture_output=True, text=True, env=offered)
         if done.returncode or not out.exists():
             last = (done.stderr.strip().splitlines() or ["without a word"])[-1]
             raise SimulationError(f"the trial failed: {last}")

@@ -145,14 +145,18 @@ def test_without_its_packages_it_says_so_and_stops(
 
 @pytest.fixture
 def small_trial(tmp_path: Path, tiny_settings: dict[str, Any]) -> str:
+    ant = {"env": {"name": "ant", "nworld": 4}, "shac": tiny_settings["shac"] | {"horizon": 4}}
     path = tmp_path / "small.yaml"
-    path.write_text(dump_yaml(tiny_settings))
+    path.write_text(dump_yaml(tiny_settings | ant))
     return str(path)
 
 
-def test_a_trial_that_repeats(small_trial: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--repeat", small_trial, "--device", "cpu", "--epochs", "2"]) == 0
-    assert "2 epochs on cpu twice: " in capsys.readouterr().out
+def test_a_trial_repeats_in_another_process_with_more_threads(
+    small_trial: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--repeat", small_trial, "--device", "cpu", "--epochs", "1", "--set", "trial.deterministic=true"]
+    assert main(words) == 0
+    assert "1 epoch(s) on cpu twice: " in capsys.readouterr().out
 
 
 def test_a_trial_that_does_not_repeat(
