@@ -32,13 +32,14 @@ LEVERS = {
     "sparse": ["physics.jacobian=sparse"],
     "tf32": ["shac.critic_products=tf32"],
     "fused": ["shac.critic_kernels=fused"],
+    "line search": ["physics.ls_iterations=10"],
     "iterations": ["physics.iterations=5"],
     "substeps": ["physics.substeps=2"],
     "batches": ["shac.critic_batches=2"],
     "passes": ["shac.critic_iterations=8"],
     "eager": ["shac.capture=off"],
 }
-"""Settings by the name of the lever. The last five change what is learned, or are there to compare with."""
+"""Settings by the name of the lever. The last six change what is learned, or are there to compare with."""
 TOGETHER = ["rows", "tape_all", "tf32", "fused"]
 """Levers that change results by rounding only."""
 PARTS = ("rollout", "backward", "critic")

@@ -325,8 +325,9 @@ def pull_actuators_of(
         wp.atomic_add(tendon_bars_out.length, worldid, t, -gear * length_slope)
         wp.atomic_add(tendon_bars_out.qvel, worldid, t, gear * rate_bar[1])
         wp.atomic_add(tendon_bars_out.lam, worldid, t, gear * rate_bar[0])
-        wp.atomic_add(tendon_bars_out.mu, worldid, t, gear * rate_bar[2])
-        wp.atomic_add(tendon_bars_out.smooth, worldid, t, gear * rate_bar[3])
+        if implicit_all:
+            wp.atomic_add(tendon_bars_out.mu, worldid, t, gear * rate_bar[2])
+            wp.atomic_add(tendon_bars_out.smooth, worldid, t, gear * rate_bar[3])
         return
     if kind == TrnType.SITE or kind == TrnType.SLIDERCRANK:
         return
