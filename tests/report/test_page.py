@@ -171,6 +171,9 @@ def test_paper_shows_everything(page: Page) -> None:
     cut = "d => getComputedStyle(d).overflowX !== 'visible'"
     hidden = page.evaluate(f"[...document.querySelectorAll('.scroll')].filter({cut}).length")
     assert hidden == 0
+    page.set_viewport_size({"width": 720, "height": 1000})  # about a page of A4
+    beyond = "[...document.querySelectorAll('body *')].filter(e => e.getBoundingClientRect().right > innerWidth + 1)"
+    assert page.evaluate(f"{beyond}.map(e => e.outerHTML.slice(0, 80))") == [], "nothing is cut off"
 
 
 def test_the_best_policy_is_shown_and_not_made_twice(reported: Experiment, capsys: pytest.CaptureFixture[str]) -> None:
