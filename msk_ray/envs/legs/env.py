@@ -323,8 +323,7 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
         angles = state.qpos[:, self._hinge_qpos]
         # At most one side of a range is exceeded.
         overshoot = torch.maximum(low - angles, angles - high).clamp_min(0.0) / _LIMIT_UNIT
-        age = self.state.age
-        change = self._own_sides(action, age) - self._own_sides(self.state.action, age - 1)
+        change = self._own_sides(action, self.state.age) - self._own_sides(self.state.action, self.state.age - 1)
         # The trunk is half of the body: the centre of mass moves with its lean.
         velocity = root.velocity + _TRUNK_LEVER * torch.linalg.cross(root.spin, root.up)
         place = root.place + (velocity * self._pendulum_time + _TRUNK_LEVER * (root.up - self._upright))[:, :2]
