@@ -13,9 +13,11 @@ from msk_ray.physics.mjw_private import ConstraintType, contact_kbimp, vec5
 
 wp.set_module_options({"enable_backward": False})
 
+_SLOTS = 32
+"""Rows of a world that a GPU works on at the same time. Few worlds have more, while the buffer has room for many."""
 _LANES = 2
-"""Threads of a GPU that share a row of S J. Most rows of the buffer are empty and each thread works out the law of its
-contact again, so that a thread for each entry took 150 µs for 4096 ants on an H200."""
+"""Threads of a GPU that share a row of S J, each of which works out the law of the row's contact. A thread for each
+entry of the whole buffer took 150 µs for 4096 ants on an H200, and two for each of its rows 75."""
 
 _MINIMP = wp.constant(1.0e-4)
 _MAXIMP = wp.constant(0.9999)
@@ -98,6 +100,7 @@ def row_laws(
     # Model:
     nv: int,
     # In:
+    slots: int,
     nefc_in: wp.array[int],
     rows_in: Rows,
     jacobian_in: wp.array3d[float],
@@ -105,30 +108,32 @@ def row_laws(
     # Out:
     laws_out: RowLaws,
 ) -> None:
-    """jar = J a - aref, the force f of uncoupled rows, and their slope s = -∂f/∂jar. Elliptic rows get f = s = 0."""
-    worldid, row = wp.tid()
-    if row >= wp.min(nefc_in[worldid], laws_out.jar.shape[1]):
-        return
-    jar = -rows_in.aref[worldid, row]
-    for j in range(nv):
-        jar += jacobian_in[worldid, row, j] * qacc_in[worldid, j]
-    d = rows_in.D[worldid, row]
-    kind = rows_in.type[worldid, row]
-    force = float(0.0)
-    slope = float(0.0)
-    if kind == ConstraintType.EQUALITY:
-        force = -d * jar
-        slope = d
-    elif kind == ConstraintType.FRICTION_DOF or kind == ConstraintType.FRICTION_TENDON:
-        loss = rows_in.frictionloss[worldid, row]
-        force = wp.clamp(-d * jar, -loss, loss)
-        slope = wp.where(wp.abs(d * jar) < loss, d, 0.0)
-    elif kind != ConstraintType.CONTACT_ELLIPTIC and jar < 0.0:
-        force = -d * jar
-        slope = d
-    laws_out.jar[worldid, row] = jar
-    laws_out.force[worldid, row] = force
-    laws_out.slope[worldid, row] = slope
+    """jar = J a - aref, the force f of uncoupled rows, and their slope s = -∂f/∂jar. Elliptic rows get f = s = 0.
+
+    `slots` threads take all rows of a world in turn.
+    """
+    worldid, slot = wp.tid()
+    for row in range(slot, wp.min(nefc_in[worldid], laws_out.jar.shape[1]), slots):
+        jar = -rows_in.aref[worldid, row]
+        for j in range(nv):
+            jar += jacobian_in[worldid, row, j] * qacc_in[worldid, j]
+        d = rows_in.D[worldid, row]
+        kind = rows_in.type[worldid, row]
+        force = float(0.0)
+        slope = float(0.0)
+        if kind == ConstraintType.EQUALITY:
+            force = -d * jar
+            slope = d
+        elif kind == ConstraintType.FRICTION_DOF or kind == ConstraintType.FRICTION_TENDON:
+            loss = rows_in.frictionloss[worldid, row]
+            force = wp.clamp(-d * jar, -loss, loss)
+            slope = wp.where(wp.abs(d * jar) < loss, d, 0.0)
+        elif kind != ConstraintType.CONTACT_ELLIPTIC and jar < 0.0:
+            force = -d * jar
+            slope = d
+        laws_out.jar[worldid, row] = jar
+        laws_out.force[worldid, row] = force
+        laws_out.slope[worldid, row] = slope
 
 
 @wp.struct
@@ -192,14 +197,16 @@ def cone_slope(cone: Cone, mass: vec6, friction: vec5, dim: int, x: vec6) -> vec
     return out
 
 
-@wp.kernel
-def scaled_jacobian(
+@wp.func
+def scale_row(
+    worldid: int,
+    row: int,
+    lane: int,
+    lanes: int,
     # Model:
     nv: int,
-    opt_impratio_invsqrt: wp.array[float],
+    impratio_invsqrt: float,
     # In:
-    lanes: int,
-    nefc_in: wp.array[int],
     rows_in: Rows,
     jacobian_in: wp.array3d[float],
     laws_in: RowLaws,
@@ -207,10 +214,7 @@ def scaled_jacobian(
     # Out:
     scaled_out: wp.array3d[float],
 ) -> None:
-    """S J, `lanes` threads a row; needed for elliptic cones only, whose S couples the rows of a contact."""
-    worldid, row, lane = wp.tid()
-    if row >= wp.min(nefc_in[worldid], laws_in.jar.shape[1]):
-        return
+    """Rows of S J that belong to one row: its own, or all of the contact whose first it is."""
     if rows_in.type[worldid, row] != ConstraintType.CONTACT_ELLIPTIC:
         for dof in range(lane, nv, lanes):
             scaled_out[worldid, row, dof] = laws_in.slope[worldid, row] * jacobian_in[worldid, row, dof]
@@ -225,8 +229,7 @@ def scaled_jacobian(
         jar[i] = laws_in.jar[worldid, row + i]
         mass[i] = rows_in.D[worldid, row + i]
     friction = contacts_in.friction[con]
-    mu = friction[0] * opt_impratio_invsqrt[worldid % opt_impratio_invsqrt.shape[0]]
-    cone = cone_law(jar, mass, friction, mu, dim)
+    cone = cone_law(jar, mass, friction, friction[0] * impratio_invsqrt, dim)
     for dof in range(lane, nv, lanes):
         column = vec6()
         for i in range(dim):
@@ -234,6 +237,32 @@ def scaled_jacobian(
         product = cone_slope(cone, mass, friction, dim, column)
         for i in range(dim):
             scaled_out[worldid, row + i, dof] = product[i]
+
+
+@wp.kernel
+def scaled_jacobian(
+    # Model:
+    nv: int,
+    opt_impratio_invsqrt: wp.array[float],
+    # In:
+    slots: int,
+    lanes: int,
+    nefc_in: wp.array[int],
+    rows_in: Rows,
+    jacobian_in: wp.array3d[float],
+    laws_in: RowLaws,
+    contacts_in: Contacts,
+    # Out:
+    scaled_out: wp.array3d[float],
+) -> None:
+    """S J; needed for elliptic cones only, whose S couples the rows of a contact.
+
+    `slots` groups of `lanes` threads take all rows of a world in turn.
+    """
+    worldid, slot, lane = wp.tid()
+    impratio = opt_impratio_invsqrt[worldid % opt_impratio_invsqrt.shape[0]]
+    for row in range(slot, wp.min(nefc_in[worldid], laws_in.jar.shape[1]), slots):
+        scale_row(worldid, row, lane, lanes, nv, impratio, rows_in, jacobian_in, laws_in, contacts_in, scaled_out)
 
 
 class ConstraintLaws:
@@ -264,20 +293,22 @@ class ConstraintLaws:
                 outputs=[self._dense],
             )
         jacobian = self.jacobian(at)
+        slots = work.lanes(min(_SLOTS, work.njmax))
         wp.launch(
             row_laws,
-            dim=(work.nworld, work.njmax),
-            inputs=[m.nv, d.nefc, at.rows, jacobian, d.qacc],
+            dim=(work.nworld, slots),
+            inputs=[m.nv, slots, d.nefc, at.rows, jacobian, d.qacc],
             outputs=[work.laws],
         )
         if work.settings.elliptic:
             lanes = work.lanes(_LANES, meet=False)
             wp.launch(
                 scaled_jacobian,
-                dim=(work.nworld, work.njmax, lanes),
+                dim=(work.nworld, slots, lanes),
                 inputs=[
                     m.nv,
                     m.opt.impratio_invsqrt,
+                    slots,
                     lanes,
                     d.nefc,
                     at.rows,
