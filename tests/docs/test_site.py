@@ -82,7 +82,7 @@ def test_a_browser_finds_no_fault_and_scrolls_down_only(address: str, browser: A
         "request", lambda request: None if request.url.startswith((address, "data:")) else faults.append(request.url)
     )
     page.on("response", lambda response: faults.append(response.url) if response.status >= 400 else None)
-    for name in ("index", "api"):
+    for name in ("index", "api", "tutorials/bouncing_ball"):
         page.goto(f"{address}/{name}.html")
         assert page.evaluate("document.documentElement.scrollWidth") <= width, name
         assert page.locator("h1").count() == 1
