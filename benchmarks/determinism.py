@@ -309,7 +309,7 @@ def variants(scene: Scene) -> dict[str, tuple[WorldBatch, Launch]]:
         chosen = copy.copy(stages)
         chosen._atomic = _with_flags(ordered.model, flags)
         if flags:
-            chosen.racing = frozenset(("kinematics", "inertia", "velocity", "actuation", "acceleration", "integration"))
+            chosen.racing = frozenset(("inertia", "velocity", "actuation", "acceleration", "integration"))
         return lambda: chosen.step(ordered.model, ordered.data)
 
     fixed = {"graph_conditional": False, "iterations": min(ITERATIONS, int(package.model.opt.iterations))}

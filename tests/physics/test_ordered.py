@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import mujoco
+import mujoco_warp as mjw
 import numpy as np
 import pytest
 import torch
@@ -190,14 +191,10 @@ def test_the_example_finds_nothing_unordered_on_a_cpu(root: Path, capsys: pytest
 @pytest.mark.parametrize(
     ("change", "races"),
     [
-        (lambda text: text, {"kinematics"}),
-        (lambda text: text.replace('<fixed name="t"', '<fixed name="t" stiffness="1"'), {"kinematics", "velocity"}),
-        (lambda text: text.replace('name="a"', 'name="a" actuatorfrcrange="-1 1"'), {"kinematics", "actuation"}),
-        (lambda text: text.replace("<option", '<option integrator="implicitfast"'), {"kinematics", "integration"}),
-        (
-            lambda text: text.replace('<motor tendon="t"/>', "").replace("<fixed", "<!--").replace("</fixed>", "-->"),
-            set(),
-        ),
+        (lambda text: text, set()),
+        (lambda text: text.replace('<fixed name="t"', '<fixed name="t" stiffness="1"'), {"velocity"}),
+        (lambda text: text.replace('name="a"', 'name="a" actuatorfrcrange="-1 1"'), {"actuation"}),
+        (lambda text: text.replace("<option", '<option integrator="implicitfast"'), {"integration"}),
     ],
 )
 def test_atomics_get_an_order_where_threads_meet(change: Callable[[str], str], races: set[str]) -> None:
@@ -206,6 +203,55 @@ def test_atomics_get_an_order_where_threads_meet(change: Callable[[str], str], r
     assert isinstance(batch.stages, OrderedStages)
     assert batch.stages.racing == races
     assert bool(batch.stages.summing(batch.model).opt.deterministic) is bool(races)
+
+
+def wrapped_tendons() -> mujoco.MjModel:
+    """An arm with two tendons over sites, around a cylinder and through a pulley, and one of joints."""
+    return mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody>
+          <site name="s0" pos="0 0 0.05"/><site name="p0" pos="0.1 0 0.1"/>
+          <body pos="0 0 0"><joint name="a" axis="0 1 0"/><geom type="capsule" size="0.02" fromto="0 0 0 0.3 0 0"/>
+            <site name="s1" pos="0.2 0 0.04"/><site name="p1" pos="0.15 0.02 0.03"/>
+            <body pos="0.3 0 0"><joint name="b" axis="0 1 0"/>
+              <geom name="wrap" type="cylinder" size="0.03 0.1" euler="90 0 0" pos="0 0 0"/>
+              <geom type="capsule" size="0.02" fromto="0 0 0 0.3 0 0"/>
+              <site name="s2" pos="0.1 0 0.04"/><site name="s3" pos="0.2 0 0.04"/><site name="p2" pos="0.1 0.02 0.03"/>
+            </body></body></worldbody>
+          <tendon>
+            <spatial name="one"><site site="s0"/><site site="s1"/><geom geom="wrap"/><site site="s2"/>
+              <site site="s3"/></spatial>
+            <spatial name="two"><site site="p0"/><site site="p1"/><pulley divisor="2"/><site site="p1"/>
+              <site site="p2"/></spatial>
+            <fixed name="three"><joint joint="a" coef="1"/><joint joint="b" coef="-0.5"/></fixed>
+          </tendon></mujoco>"""
+    )
+
+
+def test_tendons_are_those_of_the_package_and_elements_of_one_never_meet() -> None:
+    mjm = wrapped_tendons()
+
+    def lengths(ordered: bool) -> list[np.ndarray]:
+        batch = WorldBatch(mjm, WORLDS, 1, "cpu", ordered=ordered)
+        rng = np.random.default_rng(0)
+        batch.data.qpos.assign(rng.uniform(-0.5, 0.5, size=(WORLDS, mjm.nq)).astype(np.float32))
+        mjw.kinematics(batch.model, batch.data)
+        mjw.com_pos(batch.model, batch.data)
+        batch.stages.tendon(batch.model, batch.data)
+        return [np.array(batch.data.ten_length.numpy()), np.array(batch.data.ten_J.numpy())]
+
+    for one, other in zip(lengths(True), lengths(False), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)
+    batch = WorldBatch(mjm, 1, 1, "cpu", ordered=True)
+    assert isinstance(batch.stages, OrderedStages)
+    assert batch.stages._tendons is not None
+    model, parts = batch.model, batch.stages._tendons._parts
+    assert len(parts) == 2
+    for kind, count in (("jnt", 2), ("site_pair", 4), ("geom", 1)):
+        tendons = [getattr(part, f"tendon_{kind}_adr").numpy() for part in parts]
+        assert all(len(set(some)) == len(some) for some in tendons)
+        places = np.concatenate([getattr(part, f"wrap_{kind}_adr").numpy() for part in parts])
+        assert sorted(places) == sorted(getattr(model, f"wrap_{kind}_adr").numpy())
+        assert len(places) == count
 
 
 def test_a_sparse_jacobian_is_made_dense() -> None:

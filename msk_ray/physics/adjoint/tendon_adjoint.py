@@ -72,7 +72,7 @@ class TendonAdjoint:
         m = self._work.model
         mjw.kinematics(m, data)
         mjw.com_pos(m, data)
-        mjw.tendon(self._work.stages.summing(m), data)
+        self._work.stages.tendon(m, data)
         wp.launch(
             tendon_rates,
             dim=self.rate.shape,

@@ -13,6 +13,7 @@ from msk_ray.physics.branches import motors_apart
 from msk_ray.physics.ordered.contacts import ContactOrder
 from msk_ray.physics.ordered.rows import RowOrder
 from msk_ray.physics.ordered.solve import solve
+from msk_ray.physics.ordered.tendons import TendonOrder
 
 
 class Stages(Protocol):
@@ -26,6 +27,9 @@ class Stages(Protocol):
 
     def position(self, model: Any, data: Any) -> None:
         """Launch the position stage, without a factor of the inertia."""
+
+    def tendon(self, model: Any, data: Any) -> None:
+        """Launch lengths and Jacobians of tendons."""
 
     def summing(self, model: Any) -> Any:
         """The model to give to stages of mujoco_warp that are launched one by one."""
@@ -43,6 +47,10 @@ class PackageStages:
     def position(self, model: Any, data: Any) -> None:
         """Launch `mujoco_warp.fwd_position`."""
         mjw.fwd_position(model, data, factorize=False)
+
+    def tendon(self, model: Any, data: Any) -> None:
+        """Launch `mujoco_warp.tendon`."""
+        mjw.tendon(model, data)
 
     def summing(self, model: Any) -> Any:
         """The model itself."""
@@ -75,7 +83,6 @@ def racing(mjm: mujoco.MjModel, model: Any) -> frozenset[str]:
     """
     trees = np.asarray(mjm.tree_dofnum)
     found = {
-        "kinematics": mjm.ntendon > 0,
         "inertia": bool(np.any(mjm.tendon_armature)),
         # J v of a row is added up in parts.
         "constraint": model.nv_pad > model.block_dim.contact_jac_tiled,
@@ -156,6 +163,7 @@ class OrderedStages:
         self._atomic, opt = copy.copy(model), copy.copy(model.opt)
         opt.deterministic = int(mjw.DeterminismType.ATOMICS)
         self._atomic.opt = opt
+        self._tendons = TendonOrder(model) if mjm.ntendon else None
         self._contacts: dict[tuple[int, int], ContactOrder] = {}
         self._rows: dict[tuple[int, int], RowOrder] = {}
 
@@ -178,7 +186,9 @@ class OrderedStages:
         if "inertia" in self.racing:
             mjw.fwd_position(self._atomic, data, factorize=False)
         else:
-            mjw.fwd_kinematics(self._of("kinematics", model), data)
+            mjw.kinematics(model, data)
+            mjw.com_pos(model, data)
+            self.tendon(model, data)
             mjw.crb(model, data)
             if model.opt.run_collision_detection:
                 mjw.collision(model, data)
@@ -186,6 +196,11 @@ class OrderedStages:
             mjw.transmission(model, data)
         if data.njmax:
             self.sort_rows(data)
+
+    def tendon(self, model: Any, data: Any) -> None:
+        """Launch lengths and Jacobians of tendons."""
+        if self._tendons is not None:
+            self._tendons.launch(data)
 
     def summing(self, model: Any) -> Any:
         """A model whose sums through atomics Warp adds up in a fixed order."""

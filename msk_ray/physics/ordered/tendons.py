@@ -1,0 +1,74 @@
+"""Lengths and Jacobians of tendons, added up element after element of their paths.
+
+mujoco_warp gives every joint, pair of sites and geom of all tendons a thread, which adds to its tendon's length. Here
+its public `tendon` runs on the first elements of all tendons, then on the second ones, and so on: in each run no two
+threads have the same tendon.
+"""
+
+import copy
+from typing import Any
+
+import mujoco_warp as mjw
+import numpy as np
+import warp as wp
+
+_KINDS = ("jnt", "site_pair", "geom")
+"""Kinds of elements, each with two arrays of the model: the tendon of every element, and where it is."""
+
+
+@wp.kernel(enable_backward=False)
+def add_part(
+    # In:
+    part_in: wp.array2d[float],
+    # Out:
+    total_out: wp.array2d[float],
+) -> None:
+    worldid, i = wp.tid()
+    total_out[worldid, i] = total_out[worldid, i] + part_in[worldid, i]
+
+
+class TendonOrder:
+    """Launches of the lengths and Jacobians of all tendons.
+
+    Args:
+        model: mujoco_warp's model, before it is sealed.
+    """
+
+    def __init__(self, model: Any) -> None:
+        self._parts: list[Any] = []
+        ranks = {kind: _rank(getattr(model, f"tendon_{kind}_adr").numpy()) for kind in _KINDS}
+        for k in range(1 + max((int(r.max()) for r in ranks.values() if r.size), default=-1)):
+            part = copy.copy(model)
+            # Points of the path, for drawing, which nobody here looks at.
+            part.tendon_num = wp.zeros_like(model.tendon_num)
+            for kind, rank in ranks.items():
+                for name in (f"tendon_{kind}_adr", f"wrap_{kind}_adr"):
+                    setattr(part, name, wp.array(getattr(model, name).numpy()[rank == k], dtype=int))
+            self._parts.append(part)
+        self._scratch: dict[int, tuple[wp.array, wp.array]] = {}
+
+    def launch(self, data: Any) -> None:
+        """Launch them, into `data.ten_length` and `data.ten_J`."""
+        totals = (data.ten_length, data.ten_J)
+        if data.nworld not in self._scratch:
+            length, jacobian = (wp.zeros_like(total) for total in totals)
+            self._scratch[data.nworld] = length, jacobian
+        parts = self._scratch[data.nworld]
+        own = copy.copy(data)
+        own.ten_length, own.ten_J = parts
+        for total in totals:
+            total.zero_()
+        for model in self._parts:
+            mjw.tendon(model, own)
+            for part, total in zip(parts, totals, strict=True):
+                wp.launch(add_part, dim=total.shape, inputs=[part], outputs=[total])
+
+
+def _rank(tendons: np.ndarray) -> np.ndarray:
+    """How many elements before each one have its tendon."""
+    seen: dict[int, int] = {}
+    ranks = []
+    for tendon in tendons:
+        ranks.append(seen.get(int(tendon), 0))
+        seen[int(tendon)] = ranks[-1] + 1
+    return np.array(ranks, dtype=int)
