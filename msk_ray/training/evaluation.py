@@ -102,11 +102,6 @@ class Evaluator:
             randomize=True,
             deterministic=config.trial.deterministic,
         )
-        if self.env.recorded_worlds > e.nworld:
-            raise ConfigError(
-                f"env {config.env.name} records {self.env.recorded_worlds} worlds of every evaluation, which has "
-                f"{e.nworld}: raise evaluation.nworld"
-            )
         self.env.generator = torch.Generator()
         self.steps = steps
         self._policies = policies
@@ -148,6 +143,19 @@ class Evaluator:
         """
         at_once = (policies[first : first + self._policies] for first in range(0, len(policies), self._policies))
         return [figures for some in at_once for figures in self._run(some)]
+
+    def check_recorded(self) -> None:
+        """Refuse an environment that wants more worlds recorded than `run` has.
+
+        Raises:
+            ConfigError: it does.
+        """
+        wanted = self.env.recorded_worlds
+        if wanted > self._worlds:
+            raise ConfigError(
+                f"the environment records {wanted} worlds of every evaluation, which has {self._worlds}: write an "
+                f"evaluation.nworld of {wanted} or more"
+            )
 
     def _run(self, policies: Sequence[Policy]) -> list[dict[str, float]]:
         """The figures of each of at most as many policies as there is room for."""

@@ -110,6 +110,7 @@ class Trainer(Place):
             self.algorithm = make_algorithm(config, device, group)
             self.env = self.algorithm.env
             self.evaluator = Evaluator(config, device, policies=self.together)
+            self.evaluator.check_recorded()
         self._damages: tuple[Damage, ...] = ()
         self._unreadable: list[str] = []
 

@@ -72,7 +72,7 @@ def test_a_model_without_legs_is_refused() -> None:
 def test_the_command_writes_json_and_a_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = parse_config(
         {
-            "env": {"name": "myoleg26", "nworld": 4, "target_speed": 0.0, "gait_worlds": 1},
+            "env": {"name": "myoleg26", "nworld": 4, "target_speed": 0.0, "gait_worlds": 2},
             "shac": {"horizon": 2, "critic_iterations": 1, "critic_batches": 1},
             "actor": {"hidden": [8]},
             "critic": {"hidden": [8]},
@@ -80,6 +80,9 @@ def test_the_command_writes_json_and_a_picture(tmp_path: Path, capsys: pytest.Ca
             "trial": {"epochs": 1},
         }
     )
+    fewer = config.model_copy(update={"evaluation": config.evaluation.model_copy(update={"nworld": 1})})
+    with pytest.raises(ConfigError, match=r"records 2 worlds of every evaluation.*evaluation.nworld of 2 or more"):
+        Trainer(fewer, tmp_path / "refused", "cpu")
     trainer = Trainer(config, tmp_path / "trial", "cpu")
     row = trainer.run_epoch()
     trainer.close()
