@@ -13,7 +13,7 @@ from msk_ray.algorithms.base import Algorithm, EpochResult, simulation_metrics
 from msk_ray.algorithms.episodes import EpisodeTracker
 from msk_ray.algorithms.shac.actor_update import ActorUpdate, EpochInputs
 from msk_ray.algorithms.shac.copies import from_first, spread
-from msk_ray.algorithms.shac.critic_fit import CriticFit
+from msk_ray.algorithms.shac.critic_fit import Arithmetic, CriticFit
 from msk_ray.algorithms.shac.curriculum import ContactSchedule
 from msk_ray.algorithms.shac.entropy import EntropyBonus
 from msk_ray.algorithms.shac.horizon import RolloutLength
@@ -59,8 +59,7 @@ class Shac(Algorithm):
             c.critic_grad_norm,
             weight_decay=c.weight_decay,
             tolerance=c.critic_tolerance,
-            tf32=c.critic_products == "tf32",
-            fused=c.critic_kernels == "fused",
+            arithmetic=Arithmetic(tf32=c.critic_products == "tf32", fused=c.critic_kernels == "fused"),
             group=env.group,
         )
         self.noise_generator = torch.Generator(device=device).manual_seed(config.trial.seed_of("noise") + 1)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,6 +16,18 @@ _WINDOW = 4
 """Changes of the loss from pass to pass that count together."""
 
 
+class Arithmetic(NamedTuple):
+    """How a fit computes its networks."""
+
+    tf32: bool = False
+    """Whether matrix products multiply numbers of 10 bits of mantissa."""
+    fused: bool = False
+    """Whether hidden layers take few kernels; they must be ELU and LayerNorm."""
+
+
+EXACT = Arithmetic()
+
+
 class CriticFit:
     """Adam on the mean squared error, with each network's gradient norm bounded.
 
@@ -25,8 +38,7 @@ class CriticFit:
         grad_norm: bound on each network's gradient norm; None for no bound.
         weight_decay: decoupled weight decay; 0 for none.
         tolerance: change of the loss a pass, relative to it, below which no further step is taken; None: all steps.
-        tf32: whether matrix products multiply numbers of 10 bits of mantissa.
-        fused: whether hidden layers take few kernels; they must be ELU and LayerNorm.
+        arithmetic: how the networks are computed.
         group: the processes that fit it together, each with its share of every minibatch.
 
     Attributes:
@@ -45,17 +57,16 @@ class CriticFit:
         *,
         weight_decay: float = 0.0,
         tolerance: float | None = None,
-        tf32: bool = False,
-        fused: bool = False,
+        arithmetic: Arithmetic = EXACT,
         group: Group = ALONE,
     ) -> None:
         device = next(critic.parameters()).device
-        if tf32 and (device.type != "cuda" or torch.cuda.get_device_capability(device) < (8, 0)):
+        if arithmetic.tf32 and (device.type != "cuda" or torch.cuda.get_device_capability(device) < (8, 0)):
             raise ConfigError(f"shac.critic_products: {device.type} has no tf32 here: write float32")
-        self._values = critic.fused if fused else critic
+        self._values = critic.fused if arithmetic.fused else critic
         self._grad_norm = grad_norm
         self._tolerance = tolerance
-        self._tf32 = tf32
+        self._tf32 = arithmetic.tf32
         self._group = group
         # Kept, because a module looks for its parameters everywhere below it each time.
         self._members = [list(member.parameters()) for member in critic.members]

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from msk_ray.algorithms.shac.critic_fit import CriticFit
+from msk_ray.algorithms.shac.critic_fit import Arithmetic, CriticFit
 from msk_ray.config.schema import CriticConfig
 from msk_ray.errors import ConfigError
 from msk_ray.networks import Critic
@@ -79,7 +79,7 @@ def test_weight_decay_by_hand() -> None:
 def test_tf32_is_refused_on_a_cpu() -> None:
     critic = Critic(CriticConfig(hidden=(8,)), 1, torch.Generator().manual_seed(0))
     with pytest.raises(ConfigError, match=r"shac\.critic_products: cpu has no tf32 here: write float32"):
-        CriticFit(critic, 1e-3, (0.9, 0.99), None, tf32=True)
+        CriticFit(critic, 1e-3, (0.9, 0.99), None, arithmetic=Arithmetic(tf32=True))
 
 
 @pytest.mark.gpu
@@ -90,7 +90,7 @@ def test_tf32_rounds_the_factors_of_products_in_the_fit_alone() -> None:
     losses = []
     for tf32 in (False, True):
         critic = Critic(CriticConfig(hidden=(256,)), 64, torch.Generator().manual_seed(1)).cuda()
-        fit = CriticFit(critic, 1e-3, (0.9, 0.99), None, tf32=tf32)
+        fit = CriticFit(critic, 1e-3, (0.9, 0.99), None, arithmetic=Arithmetic(tf32=tf32))
         losses.append(float(fit.run(obs, obs[:, 0], torch.arange(512, device="cuda")[None], 1)))
         assert not torch.backends.cuda.matmul.allow_tf32
     assert losses[0] != losses[1]
@@ -104,7 +104,9 @@ def test_fused_layers_fit_alike() -> None:
     fitted = []
     for fused in (False, True):
         critic = Critic(CriticConfig(hidden=(16, 8), count=2), 3, torch.Generator().manual_seed(1))
-        loss = CriticFit(critic, 1e-2, (0.9, 0.99), 1.0, fused=fused).run(obs, obs[:, 0], orders, 1)
+        loss = CriticFit(critic, 1e-2, (0.9, 0.99), 1.0, arithmetic=Arithmetic(fused=fused)).run(
+            obs, obs[:, 0], orders, 1
+        )
         fitted.append((critic(obs), loss))
     torch.testing.assert_close(*fitted, rtol=1e-3, atol=1e-4)
     assert not torch.equal(fitted[0][0], fitted[1][0])
