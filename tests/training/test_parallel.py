@@ -43,8 +43,8 @@ SETTINGS: dict[str, Any] = {
     "trial": {"epochs": 6, "checkpoint_interval": 2, "loggers": []},
 }
 ROUNDING = {"rel": 1e-4, "abs": 1e-5}
-NOISE = ("seconds", "env_steps_per_s", "time/", "physics/solver_residual")
-"""How the names of figures begin that are times, or nothing but rounding."""
+NOISE = ("seconds", "env_steps_per_s", "time/", "physics/solver_residual", "hash/")
+"""How the names of figures begin that are times, or that rounding changes altogether."""
 
 
 def config_of(gpus: int) -> Config:

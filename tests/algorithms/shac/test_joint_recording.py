@@ -35,6 +35,7 @@ def runner_of(
     runner._group = Two(other)
     counts = np.zeros((2, 128), int) if counts is None else counts
     batch = SimpleNamespace(
+        ordered=False,
         unrolled_iterations=unrolled,
         substeps=2,
         iterations=SimpleNamespace(read=lambda: counts),
