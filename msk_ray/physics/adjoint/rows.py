@@ -293,7 +293,7 @@ class ConstraintLaws:
                 outputs=[self._dense],
             )
         jacobian = self.jacobian(at)
-        slots = work.lanes(min(_SLOTS, work.njmax))
+        slots = work.lanes(min(_SLOTS, work.njmax), meet=False)
         wp.launch(
             row_laws,
             dim=(work.nworld, slots),
