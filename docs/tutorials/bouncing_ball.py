@@ -136,8 +136,8 @@ plt.show()
 # ## Why horizons are short
 #
 # Now the ball falls through rows of pins. Each pin it hits sends it somewhere else, and a small difference at the
-# start grows with every hit. We ask for the gradient of its position sideways by where it started, after more and
-# more steps.
+# start grows with every hit. We ask for the gradient of its sideways position with respect to where it started,
+# after more and more steps.
 
 # %%
 ROWS, APART, PIN = 4, 0.25, 0.05

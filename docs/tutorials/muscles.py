@@ -132,8 +132,9 @@ plt.show()
 # ## Fit a parameter
 #
 # How strong is this muscle? Suppose somebody measured the elbow's torque at several angles, fully activated, with 1 N
-# m of noise, and the true peak force is 760 N. A step takes values of the model's fields (`parameters=`), and the
-# gradient by them. Each measurement is one world: held still, the first step's change of speed shows the torque.
+# m of noise, and the true peak force is 760 N. A step takes values of the model's fields (`parameters=`), and gives
+# gradients with respect to them. Each measurement is one world: held still, the first step's change of speed shows
+# the torque.
 
 # %%
 TRUE, NOISE = 760.0, 1.0

@@ -39,7 +39,12 @@ def parser() -> Parser:
     """The command line."""
     p = Parser("python -m msk_ray.dashboard", DESCRIPTION, EXAMPLES)
     p.add_argument(
-        "storage", nargs="?", type=Path, default=Path("runs"), metavar="STORAGE", help="folder of experiments (runs/)"
+        "storage",
+        nargs="?",
+        type=Path,
+        default=Path("runs"),
+        metavar="STORAGE",
+        help="folder of experiments (default: runs/)",
     )
     p.add_argument("--host", default="127.0.0.1", metavar="ADDRESS", help="address to listen on (default: %(default)s)")
     p.add_argument(

@@ -34,7 +34,7 @@ EXAMPLES = """\
 def parser() -> Parser:
     """The command line."""
     p = Parser("python -m msk_ray.diagnose", DESCRIPTION, EXAMPLES)
-    p.add_argument("subject", type=Path, metavar="CHECKPOINT_OR_CONFIG")
+    p.add_argument("subject", type=Path, metavar="CHECKPOINT_OR_CONFIG", help="a .pt file, or a config's .yaml file")
     p.add_argument(
         "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help=f"for a config: {SET_HELP}"
     )
@@ -45,11 +45,26 @@ def parser() -> Parser:
         choices=("reset", "standing", "gait"),
         help="where trajectories start (default: all that apply)",
     )
-    p.add_argument("--horizons", nargs="+", type=int, default=[1, 4, 8, 16, 32], metavar="H", help="env steps")
-    p.add_argument("--worlds", type=int, default=4, help="starting states of each kind")
-    p.add_argument("--directions", type=int, default=16, help="random directions in parameter space")
-    p.add_argument("--seed", type=int, default=0)
-    p.add_argument("--device", default="cpu", help="cpu or cuda:N")
+    p.add_argument(
+        "--horizons",
+        nargs="+",
+        type=int,
+        default=[1, 4, 8, 16, 32],
+        metavar="H",
+        help="lengths of trajectories, in env steps (default: 1 4 8 16 32)",
+    )
+    p.add_argument(
+        "--worlds", type=int, default=4, metavar="W", help="starting states of each kind (default: %(default)s)"
+    )
+    p.add_argument(
+        "--directions",
+        type=int,
+        default=16,
+        metavar="N",
+        help="random directions in the space of the policy's weights (default: %(default)s)",
+    )
+    p.add_argument("--seed", type=int, default=0, help="seed of states and directions (default: %(default)s)")
+    p.add_argument("--device", default="cpu", help="cpu or cuda:N (default: %(default)s)")
     p.add_argument("--output", type=Path, metavar="DIR", help="folder to write to (default: runs/diagnose/NAME)")
     return p
 

@@ -45,10 +45,10 @@ EXAMPLES = """\
   python -m msk_ray.evaluate runs/demo/trials/1a2b3c4d/checkpoints/epoch_000100.pt
   python -m msk_ray.evaluate ant_lr --physics reference,published,own    # how much of it is the physics?
   python -m msk_ray.evaluate ant_lr --worlds 256 --seeds 0-4             # fresh initial states
-  python -m msk_ray.evaluate runs/mine --vary body_mass=0.8x,1.2x        # how well does it bear other masses?
+  python -m msk_ray.evaluate runs/mine --vary body_mass=0.8x,1.2x        # how well does it work with other masses?
   python -m msk_ray.evaluate runs/train/myoleg26_seed0 --with push,uphill,rough,weak   # how robust is it?
   python -m msk_ray.evaluate runs/train/myosuite_walk_seed0 --in myosuite   # in MyoSuite's own environment
-  python -m msk_ray.evaluate policies/                                   # the trained policies: are their scores true?
+  python -m msk_ray.evaluate policies/                                   # do the trained policies score as recorded?
 
 exit codes: 0 done, 1 a policy could not be evaluated, or one of a zoo does not score what is recorded, 2 refused."""
 
@@ -73,8 +73,8 @@ def parser() -> Parser:
         "--with",
         dest="conditions",
         metavar="LIST",
-        help="comma-separated circumstances that the environment knows, beside its own: for legs push, weak, and on "
-        "myoleg26 uphill, downhill, rough",
+        help="comma-separated harder circumstances, to evaluate in addition to the usual ones: for legs push, weak, "
+        "and on myoleg26 uphill, downhill, rough",
     )
     p.add_argument(
         "--in",

@@ -11,8 +11,8 @@ from msk_ray.errors import ConfigError, brief
 from msk_ray.text_table import text_table
 
 HELP = (
-    "evaluate the model's own value and these of a field of the model: geom_friction=0.4,0.8,1.2, or multiples of it: "
-    "body_mass=0.8x,1.2x"
+    "evaluate with the model's own value of a field, and with these: geom_friction=0.4,0.8,1.2, or multiples of its "
+    "own: body_mass=0.8x,1.2x"
 )
 
 

@@ -76,7 +76,7 @@ def parser() -> Parser:
         choices=("Euler", "implicitfast", "RK4"),
         help="check the model with this integrator instead of its own, as if its file said so",
     )
-    p.add_argument("--substeps", type=_positive(int), default=1, metavar="N", help="physics steps (default 1)")
+    p.add_argument("--substeps", type=_positive(int), default=1, metavar="N", help="physics steps (default: 1)")
     p.add_argument(
         "--states",
         default="standing,random",
@@ -91,12 +91,12 @@ def parser() -> Parser:
         help="comma-separated fields of the model whose gradients are compared too, such as body_mass,opt.gravity; "
         "all for every one that the model has (default: none)",
     )
-    p.add_argument("--worlds", type=_positive(int), default=8, metavar="W", help="states of each kind (default 8)")
+    p.add_argument("--worlds", type=_positive(int), default=8, metavar="W", help="states of each kind (default: 8)")
     p.add_argument(
         "--tolerance", type=_positive(float), default=1e-2, metavar="T", help="largest rel_error (default: %(default)s)"
     )
     p.add_argument("--seed", type=int, default=0, help="seed of states and cotangents (default: 0)")
-    p.add_argument("--device", default="cpu", help="cpu or cuda:N (default cpu)")
+    p.add_argument("--device", default="cpu", help="cpu or cuda:N (default: cpu)")
     p.add_argument(
         "--solver-tolerance",
         type=_positive(float),
