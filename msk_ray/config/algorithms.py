@@ -157,12 +157,13 @@ class ShacConfig(AlgorithmSettings):
     critic_iterations: Count = 16
     """Passes over the rollout per epoch; with `critic_tolerance`, the largest number of them."""
     critic_tolerance: PositiveFloat | None = None
-    """Stop the passes where the loss changes by less than this share of itself a pass, on average over the last four,
-    as AHAC does by an absolute number; null: all passes. A recorded fit computes all, and leaves out their steps."""
+    """Stop the passes when the loss changes by less than this share of itself per pass, on average over the last four
+    (in AHAC, by less than an absolute number); null: all passes. A recorded fit computes all passes, and leaves out the
+    optimiser's steps of those after the stop."""
     critic_batches: Count = 4
     """Minibatches a pass."""
     critic_products: Literal["float32", "tf32"] = "float32"
-    """Numbers that the matrix products of the critic's fit multiply; `tf32` has 10 bits of mantissa, for which recent
+    """Format of the factors in matrix products of the critic's fit; `tf32` has 10 bits of mantissa, for which recent
     GPUs have faster units. Sums, and everything else, are in float32."""
     critic_kernels: Literal["torch", "fused"] = "torch"
     """`fused`: activation and norm of a layer are one kernel forward and two back in the critic's fit, where torch has
@@ -170,10 +171,13 @@ class ShacConfig(AlgorithmSettings):
     target_critic_alpha: Fraction = 0.2
     """target ← α·target + (1 − α)·critic after each epoch."""
     actor_lr: PositiveFloat = 2e-3
+    """Learning rate of the actor."""
     critic_lr: PositiveFloat = 2e-3
+    """Learning rate of the critic."""
     lr_schedule: Literal["linear", "constant"] = "linear"
     """`linear` decreases from the given rate to `final_lr` at the last epoch."""
     final_lr: PositiveFloat = 1e-5
+    """Learning rate at the last epoch of the linear schedule."""
     betas: tuple[Fraction, Fraction] = (0.7, 0.95)
     """Adam's moment decays."""
     weight_decay: NonNegative = 0.0
@@ -203,6 +207,7 @@ class ShacConfig(AlgorithmSettings):
     normalize_return: bool = False
     """Divide rewards by the running standard deviation of the return."""
     reward_scale: PositiveFloat = 1.0
+    """Factor on the rewards of training; scores are without it."""
     max_nonfinite_share: Fraction = 0.05
     """Share of worlds whose gradient may be non-finite in an epoch before the trial stops with an error."""
     capture: Annotated[Literal["auto", "off", False], AfterValidator(_off)] = "auto"

@@ -77,8 +77,8 @@ class PhysicsConfig(Section):
     ls_iterations: Count | None = None
     """Line search iteration limit."""
     jacobian: Literal["dense", "sparse"] | None = None
-    """How mujoco_warp stores the Jacobian of the constraints; the results differ by rounding, and time and memory on a
-    GPU with the model."""
+    """How mujoco_warp stores the Jacobian of the constraints. The results differ by rounding; which one takes less time
+    and memory on a GPU depends on the model."""
     integrator: Literal["Euler", "implicitfast", "RK4"] | None = None
     cone: Literal["pyramidal", "elliptic"] | None = None
     """Friction cone. The pyramid's edges make contact gradients explode over long horizons; the ellipse has none."""

@@ -41,11 +41,12 @@ def _declared_settings(value: Any, info: ValidationInfo) -> Any:
 
 
 class ContactStart(Section):
-    """Contact physics at the start of a curriculum; fields left null have the values of the trial's physics."""
+    """Contact physics at the start of a curriculum; fields left null keep the values of the trial's physics."""
 
     solref: tuple[PositiveFloat, PositiveFloat] | None = None
     """Contact time constant [s] and damping ratio."""
     solimp: Vec5 | None = None
+    """Contact impedance d0, dwidth, width [m], midpoint, power."""
     solreffriction: tuple[PositiveFloat, PositiveFloat] | None = None
     """Time constant [s] and damping ratio of the friction directions; (1, 1) is viscous."""
     friction: PositiveFloat | None = None
@@ -72,6 +73,7 @@ class NetworkConfig(Section):
     """A multilayer perceptron."""
 
     hidden: Annotated[tuple[Annotated[int, Field(gt=0, le=65536)], ...], Field(max_length=64)] = (64, 64)
+    """Sizes of the hidden layers."""
     activation: Literal["elu", "silu", "relu", "tanh"] = "elu"
     layer_norm: bool = True
     """Normalise each hidden layer."""
@@ -81,7 +83,7 @@ class ActorConfig(NetworkConfig):
     """Policy network. Its output is squashed by tanh."""
 
     stochastic: bool = True
-    """Gaussian; False is deterministic."""
+    """Draw actions from a Gaussian; False: a deterministic policy."""
     log_std: float = -1.0
     """Initial log standard deviation, before tanh."""
     state_std: bool = False
@@ -94,7 +96,7 @@ class CriticConfig(NetworkConfig):
     """Value network(s)."""
 
     count: Annotated[int, Field(ge=1, le=2)] = 1
-    """Number of critics; with two, the smaller value is used."""
+    """Number of critics; with two, the smaller value counts."""
 
 
 class EvaluationConfig(Section):
@@ -103,6 +105,7 @@ class EvaluationConfig(Section):
     interval: Count = 10
     """Epochs between evaluations."""
     nworld: Count = 64
+    """Worlds, each of which runs one episode."""
     steps: Count | None = None
     """Env steps; null: the env's episode length."""
     seed: Whole = 1234
@@ -114,7 +117,7 @@ Seed = Annotated[int, Field(ge=0, lt=2**31)]
 
 
 class SeedsConfig(Section):
-    """Seeds of parts of a trial, so that one can be varied and the others held. What is null has `trial.seed`.
+    """Seeds of parts of a trial, so that one can be varied and the others held. A part left null uses `trial.seed`.
 
     Noise and minibatches come from one generator until one of them is given: then each has its own.
     """
@@ -133,7 +136,9 @@ class TrialConfig(Section):
     """Length, seed, and saving of a trial."""
 
     epochs: Count = 500
+    """Updates of the policy."""
     seed: Seed = 0
+    """Seed of everything that is drawn, except what `seeds` and `evaluation.seed` set."""
     seeds: SeedsConfig = SeedsConfig()
     deterministic: bool = False
     """Add everything up in a fixed order, so that a GPU repeats the trial bit for bit (docs/repeat.md)."""
