@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from msk_ray.envs import MjcfSettings as MjcfSettings
     from msk_ray.gradcheck import check_gradients as check_gradients
     from msk_ray.simulation import Backward as Backward
+    from msk_ray.simulation import Capacity as Capacity
     from msk_ray.simulation import FdJacobian as FdJacobian
     from msk_ray.simulation import Hybrid as Hybrid
     from msk_ray.simulation import Simulation as Simulation
@@ -36,6 +37,7 @@ _HOMES = {
     "Algorithm": "msk_ray.algorithms",
     "AlgorithmSettings": "msk_ray.config",
     "Backward": "msk_ray.simulation",
+    "Capacity": "msk_ray.simulation",
     "Config": "msk_ray.config",
     "Env": "msk_ray.envs",
     "EnvSettings": "msk_ray.config",

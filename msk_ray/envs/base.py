@@ -115,8 +115,7 @@ class Env(ABC, Generic[SettingsT]):
             round(config.control_timestep / self.model.opt.timestep),
             backward,
             device,
-            nconmax=physics.nconmax,
-            njmax=physics.njmax,
+            capacity=Capacity(physics.nconmax or 0, physics.njmax or 0),
             tolerance=physics.tolerance,
             ordered=physics.ordered,
         )

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from msk_ray.cli import Parser, run
 from msk_ray.errors import ConfigError, UnsupportedModelError
+from msk_ray.physics.capacity import Capacity
 from msk_ray.progress import COMPILING, Pace, announce
 
 if TYPE_CHECKING:
@@ -184,8 +185,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             args.substeps,
             backward,
             args.device,
-            nconmax=args.nconmax,
-            njmax=args.njmax,
+            capacity=Capacity(args.nconmax or 0, args.njmax or 0),
             tolerance=args.solver_tolerance,
         )
         pace = None if args.json else Pace("states", args.worlds * len(set(states)))

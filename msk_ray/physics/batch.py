@@ -11,7 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from msk_ray.errors import ConfigError, UnsupportedModelError
-from msk_ray.physics.capacity import Capacity, default_capacity, scalar_rows
+from msk_ray.physics.capacity import UNKNOWN, Capacity, default_capacity, scalar_rows
 from msk_ray.physics.graph import joined_stream
 from msk_ray.physics.iterations import IterationWatch
 from msk_ray.physics.ordered import OrderedStages, check_ordered, dense
@@ -70,7 +70,7 @@ class WorldBatch:
 
     Args:
         mjm: the C MuJoCo model, which must not change while the batch lives.
-        nconmax, njmax: contacts and constraint rows a world. By default a bound from the geometry where that is small,
+        capacity: contacts and constraint rows a world. Where it is 0, a bound from the geometry where that is small,
             else what a short probe in C MuJoCo needed and half as much again.
         tolerance: solver tolerance, below mujoco_warp's floor of 1e-6 if wanted.
         contact_reach: distance [m] within which contacts are found before they touch, without any force.
@@ -104,8 +104,7 @@ class WorldBatch:
         substeps: int,
         device: str,
         *,
-        nconmax: int | None = None,
-        njmax: int | None = None,
+        capacity: Capacity = UNKNOWN,
         tolerance: float | None = None,
         contact_reach: float = 0.0,
         ordered: bool = False,
@@ -126,9 +125,9 @@ class WorldBatch:
         self._model = self._load(nworld)
         self.unrolled_iterations: tuple[int, ...] | None = None
         self._watch = ModelWatch(mjm)
-        self._given = Capacity(nconmax or 0, njmax or 0)
+        self._given = capacity
         start, self._bound = default_capacity(self.structure) if not all(self._given) else (self._given, None)
-        self._allocate(nworld, Capacity(nconmax or start.contacts, njmax or start.rows))
+        self._allocate(nworld, Capacity(capacity.contacts or start.contacts, capacity.rows or start.rows))
 
     def _structure(self) -> mujoco.MjModel:
         model = structure(self.mjm, self.parameters)

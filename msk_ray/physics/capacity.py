@@ -2,7 +2,7 @@
 
 import hashlib
 import math
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import mujoco
 import numpy as np
@@ -32,9 +32,9 @@ Array = NDArray[np.float64]
 class Capacity(NamedTuple):
     """Room of one world. mujoco_warp pools the contacts of all worlds, but not their rows."""
 
-    contacts: int
+    contacts: int = 0
     """Contacts, and pairs of geoms near enough to be looked at, whichever are more."""
-    rows: int
+    rows: int = 0
     """Constraint rows."""
 
     def at_least(self, other: "Capacity") -> "Capacity":
@@ -44,6 +44,10 @@ class Capacity(NamedTuple):
     def at_most(self, other: "Capacity") -> "Capacity":
         """The smaller of both, one by one."""
         return Capacity(min(self.contacts, other.contacts), min(self.rows, other.rows))
+
+
+UNKNOWN: Final = Capacity()
+"""To be found from the model."""
 
 
 class _Counter:

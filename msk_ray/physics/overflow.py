@@ -137,5 +137,5 @@ def loss_error(lost: int, now: Capacity, wanted: Capacity) -> SimulationError:
         settings.append(f"physics.njmax: {wanted.rows} (now {now.rows} constraint rows a world)")
     return SimulationError(
         f"a step lost contacts or constraint rows, so its results are no state: write {' and '.join(settings)}; in "
-        "Python and on the command line of gradcheck the settings are nconmax and njmax"
+        "Python, give the Simulation a capacity, and on the command line of gradcheck --nconmax and --njmax"
     )

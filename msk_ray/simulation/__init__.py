@@ -1,5 +1,6 @@
 """The differentiable step: the one place where torch and Warp meet."""
 
+from msk_ray.physics.capacity import Capacity
 from msk_ray.simulation.backward import Backward, InputGradients, StepState
 from msk_ray.simulation.fd_jacobian import FdJacobian
 from msk_ray.simulation.jacobian import Linearization
@@ -8,6 +9,7 @@ from msk_ray.simulation.tape import Hybrid, TapeAll, TapePerSubstep
 
 __all__ = [
     "Backward",
+    "Capacity",
     "FdJacobian",
     "Hybrid",
     "InputGradients",

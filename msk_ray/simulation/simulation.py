@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from msk_ray.errors import ConfigError, DeviceError, UnsupportedModelError
 from msk_ray.physics import WorldBatch
-from msk_ray.physics.capacity import Capacity
+from msk_ray.physics.capacity import UNKNOWN, Capacity
 from msk_ray.simulation.backward import Applied, Backward, Needs, StepState
 from msk_ray.simulation.bundles import Bundles, StepParameters
 from msk_ray.simulation.jacobian import Linearization
@@ -112,7 +112,7 @@ class Simulation:
         backward: how to differentiate: a mode or its name (tape_per_substep, tape_all, fd_jacobian, hybrid); None for
             forward only.
         device: "cpu", "cuda" or "cuda:N".
-        nconmax, njmax: contacts and constraint rows per world. By default a bound from the geometry if that is small,
+        capacity: contacts and constraint rows per world. Where it is 0, a bound from the geometry if that is small,
             otherwise 1.5 times what a short probe in C MuJoCo needed, which grows with use.
         tolerance: solver tolerance, which may be below mujoco_warp's floor of 1e-6.
         ordered: add everything up in a fixed order, so that a GPU repeats steps and gradients bit for bit.
@@ -132,8 +132,7 @@ class Simulation:
         backward: Backward | str | None = TapePerSubstep.name,
         device: str | torch.device = "cpu",
         *,
-        nconmax: int | None = None,
-        njmax: int | None = None,
+        capacity: Capacity = UNKNOWN,
         tolerance: float | None = None,
         ordered: bool = False,
     ) -> None:
@@ -157,8 +156,7 @@ class Simulation:
             nworld,
             substeps,
             str(self.device),
-            nconmax=nconmax,
-            njmax=njmax,
+            capacity=capacity,
             tolerance=tolerance,
             contact_reach=mode.contact_reach if mode is not None else 0.0,
             ordered=ordered,
@@ -393,7 +391,7 @@ class Simulation:
         return self.batch.capacity
 
     def reserve(self, capacity: Capacity) -> None:
-        """Enlarge the buffers to at least `capacity` per world, unless `nconmax` and `njmax` fix them."""
+        """Enlarge the buffers to at least `capacity` per world, unless the constructor's fixes them."""
         self._stepper.reserve(capacity)
 
     def diagnostics(self) -> dict[str, float]:

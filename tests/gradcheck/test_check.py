@@ -11,6 +11,7 @@ from conftest import ant_xml
 from msk_ray.errors import ConfigError, SimulationError
 from msk_ray.gradcheck import STATE_KINDS, GradientCheck, Limits, Oracle, Point, check_gradients
 from msk_ray.gradcheck.check import check_request, compare, forward_mismatch
+from msk_ray.physics.capacity import Capacity
 from msk_ray.simulation import FdJacobian, Simulation
 from msk_ray.simulation.backward import InputGradients
 
@@ -178,7 +179,7 @@ def test_lost_contacts_of_the_perturbed_copies_are_an_error():
     """Every copy of every world needs its room, not only the worlds that are stepped."""
     model = mujoco.MjModel.from_xml_string(ant_xml("elliptic"))
     # Lifted far off the ground, the world itself fits; its copies, moved by 1 m, do not.
-    sim = Simulation(model, 1, 1, FdJacobian(eps_qpos=1.0), "cpu", njmax=4)
+    sim = Simulation(model, 1, 1, FdJacobian(eps_qpos=1.0), "cpu", capacity=Capacity(rows=4))
     start = sim.initial_state()
     qpos = start.qpos.clone()
     qpos[:, 2] = 1.2

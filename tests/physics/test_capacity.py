@@ -72,7 +72,7 @@ def landing(batch: WorldBatch) -> np.ndarray:
 
 
 def test_only_the_world_that_lost_rows_becomes_nan_and_its_rows_are_counted():
-    batch = WorldBatch(studded_plate(), 3, 2, "cpu", nconmax=200, njmax=64)
+    batch = WorldBatch(studded_plate(), 3, 2, "cpu", capacity=Capacity(200, 64))
     qvel = landing(batch)
     assert np.isnan(qvel[0]).all()
     assert np.isfinite(qvel[1:]).all()
@@ -80,18 +80,18 @@ def test_only_the_world_that_lost_rows_becomes_nan_and_its_rows_are_counted():
     with pytest.raises(SimulationError, match=r"physics\.njmax: 320 \(now 64"):
         batch.raise_losses()
     batch.raise_losses()  # said once
-    assert np.isfinite(landing(WorldBatch(studded_plate(), 3, 2, "cpu", nconmax=200, njmax=320))).all()
+    assert np.isfinite(landing(WorldBatch(studded_plate(), 3, 2, "cpu", capacity=Capacity(200, 320)))).all()
 
 
 def test_contacts_are_pooled_so_their_loss_takes_every_world():
-    batch = WorldBatch(studded_plate(), 3, 2, "cpu", nconmax=20, njmax=320)  # 60 for the 64 of world 0
+    batch = WorldBatch(studded_plate(), 3, 2, "cpu", capacity=Capacity(20, 320))  # 60 for the 64 of world 0
     assert np.isnan(landing(batch)).all()
     with pytest.raises(SimulationError, match=r"physics\.nconmax: 40 \(now 20"):
         batch.raise_losses()
 
 
 def test_given_sizes_do_not_grow_and_others_do_up_to_the_bound():
-    given = WorldBatch(studded_plate(), 1, 2, "cpu", nconmax=100, njmax=64)
+    given = WorldBatch(studded_plate(), 1, 2, "cpu", capacity=Capacity(100, 64))
     landing(given)
     with pytest.raises(SimulationError, match="njmax"):
         given.larger()
@@ -114,7 +114,7 @@ def test_batches_of_another_size_share_the_model():
 
 def test_taped_step_says_so_at_once_on_cpu():
     model = studded_plate()
-    step = TapedStep(WorldBatch(model, 1, 2, "cpu", nconmax=100, njmax=64))
+    step = TapedStep(WorldBatch(model, 1, 2, "cpu", capacity=Capacity(100, 64)))
     low = model.qpos0.copy()
     low[2] = 0.0495
     state = WarpState(

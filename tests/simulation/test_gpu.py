@@ -15,6 +15,7 @@ from msk_ray.envs.ant.config import AntSettings
 from msk_ray.envs.ant.model import build_ant
 from msk_ray.errors import SimulationError
 from msk_ray.gradcheck import check_gradients
+from msk_ray.physics.capacity import Capacity
 from msk_ray.simulation import Simulation, TapePerSubstep
 from msk_ray.training import Evaluator, Trainer, read_metrics
 
@@ -98,7 +99,7 @@ def lying(sim: Simulation) -> dict[str, torch.Tensor]:
 
 
 def test_lost_rows_are_nan_at_once_and_an_error_in_backward() -> None:
-    sim = Simulation(studded_plate(), 3, 2, TapePerSubstep(), "cuda", nconmax=200, njmax=64)
+    sim = Simulation(studded_plate(), 3, 2, TapePerSubstep(), "cuda", capacity=Capacity(200, 64))
     end = sim.step(**lying(sim))
     assert end.qvel[0].isnan().all()
     assert end.qvel[1:].isfinite().all()
@@ -107,7 +108,7 @@ def test_lost_rows_are_nan_at_once_and_an_error_in_backward() -> None:
 
 
 def test_lost_rows_are_an_error_at_the_next_step_that_comes_after_them() -> None:
-    sim = Simulation(studded_plate(), 3, 2, None, "cuda", nconmax=200, njmax=64)
+    sim = Simulation(studded_plate(), 3, 2, None, "cuda", capacity=Capacity(200, 64))
     start = {name: value.detach() for name, value in lying(sim).items()}
     sim.step(**start)
     torch.cuda.synchronize()

@@ -63,7 +63,7 @@ def test_a_step_is_repeated_with_more_room(name):
     """The second of three steps lands; each is pulled back with the buffers that it was made with."""
     model = studded_plate()
 
-    def gradients(mode: Backward, **sizes: int) -> tuple[list[np.ndarray], Simulation]:
+    def gradients(mode: Backward, **sizes: Capacity) -> tuple[list[np.ndarray], Simulation]:
         sim = Simulation(model, 2, 2, mode, "cpu", tolerance=1e-12, **sizes)
         inputs = falling(model, 2)
         state = (inputs["qpos"], inputs["qvel"], inputs["act"])
@@ -73,7 +73,7 @@ def test_a_step_is_repeated_with_more_room(name):
         wanted = [inputs[n] for n in ("ctrl", "qpos", "qvel")]
         return [g.numpy() for g in (*torch.autograd.grad(loss, wanted), state[0].detach(), state[1].detach())], sim
 
-    expected, roomy = gradients(MODES[name](), nconmax=320, njmax=1280)
+    expected, roomy = gradients(MODES[name](), capacity=Capacity(320, 1280))
     assert roomy.capacity == (320, 1280)
     found, grown = gradients(MODES[name]())
     assert grown.capacity.rows >= 256
@@ -85,7 +85,7 @@ def test_a_step_is_repeated_with_more_room(name):
 @pytest.mark.parametrize("name", ["tape_per_substep", "fd_jacobian"])
 def test_given_sizes_that_are_too_small_are_an_error_at_the_step(name):
     model = studded_plate()
-    sim = Simulation(model, 2, 4, MODES[name](), "cpu", nconmax=48, njmax=64)
+    sim = Simulation(model, 2, 4, MODES[name](), "cpu", capacity=Capacity(48, 64))
     state = sim.initial_state()
     ctrl = torch.zeros(2, model.nu)
     while float(state.qpos[0, 2]) > 0.15:
@@ -115,6 +115,6 @@ def test_buffers_that_are_nearly_full_grow_between_epochs():
 
 
 def test_reserve_leaves_given_sizes_alone():
-    sim = Simulation(studded_plate(), 1, 1, None, "cpu", njmax=100)
+    sim = Simulation(studded_plate(), 1, 1, None, "cpu", capacity=Capacity(rows=100))
     sim.reserve(Capacity(10**6, 10**6))
     assert sim.capacity == (320, 100)
