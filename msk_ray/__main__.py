@@ -4,6 +4,7 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
+import msk_ray
 from msk_ray import signals
 from msk_ray.cli import run
 
@@ -37,6 +38,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     if not arguments or arguments[0] in ("-h", "--help"):
         print(usage())
+        return 0
+    if arguments == ["--version"]:
+        print(f"msk_ray {msk_ray.__version__}")
         return 0
     name, *rest = arguments
     if name not in COMMANDS:

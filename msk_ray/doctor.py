@@ -22,6 +22,7 @@ from msk_ray.config import SET_HELP
 from msk_ray.errors import ConfigError, MskRayError, StorageError
 from msk_ray.files import make_folder
 from msk_ray.nvidia_smi import ask_driver
+from msk_ray.progress import COMPILING, announce
 
 DESCRIPTION = """\
 Check that this machine can run trials: versions, GPU and driver, gradients of one step, Ray, the storage folder.
@@ -95,36 +96,44 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
     if args.repeat is not None:
-        return _report(
-            [
-                lambda: [
-                    check_repeat(args.repeat, args.overrides, args.device, 3 if args.epochs is None else args.epochs)
-                ]
-            ]
-        )
+        epochs = 3 if args.epochs is None else args.epochs
+        return _report([Check(lambda: [check_repeat(args.repeat, args.overrides, args.device, epochs)])])
     if args.epochs is not None or args.overrides:
         raise ConfigError("--epochs and --set go with --repeat CONFIG")
-    checks: list[Callable[[], list[Finding]]] = [
-        check_python,
-        check_packages,
-        check_imports,
-        lambda: check_gpus(args.device),
-        lambda: [check_gradient(args.device)],
-        lambda: [check_ray()],
-        lambda: [check_storage(args.storage)],
+    checks: list[Check] = [
+        Check(check_python),
+        Check(check_packages),
+        Check(check_imports, needed=True),
+        Check(lambda: check_gpus(args.device), "looking for GPUs"),
+        Check(lambda: [check_gradient(args.device)], f"checking gradients of one step; {COMPILING}"),
+        Check(lambda: [check_ray()], "starting Ray"),
+        Check(lambda: [check_storage(args.storage)]),
     ]
     return _report(checks)
 
 
-def _report(checks: list[Callable[[], list[Finding]]]) -> int:
+@dataclass(frozen=True)
+class Check:
+    """A check, and what to say before it."""
+
+    findings: Callable[[], list[Finding]]
+    beginning: str = ""
+    """What it is about to do, for one that takes seconds."""
+    needed: bool = False
+    """Whether its findings, if there are any, end the examination."""
+
+
+def _report(checks: list[Check]) -> int:
     broken = 0
     for check in checks:
+        if check.beginning:
+            announce(check.beginning)
         # Print each line as soon as it is known: kernels may take a minute to compile.
-        findings = check()
+        findings = check.findings()
         for finding in findings:
             print(f"{'FIX' if finding.broken else 'ok':5} {finding.subject:9} {finding.text}", flush=True)
             broken += finding.broken
-        if check is check_imports and findings:
+        if check.needed and findings:
             break
     print(f"{broken} problem(s) to fix" if broken else "all checks passed")
     return 1 if broken else 0

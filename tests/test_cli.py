@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+import msk_ray
+from msk_ray import __main__ as commands
 from msk_ray.cli import Parser, run, typed_command
 from msk_ray.errors import ConfigError
 
@@ -55,3 +57,8 @@ def test_an_error_is_one_harmless_line(capsys: pytest.CaptureFixture[str]) -> No
     with pytest.raises(SystemExit):
         Parser("x", "", "").parse_args(["\x1b[2J"])
     assert "\x1b" not in capsys.readouterr().err
+
+
+def test_the_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert commands.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"msk_ray {msk_ray.__version__}\n"

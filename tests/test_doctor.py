@@ -11,6 +11,7 @@ from msk_ray import doctor, repeat
 from msk_ray.cli import run
 from msk_ray.config import dump_yaml
 from msk_ray.doctor import GpuFacts, check_ray, check_storage, gpu_findings, main, package_findings
+from msk_ray.progress import COMPILING
 
 NO_GPU = GpuFacts(None, 0, None, "12.8", 0, (12, 9), 0, None)
 TWO = GpuFacts("570.1", 2, (12, 8), "12.8", 2, (12, 9), 2, None)
@@ -113,9 +114,12 @@ def test_the_whole_on_cpu(
     monkeypatch.setattr(doctor, "_gpu_facts", lambda: NO_GPU)
     assert run(main, ["--device", "cpu", "--storage", str(tmp_path / "runs")]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[:2] for line in lines[:-1]] == [
+    assert [line.split()[:2] for line in lines[:-1] if not line.endswith(" ...")] == [
         ["ok", name] for name in ("python", "packages", "gpu", "gradient", "ray", "storage")
     ]
+    slow = {lines[at + 1].split()[1]: line for at, line in enumerate(lines) if line.endswith(" ...")}
+    assert list(slow) == ["gpu", "gradient", "ray"], "what takes seconds says so first"
+    assert COMPILING in slow["gradient"]
     assert lines[-1] == "all checks passed"
 
 

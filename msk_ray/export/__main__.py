@@ -9,6 +9,7 @@ from msk_ray.cli import Parser, run
 from msk_ray.errors import ConfigError
 from msk_ray.evaluate.targets import best_checkpoint, find_target
 from msk_ray.files import make_folder
+from msk_ray.progress import announce
 from msk_ray.sweep.space import parse_seeds
 
 DESCRIPTION = """\
@@ -77,6 +78,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         raise ConfigError(f"--{given[0]}: only --zoo reads it; leave it out")
     _check_paths(paths, checkpoint)
     # torch and Warp take seconds to load; a wrong command line should not wait for them.
+    announce(f"exporting {checkpoint}")
     from msk_ray.export.write import export
 
     if "onnx" in paths:

@@ -45,7 +45,7 @@ def describe(
         "observation": {
             "size": env.obs_size,
             "entries": None if layout is None else [entry._asdict() for entry in layout],
-            "description": inspect.getdoc(type(env)),
+            "description": _own_docstring(type(env)),
         },
         "action": {"size": env.action_size, "range": [-1.0, 1.0], "names": env.action_names()},
         "ctrl": _controls(model) if policy.gives_control else None,
@@ -72,6 +72,11 @@ def describe(
         },
         "checked": {"observations": CHECKED, "tolerance": TOLERANCE},
     }
+
+
+def _own_docstring(of: type) -> str | None:
+    """A class's docstring; None if it only inherits one, which describes another class."""
+    return None if of.__doc__ is None else inspect.cleandoc(of.__doc__)
 
 
 def _start(env: Env[Any]) -> dict[str, list[float]]:

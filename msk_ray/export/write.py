@@ -53,8 +53,15 @@ def export(checkpoint: Path, paths: Mapping[str, Path], physics: str) -> Iterato
         model = path.with_suffix(".mjb")
         write_bytes(model, model_bytes(env.model))
         yield f"{model}: the model under {shown} physics, for MuJoCo {mujoco.__version__}"
-        write_json(path, describe(saved, policy, env, shown, {**files, "model": model.name}))
-        yield f"{path}: observation, action, periods"
+        about = describe(saved, policy, env, shown, {**files, "model": model.name})
+        write_json(path, about)
+        unnamed = about["observation"]["entries"] is None
+        hint = (
+            f"; to name entries of the observation, write {type(env).__qualname__}.observation_layout"
+            if unnamed
+            else ""
+        )
+        yield f"{path}: observation, action, periods{hint}"
 
 
 def policy_to_control(saved: SavedPolicy, physics: str) -> tuple[PolicyToControl, Env[Any], str]:

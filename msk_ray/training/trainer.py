@@ -20,6 +20,7 @@ from msk_ray.experiment.metrics import HASH, SCORE, read_metrics, read_rows
 from msk_ray.files import remove_stale, write_bytes
 from msk_ray.group import ALONE, Group
 from msk_ray.networks import as_number, parameter_hash
+from msk_ray.simulation.simulation import resolve_device
 from msk_ray.training.checkpoint import (
     epoch_checkpoints,
     milestone_path,
@@ -86,7 +87,9 @@ class Trainer(Place):
                 f"trial.gpus {config.trial.gpus}: a Trainer is one process; start this trial with msk_ray.train or "
                 "msk_ray.training.make_trainer"
             )
-        algorithm_class(config)  # one that cannot be found is reported before anything is written
+        # What cannot be found is reported before anything is written.
+        algorithm_class(config)
+        resolve_device(device)
         super().__init__(config, logdir)
         self._log = TrialLog(logdir, config)
         self._group = group

@@ -11,6 +11,7 @@ from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.results import best_record, read_records
 from msk_ray.experiment.results_table import HEADER, reduced_note, result_rows, summary, table_document, variant_rows
 from msk_ray.files import write_json, write_text
+from msk_ray.progress import announce
 from msk_ray.text import printable
 from msk_ray.text_table import text_table
 
@@ -56,6 +57,7 @@ def write_report(experiment: Experiment) -> None:
     It runs in a separate process, because it draws with OpenGL and simulates the best policy, and a failure there must
     not affect the results above.
     """
+    announce("writing the report")
     command = [sys.executable, "-m", "msk_ray.report", str(experiment.path)]
     code = subprocess.run(command).returncode
     if code:

@@ -8,6 +8,7 @@ from typing import Any
 import ray
 
 from msk_ray.errors import DeviceError
+from msk_ray.progress import announce
 from msk_ray.tune import worker_prestart
 from msk_ray.tune.addresses import check_reachable
 from msk_ray.tune.interrupts import end_ray, starting_ray
@@ -46,6 +47,8 @@ def ray_session(address: str | None, dashboard: bool | None = None, trials: bool
         "runtime_env": {"worker_process_setup_hook": worker_prestart.HOOK} if trials else None,
     }
     try:
+        if address is None:
+            announce("starting Ray")
         with starting_ray():
             context = _init(address, dashboard, common)
         if context.dashboard_url:

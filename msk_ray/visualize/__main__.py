@@ -3,7 +3,7 @@
 import argparse
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,12 +12,15 @@ from msk_ray.errors import CheckpointError, ConfigError
 from msk_ray.evaluate.__main__ import positive
 from msk_ray.evaluate.targets import Target, best_checkpoint, best_trial_folder, find_target, trial_folder_of
 from msk_ray.files import make_folder
-from msk_ray.progress import COMPILING, announce
+from msk_ray.progress import COMPILING, Pace, announce
 from msk_ray.text_table import text_table
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from msk_ray.evaluate.measure import Bench, Request
     from msk_ray.visualize.episodes import Recording
+    from msk_ray.visualize.render import View
 
 DESCRIPTION = """\
 Watch a policy: in MuJoCo's viewer if there is a display, or as video, frames, film strip or statistics without one.
@@ -209,26 +212,16 @@ def episode_table(recording: "Recording") -> str:
 
 def _draw(args: argparse.Namespace, recording: "Recording", checkpoint: Path, epoch: int) -> None:
     from msk_ray.visualize.film import save_image, strip, write_frames, write_video
-    from msk_ray.visualize.render import View, frames
+    from msk_ray.visualize.render import View
     from msk_ray.visualize.strips import episode_frames
 
     width, height = args.size or (640, 480)
     view = View(width, height, args.camera)
-    if args.video or args.save_frames:
-        film = (
-            frame for world in range(recording.count) for frame in frames(recording.frames_at(world, args.fps), view)
-        )
-        if args.video:
-            args.video.parent.mkdir(parents=True, exist_ok=True)
-            print(f"{write_video(film, args.video, args.fps)} frames in {args.video}")
-        if args.save_frames:
-            if args.video:
-                film = (
-                    frame
-                    for world in range(recording.count)
-                    for frame in frames(recording.frames_at(world, args.fps), view)
-                )
-            print(f"{write_frames(film, args.save_frames)} frames in {args.save_frames}/")
+    if args.video:
+        args.video.parent.mkdir(parents=True, exist_ok=True)
+        print(f"{write_video(_film(recording, args.fps, view), args.video, args.fps)} frames in {args.video}")
+    if args.save_frames:
+        print(f"{write_frames(_film(recording, args.fps, view), args.save_frames)} frames in {args.save_frames}/")
     if args.strip:
         width, height = args.size or (320, 240)
         image = strip(*episode_frames(recording, args.frames or 8, View(width, height, args.camera)))
@@ -238,6 +231,19 @@ def _draw(args: argparse.Namespace, recording: "Recording", checkpoint: Path, ep
             from msk_ray.visualize.strips import log_strip
 
             print(f"TensorBoard: {log_strip(image, trial_folder_of(checkpoint), epoch)}")
+
+
+def _film(recording: "Recording", fps: float, view: "View") -> Iterator["np.ndarray"]:
+    """Frames (height, width, 3), uint8, of all episodes, one after the other; says how far it is."""
+    from msk_ray.visualize.render import frames
+
+    episodes = [recording.frames_at(world, fps) for world in range(recording.count)]
+    total = sum(len(states) for states in episodes)
+    announce(f"drawing {total} frames of {view.width}x{view.height}")
+    pace = Pace("frames", total)
+    for done, frame in enumerate((frame for states in episodes for frame in frames(states, view)), 1):
+        yield frame
+        pace(done)
 
 
 def _progression(args: argparse.Namespace, target: Target, bench: "Bench", request: "Request") -> int:

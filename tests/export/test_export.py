@@ -73,6 +73,17 @@ def test_description_and_model_say_what_another_program_needs(exported: Path) ->
     assert [model.joint(i).name for i in range(model.njnt)] == about["model"]["joints"]
 
 
+def test_without_a_layout_the_description_says_what_to_write(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(CartPole, "observation_layout", lambda self: None)
+    monkeypatch.setattr(CartPole, "__doc__", None)
+    assert run(main, ["cartpole", "--torchscript", str(tmp_path / "p.pt")]) == 0
+    assert "to name entries of the observation, write CartPole.observation_layout" in capsys.readouterr().out
+    about = json.loads((tmp_path / "p.json").read_text())["observation"]
+    assert about == {"size": 5, "entries": None, "description": None}, "not that of the class it inherits from"
+
+
 def test_in_c_mujoco_it_scores_what_evaluate_says(
     exported: Path, root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

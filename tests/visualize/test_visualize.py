@@ -90,7 +90,9 @@ def test_video_and_strip(target: Path, tmp_path: Path, drawing: str, capsys: pyt
         left, right = (np.asarray(image)[:120, x : x + 160] for x in (0, 328))
     assert np.ptp(left) > 50
     assert not np.array_equal(left, right)
-    assert "frames in" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert f"drawing {len(shots)} frames of 160x120 ..." in said
+    assert f"{len(shots)} frames in {video}" in said
 
 
 def test_a_gif_repeats_and_keeps_time(tmp_path: Path) -> None:
