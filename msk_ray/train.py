@@ -29,6 +29,7 @@ from msk_ray.experiment.layout import ENVIRONMENT_FILE
 from msk_ray.experiment.metrics import SCORE, read_rows
 from msk_ray.experiment.ownership import Ownership, owned
 from msk_ray.files import check_writable, make_folder, write_json
+from msk_ray.progress import COMPILING, ProgressLine, announce
 from msk_ray.signals import RESUMABLE, StopRequest, listening
 from msk_ray.text import printable
 
@@ -216,16 +217,14 @@ def _trainer(
 def _train(
     config: Config, args: argparse.Namespace, ownership: Ownership, stop: StopRequest, resume_command: str
 ) -> int:
-    device = _choose_device(args.device)
-    from msk_ray.progress import ProgressLine
-
     logdir = ownership.folder
+    print(
+        f"{config.env.name}: {config.trial.epochs} epochs, {config.env.nworld} worlds; log folder {logdir}", flush=True
+    )
+    device = _choose_device(args.device)
     gpus = config.trial.gpus
     place = device if gpus == 1 else f"{gpus} {'CPU processes' if device == 'cpu' else f'GPUs, the first {device}'}"
-    print(
-        f"{config.env.name}: {config.trial.epochs} epochs, {config.env.nworld} worlds, on {place}; log folder {logdir}"
-    )
-    print("preparing kernels (a first run compiles them, up to a minute) ...", flush=True)
+    announce(f"on {place}; {COMPILING}")
     trainer = _trainer(config, logdir, device, args.resume, args.score_at_once)
     if args.resume:
         path, faults = trainer.restore_latest()

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from msk_ray.cli import run
+from msk_ray.errors import DeviceError
 from msk_ray.train import main
 
 pytestmark = pytest.mark.long
@@ -77,3 +78,16 @@ def test_help_teaches_by_example(root: Path, tmp_path: Path) -> None:
     result = train(root, tmp_path, "--help")
     assert result.returncode == 0
     assert "--config configs/cartpole.yaml" in result.stdout
+
+
+def test_it_speaks_before_torch_is_loaded(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Which takes seconds."""
+
+    def load(asked: str | None) -> str:
+        raise DeviceError("loading")
+
+    monkeypatch.setattr("msk_ray.train._choose_device", load)
+    assert run(main, ["--config", str(root / "configs" / "cartpole.yaml"), "--logdir", str(tmp_path)]) == 2
+    assert capsys.readouterr().out == f"cartpole: 300 epochs, 64 worlds; log folder {tmp_path}\n"

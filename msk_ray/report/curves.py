@@ -233,13 +233,16 @@ class Floor:
 
 
 def _floor(curves: Sequence[Curve]) -> Floor | None:
-    """The axis reaches down to the worst first or best score: policies that fall apart leave it. None if none does."""
+    """The axis reaches down to the worst first or best score: policies that fall apart leave it. None if none does,
+    or if an axis half as long again shows all.
+    """
     scores = [score for _, y in curves for score in (y[0], y.max())]
-    bottom = min(scores) - 0.1 * (max(scores) - min(scores))
+    span = max(scores) - min(scores)
+    bottom = min(scores) - 0.1 * span
     lowest = [float(y.min()) for _, y in curves]
-    left = sum(low < bottom for low in lowest)
-    if max(scores) == min(scores) or not left:
+    if span == 0.0 or min(lowest) >= min(scores) - 0.5 * span:
         return None
+    left = sum(low < bottom for low in lowest)
     trials = "1 trial goes" if left == 1 else f"{left} trials go"
     return Floor(float(f"{bottom:.3g}"), f"▼ {trials} below this axis, down to {min(lowest):.4g}")
 

@@ -219,6 +219,10 @@ def test_an_axis_says_what_leaves_it(experiment: Experiment) -> None:
         "at": pytest.approx(-3.4),
         "text": "▼ 1 trial goes below this axis, down to -5000",
     }
+    fill(reading.trials[0].folder, [0.0, 34.0, -10.0], Ending(Outcome.FINISHED, "all 4 epochs done"))
+    near = learning_curves(read_experiment(experiment, time.time()).variants, None, "x", places)
+    assert near is not None
+    assert near.chart["floor"] is None, "little is won by cutting off what is near"
 
 
 def test_charts_have_the_numbers_of_their_trials(experiment: Experiment) -> None:
