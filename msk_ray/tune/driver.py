@@ -31,7 +31,7 @@ from msk_ray.experiment.ownership import Ownership
 from msk_ray.experiment.results import read_record
 from msk_ray.experiment.scheduler_log import SchedulerLog
 from msk_ray.experiment.trial import Trial
-from msk_ray.progress import format_duration
+from msk_ray.progress import announce, format_duration
 from msk_ray.signals import StopRequest, listening
 from msk_ray.sweep.budget import extreme_configs, longest_budget
 from msk_ray.sweep.operators import Listed
@@ -126,6 +126,7 @@ def run_trials(plan: Plan) -> bool:
         f"{f'{plan.placement.gpus:g} GPU each' if plan.placement.gpus else 'CPU'}; into {experiment.path}",
         flush=True,
     )
+    announce("starting the first trials")
     with listening() as stop, stop.deferred():
         console = Console(remaining, concurrent)
         supervisor = Supervisor(
