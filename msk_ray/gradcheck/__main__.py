@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 from msk_ray.cli import Parser, run
 from msk_ray.errors import ConfigError, UnsupportedModelError
-from msk_ray.physics.capacity import Capacity
 from msk_ray.progress import COMPILING, Pace, announce
 
 if TYPE_CHECKING:
@@ -163,6 +162,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
     # torch and Warp take seconds to load; a wrong command line should not wait for them.
     from msk_ray.gradcheck.check import GradientCheck, Limits, check_gradients, check_request
+    from msk_ray.physics.capacity import Capacity
     from msk_ray.physics.parameters import check_names, names_of
     from msk_ray.simulation import Simulation
     from msk_ray.simulation.modes import make_backward
