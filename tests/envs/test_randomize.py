@@ -8,7 +8,6 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from hopper import Hopper
 from oracle import INPUTS, differences, relative
 from scenes import ant, ant_points, random_weights
 
@@ -190,7 +189,7 @@ def test_an_environment_from_outside_is_randomized_too() -> None:
     physics = PhysicsConfig.model_validate(
         {"randomize": {"geom_friction": {"low": 0.4, "high": 1.2, "mode": "value", "only": ["foot", "floor"]}}}
     )
-    settings = Hopper.Settings(name="hopper:Hopper")
+    settings = parse_config({"env": {"name": "hopper:Hopper"}}).env
     env = make_env(settings, physics, 3, "cpu", 0, randomize=True)
     action = torch.zeros(3, env.action_size, requires_grad=True)
     for _ in range(3):
