@@ -3,6 +3,7 @@
 import math
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -17,14 +18,20 @@ from msk_ray.training import Trainer
 pytestmark = pytest.mark.gpu
 
 
-def measured(device: str) -> dict[str, torch.Tensor]:
-    """A, B and gradients of an ant in contact whose worlds differ in friction, under forces from outside."""
+def in_contact(device: str) -> tuple[mujoco.MjModel, Simulation, list[torch.Tensor]]:
+    """An ant, its simulation and (ctrl, qpos, qvel, act) of six states in contact."""
     model = ant("elliptic")
     points = ant_points(model, 6, seed=2)
     sim = Simulation(model, 6, 4, device=device, tolerance=1e-9)
     inputs = [
         torch.tensor(np.stack([getattr(p, n) for p in points]), dtype=torch.float32, device=device) for n in INPUTS
     ]
+    return model, sim, inputs
+
+
+def measured(device: str) -> dict[str, torch.Tensor]:
+    """A, B and gradients of an ant in contact whose worlds differ in friction, under forces from outside."""
+    model, sim, inputs = in_contact(device)
     friction = torch.tensor(model.geom_friction, dtype=torch.float32).repeat(6, 1, 1)
     friction[:, :, 0] = torch.linspace(0.4, 1.2, 6)[:, None]
     parameters = {"geom_friction": friction.to(device)}
@@ -47,12 +54,7 @@ def test_jacobians_and_forces_are_those_of_the_cpu() -> None:
 
 def of_all_parameters(device: str) -> dict[str, torch.Tensor]:
     """Gradients of all parameters of an ant in contact, whose stages share several CUDA streams."""
-    model = ant("elliptic")
-    points = ant_points(model, 6, seed=2)
-    sim = Simulation(model, 6, 4, device=device, tolerance=1e-9)
-    inputs = [
-        torch.tensor(np.stack([getattr(p, n) for p in points]), dtype=torch.float32, device=device) for n in INPUTS
-    ]
+    model, sim, inputs = in_contact(device)
     values = {}
     for name in names_of(model):
         value = torch.as_tensor(PARAMETERS[name].value(model), dtype=torch.float32, device=device)
