@@ -225,124 +225,6 @@ class ActuatorBars:
     rate: wp.array2d[wp.vec4]
 
 
-@wp.func
-def pull_actuators_of(
-    worldid: int,
-    uid: int,
-    # Model:
-    opt_timestep: wp.array[float],
-    clampctrl: bool,
-    clampact: bool,
-    implicit_all: bool,
-    implicit_address: wp.array2d[int],
-    actuators: ActuatorSettings,
-    # In:
-    live_in: wp.array[int],
-    drive_in: Drive,
-    state_in: State,
-    multipliers_in: Multipliers,
-    # Out:
-    grad_act_out: wp.array2d[float],
-    grad_ctrl_out: wp.array2d[float],
-    slopes_out: DofSlopes,
-    tendon_bars_out: TendonBars,
-    actuator_bars_out: ActuatorBars,
-) -> None:
-    """Φ ∋ -(m·λ) F(len, m·v, act, ctrl) - h κ dF/dv and ḡ·act': gradients of ctrl and act, and those of len and rates.
-
-    With implicit integration κ = Σ m_i m_j μ_i â_j over the pairs that `implicit_address` has. A tendon's cotangents
-    go to its tendon. For other transmissions whose moment m turns with q, `rate_bar` keeps ∂Φ/∂(m·λ, m·v, m·μ, m·â).
-    """
-    timestep = opt_timestep[worldid % opt_timestep.shape[0]]
-    law = actuator_law(worldid, uid, timestep, clampctrl, clampact, actuators)
-    ctrl = float(0.0)
-    source = actuators.actuator_ctrladr[uid]
-    if actuators.actuator_ctrlnum[uid] > 0:
-        ctrl = drive_in.ctrl[worldid, source]
-    act = float(0.0)
-    act_weight = float(0.0)
-    slot = actuators.actuator_actadr[uid] + actuators.actuator_actnum[uid] - 1
-    if law.dyntype != DynType.NONE:
-        act = drive_in.act[worldid, slot]
-        act_weight = grad_act_out[worldid, slot]
-
-    start = drive_in.moment_rowadr[worldid, uid]
-    end = start + drive_in.moment_rownnz[worldid, uid]
-    rate = float(0.0)
-    velocity = float(0.0)
-    for k in range(start, end):
-        dof = drive_in.moment_colind[worldid, k]
-        velocity += drive_in.actuator_moment[worldid, k] * state_in.qvel[worldid, dof]
-        if not is_held(worldid, dof, actuators, drive_in):
-            rate += drive_in.actuator_moment[worldid, k] * multipliers_in.lam[worldid, dof]
-
-    law.implicit = 0
-    h = law.timestep
-    kappa = float(0.0)
-    rate_mu = float(0.0)
-    rate_smooth = float(0.0)
-    if implicit_all:
-        law.implicit = 1
-        for k in range(start, end):
-            i = drive_in.moment_colind[worldid, k]
-            if implicit_address[i, i] < 0:
-                continue
-            rate_mu += drive_in.actuator_moment[worldid, k] * multipliers_in.mu[worldid, i]
-            rate_smooth += drive_in.actuator_moment[worldid, k] * (
-                state_in.qacc[worldid, i] - multipliers_in.excess[worldid, i]
-            )
-            for m in range(start, end):
-                j = drive_in.moment_colind[worldid, m]
-                if implicit_address[wp.max(i, j), wp.min(i, j)] >= 0:
-                    smooth = state_in.qacc[worldid, j] - multipliers_in.excess[worldid, j]
-                    kappa += (
-                        drive_in.actuator_moment[worldid, k]
-                        * drive_in.actuator_moment[worldid, m]
-                        * multipliers_in.mu[worldid, i]
-                        * smooth
-                    )
-
-    length = drive_in.actuator_length[worldid, uid]
-    _l, ctrl_slope, act_slope, length_slope, velocity_slope, _a, force, slope = wp.grad(actuator_score)(
-        law, ctrl, act, length, velocity, act_weight, rate, h * kappa
-    )
-    live = live_in[worldid] != 0
-    if law.dyntype != DynType.NONE:
-        grad_act_out[worldid, slot] = wp.where(live, act_slope, 0.0)
-    if live and actuators.actuator_ctrlnum[uid] > 0:
-        grad_ctrl_out[worldid, source] += ctrl_slope
-    actuator_bars_out.length[worldid, uid] = -length_slope
-    # ∂Φ/∂(m·λ) = -F ,  ∂Φ/∂(m·μ) = -h F' m·â ,  ∂Φ/∂(m·â) = -h F' m·μ
-    rate_bar = wp.vec4(-force, -velocity_slope, -h * slope * rate_smooth, -h * slope * rate_mu)
-    if not implicit_all:
-        rate_bar[2] = 0.0
-        rate_bar[3] = 0.0
-    actuator_bars_out.rate[worldid, uid] = rate_bar
-    kind = actuators.actuator_trntype[uid]
-    if kind == TrnType.TENDON:
-        t = actuators.actuator_trnid[uid][0]
-        gear = actuators.actuator_gear[worldid % actuators.actuator_gear.shape[0], uid][0]
-        wp.atomic_add(tendon_bars_out.length, worldid, t, -gear * length_slope)
-        wp.atomic_add(tendon_bars_out.qvel, worldid, t, gear * rate_bar[1])
-        wp.atomic_add(tendon_bars_out.lam, worldid, t, gear * rate_bar[0])
-        if implicit_all:
-            wp.atomic_add(tendon_bars_out.mu, worldid, t, gear * rate_bar[2])
-            wp.atomic_add(tendon_bars_out.smooth, worldid, t, gear * rate_bar[3])
-        return
-    if kind == TrnType.SITE or kind == TrnType.SLIDERCRANK:
-        return
-    # Length is the integral of the moment for hinges and slides; where it is not, `transmission` does it.
-    straight = bool(False)
-    if kind == TrnType.JOINT or kind == TrnType.JOINTINPARENT:
-        joint = actuators.jnt_type[actuators.actuator_trnid[uid][0]]
-        straight = joint == JointType.HINGE or joint == JointType.SLIDE
-    for k in range(start, end):
-        dof = drive_in.moment_colind[worldid, k]
-        wp.atomic_add(slopes_out.qvel, worldid, dof, rate_bar[1] * drive_in.actuator_moment[worldid, k])
-        if straight:
-            wp.atomic_add(slopes_out.qpos, worldid, dof, -length_slope * drive_in.actuator_moment[worldid, k])
-
-
 @wp.kernel
 def pull_actuators(
     lanes: int,
@@ -366,28 +248,102 @@ def pull_actuators(
     tendon_bars_out: TendonBars,
     actuator_bars_out: ActuatorBars,
 ) -> None:
-    """All actuators of a world, in the order of each thread."""
+    """Φ ∋ -(m·λ) F(len, m·v, act, ctrl) - h κ dF/dv and ḡ·act': gradients of ctrl and act, and those of len and rates.
+
+    With implicit integration κ = Σ m_i m_j μ_i â_j over the pairs that `implicit_address` has. A tendon's cotangents
+    go to its tendon. For other transmissions whose moment m turns with q, `rate_bar` keeps ∂Φ/∂(m·λ, m·v, m·μ, m·â).
+    `lanes` threads take all `count` actuators of a world in turn.
+    """
     worldid, lane = wp.tid()
     for uid in range(lane, count, lanes):
-        pull_actuators_of(
-            worldid,
-            uid,
-            opt_timestep,
-            clampctrl,
-            clampact,
-            implicit_all,
-            implicit_address,
-            actuators,
-            live_in,
-            drive_in,
-            state_in,
-            multipliers_in,
-            grad_act_out,
-            grad_ctrl_out,
-            slopes_out,
-            tendon_bars_out,
-            actuator_bars_out,
+        timestep = opt_timestep[worldid % opt_timestep.shape[0]]
+        law = actuator_law(worldid, uid, timestep, clampctrl, clampact, actuators)
+        ctrl = float(0.0)
+        source = actuators.actuator_ctrladr[uid]
+        if actuators.actuator_ctrlnum[uid] > 0:
+            ctrl = drive_in.ctrl[worldid, source]
+        act = float(0.0)
+        act_weight = float(0.0)
+        slot = actuators.actuator_actadr[uid] + actuators.actuator_actnum[uid] - 1
+        if law.dyntype != DynType.NONE:
+            act = drive_in.act[worldid, slot]
+            act_weight = grad_act_out[worldid, slot]
+
+        start = drive_in.moment_rowadr[worldid, uid]
+        end = start + drive_in.moment_rownnz[worldid, uid]
+        rate = float(0.0)
+        velocity = float(0.0)
+        for k in range(start, end):
+            dof = drive_in.moment_colind[worldid, k]
+            velocity += drive_in.actuator_moment[worldid, k] * state_in.qvel[worldid, dof]
+            if not is_held(worldid, dof, actuators, drive_in):
+                rate += drive_in.actuator_moment[worldid, k] * multipliers_in.lam[worldid, dof]
+
+        law.implicit = 0
+        h = law.timestep
+        kappa = float(0.0)
+        rate_mu = float(0.0)
+        rate_smooth = float(0.0)
+        if implicit_all:
+            law.implicit = 1
+            for k in range(start, end):
+                i = drive_in.moment_colind[worldid, k]
+                if implicit_address[i, i] < 0:
+                    continue
+                rate_mu += drive_in.actuator_moment[worldid, k] * multipliers_in.mu[worldid, i]
+                rate_smooth += drive_in.actuator_moment[worldid, k] * (
+                    state_in.qacc[worldid, i] - multipliers_in.excess[worldid, i]
+                )
+                for m in range(start, end):
+                    j = drive_in.moment_colind[worldid, m]
+                    if implicit_address[wp.max(i, j), wp.min(i, j)] >= 0:
+                        smooth = state_in.qacc[worldid, j] - multipliers_in.excess[worldid, j]
+                        kappa += (
+                            drive_in.actuator_moment[worldid, k]
+                            * drive_in.actuator_moment[worldid, m]
+                            * multipliers_in.mu[worldid, i]
+                            * smooth
+                        )
+
+        length = drive_in.actuator_length[worldid, uid]
+        _l, ctrl_slope, act_slope, length_slope, velocity_slope, _a, force, slope = wp.grad(actuator_score)(
+            law, ctrl, act, length, velocity, act_weight, rate, h * kappa
         )
+        live = live_in[worldid] != 0
+        if law.dyntype != DynType.NONE:
+            grad_act_out[worldid, slot] = wp.where(live, act_slope, 0.0)
+        if live and actuators.actuator_ctrlnum[uid] > 0:
+            grad_ctrl_out[worldid, source] += ctrl_slope
+        actuator_bars_out.length[worldid, uid] = -length_slope
+        # ∂Φ/∂(m·λ) = -F ,  ∂Φ/∂(m·μ) = -h F' m·â ,  ∂Φ/∂(m·â) = -h F' m·μ
+        rate_bar = wp.vec4(-force, -velocity_slope, -h * slope * rate_smooth, -h * slope * rate_mu)
+        if not implicit_all:
+            rate_bar[2] = 0.0
+            rate_bar[3] = 0.0
+        actuator_bars_out.rate[worldid, uid] = rate_bar
+        kind = actuators.actuator_trntype[uid]
+        if kind == TrnType.TENDON:
+            t = actuators.actuator_trnid[uid][0]
+            gear = actuators.actuator_gear[worldid % actuators.actuator_gear.shape[0], uid][0]
+            wp.atomic_add(tendon_bars_out.length, worldid, t, -gear * length_slope)
+            wp.atomic_add(tendon_bars_out.qvel, worldid, t, gear * rate_bar[1])
+            wp.atomic_add(tendon_bars_out.lam, worldid, t, gear * rate_bar[0])
+            if implicit_all:
+                wp.atomic_add(tendon_bars_out.mu, worldid, t, gear * rate_bar[2])
+                wp.atomic_add(tendon_bars_out.smooth, worldid, t, gear * rate_bar[3])
+            continue
+        if kind == TrnType.SITE or kind == TrnType.SLIDERCRANK:
+            continue
+        # Length is the integral of the moment for hinges and slides; where it is not, `transmission` does it.
+        straight = bool(False)
+        if kind == TrnType.JOINT or kind == TrnType.JOINTINPARENT:
+            joint = actuators.jnt_type[actuators.actuator_trnid[uid][0]]
+            straight = joint == JointType.HINGE or joint == JointType.SLIDE
+        for k in range(start, end):
+            dof = drive_in.moment_colind[worldid, k]
+            wp.atomic_add(slopes_out.qvel, worldid, dof, rate_bar[1] * drive_in.actuator_moment[worldid, k])
+            if straight:
+                wp.atomic_add(slopes_out.qpos, worldid, dof, -length_slope * drive_in.actuator_moment[worldid, k])
 
 
 class ActuatorForces:

@@ -61,169 +61,6 @@ def frame_weight(frame: wp.mat33, weight: vec6, slide: wp.vec3, spin: wp.vec3) -
     return out
 
 
-@wp.func
-def pull_contacts_of(
-    con: int,
-    # Model:
-    opt_timestep: wp.array[float],
-    opt_disableflags: int,
-    opt_impratio_invsqrt: wp.array[float],
-    shapes: Shapes,
-    # In:
-    rows_in: Rows,
-    laws_in: RowLaws,
-    contacts_in: Contacts,
-    motion_in: Motion,
-    fields_in: Fields,
-    # Out:
-    bars_out: FieldBars,
-    contact_bars_out: ContactBars,
-) -> None:
-    """Φ ∋ -Σ_r ρ_r(λ) f_r(ρ(a) - aref): wrenches on both bodies, and cotangents of (dist, pos, frame)."""
-    contact_bars_out.dist[con] = 0.0
-    contact_bars_out.pos[con] = wp.vec3(0.0)
-    contact_bars_out.frame[con] = wp.mat33()
-    first = contacts_in.efc_address[con, 0]
-    if first < 0:
-        return
-    worldid = contacts_in.worldid[con]
-    dim = contacts_in.dim[con]
-    elliptic = rows_in.type[worldid, first] == ConstraintType.CONTACT_ELLIPTIC
-    count = dim
-    if not elliptic and dim > 1:
-        count = 2 * (dim - 1)
-    if contacts_in.efc_address[con, count - 1] < 0:
-        return
-    friction = contacts_in.friction[con]
-    mu = friction[0] * opt_impratio_invsqrt[worldid % opt_impratio_invsqrt.shape[0]]
-
-    # A contact none of whose rows pushes has no slope anywhere.
-    jar = vec6()
-    mass = vec6()
-    active = bool(False)
-    if elliptic:
-        for i in range(dim):
-            jar[i] = laws_in.jar[worldid, first + i]
-            mass[i] = rows_in.D[worldid, first + i]
-    cone = cone_law(jar, mass, friction, mu, dim)
-    if elliptic:
-        active = cone.zone != 0
-    else:
-        for i in range(count):
-            active = active or laws_in.slope[worldid, first + i] != 0.0
-    if not active:
-        return
-
-    geoms = contacts_in.geom[con]
-    body1 = shapes.geom_bodyid[geoms[0]]
-    body2 = shapes.geom_bodyid[geoms[1]]
-    point = contacts_in.pos[con]
-    frame = contacts_in.frame[con]
-    arm1 = point - motion_in.subtree_com[worldid, shapes.body_rootid[body1]]
-    arm2 = point - motion_in.subtree_com[worldid, shapes.body_rootid[body2]]
-    lam1 = fields_in.lam[worldid, body1]
-    lam2 = fields_in.lam[worldid, body2]
-    acc1 = fields_in.qacc[worldid, body1]
-    acc2 = fields_in.qacc[worldid, body2]
-    vel1 = motion_in.cvel[worldid, body1]
-    vel2 = motion_in.cvel[worldid, body2]
-    lam_slide = point_velocity(lam2, arm2) - point_velocity(lam1, arm1)
-    acc_slide = point_velocity(acc2, arm2) - point_velocity(acc1, arm1)
-    vel_slide = point_velocity(vel2, arm2) - point_velocity(vel1, arm1)
-    lam_spin = wp.spatial_top(lam2) - wp.spatial_top(lam1)
-    acc_spin = wp.spatial_top(acc2) - wp.spatial_top(acc1)
-    vel_spin = wp.spatial_top(vel2) - wp.spatial_top(vel1)
-    rate = components(frame, lam_slide, lam_spin, dim)
-
-    timestep = opt_timestep[worldid % opt_timestep.shape[0]]
-    pos = contacts_in.dist[con] - contacts_in.includemargin[con]
-    solref = contacts_in.solref[con]
-    solimp = contacts_in.solimp[con]
-    normal_row = row_slopes(opt_disableflags, timestep, solref, solimp, pos)
-    lam_bar = vec6()
-    acc_bar = vec6()
-    vel_bar = vec6()
-    dist_bar = float(0.0)
-    if elliptic:
-        sideways = contacts_in.solreffriction[con]
-        if sideways[0] == 0.0 and sideways[1] == 0.0:
-            sideways = solref
-        side_row = row_slopes(opt_disableflags, timestep, sideways, solimp, pos)
-        # ∂Φ/∂jar = S ρ(λ) =: y ,  jar = ρ(a) + b ρ(v) + k imp pos (normal row only)
-        y = cone_slope(cone, mass, friction, dim, rate)
-        work = float(0.0)
-        for i in range(dim):
-            lam_bar[i] = -cone.force[i]
-            acc_bar[i] = y[i]
-            vel_bar[i] = wp.where(i == 0, normal_row.damping, side_row.damping) * y[i]
-            work += rate[i] * cone.force[i]
-        # f is of degree one in D, whose ratios are fixed: ∂Φ/∂pos ∋ -ρ(λ)·f d(log D)
-        dist_bar = normal_row.stiffness * y[0] - normal_row.mass * work
-    else:
-        for i in range(count):
-            row = first + i
-            s = laws_in.slope[worldid, row]
-            if s != 0.0:
-                f = laws_in.force[worldid, row]
-                k = i / 2 + 1
-                lean = float(0.0)
-                if dim > 1:
-                    lean = friction[k - 1] * wp.where(i % 2 == 0, 1.0, -1.0)
-                # ρ_row = ρ₀ ± φ_k ρ_k
-                row_rate = rate[0]
-                if dim > 1:
-                    row_rate += lean * rate[k]
-                y_row = s * row_rate
-                lam_bar[0] -= f
-                acc_bar[0] += y_row
-                if dim > 1:
-                    lam_bar[k] -= lean * f
-                    acc_bar[k] += lean * y_row
-                dist_bar += normal_row.stiffness * y_row - normal_row.mass * row_rate * f
-        vel_bar = normal_row.damping * acc_bar
-
-    lam_force = along_frame(frame, lam_bar, 0)
-    acc_force = along_frame(frame, acc_bar, 0)
-    vel_force = along_frame(frame, vel_bar, 0)
-    lam_torque = along_frame(frame, lam_bar, 3)
-    acc_torque = along_frame(frame, acc_bar, 3)
-    vel_torque = along_frame(frame, vel_bar, 3)
-
-    contact_bars_out.dist[con] = dist_bar
-    # ρ moves with the point as ω × dp  ⇒  p̄ = Σ_x ū(x) × ω(x)
-    contact_bars_out.pos[con] = (
-        wp.cross(lam_force, lam_spin) + wp.cross(acc_force, acc_spin) + wp.cross(vel_force, vel_spin)
-    )
-    contact_bars_out.frame[con] = (
-        frame_weight(frame, lam_bar, lam_slide, lam_spin)
-        + frame_weight(frame, acc_bar, acc_slide, acc_spin)
-        + frame_weight(frame, vel_bar, vel_slide, vel_spin)
-    )
-    for side in range(2):
-        body = body1
-        arm = arm1
-        sign = float(-1.0)
-        lam = lam1
-        acc = acc1
-        vel = vel1
-        if side == 1:
-            body = body2
-            arm = arm2
-            sign = float(1.0)
-            lam = lam2
-            acc = acc2
-            vel = vel2
-        if body > 0:
-            lam_wrench = sign * wrench(lam_force, lam_torque, arm)
-            acc_wrench = sign * wrench(acc_force, acc_torque, arm)
-            vel_wrench = sign * wrench(vel_force, vel_torque, arm)
-            wp.atomic_add(bars_out.lam, worldid, body, lam_wrench)
-            wp.atomic_add(bars_out.qacc, worldid, body, acc_wrench)
-            wp.atomic_add(bars_out.qvel, worldid, body, vel_wrench)
-            moved = carried(lam, lam_wrench) + carried(acc, acc_wrench) + carried(vel, vel_wrench)
-            wp.atomic_add(bars_out.moved, worldid, body, moved)
-
-
 @wp.kernel
 def pull_contacts(
     in_turn: bool,
@@ -243,23 +80,151 @@ def pull_contacts(
     bars_out: FieldBars,
     contact_bars_out: ContactBars,
 ) -> None:
-    """All contacts of a thread, in their order."""
-    first = wp.tid()
-    for con in range(first, contacts_end(first, in_turn, nacon_in[0], contacts_in.worldid)):
-        pull_contacts_of(
-            con,
-            opt_timestep,
-            opt_disableflags,
-            opt_impratio_invsqrt,
-            shapes,
-            rows_in,
-            laws_in,
-            contacts_in,
-            motion_in,
-            fields_in,
-            bars_out,
-            contact_bars_out,
+    """Φ ∋ -Σ_r ρ_r(λ) f_r(ρ(a) - aref): wrenches on both bodies, and cotangents of (dist, pos, frame)."""
+    start = wp.tid()
+    for con in range(start, contacts_end(start, in_turn, nacon_in[0], contacts_in.worldid)):
+        contact_bars_out.dist[con] = 0.0
+        contact_bars_out.pos[con] = wp.vec3(0.0)
+        contact_bars_out.frame[con] = wp.mat33()
+        first = contacts_in.efc_address[con, 0]
+        if first < 0:
+            continue
+        worldid = contacts_in.worldid[con]
+        dim = contacts_in.dim[con]
+        elliptic = rows_in.type[worldid, first] == ConstraintType.CONTACT_ELLIPTIC
+        count = dim
+        if not elliptic and dim > 1:
+            count = 2 * (dim - 1)
+        if contacts_in.efc_address[con, count - 1] < 0:
+            continue
+        friction = contacts_in.friction[con]
+        mu = friction[0] * opt_impratio_invsqrt[worldid % opt_impratio_invsqrt.shape[0]]
+
+        # A contact none of whose rows pushes has no slope anywhere.
+        jar = vec6()
+        mass = vec6()
+        active = bool(False)
+        if elliptic:
+            for i in range(dim):
+                jar[i] = laws_in.jar[worldid, first + i]
+                mass[i] = rows_in.D[worldid, first + i]
+        cone = cone_law(jar, mass, friction, mu, dim)
+        if elliptic:
+            active = cone.zone != 0
+        else:
+            for i in range(count):
+                active = active or laws_in.slope[worldid, first + i] != 0.0
+        if not active:
+            continue
+
+        geoms = contacts_in.geom[con]
+        body1 = shapes.geom_bodyid[geoms[0]]
+        body2 = shapes.geom_bodyid[geoms[1]]
+        point = contacts_in.pos[con]
+        frame = contacts_in.frame[con]
+        arm1 = point - motion_in.subtree_com[worldid, shapes.body_rootid[body1]]
+        arm2 = point - motion_in.subtree_com[worldid, shapes.body_rootid[body2]]
+        lam1 = fields_in.lam[worldid, body1]
+        lam2 = fields_in.lam[worldid, body2]
+        acc1 = fields_in.qacc[worldid, body1]
+        acc2 = fields_in.qacc[worldid, body2]
+        vel1 = motion_in.cvel[worldid, body1]
+        vel2 = motion_in.cvel[worldid, body2]
+        lam_slide = point_velocity(lam2, arm2) - point_velocity(lam1, arm1)
+        acc_slide = point_velocity(acc2, arm2) - point_velocity(acc1, arm1)
+        vel_slide = point_velocity(vel2, arm2) - point_velocity(vel1, arm1)
+        lam_spin = wp.spatial_top(lam2) - wp.spatial_top(lam1)
+        acc_spin = wp.spatial_top(acc2) - wp.spatial_top(acc1)
+        vel_spin = wp.spatial_top(vel2) - wp.spatial_top(vel1)
+        rate = components(frame, lam_slide, lam_spin, dim)
+
+        timestep = opt_timestep[worldid % opt_timestep.shape[0]]
+        pos = contacts_in.dist[con] - contacts_in.includemargin[con]
+        solref = contacts_in.solref[con]
+        solimp = contacts_in.solimp[con]
+        normal_row = row_slopes(opt_disableflags, timestep, solref, solimp, pos)
+        lam_bar = vec6()
+        acc_bar = vec6()
+        vel_bar = vec6()
+        dist_bar = float(0.0)
+        if elliptic:
+            sideways = contacts_in.solreffriction[con]
+            if sideways[0] == 0.0 and sideways[1] == 0.0:
+                sideways = solref
+            side_row = row_slopes(opt_disableflags, timestep, sideways, solimp, pos)
+            # ∂Φ/∂jar = S ρ(λ) =: y ,  jar = ρ(a) + b ρ(v) + k imp pos (normal row only)
+            y = cone_slope(cone, mass, friction, dim, rate)
+            work = float(0.0)
+            for i in range(dim):
+                lam_bar[i] = -cone.force[i]
+                acc_bar[i] = y[i]
+                vel_bar[i] = wp.where(i == 0, normal_row.damping, side_row.damping) * y[i]
+                work += rate[i] * cone.force[i]
+            # f is of degree one in D, whose ratios are fixed: ∂Φ/∂pos ∋ -ρ(λ)·f d(log D)
+            dist_bar = normal_row.stiffness * y[0] - normal_row.mass * work
+        else:
+            for i in range(count):
+                row = first + i
+                s = laws_in.slope[worldid, row]
+                if s != 0.0:
+                    f = laws_in.force[worldid, row]
+                    k = i / 2 + 1
+                    lean = float(0.0)
+                    if dim > 1:
+                        lean = friction[k - 1] * wp.where(i % 2 == 0, 1.0, -1.0)
+                    # ρ_row = ρ₀ ± φ_k ρ_k
+                    row_rate = rate[0]
+                    if dim > 1:
+                        row_rate += lean * rate[k]
+                    y_row = s * row_rate
+                    lam_bar[0] -= f
+                    acc_bar[0] += y_row
+                    if dim > 1:
+                        lam_bar[k] -= lean * f
+                        acc_bar[k] += lean * y_row
+                    dist_bar += normal_row.stiffness * y_row - normal_row.mass * row_rate * f
+            vel_bar = normal_row.damping * acc_bar
+
+        lam_force = along_frame(frame, lam_bar, 0)
+        acc_force = along_frame(frame, acc_bar, 0)
+        vel_force = along_frame(frame, vel_bar, 0)
+        lam_torque = along_frame(frame, lam_bar, 3)
+        acc_torque = along_frame(frame, acc_bar, 3)
+        vel_torque = along_frame(frame, vel_bar, 3)
+
+        contact_bars_out.dist[con] = dist_bar
+        # ρ moves with the point as ω × dp  ⇒  p̄ = Σ_x ū(x) × ω(x)
+        contact_bars_out.pos[con] = (
+            wp.cross(lam_force, lam_spin) + wp.cross(acc_force, acc_spin) + wp.cross(vel_force, vel_spin)
         )
+        contact_bars_out.frame[con] = (
+            frame_weight(frame, lam_bar, lam_slide, lam_spin)
+            + frame_weight(frame, acc_bar, acc_slide, acc_spin)
+            + frame_weight(frame, vel_bar, vel_slide, vel_spin)
+        )
+        for side in range(2):
+            body = body1
+            arm = arm1
+            sign = float(-1.0)
+            lam = lam1
+            acc = acc1
+            vel = vel1
+            if side == 1:
+                body = body2
+                arm = arm2
+                sign = float(1.0)
+                lam = lam2
+                acc = acc2
+                vel = vel2
+            if body > 0:
+                lam_wrench = sign * wrench(lam_force, lam_torque, arm)
+                acc_wrench = sign * wrench(acc_force, acc_torque, arm)
+                vel_wrench = sign * wrench(vel_force, vel_torque, arm)
+                wp.atomic_add(bars_out.lam, worldid, body, lam_wrench)
+                wp.atomic_add(bars_out.qacc, worldid, body, acc_wrench)
+                wp.atomic_add(bars_out.qvel, worldid, body, vel_wrench)
+                moved = carried(lam, lam_wrench) + carried(acc, acc_wrench) + carried(vel, vel_wrench)
+                wp.atomic_add(bars_out.moved, worldid, body, moved)
 
 
 class ContactForces:

@@ -250,68 +250,6 @@ def framed(normal: wp.vec3, weight: wp.mat33) -> wp.float32:
     return wp.dot(weight[0], frame[0]) + wp.dot(weight[1], frame[1]) + wp.dot(weight[2], frame[2])
 
 
-@wp.func
-def pull_convex_of(
-    con: int,
-    # Model:
-    shapes: Shapes,
-    meshes: Meshes,
-    native_ccd: int,
-    multi_ccd: int,
-    substep: int,
-    # In:
-    contacts_in: Contacts,
-    geom_xpos_in: wp.array2d[wp.vec3],
-    geom_xmat_in: wp.array2d[wp.mat33],
-    subtree_com_in: wp.array2d[wp.vec3],
-    contact_bars_in: ContactBars,
-    # Out:
-    moved_bar_out: wp.array2d[wp.spatial_vector],
-    touches_out: Touches,
-    wrenches_out: wp.array2d[wp.spatial_vector],
-) -> None:
-    """Cotangents of (dist, pos, frame) to wrenches on the two bodies whose displacement moves them."""
-    if contacts_in.efc_address[con, 0] < 0 and contact_bars_in.dist[con] == 0.0:
-        return
-    geoms = contacts_in.geom[con]
-    type1 = shapes.geom_type[geoms[0]]
-    type2 = shapes.geom_type[geoms[1]]
-    if not is_convex_pair(type1, type2):
-        return
-    bars = Bars()
-    bars.dist = contact_bars_in.dist[con]
-    bars.point = contact_bars_in.pos[con]
-    if wrenches_out.shape[0] > 0:
-        wrenches_out[con, 0] = wp.spatial_vector(wp.vec3(0.0), wp.vec3(0.0))
-        wrenches_out[con, 1] = wp.spatial_vector(wp.vec3(0.0), wp.vec3(0.0))
-    # A contact that pushes nothing, or whose world has no cotangent, has none either.
-    if bars.dist == 0.0 and wp.dot(bars.point, bars.point) == 0.0:
-        return
-    seen = Seen()
-    seen.dist = contacts_in.dist[con]
-    seen.point = contacts_in.pos[con]
-    seen.normal = contacts_in.frame[con][0]
-    normal_bar, _weight = wp.grad(framed)(seen.normal, contact_bars_in.frame[con])
-    bars.normal = normal_bar
-    worldid = contacts_in.worldid[con]
-    solid1 = solid_of(geoms[0], worldid, shapes, meshes, geom_xpos_in, geom_xmat_in)
-    solid2 = solid_of(geoms[1], worldid, shapes, meshes, geom_xpos_in, geom_xmat_in)
-    push, exact = convex_wrenches(solid1, solid2, meshes, seen, bars, native_ccd, multi_ccd)
-    if not exact:
-        count_touch(touches_out, worldid, substep, shapes.geom_type.shape[0], geoms[0], geoms[1], type1, type2)
-    if wrenches_out.shape[0] > 0:
-        wrenches_out[con, 0] = wrench(push.force1, push.torque1, seen.point - solid1.pos)
-        wrenches_out[con, 1] = wrench(push.force2, push.torque2, seen.point - solid2.pos)
-    body1 = shapes.geom_bodyid[geoms[0]]
-    body2 = shapes.geom_bodyid[geoms[1]]
-    if body1 > 0:
-        arm = seen.point - subtree_com_in[worldid, shapes.body_rootid[body1]]
-        wp.atomic_add(moved_bar_out, worldid, body1, wrench(push.force1, push.torque1, arm))
-    if body2 > 0:
-        arm = seen.point - subtree_com_in[worldid, shapes.body_rootid[body2]]
-        wp.atomic_add(moved_bar_out, worldid, body2, wrench(push.force2, push.torque2, arm))
-
-
 @wp.kernel
 def pull_convex(
     in_turn: bool,
@@ -333,25 +271,48 @@ def pull_convex(
     touches_out: Touches,
     wrenches_out: wp.array2d[wp.spatial_vector],
 ) -> None:
-    """All contacts of a thread, in their order."""
-    first = wp.tid()
-    for con in range(first, contacts_end(first, in_turn, nacon_in[0], contacts_in.worldid)):
-        pull_convex_of(
-            con,
-            shapes,
-            meshes,
-            native_ccd,
-            multi_ccd,
-            substep,
-            contacts_in,
-            geom_xpos_in,
-            geom_xmat_in,
-            subtree_com_in,
-            contact_bars_in,
-            moved_bar_out,
-            touches_out,
-            wrenches_out,
-        )
+    """Cotangents of (dist, pos, frame) to wrenches on the two bodies whose displacement moves them."""
+    start = wp.tid()
+    for con in range(start, contacts_end(start, in_turn, nacon_in[0], contacts_in.worldid)):
+        if contacts_in.efc_address[con, 0] < 0 and contact_bars_in.dist[con] == 0.0:
+            continue
+        geoms = contacts_in.geom[con]
+        type1 = shapes.geom_type[geoms[0]]
+        type2 = shapes.geom_type[geoms[1]]
+        if not is_convex_pair(type1, type2):
+            continue
+        bars = Bars()
+        bars.dist = contact_bars_in.dist[con]
+        bars.point = contact_bars_in.pos[con]
+        if wrenches_out.shape[0] > 0:
+            wrenches_out[con, 0] = wp.spatial_vector(wp.vec3(0.0), wp.vec3(0.0))
+            wrenches_out[con, 1] = wp.spatial_vector(wp.vec3(0.0), wp.vec3(0.0))
+        # A contact that pushes nothing, or whose world has no cotangent, has none either.
+        if bars.dist == 0.0 and wp.dot(bars.point, bars.point) == 0.0:
+            continue
+        seen = Seen()
+        seen.dist = contacts_in.dist[con]
+        seen.point = contacts_in.pos[con]
+        seen.normal = contacts_in.frame[con][0]
+        normal_bar, _weight = wp.grad(framed)(seen.normal, contact_bars_in.frame[con])
+        bars.normal = normal_bar
+        worldid = contacts_in.worldid[con]
+        solid1 = solid_of(geoms[0], worldid, shapes, meshes, geom_xpos_in, geom_xmat_in)
+        solid2 = solid_of(geoms[1], worldid, shapes, meshes, geom_xpos_in, geom_xmat_in)
+        push, exact = convex_wrenches(solid1, solid2, meshes, seen, bars, native_ccd, multi_ccd)
+        if not exact:
+            count_touch(touches_out, worldid, substep, shapes.geom_type.shape[0], geoms[0], geoms[1], type1, type2)
+        if wrenches_out.shape[0] > 0:
+            wrenches_out[con, 0] = wrench(push.force1, push.torque1, seen.point - solid1.pos)
+            wrenches_out[con, 1] = wrench(push.force2, push.torque2, seen.point - solid2.pos)
+        body1 = shapes.geom_bodyid[geoms[0]]
+        body2 = shapes.geom_bodyid[geoms[1]]
+        if body1 > 0:
+            arm = seen.point - subtree_com_in[worldid, shapes.body_rootid[body1]]
+            wp.atomic_add(moved_bar_out, worldid, body1, wrench(push.force1, push.torque1, arm))
+        if body2 > 0:
+            arm = seen.point - subtree_com_in[worldid, shapes.body_rootid[body2]]
+            wp.atomic_add(moved_bar_out, worldid, body2, wrench(push.force2, push.torque2, arm))
 
 
 class ConvexContacts:

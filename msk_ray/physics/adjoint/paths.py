@@ -151,131 +151,6 @@ def fields_of(
     return out
 
 
-@wp.func
-def pull_paths_of(
-    worldid: int,
-    e: int,
-    # Model:
-    paths: Paths,
-    # In:
-    touch_in: wp.array2d[wp.spatial_vector],
-    inside_in: wp.array2d[wp.vec4],
-    poses_in: PathPoses,
-    motion_in: Motion,
-    fields_in: Fields,
-    tendon_bars_in: TendonBars,
-    # Out:
-    bars_out: FieldBars,
-) -> None:
-    """How J x of a spatial tendon turns with q: one thread a stretch of path between two sites, geom or not."""
-    t = paths.segment_tendon[e]
-    first = paths.segment_first[e]
-    site0 = paths.wrap_objid[first]
-    site1 = paths.wrap_objid[paths.segment_last[e]]
-    body0 = paths.site_bodyid[site0]
-    body1 = paths.site_bodyid[site1]
-    touch = touch_in[worldid, e]
-    straight = touch[0] >= MJ_MAXVAL
-    if straight and body0 == body1:
-        return  # it turns with its body
-    rates = rates_of(worldid, t, paths.wrap_pulley_scale[first], tendon_bars_in)
-    f0 = fields_of(body0, worldid, rates, fields_in, motion_in.cvel)
-    f1 = fields_of(body1, worldid, rates, fields_in, motion_in.cvel)
-    start = poses_in.site_xpos[worldid, site0]
-    end = poses_in.site_xpos[worldid, site1]
-    com0 = motion_in.subtree_com[worldid, paths.body_rootid[body0]]
-    com1 = motion_in.subtree_com[worldid, paths.body_rootid[body1]]
-
-    place = paths.segment_geom[e]
-    geom = int(0)
-    kind = int(0)
-    radius = float(0.0)
-    side = wp.vec3(MJ_MAXVAL)
-    if place >= 0:
-        geom = paths.wrap_objid[place]
-        kind = paths.wrap_type[place]
-        radius = paths.geom_size[worldid % paths.geom_size.shape[0], geom][0]
-        sidesite = int(wp.round(paths.wrap_prm[place]))
-        if sidesite >= 0:
-            side = poses_in.site_xpos[worldid, sidesite]
-    zero = wp.vec3(0.0)
-    if straight:
-        n = wp.normalize(end - start)
-        slide = point_velocity(weigh(rates, f1), end - com1) - point_velocity(weigh(rates, f0), start - com0)
-        turn = segment_turn(start, end, slide)
-        moved0 = end_wrench(start - com0, -n, -turn, rates, f0)
-        moved1 = end_wrench(end - com1, n, turn, rates, f1)
-        push_body(body0, worldid, wrench(-n, zero, start - com0), moved0, rates, bars_out)
-        push_body(body1, worldid, wrench(n, zero, end - com1), moved1, rates, bars_out)
-        return
-
-    touch0 = wp.spatial_top(touch)
-    touch1 = wp.spatial_bottom(touch)
-    body = paths.geom_bodyid[geom]
-    com = motion_in.subtree_com[worldid, paths.body_rootid[body]]
-    fg = fields_of(body, worldid, rates, fields_in, motion_in.cvel)
-    total = weigh(rates, fg)
-    spin = wp.spatial_top(total)
-    along0 = wp.spatial_vectorf()
-    along1 = wp.spatial_vectorf()
-    along = wp.spatial_vectorf()
-    moved0 = wp.spatial_vectorf()
-    moved1 = wp.spatial_vectorf()
-    moved = wp.spatial_vectorf()
-    touch0_bar = zero
-    touch1_bar = zero
-    if body0 != body:
-        n = wp.normalize(touch0 - start)
-        slide = point_velocity(total, touch0 - com) - point_velocity(weigh(rates, f0), start - com0)
-        turn = segment_turn(start, touch0, slide)
-        along0 = wrench(-n, zero, start - com0)
-        moved0 = end_wrench(start - com0, -n, -turn, rates, f0)
-        # The tangent point's displacement is not the geom's: its cotangent goes through the wrap below.
-        touch0_bar = turn + wp.cross(n, spin)
-        along += wrench(n, zero, touch0 - com)
-        moved += end_wrench(touch0 - com, n, -wp.cross(n, spin), rates, fg)
-    if body1 != body:
-        n = wp.normalize(end - touch1)
-        slide = point_velocity(weigh(rates, f1), end - com1) - point_velocity(total, touch1 - com)
-        turn = segment_turn(touch1, end, slide)
-        along1 = wrench(n, zero, end - com1)
-        moved1 = end_wrench(end - com1, n, turn, rates, f1)
-        touch1_bar = -turn - wp.cross(n, spin)
-        along += wrench(-n, zero, touch1 - com)
-        moved += end_wrench(touch1 - com, -n, wp.cross(n, spin), rates, fg)
-    mat = poses_in.geom_xmat[worldid, geom]
-    pos = poses_in.geom_xpos[worldid, geom]
-    start_bar = zero
-    end_bar = zero
-    pos_bar = zero
-    mat_bar = wp.mat33(0.0)
-    side_bar = zero
-    spot = inside_in[worldid, e]
-    if spot[3] != 0.0:
-        start_bar, end_bar, pos_bar, mat_bar, _r, _k, _p, _w = wp.grad(inside_score)(
-            start, end, pos, mat, radius, kind, wp.vec3(spot[0], spot[1], spot[2]), touch0_bar + touch1_bar
-        )
-    else:
-        start_bar, end_bar, pos_bar, mat_bar, _r, _k, side_bar, _w0, _w1 = wp.grad(wrap_score)(
-            start, end, pos, mat, radius, kind, side, touch0_bar, touch1_bar
-        )
-    # dR = [ω] R  ⇒  torque Σ_k R_k × R̄_k over the columns
-    torque = zero
-    for k in range(3):
-        column = wp.vec3(mat[0, k], mat[1, k], mat[2, k])
-        column_bar = wp.vec3(mat_bar[0, k], mat_bar[1, k], mat_bar[2, k])
-        torque += wp.cross(column, column_bar)
-    push_body(body0, worldid, along0, moved0 + wrench(start_bar, zero, start - com0), rates, bars_out)
-    push_body(body1, worldid, along1, moved1 + wrench(end_bar, zero, end - com1), rates, bars_out)
-    push_body(body, worldid, along, moved + wrench(pos_bar, torque, pos - com), rates, bars_out)
-    sidesite = int(wp.round(paths.wrap_prm[place]))
-    if sidesite >= 0:
-        owner = paths.site_bodyid[sidesite]
-        if owner > 0:
-            arm = side - motion_in.subtree_com[worldid, paths.body_rootid[owner]]
-            wp.atomic_add(bars_out.moved, worldid, owner, wrench(side_bar, zero, arm))
-
-
 @wp.kernel
 def pull_paths(
     lanes: int,
@@ -292,10 +167,119 @@ def pull_paths(
     # Out:
     bars_out: FieldBars,
 ) -> None:
-    """All elements of paths of a world, in the order of each thread."""
+    """How J x of a spatial tendon turns with q.
+
+    `lanes` threads take all `count` stretches of path of a world in turn: those between two sites, with or without a
+    geom.
+    """
     worldid, lane = wp.tid()
     for e in range(lane, count, lanes):
-        pull_paths_of(worldid, e, paths, touch_in, inside_in, poses_in, motion_in, fields_in, tendon_bars_in, bars_out)
+        t = paths.segment_tendon[e]
+        first = paths.segment_first[e]
+        site0 = paths.wrap_objid[first]
+        site1 = paths.wrap_objid[paths.segment_last[e]]
+        body0 = paths.site_bodyid[site0]
+        body1 = paths.site_bodyid[site1]
+        touch = touch_in[worldid, e]
+        straight = touch[0] >= MJ_MAXVAL
+        if straight and body0 == body1:
+            continue  # it turns with its body
+        rates = rates_of(worldid, t, paths.wrap_pulley_scale[first], tendon_bars_in)
+        f0 = fields_of(body0, worldid, rates, fields_in, motion_in.cvel)
+        f1 = fields_of(body1, worldid, rates, fields_in, motion_in.cvel)
+        start = poses_in.site_xpos[worldid, site0]
+        end = poses_in.site_xpos[worldid, site1]
+        com0 = motion_in.subtree_com[worldid, paths.body_rootid[body0]]
+        com1 = motion_in.subtree_com[worldid, paths.body_rootid[body1]]
+
+        place = paths.segment_geom[e]
+        geom = int(0)
+        kind = int(0)
+        radius = float(0.0)
+        side = wp.vec3(MJ_MAXVAL)
+        if place >= 0:
+            geom = paths.wrap_objid[place]
+            kind = paths.wrap_type[place]
+            radius = paths.geom_size[worldid % paths.geom_size.shape[0], geom][0]
+            sidesite = int(wp.round(paths.wrap_prm[place]))
+            if sidesite >= 0:
+                side = poses_in.site_xpos[worldid, sidesite]
+        zero = wp.vec3(0.0)
+        if straight:
+            n = wp.normalize(end - start)
+            slide = point_velocity(weigh(rates, f1), end - com1) - point_velocity(weigh(rates, f0), start - com0)
+            turn = segment_turn(start, end, slide)
+            moved0 = end_wrench(start - com0, -n, -turn, rates, f0)
+            moved1 = end_wrench(end - com1, n, turn, rates, f1)
+            push_body(body0, worldid, wrench(-n, zero, start - com0), moved0, rates, bars_out)
+            push_body(body1, worldid, wrench(n, zero, end - com1), moved1, rates, bars_out)
+            continue
+
+        touch0 = wp.spatial_top(touch)
+        touch1 = wp.spatial_bottom(touch)
+        body = paths.geom_bodyid[geom]
+        com = motion_in.subtree_com[worldid, paths.body_rootid[body]]
+        fg = fields_of(body, worldid, rates, fields_in, motion_in.cvel)
+        total = weigh(rates, fg)
+        spin = wp.spatial_top(total)
+        along0 = wp.spatial_vectorf()
+        along1 = wp.spatial_vectorf()
+        along = wp.spatial_vectorf()
+        moved0 = wp.spatial_vectorf()
+        moved1 = wp.spatial_vectorf()
+        moved = wp.spatial_vectorf()
+        touch0_bar = zero
+        touch1_bar = zero
+        if body0 != body:
+            n = wp.normalize(touch0 - start)
+            slide = point_velocity(total, touch0 - com) - point_velocity(weigh(rates, f0), start - com0)
+            turn = segment_turn(start, touch0, slide)
+            along0 = wrench(-n, zero, start - com0)
+            moved0 = end_wrench(start - com0, -n, -turn, rates, f0)
+            # The tangent point's displacement is not the geom's: its cotangent goes through the wrap below.
+            touch0_bar = turn + wp.cross(n, spin)
+            along += wrench(n, zero, touch0 - com)
+            moved += end_wrench(touch0 - com, n, -wp.cross(n, spin), rates, fg)
+        if body1 != body:
+            n = wp.normalize(end - touch1)
+            slide = point_velocity(weigh(rates, f1), end - com1) - point_velocity(total, touch1 - com)
+            turn = segment_turn(touch1, end, slide)
+            along1 = wrench(n, zero, end - com1)
+            moved1 = end_wrench(end - com1, n, turn, rates, f1)
+            touch1_bar = -turn - wp.cross(n, spin)
+            along += wrench(-n, zero, touch1 - com)
+            moved += end_wrench(touch1 - com, -n, wp.cross(n, spin), rates, fg)
+        mat = poses_in.geom_xmat[worldid, geom]
+        pos = poses_in.geom_xpos[worldid, geom]
+        start_bar = zero
+        end_bar = zero
+        pos_bar = zero
+        mat_bar = wp.mat33(0.0)
+        side_bar = zero
+        spot = inside_in[worldid, e]
+        if spot[3] != 0.0:
+            start_bar, end_bar, pos_bar, mat_bar, _r, _k, _p, _w = wp.grad(inside_score)(
+                start, end, pos, mat, radius, kind, wp.vec3(spot[0], spot[1], spot[2]), touch0_bar + touch1_bar
+            )
+        else:
+            start_bar, end_bar, pos_bar, mat_bar, _r, _k, side_bar, _w0, _w1 = wp.grad(wrap_score)(
+                start, end, pos, mat, radius, kind, side, touch0_bar, touch1_bar
+            )
+        # dR = [ω] R  ⇒  torque Σ_k R_k × R̄_k over the columns
+        torque = zero
+        for k in range(3):
+            column = wp.vec3(mat[0, k], mat[1, k], mat[2, k])
+            column_bar = wp.vec3(mat_bar[0, k], mat_bar[1, k], mat_bar[2, k])
+            torque += wp.cross(column, column_bar)
+        push_body(body0, worldid, along0, moved0 + wrench(start_bar, zero, start - com0), rates, bars_out)
+        push_body(body1, worldid, along1, moved1 + wrench(end_bar, zero, end - com1), rates, bars_out)
+        push_body(body, worldid, along, moved + wrench(pos_bar, torque, pos - com), rates, bars_out)
+        sidesite = int(wp.round(paths.wrap_prm[place]))
+        if sidesite >= 0:
+            owner = paths.site_bodyid[sidesite]
+            if owner > 0:
+                arm = side - motion_in.subtree_com[worldid, paths.body_rootid[owner]]
+                wp.atomic_add(bars_out.moved, worldid, owner, wrench(side_bar, zero, arm))
 
 
 class TendonPaths:

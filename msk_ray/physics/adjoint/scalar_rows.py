@@ -129,135 +129,6 @@ def row_spring(worldid: int, kind: int, ident: int, settings: RowSettings) -> Ro
     return out
 
 
-@wp.func
-def pull_rows_of(
-    worldid: int,
-    row: int,
-    # Model:
-    opt_timestep: wp.array[float],
-    opt_disableflags: int,
-    joints: Joints,
-    tendons: TendonRows,
-    settings: RowSettings,
-    # In:
-    nefc_in: wp.array[int],
-    rows_in: Rows,
-    jacobian_in: wp.array3d[float],
-    laws_in: RowLaws,
-    state_in: State,
-    lam_in: wp.array2d[float],
-    ten_J_in: wp.array2d[float],
-    ten_length_in: wp.array2d[float],
-    # Out:
-    slopes_out: DofSlopes,
-    tendon_bars_out: TendonBars,
-) -> None:
-    """Φ ∋ -ρ(λ) f(ρ(a) + b ρ(v) + k imp pos) of every row that joints and tendons make; f also moves with D(pos)."""
-    if row >= wp.min(nefc_in[worldid], laws_in.slope.shape[1]):
-        return
-    kind = rows_in.type[worldid, row]
-    s = laws_in.slope[worldid, row]
-    f = laws_in.force[worldid, row]
-    if s == 0.0 and f == 0.0:
-        return
-    ident = rows_in.id[worldid, row]
-    if kind == ConstraintType.EQUALITY:
-        if settings.eq_type[ident] != EqType.JOINT and settings.eq_type[ident] != EqType.TENDON:
-            return
-    spring = row_spring(worldid, kind, ident, settings)
-    if not spring.known:
-        return
-
-    pos = rows_in.pos[worldid, row] - rows_in.margin[worldid, row]
-    timestep = opt_timestep[worldid % opt_timestep.shape[0]]
-    slopes = row_slopes(opt_disableflags, timestep, spring.solref, spring.solimp, pos)
-    rate = float(0.0)
-    for j in range(lam_in.shape[1]):
-        rate += jacobian_in[worldid, row, j] * lam_in[worldid, j]
-    # ∂Φ/∂jar = s ρ(λ) =: y
-    y = s * rate
-    vel_bar = slopes.damping * y
-    pos_bar = slopes.stiffness * y - slopes.mass * rate * f
-    bars = wp.vec4(pos_bar, vel_bar, -f, y)
-
-    if kind == ConstraintType.FRICTION_DOF:
-        add_joint_row(worldid, ident, 1.0, 0.0, vel_bar, slopes_out)
-    elif kind == ConstraintType.LIMIT_JOINT:
-        dof = joints.jnt_dofadr[ident]
-        if joints.jnt_type[ident] == JointType.BALL:
-            adr = joints.jnt_qposadr[ident]
-            turn = quat_angle_axis(
-                wp.vec4(
-                    state_in.qpos[worldid, adr],
-                    state_in.qpos[worldid, adr + 1],
-                    state_in.qpos[worldid, adr + 2],
-                    state_in.qpos[worldid, adr + 3],
-                )
-            )
-            axis = wp.vec3(turn[0], turn[1], turn[2])
-            # ρ(x) = -axis·x ,  d(pos) = -axis·w ,  d(axis) = ½ cot(θ/2) w⊥ + ½ axis × w
-            axis_bar = wp.vec3(0.0)
-            for i in range(3):
-                v = state_in.qvel[worldid, dof + i]
-                a = state_in.qacc[worldid, dof + i]
-                axis_bar[i] = -(bars[2] * lam_in[worldid, dof + i] + vel_bar * v + y * a)
-            across = axis_bar - axis * wp.dot(axis, axis_bar)
-            moved = -pos_bar * axis + 0.5 * wp.cross(axis_bar, axis)
-            if turn[3] > 0.0:  # without a rotation there is no axis, and mujoco_warp's row is zero
-                moved += 0.5 / wp.tan(0.5 * turn[3]) * across
-            for i in range(3):
-                wp.atomic_add(slopes_out.qpos, worldid, dof + i, moved[i])
-                wp.atomic_add(slopes_out.qvel, worldid, dof + i, -vel_bar * axis[i])
-        else:
-            sign = jacobian_in[worldid, row, dof]
-            add_joint_row(worldid, dof, sign, pos_bar, vel_bar, slopes_out)
-    elif kind == ConstraintType.FRICTION_TENDON:
-        bars[0] = 0.0
-        add_tendon_row(worldid, ident, 1.0, bars, tendon_bars_out)
-    elif kind == ConstraintType.LIMIT_TENDON:
-        bounds = settings.tendon_range[worldid % settings.tendon_range.shape[0], ident]
-        length = ten_length_in[worldid, ident]
-        sign = wp.where(length - bounds[0] < bounds[1] - length, 1.0, -1.0)
-        add_tendon_row(worldid, ident, sign, bars, tendon_bars_out)
-    else:
-        # pos = x₁ - p(x₂) ,  ρ(x) = ρ₁(x) - p' ρ₂(x) ,  d(p') = p'' dx₂
-        first = settings.eq_obj1id[ident]
-        second = settings.eq_obj2id[ident]
-        data = settings.eq_data[worldid % settings.eq_data.shape[0], ident]
-        x = float(0.0)
-        if second >= 0:
-            if settings.eq_type[ident] == EqType.JOINT:
-                adr = joints.jnt_qposadr[second]
-                x = state_in.qpos[worldid, adr] - settings.qpos0[worldid % settings.qpos0.shape[0], adr]
-            else:
-                x = (
-                    ten_length_in[worldid, second]
-                    - settings.tendon_length0[worldid % settings.tendon_length0.shape[0], second]
-                )
-        bend1 = data[1] + x * (2.0 * data[2] + x * (3.0 * data[3] + x * 4.0 * data[4]))
-        bend2 = 2.0 * data[2] + x * (6.0 * data[3] + x * 12.0 * data[4])
-        if settings.eq_type[ident] == EqType.JOINT:
-            add_joint_row(worldid, joints.jnt_dofadr[first], 1.0, pos_bar, vel_bar, slopes_out)
-            if second >= 0:
-                dof = joints.jnt_dofadr[second]
-                mixed = (
-                    bars[2] * lam_in[worldid, dof]
-                    + vel_bar * state_in.qvel[worldid, dof]
-                    + y * state_in.qacc[worldid, dof]
-                )
-                add_joint_row(worldid, dof, -bend1, pos_bar, vel_bar, slopes_out)
-                wp.atomic_add(slopes_out.qpos, worldid, dof, -bend2 * mixed)
-        else:
-            add_tendon_row(worldid, first, 1.0, bars, tendon_bars_out)
-            if second >= 0:
-                jac = ten_J_in[worldid]
-                mixed = bars[2] * tendon_rate(tendons, second, jac, lam_in[worldid])
-                mixed += vel_bar * tendon_rate(tendons, second, jac, state_in.qvel[worldid])
-                mixed += y * tendon_rate(tendons, second, jac, state_in.qacc[worldid])
-                add_tendon_row(worldid, second, -bend1, bars, tendon_bars_out)
-                wp.atomic_add(tendon_bars_out.length, worldid, second, -bend2 * mixed)
-
-
 @wp.kernel
 def pull_rows(
     lanes: int,
@@ -281,28 +152,115 @@ def pull_rows(
     slopes_out: DofSlopes,
     tendon_bars_out: TendonBars,
 ) -> None:
-    """All rows of a world, in the order of each thread."""
+    """Φ ∋ -ρ(λ) f(ρ(a) + b ρ(v) + k imp pos) of every row that joints and tendons make; f also moves with D(pos).
+
+    `lanes` threads take the first `count` rows of a world in turn.
+    """
     worldid, lane = wp.tid()
     for row in range(lane, count, lanes):
-        pull_rows_of(
-            worldid,
-            row,
-            opt_timestep,
-            opt_disableflags,
-            joints,
-            tendons,
-            settings,
-            nefc_in,
-            rows_in,
-            jacobian_in,
-            laws_in,
-            state_in,
-            lam_in,
-            ten_J_in,
-            ten_length_in,
-            slopes_out,
-            tendon_bars_out,
-        )
+        if row >= wp.min(nefc_in[worldid], laws_in.slope.shape[1]):
+            continue
+        kind = rows_in.type[worldid, row]
+        s = laws_in.slope[worldid, row]
+        f = laws_in.force[worldid, row]
+        if s == 0.0 and f == 0.0:
+            continue
+        ident = rows_in.id[worldid, row]
+        if kind == ConstraintType.EQUALITY:
+            if settings.eq_type[ident] != EqType.JOINT and settings.eq_type[ident] != EqType.TENDON:
+                continue
+        spring = row_spring(worldid, kind, ident, settings)
+        if not spring.known:
+            continue
+
+        pos = rows_in.pos[worldid, row] - rows_in.margin[worldid, row]
+        timestep = opt_timestep[worldid % opt_timestep.shape[0]]
+        slopes = row_slopes(opt_disableflags, timestep, spring.solref, spring.solimp, pos)
+        rate = float(0.0)
+        for j in range(lam_in.shape[1]):
+            rate += jacobian_in[worldid, row, j] * lam_in[worldid, j]
+        # ∂Φ/∂jar = s ρ(λ) =: y
+        y = s * rate
+        vel_bar = slopes.damping * y
+        pos_bar = slopes.stiffness * y - slopes.mass * rate * f
+        bars = wp.vec4(pos_bar, vel_bar, -f, y)
+
+        if kind == ConstraintType.FRICTION_DOF:
+            add_joint_row(worldid, ident, 1.0, 0.0, vel_bar, slopes_out)
+        elif kind == ConstraintType.LIMIT_JOINT:
+            dof = joints.jnt_dofadr[ident]
+            if joints.jnt_type[ident] == JointType.BALL:
+                adr = joints.jnt_qposadr[ident]
+                turn = quat_angle_axis(
+                    wp.vec4(
+                        state_in.qpos[worldid, adr],
+                        state_in.qpos[worldid, adr + 1],
+                        state_in.qpos[worldid, adr + 2],
+                        state_in.qpos[worldid, adr + 3],
+                    )
+                )
+                axis = wp.vec3(turn[0], turn[1], turn[2])
+                # ρ(x) = -axis·x ,  d(pos) = -axis·w ,  d(axis) = ½ cot(θ/2) w⊥ + ½ axis × w
+                axis_bar = wp.vec3(0.0)
+                for i in range(3):
+                    v = state_in.qvel[worldid, dof + i]
+                    a = state_in.qacc[worldid, dof + i]
+                    axis_bar[i] = -(bars[2] * lam_in[worldid, dof + i] + vel_bar * v + y * a)
+                across = axis_bar - axis * wp.dot(axis, axis_bar)
+                moved = -pos_bar * axis + 0.5 * wp.cross(axis_bar, axis)
+                if turn[3] > 0.0:  # without a rotation there is no axis, and mujoco_warp's row is zero
+                    moved += 0.5 / wp.tan(0.5 * turn[3]) * across
+                for i in range(3):
+                    wp.atomic_add(slopes_out.qpos, worldid, dof + i, moved[i])
+                    wp.atomic_add(slopes_out.qvel, worldid, dof + i, -vel_bar * axis[i])
+            else:
+                sign = jacobian_in[worldid, row, dof]
+                add_joint_row(worldid, dof, sign, pos_bar, vel_bar, slopes_out)
+        elif kind == ConstraintType.FRICTION_TENDON:
+            bars[0] = 0.0
+            add_tendon_row(worldid, ident, 1.0, bars, tendon_bars_out)
+        elif kind == ConstraintType.LIMIT_TENDON:
+            bounds = settings.tendon_range[worldid % settings.tendon_range.shape[0], ident]
+            length = ten_length_in[worldid, ident]
+            sign = wp.where(length - bounds[0] < bounds[1] - length, 1.0, -1.0)
+            add_tendon_row(worldid, ident, sign, bars, tendon_bars_out)
+        else:
+            # pos = x₁ - p(x₂) ,  ρ(x) = ρ₁(x) - p' ρ₂(x) ,  d(p') = p'' dx₂
+            first = settings.eq_obj1id[ident]
+            second = settings.eq_obj2id[ident]
+            data = settings.eq_data[worldid % settings.eq_data.shape[0], ident]
+            x = float(0.0)
+            if second >= 0:
+                if settings.eq_type[ident] == EqType.JOINT:
+                    adr = joints.jnt_qposadr[second]
+                    x = state_in.qpos[worldid, adr] - settings.qpos0[worldid % settings.qpos0.shape[0], adr]
+                else:
+                    x = (
+                        ten_length_in[worldid, second]
+                        - settings.tendon_length0[worldid % settings.tendon_length0.shape[0], second]
+                    )
+            bend1 = data[1] + x * (2.0 * data[2] + x * (3.0 * data[3] + x * 4.0 * data[4]))
+            bend2 = 2.0 * data[2] + x * (6.0 * data[3] + x * 12.0 * data[4])
+            if settings.eq_type[ident] == EqType.JOINT:
+                add_joint_row(worldid, joints.jnt_dofadr[first], 1.0, pos_bar, vel_bar, slopes_out)
+                if second >= 0:
+                    dof = joints.jnt_dofadr[second]
+                    mixed = (
+                        bars[2] * lam_in[worldid, dof]
+                        + vel_bar * state_in.qvel[worldid, dof]
+                        + y * state_in.qacc[worldid, dof]
+                    )
+                    add_joint_row(worldid, dof, -bend1, pos_bar, vel_bar, slopes_out)
+                    wp.atomic_add(slopes_out.qpos, worldid, dof, -bend2 * mixed)
+            else:
+                add_tendon_row(worldid, first, 1.0, bars, tendon_bars_out)
+                if second >= 0:
+                    jac = ten_J_in[worldid]
+                    mixed = bars[2] * tendon_rate(tendons, second, jac, lam_in[worldid])
+                    mixed += vel_bar * tendon_rate(tendons, second, jac, state_in.qvel[worldid])
+                    mixed += y * tendon_rate(tendons, second, jac, state_in.qacc[worldid])
+                    add_tendon_row(worldid, second, -bend1, bars, tendon_bars_out)
+                    wp.atomic_add(tendon_bars_out.length, worldid, second, -bend2 * mixed)
 
 
 def foremost_rows(work: Workspace) -> int:

@@ -124,62 +124,6 @@ def push_load(
         wp.atomic_add(bars_out.moved, worldid, body, carried(total, load) + moved)
 
 
-@wp.func
-def pull_site_pairs_of(
-    worldid: int,
-    uid: int,
-    # Model:
-    pairs: SitePairs,
-    # In:
-    poses_in: SitePoses,
-    motion_in: Motion,
-    actuator_bars_in: ActuatorBars,
-    fields_in: Fields,
-    # Out:
-    bars_out: FieldBars,
-) -> None:
-    """What length and rates of an actuator between two sites give both bodies."""
-    kind = pairs.actuator_trntype[uid]
-    site = pairs.actuator_trnid[uid][0]
-    other_site = pairs.actuator_trnid[uid][1]
-    if kind != TrnType.SLIDERCRANK and (kind != TrnType.SITE or other_site < 0):
-        return
-    body = pairs.site_bodyid[site]
-    other = pairs.site_bodyid[other_site]
-    common = pairs.common_body[uid]
-    rates = actuator_bars_in.rate[worldid, uid]
-    length_bar = actuator_bars_in.length[worldid, uid]
-    gear = pairs.actuator_gear[worldid % pairs.actuator_gear.shape[0], uid]
-    crank = int(kind == TrnType.SLIDERCRANK)
-    own_field = total_field(body, worldid, rates, fields_in, motion_in.cvel)
-    other_field = total_field(other, worldid, rates, fields_in, motion_in.cvel)
-    common_field = total_field(common, worldid, rates, fields_in, motion_in.cvel)
-    centre = motion_in.subtree_com[worldid, pairs.body_rootid[body]]
-    other_centre = motion_in.subtree_com[worldid, pairs.body_rootid[other]]
-    point = poses_in.site_xpos[worldid, site]
-    origin = poses_in.site_xpos[worldid, other_site]
-    frame = poses_in.site_xmat[worldid, other_site]
-    rod = pairs.actuator_cranklength[worldid % pairs.actuator_cranklength.shape[0], uid]
-    _k, _g, _r, _l, point_bar, origin_bar, frame_bar, _c, _o, load, other_load, common_load = wp.grad(pair_score)(
-        crank, gear, rod, length_bar, point, origin, frame, centre, other_centre, own_field, other_field, common_field
-    )
-    torque = wp.vec3(0.0)
-    turn = wp.spatial_bottom(gear)
-    if crank == 0 and wp.length_sq(turn) > 0.0:
-        # length ∋ gear·log(Rᵀ Q): with Q turning by w in the world, d log = Jr⁻¹ Qᵀ w
-        own_rest = pairs.site_quat[worldid % pairs.site_quat.shape[0], site]
-        other_rest = pairs.site_quat[worldid % pairs.site_quat.shape[0], other_site]
-        phi = quat_sub(
-            mul_quat(poses_in.xquat[worldid, body], own_rest), mul_quat(poses_in.xquat[worldid, other], other_rest)
-        )
-        torque = poses_in.site_xmat[worldid, site] @ (length_bar * log_rate_pullback(phi, turn))
-    own_moved = wrench(point_bar, torque, point - centre)
-    other_moved = wrench(origin_bar, turning_torque(frame, frame_bar) - torque, origin - other_centre)
-    push_load(body, worldid, rates, load, own_field, own_moved, bars_out)
-    push_load(other, worldid, rates, other_load, other_field, other_moved, bars_out)
-    push_load(common, worldid, rates, common_load, common_field, wp.spatial_vector(), bars_out)
-
-
 @wp.kernel
 def pull_site_pairs(
     lanes: int,
@@ -194,10 +138,62 @@ def pull_site_pairs(
     # Out:
     bars_out: FieldBars,
 ) -> None:
-    """All actuators of a world, in the order of each thread."""
+    """What length and rates of an actuator between two sites give both bodies.
+
+    `lanes` threads take all `count` actuators of a world in turn.
+    """
     worldid, lane = wp.tid()
     for uid in range(lane, count, lanes):
-        pull_site_pairs_of(worldid, uid, pairs, poses_in, motion_in, actuator_bars_in, fields_in, bars_out)
+        kind = pairs.actuator_trntype[uid]
+        site = pairs.actuator_trnid[uid][0]
+        other_site = pairs.actuator_trnid[uid][1]
+        if kind != TrnType.SLIDERCRANK and (kind != TrnType.SITE or other_site < 0):
+            continue
+        body = pairs.site_bodyid[site]
+        other = pairs.site_bodyid[other_site]
+        common = pairs.common_body[uid]
+        rates = actuator_bars_in.rate[worldid, uid]
+        length_bar = actuator_bars_in.length[worldid, uid]
+        gear = pairs.actuator_gear[worldid % pairs.actuator_gear.shape[0], uid]
+        crank = int(kind == TrnType.SLIDERCRANK)
+        own_field = total_field(body, worldid, rates, fields_in, motion_in.cvel)
+        other_field = total_field(other, worldid, rates, fields_in, motion_in.cvel)
+        common_field = total_field(common, worldid, rates, fields_in, motion_in.cvel)
+        centre = motion_in.subtree_com[worldid, pairs.body_rootid[body]]
+        other_centre = motion_in.subtree_com[worldid, pairs.body_rootid[other]]
+        point = poses_in.site_xpos[worldid, site]
+        origin = poses_in.site_xpos[worldid, other_site]
+        frame = poses_in.site_xmat[worldid, other_site]
+        rod = pairs.actuator_cranklength[worldid % pairs.actuator_cranklength.shape[0], uid]
+        _k, _g, _r, _l, point_bar, origin_bar, frame_bar, _c, _o, load, other_load, common_load = wp.grad(pair_score)(
+            crank,
+            gear,
+            rod,
+            length_bar,
+            point,
+            origin,
+            frame,
+            centre,
+            other_centre,
+            own_field,
+            other_field,
+            common_field,
+        )
+        torque = wp.vec3(0.0)
+        turn = wp.spatial_bottom(gear)
+        if crank == 0 and wp.length_sq(turn) > 0.0:
+            # length ∋ gear·log(Rᵀ Q): with Q turning by w in the world, d log = Jr⁻¹ Qᵀ w
+            own_rest = pairs.site_quat[worldid % pairs.site_quat.shape[0], site]
+            other_rest = pairs.site_quat[worldid % pairs.site_quat.shape[0], other_site]
+            phi = quat_sub(
+                mul_quat(poses_in.xquat[worldid, body], own_rest), mul_quat(poses_in.xquat[worldid, other], other_rest)
+            )
+            torque = poses_in.site_xmat[worldid, site] @ (length_bar * log_rate_pullback(phi, turn))
+        own_moved = wrench(point_bar, torque, point - centre)
+        other_moved = wrench(origin_bar, turning_torque(frame, frame_bar) - torque, origin - other_centre)
+        push_load(body, worldid, rates, load, own_field, own_moved, bars_out)
+        push_load(other, worldid, rates, other_load, other_field, other_moved, bars_out)
+        push_load(common, worldid, rates, common_load, common_field, wp.spatial_vector(), bars_out)
 
 
 class _CommonBodies:

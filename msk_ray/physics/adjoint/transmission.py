@@ -22,61 +22,6 @@ class Transmissions:
     actuator_gear: wp.array2d[wp.spatial_vector]
 
 
-@wp.func
-def pull_turning_joints_of(
-    worldid: int,
-    uid: int,
-    # Model:
-    joints: Joints,
-    transmissions: Transmissions,
-    # In:
-    state_in: State,
-    multipliers_in: Multipliers,
-    moment_rowadr_in: wp.array2d[int],
-    moment_in: wp.array2d[float],
-    actuator_bars_in: ActuatorBars,
-    # Out:
-    phi_qpos_out: wp.array2d[float],
-) -> None:
-    """len = gear·log(q) of a ball joint; in the parent's frame the moment is m = R(q)ᵀ gear."""
-    kind = transmissions.actuator_trntype[uid]
-    if kind != TrnType.JOINT and kind != TrnType.JOINTINPARENT:
-        return
-    jnt = transmissions.actuator_trnid[uid][0]
-    joint = joints.jnt_type[jnt]
-    if joint != JointType.BALL and joint != JointType.FREE:
-        return
-    dof = joints.jnt_dofadr[jnt]
-    first = moment_rowadr_in[worldid, uid]
-    slope = wp.vec3(0.0)
-    if joint == JointType.BALL:
-        q = joints.jnt_qposadr[jnt]
-        quat = wp.quat(
-            state_in.qpos[worldid, q],
-            state_in.qpos[worldid, q + 1],
-            state_in.qpos[worldid, q + 2],
-            state_in.qpos[worldid, q + 3],
-        )
-        phi = quat_to_vel(wp.normalize(quat))
-        gear = wp.spatial_top(transmissions.actuator_gear[worldid % transmissions.actuator_gear.shape[0], uid])
-        slope = actuator_bars_in.length[worldid, uid] * log_rate_pullback(phi, gear)
-    else:
-        dof += 3
-        first += 3
-    if kind == TrnType.JOINTINPARENT:
-        bars = actuator_bars_in.rate[worldid, uid]
-        moment = wp.vec3(moment_in[worldid, first], moment_in[worldid, first + 1], moment_in[worldid, first + 2])
-        x = wp.vec3(0.0)
-        for i in range(3):
-            smooth = state_in.qacc[worldid, dof + i] - multipliers_in.excess[worldid, dof + i]
-            x[i] = bars[0] * multipliers_in.lam[worldid, dof + i] + bars[1] * state_in.qvel[worldid, dof + i]
-            x[i] += bars[2] * multipliers_in.mu[worldid, dof + i] + bars[3] * smooth
-        # m·x = gear·R x ,  d(R x) = R (w × x)
-        slope += wp.cross(x, moment)
-    for i in range(3):
-        wp.atomic_add(phi_qpos_out, worldid, dof + i, slope[i])
-
-
 @wp.kernel
 def pull_turning_joints(
     lanes: int,
@@ -93,67 +38,48 @@ def pull_turning_joints(
     # Out:
     phi_qpos_out: wp.array2d[float],
 ) -> None:
-    """All actuators of a world, in the order of each thread."""
+    """len = gear·log(q) of a ball joint; in the parent's frame the moment is m = R(q)ᵀ gear.
+
+    `lanes` threads take all `count` actuators of a world in turn.
+    """
     worldid, lane = wp.tid()
     for uid in range(lane, count, lanes):
-        pull_turning_joints_of(
-            worldid,
-            uid,
-            joints,
-            transmissions,
-            state_in,
-            multipliers_in,
-            moment_rowadr_in,
-            moment_in,
-            actuator_bars_in,
-            phi_qpos_out,
-        )
-
-
-@wp.func
-def pull_sites_of(
-    worldid: int,
-    uid: int,
-    # Model:
-    body_rootid: wp.array[int],
-    site_bodyid: wp.array[int],
-    transmissions: Transmissions,
-    # In:
-    site_xpos_in: wp.array2d[wp.vec3],
-    site_xmat_in: wp.array2d[wp.mat33],
-    motion_in: Motion,
-    actuator_bars_in: ActuatorBars,
-    fields_in: Fields,
-    # Out:
-    bars_out: FieldBars,
-) -> None:
-    """m·x = F·u(x) + T·ω(x) at the site, with force F and torque T fixed in the site's frame; len = 0."""
-    if transmissions.actuator_trntype[uid] != TrnType.SITE or transmissions.actuator_trnid[uid][1] >= 0:
-        return
-    site = transmissions.actuator_trnid[uid][0]
-    body = site_bodyid[site]
-    if body == 0:
-        return
-    gear = transmissions.actuator_gear[worldid % transmissions.actuator_gear.shape[0], uid]
-    mat = site_xmat_in[worldid, site]
-    force = mat @ wp.spatial_top(gear)
-    torque = mat @ wp.spatial_bottom(gear)
-    arm = site_xpos_in[worldid, site] - motion_in.subtree_com[worldid, body_rootid[body]]
-    load = wrench(force, torque, arm)
-    bars = actuator_bars_in.rate[worldid, uid]
-    smooth = fields_in.qacc[worldid, body] - fields_in.excess[worldid, body]
-    total = bars[0] * fields_in.lam[worldid, body] + bars[1] * motion_in.cvel[worldid, body]
-    total += bars[2] * fields_in.mu[worldid, body] + bars[3] * smooth
-    wp.atomic_add(bars_out.lam, worldid, body, bars[0] * load)
-    wp.atomic_add(bars_out.qvel, worldid, body, bars[1] * load)
-    wp.atomic_add(bars_out.mu, worldid, body, bars[2] * load)
-    # â = a - (a - â)
-    wp.atomic_add(bars_out.qacc, worldid, body, bars[3] * load)
-    wp.atomic_add(bars_out.excess, worldid, body, -bars[3] * load)
-    # The point moves (p̄ = F × ω), and F and T turn with the body: torques F × u and T × ω.
-    spin = wp.spatial_top(total)
-    turn = wp.cross(force, point_velocity(total, arm)) + wp.cross(torque, spin)
-    wp.atomic_add(bars_out.moved, worldid, body, carried(total, load) + wrench(wp.cross(force, spin), turn, arm))
+        kind = transmissions.actuator_trntype[uid]
+        if kind != TrnType.JOINT and kind != TrnType.JOINTINPARENT:
+            continue
+        jnt = transmissions.actuator_trnid[uid][0]
+        joint = joints.jnt_type[jnt]
+        if joint != JointType.BALL and joint != JointType.FREE:
+            continue
+        dof = joints.jnt_dofadr[jnt]
+        first = moment_rowadr_in[worldid, uid]
+        slope = wp.vec3(0.0)
+        if joint == JointType.BALL:
+            q = joints.jnt_qposadr[jnt]
+            quat = wp.quat(
+                state_in.qpos[worldid, q],
+                state_in.qpos[worldid, q + 1],
+                state_in.qpos[worldid, q + 2],
+                state_in.qpos[worldid, q + 3],
+            )
+            phi = quat_to_vel(wp.normalize(quat))
+            gear = wp.spatial_top(transmissions.actuator_gear[worldid % transmissions.actuator_gear.shape[0], uid])
+            slope = actuator_bars_in.length[worldid, uid] * log_rate_pullback(phi, gear)
+        else:
+            dof += 3
+            first += 3
+        if kind == TrnType.JOINTINPARENT:
+            bars = actuator_bars_in.rate[worldid, uid]
+            moment = wp.vec3(moment_in[worldid, first], moment_in[worldid, first + 1], moment_in[worldid, first + 2])
+            x = wp.vec3(0.0)
+            for i in range(3):
+                smooth = state_in.qacc[worldid, dof + i] - multipliers_in.excess[worldid, dof + i]
+                x[i] = bars[0] * multipliers_in.lam[worldid, dof + i] + bars[1] * state_in.qvel[worldid, dof + i]
+                x[i] += bars[2] * multipliers_in.mu[worldid, dof + i] + bars[3] * smooth
+            # m·x = gear·R x ,  d(R x) = R (w × x)
+            slope += wp.cross(x, moment)
+        for i in range(3):
+            wp.atomic_add(phi_qpos_out, worldid, dof + i, slope[i])
 
 
 @wp.kernel
@@ -173,22 +99,38 @@ def pull_sites(
     # Out:
     bars_out: FieldBars,
 ) -> None:
-    """All actuators of a world, in the order of each thread."""
+    """m·x = F·u(x) + T·ω(x) at the site, with force F and torque T fixed in the site's frame; len = 0.
+
+    `lanes` threads take all `count` actuators of a world in turn.
+    """
     worldid, lane = wp.tid()
     for uid in range(lane, count, lanes):
-        pull_sites_of(
-            worldid,
-            uid,
-            body_rootid,
-            site_bodyid,
-            transmissions,
-            site_xpos_in,
-            site_xmat_in,
-            motion_in,
-            actuator_bars_in,
-            fields_in,
-            bars_out,
-        )
+        if transmissions.actuator_trntype[uid] != TrnType.SITE or transmissions.actuator_trnid[uid][1] >= 0:
+            continue
+        site = transmissions.actuator_trnid[uid][0]
+        body = site_bodyid[site]
+        if body == 0:
+            continue
+        gear = transmissions.actuator_gear[worldid % transmissions.actuator_gear.shape[0], uid]
+        mat = site_xmat_in[worldid, site]
+        force = mat @ wp.spatial_top(gear)
+        torque = mat @ wp.spatial_bottom(gear)
+        arm = site_xpos_in[worldid, site] - motion_in.subtree_com[worldid, body_rootid[body]]
+        load = wrench(force, torque, arm)
+        bars = actuator_bars_in.rate[worldid, uid]
+        smooth = fields_in.qacc[worldid, body] - fields_in.excess[worldid, body]
+        total = bars[0] * fields_in.lam[worldid, body] + bars[1] * motion_in.cvel[worldid, body]
+        total += bars[2] * fields_in.mu[worldid, body] + bars[3] * smooth
+        wp.atomic_add(bars_out.lam, worldid, body, bars[0] * load)
+        wp.atomic_add(bars_out.qvel, worldid, body, bars[1] * load)
+        wp.atomic_add(bars_out.mu, worldid, body, bars[2] * load)
+        # â = a - (a - â)
+        wp.atomic_add(bars_out.qacc, worldid, body, bars[3] * load)
+        wp.atomic_add(bars_out.excess, worldid, body, -bars[3] * load)
+        # The point moves (p̄ = F × ω), and F and T turn with the body: torques F × u and T × ω.
+        spin = wp.spatial_top(total)
+        turn = wp.cross(force, point_velocity(total, arm)) + wp.cross(torque, spin)
+        wp.atomic_add(bars_out.moved, worldid, body, carried(total, load) + wrench(wp.cross(force, spin), turn, arm))
 
 
 class TurningTransmissions:
