@@ -15,8 +15,8 @@ import warp as wp
 from msk_ray.errors import UnsupportedModelError
 from msk_ray.physics import WorldBatch
 from msk_ray.physics.arrays import gather
-from msk_ray.physics.ordered.contacts import ContactFields, ContactOrder
-from msk_ray.physics.ordered.rows import RowFields, RowOrder
+from msk_ray.physics.ordered.contacts import ContactOrder, ContactRecords
+from msk_ray.physics.ordered.rows import RowOrder, RowRecords
 from msk_ray.physics.ordered.stages import OrderedStages
 from msk_ray.simulation import TapePerSubstep
 
@@ -60,8 +60,8 @@ def shuffled(monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
             array.assign(values)
 
     def contacts(self: ContactOrder, data: Any) -> None:
-        fields = gather(ContactFields, data.contact)
-        permute([getattr(fields, n) for n in ContactFields.vars], rng.permutation(int(data.nacon.numpy()[0])))
+        fields = gather(ContactRecords, data.contact)
+        permute([getattr(fields, n) for n in ContactRecords.vars], rng.permutation(int(data.nacon.numpy()[0])))
         sort_contacts(self, data)
 
     def rows(self: RowOrder, data: Any) -> None:
@@ -77,7 +77,7 @@ def shuffled(monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
                 for k in rng.permutation([b for b in blocks if b[0] == kind])
             ]
             order = np.array([row for key in keys for row in blocks[tuple(int(x) for x in key)]], dtype=int)
-            permute([getattr(data.efc, n) for n in (*RowFields.vars, "J")], order, world)
+            permute([getattr(data.efc, n) for n in (*RowRecords.vars, "J")], order, world)
             place = {int(old): new for new, old in enumerate(order)}
             address, owner = data.contact.efc_address.numpy().copy(), data.contact.worldid.numpy()
             for con in range(int(data.nacon.numpy()[0])):

@@ -97,7 +97,7 @@ class Motion:
 
 @wp.struct
 class Rows:
-    """Constraint rows, (W, R)."""
+    """What the pullback reads of constraint rows, (W, R)."""
 
     type: wp.array2d[int]
     id: wp.array2d[int]
@@ -110,7 +110,7 @@ class Rows:
 
 @wp.struct
 class Contacts:
-    """Contacts of all worlds, (C,)."""
+    """What the pullback reads of the contacts of all worlds, (C,)."""
 
     dist: wp.array[float]
     pos: wp.array[wp.vec3]

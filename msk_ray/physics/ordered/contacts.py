@@ -11,8 +11,11 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.struct
-class ContactFields:
-    """What mujoco_warp knows of every contact when collision detection ends, (C,); no contact has rows yet."""
+class ContactRecords:
+    """Contacts whole, to be moved: all that mujoco_warp has of them when collision detection ends, (C,).
+
+    No contact has rows yet, so their addresses are not part of it.
+    """
 
     dist: wp.array[float]
     pos: wp.array[wp.vec3]
@@ -31,7 +34,7 @@ class ContactFields:
 
 
 @wp.func
-def copy_contact(source: ContactFields, i: int, target: ContactFields, j: int) -> None:
+def copy_contact(source: ContactRecords, i: int, target: ContactRecords, j: int) -> None:
     target.dist[j] = source.dist[i]
     target.pos[j] = source.pos[i]
     target.frame[j] = source.frame[i]
@@ -49,7 +52,7 @@ def copy_contact(source: ContactFields, i: int, target: ContactFields, j: int) -
 
 
 @wp.func
-def is_before(contacts: ContactFields, i: int, j: int) -> bool:
+def is_before(contacts: ContactRecords, i: int, j: int) -> bool:
     """Whether contact i of a world comes before its contact j. Ties are contacts of the same place."""
     a, b = contacts.geom[i], contacts.geom[j]
     if a[0] != b[0]:
@@ -151,10 +154,10 @@ def sort_into(
     count_in: wp.array[int],
     first_in: wp.array[int],
     member_in: wp.array[int],
-    contacts_in: ContactFields,
+    contacts_in: ContactRecords,
     # Out:
     source_out: wp.array[int],
-    sorted_out: ContactFields,
+    sorted_out: ContactRecords,
 ) -> None:
     """Copies every contact to its place in the sorted list."""
     i = wp.tid()
@@ -177,9 +180,9 @@ def take_back(
     # In:
     nacon_in: wp.array[int],
     source_in: wp.array[int],
-    sorted_in: ContactFields,
+    sorted_in: ContactRecords,
     # Out:
-    contacts_out: ContactFields,
+    contacts_out: ContactRecords,
 ) -> None:
     """Copies contacts whose place changed from the sorted list."""
     i = wp.tid()
@@ -201,11 +204,11 @@ class ContactOrder:
         self._count, self._first, self._taken = (wp.zeros(worlds, dtype=int) for _ in range(3))
         self._block = wp.zeros(blocks, dtype=int)
         self._member, self._source = (wp.zeros(room, dtype=int) for _ in range(2))
-        self._sorted = allocate(ContactFields, room)
+        self._sorted = allocate(ContactRecords, room)
 
     def launch(self, data: Any) -> None:
         """Launch the sort."""
-        contacts = gather(ContactFields, data.contact)
+        contacts = gather(ContactRecords, data.contact)
         worlds, room = data.nworld, data.naconmax
         wp.launch(clear, dim=worlds, outputs=[self._count, self._taken])
         wp.launch(count_contacts, dim=room, inputs=[data.nacon, contacts.worldid], outputs=[self._count])

@@ -11,8 +11,8 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.struct
-class RowFields:
-    """What mujoco_warp knows of every row before the solver starts, (W, R)."""
+class RowRecords:
+    """Rows whole, to be moved: all but the Jacobian that mujoco_warp has of them before the solver starts, (W, R)."""
 
     type: wp.array2d[int]
     id: wp.array2d[int]
@@ -25,7 +25,7 @@ class RowFields:
 
 
 @wp.func
-def copy_row(source: RowFields, target: RowFields, worldid: int, i: int, j: int) -> None:
+def copy_row(source: RowRecords, target: RowRecords, worldid: int, i: int, j: int) -> None:
     target.type[worldid, j] = source.type[worldid, i]
     target.id[worldid, j] = source.id[worldid, i]
     target.pos[worldid, j] = source.pos[worldid, i]
@@ -41,12 +41,12 @@ def sort_rows(
     # In:
     nefc_in: wp.array[int],
     njmax: int,
-    rows_in: RowFields,
+    rows_in: RowRecords,
     jacobian_in: wp.array3d[float],
     # Out:
     place_out: wp.array2d[int],
     source_out: wp.array2d[int],
-    sorted_out: RowFields,
+    sorted_out: RowRecords,
     jacobian_out: wp.array3d[float],
 ) -> None:
     """Copies every row to its place: by kind, then by the element it belongs to; rows of one element stay together.
@@ -82,10 +82,10 @@ def take_back(
     nefc_in: wp.array[int],
     njmax: int,
     source_in: wp.array2d[int],
-    sorted_in: RowFields,
+    sorted_in: RowRecords,
     jacobian_in: wp.array3d[float],
     # Out:
-    rows_out: RowFields,
+    rows_out: RowRecords,
     jacobian_out: wp.array3d[float],
 ) -> None:
     """Copies rows whose place changed from the sorted list."""
@@ -125,12 +125,12 @@ class RowOrder:
     def __init__(self, data: Any) -> None:
         shape = (data.nworld, data.njmax)
         self._place, self._source = (wp.zeros(shape, dtype=int) for _ in range(2))
-        self._sorted = allocate(RowFields, *shape)
+        self._sorted = allocate(RowRecords, *shape)
         self._jacobian = wp.zeros((*shape, data.efc.J.shape[2]), dtype=float)
 
     def launch(self, data: Any) -> None:
         """Launch the sort."""
-        rows, shape = gather(RowFields, data.efc), (data.nworld, data.njmax)
+        rows, shape = gather(RowRecords, data.efc), (data.nworld, data.njmax)
         wp.launch(
             sort_rows,
             dim=shape,
