@@ -4,7 +4,7 @@ import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
@@ -32,6 +32,8 @@ class EpochResult:
     """Env steps simulated, all worlds together."""
     metrics: dict[str, float]
     """Metrics for the logs, by name; nothing in the program reads them back."""
+    episodes: int | None = None
+    """Episodes that ended, all worlds together; None if the algorithm does not say."""
 
 
 class Algorithm(ABC):
@@ -88,6 +90,13 @@ class Algorithm(ABC):
         Raises:
             SimulationError: training cannot continue: a gradient is not finite, or the physics failed.
         """
+
+    def run_epoch(self, epoch: int) -> EpochResult:
+        """`update` between the beginning and the end of the environment's epoch."""
+        self.env.begin_epoch(epoch)
+        result = self.update(epoch)
+        length = None if result.episodes is None else result.env_steps / max(result.episodes, 1)
+        return replace(result, metrics={**result.metrics, **self.env.end_epoch(length)})
 
     @classmethod
     def policy_modules(cls, network: nn.Module) -> dict[str, nn.Module]:

@@ -108,6 +108,8 @@ _LATER: dict[tuple[str, ...], Any] = {
     ("env", "clock"): False,
     ("env", "symmetric"): False,
     ("env", "gait_worlds"): 0,
+    ("env", "assist", "power"): 1.0,
+    ("env", "assist", "steady"): None,
     ("env", "push"): {"speed": 0.0, "interval": 2.0},
     ("env", "tracking"): {"start": 1.0, "end": 1.0, "epochs": 0},
     **{("env", name): 0.0 for name in ("metabolic", "fatigue", "head", "impact", "footfall", "clearance")},

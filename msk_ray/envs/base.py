@@ -161,6 +161,10 @@ class Env(ABC, Generic[SettingsT]):
         tensors again each time, but a number only once.
         """
 
+    def end_epoch(self, length: float | None) -> dict[str, float]:
+        """Called after each training epoch with its env steps per episode that ended, if known; figures for logs."""
+        return {}
+
     def control(self, action: Tensor) -> Tensor:
         """Controls (W, nu) of the model for actions (W, A) in the current state."""
         return action
@@ -304,15 +308,14 @@ class Env(ABC, Generic[SettingsT]):
         # The state of a generator is a host tensor on every device.
         self.generator.set_state(state["env_generator"].cpu())
         *physics, action, age = map(self.group.own, state["env_state"])
-        numbers = []
+        numbers = [torch.zeros((self.nworld, 0), device=self.device)]
         if self.randomizer is not None:
             drawn = state["randomizer"]
             numbers.append(self.group.own(drawn["numbers"].to(self.device)))
             self.randomizer.generator.set_state(drawn["generator"].cpu())
         if "env_task" in state:
             numbers.append(self.group.own(state["env_task"].to(self.device)))
-        empty = torch.zeros((self.nworld, 0), device=self.device)
-        self.state = EnvState(StepState(*physics), action, age, torch.cat([empty, *numbers], dim=-1))
+        self.state = EnvState(StepState(*physics), action, age, torch.cat(numbers, dim=-1))
         if "capacity" in state:
             # The buffer sizes that the trial had grown to: the next step may need them.
             self.sim.reserve(Capacity(*state["capacity"]))

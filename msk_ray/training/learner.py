@@ -96,8 +96,7 @@ def follow(config: Config, device: str, group: Group) -> None:
                 case ("load", path):
                     load_state(algorithm, read_checkpoint(Path(path)))
                 case ("update", epoch):
-                    algorithm.env.begin_epoch(epoch)
-                    algorithm.update(epoch)
+                    algorithm.run_epoch(epoch)
                 case ("state_dict",):
                     algorithm.state_dict()  # takes part in gathering it
                 case _:

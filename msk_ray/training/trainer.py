@@ -142,8 +142,7 @@ class Trainer(Place):
         try:
             with self._memory():
                 self._group.tell("update", self.epoch)
-                self.env.begin_epoch(self.epoch)
-                result = self.algorithm.update(self.epoch)
+                result = self.algorithm.run_epoch(self.epoch)
         except SimulationError:
             self._score_despite_failure()
             raise

@@ -9,7 +9,8 @@ import torch
 
 from msk_ray.config import PhysicsConfig, parse_config
 from msk_ray.envs import make_env
-from msk_ray.envs.legs.config import LegReward
+from msk_ray.envs.legs.assistance import Assistance
+from msk_ray.envs.legs.config import AssistConfig, LegReward
 from msk_ray.envs.legs.muscles import MuscleCurves
 from msk_ray.envs.legs.terms import stride_error
 from msk_ray.envs.myoleg26.config import MyoLeg26Settings
@@ -253,6 +254,28 @@ def test_assistance_fades_and_the_score_is_free_of_it() -> None:
     assert not forces[3].any()
     reference = MyoLeg26.reference_settings(helped.config)
     assert reference.assist.epochs == 0
+
+
+def test_springs_stay_while_the_legs_fall() -> None:
+    config = AssistConfig(epochs=2, share=0.8, power=2.0, steady=4.0)
+    springs = Assistance(config, 0.02, torch.device("cpu"))
+    shares = []
+    for epoch, length in enumerate((199.0, 200.0, 50.0, 500.0, 20.0)):
+        springs.begin_epoch(epoch)
+        assert springs.end_epoch(length) == {"train/assist": pytest.approx(springs.share.item())}
+        shares.append(springs.share.item())
+    assert shares == pytest.approx([0.8, 0.8, 0.2, 0.2, 0.0]), "0.8 (1 - k/2)², k counts episodes of 4 s and more"
+    with pytest.raises(ConfigError, match="steady: null"):
+        springs.end_epoch(None)
+
+
+def test_a_resumed_trial_has_the_springs_it_had() -> None:
+    env, resumed = (make(1, assist={"epochs": 4, "steady": 4.0}) for _ in range(2))
+    env.end_epoch(300.0)
+    resumed.load_state_dict(env.state_dict())
+    for each in (env, resumed):
+        each.begin_epoch(1)
+        assert each.end_epoch(0.0) == {"train/assist": 0.75}
 
 
 def test_assistance_holds_the_trunk_and_does_not_ring() -> None:

@@ -147,7 +147,7 @@ class Ppo(Algorithm):
             **{f"time/{part}_s": seconds for part, seconds in clock.seconds().items()},
             **simulation_metrics(self.env),
         }
-        return EpochResult(self.settings.steps * self.env.nworld, numbers)
+        return EpochResult(self.settings.steps * self.env.nworld, numbers, round(numbers["train/episodes"]))
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that a later `load_state_dict` needs to continue exactly, including the environment's state."""

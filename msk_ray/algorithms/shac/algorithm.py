@@ -149,7 +149,8 @@ class Shac(Algorithm):
             **simulation_metrics(self.env),
         }
         self._runner.adapt()
-        return EpochResult(horizon * self._worlds, numbers)
+        ended = round(numbers["train/episodes"]) * self._copies  # tracked are the episodes of one copy of each
+        return EpochResult(horizon * self._worlds, numbers, ended)
 
     def note_state(self) -> None:
         """Let the witness, if there is one, note worlds and modules, once the critic's fit has ended."""

@@ -99,7 +99,7 @@ class TrackingSchedule(Section):
 
 
 class AssistConfig(Section):
-    """Springs and dampers that hold the pelvis up during training, annealed linearly to zero.
+    """Springs and dampers that hold the pelvis up during training, annealed to zero.
 
     Evaluation never uses them.
     """
@@ -108,6 +108,12 @@ class AssistConfig(Section):
     """Epochs until they are gone; 0: none at all."""
     share: Fraction = 1.0
     """Share of the stiffness below, at epoch 0."""
+    power: PositiveFloat = 1.0
+    """The share falls as (1 - epoch / epochs)^power: above 1, more epochs have weak springs, which leave the balance to
+    the policy."""
+    steady: PositiveFloat | None = None
+    """Training time from the end of one episode to the next [s] from which an epoch counts as one of `epochs`: the
+    springs stay as strong as they are while the legs fall sooner. Null: every epoch counts."""
     balance: NonNegative = 800.0
     """Righting torque of tilt and list [N m/rad]; that of rotation is smaller in proportion to its inertia. Critically
     damped."""
@@ -117,8 +123,8 @@ class AssistConfig(Section):
     """Share of the body's weight that is carried."""
 
     def at(self, epoch: int) -> float:
-        """Share of the stiffness at `epoch`, counted from 0."""
-        return self.share * max(0.0, 1.0 - epoch / self.epochs) if self.epochs else 0.0
+        """Share of the stiffness after `epoch` epochs that count."""
+        return self.share * max(0.0, 1.0 - epoch / self.epochs) ** self.power if self.epochs else 0.0
 
 
 class PushConfig(Section):
@@ -188,7 +194,7 @@ class LegSettings(EnvSettings):
         unread = {}
         r = self.reward
         if not self.assist.epochs:
-            for name in ("share", "balance", "lateral", "support"):
+            for name in ("share", "power", "steady", "balance", "lateral", "support"):
                 unread[f"assist.{name}"] = "env.assist.epochs is 0"
         if self.push.speed == 0.0:
             unread["push.interval"] = "env.push.speed is 0"

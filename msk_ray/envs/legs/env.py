@@ -5,10 +5,9 @@ Axes: W worlds, U muscles, N hinges of the legs.
 
 import math
 from abc import abstractmethod
-from collections.abc import Sequence
-from typing import ClassVar, Generic, TypeVar
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Generic, TypeVar
 
-import mujoco
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -19,13 +18,15 @@ from msk_ray.config.physics import CONTACTS, LIMITS
 from msk_ray.envs.base import Env
 from msk_ray.envs.layout import Entry, entries
 from msk_ray.envs.legs import terms as costs
+from msk_ray.envs.legs.assistance import Assistance
 from msk_ray.envs.legs.config import FURTHER, AssistConfig, LegReward, LegSettings
-from msk_ray.envs.legs.gait.body import SIDES, analyse, world_axes
+from msk_ray.envs.legs.feet import Feet, FootMotion
+from msk_ray.envs.legs.gait.body import analyse, world_axes
 from msk_ray.envs.legs.gait.measure import measure, summary
 from msk_ray.envs.legs.metabolic import muscle_masses, total_power
 from msk_ray.envs.legs.mirror import Mirror, check_mirrored, leg_mirrors
 from msk_ray.envs.legs.muscles import MuscleCurves, columns
-from msk_ray.envs.legs.push import pushes
+from msk_ray.envs.legs.push import pushed
 from msk_ray.envs.legs.reference import Reference
 from msk_ray.envs.legs.root import Root
 from msk_ray.simulation import StepState
@@ -42,8 +43,6 @@ _HEAD_LEVER = 0.65
 """Height of the head above the pelvis [m]."""
 _LEG_LENGTH = 0.9
 """Leg whose steps have the length of people's [m]."""
-_FOOT = ("calcn", "toes")
-"""Bodies whose origins are the heel and the joint of the toes."""
 _GAINS = frozenset(("forward_vel", "progress", "upright", "heading", "alive"))
 """The terms of the reward that are no costs."""
 _VELOCITY_SCALE = 0.1
@@ -100,6 +99,9 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
             stand = torch.tensor(self.model.key("stand").qpos, dtype=torch.float32, device=self.device)[None]
             still = torch.zeros((1, self.model.nv), device=self.device)
             self._upright = self.root(StepState(stand, still, still[:, :0])).up[0]
+            # The first three dofs move the pelvis without turning it: what they are for a speed forward, and left.
+            units = torch.eye(3, self.model.nv, device=self.device)
+            self._slides = self.root(StepState(stand.repeat(3, 1), units, units[:, :0])).velocity.T[:2]
         self._pendulum_time = math.sqrt(self.stand_height / _GRAVITY)
         ranges = torch.tensor(self.model.jnt_range[self.hinges], dtype=torch.float32, device=self.device)
         self._limits = ranges[:, 0] + _LIMIT_MARGIN, ranges[:, 1] - _LIMIT_MARGIN
@@ -108,7 +110,7 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
         self._flexion_qpos = columns([joint.qposadr[0] for joint in flexions], self.device)
         self._tasked = self.config.clock or self.config.speed_range is not None
         self._tracking_share = torch.tensor(self.config.tracking.at(0), device=self.device)
-        self._assist_share = torch.tensor(self.config.assist.at(0), device=self.device)
+        self._assistance = Assistance(self.config.assist, self.config.control_timestep, self.device)
         self.recorded_worlds = self.config.gait_worlds
         self._prepare_terms()
         self._mirror: Mirror | None = None
@@ -132,23 +134,8 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
             self.reference = Reference(self.model, self.device)
             self._track_qpos = columns(self.model.jnt_qposadr[self.reference.joints], self.device)
             self._track_dofs = columns(self.model.jnt_dofadr[self.reference.joints], self.device)
-        with torch.no_grad():
-            # The first three dofs move the pelvis without turning it: what they are for a speed forward, and left.
-            rest = torch.tensor(self.model.key("stand").qpos, dtype=torch.float32, device=self.device).repeat(3, 1)
-            units = torch.eye(3, self.model.nv, device=self.device)
-            self._slides = self.root(StepState(rest, units, rest[:, :0])).velocity.T[:2]
         if {"impact", "footfall", "clearance"} & set(self._further):
-            self._prepare_feet()
-
-    def _prepare_feet(self) -> None:
-        self._feet = [f"{body}_{side}" for side in SIDES for body in _FOOT]
-        axes = world_axes(self.model)
-        data = mujoco.MjData(self.model)
-        mujoco.mj_resetDataKeyframe(self.model, data, self.model.key("stand").id)
-        mujoco.mj_kinematics(self.model, data)
-        above = [(data.body(name).xpos - data.body("pelvis").xpos) @ axes[2] for name in self._feet]
-        self._foot_heights = self.stand_height + torch.tensor(above, dtype=torch.float32, device=self.device)
-        self._up = torch.tensor(axes[2], dtype=torch.float32, device=self.device)
+            self._feet = Feet(self.model, self.stand_height, self.device)
 
     def weights(self, reward: LegReward) -> Tensor:
         """Weights of the terms, negative for costs."""
@@ -221,16 +208,20 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
 
     def begin_epoch(self, epoch: int) -> None:
         self._tracking_share.fill_(self.config.tracking.at(epoch))
-        self._assist_share.fill_(self.config.assist.at(epoch))
+        self._assistance.begin_epoch(epoch)
+
+    def end_epoch(self, length: float | None) -> dict[str, float]:
+        return self._assistance.end_epoch(length)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {**super().state_dict(), **self._assistance.state_dict()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        super().load_state_dict(state)
+        self._assistance.load_state_dict(state)
 
     def disturbed(self, state: StepState) -> StepState:
-        push = self.config.push
-        if push.speed == 0.0:
-            return state
-        every = max(1, round(push.interval / self.config.control_timestep))
-        change = pushes(self.state.age, every, push.speed)
-        moved = state.qvel[:, :3] + change[:, :1] * self._slides[0] + change[:, 1:] * self._slides[1]
-        return state._replace(qvel=torch.cat((moved, state.qvel[:, 3:]), dim=-1))
+        return pushed(state, self.state.age, self.config.push, self.config.control_timestep, self._slides)
 
     def draw_start(self, count: int) -> tuple[StepState, Tensor]:
         if not self._tasked:
@@ -359,7 +350,8 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
             case "head":
                 return self._head_speed(state)[:, 1:].square().sum(-1)
             case "impact":
-                return costs.impact(*self._foot_motion(state)[:2])
+                feet = self._foot_motion(state)
+                return costs.impact(feet.height, feet.rise)
             case "footfall":
                 return self._footfall(state)
             case "clearance":
@@ -377,13 +369,8 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
         root = self.root(state)
         return root.velocity + _HEAD_LEVER * torch.linalg.cross(root.spin, root.up)
 
-    def _foot_motion(self, state: StepState) -> tuple[Tensor, Tensor, Tensor]:
-        """Heel and toes of the right foot, then of the left: heights above their place in standing [m], upward
-        velocities [m/s], each (W, 4), and velocities [m/s], (W, 4, 3)."""
-        frames, root = self.frames(state), self.root(state)
-        above = ((frames.position(self._feet) - frames.position("pelvis")[:, None]) * self._up).sum(-1)
-        velocity = frames.velocity(self._feet)
-        return root.height[:, None] + above - self._foot_heights, (velocity * self._up).sum(-1), velocity
+    def _foot_motion(self, state: StepState) -> FootMotion:
+        return self._feet.motion(self.frames(state), self.root(state).height)
 
     def _leg_phases(self) -> tuple[Tensor, Tensor]:
         """Phases [turns] of the right and the left leg in the state that a step leads to, each (W,)."""
@@ -391,12 +378,13 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
         return phase, phase + 0.5
 
     def _footfall(self, state: StepState) -> Tensor:
-        velocity, (right, left) = self._foot_motion(state)[2], self._leg_phases()
-        first = costs.sliding(right, velocity[:, 0], velocity[:, 1])
-        return first + costs.sliding(left, velocity[:, 2], velocity[:, 3])
+        velocity, (right, left) = self._foot_motion(state).velocity, self._leg_phases()
+        return costs.sliding(right, velocity[:, 0], velocity[:, 1]) + costs.sliding(
+            left, velocity[:, 2], velocity[:, 3]
+        )
 
     def _clearance(self, state: StepState) -> Tensor:
-        heights, (right, left) = self._foot_motion(state)[0], self._leg_phases()
+        heights, (right, left) = self._foot_motion(state).height, self._leg_phases()
         wanted = self.config.reward.clearance_height
         return costs.dragging(right, heights[:, :2], wanted) + costs.dragging(left, heights[:, 2:], wanted)
 

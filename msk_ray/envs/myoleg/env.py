@@ -100,7 +100,7 @@ class MyoLeg(LegEnv[MyoLegSettings]):
         along, spin = quat_log(error) @ self._local.T, v[:, 3:6] @ self._local.T
         torque = -(self._righting * along + self._turning * spin) @ self._local
         root = torch.cat((push[:, None] * left + self._lift * up, torque), dim=-1)
-        return self._assist_share * torch.nn.functional.pad(root, (0, v.shape[1] - 6))
+        return self._assistance.share * torch.nn.functional.pad(root, (0, v.shape[1] - 6))
 
     def draw_physics(self, count: int) -> StepState:
         return self._near(self._stand.repeat(count, 1), torch.zeros((count, self.model.nv), device=self.device))

@@ -77,7 +77,7 @@ class MyoLeg26(LegEnv[MyoLeg26Settings]):
             return excitation
         qpos, qvel, _ = self.state.physics
         force = self._lift - self._springs * (qpos[:, :6] - self._upright_pose) - self._dampers * qvel[:, :6]
-        return torch.cat((excitation, self._assist_share * force), dim=-1)
+        return torch.cat((excitation, self._assistance.share * force), dim=-1)
 
     def draw_physics(self, count: int) -> StepState:
         if len(self._starts.qpos) > 1 and self.config.stochastic_reset:

@@ -11,6 +11,7 @@ from msk_ray.algorithms.shac.copies import spread
 from msk_ray.algorithms.shac.schedules import contact_horizon
 from msk_ray.config import ContactHorizon, PerturbedCopies, overlay, parse_config
 from msk_ray.envs import make_env
+from msk_ray.envs.hopper.env import Hopper
 from msk_ray.errors import ConfigError
 from msk_ray.training import Trainer
 
@@ -134,9 +135,13 @@ def test_copies_start_near_the_first_of_their_group() -> None:
     assert torch.equal(after.physics.qvel, before.physics.qvel[first])
 
 
-def test_the_episodes_of_copies_are_not_counted(tmp_path: Path) -> None:
+def test_the_episodes_of_copies_are_not_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Episodes of 12 env steps, cut at the third epoch of four: one of each of the two groups."""
+    told: list[float | None] = []
+    monkeypatch.setattr(Hopper, "end_epoch", lambda env, length: told.append(length) or {"train/told": length})
     rows = trained({"shac.copies": {"count": 2}, "env.early_termination": False}, tmp_path, 3)[1]
+    assert told == [16, 16, 4], "env steps of an epoch over all of its episodes, and not divided where none ended"
+    assert rows[2]["train/told"] == 4
     assert [row["train/episodes"] for row in rows] == [0, 0, 2]
     assert rows[2]["train/episode_length"] == 12
 

@@ -1,0 +1,44 @@
+"""Where heels and toes are, and how they move. Axes: W worlds."""
+
+from typing import NamedTuple
+
+import mujoco
+import torch
+from torch import Tensor
+
+from msk_ray.envs.legs.gait.body import SIDES, world_axes
+from msk_ray.simulation.kinematics import Frames
+
+_FOOT = ("calcn", "toes")
+"""Bodies whose origins are the heel and the joint of the toes."""
+
+
+class FootMotion(NamedTuple):
+    """Heel and toes of the right foot, then of the left."""
+
+    height: Tensor
+    """Above their place in standing [m], (W, 4)."""
+    rise: Tensor
+    """Upward velocities [m/s], (W, 4)."""
+    velocity: Tensor
+    """Velocities [m/s], (W, 4, 3)."""
+
+
+class Feet:
+    """The feet of a model with a keyframe `stand`, in which its pelvis is `stand_height` [m] above the ground."""
+
+    def __init__(self, model: mujoco.MjModel, stand_height: float, device: torch.device) -> None:
+        self._names = [f"{body}_{side}" for side in SIDES for body in _FOOT]
+        axes = world_axes(model)
+        data = mujoco.MjData(model)
+        mujoco.mj_resetDataKeyframe(model, data, model.key("stand").id)
+        mujoco.mj_kinematics(model, data)
+        above = [(data.body(name).xpos - data.body("pelvis").xpos) @ axes[2] for name in self._names]
+        self._rest = stand_height + torch.tensor(above, dtype=torch.float32, device=device)
+        self._up = torch.tensor(axes[2], dtype=torch.float32, device=device)
+
+    def motion(self, frames: Frames, height: Tensor) -> FootMotion:
+        """Their motion where the pelvis is at a height (W,) above the ground [m]."""
+        above = ((frames.position(self._names) - frames.position("pelvis")[:, None]) * self._up).sum(-1)
+        velocity = frames.velocity(self._names)
+        return FootMotion(height[:, None] + above - self._rest, (velocity * self._up).sum(-1), velocity)
