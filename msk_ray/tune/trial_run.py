@@ -103,7 +103,7 @@ def run_trial(
         done = None
     if done is not None:
         return done
-        # The error of an earlier attempt stays in the trial's output; this file is about the latest one.
+    # The error of an earlier attempt stays in the trial's output; this file is about the latest one.
     (folder / ERROR_FILE).unlink(missing_ok=True)
     attempt = FIRST
     try:
@@ -166,11 +166,6 @@ def _train(
 ) -> Ending | None:
     trainer = make_trainer(trial.config, folder, device)
     try:
-        note = str(read_attempt(folder))
-        if note:
-            # For anyone who reads only these settings.
-            settings = folder / "config.yaml"
-            write_text(settings, f"# {note} asked for\n{settings.read_text(encoding='utf-8')}")
         if handed is not None:
             trainer.restore(handed.path, handed.changed)
             # best.pt belongs to this trial; with a better member's best score it would never be replaced.
@@ -181,6 +176,11 @@ def _train(
             for fault in faults:
                 print(f"skipped: {fault}", flush=True)
             print(f"continuing from {path}" if path else "starting", flush=True)
+        note = str(read_attempt(folder))
+        if note:
+            # For anyone who reads only these settings, which restoring has written.
+            settings = folder / "config.yaml"
+            write_text(settings, f"# {note} asked for\n{settings.read_text(encoding='utf-8')}")
         return _loop(trial, folder, stop, trainer, hooks)
     finally:
         trainer.close()

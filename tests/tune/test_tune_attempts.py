@@ -214,6 +214,7 @@ def test_a_real_trainer_leaves_one_curve(
     # horizon × worlds: rows of 8 worlds would count twice as many.
     assert [row["env_steps"] for row in read_rows(folder)] == [8 * 4 * epoch for epoch in range(7)]
     assert read_checkpoint(folder / "checkpoints" / "epoch_000006.pt")["config"]["env"]["nworld"] == 4
+    assert (folder / "config.yaml").read_text().startswith("# half the worlds: 4 of 8 asked for\n")
     board = EventAccumulator(str(folder), size_guidance={"scalars": 0})
     board.Reload()
     assert [(e.step, e.value) for e in board.Scalars("progress/env_steps")] == [(n, 32.0 * n) for n in range(7)]
