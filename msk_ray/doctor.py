@@ -396,7 +396,7 @@ def _no_gpu(who: str, built_for: str, facts: GpuFacts) -> str:
 
 def _index(device: str | None) -> int | None:
     number = (device or "").partition(":")[2]
-    return int(number) if number.isdigit() else None
+    return int(number) if number.isdecimal() else None
 
 
 def _one_line(error: Exception) -> str:

@@ -113,10 +113,6 @@ class Algorithm(ABC):
         action: Tensor = self.network(obs)
         return action
 
-    def policy_state_dict(self) -> dict[str, Any]:
-        """State of the modules that `policy` uses, by module name."""
-        return {name: module.state_dict() for name, module in self.policy_modules(self.network).items()}
-
     def note_state(self) -> None:
         """Let the witness, if there is one, note the worlds and everything that is saved as a module."""
         if self.witness is None:

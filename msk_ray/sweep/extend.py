@@ -29,7 +29,7 @@ def parse_extension(texts: Sequence[str]) -> dict[str, Any]:
         if kind == "seeds":
             parse_seeds(value)
             extension[kind] = value
-        elif value.isdigit() and int(value) > 0:
+        elif value.isdecimal() and int(value) > 0:
             extension[kind] = int(value)
         else:
             raise ConfigError(f"--extend {text!r}: write a whole number, the new total")

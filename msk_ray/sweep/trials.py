@@ -10,7 +10,7 @@ from typing import Any
 from msk_ray.config import Config, leaves, overlay, parse_config, read_config, refuse_ignored
 from msk_ray.errors import ConfigError
 from msk_ray.experiment.trial import ID_DIGITS, Trial, trial_id, variant_text, with_epochs
-from msk_ray.sweep.operators import Level, Operator
+from msk_ray.sweep.operators import Level, Listed, Operator
 from msk_ray.sweep.space import Space
 
 
@@ -154,9 +154,16 @@ def _ablations(space: Space) -> Iterator[tuple[dict[str, str], dict[str, Any]]]:
 
 
 def _check_collisions(space: Space) -> None:
-    """Refuse two parameters that set the same config key."""
+    """Refuse two parameters that set the same config key, and two values of one that tables could not tell apart."""
     owner: dict[str, str] = {}
     for key, op in space.parameters.items():
+        values: dict[str, Any] = {}
+        for level in op.levels if isinstance(op, Listed) else ():
+            if values.setdefault(level.label, level.value) != level.value:
+                raise ConfigError(
+                    f"{space.name}: parameters.{key}: two values are both shown as {level.label}; give each a label: "
+                    "{label: NAME, value: VALUE}"
+                )
         for leaf in sorted({leaf for level in op.extremes() for leaf, _ in leaves(key, level.value)}):
             other = owner.setdefault(leaf, key)
             if other != key:
@@ -175,7 +182,7 @@ def find_trial(trials: list[Trial], text: str) -> Trial:
     Raises:
         ConfigError: there is none, or more than one.
     """
-    if text.isdigit() and len(text) < ID_DIGITS and int(text) < len(trials):
+    if text.isdecimal() and len(text) < ID_DIGITS and int(text) < len(trials):
         return trials[int(text)]
     matches = [trial for trial in trials if trial.id.startswith(text)]
     if len(matches) == 1:

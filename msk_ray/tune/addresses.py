@@ -12,5 +12,5 @@ def check_reachable(address: str) -> None:
         OSError: nothing does.
     """
     host, _, port = address.rpartition(":")
-    if "://" not in address and port.isdigit():
+    if "://" not in address and port.isdecimal():
         socket.create_connection((host, int(port)), timeout=_LIMIT_S).close()

@@ -89,6 +89,11 @@ def test_epochs_that_the_space_varies_are_not_extended(make_space: Any, tmp_path
 def test_what_is_typed() -> None:
     assert parse_extension(["epochs=400", "seeds=0-4"]) == {"epochs": 400, "seeds": "0-4"}
     assert extended_space({"samples": 2, "base": "b"}, {"epochs": 4, "samples": 3}) == {"samples": 3, "base": "b"}
-    for text, message in (("400", "write epochs=N"), ("epochs=x", "a whole number"), ("seeds=x", "whole numbers")):
+    for text, message in (
+        ("400", "write epochs=N"),
+        ("epochs=x", "a whole number"),
+        ("epochs=²", "a whole number"),
+        ("seeds=x", "whole numbers"),
+    ):
         with pytest.raises(ConfigError, match=message):
             parse_extension([text])

@@ -35,6 +35,11 @@ def test_randint_includes_both_ends() -> None:
     assert {RandInt(2, 4).draw(rng).value for _ in range(100)} == {2, 3, 4}
 
 
+def test_whole_numbers_of_any_length_are_told_apart() -> None:
+    op, rng = RandInt(1_000_000, 1_000_009), random.Random(0)
+    assert {level.label for level in (op.draw(rng) for _ in range(100))} == {str(1_000_000 + n) for n in range(10)}
+
+
 def test_draws_have_six_digits() -> None:
     value = Uniform(0.0, 1.0).draw(random.Random(1)).value
     assert value == float(f"{value:.6g}")

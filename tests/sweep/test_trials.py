@@ -86,6 +86,7 @@ def test_a_mapping_is_laid_over_a_section_and_replaces_a_number() -> None:
         ({"parameters": {"shac.gamma": {"uniform": [0.5, 1.5]}}}, "gamma uniform at its end 1.5"),
         ({"parameters": {"shac.gamma": {"grid": [0.9, 2.0]}}}, "trial 1 .*less than or equal to 1"),
         ({"parameters": {"shac.gamma": {"grid": [0.9, 0.9]}}}, "same trial"),
+        ({"parameters": {"shac.gamma": {"grid": [0.9, 0.90000001]}}}, "both shown as 0.9; give each a label"),
         ({"parameters": {"shac": {"grid": [{"gamma": 0.9}]}, "shac.gamma": {"grid": [0.8]}}}, "both set shac.gamma"),
         ({"parameters": {"trial.seed": {"grid": [1]}}}, "section of their own; write seeds"),
         ({"overrides": {"shac.gamm": 1}}, "did you mean 'gamma'"),

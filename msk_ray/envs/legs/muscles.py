@@ -73,11 +73,6 @@ class MuscleCurves:
         curve: Tensor = _Curve.apply(self.moving, rate)
         return curve
 
-    def passive_curve(self, length: Tensor) -> Tensor:
-        """Passive force against length."""
-        curve: Tensor = _Curve.apply(self.passive, length)
-        return curve
-
     def active(self, length: Tensor) -> tuple[Tensor, Tensor]:
         """`length_curve` and its slope.
 
@@ -99,7 +94,7 @@ class MuscleCurves:
         return torch.where(rate <= 0.0, square, self._lengthening - self._reach * square), 2.0 * w
 
     def passive(self, length: Tensor) -> tuple[Tensor, Tensor]:
-        """`passive_curve` and its slope: a parabola up to half way to `upper`, and its tangent from there."""
+        """Passive force against length, and its slope: a parabola half way to `upper`, and its tangent from there."""
         stretch = (length - 1.0).clamp_min(0.0) * self._bend
         bent = stretch.clamp_max(1.0)
         return self._passive * (stretch - 0.5 * bent) * bent, self._stiffness * bent

@@ -118,7 +118,7 @@ class Range(Operator):
             number = _six_digits(math.exp(rng.uniform(math.log(self.low), math.log(self.high))))
         else:
             number = _six_digits(rng.uniform(self.low, self.high))
-        return Level(self.clip(number), f"{number:g}")
+        return Level(self.clip(number), describe(number))
 
     def clip(self, number: float) -> float:
         """The nearest value inside the range."""
@@ -128,7 +128,7 @@ class Range(Operator):
     def extremes(self) -> tuple[Level, ...]:
         """Both ends."""
         low, high = self.clip(self.low), self.clip(self.high)
-        return Level(low, f"{low:g}"), Level(high, f"{high:g}")
+        return Level(low, describe(low)), Level(high, describe(high))
 
     def check(self) -> tuple[Level, ...]:
         return self.extremes()
