@@ -169,7 +169,7 @@ class Shac(Algorithm):
             **super().state_dict(),
             "actor_optimizer": self.actor_optimizer.state_dict(),
             "critic_optimizer": self.critic_fit.optimizer.state_dict(),
-            "critic_loss": self._runner.last_loss,
+            "critic_loss": self._runner.newest_loss,
             "noise_generator": self.noise_generator.get_state(),
             **({"minibatch_generator": self.minibatch_generator.get_state()} if self._apart else {}),
             "episodes": self.episodes.state_dict(),
@@ -186,7 +186,7 @@ class Shac(Algorithm):
         super().load_state_dict(state)
         self.actor_optimizer.load_state_dict(state["actor_optimizer"])
         self.critic_fit.optimizer.load_state_dict(state["critic_optimizer"])
-        self._runner.last_loss = state.get("critic_loss")
+        self._runner.resume(state.get("critic_loss"))
         # Generator states are host tensors on every device.
         self.noise_generator.set_state(state["noise_generator"].cpu())
         if self._apart:

@@ -52,6 +52,15 @@ class EagerRunner:
         self._clock = Clock(env.device)
         self.last_loss: Tensor | None = None
 
+    @property
+    def newest_loss(self) -> Tensor | None:
+        """The critic's loss in the newest fit, once that has ended; None before the first."""
+        return self.last_loss
+
+    def resume(self, loss: Tensor | None) -> None:
+        """Go on after a fit that had this `newest_loss`."""
+        self.last_loss = loss
+
     def run_actor(self, inputs: EpochInputs) -> ActorOutcome:
         """The rollout, and the actor's step along its gradient."""
         self._clock = Clock(self._device)
@@ -138,6 +147,14 @@ class RecordedRunner(EagerRunner):
                 f"{type(env).__qualname__}.begin_epoch may change numbers: keep them in tensors that it changes in "
                 "place, and set begin_epoch_in_place"
             )
+
+    @property
+    def newest_loss(self) -> Tensor | None:
+        return self.last_loss if self._newest_loss is None else self._newest_loss
+
+    def resume(self, loss: Tensor | None) -> None:
+        super().resume(loss)
+        self._newest_loss = None
 
     def run_actor(self, inputs: EpochInputs) -> ActorOutcome:
         epoch = self._epoch(inputs)

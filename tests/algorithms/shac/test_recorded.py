@@ -155,13 +155,14 @@ def test_a_resumed_trial_goes_on_as_before(tmp_path: Path) -> None:
     for _ in range(4):
         trainer.run_epoch()
     path = trainer.save()
-    for _ in range(3):
-        trainer.run_epoch()
+    rows = [trainer.run_epoch() for _ in range(3)]
     again = make(CARTPOLE, tmp_path / "b", entropy={"coefficient": 0.1, "target": -0.5})
     again.restore(path)
-    for _ in range(3):
-        row = again.run_epoch()
-    assert row["train/recorded"] == 1.0
+    resumed = [again.run_epoch() for _ in range(3)]
+    assert resumed[-1]["train/recorded"] == 1.0
+    # Each row has the loss of the fit before, the first one that of a fit before the checkpoint.
+    name = "train/critic_loss"
+    assert [row[name] for row in resumed] == pytest.approx([row[name] for row in rows], rel=1e-3)
     assert difference(weights(again), weights(trainer)) < 1e-4
 
 
