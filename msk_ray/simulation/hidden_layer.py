@@ -13,9 +13,11 @@ from torch.autograd.function import once_differentiable
 
 from msk_ray.simulation.buffers import stream_of
 
+_LANES = 32
+"""Threads that share a row: one warp, whose sums do not wait for others."""
 _BLOCK = 128
-"""Threads of a block: those that share a row, or neighbouring features."""
-_CHUNK = 64
+"""Threads of a block of neighbouring features."""
+_CHUNK = 32
 """Rows that a thread adds up. Sums of chunks are added by torch, so that their order is fixed."""
 
 wp.set_module_options({"enable_backward": False})
@@ -25,12 +27,6 @@ wp.set_module_options({"enable_backward": False})
 def elu(x: float) -> float:
     """x, or exp(x) - 1 where it is negative."""
     return wp.where(x > 0.0, x, wp.exp(wp.min(x, 0.0)) - 1.0)
-
-
-@wp.func
-def elu_slope(x: float) -> float:
-    """Its derivative."""
-    return wp.where(x > 0.0, 1.0, wp.exp(wp.min(x, 0.0)))
 
 
 @wp.kernel
@@ -63,7 +59,7 @@ def activate(
 
 
 @wp.kernel
-def pull_rows_back(
+def average_rows(
     # In:
     x_in: wp.array2d[float],
     gain_in: wp.array[float],
@@ -71,9 +67,9 @@ def pull_rows_back(
     scale_in: wp.array[float],
     bar_in: wp.array2d[float],
     # Out:
-    x_bar_out: wp.array2d[float],
+    means_out: wp.array2d[float],
 ) -> None:
-    """x̄ = ELU'(x) · scale · (h̄ - mean h̄ - h · mean (h̄ h)), h̄ = gain · ȳ; a block a row."""
+    """mean h̄ and mean (h̄ h), h̄ = gain · ȳ; a block a row."""
     row, lane = wp.tid()
     width = x_in.shape[1]
     mean = mean_in[row]
@@ -82,35 +78,45 @@ def pull_rows_back(
     for k in range(lane, width, wp.block_dim()):
         h_bar = gain_in[k] * bar_in[row, k]
         sums += wp.vec2(h_bar, h_bar * (elu(x_in[row, k]) - mean) * scale)
-    total = wp.tile_reduce(wp.add, wp.tile(sums, preserve_type=True))[0] / float(width)
-    for k in range(lane, width, wp.block_dim()):
-        x = x_in[row, k]
-        h = (elu(x) - mean) * scale
-        x_bar_out[row, k] = elu_slope(x) * scale * (gain_in[k] * bar_in[row, k] - total[0] - h * total[1])
+    total = wp.tile_reduce(wp.add, wp.tile(sums, preserve_type=True))[0]
+    if lane == 0:
+        means_out[row, 0] = total[0] / float(width)
+        means_out[row, 1] = total[1] / float(width)
 
 
 @wp.kernel
-def add_rows_up(
+def pull_rows_back(
     # In:
     x_in: wp.array2d[float],
+    gain_in: wp.array[float],
     mean_in: wp.array[float],
     scale_in: wp.array[float],
     bar_in: wp.array2d[float],
-    x_bar_in: wp.array2d[float],
+    means_in: wp.array2d[float],
     chunk: int,
     # Out:
+    x_bar_out: wp.array2d[float],
     sums_out: wp.array3d[float],
 ) -> None:
-    """Σ ȳ h, Σ ȳ and Σ x̄ over each chunk of rows: what gain, shift and bias pull back; a thread a feature."""
+    """x̄ = ELU'(x) · scale · (h̄ - mean h̄ - h · mean (h̄ h)), and Σ ȳ h, Σ ȳ and Σ x̄ over each chunk of rows, which is
+    what gain, shift and bias pull back; a thread a feature of a chunk."""
     part, k = wp.tid()
+    gain = gain_in[k]
     gain_bar = float(0.0)
     shift_bar = float(0.0)
     bias_bar = float(0.0)
     for row in range(part * chunk, wp.min((part + 1) * chunk, x_in.shape[0])):
+        x = x_in[row, k]
         bar = bar_in[row, k]
-        gain_bar += bar * (elu(x_in[row, k]) - mean_in[row]) * scale_in[row]
+        scale = scale_in[row]
+        # e to the x where x is negative: ELU's slope, and ELU but for 1.
+        slope = wp.exp(wp.min(x, 0.0))
+        h = (wp.max(x, 0.0) + slope - 1.0 - mean_in[row]) * scale
+        x_bar = slope * scale * (gain * bar - means_in[row, 0] - h * means_in[row, 1])
+        x_bar_out[row, k] = x_bar
+        gain_bar += bar * h
         shift_bar += bar
-        bias_bar += x_bar_in[row, k]
+        bias_bar += x_bar
     sums_out[part, 0, k] = gain_bar
     sums_out[part, 1, k] = shift_bar
     sums_out[part, 2, k] = bias_bar
@@ -135,11 +141,13 @@ class _HiddenLayer(torch.autograd.Function):
     def backward(ctx: Any, bar: Tensor) -> tuple[Tensor | None, ...]:
         x, weight, inner, gain, mean, scale = ctx.saved_tensors
         bar = bar.contiguous()
+        means = inner.new_empty((len(inner), 2))
+        _launch(average_rows, len(inner), (inner, gain, mean, scale, bar), (means,))
         inner_bar = torch.empty_like(inner)
-        _launch(pull_rows_back, len(inner), (inner, gain, mean, scale, bar), (inner_bar,))
         parts = -(-len(inner) // _CHUNK)
         sums = inner.new_empty((parts, 3, inner.shape[1]))
-        _launch(add_rows_up, (parts, inner.shape[1]), (inner, mean, scale, bar, inner_bar), (sums,), _CHUNK)
+        given = (inner, gain, mean, scale, bar, means)
+        _launch(pull_rows_back, (parts, inner.shape[1]), given, (inner_bar, sums), _CHUNK)
         gain_bar, shift_bar, bias_bar = sums.sum(0).unbind()
         x_bar = inner_bar @ weight if ctx.needs_input_grad[0] else None
         return x_bar, inner_bar.t() @ x, bias_bar, gain_bar, shift_bar, None
@@ -164,7 +172,8 @@ def _launch(
     wp.init()
     device = inputs[0].device
     arrays = [[wp.from_torch(t.detach(), requires_grad=False) for t in group] for group in (inputs, outputs)]
-    launch = wp.launch_tiled if isinstance(size, int) else wp.launch
+    rows = isinstance(size, int)
+    launch = wp.launch_tiled if rows else wp.launch
     launch(
         kernel,
         dim=size,
@@ -172,5 +181,5 @@ def _launch(
         outputs=arrays[1],
         device=str(device),
         stream=stream_of(device),
-        block_dim=_BLOCK,
+        block_dim=_LANES if rows else _BLOCK,
     )

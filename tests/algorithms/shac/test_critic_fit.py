@@ -85,13 +85,14 @@ def test_tf32_is_refused_on_a_cpu() -> None:
 @pytest.mark.gpu
 def test_tf32_rounds_the_factors_of_products_in_the_fit_alone() -> None:
     """One step from the same start: the losses differ, by less than the 2⁻¹⁰ of the factors makes of them."""
-    generator = torch.Generator().manual_seed(0)
-    obs = torch.randn(512, 64, generator=generator).cuda()
+    # Large enough for cuBLAS to take the kernels that round.
+    rows, inputs = 8192, 128
+    obs = torch.randn(rows, inputs, generator=torch.Generator().manual_seed(0)).cuda()
     losses = []
     for tf32 in (False, True):
-        critic = Critic(CriticConfig(hidden=(256,)), 64, torch.Generator().manual_seed(1)).cuda()
+        critic = Critic(CriticConfig(hidden=(512, 256)), inputs, torch.Generator().manual_seed(1)).cuda()
         fit = CriticFit(critic, 1e-3, (0.9, 0.99), None, arithmetic=Arithmetic(tf32=tf32))
-        losses.append(float(fit.run(obs, obs[:, 0], torch.arange(512, device="cuda")[None], 1)))
+        losses.append(float(fit.run(obs, obs[:, 0], torch.arange(rows, device="cuda")[None], 1)))
         assert not torch.backends.cuda.matmul.allow_tf32
     assert losses[0] != losses[1]
     assert abs(losses[0] - losses[1]) < 1e-2 * losses[0]
