@@ -1,5 +1,5 @@
-"""Time of `Simulation.step` as a user calls it, alone and with its backward pass; with --against for two checkouts in
-turn.
+"""Time of `Simulation.step` as a user calls it, alone and with its backward pass, and the memory of a GPU that a
+simulation and its rollout take; with --against for two checkouts in turn.
 
 Wall time on a GPU, the process's own time on CPU.
 """
@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 
 import torch
-from record import RESULTS, markdown_table, publish
+from record import RESULTS, markdown_table, publish, used_bytes
 from step_models import MODELS
 
 from msk_ray.simulation import Simulation, TapePerSubstep
@@ -42,13 +42,14 @@ def seconds(sim: Simulation, steps: int, backward: bool) -> float:
 
 
 def measure(name: str, args: argparse.Namespace) -> list[float]:
-    """Shortest duration over repeats of a step [ms], and of a step with its backward pass."""
+    """Shortest duration over repeats of a step [ms], of a step with its backward pass, and memory [MiB]."""
+    before = used_bytes(torch.device(args.device))
     sim = Simulation(MODELS[name](), args.worlds, args.substeps, TapePerSubstep(), args.device)
     times = []
     for backward in (False, True):
         seconds(sim, args.steps, backward)
         times.append(1e3 * min(seconds(sim, args.steps, backward) for _ in range(args.repeats)))
-    return times
+    return [*times, (used_bytes(sim.device) - before) / 2**20]
 
 
 def elsewhere(tree: Path, arguments: list[str]) -> dict[str, list[float]]:
@@ -73,10 +74,10 @@ def compared(args: argparse.Namespace) -> list[list[str]]:
             print(tree, rounds[tree][-1], flush=True)
     rows = []
     for name in args.models:
-        here, there = ([statistics.median(r[name][k] for r in rounds[t]) for k in (0, 1)] for t in trees)
-        figures = [f"{value:.3f}" for pair in zip(there, here, strict=True) for value in pair]
-        changes = [f"{100 * (h / t - 1):+.1f} %" for h, t in zip(here, there, strict=True)]
-        rows.append([name, *figures[:2], changes[0], *figures[2:], changes[1]])
+        here, there = ([statistics.median(r[name][k] for r in rounds[t]) for k in range(3)] for t in trees)
+        figures = [f"{value:.3f}" for pair in zip(there[:2], here[:2], strict=True) for value in pair]
+        changes = [f"{100 * (h / t - 1):+.1f} %" for h, t in zip(here[:2], there[:2], strict=True)]
+        rows.append([name, *figures[:2], changes[0], *figures[2:], changes[1], f"{there[2]:.0f}", f"{here[2]:.0f}"])
     return rows
 
 
@@ -99,10 +100,14 @@ def main() -> None:
         return
     if args.against is not None:
         header = ["model", "step, there", "here", "change", "step and backward, there", "here", "change"]
+        header += ["MiB, there", "here"]
         rows = compared(args)
     else:
-        header = ["model", "step", "step and backward"]
-        rows = [[name, *(f"{value:.3f}" for value in measure(name, args))] for name in args.models]
+        header = ["model", "step", "step and backward", "MiB"]
+        found = {name: measure(name, args) for name in args.models}
+        rows = [[name, *(f"{value:.3f}" for value in v[:2]), f"{v[2]:.0f}"] for name, v in found.items()]
+            [name, *(f"{value:.3f}" for value in times), f"{memory:.0f}"] for name, (*times, memory) in found.items()
+        ]
     title = f"One env step of {args.substeps} substeps in {args.worlds} worlds [ms]"
     publish("env_step", title, args.device, markdown_table(header, rows), args.results)
 

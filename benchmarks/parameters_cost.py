@@ -11,7 +11,7 @@ from pathlib import Path
 import mujoco
 import torch
 from parameters import MODELS
-from record import RESULTS, markdown_table, publish
+from record import RESULTS, markdown_table, publish, used_bytes
 from torch import Tensor
 
 from msk_ray.physics.parameters import PARAMETERS, names_of
@@ -44,16 +44,6 @@ def milliseconds(sim: Simulation, values: dict[str, Tensor], steps: int) -> tupl
     state.qvel.sum().backward()
     wait()
     return 1e3 * (middle - begin) / steps, 1e3 * (clock() - middle) / steps
-
-
-def used_bytes(device: torch.device) -> int:
-    """Memory in use on a GPU, by everyone; 0 on CPU."""
-    if device.type != "cuda":
-        return 0
-    torch.cuda.synchronize(device)
-    torch.cuda.empty_cache()
-    free, total = torch.cuda.mem_get_info(device)
-    return int(total - free)
 
 
 def measure(model: mujoco.MjModel, args: argparse.Namespace) -> list[list[str]]:

@@ -8,6 +8,10 @@ import subprocess
 import sys
 from importlib.metadata import version
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import torch
 
 RESULTS = Path(__file__).parent / "results"
 PACKAGES = ("torch", "warp-lang", "mujoco", "mujoco-warp")
@@ -25,6 +29,18 @@ def device_name(device: str) -> str:
         names = [line.split(":", 1)[1].strip() for line in cpuinfo.read_text().splitlines() if "model name" in line]
         model = names[0] if names else model
     return f"{model}, {os.cpu_count()} cores, {torch.get_num_threads()} torch threads"
+
+
+def used_bytes(device: "torch.device") -> int:
+    """Memory in use on a GPU, by everyone; 0 on CPU."""
+    import torch
+
+    if device.type != "cuda":
+        return 0
+    torch.cuda.synchronize(device)
+    torch.cuda.empty_cache()
+    free, total = torch.cuda.mem_get_info(device)
+    return int(total - free)
 
 
 def commit() -> str:
