@@ -106,8 +106,6 @@ def main() -> None:
         header = ["model", "step", "step and backward", "MiB"]
         found = {name: measure(name, args) for name in args.models}
         rows = [[name, *(f"{value:.3f}" for value in v[:2]), f"{v[2]:.0f}"] for name, v in found.items()]
-            [name, *(f"{value:.3f}" for value in times), f"{memory:.0f}"] for name, (*times, memory) in found.items()
-        ]
     title = f"One env step of {args.substeps} substeps in {args.worlds} worlds [ms]"
     publish("env_step", title, args.device, markdown_table(header, rows), args.results)
 
