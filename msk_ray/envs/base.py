@@ -27,7 +27,7 @@ from msk_ray.simulation.tendons import Tendons
 SettingsT = TypeVar("SettingsT", bound=EnvSettings)
 
 # A world whose state exceeds this bound has diverged: no model here reaches it as long as the solver works.
-_ABSURD = 1e6
+_STATE_BOUND = 1e6
 
 
 class EnvState(NamedTuple):
@@ -62,7 +62,8 @@ class Transition(NamedTuple):
     reward: Tensor
     """Reward, shape (W,); 0 in a world that diverged."""
     terms: Tensor
-    """Weighted parts of the reward, detached, shape (W, T), named by the environment's `reward_names`."""
+    """Weighted parts of the reward, detached, which sum to it, shape (W, T), named by the environment's
+    `reward_names`."""
     obs: Tensor
     """Observation of the state reached, before any reset, shape (W, O)."""
     terminated: Tensor
@@ -333,7 +334,7 @@ class Env(ABC, Generic[SettingsT]):
         before = self.disturbed(self.state.physics)
         control, force = self.control(action), self.applied_force(before)
         after = self.sim.step(control, *before, qfrc_applied=force, parameters=self.parameters)
-        diverged = ~self._sound(after)
+        diverged = ~self._is_valid(after)
         # `where` sends no cotangent into a diverged world's step, so its gradient cannot reach the batch.
         after = StepState(*(_where(diverged, b.detach(), a) for b, a in zip(before, after, strict=True)))
         self._reached, self._diverged = after, diverged
@@ -351,7 +352,8 @@ class Env(ABC, Generic[SettingsT]):
                 "with torch from state, frames, tendons and action, without .detach(), .item() or numpy",
                 stacklevel=2,
             )
-        reward = terms.sum(-1).masked_fill(diverged, 0.0)
+        terms = terms.masked_fill(diverged[:, None], 0.0)
+        reward = terms.sum(-1)
         age = self.state.age + 1
         terminated = diverged | self.fell(after)
         truncated = (age >= self.config.episode_length) & ~terminated
@@ -435,9 +437,9 @@ class Env(ABC, Generic[SettingsT]):
         )
 
     @torch.no_grad()
-    def _sound(self, state: StepState) -> Tensor:
-        # NaN compares false, so one comparison finds both non-finite and absurd values.
-        return (torch.cat(state, dim=-1).abs() < _ABSURD).all(-1)
+    def _is_valid(self, state: StepState) -> Tensor:
+        # NaN compares false, so one comparison finds both non-finite values and those out of bounds.
+        return (torch.cat(state, dim=-1).abs() < _STATE_BOUND).all(-1)
 
 
 def _where(worlds: Tensor, chosen: Tensor, others: Tensor) -> Tensor:

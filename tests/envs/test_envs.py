@@ -125,6 +125,7 @@ def test_a_diverged_world_is_reset_counted_and_kept_out_of_the_gradient() -> Non
     assert transition.diverged.tolist() == [False, True, False]
     assert transition.terminated.tolist() == [False, True, False]
     assert transition.reward[1] == 0
+    assert torch.equal(transition.terms.sum(-1), transition.reward.detach())
     transition.reward.sum().backward()
     assert action.grad.isfinite().all()
     assert action.grad[1] == 0
