@@ -24,11 +24,16 @@ class ProgressLine:
         left = (now - self._start) / max(1, epoch - self._first) * (self._epochs - epoch)
         if "eval/score" in row:
             best = f" (best {row['eval/best_score']:.1f})" if "eval/best_score" in row else ""
-            self._score = f"  eval {row['eval/score']:.1f}{best}"
-        text = (
-            f"epoch {epoch}/{self._epochs}  {row['env_steps_per_s']:,.0f} env steps/s  "
-            f"reward {row['train/reward']:.3f}{self._score}  {format_duration(left)} left"
-        )
+            self._score = f"eval {row['eval/score']:.1f}{best}"
+        parts = [
+            f"epoch {epoch}/{self._epochs}",
+            f"{row['env_steps_per_s']:,.0f} env steps/s",
+            # An algorithm from outside need not have it.
+            f"reward {row['train/reward']:.3f}" if "train/reward" in row else "",
+            self._score,
+            f"{format_duration(left)} left",
+        ]
+        text = "  ".join(filter(None, parts))
         if self._terminal:
             print(f"\r\x1b[K{text}", end="", flush=True)
         elif now - self._last_line >= 10.0 or epoch == self._epochs:

@@ -14,7 +14,7 @@ from msk_ray.diagnose.__main__ import main as diagnose
 from msk_ray.evaluate.__main__ import main as evaluate
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.gradcheck.__main__ import main as gradcheck
-from msk_ray.progress import Pace
+from msk_ray.progress import Pace, ProgressLine
 from msk_ray.visualize.__main__ import main as visualize
 
 COMMANDS = ("gradcheck", "diagnose", "evaluate", "visualize")
@@ -26,6 +26,11 @@ def test_they_speak_before_torch_is_loaded() -> None:
     modules = ", ".join(f"msk_ray.{name}.__main__" for name in COMMANDS)
     code = f"import sys, {modules}; print([name for name in ('torch', 'warp', 'mujoco_warp') if name in sys.modules])"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "[]\n"
+
+
+def test_progress_needs_no_more_of_a_row_than_every_algorithm_has(capsys: pytest.CaptureFixture[str]) -> None:
+    ProgressLine(1, 0).show({"epoch": 1, "env_steps": 8, "seconds": 0.1, "env_steps_per_s": 1234.5})
+    assert capsys.readouterr().out == "epoch 1/1  1,234 env steps/s  0s left\n"
 
 
 def test_warp_starts_without_a_word_where_there_is_no_gpu() -> None:
