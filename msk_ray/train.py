@@ -16,6 +16,7 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -234,7 +235,8 @@ def _train(
     if trainer.together > 1:
         print(f"policies are scored {trainer.together} at a time, after two minutes at most (or --score-at-once)")
     progress = ProgressLine(config.trial.epochs, trainer.epoch)
-    with stop.deferred():
+    # However it ends, loggers write out the rows that they still hold.
+    with stop.deferred(), closing(trainer):
         while not trainer.finished and not stop:
             ownership.check()
             progress.show(trainer.run_epoch())
@@ -243,12 +245,11 @@ def _train(
             ownership.check()
             trainer.save()
             trainer.score_waiting()
-            trainer.close()
-            assert stop.signal is not None
-            command = printable(resume_command)
-            print(f"stopped by {stop.signal.name} after epoch {trainer.epoch}; continue with: {command}")
-            return RESUMABLE
-        trainer.close()
+    if not trainer.finished:
+        assert stop.signal is not None
+        command = printable(resume_command)
+        print(f"stopped by {stop.signal.name} after epoch {trainer.epoch}; continue with: {command}")
+        return RESUMABLE
     if math.isfinite(trainer.best_score):
         untrained = _untrained_score(logdir)
         print(f"best evaluation score {trainer.best_score:.1f}{untrained}: {trainer.best_checkpoint}")

@@ -14,8 +14,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 from tensorboard.compat.proto.event_pb2 import SessionLog
 
-from msk_ray.config import Config, load_config, parse_config
-from msk_ray.errors import ConfigError, LoggerError, StorageFailure
+import msk_ray.train as train_command
+from msk_ray.config import Config, dump_yaml, load_config, parse_config
+from msk_ray.errors import ConfigError, LoggerError, SimulationError, StorageFailure
 from msk_ray.experiment.metrics import read_metrics
 from msk_ray.training import Trainer, precompile
 from msk_ray.training.loggers import TrialLog
@@ -133,6 +134,24 @@ def test_a_logger_from_outside_hears_everything_in_order(outside: Any, tmp_path:
     assert outside.Heard.calls == [
         ("rewind", -1), ("config", "cartpole"), ("write", row(0, a=1.0)), ("write", row(1, a=2.0)), ("close",),
     ]  # fmt: skip
+
+
+def test_a_command_that_fails_closes_its_loggers(
+    outside: Any, tiny_settings: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_epoch = Trainer.run_epoch
+
+    def fail_in_the_second(self: Trainer) -> dict[str, float]:
+        if self.epoch == 1:
+            raise SimulationError("made up")
+        return run_epoch(self)
+
+    monkeypatch.setattr(Trainer, "run_epoch", fail_in_the_second)
+    (tmp_path / "tiny.yaml").write_text(dump_yaml(tiny_settings))
+    settings = ["--set", "trial.loggers=[loggers_outside:Heard]", "--device", "cpu"]
+    with pytest.raises(SimulationError, match="made up"):
+        train_command.main(["--config", str(tmp_path / "tiny.yaml"), "--logdir", str(tmp_path / "trial"), *settings])
+    assert [call[0] for call in outside.Heard.calls] == ["config", "write", "write", "close"]
 
 
 def test_a_logger_that_fails_loses_no_row_and_is_named(outside: Any, tmp_path: Path) -> None:
