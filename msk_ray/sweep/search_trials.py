@@ -35,8 +35,9 @@ def search_trial(space: Space, base: Mapping[str, Any], params: Mapping[str, Any
 
 
 def write_params(folder: Path, params: Mapping[str, Any]) -> None:
-    """Record a search's choice in the trial's folder."""
-    write_json(folder / PARAMS_FILE, dict(params))
+    """Record a search's choice in the trial's folder, once: the ages of these files tell `recover` which came first."""
+    if not (folder / PARAMS_FILE).exists():
+        write_json(folder / PARAMS_FILE, dict(params))
 
 
 def recover(experiment: Experiment, space: Space) -> list[SearchTrial]:
