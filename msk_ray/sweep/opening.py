@@ -63,7 +63,7 @@ def reopen(path: Path, trials: list[Trial] | None, extension: Mapping[str, Any] 
             f"--name (--extend adds samples, seeds or epochs). To continue it with its original settings: "
             f"{experiment.resume_command()}"
         )
-        # Also without a new extension: an earlier one may have been interrupted right after writing its manifest.
+    # Also without a new extension: an earlier one may have been interrupted right after writing its manifest.
     experiment.clear_outgrown()
     experiment.stop_file.unlink(missing_ok=True)
     return experiment
@@ -109,8 +109,7 @@ def difference_of(recorded: list[Trial], now: list[Trial]) -> str | None:
     added = [trial for trial in now if trial.id not in old]
     if not gone and not added:
         return None
-        # Trials at the same position were most likely one trial before an edit, and the edit is the best
-        # description.
+    # Trials at the same position were most likely one trial before an edit, and the edit is the best description.
     for before, after in zip(gone, added, strict=False):
         if before.index == after.index:
             return f"trial {before.index} changed: {describe_changes(before.config, after.config)}"

@@ -98,10 +98,10 @@ def run_trials(plan: Plan) -> bool:
     experiment, space = plan.experiment, plan.space
     _finish_pruning(plan)
     remaining = [t for t in plan.trials if read_record(t, experiment.trial_folder(t.id)).ending is None]
-    made_up = [] if plan.trials else recover(experiment, space)
-    begun = [m for m in made_up if read_record(m.trial, experiment.trial_folder(m.trial.id)).ending is None]
-    missing = space.file.samples - len(made_up) + len(begun)
-    if (plan.trials and not remaining) or (made_up and missing <= 0):
+    suggested = [] if plan.trials else recover(experiment, space)
+    begun = [s for s in suggested if read_record(s.trial, experiment.trial_folder(s.trial.id)).ending is None]
+    missing = space.file.samples - len(suggested) + len(begun)
+    if (plan.trials and not remaining) or (suggested and missing <= 0):
         print("all trials have ended already")
         return True
     base = base_settings(space) if not plan.trials else {}
@@ -136,9 +136,9 @@ def run_trials(plan: Plan) -> bool:
             stop,
             plan.guard,
             waiting=remaining,
-            started=[m.trial for m in made_up],
+            started=[s.trial for s in suggested],
         )
-        _fit(plan, job, supervisor, stop, remaining, made_up)
+        _fit(plan, job, supervisor, stop, remaining, suggested)
         if not plan.trials:
             # A search suggests trials as it goes; they enter the manifest once they are known.
             experiment.set_trials(supervisor.started)
@@ -167,7 +167,12 @@ def _finish_pruning(plan: Plan) -> None:
 
 
 def _fit(
-    plan: Plan, job: Job, supervisor: Supervisor, stop: StopRequest, remaining: list[Trial], made_up: list[SearchTrial]
+    plan: Plan,
+    job: Job,
+    supervisor: Supervisor,
+    stop: StopRequest,
+    remaining: list[Trial],
+    suggested: list[SearchTrial],
 ) -> None:
     spec, file = plan.space.file.scheduler, plan.space.file
     budget = _budget(plan)
@@ -185,7 +190,7 @@ def _fit(
     # A search ends by itself; a list of trials is used once as the parameter space.
     search: Any
     if file.searches:
-        search, samples = _suggestions(plan, made_up, identify), -1
+        search, samples = _suggestions(plan, suggested, identify), -1
     else:
         search, samples = TrialList(plan.experiment, identify, plan.max_concurrent), 1
     node = _OwnNode()
@@ -244,18 +249,18 @@ def _identify(job: Job, config: Mapping[str, Any]) -> str:
     return config["id"] if "id" in config else job.trial_of(config).id
 
 
-def _suggestions(plan: Plan, made_up: list[SearchTrial], identify: Identify) -> Suggestions:
+def _suggestions(plan: Plan, suggested: list[SearchTrial], identify: Identify) -> Suggestions:
     """The space's search, told the results of its suggestions so far."""
     begun, scored = [], []
-    for made in made_up:
-        record = read_record(made.trial, plan.experiment.trial_folder(made.trial.id))
+    for earlier in suggested:
+        record = read_record(earlier.trial, plan.experiment.trial_folder(earlier.trial.id))
         if record.ending is None:
-            begun.append(made.params)
+            begun.append(earlier.params)
         else:
-            scored.append((made.params, record))
+            scored.append((earlier.params, record))
     file = plan.space.file
     # With the original seed, the original draws would be repeated.
-    seed = file.sample_seed + len(made_up)
+    seed = file.sample_seed + len(suggested)
     given = (file.objectives,) if file.objectives else ()
     search = search_class(file.search)(plan.space.sampled, seed, *given)
     for params, record in scored:

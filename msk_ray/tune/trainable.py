@@ -89,9 +89,8 @@ def make_trainable(job: Job, resources: dict[str, float]) -> type[tune.Trainable
             with _owned(folder, job):
                 in_frame_named(trial.label, lambda: work(trial, folder))
         except Exception as error:
-            # Whatever failed first on a full disk, perhaps a line of output: the driver must be told about the
-            # disk. The same
-            # holds for a missing file when the whole folder is missing.
+            # Whatever failed first on a full disk, perhaps a line of output: the driver must be told about the disk.
+            # The same holds for a missing file when the whole folder is missing.
             failure = storage_failure(error) or job.experiment.lost(trial.id)
             if failure is None or failure is error:
                 raise
