@@ -155,16 +155,24 @@ def levels_of(rows: Sequence[tuple[str, Any, T]]) -> dict[str, list[T]]:
     if len(numbers) == len(rows) and len(set(numbers)) > 2 * BINS:
         edges = np.quantile(numbers, np.linspace(0.0, 1.0, BINS + 1))
         bins = np.clip(np.searchsorted(edges, numbers, side="right") - 1, 0, BINS - 1)
-        for place in range(BINS):
-            label = f"{edges[place]:.3g} … {edges[place + 1]:.3g}"
-            inside = [item for (_, _, item), own in zip(rows, bins, strict=True) if own == place]
-            if inside:
-                levels[label] = inside
+        filled = sorted(set(bins.tolist()))
+        labels = _bin_labels([(float(edges[place]), float(edges[place + 1])) for place in filled])
+        for label, place in zip(labels, filled, strict=True):
+            levels[label] = [item for (_, _, item), own in zip(rows, bins, strict=True) if own == place]
         return levels
     numeric = len(numbers) == len(rows)
     for label, _, item in sorted(rows, key=lambda row: row[1]) if numeric else rows:
         levels.setdefault(label, []).append(item)
     return levels
+
+
+def _bin_labels(bins: Sequence[tuple[float, float]]) -> list[str]:
+    """`low … high` of each, with three digits or as many as tell them apart."""
+    for digits in range(3, 18):
+        labels = [f"{low:.{digits}g} … {high:.{digits}g}" for low, high in bins]
+        if len(set(labels)) == len(labels):
+            return labels
+    raise AssertionError("different numbers differ within 17 digits")
 
 
 def variance_share(groups: Sequence[Sequence[float]]) -> float | None:

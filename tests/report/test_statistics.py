@@ -58,6 +58,9 @@ def test_levels_of_numbers_and_names() -> None:
     quarters = levels_of(drawn)
     assert [len(scores) for scores in quarters.values()] == [3, 3, 3, 3]
     assert next(iter(quarters.values())) == [0.0, 1.0, 2.0]
+    close = levels_of([("", 1000 + n, float(n)) for n in range(12)])
+    assert list(close) == ["1000 … 1003", "1003 … 1006", "1006 … 1008", "1008 … 1011"], "digits that tell them apart"
+    assert [len(items) for items in close.values()] == [3, 3, 3, 3]
 
 
 def test_the_parameter_that_matters_comes_first() -> None:
