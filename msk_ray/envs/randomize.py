@@ -69,9 +69,8 @@ class Randomizer:
     """
 
     def __init__(self, config: RandomizeConfig, model: mujoco.MjModel, device: torch.device, seed: int) -> None:
-        # With the seed of the generator of initial states, the numbers would be the very ones these are drawn from.
-        own = int(np.random.SeedSequence((seed, _STREAM)).generate_state(1)[0])
-        self.generator = torch.Generator(device=device).manual_seed(own)
+        self.generator = torch.Generator(device=device)
+        self.seed(seed)
         self._device = device
         chosen = {name: _chosen(model, name, draw) for name, draw in config.drawn.items()}
         owners = {name: _owners(model, name, rows) for name, rows in chosen.items()}
@@ -86,6 +85,12 @@ class Randomizer:
         self._const, self._slope = (torch.cat(parts, dim=-1) for parts in zip(*linear.values(), strict=True))
         self._shapes = {name: attrgetter(name)(model).shape for name in linear}
         self.parameters = tuple(self._shapes)
+
+    def seed(self, seed: int) -> None:
+        """Draw from now on as after construction with this seed, the environment's."""
+        # With the seed of the generator of initial states, the numbers would be the very ones these are drawn from.
+        own = int(np.random.SeedSequence((seed, _STREAM)).generate_state(1)[0])
+        self.generator.manual_seed(own)
 
     def draw(self, count: int) -> Tensor:
         """Numbers of `count` episodes, (count, K)."""

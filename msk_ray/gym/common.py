@@ -40,4 +40,4 @@ def seed_env(env: Env[Any], seed: int) -> None:
     """Draw initial states, and randomized parameters, from a seed."""
     env.generator.manual_seed(seed)
     if env.randomizer is not None:
-        env.randomizer.generator.manual_seed(seed)
+        env.randomizer.seed(seed)

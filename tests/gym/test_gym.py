@@ -64,6 +64,16 @@ def test_the_last_observation_of_an_episode_is_kept_beside_the_first_of_the_next
     assert not np.array_equal(batched.reset()[0], first)
 
 
+def test_a_seed_draws_states_and_parameters_that_tell_nothing_of_each_other() -> None:
+    changes = {"physics.randomize": {"body_mass": {"low": 0.5, "high": 1.5}}, "trial.seed": 3}
+    env = BatchedEnv(_cartpole(**changes), 4).env
+    first = env.state
+    again = BatchedEnv(_cartpole(**changes | {"trial.seed": 4}), 4)
+    again.reset(seed=3)
+    assert torch.equal(again.env.state.physics.qpos, first.physics.qpos)
+    assert torch.equal(again.env.state.numbers, first.numbers), "as in a trial of this seed"
+
+
 def test_tensors_and_arrays_say_the_same(batched: BatchedEnv[np.ndarray]) -> None:
     tensors: BatchedEnv[torch.Tensor] = BatchedEnv(_cartpole(**{"env.episode_length": 3}), 4, arrays="torch")
     obs, _ = batched.reset(seed=5)
