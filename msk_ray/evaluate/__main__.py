@@ -143,9 +143,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _evaluate_zoo(target: Target, args: argparse.Namespace) -> int:
     """Evaluate the policies of a zoo, each as its entry says."""
-    for option in ("worlds", "seeds", "steps", "physics", "vary", "elsewhere", "python"):
+    for option in ("worlds", "seeds", "steps", "physics", "vary", "conditions", "elsewhere", "python"):
         if getattr(args, option) is not None:
-            shown = "in" if option == "elsewhere" else option
+            shown = {"elsewhere": "in", "conditions": "with"}.get(option, option)
             raise ConfigError(f"--{shown}: the policies of {target.path} are evaluated as recorded there; leave it out")
     zoo.read_zoo(target.path)  # torch and Warp take seconds to load; a damaged entry should not wait for them
     announce(f"evaluating the policies of {target.path} as recorded there; {COMPILING}")

@@ -103,7 +103,8 @@ class Bench:
         own = config.evaluation.model_copy(update={k: v for k, v in changes.items() if v is not None})
         config = config.model_copy(update={"evaluation": own})
         settings = env_class(config.env).reference_settings(config.env)
-        key = repr((settings, physics, request.varied, own.nworld, own.steps, own.seed))
+        sizes = (own.nworld, own.steps, own.seed)
+        key = repr((settings, physics, request.varied, sizes, config.trial.deterministic))
         if key not in self._evaluators:
             with named_out_of_memory(self._device, own.nworld, *_WORLDS):
                 self._evaluators[key] = Evaluator(config, self._device, physics, request.varied)

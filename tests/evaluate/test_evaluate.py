@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from msk_ray.cli import run
+from msk_ray.config import parse_config
 from msk_ray.errors import CheckpointError
 from msk_ray.evaluate.__main__ import main
 from msk_ray.evaluate.measure import Bench, Request, figures
@@ -150,6 +151,17 @@ def test_physics_by_name(ant_trial: Path) -> None:
     assert reference["score"] == own["score"]  # this trial trains on the reference physics as it stands
     assert set(reference["terms"]) == {"forward_vel", "up", "heading", "height", "action"}
     assert "vx" in reference["outcomes"]
+
+
+def test_trials_share_a_simulation_unless_one_adds_up_in_a_fixed_order(tiny_settings: dict[str, Any]) -> None:
+    bench = Bench("cpu")
+    trials = [{}, {"seed": 1}, {"deterministic": True}]
+    one, other, ordered = (
+        bench.evaluator(parse_config({**tiny_settings, "trial": trial}), Request())[0] for trial in trials
+    )
+    assert one is other
+    assert ordered is not one
+    assert ordered.env.sim.batch.ordered
 
 
 def test_figures_by_hand() -> None:

@@ -194,7 +194,8 @@ def test_bad_input_of_a_zoo_is_one_line(copy: Path, capsys: pytest.CaptureFixtur
         (error,) = capsys.readouterr().err.splitlines()
         return error
 
-    assert "evaluated as recorded there; leave it out" in refused(evaluate, "--worlds", "3")
+    for option, value in (("--worlds", "3"), ("--with", "push")):
+        assert f"{option}: the policies of {copy} are evaluated as recorded there" in refused(evaluate, option, value)
     assert "holds several policies; give one of them: pole.pt" in refused(visualize, "--no-render")
     shutil.copy(SHIPPED / "cartpole.pt", copy / "pole.pt")
     assert "pole.yaml is about another policy than pole.pt" in refused(evaluate)
