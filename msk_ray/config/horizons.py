@@ -31,8 +31,7 @@ class _BoundedHorizon(Section):
     def _bounds(self) -> _BoundedHorizon:
         if not self.shortest <= self.start <= self.longest:
             raise ValueError(
-                f"adaptive horizon: start {self.start} must be between shortest {self.shortest} and longest "
-                f"{self.longest}"
+                f"shac.horizon: start {self.start} must be between shortest {self.shortest} and longest {self.longest}"
             )
         return self
 

@@ -143,8 +143,7 @@ def describe_fault(
     faults = error.errors()
     # A misspelt key is often missing under its right name too; report the misspelling.
     first = min(faults, key=lambda fault: fault["type"] != "extra_forbidden")
-    # Discriminated unions put the tag into the location; it is not a key of the file.
-    location = [shortened(str(part)) for part in first["loc"] if part not in _TAGS]
+    location = [shortened(str(part)) for part in _without_tags(first["loc"])]
     where = ".".join(location)
     if first["type"] == "extra_forbidden":
         section = _model_at(root, location[:-1], first["loc"], named or {})
@@ -170,8 +169,14 @@ def describe_fault(
 _MAX_MESSAGE = 400
 
 
-_TAGS = ("constant", "schedule", "adaptive")
-"""Tags of discriminated unions, which pydantic puts into an error's location."""
+_TAGGED = {"horizon": ("constant", "schedule", "adaptive", "contact")}
+"""Settings of several kinds, and the tags of these."""
+
+
+def _without_tags(location: tuple[Any, ...]) -> list[Any]:
+    """An error's location without the tags that pydantic puts behind a setting of several kinds: they are no keys."""
+    pairs = zip((None, *location), location, strict=False)
+    return [part for before, part in pairs if part not in _TAGGED.get(str(before), ())]
 
 
 def _is_model(kind: Any) -> bool:

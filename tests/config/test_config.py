@@ -105,7 +105,12 @@ def test_substeps_follow_from_either_setting() -> None:
             "shac.horizon={start: 4, target: 8, longset: 9}",
             "shac.horizon.longset: unknown key; did you mean 'longest'?",
         ),
-        ("shac.horizon={start: 2, target: 8}", "must be between shortest 4 and longest 64"),
+        (
+            "shac.horizon={start: 4, contact: 8, longset: 9}",
+            "shac.horizon.longset: unknown key; did you mean 'longest'?",
+        ),
+        ("shac.horizon={start: 4, contact: -8}", "shac.horizon.contact: Input should be greater than 0"),
+        ("shac.horizon={start: 2, target: 8}", "shac.horizon: start 2 must be between shortest 4 and longest 64"),
         ("curriculum={start: {}, epochs: 3}", "write at least one of solref"),
         ("curriculum={start: {friction: 2}, epochs: 3}", "curriculum: cartpole has no contacts"),
         ("shac.entropy={coefficient: 0}", "shac.entropy.coefficient: Input should be greater than 0"),
