@@ -124,7 +124,7 @@ def _named(data: Any) -> dict[str, type[BaseModel]]:
         found["env"] = settings_class(env_name(data))
     algorithm = data.get("algorithm")
     name = algorithm.get("name") if isinstance(algorithm, Mapping) else None
-    if name is not None and name not in BUILT_IN:
+    if isinstance(name, str) and name not in BUILT_IN:
         with contextlib.suppress(ConfigError):
             found["algorithm.settings"] = settings_from_outside(name)
     return found

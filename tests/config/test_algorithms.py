@@ -69,6 +69,7 @@ def test_a_section_that_is_dropped_is_still_checked() -> None:
     ("changes", "message"),
     [
         ({"algorithm": {"name": "pppo"}}, "algorithm.name: unknown name 'pppo'; did you mean 'ppo'"),
+        ({"algorithm": {"name": []}}, "algorithm.name: Input should be a valid string"),
         ({"algorithm": {"nam": "ppo"}}, "algorithm.nam: unknown key; did you mean 'name'"),
         ({"algorithm": {"settings": {"horizon": 4}}}, "algorithm.settings: the settings of shac .* write shac.horizon"),
         ({"algorithm": {"name": "no_such_module:Walk"}}, "algorithm.name: no module 'no_such_module'"),
