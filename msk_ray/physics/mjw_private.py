@@ -14,6 +14,7 @@ from mujoco_warp._src.collision_primitive_core import (
     sphere_sphere,
 )
 from mujoco_warp._src.constraint import _contact_kbimp as contact_kbimp
+from mujoco_warp._src.derivative import _qderiv_actuator_passive_vel as actuator_velocity_slopes
 from mujoco_warp._src.math import (
     deriv_expmap,
     inert_vec,
@@ -75,6 +76,7 @@ __all__ = [
     "ConstraintType",
     "EqType",
     "WrapType",
+    "actuator_velocity_slopes",
     "capsule_capsule",
     "cholesky_factorize_solve",
     "contact_kbimp",

@@ -80,8 +80,9 @@ MEMBERS = {
         "CYLINDER": mujoco.mjtWrap.mjWRAP_CYLINDER,
     },
 }
-# Functions and kernels of the Newton solver, around which `physics.ordered.solve` is built: all of their text counts.
+# Functions and kernels around which `physics.ordered` builds stages of its own: all of their text counts.
 SOURCES: dict[str, str] = {
+    "actuator_velocity_slopes": "e48909bc9b681b60",
     "cholesky_factorize_solve": "2a5ee35790e5f9c4",
     "create_solver_context": "e10a84bfd7dfcf18",
     "init_context": "f6184b56c9f0a494",

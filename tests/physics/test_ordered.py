@@ -254,6 +254,60 @@ def test_tendons_are_those_of_the_package_and_elements_of_one_never_meet() -> No
         assert len(places) == count
 
 
+def driven_arm() -> mujoco.MjModel:
+    """An arm under implicitfast with a servo, a damper and muscles, two of which share its joints."""
+    text = """<mujoco><option timestep="0.005" integrator="implicitfast"/><worldbody>
+        <site name="s0" pos="0 0 0.05"/>
+        <body><joint name="a" axis="0 1 0" damping="0.1"/><geom type="capsule" size="0.02" fromto="0 0 0 0.3 0 0"/>
+          <body pos="0.3 0 0"><joint name="b" axis="0 1 0"/><geom type="capsule" size="0.02" fromto="0 0 0 0.3 0 0"/>
+            <site name="s1" pos="0.1 0 0.04"/>
+            <body pos="0.3 0 0"><joint name="c" axis="0 0 1"/><geom type="capsule" size="0.02" fromto="0 0 0 0.2 0 0"/>
+            </body></body></body>
+        <body pos="0 1 0"><joint name="d" axis="0 1 0"/><geom type="capsule" size="0.02" fromto="0 0 0 0.3 0 0"/></body>
+      </worldbody>
+      <tendon><spatial name="t"><site site="s0"/><site site="s1"/></spatial>
+        <fixed name="f"><joint joint="c" coef="0.1"/><joint joint="d" coef="-0.2"/></fixed></tendon>
+      <actuator><position joint="a" kp="20" kv="3"/><muscle tendon="t" force="50"/><damper joint="b" kv="2"
+        ctrlrange="0 1"/><position tendon="f" kp="5" kv="4"/><motor joint="d"/></actuator></mujoco>"""
+    return mujoco.MjModel.from_xml_string(text)
+
+
+def test_actuators_add_to_the_implicit_matrix_in_their_order() -> None:
+    """The package's matrix, step and pullback but for rounding, and no thread that meets another."""
+    mjm = driven_arm()
+
+    def run(ordered: bool) -> list[np.ndarray]:
+        batch = WorldBatch(mjm, WORLDS, 1, "cpu", ordered=ordered)
+        assert not batch.stages.summing(batch.model).opt.deterministic
+        tape = TapePerSubstep()
+        tape.attach(batch)
+        rng, data = np.random.default_rng(0), batch.data
+        data.qpos.assign(rng.uniform(-0.5, 0.5, size=(WORLDS, mjm.nq)).astype(np.float32))
+        data.qvel.assign(rng.normal(size=(WORLDS, mjm.nv)).astype(np.float32))
+        data.ctrl.assign(rng.uniform(0.1, 1.0, size=(WORLDS, mjm.nu)).astype(np.float32))
+        data.act.assign(rng.uniform(0.1, 1.0, size=(WORLDS, mjm.na)).astype(np.float32))
+        mjw.forward(batch.model, data)
+        out = wp.zeros((WORLDS, batch.model.nC), dtype=float, device="cpu")
+        batch.stages.slopes(batch.model, data, out)
+        tape.launch_step(batch)
+        for view in tape.cotangent:
+            view.copy_(torch.linspace(-1.0, 1.0, view.numel()).view(view.shape))
+        tape.launch_backward()
+        inertia = np.array(data.M.numpy())
+        return [
+            np.array(out.numpy()),
+            inertia,
+            *(v.numpy().copy() for v in tape.cotangent),
+            data.qvel.numpy(),
+            data.act.numpy(),
+        ]
+
+    ours, theirs = run(True), run(False)
+    assert np.abs(theirs[0] - theirs[1]).max() > 0.05 * np.abs(theirs[1]).max()
+    for one, other in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5 * float(np.abs(other).max()))
+
+
 def test_a_sparse_jacobian_is_made_dense() -> None:
     mjm = model("elliptic", "sparse")
     batch = WorldBatch(mjm, 1, 1, "cpu", ordered=True)

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import mujoco_warp as mjw
 import warp as wp
 
 from msk_ray.physics.adjoint.free_bodies import FreeBodySolves
@@ -193,7 +192,7 @@ class LinearSystems:
         work, m, d, settings = self._work, self._work.model, at.data, self._work.settings
         if settings.implicit_all:
             # M - h ∂τ/∂v of the implicitfast integrator, in the sparse layout of M
-            mjw.deriv_smooth_vel(work.stages.summing(m), d, self._step)
+            work.stages.slopes(m, d, self._step)
             if self._free is not None:
                 self._free.hold(at, self._step)
         wp.launch(

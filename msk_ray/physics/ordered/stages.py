@@ -12,6 +12,7 @@ from msk_ray.errors import UnsupportedModelError
 from msk_ray.physics.branches import motors_apart
 from msk_ray.physics.ordered.contacts import ContactOrder
 from msk_ray.physics.ordered.rows import RowOrder
+from msk_ray.physics.ordered.slopes import SlopeOrder, slopes_apart
 from msk_ray.physics.ordered.solve import solve
 from msk_ray.physics.ordered.tendons import TendonOrder
 
@@ -30,6 +31,9 @@ class Stages(Protocol):
 
     def tendon(self, model: Any, data: Any) -> None:
         """Launch lengths and Jacobians of tendons."""
+
+    def slopes(self, model: Any, data: Any, out: wp.array) -> None:
+        """Launch M - h ∂τ/∂v of the implicitfast integrator, in the layout of M, into `out` (W, nC)."""
 
     def summing(self, model: Any) -> Any:
         """The model to give to stages of mujoco_warp that are launched one by one."""
@@ -51,6 +55,10 @@ class PackageStages:
     def tendon(self, model: Any, data: Any) -> None:
         """Launch `mujoco_warp.tendon`."""
         mjw.tendon(model, data)
+
+    def slopes(self, model: Any, data: Any, out: wp.array) -> None:
+        """Launch `mujoco_warp.deriv_smooth_vel`."""
+        mjw.deriv_smooth_vel(model, data, out)
 
     def summing(self, model: Any) -> Any:
         """The model itself."""
@@ -92,7 +100,7 @@ def racing(mjm: mujoco.MjModel, model: Any) -> frozenset[str]:
         or bool(np.any(mjm.tendon_actfrclimited)),
         # The inertia of a larger tree is factored over its branches.
         "acceleration": len(trees) > 0 and int(trees.max()) > _DENSE_TREE,
-        "integration": mjm.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER,
+        "integration": mjm.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER and not slopes_apart(mjm, model),
     }
     return frozenset(name for name, races in found.items() if races)
 
@@ -164,6 +172,8 @@ class OrderedStages:
         opt.deterministic = int(mjw.DeterminismType.ATOMICS)
         self._atomic.opt = opt
         self._tendons = TendonOrder(model) if mjm.ntendon else None
+        implicit = mjm.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        self._slopes = SlopeOrder(mjm, model) if implicit and "integration" not in self.racing else None
         self._contacts: dict[tuple[int, int], ContactOrder] = {}
         self._rows: dict[tuple[int, int], RowOrder] = {}
 
@@ -202,6 +212,13 @@ class OrderedStages:
         if self._tendons is not None:
             self._tendons.launch(data)
 
+    def slopes(self, model: Any, data: Any, out: wp.array) -> None:
+        """Launch M - h ∂τ/∂v of the implicitfast integrator, in the layout of M, into `out` (W, nC)."""
+        if self._slopes is not None:
+            self._slopes.launch(model, data, out)
+        else:
+            mjw.deriv_smooth_vel(self._of("integration", model), data, out)
+
     def summing(self, model: Any) -> Any:
         """A model whose sums through atomics Warp adds up in a fixed order."""
         return self._atomic if self.racing else model
@@ -236,6 +253,8 @@ class OrderedStages:
         mjw.sensor_acc(model, data)
         if model.opt.integrator == mjw.IntegratorType.EULER:
             mjw.euler(self._of("acceleration", model), data)
+        elif self._slopes is not None:
+            self._slopes.integrate(model, data)
         else:
             mjw.implicit(self._of("integration", model), data)
 
