@@ -8,21 +8,21 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from msk_ray.envs.base import Env as Env
-    from msk_ray.envs.base import EnvState as EnvState
-    from msk_ray.envs.base import Resets as Resets
-    from msk_ray.envs.base import Transition as Transition
     from msk_ray.envs.make import env_class as env_class
     from msk_ray.envs.make import make_env as make_env
     from msk_ray.envs.mjcf.config import MjcfSettings as MjcfSettings
     from msk_ray.envs.mjcf.env import MjcfEnv as MjcfEnv
+    from msk_ray.envs.records import EnvState as EnvState
+    from msk_ray.envs.records import Resets as Resets
+    from msk_ray.envs.records import Transition as Transition
 
 _HOMES = {
     "Env": "msk_ray.envs.base",
-    "EnvState": "msk_ray.envs.base",
+    "EnvState": "msk_ray.envs.records",
     "MjcfEnv": "msk_ray.envs.mjcf.env",
     "MjcfSettings": "msk_ray.envs.mjcf.config",
-    "Resets": "msk_ray.envs.base",
-    "Transition": "msk_ray.envs.base",
+    "Resets": "msk_ray.envs.records",
+    "Transition": "msk_ray.envs.records",
     "env_class": "msk_ray.envs.make",
     "make_env": "msk_ray.envs.make",
 }

@@ -8,7 +8,7 @@ import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import mujoco
 import torch
@@ -17,6 +17,7 @@ from torch import Tensor
 from msk_ray.config import EnvSettings, PhysicsConfig
 from msk_ray.envs.layout import Entry
 from msk_ray.envs.randomize import Randomizer
+from msk_ray.envs.records import EnvState, Resets, Transition
 from msk_ray.errors import ConfigError
 from msk_ray.group import ALONE, Group
 from msk_ray.physics.capacity import Capacity
@@ -28,50 +29,6 @@ SettingsT = TypeVar("SettingsT", bound=EnvSettings)
 
 # A world whose state exceeds this bound has diverged: no model here reaches it as long as the solver works.
 _STATE_BOUND = 1e6
-
-
-class EnvState(NamedTuple):
-    """The state of every world."""
-
-    physics: StepState
-    """Physical state, attached to the graph."""
-    action: Tensor
-    """Last action, shape (W, A), attached."""
-    age: Tensor
-    """Env steps since reset, shape (W,), int64."""
-    numbers: Tensor
-    """Numbers drawn for each world's episode, shape (W, K + T): K by `physics.randomize`, then T of the task."""
-
-    def detach(self) -> "EnvState":
-        """The same state, cut from the graph."""
-        return EnvState(StepState(*(t.detach() for t in self.physics)), self.action.detach(), self.age, self.numbers)
-
-
-class Resets(NamedTuple):
-    """What the next episodes of worlds begin with; N episodes."""
-
-    physics: StepState
-    """Physical states, each (N, n)."""
-    numbers: Tensor
-    """As in `EnvState`, (N, K + T)."""
-
-
-class Transition(NamedTuple):
-    """One env step of all worlds."""
-
-    reward: Tensor
-    """Reward, shape (W,); 0 in a world that diverged."""
-    terms: Tensor
-    """Weighted parts of the reward, detached, which sum to it, shape (W, T), named by the environment's
-    `reward_names`."""
-    obs: Tensor
-    """Observation of the state reached, before any reset, shape (W, O)."""
-    terminated: Tensor
-    """The episode ended by itself (fell, diverged): nothing follows, shape (W,) bool."""
-    truncated: Tensor
-    """The time limit cut the episode: the value of later steps still counts, shape (W,) bool."""
-    diverged: Tensor
-    """The physics exceeded all bounds, shape (W,) bool; included in `terminated`."""
 
 
 class Env(ABC, Generic[SettingsT]):

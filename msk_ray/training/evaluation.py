@@ -9,7 +9,7 @@ from torch import Tensor
 
 from msk_ray.config import Config, PhysicsConfig, RandomizeConfig
 from msk_ray.envs import Env, env_class, make_env
-from msk_ray.envs.base import Resets, Transition
+from msk_ray.envs.records import Resets, Transition
 from msk_ray.errors import ConfigError
 from msk_ray.simulation import StepState
 from msk_ray.training.policy_group import Policy, PolicyGroup, streams_for

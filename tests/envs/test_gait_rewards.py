@@ -10,7 +10,6 @@ from pydantic import ValidationError
 
 from msk_ray.config import PhysicsConfig
 from msk_ray.envs import make_env
-from msk_ray.envs.base import EnvState
 from msk_ray.envs.legs import terms
 from msk_ray.envs.legs.clock import fourier, series, window
 from msk_ray.envs.legs.config import LegReward
@@ -19,6 +18,7 @@ from msk_ray.envs.legs.push import pushes
 from msk_ray.envs.legs.reference import people_angles
 from msk_ray.envs.myoleg26.config import MyoLeg26Settings
 from msk_ray.envs.myoleg26.env import MyoLeg26
+from msk_ray.envs.records import EnvState
 from msk_ray.simulation import StepState
 
 EVERY = {"metabolic": 0.1, "fatigue": 0.1, "head": 0.1, "impact": 0.1, "footfall": 0.1, "clearance": 0.1, "track": 0.5}
