@@ -11,7 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from msk_ray.errors import ConfigError, UnsupportedModelError
-from msk_ray.physics.capacity import UNKNOWN, Capacity, default_capacity, scalar_rows
+from msk_ray.physics.capacity import UNKNOWN, Capacity, default_capacity, geometric_bound, scalar_rows
 from msk_ray.physics.graph import joined_stream
 from msk_ray.physics.iterations import IterationWatch
 from msk_ray.physics.ordered import OrderedStages, check_ordered, dense
@@ -147,6 +147,10 @@ class WorldBatch:
                 model.opt.tolerance = wp.array([self._tolerance], dtype=float)
             model.opt.warn_overflow = 0  # read back by `losses`, not printed from kernels
             model.ncam = model.nlight = 0  # nothing looks: two launches less a substep
+            if geometric_bound(self.structure) == Capacity(0, 0):
+                model.opt.disableflags |= (
+                    mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+                )  # nothing looks for rows that cannot be
             open_arrays(self.mjm, model, self.parameters, nworld)
             if self.ordered:
                 self.stages = OrderedStages(self.structure, model)
@@ -163,6 +167,10 @@ class WorldBatch:
         self.capacity = capacity
         with wp.ScopedDevice(self.device):
             self.data = mjw.make_data(self.structure, nworld=nworld, nconmax=capacity.contacts, njmax=capacity.rows)
+            if capacity.rows == 0:
+                # Integrators read M qacc where the solver leaves it, which mujoco_warp leaves out without rows: then it
+                # is the smooth force.
+                self.data.efc.Ma = self.data.qfrc_smooth
         self.losses = LossWatch(self.data, self.device)
         self.iterations = IterationWatch(self.substeps, nworld, self.device)
 

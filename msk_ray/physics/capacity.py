@@ -115,15 +115,22 @@ def geometric_bound(model: mujoco.MjModel) -> Capacity | None:
     """Room that no pose can exceed, or None where a geometry sets no bound (height fields, distance fields, flexes).
 
     Counts every pair of geoms that the collision masks or explicit pairs let through; the parent filter is not
-    applied, so the bound errs upwards.
+    applied, so the bound errs upwards. It is zero for a model without contacts and other constraints.
     """
+    off, bit = model.opt.disableflags, mujoco.mjtDisableBit
+    if off & bit.mjDSBL_CONSTRAINT:
+        return Capacity(0, 0)
+    if model.nflex:
+        return None
+    if off & bit.mjDSBL_CONTACT:
+        return Capacity(0, scalar_rows(model))
     pairs = candidate_pairs(model, filtered=False)
     counts = contacts_of(model, pairs)
-    if model.nflex or np.any(counts > mujoco.mjMAXCONPAIR):
+    if np.any(counts > mujoco.mjMAXCONPAIR):
         return None
     contacts = max(int(counts.sum()), len(pairs))
     rows = int((counts * rows_per_contact(model, pairs)).sum()) + scalar_rows(model)
-    return Capacity(max(contacts, 1), max(rows, 1))
+    return Capacity(contacts, rows)
 
 
 def default_capacity(model: mujoco.MjModel) -> tuple[Capacity, Capacity | None]:

@@ -90,7 +90,7 @@ class Engine:
         """
         self.settle()
         _, limited, used = self.batch.losses.read()
-        room = self.batch.capacity
+        room = self.batch.capacity.at_least(Capacity(1, 1))  # a model that can have none uses none of it
         figures = {
             "solver_limit_share": limited,
             "contacts_share": used.contacts / room.contacts,

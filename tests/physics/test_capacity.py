@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 from mujoco_warp import OverflowType
-from scenes import ant, studded_plate
+from scenes import ant, cartpole, studded_plate
 
 from msk_ray.errors import SimulationError
 from msk_ray.physics import TapedStep, WarpState, WorldBatch, capacity
@@ -18,6 +18,35 @@ def test_a_small_bound_is_taken_as_it_is_and_worked_out_by_hand():
     # 8 capsules of 2 contacts and a sphere of 1 on the plane, 4 pyramid rows each; 8 hinges limited on both sides.
     assert geometric_bound(ant()) == Capacity(17, 4 * 17 + 2 * 8)
     assert default_capacity(ant()) == (Capacity(17, 84), Capacity(17, 84))
+
+
+def test_a_model_that_can_have_no_constraints_gets_no_room_for_them():
+    model = cartpole()
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    assert default_capacity(model) == (Capacity(0, 0), Capacity(0, 0))
+    model.jnt_limited[:] = [1, 0]  # on both sides
+    assert geometric_bound(model) == Capacity(0, 2)
+    model = ant()
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    assert geometric_bound(model) == Capacity(0, 0)
+
+
+@pytest.mark.parametrize("integrator", ["EULER", "IMPLICITFAST"])
+def test_without_room_for_rows_the_step_is_that_of_c_mujoco(integrator):
+    """Damped, because implicit damping needs M qacc, which mujoco_warp leaves to its solver."""
+    model = cartpole()
+    model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator}")
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    model.dof_damping[:] = [3.0, 0.1]
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:], data.ctrl[:] = [0.3, 0.7], [1.0, -2.0], 0.5
+    batch = WorldBatch(model, 1, 2, "cpu")
+    for name in ("qpos", "qvel", "ctrl"):
+        getattr(batch.data, name).assign(getattr(data, name)[None].astype(np.float32))
+    batch.launch_step()
+    mujoco.mj_step(model, data, nstep=2)
+    np.testing.assert_allclose(batch.data.qvel.numpy()[0], data.qvel, rtol=1e-5)
+    np.testing.assert_allclose(batch.data.qpos.numpy()[0], data.qpos, rtol=1e-5)
 
 
 def test_a_large_bound_is_tried_out():

@@ -32,9 +32,11 @@ def errors_of(model, points, substeps, mode):
     return errors, len(errors["qpos"])
 
 
-@pytest.mark.parametrize("substeps", [1, 16])
-def test_cartpole(substeps):
+@pytest.mark.parametrize(("substeps", "contacts"), [(1, True), (16, True), (16, False)])
+def test_cartpole(substeps, contacts):
     model = cartpole()
+    if not contacts:  # then there is no room for any rows
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     rng = np.random.default_rng(0)
     points = [
         float32(rng.normal(size=2), rng.normal(size=2), np.zeros(0), rng.uniform(-0.9, 0.9, size=1)) for _ in range(6)
