@@ -7,10 +7,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from msk_ray.algorithms.shac.optimizer import RateAdam, clip_gradients
+from msk_ray.algorithms.shac.optimizer import RateAdam, clip
 from msk_ray.errors import ConfigError
 from msk_ray.group import ALONE, Group
 from msk_ray.networks import Critic
+from msk_ray.networks.chain import Chain
 
 _WINDOW = 4
 """Changes of the loss from pass to pass that count together."""
@@ -63,14 +64,16 @@ class CriticFit:
         device = next(critic.parameters()).device
         if arithmetic.tf32 and (device.type != "cuda" or torch.cuda.get_device_capability(device) < (8, 0)):
             raise ConfigError(f"shac.critic_products: {device.type} has no tf32 here: write float32")
+        # Kept, because a module looks for its parameters everywhere below it each time.
+        self._members = [list(member.parameters()) for member in critic.members]
+        self._parameters = [parameter for member in self._members for parameter in member]
         self._values = critic.fused if arithmetic.fused else critic
+        by_hand = device.type == "cpu" and not arithmetic.fused
+        self._chains = [Chain(member.children()) for member in critic.members] if by_hand else None
         self._grad_norm = grad_norm
         self._tolerance = tolerance
         self._tf32 = arithmetic.tf32
         self._group = group
-        # Kept, because a module looks for its parameters everywhere below it each time.
-        self._members = [list(member.parameters()) for member in critic.members]
-        self._parameters = [parameter for member in self._members for parameter in member]
         self.optimizer = RateAdam(self._parameters, learning_rate, betas, weight_decay)
 
     def draw_orders(self, rows: int, passes: int, generator: torch.Generator) -> Tensor:
@@ -108,17 +111,35 @@ class CriticFit:
         settled = change < self._tolerance * passes[-1]
         return settled if before is None else settled | before
 
+    @torch.no_grad()
     def _step(self, obs: Tensor, targets: Tensor, skip: Tensor | None) -> Tensor:
-        loss = (self._values(obs) - targets).square().mean()
-        self.optimizer.zero_grad()
-        loss.backward()
-        mean = loss.detach()
-        self._group.mean([mean, *(p.grad for p in self._parameters if p.grad is not None)])
+        find = self._by_autograd if self._chains is None else self._by_hand
+        mean, gradients = find(obs, targets)
+        self._group.mean([mean, *(gradient for member in gradients for gradient in member)])
         if self._grad_norm is not None:
-            for parameters in self._members:
-                clip_gradients(parameters, self._grad_norm)
-        self.optimizer.step(skip)
+            gradients = [clip(member, self._grad_norm)[0] for member in gradients]
+        self.optimizer.step_along([gradient for member in gradients for gradient in member], skip)
         return mean
+
+    def _by_autograd(self, obs: Tensor, targets: Tensor) -> tuple[Tensor, list[list[Tensor]]]:
+        """The loss of rows, and its gradients by member and parameter."""
+        with torch.enable_grad():
+            loss = (self._values(obs) - targets).square().mean()
+            found = iter(torch.autograd.grad(loss, self._parameters))
+        return loss.detach(), [[next(found) for _ in member] for member in self._members]
+
+    def _by_hand(self, obs: Tensor, targets: Tensor) -> tuple[Tensor, list[list[Tensor]]]:
+        """The same on a CPU."""
+        assert self._chains is not None
+        loss, found = obs.new_zeros(()), []
+        scale = 1.0 / (len(self._chains) * len(obs))
+        for chain, parameters in zip(self._chains, self._members, strict=True):
+            values, kept = chain.forward(obs, parameters)
+            error = values - targets[:, None]
+            loss += scale * error.square().sum()
+            _, gradients = chain.backward(kept, error.mul_(2.0 * scale), of_x=False)
+            found.append(gradients)
+        return loss, found
 
 
 @contextmanager

@@ -13,24 +13,28 @@ tensor, or each 65536 elements of one, so that for three layers nearly all of th
 _NORM_EPSILON = 1e-6
 
 
-def clip_gradients(parameters: Sequence[nn.Parameter], limit: float) -> Tensor:
-    """Bound the joint norm of the gradients, in place, and return it as it was; infinity for no bound."""
-    if parameters[0].device.type == "cpu":
-        return nn.utils.clip_grad_norm_(parameters, limit)
-    return clip_flat(parameters, limit)
+@torch.no_grad()
+def clip_gradients(parameters: Iterable[nn.Parameter], limit: float) -> Tensor:
+    """Bound the joint norm of the gradients and return it as it was; infinity for no bound."""
+    used = [parameter for parameter in parameters if parameter.grad is not None]
+    clipped, norm = clip([parameter.grad for parameter in used if parameter.grad is not None], limit)
+    for parameter, part in zip(used, clipped, strict=True):
+        parameter.grad = part
+    return norm
 
 
 @torch.no_grad()
-def clip_flat(parameters: Sequence[nn.Parameter], limit: float) -> Tensor:
-    """The same with all gradients in one tensor, which takes few kernels; their values differ by rounding."""
-    used = [parameter for parameter in parameters if parameter.grad is not None]
-    flat = torch.cat([parameter.grad.flatten() for parameter in used if parameter.grad is not None])
+def clip(gradients: Sequence[Tensor], limit: float) -> tuple[list[Tensor], Tensor]:
+    """Gradients whose joint norm is at most `limit`, in one piece of memory, and their norm before.
+
+    One tensor takes few kernels; torch's own function, with many, differs by rounding.
+    """
+    flat = torch.cat([gradient.flatten() for gradient in gradients])
     norm = torch.linalg.vector_norm(flat)
     if limit < float("inf"):
         flat.mul_((limit / (norm + _NORM_EPSILON)).clamp_max(1.0))
-    for parameter, part in zip(used, flat.split([parameter.numel() for parameter in used]), strict=True):
-        parameter.grad = part.view_as(parameter)
-    return norm
+    parts = flat.split([gradient.numel() for gradient in gradients])
+    return [part.view_as(gradient) for part, gradient in zip(parts, gradients, strict=True)], norm
 
 
 class RateAdam:
@@ -77,15 +81,20 @@ class RateAdam:
         Args:
             skip: a bool scalar; True leaves parameters and moments as they are. The host does not wait for it.
         """
-        gradients = {k: p.grad for k, p in enumerate(self._parameters) if p.grad is not None}
+        self.step_along([parameter.grad for parameter in self._parameters], skip)
+
+    @torch.no_grad()
+    def step_along(self, gradients: Sequence[Tensor | None], skip: Tensor | None = None) -> None:
+        """The same with these gradients, one for each parameter."""
+        used = [k for k, gradient in enumerate(gradients) if gradient is not None]
         skipped = None if skip is None else skip.float()
         self._count += 1 if skipped is None else 1 - skipped
         stepped, means, squares = (
-            self._pieces(values[k] for k in gradients) for values in (self._parameters, self._means, self._squares)
+            self._pieces(values[k] for k in used) for values in (self._parameters, self._means, self._squares)
         )
         torch._fused_adamw_(
             stepped,
-            self._pieces(gradient.contiguous() for gradient in gradients.values()),
+            self._pieces(gradient.contiguous() for gradient in gradients if gradient is not None),
             means,
             squares,
             [],

@@ -66,6 +66,22 @@ def test_a_fit_that_has_settled_takes_no_further_steps() -> None:
     assert not torch.equal(weights["five"], weights["plain"])
 
 
+@pytest.mark.parametrize("grad_norm", [1e-3, None])
+def test_gradients_without_autograd_are_its_own(grad_norm: float | None) -> None:
+    """Of two networks, whose norms are bounded apart, for rows that are no power of two."""
+    generator = torch.Generator().manual_seed(1)
+    obs, targets = torch.randn(30, 3, generator=generator), torch.randn(30, generator=generator)
+    fitted = []
+    for by_hand in (True, False):
+        critic = Critic(CriticConfig(hidden=(8, 8), count=2), 3, torch.Generator().manual_seed(0))
+        fit = CriticFit(critic, 1e-2, (0.7, 0.95), grad_norm)
+        fit._chains = fit._chains if by_hand else None
+        assert (fit._chains is not None) == by_hand
+        loss = fit.run(obs, targets, fit.draw_orders(30, 3, torch.Generator().manual_seed(2)), 2)
+        fitted.append([loss, *(p.detach() for p in critic.parameters())])
+    torch.testing.assert_close(*fitted, rtol=1e-4, atol=1e-5)
+
+
 def test_weight_decay_by_hand() -> None:
     critic = Critic(CriticConfig(hidden=(), layer_norm=False), 1, torch.Generator().manual_seed(0))
     before = [p.detach().clone() for p in critic.parameters()]

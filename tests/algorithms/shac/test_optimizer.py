@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from msk_ray.algorithms.shac.optimizer import RateAdam, clip_flat
+from msk_ray.algorithms.shac.optimizer import RateAdam, clip_gradients
 
 
 def stepped(parameter: nn.Parameter, adam: RateAdam, gradients: list[float]) -> None:
@@ -87,7 +87,7 @@ def test_gradients_clipped_in_one_tensor_are_those_that_torch_clips(limit: float
         parameters[0].grad = torch.arange(6.0).view(3, 2).T
         parameters[1].grad = torch.tensor([0.5, -2.0, 0.0, 1.0])
     expected = nn.utils.clip_grad_norm_(theirs, limit)
-    assert torch.isclose(clip_flat(ours, limit), expected)
+    assert torch.isclose(clip_gradients(ours, limit), expected)
     for a, b in zip(ours[:2], theirs[:2], strict=True):
         torch.testing.assert_close(a.grad, b.grad)
     assert ours[2].grad is None

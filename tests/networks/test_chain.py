@@ -1,0 +1,33 @@
+"""Layers called one by one: torch's outputs and gradients."""
+
+import pytest
+import torch
+
+from msk_ray.config.schema import CriticConfig
+from msk_ray.networks.chain import Chain
+from msk_ray.networks.mlp import make_mlp
+
+
+@pytest.mark.parametrize("layer_norm", [True, False])
+@pytest.mark.parametrize("activation", ["elu", "silu", "relu", "tanh"])
+def test_gradients_are_those_of_autograd(activation: str, layer_norm: bool) -> None:
+    generator = torch.Generator().manual_seed(0)
+    config = CriticConfig(hidden=(7, 4), activation=activation, layer_norm=layer_norm)
+    network = make_mlp(config, 3, 2, generator).double()
+    with torch.no_grad():
+        for parameter in network.parameters():  # biases begin at zero, and gains of norms at one
+            parameter += 0.3 * torch.randn(parameter.shape, generator=generator)
+    x = torch.randn(9, 3, generator=generator).double().requires_grad_()
+    bar = torch.randn(9, 2, generator=generator).double()
+    parameters = list(network.parameters())
+    expected = network(x)
+    gradients = torch.autograd.grad(expected, [x, *parameters], bar)
+    chain = Chain(network.children())
+    with torch.no_grad():
+        y, kept = chain.forward(x, parameters)
+        x_bar, found = chain.backward(kept, bar, of_x=True)
+        unwanted, same = chain.backward(kept, bar, of_x=False)
+    torch.testing.assert_close(y, expected)
+    torch.testing.assert_close([x_bar, *found], list(gradients))
+    assert unwanted is None
+    assert all(map(torch.equal, same, found))
