@@ -5,9 +5,9 @@ from contextlib import contextmanager
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from msk_ray.algorithms.shac.optimizer import RateAdam, clip
+from msk_ray.algorithms.shac.optimizer import RateAdam, clip, clip_flat, views_of
 from msk_ray.errors import ConfigError
 from msk_ray.group import ALONE, Group
 from msk_ray.networks import Critic
@@ -69,7 +69,7 @@ class CriticFit:
         self._parameters = [parameter for member in self._members for parameter in member]
         self._values = critic.fused if arithmetic.fused else critic
         by_hand = device.type == "cpu" and not arithmetic.fused
-        self._chains = [Chain(member.children()) for member in critic.members] if by_hand else None
+        self._passes = [_Pass(member) for member in critic.members] if by_hand else None
         self._grad_norm = grad_norm
         self._tolerance = tolerance
         self._tf32 = arithmetic.tf32
@@ -113,33 +113,58 @@ class CriticFit:
 
     @torch.no_grad()
     def _step(self, obs: Tensor, targets: Tensor, skip: Tensor | None) -> Tensor:
-        find = self._by_autograd if self._chains is None else self._by_hand
+        find = self._by_autograd if self._passes is None else self._by_hand
         mean, gradients = find(obs, targets)
-        self._group.mean([mean, *(gradient for member in gradients for gradient in member)])
-        if self._grad_norm is not None:
-            gradients = [clip(member, self._grad_norm)[0] for member in gradients]
-        self.optimizer.step_along([gradient for member in gradients for gradient in member], skip)
+        self.optimizer.step_along(gradients, skip)
         return mean
 
-    def _by_autograd(self, obs: Tensor, targets: Tensor) -> tuple[Tensor, list[list[Tensor]]]:
-        """The loss of rows, and its gradients by member and parameter."""
+    def _by_autograd(self, obs: Tensor, targets: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """The loss of rows, and the gradient along which the step goes, by parameter."""
         with torch.enable_grad():
             loss = (self._values(obs) - targets).square().mean()
-            found = iter(torch.autograd.grad(loss, self._parameters))
-        return loss.detach(), [[next(found) for _ in member] for member in self._members]
+            found = torch.autograd.grad(loss, self._parameters)
+        mean, gradients = loss.detach(), list(found)
+        self._group.mean([mean, *gradients])
+        if self._grad_norm is None:
+            return mean, gradients
+        each = iter(gradients)
+        clipped = [clip([next(each) for _ in member], self._grad_norm)[0] for member in self._members]
+        return mean, [gradient for member in clipped for gradient in member]
 
-    def _by_hand(self, obs: Tensor, targets: Tensor) -> tuple[Tensor, list[list[Tensor]]]:
-        """The same on a CPU."""
-        assert self._chains is not None
-        loss, found = obs.new_zeros(()), []
-        scale = 1.0 / (len(self._chains) * len(obs))
-        for chain, parameters in zip(self._chains, self._members, strict=True):
-            values, kept = chain.forward(obs, parameters)
-            error = values - targets[:, None]
-            loss += scale * error.square().sum()
-            _, gradients = chain.backward(kept, error.mul_(2.0 * scale), of_x=False)
-            found.append(gradients)
-        return loss, found
+    def _by_hand(self, obs: Tensor, targets: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """The same on a CPU, without the notes of autograd, which take it longer than what they are about."""
+        assert self._passes is not None
+        loss = obs.new_zeros(())
+        for member in self._passes:
+            loss += member.run(obs, targets, 1.0 / len(self._passes))
+        self._group.mean([loss, *(member.gradient for member in self._passes)])
+        if self._grad_norm is not None:
+            for member in self._passes:
+                clip_flat(member.gradient, self._grad_norm)
+        return loss, [part for member in self._passes for part in member.parts]
+
+
+class _Pass:
+    """Loss and gradient of one network on a CPU.
+
+    Attributes:
+        gradient: that of the last `run`, in one piece (N,); `parts` are views of it by parameter.
+    """
+
+    def __init__(self, member: nn.Module) -> None:
+        self._parameters = list(member.parameters())
+        self._chain = Chain(member.children())
+        self.gradient = torch.cat([torch.zeros_like(parameter).flatten() for parameter in self._parameters])
+        self.parts = views_of(self.gradient, self._parameters)
+
+    def run(self, obs: Tensor, targets: Tensor, weight: float) -> Tensor:
+        """The mean squared error of rows, times a weight."""
+        values, kept = self._chain.forward(obs, self._parameters)
+        error = values - targets[:, None]
+        scale = weight / len(obs)
+        loss = scale * error.square().sum()
+        self._chain.backward(kept, error.mul_(2.0 * scale), self.parts, of_x=False)
+        return loss
 
 
 @contextmanager

@@ -30,11 +30,23 @@ def clip(gradients: Sequence[Tensor], limit: float) -> tuple[list[Tensor], Tenso
     One tensor takes few kernels; torch's own function, with many, differs by rounding.
     """
     flat = torch.cat([gradient.flatten() for gradient in gradients])
-    norm = torch.linalg.vector_norm(flat)
+    norm = clip_flat(flat, limit)
+    return views_of(flat, gradients), norm
+
+
+@torch.no_grad()
+def clip_flat(gradient: Tensor, limit: float) -> Tensor:
+    """Bound the norm of one tensor (N,), in place, and return it as it was; infinity for no bound."""
+    norm = torch.linalg.vector_norm(gradient)
     if limit < float("inf"):
-        flat.mul_((limit / (norm + _NORM_EPSILON)).clamp_max(1.0))
-    parts = flat.split([gradient.numel() for gradient in gradients])
-    return [part.view_as(gradient) for part, gradient in zip(parts, gradients, strict=True)], norm
+        gradient.mul_((limit / (norm + _NORM_EPSILON)).clamp_max(1.0))
+    return norm
+
+
+def views_of(flat: Tensor, like: Sequence[Tensor]) -> list[Tensor]:
+    """One tensor (N,) as tensors of these shapes, one after the other."""
+    parts = flat.split([tensor.numel() for tensor in like])
+    return [part.view_as(tensor) for part, tensor in zip(parts, like, strict=True)]
 
 
 class RateAdam:

@@ -75,8 +75,8 @@ def test_gradients_without_autograd_are_its_own(grad_norm: float | None) -> None
     for by_hand in (True, False):
         critic = Critic(CriticConfig(hidden=(8, 8), count=2), 3, torch.Generator().manual_seed(0))
         fit = CriticFit(critic, 1e-2, (0.7, 0.95), grad_norm)
-        fit._chains = fit._chains if by_hand else None
-        assert (fit._chains is not None) == by_hand
+        fit._passes = fit._passes if by_hand else None
+        assert (fit._passes is not None) == by_hand
         loss = fit.run(obs, targets, fit.draw_orders(30, 3, torch.Generator().manual_seed(2)), 2)
         fitted.append([loss, *(p.detach() for p in critic.parameters())])
     torch.testing.assert_close(*fitted, rtol=1e-4, atol=1e-5)
