@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
+from tensorboard.compat.proto.summary_pb2 import Summary
 from torch.utils.tensorboard import SummaryWriter
 
 from msk_ray.errors import StorageFailure
@@ -44,9 +45,12 @@ class TensorBoard(Logger):
         """Log a row."""
         if self._board is None:
             self._board = SummaryWriter(str(self.folder))
-        for name, value in row.items():
-            if name != "epoch":
-                self._board.add_scalar(board_tag(name), value, int(row["epoch"]))
+        values = [
+            Summary.Value(tag=board_tag(name), simple_value=value) for name, value in row.items() if name != "epoch"
+        ]
+        # All in one event: `add_scalar` takes a writer's queue and lock for each.
+        assert self._board.file_writer is not None, "it is open"
+        self._board.file_writer.add_summary(Summary(value=values), int(row["epoch"]))
 
     def write_late(self, row: dict[str, float]) -> None:
         """Log figures of an earlier row, at its epoch."""
