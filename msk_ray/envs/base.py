@@ -22,6 +22,7 @@ from msk_ray.errors import ConfigError
 from msk_ray.group import ALONE, Group
 from msk_ray.physics.capacity import Capacity
 from msk_ray.simulation import Backward, Simulation, StepState
+from msk_ray.simulation.flags import known_none
 from msk_ray.simulation.kinematics import Frames, Kinematics, Names, as_named
 from msk_ray.simulation.tendons import Tendons
 
@@ -176,13 +177,16 @@ class Env(ABC, Generic[SettingsT]):
 
     def reset_state(self) -> EnvState:
         """Fresh initial states of all worlds."""
-        fresh = self._fresh.pop() if self._fresh else self.draw_resets(1)
+        fresh = self._next_resets()
         return EnvState(
             fresh.physics,
             torch.zeros((self.nworld, self.action_size), device=self.device),
             torch.zeros(self.nworld, dtype=torch.int64, device=self.device),
             fresh.numbers,
         )
+
+    def _next_resets(self) -> Resets:
+        return self._fresh.pop() if self._fresh else self.draw_resets(1)
 
     def release_graph(self) -> None:
         """Cut the state from the graph, and forget everything else that would keep the graph in memory."""
@@ -292,8 +296,9 @@ class Env(ABC, Generic[SettingsT]):
         control, force = self.control(action), self.applied_force(before)
         after = self.sim.step(control, *before, qfrc_applied=force, parameters=self.parameters)
         diverged = ~self._is_valid(after)
-        # `where` sends no cotangent into a diverged world's step, so its gradient cannot reach the batch.
-        after = StepState(*(_where(diverged, b.detach(), a) for b, a in zip(before, after, strict=True)))
+        if not (all_valid := known_none(diverged)):
+            # `where` sends no cotangent into a diverged world's step, so its gradient cannot reach the batch.
+            after = StepState(*(_where(diverged, b.detach(), a) for b, a in zip(before, after, strict=True)))
         self._reached, self._diverged = after, diverged
         obs = self.observe(after, action)
         terms = self.reward_terms(after, action, obs)
@@ -309,7 +314,8 @@ class Env(ABC, Generic[SettingsT]):
                 "with torch from state, frames, tendons and action, without .detach(), .item() or numpy",
                 stacklevel=2,
             )
-        terms = terms.masked_fill(diverged[:, None], 0.0)
+        if not all_valid:
+            terms = terms.masked_fill(diverged[:, None], 0.0)
         reward = terms.sum(-1)
         age = self.state.age + 1
         terminated = diverged | self.fell(after)
@@ -385,6 +391,9 @@ class Env(ABC, Generic[SettingsT]):
         return 2.0 * drawn.to(self.device) - 1.0
 
     def _reset_where(self, done: Tensor, reached: EnvState) -> EnvState:
+        if known_none(done):
+            self._next_resets()  # every step takes some, whether a world needs them or not
+            return reached
         fresh = self.reset_state()
         return EnvState(
             StepState(*(_where(done, f, r) for f, r in zip(fresh.physics, reached.physics, strict=True))),

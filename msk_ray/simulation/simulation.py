@@ -15,6 +15,7 @@ from msk_ray.physics import WorldBatch
 from msk_ray.physics.capacity import UNKNOWN, Capacity
 from msk_ray.simulation.backward import Applied, Backward, Needs, StepState
 from msk_ray.simulation.bundles import Bundles, StepParameters
+from msk_ray.simulation.flags import known_none
 from msk_ray.simulation.jacobian import Linearization
 from msk_ray.simulation.modes import make_backward
 from msk_ray.simulation.parameters import check_values
@@ -93,9 +94,12 @@ class WarpSimStep(torch.autograd.Function):
         found = ctx.engine.backward.vjp(saved, cotangent, Needs(*on_state, *on_forces)._replace(parameters=wanted))
         # A linear map takes zero to zero, even in a world whose Jacobian is not finite: 0 × NaN must not leak out.
         unused = torch.cat(cotangent, dim=-1).eq(0).all(-1)
+        all_used = known_none(unused)
 
         def masked(g: Tensor | None) -> Tensor | None:
-            return g if g is None or not g.numel() else g.masked_fill(unused.view(-1, *[1] * (g.dim() - 1)), 0.0)
+            if all_used or g is None or not g.numel():
+                return g
+            return g.masked_fill(unused.view(-1, *[1] * (g.dim() - 1)), 0.0)
 
         states = (masked(g) for g in (found.ctrl, found.qpos, found.qvel, found.act))
         forces = (masked(g) for g in (found.qfrc_applied, found.xfrc_applied)[: len(on_forces)])

@@ -133,6 +133,27 @@ def test_a_diverged_world_is_reset_counted_and_kept_out_of_the_gradient() -> Non
     assert env.state.physics.qvel.isfinite().all()
 
 
+def test_what_a_cpu_leaves_out_where_no_world_is_concerned_changes_nothing(
+    cartpole: CartPole, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """States, rewards and gradients over five steps, in the third of which all episodes end."""
+    runs = []
+    for looks in (True, False):
+        if not looks:  # as on a GPU
+            monkeypatch.setattr("msk_ray.envs.base.known_none", lambda _: False)
+            monkeypatch.setattr("msk_ray.simulation.simulation.known_none", lambda _: False)
+        cartpole.generator.manual_seed(1)
+        cartpole.state = cartpole.reset_state()
+        actions = torch.linspace(-0.9, 0.8, 20).view(5, 4, 1).requires_grad_()
+        steps = [cartpole.step(action) for action in actions]
+        rewards = torch.stack([step.reward for step in steps])
+        (gradient,) = torch.autograd.grad(rewards.sum(), actions)
+        assert [step.truncated.any().item() for step in steps] == [False, False, True, False, False]
+        runs.append((rewards.detach(), gradient, *cartpole.state.detach().physics, cartpole.state.age))
+        cartpole.release_graph()
+    assert all(map(torch.equal, *runs))
+
+
 def test_resets_are_the_same_for_the_same_seed_and_differ_between_worlds() -> None:
     make = lambda seed: make_env(AntSettings(name="ant"), PhysicsConfig(), 4, "cpu", seed, differentiable=False)  # noqa: E731
     first, again, other = make(5).state.physics.qpos, make(5).state.physics.qpos, make(6).state.physics.qpos
