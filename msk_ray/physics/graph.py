@@ -63,25 +63,42 @@ class Graph:
     step cost about 2 ms of Python on CPU (0.2 ms replayed) and 4 ms on GPU (0.3 ms replayed), which is why
     nothing here runs eagerly after start-up.
 
-    `launches` must issue the same kernels on the same arrays every time, and must not read results back.
-    It is run once eagerly first, which compiles its kernels; array contents after construction are undefined.
+    `launches` must issue the same kernels on the same arrays every time, and must not read results back. The first run
+    is eager, because it compiles the kernels. On CUDA that happens at construction, where a lack of memory is an error
+    of the start; array contents are undefined after it. On CPU it is the first replay, and only the second one records:
+    recording costs more than running once.
     """
 
     def __init__(self, launches: Callable[[], None], device: wp.Device) -> None:
         self._device = device
         self._launches = launches
-        with wp.ScopedDevice(device), without_collecting():
-            launches()
-            wp.synchronize_device(device)
-            with wp.ScopedCapture(device=device) as capture:
-                launches()
-        self._graph = capture.graph
+        self._graph: wp.Graph | None = None
+        self._has_run = False
+        if device.is_cuda:
+            self._run()
+            self._record()
 
     def replay(self, stream: wp.Stream | None = None) -> None:
-        """Run the recorded launches, on `stream` if the device is CUDA; within another capture, issue them into it."""
+        """Run the launches, on `stream` if the device is CUDA; within another capture, issue them into it."""
         if joined_stream() is not None:
             # A graph launched into a capture would be a child graph, which may hold no conditional nodes either.
             with wp.ScopedDevice(self._device), wp.ScopedStream(stream, sync_enter=False):
                 self._launches()
-        else:
-            wp.capture_launch(self._graph, stream=stream if self._device.is_cuda else None)
+            return
+        if not self._has_run:
+            self._run()
+            return
+        if self._graph is None:
+            self._record()
+        wp.capture_launch(self._graph, stream=stream if self._device.is_cuda else None)
+
+    def _run(self) -> None:
+        with wp.ScopedDevice(self._device), without_collecting():
+            self._launches()
+            wp.synchronize_device(self._device)
+        self._has_run = True
+
+    def _record(self) -> None:
+        with wp.ScopedDevice(self._device), without_collecting(), wp.ScopedCapture(device=self._device) as capture:
+            self._launches()
+        self._graph = capture.graph

@@ -36,7 +36,7 @@ class Engine:
         self._touch: ContactForces | None = None
 
     def _record(self) -> None:
-        """Record the step, which runs once for that."""
+        """Prepare the step, which runs once for that on CUDA."""
         self._graph = Graph(self._launches, self.batch.device)
         self._limits = self.batch.unrolled_iterations
         for watch in (self.batch.losses, self.batch.iterations):

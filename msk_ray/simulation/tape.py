@@ -149,9 +149,9 @@ class _Tape(Backward):
         )
 
     def ready(self, applied: bool, names: tuple[str, ...] = ()) -> None:
-        """Record the backward pass of steps with or without applied forces, with the gradients of some parameters.
+        """Prepare the backward pass of steps with or without applied forces, with the gradients of some parameters.
 
-        It leaves the checkpoints undefined.
+        On CUDA it runs once for that, which leaves the checkpoints undefined.
         """
         if (applied, names) not in self._graphs:
             if names and self._batch.ordered:
