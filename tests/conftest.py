@@ -28,7 +28,7 @@ BASE = {
     "env": {"name": "cartpole", "nworld": 8},
     "shac": {"horizon": 8},
     "evaluation": {"interval": 2},
-    "trial": {"epochs": 20, "checkpoint_interval": 2},
+    "trial": {"epochs": 20, "checkpoint_interval": 2, "loggers": []},
 }
 
 
@@ -44,11 +44,14 @@ def root() -> Path:
 
 
 @pytest.fixture(autouse=True, scope="session")
-def hangup() -> Iterator[None]:
-    """SIGHUP does what it does by default, also where the tests themselves run under `nohup`."""
-    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+def not_ignored() -> Iterator[None]:
+    """SIGHUP and SIGINT do what they do by default, also where the tests themselves run under `nohup` or after a shell's
+    `&`, which has programs ignore them: a shell that a test starts could not be interrupted."""
+    defaults = {signal.SIGHUP: signal.SIG_DFL, signal.SIGINT: signal.default_int_handler}
+    before = {number: signal.signal(number, handler) for number, handler in defaults.items()}
     yield
-    signal.signal(signal.SIGHUP, before)
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture(autouse=True)

@@ -125,9 +125,8 @@ def _rows(trials: Sequence[Trial]) -> list[tuple[str, ...]]:
 def _debug(options: Options, space: Space, trial: Trial) -> int:
     """Run one trial in this process, in a separate folder."""
     from msk_ray.experiment.results import read_record
-    from msk_ray.training import make_trainer
     from msk_ray.tune.devices import local_gpus
-    from msk_ray.tune.trial_run import Hooks, run_trial
+    from msk_ray.tune.trial_run import Hooks, make_trainer, run_trial
 
     folder = (options.path.parent / "debug" / f"{space.name}_{trial.id}_{time.strftime('%Y%m%d_%H%M%S')}").resolve()
     make_folder(folder)
@@ -156,7 +155,7 @@ def _run(
         if options.going_on:
             ownership = stack.enter_context(own(path, new=False, force=options.force))
             experiment, trials = _go_on(options, space, trials, recorded)
-        # ray and torch take seconds to load; a wrong command line should not wait for them.
+        # ray takes seconds to load; a wrong command line should not wait for them.
         from msk_ray.tune import driver, session
         from msk_ray.tune.devices import choose_placement, local_gpus
         from msk_ray.tune.finish import finish, write_report
@@ -167,7 +166,7 @@ def _run(
             return choose_placement(resources, options.gpus_per_trial, options.cpu, gpus, processes)
 
         if options.address is None:
-            placement = place(local_gpus())
+            placement = place(0 if options.cpu else local_gpus())  # counting them loads torch
         if not options.going_on:
             ownership = stack.enter_context(own(path, new=True, force=options.force))
             experiment = opening.create(path, space, trials, options.as_data())

@@ -5,7 +5,7 @@ import math
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from functools import partial
@@ -41,7 +41,6 @@ from msk_ray.sweep.search import search_class
 from msk_ray.sweep.search_trials import SearchTrial, recover
 from msk_ray.sweep.space import Space
 from msk_ray.sweep.trials import base_settings
-from msk_ray.training import make_trainer, precompile
 from msk_ray.tune.console import Console
 from msk_ray.tune.devices import Placement
 from msk_ray.tune.gauges import StateGauge
@@ -51,10 +50,8 @@ from msk_ray.tune.queue import Identify, Suggestions, TrialList
 from msk_ray.tune.schedulers import METRIC, Population, PruningScheduler
 from msk_ray.tune.supervisor import Supervisor
 from msk_ray.tune.trainable import Job, make_trainable
-from msk_ray.tune.trial_run import MakeTrainer
+from msk_ray.tune.trial_run import MakeTrainer, Precompile, make_trainer, precompile
 from msk_ray.tune.worker_prestart import WorkerPrestart, nodes_for
-
-Precompile = Callable[[Config, str, Path], None]
 
 
 @dataclass(frozen=True)

@@ -98,7 +98,7 @@ def make_trainable(job: Job, resources: dict[str, float]) -> type[tune.Trainable
 
     def work(trial: Trial, folder: Path) -> None:
         _redirect_output(folder / OUTPUT_FILE)
-        _record_device(folder / DEVICE_FILE)
+        _record_device(folder / DEVICE_FILE, job.gpus)
         attempt = read_attempt(folder)
         log_hparams(folder, attempt.effective(trial))
         if job.gpus:
@@ -289,17 +289,18 @@ def _wait_for_gpu(share: float) -> None:
         )
 
 
-def _record_device(path: Path) -> None:
+def _record_device(path: Path, gpus: float) -> None:
     """Record which host, process and GPUs the trial was given, as evidence that it had them to itself."""
-    import torch
-
-    cuda = torch.cuda.is_available()
     facts = {
         "host": platform.node(),
         "pid": os.getpid(),
         "began": time.time(),
         "visible": os.environ.get("CUDA_VISIBLE_DEVICES", ""),
-        "count": torch.cuda.device_count() if cuda else 0,
-        "name": torch.cuda.get_device_name(0) if cuda else "cpu",
+        "count": 0,
+        "name": "cpu",
     }
+    if gpus:
+        import torch
+
+        facts |= {"count": torch.cuda.device_count(), "name": torch.cuda.get_device_name(0)}
     write_text(path, json.dumps(facts) + "\n")

@@ -42,6 +42,22 @@ class TrainerLike(Protocol):
 
 MakeTrainer = Callable[[Config, Path, str], TrainerLike]
 """Makes the trainer of a config, in a folder, on a device."""
+Precompile = Callable[[Config, str, Path], None]
+"""Compiles the kernels of a config, for a device; what else it writes goes into a folder."""
+
+
+def make_trainer(config: Config, folder: Path, device: str) -> TrainerLike:
+    """`msk_ray.training.make_trainer`; torch is loaded by the process that calls this, and not by the driver."""
+    from msk_ray import training
+
+    return training.make_trainer(config, folder, device)
+
+
+def precompile(config: Config, device: str, folder: Path) -> None:
+    """`msk_ray.training.precompile`, in the same way."""
+    from msk_ray import training
+
+    training.precompile(config, device, folder)
 
 
 @dataclass(frozen=True)

@@ -40,4 +40,6 @@ if __name__ == "__main__":
     shown = bool(os.environ.get("STUB_DASHBOARD"))
     session.ray_session = functools.partial(session.ray_session, dashboard=None if shown else False, trials=False)
     with lean_ray(dashboard=shown):
-        sys.exit(run(main))
+        code = run(main)
+    assert "torch" not in sys.modules, "only trials need it, and it takes seconds to load"
+    sys.exit(code)
