@@ -45,8 +45,8 @@ def root() -> Path:
 
 @pytest.fixture(autouse=True, scope="session")
 def not_ignored() -> Iterator[None]:
-    """SIGHUP and SIGINT do what they do by default, also where the tests themselves run under `nohup` or after a shell's
-    `&`, which has programs ignore them: a shell that a test starts could not be interrupted."""
+    """SIGHUP and SIGINT do what they do by default, also where the tests run under `nohup` or in the background of a
+    shell, where programs ignore them: a shell that a test starts could not be interrupted."""
     defaults = {signal.SIGHUP: signal.SIG_DFL, signal.SIGINT: signal.default_int_handler}
     before = {number: signal.signal(number, handler) for number, handler in defaults.items()}
     yield

@@ -1,8 +1,5 @@
 """`python -m msk_ray.train` with inputs a user may get wrong: one line, a non-zero exit, nothing written."""
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -12,13 +9,6 @@ from msk_ray.errors import DeviceError
 from msk_ray.train import main
 
 pytestmark = pytest.mark.long
-
-
-def train(root: Path, cwd: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    environment = os.environ | {"PYTHONPATH": str(root)}
-    return subprocess.run(
-        [sys.executable, "-m", "msk_ray.train", *arguments], cwd=cwd, env=environment, capture_output=True, text=True
-    )
 
 
 @pytest.mark.parametrize(
@@ -53,31 +43,35 @@ def test_bad_input_is_one_line(
     assert not list(tmp_path.rglob("metrics.jsonl"))
 
 
-def test_a_folder_that_holds_a_trial_is_left_alone(root: Path, tmp_path: Path) -> None:
+def test_a_folder_that_holds_a_trial_is_left_alone(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "metrics.jsonl").write_text('{"epoch": 0}\n')
-    result = train(root, tmp_path, "--config", str(root / "configs" / "cartpole.yaml"), "--logdir", str(tmp_path))
-    assert result.returncode == 2
-    assert "add --resume" in result.stderr
+    assert run(main, ["--config", str(root / "configs" / "cartpole.yaml"), "--logdir", str(tmp_path)]) == 2
+    assert "add --resume" in capsys.readouterr().err
     assert (tmp_path / "metrics.jsonl").read_text() == '{"epoch": 0}\n'
 
 
-def test_a_trial_without_a_complete_checkpoint_is_not_restarted(root: Path, tmp_path: Path) -> None:
+def test_a_trial_without_a_complete_checkpoint_is_not_restarted(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "checkpoints").mkdir()
     (tmp_path / "checkpoints" / "epoch_000004.pt").write_bytes(b"torn")
     (tmp_path / "metrics.jsonl").write_text('{"epoch": 0}\n{"epoch": 1}\n')
     config = str(root / "configs" / "cartpole.yaml")
-    result = train(root, tmp_path, "--config", config, "--logdir", str(tmp_path), "--resume")
-    assert result.returncode == 2
-    assert "is complete" in result.stderr
-    assert "choose another --logdir to start again" in result.stderr
+    assert run(main, ["--config", config, "--logdir", str(tmp_path), "--device", "cpu", "--resume"]) == 2
+    error = capsys.readouterr().err
+    assert "is complete" in error
+    assert "choose another --logdir to start again" in error
     assert (tmp_path / "metrics.jsonl").read_text() == '{"epoch": 0}\n{"epoch": 1}\n'
     assert not (tmp_path / "config.yaml").exists()
 
 
-def test_help_teaches_by_example(root: Path, tmp_path: Path) -> None:
-    result = train(root, tmp_path, "--help")
-    assert result.returncode == 0
-    assert "--config configs/cartpole.yaml" in result.stdout
+def test_help_teaches_by_example(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["--help"])
+    assert ended.value.code == 0
+    assert "--config configs/cartpole.yaml" in capsys.readouterr().out
 
 
 def test_it_speaks_before_torch_is_loaded(
