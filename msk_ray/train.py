@@ -93,6 +93,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _train(config, args, ownership, stop, typed_command(words, "--resume"))
         except KeyboardInterrupt:
             if stop.signal is None or stop.insisted:
+                if waiting := _waiting(logdir):
+                    print(f"{waiting} not scored yet, so best.pt may be an early one: --resume scores what waits")
                 raise
             # Not between two epochs: kernels are still being prepared, or the disk is slow.
             begun = (logdir / "checkpoints").is_dir()
@@ -244,6 +246,8 @@ def _train(
         if not trainer.finished:
             ownership.check()
             trainer.save()
+            if waiting := _waiting(logdir):
+                announce(f"stopping: {waiting} to score first; a second Ctrl-C leaves that to --resume")
             trainer.score_waiting()
     if not trainer.finished:
         assert stop.signal is not None
@@ -257,6 +261,14 @@ def _train(
         print(f"no evaluation gave a score; {trainer.best_checkpoint} is the untrained policy")
     print(f"metrics: {logdir / 'metrics.jsonl'}; curves: tensorboard --logdir {logdir}")
     return 0
+
+
+def _waiting(logdir: Path) -> str:
+    """How many policies wait for their scores, in words; empty if none does."""
+    from msk_ray.training.checkpoint import unscored_checkpoints
+
+    count = len(unscored_checkpoints(logdir / "checkpoints"))
+    return "" if not count else "1 policy" if count == 1 else f"{count} policies"
 
 
 def _untrained_score(logdir: Path) -> str:

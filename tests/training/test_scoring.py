@@ -1,6 +1,7 @@
 """Policies scored together get the scores that they get alone, and none is lost or counted twice."""
 
 import json
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -8,10 +9,13 @@ import pytest
 import torch
 from test_trainer import comparable
 
+from msk_ray import training
 from msk_ray.algorithms import algorithm_class
-from msk_ray.config import Config, load_config, overlay, parse_config
+from msk_ray.cli import run
+from msk_ray.config import Config, dump_yaml, load_config, overlay, parse_config
 from msk_ray.errors import Failure, SimulationError, StorageFailure
 from msk_ray.experiment.checkpoint_file import read_facts
+from msk_ray.train import main
 from msk_ray.training import Evaluator, Trainer, read_metrics
 from msk_ray.training.checkpoint import milestones, read_checkpoint, unscored_checkpoints
 from msk_ray.training.policy_group import Policy
@@ -161,6 +165,39 @@ def stopped(trainer: Trainer, at: int) -> None:
     killed(trainer, at)
     trainer.save()
     trainer.score_waiting()
+
+
+@pytest.mark.parametrize("insists", [False, True])
+def test_who_stops_a_trial_is_told_of_the_scores_it_waits_for(
+    insists: bool, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """SIGTERM comes in epoch 3, when the policies of epochs 0 and 2 wait; a SIGINT while they are scored."""
+
+    class Stopped(Trainer):
+        def run_epoch(self) -> dict[str, float]:
+            if self.epoch == 2:
+                signal.raise_signal(signal.SIGTERM)
+            return super().run_epoch()
+
+        def score_waiting(self) -> None:
+            if insists:
+                signal.raise_signal(signal.SIGINT)
+            super().score_waiting()
+
+    made = [Stopped, Trainer]
+    monkeypatch.setattr(
+        training, "make_trainer", lambda config, folder, device, together: made.pop(0)(config, folder, device, 3)
+    )
+    config = tmp_path / "tiny.yaml"
+    config.write_text(dump_yaml(tiny()))
+    command = ["--config", str(config), "--device", "cpu", "--logdir", str(tmp_path / "trial")]
+    assert run(main, command) == (130 if insists else 75)
+    said, checkpoints = capsys.readouterr().out, tmp_path / "trial" / "checkpoints"
+    assert "2 policies to score first; a second Ctrl-C leaves that to --resume" in said
+    assert ("2 policies not scored yet" in said) == insists
+    assert len(unscored_checkpoints(checkpoints)) == (2 if insists else 0)
+    assert run(main, [*command, "--resume"]) == 0
+    check_record(tmp_path / "trial", whole)
 
 
 @pytest.mark.parametrize(("end", "after"), [(killed, 10), (killed_while_scoring, 10), (stopped, 1)])
