@@ -50,13 +50,23 @@ class Experiment:
 
     def resume_command(self) -> str:
         """The command that continues the experiment: the original one with --resume, which keeps the latest values of
-        `REMEMBERED`."""
+        `REMEMBERED`, and with the folder that the experiment is in now."""
         flags = {f"--{no}{option.replace('_', '-')}" for option in REMEMBERED for no in ("", "no-")}
         argv = read_environment(self.path / ENVIRONMENT_FILE)[0].get("command")
         if not argv:
             # The command is lost, or was never complete; its options are not recorded anywhere else.
             return "python -m msk_ray.tune --resume, with the options it was started with"
-        return typed_command([word for word in argv if word not in flags], "--resume")
+        words = [word for word in argv if word not in flags]
+        for place, word in enumerate(words):
+            if word == "--storage" and place + 1 < len(words):
+                words[place + 1] = self._storage(words[place + 1])
+            elif word.startswith("--storage="):
+                words[place] = f"--storage={self._storage(word.partition('=')[2])}"
+        return typed_command(words, "--resume")
+
+    def _storage(self, given: str) -> str:
+        """The storage folder as it was given, or where the experiment has been moved to since."""
+        return given if Path(given).resolve() == self.path.parent.resolve() else str(self.path.parent)
 
     @property
     def tune(self) -> Path:

@@ -141,6 +141,13 @@ def test_every_trial_to_its_end_on_request(
     facts = json.loads((made.path / "env.json").read_text())
     (made.path / "env.json").write_text(json.dumps(facts | {"command": ["msk-ray", "tune", "--no-early-stopping"]}))
     assert made.resume_command() == "msk-ray tune --resume", "not what would undo a later word"
+    here = tmp_path / "runs"
+    for words, now in (
+        (["--storage", "/elsewhere"], f"--storage {here}"),
+        ([f"--storage={here}/../runs"], f"--storage={here}/../runs"),
+    ):
+        (made.path / "env.json").write_text(json.dumps(facts | {"command": ["msk-ray", "tune", *words]}))
+        assert made.resume_command() == f"msk-ray tune {now} --resume", "where it has been moved to"
     assert early("--resume", "--early-stopping")
     assert early("--name", "other")
     assert run(main, ["--space", str(space), "--cpu", "--smoke", "--early-stopping"]) == 2
