@@ -8,7 +8,7 @@ from msk_ray.experiment.metrics import Evaluation, evaluations_of
 from msk_ray.experiment.outcomes import Outcome
 from msk_ray.experiment.scheduler_log import LogEntry
 from msk_ray.sweep.rules.asha import Asha, SuccessiveHalving
-from msk_ray.sweep.rules.median import MedianStopping
+from msk_ray.sweep.rules.median import Median, MedianStopping
 from msk_ray.sweep.rules.plateau import Plateau
 from msk_ray.sweep.rules.replay import replay
 from msk_ray.sweep.rules.stop_rule import History
@@ -98,7 +98,31 @@ def test_median_compares_best_with_the_median_of_means() -> None:
             assert rule.report(name, time, score) is None
     # Means of the others up to 20: 3, 5, 7; the median is 5.
     assert rule.report("low", 20, 4.9) is not None
+    assert rule.report("even", 20, 5.0) is None
     assert rule.report("fine", 20, 5.1) is None
+
+
+def test_median_ignores_nan() -> None:
+    rule = MedianStopping(grace=10, min_trials=1)
+    assert rule.report("a", 10, 2.0) is None
+    assert rule.report("b", 10, math.nan) is None
+    assert rule.report("b", 20, 3.0) is None, "a has not come as far, and at 10 there is no score to judge"
+    assert rule.report("c", 10, 1.0) is not None, "the median is a's alone"
+
+
+def test_median_of_a_space_waits_for_three_others_and_its_grace() -> None:
+    rule = Median(kind="median", grace=0.1).pruner(budget=1000)
+    for time in (99, 100):
+        for name in ("a", "b", "c"):
+            assert rule.report(name, time, 2.0) is None
+        # Before 100 nothing is compared.
+        assert (rule.report("low", time, 1.0) is None) == (time == 99)
+    two = Median(kind="median", grace=0.1).pruner(budget=1000)
+    for name in ("a", "b"):
+        two.report(name, 100, 2.0)
+    assert two.report("low", 100, 1.0) is None
+    two.report("c", 100, 2.0)
+    assert two.report("low", 110, 1.0) is not None
 
 
 def test_median_in_lockstep_compares_where_the_others_have_been() -> None:
@@ -125,7 +149,16 @@ def test_plateau_needs_patience_and_grace() -> None:
     assert spec.why(after(evaluations(5, 5, 5), 100)) is None  # epoch 20 of 100
     flat = spec.why(after(evaluations(1, 5, 8, 8.5, 9), 80))  # epoch 40 of 80; rise of 1.0 is not more than 1.0
     assert flat is not None
+    assert "since epoch 20" in flat
     assert spec.why(after(evaluations(1, 5, 8, 8.5, 9.5), 80)) is None
+
+
+def test_plateau_waits_for_evaluations_before_its_last_ones() -> None:
+    spec = Plateau(patience=2, grace=0.0)
+    assert spec.why(after(evaluations(5, 5), 10)) is None
+    assert spec.why(after(evaluations(5, 5, 5), 10)) is not None, "no rise at all is none"
+    between = History(row(25), evaluations(5, 5, 5), 10, 1.0)
+    assert spec.why(between) is None, "an epoch without an evaluation has nothing to judge"
 
 
 @pytest.mark.parametrize(
@@ -174,3 +207,15 @@ def test_a_journal_of_an_older_version_has_untrained_policies_in_it() -> None:
     pruner = spec.pruner(1000)
     assert replay(pruner, "env_steps", old) is None, "b is the better of the two"
     assert pruner.report("a", 310, 1.0) is not None
+
+
+def test_a_stop_is_found_again_only_if_it_was_the_last_word() -> None:
+    spec = Asha(kind="asha", grace=0.25, reduction=2)
+    stopped = [LogEntry("a", 3, 300, 3.0, 2.0, False), LogEntry("b", 3, 300, 3.0, 1.0, False)]
+    ending = replay(spec.pruner(1000), "env_steps", stopped)
+    assert ending is not None
+    assert "number 2 of 2" in ending.why
+    finished = [*stopped[:1], LogEntry("b", 3, 300, 3.0, 1.0, True)]
+    assert replay(spec.pruner(1000), "env_steps", finished) is None, "b ended by itself"
+    assert replay(spec.pruner(1000), "env_steps", [*stopped, LogEntry("c", 1, 100, 1.0, 0.0, False)]) is None
+    assert replay(spec.pruner(1000), "env_steps", []) is None

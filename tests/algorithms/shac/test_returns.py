@@ -61,3 +61,4 @@ def test_td_lambda_tells_truncation_from_termination() -> None:
     assert torch.allclose(td_lambda_targets(REWARDS, VALUES, NEVER, done, 0.5, 0.5), column(6.5, 12.0, 18.0))
     # terminated at 1: G₁ = 2, G₀ = 1 + ½(½·10 + ½·2) = 4
     assert torch.allclose(td_lambda_targets(REWARDS, VALUES, done, done, 0.5, 0.5), column(4.0, 2.0, 18.0))
+    assert torch.allclose(one_step_targets(REWARDS, VALUES, done, 0.5), column(6.0, 2.0, 18.0))

@@ -26,7 +26,8 @@ def test_an_adaptive_horizon_follows_the_cotangents_within_bounds():
     assert adapted_horizon(adaptive, 16.0, 40.0) == pytest.approx(8.0)  # sqrt(1/4)
     assert adapted_horizon(adaptive, 16.0, 4.9) == pytest.approx(16.0 * (10 / 4.9) ** 0.5)
     assert adapted_horizon(adaptive, 16.0, 1e-6) == 32
-    assert adapted_horizon(adaptive, 16.0, math.nan) == pytest.approx(16.0 / 2**0.5)
+    for unknown in (math.nan, math.inf, 0.0):
+        assert adapted_horizon(adaptive, 16.0, unknown) == pytest.approx(16.0 / 2**0.5)
 
 
 def test_a_horizon_that_follows_contact_by_hand() -> None:
