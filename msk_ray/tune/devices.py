@@ -30,7 +30,8 @@ class Placement:
         if self.gpus >= 1:
             by_gpu = total_gpus // self.gpus
         else:
-            by_gpu = total_gpus * (1 // self.gpus) if self.gpus else float("inf")
+            # 1 // 0.2 is 4: a fifth has no exact binary form.
+            by_gpu = total_gpus * int(1 / self.gpus + 1e-6) if self.gpus else float("inf")
         fitting = max(1, int(min(by_gpu, total_cpus // self.cpus)))
         return fitting if limit is None else min(fitting, limit)
 

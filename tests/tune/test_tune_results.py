@@ -218,6 +218,7 @@ def test_concurrent_trials() -> None:
     assert Placement(1.0, 1).concurrent(4, 64, None) == 4
     assert Placement(0.4, 1).concurrent(2, 64, None) == 4  # two on each GPU; 0.2 of each is left over
     assert Placement(1.0, 1).concurrent(4, 64, 3) == 3
+    assert [Placement(share, 1).concurrent(1, 64, None) for share in (0.1, 0.2, 1 / 3)] == [10, 5, 3]
 
 
 def test_text_table_cuts_the_end_only() -> None:
