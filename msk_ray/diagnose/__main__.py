@@ -1,5 +1,6 @@
 """`python -m msk_ray.diagnose`: how good are the gradients in the states that a policy visits?"""
 
+import argparse
 import json
 import statistics
 import sys
@@ -10,7 +11,8 @@ from typing import TYPE_CHECKING
 
 from msk_ray.cli import Parser, run
 from msk_ray.config import SET_HELP
-from msk_ray.errors import CheckpointError, ConfigError, StorageError
+from msk_ray.errors import CheckpointError, ConfigError
+from msk_ray.files import make_folder, write_text
 from msk_ray.progress import COMPILING, Pace, announce
 
 if TYPE_CHECKING:
@@ -72,15 +74,7 @@ def parser() -> Parser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
-    for name in ("worlds", "directions"):
-        if getattr(args, name) < 1:
-            raise ConfigError(f"--{name} must be at least 1, not {getattr(args, name)}")
-    if min(args.horizons) < 1:
-        raise ConfigError(f"--horizons must be at least 1, not {min(args.horizons)}")
-    if args.seed < 0:
-        raise ConfigError(f"--seed must not be negative, not {args.seed}")
-    if args.subject.suffix == ".pt" and not args.subject.is_file():
-        raise CheckpointError(f"no checkpoint {args.subject}")
+    _check(args)
     announce(
         f"comparing policy gradients of {args.subject} with float64 differences on {args.device}: {args.worlds} worlds "
         f"of each kind of state, horizons {', '.join(map(str, args.horizons))}, {args.directions} directions; "
@@ -88,7 +82,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
 
     # torch and Warp take seconds to load; a wrong command line should not wait for them.
-    from msk_ray.diagnose.picture import draw
     from msk_ray.diagnose.probe import probe, read_subject
     from msk_ray.simulation.simulation import resolve_device
 
@@ -104,15 +97,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     states = args.states or (("reset", "standing") if subject.saved is None else ("reset", "standing", "gait"))
     name = args.subject.stem if subject.saved is None else f"{args.subject.parent.parent.name}_{args.subject.stem}"
     output = args.output or Path("runs") / "diagnose" / name
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StorageError(f"cannot create {output}: {error.strerror or error}") from error
+    make_folder(output)
 
     rows: list[Quality] = []
     print(f"{'physics':24}{'from':10}{'horizon':>8}{'cosine: median, least':>24}{'norm ratio':>20}{'cotangent':>12}")
     chosen: Sequence[str | None] = args.variants or known or (None,)
-    group: list[Quality] = []
     pace = Pace("comparisons", len(chosen) * len(states) * len(args.horizons) * args.worlds)
     found = probe(
         subject,
@@ -126,20 +115,38 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     for row in found:
         rows.append(row)
-        group.append(row)
         pace(len(rows))
-        if len(group) == args.worlds:
-            print("".join(_cells(group)), flush=True)
-            group = []
+        if len(rows) % args.worlds == 0:
+            print("".join(_cells(rows[-args.worlds :])), flush=True)
+    _write(rows, args.worlds, output)
+    return 0
+
+
+def _check(args: argparse.Namespace) -> None:
+    """Refuse what can be refused before torch and Warp are loaded."""
+    for name in ("worlds", "directions"):
+        if getattr(args, name) < 1:
+            raise ConfigError(f"--{name} must be at least 1, not {getattr(args, name)}")
+    if min(args.horizons) < 1:
+        raise ConfigError(f"--horizons must be at least 1, not {min(args.horizons)}")
+    if args.seed < 0:
+        raise ConfigError(f"--seed must not be negative, not {args.seed}")
+    if args.subject.suffix == ".pt" and not args.subject.is_file():
+        raise CheckpointError(f"no checkpoint {args.subject}")
+
+
+def _write(rows: "Sequence[Quality]", worlds: int, output: Path) -> None:
+    """Write what was found as a table, as data and as a picture, and say where."""
+    from msk_ray.diagnose.picture import draw
+
     header = ["physics", "from", "horizon", "cosine: median, least", "norm ratio", "cotangent"]
     lines = ["| " + " | ".join(header) + " |", "|" + " --- |" * len(header)]
-    for i in range(0, len(rows), args.worlds):
-        lines.append("| " + " | ".join(cell.strip() for cell in _cells(rows[i : i + args.worlds])) + " |")
-    (output / "table.md").write_text("\n".join(lines) + "\n")
-    (output / "rows.json").write_text(json.dumps([asdict(row) for row in rows], indent=1))
+    for i in range(0, len(rows), worlds):
+        lines.append("| " + " | ".join(cell.strip() for cell in _cells(rows[i : i + worlds])) + " |")
+    write_text(output / "table.md", "\n".join(lines) + "\n")
+    write_text(output / "rows.json", json.dumps([asdict(row) for row in rows], indent=1))
     draw(rows, output / "quality.png")
     print(f"written: {output / 'table.md'}, {output / 'rows.json'}, {output / 'quality.png'}")
-    return 0
 
 
 def _cells(group: "Sequence[Quality]") -> list[str]:

@@ -171,17 +171,14 @@ def _fit(
     remaining: list[Trial],
     suggested: list[SearchTrial],
 ) -> None:
-    spec, file = plan.space.file.scheduler, plan.space.file
-    budget = _budget(plan)
-    if isinstance(spec, PopulationBasedTraining):
-        scheduler: Any = Population(spec, budget, plan.space.sampled)
-    else:
-        pruner = spec.pruner(budget)
-        journal = _journal(plan)
-        replay(pruner, spec.time_attr, journal.read()[0])
-        scheduler = PruningScheduler(
-            pruner, spec.time_attr, journal, lambda trial: job.trial_of(trial.config).id, supervisor.pruned
-        )
+    """Run the trials that remain, and let all that are told of them do their part.
+
+    Raises:
+        StorageFailure: the disk is full or gone, also where only a trial has noticed.
+        ClusterLost: the Ray node of this process has died.
+        Exception: whatever else ends Tune's loop.
+    """
+    file = plan.space.file
     resources = {"cpu": plan.placement.cpus} | ({"gpu": plan.placement.gpus} if plan.placement.gpus else {})
     identify = partial(_identify, job)
     # A search ends by itself; a list of trials is used once as the parameter space.
@@ -199,7 +196,7 @@ def _fit(
         tune_config=tune.TuneConfig(
             metric=METRIC,
             mode="max",
-            scheduler=scheduler,
+            scheduler=_scheduler(plan, job, supervisor),
             search_alg=search,
             num_samples=samples,
             max_concurrent_trials=plan.max_concurrent,
@@ -239,6 +236,18 @@ def _fit(
     if supervisor.storage_failure is not None:
         remove_remains(plan.experiment)
         raise _advised(supervisor.storage_failure)
+
+
+def _scheduler(plan: Plan, job: Job, supervisor: Supervisor) -> Population | PruningScheduler:
+    """The rule that compares trials, in the state that the recorded evaluations leave it in."""
+    spec, budget = plan.space.file.scheduler, _budget(plan)
+    if isinstance(spec, PopulationBasedTraining):
+        return Population(spec, budget, plan.space.sampled)
+    pruner, journal = spec.pruner(budget), _journal(plan)
+    replay(pruner, spec.time_attr, journal.read()[0])
+    return PruningScheduler(
+        pruner, spec.time_attr, journal, lambda trial: job.trial_of(trial.config).id, supervisor.pruned
+    )
 
 
 def _identify(job: Job, config: Mapping[str, Any]) -> str:
