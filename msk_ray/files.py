@@ -47,7 +47,9 @@ def _cannot_write(path: Path, error: OSError) -> StorageError:
 
 
 def write_bytes(path: Path, payload: bytes) -> None:
-    """Write `payload` to `path` so that a reader never sees half a file and the file survives a crash right afterwards.
+    """Write `payload` to `path` so that a reader never sees half a file.
+
+    If the process is killed right afterwards, the file is there; if the machine loses power, it or the one before.
 
     Raises:
         StorageFailure: the disk is full or the folder not writable; an existing file is left unchanged.

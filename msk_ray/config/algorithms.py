@@ -175,9 +175,9 @@ class ShacConfig(AlgorithmSettings):
     critic_lr: PositiveFloat = 2e-3
     """Learning rate of the critic."""
     lr_schedule: Literal["linear", "constant"] = "linear"
-    """`linear` decreases from the given rate to `final_lr` at the last epoch."""
+    """`linear` decreases from the given rate towards `final_lr`, which would follow the last epoch."""
     final_lr: PositiveFloat = 1e-5
-    """Learning rate at the last epoch of the linear schedule."""
+    """Learning rate at which the linear schedule ends; a lower given rate stays as it is."""
     betas: tuple[Fraction, Fraction] = (0.7, 0.95)
     """Adam's moment decays."""
     weight_decay: NonNegative = 0.0

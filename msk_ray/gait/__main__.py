@@ -12,7 +12,7 @@ from msk_ray.errors import ConfigError, brief
 from msk_ray.evaluate.__main__ import positive
 from msk_ray.evaluate.stored import eval_file_of, store_evaluation
 from msk_ray.evaluate.targets import best_checkpoint, find_target, trial_folder_of
-from msk_ray.files import write_json
+from msk_ray.files import make_folder, write_json
 from msk_ray.shipped import is_shipped
 from msk_ray.text_table import text_table
 
@@ -63,6 +63,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
     paths = [best_checkpoint(find_target(target, args.storage)) for target in args.targets]
+    shipped = next(filter(is_shipped, paths), None)
+    if shipped is not None and args.out is None:
+        raise ConfigError(f"{shipped} belongs to the package, which nothing is written into: add --out DIR")
     if args.film is not None:
         _check_film(args)
     speeds: list[float | None] = [None] if args.speeds is None else [*_speeds(args.speeds)]
@@ -81,7 +84,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             found = walk(bench, policy if speed is None else at_target_speed(policy, speed), request)
             gait, suffix = found.gait, "" if speed is None else f"_{speed:g}"
             out = args.out or trial_folder_of(path)
-            out.mkdir(parents=True, exist_ok=True)
+            make_folder(out)
             name = f"gait{suffix}" if len(paths) == 1 or args.out is None else f"gait_{len(rows)}{suffix}"
             facts = {"checkpoint": path.name, "epoch": policy.epoch, "physics": found.entry["physics"]}
             write_json(out / f"{name}.json", facts | gait)

@@ -159,3 +159,8 @@ def test_another_environment_is_refused(tmp_path: Path, tiny_cartpole: Config) -
     trainer.close()
     with pytest.raises(ConfigError, match="gait needs a model of two legs"):
         main([str(tmp_path / "t"), "--device", "cpu"])
+
+
+def test_nothing_is_written_beside_the_policies_of_the_package() -> None:
+    with pytest.raises(ConfigError, match=r"cartpole\.pt belongs to the package, .* add --out DIR"):
+        main(["cartpole"])
