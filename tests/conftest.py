@@ -1,4 +1,7 @@
-"""Shared fixtures. Worlds are few and rollouts short: everything here runs on two CPU cores."""
+"""Shared fixtures. Worlds are few and rollouts short: everything here runs on two CPU cores.
+
+torch is imported where it is needed: the process of pytest-xdist that hands out the tests needs none.
+"""
 
 import signal
 from collections.abc import Callable, Iterator
@@ -16,7 +19,6 @@ from msk_ray.sweep import opening
 from msk_ray.sweep.rules.stopping import StopSpec
 from msk_ray.sweep.space import Space, parse_space
 from msk_ray.sweep.trials import resolve_trials
-from msk_ray.training import Trainer
 from msk_ray.tune.finish import finish
 from msk_ray.tune.hparams import log_hparams
 from msk_ray.tune.trial_run import Hooks, run_trial
@@ -125,6 +127,8 @@ def make_space(tmp_path: Path, space_data: dict[str, Any]) -> MakeSpace:
 @pytest.fixture(scope="session")
 def sweep(tmp_path_factory: pytest.TempPathFactory) -> Experiment:
     """A real small sweep of CartPole, two rates by two seeds, trained here one after the other. Not to be changed."""
+    from msk_ray.training import Trainer
+
     folder = tmp_path_factory.mktemp("sweep")
     (folder / "base.yaml").write_text(dump_yaml(_tiny_settings()))
     data = {
@@ -148,6 +152,8 @@ def sweep(tmp_path_factory: pytest.TempPathFactory) -> Experiment:
 @pytest.fixture(scope="session")
 def ant_trial(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of an ant's trial of one epoch. Not to be changed."""
+    from msk_ray.training import Trainer
+
     folder = tmp_path_factory.mktemp("ant")
     trainer = Trainer(_small_config("ant"), folder, "cpu")
     trainer.run_epoch()
@@ -158,6 +164,8 @@ def ant_trial(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def myoleg26_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A checkpoint of the leg model before any training."""
+    from msk_ray.training import Trainer
+
     trainer = Trainer(_small_config("myoleg26_stand"), tmp_path_factory.mktemp("myoleg26"), "cpu")
     path = trainer.save()
     trainer.close()

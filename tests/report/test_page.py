@@ -28,21 +28,32 @@ def reported(sweep: Experiment, tmp_path_factory: pytest.TempPathFactory) -> Exp
     return copy
 
 
-@pytest.fixture(params=[1280, 375], ids=["wide", "narrow"])
-def page(reported: Experiment, browser: Any, request: pytest.FixtureRequest) -> Iterator[Page]:
-    """The page, and everything the browser complains of in `page.complaints`."""
+@pytest.fixture(scope="module", params=[1280, 375], ids=["wide", "narrow"])
+def window(browser: Any, request: pytest.FixtureRequest) -> Iterator[Page]:
+    """A window for all tests: opening one costs more than what a test does in it."""
     context = browser.new_context(viewport={"width": request.param, "height": 800})
     opened = context.new_page()
-    complaints: list[str] = []
-    opened.on("console", lambda message: complaints.append(message.text))
-    opened.on("pageerror", lambda error: complaints.append(str(error)))
-    opened.on("requestfailed", lambda failed: complaints.append(failed.url))
-    requests: list[str] = []
-    opened.on("request", lambda made: requests.append(made.url))
-    opened.goto((reported.path / "report" / "index.html").as_uri())
-    opened.complaints, opened.requests = complaints, requests  # type: ignore[attr-defined]
+    opened.complaints, opened.requests = [], []
+    opened.on("console", lambda message: opened.complaints.append(message.text))
+    opened.on("pageerror", lambda error: opened.complaints.append(str(error)))
+    opened.on("requestfailed", lambda failed: opened.complaints.append(failed.url))
+    opened.on("request", lambda made: opened.requests.append(made.url))
+    opened.width = request.param
     yield opened
     context.close()
+
+
+@pytest.fixture
+def page(reported: Experiment, window: Any) -> Page:
+    """The page as it opens, with everything the browser complains of in `complaints`, and what it loads in
+    `requests`."""
+    window.goto("about:blank")
+    window.set_viewport_size({"width": window.width, "height": 800})
+    window.emulate_media(media="null", color_scheme="null")
+    window.complaints.clear()
+    window.requests.clear()
+    window.goto((reported.path / "report" / "index.html").as_uri())
+    return window
 
 
 def test_all_is_drawn_without_complaints_and_fits(page: Page, reported: Experiment) -> None:
