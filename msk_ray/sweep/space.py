@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, SerializeAsAny, ValidationError
 
-from msk_ray.config import current_values, describe_fault, env_name, read_config, read_yaml
+from msk_ray.config import current_values, describe_fault, env_name, leaves, read_config, read_yaml
 from msk_ray.config.sections import Count, Section, Text, Whole
 from msk_ray.errors import ConfigError, brief
 from msk_ray.shipped import CONFIGS, SPACES, find_shipped, is_name, shipped_names
@@ -208,6 +208,8 @@ def parse_space(data: Mapping[str, Any], path: Path, *, recorded: bool = False) 
         parameters = {key: parse_operator(key, value) for key, value in file.parameters.items()}
         _check_count(file, parameters)
         seeds = parse_seeds(file.seeds)
+        if not recorded:
+            _check_seeds(file, parameters)
         _check_combination(file, parameters, seeds)
         base_path = _find_base(file.base, path)
     except ConfigError as error:
@@ -257,11 +259,24 @@ def _check_count(file: SpaceFile, parameters: Mapping[str, Operator]) -> None:
         )
 
 
+def _check_seeds(file: SpaceFile, parameters: Mapping[str, Operator]) -> None:
+    """Refuse `trial.seed` where the section `seeds` would replace it."""
+    places = [("overrides", file.overrides), ("smoke.overrides", file.smoke.overrides)]
+    places += [("parameters", {key: level.value}) for key, op in parameters.items() for level in op.extremes()]
+    if file.ablate is not None:
+        places.append(("ablate.baseline", file.ablate.baseline))
+        places += [(f"ablate.variants.{name}", values) for name, values in file.ablate.variants.items()]
+    for place, values in places:
+        if any(leaf == "trial.seed" for key, value in values.items() for leaf, _ in leaves(key, value)):
+            raise ConfigError(
+                f"{place}.trial.seed: seeds have a section of their own; write seeds: 0-4 (--seeds 0-4 on the command "
+                "line)"
+            )
+
+
 def _check_combination(file: SpaceFile, parameters: Mapping[str, Operator], seeds: tuple[int, ...]) -> None:
     """Refuse settings that are valid separately but not together."""
     sampled = {key: op for key, op in parameters.items() if not op.enumerated}
-    if "trial.seed" in parameters:
-        raise ConfigError("parameters.trial.seed: seeds have a section of their own; write seeds: 0-4")
     if file.ablate is not None and (sampled or file.searches):
         raise ConfigError("ablate varies one factor at a time: beside it write only grids, and search: random")
     if file.samples > 1 and not sampled:
