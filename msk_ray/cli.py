@@ -20,6 +20,11 @@ TERMINAL_LOG = "terminal.log"
 """File in a run's folder that receives the output once the terminal is closed."""
 _UNREAD = (errno.EPIPE, errno.EIO)
 """Errors from a pipe whose reader has exited, and from a closed terminal."""
+_ADVICE = {
+    errno.ENAMETOOLONG: "too long for a file name; write a shorter one",
+    errno.EACCES: "permission denied; name another file or folder, or ask its owner",
+}
+"""What a user can do about errors of the operating system that any file may give."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -95,12 +100,9 @@ def run(main: Callable[[Sequence[str] | None], int], argv: Sequence[str] | None 
         sys.stderr.close()
         return 0
     except OSError as error:
-        if error.errno != errno.ENAMETOOLONG:
+        if error.errno not in _ADVICE or error.filename is None:
             raise
-        print(
-            f"error: {printable(brief(error.filename))}: too long for a file name; write a shorter one",
-            file=sys.stderr,
-        )
+        print(f"error: {printable(brief(error.filename))}: {_ADVICE[error.errno]}", file=sys.stderr)
         return MskRayError.exit_code
     finally:
         if stop is not None:

@@ -1,5 +1,6 @@
 """Commands as one would type them again."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -57,6 +58,15 @@ def test_an_error_is_one_harmless_line(capsys: pytest.CaptureFixture[str]) -> No
     with pytest.raises(SystemExit):
         Parser("x", "", "").parse_args(["\x1b[2J"])
     assert "\x1b" not in capsys.readouterr().err
+
+
+def test_what_may_not_be_read_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    def main(argv: Sequence[str] | None) -> int:
+        raise PermissionError(errno.EACCES, "Permission denied", "/of/others")
+
+    assert run(main, []) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: '/of/others': permission denied; name another")
 
 
 def test_the_version(capsys: pytest.CaptureFixture[str]) -> None:

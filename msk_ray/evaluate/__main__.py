@@ -97,9 +97,9 @@ def parser() -> Parser:
 
 
 def positive(text: str) -> int:
-    """A whole number of at least 1."""
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"must be a whole number of at least 1, not {text}")
+    """A whole number of at least 1, within the range of Warp and CUDA."""
+    if not text.isdecimal() or not 1 <= int(text) < 2**31:
+        raise argparse.ArgumentTypeError(f"must be a whole number of at least 1 and below 2^31, not {text}")
     return int(text)
 
 

@@ -48,8 +48,8 @@ def under_condition(config: Config, name: str) -> tuple[Config, RandomizeConfig 
     """
     known = config.env.conditions
     if name not in known:
-        listed = ", ".join(known) or "none"
-        raise ConfigError(f"--with {name}: env {config.env.name} has {listed}; write one of these, or leave it out")
+        there = f"has {', '.join(known)}; write one of these, or leave it out" if known else "has none; leave it out"
+        raise ConfigError(f"--with {name}: env {config.env.name} {there}")
     values = {key: value for key, value in known[name].items() if key != "physics.randomize"}
     harder = parse_config(overlay(config.as_dict(), values)) if values else config
     varied = known[name].get("physics.randomize")

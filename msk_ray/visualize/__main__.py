@@ -13,6 +13,7 @@ from msk_ray.evaluate.__main__ import positive
 from msk_ray.evaluate.targets import Target, best_checkpoint, best_trial_folder, find_target, trial_folder_of
 from msk_ray.files import make_folder
 from msk_ray.progress import COMPILING, Pace, announce
+from msk_ray.sweep.space import parse_seeds
 from msk_ray.text_table import text_table
 
 if TYPE_CHECKING:
@@ -140,8 +141,11 @@ def _check(args: argparse.Namespace) -> Target:
     given = args.progression if args.progression is not None else args.target
     if given is None or (args.progression is not None and args.target is not None):
         raise ConfigError("name one thing to watch: a checkpoint, a trial, or an experiment")
-    if args.fps <= 0.0 or args.speed <= 0.0:
-        raise ConfigError("--fps and --speed must be above 0")
+    for option in ("fps", "speed"):
+        if not 0.0 < getattr(args, option) <= 1000.0:  # NaN is neither
+            raise ConfigError(f"--{option} {getattr(args, option):g}: write a number above 0, up to 1000")
+    if args.seed is not None:
+        parse_seeds(args.seed)
     target = find_target(given, args.storage)
     best_checkpoint(target)
     drawing = args.video or args.save_frames or args.strip or args.progression is not None

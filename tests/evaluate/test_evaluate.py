@@ -1,5 +1,6 @@
 """Evaluations: the canonical score again, the same twice, every figure by hand, and inputs one may get wrong."""
 
+import argparse
 import json
 import math
 import shutil
@@ -12,7 +13,7 @@ import torch
 from msk_ray.cli import run
 from msk_ray.config import parse_config
 from msk_ray.errors import CheckpointError
-from msk_ray.evaluate.__main__ import main
+from msk_ray.evaluate.__main__ import main, positive
 from msk_ray.evaluate.measure import Bench, Request, figures
 from msk_ray.evaluate.stored import read_evaluations, store_evaluation
 from msk_ray.experiment.attempts import Attempt, Reduced
@@ -208,6 +209,13 @@ def test_a_broken_eval_file_is_not_overwritten(trial: Path) -> None:
     (first,) = entries(trial)
     store_evaluation(trial / "eval.json", first | {"checkpoint": "other.pt"})
     assert entries(trial) == [first, first | {"checkpoint": "other.pt"}]
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "²", "2.5", str(2**31)])
+def test_counts_are_whole_numbers_that_devices_have(text: str) -> None:
+    assert positive(str(2**31 - 1)) == 2**31 - 1
+    with pytest.raises(argparse.ArgumentTypeError, match=r"at least 1 and below 2\^31, not"):
+        positive(text)
 
 
 @pytest.mark.parametrize(
