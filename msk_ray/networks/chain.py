@@ -4,14 +4,15 @@ Autograd notes every operation of a network and takes its notes apart again. On 
 arithmetic of a small network. Axes: N rows, I inputs and F features of a layer.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
+from itertools import accumulate
 from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
 
 Kept = tuple[Tensor, ...]
-"""What a layer's derivative needs of its forward pass."""
+"""What a layer's derivative needs of its forward pass, with a row for each row of its input."""
 
 _ATEN: Any = torch.ops.aten
 _elu_backward, _silu_backward = _ATEN.elu_backward.default, _ATEN.silu_backward.default
@@ -27,8 +28,11 @@ class Layer(Protocol):
     def forward(self, x: Tensor, *parameters: Tensor) -> tuple[Tensor, Kept]:
         """Its output (N, F)."""
 
-    def backward(self, kept: Kept, bar: Tensor, of_x: bool, into: Sequence[Tensor]) -> Tensor | None:
-        """The gradient of its input for the output's cotangent, if that is wanted; writes those of its parameters."""
+    def backward(
+        self, kept: Kept, parameters: Sequence[Tensor], bar: Tensor, of_x: bool, into: Sequence[Tensor] | None
+    ) -> Tensor | None:
+        """The gradient of its input for the output's cotangent, if that is wanted; writes those of its parameters, if
+        there is something to write into."""
 
 
 class _Linear:
@@ -41,16 +45,19 @@ class _Linear:
 
     def forward(self, x: Tensor, *parameters: Tensor) -> tuple[Tensor, Kept]:
         weight, bias = parameters
-        return torch.addmm(bias, x, weight.t()), (x, weight)
+        return torch.addmm(bias, x, weight.t()), (x,)
 
-    def backward(self, kept: Kept, bar: Tensor, of_x: bool, into: Sequence[Tensor]) -> Tensor | None:
-        x, weight = kept
-        if x.shape[1] < bar.shape[1]:  # the narrow side first: four times as fast for five inputs
-            into[0].copy_((x.t() @ bar).t())
-        else:
-            torch.mm(bar.t(), x, out=into[0])
-        torch.sum(bar, 0, out=into[1])
-        return bar @ weight if of_x else None
+    def backward(
+        self, kept: Kept, parameters: Sequence[Tensor], bar: Tensor, of_x: bool, into: Sequence[Tensor] | None
+    ) -> Tensor | None:
+        (x,) = kept
+        if into is not None:
+            if x.shape[1] < bar.shape[1]:  # the narrow side first: four times as fast for five inputs
+                into[0].copy_((x.t() @ bar).t())
+            else:
+                torch.mm(bar.t(), x, out=into[0])
+            torch.sum(bar, 0, out=into[1])
+        return bar @ parameters[0] if of_x else None
 
 
 class _Norm:
@@ -65,13 +72,17 @@ class _Norm:
     def forward(self, x: Tensor, *parameters: Tensor) -> tuple[Tensor, Kept]:
         gain, shift = parameters
         y, mean, scale = torch.native_layer_norm(x, self._shape, gain, shift, self._epsilon)
-        return y, (x, mean, scale, gain, shift)
+        return y, (x, mean, scale)
 
-    def backward(self, kept: Kept, bar: Tensor, of_x: bool, into: Sequence[Tensor]) -> Tensor | None:
-        x, mean, scale, gain, shift = kept
-        found = _norm_backward(bar, x, self._shape, mean, scale, gain, shift, [of_x, True, True])
-        into[0].copy_(found[1])
-        into[1].copy_(found[2])
+    def backward(
+        self, kept: Kept, parameters: Sequence[Tensor], bar: Tensor, of_x: bool, into: Sequence[Tensor] | None
+    ) -> Tensor | None:
+        x, mean, scale = kept
+        wanted = [of_x, into is not None, into is not None]
+        found = _norm_backward(bar, x, self._shape, mean, scale, *parameters, wanted)
+        if into is not None:
+            into[0].copy_(found[1])
+            into[1].copy_(found[2])
         x_bar: Tensor | None = found[0]
         return x_bar
 
@@ -93,7 +104,9 @@ class _Activation:
         y = self._function(x)
         return y, (x, y)
 
-    def backward(self, kept: Kept, bar: Tensor, of_x: bool, _: Sequence[Tensor]) -> Tensor | None:
+    def backward(
+        self, kept: Kept, parameters: Sequence[Tensor], bar: Tensor, of_x: bool, into: Sequence[Tensor] | None
+    ) -> Tensor | None:
         return self._slope(bar, *kept) if of_x else None
 
 
@@ -125,41 +138,65 @@ _LAYERS: dict[type[nn.Module], Callable[[nn.Module], Layer]] = {
 
 
 class Chain:
-    """The layers of a network, for rows on a CPU.
+    """The layers of a network, for rows on a CPU, with its present parameters.
 
     Args:
-        modules: linear layers and norms with their parameters, and activations, with torch's default constants.
+        network: linear layers, norms and activations, with torch's default constants.
+
+    Attributes:
+        parameters: the network's, in their order.
+        modules: its layers.
     """
 
-    def __init__(self, modules: Iterable[nn.Module]) -> None:
-        self._layers = [_LAYERS[type(module)](module) for module in modules]
+    def __init__(self, network: nn.Module) -> None:
+        self.modules = list(network.children())
+        self.parameters = list(network.parameters())
+        self._layers = [_LAYERS[type(module)](module) for module in self.modules]
+        ends = list(accumulate((layer.count for layer in self._layers), initial=0))
+        self._own = [slice(*ends[k : k + 2]) for k in range(len(self._layers))]
 
-    def forward(self, x: Tensor, parameters: Sequence[Tensor]) -> tuple[Tensor, list[Kept]]:
-        """The output (N, F) for rows (N, I), and what `backward` needs of each layer.
-
-        Args:
-            parameters: those of all layers, in their order.
-        """
-        kept, first = [], 0
-        for layer in self._layers:
-            x, own = layer.forward(x, *parameters[first : first + layer.count])
-            kept.append(own)
-            first += layer.count
+    def forward(self, x: Tensor) -> tuple[Tensor, list[Kept]]:
+        """The output (N, F) for rows (N, I), and what each layer keeps for `backward`."""
+        kept = []
+        for layer, own in zip(self._layers, self._own, strict=True):
+            x, of_layer = layer.forward(x, *self.parameters[own])
+            kept.append(of_layer)
         return x, kept
 
-    def backward(self, kept: Sequence[Kept], bar: Tensor, into: Sequence[Tensor], *, of_x: bool) -> Tensor | None:
-        """The gradient of the rows for the output's cotangent, if that is wanted; writes those of all parameters.
+    def backward(self, kept: Sequence[Kept], bar: Tensor, into: Sequence[Tensor]) -> None:
+        """Write the gradients of all parameters for the output's cotangent.
 
         Args:
             kept: what `forward` returned.
             bar: the cotangent (N, F).
-            into: where the gradients of the parameters go, in their order, each of the parameter's shape.
+            into: where they go, in the parameters' order and shapes.
         """
         below: Tensor | None = bar
-        end = len(into)
         for k in reversed(range(len(self._layers))):
+            own = self._own[k]
             assert below is not None
-            layer = self._layers[k]
-            below = layer.backward(kept[k], below, of_x or k > 0, into[end - layer.count : end])
-            end -= layer.count
-        return below
+            below = self._layers[k].backward(kept[k], self.parameters[own], below, k > 0, into[own])
+
+    def pull(self, kept: Sequence[Kept], bar: Tensor, of_x: bool) -> tuple[Tensor | None, list[Tensor]]:
+        """The gradient of the rows, if that is wanted, and the cotangents of the outputs of all layers."""
+        bars = [bar]
+        for k in reversed(range(1, len(self._layers))):
+            below = self._layers[k].backward(kept[k], self.parameters[self._own[k]], bars[-1], True, None)
+            assert below is not None
+            bars.append(below)
+        x_bar = self._layers[0].backward(kept[0], self.parameters[self._own[0]], bars[-1], of_x, None)
+        return x_bar, bars[::-1]
+
+    def add_up(self, kept: Sequence[Sequence[Kept]], bars: Sequence[Sequence[Tensor]], into: Sequence[Tensor]) -> None:
+        """Write the gradients of all parameters, added up over calls.
+
+        Args:
+            kept: what `forward` returned in each call.
+            bars: the cotangents that `pull` returned for it.
+            into: where they go.
+        """
+        for k, (layer, own) in enumerate(zip(self._layers, self._own, strict=True)):
+            if layer.count:
+                rows = tuple(map(torch.cat, zip(*(of_call[k] for of_call in kept), strict=True)))
+                bar = torch.cat([of_call[k] for of_call in bars])
+                layer.backward(rows, self.parameters[own], bar, False, into[own])

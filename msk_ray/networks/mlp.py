@@ -1,5 +1,6 @@
 """The multilayer perceptron that both networks use."""
 
+from collections.abc import Callable
 from itertools import pairwise
 
 import torch
@@ -11,9 +12,24 @@ from msk_ray.simulation.hidden_layer import hidden_layer
 _ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "silu": nn.SiLU, "relu": nn.ReLU, "tanh": nn.Tanh}
 
 
+class Mlp(nn.Sequential):
+    """Layers one after the other.
+
+    Attributes:
+        instead: called in the network's place while it is set.
+    """
+
+    instead: Callable[[Tensor], Tensor] | None = None
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Outputs (..., F) for inputs (..., I)."""
+        out: Tensor = super().forward(x) if self.instead is None else self.instead(x)
+        return out
+
+
 def make_mlp(
     config: NetworkConfig, inputs: int, outputs: int, generator: torch.Generator, output_gain: float = 1.0
-) -> nn.Sequential:
+) -> Mlp:
     """Linear, activation and optional LayerNorm per hidden layer; a linear last layer.
 
     Weights are orthogonal, drawn from `generator`, with gain √2 in hidden layers and `output_gain` in the last; biases
@@ -26,7 +42,7 @@ def make_mlp(
         if config.layer_norm:
             layers.append(nn.LayerNorm(fan_out))
     layers.append(_linear(sizes[-1], outputs, output_gain, generator))
-    return nn.Sequential(*layers)
+    return Mlp(*layers)
 
 
 def fused_forward(network: nn.Module, x: Tensor) -> Tensor:

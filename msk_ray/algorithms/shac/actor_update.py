@@ -1,5 +1,6 @@
 """The part of an epoch that changes the actor. The host looks at nothing in it, so that it can be recorded."""
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -15,6 +16,7 @@ from msk_ray.algorithms.shac.rollout import Rollout, collect
 from msk_ray.config import ContactHorizon, ShacConfig
 from msk_ray.envs import Env, EnvState, Resets
 from msk_ray.networks import Critic, PolicyNetwork, RunningMeanStd
+from msk_ray.networks.calls import Calls
 from msk_ray.simulation import StepState
 
 
@@ -51,6 +53,8 @@ class Rolled:
     """Of the worlds after it."""
     gate: CotangentGate
     halves: HalfBatchCosine
+    calls: Calls | None
+    """Those of the actor's network, whose gradients are still to be added up; None if autograd does it."""
 
 
 @dataclass(frozen=True)
@@ -114,10 +118,13 @@ class ActorUpdate:
         # A cotangent of norm 1/(H·W) is what a reward of one in one world sends back through the mean loss.
         bound = None if c.state_grad_clip is None else c.state_grad_clip / (len(inputs.noise) * env.nworld)
         gate = CotangentGate(bound, env.nworld, env.device)
-        halves = HalfBatchCosine(self._actor, self._group)
+        # Recorded CUDA graphs keep autograd's order of kernels, and a layer whose output has two readers its own call.
+        alone = self._actor.log_std_layer is None and env.device.type == "cpu"
+        calls = Calls(self._actor.mean) if alone else None
+        halves = HalfBatchCosine(self._actor, self._group, () if calls is None else (calls,))
         env.state = inputs.state
         env.stock_resets(inputs.resets)
-        with halves.watching():
+        with halves.watching(), nullcontext() if calls is None else calls.recording():
             rollout = collect(
                 env,
                 self._actor,
@@ -128,7 +135,7 @@ class ActorUpdate:
                 with_neg_log_prob=self._entropy is not None,
                 with_contact=isinstance(c.horizon, ContactHorizon),
             )
-        return Rolled(rollout, env.state.detach(), gate, halves)
+        return Rolled(rollout, env.state.detach(), gate, halves, calls)
 
     def learn(self, rolled: Rolled) -> ActorOutcome:
         """Take the actor's step along the rollout's gradient, and update the statistics.
@@ -143,6 +150,8 @@ class ActorUpdate:
         loss, next_values, rewards = self._loss(rollout)
         self._optimizer.zero_grad()
         loss.backward()
+        if rolled.calls is not None:
+            rolled.calls.add_gradients()
         self._group.mean([p.grad for p in self._actor.parameters() if p.grad is not None])
         cotangents = rolled.gate.record(self._group)
         limit = float("inf") if c.actor_grad_norm is None else c.actor_grad_norm

@@ -152,18 +152,18 @@ class _Pass:
     """
 
     def __init__(self, member: nn.Module) -> None:
-        self._parameters = list(member.parameters())
-        self._chain = Chain(member.children())
-        self.gradient = torch.cat([torch.zeros_like(parameter).flatten() for parameter in self._parameters])
-        self.parts = views_of(self.gradient, self._parameters)
+        self._chain = Chain(member)
+        parameters = self._chain.parameters
+        self.gradient = torch.zeros(sum(parameter.numel() for parameter in parameters))
+        self.parts = views_of(self.gradient, parameters)
 
     def run(self, obs: Tensor, targets: Tensor, weight: float) -> Tensor:
         """The mean squared error of rows, times a weight."""
-        values, kept = self._chain.forward(obs, self._parameters)
+        values, kept = self._chain.forward(obs)
         error = values - targets[:, None]
         scale = weight / len(obs)
         loss = scale * error.square().sum()
-        self._chain.backward(kept, error.mul_(2.0 * scale), self.parts, of_x=False)
+        self._chain.backward(kept, error.mul_(2.0 * scale), self.parts)
         return loss
 
 

@@ -1,6 +1,6 @@
 """How much of a policy gradient is signal: do the two halves of the batch agree?"""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from msk_ray.group import ALONE, Group
+from msk_ray.networks.calls import Calls
 
 
 class HalfBatchCosine:
@@ -21,10 +22,12 @@ class HalfBatchCosine:
     Args:
         network: its linear layers are observed; inputs have shape (W, n) with the worlds first.
         group: the processes that the worlds are spread over.
+        calls: what else records calls of its layers.
     """
 
-    def __init__(self, network: nn.Module, group: Group = ALONE) -> None:
+    def __init__(self, network: nn.Module, group: Group = ALONE, calls: Sequence[Calls] = ()) -> None:
         self._group = group
+        self._calls = calls
         self._layers = [m for m in network.modules() if isinstance(m, nn.Linear)]
         self._inputs: dict[nn.Module, list[Tensor]] = {m: [] for m in self._layers}
         self._cotangents: dict[nn.Module, dict[int, Tensor]] = {m: {} for m in self._layers}
@@ -46,11 +49,7 @@ class HalfBatchCosine:
         Call it after the backward pass. NaN where a half's gradient is zero, or for fewer than two worlds.
         """
         halves = []
-        for layer in self._layers:
-            cotangents = self._cotangents[layer]
-            steps = sorted(cotangents)
-            inputs = torch.stack([self._inputs[layer][i] for i in steps])
-            outputs = torch.stack([cotangents[i] for i in steps])
+        for inputs, outputs in self._seen():
             halves.append(
                 [
                     outputs[:, part].flatten(0, 1).T @ inputs[:, part].flatten(0, 1)
@@ -61,6 +60,18 @@ class HalfBatchCosine:
         products = [torch.stack([(a * b).sum(), a.square().sum(), b.square().sum()]) for a, b in halves]
         ab, aa, bb = torch.stack(products).sum(0)
         return ab * torch.rsqrt(aa * bb)
+
+    def _seen(self) -> Iterator[tuple[Tensor, Tensor]]:
+        """Inputs (H, W, I) of the layers and cotangents (H, W, F) of their outputs."""
+        elsewhere = {layer: seen for calls in self._calls for layer, *seen in calls.linear()}
+        for layer in self._layers:
+            if layer in elsewhere:
+                inputs, outputs = elsewhere[layer]
+            else:
+                steps = sorted(self._cotangents[layer])
+                inputs = [self._inputs[layer][i] for i in steps]
+                outputs = [self._cotangents[layer][i] for i in steps]
+            yield torch.stack(inputs), torch.stack(outputs)
 
     def _parts(self, nworld: int) -> tuple[slice, slice]:
         """Which of this process's worlds belong to either half of all worlds."""
