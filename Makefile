@@ -4,6 +4,8 @@ VENV   ?= .venv
 RUN    := $(VENV)/bin/python
 STAMP  := $(VENV)/.installed
 WORKERS ?= 4
+# Beside each other, each with a thread of its own: those of torch would wait for each other.
+PYTEST := OMP_NUM_THREADS=1 $(RUN) -m pytest --dist loadfile
 # Whatever people read; tests misspell on purpose.
 PROSE   := README.md CONTRIBUTING.md Makefile benchmarks cluster configs docs msk_ray policies tune_spaces
 
@@ -29,10 +31,10 @@ demo: env            ## a real small Ray Tune sweep (GPU if there is one), endin
 test: check unit     ## everything that CI runs
 
 test-fast: env       ## the short tests, before every commit: two minutes on two cores
-	$(RUN) -m pytest -n 2 --dist loadfile -m 'not gpu and not slow and not long'
+	$(PYTEST) -n 2 -m 'not gpu and not slow and not long'
 
 test-all: check      ## `test`, and tests that take long and repeat a shorter one with other values
-	$(RUN) -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder -m 'not gpu'
+	$(PYTEST) -n $(WORKERS) --no-loadscope-reorder -m 'not gpu'
 
 check: env           ## formatting, lint, spelling, layers and types
 	$(VENV)/bin/ruff format --check .
@@ -42,7 +44,7 @@ check: env           ## formatting, lint, spelling, layers and types
 	$(VENV)/bin/mypy
 
 unit: env            ## the tests that need no GPU, in as many processes as WORKERS says
-	$(RUN) -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
+	$(PYTEST) -n $(WORKERS) --no-loadscope-reorder
 
 gpu-test: env        ## the tests that need a CUDA device
 	$(RUN) -m pytest -m gpu

@@ -2,6 +2,7 @@
 
 import ast
 import tomllib
+from collections import Counter
 from pathlib import Path
 
 
@@ -15,6 +16,12 @@ def test_mypy_ignores_no_module(root: Path) -> None:
 def test_no_file_is_longer_than_450_lines(root: Path) -> None:
     long = {p.name: n for p in (root / "msk_ray").rglob("*.py") if (n := len(p.read_text().splitlines())) > 450}
     assert not long
+
+
+def test_files_of_tests_have_names_of_their_own(root: Path) -> None:
+    """pytest finds them by name alone: of two, it refuses one, but only where both are collected."""
+    names = Counter(path.name for path in (root / "tests").rglob("test_*.py"))
+    assert [name for name, count in names.items() if count > 1] == []
 
 
 def test_no_function_outside_kernels_has_more_than_8_parameters(root: Path) -> None:
