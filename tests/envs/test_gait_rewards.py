@@ -15,7 +15,7 @@ from msk_ray.envs.legs.clock import fourier, series, window
 from msk_ray.envs.legs.config import LegReward
 from msk_ray.envs.legs.metabolic import Fibres, muscle_masses, power
 from msk_ray.envs.legs.push import pushes
-from msk_ray.envs.legs.reference import people_angles
+from msk_ray.envs.legs.reference import people_angles, sway
 from msk_ray.envs.myoleg26.config import MyoLeg26Settings
 from msk_ray.envs.myoleg26.env import MyoLeg26
 from msk_ray.envs.records import EnvState
@@ -106,6 +106,29 @@ def test_people_step_as_far_as_they_were_measured_to() -> None:
     assert max(sliding) < 0.15
     hip, knee, ankle = people_angles()
     assert (hip - knee + ankle)[10:31].mean() == pytest.approx(0.0, abs=1e-9)
+
+
+def test_the_pelvis_sways_between_feet_that_stay() -> None:
+    """An inverted pendulum that is w from its foot when it gets there and w / cosh(T/2τ) halfway, T 60/116.8 s."""
+    half, time = 0.5 * 60.0 / 116.8, math.sqrt(0.9 / 9.81)
+    aside = sway(0.1, 0.9)
+    assert aside.max() == pytest.approx(0.1 * (1.0 - 1.0 / math.cosh(half / time)), rel=0.01)
+    assert aside.argmax() == 31
+    assert aside[:50] == pytest.approx(-aside[50:100])
+    slope = (aside[7] - aside[5]) / 0.02 / (2.0 * 2.0 * half)
+    assert slope == pytest.approx(0.1 / time * math.tanh(half / time), rel=0.03), "m/s, towards the foot"
+    env = make(1, clock=True, reset="cycle", stochastic_reset=False)
+    start = env.draw_phase(torch.arange(20) / 20, torch.full((20,), 1.25))
+    data, velocity, drift, speeds = mujoco.MjData(env.model), np.zeros(6), [], []
+    for qpos, qvel in zip(start.qpos.numpy(), start.qvel.numpy(), strict=True):
+        data.qpos[:], data.qvel[:] = qpos, qvel
+        mujoco.mj_forward(env.model, data)
+        for side in "rl":
+            body = env.model.body(f"calcn_{side}").id
+            mujoco.mj_objectVelocity(env.model, data, mujoco.mjtObj.mjOBJ_XBODY, body, velocity, 0)
+            drift.append(abs(velocity[4]))
+        speeds.append(qvel[env.model.joint("pelvis_tz").dofadr[0]])
+    assert max(drift) < 0.01 < 0.15 < max(speeds)
 
 
 def test_initial_states_track_the_reference(env: MyoLeg26) -> None:

@@ -21,6 +21,9 @@ from msk_ray.envs.legs.terms import SWING
 MEASURED_AT = 1.25
 """Speed at which the measured angles are taken to hold [m/s]; hips swing in proportion to the step length."""
 _FLAT = slice(10, 31)
+_EXCHANGE = 0.06
+"""Phase at which the weight has passed to the right foot [turns], the middle of people's double support."""
+_GRAVITY = 9.81
 
 
 def people_angles() -> np.ndarray:
@@ -36,6 +39,23 @@ def level_toes() -> np.ndarray:
     hip, knee, ankle = people_angles()
     on_ground = np.arange(101) < 100 * SWING[0]
     return np.where(on_ground, np.clip(knee - hip - ankle, 0.0, None), 0.0)
+
+
+def sway(half_width: float, height: float) -> np.ndarray:
+    """How far the pelvis is to the right of its line [m] from the right foot's strike on, (101,), at `MEASURED_AT`.
+
+    That of a linear inverted pendulum which comes to each foot with the speed that brings it back to the line when the
+    feet are exchanged (Hof 2008, doi:10.1016/j.humov.2007.08.003). Without that speed it falls away from the foot.
+
+    Args:
+        half_width: distance of each foot from the line [m].
+        height: of the pendulum [m].
+    """
+    step = 60.0 / float(np.polyval(pace_polynomials()[0], MEASURED_AT))
+    time = math.sqrt(height / _GRAVITY)
+    since = np.remainder(2.0 * (np.arange(101) / 100.0 - _EXCHANGE), 2.0)  # steps
+    over = 1.0 - np.cosh((since % 1.0 - 0.5) * step / time) / math.cosh(0.5 * step / time)
+    return half_width * np.where(since < 1.0, over, -over)
 
 
 class Reference:

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from msk_ray.envs.legs.reference import level_toes, people_angles
+from msk_ray.envs.legs.reference import level_toes, people_angles, sway
 from msk_ray.envs.myoleg26.tables import OUTLINE
 
 WALKING_SPEED: Final = 1.25
@@ -54,7 +54,8 @@ def cycle_states(model: mujoco.MjModel) -> tuple[NDArray[np.float64], NDArray[np
     distances of the gait cycle of people, from the right foot's strike on.
 
     Angles are those of `people_angles`. The trunk is upright, toes stay level while their foot is on the ground and
-    pitched, and the lowest point of the soles touches the ground. The feet are on the spot: add a forward speed.
+    pitched, and the lowest point of the soles touches the ground. The pelvis sways between the feet (`sway`), whose
+    lines stay where they are. The feet are on the spot: add a forward speed.
     """
     hip, knee, ankle = people_angles()[:, :-1]
     count, toes = len(hip), level_toes()[:-1]
@@ -62,8 +63,14 @@ def cycle_states(model: mujoco.MjModel) -> tuple[NDArray[np.float64], NDArray[np
     right = np.stack((hip, -knee, ankle, toes))
     legs = {"r": right, "l": np.roll(right, count // 2, axis=1)}
     qpos = np.zeros((count, model.nq))
+    upright = _posed(model, {}, {}, {})
+    aside = sway(abs(float(upright.body("calcn_r").xpos[1])), float(model.key("stand").qpos[1]))[:-1]
     for k in range(count):
-        data = _posed(model, {}, *(dict(zip(names, legs[side][:, k], strict=True)) for side in "rl"))
+        angles = [dict(zip(names, legs[side][:, k], strict=True)) for side in "rl"]
+        data = _posed(model, {"pelvis_tz": aside[k]}, *angles)
+        for side, chosen in zip("rl", angles, strict=True):
+            chosen["hip_adduction"] = _under(model, data, side, aside[k])
+        data = _posed(model, {"pelvis_tz": aside[k]}, *angles)
         qpos[k] = data.qpos
         qpos[k, _address(model, "pelvis_ty")] -= _lowest(model, data, "rl") + _PRESSED
     low, high = model.jnt_range[model.jnt_limited.astype(bool)].T
@@ -72,6 +79,13 @@ def cycle_states(model: mujoco.MjModel) -> tuple[NDArray[np.float64], NDArray[np
     around = np.concatenate((qpos[-1:], qpos, qpos[:1]))
     qvel = (around[2:] - around[:-2]) * (count / 2.0)
     return qpos, qvel, np.full((count, model.na), REST_ACTIVATION)
+
+
+def _under(model: mujoco.MjModel, data: mujoco.MjData, side: str, aside: float) -> float:
+    """Hip adduction [rad] that brings a foot back to its line when the pelvis has moved to the right [m]."""
+    jacobian = np.zeros((3, model.nv))
+    mujoco.mj_jacBody(model, data, jacobian, None, model.body(f"calcn_{side}").id)
+    return aside / float(jacobian[1, model.joint(f"hip_adduction_{side}").dofadr[0]])
 
 
 def holding_activations(model: mujoco.MjModel, qpos: NDArray[np.float64]) -> NDArray[np.float64]:
