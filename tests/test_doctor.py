@@ -155,6 +155,7 @@ def small_trial(tmp_path: Path, tiny_settings: dict[str, Any]) -> str:
     return str(path)
 
 
+@pytest.mark.long
 def test_a_trial_repeats_in_another_process_with_more_threads(
     small_trial: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -33,6 +33,7 @@ def test_progress_needs_no_more_of_a_row_than_every_algorithm_has(capsys: pytest
     assert capsys.readouterr().out == "epoch 1/1  1,234 env steps/s  0s left\n"
 
 
+@pytest.mark.long
 def test_warp_starts_without_a_word_where_there_is_no_gpu() -> None:
     if Path("/dev/nvidiactl").exists():
         pytest.skip("there is a GPU")

@@ -358,6 +358,7 @@ def test_bad_input_is_one_line(
     assert message in line
 
 
+@pytest.mark.long
 def test_it_serves_until_it_is_asked_to_stop(experiment: Experiment, launcher: Launcher, tmp_path: Path) -> None:
     out = tmp_path / "out.txt"
     command = [sys.executable, "-m", "msk_ray.dashboard", str(experiment.path.parent), "--port", "0", "--no-films"]

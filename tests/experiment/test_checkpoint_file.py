@@ -55,6 +55,7 @@ def test_every_flipped_bit_of_the_head_and_any_of_the_payload_is_found(tmp_path:
         assert "\n" not in str(caught.value)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("old", [False, True])
 def test_killed_anywhere_while_it_is_replaced_the_old_or_the_new_one_is_there(tmp_path: Path, old: bool) -> None:
     """Fails with a manifest beside the payload: between their two writes there was neither."""

@@ -69,6 +69,7 @@ def test_a_model_without_legs_is_refused() -> None:
         analyse(other, np.zeros((1, 7)), np.zeros((1, 6)), np.zeros((1, 0)), 0.02)
 
 
+@pytest.mark.long
 def test_the_command_writes_json_and_a_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = parse_config(
         {
