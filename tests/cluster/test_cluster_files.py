@@ -138,6 +138,7 @@ def test_document(document: Any, check: Check) -> None:
     check(document)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "document", "check"), DOCUMENTS, ids=[d[0] for d in DOCUMENTS])
 def test_every_key_misspelt_is_found(name: str, document: Any, check: Check) -> None:
     places = [place for place in keys(document) if not any(matches(place, free) for free in FREE.get(name, []))]

@@ -30,6 +30,7 @@ def cartpole(tmp_path_factory):
     return folder
 
 
+@pytest.mark.long
 def test_a_trained_policys_gradients_match_float64_from_every_state(cartpole, tmp_path, capsys):
     arguments = ["--horizons", "1", "8", "--worlds", "2", "--directions", "6", "--output", str(tmp_path)]
     assert main([str(cartpole / "checkpoints" / "best.pt"), *arguments]) == 0
@@ -45,6 +46,7 @@ def test_a_trained_policys_gradients_match_float64_from_every_state(cartpole, tm
     assert "quality.png" in capsys.readouterr().out
 
 
+@pytest.mark.long
 def test_the_ant_under_two_physics(tmp_path):
     (tmp_path / "ant.yaml").write_text(dump_yaml({"env": {"name": "ant"}, "actor": {"hidden": [8]}}))
     arguments = ["--variants", "matched", "published", "--states", "standing", "--horizons", "2"]

@@ -68,6 +68,7 @@ def code_of(page: str) -> str:
     return (ROOT / "docs" / page).read_text().split("```python\n")[1].split("```")[0]
 
 
+@pytest.mark.long
 def test_the_code_on_identification_finds_the_damping(capsys: pytest.CaptureFixture[str]) -> None:
     found: dict[str, Any] = {}
     exec(code_of("identification.md"), found)

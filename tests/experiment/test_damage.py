@@ -75,6 +75,7 @@ def test_an_odd_line_is_named_and_hides_no_other(odd: bytes, tmp_path: Path) -> 
     assert len(damage.what) <= 100
 
 
+@pytest.mark.long
 @settings(max_examples=300, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 6), anything), max_size=5), st.integers(0, 30))
 def test_lines_among_which_others_are_put_are_all_found(others: list[tuple[int, bytes]], torn: int) -> None:
@@ -92,6 +93,7 @@ def test_lines_among_which_others_are_put_are_all_found(others: list[tuple[int, 
     assert again == (found, damages)
 
 
+@pytest.mark.long
 @settings(max_examples=300, deadline=None)
 @given(anything)
 def test_a_file_of_anything_is_read_or_refused_in_one_line(data: bytes) -> None:

@@ -113,6 +113,7 @@ def test_the_command_writes_json_and_a_picture(tmp_path: Path, capsys: pytest.Ca
         main([str(tmp_path / "trial"), "--speeds", "0.5,-1"])
 
 
+@pytest.mark.long
 def test_people_on_the_legs_of_the_model_are_close_to_people(model: mujoco.MjModel, tmp_path: Path) -> None:
     """The measured angles, played back by the clock with the measured force, come back as they were measured."""
     env = make_env(

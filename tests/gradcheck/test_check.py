@@ -67,6 +67,7 @@ def test_fd_jacobian_on_a_standing_ant(cone, substeps):
     assert report.max_rel_error < 2e-2
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("substeps", "inputs"), [(1, ("ctrl", "qpos", "qvel")), (16, ("ctrl", "qvel"))])
 def test_fd_jacobian_on_an_ant_moving_in_contact(substeps, inputs):
     """The median only: a difference across a touch is wrong by the jump, whatever the perturbation."""
@@ -77,6 +78,7 @@ def test_fd_jacobian_on_an_ant_moving_in_contact(substeps, inputs):
         assert np.median(errors(report, name)) < 2e-2
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("substeps", [1, 16])
 def test_adjoint_on_an_ant_in_contact(substeps):
     """Two derivations that share no code, in all but rounding the same."""

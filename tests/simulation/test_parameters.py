@@ -38,6 +38,7 @@ def model() -> mujoco.MjModel:
     return out
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("cone", "substeps"), [("pyramidal", 1), ("elliptic", 4)])
 def test_all_parameters_of_an_ant_in_contact(model, cone, substeps):
     model = copy.copy(model)

@@ -46,6 +46,7 @@ def test_cartpole(substeps, contacts):
     assert max(max(errors[n]) for n in INPUTS) < 1e-5
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("substeps", [1, 16])
 @pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
 def test_ant_in_contact(cone, substeps):
