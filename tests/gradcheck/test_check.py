@@ -58,6 +58,7 @@ def test_fd_jacobian_on_cartpole(cartpole, substeps):
         assert np.median(errors(report, name, "policy")) < 1e-3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
 @pytest.mark.parametrize("substeps", [1, 16])
 def test_fd_jacobian_on_a_standing_ant(cone, substeps):

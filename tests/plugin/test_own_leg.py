@@ -29,6 +29,7 @@ def test_it_is_in_the_reward_with_its_weight(root: Path) -> None:
     assert terms[1][:, -1].tolist() == [0.0, 0.0]
 
 
+@pytest.mark.long
 def test_it_trains_and_is_scored_term_by_term(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     small = ("shac.horizon=2", "trial.epochs=1", "actor.hidden=[8]", "critic.hidden=[8]", "env.reward.bounce=2")
     small += ("evaluation.nworld=2", "evaluation.steps=3", "evaluation.interval=1")

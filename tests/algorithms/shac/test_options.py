@@ -68,6 +68,7 @@ def test_an_option_changes_what_is_learned(name: str, plain: Trainer, tmp_path: 
     assert not same(trainer, plain)
 
 
+@pytest.mark.long
 def test_options_resume(tmp_path: Path) -> None:
     changes: dict[str, Any] = {}
     for name, option in OPTIONS.items():
