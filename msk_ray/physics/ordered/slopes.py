@@ -96,8 +96,7 @@ class SlopeOrder:
             # It subtracts dampers from M alone. What depends on M only, is done by now.
             own = copy.copy(data)
             own.M = self._arrays(model, data)[1]
-            wp.copy(own.M, data.M)
-            self._subtract(model, data, data.M, own.M)
+            self._subtract(model, data, data.M, own.M)  # writes all entries
         mjw.implicit(self._still, own)
 
     def _subtract(self, m: Any, d: Any, matrix: wp.array, out: wp.array) -> None:
