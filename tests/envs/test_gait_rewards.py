@@ -21,8 +21,8 @@ from msk_ray.envs.myoleg26.env import MyoLeg26
 from msk_ray.envs.records import EnvState
 from msk_ray.simulation import StepState
 
-EVERY = {"metabolic": 0.1, "fatigue": 0.1, "head": 0.1, "impact": 0.1, "footfall": 0.1, "clearance": 0.1, "track": 0.5}
-EVERY["track_rate"] = 0.1
+EVERY = dict.fromkeys(("metabolic", "fatigue", "head", "impact", "footfall", "clearance", "toes"), 0.1)
+EVERY |= {"track": 0.5, "track_rate": 0.1}
 
 
 def make(nworld: int = 4, **settings: object) -> MyoLeg26:
@@ -69,6 +69,9 @@ def test_costs_by_hand() -> None:
     assert terms.sliding(phase, still, moving).tolist() == pytest.approx([once, once, 0.0])
     heights = torch.tensor([[0.005, 0.02]] * 3)
     assert terms.dragging(phase, heights, 0.01).tolist() == pytest.approx([0.0, 0.0, 0.125])
+    slope, bend = torch.full((3,), 0.2), torch.full((3,), 0.09)
+    toes = terms.lifted_toes(phase, slope, bend).tolist()
+    assert toes == pytest.approx([math.hypot(1.0, angle / 0.15) - 1.0 for angle in (0.2, 0.2, 0.3)])
     down = terms.impact(torch.tensor([[0.0, 0.03, 0.0]]), torch.tensor([[-2.0, -1.0, 1.0]]))
     assert down.item() == pytest.approx(4.0 + math.exp(-1.0))
     apart = terms.deviation(torch.tensor([[0.3, 0.0]]), torch.zeros(1, 2), 0.1)
@@ -129,6 +132,21 @@ def test_the_pelvis_sways_between_feet_that_stay() -> None:
             drift.append(abs(velocity[4]))
         speeds.append(qvel[env.model.joint("pelvis_tz").dofadr[0]])
     assert max(drift) < 0.01 < 0.15 < max(speeds)
+
+
+def test_toes_are_level_on_the_ground_and_straight_in_the_air(env: MyoLeg26) -> None:
+    """People's feet, whose toes are level until the swing; lifted by 0.4 rad, they cost as much at every phase."""
+    fresh(env)
+    numbers = torch.tensor([[1.25, phase] for phase in (0.2, 0.3, 0.7, 0.8)])
+    start = env.draw_phase(numbers[:, 1], numbers[:, 0])
+    lifted = start.qpos.clone()
+    toes = [env.model.joint(f"mtp_angle_{side}").qposadr[0] for side in "rl"]
+    start.qpos[:, toes] = torch.tensor(env.people_poses()[[20, 30, 70, 80]][:, toes], dtype=torch.float32)
+    lifted[:, toes] = start.qpos[:, toes] + 0.4
+    env.state = env.state._replace(numbers=numbers, age=torch.full((4,), -1))
+    assert env._lifted_toes(start).max() < 0.1
+    cost = env._lifted_toes(start._replace(qpos=lifted))
+    assert cost.tolist() == pytest.approx([2.0 * (math.hypot(1.0, 0.4 / 0.15) - 1.0)] * 4, rel=0.12)
 
 
 def test_initial_states_track_the_reference(env: MyoLeg26) -> None:

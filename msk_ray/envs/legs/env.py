@@ -134,7 +134,7 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
             self.reference = Reference(self.model, self.device)
             self._track_qpos = columns(self.model.jnt_qposadr[self.reference.joints], self.device)
             self._track_dofs = columns(self.model.jnt_dofadr[self.reference.joints], self.device)
-        if {"impact", "footfall", "clearance"} & set(self._further):
+        if {"impact", "footfall", "clearance", "toes"} & set(self._further):
             self._feet = Feet(self.model, self.stand_height, self.device)
 
     def weights(self, reward: LegReward) -> Tensor:
@@ -356,6 +356,8 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
                 return self._footfall(state)
             case "clearance":
                 return self._clearance(state)
+            case "toes":
+                return self._lifted_toes(state)
             case _:
                 return self._tracking(state)[("track", "track_rate").index(name)]
 
@@ -387,6 +389,12 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
         heights, (right, left) = self._foot_motion(state).height, self._leg_phases()
         wanted = self.config.reward.clearance_height
         return costs.dragging(right, heights[:, :2], wanted) + costs.dragging(left, heights[:, 2:], wanted)
+
+    def _lifted_toes(self, state: StepState) -> Tensor:
+        slope, bend = self._feet.toes(self.frames(state))
+        sides = zip(self._leg_phases(), slope.unbind(-1), bend.unbind(-1), strict=True)
+        right, left = (costs.lifted_toes(*side) for side in sides)
+        return right + left
 
     def _tracking(self, state: StepState) -> tuple[Tensor, Tensor]:
         """Costs (W,) of the distance from people's joint angles and of that from their rates."""

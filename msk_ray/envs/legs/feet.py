@@ -3,11 +3,13 @@
 from typing import NamedTuple
 
 import mujoco
+import numpy as np
 import torch
 from torch import Tensor
 
 from msk_ray.envs.legs.gait.body import SIDES, world_axes
 from msk_ray.simulation.kinematics import Frames
+from msk_ray.simulation.tangent import quat_rotate
 
 _FOOT = ("calcn", "toes")
 """Bodies whose origins are the heel and the joint of the toes."""
@@ -36,9 +38,19 @@ class Feet:
         above = [(data.body(name).xpos - data.body("pelvis").xpos) @ axes[2] for name in self._names]
         self._rest = stand_height + torch.tensor(above, dtype=torch.float32, device=device)
         self._up = torch.tensor(axes[2], dtype=torch.float32, device=device)
+        # The direction that points forward in standing, in each body's frame.
+        ahead = np.stack([data.body(name).xmat.reshape(3, 3).T @ axes[0] for name in self._names])
+        self._ahead = torch.tensor(ahead, dtype=torch.float32, device=device)
 
     def motion(self, frames: Frames, height: Tensor) -> FootMotion:
         """Their motion where the pelvis is at a height (W,) above the ground [m]."""
         above = ((frames.position(self._names) - frames.position("pelvis")[:, None]) * self._up).sum(-1)
         velocity = frames.velocity(self._names)
         return FootMotion(height[:, None] + above - self._rest, (velocity * self._up).sum(-1), velocity)
+
+    def toes(self, frames: Frames) -> tuple[Tensor, Tensor]:
+        """Sine of the angle of the toes to the ground, and 2 (1 - cos) of that to their foot, each (W, 2)."""
+        quat = frames.orientation(self._names)
+        ahead = quat_rotate(quat, self._ahead.to(quat.dtype).expand(len(quat), -1, -1)).unflatten(1, (2, 2))
+        foot, toes = ahead.unbind(2)
+        return (toes * self._up).sum(-1), (toes - foot).square().sum(-1)

@@ -14,6 +14,8 @@ SWING = (0.64, 0.92)
 """The same of the swing."""
 _SLIDING = 0.3
 """Speed of a foot that should stand beyond which its cost grows linearly [m/s]."""
+_BENT = 0.15
+"""Angle of the toes beyond which its cost grows linearly [rad]."""
 _NEAR = 0.03
 """Height above the ground at which an approaching foot counts 1/e [m]."""
 
@@ -45,6 +47,18 @@ def dragging(phase: Tensor, heights: Tensor, clearance: float) -> Tensor:
     """
     missing = torch.relu(clearance - heights) / clearance
     return window(phase, *SWING) * missing.square().mean(-1)
+
+
+def lifted_toes(phase: Tensor, slope: Tensor, bend: Tensor) -> Tensor:
+    """Cost (W,) of a foot's toes that are not level while on the ground, or bent against their foot in the air.
+
+    Args:
+        phase: of its leg [turns], (W,).
+        slope: sine of the toes' angle to the ground, (W,).
+        bend: 2 (1 - cos) of their angle to the foot, which is the angle squared while small, (W,).
+    """
+    down = window(phase, *TOES_DOWN)
+    return soft((down * slope.square() + (1.0 - down) * bend) / _BENT**2)
 
 
 def impact(heights: Tensor, fall: Tensor) -> Tensor:
