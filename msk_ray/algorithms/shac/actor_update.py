@@ -58,6 +58,27 @@ class Rolled:
 
 
 @dataclass(frozen=True)
+class Judged:
+    """A rollout's loss, and what the critic is to learn from it; obs and targets are of all worlds of the group."""
+
+    loss: Tensor
+    """The actor's, with its graph."""
+    value: Tensor
+    """Mean value of the states reached."""
+    raw: Tensor
+    """Observations as the environment gives them, (H, W, O)."""
+    normalised: Tensor
+    """The same, normalised, (H, W, O)."""
+    targets: Tensor
+    """The critic's targets for them, (H, W)."""
+
+    @property
+    def for_critic(self) -> tuple[Tensor, Tensor]:
+        """Normalised observations (H·W, O) and targets (H·W,)."""
+        return self.normalised.flatten(0, 1), self.targets.flatten()
+
+
+@dataclass(frozen=True)
 class ActorOutcome:
     """The results of one epoch, all detached, on the device; of all worlds of the group, but for the state."""
 
@@ -137,7 +158,20 @@ class ActorUpdate:
             )
         return Rolled(rollout, env.state.detach(), gate, halves, calls)
 
-    def learn(self, rolled: Rolled) -> ActorOutcome:
+    def judge(self, rolled: Rolled) -> Judged:
+        """Value the states that were reached, by the target critic: the actor's loss, and the critic's targets."""
+        c, rollout, gather = self._settings, rolled.rollout, self._group.gather
+        loss, next_values, rewards = self._loss(rollout)
+        values = next_values.detach()
+        if c.critic_method == "td-lambda":
+            targets = returns.td_lambda_targets(rewards, values, rollout.terminated, rollout.done, c.gamma, c.lam)
+        else:
+            targets = returns.one_step_targets(rewards, values, rollout.terminated, c.gamma)
+        raw = gather(rollout.obs, dim=1)
+        normalised = raw if self._normalizer is None else self._normalizer.normalize(raw)
+        return Judged(loss, values.mean(), raw, normalised, gather(targets, dim=1))
+
+    def learn(self, rolled: Rolled, judged: Judged) -> ActorOutcome:
         """Take the actor's step along the rollout's gradient, and update the statistics.
 
         The step is left out where more worlds than `max_nonfinite_share` had a gradient that was not finite, or the
@@ -147,9 +181,8 @@ class ActorUpdate:
         its own worlds, of which there are as many everywhere.
         """
         c, rollout, gather = self._settings, rolled.rollout, self._group.gather
-        loss, next_values, rewards = self._loss(rollout)
         self._optimizer.zero_grad()
-        loss.backward()
+        judged.loss.backward()
         if rolled.calls is not None:
             rolled.calls.add_gradients()
         self._group.mean([p.grad for p in self._actor.parameters() if p.grad is not None])
@@ -158,17 +191,10 @@ class ActorUpdate:
         norm = clip_gradients(list(self._actor.parameters()), limit)
         failed = (cotangents.nonfinite_share > c.max_nonfinite_share) | ~norm.isfinite()
         self._optimizer.step(skip=failed)
-        values = next_values.detach()
-        if c.critic_method == "td-lambda":
-            targets = returns.td_lambda_targets(rewards, values, rollout.terminated, rollout.done, c.gamma, c.lam)
-        else:
-            targets = returns.one_step_targets(rewards, values, rollout.terminated, c.gamma)
-        raw = obs = gather(rollout.obs, dim=1)
         if self._normalizer is not None:
-            obs = self._normalizer.normalize(raw)
-            self._normalizer.update(raw.flatten(0, 1))
+            self._normalizer.update(judged.raw.flatten(0, 1))
         detached = gather(rollout.rewards.detach(), dim=1)
-        means = {"train/actor_loss": loss.detach(), "train/value": values.mean()}
+        means = {"train/actor_loss": judged.loss.detach(), "train/value": judged.value}
         if rollout.neg_log_prob is not None:
             means["train/entropy"] = rollout.neg_log_prob.detach().mean()
         self._group.mean(list(means.values()))
@@ -179,7 +205,7 @@ class ActorUpdate:
             "grad/actor_norm": norm,
             "grad/halves_cosine": rolled.halves.cosine(),
         }
-        std = self._actor.std(obs)
+        std = self._actor.std(judged.normalised)
         if std is not None:
             metrics["train/std"] = std.detach().mean()
         if rollout.contact is not None:
@@ -187,8 +213,7 @@ class ActorUpdate:
             metrics["train/contact"] = (gather(rollout.contact, dim=1) / weight).square().mean().sqrt()
         return ActorOutcome(
             rolled.state,
-            obs.flatten(0, 1),
-            gather(targets, dim=1).flatten(),
+            *judged.for_critic,
             detached,
             gather(rollout.done, dim=1),
             cotangents,

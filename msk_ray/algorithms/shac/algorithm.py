@@ -73,13 +73,14 @@ class Shac(Algorithm):
         self._horizon = RolloutLength(c.horizon)
         self._entropy = EntropyBonus(c.entropy, env.action_size, device) if c.entropy is not None else None
         self._contacts = ContactSchedule(config.curriculum, env) if config.curriculum is not None else None
+        self._epoch = 0
         self._actor_update = ActorUpdate(
             c, env, self.network, self.target_critic, self.return_statistics, self._entropy, self.actor_optimizer
         )
         self._runner = (
-            RecordedRunner(self._actor_update, self._fit_critic, env)
+            RecordedRunner(self._actor_update, self, env)
             if c.capture == "auto" and device.type == "cuda"
-            else EagerRunner(self._actor_update, self._fit_critic, env)
+            else EagerRunner(self._actor_update, self, env)
         )
 
     @classmethod
@@ -116,16 +117,13 @@ class Shac(Algorithm):
         inputs = self._draw(horizon, epoch)
         if self.witness is not None:
             self.witness.note("draws", {"noise": inputs.noise, **inputs.state.physics._asdict()})
-        outcome = self._runner.run_actor(inputs)
+        self._epoch = epoch
+        outcome = self._runner.run(inputs)
         if self.witness is not None:
             rolled = {"observations": outcome.obs, "rewards": outcome.rewards, "ends of episodes": outcome.done}
             self.witness.note("rollout", {**rolled, **outcome.state.physics._asdict()})
             self.witness.note("values", {"targets of the critic": outcome.targets})
             self.witness.note("gradients", {"policy": torch.cat([p.flatten() for p in self.actor.parameters()])})
-        # The fit before reads its rate until it ends, which the actor's work has waited for.
-        self.critic_fit.optimizer.set_rate(self._rate(c.critic_lr, epoch))
-        orders = self.critic_fit.draw_orders(outcome.targets.numel(), c.critic_iterations, self.minibatch_generator)
-        self._runner.run_critic(outcome.obs, outcome.targets, orders)
         seconds = self._runner.seconds()
         self.env.sim.settle()
         cotangents = outcome.cotangents.statistics(1.0 / (horizon * self.env.nworld))
@@ -261,14 +259,24 @@ class Shac(Algorithm):
                 "nonfinite_gradient: the policy gradient is not finite; lower shac.actor_lr", Failure.NONFINITE
             )
 
-    def _fit_critic(self, obs: Tensor, targets: Tensor, orders: Tensor) -> Tensor:
-        """Fit the critic, move the target critic, and return the last pass's mean loss."""
+    def prepare_fit(self, rows: int) -> Tensor:
+        """Set the critic's rate, and draw the orders in which a fit passes over so many rows, (passes, rows).
+
+        The fit before must have ended: it reads its rate until then.
+        """
         c = self.settings
-        loss = self.critic_fit.run(obs, targets, orders, c.critic_batches)
-        with torch.no_grad():
-            for target, source in zip(self.target_critic.parameters(), self.critic.parameters(), strict=True):
-                target.lerp_(source, 1.0 - c.target_critic_alpha)
-        return loss
+        self.critic_fit.optimizer.set_rate(self._rate(c.critic_lr, self._epoch))
+        return self.critic_fit.draw_orders(rows, c.critic_iterations, self.minibatch_generator)
+
+    def fit_critic(self, obs: Tensor, targets: Tensor, orders: Tensor) -> Tensor:
+        """Fit the critic, and return the last pass's mean loss."""
+        return self.critic_fit.run(obs, targets, orders, self.settings.critic_batches)
+
+    @torch.no_grad()
+    def move_target(self) -> None:
+        """Let the target critic follow the critic."""
+        for target, source in zip(self.target_critic.parameters(), self.critic.parameters(), strict=True):
+            target.lerp_(source, 1.0 - self.settings.target_critic_alpha)
 
 
 def _network(config: Config, obs_size: int, action_size: int, generator: torch.Generator) -> PolicyNetwork:

@@ -6,20 +6,32 @@ from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 from msk_ray.algorithms.base import Clock
-from msk_ray.algorithms.shac.actor_update import ActorOutcome, ActorUpdate, EpochInputs, Rolled
+from msk_ray.algorithms.shac.actor_update import ActorOutcome, ActorUpdate, EpochInputs, Judged, Rolled
 from msk_ray.envs import Env
 from msk_ray.physics.iterations import limits_for, reached
 from msk_ray.simulation.capture import Recording, fill
 from msk_ray.simulation.stepper import Engine
 
-FitCritic = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""Observations (N, O), targets (N,) and orders (passes, N) to the loss; moves the target critic too."""
+
+class CriticWork(Protocol):
+    """What a runner does with the critic."""
+
+    def prepare_fit(self, rows: int) -> Tensor:
+        """Set the rate of the next fit, and draw its orders of so many rows, (passes, rows)."""
+
+    def fit_critic(self, obs: Tensor, targets: Tensor, orders: Tensor) -> Tensor:
+        """Fit the critic to observations (N, O) and targets (N,) in these orders, and return the loss."""
+
+    def move_target(self) -> None:
+        """Let the target critic follow the critic that was fitted."""
+
+
 _MOST_HORIZONS = 3
 """Recordings kept of epochs, and of fits, one for each horizon: each holds the memory of all its work."""
 _FEWEST_ITERATIONS = 6
@@ -44,9 +56,9 @@ class EagerRunner:
 
     recorded = False
 
-    def __init__(self, actor: ActorUpdate, fit_critic: FitCritic, env: Env[Any]) -> None:
+    def __init__(self, actor: ActorUpdate, critic: CriticWork, env: Env[Any]) -> None:
         self._actor = actor
-        self._fit_critic = fit_critic
+        self._critic = critic
         self._env = env
         self._device = env.device
         self._clock = Clock(env.device)
@@ -61,20 +73,24 @@ class EagerRunner:
         """Go on after a fit that had this `newest_loss`."""
         self.last_loss = loss
 
-    def run_actor(self, inputs: EpochInputs) -> ActorOutcome:
-        """The rollout, and the actor's step along its gradient."""
+    def run(self, inputs: EpochInputs) -> ActorOutcome:
+        """One epoch: the rollout, the actor's step along its gradient, and the fit of the critic."""
+        outcome = self._run_actor(inputs)
+        self.last_loss = self._critic.fit_critic(
+            outcome.obs, outcome.targets, self._critic.prepare_fit(outcome.targets.numel())
+        )
+        self._critic.move_target()
+        self._clock.mark("critic")
+        return outcome
+
+    def _run_actor(self, inputs: EpochInputs) -> ActorOutcome:
         self._clock = Clock(self._device)
         rolled = self._actor.roll(inputs)
         self._clock.mark("rollout")
-        outcome = self._actor.learn(rolled)
+        outcome = self._actor.learn(rolled, self._actor.judge(rolled))
         self._clock.mark("backward")
         self._env.release_graph()
         return outcome
-
-    def run_critic(self, obs: Tensor, targets: Tensor, orders: Tensor) -> None:
-        """Fit the critic."""
-        self.last_loss = self._fit_critic(obs, targets, orders)
-        self._clock.mark("critic")
 
     def join(self) -> None:
         """Let what follows on the current stream wait for all work that was started."""
@@ -93,6 +109,7 @@ class _Epoch:
 
     inputs: EpochInputs
     roll: Recording[Rolled]
+    judge: Recording[Judged]
     learn: Recording[ActorOutcome]
 
 
@@ -116,27 +133,32 @@ class _Recordings:
 
 
 class RecordedRunner(EagerRunner):
-    """Replays recorded epochs, one recording for each horizon; the critic is fitted beside the next rollout.
+    """Replays recorded epochs, one recording for each horizon; the critic is fitted beside what follows.
 
-    The first epoch of a horizon runs eagerly. The target critic is needed only at the end of a rollout, so that the fit
-    has that long: the mathematics are those of one after the other. `last_loss` is the loss of the fit before.
+    A fit needs a rollout's targets, and is needed when the next rollout is judged: it runs beside the backward pass and
+    the next rollout. The target critic, which the backward pass reads, follows once the fit has ended. The mathematics
+    are those of one after the other. `last_loss` is the loss of the fit before.
 
-    Work that cannot be recorded, because an environment waits for the device, runs eagerly from then on; a warning says
-    why and where. In a group, all processes record and replay the same, because recordings contain collective
-    operations, which have to be recorded everywhere or nowhere; while the critic is fitted, nothing else uses them.
+    The first epoch of a horizon runs eagerly. Work that cannot be recorded, because an environment waits for the
+    device, runs eagerly from then on; a warning says why and where. In a group, all processes record and replay the
+    same, because recordings contain collective operations, which have to be recorded everywhere or nowhere. Nothing
+    else may use them while the critic is fitted, so that the fit has to wait for the backward pass there.
 
     Args:
         env: the worlds.
     """
 
-    def __init__(self, actor: ActorUpdate, fit_critic: FitCritic, env: Env[Any]) -> None:
-        super().__init__(actor, fit_critic, env)
+    def __init__(self, actor: ActorUpdate, critic: CriticWork, env: Env[Any]) -> None:
+        super().__init__(actor, critic, env)
         self._group = env.group
         self._kept = _Recordings(env.sim.engine)
         self._fits: dict[tuple[torch.Size, ...], _Fit | None] = {}
         self._recording = torch.cuda.Stream(env.device)
         self._side = torch.cuda.Stream(env.device)
         self._fitted = torch.cuda.Event()
+        self._ready = torch.cuda.Event()
+        self._target_behind = False
+        """Whether the target critic has yet to follow the fit that was started last."""
         self._fit_clock: Clock | None = None
         self._fit_s: float | None = None
         self._newest_loss: Tensor | None = None
@@ -156,43 +178,61 @@ class RecordedRunner(EagerRunner):
         super().resume(loss)
         self._newest_loss = None
 
-    def run_actor(self, inputs: EpochInputs) -> ActorOutcome:
+    def run(self, inputs: EpochInputs) -> ActorOutcome:
         epoch = self._epoch(inputs)
         self.recorded = epoch is not None
         if epoch is None:
             self.join()
-            return super().run_actor(inputs)
+            outcome = self._run_actor(inputs)
+            self._start_fit(self._offer(outcome.obs, outcome.targets))
+            return outcome
         self._clock = Clock(self._device)
         fill(epoch.inputs.tensors(), inputs.tensors())
         epoch.roll.replay()
         self._clock.mark("rollout")
         self.join()
+        judged = epoch.judge.replay()
+        alone = self._group.size == 1
+        offered = self._offer(*judged.for_critic) if alone else None
         outcome = epoch.learn.replay()
         self._clock.mark("backward")
         self._env.state = outcome.state
+        # After the backward pass is under way, because this makes the host wait for the fit before.
+        self._start_fit(self._offer(outcome.obs, outcome.targets) if offered is None else offered)
         return outcome
 
-    def run_critic(self, obs: Tensor, targets: Tensor, orders: Tensor) -> None:
-        # The fit before has ended: the actor's work waited for it.
-        self._note_fit()
-        inputs = (obs, targets, orders)
-        fit = self._fit(inputs)
-        if fit is None:
-            clock = Clock(self._device)
-            self._newest_loss = self._fit_critic(*inputs)
-            clock.mark("critic")
-        else:
-            fill(fit.inputs, inputs)
-            self._side.wait_stream(torch.cuda.current_stream(self._device))
-            with torch.cuda.stream(self._side):
-                clock = Clock(self._device)
+    def _offer(self, obs: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
+        """Keep what a fit is to read, and the loss of the fit before, which has ended on the device by now."""
+        if self._newest_loss is not None:
+            self.last_loss = self._newest_loss.clone()
+        offered = obs.clone(), targets.clone()
+        self._ready.record(torch.cuda.current_stream(self._device))
+        return offered
+
+    def _start_fit(self, offered: tuple[Tensor, Tensor]) -> None:
+        if self._fit_clock is not None:
+            self._fit_s = self._fit_clock.seconds()["critic"]
+        with torch.cuda.stream(self._side):
+            self._side.wait_event(self._ready)
+            for tensor in offered:
+                tensor.record_stream(self._side)
+            inputs = (*offered, self._critic.prepare_fit(offered[1].numel()))
+            fit = self._fit(inputs)
+            self._fit_clock = Clock(self._device)
+            if fit is None:
+                self._newest_loss = self._critic.fit_critic(*inputs)
+            else:
+                fill(fit.inputs, inputs)
                 self._newest_loss = fit.work.replay()
-                clock.mark("critic")
-                self._fitted.record()
-        self._fit_clock = clock
+            self._fit_clock.mark("critic")
+            self._fitted.record()
+        self._target_behind = True
 
     def join(self) -> None:
         torch.cuda.current_stream(self._device).wait_event(self._fitted)
+        if self._target_behind:
+            self._critic.move_target()
+            self._target_behind = False
 
     def seconds(self) -> dict[str, float]:
         return super().seconds() | ({} if self._fit_s is None else {"critic": self._fit_s})
@@ -241,13 +281,6 @@ class RecordedRunner(EagerRunner):
         self._kept.epochs.clear()
         warnings.warn(f"epochs run operation by operation, not as recorded graphs: {why}", stacklevel=2)
 
-    def _note_fit(self) -> None:
-        """Keep loss and time of the fit that has ended, before the next one replaces them."""
-        if self._newest_loss is not None:
-            self.last_loss = self._newest_loss.clone()
-        if self._fit_clock is not None:
-            self._fit_s = self._fit_clock.seconds()["critic"]
-
     def _epoch(self, inputs: EpochInputs) -> _Epoch | None:
         """The recording of an epoch with this horizon; None if it has to run eagerly."""
         if self._refused:
@@ -274,12 +307,13 @@ class RecordedRunner(EagerRunner):
         before = self._env.state
         try:
             roll = Recording(lambda: self._actor.roll(buffers), self._recording)
-            learn = Recording(lambda: self._actor.learn(roll.result), self._recording, pool=roll.pool)
+            judge = Recording(lambda: self._actor.judge(roll.result), self._recording, pool=roll.pool)
+            learn = Recording(lambda: self._actor.learn(roll.result, judge.result), self._recording, pool=roll.pool)
         finally:
             self._env.state = before
             self._env.stock_resets(None)  # those of the recording are in its memory
             self._env.release_graph()
-        return _Epoch(buffers, roll, learn)
+        return _Epoch(buffers, roll, judge, learn)
 
     def _fit(self, inputs: tuple[Tensor, ...]) -> _Fit | None:
         """The recording of a fit of this size; None if it has to run eagerly."""
@@ -292,7 +326,7 @@ class RecordedRunner(EagerRunner):
             for oldest in recorded[: len(recorded) + 1 - _MOST_HORIZONS]:
                 del self._fits[oldest]
             buffers = tuple(t.clone() for t in inputs)
-            work = Recording(lambda: self._fit_critic(*buffers), self._side)
+            work = Recording(lambda: self._critic.fit_critic(*buffers), self._side)
             self._fits[shapes] = _Fit(buffers, work)
         return self._fits[shapes]
 
