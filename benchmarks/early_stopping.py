@@ -32,6 +32,7 @@ from msk_ray.experiment.trial_status import StatusReader
 from msk_ray.sweep.rules.asha import Asha
 from msk_ray.sweep.rules.early_stopping import Pruner, SchedulerSpec
 from msk_ray.sweep.rules.median import Median
+from msk_ray.sweep.rules.per_environment import refuse_several
 
 NEAR = 0.01
 """Share of its best score that a sweep may lose and still count as equally good."""
@@ -196,6 +197,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         raise ConfigError(f"--{describe_fault(error, SchedulerSpec)}") from error
     experiment = Experiment(args.experiment.resolve())
     records = read_records(experiment)
+    refuse_several((r.trial.environment for r in records), f"{args.experiment}: a rule compares trials by their scores")
     whole, others = choose(records, args.experiment, args.leave_out_unfinished)
     rule = Rule(spec, max(record.evaluations[-1].time(spec.time_attr) for record in whole))
     judged = judge(whole, rule.fresh(), spec.time_attr, args.slots)

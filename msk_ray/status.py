@@ -18,9 +18,16 @@ from msk_ray.experiment.damage import count_damages
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.outcomes import Outcome
 from msk_ray.experiment.snapshot import State
-from msk_ray.experiment.trial_status import StatusReader, TrialStatus, best_of, counts, find_experiments, remaining
+from msk_ray.experiment.trial_status import (
+    StatusReader,
+    TrialStatus,
+    counts,
+    describe_bests,
+    find_experiments,
+    remaining,
+)
 from msk_ray.progress import format_duration
-from msk_ray.text import printable
+from msk_ray.text import printable, printable_lines
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
@@ -133,11 +140,11 @@ def view(observer: StatusReader, width: int, rows: int | None = None) -> "Render
 
 
 def headline(experiment: Experiment, statuses: Sequence[TrialStatus]) -> str:
-    """`ant_lr · 2 running · 3 ended · best 12.3 (1a2b3c4d) · at most 2h05m left`."""
+    """`ant_lr · 2 running · 3 ended · best 12.3 (1a2b3c4d) · at most 2h05m left`; with several environments, the best
+    of each."""
     parts = [experiment.name, *(f"{n} {state}" for state, n in counts(statuses).items())]
-    best = best_of(statuses)
-    if best is not None:
-        parts.append(f"best {best.progress.best:.5g} ({best.id})")
+    if best := describe_bests(statuses, ids=True):
+        parts.append(f"best {best}")
     left = remaining(statuses)
     if left is not None:
         parts.append(f"at most {format_duration(left)} left")
@@ -249,24 +256,21 @@ def _list(storage: Path) -> int:
     table.add_column("state", ratio=2, overflow="fold")
     table.add_column("question", ratio=3, no_wrap=True, overflow="ellipsis")
     for path in paths:
-        table.add_row(*(Text(printable(cell)) for cell in (path.name, *_summary(Experiment(path)))))
+        table.add_row(*(Text(printable_lines(cell)) for cell in (printable(path.name), *_summary(Experiment(path)))))
     _console().print(table)
     return 0
 
 
 def _summary(experiment: Experiment) -> tuple[str, str, str, str]:
+    """Trials, best scores, states and question of an experiment, printable; each environment's best on its own line."""
     try:
         statuses = StatusReader(experiment).look(time.time())
         question = experiment.manifest().get("question") or ""
     except MskRayError as error:
-        return "-", "-", str(error), ""
-    best = best_of(statuses)
-    return (
-        str(len(statuses)),
-        "-" if best is None else f"{best.progress.best:.4g}",
-        ", ".join(f"{n} {state}" for state, n in counts(statuses).items()) or "no trial has started yet",
-        question,
-    )
+        return "-", "-", printable(str(error)), ""
+    states = ", ".join(f"{n} {state}" for state, n in counts(statuses).items()) or "no trial has started yet"
+    bests = printable(describe_bests(statuses, ids=False)).replace(", ", "\n")
+    return str(len(statuses)), bests or "-", states, printable(question)
 
 
 def _known(storage: Path) -> str:

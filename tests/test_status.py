@@ -17,7 +17,7 @@ from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import progress_of
 from msk_ray.experiment.outcomes import Ending, Outcome, write_ending
 from msk_ray.experiment.snapshot import State
-from msk_ray.experiment.trial_status import StatusReader, best_of, remaining
+from msk_ray.experiment.trial_status import StatusReader, bests_of, remaining
 from msk_ray.status import main, short_number
 from msk_ray.sweep import opening
 from msk_ray.sweep.space import parse_space
@@ -89,7 +89,7 @@ def test_states_from_files(experiment: Experiment) -> None:
     assert running.heartbeat_age == pytest.approx(5.0, abs=0.1)
     assert (running.device.gpu, standings[3].device.gpu) == ("3", "cpu")
     assert [s.outcome for s in standings[3:5]] == ["finished", "stopped_asha"]  # the higher score first
-    best = best_of(standings)
+    best = bests_of(standings).get("cartpole")
     assert best is standings[3]
     # One trial at a time and 4 s an epoch: 12 epochs of the running one, 16 and 19 of the silent, 20 of the waiting.
     assert remaining(standings) == (12 + 16 + 19 + 20) * 4.0

@@ -19,7 +19,7 @@ from msk_ray.errors import ConfigError, MskRayError
 from msk_ray.experiment.layout import EVAL_FILE
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.snapshot import file_stamp
-from msk_ray.experiment.trial_status import StatusReader, best_of, counts, find_experiments
+from msk_ray.experiment.trial_status import StatusReader, counts, describe_bests, find_experiments
 from msk_ray.report.best import STRIP, stored_best
 from msk_ray.report.page import Live, Section, command_of, compare, make_section, places_of, render_page
 from msk_ray.report.reading import ExperimentReader, Reading, TrialReading, explain
@@ -239,8 +239,7 @@ class Library:
             except MskRayError as error:
                 rows.append((path.name, "", "", explain(error), ""))
                 continue
-            best = best_of(statuses)
-            score = "" if best is None or best.progress.best is None else f"{best.progress.best:.5g}"
+            score = describe_bests(statuses, ids=False)
             state = ", ".join(f"{n} {state}" for state, n in counts(statuses).items()) or "no trial has started yet"
             rows.append((path.name, str(len(statuses)), score, state, question))
         return rows

@@ -19,6 +19,7 @@ from msk_ray.experiment.attempts import read_attempt
 from msk_ray.experiment.checkpoint_file import read_facts
 from msk_ray.experiment.layout import EVAL_FILE
 from msk_ray.experiment.manifest import Experiment
+from msk_ray.experiment.trial import by_environment
 from msk_ray.files import write_json
 from msk_ray.progress import COMPILING, announce
 from msk_ray.shipped import is_shipped
@@ -235,7 +236,8 @@ def figure_rows(entry: dict[str, Any]) -> list[tuple[str, dict[str, float]]]:
 
 
 def evaluate_experiment(experiment: Experiment, bench: "Bench | MyoSuiteBench", requests: "Sequence[Request]") -> int:
-    """Evaluate the best policy of each trial, store the results in its folder, and rank the trials.
+    """Evaluate the best policy of each trial, store the results in its folder, and rank the trials of each
+    environment.
 
     A trial whose policy cannot be evaluated is listed and does not stop the others. A trial that has only its untrained
     policy is listed too, without a rank.
@@ -246,14 +248,14 @@ def evaluate_experiment(experiment: Experiment, bench: "Bench | MyoSuiteBench", 
     from msk_ray.training import load_policy
 
     trials = experiment.trials()
+    groups = by_environment(trials, lambda trial: trial.environment)
     for request in requests:
-        for trial in trials[:1]:
-            bench.check(trial.config, request)
-    rankings: list[list[dict[str, Any]]] = []
+        for group in groups.values():
+            bench.check(group[0].config, request)
+    rankings: dict[tuple[int, str], list[dict[str, Any]]] = {}
     failed: dict[str, str] = {}
     untrained: dict[str, str] = {}
-    for request in requests:
-        ranking = []
+    for position, request in enumerate(requests):
         for number, trial in enumerate(trials, start=1):
             try:
                 path = best_of_trial(experiment.trial_folder(trial.id))
@@ -268,21 +270,26 @@ def evaluate_experiment(experiment: Experiment, bench: "Bench | MyoSuiteBench", 
                 print(f"{number}/{len(trials)}  {trial.id}  {printable(str(error))}", flush=True)
                 continue
             name = trial.variant + read_attempt(experiment.trial_folder(trial.id)).suffix
-            ranking.append({"trial": trial.id, "variant": name, "seed": trial.seed, **entry})
+            ranked = {"trial": trial.id, "variant": name, "seed": trial.seed, **entry}
+            rankings.setdefault((position, trial.environment), []).append(ranked)
             print(f"{number}/{len(trials)}  {trial.id}  {entry['score']['mean']:.5g}", flush=True)
-        ranking.sort(key=lambda entry: -entry["score"]["mean"])
-        rankings.append(ranking)
-    if not any(rankings):
+    for entries in rankings.values():
+        entries.sort(key=lambda entry: -entry["score"]["mean"])
+    if not rankings:
         why = next(iter([*failed.values(), *untrained.values()]), "it has no trials")
         raise CheckpointError(f"no policy of {experiment.path} could be evaluated; the first: {why}")
     missing = [{"trial": trial, "why": why} for trial, why in failed.items()]
     path = experiment.path / EVAL_FILE
-    ranked = [{"physics": entries[0]["physics"], "ranking": entries} for entries in rankings if entries]
+    listed = [
+        {"environment": environment, "physics": entries[0]["physics"], "ranking": entries}
+        for (_, environment), entries in rankings.items()
+    ]
     left_out = {"failed": missing, "untrained": sorted(untrained)}
-    write_json(path, {"format": FORMAT, "experiment": experiment.name, "rankings": ranked, **left_out})
+    write_json(path, {"format": FORMAT, "experiment": experiment.name, "rankings": listed, **left_out})
     width = max(100, shutil.get_terminal_size((160, 24)).columns)
-    for entries in filter(None, rankings):
-        print(f"\nunder {entries[0]['physics']} physics\n{ranking_text(entries, width)}")
+    for (_, environment), entries in rankings.items():
+        where = f"{printable(environment)} " if len(groups) > 1 else ""
+        print(f"\n{where}under {entries[0]['physics']} physics\n{ranking_text(entries, width)}")
     print(f"\nwritten into {path}")
     return 1 if failed else 0
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from msk_ray.errors import CheckpointError, StorageError
 from msk_ray.experiment import layout
 from msk_ray.experiment.manifest import Experiment
-from msk_ray.experiment.results import best_record, read_records
+from msk_ray.experiment.results import best_records, read_records
 from msk_ray.experiment.trial_status import find_experiments
 from msk_ray.shipped import POLICIES, find_shipped, shipped_folder, shipped_names
 
@@ -78,7 +78,7 @@ def best_checkpoint(target: Target) -> Path:
     """The checkpoint that a target stands for: the target itself, a trial's best, or the best trial's best.
 
     Raises:
-        CheckpointError: there is none yet.
+        CheckpointError: there is none yet, or there is one for each of several environments.
     """
     if target.kind is Kind.CHECKPOINT:
         return target.path
@@ -92,18 +92,26 @@ def best_trial_folder(target: Target) -> Path:
     """The folder of the trial that a target stands for.
 
     Raises:
-        CheckpointError: no trial of the experiment has a score yet.
+        CheckpointError: no trial of the experiment has a score yet, or its trials run in several environments, whose
+            scores cannot be compared.
     """
     if target.kind is Kind.CHECKPOINT:
         return trial_folder_of(target.path)
     if target.kind is Kind.TRIAL:
         return target.path
-    best = best_record(read_records(Experiment(target.path)))
-    if best is None:
+    bests = best_records(read_records(Experiment(target.path)))
+    if not bests:
         raise CheckpointError(
             f"no trained policy of {target.path} has a score yet: wait for the first evaluation, or name a trial to "
             "look at its untrained policy"
         )
+    if len(bests) > 1:
+        each = ", ".join(f"{best.folder} ({name})" for name, best in bests.items())
+        raise CheckpointError(
+            f"{target.path} has a best trial for each environment, because their scores cannot be compared; give one "
+            f"of them: {each}"
+        )
+    (best,) = bests.values()
     return best.folder
 
 

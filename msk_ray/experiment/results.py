@@ -15,7 +15,7 @@ from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import Evaluation
 from msk_ray.experiment.outcomes import Ending
 from msk_ray.experiment.snapshot import TrialReader, TrialSnapshot, read_trial
-from msk_ray.experiment.trial import Trial
+from msk_ray.experiment.trial import Trial, by_environment
 from msk_ray.text import describe
 
 
@@ -85,8 +85,19 @@ def read_records(experiment: Experiment) -> list[TrialRecord]:
     return [TrialRecord(trial, reader.read(experiment.trial_folder(trial.id), now)) for trial in experiment.trials()]
 
 
-def best_record(records: Sequence[TrialRecord]) -> TrialRecord | None:
-    """The trial with the highest score at any evaluation; None if none has a score."""
+def records_by_environment(records: Sequence[TrialRecord]) -> dict[str, list[TrialRecord]]:
+    """Records by environment: only scores of one environment can be compared."""
+    return by_environment(records, lambda record: record.trial.environment)
+
+
+def best_records(records: Sequence[TrialRecord]) -> dict[str, TrialRecord]:
+    """The trial with the highest score at any evaluation of each environment; environments without a score are left
+    out."""
+    bests = {name: _best_record(group) for name, group in records_by_environment(records).items()}
+    return {name: best for name, best in bests.items() if best is not None}
+
+
+def _best_record(records: Sequence[TrialRecord]) -> TrialRecord | None:
     scored = [(record.best.score, -record.trial.index, record) for record in records if record.best is not None]
     return max(scored, key=lambda item: item[:2])[2] if scored else None
 

@@ -6,20 +6,22 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from msk_ray.experiment.results import TrialRecord, best_record
+from msk_ray.experiment.results import TrialRecord, best_records, records_by_environment
 from msk_ray.text import markdown_cell, markdown_text, printable
 
+VARIANT_HEADER = ("variant", "seeds", "mean score", "std", "worst", "best")
 HEADER = ("trial", "changed", "seed", "score", "at epoch", "epochs", "stopped", "path", "why")
 
 
 def result_rows(records: Sequence[TrialRecord]) -> list[tuple[str, ...]]:
-    """One row per trial, the highest score first."""
+    """One row per trial of one environment, the highest score first."""
     ordered = sorted(records, key=lambda record: -record.best.score if record.best else float("inf"))
     return [_row(record) for record in ordered]
 
 
 def variant_rows(records: Sequence[TrialRecord]) -> list[tuple[str, ...]]:
-    """One row per variant: seeds, mean, standard deviation and range of the best scores. The highest mean first."""
+    """One row per variant of one environment, the highest mean first: how many seeds, and the mean, standard deviation,
+    minimum and maximum of their best scores."""
     groups: dict[str, list[TrialRecord]] = {}
     for record in records:
         groups.setdefault(record.trial.variant, []).append(record)
@@ -50,12 +52,14 @@ def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def summary(name: str, question: str, records: Sequence[TrialRecord]) -> dict[str, Any]:
-    """Everything the tables show, as plain data. Paths are relative to the experiment's folder."""
-    best = best_record(records)
+    """Everything the tables show, as plain data. Paths are relative to the experiment's folder.
+
+    `best` holds the best trial of each environment by its name.
+    """
     return {
         "experiment": name,
         "question": question,
-        "best": None if best is None else _facts(best),
+        "best": {environment: _facts(best) for environment, best in best_records(records).items()},
         "trials": [_facts(record) for record in records],
     }
 
@@ -66,24 +70,24 @@ def table_document(experiment: Path, question: str, records: Sequence[TrialRecor
     Args:
         experiment: its folder.
     """
-    parts = [
-        f"# {markdown_text(experiment.name)}\n",
-        f"{markdown_text(question)}\n" if question else "",
-        markdown(HEADER, result_rows(records)),
-    ]
-    if len({record.trial.seed for record in records}) > 1:
-        header = ("variant", "seeds", "mean score", "std", "min", "max")
-        parts += ["By variant, over seeds:\n", markdown(header, variant_rows(records))]
-        if any(record.cut for record in records):
-            parts.append(
-                "Trials that were interrupted or stopped before their end count with their best score so far, which "
-                "might have risen further: the report compares variants at equal env steps.\n"
-            )
-    best = best_record(records)
-    if best is not None:
-        half = f", {best.attempt}" if best.attempt.reduced is not None else ""
-        variant = markdown_text(printable(best.trial.variant))
-        parts.append(f"Best policy: `{_relative(best)}` ({variant}, seed {best.trial.seed}{half}).\n")
+    parts = [f"# {markdown_text(experiment.name)}\n", f"{markdown_text(question)}\n" if question else ""]
+    groups, bests = records_by_environment(records), best_records(records)
+    for environment, group in groups.items():
+        if len(groups) > 1:
+            parts.append(f"## {markdown_text(environment)}\n")
+        parts.append(markdown(HEADER, result_rows(group)))
+        if len({record.trial.seed for record in group}) > 1:
+            parts += ["By variant, over seeds:\n", markdown(VARIANT_HEADER, variant_rows(group))]
+            if any(record.cut for record in group):
+                parts.append(
+                    "Trials that were interrupted or stopped before their end count with their best score so far, "
+                    "which might have risen further: the report compares variants at equal env steps.\n"
+                )
+        best = bests.get(environment)
+        if best is not None:
+            half = f", {best.attempt}" if best.attempt.reduced is not None else ""
+            variant = markdown_text(printable(best.trial.variant))
+            parts.append(f"Best policy: `{_relative(best)}` ({variant}, seed {best.trial.seed}{half}).\n")
     if (note := reduced_note(records)) is not None:
         parts.append(f"{note}\n")
     command = shlex.join(["python", "-m", "msk_ray.report", experiment.name, "--storage", str(experiment.parent)])
@@ -130,6 +134,7 @@ def _facts(record: TrialRecord) -> dict[str, Any]:
     best, reduced = record.best, record.attempt.reduced
     return {
         "id": record.trial.id,
+        "environment": record.trial.environment,
         "changed": record.trial.changed,
         "values": record.trial.values,
         "seed": record.trial.seed,

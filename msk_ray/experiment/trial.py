@@ -2,12 +2,14 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 from msk_ray.config import Config, first_spelling, flattened
 from msk_ray.text import describe, printable
+
+T = TypeVar("T")
 
 ID_DIGITS = 8
 
@@ -35,6 +37,11 @@ class Trial:
         return self.config.trial.epochs
 
     @property
+    def environment(self) -> str:
+        """Name of the environment it runs in. Scores of different environments cannot be compared."""
+        return self.config.env.name
+
+    @property
     def variant(self) -> str:
         """The changed parameters on one line; equal for all seeds of a variant."""
         return variant_text(self.changed)
@@ -44,6 +51,14 @@ class Trial:
         """Id, changed parameters and seed on one line of printable characters, for Ray's lists and profiles."""
         # A profile separates its frames by semicolons.
         return printable(f"{self.id} {self.variant} seed={self.seed}").replace(";", ",")
+
+
+def by_environment(items: Iterable[T], environment: Callable[[T], str]) -> dict[str, list[T]]:
+    """Items by the name of their environment, environments and items in the order given."""
+    groups: dict[str, list[T]] = {}
+    for item in items:
+        groups.setdefault(environment(item), []).append(item)
+    return groups
 
 
 def variant_text(changed: Mapping[str, str]) -> str:

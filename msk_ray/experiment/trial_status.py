@@ -15,7 +15,7 @@ from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import TrialProgress
 from msk_ray.experiment.results import unlisted_trials
 from msk_ray.experiment.snapshot import Device, State, TrialReader, file_stamp
-from msk_ray.experiment.trial import Trial
+from msk_ray.experiment.trial import Trial, by_environment
 
 
 @dataclass(frozen=True)
@@ -25,6 +25,8 @@ class TrialStatus:
     id: str
     variant: str
     seed: int
+    environment: str
+    """Name of the environment it runs in; empty if that is not known."""
     epochs: int
     """Planned epochs."""
     state: State
@@ -59,7 +61,7 @@ class StatusReader:
         self._manifest: tuple[int, int] | None = None
 
     def look(self, now: float) -> list[TrialStatus]:
-        """All trials at `now` [s since the epoch], those at work first, then by score.
+        """All trials at `now` [s since the epoch], those at work first, then by environment and score.
 
         Raises:
             StorageError: the folder holds no readable experiment.
@@ -89,7 +91,7 @@ class StatusReader:
         (note,) = describe_damages([damage], damage.path.parent)
         name = damage.path.parent.name
         return TrialStatus(
-            name, "?", 0, 0, State.UNREADABLE, TrialProgress(), Device(), None, note=note, damages=(damage,)
+            name, "?", 0, "", 0, State.UNREADABLE, TrialProgress(), Device(), None, note=note, damages=(damage,)
         )
 
     def _status(self, trial: Trial, now: float) -> TrialStatus:
@@ -99,6 +101,7 @@ class StatusReader:
             trial.id,
             trial.variant,
             trial.seed,
+            trial.environment,
             trial.epochs,
             seen.state,
             seen.progress,
@@ -127,10 +130,28 @@ def remaining(statuses: Sequence[TrialStatus]) -> float | None:
     )
 
 
-def best_of(statuses: Sequence[TrialStatus]) -> TrialStatus | None:
-    """The trial with the highest score; None if none has one."""
-    scored = [s for s in statuses if s.progress.best is not None]
-    return max(scored, key=lambda s: s.progress.best or -math.inf) if scored else None
+def bests_of(statuses: Sequence[TrialStatus]) -> dict[str, TrialStatus]:
+    """The trial with the highest score of each environment, in the order of their names: scores of different
+    environments cannot be compared. Environments without a score are left out."""
+    groups = by_environment(statuses, lambda status: status.environment)
+    scored = {
+        name: [(s.progress.best, s) for s in groups[name] if s.progress.best is not None] for name in sorted(groups)
+    }
+    return {name: max(group, key=lambda item: item[0])[1] for name, group in scored.items() if group}
+
+
+def describe_bests(statuses: Sequence[TrialStatus], *, ids: bool) -> str:
+    """`12.3`, or `ant 12.3, hopper 4.5` if trials run in several environments; empty if none has a score.
+
+    Args:
+        ids: whether to name the trials, as in `12.3 (1a2b3c4d)`.
+    """
+    several = len({status.environment for status in statuses if status.environment}) > 1
+    texts = []
+    for name, best in bests_of(statuses).items():
+        which = f" ({best.id})" if ids else ""
+        texts.append(f"{name + ' ' if several else ''}{best.progress.best:.5g}{which}")
+    return ", ".join(texts)
 
 
 def find_experiments(storage: Path) -> list[Path]:
@@ -143,9 +164,9 @@ def find_experiments(storage: Path) -> list[Path]:
     return sorted(found, key=lambda path: (path.stat().st_mtime, path.name))
 
 
-def _order(status: TrialStatus) -> tuple[int, float]:
+def _order(status: TrialStatus) -> tuple[int, str, float]:
     rank = [State.RUNNING, State.STALE, State.UNREADABLE, State.ENDED, State.WAITING].index(status.state)
-    return rank, -status.progress.best if status.progress.best is not None else math.inf
+    return rank, status.environment, -status.progress.best if status.progress.best is not None else math.inf
 
 
 def _subfolders(path: Path) -> list[Path]:

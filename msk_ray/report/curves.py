@@ -107,6 +107,7 @@ def learning_curves(
     """
     means = {v: float(np.mean(scores)) for v, trials in groups.items() if (scores := _best_scores(trials))}
     curves = {v: [t.curve_over(over) for t in groups[v] if len(t.curve[0])] for v in means}
+    until = {v: _first_end(groups[v], over) for v in means}
     title, axis, more = _OVER[over]
     ranked = sorted(curves, key=lambda v: -means[v])
     if not ranked:
@@ -124,10 +125,10 @@ def learning_curves(
     def draw(figure: Figure) -> None:
         axes = figure.add_subplot()
         for variant in rest:
-            steps, mean, *_ = _mean_and_range(curves[variant])
+            steps, mean, *_ = _mean_and_range(curves[variant], until[variant])
             axes.plot(steps, mean, color=GREY, linewidth=0.7, alpha=0.6, zorder=1)
         for number, variant in enumerate(named):
-            _draw_variant(axes, curves[variant], number, shorten(variant, 44))
+            _draw_variant(axes, _mean_and_range(curves[variant], until[variant]), number, shorten(variant, 44))
             for trial in groups[variant]:
                 if trial.folder in ended:
                     x, y = ended[trial.folder]
@@ -162,7 +163,9 @@ def learning_curves(
                     "dash": DASHES[named.index(variant) // len(PALETTE)] if variant in named else "-",
                     "trials": [places[t.folder] for t in groups[variant] if len(t.curve[0])],
                     # A single seed is its own mean.
-                    "mean": _mean_lines(curves[variant]) if variant in named and len(curves[variant]) > 1 else None,
+                    "mean": [plain(line) for line in _mean_and_range(curves[variant], until[variant])]
+                    if variant in named and len(curves[variant]) > 1
+                    else None,
                 }
                 for variant in ranked
             ],
@@ -179,7 +182,7 @@ def learning_curves(
         title,
         f"Evaluation score over {axis} of {len(ranked)} variants; the best is {ranked[0]} with a mean best score of "
         f"{best:.5g}.",
-        ("Mean over seeds, band: their range. " if seeds > 1 else "")
+        ("Mean over seeds up to the end of the first that ran to its end, band: their range. " if seeds > 1 else "")
         + "A cross ends a trial that was stopped before its time; from there the mean is over those that went on."
         + more
         + _randomized([groups[variant] for variant in ranked]),
@@ -199,28 +202,37 @@ def _randomized(groups: Sequence[Sequence[TrialReading]]) -> str:
     return f" {some} trained with {kinds}, drawn for every episode; every score is of the model as it is."
 
 
-def _draw_variant(axes: Axes, curves: Sequence[Curve], number: int, label: str) -> None:
-    steps, mean, low, high = _mean_and_range(curves)
+def _draw_variant(
+    axes: Axes, means: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], number: int, label: str
+) -> None:
+    steps, mean, low, high = means
     axes.plot(steps, mean, DASHES[number // len(PALETTE)], color=_colour(number), label=label, linewidth=1.9, zorder=3)
-    if len(curves) > 1:
+    if (low < high).any():
         axes.fill_between(steps, low, high, color=_colour(number), alpha=0.16, linewidth=0, zorder=2)
 
 
-def _mean_and_range(curves: Sequence[Curve]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Steps, mean, minimum and maximum, each (N,), of curves that may end at different steps."""
+def _first_end(trials: Sequence[TrialReading], over: str) -> float:
+    """Where the first of some trials that ran to their end has its last score; infinite if none did.
+
+    Trials take different times, and with adaptive horizons different env steps: beyond this point, a mean of those that
+    are left would jump.
+    """
+    ended = (t for t in trials if t.ending is not None and t.ending.outcome in (Outcome.FINISHED, Outcome.WALL_TIME))
+    return min((float(t.curve_over(over)[0][-1]) for t in ended if len(t.curve[0])), default=math.inf)
+
+
+def _mean_and_range(curves: Sequence[Curve], until: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Steps up to `until`, mean, minimum and maximum, each (N,), of curves that may end at different steps."""
     steps = np.unique(np.concatenate([x for x, _ in curves]))
+    steps = steps[steps <= until]
     if len(steps) > POINTS:
-        steps = np.unique(np.append(np.linspace(steps[0], steps[-1], POINTS), [x[-1] for x, _ in curves]))
+        ends = [x[-1] for x, _ in curves if x[-1] <= until]
+        steps = np.unique(np.append(np.linspace(steps[0], steps[-1], POINTS), ends))
     # A curve ends where its trial did: beyond, it has no value, and the mean is over those that went on.
     values = np.array([np.interp(steps, x, y, left=np.nan, right=np.nan) for x, y in curves])
     keep = ~np.isnan(values).all(0)
     steps, values = steps[keep], values[:, keep]
     return steps, np.nanmean(values, 0), np.nanmin(values, 0), np.nanmax(values, 0)
-
-
-def _mean_lines(curves: Sequence[Curve]) -> list[list[float | None]]:
-    """Steps, mean, minimum and maximum for a chart."""
-    return [plain(line) for line in _mean_and_range(curves)]
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,15 @@ from msk_ray.report.curves import gradient_health, learning_curves, stopping_map
 from msk_ray.report.influence import parallel_coordinates, parameter_effects, ranked_effects
 from msk_ray.report.pictures import Picture, format_steps
 from msk_ray.report.reading import Condition, Reading, TrialReading
-from msk_ray.report.tables import baseline_of, failures, outcome_counts, outcome_figures, variant_rows
+from msk_ray.report.tables import (
+    VariantRow,
+    baseline_of,
+    by_variant_and_environment,
+    failures,
+    outcome_counts,
+    outcome_figures,
+    variant_rows,
+)
 from msk_ray.text import printable
 
 PAGE = "index.html"
@@ -155,6 +163,26 @@ def command_of(experiments: Sequence[Experiment], storage: Path) -> str:
     return shlex.join(["python", "-m", "msk_ray.report", *words])
 
 
+def _openers(sections: Sequence[Section]) -> dict[str, Section]:
+    """Slug of each section → the first section of its experiment, which has what its environments share."""
+    first: dict[Path, Section] = {}
+    return {s.slug: first.setdefault(s.reading.experiment.path, s) for s in sections}
+
+
+def _matrix(sections: Sequence[Section]) -> dict[str, list[VariantRow | None]]:
+    """Scores by variant and environment, if the page is of one experiment over several environments."""
+    parts = [section.reading for section in sections if section.reading.part]
+    one = len({section.reading.experiment.path for section in sections}) == 1
+    return by_variant_and_environment(parts) if one else {}
+
+
+def _leaders(matrix: Mapping[str, Sequence[VariantRow | None]]) -> list[str]:
+    """The variant with the highest mean score in each environment; empty if none has a score."""
+    columns = zip(*matrix.values(), strict=True)
+    scored = [[(row.mean, row.variant) for row in rows if row is not None and row.mean is not None] for rows in columns]
+    return [max(column)[1] if column else "" for column in scored]
+
+
 def _several_environments(readings: Sequence[Reading]) -> bool:
     return len({name for reading in readings for name in reading.environments}) > 1
 
@@ -194,6 +222,7 @@ def render_page(
         for section in sections
         for t in section.reading.trials
     ]
+    matrix = _matrix(sections)
     data = {"trials": trials, "figures": {picture.name: picture.chart for picture in pictures}}
     return (
         _templates()
@@ -201,6 +230,10 @@ def render_page(
         .render(
             sections=sections,
             together=together,
+            openers=_openers(sections),
+            experiments=list(dict.fromkeys(section.reading.experiment.name for section in sections)),
+            matrix=matrix,
+            leaders=_leaders(matrix),
             comparable=not _several_environments([section.reading for section in sections]),
             written=time.strftime("%Y-%m-%d %H:%M:%S %Z", time.localtime(now)),
             command=command,

@@ -99,5 +99,5 @@ def shorten(text: str, length: int) -> str:
 
 
 def format_steps(steps: float) -> str:
-    """1.5M, 20k."""
-    return EngFormatter(sep="", places=1)(steps)
+    """1.5M, 20.0k, 800."""
+    return EngFormatter(sep="", places=1)(steps) if steps >= 1000.0 else f"{steps:.0f}"

@@ -36,7 +36,7 @@ from msk_ray.experiment.notes import read_notes
 from msk_ray.experiment.outcomes import Ending
 from msk_ray.experiment.results import unlisted_trials
 from msk_ray.experiment.snapshot import State, TrialReader, TrialSnapshot, file_stamp
-from msk_ray.experiment.trial import Trial
+from msk_ray.experiment.trial import Trial, by_environment
 from msk_ray.sweep.space import SpaceFile, read_file
 
 _TAIL_LINES = 12
@@ -224,16 +224,17 @@ class Reading:
     @property
     def environments(self) -> list[str]:
         """Names of the environments that trials run in, in the order of the experiment."""
-        return list(dict.fromkeys(trial.trial.config.env.name for trial in self.trials))
+        return list(dict.fromkeys(trial.trial.environment for trial in self.trials))
 
     def parts(self) -> list["Reading"]:
-        """One reading for each environment, whose scores alone can be compared; itself if there is only one."""
-        if len(self.environments) < 2:
+        """One reading for each environment, whose scores alone can be compared; itself if there is only one.
+
+        A variant of a part is named without its environment, which they all share.
+        """
+        groups = by_environment(self.trials, lambda trial: trial.trial.environment)
+        if len(groups) < 2:
             return [self]
-        return [
-            replace(self, part=name, trials=tuple(t for t in self.trials if t.trial.config.env.name == name))
-            for name in self.environments
-        ]
+        return [replace(self, part=name, trials=_within(trials)) for name, trials in groups.items()]
 
     @property
     def reduced(self) -> list[TrialReading]:
@@ -243,6 +244,15 @@ class Reading:
     @property
     def seeds(self) -> set[int]:
         return {trial.trial.seed for trial in self.trials}
+
+
+def _within(trials: Sequence[TrialReading]) -> tuple[TrialReading, ...]:
+    """Trials of one environment, without the parameter that chooses it unless it sets something else too."""
+    shared = {key for key in ("env", "env.name") if len({trial.trial.changed.get(key) for trial in trials}) == 1}
+    own = ({key: text for key, text in trial.trial.changed.items() if key not in shared} for trial in trials)
+    return tuple(
+        replace(trial, trial=replace(trial.trial, changed=changed)) for trial, changed in zip(trials, own, strict=True)
+    )
 
 
 def read_experiment(experiment: Experiment, now: float) -> Reading:

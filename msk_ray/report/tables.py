@@ -1,7 +1,8 @@
 """The page's tables as plain data."""
 
 import math
-from collections.abc import Sequence
+import statistics
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from msk_ray.errors import ConfigError
@@ -47,6 +48,20 @@ class VariantRow:
     """How many of the scores are of trials with half their worlds."""
     cut: int = 0
     """How many are of trials that were stopped or interrupted before their end, without having failed."""
+    env_steps: float | None = None
+    """Env steps at which the best scores were reached, mean over seeds."""
+    seconds: float | None = None
+    """Seconds of training after which they were reached, mean over seeds."""
+
+    @property
+    def std(self) -> float | None:
+        """Standard deviation of the scores over seeds; None for fewer than two."""
+        return statistics.stdev(self.scores) if len(self.scores) > 1 else None
+
+    @property
+    def worst(self) -> float | None:
+        """Lowest score of a seed."""
+        return min(self.scores, default=None)
 
     @property
     def verdict(self) -> str:
@@ -105,11 +120,8 @@ def variant_rows(reading: Reading, baseline: str | None) -> list[VariantRow]:
         mean = _mean(scores) if scores else None
         own = variant == baseline
         at, pair = (None, None) if own else _on_equal_terms(trials, reference)
-        figures = {}
-        for name in names:
-            found = [trial.best_row[f"eval/{name}"] for trial in trials if f"eval/{name}" in trial.best_row]
-            if found:
-                figures[name] = sum(found) / len(found)
+        at_best = [trial.best_row for trial in trials]
+        means = {name: _mean_of(at_best, f"eval/{name}") for name in names}
         rows.append(
             VariantRow(
                 variant,
@@ -121,9 +133,11 @@ def variant_rows(reading: Reading, baseline: str | None) -> list[VariantRow]:
                 difference_interval(*pair) if pair else None,
                 at if pair else None,
                 own,
-                figures,
+                {name: value for name, value in means.items() if value is not None},
                 sum(trial.attempt.reduced is not None and trial.score is not None for trial in trials),
                 sum(trial.cut and trial.score is not None for trial in trials),
+                _mean_of(at_best, "env_steps"),
+                _mean_of(at_best, "seconds"),
             )
         )
     return sorted(rows, key=lambda row: (row.mean is None, -(row.mean or 0.0)))
@@ -160,6 +174,20 @@ def _on_equal_terms(
 
 def _mean(scores: Sequence[float]) -> float:
     return sum(scores) / len(scores)
+
+
+def _mean_of(rows: Sequence[Mapping[str, float]], name: str) -> float | None:
+    """Mean of a metric over the rows that have it; None if none has."""
+    found = [row[name] for row in rows if name in row]
+    return _mean(found) if found else None
+
+
+def by_variant_and_environment(parts: Sequence[Reading]) -> dict[str, list[VariantRow | None]]:
+    """Each variant's rows in the parts of one experiment, None where it has no trial; in the order of the
+    experiment."""
+    rows = [{row.variant: row for row in variant_rows(part, None)} for part in parts]
+    names = dict.fromkeys(variant for part in parts for variant in part.variants)
+    return {name: [found.get(name) for found in rows] for name in names}
 
 
 def failures(reading: Reading) -> list[tuple[str, str, list[TrialReading]]]:

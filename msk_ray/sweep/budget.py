@@ -4,9 +4,10 @@ import itertools
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-from msk_ray.config import Config, leaves, overlay, parse_config
+from msk_ray.config import Config, env_name, leaves, overlay, parse_config
 from msk_ray.config.algorithms import BUILT_IN
 from msk_ray.sweep.operators import Operator
+from msk_ray.sweep.rules.per_environment import refuse_several
 from msk_ray.sweep.space import Space, SpaceFile
 from msk_ray.sweep.trials import base_settings, check_algorithms_read, check_ranges
 
@@ -50,13 +51,21 @@ def extreme_configs(space: Space) -> list[Config]:
     parameters have their first level or lower end.
 
     Raises:
-        ConfigError: the base, an end of a range or such a combination is not a valid config.
+        ConfigError: the base, an end of a range or such a combination is not a valid config, or trials would run in
+            several environments.
     """
     base = base_settings(space)
     check_ranges(space, base)
+    _refuse_several_environments(space, base)
     configs = list(_combinations(space, base))
     check_algorithms_read(space, configs)
     return configs
+
+
+def _refuse_several_environments(space: Space, base: Mapping[str, Any]) -> None:
+    for key, op in space.sampled.items():
+        names = [env_name(overlay(base, {key: level.value})) or "" for level in op.extremes()]
+        refuse_several(names, f"{space.name}: search: {space.file.search} learns from the scores of all trials")
 
 
 def _combinations(space: Space, base: Mapping[str, Any]) -> Iterator[Config]:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, SerializeAsAny, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, SerializeAsAny, ValidationError, model_validator
 
 from msk_ray.config import current_values, describe_fault, env_name, leaves, read_config, read_yaml
 from msk_ray.config.sections import Count, Section, Text, Whole
@@ -28,8 +28,16 @@ class AblateSpec(Section):
     Grids beside it repeat all of them for each of their points.
     """
 
+    label: Text = "baseline"
+    """Name of the baseline in tables."""
     baseline: dict[str, Any] = Field(default_factory=dict)
     variants: Annotated[dict[str, dict[str, Any]], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _names_differ(self) -> "AblateSpec":
+        if self.label in self.variants:
+            raise ValueError(f"the baseline and a variant are both called {self.label}; give ablate.label another name")
+        return self
 
 
 class ResourcesSpec(Section):

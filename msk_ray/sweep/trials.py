@@ -11,6 +11,7 @@ from msk_ray.config import Config, leaves, overlay, parse_config, read_config, r
 from msk_ray.errors import ConfigError
 from msk_ray.experiment.trial import ID_DIGITS, Trial, trial_id, variant_text, with_epochs
 from msk_ray.sweep.operators import Level, Listed, Operator
+from msk_ray.sweep.rules.per_environment import refuse_several
 from msk_ray.sweep.space import Space
 
 
@@ -19,8 +20,8 @@ def resolve_trials(space: Space) -> list[Trial]:
     the next seed.
 
     Raises:
-        ConfigError: a setting that does not exist or fit, two parameters that set the same key, or two trials that
-            come out equal.
+        ConfigError: a setting that does not exist or fit, two parameters that set the same key, two trials that come
+            out equal, or several environments for a scheduler that cannot keep them apart.
     """
     base = base_settings(space)
     check_ranges(space, base)
@@ -30,6 +31,12 @@ def resolve_trials(space: Space) -> list[Trial]:
         for index, (seed, (changed, values)) in enumerate(itertools.product(space.seeds, variants))
     ]
     check_algorithms_read(space, (trial.config for trial in trials))
+    if space.file.scheduler.exchanges:
+        kind = space.file.scheduler.kind
+        refuse_several(
+            (trial.environment for trial in trials),
+            f"{space.name}: scheduler.kind: {kind} lets trials continue from better ones",
+        )
     by_id: dict[str, Trial] = {}
     for trial in trials:
         twin = by_id.setdefault(trial.id, trial)
@@ -148,7 +155,7 @@ def grid_points(grids: Mapping[str, Operator]) -> Iterator[dict[str, Level]]:
 def _ablations(space: Space) -> Iterator[tuple[dict[str, str], dict[str, Any]]]:
     ablate = space.file.ablate
     assert ablate is not None
-    yield {"variant": "baseline"}, dict(ablate.baseline)
+    yield {"variant": ablate.label}, dict(ablate.baseline)
     for name, changes in ablate.variants.items():
         yield {"variant": name}, {**ablate.baseline, **changes}
 

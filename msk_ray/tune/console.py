@@ -36,6 +36,7 @@ class Console:
             concurrent: trials that run at the same time.
         """
         self._waiting = {trial.id: trial for trial in waiting}
+        self._environments = dict.fromkeys(trial.environment for trial in self._waiting.values())
         self._concurrent = concurrent
         self._running: dict[str, _Running] = {}
         self._begun: set[str] = set()
@@ -67,6 +68,7 @@ class Console:
     def evaluated(self, trial: Trial, epoch: int, score: float, best: float) -> None:
         """A trial has been evaluated; `best` is its best score so far."""
         run = self._running.setdefault(trial.id, _Running(trial, time.monotonic()))
+        self._environments.setdefault(trial.environment)
         run.epoch, run.score = epoch, score
         if run.first_epoch is None:
             # The speed counts from the first result: the time before includes start-up and compilation.
@@ -76,12 +78,13 @@ class Console:
         run.best = max(run.best, best)
         if not math.isfinite(run.best):
             return  # no score has been a number yet
-        before = self._best
+        before = self._best_in(trial.environment)
         if trial.id not in self._bests or run.best > self._bests[trial.id][0]:
             self._bests[trial.id] = run.best, trial
         if before is None or run.best > before[0]:
             when = f" at epoch {epoch}/{trial.epochs}" if score == run.best else ""
-            self.say(f"{trial.id} best so far: score {run.best:.5g}{when}{self._suffix(trial)}")
+            where = f" in {trial.environment}" if len(self._environments) > 1 else ""
+            self.say(f"{trial.id} best so far{where}: score {run.best:.5g}{when}{self._suffix(trial)}")
 
     def retried(self, trial: Trial, why: str) -> None:
         """A trial's process has ended early, and another one takes its place."""
@@ -123,9 +126,14 @@ class Console:
     def status(self) -> str:
         """The overview: one line, and one for each running trial."""
         parts = [f"{len(self._running)} running", f"{len(self._waiting)} waiting", f"{self._ended} ended"]
-        best = self._best
-        if best is not None:
-            parts.append(f"best {best[0]:.5g} ({best[1].id})")
+        bests = []
+        for environment in self._environments:
+            best = self._best_in(environment)
+            if best is not None:
+                where = f"{environment} " if len(self._environments) > 1 else ""
+                bests.append(f"{where}{best[0]:.5g} ({best[1].id})")
+        if bests:
+            parts.append(f"best {', '.join(bests)}")
         running = [
             (run.trial.epochs - run.epoch, self._seconds_per_epoch.get(run.trial.id)) for run in self._running.values()
         ]
@@ -140,9 +148,10 @@ class Console:
             )
         return "\n".join(lines)
 
-    @property
-    def _best(self) -> tuple[float, Trial] | None:
-        return max(self._bests.values(), key=lambda best: best[0], default=None)
+    def _best_in(self, environment: str) -> tuple[float, Trial] | None:
+        """The best score in an environment and its trial: scores of different ones cannot be compared."""
+        found = [best for best in self._bests.values() if best[1].environment == environment]
+        return max(found, key=lambda best: best[0], default=None)
 
     def _name(self, trial: Trial) -> str:
         return f"{printable(trial.variant)} seed={trial.seed}{self._suffix(trial)}"

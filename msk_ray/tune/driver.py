@@ -30,11 +30,13 @@ from msk_ray.experiment.outcomes import read_ending, write_ending
 from msk_ray.experiment.ownership import Ownership
 from msk_ray.experiment.results import read_record
 from msk_ray.experiment.scheduler_log import SchedulerLog
-from msk_ray.experiment.trial import Trial
+from msk_ray.experiment.trial import Trial, by_environment
 from msk_ray.progress import announce, format_duration
 from msk_ray.signals import StopRequest, listening
 from msk_ray.sweep.budget import extreme_configs, longest_budget
 from msk_ray.sweep.operators import Listed
+from msk_ray.sweep.rules.early_stopping import Pruner
+from msk_ray.sweep.rules.per_environment import PerEnvironment
 from msk_ray.sweep.rules.population import PopulationBasedTraining
 from msk_ray.sweep.rules.replay import replay
 from msk_ray.sweep.search import search_class
@@ -154,7 +156,7 @@ def _finish_pruning(plan: Plan) -> None:
         print(f"skipped: {line}", flush=True)
     if not reports or not plan.trials:
         return
-    ending = replay(spec.pruner(_budget(plan)), spec.time_attr, reports)
+    ending = replay(_pruner(plan), spec.time_attr, reports)
     folder = plan.experiment.trial_folder(reports[-1].trial)
     if ending is None or read_ending(folder) is not None:
         return
@@ -240,10 +242,10 @@ def _fit(
 
 def _scheduler(plan: Plan, job: Job, supervisor: Supervisor) -> Population | PruningScheduler:
     """The rule that compares trials, in the state that the recorded evaluations leave it in."""
-    spec, budget = plan.space.file.scheduler, _budget(plan)
+    spec = plan.space.file.scheduler
     if isinstance(spec, PopulationBasedTraining):
-        return Population(spec, budget, plan.space.sampled)
-    pruner, journal = spec.pruner(budget), _journal(plan)
+        return Population(spec, _budget(plan), plan.space.sampled)
+    pruner, journal = _pruner(plan), _journal(plan)
     replay(pruner, spec.time_attr, journal.read()[0])
     return PruningScheduler(
         pruner, spec.time_attr, journal, lambda trial: job.trial_of(trial.config).id, supervisor.pruned
@@ -364,12 +366,24 @@ def _current_params(job: Job, trial: Trial) -> dict[str, Any]:
     return params
 
 
-def _budget(plan: Plan) -> float:
-    """The longest possible duration of a trial, in the scheduler's unit of time; infinite if no rule asks for it."""
+def _pruner(plan: Plan) -> Pruner:
+    """The rule that ends trials, without any evaluations yet; for several environments, one for each with its own
+    rungs."""
+    spec = plan.space.file.scheduler
+    groups = by_environment(plan.trials, lambda trial: trial.environment)
+    if len(groups) < 2:
+        return spec.pruner(_budget(plan))
+    rules = {name: spec.pruner(_budget(plan, trials)) for name, trials in groups.items()}
+    return PerEnvironment(rules, {trial.id: trial.environment for trial in plan.trials})
+
+
+def _budget(plan: Plan, trials: Sequence[Trial] | None = None) -> float:
+    """The longest possible duration of a trial, of all of them if none are given, in the scheduler's unit of time;
+    infinite if no rule asks for it."""
     scheduler = plan.space.file.scheduler
     if not (scheduler.ends_trials or scheduler.exchanges):
         return math.inf  # an algorithm from outside need not say how many env steps it takes
-    configs = [trial.config for trial in plan.trials] or extreme_configs(plan.space)
+    configs = [trial.config for trial in trials or plan.trials] or extreme_configs(plan.space)
     return longest_budget(plan.space.file, configs)
 
 

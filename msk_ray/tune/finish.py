@@ -8,8 +8,16 @@ import sys
 from msk_ray.experiment.damage import count_damages, describe_damages
 from msk_ray.experiment.layout import SUMMARY_FILE
 from msk_ray.experiment.manifest import Experiment
-from msk_ray.experiment.results import best_record, read_records
-from msk_ray.experiment.results_table import HEADER, reduced_note, result_rows, summary, table_document, variant_rows
+from msk_ray.experiment.results import best_records, read_records, records_by_environment
+from msk_ray.experiment.results_table import (
+    HEADER,
+    VARIANT_HEADER,
+    reduced_note,
+    result_rows,
+    summary,
+    table_document,
+    variant_rows,
+)
 from msk_ray.files import write_json, write_text
 from msk_ray.progress import announce
 from msk_ray.text import printable
@@ -31,19 +39,23 @@ def finish(experiment: Experiment) -> int:
     width = max(100, shutil.get_terminal_size((160, 24)).columns)
     write_json(experiment.path / SUMMARY_FILE, summary(experiment.name, manifest.get("question") or "", records))
     write_text(experiment.path / "table.md", table_document(experiment.path, manifest.get("question") or "", records))
-    print("\n" + text_table(HEADER, result_rows(records), width))
-    if len({record.trial.seed for record in records}) > 1:
-        header = ("variant", "seeds", "mean score", "std", "min", "max")
-        print("\n" + text_table(header, variant_rows(records), width))
+    groups = records_by_environment(records)
+    for environment, group in groups.items():
+        if len(groups) > 1:
+            print(printable(f"\n{environment}"), end="")
+        print("\n" + text_table(HEADER, result_rows(group), width))
+        if len({record.trial.seed for record in group}) > 1:
+            print("\n" + text_table(VARIANT_HEADER, variant_rows(group), width))
     damages = [damage for record in records for damage in record.snapshot.damages]
     if damages:
         print(f"\nskipped {count_damages(damages)}:")
         print("\n".join(describe_damages(damages, experiment.path)))
     if (note := reduced_note(records)) is not None:
         print(f"\n{note}")
-    best = best_record(records)
-    if best is not None and best.best is not None:
-        name = f"{best.trial.variant} seed={best.trial.seed}{best.attempt.suffix}"
+    for environment, best in best_records(records).items():
+        assert best.best is not None  # or it would not be the best
+        where = f" in {environment}" if len(groups) > 1 else ""
+        name = f"{best.trial.variant} seed={best.trial.seed}{best.attempt.suffix}{where}"
         print(f"\nbest trial   {best.trial.id}: {printable(name)}, score {best.best.score:.5g}")
         print(f"best policy  {printable(str(best.best_checkpoint or 'its checkpoint is missing'))}")
     print(printable(f"table        {experiment.path / 'table.md'}"))

@@ -18,7 +18,7 @@ from msk_ray.evaluate.measure import Bench, Request, figures
 from msk_ray.evaluate.stored import read_evaluations, store_evaluation
 from msk_ray.experiment.attempts import Attempt, Reduced
 from msk_ray.experiment.manifest import Experiment
-from msk_ray.experiment.results import best_record, read_records
+from msk_ray.experiment.results import best_records, read_records
 from msk_ray.training import load_policy, read_metrics
 from msk_ray.training.checkpoint import milestones
 from msk_ray.training.evaluation import Episodes
@@ -27,7 +27,7 @@ from msk_ray.training.evaluation import Episodes
 @pytest.fixture
 def trial(sweep: Experiment, tmp_path: Path) -> Path:
     """A copy of the best trial's folder."""
-    best = best_record(read_records(sweep))
+    best = best_records(read_records(sweep)).get("cartpole")
     assert best is not None
     return Path(shutil.copytree(best.folder, tmp_path / "trial"))
 
@@ -248,7 +248,7 @@ def test_cpu_and_gpu_agree_over_the_first_hundred_steps(name: str, sweep: Experi
     """Same initial states, but for the last bits of an orientation. After 100 steps of float32, whose rounding differs
     and contact amplifies, the median world's positions differ by less than 1e-3 (CartPole) and 2e-2 (ant) [m, rad],
     mean scores by 1 %."""
-    best = best_record(read_records(sweep))
+    best = best_records(read_records(sweep)).get("cartpole")
     assert best is not None
     folder = ant_trial if name == "ant" else best.folder
     policy = load_policy(folder / "checkpoints" / "best.pt")
@@ -271,7 +271,7 @@ def test_cpu_and_gpu_agree_over_the_first_hundred_steps(name: str, sweep: Experi
 
 @pytest.mark.gpu
 def test_a_gpu_gives_the_same_numbers_twice(sweep: Experiment) -> None:
-    best = best_record(read_records(sweep))
+    best = best_records(read_records(sweep)).get("cartpole")
     assert best is not None
     policy = load_policy(best.folder / "checkpoints" / "best.pt")
     first, second = (Bench("cuda:0").evaluate(policy, Request()) for _ in range(2))

@@ -19,7 +19,7 @@ from msk_ray.evaluate.__main__ import main as evaluate
 from msk_ray.evaluate.measure import Bench, Request
 from msk_ray.evaluate.zoo import BEGIN, END, MAX_BYTES, Score, read_zoo, zoo_text
 from msk_ray.experiment.manifest import Experiment
-from msk_ray.experiment.results import best_record, read_records
+from msk_ray.experiment.results import best_records, read_records
 from msk_ray.export import zoo as writing
 from msk_ray.export.__main__ import main as export
 from msk_ray.export.write import export as export_files
@@ -77,7 +77,7 @@ def copy(made: Path, tmp_path: Path) -> Path:
 
 
 def test_an_entry_says_what_the_policy_scores_and_where_it_comes_from(made: Path, sweep: Experiment) -> None:
-    best = best_record(read_records(sweep))
+    best = best_records(read_records(sweep)).get("cartpole")
     assert best is not None
     assert best.best is not None
     ours = msk_ray.load_policy(best.folder / "checkpoints" / "best.pt")

@@ -14,7 +14,7 @@ from msk_ray.config import Config, dump_yaml
 from msk_ray.errors import ConfigError, DeviceError, StorageError
 from msk_ray.experiment.manifest import Experiment, check_name
 from msk_ray.experiment.outcomes import Ending, Outcome, read_ending, write_ending
-from msk_ray.experiment.results import best_record, read_record
+from msk_ray.experiment.results import best_records, read_record
 from msk_ray.experiment.results_table import markdown, outcome_name, result_rows, summary, table_document, variant_rows
 from msk_ray.experiment.trial_status import StatusReader
 from msk_ray.files import make_folder
@@ -63,7 +63,7 @@ def test_records_and_tables(experiment: Experiment, tmp_path: Path) -> None:
     records = [read_record(t, experiment.trial_folder(t.id)) for t in experiment.trials()]
     assert [len(r.evaluations) for r in records] == [2, 1, 2, 0], "the untrained policy's does not count"
     assert [outcome_name(r) for r in records] == ["finished", "stopped_asha", "nonfinite", "waiting"]
-    best = best_record(records)
+    best = best_records(records).get("cartpole")
     assert best is records[2]
     rows = result_rows(records)
     assert [row[3] for row in rows] == ["7", "5", "1", "-"]
@@ -78,7 +78,7 @@ def test_records_and_tables(experiment: Experiment, tmp_path: Path) -> None:
     whole = table_document(Path("e"), "Which?", [records[0], records[2]])
     assert "before the" not in whole
     facts = json.loads(json.dumps(summary("e", "Which?", records), allow_nan=False))
-    assert facts["best"]["id"] == records[2].trial.id
+    assert facts["best"]["cartpole"]["id"] == records[2].trial.id
 
 
 def test_an_untrained_policy_has_no_score(experiment: Experiment, make_space: Any) -> None:
@@ -95,7 +95,7 @@ def test_an_untrained_policy_has_no_score(experiment: Experiment, make_space: An
         (7.0, 2),
         None,
     ]
-    assert best_record(records) is records[2]
+    assert best_records(records).get("cartpole") is records[2]
     assert [row[3:5] for row in result_rows(records)] == [("7", "2"), ("5", "2"), ("-", "-"), ("-", "-")]
     assert [row[1] for row in variant_rows(records)] == ["2 (2 before the end)", "0"]
     facts = summary("e", "Which?", records)["trials"]

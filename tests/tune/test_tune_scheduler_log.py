@@ -9,10 +9,14 @@ import pytest
 
 from msk_ray.experiment.outcomes import Ending
 from msk_ray.experiment.scheduler_log import LogEntry, SchedulerLog
+from msk_ray.sweep import opening
 from msk_ray.sweep.rules.asha import Asha
 from msk_ray.sweep.rules.early_stopping import SchedulerSpec
 from msk_ray.sweep.rules.median import Median
 from msk_ray.sweep.rules.replay import replay
+from msk_ray.sweep.trials import resolve_trials
+from msk_ray.tune import driver
+from msk_ray.tune.devices import Placement
 from msk_ray.tune.schedulers import METRIC, PruningScheduler
 
 EPOCHS = 24
@@ -102,3 +106,21 @@ def test_a_torn_end_is_cut_off(tmp_path: Path) -> None:
     assert journal.read() == ([report], ())
     journal.append(report)
     assert [json.loads(line)["trial"] for line in (tmp_path / "j").read_text().splitlines()] == ["a", "a"]
+
+
+def test_each_environment_has_rungs_of_its_own(make_space: Any, tmp_path: Path) -> None:
+    bodies = [{"label": name, "value": {"name": name, "nworld": n}} for name, n in (("cartpole", 8), ("hopper", 64))]
+    parameters = {"env": {"grid": bodies}, "shac.actor_lr": {"grid": [0.01, 0.001]}}
+    scheduler = {"kind": "asha", "grace": 0.25, "reduction": 2.0, "min_trials": 2}
+    space = make_space(parameters=parameters, scheduler=scheduler)
+    trials = resolve_trials(space)
+    experiment = opening.create(tmp_path / "runs" / "two", space, trials, {})
+    pruner = driver._pruner(driver.Plan(experiment, space, trials, Placement(0.0, 1), None))
+    # Twenty epochs of 8 steps: 1280 env steps of cartpole, whose first rung is at 320, and 10240 of hopper.
+    good, bad = (trial.id for trial in trials if trial.environment == "cartpole")
+    assert pruner.report(good, 320, 2.0) is None
+    assert "rung 320" in getattr(pruner.report(bad, 320, 1.0), "why", "")
+    good, bad = (trial.id for trial in trials if trial.environment == "hopper")
+    assert (pruner.report(good, 2559, -5.0), pruner.report(bad, 2559, -9.0)) == (None, None)
+    assert pruner.report(good, 2560, -5.0) is None, "below every cartpole"
+    assert "rung 2560" in getattr(pruner.report(bad, 2560, -9.0), "why", "")
