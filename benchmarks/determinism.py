@@ -26,7 +26,7 @@ from torch import Tensor
 import msk_ray
 from msk_ray.config import load_config
 from msk_ray.envs import make_env
-from msk_ray.physics import Graph, WorldBatch
+from msk_ray.physics import Graph, Kernels, WorldBatch
 from msk_ray.physics.ordered.solve import solve
 from msk_ray.physics.ordered.stages import OrderedStages, with_options
 from msk_ray.simulation import TapePerSubstep
@@ -269,7 +269,7 @@ class Scene:
 
     def batch(self, ordered: bool) -> WorldBatch:
         """A batch of the model."""
-        return WorldBatch(self.mjm, self.worlds, 1, self.device, ordered=ordered)
+        return WorldBatch(self.mjm, self.worlds, 1, self.device, kernels=Kernels(ordered=ordered))
 
     def load(self, batch: WorldBatch) -> None:
         """Put the state into a batch."""

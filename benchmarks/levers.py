@@ -32,6 +32,7 @@ LEVERS = {
     "sparse": ["physics.jacobian=sparse"],
     "tf32": ["shac.critic_products=tf32"],
     "fused": ["shac.critic_kernels=fused"],
+    "fused solver": ["physics.solver_kernels=fused"],
     "line search": ["physics.ls_iterations=10"],
     "iterations": ["physics.iterations=5"],
     "substeps": ["physics.substeps=2"],

@@ -24,7 +24,12 @@ GRADIENTS = frozenset(
     )
 )
 """Settings of how steps are differentiated."""
-SOLVING = frozenset(("tolerance", "iterations", "ls_iterations", "jacobian", "cone", "impratio", "nconmax", "njmax"))
+SOLVING = frozenset(
+    (
+        *("tolerance", "iterations", "ls_iterations", "solver_kernels", "jacobian", "cone", "impratio"),
+        *("nconmax", "njmax"),
+    )
+)
 """Those of the constraint solver, which a model without contacts and limits does not need."""
 CONTACTS = frozenset(("solref", "solimp", "friction", "solreffriction"))
 """Those of contacts, in models that declare their own."""
@@ -76,6 +81,9 @@ class PhysicsConfig(Section):
     """Constraint solver iteration limit."""
     ls_iterations: Count | None = None
     """Line search iteration limit."""
+    solver_kernels: Literal["mujoco_warp", "fused"] = "mujoco_warp"
+    """Kernels of the constraint solver. `fused` is one for all iterations of Newton's method, with a thread for each
+    world: for models of up to 60 degrees of freedom. The results differ by rounding."""
     jacobian: Literal["dense", "sparse"] | None = None
     """How mujoco_warp stores the Jacobian of the constraints. The results differ by rounding; which one takes less time
     and memory on a GPU depends on the model."""
@@ -125,6 +133,18 @@ class PhysicsConfig(Section):
         changed = self.model_copy()
         changed._ordered = ordered
         return changed
+
+    @model_validator(mode="after")
+    def _fused_solver_steps_once(self) -> "PhysicsConfig":
+        if self.solver_kernels == "fused":
+            if self.jacobian == "sparse":
+                raise ValueError("solver_kernels fused reads dense Jacobians: leave physics.jacobian out")
+            if self.integrator == "RK4":
+                raise ValueError(
+                    "solver_kernels fused is for one solve a step: write integrator: Euler or implicitfast, or "
+                    "solver_kernels: mujoco_warp"
+                )
+        return self
 
     @model_validator(mode="after")
     def _friction_direction_needs_ellipse(self) -> "PhysicsConfig":

@@ -88,6 +88,7 @@ _LATER: dict[tuple[str, ...], Any] = {
     ("physics", "randomize"): None,
     ("physics", "contact_reach"): None,
     ("physics", "jacobian"): None,
+    ("physics", "solver_kernels"): "mujoco_warp",
     ("trial", "seeds"): dict.fromkeys(("policy", "states", "noise", "minibatches")),
     ("trial", "deterministic"): False,
     ("trial", "threads"): 1,

@@ -20,6 +20,7 @@ from msk_ray.envs.randomize import Randomizer
 from msk_ray.envs.records import EnvState, Resets, Transition
 from msk_ray.errors import ConfigError
 from msk_ray.group import ALONE, Group
+from msk_ray.physics import Kernels
 from msk_ray.physics.capacity import Capacity
 from msk_ray.simulation import Backward, Simulation, StepState
 from msk_ray.simulation.flags import known_none
@@ -76,7 +77,7 @@ class Env(ABC, Generic[SettingsT]):
             device,
             capacity=Capacity(physics.nconmax or 0, physics.njmax or 0),
             tolerance=physics.tolerance,
-            ordered=physics.ordered,
+            kernels=Kernels(physics.ordered, fused_solver=physics.solver_kernels == "fused"),
         )
         self.device = self.sim.device
         self.action_size = self.model.nu

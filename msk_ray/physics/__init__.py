@@ -11,6 +11,16 @@ start_quietly()
 
 from msk_ray.physics.batch import WorldBatch  # noqa: E402
 from msk_ray.physics.graph import Graph, joined_stream, joining_capture, without_collecting  # noqa: E402
+from msk_ray.physics.stages import Kernels  # noqa: E402
 from msk_ray.physics.taped import TapedStep, WarpState  # noqa: E402
 
-__all__ = ["Graph", "TapedStep", "WarpState", "WorldBatch", "joined_stream", "joining_capture", "without_collecting"]
+__all__ = [
+    "Graph",
+    "Kernels",
+    "TapedStep",
+    "WarpState",
+    "WorldBatch",
+    "joined_stream",
+    "joining_capture",
+    "without_collecting",
+]

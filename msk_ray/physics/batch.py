@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 
 from msk_ray.errors import ConfigError, UnsupportedModelError
 from msk_ray.physics.capacity import UNKNOWN, Capacity, default_capacity, geometric_bound, scalar_rows
+from msk_ray.physics.fused import FusedSolver, check_fused
 from msk_ray.physics.graph import joined_stream
 from msk_ray.physics.iterations import IterationWatch
-from msk_ray.physics.ordered import OrderedStages, check_ordered, dense
-from msk_ray.physics.ordered.stages import PackageStages, Stages, with_options
+from msk_ray.physics.ordered import OrderedStages, check_ordered
 from msk_ray.physics.overflow import LossWatch, cured, loss_error, needed
 from msk_ray.physics.pairs import widened
 from msk_ray.physics.parameters import check_names, open_arrays, structure
 from msk_ray.physics.sealed import ModelWatch, seal
+from msk_ray.physics.stages import PACKAGE, ComposedStages, Kernels, PackageStages, Stages, dense, with_options
 
 
 def check_state(model: mujoco.MjModel) -> None:
@@ -74,7 +75,7 @@ class WorldBatch:
             else what a short probe in C MuJoCo needed and half as much again.
         tolerance: solver tolerance, below mujoco_warp's floor of 1e-6 if wanted.
         contact_reach: distance [m] within which contacts are found before they touch, without any force.
-        ordered: add everything up in a fixed order, so that a GPU repeats a step bit for bit; the Jacobian is dense.
+        kernels: which kernels a step is made of.
 
     Attributes:
         mjm: the C MuJoCo model.
@@ -107,22 +108,24 @@ class WorldBatch:
         capacity: Capacity = UNKNOWN,
         tolerance: float | None = None,
         contact_reach: float = 0.0,
-        ordered: bool = False,
+        kernels: Kernels = PACKAGE,
     ) -> None:
         check_state(mjm)
         check_ignored(mjm)
-        if ordered:
+        if kernels.ordered:
             check_ordered(mjm)
+        if kernels.fused_solver:
+            check_fused(mjm)
         self.mjm = mjm
         self.substeps = substeps
         self.device = wp.get_device(device)
         self.parameters: tuple[str, ...] = ()
         self._reach = contact_reach
-        self.ordered = ordered
-        self.stages: Stages = PackageStages()
+        self.kernels = kernels
         self.structure = self._structure()
         self._tolerance = tolerance
-        self._model = self._load(nworld)
+        self.stages: Stages
+        self._model, self.stages = self._load(nworld)
         self.unrolled_iterations: tuple[int, ...] | None = None
         self._watch = ModelWatch(mjm)
         self._given = capacity
@@ -131,12 +134,12 @@ class WorldBatch:
 
     def _structure(self) -> mujoco.MjModel:
         model = structure(self.mjm, self.parameters)
-        if self.ordered:
+        if self.kernels.dense:
             model = dense(model)
         return widened(model, self._reach) if self._reach > 0.0 else model
 
-    def _load(self, nworld: int) -> Any:
-        """mujoco_warp's copy of the model, sealed."""
+    def _load(self, nworld: int) -> tuple[Any, Stages]:
+        """mujoco_warp's copy of the model, sealed, and the launches of its step."""
         with wp.ScopedDevice(self.device):
             try:
                 model = mjw.put_model(self.structure)
@@ -152,10 +155,20 @@ class WorldBatch:
                     mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
                 )  # nothing looks for rows that cannot be
             open_arrays(self.mjm, model, self.parameters, nworld)
-            if self.ordered:
-                self.stages = OrderedStages(self.structure, model)
+            stages = self._make_stages(model)
         seal(model, "batch.model")
-        return model
+        return model, stages
+
+    def _make_stages(self, model: Any) -> Stages:
+        fused = FusedSolver() if self.kernels.fused_solver else None
+        if self.kernels.ordered:
+            return OrderedStages(self.structure, model, fused)
+        return PackageStages() if fused is None else ComposedStages(fused, unrolls=False)
+
+    @property
+    def ordered(self) -> bool:
+        """Whether everything is added up in a fixed order."""
+        return self.kernels.ordered
 
     @property
     def model(self) -> Any:
@@ -193,7 +206,7 @@ class WorldBatch:
         other = copy.copy(self)
         other.parameters = tuple(sorted({*self.parameters, *names}))
         other.structure = other._structure()
-        other._model = other._load(self.nworld)
+        other._model, other.stages = other._load(self.nworld)
         more = scalar_rows(other.structure) - scalar_rows(self.structure)
         if self._bound is not None:
             other._bound = self._bound._replace(rows=self._bound.rows + more)
@@ -256,10 +269,12 @@ class WorldBatch:
         """Launch substep k of an env step on `data`, this batch's own or another of the same model and size."""
         captured = joined_stream() is not None
         # In a fixed order, what is recorded and what is not have to stop at the same iteration.
-        model = self._limited(k, conditional=not captured) if captured or self.ordered else self.model
+        limited = self.stages.unrolls and (captured or self.ordered)
+        model = self._limited(k, conditional=not captured) if limited else self.model
         refresh_velocity(self.mjm, model, data)
         self.stages.step(model, data)
-        self.iterations.launch(data, k)
+        if self.stages.unrolls:
+            self.iterations.launch(data, k)
 
     def _limited(self, k: int, conditional: bool) -> Any:
         """The model with the iteration limit of substep k, with or without conditional graph nodes; the same arrays."""

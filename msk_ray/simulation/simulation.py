@@ -11,8 +11,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from msk_ray.errors import ConfigError, DeviceError, UnsupportedModelError
-from msk_ray.physics import WorldBatch
+from msk_ray.physics import Kernels, WorldBatch
 from msk_ray.physics.capacity import UNKNOWN, Capacity
+from msk_ray.physics.stages import PACKAGE
 from msk_ray.simulation.backward import Applied, Backward, Needs, StepState
 from msk_ray.simulation.bundles import Bundles, StepParameters
 from msk_ray.simulation.flags import known_none
@@ -119,7 +120,8 @@ class Simulation:
         capacity: contacts and constraint rows per world. Where it is 0, a bound from the geometry if that is small,
             otherwise 1.5 times what a short probe in C MuJoCo needed, which grows with use.
         tolerance: solver tolerance, which may be below mujoco_warp's floor of 1e-6.
-        ordered: add everything up in a fixed order, so that a GPU repeats steps and gradients bit for bit.
+        kernels: which kernels steps are made of: `Kernels(ordered=True)` adds everything up in a fixed order, so that a
+            GPU repeats steps and gradients bit for bit; `Kernels(fused_solver=True)` solves constraints in one launch.
 
     The model must not be edited while the simulation exists; if it was, the next step or backward pass raises an error.
 
@@ -138,7 +140,7 @@ class Simulation:
         *,
         capacity: Capacity = UNKNOWN,
         tolerance: float | None = None,
-        ordered: bool = False,
+        kernels: Kernels = PACKAGE,
     ) -> None:
         if nworld < 1 or substeps < 1:
             raise ConfigError(f"nworld and substeps must be at least 1, not {nworld} and {substeps}")
@@ -163,7 +165,7 @@ class Simulation:
             capacity=capacity,
             tolerance=tolerance,
             contact_reach=mode.contact_reach if mode is not None else 0.0,
-            ordered=ordered,
+            kernels=kernels,
         )
         self._stepper = Stepper(batch, mode)
 

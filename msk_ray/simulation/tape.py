@@ -157,7 +157,7 @@ class _Tape(Backward):
             if names and self._batch.ordered:
                 raise UnsupportedModelError(
                     f"gradients of {', '.join(names)} have no fixed order on a GPU: make the Simulation with "
-                    "ordered=False"
+                    "kernels=Kernels(ordered=False)"
                 )
             if names and names not in self._parameters:
                 self._parameters[names] = parameters = ParameterAdjoint(self._adjoint, names)

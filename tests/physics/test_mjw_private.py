@@ -67,7 +67,10 @@ MEMBERS = {
         "CONTACT_FRICTIONLESS": mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS,
         "CONTACT_ELLIPTIC": mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC,
     },
-    "ConstraintState": {"CONE": mujoco.mjtConstraintState.mjCNSTRSTATE_CONE},
+    "ConstraintState": {
+        name: getattr(mujoco.mjtConstraintState, f"mjCNSTRSTATE_{name}")
+        for name in ("SATISFIED", "QUADRATIC", "LINEARNEG", "LINEARPOS", "CONE")
+    },
     "EqType": {
         "CONNECT": mujoco.mjtEq.mjEQ_CONNECT,
         "WELD": mujoco.mjtEq.mjEQ_WELD,

@@ -13,7 +13,7 @@ import torch
 import warp as wp
 
 from msk_ray.errors import UnsupportedModelError
-from msk_ray.physics import WorldBatch
+from msk_ray.physics import Kernels, WorldBatch
 from msk_ray.physics.arrays import gather
 from msk_ray.physics.ordered.contacts import ContactOrder, ContactRecords
 from msk_ray.physics.ordered.rows import RowOrder, RowRecords
@@ -132,10 +132,13 @@ def cone(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-def test_any_order_of_contacts_and_rows_gives_the_same_bits(cone: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("fused", [False, True])
+def test_any_order_of_contacts_and_rows_gives_the_same_bits(
+    cone: str, fused: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def bits() -> list[bytes]:
         with wp.ScopedDevice("cpu"):
-            return stepped(WorldBatch(model(cone), WORLDS, 1, "cpu", ordered=True))
+            return stepped(WorldBatch(model(cone), WORLDS, 1, "cpu", kernels=Kernels(True, fused)))
 
     plain = bits()
     for seed in (1, 2):
@@ -151,14 +154,14 @@ def test_a_shuffle_matters_where_nothing_is_sorted(monkeypatch: pytest.MonkeyPat
     def run(seed: int) -> list[bytes]:
         with monkeypatch.context() as patch:
             shuffled(patch, seed)
-            return stepped(WorldBatch(model("elliptic"), WORLDS, 1, "cpu", ordered=True))
+            return stepped(WorldBatch(model("elliptic"), WORLDS, 1, "cpu", kernels=Kernels(ordered=True)))
 
     assert run(1) != run(2)
 
 
 def test_the_ordered_step_is_that_of_the_package(cone: str) -> None:
     def run(ordered: bool) -> list[np.ndarray]:
-        batch = WorldBatch(model(cone), WORLDS, 1, "cpu", ordered=ordered)
+        batch = WorldBatch(model(cone), WORLDS, 1, "cpu", kernels=Kernels(ordered=ordered))
         start(batch)
         for _ in range(10):
             batch.launch_substep(batch.data, 0)
@@ -169,12 +172,13 @@ def test_the_ordered_step_is_that_of_the_package(cone: str) -> None:
 
 
 @pytest.mark.gpu
-def test_a_gpu_repeats_steps_and_their_gradients(cone: str) -> None:
+@pytest.mark.parametrize("fused", [False, True])
+def test_a_gpu_repeats_steps_and_their_gradients(cone: str, fused: bool) -> None:
     worlds = 2048
 
     def run() -> list[bytes]:
         with wp.ScopedDevice("cuda:0"):
-            return stepped(WorldBatch(model(cone), worlds, 1, "cuda:0", ordered=True), steps=30)
+            return stepped(WorldBatch(model(cone), worlds, 1, "cuda:0", kernels=Kernels(True, fused)), steps=30)
 
     assert run() == run()
 
@@ -199,7 +203,7 @@ def test_the_example_finds_nothing_unordered_on_a_cpu(root: Path, capsys: pytest
 )
 def test_atomics_get_an_order_where_threads_meet(change: Callable[[str], str], races: set[str]) -> None:
     mjm = mujoco.MjModel.from_xml_string(change(TEXT).format(cone="elliptic", jacobian="dense"))
-    batch = WorldBatch(mjm, 1, 1, "cpu", ordered=True)
+    batch = WorldBatch(mjm, 1, 1, "cpu", kernels=Kernels(ordered=True))
     assert isinstance(batch.stages, OrderedStages)
     assert batch.stages.racing == races
     assert bool(batch.stages.summing(batch.model).opt.deterministic) is bool(races)
@@ -231,7 +235,7 @@ def test_tendons_are_those_of_the_package_and_elements_of_one_never_meet() -> No
     mjm = wrapped_tendons()
 
     def lengths(ordered: bool) -> list[np.ndarray]:
-        batch = WorldBatch(mjm, WORLDS, 1, "cpu", ordered=ordered)
+        batch = WorldBatch(mjm, WORLDS, 1, "cpu", kernels=Kernels(ordered=ordered))
         rng = np.random.default_rng(0)
         batch.data.qpos.assign(rng.uniform(-0.5, 0.5, size=(WORLDS, mjm.nq)).astype(np.float32))
         mjw.kinematics(batch.model, batch.data)
@@ -241,7 +245,7 @@ def test_tendons_are_those_of_the_package_and_elements_of_one_never_meet() -> No
 
     for one, other in zip(lengths(True), lengths(False), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)
-    batch = WorldBatch(mjm, 1, 1, "cpu", ordered=True)
+    batch = WorldBatch(mjm, 1, 1, "cpu", kernels=Kernels(ordered=True))
     assert isinstance(batch.stages, OrderedStages)
     assert batch.stages._tendons is not None
     model, parts = batch.model, batch.stages._tendons._parts
@@ -277,7 +281,7 @@ def test_actuators_add_to_the_implicit_matrix_in_their_order() -> None:
     mjm = driven_arm()
 
     def run(ordered: bool) -> list[np.ndarray]:
-        batch = WorldBatch(mjm, WORLDS, 1, "cpu", ordered=ordered)
+        batch = WorldBatch(mjm, WORLDS, 1, "cpu", kernels=Kernels(ordered=ordered))
         assert not batch.stages.summing(batch.model).opt.deterministic
         tape = TapePerSubstep()
         tape.attach(batch)
@@ -310,7 +314,7 @@ def test_actuators_add_to_the_implicit_matrix_in_their_order() -> None:
 
 def test_a_sparse_jacobian_is_made_dense() -> None:
     mjm = model("elliptic", "sparse")
-    batch = WorldBatch(mjm, 1, 1, "cpu", ordered=True)
+    batch = WorldBatch(mjm, 1, 1, "cpu", kernels=Kernels(ordered=True))
     assert not batch.model.is_sparse
     assert mjm.opt.jacobian == mujoco.mjtJacobian.mjJAC_SPARSE
 
@@ -327,4 +331,4 @@ def test_what_has_no_order_is_refused(change: Callable[[mujoco.MjModel], None], 
     mjm = model("elliptic")
     change(mjm)
     with pytest.raises(UnsupportedModelError, match=f"{named}.*trial.deterministic=false"):
-        WorldBatch(mjm, 1, 1, "cpu", ordered=True)
+        WorldBatch(mjm, 1, 1, "cpu", kernels=Kernels(ordered=True))

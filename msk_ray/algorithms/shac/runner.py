@@ -238,9 +238,9 @@ class RecordedRunner(EagerRunner):
         return super().seconds() | ({} if self._fit_s is None else {"critic": self._fit_s})
 
     def adapt(self) -> None:
-        if self._refused:
-            return
         batch = self._env.sim.batch
+        if self._refused or not batch.stages.unrolls:
+            return
         # Empty, if a batch with larger buffers has just taken the place of the one that the epoch ran in.
         counts = batch.iterations.read()
         before, most = batch.unrolled_iterations, int(batch.mjm.opt.iterations)

@@ -7,7 +7,7 @@ import mujoco_warp as mjw
 import numpy as np
 
 from msk_ray.physics.batch import refresh_velocity
-from msk_ray.physics.ordered.stages import Stages
+from msk_ray.physics.stages import Stages
 
 
 def recompute_stages(mjm: mujoco.MjModel, model: Any, data: Any, stages: Stages) -> None:

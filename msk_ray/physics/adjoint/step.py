@@ -31,7 +31,7 @@ from msk_ray.physics.adjoint.tendons import Tendons
 from msk_ray.physics.adjoint.transmission import TurningTransmissions
 from msk_ray.physics.adjoint.workspace import Workspace
 from msk_ray.physics.branches import between_sites
-from msk_ray.physics.ordered.stages import PackageStages, Stages
+from msk_ray.physics.stages import PackageStages, Stages
 
 _ANCHORED = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
 

@@ -14,7 +14,7 @@ from msk_ray.physics.adjoint.groups import Substep, TendonRows
 from msk_ray.physics.adjoint.integrate import Integrator
 from msk_ray.physics.adjoint.tendons import Tendons, tendon_rate
 from msk_ray.physics.adjoint.workspace import Workspace
-from msk_ray.physics.ordered.stages import Stages
+from msk_ray.physics.stages import Stages
 
 
 @wp.kernel(enable_backward=False)

@@ -21,7 +21,7 @@ from msk_ray.physics.adjoint.groups import (
     gather,
 )
 from msk_ray.physics.adjoint.tables import build_tables
-from msk_ray.physics.ordered.stages import Stages
+from msk_ray.physics.stages import Stages
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,6 @@ mujoco_warp 4.0.0 knows and does nothing for: `_sort_contacts` and `_sort_constr
 are sorted between its stages, the two sums of the solver have kernels of their own, and `ATOMICS` covers the rest.
 """
 
-from msk_ray.physics.ordered.stages import OrderedStages, check_ordered, dense
+from msk_ray.physics.ordered.stages import OrderedStages, check_ordered
 
-__all__ = ["OrderedStages", "check_ordered", "dense"]
+__all__ = ["OrderedStages", "check_ordered"]

@@ -1,7 +1,7 @@
-"""The stages of a step: mujoco_warp's own, or those between which contacts and rows are sorted."""
+"""The stages of a step, between which contacts and rows are sorted."""
 
 import copy
-from typing import Any, Protocol
+from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
@@ -15,54 +15,7 @@ from msk_ray.physics.ordered.rows import RowOrder
 from msk_ray.physics.ordered.slopes import SlopeOrder, slopes_apart
 from msk_ray.physics.ordered.solve import solve
 from msk_ray.physics.ordered.tendons import TendonOrder
-
-
-class Stages(Protocol):
-    """Launches of a step and of its parts."""
-
-    ordered: bool
-    """Whether they add everything up in a fixed order."""
-
-    def step(self, model: Any, data: Any) -> None:
-        """Launch one physics step."""
-
-    def position(self, model: Any, data: Any) -> None:
-        """Launch the position stage, without a factor of the inertia."""
-
-    def tendon(self, model: Any, data: Any) -> None:
-        """Launch lengths and Jacobians of tendons."""
-
-    def slopes(self, model: Any, data: Any, out: wp.array) -> None:
-        """Launch M - h ∂τ/∂v of the implicitfast integrator, in the layout of M, into `out` (W, nC)."""
-
-    def summing(self, model: Any) -> Any:
-        """The model to give to stages of mujoco_warp that are launched one by one."""
-
-
-class PackageStages:
-    """mujoco_warp's."""
-
-    ordered = False
-
-    def step(self, model: Any, data: Any) -> None:
-        """Launch `mujoco_warp.step`."""
-        mjw.step(model, data)
-
-    def position(self, model: Any, data: Any) -> None:
-        """Launch `mujoco_warp.fwd_position`."""
-        mjw.fwd_position(model, data, factorize=False)
-
-    def tendon(self, model: Any, data: Any) -> None:
-        """Launch `mujoco_warp.tendon`."""
-        mjw.tendon(model, data)
-
-    def slopes(self, model: Any, data: Any, out: wp.array) -> None:
-        """Launch `mujoco_warp.deriv_smooth_vel`."""
-        mjw.deriv_smooth_vel(model, data, out)
-
-    def summing(self, model: Any) -> Any:
-        """The model itself."""
-        return model
+from msk_ray.physics.stages import ComposedStages, Solver, with_options
 
 
 def check_ordered(mjm: mujoco.MjModel) -> None:
@@ -132,37 +85,20 @@ def sum_actuators(
     qfrc_actuator_out[worldid, dof] = total
 
 
-def dense(mjm: mujoco.MjModel) -> mujoco.MjModel:
-    """The model with a dense Jacobian, for which alone the solver's sums have an order."""
-    if mjm.opt.jacobian == mujoco.mjtJacobian.mjJAC_DENSE:
-        return mjm
-    changed = copy.copy(mjm)
-    changed.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-    return changed
-
-
-def with_options(model: Any, **options: Any) -> Any:
-    """A copy of mujoco_warp's model with other options and the same arrays."""
-    changed, opt = copy.copy(model), copy.copy(model.opt)
-    # The seal is not for these copies, which no recorded graph reads.
-    for name, value in options.items():
-        object.__setattr__(opt, name, value)
-    object.__setattr__(changed, "opt", opt)
-    return changed
-
-
-class OrderedStages:
+class OrderedStages(ComposedStages):
     """The same step with every sum in a fixed order.
 
     Args:
         mjm: the MjModel.
         model: mujoco_warp's model of it, with a dense Jacobian, before it is sealed. Contacts are sorted by its public
             hook `callback.contactfilter`, which ends collision detection.
+        fused: a solver whose sums have an order by themselves; None for mujoco_warp's with an order.
     """
 
     ordered = True
 
-    def __init__(self, mjm: mujoco.MjModel, model: Any) -> None:
+    def __init__(self, mjm: mujoco.MjModel, model: Any, fused: Solver | None = None) -> None:
+        super().__init__(fused or self._solve_ordered, unrolls=fused is None)
         assert not model.is_sparse, "only dense Jacobians have ordered rows"
         model.callback.contactfilter = self.sort_contacts
         self.racing = racing(mjm, model)
@@ -202,7 +138,7 @@ class OrderedStages:
             mjw.crb(model, data)
             if model.opt.run_collision_detection:
                 mjw.collision(model, data)
-            mjw.make_constraint(self._of("constraint", model), data)
+            mjw.make_constraint(self.of("constraint", model), data)
             mjw.transmission(model, data)
         if data.njmax:
             self.sort_rows(data)
@@ -217,24 +153,19 @@ class OrderedStages:
         if self._slopes is not None:
             self._slopes.launch(model, data, out)
         else:
-            mjw.deriv_smooth_vel(self._of("integration", model), data, out)
+            mjw.deriv_smooth_vel(self.of("integration", model), data, out)
 
     def summing(self, model: Any) -> Any:
         """A model whose sums through atomics Warp adds up in a fixed order."""
         return self._atomic if self.racing else model
 
-    def _of(self, stage: str, model: Any) -> Any:
+    def of(self, stage: str, model: Any) -> Any:
+        """The model for a stage, with sums in a fixed order where its threads race."""
         return self._atomic if stage in self.racing else model
 
-    def step(self, model: Any, data: Any) -> None:
-        """Launch one physics step: `mujoco_warp.step`, stage by stage."""
-        self.position(model, data)
-        data.sensordata.zero_()
-        mjw.sensor_pos(model, data)
-        data.energy.zero_()
-        mjw.fwd_velocity(self._of("velocity", model), data)
-        mjw.sensor_vel(model, data)
-        mjw.fwd_actuation(self._of("actuation", model), data)
+    def actuation(self, model: Any, data: Any) -> None:
+        """Launch the forces of actuators."""
+        super().actuation(model, data)
         if self._sums_actuators:
             wp.launch(
                 sum_actuators,
@@ -245,18 +176,19 @@ class OrderedStages:
                 ],
                 outputs=[data.qfrc_actuator],
             )
-        mjw.fwd_acceleration(self._of("acceleration", model), data, factorize=True)
+
+    def integrate(self, model: Any, data: Any) -> None:
+        """Launch the step in time."""
+        if self._slopes is not None:
+            self._slopes.integrate(model, data)
+        else:
+            super().integrate(model, data)
+
+    def _solve_ordered(self, model: Any, data: Any) -> None:
         # For many degrees of freedom the solver adds rows up in parts.
         many = model.nv > _ROW_DOFS
         fixed = {"graph_conditional": False, "iterations": model.opt.iterations}
         solve(with_options(self._atomic, **fixed) if many else model, data)
-        mjw.sensor_acc(model, data)
-        if model.opt.integrator == mjw.IntegratorType.EULER:
-            mjw.euler(self._of("acceleration", model), data)
-        elif self._slopes is not None:
-            self._slopes.integrate(model, data)
-        else:
-            mjw.implicit(self._of("integration", model), data)
 
 
 _ROW_DOFS = 50

@@ -36,6 +36,7 @@ def runner_of(
     counts = np.zeros((2, 128), int) if counts is None else counts
     batch = SimpleNamespace(
         ordered=False,
+        stages=SimpleNamespace(unrolls=True),
         unrolled_iterations=unrolled,
         substeps=2,
         iterations=SimpleNamespace(read=lambda: counts),

@@ -58,6 +58,7 @@ LEGS = {
     "physics": {},
 }
 FUSED = {**ANT, "shac": {**ANT["shac"], "critic_kernels": "fused"}}
+ONE_KERNEL = {**ANT, "physics": {"variant": "matched", "solver_kernels": "fused"}}
 CARTPOLE = {**ANT, "env": {"name": "cartpole", "nworld": 64}, "physics": {}}
 
 
@@ -102,7 +103,9 @@ def after(epochs: int, trainer: Trainer, state: dict[str, Any]) -> tuple[torch.T
 
 @pytest.mark.usefixtures("uncut")
 @pytest.mark.parametrize(
-    "settings", [ANT, CARTPOLE, OPTIONS, LEGS, FUSED], ids=["ant", "cartpole", "options", "legs", "fused"]
+    "settings",
+    [ANT, CARTPOLE, OPTIONS, LEGS, FUSED, ONE_KERNEL],
+    ids=["ant", "cartpole", "options", "legs", "fused", "one_kernel"],
 )
 def test_a_recorded_epoch_equals_one_operation_by_operation(settings: dict[str, Any], tmp_path: Path) -> None:
     recorded, eager = make(settings, tmp_path / "a"), make(settings, tmp_path / "b", capture="off")

@@ -1,0 +1,151 @@
+"""Time of an env step and of its constraint solver alone, by the solver's kernels; forward only.
+
+    python benchmarks/solver.py --configs ant ant_published myoleg26 --worlds 64 4096 16384
+
+Each row starts from worlds that have fallen to the ground under random controls. The env step is recorded as a graph
+and replayed from that state; the solver is replayed on what the stages before it left in the first substep.
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import warp as wp
+from record import RESULTS, markdown_table, publish
+
+from msk_ray.config import load_config
+from msk_ray.envs.make import env_class
+from msk_ray.physics import Graph, Kernels, WorldBatch
+from msk_ray.physics.fused import FusedSolver, scratch
+from msk_ray.physics.ordered.solve import solve as solve_ordered
+
+KERNELS = {
+    "mujoco_warp": Kernels(),
+    "fused": Kernels(fused_solver=True),
+    "ordered": Kernels(ordered=True),
+    "ordered fused": Kernels(ordered=True, fused_solver=True),
+}
+STATE = ("qpos", "qvel", "act", "ctrl")
+
+
+def build(name: str) -> tuple[mujoco.MjModel, int]:
+    """The model of a config, and its substeps."""
+    config = load_config(Path("configs") / f"{name}.yaml")
+    mjm = env_class(config.env).build_model(config.env, config.physics)
+    return mjm, config.physics.resolve_substeps(config.env.control_timestep)
+
+
+def fallen(mjm: mujoco.MjModel, worlds: int, substeps: int, device: str, steps: int) -> dict[str, np.ndarray]:
+    """States of 64 worlds after some env steps under random controls, repeated for all worlds."""
+    few = min(worlds, 64)
+    batch = WorldBatch(mjm, few, substeps, device)
+    rng = np.random.default_rng(0)
+    data = batch.data
+    with wp.ScopedDevice(batch.device):
+        graph = Graph(batch.launch_step, batch.device)
+        data.qpos.assign(np.tile(mjm.qpos0, (few, 1)).astype(np.float32))
+        data.qvel.assign(0.3 * rng.normal(size=(few, mjm.nv)).astype(np.float32))
+        data.act.zero_()
+        for _ in range(steps):
+            data.ctrl.assign(rng.uniform(-1, 1, size=(few, mjm.nu)).astype(np.float32))
+            graph.replay()
+        wp.synchronize_device(batch.device)
+    batch.raise_losses()
+    return {name: np.resize(getattr(data, name).numpy(), (worlds, *getattr(data, name).shape[1:])) for name in STATE}
+
+
+def microseconds(graph: Graph, device: wp.Device, repeats: int) -> float:
+    """Median of five timings of `repeats` replays, per replay."""
+    timings = []
+    for _ in range(6):
+        wp.synchronize_device(device)
+        begin = time.perf_counter()
+        for _ in range(repeats):
+            graph.replay()
+        wp.synchronize_device(device)
+        timings.append((time.perf_counter() - begin) * 1e6 / repeats)
+    return sorted(timings[1:])[2]
+
+
+def measure(
+    batch: WorldBatch, start: dict[str, np.ndarray], solver: Callable[..., None], repeats: int
+) -> tuple[list[str], np.ndarray]:
+    """One row, and the velocities after the env step."""
+    device, data = batch.device, batch.data
+    with wp.ScopedDevice(device):
+        held = {name: wp.array(value, dtype=float) for name, value in start.items()}
+
+        def restore() -> None:
+            for name, array in held.items():
+                wp.copy(getattr(data, name), array)
+
+        def step() -> None:
+            restore()
+            batch.launch_step()
+
+        whole = Graph(step, device)
+        copies = microseconds(Graph(restore, device), device, repeats)
+        taken = microseconds(whole, device, repeats) - copies
+        iterations = data.solver_niter.numpy().copy()
+        rows = float(np.mean(data.nefc.numpy()))
+        end = data.qvel.numpy().copy()
+        batch.raise_losses()
+        restore()
+        batch.begin_step()
+        mjw.forward(batch.model, data)
+        alone = microseconds(Graph(lambda: solver(batch.model, data), device), device, repeats)
+        first = data.solver_niter.numpy().copy()
+    row = [f"{taken / 1e3:.3f}", f"{alone:.0f}", f"{rows:.1f}"]
+    row += [f"{np.mean(n):.2f} / {np.max(n)}" for n in (first, iterations)]
+    return row, end
+
+
+def main() -> None:
+    """Run the benchmark the command line asks for."""
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("--configs", nargs="+", default=["ant"], help="names of files in configs/")
+    p.add_argument("--worlds", type=int, nargs="+", default=[64])
+    p.add_argument("--kernels", nargs="+", default=["mujoco_warp", "fused"], choices=list(KERNELS))
+    p.add_argument("--layouts", action="store_true", help="measure the fused solver in both layouts of its memory")
+    p.add_argument("--steps", type=int, default=60, help="env steps taken before timing, to land")
+    p.add_argument("--repeats", type=int, default=20, help="replays a timing averages over")
+    p.add_argument("--device", default="cuda:0" if wp.is_cuda_available() else "cpu")
+    p.add_argument("--results", type=Path, default=RESULTS, help="folder the table is appended in")
+    args = p.parse_args()
+    header = [
+        "worlds",
+        "kernels",
+        "env step ms",
+        "first solve µs",
+        "rows",
+        "iterations cold",
+        "warm",
+        "velocities differ",
+    ]
+    for name in args.configs:
+        mjm, substeps = build(name)
+        table = []
+        for worlds in args.worlds:
+            start = fallen(mjm, worlds, substeps, args.device, args.steps)
+            wanted = None
+            for kind in args.kernels:
+                kernels = KERNELS[kind]
+                for fastest in (True, False) if args.layouts and kernels.fused_solver else (True,):
+                    scratch.WORLD_FASTEST = fastest
+                    solver = FusedSolver() if kernels.fused_solver else solve_ordered if kernels.ordered else mjw.solve
+                    batch = WorldBatch(mjm, worlds, substeps, args.device, kernels=kernels)
+                    row, end = measure(batch, start, solver, args.repeats)
+                    wanted = end if wanted is None else wanted
+                    label = kind if fastest else f"{kind}, numbers of a world side by side"
+                    table.append([f"{worlds}", label, *row, f"{np.max(np.abs(end - wanted)):.1e}"])
+                    print(name, table[-1], flush=True)
+        title = f"Env step of {name} (nv {mjm.nv}, {substeps} substeps) by kernels of the solver"
+        publish("solver", title, args.device, markdown_table(header, table), args.results)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,76 @@
+"""The solver as a launch, for models that it can take."""
+
+from typing import Any
+
+import mujoco
+import mujoco_warp as mjw
+import warp as wp
+
+from msk_ray.errors import UnsupportedModelError
+from msk_ray.physics.arrays import gather
+from msk_ray.physics.fused.newton import Limits, Solution, solve_world
+from msk_ray.physics.fused.problem import RowsIn
+from msk_ray.physics.fused.scratch import make_scratch
+
+MOST_DOFS = 60
+"""Degrees of freedom up to which MuJoCo itself takes a dense Jacobian. The work of a thread grows with their cube."""
+_BLOCK = 32
+"""Worlds of a block: small blocks spread few worlds over all multiprocessors."""
+
+
+def check_fused(mjm: mujoco.MjModel) -> None:
+    """Raise UnsupportedModelError where a step needs another solver, or solves more than once."""
+    option = mjm.opt
+    known = (
+        mujoco.mjtIntegrator.mjINT_EULER,
+        mujoco.mjtIntegrator.mjINT_IMPLICIT,
+        mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    )
+    found = {
+        "solver CG or PGS": option.solver != mujoco.mjtSolver.mjSOL_NEWTON,
+        f"integrator {mujoco.mjtIntegrator(option.integrator).name[6:]}": option.integrator not in known,
+        "noslip iterations": option.noslip_iterations > 0,
+        "flexes": mjm.nflex > 0,
+        f"{mjm.nv} degrees of freedom, more than {MOST_DOFS}": mjm.nv > MOST_DOFS,
+    }
+    names = [name for name, present in found.items() if present]
+    if names:
+        raise UnsupportedModelError(
+            f"the model uses {', '.join(names)}, for which there is no fused solver: write "
+            "physics.solver_kernels: mujoco_warp"
+        )
+
+
+class FusedSolver:
+    """Newton's method of each world in one thread, from its first iteration to its last: one launch a step.
+
+    The mathematics, the criteria to stop and the results in Data are those of `mujoco_warp.solve` for a dense Jacobian.
+    A world stops when it has converged, and waits for no other than those of its warp.
+    """
+
+    def __init__(self) -> None:
+        self._scratch: dict[tuple[int, int, int], Any] = {}
+
+    def __call__(self, model: Any, data: Any) -> None:
+        """Launch it on what the stages before it left in `data`."""
+        if data.njmax == 0 or model.nv == 0:
+            mjw.solve(model, data)
+            return
+        size = (data.nworld, data.njmax, model.nv)
+        if size not in self._scratch:
+            self._scratch[size] = make_scratch(*size)
+        opt = model.opt
+        limits = gather(Limits, opt)
+        wp.launch(
+            solve_world,
+            dim=data.nworld,
+            inputs=[
+                *(model.nv, model.M_rownnz, model.M_rowadr, model.M_colind, opt.impratio_invsqrt, limits),
+                not opt.disableflags & mujoco.mjtDisableBit.mjDSBL_WARMSTART,
+                *(data.ne, data.nf, data.nefc, data.njmax, data.M),
+                *(data.qfrc_smooth, data.qacc_smooth, data.qacc_warmstart),
+                gather(RowsIn, data.efc, data.contact),
+            ],
+            outputs=[self._scratch[size], gather(Solution, data, data.efc)],
+            block_dim=_BLOCK,
+        )
