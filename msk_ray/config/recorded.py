@@ -109,6 +109,7 @@ _LATER: dict[tuple[str, ...], Any] = {
     ("env", "clock"): False,
     ("env", "symmetric"): False,
     ("env", "gait_worlds"): 0,
+    ("env", "toe_stiffness"): 0.0,
     ("env", "assist", "power"): 1.0,
     ("env", "assist", "steady"): None,
     ("env", "push"): {"speed": 0.0, "interval": 2.0},

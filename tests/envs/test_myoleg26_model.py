@@ -146,6 +146,23 @@ def test_keyframes_satisfy_every_constraint(model: mujoco.MjModel, name: str) ->
                 assert np.linalg.norm(jacobian @ data.qvel) < 0.25, "the foot in contact is nearly at rest"
 
 
+def test_a_spring_straightens_bent_toes() -> None:
+    """In free fall, 0.2 s after push-off; without it they are where push-off left them."""
+    angles = []
+    for stiffness in (0.0, 25.0):
+        model = build_myoleg26(MyoLeg26Settings(name="myoleg26", toe_stiffness=stiffness), PhysicsConfig())
+        data = mujoco.MjData(model)
+        mujoco.mj_resetDataKeyframe(model, data, model.key("stand").id)
+        data.joint("pelvis_ty").qpos += 1.0
+        data.joint("mtp_angle_r").qpos = 0.6
+        for _ in range(50):
+            mujoco.mj_step(model, data)
+        angles.append(float(data.joint("mtp_angle_r").qpos[0]))
+    free, sprung = angles
+    assert free > 0.5
+    assert abs(sprung) < 0.1
+
+
 def test_it_stays_bounded_under_any_constant_excitation(model: mujoco.MjModel) -> None:
     for excitation in (0.0, 0.3, 1.0):
         data = mujoco.MjData(model)

@@ -53,6 +53,9 @@ class MyoLeg26Settings(LegSettings):
     }
 
     terrain: TerrainConfig = TerrainConfig()
+    toe_stiffness: NonNegative = 0.0
+    """Stiffness of a spring that straightens the toes [N m/rad]; Falisse et al. 2022 (doi:10.1371/journal.pone.0256311)
+    have 25. Without it, toes that push-off has bent stay so: their muscles at rest give 0.15 N m at 30°."""
     reset: Literal["stand", "walk", "mixed", "cycle"] = "stand"
     """Initial states near the standing keyframe, the two walking ones, or all three with equal probability; `cycle`:
     near people's posture and speed at the clock's phase (`env.clock`), anywhere in the gait cycle."""

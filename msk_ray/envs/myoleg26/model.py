@@ -199,6 +199,7 @@ def _body_spec(env: MyoLeg26Settings, p: PhysicsConfig) -> mujoco.MjSpec:
                 range=[hinge.lower, hinge.upper],
                 limited=True,
                 damping=p.joint_damping,
+                stiffness=env.toe_stiffness if hinge.segment == "toes" else 0.0,
                 armature=p.armature,
                 solref_limit=list(p.solref_limit or ()),
                 solimp_limit=list(p.solimp_limit or ()),
