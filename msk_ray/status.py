@@ -38,8 +38,9 @@ Show the progress of every trial of an experiment; without EXPERIMENT, list the 
 
 It only reads files, so it works while the sweep runs, after it has died, and from another machine on a shared storage.
 
-  running  has written something lately     waiting  not started yet
-  stale    silent for ten of its epochs     else     how it ended: finished, asha, plateau, nonfinite, error ..."""
+  running      has written something lately    interrupted  the sweep was stopped or has died: --resume continues it
+  waiting      not started yet                 stale        silent for ten of its epochs, although the sweep runs
+  otherwise: how it ended, such as finished, asha, plateau, nonfinite, error"""
 
 EXAMPLES = """\
   python -m msk_ray.status                              # the experiments in runs/
@@ -48,7 +49,13 @@ EXAMPLES = """\
 
 WIDE = 140
 """Columns of a terminal from which hosts, GPU models and reasons are shown too."""
-_STYLES = {State.RUNNING: "green", State.STALE: "yellow", State.UNREADABLE: "red", State.WAITING: "dim"}
+_STYLES = {
+    State.RUNNING: "green",
+    State.STALE: "yellow",
+    State.INTERRUPTED: "yellow",
+    State.UNREADABLE: "red",
+    State.WAITING: "dim",
+}
 _FAILED = (Outcome.ERROR, Outcome.NONFINITE, Outcome.DIVERGED, Outcome.OUT_OF_MEMORY)
 
 
@@ -133,9 +140,10 @@ def view(observer: StatusReader, width: int, rows: int | None = None) -> "Render
     damages = [damage for status in statuses for damage in status.damages]
     if damages:
         lines.append(Text(f"skipped: {count_damages(damages)}", style="red"))
-    if observer.experiment.stop_file.exists() and any(s.state is not State.ENDED for s in statuses):
+    asked = observer.experiment.stop_file.exists() and any(s.state is not State.ENDED for s in statuses)
+    if asked or any(s.state is State.INTERRUPTED for s in statuses):
         command = printable(observer.experiment.resume_command())
-        lines.append(Text(f"stopped on request; continue with: {command}"))
+        lines.append(Text(f"{'stopped on request' if asked else 'interrupted'}; continue with: {command}"))
     return Group(*lines)
 
 

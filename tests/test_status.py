@@ -5,10 +5,12 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from processes import Launcher, wait_until
 
 from msk_ray.cli import run
 from msk_ray.config import dump_yaml
@@ -16,6 +18,7 @@ from msk_ray.experiment.attempts import Attempt, Reduced
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import progress_of
 from msk_ray.experiment.outcomes import Ending, Outcome, write_ending
+from msk_ray.experiment.ownership import owned
 from msk_ray.experiment.snapshot import State
 from msk_ray.experiment.trial_status import StatusReader, bests_of, remaining
 from msk_ray.status import main, short_number
@@ -73,12 +76,19 @@ def experiment(now: None, tmp_path: Path) -> Experiment:
     return made
 
 
+@pytest.fixture
+def driven(experiment: Experiment) -> Iterator[Experiment]:
+    """The same while this process is its driver."""
+    with owned(experiment.path):
+        yield experiment
+
+
 def test_states_from_files(experiment: Experiment) -> None:
     standings = StatusReader(experiment).look(NOW)
     assert [s.state for s in standings] == [
         State.RUNNING,
-        State.STALE,
-        State.STALE,
+        State.INTERRUPTED,
+        State.INTERRUPTED,
         State.ENDED,
         State.ENDED,
         State.WAITING,
@@ -96,14 +106,15 @@ def test_states_from_files(experiment: Experiment) -> None:
 
 
 @pytest.mark.parametrize(("age", "state"), [(59.0, State.RUNNING), (61.0, State.STALE), (-50.0, State.RUNNING)])
-def test_stale_after_a_minute_at_four_seconds_an_epoch(experiment: Experiment, age: float, state: State) -> None:
+def test_stale_after_a_minute_at_four_seconds_an_epoch(driven: Experiment, age: float, state: State) -> None:
+    experiment = driven
     folder = experiment.trial_folder(experiment.trials()[0].id)
     os.utime(folder / "metrics.jsonl", (NOW - age, NOW - age))
     os.utime(folder / "device.json", (NOW - 900, NOW - 900))
     assert next(s for s in StatusReader(experiment).look(NOW) if s.id == folder.name).state is state
 
 
-@pytest.mark.parametrize(("age", "state"), [(4.0, State.STALE), (6.0, State.RUNNING)])
+@pytest.mark.parametrize(("age", "state"), [(4.0, State.INTERRUPTED), (6.0, State.RUNNING)])
 def test_a_trial_whose_driver_has_left_is_not_running(experiment: Experiment, age: float, state: State) -> None:
     """The running one was heard of 5 s ago: before the driver wrote its summary, or, resumed since, after."""
     summary = experiment.path / "summary.json"
@@ -113,7 +124,32 @@ def test_a_trial_whose_driver_has_left_is_not_running(experiment: Experiment, ag
     assert next(s for s in StatusReader(experiment).look(NOW) if s.id == trial).state is state
 
 
-def test_a_process_that_has_just_started_may_take_minutes_to_compile(experiment: Experiment) -> None:
+def test_an_interrupted_trial_waits_for_a_driver_that_resumes_it(driven: Experiment) -> None:
+    (driven.path / "summary.json").write_text("{}")
+    assert {s.state for s in StatusReader(driven).look(NOW)} == {State.ENDED, State.WAITING}
+
+
+def test_a_killed_driver_leaves_interrupted_trials_at_once(
+    experiment: Experiment, launcher: Launcher, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nothing was written since, and the running one was heard of 5 s ago."""
+    script = "import sys, time; from pathlib import Path; from msk_ray.experiment.ownership import acquire"
+    script += "; acquire(Path(sys.argv[1])); time.sleep(3600)"
+    killed = launcher.start([sys.executable, "-c", script, str(experiment.path)])
+    wait_until(lambda: (experiment.path / "owner.json").exists(), killed)
+    trial = experiment.trials()[0].id
+    assert next(s for s in StatusReader(experiment).look(NOW) if s.id == trial).state is State.RUNNING
+    killed.kill()
+    killed.wait()
+    assert next(s for s in StatusReader(experiment).look(NOW) if s.id == trial).state is State.INTERRUPTED
+    assert run(main, ["rates", "--storage", str(experiment.path.parent)]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "3 interrupted" in shown
+    assert f"interrupted; continue with: {experiment.resume_command()}" in shown
+
+
+def test_a_process_that_has_just_started_may_take_minutes_to_compile(driven: Experiment) -> None:
+    experiment = driven
     folder = experiment.trial_folder(experiment.trials()[1].id)
     for age, state in ((500.0, State.RUNNING), (700.0, State.STALE)):
         os.utime(folder / "metrics.jsonl", (NOW - 5000, NOW - 5000))
@@ -165,7 +201,7 @@ def test_the_table_fits_the_terminal(
     text = capsys.readouterr().out
     lines = text.splitlines()
     assert max(map(len, lines)) <= width
-    assert lines[0].startswith("rates · 1 running · 2 stale · 1 waiting · 2 ended · best 9")
+    assert lines[0].startswith("rates · 1 running · 2 interrupted · 1 waiting · 2 ended · best 9")
     running = next(line.split() for line in lines if "running" in line and "8/20" in line)
     for cell in ("actor_lr=0.01", "8/20", "7", "12.3k", "48s"):
         assert cell in running, running

@@ -19,6 +19,14 @@ def name_of(pid: int) -> str:
     return next(iter(stat_of(pid)), "")
 
 
+def command_of(pid: int) -> str:
+    """The command line of a process, or what it calls itself; empty if there is no such process."""
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace").strip()
+    except OSError:
+        return ""
+
+
 def birth_of(pid: int) -> str:
     """When a process was started: its number alone may be used again."""
     stat = stat_of(pid)

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import msk_ray
-from fault_campaign.processes import birth_of, descendants_of, name_of
+from fault_campaign.processes import birth_of, command_of, descendants_of, name_of
 from msk_ray.experiment.metrics import read_rows
 from msk_ray.experiment.outcomes import read_ending
 from msk_ray.experiment.trial import Trial
@@ -145,17 +145,18 @@ class Sweep:
         assert self._driver is not None
         self._family |= {pid: birth_of(pid) for pid in descendants_of(self._driver.pid)}
 
-    def leftovers(self, patience_s: float = 30.0) -> int:
-        """Processes of killed drivers that are still there after a while; they are ended."""
+    def leftovers(self, patience_s: float = 30.0) -> list[str]:
+        """Names of processes of killed drivers that are still there after a while; they are ended."""
         deadline = time.monotonic() + patience_s
         while (alive := [p for p, birth in self._family.items() if birth_of(p) == birth]) and (
             time.monotonic() < deadline
         ):
             time.sleep(0.2)
+        names = [command_of(pid) for pid in alive]
         for pid in alive:
             with contextlib.suppress(ProcessLookupError):  # gone since it was counted
                 os.kill(pid, signal.SIGKILL)
-        return len(alive)
+        return names
 
 
 @contextlib.contextmanager

@@ -59,5 +59,5 @@ def judge(
     rows, lost, notes = reference.compare(sweep.path, trials or sweep.trials)
     left = sweep.leftovers()
     if left:
-        notes.append(f"{left} processes of killed drivers were still there 30 s later")
+        notes.append(f"processes of killed drivers were still there 30 s later: {', '.join(left)}")
     return Tally(fault, injected, ended_by, rows, lost, sweep.seconds, notes)

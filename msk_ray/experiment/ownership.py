@@ -235,6 +235,25 @@ def _take(folder: Path, owner: Owner, force: bool, patience_s: float) -> None:
         raise StorageFailure(f"cannot write {folder / LOCK_FILE}: {error.strerror or error}") from error
 
 
+def has_living_owner(folder: Path, now: float) -> bool | None:
+    """Whether a folder's owner is alive, for readers: nothing is written, so an owner on another machine is judged by
+    this machine's clock.
+
+    Args:
+        folder: the folder.
+        now: seconds since the epoch.
+
+    Returns:
+        None if there is no lock.
+    """
+    path = folder / LOCK_FILE
+    try:
+        touched, data = path.stat().st_mtime, path.read_bytes()
+    except OSError:
+        return None
+    return not _Found(_owner_in(data), max(0.0, now - touched)).stale
+
+
 @contextlib.contextmanager
 def owned(folder: Path, force: bool = False) -> Iterator[Ownership]:
     """Own a folder during a block; see `acquire`."""
@@ -293,11 +312,15 @@ def _find(folder: Path) -> _Found | None:
         now = probe.stat().st_mtime
     finally:
         probe.unlink(missing_ok=True)
+    return _Found(_owner_in(data), max(0.0, now - touched))
+
+
+def _owner_in(data: bytes) -> Owner | None:
+    """The owner that a lock's content names; None if it is damaged."""
     try:
-        owner: Owner | None = Owner(**json.loads(data))
+        return Owner(**json.loads(data))
     except (ValueError, TypeError):
-        owner = None
-    return _Found(owner, max(0.0, now - touched))
+        return None
 
 
 def _remove(folder: Path, found: _Found) -> None:

@@ -21,15 +21,16 @@ from msk_ray.experiment.metrics import (
     with_nan,
 )
 from msk_ray.experiment.outcomes import Ending, Outcome, load_ending
+from msk_ray.experiment.ownership import has_living_owner
 
 T = TypeVar("T")
 _BEATS = (METRICS_FILE, DEVICE_FILE, OUTPUT_FILE)
 """Files that a trial's process writes to as long as it lives."""
-STALE_EPOCHS = 10
-"""A trial is stale when it was silent for this many of its own epochs ..."""
-STALE_S = 60.0
+SILENT_EPOCHS = 10
+"""A trial is silent when it has written nothing for this many of its own epochs ..."""
+SILENT_S = 60.0
 """... and for at least this long [s]."""
-STALE_STARTING_S = 600.0
+SILENT_STARTING_S = 600.0
 """The same for a process that has not done an epoch yet: it may be compiling."""
 
 
@@ -38,8 +39,11 @@ class State(StrEnum):
 
     RUNNING = "running"
     STALE = "stale"
-    """Silent for too long: its process, its machine or the whole experiment has died, or was stopped."""
+    """Silent for too long, although the driver of its experiment is alive: it hangs, or its machine has died."""
+    INTERRUPTED = "interrupted"
+    """It has begun and not ended, and its experiment has no driver: stopped or dead, it can be resumed."""
     WAITING = "waiting"
+    """It has not started, or not since its sweep was resumed."""
     ENDED = "ended"
     UNREADABLE = "unreadable"
     """Its files do not say which trial it is."""
@@ -109,6 +113,8 @@ class TrialReader:
             keep_rows: whether snapshots hold all rows of metrics, or only their summary.
         """
         self._keep_rows = keep_rows
+        self._driver: tuple[Path, float, bool | None] = (Path(), math.nan, None)
+        """Experiment, time, and whether its driver was alive then, None without a lock: asked once for all trials."""
         self._seen: dict[Path, tuple[tuple[int, int], tuple[tuple[dict[str, float], ...], TrialProgress, Metrics]]] = {}
 
     def read(self, folder: Path, now: float) -> TrialSnapshot:
@@ -125,8 +131,23 @@ class TrialReader:
         elif age is None:
             state = State.WAITING
         else:
-            state = State.STALE if _is_silent(folder, progress, age) else State.RUNNING
+            state = self._state(folder, progress, age, now)
         return TrialSnapshot(folder, rows, progress, ending, attempt, device, state, age, tuple(damages))
+
+    def _state(self, folder: Path, progress: TrialProgress, age: float, now: float) -> State:
+        """The state of a trial that has begun and not ended."""
+        experiment, beat = folder.parent.parent, _last_beat(folder)
+        if self._driver[:2] != (experiment, now):
+            self._driver = experiment, now, has_living_owner(experiment, now)
+        driven, summary = self._driver[2], _modified(experiment / SUMMARY_FILE)
+        if summary is not None and (beat is None or beat < summary):
+            # The driver writes the summary at its very end: whoever drives now has not restarted this trial yet.
+            return State.WAITING if driven else State.INTERRUPTED
+        if driven is False:
+            return State.INTERRUPTED
+        if age <= _patience(folder, progress):
+            return State.RUNNING
+        return State.INTERRUPTED if driven is None else State.STALE
 
     def _metrics(
         self, path: Path, damages: list[Damage]
@@ -181,22 +202,14 @@ def _last_beat(folder: Path) -> float | None:
     return max((beat for name in _BEATS if (beat := _modified(folder / name)) is not None), default=None)
 
 
-def _is_silent(folder: Path, progress: TrialProgress, age: float) -> bool:
-    """Whether a trial that has not ended is stale: it has been silent for too long, or its driver, which writes the
-    summary at its very end, has exited since."""
-    summary, beat = _modified(folder.parent.parent / SUMMARY_FILE), _last_beat(folder)
-    left = summary is not None and (beat is None or beat < summary)
-    return left or age > _patience(folder, progress)
-
-
 def _patience(folder: Path, progress: TrialProgress) -> float:
-    """How long a trial may be silent before it counts as stale [s]."""
+    """How long a trial may write nothing before it counts as silent [s]."""
     started, metrics = _modified(folder / DEVICE_FILE), _modified(folder / METRICS_FILE)
     # A process younger than the metrics, as after a retry, has not completed an epoch yet.
     starting = metrics is None or (started is not None and started >= metrics)
     if starting or progress.seconds_per_epoch is None:
-        return STALE_STARTING_S
-    return max(STALE_S, STALE_EPOCHS * progress.seconds_per_epoch)
+        return SILENT_STARTING_S
+    return max(SILENT_S, SILENT_EPOCHS * progress.seconds_per_epoch)
 
 
 def file_stamp(path: Path) -> tuple[int, int] | None:

@@ -17,6 +17,8 @@ from msk_ray.experiment.results import unlisted_trials
 from msk_ray.experiment.snapshot import Device, State, TrialReader, file_stamp
 from msk_ray.experiment.trial import Trial, by_environment
 
+_ORDER = [State.RUNNING, State.STALE, State.INTERRUPTED, State.UNREADABLE, State.ENDED, State.WAITING]
+
 
 @dataclass(frozen=True)
 class TrialStatus:
@@ -122,7 +124,7 @@ def counts(statuses: Sequence[TrialStatus]) -> dict[State, int]:
 def remaining(statuses: Sequence[TrialStatus]) -> float | None:
     """Seconds until the experiment is done, at most; None while none of its trials runs at a known speed."""
     running = [s for s in statuses if s.state is State.RUNNING]
-    idle = [s for s in statuses if s.state in (State.WAITING, State.STALE)]
+    idle = [s for s in statuses if s.state in (State.WAITING, State.STALE, State.INTERRUPTED)]
     return eta(
         [(s.epochs - s.progress.epoch, s.progress.seconds_per_epoch) for s in running],
         [s.epochs - s.progress.epoch for s in idle],
@@ -165,7 +167,7 @@ def find_experiments(storage: Path) -> list[Path]:
 
 
 def _order(status: TrialStatus) -> tuple[int, str, float]:
-    rank = [State.RUNNING, State.STALE, State.UNREADABLE, State.ENDED, State.WAITING].index(status.state)
+    rank = _ORDER.index(status.state)
     return rank, status.environment, -status.progress.best if status.progress.best is not None else math.inf
 
 

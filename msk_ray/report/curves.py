@@ -58,6 +58,7 @@ _LOOK = {
     "error": ("#D55E00", "^"),
     "running": ("#0072B2", ">"),
     "interrupted": (GREY, "|"),
+    "stale": (GREY, "1"),
     "waiting": (GREY, "."),
     "unreadable": ("#000000", "1"),
 }

@@ -127,7 +127,7 @@ class TrialReading:
         have risen."""
         if self.state is State.ENDED:
             return self.ending is not None and self.ending.cut
-        return self.state in (State.RUNNING, State.STALE)
+        return self.state in (State.RUNNING, State.STALE, State.INTERRUPTED)
 
     @property
     def best_row(self) -> dict[str, float]:
@@ -145,7 +145,7 @@ class TrialReading:
         """Name of its ending, or what it is doing."""
         if self.state is State.ENDED and self.ending is not None:
             return str(self.ending.outcome)
-        return "interrupted" if self.state is State.STALE else str(self.state)
+        return str(self.state)
 
     @property
     def why(self) -> str:

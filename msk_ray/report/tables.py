@@ -14,13 +14,14 @@ from msk_ray.report.statistics import Interval, difference_interval, mean_interv
 _PLAIN_FIGURES = ("score", "score_std", "length", "fall_rate", "diverged_rate", "best_score")
 BASELINE = "baseline"
 
-MEANINGS = {
+MEANINGS: dict[str, str] = {
     Outcome.NONFINITE: "a score, loss or gradient was NaN or infinite",
     Outcome.DIVERGED: "too many simulated worlds diverged, or contacts were lost",
     Outcome.OUT_OF_MEMORY: "the device has less memory than the settings need",
     Outcome.ERROR: "an exception, or the process died too often",
     State.UNREADABLE: "the trial's files cannot be read",
-    "interrupted": "silent for too long, without an ending",
+    State.INTERRUPTED: "begun and not ended, and nothing is running it: --resume continues it",
+    State.STALE: "silent for too long, although the sweep runs",
 }
 
 
@@ -194,7 +195,7 @@ def failures(reading: Reading) -> list[tuple[str, str, list[TrialReading]]]:
     """(name, meaning, trials) of each kind of failure, the most frequent first; interrupted trials too."""
     found: dict[str, list[TrialReading]] = {}
     for trial in reading.trials:
-        if trial.failed or trial.state is State.STALE:
+        if trial.failed or trial.state in (State.INTERRUPTED, State.STALE):
             found.setdefault(trial.outcome, []).append(trial)
     ordered = sorted(found.items(), key=lambda item: -len(item[1]))
     return [(name, MEANINGS.get(name, ""), trials) for name, trials in ordered]
