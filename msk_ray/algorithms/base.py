@@ -33,7 +33,7 @@ class EpochResult:
     metrics: dict[str, float]
     """Metrics for the logs, by name; nothing in the program reads them back."""
     episodes: int | None = None
-    """Episodes that ended, all worlds together; None if the algorithm does not say."""
+    """Episodes that ended, all worlds together; None if the algorithm does not count them."""
 
 
 class Algorithm(ABC):
@@ -57,6 +57,8 @@ class Algorithm(ABC):
     Settings: ClassVar[type[AlgorithmSettings]] = AlgorithmSettings
     draws_apart: ClassVar[bool] = False
     """Whether first weights, noise and minibatches come from generators of their own where `trial.seeds` names them."""
+    counts_episodes: ClassVar[bool] = False
+    """Whether the result of every epoch says how many episodes ended, which some settings of environments need."""
 
     def __init__(self, config: Config, env: Env[Any], network: nn.Module | None = None) -> None:
         """
@@ -64,12 +66,21 @@ class Algorithm(ABC):
             config: the trial's config.
             env: the worlds to train in.
             network: the policy; None creates a new `policy_network`.
+
+        Raises:
+            ConfigError: a setting asks for what the algorithm does not do.
         """
         seeds = config.trial.seeds
         if not self.draws_apart and (config.trial.noise_apart or seeds.policy is not None):
             raise ConfigError(
                 f"trial.seeds: {config.algorithm.name} draws everything but states from one generator: write "
                 "trial.seeds.states alone"
+            )
+        if env.reads_episode_lengths and not self.counts_episodes:
+            raise ConfigError(
+                f"{env.reads_episode_lengths} needs an algorithm that counts the episodes that end, and "
+                f"{config.algorithm.name} does not: write {env.reads_episode_lengths}: null, or return "
+                "EpochResult(..., episodes=N) and set counts_episodes = True in its class"
             )
         torch.manual_seed(config.trial.seed_of("policy"))
         self.config = config
@@ -92,9 +103,16 @@ class Algorithm(ABC):
         """
 
     def run_epoch(self, epoch: int) -> EpochResult:
-        """`update` between the beginning and the end of the environment's epoch."""
+        """`update` between the beginning and the end of the environment's epoch.
+
+        Raises:
+            ConfigError: the algorithm says `counts_episodes` and did not.
+            SimulationError: as `update`.
+        """
         self.env.begin_epoch(epoch)
         result = self.update(epoch)
+        if self.counts_episodes and result.episodes is None:
+            raise ConfigError(f"{type(self).__name__} has counts_episodes = True: return EpochResult(..., episodes=N)")
         length = None if result.episodes is None else result.env_steps / max(result.episodes, 1)
         return replace(result, metrics={**result.metrics, **self.env.end_epoch(length)})
 

@@ -114,6 +114,11 @@ class Env(ABC, Generic[SettingsT]):
     def prepare(self) -> None:
         """Create constants on the device: copying one there in every step would make the host wait for the GPU."""
 
+    @property
+    def reads_episode_lengths(self) -> str | None:
+        """The setting, if any, because of which `end_epoch` has to know how long episodes were."""
+        return None
+
     def begin_epoch(self, epoch: int) -> None:
         """Called before each training epoch, counted from 0: change here what depends on the progress of training.
 

@@ -45,6 +45,7 @@ class Ppo(Algorithm):
     """
 
     Settings = PpoConfig
+    counts_episodes = True
     draws_apart = True
     settings: PpoConfig
     network: GaussianPolicy

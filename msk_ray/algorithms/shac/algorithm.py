@@ -40,6 +40,7 @@ class Shac(Algorithm):
     Settings = ShacConfig
     settings: ShacConfig
     draws_apart = True
+    counts_episodes = True
     network: PolicyNetwork
 
     def __init__(self, config: Config, env: Env[Any]) -> None:

@@ -6,7 +6,6 @@ from typing import Any
 import torch
 
 from msk_ray.envs.legs.config import AssistConfig
-from msk_ray.errors import ConfigError
 
 
 class Assistance:
@@ -36,18 +35,13 @@ class Assistance:
     def end_epoch(self, length: float | None) -> dict[str, float]:
         """Count an epoch that had this many env steps per episode that ended; its share, by metric name.
 
-        Raises:
-            ConfigError: the algorithm does not say how many episodes ended, and `steady` needs it.
+        With `steady`, the length must be known (`Env.reads_episode_lengths`).
         """
         if not self._config.epochs:
             return {}
         stood = self._config.at(self._passed)
         if self._config.steady is not None:
-            if length is None:
-                raise ConfigError(
-                    "env.assist.steady needs an algorithm that says how many episodes ended: write env.assist.steady: "
-                    "null, or let its EpochResult say so"
-                )
+            assert length is not None
             self._passed += length * self._timestep >= self._config.steady
         return {"train/assist": stood}
 

@@ -206,6 +206,11 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
     def control(self, action: Tensor) -> Tensor:
         return self.excitation(self._own_sides(action, self.state.age))
 
+    @property
+    def reads_episode_lengths(self) -> str | None:
+        assist = self.config.assist
+        return "env.assist.steady" if assist.epochs and assist.steady is not None else None
+
     def begin_epoch(self, epoch: int) -> None:
         self._tracking_share.fill_(self.config.tracking.at(epoch))
         self._assistance.begin_epoch(epoch)
