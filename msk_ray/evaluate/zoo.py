@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 MAX_BYTES = 1_000_000
 """Largest policy [B]."""
+BEST_EVALUATION = "the best evaluation"
+"""How the checkpoint best.pt of a trial is chosen."""
 BEGIN, END = "<!-- Begin of what `msk-ray export --zoo` writes. -->", "<!-- End. -->"
 _AGREEMENT = 3.0
 """Standard errors by which scores on different machines may differ: episodes are chaotic, and rounding differs."""
@@ -62,8 +64,10 @@ class Training(Section):
     command: str
     commit: str
     machine: str
+    chosen: str = BEST_EVALUATION
+    """How its checkpoint was chosen among those of the trial."""
     epoch: Count
-    """Epoch of the policy, the best by evaluation."""
+    """Epoch of the policy."""
     epochs: Count
     """Epochs of the trial."""
     env_steps: Whole
@@ -163,8 +167,8 @@ def zoo_table(entries: Mapping[str, Entry]) -> str:
 def zoo_text(entries: Mapping[str, Entry]) -> str:
     """What a zoo's README says of its policies: the table, and the command of each."""
     commands = [
-        f"- `{name}`: `{printable(entry.trained.command)}`; the best evaluation (epoch {entry.trained.epoch} of "
-        f"{entry.trained.epochs})"
+        f"- `{name}`: `{printable(entry.trained.command)}`; {printable(entry.trained.chosen)} (epoch "
+        f"{entry.trained.epoch} of {entry.trained.epochs})"
         + ("" if entry.weights == "float32" else f"; weights stored as {entry.weights}")
         + f"; scored on {printable(entry.score.device)} under {printable(entry.score.physics)} physics"
         for name, entry in entries.items()

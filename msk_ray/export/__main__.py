@@ -62,6 +62,11 @@ def parser() -> Parser:
     zoo.add_argument("--command", metavar="TEXT", help="how it was trained, if its trial does not say")
     zoo.add_argument("--commit", metavar="HASH", help="with which commit")
     zoo.add_argument("--machine", metavar="TEXT", help="on what, such as '1 × NVIDIA H200'")
+    zoo.add_argument(
+        "--chosen",
+        metavar="TEXT",
+        help="how the checkpoint was chosen, if it is not a trial's best.pt, such as 'the newest checkpoint'",
+    )
     return p
 
 
@@ -91,7 +96,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 REFERENCE = "reference"
-_ZOO_OPTIONS = ("seeds", "device", "command", "commit", "machine")
+_ZOO_OPTIONS = ("seeds", "device", "command", "commit", "machine", "chosen")
 
 
 def _add_to_zoo(args: argparse.Namespace, checkpoint: Path, files: bool) -> int:
@@ -107,7 +112,7 @@ def _add_to_zoo(args: argparse.Namespace, checkpoint: Path, files: bool) -> int:
 
     device = args.device or default_device()
     resolve_device(device)
-    given = Origin(args.command, args.commit, args.machine)
+    given = Origin(args.command, args.commit, args.machine, args.chosen)
     for line in add_to_zoo(checkpoint, args.zoo, given, seeds, device):
         print(line, flush=True)
     return 0

@@ -16,10 +16,10 @@ from msk_ray.config import Config, dump_yaml, flattened, overlay, parse_recorded
 from msk_ray.errors import ConfigError, StorageError
 from msk_ray.evaluate.measure import REFERENCE, Bench, Request
 from msk_ray.evaluate.targets import trial_folder_of
-from msk_ray.evaluate.zoo import BEGIN, END, MAX_BYTES, Entry, Training, read_zoo, score_of, zoo_text
+from msk_ray.evaluate.zoo import BEGIN, BEST_EVALUATION, END, MAX_BYTES, Entry, Training, read_zoo, score_of, zoo_text
 from msk_ray.experiment.checkpoint_file import write_checkpoint_file
 from msk_ray.experiment.environment import read_environment
-from msk_ray.experiment.layout import ENVIRONMENT_FILE
+from msk_ray.experiment.layout import ENVIRONMENT_FILE, best_checkpoint
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import read_rows
 from msk_ray.experiment.snapshot import read_trial
@@ -39,6 +39,8 @@ class Origin:
     command: str | None = None
     commit: str | None = None
     machine: str | None = None
+    chosen: str | None = None
+    """How the checkpoint was chosen; None: it is the trial's best.pt."""
 
 
 def add_to_zoo(checkpoint: Path, target: Path, given: Origin, seeds: Sequence[int], device: str) -> Iterator[str]:
@@ -56,8 +58,8 @@ def add_to_zoo(checkpoint: Path, target: Path, given: Origin, seeds: Sequence[in
         device: for the evaluation.
 
     Raises:
-        ConfigError: the trial does not say how it was trained, its policy is untrained or too large, or its settings
-            name files of this machine.
+        ConfigError: the trial does not say how it was trained, or it is not known how its checkpoint was chosen; its
+            policy is untrained or too large, or its settings name files of this machine.
         ExportError: the exported policy differs from the stored one.
         CheckpointError, UnsupportedModelError, SimulationError, StorageError: as their messages say.
     """
@@ -112,6 +114,12 @@ def _training(saved: SavedPolicy, given: Origin) -> Training:
     for name, value in (("command", command), ("commit", commit), ("machine", machine)):
         if not value:
             raise ConfigError(f"{folder} does not say with which {name} it was trained: add --{name} TEXT")
+    chosen = given.chosen or (BEST_EVALUATION if saved.path.name == best_checkpoint(folder).name else None)
+    if not chosen:
+        raise ConfigError(
+            f"{saved.path.name} is not the {best_checkpoint(folder).name} of its trial: say how it was chosen with "
+            '--chosen TEXT, such as "the newest checkpoint"'
+        )
     assert command is not None
     assert commit is not None
     assert machine is not None
@@ -120,6 +128,7 @@ def _training(saved: SavedPolicy, given: Origin) -> Training:
         command=command,
         commit=commit,
         machine=machine,
+        chosen=chosen,
         epoch=saved.epoch,
         epochs=saved.config.trial.epochs,
         env_steps=saved.env_steps,

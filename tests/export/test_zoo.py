@@ -93,6 +93,7 @@ def test_an_entry_says_what_the_policy_scores_and_where_it_comes_from(made: Path
     trained = entry.trained
     assert f"# trial {best.trial.id}: {best.trial.variant}, seed {best.trial.seed}" in trained.command
     assert (trained.machine, trained.epoch, trained.epochs) == ("1 × Thinker", best.best.epoch, 6)
+    assert trained.chosen == "the best evaluation"
     assert trained.seconds == pytest.approx(best.best.seconds, abs=0.1)
     text = (made / "README.md").read_text()
     assert text.startswith("# Mine\n")
@@ -120,6 +121,18 @@ def test_scores_agree_within_three_standard_errors() -> None:
     one, two = (Score(mean=mean, std=30.0, worlds=100, device="cpu", **other) for mean in (1000.0, 1012.0))
     assert one.agrees(two)  # the difference has a standard error of √(3² + 3²) = 4.24
     assert not one.agrees(two.model_copy(update={"mean": 1013.0}))
+
+
+def test_a_checkpoint_other_than_the_best_says_how_it_was_chosen(
+    sweep: Experiment, copy: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    checkpoint = sweep.trial_folder(sweep.trials()[0].id) / "checkpoints" / "epoch_000006.pt"
+    command = [str(checkpoint), "--zoo", str(copy / "pole"), "--seeds", "0", "--device", "cpu", "--machine", "x"]
+    assert run(export, command) == 2
+    assert "epoch_000006.pt is not the best.pt of its trial: say how it was chosen" in capsys.readouterr().err
+    assert run(export, [*command, "--chosen", "the newest checkpoint"]) == 0
+    assert read_zoo(copy)["pole"].trained.chosen == "the newest checkpoint"
+    assert "; the newest checkpoint (epoch 6 of 6); scored on" in (copy / "README.md").read_text()
 
 
 def test_a_large_policy_is_stored_in_half_precision_and_scored_so(
