@@ -82,7 +82,7 @@ class SpaceFile(Section):
     samples: Count = 1
     """Random draws of the sampled parameters (choice, uniform, loguniform, randint) for each point of the grid."""
     sample_seed: Whole = 0
-    """Seed of those draws."""
+    """Seed of those draws, of a search, and of what pbt exchanges."""
     search: Text = "random"
     """`random` resolves all trials in advance; otherwise the search that suggests them, by name or import path."""
     objectives: dict[Text, Literal["minimize", "maximize"]] = Field(default_factory=dict)

@@ -244,7 +244,7 @@ def _scheduler(plan: Plan, job: Job, supervisor: Supervisor) -> Population | Pru
     """The rule that compares trials, in the state that the recorded evaluations leave it in."""
     spec = plan.space.file.scheduler
     if isinstance(spec, PopulationBasedTraining):
-        return Population(spec, _budget(plan), plan.space.sampled)
+        return Population(spec, _budget(plan), plan.space.sampled, plan.space.file.sample_seed)
     pruner, journal = _pruner(plan), _journal(plan)
     replay(pruner, spec.time_attr, journal.read()[0])
     return PruningScheduler(

@@ -82,26 +82,53 @@ class Population(PopulationBasedTraining):
 
     Values stay inside their ranges, and a member that continues from a better one keeps its identity: Ray by itself
     would let values leave the ranges, and copy the better member's whole config, including its identity.
+
+    Ray draws from Python's global generator. Here, an exchange draws from the seed, the member and its progress: the
+    same in every run, whatever other members do meanwhile, and after a resume. Which members are the better ones still
+    depends on who has reported by then.
     """
 
-    def __init__(self, spec: PopulationSpec, budget: float, sampled: Mapping[str, Operator]) -> None:
+    FACTORS = (0.8, 1.2)
+    """By one of which an exchanged value is changed."""
+
+    def __init__(self, spec: PopulationSpec, budget: float, sampled: Mapping[str, Operator], seed: int) -> None:
+        """
+        Args:
+            spec: the section of the space.
+            budget: length of the longest trial, in the unit of `spec.time_attr`.
+            sampled: parameters that are drawn, of which those with a range are exchanged.
+            seed: of all draws.
+        """
         self._ranges = {key: op for key, op in sampled.items() if isinstance(op, Range)}
+        self._seed = seed
         super().__init__(
             time_attr=spec.time_attr,
             perturbation_interval=spec.interval * budget,
-            hyperparam_mutations={"params": {key: _draw(op) for key, op in self._ranges.items()}},
+            hyperparam_mutations={"params": {key: [op.low, op.high] for key, op in self._ranges.items()}},
             quantile_fraction=spec.quantile,
             resample_probability=spec.resample,
             log_config=False,
         )
 
+    def _checkpoint_or_exploit(
+        self, trial: Any, tune_controller: Any, upper_quantile: list[Any], lower_quantile: list[Any]
+    ) -> None:
+        if trial in lower_quantile:
+            better = sorted(upper_quantile, key=lambda member: str(member.config["id"]))
+            upper_quantile = [self._generator(trial, "from").choice(better)]
+        super()._checkpoint_or_exploit(trial, tune_controller, upper_quantile, lower_quantile)
+
     def _get_new_config(self, trial: Any, trial_to_clone: Any) -> tuple[dict[str, Any], dict[str, Any]]:
-        config, operations = super()._get_new_config(trial, trial_to_clone)
-        moved = {key: op.clip(config["params"][key]) for key, op in self._ranges.items()}
-        return {"id": trial.config["id"], "params": config["params"] | moved}, operations
+        params, operations = dict(trial_to_clone.config["params"]), {}
+        rng = self._generator(trial, "values")
+        for key, op in self._ranges.items():
+            if rng.random() < self._resample_probability:
+                params[key], operations[key] = op.draw(rng).value, "resample"
+            else:
+                factor = rng.choice(self.FACTORS)
+                params[key], operations[key] = op.clip(params[key] * factor), f"* {factor}"
+        return {"id": trial.config["id"], "params": params}, {"params": operations}
 
-
-def _draw(op: Operator) -> Callable[[], Any]:
-    """Draws a new value from a range at each call."""
-    rng = random.Random()
-    return lambda: op.draw(rng).value
+    def _generator(self, trial: Any, purpose: str) -> random.Random:
+        time = self._trial_state[trial].last_perturbation_time
+        return random.Random(f"{self._seed} {trial.config['id']} {time} {purpose}")
