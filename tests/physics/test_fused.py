@@ -13,7 +13,7 @@ from scenes import ant as dropped_ant
 
 from msk_ray.config import load_config
 from msk_ray.envs.make import env_class
-from msk_ray.errors import UnsupportedModelError
+from msk_ray.errors import ConfigError, UnsupportedModelError
 from msk_ray.gradcheck import check_gradients
 from msk_ray.physics import Kernels, WorldBatch
 from msk_ray.physics.fused import FusedSolver, check_fused, scratch
@@ -229,3 +229,10 @@ def test_models_of_many_degrees_of_freedom_are_refused() -> None:
     mjm = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
     with pytest.raises(UnsupportedModelError, match="66 degrees of freedom, more than 60"):
         WorldBatch(mjm, 1, 1, "cpu", kernels=FUSED)
+
+
+def test_more_worlds_than_can_be_counted_are_refused_before_memory_is_taken() -> None:
+    with pytest.raises(
+        ConfigError, match=r"room for 671088 worlds of 100 constraint rows.*solver_kernels: mujoco_warp"
+    ):
+        scratch.make_scratch(671_089, 100, 14)

@@ -1,64 +1,49 @@
 """Dense linear algebra of one thread, in blocks of 4 × 4 that stay in registers.
 
-Matrices are row by row, `width` numbers a row, and vectors have as many; `width` is a multiple of 4. All are rows of
-arrays (W, ...), one for each world.
+A vector has `blocks` parts of 4 numbers. A matrix has as many in each row, row by row. Both are rows of arrays of vec4
+(W, ...), one for each world.
 """
 
 import warp as wp
+
+from msk_ray.physics.fused.memory import four, put_four
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def four(values: wp.array2d[float], world: int, k: int) -> wp.vec4:
-    """Numbers k to k + 3 of a world."""
-    return wp.vec4(values[world, k], values[world, k + 1], values[world, k + 2], values[world, k + 3])
-
-
-@wp.func
-def put_four(values: wp.array2d[float], world: int, k: int, v: wp.vec4) -> None:
-    values[world, k] = v[0]
-    values[world, k + 1] = v[1]
-    values[world, k + 2] = v[2]
-    values[world, k + 3] = v[3]
-
-
-@wp.func
-def block(matrix: wp.array2d[float], world: int, start: int, width: int) -> wp.mat44:
-    """The block whose first number is at `start`."""
+def block(matrix: wp.array2d[wp.vec4], world: int, i: int, j: int, blocks: int) -> wp.mat44:
+    """Block (i, j)."""
+    start = 4 * i * blocks + j
     return wp.matrix_from_rows(
         four(matrix, world, start),
-        four(matrix, world, start + width),
-        four(matrix, world, start + 2 * width),
-        four(matrix, world, start + 3 * width),
+        four(matrix, world, start + blocks),
+        four(matrix, world, start + 2 * blocks),
+        four(matrix, world, start + 3 * blocks),
     )
 
 
 @wp.func
-def put_block(matrix: wp.array2d[float], world: int, start: int, width: int, a: wp.mat44) -> None:
-    for i in range(4):
-        put_four(matrix, world, start + i * width, a[i])
-
-
-@wp.func
-def row_product(matrix: wp.array2d[float], world: int, start: int, vector: wp.array2d[float], width: int) -> float:
-    """A row of a matrix, from `start` on, times a vector."""
-    total = float(0.0)
-    for k in range(0, width, 4):
-        total += wp.dot(four(matrix, world, start + k), four(vector, world, k))
-    return total
+def put_block(matrix: wp.array2d[wp.vec4], world: int, i: int, j: int, blocks: int, a: wp.mat44) -> None:
+    start = 4 * i * blocks + j
+    for k in range(4):
+        put_four(matrix, world, start + k * blocks, a[k])
 
 
 @wp.func
 def multiply(
-    matrix: wp.array2d[float], world: int, vector: wp.array2d[float], width: int, product: wp.array2d[float]
+    matrix: wp.array2d[wp.vec4],
+    world: int,
+    vector: wp.array2d[wp.vec4],
+    blocks: int,
+    product: wp.array2d[wp.vec4],
 ) -> None:
     """product = matrix vector."""
-    for k in range(0, width, 4):
+    for i in range(blocks):
         total = wp.vec4(0.0)
-        for j in range(0, width, 4):
-            total += block(matrix, world, k * width + j, width) @ four(vector, world, j)
-        put_four(product, world, k, total)
+        for j in range(blocks):
+            total += block(matrix, world, i, j, blocks) @ four(vector, world, j)
+        put_four(product, world, i, total)
 
 
 @wp.func
@@ -107,17 +92,21 @@ def below(factor: wp.mat44, a: wp.mat44) -> wp.mat44:
 
 @wp.func
 def solve_factored(
-    factor: wp.array2d[float], world: int, vector: wp.array2d[float], width: int, solution: wp.array2d[float]
+    factor: wp.array2d[wp.vec4],
+    world: int,
+    vector: wp.array2d[wp.vec4],
+    blocks: int,
+    solution: wp.array2d[wp.vec4],
 ) -> None:
     """solution = -(L Lᵀ)⁻¹ vector, of a factor whose diagonal holds reciprocals."""
-    for i in range(0, width, 4):
+    for i in range(blocks):
         v = -four(vector, world, i)
-        for k in range(0, i, 4):
-            v -= block(factor, world, i * width + k, width) @ four(solution, world, k)
-        put_four(solution, world, i, forward(block(factor, world, i * width + i, width), v))
-    for back in range(4, width + 4, 4):
-        i = width - back
+        for k in range(i):
+            v -= block(factor, world, i, k, blocks) @ four(solution, world, k)
+        put_four(solution, world, i, forward(block(factor, world, i, i, blocks), v))
+    for back in range(blocks):
+        i = blocks - 1 - back
         v = four(solution, world, i)
-        for k in range(i + 4, width, 4):
-            v -= wp.transpose(block(factor, world, k * width + i, width)) @ four(solution, world, k)
-        put_four(solution, world, i, backward(block(factor, world, i * width + i, width), v))
+        for k in range(i + 1, blocks):
+            v -= wp.transpose(block(factor, world, k, i, blocks)) @ four(solution, world, k)
+        put_four(solution, world, i, backward(block(factor, world, i, i, blocks), v))

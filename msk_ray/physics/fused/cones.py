@@ -7,7 +7,7 @@ With N = μ jar₀ and uᵢ = φᵢ jarᵢ, T = |u|, the cone is circular. Its d
 import warp as wp
 
 from msk_ray.physics import mjw_private as private
-from msk_ray.physics.fused.blocks import four, put_four
+from msk_ray.physics.fused.memory import four, put_four, put_number, put_whole, whole
 from msk_ray.physics.fused.scratch import CONE, Scratch
 
 wp.set_module_options({"enable_backward": False})
@@ -58,55 +58,61 @@ def cone_mass(stiffness: float, mu: float) -> float:
 
 
 @wp.func
-def update_contact(scratch: Scratch, world: int, width: int, room: int, contact: int) -> bool:
+def update_contact(scratch: Scratch, world: int, blocks: int, room: int, contact: int) -> bool:
     """Forces, states and weights of a contact's rows; whether its part of the Hessian may have changed.
 
     While it slides, its part of the Hessian is, with zᵢ = φᵢ Jᵢ, the direction û = u / T and p = Σ ûᵢ zᵢ,
-    m μ² (J₀ - p)(J₀ - p)ᵀ + m (μ² - μ N / T) Σ (zᵢ - ûᵢ p)(zᵢ - ûᵢ p)ᵀ: rows with weights that are not negative.
+    m μ² (J₀ - p)(J₀ - p)ᵀ + m (μ² - μ N / T) Σ (zᵢ - ûᵢ p)(zᵢ - ûᵢ p)ᵀ: rows with weights that are not negative. Behind
+    the rows of J are these, or J itself while all are springs.
     """
-    first = scratch.first[world, contact]
-    end = scratch.first[world, contact + 1]
-    mu = scratch.bound[world, first]
-    normal = mu * scratch.jar[world, first]
+    first = whole(scratch.first, world, contact)
+    end = whole(scratch.first, world, contact + 1)
+    head = four(scratch.springs, world, first)
+    mu = head[1]
+    normal = mu * head[2]
     squares = float(0.0)
     for p in range(first + 1, end):
-        u = scratch.bound[world, p] * scratch.jar[world, p]
+        row = four(scratch.springs, world, p)
+        u = row[1] * row[2]
         squares += u * u
     tangent = wp.sqrt(squares)
-    before = scratch.state[world, first]
+    before = whole(scratch.state, world, first)
     state = zone(normal, tangent, mu)
+    behind = room * blocks
     if state != SLIDING:
         for p in range(first, end):
-            weight = wp.where(state == QUADRATIC, scratch.stiffness[world, p], 0.0)
-            scratch.force[world, p] = -weight * scratch.jar[world, p]
-            scratch.weight[world, p] = weight
-            scratch.state[world, p] = state
+            row = four(scratch.springs, world, p)
+            weight = wp.where(state == QUADRATIC, row[0], 0.0)
+            put_number(scratch.force, world, p, -weight * row[2])
+            put_number(scratch.weight, world, p, weight)
+            put_whole(scratch.state, world, p, state)
+        if state == QUADRATIC and before == SLIDING:
+            for at in range(first * blocks, end * blocks):
+                put_four(scratch.rows, world, behind + at, four(scratch.rows, world, at))
         return state != before
-    mass = cone_mass(scratch.stiffness[world, first], mu)
+    mass = cone_mass(head[0], mu)
     inverse = 1.0 / tangent
     pull = mass * mu * (normal - mu * tangent)
-    scratch.force[world, first] = -pull
-    scratch.weight[world, first] = mass * mu * mu
-    scratch.state[world, first] = SLIDING
     turning = mass * (mu * mu - mu * normal * inverse)
+    put_number(scratch.force, world, first, -pull)
+    put_number(scratch.weight, world, first, mass * mu * mu)
+    put_whole(scratch.state, world, first, SLIDING)
     for p in range(first + 1, end):
-        scratch.force[world, p] = (
-            pull * inverse * scratch.bound[world, p] * scratch.bound[world, p] * scratch.jar[world, p]
-        )
-        scratch.weight[world, p] = turning
-        scratch.state[world, p] = SLIDING
-    behind = room * width
-    for k in range(0, width, 4):
+        row = four(scratch.springs, world, p)
+        put_number(scratch.force, world, p, pull * inverse * row[1] * row[1] * row[2])
+        put_number(scratch.weight, world, p, turning)
+        put_whole(scratch.state, world, p, SLIDING)
+    for k in range(blocks):
         mean = wp.vec4(0.0)
         for p in range(first + 1, end):
-            friction = scratch.bound[world, p]
-            mean += friction * friction * scratch.jar[world, p] * inverse * four(scratch.rows, world, p * width + k)
-        at = first * width + k
+            row = four(scratch.springs, world, p)
+            mean += row[1] * row[1] * row[2] * inverse * four(scratch.rows, world, p * blocks + k)
+        at = first * blocks + k
         put_four(scratch.rows, world, behind + at, four(scratch.rows, world, at) - mean)
         for p in range(first + 1, end):
-            friction = scratch.bound[world, p]
-            at = p * width + k
-            turned = friction * (four(scratch.rows, world, at) - scratch.jar[world, p] * inverse * mean)
+            row = four(scratch.springs, world, p)
+            at = p * blocks + k
+            turned = row[1] * (four(scratch.rows, world, at) - row[2] * inverse * mean)
             put_four(scratch.rows, world, behind + at, turned)
     return True
 
@@ -114,31 +120,27 @@ def update_contact(scratch: Scratch, world: int, width: int, room: int, contact:
 @wp.func
 def open_cone(scratch: Scratch, world: int, contact: int) -> Cone:
     """The contact on the line along the present direction."""
-    first = scratch.first[world, contact]
-    end = scratch.first[world, contact + 1]
+    first = whole(scratch.first, world, contact)
+    end = whole(scratch.first, world, contact + 1)
+    head = four(scratch.springs, world, first)
     c = Cone()
-    c.mu = scratch.bound[world, first]
-    jar = scratch.jar[world, first]
-    rate = scratch.rate[world, first]
-    stiffness = scratch.stiffness[world, first]
-    c.normal = c.mu * jar
-    c.normal_rate = c.mu * rate
-    c.mass = cone_mass(stiffness, c.mu)
-    cost = stiffness * jar * jar
-    slope = stiffness * jar * rate
-    curvature = stiffness * rate * rate
+    c.mu = head[1]
+    c.normal = head[1] * head[2]
+    c.normal_rate = head[1] * head[3]
+    c.mass = cone_mass(head[0], head[1])
+    cost = head[0] * head[2] * head[2]
+    slope = head[0] * head[2] * head[3]
+    curvature = head[0] * head[3] * head[3]
     uu = float(0.0)
     uv = float(0.0)
     vv = float(0.0)
     for p in range(first + 1, end):
-        jar = scratch.jar[world, p]
-        rate = scratch.rate[world, p]
-        stiffness = scratch.stiffness[world, p]
-        cost += stiffness * jar * jar
-        slope += stiffness * jar * rate
-        curvature += stiffness * rate * rate
-        u = scratch.bound[world, p] * jar
-        v = scratch.bound[world, p] * rate
+        row = four(scratch.springs, world, p)
+        cost += row[0] * row[2] * row[2]
+        slope += row[0] * row[2] * row[3]
+        curvature += row[0] * row[3] * row[3]
+        u = row[1] * row[2]
+        v = row[1] * row[3]
         uu += u * u
         uv += u * v
         vv += v * v
@@ -152,10 +154,12 @@ def open_cone(scratch: Scratch, world: int, contact: int) -> Cone:
         # |u|² - along² by Lagrange's identity: the difference of two large numbers would be noise.
         squares = float(0.0)
         for p in range(first + 2, end):
-            u = scratch.bound[world, p] * scratch.jar[world, p]
-            v = scratch.bound[world, p] * scratch.rate[world, p]
+            row = four(scratch.springs, world, p)
+            u = row[1] * row[2]
+            v = row[1] * row[3]
             for q in range(first + 1, p):
-                cross = scratch.bound[world, q] * (scratch.rate[world, q] * u - scratch.jar[world, q] * v)
+                other = four(scratch.springs, world, q)
+                cross = other[1] * (other[3] * u - other[2] * v)
                 squares += cross * cross
         c.across = squares / vv
     return c
@@ -164,32 +168,28 @@ def open_cone(scratch: Scratch, world: int, contact: int) -> Cone:
 @wp.func
 def keep_cone(scratch: Scratch, world: int, contact: int, c: Cone) -> None:
     k = contact * CONE
-    scratch.cones[world, k] = c.normal
-    scratch.cones[world, k + 1] = c.normal_rate
-    scratch.cones[world, k + 2] = c.along
-    scratch.cones[world, k + 3] = c.along_rate
-    scratch.cones[world, k + 4] = c.across
-    scratch.cones[world, k + 5] = c.mu
-    scratch.cones[world, k + 6] = c.mass
-    scratch.cones[world, k + 7] = c.cost
-    scratch.cones[world, k + 8] = c.slope
-    scratch.cones[world, k + 9] = c.half_curvature
+    put_four(scratch.cones, world, k, wp.vec4(c.normal, c.normal_rate, c.along, c.along_rate))
+    put_four(scratch.cones, world, k + 1, wp.vec4(c.across, c.mu, c.mass, c.cost))
+    put_four(scratch.cones, world, k + 2, wp.vec4(c.slope, c.half_curvature, 0.0, 0.0))
 
 
 @wp.func
 def kept_cone(scratch: Scratch, world: int, contact: int) -> Cone:
     k = contact * CONE
+    motion = four(scratch.cones, world, k)
+    law = four(scratch.cones, world, k + 1)
+    springs = four(scratch.cones, world, k + 2)
     c = Cone()
-    c.normal = scratch.cones[world, k]
-    c.normal_rate = scratch.cones[world, k + 1]
-    c.along = scratch.cones[world, k + 2]
-    c.along_rate = scratch.cones[world, k + 3]
-    c.across = scratch.cones[world, k + 4]
-    c.mu = scratch.cones[world, k + 5]
-    c.mass = scratch.cones[world, k + 6]
-    c.cost = scratch.cones[world, k + 7]
-    c.slope = scratch.cones[world, k + 8]
-    c.half_curvature = scratch.cones[world, k + 9]
+    c.normal = motion[0]
+    c.normal_rate = motion[1]
+    c.along = motion[2]
+    c.along_rate = motion[3]
+    c.across = law[0]
+    c.mu = law[1]
+    c.mass = law[2]
+    c.cost = law[3]
+    c.slope = springs[0]
+    c.half_curvature = springs[1]
     return c
 
 

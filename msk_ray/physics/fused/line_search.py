@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from msk_ray.physics.fused.blocks import four, row_product
 from msk_ray.physics.fused.cones import cone_along, cost_at_start, keep_cone, kept_cone, open_cone
+from msk_ray.physics.fused.memory import four, put_four
 from msk_ray.physics.fused.problem import World, place
 from msk_ray.physics.fused.scratch import Scratch
 
@@ -53,15 +53,14 @@ def smooth_along(scratch: Scratch, w: World) -> wp.vec2:
     """First and second derivative at α = 0 of what is quadratic everywhere: inertia and equalities."""
     slope = float(0.0)
     curvature = float(0.0)
-    for k in range(0, w.width, 4):
+    for k in range(w.blocks):
         s = four(scratch.direction, w.id, k)
         slope += wp.dot(s, four(scratch.inertial, w.id, k) - four(scratch.smooth, w.id, k))
         curvature += wp.dot(s, four(scratch.moved, w.id, k))
     for scalar in range(wp.min(w.equalities, w.scalars)):
-        p = place(w, scalar)
-        rate = scratch.rate[w.id, p]
-        slope += scratch.stiffness[w.id, p] * rate * scratch.jar[w.id, p]
-        curvature += scratch.stiffness[w.id, p] * rate * rate
+        row = four(scratch.springs, w.id, place(w, scalar))
+        slope += row[0] * row[2] * row[3]
+        curvature += row[0] * row[3] * row[3]
     return wp.vec2(slope, curvature)
 
 
@@ -70,14 +69,11 @@ def scalars_along(scratch: Scratch, w: World, alpha: float) -> wp.vec3:
     """Cost at α less that at 0, and its derivatives, of the rows that are neither equalities nor elliptic contacts."""
     total = wp.vec3(0.0)
     for scalar in range(w.equalities, w.scalars):
-        p = place(w, scalar)
-        stiffness = scratch.stiffness[w.id, p]
-        jar = scratch.jar[w.id, p]
-        rate = scratch.rate[w.id, p]
+        row = four(scratch.springs, w.id, place(w, scalar))
         if scalar < w.equalities + w.frictions:
-            total += friction_along(scratch.bound[w.id, p], stiffness, jar, rate, alpha)
+            total += friction_along(row[1], row[0], row[2], row[3], alpha)
         else:
-            total += spring_along(stiffness, jar, rate, alpha)
+            total += spring_along(row[0], row[2], row[3], alpha)
     return total
 
 
@@ -86,14 +82,11 @@ def scalars_cost(scratch: Scratch, w: World) -> float:
     """Cost of the same rows at α = 0."""
     cost = float(0.0)
     for scalar in range(w.equalities, w.scalars):
-        p = place(w, scalar)
-        stiffness = scratch.stiffness[w.id, p]
-        jar = scratch.jar[w.id, p]
+        row = four(scratch.springs, w.id, place(w, scalar))
         if scalar < w.equalities + w.frictions:
-            loss = scratch.bound[w.id, p]
-            cost += friction_cost(loss, loss / stiffness, stiffness, jar)
-        elif jar < 0.0:
-            cost += 0.5 * stiffness * jar * jar
+            cost += friction_cost(row[1], row[1] / row[0], row[0], row[2])
+        elif row[2] < 0.0:
+            cost += 0.5 * row[0] * row[2] * row[2]
     return cost
 
 
@@ -108,13 +101,23 @@ def cost_along(scratch: Scratch, w: World, smooth: wp.vec2, alpha: float) -> wp.
 
 
 @wp.func
-def open_rows(scratch: Scratch, w: World) -> None:
-    """J s of every row."""
-    for p in range(w.contact_rows):
-        scratch.rate[w.id, p] = row_product(scratch.rows, w.id, p * w.width, scratch.direction, w.width)
-    for scalar in range(w.scalars):
-        p = place(w, scalar)
-        scratch.rate[w.id, p] = row_product(scratch.rows, w.id, p * w.width, scratch.direction, w.width)
+def open_rows(scratch: Scratch, w: World, begin: int, end: int) -> None:
+    """J s of some rows, four at a time."""
+    for p in range(begin, end, 4):
+        last = end - 1
+        rates = wp.vec4(0.0)
+        for k in range(w.blocks):
+            s = four(scratch.direction, w.id, k)
+            rates += wp.vec4(
+                wp.dot(four(scratch.rows, w.id, p * w.blocks + k), s),
+                wp.dot(four(scratch.rows, w.id, wp.min(p + 1, last) * w.blocks + k), s),
+                wp.dot(four(scratch.rows, w.id, wp.min(p + 2, last) * w.blocks + k), s),
+                wp.dot(four(scratch.rows, w.id, wp.min(p + 3, last) * w.blocks + k), s),
+            )
+        for i in range(4):
+            if p + i < end:
+                row = four(scratch.springs, w.id, p + i)
+                put_four(scratch.springs, w.id, p + i, wp.vec4(row[0], row[1], row[2], rates[i]))
 
 
 @wp.func
@@ -128,7 +131,8 @@ def search_line(scratch: Scratch, w: World, least: float, limit: int) -> tuple[f
     Returns:
         α, by how much it lowers the cost, and whether it was found within the limit.
     """
-    open_rows(scratch, w)
+    open_rows(scratch, w, 0, w.contact_rows)
+    open_rows(scratch, w, w.room - w.scalars, w.room)
     smooth = smooth_along(scratch, w)
     start = wp.vec3(0.0) + scalars_along(scratch, w, 0.0)
     cost = scalars_cost(scratch, w)

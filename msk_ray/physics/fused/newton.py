@@ -3,13 +3,13 @@
 import warp as wp
 from mujoco_warp import OverflowType
 
-from msk_ray.physics.fused.blocks import four, multiply, put_four, solve_factored
+from msk_ray.physics.fused.blocks import multiply, solve_factored
 from msk_ray.physics.fused.line_search import search_line
+from msk_ray.physics.fused.memory import entry, four, number, put_entry, put_four, whole
 from msk_ray.physics.fused.problem import (
     RowsIn,
     World,
     factor_hessian,
-    place,
     read_rows,
     update_gradient,
     update_rows,
@@ -61,34 +61,38 @@ def read_inertia(
     for i in range(w.nv):
         for k in range(rowadr[i], rowadr[i] + rownnz[i]):
             j = colind[k]
-            entry = inertia[w.id, k]
-            scratch.inertia[w.id, i * w.width + j] = entry
-            scratch.inertia[w.id, j * w.width + i] = entry
+            value = number(inertia, w.id, k)
+            put_entry(scratch.inertia, w.id, 4 * i * w.blocks + j, value)
+            put_entry(scratch.inertia, w.id, 4 * j * w.blocks + i, value)
             if i == j:
-                trace += entry
+                trace += value
     return trace
+
+
+@wp.func
+def advance_rows(scratch: Scratch, w: World, begin: int, end: int, alpha: float) -> None:
+    for p in range(begin, end):
+        row = four(scratch.springs, w.id, p)
+        put_four(scratch.springs, w.id, p, wp.vec4(row[0], row[1], row[2] + alpha * row[3], row[3]))
 
 
 @wp.func
 def advance(scratch: Scratch, w: World, alpha: float) -> None:
     """Move along the direction."""
-    for k in range(0, w.width, 4):
+    for k in range(w.blocks):
         put_four(scratch.acc, w.id, k, four(scratch.acc, w.id, k) + alpha * four(scratch.direction, w.id, k))
         put_four(scratch.inertial, w.id, k, four(scratch.inertial, w.id, k) + alpha * four(scratch.moved, w.id, k))
-    for p in range(w.contact_rows):
-        scratch.jar[w.id, p] += alpha * scratch.rate[w.id, p]
-    for scalar in range(w.scalars):
-        p = place(w, scalar)
-        scratch.jar[w.id, p] += alpha * scratch.rate[w.id, p]
+    advance_rows(scratch, w, 0, w.contact_rows, alpha)
+    advance_rows(scratch, w, w.room - w.scalars, w.room, alpha)
 
 
 @wp.func
 def find_direction(scratch: Scratch, w: World) -> wp.vec2:
     """Newton's direction s = -H⁻¹ g, with |s|² and -g·s."""
-    solve_factored(scratch.factor, w.id, scratch.gradient, w.width, scratch.direction)
+    solve_factored(scratch.factor, w.id, scratch.gradient, w.blocks, scratch.direction)
     square = float(0.0)
     decrement = float(0.0)
-    for k in range(0, w.width, 4):
+    for k in range(w.blocks):
         s = four(scratch.direction, w.id, k)
         square += wp.dot(s, s)
         decrement -= wp.dot(s, four(scratch.gradient, w.id, k))
@@ -107,7 +111,7 @@ def iterate(scratch: Scratch, w: World, limits: Limits, scale: float, out: Solut
     done = bool(False)
     count = int(0)
     while count < limits.iterations and not done:
-        multiply(scratch.inertia, w.id, scratch.direction, w.width, scratch.moved)
+        multiply(scratch.inertia, w.id, scratch.direction, w.blocks, scratch.moved)
         least = tolerance * ls_tolerance * wp.sqrt(found[0]) / scale
         alpha, gain, exact = search_line(scratch, w, least, limits.ls_iterations)
         if not exact:
@@ -125,6 +129,14 @@ def iterate(scratch: Scratch, w: World, limits: Limits, scale: float, out: Solut
     if not done and limits.iterations > 0:
         out.overflow[w.id] = out.overflow[w.id] | _ITERATIONS
     out.solver_niter[w.id] = count
+
+
+@wp.func
+def write_rows(scratch: Scratch, w: World, begin: int, end: int, out: Solution) -> None:
+    for p in range(begin, end):
+        source = whole(scratch.source, w.id, p)
+        out.force[w.id, source] = number(scratch.force, w.id, p)
+        out.state[w.id, source] = whole(scratch.state, w.id, p)
 
 
 @wp.kernel
@@ -164,7 +176,7 @@ def solve_world(
     w = World()
     w.id = world
     w.nv = nv
-    w.width = (nv + 3) // 4 * 4
+    w.blocks = (nv + 3) // 4
     w.room = njmax
     w.equalities = ne_in[world]
     w.frictions = nf_in[world]
@@ -173,19 +185,14 @@ def solve_world(
         acc = qacc_smooth_in[world, i]
         if warm:
             acc = qacc_warmstart_in[world, i]
-        scratch.acc[world, i] = acc
-        scratch.smooth[world, i] = qfrc_smooth_in[world, i]
+        put_entry(scratch.acc, world, i, acc)
+        put_entry(scratch.smooth, world, i, qfrc_smooth_in[world, i])
     w = read_rows(rows_in, scratch, w, count, opt_impratio_invsqrt[world % opt_impratio_invsqrt.shape[0]])
-    multiply(scratch.inertia, world, scratch.acc, w.width, scratch.inertial)
+    multiply(scratch.inertia, world, scratch.acc, w.blocks, scratch.inertial)
     iterate(scratch, w, limits, 1.0 / wp.max(_MIN, trace), out)
     for i in range(nv):
-        out.qacc[world, i] = scratch.acc[world, i]
-        out.Ma[world, i] = scratch.inertial[world, i]
-        out.qfrc_constraint[world, i] = scratch.push[world, i]
-    for p in range(w.contact_rows):
-        out.force[world, scratch.source[world, p]] = scratch.force[world, p]
-        out.state[world, scratch.source[world, p]] = scratch.state[world, p]
-    for scalar in range(w.scalars):
-        p = place(w, scalar)
-        out.force[world, scratch.source[world, p]] = scratch.force[world, p]
-        out.state[world, scratch.source[world, p]] = scratch.state[world, p]
+        out.qacc[world, i] = entry(scratch.acc, world, i)
+        out.Ma[world, i] = entry(scratch.inertial, world, i)
+        out.qfrc_constraint[world, i] = entry(scratch.push, world, i)
+    write_rows(scratch, w, 0, w.contact_rows, out)
+    write_rows(scratch, w, w.room - w.scalars, w.room, out)

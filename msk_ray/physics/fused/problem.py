@@ -6,8 +6,9 @@ Axes: W worlds, R rows, C contacts.
 import warp as wp
 
 from msk_ray.physics import mjw_private as private
-from msk_ray.physics.fused.blocks import below, block, factor_block, four, put_block, put_four, row_product
+from msk_ray.physics.fused.blocks import below, block, factor_block, put_block
 from msk_ray.physics.fused.cones import QUADRATIC, SATISFIED, update_contact
+from msk_ray.physics.fused.memory import four, number, put_four, put_number, put_whole, whole
 from msk_ray.physics.fused.scratch import Scratch
 from msk_ray.physics.mjw_private import ConstraintType, vec5
 
@@ -20,14 +21,17 @@ _LINEARPOS = wp.constant(int(private.ConstraintState.LINEARPOS))
 
 @wp.struct
 class RowsIn:
-    """mujoco_warp's rows, (W, R), and their Jacobian, (W, R, nv), with what contacts add to them, (C,)."""
+    """mujoco_warp's rows, (W, R), with what contacts add to them, (C,)."""
 
     type: wp.array2d[int]
     id: wp.array2d[int]
     D: wp.array2d[float]
     aref: wp.array2d[float]
     frictionloss: wp.array2d[float]
-    J: wp.array3d[float]
+    jacobian: wp.array2d[wp.vec4]
+    """J, (W, ...), row by row in blocks."""
+    jacobian_blocks: int
+    """Blocks of its rows, in which it has more room than the problem needs."""
     friction: wp.array[vec5]
     dim: wp.array[int]
 
@@ -38,8 +42,8 @@ class World:
 
     id: int
     nv: int
-    width: int
-    """nv in whole blocks."""
+    blocks: int
+    """Blocks of 4 degrees of freedom."""
     room: int
     """R."""
     equalities: int
@@ -59,13 +63,34 @@ def place(w: World, scalar: int) -> int:
 
 @wp.func
 def read_row(rows: RowsIn, scratch: Scratch, w: World, p: int) -> None:
-    source = scratch.source[w.id, p]
-    for i in range(w.nv):
-        scratch.rows[w.id, p * w.width + i] = rows.J[w.id, source, i]
-    scratch.stiffness[w.id, p] = rows.D[w.id, source]
-    scratch.weight[w.id, p] = 0.0
-    scratch.state[w.id, p] = SATISFIED
-    scratch.jar[w.id, p] = row_product(scratch.rows, w.id, p * w.width, scratch.acc, w.width) - rows.aref[w.id, source]
+    """Copy a row, of which source and bound are known."""
+    source = whole(scratch.source, w.id, p)
+    total = float(0.0)
+    for k in range(w.blocks):
+        part = four(rows.jacobian, w.id, source * rows.jacobian_blocks + k)
+        left = w.nv - 4 * k
+        # mujoco_warp promises nothing of what is behind nv.
+        part = wp.vec4(
+            part[0],
+            wp.where(left > 1, part[1], 0.0),
+            wp.where(left > 2, part[2], 0.0),
+            wp.where(left > 3, part[3], 0.0),
+        )
+        put_four(scratch.rows, w.id, p * w.blocks + k, part)
+        put_four(scratch.rows, w.id, (w.room + p) * w.blocks + k, part)
+        total += wp.dot(part, four(scratch.acc, w.id, k))
+    spring = four(scratch.springs, w.id, p)
+    spring[0] = number(rows.D, w.id, source)
+    spring[2] = total - number(rows.aref, w.id, source)
+    put_four(scratch.springs, w.id, p, spring)
+    put_number(scratch.weight, w.id, p, 0.0)
+    put_whole(scratch.state, w.id, p, SATISFIED)
+
+
+@wp.func
+def place_row(scratch: Scratch, w: World, p: int, source: int, bound: float) -> None:
+    put_whole(scratch.source, w.id, p, source)
+    put_four(scratch.springs, w.id, p, wp.vec4(0.0, bound, 0.0, 0.0))
 
 
 @wp.func
@@ -77,29 +102,23 @@ def read_rows(rows: RowsIn, scratch: Scratch, sizes: World, count: int, impratio
     w.contact_rows = 0
     r = int(0)
     while r < count:
-        if rows.type[w.id, r] != _ELLIPTIC:
-            p = place(w, w.scalars)
-            scratch.source[w.id, p] = r
-            scratch.bound[w.id, p] = rows.frictionloss[w.id, r]
+        if whole(rows.type, w.id, r) != _ELLIPTIC:
+            place_row(scratch, w, place(w, w.scalars), r, number(rows.frictionloss, w.id, r))
             w.scalars += 1
             r += 1
         else:
-            contact = rows.id[w.id, r]
+            contact = whole(rows.id, w.id, r)
             dim = rows.dim[contact]
             if r + dim <= count:
                 friction = rows.friction[contact]
-                scratch.first[w.id, w.contacts] = w.contact_rows
-                for i in range(dim):
-                    p = w.contact_rows + i
-                    scratch.source[w.id, p] = r + i
-                    if i == 0:
-                        scratch.bound[w.id, p] = friction[0] * impratio
-                    else:
-                        scratch.bound[w.id, p] = friction[i - 1]
+                put_whole(scratch.first, w.id, w.contacts, w.contact_rows)
+                place_row(scratch, w, w.contact_rows, r, friction[0] * impratio)
+                for i in range(1, dim):
+                    place_row(scratch, w, w.contact_rows + i, r + i, friction[i - 1])
                 w.contacts += 1
                 w.contact_rows += dim
             r += dim
-    scratch.first[w.id, w.contacts] = w.contact_rows
+    put_whole(scratch.first, w.id, w.contacts, w.contact_rows)
     for p in range(w.contact_rows):
         read_row(rows, scratch, w, p)
     for scalar in range(w.scalars):
@@ -113,48 +132,50 @@ def update_rows(scratch: Scratch, w: World) -> bool:
     changed = bool(False)
     for scalar in range(w.scalars):
         p = place(w, scalar)
-        jar = scratch.jar[w.id, p]
-        stiffness = scratch.stiffness[w.id, p]
+        row = four(scratch.springs, w.id, p)
         state = QUADRATIC
-        force = -stiffness * jar
+        force = -row[0] * row[2]
         if scalar >= w.equalities:
             if scalar < w.equalities + w.frictions:
-                loss = scratch.bound[w.id, p]
-                if stiffness * jar <= -loss:
+                if force >= row[1]:
                     state = _LINEARNEG
-                    force = loss
-                elif stiffness * jar >= loss:
+                    force = row[1]
+                elif force <= -row[1]:
                     state = _LINEARPOS
-                    force = -loss
-            elif jar >= 0.0:
+                    force = -row[1]
+            elif row[2] >= 0.0:
                 state = SATISFIED
                 force = 0.0
-        weight = wp.where(state == QUADRATIC, stiffness, 0.0)
-        changed = changed or weight != scratch.weight[w.id, p]
-        scratch.force[w.id, p] = force
-        scratch.state[w.id, p] = state
-        scratch.weight[w.id, p] = weight
+        weight = wp.where(state == QUADRATIC, row[0], 0.0)
+        changed = changed or weight != number(scratch.weight, w.id, p)
+        put_number(scratch.force, w.id, p, force)
+        put_number(scratch.weight, w.id, p, weight)
+        put_whole(scratch.state, w.id, p, state)
     for contact in range(w.contacts):
-        turned = update_contact(scratch, w.id, w.width, w.room, contact)
+        turned = update_contact(scratch, w.id, w.blocks, w.room, contact)
         changed = changed or turned
     return changed
+
+
+@wp.func
+def add_forces(scratch: Scratch, w: World, begin: int, end: int, k: int, start: wp.vec4) -> wp.vec4:
+    """`start` and part k of Σ f J over some rows. Four at a time, so that their numbers are fetched together."""
+    total = start
+    for p in range(begin, end, 4):
+        for i in range(4):
+            row = wp.min(p + i, end - 1)
+            force = wp.where(p + i < end, number(scratch.force, w.id, row), 0.0)
+            total += force * four(scratch.rows, w.id, row * w.blocks + k)
+    return total
 
 
 @wp.func
 def update_gradient(scratch: Scratch, w: World) -> float:
     """Jᵀ f and the gradient M a - τ - Jᵀ f; returns its square."""
     square = float(0.0)
-    for k in range(0, w.width, 4):
-        push = wp.vec4(0.0)
-        for p in range(w.contact_rows):
-            force = scratch.force[w.id, p]
-            if force != 0.0:
-                push += force * four(scratch.rows, w.id, p * w.width + k)
-        for scalar in range(w.scalars):
-            p = place(w, scalar)
-            force = scratch.force[w.id, p]
-            if force != 0.0:
-                push += force * four(scratch.rows, w.id, p * w.width + k)
+    for k in range(w.blocks):
+        push = add_forces(scratch, w, 0, w.contact_rows, k, wp.vec4(0.0))
+        push = add_forces(scratch, w, w.room - w.scalars, w.room, k, push)
         slope = four(scratch.inertial, w.id, k) - four(scratch.smooth, w.id, k) - push
         put_four(scratch.push, w.id, k, push)
         put_four(scratch.gradient, w.id, k, slope)
@@ -163,38 +184,35 @@ def update_gradient(scratch: Scratch, w: World) -> float:
 
 
 @wp.func
-def hessian_block(scratch: Scratch, w: World, i: int, j: int) -> wp.mat44:
-    """The block at row i and column j of M plus the weighted squares of the rows."""
-    total = block(scratch.inertia, w.id, i * w.width + j, w.width)
-    for p in range(w.contact_rows):
-        weight = scratch.weight[w.id, p]
-        if weight != 0.0:
-            row = p * w.width
-            if scratch.state[w.id, p] != QUADRATIC:
-                row += w.room * w.width
-            total += wp.outer(weight * four(scratch.rows, w.id, row + i), four(scratch.rows, w.id, row + j))
-    for scalar in range(w.scalars):
-        p = place(w, scalar)
-        weight = scratch.weight[w.id, p]
-        if weight != 0.0:
-            row = p * w.width
-            total += wp.outer(weight * four(scratch.rows, w.id, row + i), four(scratch.rows, w.id, row + j))
+def add_squares(
+    scratch: Scratch, w: World, begin: int, end: int, behind: int, i: int, j: int, start: wp.mat44
+) -> wp.mat44:
+    """`start` and block (i, j) of Σ weight row rowᵀ over some rows, `behind` of which those to take are."""
+    total = start
+    for p in range(begin, end, 4):
+        for k in range(4):
+            row = wp.min(p + k, end - 1)
+            weight = wp.where(p + k < end, number(scratch.weight, w.id, row), 0.0)
+            at = (row + behind) * w.blocks
+            total += wp.outer(weight * four(scratch.rows, w.id, at + i), four(scratch.rows, w.id, at + j))
     return total
 
 
 @wp.func
 def factor_hessian(scratch: Scratch, w: World) -> None:
     """The Cholesky factor of the Hessian, column of blocks by column, each of which is added up when it is due."""
-    for j in range(0, w.width, 4):
+    for j in range(w.blocks):
         pivot = wp.mat44(0.0)
-        for i in range(j, w.width, 4):
-            total = hessian_block(scratch, w, i, j)
-            for k in range(0, j, 4):
-                total -= block(scratch.factor, w.id, i * w.width + k, w.width) @ wp.transpose(
-                    block(scratch.factor, w.id, j * w.width + k, w.width)
+        for i in range(j, w.blocks):
+            total = block(scratch.inertia, w.id, i, j, w.blocks)
+            total = add_squares(scratch, w, 0, w.contact_rows, w.room, i, j, total)
+            total = add_squares(scratch, w, w.room - w.scalars, w.room, 0, i, j, total)
+            for k in range(j):
+                total -= block(scratch.factor, w.id, i, k, w.blocks) @ wp.transpose(
+                    block(scratch.factor, w.id, j, k, w.blocks)
                 )
             if i == j:
                 pivot = factor_block(total)
-                put_block(scratch.factor, w.id, j * w.width + j, w.width, pivot)
+                put_block(scratch.factor, w.id, j, j, w.blocks, pivot)
             else:
-                put_block(scratch.factor, w.id, i * w.width + j, w.width, below(pivot, total))
+                put_block(scratch.factor, w.id, i, j, w.blocks, below(pivot, total))

@@ -1,5 +1,6 @@
 """The solver as a launch, for models that it can take."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -61,6 +62,7 @@ class FusedSolver:
             self._scratch[size] = make_scratch(*size)
         opt = model.opt
         limits = gather(Limits, opt)
+        rows = _rows(data)
         wp.launch(
             solve_world,
             dim=data.nworld,
@@ -69,8 +71,18 @@ class FusedSolver:
                 not opt.disableflags & mujoco.mjtDisableBit.mjDSBL_WARMSTART,
                 *(data.ne, data.nf, data.nefc, data.njmax, data.M),
                 *(data.qfrc_smooth, data.qacc_smooth, data.qacc_warmstart),
-                gather(RowsIn, data.efc, data.contact),
+                rows,
             ],
             outputs=[self._scratch[size], gather(Solution, data, data.efc)],
             block_dim=_BLOCK,
         )
+
+
+def _rows(data: Any) -> Any:
+    """The rows of `data`, and its Jacobian in blocks: it has room for whole ones in every row."""
+    jacobian = data.efc.J
+    worlds, count, width = jacobian.shape
+    assert jacobian.is_contiguous, "the rows of the Jacobian are not side by side"
+    assert width % 4 == 0, "the rows of the Jacobian are no whole blocks"
+    view = wp.array(ptr=jacobian.ptr, dtype=wp.vec4, shape=(worlds, count * width // 4), device=jacobian.device)
+    return gather(RowsIn, SimpleNamespace(jacobian=view, jacobian_blocks=width // 4), data.efc, data.contact)
