@@ -7,6 +7,7 @@ and replayed from that state; the solver is replayed on what the stages before i
 """
 
 import argparse
+import itertools
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -20,7 +21,7 @@ from record import RESULTS, markdown_table, publish
 from msk_ray.config import load_config
 from msk_ray.envs.make import env_class
 from msk_ray.physics import Graph, Kernels, WorldBatch
-from msk_ray.physics.fused import FusedSolver, scratch
+from msk_ray.physics.fused import FusedSolver, scratch, solver
 from msk_ray.physics.ordered.solve import solve as solve_ordered
 
 KERNELS = {
@@ -72,7 +73,7 @@ def microseconds(graph: Graph, device: wp.Device, repeats: int) -> float:
 
 
 def measure(
-    batch: WorldBatch, start: dict[str, np.ndarray], solver: Callable[..., None], repeats: int
+    batch: WorldBatch, start: dict[str, np.ndarray], solve: Callable[..., None], repeats: int
 ) -> tuple[list[str], np.ndarray]:
     """One row, and the velocities after the env step."""
     device, data = batch.device, batch.data
@@ -97,7 +98,7 @@ def measure(
         restore()
         batch.begin_step()
         mjw.forward(batch.model, data)
-        alone = microseconds(Graph(lambda: solver(batch.model, data), device), device, repeats)
+        alone = microseconds(Graph(lambda: solve(batch.model, data), device), device, repeats)
         first = data.solver_niter.numpy().copy()
     row = [f"{taken / 1e3:.3f}", f"{alone:.0f}", f"{rows:.1f}"]
     row += [f"{np.mean(n):.2f} / {np.max(n)}" for n in (first, iterations)]
@@ -110,6 +111,9 @@ def main() -> None:
     p.add_argument("--configs", nargs="+", default=["ant"], help="names of files in configs/")
     p.add_argument("--worlds", type=int, nargs="+", default=[64])
     p.add_argument("--kernels", nargs="+", default=["mujoco_warp", "fused"], choices=list(KERNELS))
+    p.add_argument(
+        "--warps", type=int, nargs="+", default=[solver.WARPS], help="of the fused solver on a multiprocessor"
+    )
     p.add_argument("--layouts", action="store_true", help="measure the fused solver in both layouts of its memory")
     p.add_argument("--steps", type=int, default=60, help="env steps taken before timing, to land")
     p.add_argument("--repeats", type=int, default=20, help="replays a timing averages over")
@@ -134,13 +138,18 @@ def main() -> None:
             wanted = None
             for kind in args.kernels:
                 kernels = KERNELS[kind]
-                for fastest in (True, False) if args.layouts and kernels.fused_solver else (True,):
-                    scratch.WORLD_FASTEST = fastest
-                    solver = FusedSolver() if kernels.fused_solver else solve_ordered if kernels.ordered else mjw.solve
+                fused = kernels.fused_solver
+                for fastest, warps in itertools.product(
+                    (True, False) if fused and args.layouts else (True,), args.warps if fused else (0,)
+                ):
+                    scratch.WORLD_FASTEST, solver.WARPS = fastest, warps
+                    launch = FusedSolver() if fused else solve_ordered if kernels.ordered else mjw.solve
                     batch = WorldBatch(mjm, worlds, substeps, args.device, kernels=kernels)
-                    row, end = measure(batch, start, solver, args.repeats)
+                    row, end = measure(batch, start, launch, args.repeats)
                     wanted = end if wanted is None else wanted
-                    label = kind if fastest else f"{kind}, numbers of a world side by side"
+                    label = (
+                        kind + (f", {warps} warps" if fused else "") + ("" if fastest else ", each world side by side")
+                    )
                     table.append([f"{worlds}", label, *row, f"{np.max(np.abs(end - wanted)):.1e}"])
                     print(name, table[-1], flush=True)
         title = f"Env step of {name} (nv {mjm.nv}, {substeps} substeps) by kernels of the solver"

@@ -1,6 +1,7 @@
 """The solver of one kernel finds what C MuJoCo finds in float64."""
 
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -16,7 +17,8 @@ from msk_ray.envs.make import env_class
 from msk_ray.errors import ConfigError, UnsupportedModelError
 from msk_ray.gradcheck import check_gradients
 from msk_ray.physics import Kernels, WorldBatch
-from msk_ray.physics.fused import FusedSolver, check_fused, scratch
+from msk_ray.physics.fused import FusedSolver, check_fused, scratch, solver
+from msk_ray.physics.fused.solver import lanes_of
 from msk_ray.physics.stages import dense
 from msk_ray.simulation import Simulation
 
@@ -100,7 +102,7 @@ def gap(found: np.ndarray, wanted: np.ndarray) -> float:
 def test_forces_and_states_are_those_of_float64(name: str) -> None:
     mjm = exact(MODELS[name]())
     check_fused(mjm)
-    solver, rng, most = FusedSolver(), np.random.default_rng(0), 0
+    solve, rng, most = FusedSolver(), np.random.default_rng(0), 0
     for seed in (1, 2, 3):
         state = touching(mjm, seed)
         count = state.nefc
@@ -114,7 +116,7 @@ def test_forces_and_states_are_those_of_float64(name: str) -> None:
             (rng.normal(size=mjm.nv) * 30.0 * (1.0 + np.max(np.abs(state.qacc))), 2e-2),
         ):
             model, data = problem(mjm, state, warm)
-            solver(model, data)
+            solve(model, data)
             for world in range(2):
                 assert gap(data.qacc.numpy()[world], state.qacc) < precision
                 assert gap(data.efc.Ma.numpy()[world, : mjm.nv], inertial) < precision
@@ -177,6 +179,23 @@ def test_either_layout_of_its_memory_gives_the_same_bits(monkeypatch: pytest.Mon
         FusedSolver()(model, data)
         found.append([array.numpy().tobytes() for array in (data.qacc, data.efc.force, data.efc.state)])
     assert found[0] == found[1]
+
+
+def test_worlds_are_spread_over_the_multiprocessors() -> None:
+    """Of 132 multiprocessors with 8 warps each; a warp has no more than 32."""
+    gpu: Any = SimpleNamespace(is_cuda=True, sm_count=132)
+    assert [lanes_of(worlds, gpu) for worlds in (1, 1056, 1057, 4096, 16384, 65536)] == [1, 1, 2, 4, 16, 32]
+
+
+def test_warps_of_few_worlds_solve_all_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    mjm = exact(MODELS["every_row_elliptic"]())
+    state = touching(mjm, 2)
+    for lanes in (1, 2):
+        monkeypatch.setattr(solver, "lanes_of", lambda worlds, device, lanes=lanes: lanes)
+        model, data = problem(mjm, state, np.zeros(mjm.nv))
+        FusedSolver()(model, data)
+        for world in range(2):
+            assert gap(data.qacc.numpy()[world], state.qacc) < 1e-3
 
 
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])

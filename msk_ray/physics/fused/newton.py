@@ -149,6 +149,7 @@ def solve_world(
     opt_impratio_invsqrt: wp.array[float],
     limits: Limits,
     warm: bool,
+    lanes: int,
     # In:
     ne_in: wp.array[int],
     nf_in: wp.array[int],
@@ -163,8 +164,15 @@ def solve_world(
     scratch: Scratch,
     out: Solution,
 ) -> None:
-    """The acceleration of least cost of one world, and the forces there. Without rows it is the smooth one."""
-    world = wp.tid()
+    """The acceleration of least cost of one world, and the forces there. Without rows it is the smooth one.
+
+    The first `lanes` threads of 32 have a world each, and the others none.
+    """
+    thread = wp.tid()
+    lane = thread % 32
+    world = thread // 32 * lanes + lane
+    if lane >= lanes or world >= nefc_in.shape[0]:
+        return
     count = wp.min(nefc_in[world], njmax)
     if count == 0:
         for i in range(nv):

@@ -15,8 +15,9 @@ from msk_ray.physics.fused.scratch import make_scratch
 
 MOST_DOFS = 60
 """Degrees of freedom up to which MuJoCo itself takes a dense Jacobian. The work of a thread grows with their cube."""
-_BLOCK = 32
-"""Worlds of a block: small blocks spread few worlds over all multiprocessors."""
+WARPS = 8
+"""Warps on each multiprocessor of a GPU among which worlds are spread: two for each of its schedulers, of which one can
+work while the other waits for memory. The worlds of a warp wait for each other, so that few are better than 32."""
 
 
 def check_fused(mjm: mujoco.MjModel) -> None:
@@ -42,6 +43,14 @@ def check_fused(mjm: mujoco.MjModel) -> None:
         )
 
 
+def lanes_of(worlds: int, device: wp.Device) -> int:
+    """Worlds of a warp: 32 or a smaller power of 2."""
+    if not device.is_cuda:
+        return 32
+    share = -(-worlds // (WARPS * device.sm_count))
+    return min(32, 1 << (share - 1).bit_length())
+
+
 class FusedSolver:
     """Newton's method of each world in one thread, from its first iteration to its last: one launch a step.
 
@@ -60,21 +69,23 @@ class FusedSolver:
         size = (data.nworld, data.njmax, model.nv)
         if size not in self._scratch:
             self._scratch[size] = make_scratch(*size)
+        lanes = lanes_of(data.nworld, data.qpos.device)
         opt = model.opt
         limits = gather(Limits, opt)
         rows = _rows(data)
         wp.launch(
             solve_world,
-            dim=data.nworld,
+            dim=-(-data.nworld // lanes) * 32,
             inputs=[
                 *(model.nv, model.M_rownnz, model.M_rowadr, model.M_colind, opt.impratio_invsqrt, limits),
                 not opt.disableflags & mujoco.mjtDisableBit.mjDSBL_WARMSTART,
+                lanes,
                 *(data.ne, data.nf, data.nefc, data.njmax, data.M),
                 *(data.qfrc_smooth, data.qacc_smooth, data.qacc_warmstart),
                 rows,
             ],
             outputs=[self._scratch[size], gather(Solution, data, data.efc)],
-            block_dim=_BLOCK,
+            block_dim=32,
         )
 
 
