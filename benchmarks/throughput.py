@@ -3,11 +3,15 @@
 Three sweeps of `python -m msk_ray.tune` over the same config with different seeds, each trial trained for the same
 time. A trial's speed is the median of its epochs, the first few left out. About four minutes on four GPUs, a minute of
 it compilation where Warp's cache is cold. With --cpu, to see that it works: two sweeps, a core for each trial.
+
+The table says whether processes share a GPU through Nvidia's MPS, which runs their kernels at the same time. Without
+it they take turns. `nvidia-cuda-mps-control -d` starts it, `echo quit | nvidia-cuda-mps-control` ends it.
 """
 
 import argparse
 import json
 import os
+import shutil
 import statistics
 import subprocess
 import sys
@@ -115,6 +119,14 @@ def run(
     return read_speeds(folder / name)
 
 
+def mps_runs() -> bool:
+    """Whether a control daemon of Nvidia's MPS answers."""
+    program = shutil.which("nvidia-cuda-mps-control")
+    if program is None:
+        return False
+    return subprocess.run([program], input="get_server_list\n", text=True, capture_output=True).returncode == 0
+
+
 def main(argv: list[str] | None = None) -> None:
     """Run the benchmark the command line asks for."""
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -144,7 +156,7 @@ def main(argv: list[str] | None = None) -> None:
         for s in (*alone, *apart, *sharing)
     ]
     header = ["sweep", "trial", "CUDA_VISIBLE_DEVICES", "GPUs seen", "env steps/s", "of lone"]
-    title = f"Trials beside each other, {args.config.stem}, {args.worlds} worlds"
+    title = f"Trials beside each other, {args.config.stem}, {args.worlds} worlds{', through MPS' if mps_runs() else ''}"
     text = "\n".join([markdown_table(header, rows), "", *(f"- {line}" for line in summary(alone, apart, sharing))])
     publish("throughput", title, "cpu" if args.cpu else "cuda:0", text, args.results)
 
