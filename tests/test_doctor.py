@@ -1,11 +1,13 @@
 """`doctor`: every line says ok or what to fix, and what is broken is found."""
 
-import os
+import signal
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from processes import members_of, wait_until
 
 from msk_ray import doctor, repeat
 from msk_ray.cli import run
@@ -91,7 +93,7 @@ def write_script(path: Path, body: str) -> None:
     path.chmod(0o755)
 
 
-def test_ray_that_works_fails_or_hangs(fake_ping: Path) -> None:
+def test_ray_that_works_fails_or_hangs(fake_ping: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_script(fake_ping, """echo noise; echo '{"worker": {}, "cpus": 4.0, "gpus": 1.0}'""")
     finding = check_ray()
     assert not finding.broken
@@ -99,12 +101,21 @@ def test_ray_that_works_fails_or_hangs(fake_ping: Path) -> None:
     write_script(fake_ping, "echo 'ConnectionError: nobody there' >&2; exit 3")
     finding = check_ray()
     assert (finding.broken, finding.text) == (True, "does not start: ConnectionError: nobody there")
-    write_script(fake_ping, f"echo $$ > {fake_ping}.pid; sleep 100")
-    finding = check_ray(limit_s=0.5)
+    write_script(fake_ping, "sleep 1000")
+    started = []
+    start = subprocess.Popen
+
+    def noted(*command: Any, **options: Any) -> "subprocess.Popen[str]":
+        started.append(start(*command, **options))
+        return started[-1]
+
+    monkeypatch.setattr(doctor.subprocess, "Popen", noted)
+    finding = check_ray(limit_s=0.1)
     assert finding.broken
     assert "did not start within" in finding.text
-    with pytest.raises(ProcessLookupError):
-        os.kill(int(Path(f"{fake_ping}.pid").read_text()), 0)
+    (process,) = started
+    assert process.returncode == -signal.SIGKILL
+    wait_until(lambda: not members_of(process.pid))
 
 
 def test_the_whole_on_cpu(

@@ -14,33 +14,46 @@ from fault_campaign.tally import RESUMABLE, Tally, judge, strike
 REFUSED = 2
 
 
-def two_drivers(reference: Reference, scratch: Path, rng: random.Random) -> list[Tally]:
-    """`--resume` beside a driver at work is refused, and `--resume --force` takes the experiment over."""
-    sweep = Sweep("two_drivers", scratch, reference.trials)
-    refused = Tally("second driver beside the first", 0, "nothing: refused")
-    taken = Tally("experiment taken over from a driver at work", 0, "nothing: the new driver ends it")
-    sweep.launch()
+def second_driver(reference: Reference, scratch: Path, rng: random.Random) -> list[Tally]:
+    """`--resume` beside a driver at work is refused."""
+    sweep = Sweep("second_driver", scratch, reference.trials)
     total = len(sweep.trials) * (EPOCHS + 1)
-    for share in (0.2, 0.4):
+    injected, notes = 0, []
+    sweep.launch()
+    for share in (0.1, 0.3):
         if not sweep.wait_for_rows(round(total * (share + rng.uniform(0.0, 0.1)))):
             break
         code = sweep.beside()
-        refused.injected += 1
+        injected += 1
         if code != REFUSED:
-            refused.notes.append(f"exit code {code} instead of {REFUSED}")
-    if sweep.wait_for_rows(round(total * 0.6)):
+            notes.append(f"exit code {code} instead of {REFUSED}")
+    if code := sweep.wait():
+        notes.append(f"the first driver ended with {code}")
+    tally = judge(reference, sweep, "second driver beside the first", injected, "nothing: refused")
+    tally.notes += notes
+    return [tally]
+
+
+def taken_over(reference: Reference, scratch: Path, rng: random.Random) -> list[Tally]:
+    """`--resume --force` takes the experiment over from a driver at work, which stops.
+
+    Early: the second driver needs seconds to start, and must not find that the first has ended meanwhile.
+    """
+    sweep = Sweep("taken_over", scratch, reference.trials)
+    total = len(sweep.trials) * (EPOCHS + 1)
+    injected, notes = 0, []
+    sweep.launch()
+    if sweep.wait_for_rows(round(total * rng.uniform(0.05, 0.15))):
         first = sweep.hand_over()
-        taken.injected += 1
+        injected += 1
         if first != RESUMABLE:
-            taken.notes.append(f"the first driver ended with {first} instead of {RESUMABLE}")
-    code = sweep.wait()
-    if code:
-        taken.notes.append(f"the second driver ended with {code}")
-    for tally in (refused, taken):
-        verdict = judge(reference, sweep, tally.fault, tally.injected, tally.ended_by)
-        verdict.notes += tally.notes
-        tally.__dict__.update(verdict.__dict__)
-    return [refused, taken]
+            notes.append(f"the first driver ended with {first} instead of {RESUMABLE}")
+    if code := sweep.wait():
+        notes.append(f"the second driver ended with {code}")
+    fault = "experiment taken over from a driver at work"
+    tally = judge(reference, sweep, fault, injected, "nothing: the new driver ends it")
+    tally.notes += notes
+    return [tally]
 
 
 def frozen_driver(reference: Reference, scratch: Path, rng: random.Random) -> list[Tally]:
@@ -95,7 +108,8 @@ def memory_limit(reference: Reference, scratch: Path, rng: random.Random) -> lis
 
 
 CAMPAIGNS: dict[str, Callable[[Reference, Path, random.Random], list[Tally]]] = {
-    "two_drivers": two_drivers,
+    "second_driver": second_driver,
+    "taken_over": taken_over,
     "frozen": frozen_driver,
     "group_sigterm": lambda *a: group_signal(*a, signal.SIGTERM),
     "group_sigusr1": lambda *a: group_signal(*a, signal.SIGUSR1),
