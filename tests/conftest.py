@@ -4,6 +4,7 @@ torch is imported where it is needed: the process of pytest-xdist that hands out
 """
 
 import signal
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -43,6 +44,19 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def root() -> Path:
     """Top folder of the repository."""
     return ROOT
+
+
+@pytest.fixture(autouse=True, scope="session")
+def temporary_files(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """What tests, libraries and the programs that they start put into the folder for temporary files goes with the
+    tests. Its path is short, because Ray's sockets lie below it, whose paths may have 107 bytes."""
+    tmp_path_factory.getbasetemp()  # stays where it is: pytest keeps its last ones
+    with tempfile.TemporaryDirectory(prefix="t_", ignore_cleanup_errors=True) as folder:
+        before, tempfile.tempdir = tempfile.tempdir, folder
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("TMPDIR", folder)
+            yield Path(folder)
+        tempfile.tempdir = before
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -18,12 +18,14 @@ class Assistance:
 
     Attributes:
         share: a number on the device, changed in place.
+        reads_episode_lengths: the setting, if any, because of which `end_epoch` needs the length.
     """
 
     def __init__(self, config: AssistConfig, timestep: float, device: torch.device) -> None:
         self._config = config
         self._timestep = timestep
         self._passed = 0
+        self.reads_episode_lengths = "env.assist.steady" if config.epochs and config.steady is not None else None
         self.share = torch.tensor(config.at(0), device=device)
 
     def begin_epoch(self, epoch: int) -> None:

@@ -208,8 +208,7 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
 
     @property
     def reads_episode_lengths(self) -> str | None:
-        assist = self.config.assist
-        return "env.assist.steady" if assist.epochs and assist.steady is not None else None
+        return self._assistance.reads_episode_lengths
 
     def begin_epoch(self, epoch: int) -> None:
         self._tracking_share.fill_(self.config.tracking.at(epoch))
