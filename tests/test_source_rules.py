@@ -24,6 +24,12 @@ def test_files_of_tests_have_names_of_their_own(root: Path) -> None:
     assert [name for name, count in names.items() if count > 1] == []
 
 
+def test_nothing_is_imported_from_a_conftest(root: Path) -> None:
+    """Several have that name: which one is found depends on which tests are collected first."""
+    importing = [p.name for p in (root / "tests").rglob("*.py") if "\nfrom conftest import" in p.read_text()]
+    assert not importing
+
+
 def test_no_function_outside_kernels_has_more_than_8_parameters(root: Path) -> None:
     found = []
     for path in (root / "msk_ray").rglob("*.py"):

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from conftest import ant_xml
+from small_models import ant_xml
 
 from msk_ray.errors import ConfigError, SimulationError
 from msk_ray.gradcheck import STATE_KINDS, GradientCheck, Limits, Oracle, Point, check_gradients

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
-from conftest import FILTERED, ant_xml, ball_on_plane, slide_model
+from small_models import FILTERED, ant_xml, ball_on_plane, slide_model
 
 from msk_ray.errors import SimulationError
 from msk_ray.gradcheck import Oracle, Point, make_states

@@ -1,7 +1,7 @@
 import mujoco
 import numpy as np
 import pytest
-from conftest import ant_xml
+from small_models import ant_xml
 
 from msk_ray.errors import ConfigError
 from msk_ray.gradcheck import STATE_KINDS, Oracle, make_states
