@@ -12,6 +12,7 @@ from msk_ray.config import Config, PhysicsConfig, overlay, parse_config
 from msk_ray.config.physics import FdConfig
 from msk_ray.envs import env_class, make_env
 from msk_ray.errors import ConfigError
+from msk_ray.physics import Kernels
 from msk_ray.simulation.modes import BACKWARD_MODES, configured_backward
 
 VALUES: dict[str, Any] = {
@@ -23,6 +24,7 @@ VALUES: dict[str, Any] = {
     "tolerance": 1e-9,
     "iterations": 7,
     "ls_iterations": 3,
+    "solver_kernels": "fused",
     "jacobian": "sparse",
     "integrator": "RK4",
     "cone": "pyramidal",
@@ -50,6 +52,7 @@ REFUSED = {
         "tolerance",
         "iterations",
         "ls_iterations",
+        "solver_kernels",
         "jacobian",
         "cone",
         "impratio",
@@ -144,8 +147,8 @@ def test_a_setting_does_something_or_is_refused(env: str, backward: str, legs: s
                 parse_config(settings)
             assert f"physics.{field}:" in str(caught.value)
             assert "leave it out" in str(caught.value)
-        elif field in ("nconmax", "njmax"):
-            parse_config(settings)  # sizes of buffers: the next test
+        elif field in ("nconmax", "njmax", "solver_kernels"):
+            parse_config(settings)  # no part of the model: the next tests
         elif field in ("substep_grad_clip", "contact_reach") or field.startswith("fd."):
             assert _backward(parse_config(settings)) != plain, f"{field} does nothing"
         else:
@@ -159,6 +162,23 @@ def test_buffers_are_as_large_as_asked_for(env: str, field: str) -> None:
     config = parse_config(overlay(_settings(env, "tape_all", ""), {f"physics.{field}": 61}))
     batch = make_env(config.env, config.physics, 1, "cpu", 0, differentiable=False).sim.batch
     assert 61 in (batch.data.naconmax, batch.data.njmax)
+
+
+def test_constraints_are_solved_by_the_kernels_asked_for() -> None:
+    settings = overlay(_settings("myosuite_walk", "tape_all", ""), {"physics.solver_kernels": "fused"})
+    config = parse_config(settings)
+    batch = make_env(config.env, config.physics, 2, "cpu", 0, deterministic=True).sim.batch
+    assert batch.kernels == Kernels(ordered=True, fused_solver=True)
+    assert not batch.stages.unrolls
+
+
+@pytest.mark.parametrize(
+    ("other", "write"),
+    [({"jacobian": "sparse"}, "leave physics.jacobian out"), ({"integrator": "RK4"}, "solver_kernels: mujoco_warp")],
+)
+def test_what_the_fused_solver_is_not_for_is_refused(other: dict[str, Any], write: str) -> None:
+    with pytest.raises(ConfigError, match=write):
+        parse_config({"env": {"name": "ant"}, "physics": {"solver_kernels": "fused", **other}})
 
 
 UNREAD: list[tuple[dict[str, Any], str, Any, dict[str, Any]]] = [
