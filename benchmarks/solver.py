@@ -7,7 +7,6 @@ and replayed from that state; the solver is replayed on what the stages before i
 """
 
 import argparse
-import itertools
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -21,7 +20,7 @@ from record import RESULTS, markdown_table, publish
 from msk_ray.config import load_config
 from msk_ray.envs.make import env_class
 from msk_ray.physics import Graph, Kernels, WorldBatch
-from msk_ray.physics.fused import FusedSolver, scratch, solver
+from msk_ray.physics.fused import FusedSolver
 from msk_ray.physics.ordered.solve import solve as solve_ordered
 
 KERNELS = {
@@ -111,10 +110,6 @@ def main() -> None:
     p.add_argument("--configs", nargs="+", default=["ant"], help="names of files in configs/")
     p.add_argument("--worlds", type=int, nargs="+", default=[64])
     p.add_argument("--kernels", nargs="+", default=["mujoco_warp", "fused"], choices=list(KERNELS))
-    p.add_argument(
-        "--warps", type=int, nargs="+", default=[solver.WARPS], help="of the fused solver on a multiprocessor"
-    )
-    p.add_argument("--layouts", action="store_true", help="measure the fused solver in both layouts of its memory")
     p.add_argument("--steps", type=int, default=60, help="env steps taken before timing, to land")
     p.add_argument("--repeats", type=int, default=20, help="replays a timing averages over")
     p.add_argument("--device", default="cuda:0" if wp.is_cuda_available() else "cpu")
@@ -138,20 +133,12 @@ def main() -> None:
             wanted = None
             for kind in args.kernels:
                 kernels = KERNELS[kind]
-                fused = kernels.fused_solver
-                for fastest, warps in itertools.product(
-                    (True, False) if fused and args.layouts else (True,), args.warps if fused else (0,)
-                ):
-                    scratch.WORLD_FASTEST, solver.WARPS = fastest, warps
-                    launch = FusedSolver() if fused else solve_ordered if kernels.ordered else mjw.solve
-                    batch = WorldBatch(mjm, worlds, substeps, args.device, kernels=kernels)
-                    row, end = measure(batch, start, launch, args.repeats)
-                    wanted = end if wanted is None else wanted
-                    label = (
-                        kind + (f", {warps} warps" if fused else "") + ("" if fastest else ", each world side by side")
-                    )
-                    table.append([f"{worlds}", label, *row, f"{np.max(np.abs(end - wanted)):.1e}"])
-                    print(name, table[-1], flush=True)
+                launch = FusedSolver() if kernels.fused_solver else solve_ordered if kernels.ordered else mjw.solve
+                batch = WorldBatch(mjm, worlds, substeps, args.device, kernels=kernels)
+                row, end = measure(batch, start, launch, args.repeats)
+                wanted = end if wanted is None else wanted
+                table.append([f"{worlds}", kind, *row, f"{np.max(np.abs(end - wanted)):.1e}"])
+                print(name, table[-1], flush=True)
         title = f"Env step of {name} (nv {mjm.nv}, {substeps} substeps) by kernels of the solver"
         publish("solver", title, args.device, markdown_table(header, table), args.results)
 

@@ -82,7 +82,7 @@ class PhysicsConfig(Section):
     ls_iterations: Count | None = None
     """Line search iteration limit."""
     solver_kernels: Literal["mujoco_warp", "fused"] = "mujoco_warp"
-    """Kernels of the constraint solver. `fused` is one for all iterations of Newton's method, with a thread for each
+    """Kernels of the constraint solver. `fused` is one for all iterations of Newton's method, with a warp for each
     world: for models of up to 60 degrees of freedom. The results differ by rounding."""
     jacobian: Literal["dense", "sparse"] | None = None
     """How mujoco_warp stores the Jacobian of the constraints. The results differ by rounding; which one takes less time

@@ -18,7 +18,7 @@ class Kernels(NamedTuple):
     ordered: bool = False
     """Add everything up in a fixed order, so that a GPU repeats a step bit for bit; the Jacobian is dense."""
     fused_solver: bool = False
-    """Solve each world's constraints in one thread, for small models; the Jacobian is dense."""
+    """Solve the constraints in one launch, for small models; the Jacobian is dense."""
 
     @property
     def dense(self) -> bool:

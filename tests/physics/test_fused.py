@@ -1,7 +1,6 @@
 """The solver of one kernel finds what C MuJoCo finds in float64."""
 
 from collections.abc import Callable
-from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -17,8 +16,7 @@ from msk_ray.envs.make import env_class
 from msk_ray.errors import ConfigError, UnsupportedModelError
 from msk_ray.gradcheck import check_gradients
 from msk_ray.physics import Kernels, WorldBatch
-from msk_ray.physics.fused import FusedSolver, check_fused, scratch, solver
-from msk_ray.physics.fused.solver import lanes_of
+from msk_ray.physics.fused import FusedSolver, check_fused, scratch
 from msk_ray.physics.stages import dense
 from msk_ray.simulation import Simulation
 
@@ -169,35 +167,6 @@ def test_a_line_search_of_one_evaluation_lowers_the_cost_all_the_same() -> None:
     assert gap(data.qacc.numpy()[0], state.qacc) < 1e-2
 
 
-def test_either_layout_of_its_memory_gives_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
-    mjm = exact(MODELS["every_row_elliptic"]())
-    state = touching(mjm, 2)
-    found = []
-    for fastest in (True, False):
-        monkeypatch.setattr(scratch, "WORLD_FASTEST", fastest)
-        model, data = problem(mjm, state, np.zeros(mjm.nv))
-        FusedSolver()(model, data)
-        found.append([array.numpy().tobytes() for array in (data.qacc, data.efc.force, data.efc.state)])
-    assert found[0] == found[1]
-
-
-def test_worlds_are_spread_over_the_multiprocessors() -> None:
-    """Of 132 multiprocessors with 8 warps each; a warp has no more than 32."""
-    gpu: Any = SimpleNamespace(is_cuda=True, sm_count=132)
-    assert [lanes_of(worlds, gpu) for worlds in (1, 1056, 1057, 4096, 16384, 65536)] == [1, 1, 2, 4, 16, 32]
-
-
-def test_warps_of_few_worlds_solve_all_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    mjm = exact(MODELS["every_row_elliptic"]())
-    state = touching(mjm, 2)
-    for lanes in (1, 2):
-        monkeypatch.setattr(solver, "lanes_of", lambda worlds, device, lanes=lanes: lanes)
-        model, data = problem(mjm, state, np.zeros(mjm.nv))
-        FusedSolver()(model, data)
-        for world in range(2):
-            assert gap(data.qacc.numpy()[world], state.qacc) < 1e-3
-
-
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
 def test_steps_are_those_of_the_package_whatever_the_worlds_beside_them(cone: str) -> None:
     """Three ants at different heights, one of which touches nothing, land and slide."""
@@ -251,7 +220,5 @@ def test_models_of_many_degrees_of_freedom_are_refused() -> None:
 
 
 def test_more_worlds_than_can_be_counted_are_refused_before_memory_is_taken() -> None:
-    with pytest.raises(
-        ConfigError, match=r"room for 671088 worlds of 100 constraint rows.*solver_kernels: mujoco_warp"
-    ):
-        scratch.make_scratch(671_089, 100, 14)
+    with pytest.raises(ConfigError, match=r"room for 67108863 worlds.*solver_kernels: mujoco_warp"):
+        scratch.make_scratch(2**26, 100, 14)

@@ -1,4 +1,4 @@
-"""A solver for small models: one kernel, in which a thread runs Newton's method of its world to the end.
+"""A solver for small models: one kernel, in which a warp runs Newton's method of its world to the end.
 
 mujoco_warp's solver launches nine kernels an iteration, and as many iterations as the slowest world needs.
 """

@@ -7,7 +7,7 @@ With N = μ jar₀ and uᵢ = φᵢ jarᵢ, T = |u|, the cone is circular. Its d
 import warp as wp
 
 from msk_ray.physics import mjw_private as private
-from msk_ray.physics.fused.memory import four, put_four, put_number, put_whole, whole
+from msk_ray.physics.fused.lanes import at, lane_count, put, put_whole, whole
 from msk_ray.physics.fused.scratch import CONE, Scratch
 
 wp.set_module_options({"enable_backward": False})
@@ -58,89 +58,115 @@ def cone_mass(stiffness: float, mu: float) -> float:
 
 
 @wp.func
-def update_contact(scratch: Scratch, world: int, blocks: int, room: int, contact: int) -> bool:
-    """Forces, states and weights of a contact's rows; whether its part of the Hessian may have changed.
-
-    While it slides, its part of the Hessian is, with zᵢ = φᵢ Jᵢ, the direction û = u / T and p = Σ ûᵢ zᵢ,
-    m μ² (J₀ - p)(J₀ - p)ᵀ + m (μ² - μ N / T) Σ (zᵢ - ûᵢ p)(zᵢ - ûᵢ p)ᵀ: rows with weights that are not negative. Behind
-    the rows of J are these, or J itself while all are springs.
-    """
-    first = whole(scratch.first, world, contact)
-    end = whole(scratch.first, world, contact + 1)
-    head = four(scratch.springs, world, first)
-    mu = head[1]
-    normal = mu * head[2]
+def update_contact(
+    scratch: Scratch, world: int, contact: int, stiffness: wp.array[float], force: wp.array[float], state: wp.array[int]
+) -> bool:
+    """Forces, states and weights of a contact's rows, by one lane; whether its part of the Hessian may have changed."""
+    jar = scratch.jar[world]
+    bound = scratch.bound[world]
+    weight = scratch.weight[world]
+    first = whole(scratch.first[world], contact)
+    end = whole(scratch.end[world], contact)
+    mu = at(bound, first)
+    normal = mu * at(jar, first)
     squares = float(0.0)
     for p in range(first + 1, end):
-        row = four(scratch.springs, world, p)
-        u = row[1] * row[2]
+        u = at(bound, p) * at(jar, p)
         squares += u * u
     tangent = wp.sqrt(squares)
-    before = whole(scratch.state, world, first)
-    state = zone(normal, tangent, mu)
-    behind = room * blocks
-    if state != SLIDING:
+    before = whole(state, first)
+    now = zone(normal, tangent, mu)
+    if now != SLIDING:
         for p in range(first, end):
-            row = four(scratch.springs, world, p)
-            weight = wp.where(state == QUADRATIC, row[0], 0.0)
-            put_number(scratch.force, world, p, -weight * row[2])
-            put_number(scratch.weight, world, p, weight)
-            put_whole(scratch.state, world, p, state)
-        if state == QUADRATIC and before == SLIDING:
-            for at in range(first * blocks, end * blocks):
-                put_four(scratch.rows, world, behind + at, four(scratch.rows, world, at))
-        return state != before
-    mass = cone_mass(head[0], mu)
+            counts = wp.where(now == QUADRATIC, at(stiffness, p), 0.0)
+            put(weight, p, counts)
+            put(force, p, -counts * at(jar, p))
+            put_whole(state, p, now)
+        # Rows that leant go back.
+        put(scratch.leaning[world], contact, wp.where(before == SLIDING, -1.0, 0.0))
+        return now != before
+    mass = cone_mass(at(stiffness, first), mu)
     inverse = 1.0 / tangent
     pull = mass * mu * (normal - mu * tangent)
     turning = mass * (mu * mu - mu * normal * inverse)
-    put_number(scratch.force, world, first, -pull)
-    put_number(scratch.weight, world, first, mass * mu * mu)
-    put_whole(scratch.state, world, first, SLIDING)
+    put(weight, first, mass * mu * mu)
+    put(force, first, -pull)
+    put_whole(state, first, SLIDING)
     for p in range(first + 1, end):
-        row = four(scratch.springs, world, p)
-        put_number(scratch.force, world, p, pull * inverse * row[1] * row[1] * row[2])
-        put_number(scratch.weight, world, p, turning)
-        put_whole(scratch.state, world, p, SLIDING)
-    for k in range(blocks):
-        mean = wp.vec4(0.0)
-        for p in range(first + 1, end):
-            row = four(scratch.springs, world, p)
-            mean += row[1] * row[1] * row[2] * inverse * four(scratch.rows, world, p * blocks + k)
-        at = first * blocks + k
-        put_four(scratch.rows, world, behind + at, four(scratch.rows, world, at) - mean)
-        for p in range(first + 1, end):
-            row = four(scratch.springs, world, p)
-            at = p * blocks + k
-            turned = row[1] * (four(scratch.rows, world, at) - row[2] * inverse * mean)
-            put_four(scratch.rows, world, behind + at, turned)
+        friction = at(bound, p)
+        put(weight, p, turning)
+        put(force, p, pull * inverse * friction * friction * at(jar, p))
+        put_whole(state, p, SLIDING)
+    put(scratch.leaning[world], contact, inverse)
     return True
 
 
 @wp.func
-def open_cone(scratch: Scratch, world: int, contact: int) -> Cone:
+def lean_rows(
+    scratch: Scratch,
+    world: int,
+    contact: int,
+    jacobian: wp.array[float],
+    stride: int,
+    nv: int,
+    width: int,
+    lane: int,
+) -> None:
+    """The rows of a contact that add to the Hessian, by all lanes.
+
+    While it slides, its part of the Hessian is, with zᵢ = φᵢ Jᵢ, the direction û = u / T and p = Σ ûᵢ zᵢ,
+    m μ² (J₀ - p)(J₀ - p)ᵀ + m (μ² - μ N / T) Σ (zᵢ - ûᵢ p)(zᵢ - ûᵢ p)ᵀ: rows with weights that are not negative.
+    Otherwise they are those of J.
+    """
+    rows = scratch.rows[world]
+    jar = scratch.jar[world]
+    bound = scratch.bound[world]
+    first = whole(scratch.first[world], contact)
+    end = whole(scratch.end[world], contact)
+    inverse = at(scratch.leaning[world], contact)
+    for i in range(lane, nv, lane_count()):
+        mean = float(0.0)
+        if inverse > 0.0:
+            for p in range(first + 1, end):
+                friction = at(bound, p)
+                mean += friction * friction * at(jar, p) * inverse * at(jacobian, p * stride + i)
+        put(rows, first * width + i, at(jacobian, first * stride + i) - mean)
+        for p in range(first + 1, end):
+            scale = wp.where(inverse > 0.0, at(bound, p), 1.0)
+            put(rows, p * width + i, scale * (at(jacobian, p * stride + i) - at(jar, p) * inverse * mean))
+
+
+@wp.func
+def open_cone(scratch: Scratch, world: int, contact: int, stiffness: wp.array[float]) -> Cone:
     """The contact on the line along the present direction."""
-    first = whole(scratch.first, world, contact)
-    end = whole(scratch.first, world, contact + 1)
-    head = four(scratch.springs, world, first)
+    jar = scratch.jar[world]
+    rate = scratch.rate[world]
+    bound = scratch.bound[world]
+    first = whole(scratch.first[world], contact)
+    end = whole(scratch.end[world], contact)
+    d = at(stiffness, first)
+    x = at(jar, first)
+    y = at(rate, first)
     c = Cone()
-    c.mu = head[1]
-    c.normal = head[1] * head[2]
-    c.normal_rate = head[1] * head[3]
-    c.mass = cone_mass(head[0], head[1])
-    cost = head[0] * head[2] * head[2]
-    slope = head[0] * head[2] * head[3]
-    curvature = head[0] * head[3] * head[3]
+    c.mu = at(bound, first)
+    c.normal = c.mu * x
+    c.normal_rate = c.mu * y
+    c.mass = cone_mass(d, c.mu)
+    cost = d * x * x
+    slope = d * x * y
+    curvature = d * y * y
     uu = float(0.0)
     uv = float(0.0)
     vv = float(0.0)
     for p in range(first + 1, end):
-        row = four(scratch.springs, world, p)
-        cost += row[0] * row[2] * row[2]
-        slope += row[0] * row[2] * row[3]
-        curvature += row[0] * row[3] * row[3]
-        u = row[1] * row[2]
-        v = row[1] * row[3]
+        d = at(stiffness, p)
+        x = at(jar, p)
+        y = at(rate, p)
+        cost += d * x * x
+        slope += d * x * y
+        curvature += d * y * y
+        u = at(bound, p) * x
+        v = at(bound, p) * y
         uu += u * u
         uv += u * v
         vv += v * v
@@ -154,42 +180,44 @@ def open_cone(scratch: Scratch, world: int, contact: int) -> Cone:
         # |u|² - along² by Lagrange's identity: the difference of two large numbers would be noise.
         squares = float(0.0)
         for p in range(first + 2, end):
-            row = four(scratch.springs, world, p)
-            u = row[1] * row[2]
-            v = row[1] * row[3]
+            u = at(bound, p) * at(jar, p)
+            v = at(bound, p) * at(rate, p)
             for q in range(first + 1, p):
-                other = four(scratch.springs, world, q)
-                cross = other[1] * (other[3] * u - other[2] * v)
+                cross = at(bound, q) * (at(rate, q) * u - at(jar, q) * v)
                 squares += cross * cross
         c.across = squares / vv
     return c
 
 
 @wp.func
-def keep_cone(scratch: Scratch, world: int, contact: int, c: Cone) -> None:
+def keep_cone(cones: wp.array[float], contact: int, c: Cone) -> None:
     k = contact * CONE
-    put_four(scratch.cones, world, k, wp.vec4(c.normal, c.normal_rate, c.along, c.along_rate))
-    put_four(scratch.cones, world, k + 1, wp.vec4(c.across, c.mu, c.mass, c.cost))
-    put_four(scratch.cones, world, k + 2, wp.vec4(c.slope, c.half_curvature, 0.0, 0.0))
+    put(cones, k, c.normal)
+    put(cones, k + 1, c.normal_rate)
+    put(cones, k + 2, c.along)
+    put(cones, k + 3, c.along_rate)
+    put(cones, k + 4, c.across)
+    put(cones, k + 5, c.mu)
+    put(cones, k + 6, c.mass)
+    put(cones, k + 7, c.cost)
+    put(cones, k + 8, c.slope)
+    put(cones, k + 9, c.half_curvature)
 
 
 @wp.func
-def kept_cone(scratch: Scratch, world: int, contact: int) -> Cone:
+def kept_cone(cones: wp.array[float], contact: int) -> Cone:
     k = contact * CONE
-    motion = four(scratch.cones, world, k)
-    law = four(scratch.cones, world, k + 1)
-    springs = four(scratch.cones, world, k + 2)
     c = Cone()
-    c.normal = motion[0]
-    c.normal_rate = motion[1]
-    c.along = motion[2]
-    c.along_rate = motion[3]
-    c.across = law[0]
-    c.mu = law[1]
-    c.mass = law[2]
-    c.cost = law[3]
-    c.slope = springs[0]
-    c.half_curvature = springs[1]
+    c.normal = at(cones, k)
+    c.normal_rate = at(cones, k + 1)
+    c.along = at(cones, k + 2)
+    c.along_rate = at(cones, k + 3)
+    c.across = at(cones, k + 4)
+    c.mu = at(cones, k + 5)
+    c.mass = at(cones, k + 6)
+    c.cost = at(cones, k + 7)
+    c.slope = at(cones, k + 8)
+    c.half_curvature = at(cones, k + 9)
     return c
 
 

@@ -3,12 +3,14 @@
 import warp as wp
 
 from msk_ray.physics.fused.cones import cone_along, cost_at_start, keep_cone, kept_cone, open_cone
-from msk_ray.physics.fused.memory import four, put_four
-from msk_ray.physics.fused.problem import World, place
+from msk_ray.physics.fused.lanes import at, four, lane_count, lane_sum, lane_sums, lane_sync, put, whole
+from msk_ray.physics.fused.problem import Rows, World
 from msk_ray.physics.fused.scratch import Scratch
+from msk_ray.physics.mjw_private import ConstraintType
 
 wp.set_module_options({"enable_backward": False})
 
+_ELLIPTIC = wp.constant(int(ConstraintType.CONTACT_ELLIPTIC))
 _NOISE = wp.constant(8.0 * 1.1920929e-07)
 """Rounding of a sum of a few dozen numbers, as a share of their size, in float32."""
 _LEAST_SLOPE = wp.constant(1.0e-6)
@@ -49,98 +51,95 @@ def spring_along(stiffness: float, jar: float, rate: float, alpha: float) -> wp.
 
 
 @wp.func
-def smooth_along(scratch: Scratch, w: World) -> wp.vec2:
-    """First and second derivative at α = 0 of what is quadratic everywhere: inertia and equalities."""
-    slope = float(0.0)
-    curvature = float(0.0)
-    for k in range(w.blocks):
-        s = four(scratch.direction, w.id, k)
-        slope += wp.dot(s, four(scratch.inertial, w.id, k) - four(scratch.smooth, w.id, k))
-        curvature += wp.dot(s, four(scratch.moved, w.id, k))
-    for scalar in range(wp.min(w.equalities, w.scalars)):
-        row = four(scratch.springs, w.id, place(w, scalar))
-        slope += row[0] * row[2] * row[3]
-        curvature += row[0] * row[3] * row[3]
-    return wp.vec2(slope, curvature)
+def row_along(rows: Rows, scratch: Scratch, w: World, r: int, alpha: float) -> wp.vec3:
+    """Cost at α less that at 0, and its derivatives, of a row that is no equality; 0 of an elliptic contact's."""
+    if whole(rows.type[w.id], r) == _ELLIPTIC:
+        return wp.vec3(0.0)
+    stiffness = at(rows.D[w.id], r)
+    jar = at(scratch.jar[w.id], r)
+    rate = at(scratch.rate[w.id], r)
+    if r < w.equalities + w.frictions:
+        return friction_along(at(rows.frictionloss[w.id], r), stiffness, jar, rate, alpha)
+    return spring_along(stiffness, jar, rate, alpha)
 
 
 @wp.func
-def scalars_along(scratch: Scratch, w: World, alpha: float) -> wp.vec3:
-    """Cost at α less that at 0, and its derivatives, of the rows that are neither equalities nor elliptic contacts."""
-    total = wp.vec3(0.0)
-    for scalar in range(w.equalities, w.scalars):
-        row = four(scratch.springs, w.id, place(w, scalar))
-        if scalar < w.equalities + w.frictions:
-            total += friction_along(row[1], row[0], row[2], row[3], alpha)
-        else:
-            total += spring_along(row[0], row[2], row[3], alpha)
-    return total
+def row_cost(rows: Rows, scratch: Scratch, w: World, r: int) -> float:
+    """Cost of the same row at α = 0."""
+    stiffness = at(rows.D[w.id], r)
+    jar = at(scratch.jar[w.id], r)
+    if whole(rows.type[w.id], r) == _ELLIPTIC:
+        return 0.0
+    if r < w.equalities + w.frictions:
+        loss = at(rows.frictionloss[w.id], r)
+        return friction_cost(loss, loss / stiffness, stiffness, jar)
+    if jar < 0.0:
+        return 0.5 * stiffness * jar * jar
+    return 0.0
 
 
 @wp.func
-def scalars_cost(scratch: Scratch, w: World) -> float:
-    """Cost of the same rows at α = 0."""
-    cost = float(0.0)
-    for scalar in range(w.equalities, w.scalars):
-        row = four(scratch.springs, w.id, place(w, scalar))
-        if scalar < w.equalities + w.frictions:
-            cost += friction_cost(row[1], row[1] / row[0], row[0], row[2])
-        elif row[2] < 0.0:
-            cost += 0.5 * row[0] * row[2] * row[2]
-    return cost
-
-
-@wp.func
-def cost_along(scratch: Scratch, w: World, smooth: wp.vec2, alpha: float) -> wp.vec3:
+def cost_along(rows: Rows, scratch: Scratch, w: World, smooth: wp.vec2, alpha: float) -> wp.vec3:
     """Cost at α less that at 0, and its first and second derivative."""
-    total = scalars_along(scratch, w, alpha)
-    for contact in range(w.contacts):
-        total += cone_along(kept_cone(scratch, w.id, contact), alpha)
+    total = wp.vec3(0.0)
+    for r in range(w.equalities + w.lane, w.rows, lane_count()):
+        total += row_along(rows, scratch, w, r, alpha)
+    for contact in range(w.lane, w.contacts, lane_count()):
+        total += cone_along(kept_cone(scratch.cones[w.id], contact), alpha)
     bent = alpha * smooth[1]
-    return total + wp.vec3(alpha * (smooth[0] + 0.5 * bent), smooth[0] + bent, smooth[1])
+    return lane_sums(total) + wp.vec3(alpha * (smooth[0] + 0.5 * bent), smooth[0] + bent, smooth[1])
 
 
 @wp.func
-def open_rows(scratch: Scratch, w: World, begin: int, end: int) -> None:
-    """J s of some rows, four at a time."""
-    for p in range(begin, end, 4):
-        last = end - 1
-        rates = wp.vec4(0.0)
-        for k in range(w.blocks):
-            s = four(scratch.direction, w.id, k)
-            rates += wp.vec4(
-                wp.dot(four(scratch.rows, w.id, p * w.blocks + k), s),
-                wp.dot(four(scratch.rows, w.id, wp.min(p + 1, last) * w.blocks + k), s),
-                wp.dot(four(scratch.rows, w.id, wp.min(p + 2, last) * w.blocks + k), s),
-                wp.dot(four(scratch.rows, w.id, wp.min(p + 3, last) * w.blocks + k), s),
-            )
-        for i in range(4):
-            if p + i < end:
-                row = four(scratch.springs, w.id, p + i)
-                put_four(scratch.springs, w.id, p + i, wp.vec4(row[0], row[1], row[2], rates[i]))
+def open_rows(rows: Rows, scratch: Scratch, w: World) -> wp.vec2:
+    """J s of every row; of equalities, what they add to slope and curvature at α = 0."""
+    jacobian = rows.jacobian[w.id]
+    direction = scratch.direction[w.id]
+    smooth = wp.vec2(0.0)
+    for r in range(w.lane, w.rows, lane_count()):
+        rate = float(0.0)
+        for k in range(0, w.width, 4):
+            rate += wp.dot(four(jacobian, r * rows.stride + k), four(direction, k))
+        put(scratch.rate[w.id], r, rate)
+        if r < w.equalities:
+            pull = at(rows.D[w.id], r) * rate
+            smooth += wp.vec2(pull * at(scratch.jar[w.id], r), pull * rate)
+    return smooth
 
 
 @wp.func
-def search_line(scratch: Scratch, w: World, least: float, limit: int) -> tuple[float, float, bool]:
+def search_line(
+    rows: Rows, scratch: Scratch, tau: wp.array[float], w: World, least: float, limit: int
+) -> tuple[float, float, bool]:
     """Newton's method for the zero of the cost's slope, which halves its bracket where it does not halve the slope.
 
     Args:
+        tau: the smooth force.
         least: the slope below which a point counts as the least; rounding of the slope may raise it.
         limit: of evaluations.
 
     Returns:
         α, by how much it lowers the cost, and whether it was found within the limit.
     """
-    open_rows(scratch, w, 0, w.contact_rows)
-    open_rows(scratch, w, w.room - w.scalars, w.room)
-    smooth = smooth_along(scratch, w)
-    start = wp.vec3(0.0) + scalars_along(scratch, w, 0.0)
-    cost = scalars_cost(scratch, w)
-    for contact in range(w.contacts):
-        cone = open_cone(scratch, w.id, contact)
-        keep_cone(scratch, w.id, contact, cone)
+    # What is quadratic everywhere: inertia and equalities.
+    smooth = open_rows(rows, scratch, w)
+    for i in range(w.lane, w.nv, lane_count()):
+        s = at(scratch.direction[w.id], i)
+        smooth += wp.vec2(s * (at(scratch.inertial[w.id], i) - at(tau, i)), s * at(scratch.moved[w.id], i))
+    lane_sync()
+    smooth = wp.vec2(lane_sum(smooth[0]), lane_sum(smooth[1]))
+    start = wp.vec3(0.0)
+    cost = float(0.0)
+    for r in range(w.equalities + w.lane, w.rows, lane_count()):
+        start += row_along(rows, scratch, w, r, 0.0)
+        cost += row_cost(rows, scratch, w, r)
+    for contact in range(w.lane, w.contacts, lane_count()):
+        cone = open_cone(scratch, w.id, contact, rows.D[w.id])
+        keep_cone(scratch.cones[w.id], contact, cone)
         start += cone_along(cone, 0.0)
         cost += cost_at_start(cone)
+    start = lane_sums(start)
+    cost = lane_sum(cost)
     slope = start[1] + smooth[0]
     curvature = start[2] + smooth[1]
     # Of a sum of squares, |Σ D jar rate| <= √(2 cost curvature): the size of the numbers that the slope adds up.
@@ -155,7 +154,7 @@ def search_line(scratch: Scratch, w: World, least: float, limit: int) -> tuple[f
     before = -slope
     alpha = before / curvature
     for _evaluation in range(limit):
-        point = cost_along(scratch, w, smooth, alpha)
+        point = cost_along(rows, scratch, w, smooth, alpha)
         steep = wp.abs(point[1])
         if steep < enough:
             if point[0] < 0.0:

@@ -1,15 +1,16 @@
-"""Newton's method for the constraint forces of a world, by one thread from the first iteration to the last."""
+"""Newton's method for the constraint forces of a world, by one warp from the first iteration to the last."""
 
 import warp as wp
 from mujoco_warp import OverflowType
 
-from msk_ray.physics.fused.blocks import multiply, solve_factored
+from msk_ray.physics.fused.dense import multiply, solve_factored
+from msk_ray.physics.fused.lanes import at, lane_count, lane_sum, lane_sync, put
 from msk_ray.physics.fused.line_search import search_line
-from msk_ray.physics.fused.memory import entry, four, number, put_entry, put_four, whole
 from msk_ray.physics.fused.problem import (
-    RowsIn,
+    Rows,
     World,
     factor_hessian,
+    find_contacts,
     read_rows,
     update_gradient,
     update_rows,
@@ -25,14 +26,23 @@ _MIN = wp.constant(float(MJ_MINVAL))
 
 
 @wp.struct
+class Inertia:
+    """M in mujoco_warp's layout, and the entries of a triangular matrix of its size."""
+
+    M_hinit_i: wp.array[int]
+    M_colind: wp.array[int]
+    dof_tri_row: wp.array[int]
+    dof_tri_col: wp.array[int]
+    M: wp.array2d[float]
+
+
+@wp.struct
 class Solution:
-    """What the solver leaves in mujoco_warp's Data."""
+    """What else the solver leaves in mujoco_warp's Data."""
 
     qacc: wp.array2d[float]
     Ma: wp.array2d[float]
     qfrc_constraint: wp.array2d[float]
-    force: wp.array2d[float]
-    state: wp.array2d[int]
     solver_niter: wp.array[int]
     overflow: wp.array[int]
 
@@ -48,159 +58,155 @@ class Limits:
 
 
 @wp.func
-def read_inertia(
-    rownnz: wp.array[int],
-    rowadr: wp.array[int],
-    colind: wp.array[int],
-    inertia: wp.array2d[float],
-    scratch: Scratch,
-    w: World,
-) -> float:
+def read_inertia(given: Inertia, scratch: Scratch, w: World) -> float:
     """Copy M, and return its trace."""
+    values = given.M[w.id]
+    inertia = scratch.inertia[w.id]
     trace = float(0.0)
-    for i in range(w.nv):
-        for k in range(rowadr[i], rowadr[i] + rownnz[i]):
-            j = colind[k]
-            value = number(inertia, w.id, k)
-            put_entry(scratch.inertia, w.id, 4 * i * w.blocks + j, value)
-            put_entry(scratch.inertia, w.id, 4 * j * w.blocks + i, value)
-            if i == j:
-                trace += value
-    return trace
-
-
-@wp.func
-def advance_rows(scratch: Scratch, w: World, begin: int, end: int, alpha: float) -> None:
-    for p in range(begin, end):
-        row = four(scratch.springs, w.id, p)
-        put_four(scratch.springs, w.id, p, wp.vec4(row[0], row[1], row[2] + alpha * row[3], row[3]))
+    for e in range(w.lane, given.M_colind.shape[0], lane_count()):
+        i = given.M_hinit_i[e]
+        j = given.M_colind[e]
+        value = at(values, e)
+        put(inertia, i * w.width + j, value)
+        put(inertia, j * w.width + i, value)
+        if i == j:
+            trace += value
+    lane_sync()
+    return lane_sum(trace)
 
 
 @wp.func
 def advance(scratch: Scratch, w: World, alpha: float) -> None:
     """Move along the direction."""
-    for k in range(w.blocks):
-        put_four(scratch.acc, w.id, k, four(scratch.acc, w.id, k) + alpha * four(scratch.direction, w.id, k))
-        put_four(scratch.inertial, w.id, k, four(scratch.inertial, w.id, k) + alpha * four(scratch.moved, w.id, k))
-    advance_rows(scratch, w, 0, w.contact_rows, alpha)
-    advance_rows(scratch, w, w.room - w.scalars, w.room, alpha)
+    for i in range(w.lane, w.nv, lane_count()):
+        put(scratch.acc[w.id], i, at(scratch.acc[w.id], i) + alpha * at(scratch.direction[w.id], i))
+        put(scratch.inertial[w.id], i, at(scratch.inertial[w.id], i) + alpha * at(scratch.moved[w.id], i))
+    for r in range(w.lane, w.rows, lane_count()):
+        put(scratch.jar[w.id], r, at(scratch.jar[w.id], r) + alpha * at(scratch.rate[w.id], r))
+    lane_sync()
 
 
 @wp.func
 def find_direction(scratch: Scratch, w: World) -> wp.vec2:
     """Newton's direction s = -H⁻¹ g, with |s|² and -g·s."""
-    solve_factored(scratch.factor, w.id, scratch.gradient, w.blocks, scratch.direction)
+    for i in range(w.lane, w.nv, lane_count()):
+        put(scratch.partial[w.id], i, -at(scratch.gradient[w.id], i))
+    lane_sync()
+    solve_factored(
+        scratch.factor[w.id],
+        scratch.pivot[w.id],
+        w.nv,
+        w.width,
+        w.lane,
+        scratch.partial[w.id],
+        scratch.direction[w.id],
+    )
     square = float(0.0)
     decrement = float(0.0)
-    for k in range(w.blocks):
-        s = four(scratch.direction, w.id, k)
-        square += wp.dot(s, s)
-        decrement -= wp.dot(s, four(scratch.gradient, w.id, k))
-    return wp.vec2(square, decrement)
+    for i in range(w.lane, w.nv, lane_count()):
+        s = at(scratch.direction[w.id], i)
+        square += s * s
+        decrement -= s * at(scratch.gradient[w.id], i)
+    return wp.vec2(lane_sum(square), lane_sum(decrement))
 
 
 @wp.func
-def iterate(scratch: Scratch, w: World, limits: Limits, scale: float, out: Solution) -> None:
+def iterate(
+    rows: Rows,
+    given: Inertia,
+    scratch: Scratch,
+    smooth: wp.array[float],
+    w: World,
+    limits: Limits,
+    scale: float,
+    out: Solution,
+) -> None:
     """Newton's iterations from the present acceleration on; `scale` is the reciprocal of the trace of M."""
     tolerance = limits.tolerance[w.id % limits.tolerance.shape[0]]
     ls_tolerance = limits.ls_tolerance[w.id % limits.ls_tolerance.shape[0]]
-    update_rows(scratch, w)
-    update_gradient(scratch, w)
-    factor_hessian(scratch, w)
+    missed = int(0)
+    update_rows(rows, scratch, w)
+    update_gradient(rows, scratch, smooth, w)
+    factor_hessian(scratch, w, given.dof_tri_row, given.dof_tri_col)
     found = find_direction(scratch, w)
     done = bool(False)
     count = int(0)
     while count < limits.iterations and not done:
-        multiply(scratch.inertia, w.id, scratch.direction, w.blocks, scratch.moved)
+        multiply(scratch.inertia[w.id], scratch.direction[w.id], w.nv, w.width, w.lane, scratch.moved[w.id])
         least = tolerance * ls_tolerance * wp.sqrt(found[0]) / scale
-        alpha, gain, exact = search_line(scratch, w, least, limits.ls_iterations)
+        alpha, gain, exact = search_line(rows, scratch, smooth, w, least, limits.ls_iterations)
         if not exact:
-            out.overflow[w.id] = out.overflow[w.id] | _LS_ITERATIONS
+            missed = _LS_ITERATIONS
         advance(scratch, w, alpha)
-        changed = update_rows(scratch, w)
-        slope = scale * wp.sqrt(update_gradient(scratch, w))
+        changed = update_rows(rows, scratch, w)
+        slope = scale * wp.sqrt(update_gradient(rows, scratch, smooth, w))
         count += 1
         done = alpha == 0.0 or (gain > 0.0 and scale * gain < tolerance) or slope < tolerance
         if not done:
             if changed:
-                factor_hessian(scratch, w)
+                factor_hessian(scratch, w, given.dof_tri_row, given.dof_tri_col)
             found = find_direction(scratch, w)
             done = 0.5 * scale * found[1] < tolerance
     if not done and limits.iterations > 0:
-        out.overflow[w.id] = out.overflow[w.id] | _ITERATIONS
-    out.solver_niter[w.id] = count
+        missed = missed | _ITERATIONS
+    if w.lane == 0:
+        out.overflow[w.id] = out.overflow[w.id] | missed
+        out.solver_niter[w.id] = count
 
 
-@wp.func
-def write_rows(scratch: Scratch, w: World, begin: int, end: int, out: Solution) -> None:
-    for p in range(begin, end):
-        source = whole(scratch.source, w.id, p)
-        out.force[w.id, source] = number(scratch.force, w.id, p)
-        out.state[w.id, source] = whole(scratch.state, w.id, p)
-
-
-@wp.kernel
+@wp.kernel(launch_bounds=(64, 12))
 def solve_world(
     # Model:
     nv: int,
-    M_rownnz: wp.array[int],
-    M_rowadr: wp.array[int],
-    M_colind: wp.array[int],
     opt_impratio_invsqrt: wp.array[float],
     limits: Limits,
     warm: bool,
-    lanes: int,
     # In:
+    inertia_in: Inertia,
     ne_in: wp.array[int],
     nf_in: wp.array[int],
+    nl_in: wp.array[int],
     nefc_in: wp.array[int],
     njmax: int,
-    inertia_in: wp.array2d[float],
     qfrc_smooth_in: wp.array2d[float],
     qacc_smooth_in: wp.array2d[float],
     qacc_warmstart_in: wp.array2d[float],
-    rows_in: RowsIn,
     # Out:
+    rows: Rows,
     scratch: Scratch,
     out: Solution,
 ) -> None:
-    """The acceleration of least cost of one world, and the forces there. Without rows it is the smooth one.
-
-    The first `lanes` threads of 32 have a world each, and the others none.
-    """
+    """The acceleration of least cost of one world, and the forces there. Without rows it is the smooth one."""
     thread = wp.tid()
-    lane = thread % 32
-    world = thread // 32 * lanes + lane
-    if lane >= lanes or world >= nefc_in.shape[0]:
-        return
-    count = wp.min(nefc_in[world], njmax)
-    if count == 0:
-        for i in range(nv):
-            out.qacc[world, i] = qacc_smooth_in[world, i]
-            out.Ma[world, i] = qfrc_smooth_in[world, i]
-            out.qfrc_constraint[world, i] = 0.0
-        out.solver_niter[world] = 0
-        return
     w = World()
-    w.id = world
+    w.id = thread // lane_count()
+    w.lane = thread % lane_count()
     w.nv = nv
-    w.blocks = (nv + 3) // 4
-    w.room = njmax
-    w.equalities = ne_in[world]
-    w.frictions = nf_in[world]
-    trace = read_inertia(M_rownnz, M_rowadr, M_colind, inertia_in, scratch, w)
-    for i in range(nv):
-        acc = qacc_smooth_in[world, i]
+    w.width = (nv + 3) // 4 * 4
+    w.rows = wp.min(nefc_in[w.id], njmax)
+    if w.rows == 0:
+        for i in range(w.lane, nv, lane_count()):
+            out.qacc[w.id, i] = qacc_smooth_in[w.id, i]
+            out.Ma[w.id, i] = qfrc_smooth_in[w.id, i]
+            out.qfrc_constraint[w.id, i] = 0.0
+        if w.lane == 0:
+            out.solver_niter[w.id] = 0
+        return
+    w.equalities = wp.min(ne_in[w.id], w.rows)
+    w.frictions = nf_in[w.id]
+    trace = read_inertia(inertia_in, scratch, w)
+    for i in range(w.lane, nv, lane_count()):
+        acc = qacc_smooth_in[w.id, i]
         if warm:
-            acc = qacc_warmstart_in[world, i]
-        put_entry(scratch.acc, world, i, acc)
-        put_entry(scratch.smooth, world, i, qfrc_smooth_in[world, i])
-    w = read_rows(rows_in, scratch, w, count, opt_impratio_invsqrt[world % opt_impratio_invsqrt.shape[0]])
-    multiply(scratch.inertia, world, scratch.acc, w.blocks, scratch.inertial)
-    iterate(scratch, w, limits, 1.0 / wp.max(_MIN, trace), out)
-    for i in range(nv):
-        out.qacc[world, i] = entry(scratch.acc, world, i)
-        out.Ma[world, i] = entry(scratch.inertial, world, i)
-        out.qfrc_constraint[world, i] = entry(scratch.push, world, i)
-    write_rows(scratch, w, 0, w.contact_rows, out)
-    write_rows(scratch, w, w.room - w.scalars, w.room, out)
+            acc = qacc_warmstart_in[w.id, i]
+        put(scratch.acc[w.id], i, acc)
+    lane_sync()
+    impratio = opt_impratio_invsqrt[w.id % opt_impratio_invsqrt.shape[0]]
+    w.contacts = find_contacts(rows, scratch, w, w.equalities + w.frictions + nl_in[w.id], impratio)
+    read_rows(rows, scratch, w)
+    multiply(scratch.inertia[w.id], scratch.acc[w.id], nv, w.width, w.lane, scratch.inertial[w.id])
+    iterate(rows, inertia_in, scratch, qfrc_smooth_in[w.id], w, limits, 1.0 / wp.max(_MIN, trace), out)
+    for i in range(w.lane, nv, lane_count()):
+        out.qacc[w.id, i] = at(scratch.acc[w.id], i)
+        out.Ma[w.id, i] = at(scratch.inertial[w.id], i)
+        out.qfrc_constraint[w.id, i] = at(scratch.push[w.id], i)

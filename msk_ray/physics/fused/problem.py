@@ -6,9 +6,9 @@ Axes: W worlds, R rows, C contacts.
 import warp as wp
 
 from msk_ray.physics import mjw_private as private
-from msk_ray.physics.fused.blocks import below, block, factor_block, put_block
-from msk_ray.physics.fused.cones import QUADRATIC, SATISFIED, update_contact
-from msk_ray.physics.fused.memory import four, number, put_four, put_number, put_whole, whole
+from msk_ray.physics.fused.cones import QUADRATIC, SATISFIED, lean_rows, update_contact
+from msk_ray.physics.fused.dense import factorize
+from msk_ray.physics.fused.lanes import at, four, lane_count, lane_sum, lane_sync, put, put_whole, whole
 from msk_ray.physics.fused.scratch import Scratch
 from msk_ray.physics.mjw_private import ConstraintType, vec5
 
@@ -20,7 +20,7 @@ _LINEARPOS = wp.constant(int(private.ConstraintState.LINEARPOS))
 
 
 @wp.struct
-class RowsIn:
+class Rows:
     """mujoco_warp's rows, (W, R), with what contacts add to them, (C,)."""
 
     type: wp.array2d[int]
@@ -28,191 +28,166 @@ class RowsIn:
     D: wp.array2d[float]
     aref: wp.array2d[float]
     frictionloss: wp.array2d[float]
-    jacobian: wp.array2d[wp.vec4]
-    """J, (W, ...), row by row in blocks."""
-    jacobian_blocks: int
-    """Blocks of its rows, in which it has more room than the problem needs."""
+    jacobian: wp.array2d[float]
+    """J, (W, ...), row by row."""
+    stride: int
+    """Numbers of its rows, more than there are degrees of freedom."""
+    force: wp.array2d[float]
+    """Written."""
+    state: wp.array2d[int]
+    """Written."""
     friction: wp.array[vec5]
     dim: wp.array[int]
 
 
 @wp.struct
 class World:
-    """Sizes of one world's problem, of which its thread knows all."""
+    """Sizes of one world's problem, known to all of its lanes."""
 
     id: int
+    lane: int
     nv: int
-    blocks: int
-    """Blocks of 4 degrees of freedom."""
-    room: int
-    """R."""
+    width: int
+    """nv in whole fours."""
+    rows: int
     equalities: int
     frictions: int
-    scalars: int
-    """Rows that are no part of an elliptic contact; equalities come first, then frictions."""
     contacts: int
     """Elliptic ones."""
-    contact_rows: int
 
 
 @wp.func
-def place(w: World, scalar: int) -> int:
-    """Where a row is that is no part of an elliptic contact."""
-    return w.room - 1 - scalar
-
-
-@wp.func
-def read_row(rows: RowsIn, scratch: Scratch, w: World, p: int) -> None:
-    """Copy a row, of which source and bound are known."""
-    source = whole(scratch.source, w.id, p)
-    total = float(0.0)
-    for k in range(w.blocks):
-        part = four(rows.jacobian, w.id, source * rows.jacobian_blocks + k)
-        left = w.nv - 4 * k
-        # mujoco_warp promises nothing of what is behind nv.
-        part = wp.vec4(
-            part[0],
-            wp.where(left > 1, part[1], 0.0),
-            wp.where(left > 2, part[2], 0.0),
-            wp.where(left > 3, part[3], 0.0),
-        )
-        put_four(scratch.rows, w.id, p * w.blocks + k, part)
-        put_four(scratch.rows, w.id, (w.room + p) * w.blocks + k, part)
-        total += wp.dot(part, four(scratch.acc, w.id, k))
-    spring = four(scratch.springs, w.id, p)
-    spring[0] = number(rows.D, w.id, source)
-    spring[2] = total - number(rows.aref, w.id, source)
-    put_four(scratch.springs, w.id, p, spring)
-    put_number(scratch.weight, w.id, p, 0.0)
-    put_whole(scratch.state, w.id, p, SATISFIED)
-
-
-@wp.func
-def place_row(scratch: Scratch, w: World, p: int, source: int, bound: float) -> None:
-    put_whole(scratch.source, w.id, p, source)
-    put_four(scratch.springs, w.id, p, wp.vec4(0.0, bound, 0.0, 0.0))
-
-
-@wp.func
-def read_rows(rows: RowsIn, scratch: Scratch, sizes: World, count: int, impratio: float) -> World:
-    """Copy `count` rows to their places, and J a - aref. A contact of which rows are lost is left out."""
-    w = sizes
-    w.scalars = 0
-    w.contacts = 0
-    w.contact_rows = 0
-    r = int(0)
-    while r < count:
-        if whole(rows.type, w.id, r) != _ELLIPTIC:
-            place_row(scratch, w, place(w, w.scalars), r, number(rows.frictionloss, w.id, r))
-            w.scalars += 1
+def find_contacts(rows: Rows, scratch: Scratch, w: World, begin: int, impratio: float) -> int:
+    """Number of elliptic contacts among the rows from `begin` on; one of which rows are lost is left out."""
+    kind = rows.type[w.id]
+    bound = scratch.bound[w.id]
+    count = int(0)
+    r = int(begin)
+    while r < w.rows:
+        if whole(kind, r) != _ELLIPTIC:
             r += 1
         else:
-            contact = whole(rows.id, w.id, r)
-            dim = rows.dim[contact]
-            if r + dim <= count:
+            contact = whole(rows.id[w.id], r)
+            end = r + rows.dim[contact]
+            if end <= w.rows:
                 friction = rows.friction[contact]
-                put_whole(scratch.first, w.id, w.contacts, w.contact_rows)
-                place_row(scratch, w, w.contact_rows, r, friction[0] * impratio)
-                for i in range(1, dim):
-                    place_row(scratch, w, w.contact_rows + i, r + i, friction[i - 1])
-                w.contacts += 1
-                w.contact_rows += dim
-            r += dim
-    put_whole(scratch.first, w.id, w.contacts, w.contact_rows)
-    for p in range(w.contact_rows):
-        read_row(rows, scratch, w, p)
-    for scalar in range(w.scalars):
-        read_row(rows, scratch, w, place(w, scalar))
-    return w
-
-
-@wp.func
-def update_rows(scratch: Scratch, w: World) -> bool:
-    """Forces, states and weights of all rows at their J a - aref; whether the Hessian may have changed."""
-    changed = bool(False)
-    for scalar in range(w.scalars):
-        p = place(w, scalar)
-        row = four(scratch.springs, w.id, p)
-        state = QUADRATIC
-        force = -row[0] * row[2]
-        if scalar >= w.equalities:
-            if scalar < w.equalities + w.frictions:
-                if force >= row[1]:
-                    state = _LINEARNEG
-                    force = row[1]
-                elif force <= -row[1]:
-                    state = _LINEARPOS
-                    force = -row[1]
-            elif row[2] >= 0.0:
-                state = SATISFIED
-                force = 0.0
-        weight = wp.where(state == QUADRATIC, row[0], 0.0)
-        changed = changed or weight != number(scratch.weight, w.id, p)
-        put_number(scratch.force, w.id, p, force)
-        put_number(scratch.weight, w.id, p, weight)
-        put_whole(scratch.state, w.id, p, state)
-    for contact in range(w.contacts):
-        turned = update_contact(scratch, w.id, w.blocks, w.room, contact)
-        changed = changed or turned
-    return changed
-
-
-@wp.func
-def add_forces(scratch: Scratch, w: World, begin: int, end: int, k: int, start: wp.vec4) -> wp.vec4:
-    """`start` and part k of Σ f J over some rows. Four at a time, so that their numbers are fetched together."""
-    total = start
-    for p in range(begin, end, 4):
-        for i in range(4):
-            row = wp.min(p + i, end - 1)
-            force = wp.where(p + i < end, number(scratch.force, w.id, row), 0.0)
-            total += force * four(scratch.rows, w.id, row * w.blocks + k)
-    return total
-
-
-@wp.func
-def update_gradient(scratch: Scratch, w: World) -> float:
-    """Jᵀ f and the gradient M a - τ - Jᵀ f; returns its square."""
-    square = float(0.0)
-    for k in range(w.blocks):
-        push = add_forces(scratch, w, 0, w.contact_rows, k, wp.vec4(0.0))
-        push = add_forces(scratch, w, w.room - w.scalars, w.room, k, push)
-        slope = four(scratch.inertial, w.id, k) - four(scratch.smooth, w.id, k) - push
-        put_four(scratch.push, w.id, k, push)
-        put_four(scratch.gradient, w.id, k, slope)
-        square += wp.dot(slope, slope)
-    return square
-
-
-@wp.func
-def add_squares(
-    scratch: Scratch, w: World, begin: int, end: int, behind: int, i: int, j: int, start: wp.mat44
-) -> wp.mat44:
-    """`start` and block (i, j) of Σ weight row rowᵀ over some rows, `behind` of which those to take are."""
-    total = start
-    for p in range(begin, end, 4):
-        for k in range(4):
-            row = wp.min(p + k, end - 1)
-            weight = wp.where(p + k < end, number(scratch.weight, w.id, row), 0.0)
-            at = (row + behind) * w.blocks
-            total += wp.outer(weight * four(scratch.rows, w.id, at + i), four(scratch.rows, w.id, at + j))
-    return total
-
-
-@wp.func
-def factor_hessian(scratch: Scratch, w: World) -> None:
-    """The Cholesky factor of the Hessian, column of blocks by column, each of which is added up when it is due."""
-    for j in range(w.blocks):
-        pivot = wp.mat44(0.0)
-        for i in range(j, w.blocks):
-            total = block(scratch.inertia, w.id, i, j, w.blocks)
-            total = add_squares(scratch, w, 0, w.contact_rows, w.room, i, j, total)
-            total = add_squares(scratch, w, w.room - w.scalars, w.room, 0, i, j, total)
-            for k in range(j):
-                total -= block(scratch.factor, w.id, i, k, w.blocks) @ wp.transpose(
-                    block(scratch.factor, w.id, j, k, w.blocks)
-                )
-            if i == j:
-                pivot = factor_block(total)
-                put_block(scratch.factor, w.id, j, j, w.blocks, pivot)
+                if w.lane == 0:
+                    put_whole(scratch.first[w.id], count, r)
+                    put_whole(scratch.end[w.id], count, end)
+                    put(scratch.leaning[w.id], count, 0.0)
+                    put(bound, r, friction[0] * impratio)
+                    for i in range(r + 1, end):
+                        put(bound, i, friction[i - r - 1])
+                count += 1
             else:
-                put_block(scratch.factor, w.id, i, j, w.blocks, below(pivot, total))
+                for i in range(r + w.lane, w.rows, lane_count()):
+                    put(rows.force[w.id], i, 0.0)
+            r = end
+    return count
+
+
+@wp.func
+def read_rows(rows: Rows, scratch: Scratch, w: World) -> None:
+    """J a - aref, and the rows as they add to the Hessian."""
+    jacobian = rows.jacobian[w.id]
+    acc = scratch.acc[w.id]
+    for r in range(w.lane, w.rows, lane_count()):
+        total = float(0.0)
+        for k in range(0, w.width, 4):
+            total += wp.dot(four(jacobian, r * rows.stride + k), four(acc, k))
+        put(scratch.jar[w.id], r, total - at(rows.aref[w.id], r))
+        put(scratch.weight[w.id], r, 0.0)
+        put_whole(rows.state[w.id], r, SATISFIED)
+    copies = scratch.rows[w.id]
+    for r in range(w.rows):
+        for i in range(w.lane, w.nv, lane_count()):
+            put(copies, r * w.width + i, at(jacobian, r * rows.stride + i))
+    lane_sync()
+
+
+@wp.func
+def update_rows(rows: Rows, scratch: Scratch, w: World) -> bool:
+    """Forces, states and weights of all rows at their J a - aref; whether the Hessian may have changed."""
+    stiffness = rows.D[w.id]
+    force = rows.force[w.id]
+    state = rows.state[w.id]
+    changed = float(0.0)
+    for r in range(w.lane, w.rows, lane_count()):
+        if whole(rows.type[w.id], r) != _ELLIPTIC:
+            jar = at(scratch.jar[w.id], r)
+            d = at(stiffness, r)
+            now = QUADRATIC
+            push = -d * jar
+            if r >= w.equalities:
+                if r < w.equalities + w.frictions:
+                    loss = at(rows.frictionloss[w.id], r)
+                    if push >= loss:
+                        now = _LINEARNEG
+                        push = loss
+                    elif push <= -loss:
+                        now = _LINEARPOS
+                        push = -loss
+                elif jar >= 0.0:
+                    now = SATISFIED
+                    push = 0.0
+            weight = wp.where(now == QUADRATIC, d, 0.0)
+            if weight != at(scratch.weight[w.id], r):
+                changed = 1.0
+            put(force, r, push)
+            put(scratch.weight[w.id], r, weight)
+            put_whole(state, r, now)
+    for contact in range(w.lane, w.contacts, lane_count()):
+        if update_contact(scratch, w.id, contact, stiffness, force, state):
+            changed = 1.0
+    lane_sync()
+    for contact in range(w.contacts):
+        if at(scratch.leaning[w.id], contact) != 0.0:
+            lean_rows(scratch, w.id, contact, rows.jacobian[w.id], rows.stride, w.nv, w.width, w.lane)
+    lane_sync()
+    return lane_sum(changed) > 0.0
+
+
+@wp.func
+def update_gradient(rows: Rows, scratch: Scratch, smooth: wp.array[float], w: World) -> float:
+    """Jᵀ f and the gradient M a - τ - Jᵀ f; returns its square.
+
+    Rows are taken four at a time, so that their numbers are fetched together.
+    """
+    force = rows.force[w.id]
+    jacobian = rows.jacobian[w.id]
+    square = float(0.0)
+    for i in range(w.lane, w.nv, lane_count()):
+        push = float(0.0)
+        for start in range(0, w.rows, 4):
+            for offset in range(4):
+                r = wp.min(start + offset, w.rows - 1)
+                part = at(force, r) * at(jacobian, r * rows.stride + i)
+                push += wp.where(start + offset < w.rows, part, 0.0)
+        slope = at(scratch.inertial[w.id], i) - at(smooth, i) - push
+        put(scratch.push[w.id], i, push)
+        put(scratch.gradient[w.id], i, slope)
+        square += slope * slope
+    lane_sync()
+    return lane_sum(square)
+
+
+@wp.func
+def factor_hessian(scratch: Scratch, w: World, tri_row: wp.array[int], tri_col: wp.array[int]) -> None:
+    """Factors of the Hessian, M plus the weighted squares of the rows, of which each lane adds up some entries."""
+    rows = scratch.rows[w.id]
+    weight = scratch.weight[w.id]
+    factor = scratch.factor[w.id]
+    for e in range(w.lane, tri_row.shape[0], lane_count()):
+        row = whole(tri_row, e)
+        col = whole(tri_col, e)
+        i = wp.max(row, col)
+        j = wp.min(row, col)
+        total = at(scratch.inertia[w.id], j * w.width + i)
+        for start in range(0, w.rows, 4):
+            for offset in range(4):
+                r = wp.min(start + offset, w.rows - 1)
+                part = at(weight, r) * at(rows, r * w.width + i) * at(rows, r * w.width + j)
+                total += wp.where(start + offset < w.rows, part, 0.0)
+        put(factor, j * w.width + i, total)
+    lane_sync()
+    factorize(factor, scratch.pivot[w.id], w.nv, w.width, w.lane)

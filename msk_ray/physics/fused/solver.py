@@ -9,15 +9,15 @@ import warp as wp
 
 from msk_ray.errors import UnsupportedModelError
 from msk_ray.physics.arrays import gather
-from msk_ray.physics.fused.newton import Limits, Solution, solve_world
-from msk_ray.physics.fused.problem import RowsIn
+from msk_ray.physics.fused.lanes import WARP
+from msk_ray.physics.fused.newton import Inertia, Limits, Solution, solve_world
+from msk_ray.physics.fused.problem import Rows
 from msk_ray.physics.fused.scratch import make_scratch
 
 MOST_DOFS = 60
-"""Degrees of freedom up to which MuJoCo itself takes a dense Jacobian. The work of a thread grows with their cube."""
-WARPS = 8
-"""Warps on each multiprocessor of a GPU among which worlds are spread: two for each of its schedulers, of which one can
-work while the other waits for memory. The worlds of a warp wait for each other, so that few are better than 32."""
+"""Degrees of freedom up to which MuJoCo itself takes a dense Jacobian."""
+_BLOCK = 64
+"""Threads of a block: two worlds."""
 
 
 def check_fused(mjm: mujoco.MjModel) -> None:
@@ -43,19 +43,11 @@ def check_fused(mjm: mujoco.MjModel) -> None:
         )
 
 
-def lanes_of(worlds: int, device: wp.Device) -> int:
-    """Worlds of a warp: 32 or a smaller power of 2."""
-    if not device.is_cuda:
-        return 32
-    share = -(-worlds // (WARPS * device.sm_count))
-    return min(32, 1 << (share - 1).bit_length())
-
-
 class FusedSolver:
-    """Newton's method of each world in one thread, from its first iteration to its last: one launch a step.
+    """Newton's method of each world in one warp, from its first iteration to its last: one launch a step.
 
     The mathematics, the criteria to stop and the results in Data are those of `mujoco_warp.solve` for a dense Jacobian.
-    A world stops when it has converged, and waits for no other than those of its warp.
+    A world stops when it has converged, and waits for no other.
     """
 
     def __init__(self) -> None:
@@ -69,31 +61,27 @@ class FusedSolver:
         size = (data.nworld, data.njmax, model.nv)
         if size not in self._scratch:
             self._scratch[size] = make_scratch(*size)
-        lanes = lanes_of(data.nworld, data.qpos.device)
         opt = model.opt
-        limits = gather(Limits, opt)
-        rows = _rows(data)
         wp.launch(
             solve_world,
-            dim=-(-data.nworld // lanes) * 32,
+            dim=data.nworld * (WARP if data.qpos.device.is_cuda else 1),
             inputs=[
-                *(model.nv, model.M_rownnz, model.M_rowadr, model.M_colind, opt.impratio_invsqrt, limits),
+                *(model.nv, opt.impratio_invsqrt, gather(Limits, opt)),
                 not opt.disableflags & mujoco.mjtDisableBit.mjDSBL_WARMSTART,
-                lanes,
-                *(data.ne, data.nf, data.nefc, data.njmax, data.M),
+                gather(Inertia, model, data),
+                *(data.ne, data.nf, data.nl, data.nefc, data.njmax),
                 *(data.qfrc_smooth, data.qacc_smooth, data.qacc_warmstart),
-                rows,
             ],
-            outputs=[self._scratch[size], gather(Solution, data, data.efc)],
-            block_dim=32,
+            outputs=[_rows(data), self._scratch[size], gather(Solution, data, data.efc)],
+            block_dim=_BLOCK,
         )
 
 
 def _rows(data: Any) -> Any:
-    """The rows of `data`, and its Jacobian in blocks: it has room for whole ones in every row."""
+    """The rows of `data`, with its Jacobian as one row of numbers for each world."""
     jacobian = data.efc.J
     worlds, count, width = jacobian.shape
     assert jacobian.is_contiguous, "the rows of the Jacobian are not side by side"
-    assert width % 4 == 0, "the rows of the Jacobian are no whole blocks"
-    view = wp.array(ptr=jacobian.ptr, dtype=wp.vec4, shape=(worlds, count * width // 4), device=jacobian.device)
-    return gather(RowsIn, SimpleNamespace(jacobian=view, jacobian_blocks=width // 4), data.efc, data.contact)
+    assert width % 4 == 0, "the rows of the Jacobian are no whole fours"
+    view = SimpleNamespace(jacobian=jacobian.reshape((worlds, count * width)), stride=width)
+    return gather(Rows, view, data.efc, data.contact)

@@ -1,0 +1,69 @@
+"""Dense linear algebra of the lanes of a world. Matrices are column by column, `width` numbers a column."""
+
+import math
+
+import warp as wp
+
+from msk_ray.physics.fused.lanes import at, lane_count, lane_sync, put
+
+wp.set_module_options({"enable_backward": False})
+
+_NAN = wp.constant(math.nan)
+
+
+@wp.func
+def multiply(
+    matrix: wp.array[float], vector: wp.array[float], size: int, width: int, lane: int, product: wp.array[float]
+) -> None:
+    """product = matrix vector. Four columns at a time, so that their numbers are fetched together."""
+    for i in range(lane, size, lane_count()):
+        total = float(0.0)
+        for j in range(0, size, 4):
+            for k in range(4):
+                # Behind `size` are zeros.
+                total += at(matrix, (j + k) * width + i) * at(vector, j + k)
+        put(product, i, total)
+    lane_sync()
+
+
+@wp.func
+def factorize(matrix: wp.array[float], pivot: wp.array[float], size: int, width: int, lane: int) -> None:
+    """L D of a lower triangle L D Lᵀ in its place, and 1 / D; NaN where D is not positive."""
+    for j in range(size):
+        for i in range(j + lane, size, lane_count()):
+            value = at(matrix, j * width + i)
+            for start in range(0, j, 4):
+                for offset in range(4):
+                    k = wp.min(start + offset, j - 1)
+                    part = at(matrix, k * width + i) * at(matrix, k * width + j) * at(pivot, k)
+                    value -= wp.where(start + offset < j, part, 0.0)
+            put(matrix, j * width + i, value)
+            if i == j:
+                put(pivot, j, wp.where(value > 0.0, 1.0 / value, _NAN))
+        lane_sync()
+
+
+@wp.func
+def solve_factored(
+    factor: wp.array[float],
+    pivot: wp.array[float],
+    size: int,
+    width: int,
+    lane: int,
+    partial: wp.array[float],
+    solution: wp.array[float],
+) -> None:
+    """solution = (L D Lᵀ)⁻¹ partial, which it overwrites."""
+    for k in range(size):
+        value = at(partial, k) * at(pivot, k)
+        for i in range(k + 1 + lane, size, lane_count()):
+            put(partial, i, at(partial, i) - at(factor, k * width + i) * value)
+        lane_sync()
+    for back in range(size):
+        i = size - 1 - back
+        value = at(partial, i) * at(pivot, i)
+        if lane == 0:
+            put(solution, i, value)
+        for k in range(lane, i, lane_count()):
+            put(partial, k, at(partial, k) - at(factor, k * width + i) * value)
+        lane_sync()
