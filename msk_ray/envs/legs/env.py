@@ -395,10 +395,8 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
         return costs.dragging(right, heights[:, :2], wanted) + costs.dragging(left, heights[:, 2:], wanted)
 
     def _lifted_toes(self, state: StepState) -> Tensor:
-        slope, bend = self._feet.toes(self.frames(state))
-        sides = zip(self._leg_phases(), slope.unbind(-1), bend.unbind(-1), strict=True)
-        right, left = (costs.lifted_toes(*side) for side in sides)
-        return right + left
+        (right, left), (slope, bend) = self._leg_phases(), self._feet.toes(self.frames(state))
+        return costs.lifted_toes(right, slope[:, 0], bend[:, 0]) + costs.lifted_toes(left, slope[:, 1], bend[:, 1])
 
     def _tracking(self, state: StepState) -> tuple[Tensor, Tensor]:
         """Costs (W,) of the distance from people's joint angles and of that from their rates."""
