@@ -11,18 +11,38 @@ wp.set_module_options({"enable_backward": False})
 _NAN = wp.constant(math.nan)
 
 
+# Unrolled, so that the numbers of several terms are fetched together.
+@wp.func_native("""
+    float total = 0.0f;
+#if defined(__CUDA_ARCH__)
+    #pragma unroll 4
+#endif
+    for (int k = 0; k < count; ++k)
+        total += weight.data[k] * matrix.data[k * width + i];
+    return total;
+""")
+def column_sum(weight: wp.array[float], matrix: wp.array[float], i: int, width: int, count: int) -> float: ...
+
+
+@wp.func_native("""
+    float total = 0.0f;
+#if defined(__CUDA_ARCH__)
+    #pragma unroll 4
+#endif
+    for (int k = 0; k < count; ++k)
+        total += weight.data[k] * matrix.data[k * width + i] * matrix.data[k * width + j];
+    return total;
+""")
+def pair_sum(weight: wp.array[float], matrix: wp.array[float], i: int, j: int, width: int, count: int) -> float: ...
+
+
 @wp.func
 def multiply(
     matrix: wp.array[float], vector: wp.array[float], size: int, width: int, lane: int, product: wp.array[float]
 ) -> None:
-    """product = matrix vector. Four columns at a time, so that their numbers are fetched together."""
+    """product = matrix vector."""
     for i in range(lane, size, lane_count()):
-        total = float(0.0)
-        for j in range(0, size, 4):
-            for k in range(4):
-                # Behind `size` are zeros.
-                total += at(matrix, (j + k) * width + i) * at(vector, j + k)
-        put(product, i, total)
+        put(product, i, column_sum(vector, matrix, i, width, size))
     lane_sync()
 
 
@@ -31,12 +51,7 @@ def factorize(matrix: wp.array[float], pivot: wp.array[float], size: int, width:
     """L D of a lower triangle L D Lᵀ in its place, and 1 / D; NaN where D is not positive."""
     for j in range(size):
         for i in range(j + lane, size, lane_count()):
-            value = at(matrix, j * width + i)
-            for start in range(0, j, 4):
-                for offset in range(4):
-                    k = wp.min(start + offset, j - 1)
-                    part = at(matrix, k * width + i) * at(matrix, k * width + j) * at(pivot, k)
-                    value -= wp.where(start + offset < j, part, 0.0)
+            value = at(matrix, j * width + i) - pair_sum(pivot, matrix, i, j, width, j)
             put(matrix, j * width + i, value)
             if i == j:
                 put(pivot, j, wp.where(value > 0.0, 1.0 / value, _NAN))

@@ -7,7 +7,7 @@ import warp as wp
 
 from msk_ray.physics import mjw_private as private
 from msk_ray.physics.fused.cones import QUADRATIC, SATISFIED, lean_rows, update_contact
-from msk_ray.physics.fused.dense import factorize
+from msk_ray.physics.fused.dense import column_sum, factorize, pair_sum
 from msk_ray.physics.fused.lanes import at, four, lane_count, lane_sum, lane_sync, put, put_whole, whole
 from msk_ray.physics.fused.scratch import Scratch
 from msk_ray.physics.mjw_private import ConstraintType, vec5
@@ -149,20 +149,12 @@ def update_rows(rows: Rows, scratch: Scratch, w: World) -> bool:
 
 @wp.func
 def update_gradient(rows: Rows, scratch: Scratch, smooth: wp.array[float], w: World) -> float:
-    """Jᵀ f and the gradient M a - τ - Jᵀ f; returns its square.
-
-    Rows are taken four at a time, so that their numbers are fetched together.
-    """
+    """Jᵀ f and the gradient M a - τ - Jᵀ f; returns its square."""
     force = rows.force[w.id]
     jacobian = rows.jacobian[w.id]
     square = float(0.0)
     for i in range(w.lane, w.nv, lane_count()):
-        push = float(0.0)
-        for start in range(0, w.rows, 4):
-            for offset in range(4):
-                r = wp.min(start + offset, w.rows - 1)
-                part = at(force, r) * at(jacobian, r * rows.stride + i)
-                push += wp.where(start + offset < w.rows, part, 0.0)
+        push = column_sum(force, jacobian, i, rows.stride, w.rows)
         slope = at(scratch.inertial[w.id], i) - at(smooth, i) - push
         put(scratch.push[w.id], i, push)
         put(scratch.gradient[w.id], i, slope)
@@ -182,12 +174,7 @@ def factor_hessian(scratch: Scratch, w: World, tri_row: wp.array[int], tri_col: 
         col = whole(tri_col, e)
         i = wp.max(row, col)
         j = wp.min(row, col)
-        total = at(scratch.inertia[w.id], j * w.width + i)
-        for start in range(0, w.rows, 4):
-            for offset in range(4):
-                r = wp.min(start + offset, w.rows - 1)
-                part = at(weight, r) * at(rows, r * w.width + i) * at(rows, r * w.width + j)
-                total += wp.where(start + offset < w.rows, part, 0.0)
+        total = at(scratch.inertia[w.id], j * w.width + i) + pair_sum(weight, rows, i, j, w.width, w.rows)
         put(factor, j * w.width + i, total)
     lane_sync()
     factorize(factor, scratch.pivot[w.id], w.nv, w.width, w.lane)
