@@ -153,7 +153,10 @@ class RecordedRunner(EagerRunner):
         self._group = env.group
         self._kept = _Recordings(env.sim.engine)
         self._fits: dict[tuple[torch.Size, ...], _Fit | None] = {}
-        self._recording = torch.cuda.Stream(env.device)
+        # The GPU starts blocks of the actor's kernels first, and fills what is left of it with the critic's: only a
+        # stream of higher priority than the usual one can be preferred.
+        self._recording = torch.cuda.Stream(env.device, priority=-1)
+        self._first = torch.cuda.Stream(env.device, priority=-1)
         self._side = torch.cuda.Stream(env.device)
         self._fitted = torch.cuda.Event()
         self._ready = torch.cuda.Event()
@@ -186,6 +189,14 @@ class RecordedRunner(EagerRunner):
             outcome = self._run_actor(inputs)
             self._start_fit(self._offer(outcome.obs, outcome.targets))
             return outcome
+        caller = torch.cuda.current_stream(self._device)
+        self._first.wait_stream(caller)
+        with torch.cuda.stream(self._first):
+            outcome = self._replay(epoch, inputs)
+        caller.wait_stream(self._first)
+        return outcome
+
+    def _replay(self, epoch: _Epoch, inputs: EpochInputs) -> ActorOutcome:
         self._clock = Clock(self._device)
         fill(epoch.inputs.tensors(), inputs.tensors())
         epoch.roll.replay()
