@@ -11,11 +11,14 @@ from pathlib import Path
 from fault_campaign.damaged_records import damaged_records
 from fault_campaign.reference import Reference
 from fault_campaign.replacements import replacements
-from fault_campaign.space import EPOCHS
+from fault_campaign.space import BODIES, EPOCHS
 from fault_campaign.storage import gone, read_only
 from fault_campaign.sweep import Sweep
 from fault_campaign.tally import RESUMABLE, Tally, judge, strike
+from msk_ray.config import dump_yaml
 from msk_ray.experiment.outcomes import read_ending
+from msk_ray.sweep.space import load_space
+from msk_ray.sweep.trials import resolve_trials
 
 DISK_MIB = 48
 
@@ -146,6 +149,17 @@ def full_disk(reference: Reference, scratch: Path, rng: random.Random) -> list[T
         subprocess.run(["umount", str(disk)], check=True)
 
 
+def bodies(reference: Reference, scratch: Path, rng: random.Random) -> list[Tally]:
+    """The driver of a sweep over two bodies and two algorithms dies twice."""
+    folder = scratch / "bodies"
+    folder.mkdir()
+    (folder / "space.yaml").write_text(dump_yaml(BODIES))
+    alone = Reference(resolve_trials(load_space(folder / "space.yaml")), folder / "reference")
+    sweep = Sweep("bodies", folder, alone.trials)
+    injected, _ = strike(sweep, rng, 2, lambda: sweep.kill(signal.SIGKILL))
+    return [judge(alone, sweep, "driver SIGKILL, two bodies by two algorithms", injected, "--resume")]
+
+
 CAMPAIGNS: dict[str, Callable[[Reference, Path, random.Random], list[Tally]]] = {
     "replacements": replacements,
     "records": damaged_records,
@@ -158,4 +172,5 @@ CAMPAIGNS: dict[str, Callable[[Reference, Path, random.Random], list[Tally]]] = 
     "checkpoints": damaged,
     "sigterm": lambda *a: killed(*a, "driver SIGTERM", 3, signal.SIGTERM),
     "driver": lambda *a: killed(*a, "driver SIGKILL", 3, signal.SIGKILL),
+    "bodies": bodies,
 }

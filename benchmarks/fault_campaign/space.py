@@ -1,4 +1,4 @@
-"""What is shot at: four small CartPole trials."""
+"""What is shot at: four small CartPole trials, or one each of two bodies and two algorithms."""
 
 EPOCHS = 40
 HANG_S = 20.0
@@ -19,4 +19,12 @@ SPACE = {
     "resources": {"max_failures": 20, "hang_s": HANG_S},
 }
 """Four trials of forty epochs, checkpointed every second one."""
+BODIES = SPACE | {
+    "parameters": {
+        "env": {"grid": [{"label": name, "value": {"name": name, "nworld": 8}} for name in ("cartpole", "hopper")]},
+        "algorithm.name": {"grid": ["shac", "ppo"]},
+    },
+    "seeds": "0",
+}
+"""Four trials of the same length: two bodies by two algorithms."""
 TIMING = ("seconds", "env_steps_per_s", "time/")
