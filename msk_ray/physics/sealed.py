@@ -41,26 +41,26 @@ def seal(holder: Any, path: str) -> None:
 class ModelWatch:
     """Tells whether an MjModel is still what it was.
 
-    The model's small arrays lie in a few stretches of one buffer, which are compared byte by byte with a copy.
+    The model's small arrays lie in a few stretches of one buffer, and those of its options in one struct; both are
+    compared byte by byte with a copy. Between the two, however close, lies memory of others.
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self._model = model
-        arrays = {name: value for name in dir(model) if isinstance(value := getattr(model, name), np.ndarray)}
-        arrays |= {
-            f"opt.{name}": value for name in dir(model.opt) if isinstance(value := getattr(model.opt, name), np.ndarray)
-        }
+        own = _arrays_of(model)
+        options = {f"opt.{name}": value for name, value in _arrays_of(model.opt).items()}
         self._options = [n for n in dir(model.opt) if isinstance(getattr(model.opt, n), (int, float))]
         self._read_options = operator.attrgetter(*self._options)
         self._scalars = self._read_options(model.opt)
         self._arrays = {
             name: (value, value.copy())
-            for name, value in arrays.items()
+            for name, value in (own | options).items()
             if value.nbytes and (value.nbytes <= _SMALL or name in _LARGE)
         }
         self._stretches = [
             (first, ctypes.string_at(first, size), size)
-            for first, size in _stretches([a for a, _ in self._arrays.values() if a.nbytes <= _SMALL])
+            for arrays in (own, options)
+            for first, size in _stretches([a for a in arrays.values() if 0 < a.nbytes <= _SMALL])
         ]
 
     def check(self, thorough: bool = False) -> None:
@@ -90,8 +90,14 @@ class ModelWatch:
         return found + [name for name, (a, then) in self._arrays.items() if a.tobytes() != then.tobytes()]
 
 
+def _arrays_of(holder: Any) -> dict[str, np.ndarray]:
+    """The arrays that are memory of `holder`; others are made when they are asked for."""
+    arrays = {name: value for name in dir(holder) if isinstance(value := getattr(holder, name), np.ndarray)}
+    return {name: value for name, value in arrays.items() if not value.flags.owndata}
+
+
 def _stretches(arrays: list[np.ndarray]) -> list[tuple[int, int]]:
-    """(address, bytes) of memory that arrays fill, apart from gaps for alignment."""
+    """(address, bytes) of memory that arrays of one allocation fill, apart from gaps for alignment."""
     merged: list[tuple[int, int]] = []
     for first, end in sorted((a.ctypes.data, a.ctypes.data + a.nbytes) for a in arrays):
         if merged and first - merged[-1][1] < 64:

@@ -1,6 +1,7 @@
 """Changes of a model under a simulation's feet, which forward and backward would follow differently, are refused."""
 
 import copy
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -11,6 +12,7 @@ from scenes import ant
 
 from msk_ray.errors import ConfigError
 from msk_ray.physics import TapedStep, WarpState, WorldBatch
+from msk_ray.physics.sealed import ModelWatch
 from msk_ray.simulation import Simulation, TapePerSubstep
 
 
@@ -52,6 +54,24 @@ def test_an_edit_taken_back_and_an_edited_copy_are_none():
     model.geom_friction[:] = kept
     loss.backward()
     sim.diagnostics()
+
+
+def test_memory_of_others_between_the_arrays_may_change():
+    """The heap may put the model's options right behind its buffer, with something small of somebody else between."""
+    heap = bytearray(128)
+    option = SimpleNamespace(gravity=np.frombuffer(heap, np.uint8, 8, 40), timestep=0.01, iterations=3)
+    model = SimpleNamespace(qpos0=np.frombuffer(heap, np.uint8, 8, 0), opt=option)
+    watch = ModelWatch(model)
+    heap[20] = 7
+    watch.check()
+    heap[44] = 7
+    with pytest.raises(ConfigError, match=r"\(opt\.gravity\)"):
+        watch.check()
+
+
+def test_only_memory_of_the_model_is_compared():
+    """MuJoCo makes some arrays when they are asked for, wherever there is room."""
+    assert not [name for name, (value, _) in ModelWatch(ant())._arrays.items() if value.flags.owndata]
 
 
 def test_large_arrays_are_compared_in_diagnostics():
