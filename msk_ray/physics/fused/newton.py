@@ -154,6 +154,7 @@ def iterate(
         out.solver_niter[w.id] = count
 
 
+# 80 registers a thread. With 64, (64, 16), an env step of 4096 ants took 6 % less time on an H200, of 64 ants 4 % more.
 @wp.kernel(launch_bounds=(64, 12))
 def solve_world(
     # Model:
