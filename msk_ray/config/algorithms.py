@@ -165,9 +165,10 @@ class ShacConfig(AlgorithmSettings):
     critic_products: Literal["float32", "tf32"] = "float32"
     """Format of the factors in matrix products of the critic's fit; `tf32` has 10 bits of mantissa, for which recent
     GPUs have faster units. Sums, and everything else, are in float32."""
-    critic_kernels: Literal["torch", "fused"] = "torch"
+    critic_kernels: Literal["torch", "fused", "auto"] = "torch"
     """`fused`: activation and norm of a layer are one kernel forward and two back in the critic's fit, where torch has
-    four and nine; the results differ by rounding. For elu with layer_norm, on a GPU: on a CPU it is slower."""
+    four and nine; the results differ by rounding. For elu with layer_norm, on a GPU: on a CPU it is slower. `auto`:
+    fused where it is meant for, else torch."""
     target_critic_alpha: Fraction = 0.2
     """target ← α·target + (1 − α)·critic after each epoch."""
     actor_lr: PositiveFloat = 2e-3

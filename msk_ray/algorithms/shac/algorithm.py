@@ -60,7 +60,7 @@ class Shac(Algorithm):
             c.critic_grad_norm,
             weight_decay=c.weight_decay,
             tolerance=c.critic_tolerance,
-            arithmetic=Arithmetic(tf32=c.critic_products == "tf32", fused=c.critic_kernels == "fused"),
+            arithmetic=_arithmetic(config, device),
             group=env.group,
         )
         self.noise_generator = torch.Generator(device=device).manual_seed(config.trial.seed_of("noise") + 1)
@@ -278,6 +278,14 @@ class Shac(Algorithm):
         """Let the target critic follow the critic."""
         for target, source in zip(self.target_critic.parameters(), self.critic.parameters(), strict=True):
             target.lerp_(source, 1.0 - self.settings.target_critic_alpha)
+
+
+def _arithmetic(config: Config, device: torch.device) -> Arithmetic:
+    c = config.algorithm_settings
+    assert isinstance(c, ShacConfig)
+    fits = device.type == "cuda" and config.critic.activation == "elu" and config.critic.layer_norm
+    fused = c.critic_kernels == "fused" or (c.critic_kernels == "auto" and fits)
+    return Arithmetic(tf32=c.critic_products == "tf32", fused=fused)
 
 
 def _network(config: Config, obs_size: int, action_size: int, generator: torch.Generator) -> PolicyNetwork:

@@ -3,7 +3,9 @@
 import pytest
 import torch
 
+from msk_ray.algorithms.shac.algorithm import _arithmetic
 from msk_ray.algorithms.shac.critic_fit import Arithmetic, CriticFit
+from msk_ray.config import parse_config
 from msk_ray.config.schema import CriticConfig
 from msk_ray.errors import ConfigError
 from msk_ray.networks import Critic
@@ -127,3 +129,12 @@ def test_fused_layers_fit_alike() -> None:
         fitted.append((critic(obs), loss))
     torch.testing.assert_close(*fitted, rtol=1e-3, atol=1e-4)
     assert not torch.equal(fitted[0][0], fitted[1][0])
+
+
+@pytest.mark.parametrize(
+    ("device", "critic", "fused"),
+    [("cuda", {}, True), ("cpu", {}, False), ("cuda", {"activation": "silu"}, False)],
+)
+def test_auto_fuses_layers_where_that_is_faster_and_possible(device: str, critic: dict[str, str], fused: bool) -> None:
+    config = parse_config({"env": {"name": "cartpole"}, "shac": {"critic_kernels": "auto"}, "critic": critic})
+    assert _arithmetic(config, torch.device(device)) == Arithmetic(tf32=False, fused=fused)
