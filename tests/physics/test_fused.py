@@ -7,15 +7,17 @@ import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import pytest
+import torch
 import warp as wp
 from mujoco_warp import OverflowType
 from scenes import ant as dropped_ant
 
 from msk_ray.config import load_config
 from msk_ray.envs.make import env_class
-from msk_ray.errors import ConfigError, UnsupportedModelError
+from msk_ray.errors import ConfigError, SimulationError, UnsupportedModelError
 from msk_ray.gradcheck import check_gradients
 from msk_ray.physics import Kernels, WorldBatch
+from msk_ray.physics.capacity import Capacity
 from msk_ray.physics.fused import FusedSolver, check_fused, scratch
 from msk_ray.physics.stages import dense
 from msk_ray.simulation import Simulation
@@ -190,11 +192,41 @@ def test_steps_are_those_of_the_package_whatever_the_worlds_beside_them(cone: st
     np.testing.assert_allclose(own_qvel, qvel, atol=2e-3)
 
 
-def test_gradients_of_its_steps_are_those_of_float64() -> None:
-    sim = Simulation(dropped_ant("elliptic"), 2, 4, tolerance=1e-9, kernels=FUSED)
+@pytest.mark.parametrize("mode", ["tape_per_substep", "tape_all"])
+def test_gradients_of_its_steps_are_those_of_float64(mode: str) -> None:
+    sim = Simulation(dropped_ant("elliptic"), 2, 4, mode, tolerance=1e-9, kernels=FUSED)
     report = check_gradients(sim, states=("standing", "contact"))
     assert report.checked >= 4
     assert report.max_rel_error < 1e-3
+
+
+def test_worlds_may_differ_in_parameters_of_the_model() -> None:
+    model = dropped_ant("elliptic")
+    qpos = torch.tensor(np.tile(model.qpos0, (2, 1)), dtype=torch.float32)
+    qpos[:, 2] = 0.2
+    masses = torch.tensor(np.outer([1.0, 3.0], model.body_mass), dtype=torch.float32)
+    ends = []
+    for kernels in (Kernels(), FUSED):
+        sim = Simulation(model, 2, 4, None, kernels=kernels)
+        given = (torch.zeros(2, model.nu), qpos, torch.ones(2, model.nv), torch.zeros(2, model.na))
+        ends.append(sim.step(*given, parameters={"body_mass": masses}).qvel)
+        assert int(sim.batch.data.nefc.numpy().min()) >= 3
+    assert float((ends[0][0] - ends[0][1]).abs().max()) > 0.1
+    torch.testing.assert_close(ends[1], ends[0], rtol=1e-4, atol=1e-3)
+
+
+@pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
+def test_rows_that_were_lost_are_reported_and_leave_numbers_behind(cone: str) -> None:
+    """Room ends within a contact."""
+    sim = Simulation(dropped_ant(cone), 1, 1, None, capacity=Capacity(9, 5), kernels=FUSED)
+    qpos = sim.initial_state().qpos
+    qpos[:, 2] = 0.02
+    with pytest.raises(SimulationError, match=r"physics\.njmax"):
+        sim.step(torch.zeros(1, 8), qpos, torch.zeros(1, 14), torch.zeros(1, 0))
+    data = sim.batch.data
+    assert int(data.nefc.numpy()[0]) > 5
+    assert np.isfinite(data.qacc.numpy()).all()
+    assert np.isfinite(data.efc.force.numpy()[0, :5]).all()
 
 
 @pytest.mark.parametrize(
