@@ -109,7 +109,9 @@ class Env(ABC, Generic[SettingsT]):
         variants = cls.Settings.variants
         if not variants:
             return physics
-        return PhysicsConfig(variant=variant or variants[0], nconmax=physics.nconmax, njmax=physics.njmax)
+        # Buffers and kernels change no physics.
+        kept = {name: getattr(physics, name) for name in ("nconmax", "njmax", "solver_kernels")}
+        return PhysicsConfig(variant=variant or variants[0], **kept)
 
     def prepare(self) -> None:
         """Create constants on the device: copying one there in every step would make the host wait for the GPU."""
