@@ -1,6 +1,7 @@
 """The solver of one kernel finds what C MuJoCo finds in float64."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -18,7 +19,7 @@ from msk_ray.errors import ConfigError, SimulationError, UnsupportedModelError
 from msk_ray.gradcheck import check_gradients
 from msk_ray.physics import Kernels, WorldBatch
 from msk_ray.physics.capacity import Capacity
-from msk_ray.physics.fused import FusedSolver, check_fused, scratch
+from msk_ray.physics.fused import FusedSolver, check_fused, newton, scratch
 from msk_ray.physics.stages import dense
 from msk_ray.simulation import Simulation
 
@@ -254,3 +255,12 @@ def test_models_of_many_degrees_of_freedom_are_refused() -> None:
 def test_more_worlds_than_can_be_counted_are_refused_before_memory_is_taken() -> None:
     with pytest.raises(ConfigError, match=r"room for 67108863 worlds.*solver_kernels: mujoco_warp"):
         scratch.make_scratch(2**26, 100, 14)
+
+
+def test_the_kernel_compiles_for_a_gpu(tmp_path: Path) -> None:
+    """Warp brings the compiler along; a mistake in the parts that only a GPU has would be seen nowhere else here."""
+    wp.compile_aot_module(newton.solve_world.module, arch=90, module_dir=str(tmp_path), use_ptx=True)
+    (found,) = tmp_path.glob("*.ptx")
+    text = found.read_text()
+    assert ".entry solve_world" in text
+    assert "shfl.sync" in text
