@@ -51,13 +51,16 @@ def starting_ray() -> Iterator[None]:
 
 def end_ray() -> None:
     """`ray.shutdown`, and an end to the daemons that `starting_ray` has let start: they do not hear that they are asked
-    to go, for which Ray gives each of them a second."""
+    to go, for which Ray gives each of them a second. Their agents would try for a minute to tell a daemon that has gone
+    about the other's end."""
     done = threading.Event()
 
     def end_daemons() -> None:
         while not done.wait(_POLL_S):
             if not ray.is_initialized():  # while it is, this process needs them
-                for pid in _deaf_children():
+                daemons = _deaf_children(os.getpid())
+                agents = [pid for daemon in daemons for pid in _deaf_children(daemon) if _is_agent(pid)]
+                for pid in (*daemons, *agents):
                     with suppress(ProcessLookupError):  # Ray was faster
                         os.kill(pid, signal.SIGKILL)
 
@@ -70,8 +73,9 @@ def end_ray() -> None:
         thread.join()
 
 
-def _deaf_children() -> Iterator[int]:
-    """Child processes of this process that have SIGTERM blocked."""
+def _deaf_children(parent: int) -> list[int]:
+    """Child processes of a process that have SIGTERM blocked."""
+    found = []
     for entry in Path("/proc").iterdir():
         if not entry.name.isdigit():
             continue
@@ -80,8 +84,16 @@ def _deaf_children() -> Iterator[int]:
         except OSError:
             continue  # it has ended meanwhile
         facts = dict(line.split(":", 1) for line in lines if ":" in line)
-        if int(facts["PPid"]) == os.getpid() and int(facts["SigBlk"], 16) >> (signal.SIGTERM - 1) & 1:
-            yield int(entry.name)
+        if int(facts["PPid"]) == parent and int(facts["SigBlk"], 16) >> (signal.SIGTERM - 1) & 1:
+            found.append(int(entry.name))
+    return found
+
+
+def _is_agent(pid: int) -> bool:
+    """Whether a child of a raylet is one of the agents that it keeps, rather than a worker, which ends by itself."""
+    with suppress(OSError):
+        return b"Agent" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    return False  # it has ended meanwhile
 
 
 def run_in_thread(work: Callable[[], object], stop: StopRequest) -> None:
