@@ -7,7 +7,6 @@ and replayed from that state; the solver is replayed on what the stages before i
 """
 
 import argparse
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,6 +15,7 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 from record import RESULTS, markdown_table, publish
+from replay import milliseconds
 
 from msk_ray.config import load_config
 from msk_ray.envs.make import env_class
@@ -58,19 +58,6 @@ def fallen(mjm: mujoco.MjModel, worlds: int, substeps: int, device: str, steps: 
     return {name: np.resize(getattr(data, name).numpy(), (worlds, *getattr(data, name).shape[1:])) for name in STATE}
 
 
-def microseconds(graph: Graph, device: wp.Device, repeats: int) -> float:
-    """Median of five timings of `repeats` replays, per replay."""
-    timings = []
-    for _ in range(6):
-        wp.synchronize_device(device)
-        begin = time.perf_counter()
-        for _ in range(repeats):
-            graph.replay()
-        wp.synchronize_device(device)
-        timings.append((time.perf_counter() - begin) * 1e6 / repeats)
-    return sorted(timings[1:])[2]
-
-
 def measure(
     batch: WorldBatch, start: dict[str, np.ndarray], solve: Callable[..., None], repeats: int
 ) -> tuple[list[str], np.ndarray]:
@@ -88,8 +75,8 @@ def measure(
             batch.launch_step()
 
         whole = Graph(step, device)
-        copies = microseconds(Graph(restore, device), device, repeats)
-        taken = microseconds(whole, device, repeats) - copies
+        copies = milliseconds(Graph(restore, device), device, repeats)
+        taken = milliseconds(whole, device, repeats) - copies
         iterations = data.solver_niter.numpy().copy()
         rows = float(np.mean(data.nefc.numpy()))
         end = data.qvel.numpy().copy()
@@ -97,9 +84,9 @@ def measure(
         restore()
         batch.begin_step()
         mjw.forward(batch.model, data)
-        alone = microseconds(Graph(lambda: solve(batch.model, data), device), device, repeats)
+        alone = milliseconds(Graph(lambda: solve(batch.model, data), device), device, repeats)
         first = data.solver_niter.numpy().copy()
-    row = [f"{taken / 1e3:.3f}", f"{alone:.0f}", f"{rows:.1f}"]
+    row = [f"{taken:.3f}", f"{1e3 * alone:.0f}", f"{rows:.1f}"]
     row += [f"{np.mean(n):.2f} / {np.max(n)}" for n in (first, iterations)]
     return row, end
 

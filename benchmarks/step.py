@@ -1,7 +1,6 @@
 """Time of one substep: forward, its adjoint alone, and backward with recompute; and memory, for several models."""
 
 import argparse
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,24 +9,12 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 from record import RESULTS, markdown_table, publish
+from replay import milliseconds
 from step_models import MODELS
 
 from msk_ray.errors import UnsupportedModelError
 from msk_ray.physics import Graph, WorldBatch
 from msk_ray.simulation import TapeAll, TapePerSubstep
-
-
-def milliseconds(graph: Graph, device: wp.Device, repeats: int) -> float:
-    """Median of five timings of `repeats` replays, per replay."""
-    timings = []
-    for _ in range(6):
-        wp.synchronize_device(device)
-        begin = time.perf_counter()
-        for _ in range(repeats):
-            graph.replay()
-        wp.synchronize_device(device)
-        timings.append((time.perf_counter() - begin) * 1e3 / repeats)
-    return sorted(timings[1:])[2]
 
 
 def settle(batch: WorldBatch, steps: int) -> dict[str, wp.array]:

@@ -74,7 +74,6 @@ class Shac(Algorithm):
         self._horizon = RolloutLength(c.horizon)
         self._entropy = EntropyBonus(c.entropy, env.action_size, device) if c.entropy is not None else None
         self._contacts = ContactSchedule(config.curriculum, env) if config.curriculum is not None else None
-        self._epoch = 0
         self._actor_update = ActorUpdate(
             c, env, self.network, self.target_critic, self.return_statistics, self._entropy, self.actor_optimizer
         )
@@ -118,8 +117,7 @@ class Shac(Algorithm):
         inputs = self._draw(horizon, epoch)
         if self.witness is not None:
             self.witness.note("draws", {"noise": inputs.noise, **inputs.state.physics._asdict()})
-        self._epoch = epoch
-        outcome = self._runner.run(inputs)
+        outcome = self._runner.run(inputs, self._rate(c.critic_lr, epoch))
         if self.witness is not None:
             rolled = {"observations": outcome.obs, "rewards": outcome.rewards, "ends of episodes": outcome.done}
             self.witness.note("rollout", {**rolled, **outcome.state.physics._asdict()})
@@ -260,14 +258,13 @@ class Shac(Algorithm):
                 "nonfinite_gradient: the policy gradient is not finite; lower shac.actor_lr", Failure.NONFINITE
             )
 
-    def prepare_fit(self, rows: int) -> Tensor:
+    def prepare_fit(self, rows: int, rate: float) -> Tensor:
         """Set the critic's rate, and draw the orders in which a fit passes over so many rows, (passes, rows).
 
         The fit before must have ended: it reads its rate until then.
         """
-        c = self.settings
-        self.critic_fit.optimizer.set_rate(self._rate(c.critic_lr, self._epoch))
-        return self.critic_fit.draw_orders(rows, c.critic_iterations, self.minibatch_generator)
+        self.critic_fit.optimizer.set_rate(rate)
+        return self.critic_fit.draw_orders(rows, self.settings.critic_iterations, self.minibatch_generator)
 
     def fit_critic(self, obs: Tensor, targets: Tensor, orders: Tensor) -> Tensor:
         """Fit the critic, and return the last pass's mean loss."""

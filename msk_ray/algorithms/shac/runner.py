@@ -22,7 +22,7 @@ from msk_ray.simulation.stepper import Engine
 class CriticWork(Protocol):
     """What a runner does with the critic."""
 
-    def prepare_fit(self, rows: int) -> Tensor:
+    def prepare_fit(self, rows: int, rate: float) -> Tensor:
         """Set the rate of the next fit, and draw its orders of so many rows, (passes, rows)."""
 
     def fit_critic(self, obs: Tensor, targets: Tensor, orders: Tensor) -> Tensor:
@@ -73,11 +73,11 @@ class EagerRunner:
         """Go on after a fit that had this `newest_loss`."""
         self.last_loss = loss
 
-    def run(self, inputs: EpochInputs) -> ActorOutcome:
-        """One epoch: the rollout, the actor's step along its gradient, and the fit of the critic."""
+    def run(self, inputs: EpochInputs, critic_rate: float) -> ActorOutcome:
+        """One epoch: the rollout, the actor's step along its gradient, and the fit of the critic at this rate."""
         outcome = self._run_actor(inputs)
         self.last_loss = self._critic.fit_critic(
-            outcome.obs, outcome.targets, self._critic.prepare_fit(outcome.targets.numel())
+            outcome.obs, outcome.targets, self._critic.prepare_fit(outcome.targets.numel(), critic_rate)
         )
         self._critic.move_target()
         self._clock.mark("critic")
@@ -181,22 +181,22 @@ class RecordedRunner(EagerRunner):
         super().resume(loss)
         self._newest_loss = None
 
-    def run(self, inputs: EpochInputs) -> ActorOutcome:
+    def run(self, inputs: EpochInputs, critic_rate: float) -> ActorOutcome:
         epoch = self._epoch(inputs)
         self.recorded = epoch is not None
         if epoch is None:
             self.join()
             outcome = self._run_actor(inputs)
-            self._start_fit(self._offer(outcome.obs, outcome.targets))
+            self._start_fit(self._offer(outcome.obs, outcome.targets), critic_rate)
             return outcome
         caller = torch.cuda.current_stream(self._device)
         self._first.wait_stream(caller)
         with torch.cuda.stream(self._first):
-            outcome = self._replay(epoch, inputs)
+            outcome = self._replay(epoch, inputs, critic_rate)
         caller.wait_stream(self._first)
         return outcome
 
-    def _replay(self, epoch: _Epoch, inputs: EpochInputs) -> ActorOutcome:
+    def _replay(self, epoch: _Epoch, inputs: EpochInputs, critic_rate: float) -> ActorOutcome:
         self._clock = Clock(self._device)
         fill(epoch.inputs.tensors(), inputs.tensors())
         epoch.roll.replay()
@@ -209,7 +209,7 @@ class RecordedRunner(EagerRunner):
         self._clock.mark("backward")
         self._env.state = outcome.state
         # After the backward pass is under way, because this makes the host wait for the fit before.
-        self._start_fit(self._offer(outcome.obs, outcome.targets) if offered is None else offered)
+        self._start_fit(self._offer(outcome.obs, outcome.targets) if offered is None else offered, critic_rate)
         return outcome
 
     def _offer(self, obs: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
@@ -220,14 +220,14 @@ class RecordedRunner(EagerRunner):
         self._ready.record(torch.cuda.current_stream(self._device))
         return offered
 
-    def _start_fit(self, offered: tuple[Tensor, Tensor]) -> None:
+    def _start_fit(self, offered: tuple[Tensor, Tensor], rate: float) -> None:
         if self._fit_clock is not None:
             self._fit_s = self._fit_clock.seconds()["critic"]
         with torch.cuda.stream(self._side):
             self._side.wait_event(self._ready)
             for tensor in offered:
                 tensor.record_stream(self._side)
-            inputs = (*offered, self._critic.prepare_fit(offered[1].numel()))
+            inputs = (*offered, self._critic.prepare_fit(offered[1].numel(), rate))
             fit = self._fit(inputs)
             self._fit_clock = Clock(self._device)
             if fit is None:

@@ -5,6 +5,7 @@ from typing import Any
 import warp as wp
 
 from msk_ray.errors import ConfigError
+from msk_ray.physics.fused.lanes import WARP
 
 CONE = wp.constant(10)
 """Numbers that the line search keeps of each elliptic contact."""
@@ -66,13 +67,13 @@ def make_scratch(worlds: int, rows: int, nv: int) -> Any:
     Raises:
         ConfigError: the threads would be too many to be counted in 32 bits.
     """
-    if worlds * 32 > _MOST:
+    if worlds * WARP > _MOST:
         raise ConfigError(
-            f"the fused solver has room for {_MOST // 32} worlds: take fewer, or write "
+            f"the fused solver has room for {_MOST // WARP} worlds: take fewer, or write "
             "physics.solver_kernels: mujoco_warp"
         )
     width, contacts = padded(nv), rows // 3 + 1  # an elliptic contact has 3 rows or more
-    widths = {"inertia": width * width, "factor": width * width, "rows": rows * width, "cones": 10 * contacts}
+    widths = {"inertia": width * width, "factor": width * width, "rows": rows * width, "cones": CONE * contacts}
     widths |= dict.fromkeys(("leaning", "first", "end"), contacts)
     widths |= dict.fromkeys(("pivot", "acc", "inertial", "push", "gradient", "partial", "direction", "moved"), width)
     kind: Any = Scratch
