@@ -1,6 +1,7 @@
 """Deterministic evaluation on fixed seeds: the canonical score."""
 
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -8,15 +9,18 @@ import torch
 from torch import Tensor
 
 from msk_ray.config import Config, PhysicsConfig, RandomizeConfig
-from msk_ray.envs import Env, env_class, make_env
+from msk_ray.envs import Env, EnvState, env_class, make_env
 from msk_ray.envs.records import Resets, Transition
 from msk_ray.errors import ConfigError
 from msk_ray.simulation import StepState
+from msk_ray.simulation.capture import Recording, fill
 from msk_ray.training.policy_group import Policy, PolicyGroup, streams_for
 
 OnStep = Callable[[StepState, Tensor], None]
 _CHECK_EVERY = 25
 """Env steps between looks at whether any world still runs."""
+_EAGER_STEPS = 2
+"""Env steps before one is recorded: kernels are compiled in the first, and buffers made in both."""
 
 
 class Episodes(NamedTuple):
@@ -105,7 +109,7 @@ class Evaluator:
         self.env.generator = torch.Generator()
         self.steps = steps
         self._policies = policies
-        self._streams = streams_for(self.env.device) if policies > 1 else []
+        self._streams = streams_for(self.env.device)
         self._worlds = e.nworld
         self._tail = min(steps, math.ceil(1.0 / settings.control_timestep))
 
@@ -194,15 +198,24 @@ class Evaluator:
         env.generator.manual_seed(self._seed if seed is None else seed)
         self._reset()
         policy = PolicyGroup(policies, self._worlds, env, self._streams)
-        record = _Record(env, len(policies), self._worlds, self.steps - self._tail)
+        record = _Record(env, len(policies), self._worlds)
         control = torch.zeros((env.nworld, env.model.nu), device=env.device)
+        recorded: _RecordedStep | None = None
         for step in range(self.steps):
-            action = policy(env.observation())
-            if on_step is not None:
-                control = env.control(action)
-                on_step(env.state.physics, control)
-            transition = env.step(action, auto_reset=False)
-            record.add(step, transition, env.outcome_terms(env.state.physics))
+            in_tail = step >= self.steps - self._tail
+            if step == _EAGER_STEPS and on_step is None and self._records_steps() and not in_tail:
+                recorded = _recorded_step(env, policy, record, self._streams[0])
+            if in_tail and recorded is not None:
+                recorded.leave()
+                recorded = None
+            if recorded is not None:
+                recorded.run()
+            else:
+                action = policy(env.observation())
+                if on_step is not None:
+                    control = env.control(action)
+                    on_step(env.state.physics, control)
+                record.add(env.step(action, auto_reset=False), env.outcome_terms(env.state.physics), in_tail=in_tail)
             if pace is not None:
                 pace(step + 1)
             if step % _CHECK_EVERY == 0 and step < self.steps - 1 and record.all_ended():
@@ -211,6 +224,11 @@ class Evaluator:
             on_step(env.state.physics, control)
         env.sim.diagnostics()  # raises if contacts were lost
         return record.episodes()
+
+    def _records_steps(self) -> bool:
+        """Whether an env step can be recorded as it is: mujoco_warp's solver ends in a loop that a graph of torch's
+        cannot hold."""
+        return bool(self._streams) and self.env.sim.batch.kernels.fused_solver
 
     def _reset(self) -> None:
         """Put the worlds of every policy into the same initial states."""
@@ -234,21 +252,77 @@ class Evaluator:
         return {name: float(value) for name, value in figures.items()}
 
 
+class _RecordedStep:
+    """An env step of all policies, with what is counted of it, as one CUDA graph.
+
+    Args:
+        env: the worlds; their state is kept in tensors of its own until `leave`.
+        policy: the policies.
+        record: what the steps are counted in.
+        stream: where to record.
+
+    Raises:
+        RuntimeError: the environment makes the host wait for the device.
+    """
+
+    def __init__(self, env: Env[Any], policy: PolicyGroup, record: "_Record", stream: torch.cuda.Stream) -> None:
+        self._env = env
+        before = env.state
+        self._state = EnvState(StepState(*(t.clone() for t in before.physics)), *(t.clone() for t in before[1:]))
+
+        def work() -> None:
+            env.state = self._state
+            transition = env.step(policy.act(env.observation()), auto_reset=False)
+            record.add(transition, env.outcome_terms(env.state.physics), in_tail=False)
+            fill(_tensors(self._state), _tensors(env.state))
+
+        try:
+            self._work = Recording(work, stream)
+        finally:
+            env.state = before
+            env.release_graph()
+
+    def run(self) -> None:
+        """Take the step."""
+        self._work.replay()
+
+    def leave(self) -> None:
+        """Give the environment the state that was reached."""
+        self._env.state = self._state
+        self._env.release_graph()
+
+
+def _tensors(state: EnvState) -> list[Tensor]:
+    return [*state.physics, *state[1:]]
+
+
+def _recorded_step(
+    env: Env[Any], policy: PolicyGroup, record: "_Record", stream: torch.cuda.Stream
+) -> _RecordedStep | None:
+    try:
+        return _RecordedStep(env, policy, record, stream)
+    except RuntimeError as error:
+        torch.cuda.empty_cache()
+        warnings.warn(
+            f"an evaluation runs operation by operation: its steps cannot be recorded ({str(error).splitlines()[0]})",
+            stacklevel=2,
+        )
+        return None
+
+
 class _Record:
-    """What happens in the first episodes of all worlds.
+    """What happens in the first episodes of all worlds. It counts in place, so that counting can be recorded.
 
     Args:
         env: the worlds.
         policies: number of policies; worlds beyond theirs are left out.
         worlds: worlds of each.
-        tail_from: env step from which on outcome terms are kept for `Env.success`.
     """
 
-    def __init__(self, env: Env[Any], policies: int, worlds: int, tail_from: int) -> None:
+    def __init__(self, env: Env[Any], policies: int, worlds: int) -> None:
         zeros = torch.zeros(env.nworld, device=env.device)
         self._env = env
         self._parts = [slice(k * worlds, (k + 1) * worlds) for k in range(policies)]
-        self._tail_from = tail_from
         self._alive = torch.arange(env.nworld, device=env.device) < policies * worlds
         self._score, self._length = zeros.clone(), zeros.clone()
         self._fell, self._diverged = torch.zeros_like(self._alive), torch.zeros_like(self._alive)
@@ -258,16 +332,19 @@ class _Record:
         self._ended = [False] * policies
         """Whether all episodes of a policy were seen to have ended before the last step."""
 
-    def add(self, step: int, transition: Transition, outcome: dict[str, Tensor]) -> None:
-        """Count an env step in the worlds whose episode has not ended."""
+    def add(self, transition: Transition, outcome: dict[str, Tensor], *, in_tail: bool) -> None:
+        """Count an env step in the worlds whose episode has not ended; keep its outcome terms for `Env.success` if it
+        is in the tail of the episodes."""
         alive = self._alive
         counted = {name: value.masked_fill(~alive, 0.0) for name, value in outcome.items()}
         self._score += transition.reward.masked_fill(~alive, 0.0)
         self._length += alive
         self._terms += transition.terms.masked_fill(~alive[:, None], 0.0)
         for name, value in counted.items():
-            self._outcomes[name] = self._outcomes.get(name, torch.zeros_like(value)) + value
-        if step >= self._tail_from:
+            if name not in self._outcomes:
+                self._outcomes[name] = torch.zeros_like(value)
+            self._outcomes[name] += value
+        if in_tail:
             self._tail.append(counted)
         self._fell |= alive & transition.terminated & ~transition.diverged
         self._diverged |= alive & transition.diverged

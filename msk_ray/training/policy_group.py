@@ -64,6 +64,10 @@ class PolicyGroup:
         fill([self._obs], [obs])
         return self._recording.replay().clone()  # the state keeps it while the next replay overwrites it
 
+    def act(self, obs: Tensor) -> Tensor:
+        """The same, launched one by one, to be recorded as a part of something larger."""
+        return self._act_side_by_side(obs) if self._records else self._act(obs)
+
     def _act(self, obs: Tensor) -> Tensor:
         actions = [p(obs[k * self._worlds : (k + 1) * self._worlds]) for k, p in enumerate(self._policies)]
         return torch.cat([*actions, self._idle])

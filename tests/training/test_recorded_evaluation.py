@@ -1,0 +1,61 @@
+"""Env steps of an evaluation as one recording: on a CPU, one that runs the work again each time."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+
+from msk_ray.config import Config, parse_config
+from msk_ray.training import evaluation
+from msk_ray.training.evaluation import Episodes, Evaluator
+
+
+class Again:
+    """Stands for a recording, which runs nothing when it is made, and the work in each replay."""
+
+    made = 0
+
+    def __init__(self, work: Callable[[], None], stream: Any) -> None:
+        self._work = work
+        type(self).made += 1
+
+    def replay(self) -> None:
+        self._work()
+
+
+def settings(**env: Any) -> Config:
+    return parse_config(
+        {
+            "env": {"name": "ant", **env},
+            "physics": {"variant": "matched", "solver_kernels": "fused"},
+            "evaluation": {"nworld": 3, "steps": 90},
+        }
+    )
+
+
+def lift(obs: torch.Tensor) -> torch.Tensor:
+    return 0.1 * torch.sin(obs[:, :8])
+
+
+def push(obs: torch.Tensor) -> torch.Tensor:
+    return torch.tanh(obs[:, 5:13])
+
+
+def episodes(config: Config, recorded: bool, monkeypatch: pytest.MonkeyPatch) -> list[Episodes]:
+    monkeypatch.setattr(evaluation, "Recording", Again)
+    monkeypatch.setattr(Evaluator, "_records_steps", lambda _: recorded)
+    evaluator = Evaluator(config, "cpu", policies=2)
+    evaluator._streams = [None]  # type: ignore[list-item]
+    group = evaluation.PolicyGroup
+    monkeypatch.setattr(evaluation, "PolicyGroup", lambda policies, worlds, env, _: group(policies, worlds, env, []))
+    return evaluator._episodes([lift, push])
+
+
+def test_it_counts_what_steps_one_by_one_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    found, expected = (episodes(settings(), recorded, monkeypatch) for recorded in (True, False))
+    assert Again.made == 1
+    for one, other in zip(found, expected, strict=True):
+        for name in ("score", "length", "fell", "diverged", "terms"):
+            assert torch.equal(getattr(one, name), getattr(other, name)), name
+        assert {n: v.tolist() for n, v in one.outcomes.items()} == {n: v.tolist() for n, v in other.outcomes.items()}
