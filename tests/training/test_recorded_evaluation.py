@@ -42,6 +42,13 @@ def push(obs: torch.Tensor) -> torch.Tensor:
     return torch.tanh(obs[:, 5:13])
 
 
+def assert_equal(found: list[Episodes], expected: list[Episodes]) -> None:
+    for one, other in zip(found, expected, strict=True):
+        for name in ("score", "length", "fell", "diverged", "terms"):
+            assert torch.equal(getattr(one, name), getattr(other, name)), name
+        assert {n: v.tolist() for n, v in one.outcomes.items()} == {n: v.tolist() for n, v in other.outcomes.items()}
+
+
 def episodes(config: Config, recorded: bool, monkeypatch: pytest.MonkeyPatch) -> list[Episodes]:
     monkeypatch.setattr(evaluation, "Recording", Again)
     monkeypatch.setattr(Evaluator, "_records_steps", lambda _: recorded)
@@ -55,7 +62,38 @@ def episodes(config: Config, recorded: bool, monkeypatch: pytest.MonkeyPatch) ->
 def test_it_counts_what_steps_one_by_one_count(monkeypatch: pytest.MonkeyPatch) -> None:
     found, expected = (episodes(settings(), recorded, monkeypatch) for recorded in (True, False))
     assert Again.made == 1
-    for one, other in zip(found, expected, strict=True):
-        for name in ("score", "length", "fell", "diverged", "terms"):
-            assert torch.equal(getattr(one, name), getattr(other, name)), name
-        assert {n: v.tolist() for n, v in one.outcomes.items()} == {n: v.tolist() for n, v in other.outcomes.items()}
+    assert_equal(found, expected)
+
+
+@pytest.mark.gpu
+@pytest.mark.filterwarnings("error:.*cannot be recorded")
+@pytest.mark.parametrize("name", ["ant", "myoleg26"])
+@pytest.mark.parametrize("policies", [1, 3])
+def test_recorded_steps_on_a_gpu_have_the_bits_of_steps_one_by_one(
+    name: str, policies: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = parse_config(
+        {
+            "env": {"name": name},
+            "physics": {"solver_kernels": "fused"},
+            "evaluation": {"nworld": 8, "steps": 120},
+            "trial": {"deterministic": True},
+        }
+    )
+    evaluator = Evaluator(config, "cuda:0", policies=policies)
+    made: list[object] = []
+    record = evaluation._recorded_step
+    monkeypatch.setattr(evaluation, "_recorded_step", lambda *args: made.append(record(*args)) or made[-1])
+
+    def act(k: int) -> evaluation.Policy:
+        return lambda obs: 0.3 * torch.sin(obs[:, :1] + k + torch.arange(evaluator.env.action_size, device=obs.device))
+
+    acting = [act(k) for k in range(policies)]
+    found = evaluator._episodes(acting)
+    again = evaluator._episodes(acting)
+    monkeypatch.setattr(Evaluator, "_records_steps", lambda _: False)
+    expected = evaluator._episodes(acting)
+    assert len(made) == 2
+    assert None not in made
+    assert_equal(found, expected)
+    assert_equal(again, expected)
