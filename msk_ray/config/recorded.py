@@ -125,5 +125,11 @@ _LATER: dict[tuple[str, ...], Any] = {
 _NO_ASSISTANCE = {"epochs": 0, "share": 1.0, "balance": 800.0, "lateral": 800.0, "support": 0.0}
 _LATER_OF: dict[str, dict[tuple[str, ...], Any]] = {
     "myoleg": {("env", "assist"): _NO_ASSISTANCE, ("env", "reset"): "stand"},
+    "myosuite_walk": {
+        ("env", "assist"): _NO_ASSISTANCE,
+        ("env", "cycle"): 0.0,
+        **{("env", "reward", name): 0.0 for name in ("height", "effort", "footfall", "clearance")},
+        ("env", "reward", "clearance_height"): 0.02,
+    },
 }
 """The same of one environment, by its name, where others had a setting of that name from the first."""

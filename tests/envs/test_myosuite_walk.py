@@ -19,6 +19,7 @@ from msk_ray.envs.records import EnvState
 from msk_ray.errors import ConfigError
 from msk_ray.gradcheck import check_gradients
 from msk_ray.simulation import Simulation, StepState
+from msk_ray.simulation.tangent import quat_multiply
 from msk_ray.training import Trainer
 
 pytestmark = pytest.mark.long
@@ -82,6 +83,45 @@ def test_resets_are_those_of_myosuite() -> None:
     assert not standing.qvel.any()
 
 
+def test_episodes_may_start_anywhere_in_the_cycle_of_people() -> None:
+    """The hips are where the reward wants them, as far as people's reach."""
+    env = make(256, reset="random", cycle=0.5, reward={"footfall": 1.0, "clearance": 1.0})
+    q, v, act = env.state.physics
+    ahead = env.task_numbers(env.state.numbers)[:, 0]
+    elsewhere = act[:, 0] > 0.0
+    assert 0.4 < elsewhere.float().mean() < 0.6
+    assert not ahead[~elsewhere].any()
+    assert ahead.unique().numel() > 40
+    wanted = torch.cos(2.0 * torch.pi * ahead[elsewhere] / 100.0)
+    right, left = (q[elsewhere, env.model.joint(f"hip_flexion_{side}").qposadr[0]] for side in "rl")
+    assert torch.corrcoef(torch.stack((wanted, right, -left)))[0].min() > 0.95
+    assert -v[elsewhere, 1].mean() == pytest.approx(1.2, abs=1e-3)
+    assert torch.equal(env.observation()[:, 2 + 33 + 34 + 4 + 2 + 1 + 6], ahead / 100.0)
+    terms = env.step(torch.zeros(256, 80)).terms[:, -2:]
+    assert (terms[elsewhere] <= 0.0).all()
+    assert terms[elsewhere].mean(0)[0] > -0.5, "people's feet stand still when they are on the ground"
+    assert not make(2, cycle=1.0, stochastic_reset=False).state.physics.act.any()
+    assert settings(cycle=1.0, stochastic_reset=False).unread()["cycle"] == "env.stochastic_reset is false"
+
+
+def test_springs_turn_the_pelvis_to_standing_and_fade() -> None:
+    env = make(2, reset="none", assist={"epochs": 4, "steady": 0.5, "balance": 700.0, "lateral": 100.0})
+    q, v, act = env.state.physics
+    # The right world is 10 cm aside, and turned by 0.1 rad about the vertical.
+    turn = torch.tensor([np.cos(0.05), 0.0, 0.0, np.sin(0.05)], dtype=torch.float32)
+    q[1, 3:7] = quat_multiply(turn[None], q[1:, 3:7])[0]
+    q[1, 0] += 0.1
+    force = env.applied_force(StepState(q, v, act))
+    assert force is not None
+    assert force[0].numpy() == pytest.approx(np.zeros(34), abs=1e-4)
+    assert force[1].numpy() == pytest.approx([-10.0, 0.0, 0.0, 0.0, 0.0, -8.5, *[0.0] * 28], abs=1e-2)
+    assert env.end_epoch(49.0) == {"train/assist": 1.0}
+    assert env.end_epoch(51.0) == {"train/assist": 1.0}
+    env.begin_epoch(2)
+    assert env.applied_force(StepState(q, v, act))[1, 0].item() == pytest.approx(-7.5)  # type: ignore[index]
+    assert env.state_dict()["assist_epochs"] == 1
+
+
 def test_gradients_of_a_step() -> None:
     model = build_myosuite_walk(settings(), PhysicsConfig())
     assert model.opt.timestep == pytest.approx(1e-3)
@@ -125,7 +165,8 @@ def test_reward_and_observation_have_the_gradient_of_their_own_values() -> None:
 
 
 def test_scores_are_without_what_makes_training_easier() -> None:
-    trained = settings(reset="random", smoothing=0.4, reward=MyoSuiteWalkReward(done=-10.0))
+    rewards = MyoSuiteWalkReward(done=-10.0, height=200.0, footfall=1.0)
+    trained = settings(reset="random", smoothing=0.4, cycle=0.5, assist={"epochs": 9}, reward=rewards)
     assert MyoSuiteWalk.reference_settings(trained) == settings(reset="random", smoothing=0.0)
     physics = PhysicsConfig(cone="elliptic", substeps=5, njmax=300)
     model = build_myosuite_walk(settings(smoothing=0.0), MyoSuiteWalk.reference_physics(physics, None))

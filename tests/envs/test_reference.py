@@ -69,5 +69,5 @@ def test_only_the_reward_is_reset(name: str) -> None:
     reference = env.reference_settings(trained)
     assert reference.reward == default.reward != trained.reward
     # Help for training that scores are without; they are taken at target_speed.
-    own = {"reward", "assist", "smoothing", "speed_range"}
+    own = {"reward", "assist", "smoothing", "speed_range", "cycle"}
     assert reference.model_dump(exclude=own) == trained.model_dump(exclude=own)

@@ -1,11 +1,29 @@
-"""How much of the springs at the pelvis is left."""
+"""Springs that hold the pelvis up during training, and how much of them is left.
 
+Axes: W worlds.
+"""
+
+import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Generic, TypeVar
 
+import mujoco
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
+from msk_ray.config import EnvSettings
+from msk_ray.envs.base import Env
 from msk_ray.envs.legs.config import AssistConfig
+from msk_ray.simulation import StepState
+from msk_ray.simulation.tangent import quat_conjugate, quat_log, quat_multiply
+
+AnySettings = TypeVar("AnySettings", bound=EnvSettings)
+
+TRUNK_INERTIA = (7.0, 7.0, 0.85)
+"""About the forward, left and up axes [kg m²] of myoleg26's pelvis and trunk with hanging legs: what the springs
+turn."""
 
 
 class Assistance:
@@ -55,3 +73,75 @@ class Assistance:
         """Continue from a `state_dict`."""
         if self._config.steady is not None:
             self._passed = state["assist_epochs"]
+
+
+class FreeSprings:
+    """Springs and dampers at full strength on a pelvis that is a free joint, the first of its model.
+
+    They turn it to its orientation in the keyframe `stand`, and pull it onto the line that leads forward from there.
+    Forward, left and up are the rows of `axes` (3, 3) in the world.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, axes: NDArray[np.float64], config: AssistConfig, device: torch.device
+    ) -> None:
+        stand = model.key("stand").qpos
+
+        def tensor(values: object) -> Tensor:
+            return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=device)
+
+        self._local, self._stand = tensor(in_root(model, axes)), tensor(stand[3:7])
+        stiffness = [config.balance * inertia / TRUNK_INERTIA[0] for inertia in TRUNK_INERTIA]
+        self._righting = tensor(stiffness)
+        self._turning = tensor([2.0 * math.sqrt(k * i) for k, i in zip(stiffness, TRUNK_INERTIA, strict=True)])
+        mass = float(model.body_subtreemass[0])
+        self._lateral, self._lateral_damping = config.lateral, 2.0 * math.sqrt(config.lateral * mass)
+        self._left, self._rest = tensor(axes[1]), float(stand[:3] @ axes[1])
+        self._lift = tensor(axes[2] * config.support * mass * float(np.linalg.norm(model.opt.gravity)))
+
+    def force(self, state: StepState) -> Tensor:
+        """Forces on the degrees of freedom [N, N m], (W, nv)."""
+        q, v = state.qpos, state.qvel
+        aside, drift = (q[:, :3] * self._left).sum(-1) - self._rest, (v[:, :3] * self._left).sum(-1)
+        push = -(self._lateral * aside + self._lateral_damping * drift)
+        # Forces on a free joint's rotation are in the body's frame, as its velocity is.
+        error = quat_multiply(quat_conjugate(self._stand.expand(len(q), 4)), q[:, 3:7])
+        along, spin = quat_log(error) @ self._local.T, v[:, 3:6] @ self._local.T
+        torque = -(self._righting * along + self._turning * spin) @ self._local
+        root = torch.cat((push[:, None] * self._left + self._lift, torque), dim=-1)
+        return torch.nn.functional.pad(root, (0, v.shape[1] - 6))
+
+
+def in_root(model: mujoco.MjModel, axes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Axes of the world, rows (3, 3), in the frame that the free root has in the keyframe `stand`."""
+    start = np.zeros(9)
+    mujoco.mju_quat2Mat(start, model.key("stand").qpos[3:7])
+    return axes @ start.reshape(3, 3)
+
+
+class AssistedEnv(Env[AnySettings], Generic[AnySettings]):
+    """An environment with springs that fade.
+
+    Attributes:
+        assistance: how much is left of them; to be set in `prepare`.
+    """
+
+    begin_epoch_in_place = True
+    assistance: Assistance
+
+    @property
+    def reads_episode_lengths(self) -> str | None:
+        return self.assistance.reads_episode_lengths
+
+    def begin_epoch(self, epoch: int) -> None:
+        self.assistance.begin_epoch(epoch)
+
+    def end_epoch(self, length: float | None) -> dict[str, float]:
+        return self.assistance.end_epoch(length)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {**super().state_dict(), **self.assistance.state_dict()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        super().load_state_dict(state)
+        self.assistance.load_state_dict(state)

@@ -130,6 +130,11 @@ class AssistConfig(Section):
         """Share of the stiffness after `epoch` epochs that count."""
         return self.share * max(0.0, 1.0 - epoch / self.epochs) ** self.power if self.epochs else 0.0
 
+    def unread(self) -> dict[str, str]:
+        """Settings that nothing reads, with the reason."""
+        names = () if self.epochs else ("share", "power", "steady", "balance", "lateral", "support")
+        return {f"assist.{name}": "env.assist.epochs is 0" for name in names}
+
 
 class PushConfig(Section):
     """Pushes of the pelvis, which change its speed at once."""
@@ -195,11 +200,8 @@ class LegSettings(EnvSettings):
         return self
 
     def unread(self) -> dict[str, str]:
-        unread = {}
+        unread = self.assist.unread()
         r = self.reward
-        if not self.assist.epochs:
-            for name in ("share", "power", "steady", "balance", "lateral", "support"):
-                unread[f"assist.{name}"] = "env.assist.epochs is 0"
         if self.push.speed == 0.0:
             unread["push.interval"] = "env.push.speed is 0"
         for name, weight in (

@@ -5,8 +5,8 @@ Axes: W worlds, U muscles, N hinges of the legs.
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Generic, TypeVar
+from collections.abc import Sequence
+from typing import ClassVar, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -15,10 +15,9 @@ from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
 from msk_ray.config.physics import CONTACTS, LIMITS
-from msk_ray.envs.base import Env
 from msk_ray.envs.layout import Entry, entries
 from msk_ray.envs.legs import terms as costs
-from msk_ray.envs.legs.assistance import Assistance
+from msk_ray.envs.legs.assistance import Assistance, AssistedEnv
 from msk_ray.envs.legs.config import FURTHER, AssistConfig, LegReward, LegSettings
 from msk_ray.envs.legs.feet import Feet, FootMotion
 from msk_ray.envs.legs.gait.body import analyse, world_axes
@@ -49,7 +48,7 @@ _VELOCITY_SCALE = 0.1
 """Scale of joint velocities in the observation [s/rad]."""
 
 
-class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
+class LegEnv(AssistedEnv[AnyLegSettings], Generic[AnyLegSettings]):
     """Observation, in this order, for U muscles and N leg hinges:
 
     ======= ===================================================================
@@ -76,7 +75,6 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
     second half; the phase that is observed is then that of the left leg.
     """
 
-    begin_epoch_in_place = True
     reward_names: tuple[str, ...] = (
         *("forward_vel", "progress", "upright", "heading", "height", "alive", "effort", "joint_limit"),
         *("smoothness", "capture", "sway", "symmetry", "stride"),
@@ -110,7 +108,7 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
         self._flexion_qpos = columns([joint.qposadr[0] for joint in flexions], self.device)
         self._tasked = self.config.clock or self.config.speed_range is not None
         self._tracking_share = torch.tensor(self.config.tracking.at(0), device=self.device)
-        self._assistance = Assistance(self.config.assist, self.config.control_timestep, self.device)
+        self.assistance = Assistance(self.config.assist, self.config.control_timestep, self.device)
         self.recorded_worlds = self.config.gait_worlds
         self._prepare_terms()
         self._mirror: Mirror | None = None
@@ -206,23 +204,9 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
     def control(self, action: Tensor) -> Tensor:
         return self.excitation(self._own_sides(action, self.state.age))
 
-    @property
-    def reads_episode_lengths(self) -> str | None:
-        return self._assistance.reads_episode_lengths
-
     def begin_epoch(self, epoch: int) -> None:
+        super().begin_epoch(epoch)
         self._tracking_share.fill_(self.config.tracking.at(epoch))
-        self._assistance.begin_epoch(epoch)
-
-    def end_epoch(self, length: float | None) -> dict[str, float]:
-        return self._assistance.end_epoch(length)
-
-    def state_dict(self) -> dict[str, Any]:
-        return {**super().state_dict(), **self._assistance.state_dict()}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        super().load_state_dict(state)
-        self._assistance.load_state_dict(state)
 
     def disturbed(self, state: StepState) -> StepState:
         return pushed(state, self.state.age, self.config.push, self.config.control_timestep, self._slides)
@@ -357,9 +341,10 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
                 feet = self._foot_motion(state)
                 return costs.impact(feet.height, feet.rise)
             case "footfall":
-                return self._footfall(state)
+                return self._foot_motion(state).sliding(self._leg_phases()[0])
             case "clearance":
-                return self._clearance(state)
+                wanted = self.config.reward.clearance_height
+                return self._foot_motion(state).dragging(self._leg_phases()[0], wanted)
             case "toes":
                 return self._lifted_toes(state)
             case _:
@@ -382,17 +367,6 @@ class LegEnv(Env[AnyLegSettings], Generic[AnyLegSettings]):
         """Phases [turns] of the right and the left leg in the state that a step leads to, each (W,)."""
         phase = self.phase(self.state.numbers, self.state.age + 1)
         return phase, phase + 0.5
-
-    def _footfall(self, state: StepState) -> Tensor:
-        velocity, (right, left) = self._foot_motion(state).velocity, self._leg_phases()
-        return costs.sliding(right, velocity[:, 0], velocity[:, 1]) + costs.sliding(
-            left, velocity[:, 2], velocity[:, 3]
-        )
-
-    def _clearance(self, state: StepState) -> Tensor:
-        heights, (right, left) = self._foot_motion(state).height, self._leg_phases()
-        wanted = self.config.reward.clearance_height
-        return costs.dragging(right, heights[:, :2], wanted) + costs.dragging(left, heights[:, 2:], wanted)
 
     def _lifted_toes(self, state: StepState) -> Tensor:
         (right, left), (slope, bend) = self._leg_phases(), self._feet.toes(self.frames(state))

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from msk_ray.envs.legs import terms as costs
 from msk_ray.envs.legs.gait.body import SIDES, world_axes
 from msk_ray.simulation.kinematics import Frames
 from msk_ray.simulation.tangent import quat_rotate
@@ -24,6 +25,16 @@ class FootMotion(NamedTuple):
     """Upward velocities [m/s], (W, 4)."""
     velocity: Tensor
     """Velocities [m/s], (W, 4, 3)."""
+
+    def sliding(self, phase: Tensor) -> Tensor:
+        """Cost (W,) of feet that move while they should stand, at the right leg's phases (W,) [turns]."""
+        speed = self.velocity
+        return costs.sliding(phase, speed[:, 0], speed[:, 1]) + costs.sliding(phase + 0.5, speed[:, 2], speed[:, 3])
+
+    def dragging(self, phase: Tensor, clearance: float) -> Tensor:
+        """Cost (W,) of feet that are lower than `clearance` [m] in their swing, at the right leg's phases (W,)."""
+        right, left = self.height[:, :2], self.height[:, 2:]
+        return costs.dragging(phase, right, clearance) + costs.dragging(phase + 0.5, left, clearance)
 
 
 class Feet:

@@ -1,7 +1,6 @@
 """`myoleg` standing or walking the way its toes point."""
 
 import logging
-import math
 
 import mujoco
 import numpy as np
@@ -11,6 +10,7 @@ from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
 from msk_ray.envs.layout import Entry, entries
+from msk_ray.envs.legs.assistance import FreeSprings, in_root
 from msk_ray.envs.legs.env import LegEnv
 from msk_ray.envs.legs.gait.body import world_axes
 from msk_ray.envs.legs.muscles import columns
@@ -18,11 +18,9 @@ from msk_ray.envs.legs.root import Root
 from msk_ray.envs.myoleg.config import MyoLegSettings
 from msk_ray.envs.myoleg.model import Couplings, build_myoleg, cycle_states, find_model, ground_height
 from msk_ray.simulation import StepState
-from msk_ray.simulation.tangent import quat_conjugate, quat_log, quat_multiply, quat_rotate
+from msk_ray.simulation.tangent import quat_rotate
 
 _START_ACTIVATION = 0.05
-_TRUNK_INERTIA = (7.0, 7.0, 0.85)
-"""About the forward, left and up axes of the pelvis [kg m²], as in myoleg26: what the assistance turns."""
 _log = logging.getLogger(__name__)
 
 
@@ -55,15 +53,11 @@ class MyoLeg(LegEnv[MyoLegSettings]):
         self._ground = ground_height(model)
         self.stand_height = float(stand[2]) - self._ground
         axes = world_axes(model)
-        start = np.zeros(9)
-        mujoco.mju_quat2Mat(start, stand[3:7])
-        # The same axes in the frame of the root, in which they are fixed.
-        local = axes @ start.reshape(3, 3)
 
         def tensor(values: object) -> Tensor:
             return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=self.device)
 
-        self._axes, self._local = tensor(axes), tensor(local)
+        self._axes, self._local = tensor(axes), tensor(in_root(model, axes))
         self._stand = tensor(stand)
         self._ranges = tuple(tensor(bound) for bound in model.jnt_range[self.hinges].T)
         self._dependent, self._driving = (
@@ -77,30 +71,10 @@ class MyoLeg(LegEnv[MyoLegSettings]):
 
         if self.config.reset == "cycle":
             self._cycle = tuple(map(tensor, cycle_states(model)))
-        a = self.config.assist
-        # Righting torques about the forward, left and up axes of the pelvis.
-        stiffness = [a.balance * inertia / _TRUNK_INERTIA[0] for inertia in _TRUNK_INERTIA]
-        self._righting = tensor(stiffness)
-        self._turning = tensor([2.0 * math.sqrt(k * i) for k, i in zip(stiffness, _TRUNK_INERTIA, strict=True)])
-        mass = float(model.body_subtreemass[0])
-        self._lateral_damping = 2.0 * math.sqrt(a.lateral * mass)
-        self._lift = a.support * mass * float(np.linalg.norm(model.opt.gravity))
-        self._rest = float(stand[:3] @ axes[1])
+        self._springs = FreeSprings(model, axes, self.config.assist, self.device)
 
     def applied_force(self, state: StepState) -> Tensor | None:
-        a = self.config.assist
-        if not a.epochs:
-            return None
-        q, v = state.qpos, state.qvel
-        left, up = self._axes[1], self._axes[2]
-        aside, drift = (q[:, :3] * left).sum(-1) - self._rest, (v[:, :3] * left).sum(-1)
-        push = -(a.lateral * aside + self._lateral_damping * drift)
-        # Forces on a free joint's rotation are in the body's frame, as its velocity is.
-        error = quat_multiply(quat_conjugate(self._stand[3:7].expand(len(q), 4)), q[:, 3:7])
-        along, spin = quat_log(error) @ self._local.T, v[:, 3:6] @ self._local.T
-        torque = -(self._righting * along + self._turning * spin) @ self._local
-        root = torch.cat((push[:, None] * left + self._lift * up, torque), dim=-1)
-        return self._assistance.share * torch.nn.functional.pad(root, (0, v.shape[1] - 6))
+        return self.assistance.share * self._springs.force(state) if self.config.assist.epochs else None
 
     def draw_physics(self, count: int) -> StepState:
         return self._near(self._stand.repeat(count, 1), torch.zeros((count, self.model.nv), device=self.device))

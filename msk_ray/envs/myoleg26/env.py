@@ -10,6 +10,7 @@ from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
 from msk_ray.envs.layout import Entry
+from msk_ray.envs.legs.assistance import TRUNK_INERTIA
 from msk_ray.envs.legs.env import LegEnv
 from msk_ray.envs.legs.root import Root
 from msk_ray.envs.myoleg26.config import MyoLeg26Settings
@@ -19,8 +20,6 @@ from msk_ray.envs.myoleg26.tables import JOINTS
 from msk_ray.envs.myoleg26.terrain import Terrain
 from msk_ray.simulation import StepState
 
-_TRUNK_INERTIA = (7.0, 7.0, 0.85)
-"""Inertia about tilt, list and rotation [kg m²] of pelvis and trunk with hanging legs, which the assistance turns."""
 _GRAVITY = 9.81
 
 
@@ -61,8 +60,8 @@ class MyoLeg26(LegEnv[MyoLeg26Settings]):
         a = self.config.assist
         # Critical damping: c = 2 √(k m).
         # The same frequency about all three axes; otherwise the light one would oscillate within a control step.
-        righting = [a.balance * inertia / _TRUNK_INERTIA[0] for inertia in _TRUNK_INERTIA]
-        damping = [2.0 * math.sqrt(k * inertia) for k, inertia in zip(righting, _TRUNK_INERTIA, strict=True)]
+        righting = [a.balance * inertia / TRUNK_INERTIA[0] for inertia in TRUNK_INERTIA]
+        damping = [2.0 * math.sqrt(k * inertia) for k, inertia in zip(righting, TRUNK_INERTIA, strict=True)]
         self._springs = self._tensor([0.0, 0.0, a.lateral, *righting])
         self._dampers = self._tensor([0.0, 0.0, 2.0 * math.sqrt(a.lateral * mass), *damping])
         self._lift = self._tensor([0.0, a.support * mass * _GRAVITY, 0.0, 0.0, 0.0, 0.0])
@@ -77,7 +76,7 @@ class MyoLeg26(LegEnv[MyoLeg26Settings]):
             return excitation
         qpos, qvel, _ = self.state.physics
         force = self._lift - self._springs * (qpos[:, :6] - self._upright_pose) - self._dampers * qvel[:, :6]
-        return torch.cat((excitation, self._assistance.share * force), dim=-1)
+        return torch.cat((excitation, self.assistance.share * force), dim=-1)
 
     def draw_physics(self, count: int) -> StepState:
         if len(self._starts.qpos) > 1 and self.config.stochastic_reset:

@@ -4,6 +4,7 @@ Axes: W worlds, U muscles.
 """
 
 import math
+from collections.abc import Callable
 
 import mujoco
 import numpy as np
@@ -11,10 +12,15 @@ import torch
 from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
-from msk_ray.envs.base import Env
 from msk_ray.envs.layout import Entry, entries, vector
+from msk_ray.envs.legs.assistance import Assistance, AssistedEnv, FreeSprings
+from msk_ray.envs.legs.clock import fourier
+from msk_ray.envs.legs.config import AssistConfig
+from msk_ray.envs.legs.feet import Feet
 from msk_ray.envs.legs.muscles import MuscleCurves
-from msk_ray.envs.myosuite_walk.config import MyoSuiteWalkSettings
+from msk_ray.envs.legs.reference import people_angles
+from msk_ray.envs.myoleg.model import cycle_states
+from msk_ray.envs.myosuite_walk.config import FURTHER, MyoSuiteWalkSettings
 from msk_ray.envs.myosuite_walk.model import HINGES, build_myosuite_walk
 from msk_ray.simulation import StepState
 
@@ -29,10 +35,14 @@ _MIN_HEIGHT = 0.8
 _MAX_TURN = 0.8
 """Cosine between the x axes of the root and of the world above which an episode ends."""
 _RESET_NOISE = 0.02
+_AXES = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+"""Forward, left and up. (In MyoSuite's `stand`, the left foot points 16° outwards.)"""
 _FEET = ["talus_l", "talus_r"]
+_CYCLE_ACTIVATION = 0.05
+"""Of every muscle where an episode starts in the gait cycle."""
 
 
-class MyoSuiteWalk(Env[MyoSuiteWalkSettings]):
+class MyoSuiteWalk(AssistedEnv[MyoSuiteWalkSettings]):
     """Observation (403 for 80 muscles), in this order:
 
     ======= ====================================================================
@@ -55,10 +65,12 @@ class MyoSuiteWalk(Env[MyoSuiteWalkSettings]):
 
     The phase lags the count of steps by one, as in MyoSuite: the first two observations of an episode have phase 0, and
     the reward of a step is for the phase of the observation that it ends in.
+
+    With `cycle`, the number of an episode's task is how many steps its phase is ahead of MyoSuite's.
     """
 
     Settings = MyoSuiteWalkSettings
-    reward_names = ("vel_reward", "cyclic_hip", "ref_rot", "joint_angle_rew", "done")
+    reward_names: tuple[str, ...] = ("vel_reward", "cyclic_hip", "ref_rot", "joint_angle_rew", "done")
 
     @classmethod
     def build_model(cls, config: MyoSuiteWalkSettings, physics: PhysicsConfig) -> mujoco.MjModel:
@@ -66,13 +78,15 @@ class MyoSuiteWalk(Env[MyoSuiteWalkSettings]):
 
     @classmethod
     def reference_settings(cls, config: MyoSuiteWalkSettings) -> MyoSuiteWalkSettings:
-        """As for every environment, and with MyoSuite's own switch between activation and deactivation."""
-        return super().reference_settings(config).model_copy(update={"smoothing": 0.0})
+        """As for every environment, and with MyoSuite's own starts and switch between activation and deactivation."""
+        own = {"smoothing": 0.0, "cycle": 0.0, "assist": AssistConfig()}
+        return super().reference_settings(config).model_copy(update=own)
 
     @classmethod
     def reference_physics(cls, physics: PhysicsConfig, variant: str | None) -> PhysicsConfig:
         """MyoSuite's time step, contacts and solver."""
-        return PhysicsConfig(nconmax=physics.nconmax, njmax=physics.njmax)
+        # Buffers and kernels change no physics.
+        return PhysicsConfig(nconmax=physics.nconmax, njmax=physics.njmax, solver_kernels=physics.solver_kernels)
 
     def prepare(self) -> None:
         model = self.model
@@ -95,6 +109,50 @@ class MyoSuiteWalk(Env[MyoSuiteWalkSettings]):
         hinges = torch.tensor([model.joint(name).qposadr[0] for name in HINGES], device=self.device)
         self._flexions, self._others = hinges[:2], hinges[2:]
         self._swing = tensor([-_SWING, _SWING])
+        # The phase of people's right leg where MyoSuite's is 0: where the first harmonic of their hip is largest.
+        even, odd = fourier(people_angles()[0])[:, 1]
+        self._hip_lag = math.atan2(odd, even) / math.tau
+        self.assistance = Assistance(self.config.assist, self.config.control_timestep, self.device)
+        self._springs = FreeSprings(model, _AXES, self.config.assist, self.device)
+        self._starts_in_cycle = self.config.cycle > 0.0 and self.config.stochastic_reset
+        if self._starts_in_cycle:
+            self._cycle = self._cycle_starts(tensor)
+        self._prepare_terms()
+
+    def _prepare_terms(self) -> None:
+        """The terms that MyoSuite does not have, and what they need."""
+        self._further = [name for name in FURTHER if getattr(self.config.reward, name) > 0.0]
+        self.reward_names = (*type(self).reward_names, *self._further)
+        data = mujoco.MjData(self.model)
+        mujoco.mj_resetDataKeyframe(self.model, data, self.model.key("stand").id)
+        mujoco.mj_kinematics(self.model, data)
+        mujoco.mj_comPos(self.model, data)
+        self._standing_center = float(data.subtree_com[0, 2])
+        self._feet = Feet(self.model, float(self.model.key("stand").qpos[2]), self.device)
+
+    def _cycle_starts(self, tensor: Callable[[object], Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        """qpos (N, nq), qvel (N, nv) and steps ahead (N, 1) of starts over the gait cycle."""
+        qpos, qvel = cycle_states(self.model)
+        qvel /= _PERIOD * self.config.control_timestep
+        qvel[:, :3] += SPEED * _AXES[0]
+        ahead = np.arange(len(qpos)) / len(qpos) - self._hip_lag
+        return tensor(qpos), tensor(qvel), tensor(np.round(_PERIOD * (ahead % 1.0))[:, None])
+
+    def draw_start(self, count: int) -> tuple[StepState, Tensor]:
+        start, task = super().draw_start(count)
+        if not self._starts_in_cycle:
+            return start, task
+        qpos, qvel, ahead = self._cycle
+        drawn = 0.5 + 0.5 * self.uniform(count, 2)
+        at = (drawn[:, 1] * len(qpos)).long()
+        elsewhere = drawn[:, :1] < self.config.cycle
+        act = torch.full_like(start.act, _CYCLE_ACTIVATION)
+        cycle = StepState(qpos[at], qvel[at], act)
+        mixed = StepState(*(torch.where(elsewhere, c, s) for c, s in zip(cycle, start, strict=True)))
+        return mixed, torch.where(elsewhere, ahead[at], 0.0)
+
+    def applied_force(self, state: StepState) -> Tensor | None:
+        return self.assistance.share * self._springs.force(state) if self.config.assist.epochs else None
 
     def draw_physics(self, count: int) -> StepState:
         starts, speeds = self._starts
@@ -145,8 +203,10 @@ class MyoSuiteWalk(Env[MyoSuiteWalkSettings]):
             dim=-1,
         )
 
-    @staticmethod
-    def _phase(steps: Tensor) -> Tensor:
+    def _phase(self, steps: Tensor) -> Tensor:
+        """Phase [turns] after so many steps of MyoSuite's, (W,)."""
+        if self._starts_in_cycle:
+            steps = steps + self.task_numbers(self.state.numbers)[:, 0]
         return torch.remainder(steps, _PERIOD) / _PERIOD
 
     def _velocity(self, state: StepState) -> Tensor:
@@ -192,14 +252,25 @@ class MyoSuiteWalk(Env[MyoSuiteWalkSettings]):
         flexions = self._swing * wave[:, None] - state.qpos[:, self._flexions]
         turned = state.qpos[:, 3:7] - self._upright
         others = state.qpos[:, self._others].abs().mean(-1)
-        terms = (
+        terms = [
             r.vel_reward * toward,
             r.cyclic_hip * torch.linalg.vector_norm(flexions, dim=-1),
             r.ref_rot * torch.exp(-5.0 * torch.linalg.vector_norm(turned, dim=-1)),
             r.joint_angle_rew * torch.exp(-5.0 * others),
             r.done * self.fell(state).float(),
-        )
+        ]
+        terms += [-getattr(r, name) * self._further_cost(name, state) for name in self._further]
         return torch.stack(terms, dim=-1)
+
+    def _further_cost(self, name: str, state: StepState) -> Tensor:
+        """One of the terms of `FURTHER`, without its weight, (W,)."""
+        if name == "height":
+            return torch.relu(self._standing_center - self.frames(state).center_of_mass()[:, 2]).square()
+        if name == "effort":
+            return state.act.square().mean(-1)
+        phase = self._phase(self.state.age) + self._hip_lag
+        feet = self._feet.motion(self.frames(state), state.qpos[:, 2])
+        return feet.sliding(phase) if name == "footfall" else feet.dragging(phase, self.config.reward.clearance_height)
 
     def fell(self, state: StepState) -> Tensor:
         low = self.frames(state).center_of_mass()[:, 2] < _MIN_HEIGHT
