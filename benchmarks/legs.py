@@ -1,7 +1,9 @@
 """Control steps per second of the muscle-driven legs: forward, and forward with backward, compared with C MuJoCo and
 myosuite.
 
-A control step is what the environment does for one action: 20 ms of physics, observation, reward and resets.
+A control step is what the environment does for one action: 20 ms of physics, observation, reward and resets. `recorded`
+is forward and backward replayed as one CUDA graph, as training does; it needs `--set physics.solver_kernels=fused`,
+because the loop of mujoco_warp's solver cannot be part of such a graph.
 """
 
 import argparse
@@ -19,6 +21,7 @@ from msk_ray.config import Config, load_config
 from msk_ray.envs import make_env
 from msk_ray.envs.myoleg.model import find_model
 from msk_ray.errors import ConfigError
+from msk_ray.simulation.capture import Recording
 
 MODELS = {"myoleg26": ("configs/myoleg26.yaml", "env.assist.epochs=0"), "myolegs": ("configs/myoleg.yaml",)}
 ROOT = Path(__file__).resolve().parent.parent
@@ -52,7 +55,7 @@ def measure(config: Config, worlds: int, device: str, horizon: int, seconds: flo
 
     def restart() -> None:
         env.state = env.reset_state()
-        env.stock_resets(horizon)
+        env.stock_resets(env.draw_resets(horizon))
 
     def simulate() -> None:
         state = env.reset_state().physics
@@ -75,8 +78,34 @@ def measure(config: Config, worlds: int, device: str, horizon: int, seconds: flo
         total.backward()
 
     rates = [rate(run, horizon * worlds, env.device, seconds) for run in (simulate, forward, both)]
+    figures = [*(f"{value:,.0f}" for value in rates), f"{rates[1] / rates[2]:.2f}"]
+    if env.device.type == "cuda" and env.sim.batch.kernels.fused_solver:
+        replay = recorded(env, actions).replay
+        figures.append(f"{rate(lambda: [replay() for _ in range(4)], 4 * horizon * worlds, env.device, seconds):,.0f}")
+    else:
+        figures.append("-")
     env.sim.diagnostics()  # raises if contacts were lost
-    return [str(worlds), *(f"{value:,.0f}" for value in rates), f"{rates[1] / rates[2]:.2f}"]
+    return [str(worlds), *figures]
+
+
+def recorded(env: Any, actions: torch.Tensor) -> Recording[Any]:
+    """Control steps under actions (H, W, A) from one state, and the gradient of their reward, as one CUDA graph."""
+    start, resets = env.reset_state(), env.draw_resets(len(actions))
+    inputs = actions.clone().requires_grad_()
+
+    def work() -> Any:
+        env.state = start
+        env.stock_resets(resets)
+        total = torch.zeros((), device=env.device)
+        for action in inputs:
+            total = total + env.step(action).reward.mean()
+        return torch.autograd.grad(total, inputs)
+
+    work()
+    recording = Recording(work, torch.cuda.Stream(env.device))
+    env.state = start
+    env.stock_resets(None)
+    return recording
 
 
 def c_mujoco(model: mujoco.MjModel, substeps: int, seconds: float) -> float:
@@ -115,14 +144,15 @@ def main() -> None:
     p.add_argument("--worlds", type=int, nargs="+", default=[64])
     p.add_argument("--horizon", type=int, default=16, help="control steps the gradient goes through")
     p.add_argument("--seconds", type=float, default=1.5, help="each figure is measured for at least this long")
+    p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     p.add_argument("--myosuite", metavar="ENV", default="myoLegWalk-v0", help="of myosuite, if that is installed")
     p.add_argument("--device", default="cuda:0" if torch.cuda.is_available() else "cpu")
     p.add_argument("--results", type=Path, default=RESULTS, help="folder the table is appended in")
     args = p.parse_args()
-    header = ["worlds", "physics", "forward", "forward + backward", "forward / both"]
+    header = ["worlds", "physics", "forward", "forward + backward", "forward / both", "recorded"]
     for name in args.models:
         path, *overrides = MODELS[name]
-        config = load_config(ROOT / path, overrides)
+        config = load_config(ROOT / path, [*overrides, *args.set])
         try:
             rows = []
             for worlds in args.worlds:
