@@ -6,7 +6,7 @@ MyoSuite 2.12 needs MuJoCo 3.6 and msk_ray 4.0, so one environment cannot hold b
 import json
 import subprocess
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from types import TracebackType
@@ -14,9 +14,12 @@ from typing import IO, Any, Final
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from msk_ray.config import Config
 from msk_ray.envs.myosuite_walk.config import MyoSuiteWalkSettings
+from msk_ray.envs.myosuite_walk.mirror import WalkMirror
+from msk_ray.envs.myosuite_walk.model import build_myosuite_walk
 from msk_ray.errors import ConfigError, SimulationError
 from msk_ray.evaluate import myosuite_worker as worker
 from msk_ray.evaluate.apart import INSTALL
@@ -31,6 +34,7 @@ RESETS: Final = ("init", "random")
 """MyoSuite's own resets, and those of `reset_type='random'`."""
 EPISODES: Final = 20
 STEPS: Final = 1000
+_Act = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 
 
 def requests(worlds: int | None, seeds: tuple[int, ...] | None, steps: int | None) -> list[Request]:
@@ -83,14 +87,32 @@ class MyoSuiteBench:
         assert request.steps is not None
         seeds = request.seeds or (0,)
         reset = request.physics.removeprefix("myosuite ")
+        act = _acting(policy)
         runs, versions = [], {}
         for seed in seeds:
             asked = {"env": ENVIRONMENT, "reset": reset, "seed": seed}
             with _Worker(self._python, {**asked, "episodes": request.worlds, "steps": request.steps}) as running:
-                runs.append(running.episodes(policy, request.worlds, request.steps))
+                runs.append(running.episodes(act, request.worlds, request.steps))
                 versions = running.versions
         made = Made(request.physics, False, request.worlds, seeds, request.steps, "cpu")
         return entry_of(policy, made, runs, worker.TERMS) | {"myosuite": versions}
+
+
+def _acting(policy: SavedPolicy) -> _Act:
+    """The action (U,) of a policy for an observation (O,) of MyoSuite."""
+    env = policy.config.env
+    assert isinstance(env, MyoSuiteWalkSettings)
+    if not env.symmetric:
+        return lambda obs: policy(obs[None])[0]
+    mirror = WalkMirror(build_myosuite_walk(env, policy.config.physics), torch.device("cpu"))
+
+    def act(obs: NDArray[np.float32]) -> NDArray[np.float32]:
+        row = torch.from_numpy(obs[None])
+        action = torch.from_numpy(policy(mirror.observation(row).numpy()))
+        exchanged: NDArray[np.float32] = mirror.action(mirror.exchanged(row), action)[0].numpy()
+        return exchanged
+
+    return act
 
 
 class _Worker(AbstractContextManager["_Worker"]):
@@ -128,9 +150,9 @@ class _Worker(AbstractContextManager["_Worker"]):
         assert self._process.stdout is not None
         return self._process.stdout
 
-    def episodes(self, policy: SavedPolicy, count: int, steps: int) -> Episodes:
+    def episodes(self, act: _Act, count: int, steps: int) -> Episodes:
         """`count` episodes of at most `steps` steps, one after the other, as a tensor entry each."""
-        found = [self._episode(policy, steps) for _ in range(count)]
+        found = [self._episode(act, steps) for _ in range(count)]
         last = [episode[-1] for episode in found]
 
         def summed(name: str) -> torch.Tensor:
@@ -147,13 +169,13 @@ class _Worker(AbstractContextManager["_Worker"]):
             success=None,
         )
 
-    def _episode(self, policy: SavedPolicy, steps: int) -> np.ndarray:
+    def _episode(self, act: _Act, steps: int) -> np.ndarray:
         """Records of one episode, (T,)."""
         assert self._process.stdin is not None
         found: list[np.ndarray] = []
         obs = self._read()["obs"]
         while len(found) < steps:
-            action = policy(obs[None])[0].astype("<f4")
+            action = act(obs).astype("<f4")
             try:
                 self._process.stdin.write(action.tobytes())
                 self._process.stdin.flush()

@@ -10,10 +10,13 @@ import torch
 from myosuite_model import walk_model
 
 from msk_ray.cli import run
-from msk_ray.config import load_config
+from msk_ray.config import PhysicsConfig, load_config
+from msk_ray.envs import make_env
+from msk_ray.envs.base import Env
 from msk_ray.evaluate.__main__ import main
+from msk_ray.evaluate.myosuite import _acting
 from msk_ray.evaluate.stored import read_evaluations
-from msk_ray.training import Trainer
+from msk_ray.training import Trainer, load_policy
 
 pytestmark = pytest.mark.long
 
@@ -68,8 +71,6 @@ def trial(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def stand_in(trial: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The Python of an environment with a package that calls itself MyoSuite 2.12.2."""
-    from msk_ray.training import load_policy
-
     place = tmp_path_factory.mktemp("apart")
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(place)], check=True)
     (site,) = place.glob("lib/python*/site-packages")
@@ -111,6 +112,31 @@ def test_every_figure_by_hand(trial: Path, stand_in: Path, capsys: pytest.Captur
     assert own["myosuite"]["myosuite"] == "2.12.2"
     assert not own["canonical"]
     assert "under myosuite random physics: 3 worlds, seeds 0,1, 5 steps, on cpu" in capsys.readouterr().out
+
+
+def test_a_symmetric_policy_acts_there_as_in_training(trial: Path) -> None:
+    found = load_policy(trial / "checkpoints" / "best.pt")
+    config = load_config("myosuite_walk", [f"env.model={walk_model()}", "env.reset=random"])
+
+    def make(symmetric: bool) -> Env[Any]:
+        settings = config.env.model_copy(update={"symmetric": symmetric, "cycle": 1.0})
+        return make_env(settings, PhysicsConfig(), 8, "cpu", 0, differentiable=False)
+
+    plain, symmetric = make(False), make(True)
+
+    class Policy:
+        config = load_config("myosuite_walk", [f"env.model={walk_model()}", "env.symmetric=true"])
+
+        def __call__(self, obs: Any) -> Any:
+            return found(obs)
+
+    act = _acting(Policy())  # type: ignore[arg-type]
+    actions = torch.stack([torch.as_tensor(act(obs)) for obs in plain.observation().numpy()])
+    there = symmetric.control(torch.as_tensor(found(symmetric.observation().numpy())))
+    torch.testing.assert_close(plain.control(actions), there)
+    exchanged = plain.observation()[:, 82] >= 0.5
+    assert 0 < exchanged.sum() < 8
+    assert (plain.control(torch.as_tensor(found(plain.observation().numpy()))) != there).any(-1).equal(exchanged)
 
 
 def test_what_cannot_be_evaluated_there_is_one_line(

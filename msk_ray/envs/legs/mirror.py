@@ -3,6 +3,7 @@
 Axes: O observation, A action.
 """
 
+import re
 from collections.abc import Sequence
 
 import mujoco
@@ -15,6 +16,7 @@ from msk_ray.errors import UnsupportedModelError
 _TOLERANCE = 2e-3
 """Largest distance between a body and the mirror image of its counterpart [m]."""
 _SAMPLES = 4
+_SIDE = re.compile(r"_([rl])(?=_|$)")
 
 
 class Mirror:
@@ -46,14 +48,14 @@ class Mirror:
 
 
 def other_side(names: Sequence[str]) -> list[int]:
-    """For each name its counterpart's place in the list; names end in _r or _l, others are their own.
+    """For each name its counterpart's place in the list, by the first _r or _l in it; others are their own.
 
     Raises:
         UnsupportedModelError: there is no counterpart.
     """
     found = []
     for name in names:
-        swapped = name[:-1] + {"r": "l", "l": "r"}[name[-1]] if name.endswith(("_r", "_l")) else name
+        swapped = _SIDE.sub(lambda side: "_l" if side[1] == "r" else "_r", name, count=1)
         if swapped not in names:
             raise UnsupportedModelError(
                 f"env.symmetric: {name} has no counterpart {swapped}: write env.symmetric: false"

@@ -55,6 +55,10 @@ class MyoSuiteWalkSettings(EnvSettings):
     cycle: Fraction = 0.0
     """Share of training's episodes that start elsewhere: anywhere in people's gait cycle, in their posture and with
     their speeds, at the phase at which the reward wants the hips like that. Scores are without them."""
+    symmetric: bool = False
+    """One half of the cycle is the mirror image of the other: while the phase is in its second half, right and left are
+    exchanged in MyoSuite's observation before the policy sees it, with the phase half a turn back, and in its actions.
+    It is part of the policy, in scores as in training. (Muscles of both sides differ by 1 %.)"""
     assist: AssistConfig = AssistConfig()
     smoothing: Fraction = 0.2
     """Width, in excitation, of the blend between activation and deactivation, which has no slope without it. Scores are

@@ -21,6 +21,7 @@ from msk_ray.envs.legs.muscles import MuscleCurves
 from msk_ray.envs.legs.reference import people_angles
 from msk_ray.envs.myoleg.model import cycle_states
 from msk_ray.envs.myosuite_walk.config import FURTHER, MyoSuiteWalkSettings
+from msk_ray.envs.myosuite_walk.mirror import WalkMirror
 from msk_ray.envs.myosuite_walk.model import HINGES, build_myosuite_walk
 from msk_ray.simulation import StepState
 
@@ -66,6 +67,8 @@ class MyoSuiteWalk(AssistedEnv[MyoSuiteWalkSettings]):
     The phase lags the count of steps by one, as in MyoSuite: the first two observations of an episode have phase 0, and
     the reward of a step is for the phase of the observation that it ends in.
 
+    With `symmetric`, right and left are exchanged while the phase is in its second half, and it is half a turn less.
+
     With `cycle`, the number of an episode's task is how many steps its phase is ahead of MyoSuite's.
     """
 
@@ -109,6 +112,7 @@ class MyoSuiteWalk(AssistedEnv[MyoSuiteWalkSettings]):
         hinges = torch.tensor([model.joint(name).qposadr[0] for name in HINGES], device=self.device)
         self._flexions, self._others = hinges[:2], hinges[2:]
         self._swing = tensor([-_SWING, _SWING])
+        self._mirror = WalkMirror(model, self.device) if self.config.symmetric else None
         # The phase of people's right leg where MyoSuite's is 0: where the first harmonic of their hip is largest.
         even, odd = fourier(people_angles()[0])[:, 1]
         self._hip_lag = math.atan2(odd, even) / math.tau
@@ -169,14 +173,20 @@ class MyoSuiteWalk(AssistedEnv[MyoSuiteWalkSettings]):
 
     def control(self, action: Tensor) -> Tensor:
         """Excitations 1/(1 + exp(−5 (a − ½))): 0.08 at action 0, and 0.0006 to 0.92 over [−1, 1]."""
+        if self._mirror is not None:
+            action = self._mirror.action(self._phase(self._observed_steps()) >= 0.5, action)
         return torch.sigmoid(5.0 * (action - 0.5))
 
     def observation(self) -> Tensor:
-        return self._observe(self.state.physics, (self.state.age - 1).clamp_min(0))
+        return self._observe(self.state.physics, self._observed_steps())
 
     def observe(self, state: StepState, action: Tensor) -> Tensor:
         """Observation (W, O) of a state to which a step from the current one has led."""
         return self._observe(state, self.state.age)
+
+    def _observed_steps(self) -> Tensor:
+        """Steps (W,) whose phase the current state is observed with."""
+        return (self.state.age - 1).clamp_min(0)
 
     def _observe(self, state: StepState, steps: Tensor) -> Tensor:
         q, v = state.qpos, state.qvel
@@ -185,7 +195,7 @@ class MyoSuiteWalk(AssistedEnv[MyoSuiteWalkSettings]):
         length, rate = self.tendons(state)
         length, rate = length[:, self._muscles.tendons], rate[:, self._muscles.tendons]
         pull = self._muscles.force(state.act, *self._muscles.normalised(length, rate))
-        return torch.cat(
+        obs = torch.cat(
             (
                 q[:, 2:],
                 self.config.control_timestep * v,
@@ -202,6 +212,7 @@ class MyoSuiteWalk(AssistedEnv[MyoSuiteWalkSettings]):
             ),
             dim=-1,
         )
+        return obs if self._mirror is None else self._mirror.observation(obs)
 
     def _phase(self, steps: Tensor) -> Tensor:
         """Phase [turns] after so many steps of MyoSuite's, (W,)."""
