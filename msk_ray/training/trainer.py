@@ -286,7 +286,8 @@ class Trainer(Place):
         """
         started = time.perf_counter()
         waiting = list(self._unscored.epochs)
-        policies = [*map(self._waiting_policy, waiting), *own]
+        states = {epoch: self._unscored.state(epoch) for epoch in waiting}
+        policies = [*(self._waiting_policy(*item) for item in states.items()), *own]
         if not policies:
             return [], 0.0
         if waiting:
@@ -296,19 +297,18 @@ class Trainer(Place):
         each_s = (time.perf_counter() - started) / len(policies)
         rows = {int(row["epoch"]): row for row in read_rows(self.logdir)} if waiting else {}
         for epoch, found in zip(waiting, figures, strict=False):
-            modules = self._unscored.state(epoch)["algorithm"]["modules"]
-            late = self._record(epoch, found, partial(self._unscored.state, epoch), parameter_hash(modules))
+            state = states.pop(epoch)
+            late = self._record(epoch, found, partial(dict, state), parameter_hash(state["algorithm"]["modules"]))
             row = rows.get(epoch)
             if row is None:
-                state = self._unscored.state(epoch)
                 row = {key: state[key] for key in ("epoch", "env_steps", "seconds")}
             waited_s = row.get("time/evaluation_s", 0.0)
             self._log.write_late(row, late | {"time/evaluation_s": waited_s + each_s})
             self._unscored.remove(epoch)
         return figures[len(waiting) :], each_s * len(waiting)
 
-    def _waiting_policy(self, epoch: int) -> Policy:
-        state, path = self._unscored.state(epoch), unscored_path(self.checkpoints, epoch)
+    def _waiting_policy(self, epoch: int, state: dict[str, Any]) -> Policy:
+        path = unscored_path(self.checkpoints, epoch)
         saved = SavedPolicy(path, self.config, epoch, state["env_steps"], "", state["algorithm"]["modules"])
         cuda = [self.env.device] if self.env.device.type == "cuda" else []
         with torch.random.fork_rng(cuda):  # new networks draw weights, which training must not notice
