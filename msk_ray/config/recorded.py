@@ -114,7 +114,10 @@ _LATER: dict[tuple[str, ...], Any] = {
     ("env", "assist", "steady"): None,
     ("env", "push"): {"speed": 0.0, "interval": 2.0},
     ("env", "tracking"): {"start": 1.0, "end": 1.0, "epochs": 0},
-    **{("env", name): 0.0 for name in ("metabolic", "fatigue", "head", "impact", "footfall", "clearance", "toes")},
+    **{
+        ("env", name): 0.0
+        for name in ("metabolic", "fatigue", "head", "impact", "footfall", "clearance", "toes", "vault")
+    },
     **{("env", name): 0.0 for name in ("track", "track_rate")},
     ("env", "clearance_height"): 0.01,
     ("env", "track_scale"): 0.15,

@@ -7,9 +7,9 @@ from pydantic import Field, PositiveFloat, model_validator
 
 from msk_ray.config.sections import Count, EnvSettings, Fraction, NonNegative, Reward, Section, Whole
 
-FURTHER = ("metabolic", "fatigue", "head", "impact", "footfall", "clearance", "toes", "track", "track_rate")
+FURTHER = ("metabolic", "fatigue", "head", "impact", "footfall", "clearance", "toes", "vault", "track", "track_rate")
 """Weights of terms that are there only where they are not zero."""
-CLOCKED = ("footfall", "clearance", "toes", "track", "track_rate")
+CLOCKED = ("footfall", "clearance", "toes", "vault", "track", "track_rate")
 """Weights of terms that need the clock."""
 
 
@@ -78,6 +78,10 @@ class LegReward(Reward):
     """Weight of the angle of the toes from level while the clock wants them on the ground, and from straight otherwise,
     linear beyond 0.15 rad. Without it they stay lifted, and the foot has no lever for the end of the push-off. Needs
     `env.clock`."""
+    vault: NonNegative = 0.0
+    """Weight of √(1 + (Δv / 0.1 m/s)²) - 1, where Δv is how far the pelvis's vertical velocity is from that of a body
+    that vaults over each leg: lowest in the middle of double support, highest half a step later, by as much as people's
+    centre of mass rises at that speed. It decides when feet push off. Needs `env.clock`."""
     track: NonNegative = 0.0
     """Weight of √(1 + mean (Δq / track_scale)²) - 1, where Δq is how far hip flexion, knee and ankle of both legs are
     from the mean of people at the clock's phase. Needs `env.clock`."""

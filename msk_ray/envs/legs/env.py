@@ -347,6 +347,10 @@ class LegEnv(AssistedEnv[AnyLegSettings], Generic[AnyLegSettings]):
                 return self._foot_motion(state).dragging(self._leg_phases()[0], wanted)
             case "toes":
                 return self._lifted_toes(state)
+            case "vault":
+                speed = self.task_numbers(self.state.numbers)[:, 0]
+                rise = self.reference.pace.vault(self._leg_phases()[0], speed)
+                return costs.vaulting(self.root(state).velocity[:, 2], rise)
             case _:
                 return self._tracking(state)[("track", "track_rate").index(name)]
 

@@ -23,6 +23,9 @@ MEASURED_AT = 1.25
 _FLAT = slice(10, 31)
 _EXCHANGE = 0.06
 """Phase at which the weight has passed to the right foot [turns], the middle of people's double support."""
+_RISE = (0.0112, 0.0232)
+"""How far the centre of mass rises in a step [m] = first + second × speed [m/s]: 2.74 cm at 0.7 m/s and 4.83 cm at 1.6
+m/s (Orendurff et al. 2004, J Rehabil Res Dev 41:829)."""
 _GRAVITY = 9.81
 
 
@@ -101,6 +104,12 @@ class Pace(NamedTuple):
     def step_length(self, speed: Tensor) -> Tensor:
         """Step length [m], (W,)."""
         return polynomial(self.step_polynomial, speed)
+
+    def vault(self, phase: Tensor, speed: Tensor) -> Tensor:
+        """Vertical velocity [m/s], (W,), of a centre of mass that rises and sinks as a sine at phases (W,) [turns]."""
+        rise = _RISE[0] + _RISE[1] * speed
+        turn = 2.0 * math.tau * self.strides_per_second(speed)  # once a step [rad/s]
+        return 0.5 * rise * turn * torch.sin(2.0 * math.tau * (phase - _EXCHANGE)).to(speed.dtype)
 
     def hip_swing(self, speed: Tensor, leg: float) -> Tensor:
         """Largest angle between both hips [rad], (W,), of legs of this length [m] that take such steps."""

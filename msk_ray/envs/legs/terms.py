@@ -16,6 +16,8 @@ _SLIDING = 0.3
 """Speed of a foot that should stand beyond which its cost grows linearly [m/s]."""
 _BENT = 0.15
 """Angle of the toes beyond which its cost grows linearly [rad]."""
+_VAULTING = 0.1
+"""Error of the pelvis's vertical velocity beyond which its cost grows linearly [m/s]."""
 _NEAR = 0.03
 """Height above the ground at which an approaching foot counts 1/e [m]."""
 
@@ -69,6 +71,11 @@ def impact(heights: Tensor, fall: Tensor) -> Tensor:
         fall: upward velocities [m/s], (W, F).
     """
     return (torch.relu(-fall).square() * torch.exp(-heights.clamp_min(0.0) / _NEAR)).sum(-1)
+
+
+def vaulting(velocity: Tensor, wanted: Tensor) -> Tensor:
+    """Cost (W,) of vertical velocities (W,) [m/s] of the pelvis apart from those of a vaulting body."""
+    return soft(((velocity - wanted) / _VAULTING).square())
 
 
 def deviation(values: Tensor, reference: Tensor, scale: float) -> Tensor:
