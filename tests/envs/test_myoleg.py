@@ -98,6 +98,12 @@ def test_a_file_of_ones_own_is_taken_before_any_package(install, tmp_path: Path)
         ("<mujoco", "MuJoCo cannot load"),
         (TOY.format(root=""), "no free joint first"),
         (TOY.format(root="<freejoint/>").replace('<geom type="plane" size="1 1 1"/>', ""), "meets no ground"),
+        (
+            TOY.format(root="<freejoint/>").replace(
+                "<body name", '<geom name="box" type="box" size=".5 .5 .2"/><body name', 1
+            ),
+            "stands on geom box, which ends; remove it",
+        ),
     ],
 )
 def test_a_file_that_does_not_fit_is_refused_on_one_line(tmp_path: Path, text: str | None, message: str) -> None:

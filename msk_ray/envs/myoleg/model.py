@@ -223,9 +223,21 @@ def standing_pose(model: mujoco.MjModel) -> NDArray[np.float64]:
     """The reference configuration with its equalities satisfied, lowered until it touches the ground.
 
     Raises:
-        ConfigError: it touches nothing over two metres.
+        ConfigError: it touches nothing over two metres, or stands on scenery, from which it could only walk off.
     """
-    return lowered(model, Couplings(model).satisfied(model.qpos0))
+    pose = lowered(model, Couplings(model).satisfied(model.qpos0))
+    data = mujoco.MjData(model)
+    data.qpos[:] = pose
+    data.qpos[2] -= 2.0 * _SINKING
+    mujoco.mj_fwdPosition(model, data)
+    for geom in data.contact.geom.ravel():
+        if model.geom_bodyid[geom] == 0 and model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_PLANE:
+            name = model.geom(geom).name or f"number {geom}"
+            raise ConfigError(
+                f"env.model: the standing pose stands on geom {name}, which ends; remove it from worldbody, or write "
+                "contype 0 and conaffinity 0, so that the legs stand on the plane"
+            )
+    return pose
 
 
 def lowered(model: mujoco.MjModel, pose: NDArray[np.float64]) -> NDArray[np.float64]:
