@@ -23,7 +23,8 @@ distance, one number for all of it (about 1 for a healthy person, 10 for one who
 
 Episodes are those of the evaluation: without noise or assistance, from fixed initial states. Their first second is
 left out. Writes gait.json and gait.png into the trial's folder or that of --out, and adds the gait to its eval.json.
-Several policies are compared in one table; with --speeds, each is told these speeds one after the other."""
+Several policies are compared in one table; with --speeds, each is told these speeds one after the other, and speeds.png
+shows cadence and step length against speed."""
 
 EXAMPLES = """\
   python -m msk_ray.gait runs/train/myoleg26_seed0
@@ -71,7 +72,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     speeds: list[float | None] = [None] if args.speeds is None else [*_speeds(args.speeds)]
 
     from msk_ray.evaluate.measure import Bench, Request, default_device
-    from msk_ray.gait.picture import draw
+    from msk_ray.gait.picture import draw, draw_speeds
     from msk_ray.gait.walk import at_target_speed, walk
     from msk_ray.training import load_policy
 
@@ -80,6 +81,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     rows: list[tuple[str, dict[str, Any]]] = []
     for path in paths:
         policy = load_policy(path)
+        told: list[tuple[float, dict[str, Any]]] = []
         for speed in speeds:
             found = walk(bench, policy if speed is None else at_target_speed(policy, speed), request)
             gait, suffix = found.gait, "" if speed is None else f"_{speed:g}"
@@ -102,6 +104,12 @@ def main(argv: Sequence[str] | None = None) -> int:
                 film(figures(model, stride), figures(model, people), seconds, args.film)
                 print(f"written into {args.film}")
             rows.append((f"{trial_folder_of(path).name}/{path.name}{suffix}", gait))
+            if speed is not None:
+                told.append((speed, gait))
+        if len(told) > 1:
+            name = "speeds" if len(paths) == 1 or args.out is None else f"speeds_{len(rows)}"
+            draw_speeds(told, f"{path.name}, epoch {policy.epoch}", out / f"{name}.png")
+            print(f"written into {out / name}.png")
     if len(rows) > 1:
         print(side_by_side(rows))
     return 0

@@ -1,5 +1,7 @@
 """The gait as a picture: curves over the cycle with human landmarks, and measures with human ranges."""
 
+from collections.abc import Sequence
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ import numpy as np
 from matplotlib.patches import Rectangle
 
 from msk_ray.envs.legs.gait.compare import BAND
-from msk_ray.envs.legs.gait.people import curve, envelope
+from msk_ray.envs.legs.gait.people import curve, envelope, pace
 from msk_ray.envs.legs.gait.ranges import LANDMARKS
 
 _PANELS = {
@@ -54,6 +56,38 @@ def draw(gait: dict[str, Any], title: str, path: Path) -> None:
         axis.axis("off")
     strides = f"{gait['strides']} strides in {gait['episodes']} episodes"
     figure.suptitle(f"{title}: {strides}; green: people, mean ± 2 SD (boxes: ranges of textbooks; muscles: timing)")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def draw_speeds(gaits: Sequence[tuple[float, dict[str, Any]]], title: str, path: Path) -> None:
+    """Write a PNG of cadence and step length against speed, over the mean ± 2 SD of people.
+
+    Args:
+        gaits: what the policy was told [m/s], and the result of `measure`.
+        title: above the picture.
+        path: file to write.
+    """
+    figure, axes = plt.subplots(1, 2, figsize=(11, 4.5), constrained_layout=True)
+    told = [speed for speed, _ in gaits]
+    speeds = np.linspace(min(told) - 0.1, max(told) + 0.1, 61)
+    people = [pace(float(speed)) for speed in speeds]
+    for axis, name, label in zip(
+        axes, ("cadence", "step_length"), ("cadence [steps/min]", "step length [m]"), strict=True
+    ):
+        mean = np.array([getattr(one, name) for one in people])
+        sd = np.array([getattr(one, f"{name}_sd") for one in people])
+        axis.plot(speeds, mean, color="tab:green", label="people, mean ± 2 SD")
+        axis.fill_between(speeds, mean - BAND * sd, mean + BAND * sd, color="tab:green", alpha=0.15, linewidth=0)
+        found = [
+            (gait["measures"]["speed"]["value"], gait["measures"][name]["value"])
+            for _, gait in sorted(gaits, key=itemgetter(0))
+        ]
+        known = np.array([point for point in found if None not in point], dtype=float).reshape(-1, 2)
+        axis.plot(*known.T, "o-", color="tab:red", label="policy")
+        axis.set(xlabel="speed [m/s]", ylabel=label)
+    axes[0].legend(frameon=False)
+    figure.suptitle(f"{title}, told {', '.join(f'{speed:g}' for speed in told)} m/s")
     figure.savefig(path, dpi=110)
     plt.close(figure)
 

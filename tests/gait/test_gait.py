@@ -100,6 +100,7 @@ def test_the_command_writes_json_and_a_picture(tmp_path: Path, capsys: pytest.Ca
     more = [str(tmp_path / "trial"), "--worlds", "1", "--steps", "5", "--device", "cpu", "--speeds", "0.5,1.25"]
     assert main(more) == 0
     assert (tmp_path / "trial" / "gait_0.5.json").is_file()
+    assert (tmp_path / "trial" / "speeds.png").stat().st_size > 10_000
     assert len([line for line in capsys.readouterr().out.splitlines() if "best.pt_" in line]) == 2
     shorter = ["--worlds", "2", "--steps", "10", "--device", "cpu"]
     assert evaluate([str(tmp_path / "trial"), *shorter, "--with", "push,weak"]) == 0
