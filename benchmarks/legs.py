@@ -91,9 +91,10 @@ def measure(config: Config, worlds: int, device: str, horizon: int, seconds: flo
 def recorded(env: Any, actions: torch.Tensor) -> Recording[Any]:
     """Control steps under actions (H, W, A) from one state, and the gradient of their reward, as one CUDA graph."""
     start, resets = env.reset_state(), env.draw_resets(len(actions))
-    inputs = actions.clone().requires_grad_()
 
     def work() -> Any:
+        # Made here, because autograd would go on using the stream on which it first saw them.
+        inputs = actions.clone().requires_grad_()
         env.state = start
         env.stock_resets(resets)
         total = torch.zeros((), device=env.device)
