@@ -216,7 +216,12 @@ class RecordedRunner(EagerRunner):
         """Keep what a fit is to read, and the loss of the fit before, which has ended on the device by now."""
         if self._newest_loss is not None:
             self.last_loss = self._newest_loss.clone()
-        offered = obs.clone(), targets.clone()
+        fit = next((f for key, f in self._fits.items() if f and key[:2] == (obs.shape, targets.shape)), None)
+        if fit is None:
+            offered = obs.clone(), targets.clone()
+        else:  # whose last replay has ended
+            offered = fit.inputs[0], fit.inputs[1]
+            fill(offered, (obs, targets))
         self._ready.record(torch.cuda.current_stream(self._device))
         return offered
 
