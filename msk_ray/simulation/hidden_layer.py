@@ -11,22 +11,91 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from msk_ray.physics.fused.lanes import WARP, lane_count, lane_sum
 from msk_ray.simulation.buffers import stream_of
 
-_LANES = 32
-"""Threads that share a row: one warp, whose sums do not wait for others."""
 _BLOCK = 128
-"""Threads of a block of neighbouring features."""
+"""Threads of a block: neighbouring features, or the warps of a few rows."""
 _CHUNK = 32
 """Rows that a thread adds up. Sums of chunks are added by torch, so that their order is fixed."""
 
 wp.set_module_options({"enable_backward": False})
 
 
-@wp.func
-def elu(x: float) -> float:
-    """x, or exp(x) - 1 where it is negative."""
-    return wp.where(x > 0.0, x, wp.exp(wp.min(x, 0.0)) - 1.0)
+# Unrolled, so that the numbers of several turns are fetched together. What is not a number stays so.
+_LOOP = """
+#if defined(__CUDA_ARCH__)
+    #pragma unroll 4
+#endif
+    for (int k = lane; k < width; k += step) {
+        const float e = x[k] > 0.0f ? x[k] : wp::exp(x[k]) - 1.0f;
+"""
+
+
+@wp.func_native(
+    f"""
+    const float* __restrict__ x = x_in.data + (size_t)row * width;
+    float sum = 0.0f, squares = 0.0f;
+    {_LOOP}
+        sum += e;
+        squares += e * e;
+    }}
+    return wp::vec_t<2, wp::float32>(sum, squares);
+"""
+)
+def active_sums(x_in: wp.array2d[float], row: int, width: int, lane: int, step: int) -> wp.vec2: ...
+
+
+@wp.func_native(
+    f"""
+    const float* __restrict__ x = x_in.data + (size_t)row * width;
+    float* __restrict__ y = y_out.data + (size_t)row * width;
+    const float* __restrict__ gain = gain_in.data;
+    const float* __restrict__ shift = shift_in.data;
+    {_LOOP}
+        y[k] = (e - mean) * scale * gain[k] + shift[k];
+    }}
+"""
+)
+def write_norm(
+    x_in: wp.array2d[float],
+    gain_in: wp.array[float],
+    shift_in: wp.array[float],
+    mean: float,
+    scale: float,
+    row: int,
+    width: int,
+    lane: int,
+    step: int,
+    y_out: wp.array2d[float],
+) -> None: ...
+
+
+@wp.func_native(
+    f"""
+    const float* __restrict__ x = x_in.data + (size_t)row * width;
+    const float* __restrict__ bar = bar_in.data + (size_t)row * width;
+    const float* __restrict__ gain = gain_in.data;
+    float sum = 0.0f, products = 0.0f;
+    {_LOOP}
+        const float h_bar = gain[k] * bar[k];
+        sum += h_bar;
+        products += h_bar * (e - mean) * scale;
+    }}
+    return wp::vec_t<2, wp::float32>(sum, products);
+"""
+)
+def pulled_sums(
+    x_in: wp.array2d[float],
+    gain_in: wp.array[float],
+    bar_in: wp.array2d[float],
+    mean: float,
+    scale: float,
+    row: int,
+    width: int,
+    lane: int,
+    step: int,
+) -> wp.vec2: ...
 
 
 @wp.kernel
@@ -41,21 +110,18 @@ def activate(
     mean_out: wp.array[float],
     scale_out: wp.array[float],
 ) -> None:
-    """y = gain · h + shift, h = (e - mean e) · scale, e = ELU(x); a block a row."""
-    row, lane = wp.tid()
+    """y = gain · h + shift, h = (e - mean e) · scale, e = ELU(x); a warp a row."""
+    thread = wp.tid()
+    row = thread // lane_count()
+    lane = thread % lane_count()
     width = x_in.shape[1]
-    sums = wp.vec2(0.0, 0.0)
-    for k in range(lane, width, wp.block_dim()):
-        e = elu(x_in[row, k])
-        sums += wp.vec2(e, e * e)
-    total = wp.tile_reduce(wp.add, wp.tile(sums, preserve_type=True))[0]
-    mean = total[0] / float(width)
-    scale = 1.0 / wp.sqrt(wp.max(total[1] / float(width) - mean * mean, 0.0) + epsilon)
+    sums = active_sums(x_in, row, width, lane, lane_count())
+    mean = lane_sum(sums[0]) / float(width)
+    scale = 1.0 / wp.sqrt(wp.max(lane_sum(sums[1]) / float(width) - mean * mean, 0.0) + epsilon)
     if lane == 0:
         mean_out[row] = mean
         scale_out[row] = scale
-    for k in range(lane, width, wp.block_dim()):
-        y_out[row, k] = (elu(x_in[row, k]) - mean) * scale * gain_in[k] + shift_in[k]
+    write_norm(x_in, gain_in, shift_in, mean, scale, row, width, lane, lane_count(), y_out)
 
 
 @wp.kernel
@@ -69,19 +135,59 @@ def average_rows(
     # Out:
     means_out: wp.array2d[float],
 ) -> None:
-    """mean h̄ and mean (h̄ h), h̄ = gain · ȳ; a block a row."""
-    row, lane = wp.tid()
+    """mean h̄ and mean (h̄ h), h̄ = gain · ȳ; a warp a row."""
+    thread = wp.tid()
+    row = thread // lane_count()
+    lane = thread % lane_count()
     width = x_in.shape[1]
-    mean = mean_in[row]
-    scale = scale_in[row]
-    sums = wp.vec2(0.0, 0.0)
-    for k in range(lane, width, wp.block_dim()):
-        h_bar = gain_in[k] * bar_in[row, k]
-        sums += wp.vec2(h_bar, h_bar * (elu(x_in[row, k]) - mean) * scale)
-    total = wp.tile_reduce(wp.add, wp.tile(sums, preserve_type=True))[0]
+    sums = pulled_sums(x_in, gain_in, bar_in, mean_in[row], scale_in[row], row, width, lane, lane_count())
+    first = lane_sum(sums[0]) / float(width)
+    second = lane_sum(sums[1]) / float(width)
     if lane == 0:
-        means_out[row, 0] = total[0] / float(width)
-        means_out[row, 1] = total[1] / float(width)
+        means_out[row, 0] = first
+        means_out[row, 1] = second
+
+
+@wp.func_native(
+    """
+    const float* __restrict__ x_in = x.data + k;
+    const float* __restrict__ bar_in = bar.data + k;
+    const float* __restrict__ means_in = means.data;
+    const float* __restrict__ mean_in = mean.data;
+    const float* __restrict__ scale_in = scale.data;
+    float* __restrict__ x_bar_out = x_bar.data + k;
+    float gain_bar = 0.0f, shift_bar = 0.0f, bias_bar = 0.0f;
+#if defined(__CUDA_ARCH__)
+    #pragma unroll 4
+#endif
+    for (int row = begin; row < end; ++row) {
+        const float value = x_in[(size_t)row * width];
+        const float y_bar = bar_in[(size_t)row * width];
+        // e to the x where x is negative: ELU's slope, and ELU but for 1.
+        const float slope = wp::exp(wp::min(value, 0.0f));
+        const float h = (wp::max(value, 0.0f) + slope - 1.0f - mean_in[row]) * scale_in[row];
+        const float pulled = slope * scale_in[row] * (gain * y_bar - means_in[2 * row] - h * means_in[2 * row + 1]);
+        x_bar_out[(size_t)row * width] = pulled;
+        gain_bar += y_bar * h;
+        shift_bar += y_bar;
+        bias_bar += pulled;
+    }
+    return wp::vec_t<3, wp::float32>(gain_bar, shift_bar, bias_bar);
+"""
+)
+def pull_column(
+    x: wp.array2d[float],
+    gain: float,
+    mean: wp.array[float],
+    scale: wp.array[float],
+    bar: wp.array2d[float],
+    means: wp.array2d[float],
+    begin: int,
+    end: int,
+    k: int,
+    width: int,
+    x_bar: wp.array2d[float],
+) -> wp.vec3: ...
 
 
 @wp.kernel
@@ -101,25 +207,11 @@ def pull_rows_back(
     """x̄ = ELU'(x) · scale · (h̄ - mean h̄ - h · mean (h̄ h)), and Σ ȳ h, Σ ȳ and Σ x̄ over each chunk of rows, which is
     what gain, shift and bias pull back; a thread a feature of a chunk."""
     part, k = wp.tid()
-    gain = gain_in[k]
-    gain_bar = float(0.0)
-    shift_bar = float(0.0)
-    bias_bar = float(0.0)
-    for row in range(part * chunk, wp.min((part + 1) * chunk, x_in.shape[0])):
-        x = x_in[row, k]
-        bar = bar_in[row, k]
-        scale = scale_in[row]
-        # e to the x where x is negative: ELU's slope, and ELU but for 1.
-        slope = wp.exp(wp.min(x, 0.0))
-        h = (wp.max(x, 0.0) + slope - 1.0 - mean_in[row]) * scale
-        x_bar = slope * scale * (gain * bar - means_in[row, 0] - h * means_in[row, 1])
-        x_bar_out[row, k] = x_bar
-        gain_bar += bar * h
-        shift_bar += bar
-        bias_bar += x_bar
-    sums_out[part, 0, k] = gain_bar
-    sums_out[part, 1, k] = shift_bar
-    sums_out[part, 2, k] = bias_bar
+    begin = part * chunk
+    end = wp.min(begin + chunk, x_in.shape[0])
+    sums = pull_column(x_in, gain_in[k], mean_in, scale_in, bar_in, means_in, begin, end, k, x_in.shape[1], x_bar_out)
+    for i in range(3):
+        sums_out[part, i, k] = sums[i]
 
 
 class _HiddenLayer(torch.autograd.Function):
@@ -168,18 +260,16 @@ def hidden_layer(x: Tensor, weight: Tensor, bias: Tensor, gain: Tensor, shift: T
 def _launch(
     kernel: Any, size: int | tuple[int, int], inputs: tuple[Tensor, ...], outputs: tuple[Tensor, ...], *numbers: float
 ) -> None:
-    """Launch over rows, a block each, or over (chunks, features), on torch's current stream."""
+    """Launch over rows, a warp each, or over (chunks, features), on torch's current stream."""
     wp.init()
     device = inputs[0].device
     arrays = [[wp.from_torch(t.detach(), requires_grad=False) for t in group] for group in (inputs, outputs)]
-    rows = isinstance(size, int)
-    launch = wp.launch_tiled if rows else wp.launch
-    launch(
+    wp.launch(
         kernel,
-        dim=size,
+        dim=size * (WARP if device.type == "cuda" else 1) if isinstance(size, int) else size,
         inputs=[*arrays[0], *numbers],
         outputs=arrays[1],
         device=str(device),
         stream=stream_of(device),
-        block_dim=_LANES if rows else _BLOCK,
+        block_dim=_BLOCK,
     )

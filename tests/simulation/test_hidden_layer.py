@@ -35,3 +35,11 @@ def test_inputs_without_gradients_have_none() -> None:
     (found,) = torch.autograd.grad(hidden_layer(*inputs, 1e-5).square().sum(), inputs[1:2])
     assert found.shape == (5, 3)
     assert not hidden_layer(*(t.detach() for t in inputs), 1e-5).requires_grad
+
+
+def test_what_is_not_a_number_stays_so_in_its_row() -> None:
+    x = torch.ones(3, 4)
+    x[1, 2] = torch.nan
+    found = hidden_layer(x, torch.eye(5, 4), torch.zeros(5), torch.ones(5), torch.zeros(5), 1e-5)
+    assert found.isnan().all(1).tolist() == [False, True, False]
+    assert found[[0, 2]].isfinite().all()
