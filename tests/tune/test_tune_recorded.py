@@ -50,6 +50,7 @@ SINCE = {
     "ant": [*_KERNELS, "physics.backward=tape_per_substep"],
     "ant_hard_friction": [*_KERNELS, "physics.backward=tape_per_substep"],
     "ant_fd": _KERNELS,
+    "myoleg26": _KERNELS,
 }
 """What takes back the settings that a shipped config has been given since: they make it faster."""
 
