@@ -17,9 +17,9 @@ from msk_ray.shipped import is_shipped
 from msk_ray.text_table import text_table
 
 DESCRIPTION = """\
-Measure the gait of a policy of a leg environment (myoleg26, myoleg): speed, cadence, step length, duty factor, joint
-angles and ground reaction over the gait cycle, symmetry, cost and falls, compared with healthy people, and the gait
-distance, one number for all of it (about 1 for a healthy person, 10 for one who does not walk).
+Measure the gait of a policy of a leg environment (myoleg26, myoleg, myosuite_walk): speed, cadence, step length, duty
+factor, joint angles and ground reaction over the gait cycle, symmetry, cost and falls, compared with healthy people,
+and the gait distance, one number for all of it (about 1 for a healthy person, 10 for one who does not walk).
 
 Episodes are those of the evaluation: without noise or assistance, from fixed initial states. Their first second is
 left out. Writes gait.json and gait.png into the trial's folder or that of --out, and adds the gait to its eval.json.
@@ -71,6 +71,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         _check_film(args)
     speeds: list[float | None] = [None] if args.speeds is None else [*_speeds(args.speeds)]
 
+    from msk_ray.envs.legs.env import LegEnv
+    from msk_ray.envs.make import env_class
     from msk_ray.evaluate.measure import Bench, Request, default_device
     from msk_ray.gait.picture import draw, draw_speeds
     from msk_ray.gait.walk import at_target_speed, walk
@@ -81,6 +83,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     rows: list[tuple[str, dict[str, Any]]] = []
     for path in paths:
         policy = load_policy(path)
+        if args.film is not None and not issubclass(env_class(policy.config.env), LegEnv):
+            raise ConfigError(f"--film: env {policy.config.env.name} has no poses of people; leave it out")
         told: list[tuple[float, dict[str, Any]]] = []
         for speed in speeds:
             found = walk(bench, policy if speed is None else at_target_speed(policy, speed), request)
@@ -100,6 +104,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 from msk_ray.gait.stick import figures, film, one_stride
 
                 stride, seconds = one_stride(found.episodes, found.qpos)
+                assert isinstance(found.env, LegEnv)
                 model, people = found.env.model, found.env.people_poses()
                 film(figures(model, stride), figures(model, people), seconds, args.film)
                 print(f"written into {args.film}")

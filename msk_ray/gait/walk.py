@@ -3,8 +3,8 @@
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+from msk_ray.envs import Env
 from msk_ray.envs.legs.config import LegSettings
-from msk_ray.envs.legs.env import LegEnv
 from msk_ray.envs.legs.gait.body import Array, Episode, analyse, check_legs
 from msk_ray.envs.legs.gait.measure import measure
 from msk_ray.errors import ConfigError
@@ -26,7 +26,7 @@ class Walk(NamedTuple):
     episodes: list[Episode]
     qpos: list[Array]
     """Positions of each episode, (T, nq)."""
-    env: LegEnv[Any]
+    env: Env[Any]
 
 
 def at_target_speed(policy: SavedPolicy, speed: float) -> SavedPolicy:
@@ -52,7 +52,6 @@ def walk(bench: Bench, policy: SavedPolicy, request: Request) -> Walk:
     evaluator = bench.evaluator(policy.config, request)[0]
     env = evaluator.env
     check_legs(env.model)
-    assert isinstance(env, LegEnv)
     recording = record(bench, policy, request)
     episodes, positions = [], []
     for world in range(recording.count):

@@ -1,6 +1,7 @@
 """`myosuite_walk` against recorded steps of MyoSuite's own environment, and its gradients against float64 C MuJoCo."""
 
 import importlib.util
+import json
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from msk_ray.envs.myosuite_walk.env import MyoSuiteWalk
 from msk_ray.envs.myosuite_walk.model import KEYFRAMES, build_myosuite_walk, find_file
 from msk_ray.envs.records import EnvState
 from msk_ray.errors import ConfigError
+from msk_ray.gait.__main__ import main as gait
 from msk_ray.gradcheck import check_gradients
 from msk_ray.simulation import Simulation, StepState
 from msk_ray.simulation.tangent import quat_multiply
@@ -205,7 +207,7 @@ def test_scores_are_without_what_makes_training_easier() -> None:
     assert (model.opt.timestep, int(model.opt.cone), set(model.actuator_dynprm[:, 2])) == (1e-3, 0, {0.0})
 
 
-def test_the_config_trains(root: Path, tmp_path: Path) -> None:
+def test_the_config_trains_and_its_gait_is_measured(root: Path, tmp_path: Path) -> None:
     small = (f"env.model={walk_model()}", "env.nworld=2", "shac.horizon=2", "trial.epochs=1", "actor.hidden=[8]")
     rest = ("critic.hidden=[8]", "evaluation.nworld=2", "evaluation.steps=2", "evaluation.interval=1")
     trainer = Trainer(load_config(root / "configs" / "myosuite_walk.yaml", [*small, *rest]), tmp_path, "cpu")
@@ -215,6 +217,10 @@ def test_the_config_trains(root: Path, tmp_path: Path) -> None:
     trainer.close()
     assert after.isfinite().all()
     assert not torch.equal(before, after)
+    assert gait([str(tmp_path), "--worlds", "1", "--steps", "5", "--device", "cpu"]) == 0
+    assert json.loads((tmp_path / "gait.json").read_text())["episodes"] == 1
+    with pytest.raises(ConfigError, match="--film: env myosuite_walk has no poses of people; leave it out"):
+        gait([str(tmp_path), "--film", str(tmp_path / "stride.gif")])
 
 
 def test_a_model_that_is_not_myosuites_is_refused_on_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
