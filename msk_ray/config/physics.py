@@ -128,6 +128,12 @@ class PhysicsConfig(Section):
         """Whether sums have a fixed order, which `trial.deterministic` decides."""
         return self._ordered
 
+    def named(self, variant: str | None) -> "PhysicsConfig":
+        """A variant's physics, None for the model's own, with the buffers and kernels of this, which change none."""
+        return PhysicsConfig(
+            variant=variant, nconmax=self.nconmax, njmax=self.njmax, solver_kernels=self.solver_kernels
+        )
+
     def in_order(self, ordered: bool) -> "PhysicsConfig":
         """The same settings with sums in a fixed order, or not."""
         changed = self.model_copy()

@@ -107,11 +107,7 @@ class Env(ABC, Generic[SettingsT]):
     def reference_physics(cls, physics: PhysicsConfig, variant: str | None) -> PhysicsConfig:
         """The physics that policies are scored under: an unchanged named variant, or `physics` if there is none."""
         variants = cls.Settings.variants
-        if not variants:
-            return physics
-        # Buffers and kernels change no physics.
-        kept = {name: getattr(physics, name) for name in ("nconmax", "njmax", "solver_kernels")}
-        return PhysicsConfig(variant=variant or variants[0], **kept)
+        return physics.named(variant or variants[0]) if variants else physics
 
     def prepare(self) -> None:
         """Create constants on the device: copying one there in every step would make the host wait for the GPU."""

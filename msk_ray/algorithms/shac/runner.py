@@ -152,7 +152,7 @@ class RecordedRunner(EagerRunner):
         super().__init__(actor, critic, env)
         self._group = env.group
         self._kept = _Recordings(env.sim.engine)
-        self._fits: dict[tuple[torch.Size, ...], _Fit | None] = {}
+        self._fits: dict[tuple[torch.Size, torch.Size], _Fit | None] = {}
         # The GPU starts blocks of the actor's kernels first, and fills what is left of it with the critic's: only a
         # stream of higher priority than the usual one can be preferred.
         self._recording = torch.cuda.Stream(env.device, priority=-1)
@@ -216,7 +216,7 @@ class RecordedRunner(EagerRunner):
         """Keep what a fit is to read, and the loss of the fit before, which has ended on the device by now."""
         if self._newest_loss is not None:
             self.last_loss = self._newest_loss.clone()
-        fit = next((f for key, f in self._fits.items() if f and key[:2] == (obs.shape, targets.shape)), None)
+        fit = self._fits.get((obs.shape, targets.shape))
         if fit is None:
             offered = obs.clone(), targets.clone()
         else:  # whose last replay has ended
@@ -333,7 +333,7 @@ class RecordedRunner(EagerRunner):
 
     def _fit(self, inputs: tuple[Tensor, ...]) -> _Fit | None:
         """The recording of a fit of this size; None if it has to run eagerly."""
-        shapes = tuple(t.shape for t in inputs)
+        shapes = (inputs[0].shape, inputs[1].shape)  # which decide that of the orders
         if shapes not in self._fits:
             self._fits[shapes] = None
             return None

@@ -21,7 +21,7 @@ from msk_ray.simulation.tangent import quat_conjugate, quat_log, quat_multiply
 
 AnySettings = TypeVar("AnySettings", bound=EnvSettings)
 
-TRUNK_INERTIA = (7.0, 7.0, 0.85)
+_TRUNK_INERTIA = (7.0, 7.0, 0.85)
 """About the forward, left and up axes [kg m²] of myoleg26's pelvis and trunk with hanging legs: what the springs
 turn."""
 
@@ -91,9 +91,7 @@ class FreeSprings:
             return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=device)
 
         self._local, self._stand = tensor(in_root(model, axes)), tensor(stand[3:7])
-        stiffness = [config.balance * inertia / TRUNK_INERTIA[0] for inertia in TRUNK_INERTIA]
-        self._righting = tensor(stiffness)
-        self._turning = tensor([2.0 * math.sqrt(k * i) for k, i in zip(stiffness, TRUNK_INERTIA, strict=True)])
+        self._righting, self._turning = map(tensor, righting(config))
         mass = float(model.body_subtreemass[0])
         self._lateral, self._lateral_damping = config.lateral, 2.0 * math.sqrt(config.lateral * mass)
         self._left, self._rest = tensor(axes[1]), float(stand[:3] @ axes[1])
@@ -110,6 +108,15 @@ class FreeSprings:
         torque = -(self._righting * along + self._turning * spin) @ self._local
         root = torch.cat((push[:, None] * self._left + self._lift, torque), dim=-1)
         return torch.nn.functional.pad(root, (0, v.shape[1] - 6))
+
+
+def righting(config: AssistConfig) -> tuple[list[float], list[float]]:
+    """Stiffness [N m/rad] and critical damping, 2 √(k m), [N m s/rad] about the forward, left and up axes.
+
+    The frequency is the same about all three; otherwise the light one would oscillate within a control step.
+    """
+    stiffness = [config.balance * inertia / _TRUNK_INERTIA[0] for inertia in _TRUNK_INERTIA]
+    return stiffness, [2.0 * math.sqrt(k * inertia) for k, inertia in zip(stiffness, _TRUNK_INERTIA, strict=True)]
 
 
 def in_root(model: mujoco.MjModel, axes: NDArray[np.float64]) -> NDArray[np.float64]:

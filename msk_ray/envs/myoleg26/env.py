@@ -10,7 +10,7 @@ from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
 from msk_ray.envs.layout import Entry
-from msk_ray.envs.legs.assistance import TRUNK_INERTIA
+from msk_ray.envs.legs.assistance import righting
 from msk_ray.envs.legs.env import LegEnv
 from msk_ray.envs.legs.root import Root
 from msk_ray.envs.myoleg26.config import MyoLeg26Settings
@@ -58,11 +58,8 @@ class MyoLeg26(LegEnv[MyoLeg26Settings]):
             self._cycle = StepState(*map(self._tensor, cycle_states(model)))
         mass = float(model.body_subtreemass[0])
         a = self.config.assist
-        # Critical damping: c = 2 √(k m).
-        # The same frequency about all three axes; otherwise the light one would oscillate within a control step.
-        righting = [a.balance * inertia / TRUNK_INERTIA[0] for inertia in TRUNK_INERTIA]
-        damping = [2.0 * math.sqrt(k * inertia) for k, inertia in zip(righting, TRUNK_INERTIA, strict=True)]
-        self._springs = self._tensor([0.0, 0.0, a.lateral, *righting])
+        stiffness, damping = righting(a)
+        self._springs = self._tensor([0.0, 0.0, a.lateral, *stiffness])
         self._dampers = self._tensor([0.0, 0.0, 2.0 * math.sqrt(a.lateral * mass), *damping])
         self._lift = self._tensor([0.0, a.support * mass * _GRAVITY, 0.0, 0.0, 0.0, 0.0])
         self._upright_pose = self._tensor(model.key("stand").qpos[:6])

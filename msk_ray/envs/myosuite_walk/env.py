@@ -88,8 +88,7 @@ class MyoSuiteWalk(AssistedEnv[MyoSuiteWalkSettings]):
     @classmethod
     def reference_physics(cls, physics: PhysicsConfig, variant: str | None) -> PhysicsConfig:
         """MyoSuite's time step, contacts and solver."""
-        # Buffers and kernels change no physics.
-        return PhysicsConfig(nconmax=physics.nconmax, njmax=physics.njmax, solver_kernels=physics.solver_kernels)
+        return physics.named(None)
 
     def prepare(self) -> None:
         model = self.model
