@@ -105,6 +105,20 @@ def test_ant_reward_terms_follow_their_weights() -> None:
     assert terms == pytest.approx({"forward_vel": 4.5, "up": 2.0, "heading": 0.5, "height": 2.0, "action": -0.5})
 
 
+def test_an_ant_past_its_joints_ranges_pays_for_the_squared_overshoot() -> None:
+    config = AntSettings(name="ant", reward=AntReward(joint_limit=0.5, action_penalty=0.25))
+    env = make_env(config, PhysicsConfig(), 1, "cpu", 0, differentiable=False)
+    # Hips have 40 degrees to either side, ankles 30 to 100 (legs 1 and 4) or -100 to -30.
+    high, low, inside = math.radians(100.0) + 0.3, -math.radians(40.0) - 0.1, math.radians(-50.0)
+    joints = [0.0, high, low, inside, 0.0, inside, 0.0, 1.0]
+    state = StepState(torch.tensor([[0.0, 0, 0.77, 1, 0, 0, 0, *joints]]), torch.zeros(1, 14), torch.zeros(1, 0))
+    terms = named_terms(env, state, torch.full((1, 8), 0.5))
+    assert list(terms) == ["forward_vel", "up", "heading", "height", "action", "joint_limit"]
+    assert terms["joint_limit"].item() == pytest.approx(-0.5 * (3.0**2 + 1.0**2), rel=1e-5)
+    assert terms["action"].item() == pytest.approx(-0.25 * 8 * 0.25)
+    assert Ant.reference_settings(config).reward == AntReward(), "scores leave it out"
+
+
 def test_an_ant_that_falls_terminates_and_restarts(ant: Ant) -> None:
     place(ant, [0.0, 0, 0.2, 1, 0, 0, 0, 0, 1, 0, -1, 0, -1, 0, 1])
     with torch.no_grad():

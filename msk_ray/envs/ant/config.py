@@ -17,6 +17,8 @@ class AntReward(Reward):
     """Weight of the torso's height above `env.termination_height` [1/m]."""
     action_penalty: NonNegative = 0.0
     """Weight of the summed squared action."""
+    joint_limit: NonNegative = 0.0
+    """Weight of the summed squared overshoot past the joints' ranges, in units of 0.1 rad."""
 
 
 class AntSettings(EnvSettings):

@@ -15,6 +15,8 @@ from msk_ray.simulation import StepState
 from msk_ray.simulation.tangent import quat_exp, quat_multiply, quat_rotate
 
 _JOINT_VELOCITY_SCALE = 0.1
+_LIMIT_UNIT = 0.1
+"""Overshoot past a joint's range that costs the weight of `joint_limit` [rad]."""
 
 
 class Ant(Env[AntSettings]):
@@ -43,10 +45,14 @@ class Ant(Env[AntSettings]):
 
     def prepare(self) -> None:
         r = self.config.reward
+        if r.joint_limit > 0.0:
+            self.reward_names = (*type(self).reward_names, "joint_limit")
+            ranges = torch.tensor(self.model.jnt_range[1:], dtype=torch.float32, device=self.device)
+            self._low, self._high = ranges.unbind(-1)
         # World z of the torso's z axis and world x of its x axis are w² - x² - y² + z² and w² + x² - y² - z².
         self._axes = torch.tensor(((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)), device=self.device)
-        # All terms but the action penalty are linear in the observation.
-        linear = torch.zeros(self.obs_size, len(self.reward_names))
+        # All terms but the costs of actions and of joint limits are linear in the observation.
+        linear = torch.zeros(self.obs_size, len(type(self).reward_names))
         for term, (entry, weight) in enumerate(((5, r.forward_vel), (27, r.up), (28, r.heading), (0, r.height))):
             linear[entry, term] = weight
         offset = torch.tensor((0.0, 0.0, 0.0, -r.height * self.config.termination_height, 0.0))
@@ -85,11 +91,17 @@ class Ant(Env[AntSettings]):
         ]
 
     def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+        r = self.config.reward
         terms = torch.addmm(self._offset, obs, self._linear)
-        if self.config.reward.action_penalty == 0.0:
-            return terms
-        effort = -self.config.reward.action_penalty * action.square().sum(-1, keepdim=True)
-        return torch.cat((terms[:, :-1], effort), dim=-1)
+        if r.action_penalty > 0.0:
+            effort = -r.action_penalty * action.square().sum(-1, keepdim=True)
+            terms = torch.cat((terms[:, :-1], effort), dim=-1)
+        if r.joint_limit > 0.0:
+            angles = state.qpos[:, 7:]
+            # At most one end of a range is exceeded.
+            overshoot = torch.maximum(self._low - angles, angles - self._high).clamp_min(0.0) / _LIMIT_UNIT
+            terms = torch.cat((terms, -r.joint_limit * overshoot.square().sum(-1, keepdim=True)), dim=-1)
+        return terms
 
     def fell(self, state: StepState) -> Tensor:
         if not self.config.early_termination:
