@@ -37,7 +37,7 @@ class Ant(Env[AntSettings]):
 
     obs_size = 37
     Settings = AntSettings
-    reward_names = ("forward_vel", "up", "heading", "height", "action")
+    reward_names: tuple[str, ...] = ("forward_vel", "up", "heading", "height", "action")
 
     @classmethod
     def build_model(cls, config: AntSettings, physics: PhysicsConfig) -> mujoco.MjModel:
