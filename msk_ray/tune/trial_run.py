@@ -188,10 +188,12 @@ def _train(
             own = [e.score for e in evaluations_of(read_rows(folder)) if math.isfinite(e.score)]
             trainer.best_score = max(own, default=-math.inf)
         else:
+            done = max((int(row["epoch"]) for row in read_rows(folder)), default=0)
             path, faults = trainer.restore_latest()
             for fault in faults:
                 print(f"skipped: {fault}", flush=True)
-            print(f"continuing from {path}" if path else "starting", flush=True)
+            again = f"starting again: there is no complete checkpoint of the {done} epochs it had run"
+            print(f"continuing from {path}" if path else again if done else "starting", flush=True)
         note = str(read_attempt(folder))
         if note:
             # For anyone who reads only these settings, which restoring has written.

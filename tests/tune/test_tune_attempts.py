@@ -100,6 +100,20 @@ def test_a_damaged_outcome_is_said_and_the_trial_goes_on(
     assert read_ending(tmp_path) == Ending(Outcome.FINISHED, "all 20 epochs done")
 
 
+def test_a_trial_whose_checkpoints_are_gone_says_that_it_starts_again(
+    crowded: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trial = crowded(0.0)
+    attempt(trial, tmp_path)
+    assert "starting\n" in capsys.readouterr().out
+    (tmp_path / "outcome.json").unlink()
+    for checkpoint in (tmp_path / "checkpoints").glob("epoch_*.pt"):
+        checkpoint.unlink()
+    assert attempt(trial, tmp_path) == Ending(Outcome.FINISHED, "all 20 epochs done")
+    assert "starting again: there is no complete checkpoint of the 20 epochs it had run" in capsys.readouterr().out
+    assert [row["epoch"] for row in read_rows(tmp_path)] == list(range(21))
+
+
 def test_a_trial_whose_number_of_worlds_is_damaged_ends_and_says_what_to_write(crowded: Any, tmp_path: Path) -> None:
     trial = crowded(LATE_CROWD)
     assert attempt(trial, tmp_path) is None
