@@ -42,8 +42,9 @@ FAKES = {
         shift 2
         export JOBS_TMPDIR=$folder RAY_TMPDIR=$folder$place RAY_AUTH_TOKEN_PATH=$folder$place/token
         exec "$script" "$folder$place" "$@" """,
+    # It is told to end again and again until it has ended, and writes that down once.
     "ray": """
-        trap 'echo step ended >> "$LOG"; exit 0' TERM
+        trap 'trap "" TERM; echo step ended >> "$LOG"; exit 0' TERM
         echo "ray $*" >> "$LOG"
         stat -c 'token %a' "$RAY_AUTH_TOKEN_PATH" >> "$LOG"
         stat -c 'folder %a' "$RAY_TMPDIR" >> "$LOG"
