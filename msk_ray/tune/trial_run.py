@@ -192,8 +192,12 @@ def _train(
             path, faults = trainer.restore_latest()
             for fault in faults:
                 print(f"skipped: {fault}", flush=True)
-            again = f"starting again: there is no complete checkpoint of the {done} epochs it had run"
-            print(f"continuing from {path}" if path else again if done else "starting", flush=True)
+            if path is not None:
+                print(f"continuing from {path}", flush=True)
+            elif done:
+                print(f"starting again: there is no complete checkpoint of the {done} epochs it had run", flush=True)
+            else:
+                print("starting", flush=True)
         note = str(read_attempt(folder))
         if note:
             # For anyone who reads only these settings, which restoring has written.

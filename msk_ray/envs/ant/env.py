@@ -11,12 +11,11 @@ from msk_ray.envs.ant.config import AntSettings
 from msk_ray.envs.ant.model import STAND_HEIGHT, STAND_JOINTS, build_ant
 from msk_ray.envs.base import Env
 from msk_ray.envs.layout import Entry, entries, floating_body
+from msk_ray.envs.limits import squared_overshoot
 from msk_ray.simulation import StepState
 from msk_ray.simulation.tangent import quat_exp, quat_multiply, quat_rotate
 
 _JOINT_VELOCITY_SCALE = 0.1
-_LIMIT_UNIT = 0.1
-"""Overshoot past a joint's range that costs the weight of `joint_limit` [rad]."""
 
 
 class Ant(Env[AntSettings]):
@@ -97,10 +96,8 @@ class Ant(Env[AntSettings]):
             effort = -r.action_penalty * action.square().sum(-1, keepdim=True)
             terms = torch.cat((terms[:, :-1], effort), dim=-1)
         if r.joint_limit > 0.0:
-            angles = state.qpos[:, 7:]
-            # At most one end of a range is exceeded.
-            overshoot = torch.maximum(self._low - angles, angles - self._high).clamp_min(0.0) / _LIMIT_UNIT
-            terms = torch.cat((terms, -r.joint_limit * overshoot.square().sum(-1, keepdim=True)), dim=-1)
+            overshoot = squared_overshoot(state.qpos[:, 7:], self._low, self._high)
+            terms = torch.cat((terms, -r.joint_limit * overshoot[:, None]), dim=-1)
         return terms
 
     def fell(self, state: StepState) -> Tensor:

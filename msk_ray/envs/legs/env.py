@@ -28,6 +28,7 @@ from msk_ray.envs.legs.muscles import MuscleCurves, columns
 from msk_ray.envs.legs.push import pushed
 from msk_ray.envs.legs.reference import Reference
 from msk_ray.envs.legs.root import Root
+from msk_ray.envs.limits import squared_overshoot
 from msk_ray.simulation import StepState
 
 AnyLegSettings = TypeVar("AnyLegSettings", bound=LegSettings)
@@ -37,7 +38,6 @@ _TRUNK_LEVER = 0.18
 """How far the centre of mass moves with the trunk's up axis [m]: 34 kg of 75 kg, 0.4 m above the pelvis."""
 _LIMIT_MARGIN = 0.05
 """Distance from a joint limit at which the penalty starts [rad]."""
-_LIMIT_UNIT = 0.1
 _HEAD_LEVER = 0.65
 """Height of the head above the pelvis [m]."""
 _LEG_LENGTH = 0.9
@@ -298,10 +298,7 @@ class LegEnv(AssistedEnv[AnyLegSettings], Generic[AnyLegSettings]):
             turn = math.tau * pace.strides_per_second(target)
         root = self.root(state)
         (speed, _, _), (_, _, upright) = root.velocity.unbind(-1), root.up.unbind(-1)
-        low, high = self._limits
         angles = state.qpos[:, self._hinge_qpos]
-        # At most one side of a range is exceeded.
-        overshoot = torch.maximum(low - angles, angles - high).clamp_min(0.0) / _LIMIT_UNIT
         change = self._own_sides(action, self.state.age) - self._own_sides(self.state.action, self.state.age - 1)
         # The trunk is half of the body: the centre of mass moves with its lean.
         velocity = root.velocity + _TRUNK_LEVER * torch.linalg.cross(root.spin, root.up)
@@ -318,7 +315,7 @@ class LegEnv(AssistedEnv[AnyLegSettings], Generic[AnyLegSettings]):
             torch.relu(self.stand_height - root.height).square(),
             torch.ones_like(speed),
             state.act.square().mean(-1),
-            overshoot.square().sum(-1),
+            squared_overshoot(angles, *self._limits),
             change.square().mean(-1),
             capture,
             root.spin.square().sum(-1),
