@@ -116,7 +116,10 @@ _LATER: dict[tuple[str, ...], Any] = {
     ("env", "tracking"): {"start": 1.0, "end": 1.0, "epochs": 0},
     **{
         ("env", name): 0.0
-        for name in ("metabolic", "fatigue", "head", "impact", "footfall", "clearance", "toes", "vault")
+        for name in (
+            *("metabolic", "fatigue", "head", "impact", "footfall", "clearance", "toes", "vault"),
+            "out_of_plane",
+        )
     },
     **{("env", name): 0.0 for name in ("track", "track_rate")},
     ("env", "clearance_height"): 0.01,

@@ -22,7 +22,7 @@ from msk_ray.envs.records import EnvState
 from msk_ray.simulation import StepState
 
 EVERY = dict.fromkeys(("metabolic", "fatigue", "head", "impact", "footfall", "clearance", "toes", "vault"), 0.1)
-EVERY |= {"track": 0.5, "track_rate": 0.1}
+EVERY |= {"out_of_plane": 0.1, "track": 0.5, "track_rate": 0.1}
 
 
 def make(nworld: int = 4, **settings: object) -> MyoLeg26:
@@ -123,6 +123,20 @@ def test_a_vaulting_body_rises_half_a_step_after_double_support(env: MyoLeg26) -
     assert terms.vaulting(torch.tensor([0.3, 0.0]), torch.tensor([0.1, 0.0])).tolist() == pytest.approx(
         [math.sqrt(5.0) - 1.0, 0.0]
     )
+
+
+def test_legs_out_of_the_plane_of_walking_cost_their_angles() -> None:
+    """0.3 and 0 rad, twice and no times 0.15: √(1 + (4 + 0)/2) - 1; the model has hip rotations too, at 0 here."""
+    found = terms.out_of_plane(torch.tensor([[0.3, 0.0], [0.0, 0.0]]))
+    assert found.tolist() == pytest.approx([math.sqrt(3.0) - 1.0, 0.0])
+    env = make(1, reward={"out_of_plane": 2.0})
+    state = env.state.physics
+    qpos = state.qpos.clone()
+    for side, angle in (("r", -0.3), ("l", 0.0)):
+        qpos[:, env.model.joint(f"hip_adduction_{side}").qposadr[0]] = angle
+        qpos[:, env.model.joint(f"hip_rotation_{side}").qposadr[0]] = 0.0
+    reward = env.reward_terms(state._replace(qpos=qpos), torch.zeros(1, env.action_size), env.observation())
+    assert reward[0, env.reward_names.index("out_of_plane")].item() == pytest.approx(-2.0 * (math.sqrt(2.0) - 1.0))
 
 
 def test_the_pelvis_sways_between_feet_that_stay() -> None:

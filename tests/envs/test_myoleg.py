@@ -212,11 +212,23 @@ def test_people_step_on_80_muscles_and_springs_right_the_pelvis() -> None:
             assert np.linalg.norm(velocity[3:]) < 0.2
     assert apart[0] == pytest.approx(0.64, abs=0.03)
     assert apart[2] == pytest.approx(-apart[0], abs=0.02)
+    # Over the right foot the pelvis is 2 cm to the right (axes[1] is left) and moves as an inverted pendulum does, to
+    # the right at strike, while each foot keeps its line.
+    aside, drift = start.qpos[:, :3].numpy() @ axes[1], start.qvel[:, :3].numpy() @ axes[1]
+    assert aside[1] == pytest.approx(-0.02, abs=0.01)
+    assert drift[0] < -0.1
+    assert drift[2] == pytest.approx(-drift[0], abs=0.02)
+    lines = []
+    for k in range(3):
+        data.qpos[:] = start.qpos[k].numpy()
+        mujoco.mj_kinematics(model, data)
+        lines.append([data.body(f"calcn_{side}").xpos @ axes[1] for side in "rl"])
+    assert np.ptp(lines, axis=0) == pytest.approx(0.0, abs=0.01)
     # Leaning forward by 0.1 rad, against 800 N m/rad; 1 cm aside, against 800 N/m
     lean = quat_exp(torch.tensor(0.1 * axes[1], dtype=torch.float32))
     state = StepState(*(part[:1].clone() for part in env.state.physics))
     state.qpos[0, 3:7] = quat_multiply(lean, torch.tensor(model.key("stand").qpos[3:7], dtype=torch.float32))
-    state.qpos[0, :3] += torch.tensor(0.01 * axes[1], dtype=torch.float32)
+    state.qpos[0, :3] = torch.tensor(model.key("stand").qpos[:3] + 0.01 * axes[1], dtype=torch.float32)
     force = env.applied_force(state._replace(qvel=torch.zeros_like(state.qvel)))
     torque = quat_rotate(state.qpos[:, 3:7], force[:, 3:6])[0].numpy() @ axes.T
     assert torque == pytest.approx([0.0, -80.0, 0.0], abs=0.01)

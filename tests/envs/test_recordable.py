@@ -9,7 +9,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from msk_ray.config import parse_config
 from msk_ray.envs import make_env
 
-_LEG_TERMS = ("metabolic", "fatigue", "head", "impact", "footfall", "clearance", "toes", "vault", "track", "track_rate")
+_LEG_TERMS = (
+    *("metabolic", "fatigue", "head", "impact", "footfall", "clearance", "toes", "vault", "out_of_plane", "track"),
+    "track_rate",
+)
 ENVIRONMENTS: dict[str, dict[str, Any]] = {
     "ant": {"name": "ant"},
     "hopper": {"name": "hopper"},

@@ -7,8 +7,13 @@ from pydantic import Field, PositiveFloat, model_validator
 
 from msk_ray.config.sections import Count, EnvSettings, Fraction, NonNegative, Reward, Section, Whole
 
-FURTHER = ("metabolic", "fatigue", "head", "impact", "footfall", "clearance", "toes", "vault", "track", "track_rate")
+FURTHER = (
+    *("metabolic", "fatigue", "head", "impact", "footfall", "clearance", "toes", "vault", "out_of_plane", "track"),
+    "track_rate",
+)
 """Weights of terms that are there only where they are not zero."""
+OUT_OF_PLANE = ("hip_adduction", "hip_rotation", "subtalar_angle")
+"""Joints, without their side, whose angles the term `out_of_plane` keeps small. Every model has the first."""
 CLOCKED = ("footfall", "clearance", "toes", "vault", "track", "track_rate")
 """Weights of terms that need the clock."""
 
@@ -82,6 +87,9 @@ class LegReward(Reward):
     """Weight of √(1 + (Δv / 0.1 m/s)²) - 1, where Δv is how far the pelvis's vertical velocity is from that of a body
     that vaults over each leg: lowest in the middle of double support, highest half a step later, by as much as people's
     centre of mass rises at that speed. It decides when feet push off. Needs `env.clock`."""
+    out_of_plane: NonNegative = 0.0
+    """Weight of √(1 + mean (q / 0.15 rad)²) - 1 of hip adduction, hip rotation and subtalar angle q, as far as the
+    model has them: joints that turn people's legs out of the plane they walk in, by less than 10° either way."""
     track: NonNegative = 0.0
     """Weight of √(1 + mean (Δq / track_scale)²) - 1, where Δq is how far hip flexion, knee and ankle of both legs are
     from the mean of people at the clock's phase. Needs `env.clock`."""

@@ -18,7 +18,7 @@ from msk_ray.config.physics import CONTACTS, LIMITS
 from msk_ray.envs.layout import Entry, entries
 from msk_ray.envs.legs import terms as costs
 from msk_ray.envs.legs.assistance import Assistance, AssistedEnv
-from msk_ray.envs.legs.config import FURTHER, AssistConfig, LegReward, LegSettings
+from msk_ray.envs.legs.config import FURTHER, OUT_OF_PLANE, AssistConfig, LegReward, LegSettings
 from msk_ray.envs.legs.feet import Feet, FootMotion
 from msk_ray.envs.legs.gait.body import analyse, world_axes
 from msk_ray.envs.legs.gait.measure import measure, summary
@@ -132,6 +132,9 @@ class LegEnv(AssistedEnv[AnyLegSettings], Generic[AnyLegSettings]):
             self.reference = Reference(self.model, self.device)
             self._track_qpos = columns(self.model.jnt_qposadr[self.reference.joints], self.device)
             self._track_dofs = columns(self.model.jnt_dofadr[self.reference.joints], self.device)
+        if "out_of_plane" in self._further:
+            sideways = [j for j in self.hinges if self.model.joint(j).name.rsplit("_", 1)[0] in OUT_OF_PLANE]
+            self._sideways_qpos = columns(self.model.jnt_qposadr[sideways], self.device)
         if {"impact", "footfall", "clearance", "toes"} & set(self._further):
             self._feet = Feet(self.model, self.stand_height, self.device)
 
@@ -344,6 +347,8 @@ class LegEnv(AssistedEnv[AnyLegSettings], Generic[AnyLegSettings]):
                 return self._foot_motion(state).dragging(self._leg_phases()[0], wanted)
             case "toes":
                 return self._lifted_toes(state)
+            case "out_of_plane":
+                return costs.out_of_plane(state.qpos[:, self._sideways_qpos])
             case "vault":
                 speed = self.task_numbers(self.state.numbers)[:, 0]
                 rise = self.reference.pace.vault(self._leg_phases()[0], speed)

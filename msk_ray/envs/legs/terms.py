@@ -18,6 +18,8 @@ _BENT = 0.15
 """Angle of the toes beyond which its cost grows linearly [rad]."""
 _VAULTING = 0.1
 """Error of the pelvis's vertical velocity beyond which its cost grows linearly [m/s]."""
+_TURNED = 0.15
+"""Angle out of the plane of walking beyond which its cost grows linearly [rad]."""
 _NEAR = 0.03
 """Height above the ground at which an approaching foot counts 1/e [m]."""
 
@@ -76,6 +78,11 @@ def impact(heights: Tensor, fall: Tensor) -> Tensor:
 def vaulting(velocity: Tensor, wanted: Tensor) -> Tensor:
     """Cost (W,) of vertical velocities (W,) [m/s] of the pelvis apart from those of a vaulting body."""
     return soft(((velocity - wanted) / _VAULTING).square())
+
+
+def out_of_plane(angles: Tensor) -> Tensor:
+    """Cost (W,) of angles (W, n) [rad] of joints that turn legs out of the plane they walk in."""
+    return soft((angles / _TURNED).square().mean(-1))
 
 
 def deviation(values: Tensor, reference: Tensor, scale: float) -> Tensor:

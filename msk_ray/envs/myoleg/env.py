@@ -70,7 +70,7 @@ class MyoLeg(LegEnv[MyoLegSettings]):
         self._coefficients = tensor(couplings.coefficients)
 
         if self.config.reset == "cycle":
-            self._cycle = tuple(map(tensor, cycle_states(model)))
+            self._cycle = tuple(map(tensor, cycle_states(model, swaying=True)))
         self._springs = FreeSprings(model, axes, self.config.assist, self.device)
 
     def applied_force(self, state: StepState) -> Tensor | None:

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msk_ray.config import PhysicsConfig
-from msk_ray.envs.legs.gait.body import JOINTS, flexion_sign
-from msk_ray.envs.legs.reference import level_toes, people_angles
+from msk_ray.envs.legs.gait.body import JOINTS, SIDES, flexion_sign, world_axes
+from msk_ray.envs.legs.reference import level_toes, people_angles, sway
 from msk_ray.envs.myoleg.config import PACKAGED_MODELS, MyoLegSettings
 from msk_ray.envs.options import apply_options
 from msk_ray.errors import ConfigError
@@ -265,12 +265,13 @@ def lowered(model: mujoco.MjModel, pose: NDArray[np.float64]) -> NDArray[np.floa
     return pose
 
 
-def cycle_states(model: mujoco.MjModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def cycle_states(model: mujoco.MjModel, swaying: bool = False) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """qpos (N, nq) and qvel (N, nv) of legs that take one stride a second on the spot, at N equal distances of the gait
     cycle of people, from the right foot's strike on.
 
     Hips, knees and ankles are those of `people_angles`, toes on the ground are level, and everything else is as in
-    standing. The lowest point touches the ground.
+    standing. The lowest point touches the ground. If `swaying`, the pelvis moves to the side between the feet as an
+    inverted pendulum does (`sway`), and the hips adduct so that the feet stay on their lines.
     """
     toes, couplings = level_toes(), Couplings(model)
 
@@ -289,7 +290,10 @@ def cycle_states(model: mujoco.MjModel) -> tuple[NDArray[np.float64], NDArray[np
 
     # Toes that bend the wrong way lift the body when the heel has left the ground.
     toe_sign = min((1.0, -1.0), key=lambda sign: float(posed(sign, [54])[0, 2]))
-    qpos = posed(toe_sign, list(range(0, 100, 100 // CYCLE_STATES)))
+    phases = list(range(0, 100, 100 // CYCLE_STATES))
+    qpos = posed(toe_sign, phases)
+    if swaying:
+        qpos = _swayed(model, qpos, phases)
     around = np.concatenate((qpos[-1:], qpos, qpos[:1]))
     slopes = (around[2:] - around[:-2]) * (CYCLE_STATES / 2.0)
     qvel = np.zeros((CYCLE_STATES, model.nv))
@@ -297,3 +301,25 @@ def cycle_states(model: mujoco.MjModel) -> tuple[NDArray[np.float64], NDArray[np
     # Behind the free root, every joint is a hinge or a slide.
     qvel[:, model.jnt_dofadr[1:]] = slopes[:, model.jnt_qposadr[1:]]
     return qpos, qvel
+
+
+def _swayed(model: mujoco.MjModel, poses: NDArray[np.float64], phases: list[int]) -> NDArray[np.float64]:
+    """Poses (N, nq) at these phases [% of the cycle] with the pelvis moved to the side and the feet on their lines."""
+    data, couplings, left = mujoco.MjData(model), Couplings(model), world_axes(model)[1]
+    data.qpos[:] = model.key("stand").qpos
+    mujoco.mj_kinematics(model, data)
+    apart = float((data.body("calcn_l").xpos - data.body("calcn_r").xpos) @ left)
+    aside = sway(apart / 2.0, float(model.key("stand").qpos[2]) - ground_height(model))[phases]
+    moved = []
+    for pose, right in zip(poses.copy(), aside, strict=True):
+        data.qpos[:] = pose
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        for side in SIDES:
+            jacobian, joint = np.zeros((3, model.nv)), model.joint(f"hip_adduction_{side}")
+            mujoco.mj_jacBody(model, data, jacobian, None, model.body(f"calcn_{side}").id)
+            back = right / float(left @ jacobian[:, joint.dofadr[0]])
+            pose[joint.qposadr[0]] = np.clip(pose[joint.qposadr[0]] + back, *joint.range)
+        pose[:3] -= right * left
+        moved.append(lowered(model, couplings.satisfied(pose)))
+    return np.stack(moved)
