@@ -119,6 +119,18 @@ def test_an_ant_past_its_joints_ranges_pays_for_the_squared_overshoot() -> None:
     assert Ant.reference_settings(config).reward == AntReward(), "scores leave it out"
 
 
+def test_an_ants_cost_of_joint_ranges_fades() -> None:
+    """Half of it after 10 of 20 epochs, nothing from 20 on; an ankle 0.2 rad past its range costs 0.5 (0.2 / 0.1)²."""
+    config = AntSettings(name="ant", reward=AntReward(joint_limit=0.5), joint_limit_epochs=20)
+    env = make_env(config, PhysicsConfig(), 1, "cpu", 0, differentiable=False)
+    joints = [0.0, math.radians(100.0) + 0.2, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0]
+    state = StepState(torch.tensor([[0.0, 0, 0.77, 1, 0, 0, 0, *joints]]), torch.zeros(1, 14), torch.zeros(1, 0))
+    for epoch, share in ((0, 1.0), (10, 0.5), (20, 0.0), (30, 0.0)):
+        env.begin_epoch(epoch)
+        found = named_terms(env, state, torch.zeros(1, 8))["joint_limit"].item()
+        assert found == pytest.approx(-2.0 * share, rel=1e-4)
+
+
 def test_an_ant_that_falls_terminates_and_restarts(ant: Ant) -> None:
     place(ant, [0.0, 0, 0.2, 1, 0, 0, 0, 0, 1, 0, -1, 0, -1, 0, 1])
     with torch.no_grad():

@@ -1,7 +1,7 @@
 """The settings of the ant."""
 
 from msk_ray.config.physics import CONTACTS, JOINTS, LIMITS, SOLVING, STEPPING
-from msk_ray.config.sections import Count, EnvSettings, NonNegative, Reward
+from msk_ray.config.sections import Count, EnvSettings, NonNegative, Reward, Whole
 
 
 class AntReward(Reward):
@@ -34,3 +34,8 @@ class AntSettings(EnvSettings):
     """Torso height below which an episode ends [m]."""
     early_termination: bool = True
     """End an episode on falling below `termination_height`."""
+    joint_limit_epochs: Whole = 0
+    """Epochs over which the weight `reward.joint_limit` falls linearly to 0; 0: it stays."""
+
+    def unread(self) -> dict[str, str]:
+        return {"joint_limit_epochs": "env.reward.joint_limit is 0"} if self.reward.joint_limit == 0.0 else {}

@@ -34,6 +34,7 @@ class Ant(Env[AntSettings]):
     ====== ===========================================================
     """
 
+    begin_epoch_in_place = True
     obs_size = 37
     Settings = AntSettings
     reward_names: tuple[str, ...] = ("forward_vel", "up", "heading", "height", "action")
@@ -48,6 +49,8 @@ class Ant(Env[AntSettings]):
             self.reward_names = (*type(self).reward_names, "joint_limit")
             ranges = torch.tensor(self.model.jnt_range[1:], dtype=torch.float32, device=self.device)
             self._low, self._high = ranges.unbind(-1)
+        self._limit_share = torch.ones((), device=self.device)
+        """How much of `joint_limit` is left."""
         # World z of the torso's z axis and world x of its x axis are w² - x² - y² + z² and w² + x² - y² - z².
         self._axes = torch.tensor(((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)), device=self.device)
         # All terms but the costs of actions and of joint limits are linear in the observation.
@@ -57,6 +60,10 @@ class Ant(Env[AntSettings]):
         offset = torch.tensor((0.0, 0.0, 0.0, -r.height * self.config.termination_height, 0.0))
         self._linear, self._offset = linear.to(self.device), offset.to(self.device)
         self._stand = torch.tensor((0.0, 0.0, STAND_HEIGHT, 1.0, 0.0, 0.0, 0.0, *STAND_JOINTS), device=self.device)
+
+    def begin_epoch(self, epoch: int) -> None:
+        if self.config.joint_limit_epochs:
+            self._limit_share.fill_(max(0.0, 1.0 - epoch / self.config.joint_limit_epochs))
 
     def draw_physics(self, count: int) -> StepState:
         stand = self._stand
@@ -97,7 +104,10 @@ class Ant(Env[AntSettings]):
             terms = torch.cat((terms[:, :-1], effort), dim=-1)
         if r.joint_limit > 0.0:
             overshoot = squared_overshoot(state.qpos[:, 7:], self._low, self._high)
-            terms = torch.cat((terms, -r.joint_limit * overshoot[:, None]), dim=-1)
+            cost = -r.joint_limit * overshoot[:, None]
+            if self.config.joint_limit_epochs:
+                cost = self._limit_share * cost
+            terms = torch.cat((terms, cost), dim=-1)
         return terms
 
     def fell(self, state: StepState) -> Tensor:
