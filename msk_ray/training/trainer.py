@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from msk_ray.algorithms import algorithm_class
 from msk_ray.config import Config, dump_yaml, overlay, parse_config, parse_recorded
@@ -189,7 +190,8 @@ class Trainer(Place):
             changed: dotted settings that may differ from those it was written under.
 
         Raises:
-            CheckpointError: it is missing, incomplete, or was written under other settings.
+            CheckpointError: it is missing, incomplete, was written under other settings, or on a GPU and is to continue
+                on a CPU, or the other way round.
         """
         state = _expect(path, read_checkpoint(path))
         recorded = parse_recorded(state["config"], f"{path}: its settings")
@@ -203,6 +205,7 @@ class Trainer(Place):
                 f"{path} has {state['epoch']} epochs already: set trial.epochs to the new total, not "
                 f"{self.config.trial.epochs}"
             )
+        _check_generators(path, state["algorithm"]["env_generator"], self.algorithm.env.device)
         before, now = recorded.trial.gpus, self.config.trial.gpus
         if before != now:
             warnings.warn(
@@ -397,6 +400,17 @@ def precompile(config: Config, device: str, logdir: Path) -> None:
     trainer = Trainer(parse_config(overlay(config.as_dict(), tiny), "a short epoch"), logdir, device)
     trainer.run_epoch()
     trainer.close()
+
+
+def _check_generators(path: Path, saved: Tensor, device: torch.device) -> None:
+    """Refuse generators of the other kind of device: they draw other numbers, and their states do not fit."""
+    if len(saved) == len(torch.Generator(device=device).get_state()):
+        return
+    there, here, option = ("CPU", "GPU", "cpu") if device.type == "cuda" else ("GPU", "CPU", "cuda:0")
+    raise CheckpointError(
+        f"{path} was written on a {there}, and a {here} draws other random numbers; use --device {option}, or begin "
+        f"another trial with its networks: --set trial.start_from={path}"
+    )
 
 
 def _expect(path: Path, state: dict[str, Any]) -> dict[str, Any]:

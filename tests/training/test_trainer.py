@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 import yaml
 from needs import slow
 from processes import Launcher, catches, wait_until
@@ -281,6 +282,17 @@ def test_a_resume_with_more_epochs_is_recorded(tiny_cartpole: Config, tmp_path: 
     trainer.restore_latest()
     trainer.close()
     assert yaml.safe_load((tmp_path / "config.yaml").read_text())["trial"]["epochs"] == 8
+
+
+def test_a_checkpoint_of_a_gpu_is_refused_on_a_cpu(tiny_cartpole: Config, tmp_path: Path) -> None:
+    """The state of a generator has 16 bytes on a GPU and 5056 on a CPU."""
+    train(tiny_cartpole, tmp_path)
+    path = epoch_checkpoints(tmp_path / "checkpoints")[0]
+    state = read_checkpoint(path)
+    state["algorithm"]["env_generator"] = torch.zeros(16, dtype=torch.uint8)
+    write_checkpoint(path, state, {"epoch": state["epoch"]})
+    with pytest.raises(CheckpointError, match=r"on a GPU.*--device cuda:0.*trial\.start_from=.*epoch_000006\.pt"):
+        Trainer(tiny_cartpole, tmp_path, "cpu").restore(path)
 
 
 def test_a_torn_checkpoint_falls_back_to_the_one_before(tiny_cartpole: Config, tmp_path: Path) -> None:
