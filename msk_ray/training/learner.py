@@ -54,7 +54,12 @@ def start_from(algorithm: Algorithm, path: str) -> None:
     Raises:
         CheckpointError: it is missing, incomplete, or does not fit.
     """
-    state = read_checkpoint(Path(path))
+    try:
+        state = read_checkpoint(Path(path))
+    except CheckpointError as error:
+        raise CheckpointError(
+            f"trial.start_from: {error}; train that policy first, or write the path of another"
+        ) from error
     try:
         algorithm.start_from(_to_device(state["algorithm"]["modules"], algorithm.env.device))
     except (KeyError, TypeError, RuntimeError) as error:

@@ -63,6 +63,8 @@ def test_without_any_package_the_line_says_what_to_install(install) -> None:
         find_model(None)
     with pytest.raises(ConfigError, match="myosuite3 is missing or lacks a model myolegs; install"):
         find_model("myolegs", "myosuite3")
+    with pytest.raises(ConfigError, match=r"myosuite2 is missing .*`pip install --no-deps myosuite==2\.12\.2`"):
+        find_model(None, "myosuite2")
 
 
 def test_packages_are_tried_in_order_and_named(install) -> None:

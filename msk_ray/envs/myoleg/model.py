@@ -22,6 +22,8 @@ from msk_ray.envs.options import apply_options
 from msk_ray.errors import ConfigError
 
 INSTALL: Final = "install one with `pip install myo-sim`, or set env.model to the path of an MJCF file"
+INSTALL_OF: Final = {"myosuite2": "pip install --no-deps myosuite==2.12.2", "myosuite3": "pip install myosuite"}
+"""How to get the models of one package; `INSTALL` has myo_sim's."""
 SUBSTEPS: Final = 10
 """Physics steps of a control step of 20 ms: 2 ms each, as the models' own."""
 SMOOTHING: Final = 0.2
@@ -69,7 +71,10 @@ def find_model(model: str | None, source: str = "auto") -> Source:
         if found is not None:
             return found
     looked = "none of myosuite 2, myosuite 3 and myo_sim has" if source == "auto" else f"{source} is missing or lacks"
-    raise ConfigError(f"env.model: {looked} a model {name}; {INSTALL}")
+    install = INSTALL
+    if source in INSTALL_OF:
+        install = f"install it with `{INSTALL_OF[source]}`, or set env.source to auto to take any installed model"
+    raise ConfigError(f"env.model: {looked} a model {name}; {install}")
 
 
 def package_folder(name: str) -> tuple[Path, str] | None:
