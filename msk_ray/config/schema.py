@@ -144,7 +144,8 @@ class TrialConfig(Section):
     """Add everything up in a fixed order, so that a GPU repeats the trial bit for bit (docs/repeat.md)."""
     start_from: Text | None = None
     """Checkpoint of another trial, such as a best.pt, from whose networks and observation statistics this one starts;
-    null starts from random networks. Optimisers and worlds are new either way."""
+    null starts from random networks. Optimisers and worlds are new either way; so is the critic if the file has only a
+    policy, which may then get worse before it gets better."""
     checkpoint_interval: Count = 10
     """Epochs between checkpoints."""
     keep_checkpoints: Annotated[int, Field(ge=2)] = 2

@@ -48,8 +48,11 @@ def naming_memory(config: Config, device: str) -> AbstractContextManager[None]:
     return named_out_of_memory(device, worlds, "env.nworld", *other)
 
 
-def start_from(algorithm: Algorithm, path: str) -> None:
+def start_from(algorithm: Algorithm, path: str) -> list[str]:
     """Give an algorithm the networks and statistics of another trial's checkpoint.
+
+    Returns:
+        Names of its modules that the checkpoint does not have and that begin untrained.
 
     Raises:
         CheckpointError: it is missing, incomplete, or does not fit.
@@ -68,6 +71,7 @@ def start_from(algorithm: Algorithm, path: str) -> None:
             f"trial.start_from: {path} does not fit this trial ({what}): give a checkpoint of the same env, algorithm "
             "and networks"
         ) from error
+    return [name for name in algorithm.modules() if name not in state["algorithm"]["modules"]]
 
 
 def load_state(algorithm: Algorithm, checkpoint: Mapping[str, Any]) -> None:

@@ -261,7 +261,12 @@ class Trainer(Place):
     def _start_from(self, path: str | None) -> None:
         if path is not None:
             self._group.tell("start_from", path)
-            start_from(self.algorithm, path)
+            if missing := start_from(self.algorithm, path):
+                warnings.warn(
+                    f"trial.start_from: {path} has no {' and no '.join(missing)}, which begin untrained: the policy "
+                    "may get worse before it gets better; a checkpoint of a whole trial has them",
+                    stacklevel=2,
+                )
 
     def _begin(self) -> None:
         """Everything before the first epoch. The untrained policy is there to look at; it has no score in `best.pt`, so

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -100,7 +101,9 @@ def test_a_trial_can_start_from_another_ones_networks(tiny_cartpole: Config, tmp
     settings = tiny_cartpole.as_dict()
     settings["trial"]["start_from"] = str(best)
     second = Trainer(Config.model_validate(settings), tmp_path / "second", "cpu")
-    second.run_epoch()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        second.run_epoch()
     second.close()
     initial = read_metrics(tmp_path / "second" / "metrics.jsonl")[0]
     assert initial["epoch"] == 0
@@ -114,7 +117,8 @@ def test_a_policy_saved_alone_is_enough_to_start_from(tiny_cartpole: Config, tmp
     settings = tiny_cartpole.as_dict()
     settings["trial"]["start_from"] = str(policy)
     second = Trainer(Config.model_validate(settings), tmp_path / "second", "cpu")
-    second.run_epoch()
+    with pytest.warns(UserWarning, match="has no critic and no target_critic, which begin untrained"):
+        second.run_epoch()
     second.close()
     last = read_metrics(tmp_path / "first" / "metrics.jsonl")[-1]
     assert read_metrics(tmp_path / "second" / "metrics.jsonl")[0]["eval/score"] == pytest.approx(last["eval/score"])
