@@ -19,6 +19,7 @@ from msk_ray.envs.legs.reference import people_angles, sway
 from msk_ray.envs.myoleg26.config import MyoLeg26Settings
 from msk_ray.envs.myoleg26.env import MyoLeg26
 from msk_ray.envs.records import EnvState
+from msk_ray.errors import ConfigError
 from msk_ray.simulation import StepState
 
 EVERY = dict.fromkeys(("metabolic", "fatigue", "head", "impact", "footfall", "clearance", "toes", "vault"), 0.1)
@@ -137,6 +138,12 @@ def test_legs_out_of_the_plane_of_walking_cost_their_angles() -> None:
         qpos[:, env.model.joint(f"hip_rotation_{side}").qposadr[0]] = 0.0
     reward = env.reward_terms(state._replace(qpos=qpos), torch.zeros(1, env.action_size), env.observation())
     assert reward[0, env.reward_names.index("out_of_plane")].item() == pytest.approx(-2.0 * (math.sqrt(2.0) - 1.0))
+
+
+def test_a_model_without_joints_out_of_the_plane_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("msk_ray.envs.legs.env.OUT_OF_PLANE", ("elbow",))
+    with pytest.raises(ConfigError, match=r"env\.reward\.out_of_plane: the model has none of the joints elbow"):
+        make(1, reward={"out_of_plane": 1.0})
 
 
 def test_the_pelvis_sways_between_feet_that_stay() -> None:

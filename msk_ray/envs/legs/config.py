@@ -13,7 +13,7 @@ FURTHER = (
 )
 """Weights of terms that are there only where they are not zero."""
 OUT_OF_PLANE = ("hip_adduction", "hip_rotation", "subtalar_angle")
-"""Joints, without their side, whose angles the term `out_of_plane` keeps small. Every model has the first."""
+"""Joints, without their side, whose angles the term `out_of_plane` keeps small."""
 CLOCKED = ("footfall", "clearance", "toes", "vault", "track", "track_rate")
 """Weights of terms that need the clock."""
 

@@ -29,6 +29,7 @@ from msk_ray.envs.legs.push import pushed
 from msk_ray.envs.legs.reference import Reference
 from msk_ray.envs.legs.root import Root
 from msk_ray.envs.limits import squared_overshoot
+from msk_ray.errors import ConfigError
 from msk_ray.simulation import StepState
 
 AnyLegSettings = TypeVar("AnyLegSettings", bound=LegSettings)
@@ -134,6 +135,11 @@ class LegEnv(AssistedEnv[AnyLegSettings], Generic[AnyLegSettings]):
             self._track_dofs = columns(self.model.jnt_dofadr[self.reference.joints], self.device)
         if "out_of_plane" in self._further:
             sideways = [j for j in self.hinges if self.model.joint(j).name.rsplit("_", 1)[0] in OUT_OF_PLANE]
+            if not sideways:
+                raise ConfigError(
+                    f"env.reward.out_of_plane: the model has none of the joints {', '.join(OUT_OF_PLANE)} (with _r and "
+                    "_l); leave it out"
+                )
             self._sideways_qpos = columns(self.model.jnt_qposadr[sideways], self.device)
         if {"impact", "footfall", "clearance", "toes"} & set(self._further):
             self._feet = Feet(self.model, self.stand_height, self.device)
