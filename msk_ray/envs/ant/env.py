@@ -43,6 +43,10 @@ class Ant(Env[AntSettings]):
     def build_model(cls, config: AntSettings, physics: PhysicsConfig) -> mujoco.MjModel:
         return build_ant(config, physics)
 
+    @classmethod
+    def reference_settings(cls, config: AntSettings) -> AntSettings:
+        return super().reference_settings(config).model_copy(update={"joint_limit_epochs": 0})
+
     def prepare(self) -> None:
         r = self.config.reward
         if r.joint_limit > 0.0:
