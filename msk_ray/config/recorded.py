@@ -118,10 +118,9 @@ _LATER: dict[tuple[str, ...], Any] = {
         ("env", name): 0.0
         for name in (
             *("metabolic", "fatigue", "head", "impact", "footfall", "clearance", "toes", "vault"),
-            "out_of_plane",
+            *("out_of_plane", "track", "track_rate"),
         )
     },
-    **{("env", name): 0.0 for name in ("track", "track_rate")},
     ("env", "clearance_height"): 0.01,
     ("env", "track_scale"): 0.15,
     ("env", "track_rate_scale"): 2.0,

@@ -61,6 +61,21 @@ def sway(half_width: float, height: float) -> np.ndarray:
     return half_width * np.where(since < 1.0, over, -over)
 
 
+def adduction_under(model: mujoco.MjModel, data: mujoco.MjData, side: str, aside: float, left: np.ndarray) -> float:
+    """Change of hip adduction [rad] that brings a foot back to its line when the pelvis has moved to the right.
+
+    Args:
+        model: of legs.
+        data: their pose, with `mj_comPos` done.
+        side: r or l.
+        aside: how far the pelvis has moved [m].
+        left: direction in the world, (3,).
+    """
+    jacobian = np.zeros((3, model.nv))
+    mujoco.mj_jacBody(model, data, jacobian, None, model.body(f"calcn_{side}").id)
+    return aside / float(left @ jacobian[:, model.joint(f"hip_adduction_{side}").dofadr[0]])
+
+
 class Reference:
     """Angles of hip, knee and ankle of both legs in a model.
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from msk_ray.config import PhysicsConfig
 from msk_ray.envs.legs.gait.body import JOINTS, SIDES, flexion_sign, world_axes
-from msk_ray.envs.legs.reference import level_toes, people_angles, sway
+from msk_ray.envs.legs.reference import adduction_under, level_toes, people_angles, sway
 from msk_ray.envs.myoleg.config import PACKAGED_MODELS, MyoLegSettings
 from msk_ray.envs.options import apply_options
 from msk_ray.errors import ConfigError
@@ -321,9 +321,8 @@ def _swayed(model: mujoco.MjModel, poses: NDArray[np.float64], phases: list[int]
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         for side in SIDES:
-            jacobian, joint = np.zeros((3, model.nv)), model.joint(f"hip_adduction_{side}")
-            mujoco.mj_jacBody(model, data, jacobian, None, model.body(f"calcn_{side}").id)
-            back = right / float(left @ jacobian[:, joint.dofadr[0]])
+            joint = model.joint(f"hip_adduction_{side}")
+            back = adduction_under(model, data, side, right, left)
             pose[joint.qposadr[0]] = np.clip(pose[joint.qposadr[0]] + back, *joint.range)
         pose[:3] -= right * left
         moved.append(lowered(model, couplings.satisfied(pose)))

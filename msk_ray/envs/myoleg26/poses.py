@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from msk_ray.envs.legs.reference import level_toes, people_angles, sway
+from msk_ray.envs.legs.reference import adduction_under, level_toes, people_angles, sway
 from msk_ray.envs.myoleg26.tables import OUTLINE
 
 WALKING_SPEED: Final = 1.25
@@ -18,6 +18,7 @@ WALKING_SPEED: Final = 1.25
 REST_ACTIVATION: Final = 0.02
 """Activation of every muscle in the walking keyframes, and the smallest in standing: a little tension stiffens
 joints."""
+_LEFT: Final = np.array([0.0, 1.0, 0.0])
 _LEAST_EFFORT: Final = 1e-4
 _SOLVER_STEPS: Final = 3000
 _PRESSED: Final = 5e-4
@@ -69,7 +70,7 @@ def cycle_states(model: mujoco.MjModel) -> tuple[NDArray[np.float64], NDArray[np
         angles = [dict(zip(names, legs[side][:, k], strict=True)) for side in "rl"]
         data = _posed(model, {"pelvis_tz": aside[k]}, *angles)
         for side, chosen in zip("rl", angles, strict=True):
-            chosen["hip_adduction"] = _under(model, data, side, aside[k])
+            chosen["hip_adduction"] = adduction_under(model, data, side, aside[k], _LEFT)
         data = _posed(model, {"pelvis_tz": aside[k]}, *angles)
         qpos[k] = data.qpos
         qpos[k, _address(model, "pelvis_ty")] -= _lowest(model, data, "rl") + _PRESSED
@@ -79,13 +80,6 @@ def cycle_states(model: mujoco.MjModel) -> tuple[NDArray[np.float64], NDArray[np
     around = np.concatenate((qpos[-1:], qpos, qpos[:1]))
     qvel = (around[2:] - around[:-2]) * (count / 2.0)
     return qpos, qvel, np.full((count, model.na), REST_ACTIVATION)
-
-
-def _under(model: mujoco.MjModel, data: mujoco.MjData, side: str, aside: float) -> float:
-    """Hip adduction [rad] that brings a foot back to its line when the pelvis has moved to the right [m]."""
-    jacobian = np.zeros((3, model.nv))
-    mujoco.mj_jacBody(model, data, jacobian, None, model.body(f"calcn_{side}").id)
-    return aside / float(jacobian[1, model.joint(f"hip_adduction_{side}").dofadr[0]])
 
 
 def holding_activations(model: mujoco.MjModel, qpos: NDArray[np.float64]) -> NDArray[np.float64]:

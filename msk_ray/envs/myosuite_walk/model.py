@@ -6,14 +6,14 @@ from typing import Final
 import mujoco
 
 from msk_ray.config import PhysicsConfig
-from msk_ray.envs.myoleg.model import package_folder, spec_of_file
+from msk_ray.envs.myoleg.model import INSTALL_OF, package_folder, spec_of_file
 from msk_ray.envs.myosuite_walk.config import MyoSuiteWalkSettings
 from msk_ray.envs.options import apply_options
 from msk_ray.errors import ConfigError
 
 VERSION: Final = "2.12"
 """Version of MyoSuite whose task this is."""
-INSTALL: Final = "pip install --no-deps myosuite==2.12.2, or set env.model to the path of its myolegs.xml"
+INSTALL: Final = f"{INSTALL_OF['myosuite2']}, or set env.model to the path of its myolegs.xml"
 SUBSTEPS: Final = 10
 """Physics steps of an env step: MyoSuite's frame_skip."""
 KEYFRAMES: Final = ("stand", "crouch", "right_knee_flexed", "left_knee_flexed")
