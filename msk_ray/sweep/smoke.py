@@ -31,10 +31,15 @@ def shrink(space: Space, trials: list[Trial]) -> list[Trial]:
     """
     base = base_settings(space)
     short: dict[str, Trial] = {}
-    for trial in cover(trials)[: space.file.smoke.max_trials]:
+    chosen = cover(trials)[: space.file.smoke.max_trials]
+    # Two variants that differ only in what is shortened become equal, and one of them is enough. If that leaves a
+    # single trial, which would test neither concurrency nor comparison, another seed joins.
+    others = [trial for trial in trials if trial not in chosen]
+    for trial in [*chosen, *others]:
+        if len(short) >= min(2, len(trials)) and trial not in chosen:
+            break
         values = {**trial.values, **shorten(trial.config), **space.file.smoke.overrides}
         small = make_trial(space, base, trial.changed, values, trial.seed, len(short))
-        # Two variants that differ only in what was shortened become equal; one of them is enough.
         short.setdefault(small.id, small)
     return list(short.values())
 

@@ -145,6 +145,13 @@ def test_smoke_is_short_and_keeps_horizons_apart(make_space: Any) -> None:
     assert [(t.config.shac.horizon, t.epochs, t.config.env.nworld) for t in trials] == [(4, 2, 8), (8, 2, 8)]
 
 
+def test_smoke_of_variants_that_become_equal_adds_a_seed(make_space: Any) -> None:
+    # Horizons 4 and 8 are both shortened to 2.
+    space = make_space(parameters={"shac.horizon": {"grid": [4, 8]}}, seeds="0-4")
+    trials = shrink(space, resolve_trials(space))
+    assert [(t.config.shac.horizon, t.seed) for t in trials] == [(2, 0), (2, 1)]
+
+
 def test_shipped_spaces_resolve(root: Any) -> None:
     names = sorted(path.stem for path in (root / "tune_spaces").glob("*.yaml"))
     assert {"cartpole_smoke", "ant_ablate", "ant_horizon", "ant_lr", "ant_softness", "ant_reward"} <= set(names)
