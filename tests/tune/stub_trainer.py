@@ -34,6 +34,8 @@ class StubTrainer:
     """Same surface as `msk_ray.training.Trainer`."""
 
     seconds_per_epoch = 0.02
+    members = 1
+    """At epoch `HELD_AT`, a trial waits until so many of its experiment have come as far."""
 
     def __init__(self, config: Config, logdir: Path, device: str) -> None:
         self.config, self.logdir, self.device = config, logdir, device
@@ -64,6 +66,8 @@ class StubTrainer:
         hold, stop = Path(os.environ.get("STUB_HOLD", "/nowhere")), self.logdir.parent.parent / "stop"
         while self.epoch >= HELD_AT and hold.exists() and not stop.exists():
             time.sleep(0.01)
+        while self.epoch == HELD_AT and self._arrived() < self.members and not stop.exists():
+            time.sleep(0.01)
         if self.epoch == 0:
             (self.logdir / "checkpoints" / "best.pt").write_text("untrained")
             self._write({**self._row(), "eval/score": 0.0})
@@ -82,6 +86,11 @@ class StubTrainer:
         if self.epoch % self.config.trial.checkpoint_interval == 0 or self.finished:
             self.save()
         return row
+
+    def _arrived(self) -> int:
+        """Trials of this experiment that have done `HELD_AT` epochs (their first row is of epoch 0)."""
+        rows = [file.read_bytes().count(b"\n") for file in self.logdir.parent.glob("*/metrics.jsonl")]
+        return sum(count > HELD_AT for count in rows)
 
     def _row(self) -> dict[str, float]:
         steps = 100 * self.epoch
