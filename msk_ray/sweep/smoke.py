@@ -32,11 +32,11 @@ def shrink(space: Space, trials: list[Trial]) -> list[Trial]:
     base = base_settings(space)
     short: dict[str, Trial] = {}
     chosen = cover(trials)[: space.file.smoke.max_trials]
-    # Two variants that differ only in what is shortened become equal, and one of them is enough. If that leaves a
-    # single trial, which would test neither concurrency nor comparison, another seed joins.
-    others = [trial for trial in trials if trial not in chosen]
-    for trial in [*chosen, *others]:
-        if len(short) >= min(2, len(trials)) and trial not in chosen:
+    # Two variants that differ only in what is shortened become equal, and one of them is enough. A single trial would
+    # test neither concurrency nor comparison, so further ones join until there are two.
+    spare = [trial for trial in trials if trial not in chosen]
+    for place, trial in enumerate([*chosen, *spare]):
+        if place >= len(chosen) and len(short) >= min(2, space.file.smoke.max_trials):
             break
         values = {**trial.values, **shorten(trial.config), **space.file.smoke.overrides}
         small = make_trial(space, base, trial.changed, values, trial.seed, len(short))
@@ -56,12 +56,6 @@ def cover(trials: list[Trial]) -> list[Trial]:
             break
         chosen.append(best)
         missing -= gain
-    # A single trial would test neither concurrency nor comparison.
-    for trial in trials:
-        if len(chosen) >= min(2, len(trials)):
-            break
-        if trial not in chosen:
-            chosen.append(trial)
     return sorted(chosen, key=lambda trial: trial.index)
 
 

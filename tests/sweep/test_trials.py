@@ -150,6 +150,8 @@ def test_smoke_of_variants_that_become_equal_adds_a_seed(make_space: Any) -> Non
     space = make_space(parameters={"shac.horizon": {"grid": [4, 8]}}, seeds="0-4")
     trials = shrink(space, resolve_trials(space))
     assert [(t.config.shac.horizon, t.seed) for t in trials] == [(2, 0), (2, 1)]
+    alone = make_space(parameters={"shac.horizon": {"grid": [4, 8]}}, seeds="0-4", smoke={"max_trials": 1})
+    assert len(shrink(alone, resolve_trials(alone))) == 1
 
 
 def test_shipped_spaces_resolve(root: Any) -> None:
