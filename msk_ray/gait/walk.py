@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 from msk_ray.envs import Env
 from msk_ray.envs.legs.config import LegSettings
-from msk_ray.envs.legs.gait.body import Array, Episode, analyse, check_legs
+from msk_ray.envs.legs.gait.body import Array, Episode, Series, analyse, at_substeps, check_legs
 from msk_ray.envs.legs.gait.measure import measure
 from msk_ray.errors import ConfigError
 from msk_ray.evaluate.measure import Bench, Made, Request, device_name, entry_of
@@ -25,7 +25,7 @@ class Walk(NamedTuple):
     """An entry of `eval.json`, with the gait's figures under `gait`."""
     episodes: list[Episode]
     qpos: list[Array]
-    """Positions of each episode, (T, nq)."""
+    """Positions of each episode, (T, nq), at the times of its series."""
     env: Env[Any]
 
 
@@ -43,7 +43,9 @@ def at_target_speed(policy: SavedPolicy, speed: float) -> SavedPolicy:
 
 
 def walk(bench: Bench, policy: SavedPolicy, request: Request) -> Walk:
-    """Run episodes and measure the gait in them.
+    """Run episodes and measure the gait in them, at every physics step.
+
+    An env step is 2 % of a gait cycle long: a foot strike that is only seen at its end comes half of that too late.
 
     Raises:
         ConfigError: the model has no legs with the names that the leg environments use.
@@ -53,11 +55,13 @@ def walk(bench: Bench, policy: SavedPolicy, request: Request) -> Walk:
     env = evaluator.env
     check_legs(env.model)
     recording = record(bench, policy, request)
-    episodes, positions = [], []
+    model, episodes, positions = recording.model, [], []
     for world in range(recording.count):
         states = recording.world(world)
-        positions.append(states.qpos)
-        episodes.append(analyse(recording.model, states.qpos, states.qvel, states.act, recording.timestep))
+        recorded = Series(states.qpos, states.qvel, states.act)
+        series = at_substeps(model, recorded, states.ctrl[:-1], round(recording.timestep / model.opt.timestep))
+        positions.append(series.qpos)
+        episodes.append(analyse(model, *series, model.opt.timestep))
     gait = measure(episodes, recording.episodes.fell.tolist())
     seeds = request.seeds or (policy.config.evaluation.seed,)
     made = Made(

@@ -409,6 +409,8 @@ class LegEnv(AssistedEnv[AnyLegSettings], Generic[AnyLegSettings]):
         }
 
     def trajectory_figures(self, trajectories: Sequence[StepState]) -> dict[str, float]:
+        # From states of env steps only: repeating the physics steps between them, as `msk_ray.gait` does, takes time
+        # that training would wait for. Strikes come up to an env step late here.
         found = []
         for states in trajectories:
             qpos, qvel, act = (part.double().numpy() for part in states)

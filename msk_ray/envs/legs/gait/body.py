@@ -3,9 +3,13 @@
 Axes: T samples, U muscles.
 """
 
+import copy
+import os
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import mujoco
+import mujoco.rollout
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -46,6 +50,59 @@ class Episode:
     """Activations of the muscles of `people.EMG` that the model has, by name and side, each (T,)."""
 
 
+class Series(NamedTuple):
+    """States of one episode, equally spaced in time."""
+
+    qpos: Array
+    """Shape (T, nq)."""
+    qvel: Array
+    """Shape (T, nv)."""
+    act: Array
+    """Shape (T, na)."""
+
+
+def at_substeps(model: mujoco.MjModel, states: Series, ctrl: Array, substeps: int) -> Series:
+    """States of every physics step: C MuJoCo repeats each env step from its recorded state.
+
+    Nothing drifts, because each env step starts from what was recorded, also after a push between two of them.
+
+    Args:
+        model: of the episode, with its physics timestep.
+        states: recorded at T env steps.
+        ctrl: controls held from each of the first T - 1 states to the next, (T - 1, nu).
+        substeps: physics steps per env step.
+
+    Returns:
+        (T - 1) substeps + 1 states, `model.opt.timestep` apart, of which each `substeps`-th is a recorded one.
+
+    Raises:
+        ValueError: the shapes do not fit, or the model has states beside qpos, qvel and act (plugins, delays).
+    """
+    count = len(states.qpos) - 1
+    if len(ctrl) != count:
+        raise ValueError(f"{len(ctrl)} controls for {count} env steps between {count + 1} states")
+    parts = (model.nq, model.nv, model.na)
+    full = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    if full != 1 + sum(parts):
+        raise ValueError("the model has states beside qpos, qvel and act; their values are not recorded")
+    if count == 0 or substeps == 1:
+        return states
+    model = copy.copy(model)
+    # A diverged episode stays diverged instead of starting again in the reference pose.
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    first = np.concatenate((np.zeros((count, 1)), *(part[:-1] for part in states)), axis=1)
+    held = np.repeat(ctrl[:, None], substeps - 1, axis=1)
+    threads = [mujoco.MjData(model) for _ in range(os.cpu_count() or 1)]
+    later, _ = mujoco.rollout.rollout(model, threads, first, held)
+    dense = np.concatenate((first[:, None], later), axis=1)[..., 1:].reshape(count * substeps, -1)
+    return Series(
+        *(
+            np.concatenate((part, last[-1:]))
+            for part, last in zip(np.split(dense, np.cumsum(parts)[:-1], axis=1), states, strict=True)
+        )
+    )
+
+
 def analyse(model: mujoco.MjModel, qpos: Array, qvel: Array, act: Array, timestep: float) -> Episode:
     """Time series of states (T, nq), (T, nv), (T, na) that are `timestep` [s] apart.
 
@@ -56,6 +113,7 @@ def analyse(model: mujoco.MjModel, qpos: Array, qvel: Array, act: Array, timeste
     axes = world_axes(model)
     angles = {name: _angles(model, joint, qpos) for name, joint in JOINTS.items()}
     owners = {side: _carried_by(model, model.body(f"talus_{side}").id) for side in SIDES}
+    pelvis, heels = model.body("pelvis").id, {side: model.body(f"calcn_{side}").id for side in SIDES}
     weight = float(np.linalg.norm(model.opt.gravity) * model.body_subtreemass[0])
     muscles = np.flatnonzero(model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_MUSCLE))
     data = mujoco.MjData(model)
@@ -67,10 +125,10 @@ def analyse(model: mujoco.MjModel, qpos: Array, qvel: Array, act: Array, timeste
     for t in range(count):
         data.qpos[:], data.qvel[:], data.act[:] = qpos[t], qvel[t], act[t]
         mujoco.mj_forward(model, data)
-        forward[t] = data.body("pelvis").xpos @ axes[0]
+        forward[t] = data.xpos[pelvis] @ axes[0]
         lengths[t], rates[t] = data.ten_length, data.ten_velocity
         for side in SIDES:
-            feet[side][t] = data.body(f"calcn_{side}").xpos @ axes[0]
+            feet[side][t] = data.xpos[heels[side]] @ axes[0]
             forces[side][t] = axes @ ground_reaction(model, data, owners[side]) / weight
         # A muscle's force is negative where it pulls, its velocity where it shortens.
         given = data.actuator_force[muscles] * data.actuator_velocity[muscles]

@@ -8,6 +8,7 @@ import numpy as np
 from msk_ray.envs.legs.gait.body import CURVES, SIDES, Array, Episode
 from msk_ray.envs.legs.gait.compare import at_speed, difference, gait_distance, timing
 from msk_ray.envs.legs.gait.cycles import (
+    Flags,
     Stride,
     cadence,
     extremum,
@@ -58,10 +59,7 @@ def measure(episodes: Sequence[Episode], fell: Sequence[bool]) -> dict[str, Any]
         distance = float(episode.forward[-1] - episode.forward[start])
         values["speed"].append(distance / seconds)
         _add_costs(costs, episode, start, distance)
-        contact = {
-            side: on_ground(episode.curves["vertical_force"][side][start:], 1.0, least=_least(episode.timestep))
-            for side in SIDES
-        }
+        contact = {side: settled_contact(episode, side) for side in SIDES}
         steps = cadence(contact["r"], contact["l"], episode.timestep)
         if steps is not None:
             values["cadence"].append(steps)
@@ -120,9 +118,11 @@ def _both_sides(curves: dict[str, dict[str, list[Array]]]) -> dict[str, tuple[Ar
     return {name: mean for name, mean in means.items() if mean is not None}
 
 
-def _least(timestep: float) -> int:
-    """Samples in 60 ms: no step or swing is shorter."""
-    return max(1, round(0.06 / timestep))
+def settled_contact(episode: Episode, side: str) -> Flags:
+    """Whether a foot is on the ground, from the end of `SETTLING` on. No step or swing is shorter than 60 ms."""
+    start = round(SETTLING / episode.timestep)
+    least = max(1, round(0.06 / episode.timestep))
+    return on_ground(episode.curves["vertical_force"][side][start:], 1.0, least=least)
 
 
 def _add_costs(costs: dict[str, list[float]], episode: Episode, start: int, distance: float) -> None:
