@@ -130,6 +130,10 @@ _LATER: dict[tuple[str, ...], Any] = {
 _NO_ASSISTANCE = {"epochs": 0, "share": 1.0, "balance": 800.0, "lateral": 800.0, "support": 0.0}
 _LATER_OF: dict[str, dict[tuple[str, ...], Any]] = {
     "ant": {("env", "joint_limit"): 0.0, ("env", "joint_limit_epochs"): 0},
+    **{
+        name: {("env", "reward", "joint_limit"): 0.0, ("env", "joint_limit_epochs"): 0}
+        for name in ("hopper", "cheetah", "humanoid")
+    },
     "myoleg": {("env", "assist"): _NO_ASSISTANCE, ("env", "reset"): "stand"},
     "myosuite_walk": {
         ("env", "assist"): _NO_ASSISTANCE,

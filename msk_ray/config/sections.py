@@ -96,3 +96,21 @@ class EnvSettings(Section):
     def unread(self) -> dict[str, str]:
         """Settings of this section, dotted, that nothing reads because of others, and the reason for each."""
         return {}
+
+
+class LimitedReward(Reward):
+    """The weights of a body whose training can charge for joints past their ranges."""
+
+    joint_limit: NonNegative = 0.0
+    """Weight of the summed squared overshoot past the joints' ranges, in units of 0.1 rad."""
+
+
+class LimitedSettings(EnvSettings):
+    """The settings of such a body."""
+
+    reward: LimitedReward = LimitedReward()
+    joint_limit_epochs: Whole = 0
+    """Epochs over which the weight `reward.joint_limit` falls linearly to 0; 0: it stays."""
+
+    def unread(self) -> dict[str, str]:
+        return {"joint_limit_epochs": "env.reward.joint_limit is 0"} if self.reward.joint_limit == 0.0 else {}

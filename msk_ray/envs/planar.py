@@ -4,12 +4,12 @@ import mujoco
 import torch
 from torch import Tensor
 
-from msk_ray.envs.base import Env, SettingsT
 from msk_ray.envs.layout import Entry
+from msk_ray.envs.limits import LimitedBody, LimitedT
 from msk_ray.simulation import StepState
 
 
-class PlanarBody(Env[SettingsT]):
+class PlanarBody(LimitedBody[LimitedT]):
     """A body whose observation is its coordinates, all but x, and the velocities of all, in the order of its joints."""
 
     def observe(self, state: StepState, action: Tensor) -> Tensor:

@@ -3,10 +3,11 @@
 import math
 
 import mujoco
+import numpy as np
 import pytest
 import torch
 
-from msk_ray.config import PhysicsConfig
+from msk_ray.config import PhysicsConfig, parse_config
 from msk_ray.envs import make_env
 from msk_ray.envs.ant.config import AntReward, AntSettings
 from msk_ray.envs.ant.env import Ant
@@ -129,6 +130,29 @@ def test_an_ants_cost_of_joint_ranges_fades() -> None:
         env.begin_epoch(epoch)
         found = named_terms(env, state, torch.zeros(1, 8))["joint_limit"].item()
         assert found == pytest.approx(-2.0 * share, rel=1e-4)
+
+
+@pytest.mark.parametrize("name", ["hopper", "cheetah", "humanoid"])
+def test_other_bodies_pay_for_joints_past_their_ranges_too(name: str) -> None:
+    """0.2 rad below the range of the last joint, 0.1 rad above that of the first: 0.5 (2² + 1²), half of it later."""
+    config = parse_config(
+        {"env": {"name": name, "nworld": 1, "reward": {"joint_limit": 0.5}, "joint_limit_epochs": 20}}
+    ).env
+    env = make_env(config, PhysicsConfig(), 1, "cpu", 0, differentiable=False)
+    joints = np.flatnonzero(env.model.jnt_limited)
+    assert len(joints) == env.action_size, "every driven joint has a range"
+    qpos = torch.zeros(1, env.model.nq)
+    at, ranges = env.model.jnt_qposadr[joints], env.model.jnt_range[joints]
+    qpos[0, at] = torch.tensor(ranges.mean(-1), dtype=torch.float32)
+    qpos[0, at[-1]] = ranges[-1, 0] - 0.2
+    qpos[0, at[0]] = ranges[0, 1] + 0.1
+    state = StepState(qpos, torch.zeros(1, env.model.nv), torch.zeros(1, 0))
+    for epoch, share in ((0, 1.0), (10, 0.5), (20, 0.0)):
+        env.begin_epoch(epoch)
+        found = named_terms(env, state, torch.zeros(1, env.action_size))
+        assert list(found)[-1] == "joint_limit"
+        assert found["joint_limit"].item() == pytest.approx(-2.5 * share, rel=1e-4)
+    assert type(env).reference_settings(config).reward == type(config.reward)(), "scores leave it out"
 
 
 def test_an_ant_that_falls_terminates_and_restarts(ant: Ant) -> None:

@@ -1,10 +1,10 @@
 """The settings of the ant."""
 
 from msk_ray.config.physics import CONTACTS, JOINTS, LIMITS, SOLVING, STEPPING
-from msk_ray.config.sections import Count, EnvSettings, NonNegative, Reward, Whole
+from msk_ray.config.sections import Count, LimitedReward, LimitedSettings, NonNegative
 
 
-class AntReward(Reward):
+class AntReward(LimitedReward):
     """Weights per env step."""
 
     forward_vel: float = 1.0
@@ -17,11 +17,9 @@ class AntReward(Reward):
     """Weight of the torso's height above `env.termination_height` [1/m]."""
     action_penalty: NonNegative = 0.0
     """Weight of the summed squared action."""
-    joint_limit: NonNegative = 0.0
-    """Weight of the summed squared overshoot past the joints' ranges, in units of 0.1 rad."""
 
 
-class AntSettings(EnvSettings):
+class AntSettings(LimitedSettings):
     """A four-legged walker whose reward asks for forward velocity."""
 
     variants = ("matched", "matched_hard_friction", "published")
@@ -34,8 +32,3 @@ class AntSettings(EnvSettings):
     """Torso height below which an episode ends [m]."""
     early_termination: bool = True
     """End an episode on falling below `termination_height`."""
-    joint_limit_epochs: Whole = 0
-    """Epochs over which the weight `reward.joint_limit` falls linearly to 0; 0: it stays."""
-
-    def unread(self) -> dict[str, str]:
-        return {"joint_limit_epochs": "env.reward.joint_limit is 0"} if self.reward.joint_limit == 0.0 else {}

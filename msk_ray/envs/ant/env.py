@@ -9,16 +9,15 @@ from torch import Tensor
 from msk_ray.config import PhysicsConfig
 from msk_ray.envs.ant.config import AntSettings
 from msk_ray.envs.ant.model import STAND_HEIGHT, STAND_JOINTS, build_ant
-from msk_ray.envs.base import Env
 from msk_ray.envs.layout import Entry, entries, floating_body
-from msk_ray.envs.limits import squared_overshoot
+from msk_ray.envs.limits import LimitedBody
 from msk_ray.simulation import StepState
 from msk_ray.simulation.tangent import quat_exp, quat_multiply, quat_rotate
 
 _JOINT_VELOCITY_SCALE = 0.1
 
 
-class Ant(Env[AntSettings]):
+class Ant(LimitedBody[AntSettings]):
     """Observation (37), in this order:
 
     ====== ===========================================================
@@ -34,7 +33,6 @@ class Ant(Env[AntSettings]):
     ====== ===========================================================
     """
 
-    begin_epoch_in_place = True
     obs_size = 37
     Settings = AntSettings
     reward_names: tuple[str, ...] = ("forward_vel", "up", "heading", "height", "action")
@@ -43,18 +41,9 @@ class Ant(Env[AntSettings]):
     def build_model(cls, config: AntSettings, physics: PhysicsConfig) -> mujoco.MjModel:
         return build_ant(config, physics)
 
-    @classmethod
-    def reference_settings(cls, config: AntSettings) -> AntSettings:
-        return super().reference_settings(config).model_copy(update={"joint_limit_epochs": 0})
-
     def prepare(self) -> None:
+        super().prepare()
         r = self.config.reward
-        if r.joint_limit > 0.0:
-            self.reward_names = (*type(self).reward_names, "joint_limit")
-            ranges = torch.tensor(self.model.jnt_range[1:], dtype=torch.float32, device=self.device)
-            self._low, self._high = ranges.unbind(-1)
-        self._limit_share = torch.ones((), device=self.device)
-        """How much of `joint_limit` is left."""
         # World z of the torso's z axis and world x of its x axis are w² - x² - y² + z² and w² + x² - y² - z².
         self._axes = torch.tensor(((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)), device=self.device)
         # All terms but the costs of actions and of joint limits are linear in the observation.
@@ -64,10 +53,6 @@ class Ant(Env[AntSettings]):
         offset = torch.tensor((0.0, 0.0, 0.0, -r.height * self.config.termination_height, 0.0))
         self._linear, self._offset = linear.to(self.device), offset.to(self.device)
         self._stand = torch.tensor((0.0, 0.0, STAND_HEIGHT, 1.0, 0.0, 0.0, 0.0, *STAND_JOINTS), device=self.device)
-
-    def begin_epoch(self, epoch: int) -> None:
-        if self.config.joint_limit_epochs:
-            self._limit_share.fill_(max(0.0, 1.0 - epoch / self.config.joint_limit_epochs))
 
     def draw_physics(self, count: int) -> StepState:
         stand = self._stand
@@ -106,13 +91,7 @@ class Ant(Env[AntSettings]):
         if r.action_penalty > 0.0:
             effort = -r.action_penalty * action.square().sum(-1, keepdim=True)
             terms = torch.cat((terms[:, :-1], effort), dim=-1)
-        if r.joint_limit > 0.0:
-            overshoot = squared_overshoot(state.qpos[:, 7:], self._low, self._high)
-            cost = -r.joint_limit * overshoot[:, None]
-            if self.config.joint_limit_epochs:
-                cost = self._limit_share * cost
-            terms = torch.cat((terms, cost), dim=-1)
-        return terms
+        return self.with_limit_cost(terms, state)
 
     def fell(self, state: StepState) -> Tensor:
         if not self.config.early_termination:

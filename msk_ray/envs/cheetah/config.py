@@ -1,10 +1,10 @@
 """The settings of the cheetah."""
 
 from msk_ray.config.physics import CONTACTS, JOINTS, LIMITS, SOLVING, STEPPING
-from msk_ray.config.sections import Count, EnvSettings, NonNegative, Reward
+from msk_ray.config.sections import Count, LimitedReward, LimitedSettings, NonNegative
 
 
-class CheetahReward(Reward):
+class CheetahReward(LimitedReward):
     """Weights per env step."""
 
     forward_vel: float = 1.0
@@ -13,7 +13,7 @@ class CheetahReward(Reward):
     """Weight of the summed squared action."""
 
 
-class CheetahSettings(EnvSettings):
+class CheetahSettings(LimitedSettings):
     """A planar body on two legs whose reward asks for forward velocity; its episodes end only at the time limit."""
 
     variants = ("matched", "published")

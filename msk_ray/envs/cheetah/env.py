@@ -35,6 +35,7 @@ class Cheetah(PlanarBody[CheetahSettings]):
         return build_cheetah(config, physics)
 
     def prepare(self) -> None:
+        super().prepare()
         self._start = torch.zeros(9, device=self.device)
         self._start[1] = _START_HEIGHT
 
@@ -44,4 +45,5 @@ class Cheetah(PlanarBody[CheetahSettings]):
 
     def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
         r = self.config.reward
-        return torch.stack((r.forward_vel * obs[:, 8], -r.action_penalty * action.square().sum(-1)), dim=-1)
+        terms = torch.stack((r.forward_vel * obs[:, 8], -r.action_penalty * action.square().sum(-1)), dim=-1)
+        return self.with_limit_cost(terms, state)

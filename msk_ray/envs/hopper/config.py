@@ -1,10 +1,10 @@
 """The settings of the hopper."""
 
 from msk_ray.config.physics import CONTACTS, JOINTS, LIMITS, SOLVING, STEPPING
-from msk_ray.config.sections import Count, EnvSettings, NonNegative, Reward
+from msk_ray.config.sections import Count, LimitedReward, LimitedSettings, NonNegative
 
 
-class HopperReward(Reward):
+class HopperReward(LimitedReward):
     """Weights per env step."""
 
     forward_vel: float = 1.0
@@ -21,7 +21,7 @@ class HopperReward(Reward):
     """Weight of the summed squared action."""
 
 
-class HopperSettings(EnvSettings):
+class HopperSettings(LimitedSettings):
     """A planar body on one leg whose reward asks for forward velocity."""
 
     variants = ("matched", "published")
@@ -36,4 +36,5 @@ class HopperSettings(EnvSettings):
     """End an episode on falling below `termination_height`."""
 
     def unread(self) -> dict[str, str]:
-        return {} if self.early_termination else {"termination_height": "env.early_termination is false"}
+        heights = {} if self.early_termination else {"termination_height": "env.early_termination is false"}
+        return super().unread() | heights

@@ -45,7 +45,7 @@ class Hopper(PlanarBody[HopperSettings]):
     def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
         r = self.config.reward
         above = (obs[:, 0] - r.full_height).clamp(_BOTTOM, _TOP)
-        return torch.stack(
+        terms = torch.stack(
             (
                 r.forward_vel * obs[:, 5],
                 torch.where(above < 0.0, -r.drop * above.square(), r.height * above),
@@ -54,6 +54,7 @@ class Hopper(PlanarBody[HopperSettings]):
             ),
             dim=-1,
         )
+        return self.with_limit_cost(terms, state)
 
     def fell(self, state: StepState) -> Tensor:
         if not self.config.early_termination:

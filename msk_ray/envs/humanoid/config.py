@@ -1,10 +1,10 @@
 """The settings of the humanoid."""
 
 from msk_ray.config.physics import CONTACTS, JOINTS, LIMITS, SOLVING, STEPPING
-from msk_ray.config.sections import Count, EnvSettings, NonNegative, Reward
+from msk_ray.config.sections import Count, LimitedReward, LimitedSettings, NonNegative
 
 
-class HumanoidReward(Reward):
+class HumanoidReward(LimitedReward):
     """Weights per env step."""
 
     forward_vel: float = 1.0
@@ -23,7 +23,7 @@ class HumanoidReward(Reward):
     """Weight of the summed squared action."""
 
 
-class HumanoidSettings(EnvSettings):
+class HumanoidSettings(LimitedSettings):
     """A walker on two legs whose reward asks for forward velocity."""
 
     variants = ("matched", "published")
@@ -38,4 +38,5 @@ class HumanoidSettings(EnvSettings):
     """End an episode on falling below `termination_height`."""
 
     def unread(self) -> dict[str, str]:
-        return {} if self.early_termination else {"termination_height": "env.early_termination is false"}
+        heights = {} if self.early_termination else {"termination_height": "env.early_termination is false"}
+        return super().unread() | heights

@@ -7,10 +7,10 @@ import torch
 from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
-from msk_ray.envs.base import Env
 from msk_ray.envs.humanoid.config import HumanoidSettings
 from msk_ray.envs.humanoid.model import START_HEIGHT, build_humanoid
 from msk_ray.envs.layout import Entry, entries, floating_body
+from msk_ray.envs.limits import LimitedBody
 from msk_ray.simulation import StepState
 from msk_ray.simulation.tangent import quat_exp, quat_rotate
 
@@ -20,7 +20,7 @@ _TOP = 0.1
 _BOTTOM = -1.0
 
 
-class Humanoid(Env[HumanoidSettings]):
+class Humanoid(LimitedBody[HumanoidSettings]):
     """Observation (76), in this order; source: `envs/humanoid.py` of github.com/NVlabs/DiffRL.
 
     ====== ==========================================================================================
@@ -46,6 +46,7 @@ class Humanoid(Env[HumanoidSettings]):
         return build_humanoid(config, physics)
 
     def prepare(self) -> None:
+        super().prepare()
         self._forward = torch.tensor((1.0, 0.0, 0.0), device=self.device)
         self._target = torch.tensor((_TARGET, 0.0), device=self.device)
         self._start = torch.tensor((0.0, 0.0, START_HEIGHT), device=self.device)
@@ -86,7 +87,7 @@ class Humanoid(Env[HumanoidSettings]):
     def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
         r = self.config.reward
         above = (obs[:, 0] - r.full_height).clamp(_BOTTOM, _TOP)
-        return torch.stack(
+        terms = torch.stack(
             (
                 r.forward_vel * obs[:, 5],
                 r.up * obs[:, 53],
@@ -96,6 +97,7 @@ class Humanoid(Env[HumanoidSettings]):
             ),
             dim=-1,
         )
+        return self.with_limit_cost(terms, state)
 
     def fell(self, state: StepState) -> Tensor:
         if not self.config.early_termination:
