@@ -118,7 +118,7 @@ _LATER: dict[tuple[str, ...], Any] = {
         ("env", name): 0.0
         for name in (
             *("metabolic", "fatigue", "head", "impact", "footfall", "clearance", "toes", "vault"),
-            *("out_of_plane", "track", "track_rate"),
+            *("out_of_plane", "track", "track_rate", "landing"),
         )
     },
     ("env", "clearance_height"): 0.01,

@@ -23,7 +23,7 @@ from msk_ray.errors import ConfigError
 from msk_ray.simulation import StepState
 
 EVERY = dict.fromkeys(("metabolic", "fatigue", "head", "impact", "footfall", "clearance", "toes", "vault"), 0.1)
-EVERY |= {"out_of_plane": 0.1, "track": 0.5, "track_rate": 0.1}
+EVERY |= {"out_of_plane": 0.1, "track": 0.5, "track_rate": 0.1, "landing": 0.1}
 
 
 def make(nworld: int = 4, **settings: object) -> MyoLeg26:
@@ -70,6 +70,10 @@ def test_costs_by_hand() -> None:
     assert terms.sliding(phase, still, moving).tolist() == pytest.approx([once, once, 0.0])
     heights = torch.tensor([[0.005, 0.02]] * 3)
     assert terms.dragging(phase, heights, 0.01).tolist() == pytest.approx([0.0, 0.0, 0.125])
+    # 3.46 mm are √3 × 2 mm; half a flank before the window is open, and in the air for the rest of the cycle.
+    struck = torch.tensor([0.05, 0.0, 0.05, 0.5, 0.95])
+    heel = torch.tensor([0.002 * math.sqrt(3.0)] * 2 + [-0.002] + [0.01] * 2)
+    assert terms.hovering(struck, heel).tolist() == pytest.approx([1.0, 0.5, 0.0, 0.0, 0.0], abs=1e-6)
     slope, bend = torch.full((3,), 0.2), torch.full((3,), 0.09)
     toes = terms.lifted_toes(phase, slope, bend).tolist()
     assert toes == pytest.approx([math.hypot(1.0, angle / 0.15) - 1.0 for angle in (0.2, 0.2, 0.3)])

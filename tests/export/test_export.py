@@ -182,7 +182,7 @@ def test_layouts_name_the_entries_of_observations(name: str) -> None:
         (["cartpole"], "nothing to write"),
         (["cartpole", "--onnx", "p.pt"], "write a name that ends in .onnx"),
         (["cartpole", "--torchscript", str(CHECKPOINT)], "this is the checkpoint itself"),
-        (["cartpool", "--onnx", "p.onnx"], "policies/ ant, ant_hard, cartpole"),
+        (["cartpool", "--onnx", "p.onnx"], "policies/ ant, ant_fast, ant_fast_friction, ant_hard, cartpole"),
         (["cartpole", "--onnx", "p.onnx", "--physics", "moon"], "write one of reference, own"),
     ],
 )

@@ -9,12 +9,12 @@ from msk_ray.config.sections import Count, EnvSettings, Fraction, NonNegative, R
 
 FURTHER = (
     *("metabolic", "fatigue", "head", "impact", "footfall", "clearance", "toes", "vault", "out_of_plane", "track"),
-    "track_rate",
+    *("track_rate", "landing"),
 )
 """Weights of terms that are there only where they are not zero."""
 OUT_OF_PLANE = ("hip_adduction", "hip_rotation", "subtalar_angle")
 """Joints, without their side, whose angles the term `out_of_plane` keeps small."""
-CLOCKED = ("footfall", "clearance", "toes", "vault", "track", "track_rate")
+CLOCKED = ("footfall", "landing", "clearance", "toes", "vault", "track", "track_rate")
 """Weights of terms that need the clock."""
 
 
@@ -73,6 +73,10 @@ class LegReward(Reward):
     footfall: NonNegative = 0.0
     """Weight of the speed of heel and toes while the clock wants them on the ground: in people the heel is down until
     40 % of the cycle, the toes from 10 to 60 %. Needs `env.clock`."""
+    landing: NonNegative = 0.0
+    """Weight of √(1 + (h / 2 mm)²) - 1, where h is how far a heel is above its place in standing just after the clock
+    wants it to strike. Without it a heel may hover a few millimetres above the ground, slowly enough for `footfall`,
+    and land late. Needs `env.clock`."""
     clearance: NonNegative = 0.0
     """Weight of ((clearance_height - height) / clearance_height)² of heel and toes below that height while the clock
     wants the foot in the air. Needs `env.clock`."""

@@ -141,7 +141,7 @@ class LegEnv(AssistedEnv[AnyLegSettings], Generic[AnyLegSettings]):
                     "_l); leave it out"
                 )
             self._sideways_qpos = columns(self.model.jnt_qposadr[sideways], self.device)
-        if {"impact", "footfall", "clearance", "toes"} & set(self._further):
+        if {"impact", "footfall", "landing", "clearance", "toes"} & set(self._further):
             self._feet = Feet(self.model, self.stand_height, self.device)
 
     def weights(self, reward: LegReward) -> Tensor:
@@ -348,6 +348,8 @@ class LegEnv(AssistedEnv[AnyLegSettings], Generic[AnyLegSettings]):
                 return costs.impact(feet.height, feet.rise)
             case "footfall":
                 return self._foot_motion(state).sliding(self._leg_phases()[0])
+            case "landing":
+                return self._foot_motion(state).hovering(self._leg_phases()[0])
             case "clearance":
                 wanted = self.config.reward.clearance_height
                 return self._foot_motion(state).dragging(self._leg_phases()[0], wanted)

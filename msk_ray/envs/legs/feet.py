@@ -31,6 +31,11 @@ class FootMotion(NamedTuple):
         speed = self.velocity
         return costs.sliding(phase, speed[:, 0], speed[:, 1]) + costs.sliding(phase + 0.5, speed[:, 2], speed[:, 3])
 
+    def hovering(self, phase: Tensor) -> Tensor:
+        """Cost (W,) of heels that have not landed when they should, at the right leg's phases (W,) [turns]."""
+        heels = self.height[:, 0], self.height[:, 2]
+        return costs.hovering(phase, heels[0]) + costs.hovering(phase + 0.5, heels[1])
+
     def dragging(self, phase: Tensor, clearance: float) -> Tensor:
         """Cost (W,) of feet that are lower than `clearance` [m] in their swing, at the right leg's phases (W,)."""
         right, left = self.height[:, :2], self.height[:, 2:]

@@ -10,8 +10,12 @@ HEEL_DOWN = (0.02, 0.40)
 are those at which the feet of `people_angles` move by less than 0.3 m/s, or are 1 cm above the ground."""
 TOES_DOWN = (0.10, 0.60)
 """The same of the toes."""
+LANDED = (-0.02, 0.12)
+"""The same of the heel just after its strike, which is at phase 0 in people."""
 SWING = (0.64, 0.92)
 """The same of the swing."""
+_HOVERING = 0.002
+"""Height of a heel that should have landed beyond which its cost grows linearly [m]."""
 _SLIDING = 0.3
 """Speed of a foot that should stand beyond which its cost grows linearly [m/s]."""
 _BENT = 0.15
@@ -39,6 +43,16 @@ def sliding(phase: Tensor, heel: Tensor, toes: Tensor) -> Tensor:
     down = window(phase, *HEEL_DOWN), window(phase, *TOES_DOWN)
     speeds = ((velocity / _SLIDING).square().sum(-1) for velocity in (heel, toes))
     return sum((on * soft(speed) for on, speed in zip(down, speeds, strict=True)), torch.zeros_like(phase))
+
+
+def hovering(phase: Tensor, heel: Tensor) -> Tensor:
+    """Cost (W,) of a heel that is above the ground when it should have landed.
+
+    Args:
+        phase: of its leg [turns], (W,).
+        heel: its height above its place in standing [m], (W,).
+    """
+    return window(phase, *LANDED) * soft((torch.relu(heel) / _HOVERING).square())
 
 
 def dragging(phase: Tensor, heights: Tensor, clearance: float) -> Tensor:

@@ -43,7 +43,10 @@ OPTIONS = {
         "horizon": {"start": 4, "shortest": 4, "longest": 4, "contact": 1.0},
     },
 }
-_WEIGHTS = ("metabolic", "fatigue", "head", "impact", "footfall", "clearance", "toes", "vault", "track", "track_rate")
+_WEIGHTS = (
+    *("metabolic", "fatigue", "head", "impact", "footfall", "landing", "clearance", "toes", "vault", "track"),
+    "track_rate",
+)
 LEGS = {
     **ANT,
     "env": {
