@@ -253,8 +253,26 @@ def test_every_further_term_has_a_gradient_and_none_is_there_by_default(env: Myo
     for name, value in zip(env.reward_names[-len(EVERY) :], worth[-len(EVERY) :], strict=True):
         (slope,) = torch.autograd.grad(value, action, retain_graph=True)
         assert slope.isfinite().all(), name
-        if name != "clearance":  # people's feet are high enough
+        if name not in ("clearance", "landing"):  # people's feet are high enough, and their heels have landed
             assert slope.abs().max() > 1e-7, name
+
+
+def test_a_heel_that_hovers_pulls_the_pelvis_down() -> None:
+    env = make(1, clock=True, reset="cycle", stochastic_reset=False, reward={"landing": 1.0})
+    physics = env.draw_phase(torch.tensor([0.03]), torch.tensor([1.25]))
+    env.state = env.state._replace(physics=physics, numbers=torch.tensor([[1.25, 0.03]]))
+    up = int(env.model.joint("pelvis_ty").qposadr[0])
+    found = []
+    for lifted in (0.0, 0.01):
+        qpos = physics.qpos.clone()
+        qpos[0, up] += lifted
+        qpos.requires_grad_(True)
+        state = physics._replace(qpos=qpos)
+        cost = env.reward_terms(state, torch.zeros(1, 26), env.observe(state, torch.zeros(1, 26)))[0, -1]
+        (slope,) = torch.autograd.grad(cost, qpos)
+        found.append((cost.item(), slope[0, up].item()))
+    assert found[1][0] < found[0][0] - 1.0
+    assert found[1][1] < -100.0
 
 
 def test_a_schedule_fades_the_reference() -> None:
