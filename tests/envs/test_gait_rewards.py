@@ -71,7 +71,7 @@ def test_costs_by_hand() -> None:
     heights = torch.tensor([[0.005, 0.02]] * 3)
     assert terms.dragging(phase, heights, 0.01).tolist() == pytest.approx([0.0, 0.0, 0.125])
     # 3.46 mm are √3 × 2 mm; half a flank before the window is open, and in the air for the rest of the cycle.
-    struck = torch.tensor([0.05, 0.0, 0.05, 0.5, 0.95])
+    struck = torch.tensor([0.05, -0.02, 0.05, 0.5, 0.95])
     heel = torch.tensor([0.002 * math.sqrt(3.0)] * 2 + [-0.002] + [0.01] * 2)
     assert terms.hovering(struck, heel).tolist() == pytest.approx([1.0, 0.5, 0.0, 0.0, 0.0], abs=1e-6)
     slope, bend = torch.full((3,), 0.2), torch.full((3,), 0.09)

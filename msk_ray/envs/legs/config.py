@@ -74,9 +74,9 @@ class LegReward(Reward):
     """Weight of the speed of heel and toes while the clock wants them on the ground: in people the heel is down until
     40 % of the cycle, the toes from 10 to 60 %. Needs `env.clock`."""
     landing: NonNegative = 0.0
-    """Weight of √(1 + (h / 2 mm)²) - 1, where h is how far a heel is above its place in standing just after the clock
-    wants it to strike. Without it a heel may hover a few millimetres above the ground, slowly enough for `footfall`,
-    and land late. Needs `env.clock`."""
+    """Weight of √(1 + (h / 2 mm)²) - 1, where h is how far a heel is above its place in standing, from 4 % of the cycle
+    before the clock wants it to strike to 12 % after. Without it a heel may hover a few millimetres above the ground,
+    slowly enough for `footfall`, and land late. Needs `env.clock`."""
     clearance: NonNegative = 0.0
     """Weight of ((clearance_height - height) / clearance_height)² of heel and toes below that height while the clock
     wants the foot in the air. Needs `env.clock`."""

@@ -10,8 +10,9 @@ HEEL_DOWN = (0.02, 0.40)
 are those at which the feet of `people_angles` move by less than 0.3 m/s, or are 1 cm above the ground."""
 TOES_DOWN = (0.10, 0.60)
 """The same of the toes."""
-LANDED = (-0.02, 0.12)
-"""The same of the heel just after its strike, which is at phase 0 in people."""
+LANDED = (-0.04, 0.12)
+"""The same of the heel around its strike, which is at phase 0 in people. Toes leave the ground up to 5 % of the cycle
+earlier than people's, so that strikes have to be early as well for a stance as long as theirs."""
 SWING = (0.64, 0.92)
 """The same of the swing."""
 _HOVERING = 0.002
