@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msk_ray.envs.legs.gait.body import SIDES, Episode, world_axes
-from msk_ray.envs.legs.gait.cycles import on_ground, strides
-from msk_ray.envs.legs.gait.measure import SETTLING
+from msk_ray.envs.legs.gait.cycles import strides
+from msk_ray.envs.legs.gait.measure import contacts, settled
 from msk_ray.errors import ConfigError
 from msk_ray.visualize.film import write_video
 
@@ -58,14 +58,17 @@ def figures(model: mujoco.MjModel, qpos: Array) -> Array:
 def one_stride(episodes: list[Episode], qpos: list[Array]) -> tuple[Array, float]:
     """qpos (T, nq) of the middle stride of the right foot in the longest episode, and its duration [s].
 
+    Args:
+        episodes: time series.
+        qpos: of each episode, at the same samples.
+
     Raises:
         ConfigError: there is none.
     """
     longest = max(range(len(episodes)), key=lambda k: len(episodes[k].forward))
     episode = episodes[longest]
-    start = round(SETTLING / episode.timestep)
-    contact = on_ground(episode.curves["vertical_force"]["r"][start:], 1.0)
-    found = strides(contact)
+    start = settled(episode)
+    found = strides(contacts(episode, "r"))
     if not found:
         raise ConfigError("--film: the policy takes no stride to draw; leave it out")
     middle = found[len(found) // 2]

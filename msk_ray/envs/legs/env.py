@@ -409,6 +409,10 @@ class LegEnv(AssistedEnv[AnyLegSettings], Generic[AnyLegSettings]):
         }
 
     def trajectory_figures(self, trajectories: Sequence[StepState]) -> dict[str, float]:
+        """Figures of the gait at control steps, so that foot strikes are seen up to one of them late.
+
+        `python -m msk_ray.gait` repeats the physics substeps between them, which would cost time in every evaluation.
+        """
         found = []
         for states in trajectories:
             qpos, qvel, act = (part.double().numpy() for part in states)

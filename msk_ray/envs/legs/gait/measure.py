@@ -8,6 +8,7 @@ import numpy as np
 from msk_ray.envs.legs.gait.body import CURVES, SIDES, Array, Episode
 from msk_ray.envs.legs.gait.compare import at_speed, difference, gait_distance, timing
 from msk_ray.envs.legs.gait.cycles import (
+    Flags,
     Stride,
     cadence,
     extremum,
@@ -24,6 +25,8 @@ from msk_ray.envs.legs.metabolic import BASAL
 
 SETTLING = 1.0
 """Start of an episode that is left out [s], so that the settled gait is measured."""
+_SHORTEST = 0.06
+"""Contacts and gaps that are shorter are chatter [s]: no step or swing is."""
 
 
 def measure(episodes: Sequence[Episode], fell: Sequence[bool]) -> dict[str, Any]:
@@ -51,17 +54,14 @@ def measure(episodes: Sequence[Episode], fell: Sequence[bool]) -> dict[str, Any]
     muscles: dict[str, dict[str, list[Array]]] = {name: {side: [] for side in SIDES} for name in EMG}
     count = 0
     for episode in episodes:
-        start = round(SETTLING / episode.timestep)
+        start = settled(episode)
         if len(episode.forward) - start < 2:
             continue
         seconds = (len(episode.forward) - 1 - start) * episode.timestep
         distance = float(episode.forward[-1] - episode.forward[start])
         values["speed"].append(distance / seconds)
         _add_costs(costs, episode, start, distance)
-        contact = {
-            side: on_ground(episode.curves["vertical_force"][side][start:], 1.0, least=_least(episode.timestep))
-            for side in SIDES
-        }
+        contact = {side: contacts(episode, side) for side in SIDES}
         steps = cadence(contact["r"], contact["l"], episode.timestep)
         if steps is not None:
             values["cadence"].append(steps)
@@ -120,9 +120,15 @@ def _both_sides(curves: dict[str, dict[str, list[Array]]]) -> dict[str, tuple[Ar
     return {name: mean for name, mean in means.items() if mean is not None}
 
 
-def _least(timestep: float) -> int:
-    """Samples in 60 ms: no step or swing is shorter."""
-    return max(1, round(0.06 / timestep))
+def settled(episode: Episode) -> int:
+    """The first sample of the settled gait."""
+    return round(SETTLING / episode.timestep)
+
+
+def contacts(episode: Episode, side: str) -> Flags:
+    """Whether a foot bears load, from sample `settled` on."""
+    least = max(1, round(_SHORTEST / episode.timestep))
+    return on_ground(episode.curves["vertical_force"][side][settled(episode) :], 1.0, least=least)
 
 
 def _add_costs(costs: dict[str, list[float]], episode: Episode, start: int, distance: float) -> None:
