@@ -17,7 +17,7 @@ from msk_ray.gradcheck.__main__ import main as gradcheck
 from msk_ray.progress import Pace, ProgressLine
 from msk_ray.visualize.__main__ import main as visualize
 
-COMMANDS = ("gradcheck", "diagnose", "evaluate", "visualize")
+COMMANDS = ("gradcheck", "diagnose", "evaluate", "visualize", "gait")
 PGS = """<mujoco><option solver="PGS"/><worldbody><body><joint/><geom size=".1"/></body></worldbody></mujoco>"""
 
 

@@ -122,9 +122,9 @@ class Bench:
         except ConfigError as error:
             raise ConfigError(f"--vary {str(error).removeprefix('physics.randomize.')}") from None
 
-    def pace(self, steps: int) -> Pace | None:
-        """What says how far an episode of so many env steps is; None if nothing is to be printed."""
-        return Pace("env steps at most", steps) if self._tell else None
+    def pace(self, total: int, unit: str = "env steps at most") -> Pace | None:
+        """What says how far it is with so many of a unit; None if nothing is to be printed."""
+        return Pace(unit, total) if self._tell else None
 
     def evaluate(self, policy: SavedPolicy, request: Request) -> dict[str, Any]:
         """One entry of `eval.json`: what was evaluated, how, and the results.

@@ -13,6 +13,7 @@ from msk_ray.evaluate.__main__ import positive
 from msk_ray.evaluate.stored import eval_file_of, store_evaluation
 from msk_ray.evaluate.targets import best_checkpoint, find_target, trial_folder_of
 from msk_ray.files import make_folder, write_json
+from msk_ray.progress import COMPILING, announce
 from msk_ray.shipped import is_shipped
 from msk_ray.text_table import text_table
 
@@ -22,9 +23,10 @@ factor, joint angles and ground reaction over the gait cycle, symmetry, cost and
 and the gait distance, one number for all of it (about 1 for a healthy person, 10 for one who does not walk).
 
 Episodes are those of the evaluation: without noise or assistance, from fixed initial states. Their first second is
-left out. Writes gait.json and gait.png into the trial's folder or that of --out, and adds the gait to its eval.json.
-Several policies are compared in one table; with --speeds, each is told these speeds one after the other, and speeds.png
-shows cadence and step length against speed."""
+left out. They are measured at every physics substep, which C MuJoCo repeats from the state at each env step. Writes
+gait.json and gait.png into the trial's folder or that of --out, and adds the gait to its eval.json. Several policies
+are compared in one table; with --speeds, each is told these speeds one after the other, and speeds.png shows cadence
+and step length against speed."""
 
 EXAMPLES = """\
   python -m msk_ray.gait runs/train/myoleg26_seed0
@@ -70,6 +72,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if args.film is not None:
         _check_film(args)
     speeds: list[float | None] = [None] if args.speeds is None else [*_speeds(args.speeds)]
+    what = paths[0] if len(paths) == 1 else f"{len(paths)} policies"
+    announce(f"measuring the gait of {what}; {COMPILING}")
 
     from msk_ray.envs.legs.env import LegEnv
     from msk_ray.envs.make import env_class
@@ -78,7 +82,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     from msk_ray.gait.walk import at_target_speed, walk
     from msk_ray.training import load_policy
 
-    bench = Bench(args.device or default_device())
+    bench = Bench(args.device or default_device(), tell=True)
     request = Request(worlds=args.worlds, steps=args.steps)
     rows: list[tuple[str, dict[str, Any]]] = []
     for path in paths:

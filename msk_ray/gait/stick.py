@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from msk_ray.envs.legs.gait.body import SIDES, Episode, world_axes
 from msk_ray.envs.legs.gait.cycles import strides
-from msk_ray.envs.legs.gait.measure import SETTLING, settled_contact
+from msk_ray.envs.legs.gait.measure import contacts, settled
 from msk_ray.errors import ConfigError
 from msk_ray.visualize.film import write_video
 
@@ -58,13 +58,17 @@ def figures(model: mujoco.MjModel, qpos: Array) -> Array:
 def one_stride(episodes: list[Episode], qpos: list[Array]) -> tuple[Array, float]:
     """qpos (T, nq) of the middle stride of the right foot in the longest episode, and its duration [s].
 
+    Args:
+        episodes: time series.
+        qpos: of each episode, at the same samples.
+
     Raises:
         ConfigError: there is none.
     """
     longest = max(range(len(episodes)), key=lambda k: len(episodes[k].forward))
     episode = episodes[longest]
-    start = round(SETTLING / episode.timestep)
-    found = strides(settled_contact(episode, "r"))
+    start = settled(episode)
+    found = strides(contacts(episode, "r"))
     if not found:
         raise ConfigError("--film: the policy takes no stride to draw; leave it out")
     middle = found[len(found) // 2]

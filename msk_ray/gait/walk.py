@@ -3,14 +3,17 @@
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from msk_ray.envs import Env
 from msk_ray.envs.legs.config import LegSettings
-from msk_ray.envs.legs.gait.body import Array, Episode, Series, analyse, at_substeps, check_legs
+from msk_ray.envs.legs.gait.body import Array, Episode, Motion, analyse, between, check_legs
 from msk_ray.envs.legs.gait.measure import measure
 from msk_ray.errors import ConfigError
 from msk_ray.evaluate.measure import Bench, Made, Request, device_name, entry_of
 from msk_ray.training import SavedPolicy
-from msk_ray.visualize.episodes import record
+from msk_ray.training.threads import use_threads
+from msk_ray.visualize.episodes import Recording, record
 
 _KEPT = ("gait_distance", "gait_distance_parts", "people", "at_speed", "measures", "timing", "costs", "strides")
 """Parts of a gait that `eval.json` has; curves are in `gait.json`."""
@@ -25,7 +28,7 @@ class Walk(NamedTuple):
     """An entry of `eval.json`, with the gait's figures under `gait`."""
     episodes: list[Episode]
     qpos: list[Array]
-    """Positions of each episode, (T, nq), at the times of its series."""
+    """Positions of each episode at its samples, (T, nq)."""
     env: Env[Any]
 
 
@@ -43,25 +46,27 @@ def at_target_speed(policy: SavedPolicy, speed: float) -> SavedPolicy:
 
 
 def walk(bench: Bench, policy: SavedPolicy, request: Request) -> Walk:
-    """Run episodes and measure the gait in them, at every physics step.
+    """Run episodes and measure the gait in them, at every physics substep (`body.between`).
 
-    An env step is 2 % of a gait cycle long: a foot strike that is only seen at its end comes half of that too late.
+    The figures of an evaluation during training are at control steps instead (`LegEnv.trajectory_figures`).
 
     Raises:
         ConfigError: the model has no legs with the names that the leg environments use.
-        MskRayError: as for `record`.
+        MskRayError: as for `record` and `between`.
     """
+    use_threads(policy.config)
     evaluator = bench.evaluator(policy.config, request)[0]
     env = evaluator.env
     check_legs(env.model)
     recording = record(bench, policy, request)
-    model, episodes, positions = recording.model, [], []
+    episodes, positions = [], []
+    pace = bench.pace(recording.count, "episodes measured")
     for world in range(recording.count):
-        states = recording.world(world)
-        recorded = Series(states.qpos, states.qvel, states.act)
-        series = at_substeps(model, recorded, states.ctrl[:-1], round(recording.timestep / model.opt.timestep))
-        positions.append(series.qpos)
-        episodes.append(analyse(model, *series, model.opt.timestep))
+        motion = every_substep(recording, world, env.sim.substeps)
+        positions.append(motion.qpos)
+        episodes.append(analyse(recording.model, *motion, recording.model.opt.timestep))
+        if pace is not None:
+            pace(world + 1)
     gait = measure(episodes, recording.episodes.fell.tolist())
     seeds = request.seeds or (policy.config.evaluation.seed,)
     made = Made(
@@ -69,3 +74,22 @@ def walk(bench: Bench, policy: SavedPolicy, request: Request) -> Walk:
     )
     entry = entry_of(policy, made, [recording.episodes], evaluator.env.reward_names)
     return Walk(gait, entry | {"gait": {name: gait[name] for name in _KEPT}}, episodes, positions, env)
+
+
+def every_substep(recording: Recording, world: int, substeps: int) -> Motion:
+    """The states of one episode at every physics substep.
+
+    Args:
+        recording: the episodes.
+        world: which.
+        substeps: physics steps per env step.
+
+    Raises:
+        SimulationError: as for `between`.
+    """
+    # A step that diverged has no result: the state that is recorded after it is the one before.
+    count = recording.length(world) + 1 - int(recording.episodes.diverged[world])
+    states = recording.world(world).at(np.arange(count))
+    applied = None if recording.applied is None else recording.applied[:count, world].double().numpy()
+    recorded = Motion(states.qpos, states.qvel, states.act)
+    return between(recording.model, recorded, states.ctrl, substeps, applied)

@@ -24,9 +24,11 @@ class Recording:
     """Duration of an env step [s]."""
     model: Any
     states: StepState
-    """Shapes (T + 1, W, ·), on the CPU."""
+    """Shapes (T + 1, W, ·), on the CPU. A state that a step begins with after a push has the velocity after it."""
     controls: Tensor
     """Shape (T + 1, W, nu); the last row repeats the one before."""
+    applied: Tensor | None
+    """Forces on the degrees of freedom [N, N m] during each step, shape (T + 1, W, nv); None for none."""
 
     @property
     def count(self) -> int:
@@ -62,20 +64,27 @@ def record(bench: Bench, policy: SavedPolicy, request: Request) -> Recording:
         MskRayError: as for `Bench.evaluator`, or the checkpoint does not fit its environment.
     """
     evaluator, physics = bench.evaluator(policy.config, request)
+    env = evaluator.env
     states: list[StepState] = []
     controls: list[Tensor] = []
+    forces: list[Tensor] = []
 
     def keep(state: StepState, control: Tensor) -> None:
+        state = env.disturbed(state)
         states.append(StepState(*(t.cpu() for t in state)))
         controls.append(control.cpu())
+        force = env.applied_force(state)
+        if force is not None:
+            forces.append(force.cpu())
 
     seed = request.seeds[0] if request.seeds else None
-    episodes = evaluator.episodes(policy.on(evaluator.env), seed, keep, bench.pace(evaluator.steps))
+    episodes = evaluator.episodes(policy.on(env), seed, keep, bench.pace(evaluator.steps))
     return Recording(
         episodes.cpu(),
         physics,
         policy.config.env.control_timestep,
-        evaluator.env.model,
+        env.model,
         StepState(*(torch.stack(parts) for parts in zip(*states, strict=True))),
         torch.stack(controls),
+        torch.stack(forces) if forces else None,
     )

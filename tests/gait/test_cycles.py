@@ -1,5 +1,7 @@
 """Gait cycles of synthetic gaits whose measures are worked out by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from msk_ray.envs.legs.gait import cycles
 from msk_ray.envs.legs.gait.body import CURVES, Episode
 from msk_ray.envs.legs.gait.measure import measure
 from msk_ray.envs.legs.gait.ranges import LANDMARKS, MEASURES
+from msk_ray.gait.stick import one_stride
 
 STEP = 0.02
 """Seconds between samples."""
@@ -18,8 +21,8 @@ def test_contact_needs_load_and_ignores_chatter() -> None:
     contact = cycles.on_ground(force, 1000.0, least=2)
     # the gap of one at 4 is closed, then the contact of one at 11 is undone; 40 N would not have counted
     assert contact.tolist() == [False, False, True, True, True, True, True, True, False, False, False, False, False]
-    assert not cycles.on_ground(np.full(5, 40.0), 1000.0).any()
-    assert cycles.on_ground(np.full(5, 60.0), 1000.0).all()
+    assert not cycles.on_ground(np.full(5, 40.0), 1000.0, least=1).any()
+    assert cycles.on_ground(np.full(5, 60.0), 1000.0, least=1).all()
 
 
 def test_strides_by_hand() -> None:
@@ -151,3 +154,14 @@ def test_every_human_range_has_a_source_and_a_curve() -> None:
         assert limits.least < limits.most
         assert len(limits.source) > 20
     assert {landmark.curve for landmark in LANDMARKS.values()} <= set(CURVES)
+
+
+@pytest.mark.parametrize("timestep", [0.02, 0.004])
+def test_a_foot_that_bounces_has_not_taken_a_step(timestep: float) -> None:
+    time = np.arange(round(6.0 / timestep)) * timestep + 1e-9
+    force = np.where((time % 1.0 < 0.6) & ~((time % 1.0 > 0.3) & (time % 1.0 < 0.34)), 0.8, 0.0)
+    episode = replace(walking(), timestep=timestep, forward=time, curves={"vertical_force": {"r": force}})
+    stride, seconds = one_stride([episode], [time[:, None]])
+    assert seconds == pytest.approx(1.0)
+    assert len(stride) == round(1.0 / timestep)
+    assert stride[0, 0] % 1.0 == pytest.approx(0.0, abs=1e-6)

@@ -12,20 +12,16 @@ from PIL import Image
 
 from msk_ray.config import Config, PhysicsConfig, parse_config
 from msk_ray.envs import make_env
-from msk_ray.envs.legs.gait.body import SIDES, Series, analyse, at_substeps
-from msk_ray.envs.legs.gait.cycles import strikes
-from msk_ray.envs.legs.gait.measure import SETTLING, measure, settled_contact
+from msk_ray.envs.legs.gait.body import analyse
+from msk_ray.envs.legs.gait.measure import measure
 from msk_ray.envs.legs.gait.people import curve
 from msk_ray.envs.myoleg26.config import MyoLeg26Settings
 from msk_ray.envs.myoleg26.model import build_myoleg26
 from msk_ray.errors import ConfigError
 from msk_ray.evaluate.__main__ import main as evaluate
-from msk_ray.evaluate.measure import Bench, Request
 from msk_ray.gait.__main__ import main
 from msk_ray.gait.stick import figures, film, one_stride
-from msk_ray.training import Trainer, load_policy
-from msk_ray.visualize.episodes import record
-from msk_ray.visualize.render import States
+from msk_ray.training import Trainer
 
 
 @pytest.fixture(scope="module")
@@ -63,54 +59,6 @@ def test_a_leading_foot_is_ahead(model: mujoco.MjModel) -> None:
     key = model.key("walk_right")
     episode = analyse(model, key.qpos[None], key.qvel[None], key.act[None], 0.02)
     assert episode.feet["r"][0] - episode.feet["l"][0] > 0.4
-
-
-@pytest.fixture(scope="module")
-def walk() -> States:
-    """Three seconds of the trained policy."""
-    policy = load_policy(Path(__file__).parents[2] / "policies" / "myoleg26.pt")
-    return record(Bench("cpu"), policy, Request(worlds=1, steps=150)).world(0)
-
-
-@pytest.mark.parametrize("row", [0, 1, -1])
-def test_states_between_env_steps_lead_to_the_next_one(walk: States, row: int) -> None:
-    """One physics step from the last state in between is the next recorded state, with the right controls only."""
-    recorded, ctrl = Series(walk.qpos, walk.qvel, walk.act), np.roll(walk.ctrl[:-1], row, axis=0)
-    dense = at_substeps(walk.model, recorded, ctrl, 5)
-    assert [len(part) for part in dense] == [5 * 150 + 1] * 3
-    for part, same in zip(dense, recorded, strict=True):
-        np.testing.assert_array_equal(part[::5], same)
-    data, errors = mujoco.MjData(walk.model), []
-    for t, control in enumerate(ctrl):
-        data.qpos[:], data.qvel[:], data.act[:] = (part[5 * t + 4] for part in dense)
-        data.ctrl[:] = control
-        mujoco.mj_step(walk.model, data)
-        errors.append(np.abs(data.qpos - walk.qpos[t + 1]).max())
-    # [m] and [rad], float32 against float64: 5e-7 and 7e-6 were seen.
-    close = np.median(errors) < 2e-6 and max(errors) < 5e-5
-    assert close == (row == 0)
-
-
-def test_strikes_between_env_steps_come_earlier(walk: States) -> None:
-    recorded = Series(walk.qpos, walk.qvel, walk.act)
-    dense = at_substeps(walk.model, recorded, walk.ctrl[:-1], 5)
-    coarse, fine = analyse(walk.model, *recorded, 0.02), analyse(walk.model, *dense, walk.model.opt.timestep)
-    assert fine.timestep == pytest.approx(0.004)
-    late = []
-    for side in SIDES:
-        seen, found = (strikes(settled_contact(episode, side)) * episode.timestep for episode in (coarse, fine))
-        assert len(seen) == len(found) >= 1
-        late += (seen - found).tolist()
-    assert SETTLING == 1.0
-    assert min(late) >= 0.0
-    assert max(late) < 0.02
-    assert max(late) > 0.0, "not every foot lands at the end of an env step"
-
-
-def test_states_between_env_steps_need_what_was_recorded(walk: States) -> None:
-    recorded = Series(walk.qpos, walk.qvel, walk.act)
-    with pytest.raises(ValueError, match="151 controls for 150 env steps"):
-        at_substeps(walk.model, recorded, walk.ctrl, 5)
 
 
 def test_a_model_without_legs_is_refused() -> None:

@@ -184,7 +184,9 @@ class LegSettings(EnvSettings):
     observes the legs with right and left exchanged, and so are its actions. Needs `env.clock`."""
     gait_worlds: Whole = 0
     """Worlds of every evaluation during training whose gait is compared with people's (`eval/gait_distance`, `cadence`,
-    `step_length`, `duty_factor`, `asymmetry`, `cost_of_transport`), by C MuJoCo: about 0.02 s each; 0: none."""
+    `step_length`, `duty_factor`, `asymmetry`, `cost_of_transport`), by C MuJoCo: about 0.02 s each; 0: none. They are
+    measured at control steps, so that foot strikes are seen up to one of them late; `msk_ray.gait` measures at
+    substeps."""
     assist: AssistConfig = AssistConfig()
     push: PushConfig = PushConfig()
     tracking: TrackingSchedule = TrackingSchedule()

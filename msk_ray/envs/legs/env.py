@@ -411,8 +411,10 @@ class LegEnv(AssistedEnv[AnyLegSettings], Generic[AnyLegSettings]):
         }
 
     def trajectory_figures(self, trajectories: Sequence[StepState]) -> dict[str, float]:
-        # From states of env steps only: repeating the physics steps between them, as `msk_ray.gait` does, takes time
-        # that training would wait for. Strikes come up to an env step late here.
+        """Figures of the gait at control steps, so that foot strikes are seen up to one of them late.
+
+        `python -m msk_ray.gait` repeats the physics substeps between them, which would cost time in every evaluation.
+        """
         found = []
         for states in trajectories:
             qpos, qvel, act = (part.double().numpy() for part in states)

@@ -3,27 +3,37 @@
 Axes: T samples, U muscles.
 """
 
-import copy
-import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import mujoco
-import mujoco.rollout
 import numpy as np
 import torch
+from mujoco.rollout import rollout
 from numpy.typing import NDArray
 
 from msk_ray.envs.legs.gait.people import ALIASES
 from msk_ray.envs.legs.metabolic import muscle_masses, total_power
 from msk_ray.envs.legs.muscles import MuscleCurves
-from msk_ray.errors import ConfigError
+from msk_ray.errors import ConfigError, SimulationError
 
 Array = NDArray[np.float64]
 SIDES = ("r", "l")
 CURVES = ("hip_flexion", "knee_flexion", "ankle_dorsiflexion", "vertical_force", "forward_force")
 """Curves over a gait cycle: angles [°], forces [body weights]."""
 JOINTS = {"hip_flexion": "hip_flexion", "knee_flexion": "knee_angle", "ankle_dorsiflexion": "ankle_angle"}
+
+
+class Motion(NamedTuple):
+    """States of one episode."""
+
+    qpos: Array
+    """Shape (T, nq)."""
+    qvel: Array
+    """Shape (T, nv)."""
+    act: Array
+    """Shape (T, na)."""
 
 
 @dataclass(frozen=True)
@@ -50,57 +60,71 @@ class Episode:
     """Activations of the muscles of `people.EMG` that the model has, by name and side, each (T,)."""
 
 
-class Series(NamedTuple):
-    """States of one episode, equally spaced in time."""
+def between(
+    model: mujoco.MjModel, recorded: Motion, ctrl: Array, substeps: int, applied: Array | None = None
+) -> Motion:
+    """The states of an episode at every physics substep, from those at control steps.
 
-    qpos: Array
-    """Shape (T, nq)."""
-    qvel: Array
-    """Shape (T, nv)."""
-    act: Array
-    """Shape (T, na)."""
-
-
-def at_substeps(model: mujoco.MjModel, states: Series, ctrl: Array, substeps: int) -> Series:
-    """States of every physics step: C MuJoCo repeats each env step from its recorded state.
-
-    Nothing drifts, because each env step starts from what was recorded, also after a push between two of them.
+    The recorded states are the truth and every `substeps`-th sample: each control step is repeated from the state that
+    is recorded at its beginning, so what float32 and float64 make different does not add up.
 
     Args:
-        model: of the episode, with its physics timestep.
-        states: recorded at T env steps.
-        ctrl: controls held from each of the first T - 1 states to the next, (T - 1, nu).
-        substeps: physics steps per env step.
+        model: what the episode was simulated with; its timestep is that of a substep.
+        recorded: states at the C + 1 ends of C control steps, each as its control step begins with it.
+        ctrl: row t acts from state t to state t + 1, the last row on nothing, shape (C + 1, nu).
+        substeps: physics steps per control step.
+        applied: forces on the degrees of freedom [N, N m], in rows like those of `ctrl`, (C + 1, nv); None for none.
 
     Returns:
-        (T - 1) substeps + 1 states, `model.opt.timestep` apart, of which each `substeps`-th is a recorded one.
+        C * substeps + 1 states, `model.opt.timestep` apart.
 
     Raises:
-        ValueError: the shapes do not fit, or the model has states beside qpos, qvel and act (plugins, delays).
+        SimulationError: as for `repeated`.
     """
-    count = len(states.qpos) - 1
-    if len(ctrl) != count:
-        raise ValueError(f"{len(ctrl)} controls for {count} env steps between {count + 1} states")
-    parts = (model.nq, model.nv, model.na)
-    full = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-    if full != 1 + sum(parts):
-        raise ValueError("the model has states beside qpos, qvel and act; their values are not recorded")
-    if count == 0 or substeps == 1:
-        return states
-    model = copy.copy(model)
-    # A diverged episode stays diverged instead of starting again in the reference pose.
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    first = np.concatenate((np.zeros((count, 1)), *(part[:-1] for part in states)), axis=1)
-    held = np.repeat(ctrl[:, None], substeps - 1, axis=1)
-    threads = [mujoco.MjData(model) for _ in range(os.cpu_count() or 1)]
-    later, _ = mujoco.rollout.rollout(model, threads, first, held)
-    dense = np.concatenate((first[:, None], later), axis=1)[..., 1:].reshape(count * substeps, -1)
-    return Series(
-        *(
-            np.concatenate((part, last[-1:]))
-            for part, last in zip(np.split(dense, np.cumsum(parts)[:-1], axis=1), states, strict=True)
+    if substeps == 1 or len(ctrl) == 1:
+        return recorded
+    inside = repeated(model, recorded, ctrl, substeps, applied)
+
+    def joined(start: Array, after: Array) -> Array:
+        samples = np.concatenate((start[:-1, None], after[:, :-1]), axis=1)
+        return np.concatenate((samples.reshape(-1, start.shape[1]), start[-1:]))
+
+    return Motion(*(joined(start, after) for start, after in zip(recorded, inside, strict=True)))
+
+
+def repeated(
+    model: mujoco.MjModel, recorded: Motion, ctrl: Array, substeps: int, applied: Array | None = None
+) -> Motion:
+    """The states after each substep of C control steps, (C, substeps, ·), each control step from its recorded state.
+
+    The last one of a control step is what C MuJoCo has for the next recorded state.
+
+    Args:
+        model, recorded, ctrl, substeps, applied: as for `between`.
+
+    Raises:
+        SimulationError: C MuJoCo diverged.
+    """
+    kind = mujoco.mjtState
+    threads = [mujoco.MjData(model) for _ in range(torch.get_num_threads())]
+    start = np.empty(mujoco.mj_stateSize(model, kind.mjSTATE_FULLPHYSICS))
+    mujoco.mj_getState(model, threads[0], start, kind.mjSTATE_FULLPHYSICS)
+    # MuJoCo's order: time, qpos, qvel, act.
+    ends = np.cumsum([1, model.nq, model.nv, model.na])
+    starts = np.tile(start, (len(ctrl) - 1, 1))
+    starts[:, 1 : ends[-1]] = np.concatenate([part[:-1] for part in recorded], axis=1)
+    inputs, spec = ctrl[:-1], int(kind.mjSTATE_CTRL)
+    if applied is not None:
+        inputs, spec = np.concatenate((inputs, applied[:-1]), axis=1), spec | int(kind.mjSTATE_QFRC_APPLIED)
+    states, _ = rollout(model, threads, starts, inputs[:, None], control_spec=spec, nstep=substeps)
+    # Where a state diverges, MuJoCo starts again at time 0, and `rollout` repeats its last row.
+    lost = np.flatnonzero(np.abs(states[:, -1, 0] / model.opt.timestep - substeps) > 0.5)
+    if len(lost):
+        raise SimulationError(
+            f"C MuJoCo diverges in control step {lost[0]} of an episode, where the simulator did not: lower "
+            "physics.timestep"
         )
-    )
+    return Motion(*np.split(states[..., : ends[-1]], ends[:-1], axis=-1)[1:])
 
 
 def analyse(model: mujoco.MjModel, qpos: Array, qvel: Array, act: Array, timestep: float) -> Episode:
@@ -112,30 +136,31 @@ def analyse(model: mujoco.MjModel, qpos: Array, qvel: Array, act: Array, timeste
     check_legs(model)
     axes = world_axes(model)
     angles = {name: _angles(model, joint, qpos) for name, joint in JOINTS.items()}
-    owners = {side: _carried_by(model, model.body(f"talus_{side}").id) for side in SIDES}
-    pelvis, heels = model.body("pelvis").id, {side: model.body(f"calcn_{side}").id for side in SIDES}
+    owners = [_carried_by(model, model.body(f"talus_{side}").id) for side in SIDES]
     weight = float(np.linalg.norm(model.opt.gravity) * model.body_subtreemass[0])
     muscles = np.flatnonzero(model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_MUSCLE))
+    bodies = [model.body(name).id for name in ("pelvis", *(f"calcn_{side}" for side in SIDES))]
     data = mujoco.MjData(model)
     count = len(qpos)
-    feet = {side: np.zeros(count) for side in SIDES}
-    forces = {side: np.zeros((count, 3)) for side in SIDES}
-    forward, given_power = np.zeros(count), np.zeros(count)
+    places, forces = np.zeros((count, 3, 3)), np.zeros((count, 2, 3))
     lengths, rates = np.zeros((count, model.ntendon)), np.zeros((count, model.ntendon))
+    pulls, speeds = np.zeros((count, model.nu)), np.zeros((count, model.nu))
+    # The loop takes most of the time of an analysis: what can be computed for all samples at once is left for later.
     for t in range(count):
-        data.qpos[:], data.qvel[:], data.act[:] = qpos[t], qvel[t], act[t]
+        data.qpos, data.qvel, data.act = qpos[t], qvel[t], act[t]
         mujoco.mj_forward(model, data)
-        forward[t] = data.xpos[pelvis] @ axes[0]
+        places[t] = data.xpos[bodies]
         lengths[t], rates[t] = data.ten_length, data.ten_velocity
-        for side in SIDES:
-            feet[side][t] = data.xpos[heels[side]] @ axes[0]
-            forces[side][t] = axes @ ground_reaction(model, data, owners[side]) / weight
-        # A muscle's force is negative where it pulls, its velocity where it shortens.
-        given = data.actuator_force[muscles] * data.actuator_velocity[muscles]
-        given_power[t] = np.maximum(given, 0.0).sum()
+        pulls[t], speeds[t] = data.actuator_force, data.actuator_velocity
+        forces[t] = ground_reactions(model, data, owners)
+    forward, *heels = (places @ axes[0]).T
+    forces = forces @ axes.T / weight
+    # A muscle's force is negative where it pulls, its velocity where it shortens.
+    given_power = np.maximum(pulls[:, muscles] * speeds[:, muscles], 0.0).sum(1)
     curves = dict(angles)
-    curves["vertical_force"] = {side: forces[side][:, 2] for side in SIDES}
-    curves["forward_force"] = {side: forces[side][:, 0] for side in SIDES}
+    curves["vertical_force"] = {side: forces[:, k, 2] for k, side in enumerate(SIDES)}
+    curves["forward_force"] = {side: forces[:, k, 0] for k, side in enumerate(SIDES)}
+    feet = dict(zip(SIDES, heels, strict=True))
     heat = metabolic_power(model, act, lengths, rates)
     return Episode(timestep, weight, forward, feet, curves, act, given_power, heat, _activations(model, act))
 
@@ -174,16 +199,22 @@ def check_legs(model: mujoco.MjModel) -> None:
         raise ConfigError(f"gait needs a model of two legs, as myoleg26 has: {error.args[0]}") from None
 
 
-def ground_reaction(model: mujoco.MjModel, data: mujoco.MjData, bodies: frozenset[int]) -> Array:
-    """Force of the world on a set of bodies [N], in the world frame, shape (3,)."""
-    total, wrench = np.zeros(3), np.zeros(6)
-    for k in range(data.ncon):
-        first, second = (int(model.geom_bodyid[g]) for g in data.contact.geom[k])
-        sign = 1.0 if first == 0 and second in bodies else -1.0 if second == 0 and first in bodies else 0.0
-        if sign != 0.0:
-            mujoco.mj_contactForce(model, data, k, wrench)
-            # The force in the contact's frame acts on the second geom.
-            total += sign * data.contact.frame[k].reshape(3, 3).T @ wrench[:3]
+def ground_reactions(model: mujoco.MjModel, data: mujoco.MjData, owners: Sequence[frozenset[int]]) -> Array:
+    """Force of the world on each of S sets of bodies [N], in the world frame, shape (S, 3)."""
+    total, wrench = np.zeros((len(owners), 3)), np.zeros(6)
+    if data.ncon == 0:
+        return total
+    contact = data.contact
+    frames = contact.frame
+    for k, (first, second) in enumerate(model.geom_bodyid[contact.geom].tolist()):
+        if first != 0 and second != 0:
+            continue
+        for row, bodies in enumerate(owners):
+            sign = 1.0 if first == 0 and second in bodies else -1.0 if second == 0 and first in bodies else 0.0
+            if sign != 0.0:
+                mujoco.mj_contactForce(model, data, k, wrench)
+                # The force in the contact's frame acts on the second geom.
+                total[row] += sign * frames[k].reshape(3, 3).T @ wrench[:3]
     return total
 
 

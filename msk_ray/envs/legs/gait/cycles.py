@@ -36,7 +36,7 @@ class Stride(NamedTuple):
         return (self.toe_off - self.start) / self.samples
 
 
-def on_ground(force: Array, weight: float, *, threshold: float = 0.05, least: int = 3) -> Flags:
+def on_ground(force: Array, weight: float, *, threshold: float = 0.05, least: int) -> Flags:
     """Whether a foot bears load, shape (T,), from its vertical force (T,) [N].
 
     Args:

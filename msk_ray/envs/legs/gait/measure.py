@@ -25,6 +25,8 @@ from msk_ray.envs.legs.metabolic import BASAL
 
 SETTLING = 1.0
 """Start of an episode that is left out [s], so that the settled gait is measured."""
+_SHORTEST = 0.06
+"""Contacts and gaps that are shorter are chatter [s]: no step or swing is."""
 
 
 def measure(episodes: Sequence[Episode], fell: Sequence[bool]) -> dict[str, Any]:
@@ -52,14 +54,14 @@ def measure(episodes: Sequence[Episode], fell: Sequence[bool]) -> dict[str, Any]
     muscles: dict[str, dict[str, list[Array]]] = {name: {side: [] for side in SIDES} for name in EMG}
     count = 0
     for episode in episodes:
-        start = round(SETTLING / episode.timestep)
+        start = settled(episode)
         if len(episode.forward) - start < 2:
             continue
         seconds = (len(episode.forward) - 1 - start) * episode.timestep
         distance = float(episode.forward[-1] - episode.forward[start])
         values["speed"].append(distance / seconds)
         _add_costs(costs, episode, start, distance)
-        contact = {side: settled_contact(episode, side) for side in SIDES}
+        contact = {side: contacts(episode, side) for side in SIDES}
         steps = cadence(contact["r"], contact["l"], episode.timestep)
         if steps is not None:
             values["cadence"].append(steps)
@@ -118,11 +120,15 @@ def _both_sides(curves: dict[str, dict[str, list[Array]]]) -> dict[str, tuple[Ar
     return {name: mean for name, mean in means.items() if mean is not None}
 
 
-def settled_contact(episode: Episode, side: str) -> Flags:
-    """Whether a foot is on the ground, from the end of `SETTLING` on. No step or swing is shorter than 60 ms."""
-    start = round(SETTLING / episode.timestep)
-    least = max(1, round(0.06 / episode.timestep))
-    return on_ground(episode.curves["vertical_force"][side][start:], 1.0, least=least)
+def settled(episode: Episode) -> int:
+    """The first sample of the settled gait."""
+    return round(SETTLING / episode.timestep)
+
+
+def contacts(episode: Episode, side: str) -> Flags:
+    """Whether a foot bears load, from sample `settled` on."""
+    least = max(1, round(_SHORTEST / episode.timestep))
+    return on_ground(episode.curves["vertical_force"][side][settled(episode) :], 1.0, least=least)
 
 
 def _add_costs(costs: dict[str, list[float]], episode: Episode, start: int, distance: float) -> None:
