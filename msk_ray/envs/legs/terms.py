@@ -10,11 +10,12 @@ HEEL_DOWN = (0.02, 0.40)
 are those at which the feet of `people_angles` move by less than 0.3 m/s, or are 1 cm above the ground."""
 TOES_DOWN = (0.10, 0.60)
 """The same of the toes."""
-LANDED = (-0.04, 0.12)
-"""The same of the heel around its strike, which is at phase 0 in people. Toes leave the ground up to 5 % of the cycle
-earlier than people's, so that strikes have to be early as well for a stance as long as theirs."""
 SWING = (0.64, 0.92)
 """The same of the swing."""
+LANDED = (-0.04, 0.12)
+"""Phases of the own leg, with flanks inside, at which the heel should have landed; people's strike is at 0. It opens
+earlier because the toes of these legs leave the ground up to 5 % of the cycle before people's, and a stance as long as
+theirs has to begin earlier, too."""
 _HOVERING = 0.002
 """Height of a heel that should have landed beyond which its cost grows linearly [m]."""
 _SLIDING = 0.3
