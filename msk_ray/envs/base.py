@@ -189,6 +189,14 @@ class Env(ABC, Generic[SettingsT]):
             fresh.numbers,
         )
 
+    def spread_ages(self) -> None:
+        """Give the worlds ages spread evenly over the episode length: they then reset at different times."""
+        worlds = self.nworld * self.group.size
+        # By multiples of the golden ratio, modulo 1, any run of neighbouring worlds is spread evenly too.
+        share = torch.arange(worlds, dtype=torch.float64) * ((math.sqrt(5.0) - 1.0) / 2.0) % 1.0
+        age = (share * self.config.episode_length).long().to(self.device)
+        self.state = self.state._replace(age=self.group.own(age))
+
     def _next_resets(self) -> Resets:
         return self._fresh.pop() if self._fresh else self.draw_resets(1)
 

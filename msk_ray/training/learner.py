@@ -37,6 +37,8 @@ def make_algorithm(config: Config, device: str, group: Group = ALONE) -> Algorit
     )
     if group.size > 1:
         env.join(group)
+    if config.env.spread_resets:
+        env.spread_ages()
     return algorithm(config, env)
 
 
