@@ -105,6 +105,7 @@ _LATER: dict[tuple[str, ...], Any] = {
     ("shac", "exploration"): None,
     ("shac", "copies"): None,
     ("actor", "state_std"): False,
+    ("env", "spread_resets"): False,
     ("env", "speed_range"): None,
     ("env", "clock"): False,
     ("env", "symmetric"): False,
