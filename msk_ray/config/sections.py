@@ -92,8 +92,8 @@ class EnvSettings(Section):
     stochastic_reset: bool = True
     """Draw random initial states; False starts every episode in the same state."""
     spread_resets: bool = False
-    """Begin training with episodes of ages spread over `episode_length`. Otherwise all worlds that do not fall reset in
-    the same env steps, and in between a policy can forget how to start. Evaluations always begin at age 0."""
+    """Begin training with episodes of ages spread over `episode_length`; otherwise all worlds that do not fall reset in
+    the same env steps. Evaluations always begin at age 0."""
     reward: Reward = Reward()
 
     def unread(self) -> dict[str, str]:
