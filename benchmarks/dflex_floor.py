@@ -120,16 +120,18 @@ def _state(data: mujoco.MjData) -> StepState:
 def compare(path: Path, steps: int, episodes: int) -> list[list[str]]:
     """One row for each law: policy, law, score and spread, env steps, velocity."""
     policy = load_policy(path)
-    config = policy.config
-    if config.env.name not in LAWS:
-        raise ConfigError(f"{path}: its environment is {config.env.name}; write one of {', '.join(LAWS)}")
+    name = policy.config.env.name
+    if name not in LAWS:
+        raise ConfigError(f"{path}: its environment is {name}; write one of {', '.join(LAWS)}")
     physics = PhysicsConfig(variant="matched")
-    env = make_env(config.env, physics, 1, "cpu", 0, differentiable=False)
+    # Scores are under the reference reward, whatever the policy was trained on.
+    config = env_class(policy.config.env).reference_settings(policy.config.env)
+    env = make_env(config, physics, 1, "cpu", 0, differentiable=False)
     network = policy.network(env)
-    free = env_class(config.env).build_model(config.env, physics)
-    springs = Springs(free, LAWS[config.env.name])
+    free = env_class(config).build_model(config, physics)
+    springs = Springs(free, LAWS[name])
     free.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT)
-    free.opt.timestep = config.env.control_timestep / SUBSTEPS
+    free.opt.timestep = config.control_timestep / SUBSTEPS
 
     def as_dflex(model: mujoco.MjModel, data: mujoco.MjData) -> None:
         for _ in range(SUBSTEPS):
@@ -145,7 +147,7 @@ def compare(path: Path, steps: int, episodes: int) -> list[list[str]]:
         env.generator.manual_seed(1234)
         found = np.array([episode(env, network, model, advance, steps) for _ in range(episodes)])
         score, length, speed = found.mean(0)
-        rows.append([config.env.name, law, f"{score:.0f} ± {found[:, 0].std():.0f}", f"{length:.0f}", f"{speed:.2f}"])
+        rows.append([path.stem, law, f"{score:.0f} ± {found[:, 0].std():.0f}", f"{length:.0f}", f"{speed:.2f}"])
     return rows
 
 
