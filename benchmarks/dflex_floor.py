@@ -1,4 +1,5 @@
-"""How far are the contacts and joint limits of `matched` physics from dflex's own? Policies are scored under both.
+"""How far are the contacts and joint limits of `matched` physics from dflex's own? Policies are scored under both,
+and those of the ant under `matched_springs`.
 
 dflex's law (`eval_rigid_contacts_art` and `jcalc_tau` in `dflex/dflex/sim.py` of github.com/NVlabs/DiffRL) is applied
 as external forces in C MuJoCo, to the model of `matched` physics without its contacts and limits: k_e·c out of the
@@ -118,17 +119,18 @@ def _state(data: mujoco.MjData) -> StepState:
 
 
 def compare(path: Path, steps: int, episodes: int) -> list[list[str]]:
-    """One row for each law: policy, law, score and spread, env steps, velocity."""
+    """One row for each named physics and one for dflex's law: policy, which, score and spread, env steps, velocity."""
     policy = load_policy(path)
     name = policy.config.env.name
     if name not in LAWS:
         raise ConfigError(f"{path}: its environment is {name}; write one of {', '.join(LAWS)}")
-    physics = PhysicsConfig(variant="matched")
     # Scores are under the reference reward, whatever the policy was trained on.
     config = env_class(policy.config.env).reference_settings(policy.config.env)
-    env = make_env(config, physics, 1, "cpu", 0, differentiable=False)
+    named = [name for name in ("matched", "matched_springs") if name in config.variants]
+    envs = {name: make_env(config, PhysicsConfig(variant=name), 1, "cpu", 0, differentiable=False) for name in named}
+    env = envs["matched"]
     network = policy.network(env)
-    free = env_class(config).build_model(config, physics)
+    free = env_class(config).build_model(config, PhysicsConfig(variant="matched"))
     springs = Springs(free, LAWS[name])
     free.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT)
     free.opt.timestep = config.control_timestep / SUBSTEPS
@@ -139,11 +141,12 @@ def compare(path: Path, steps: int, episodes: int) -> list[list[str]]:
             springs.apply(model, data)
             mujoco.mj_step2(model, data)
 
-    def matched(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    def as_mujoco(model: mujoco.MjModel, data: mujoco.MjData) -> None:
         mujoco.mj_step(model, data, nstep=env.sim.substeps)
 
     rows: list[list[str]] = []
-    for law, model, advance in (("matched", env.model, matched), ("dflex's", free, as_dflex)):
+    named_laws = [(name, envs[name].model, as_mujoco) for name in named]
+    for law, model, advance in (*named_laws, ("dflex's", free, as_dflex)):
         env.generator.manual_seed(1234)
         found = np.array([episode(env, network, model, advance, steps) for _ in range(episodes)])
         score, length, speed = found.mean(0)

@@ -61,7 +61,7 @@ class PhysicsConfig(Section):
 
     variant: Text | None = None
     """Named physics of the environment: for hopper, cheetah and humanoid `published` or `matched`, for ant also
-    `matched_hard_friction`."""
+    `matched_hard_friction` and `matched_springs`."""
     backward: Literal["tape_per_substep", "tape_all", "fd_jacobian", "hybrid"] = "tape_per_substep"
     """Backward mode of the step. `tape_*` are exact; `fd_jacobian` differentiates any model by finite differences;
     `hybrid` takes the state's gradient from the tape and the control's from finite differences, for diagnosis."""

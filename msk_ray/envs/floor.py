@@ -90,8 +90,8 @@ def compile_on_floor(
         if physics.armature is not None:
             joint.armature = physics.armature
     if isinstance(contacts, SpringContacts):
-        _match(spec, contacts)
-    _override(spec, physics)
+        match_springs(spec, contacts)
+    override(spec, physics)
     return spec.compile()
 
 
@@ -108,8 +108,8 @@ def _actuated(spec: mujoco.MjSpec) -> list[mujoco.MjsJoint]:
     return [joint for joint in spec.joints if joint.name in driven]
 
 
-def _match(spec: mujoco.MjSpec, contacts: SpringContacts) -> None:
-    """Give every pair and limit the reference that has the springs and dampers of `contacts` in place."""
+def match_springs(spec: mujoco.MjSpec, contacts: SpringContacts) -> None:
+    """Give every pair, and the limits of actuated joints, the springs and dampers of `contacts` in place."""
     model = spec.compile()
     elliptic = model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
     for pair in spec.pairs:
@@ -135,7 +135,8 @@ def _constant(impedance: float) -> list[float]:
     return [impedance, impedance, 0.01, 0.5, 2.0]
 
 
-def _override(spec: mujoco.MjSpec, physics: PhysicsConfig) -> None:
+def override(spec: mujoco.MjSpec, physics: PhysicsConfig) -> None:
+    """Set what `physics` overrides of pairs, limits and motors."""
     for pair in spec.pairs:
         if physics.solref is not None:
             pair.solref = list(physics.solref)

@@ -240,6 +240,18 @@ def test_physics_knobs_reach_the_model() -> None:
     assert (model.actuator_gear[:, 0] == 77.0).all()
 
 
+def test_settings_override_what_springs_would_set() -> None:
+    own = PhysicsConfig(variant="matched_springs")
+    other = PhysicsConfig(variant="matched_springs", solref=(0.05, 1.0), friction=0.4, solreffriction=(0.33, 1.0))
+    springs, changed = (build_ant(AntSettings(name="ant"), physics) for physics in (own, other))
+    assert (changed.pair_solref == [0.05, 1.0]).all()
+    assert (changed.pair_friction[:, :2] == 0.4).all()
+    assert (changed.pair_solreffriction == [0.33, 1.0]).all()
+    assert (changed.pair_solimp == springs.pair_solimp).all()
+    assert (changed.jnt_solref == springs.jnt_solref).all()
+    assert not (springs.pair_solref == changed.pair_solref).any()
+
+
 def test_a_pyramid_drops_the_softened_friction_it_cannot_have() -> None:
     model = build_ant(AntSettings(name="ant"), PhysicsConfig(variant="matched", cone="pyramidal"))
     assert (model.pair_solreffriction == 0).all()

@@ -19,7 +19,12 @@ from msk_ray.simulation import Simulation, StepState
 
 SIZES = {"hopper": (6, 6, 3, 4), "cheetah": (9, 9, 6, 8), "humanoid": (28, 27, 21, 19)}
 """nq, nv, nu and pairs with the floor."""
-GROUND = {"hopper": (2e4, 1e3, 1e3, 0.9), "cheetah": (2e4, 1e3, 1e3, 1.0), "humanoid": (2e4, 5e3, 1e3, 0.75)}
+GROUND = {
+    "ant": (4e4, 1e4, 3e3, 0.75),
+    "hopper": (2e4, 1e3, 1e3, 0.9),
+    "cheetah": (2e4, 1e3, 1e3, 1.0),
+    "humanoid": (2e4, 5e3, 1e3, 0.75),
+}
 """dflex's contact: stiffness [N/m], damping per depth [N s/m²], friction damping [N s/m], friction coefficient
 (envs/*.py of NVlabs/DiffRL)."""
 
@@ -27,6 +32,11 @@ GROUND = {"hopper": (2e4, 1e3, 1e3, 0.9), "cheetah": (2e4, 1e3, 1e3, 1.0), "huma
 def model_of(name: str, **physics: Any) -> mujoco.MjModel:
     config = parse_config({"env": {"name": name}, "physics": physics})
     return env_class(config.env).build_model(config.env, config.physics)
+
+
+def on_springs(name: str) -> mujoco.MjModel:
+    """The body on contacts made of dflex's springs."""
+    return model_of(name, variant="matched_springs" if name == "ant" else "matched")
 
 
 @cache
@@ -133,11 +143,11 @@ def test_measures_of_the_sources() -> None:
     assert model_of("humanoid", variant="published").actuator_gear[3:9, 0].tolist() == [45, 45, 135, 90, 22.5, 22.5]
 
 
-@pytest.mark.parametrize("name", sorted(SIZES))
+@pytest.mark.parametrize("name", sorted(GROUND))
 def test_a_foot_pressed_into_the_floor_is_pushed_as_in_dflex(name: str) -> None:
     """D (d k c − b v): k_e·c and −k_d·(1 cm)·v up, −k_f·v along the floor, and 1000 N m/rad from a limit."""
     stiffness, damping, viscosity, friction = GROUND[name]
-    model = model_of(name)
+    model = on_springs(name)
     assert set(model.pair_friction[:, 0]) == {friction}
     data = pressed(model, 0.005)
     data.qvel[0] = 0.02
@@ -162,21 +172,23 @@ def test_a_foot_pressed_into_the_floor_is_pushed_as_in_dflex(name: str) -> None:
 def pressed(model: mujoco.MjModel, depth: float) -> mujoco.MjData:
     """The body at rest with its feet flat and as deep in the floor as that [m]."""
     data = mujoco.MjData(model)
+    if model.nkey:
+        data.qpos[:] = model.key("stand").qpos
     if model.nv == 6:
         data.qpos[3:] = (-0.2, -0.4, 0.6)  # away from the ends of the ranges
     mujoco.mj_forward(model, data)
-    lowest = min(
-        mujoco.mj_geomDistance(model, data, model.geom("floor").id, geom, 9.0, None) for geom in range(model.ngeom - 1)
-    )
+    floor = model.geom("floor").id
+    geoms = [geom for geom in range(model.ngeom) if geom != floor]
+    lowest = min(mujoco.mj_geomDistance(model, data, floor, geom, 9.0, None) for geom in geoms)
     data.qpos[2 if model.nq > model.nv else 1] -= lowest + depth
     mujoco.mj_forward(model, data)
     return data
 
 
-@pytest.mark.parametrize("name", sorted(SIZES))
+@pytest.mark.parametrize("name", sorted(GROUND))
 def test_gradients_of_a_step(name: str) -> None:
     """Against float64 central differences: standing symmetrically, sliding, and moving in contact."""
-    model = model_of(name)
+    model = on_springs(name)
     sim = Simulation(model, 2, 4, tolerance=1e-9)
     qpos = pressed(model, 0.004).qpos.astype(np.float32).astype(np.float64)
     ctrl = np.linspace(-0.3, 0.4, model.nu).astype(np.float32).astype(np.float64)

@@ -1,1 +1,1 @@
-"""A four-legged walker with motors, in three named physics."""
+"""A four-legged walker with motors, in four named physics."""

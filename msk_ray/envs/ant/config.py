@@ -22,7 +22,7 @@ class AntReward(LimitedReward):
 class AntSettings(LimitedSettings):
     """A four-legged walker whose reward asks for forward velocity."""
 
-    variants = ("matched", "matched_hard_friction", "published")
+    variants = ("matched", "matched_hard_friction", "matched_springs", "published")
     pyramidal_variants = frozenset(("published",))
     reads_physics = STEPPING | SOLVING | CONTACTS | LIMITS | JOINTS | {"variant", "gear"}
 

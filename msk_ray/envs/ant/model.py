@@ -1,4 +1,4 @@
-"""The ant: a sphere on four two-jointed legs, in three named physics.
+"""The ant: a sphere on four two-jointed legs, in four named physics.
 
 Geometry is the classic ant's (Schulman et al. 2016, "High-dimensional continuous control using generalized advantage
 estimation"): torso radius 0.25 m, capsule legs of radius 0.08 m.
@@ -12,6 +12,7 @@ import numpy as np
 
 from msk_ray.config import PhysicsConfig
 from msk_ray.envs.ant.config import AntSettings
+from msk_ray.envs.floor import SpringContacts, match_springs, override
 from msk_ray.envs.options import add_grid, add_sky, apply_options
 
 STAND_HEIGHT = 0.75
@@ -36,6 +37,8 @@ class AntPhysics:
     hip_range: tuple[float, float]
     gear: float
     density: float
+    springs: SpringContacts | None = None
+    """dflex's contacts and limits, in place of those above."""
 
 
 # Contacts, limits and damping of `matched` reproduce those of the dflex ant, with which SHAC's reference results were
@@ -75,6 +78,10 @@ VARIANTS = {
     ),
     "matched": _MATCHED,
     "matched_hard_friction": replace(_MATCHED, solreffriction=(0.0, 0.0)),
+    # The constants of `envs/ant.py` of github.com/NVlabs/DiffRL, as those of the other bodies in `envs/floor.py`.
+    "matched_springs": replace(
+        _MATCHED, springs=SpringContacts(stiffness=4e4, damping=1e4, friction_damping=3e3, friction=0.75)
+    ),
 }
 
 _KNOBS = (
@@ -163,6 +170,9 @@ def ant_spec(env: AntSettings, physics: PhysicsConfig) -> mujoco.MjSpec:
         pair.solimp = list(p.solimp)
         pair.friction = [p.friction, p.friction, 0.005, 0.0001, 0.0001]
         pair.solreffriction = list(p.solreffriction)
+    if p.springs is not None:
+        match_springs(spec, p.springs)
+        override(spec, physics)
     stand = np.concatenate([[0, 0, STAND_HEIGHT, 1, 0, 0, 0], STAND_JOINTS])
     spec.add_key(name="stand", qpos=stand)
     return spec
