@@ -36,6 +36,8 @@ class StubTrainer:
     seconds_per_epoch = 0.02
     members = 1
     """At epoch `HELD_AT`, a trial waits until so many of its experiment have come as far."""
+    until_moved = False
+    """Once a trial of this experiment has been given another's state, all go to their last epoch at once."""
 
     def __init__(self, config: Config, logdir: Path, device: str) -> None:
         self.config, self.logdir, self.device = config, logdir, device
@@ -51,6 +53,10 @@ class StubTrainer:
         if self.behaviour == DOOMED_CROWD and not (logdir / "died_once").exists():
             (logdir / "died_once").touch()
             os.kill(os.getpid(), signal.SIGKILL)
+
+    @property
+    def _moved(self) -> Path:
+        return self.logdir.parent.parent / "moved"
 
     @property
     def finished(self) -> bool:
@@ -71,7 +77,8 @@ class StubTrainer:
         if self.epoch == 0:
             (self.logdir / "checkpoints" / "best.pt").write_text("untrained")
             self._write({**self._row(), "eval/score": 0.0})
-        self.epoch += 1
+        ends = self.until_moved and self._moved.exists()
+        self.epoch = self.config.trial.epochs if ends else self.epoch + 1
         row = self._row()
         if self.epoch == MISBEHAVE_AT:
             self._misbehave(row)
@@ -133,6 +140,8 @@ class StubTrainer:
         if state["nworld"] != self.config.env.nworld:
             raise CheckpointError(f"{path} was written under other settings")
         self.epoch, self.best_score = state["epoch"], state["best_score"]
+        if changed:
+            self._moved.touch()
 
     def restore_latest(self) -> tuple[Path | None, list[str]]:
         found = sorted((self.logdir / "checkpoints").glob("epoch_*.pt"))
