@@ -41,8 +41,9 @@ class AntPhysics:
     """dflex's contacts and limits, in place of those above."""
 
 
-# Contacts, limits and damping of `matched` reproduce those of the dflex ant, with which SHAC's reference results were
-# obtained; solreffriction (0.19, 1) is as soft as its friction, which is viscous below about 0.11 m/s.
+# Masses, joints and motors of `matched` are those of the dflex ant, with which SHAC's reference results were obtained. Its
+# contacts and limits imitate dflex's, with an impedance of 0.9 that resists acceleration too; policies do not run on both
+# (docs/ant.md).
 _MATCHED = AntPhysics(
     cone="elliptic",
     solref=(0.065, 1.0),
