@@ -41,9 +41,9 @@ class AntPhysics:
     """dflex's contacts and limits, in place of those above."""
 
 
-# Masses, joints and motors of `matched` are those of the dflex ant, with which SHAC's reference results were obtained. Its
-# contacts and limits imitate dflex's, with an impedance of 0.9 that resists acceleration too; policies do not run on both
-# (docs/ant.md).
+# Masses, joints and motors of `matched` are those of the dflex ant, with which SHAC's reference results were obtained.
+# Its contacts and limits imitate dflex's, with an impedance of 0.9, which resists acceleration too; policies of one do
+# not run on the other (docs/ant.md).
 _MATCHED = AntPhysics(
     cone="elliptic",
     solref=(0.065, 1.0),
