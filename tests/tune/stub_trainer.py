@@ -132,7 +132,7 @@ class StubTrainer:
     def save(self) -> Path:
         path = self.logdir / "checkpoints" / f"epoch_{self.epoch:06d}.pt"
         state = {"epoch": self.epoch, "best_score": self.best_score, "nworld": self.config.env.nworld}
-        path.write_text(json.dumps(state))
+        path.write_text(json.dumps(state | {"trial": self.logdir.name}))
         return path
 
     def restore(self, path: Path, changed: Collection[str] = ()) -> None:
@@ -140,7 +140,8 @@ class StubTrainer:
         if state["nworld"] != self.config.env.nworld:
             raise CheckpointError(f"{path} was written under other settings")
         self.epoch, self.best_score = state["epoch"], state["best_score"]
-        if changed:
+        # `changed` does not say it: a member that is paused or retried gets its own state back in the same way.
+        if self.until_moved and state["trial"] != self.logdir.name:
             self._moved.touch()
 
     def restore_latest(self) -> tuple[Path | None, list[str]]:
