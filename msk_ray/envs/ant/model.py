@@ -85,28 +85,6 @@ VARIANTS = {
     ),
 }
 
-_KNOBS = (
-    "cone",
-    "solref",
-    "solimp",
-    "friction",
-    "solreffriction",
-    "joint_damping",
-    "armature",
-    "solref_limit",
-    "solimp_limit",
-    "gear",
-)
-
-
-def resolve_ant_physics(physics: PhysicsConfig) -> AntPhysics:
-    """The named physics with the settings that `physics` overrides."""
-    base = VARIANTS[physics.variant or "matched"]
-    changes = {name: getattr(physics, name) for name in _KNOBS if getattr(physics, name) is not None}
-    if changes.get("cone") == "pyramidal" and "solreffriction" not in changes:
-        changes["solreffriction"] = (0.0, 0.0)  # the pyramid has no friction directions of its own
-    return replace(base, **changes)
-
 
 def build_ant(env: AntSettings, physics: PhysicsConfig) -> mujoco.MjModel:
     """The model that `ant_spec` describes."""
@@ -118,11 +96,12 @@ def ant_spec(env: AntSettings, physics: PhysicsConfig) -> mujoco.MjSpec:
 
     All contacts are explicit pairs of a geom with the floor, so that friction can be softened independently.
     """
-    p = resolve_ant_physics(physics)
+    p = VARIANTS[physics.variant or "matched"]
+    cone = physics.cone or p.cone
     spec = mujoco.MjSpec()
     spec.modelname = "ant"
     spec.compiler.degree = True
-    apply_options(spec, physics.model_copy(update={"cone": p.cone}), env.control_timestep)
+    apply_options(spec, physics.model_copy(update={"cone": cone}), env.control_timestep)
     add_sky(spec)
     world = spec.worldbody
     grid = add_grid(spec)
@@ -141,8 +120,8 @@ def ant_spec(env: AntSettings, physics: PhysicsConfig) -> mujoco.MjSpec:
     torso.add_geom(name="torso", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.25, 0, 0], **body_look)
     joint = {
         "type": mujoco.mjtJoint.mjJNT_HINGE,
-        "damping": p.joint_damping,
-        "armature": p.armature,
+        "damping": p.joint_damping if physics.joint_damping is None else physics.joint_damping,
+        "armature": p.armature if physics.armature is None else physics.armature,
         "limited": True,
         "solref_limit": list(p.solref_limit),
         "solimp_limit": list(p.solimp_limit),
@@ -170,10 +149,11 @@ def ant_spec(env: AntSettings, physics: PhysicsConfig) -> mujoco.MjSpec:
         pair.solref = list(p.solref)
         pair.solimp = list(p.solimp)
         pair.friction = [p.friction, p.friction, 0.005, 0.0001, 0.0001]
-        pair.solreffriction = list(p.solreffriction)
+        if cone == "elliptic":  # the pyramid has no friction directions of its own
+            pair.solreffriction = list(p.solreffriction)
     if p.springs is not None:
         match_springs(spec, p.springs)
-        override(spec, physics)
+    override(spec, physics)
     stand = np.concatenate([[0, 0, STAND_HEIGHT, 1, 0, 0, 0], STAND_JOINTS])
     spec.add_key(name="stand", qpos=stand)
     return spec
