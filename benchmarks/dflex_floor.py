@@ -124,13 +124,13 @@ def compare(path: Path, steps: int, episodes: int) -> list[list[str]]:
     name = policy.config.env.name
     if name not in LAWS:
         raise ConfigError(f"{path}: its environment is {name}; write one of {', '.join(LAWS)}")
+    body = env_class(policy.config.env)
     # Scores are under the reference reward, whatever the policy was trained on.
-    config = env_class(policy.config.env).reference_settings(policy.config.env)
-    named = [name for name in ("matched", "matched_springs") if name in config.variants]
-    envs = {name: make_env(config, PhysicsConfig(variant=name), 1, "cpu", 0, differentiable=False) for name in named}
-    env = envs["matched"]
+    config = body.reference_settings(policy.config.env)
+    physics = PhysicsConfig(variant="matched")
+    env = make_env(config, physics, 1, "cpu", 0, differentiable=False)
     network = policy.network(env)
-    free = env_class(config).build_model(config, PhysicsConfig(variant="matched"))
+    free = body.build_model(config, physics)
     springs = Springs(free, LAWS[name])
     free.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT)
     free.opt.timestep = config.control_timestep / SUBSTEPS
@@ -144,9 +144,13 @@ def compare(path: Path, steps: int, episodes: int) -> list[list[str]]:
     def as_mujoco(model: mujoco.MjModel, data: mujoco.MjData) -> None:
         mujoco.mj_step(model, data, nstep=env.sim.substeps)
 
+    laws: list[tuple[str, mujoco.MjModel, Advance]] = [("matched", env.model, as_mujoco)]
+    if "matched_springs" in config.variants:
+        near = body.build_model(config, PhysicsConfig(variant="matched_springs"))
+        laws.append(("matched_springs", near, as_mujoco))
+    laws.append(("dflex's", free, as_dflex))
     rows: list[list[str]] = []
-    named_laws = [(name, envs[name].model, as_mujoco) for name in named]
-    for law, model, advance in (*named_laws, ("dflex's", free, as_dflex)):
+    for law, model, advance in laws:
         env.generator.manual_seed(1234)
         found = np.array([episode(env, network, model, advance, steps) for _ in range(episodes)])
         score, length, speed = found.mean(0)
