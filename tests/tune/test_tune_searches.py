@@ -57,10 +57,12 @@ def test_population_stays_in_its_range(make_space: Any, tmp_path: Path, monkeypa
     # none moves, pytest's limit of time ends the test.
     monkeypatch.setattr(StubTrainer, "members", 2)
     monkeypatch.setattr(StubTrainer, "until_moved", True)
+    # The range is narrower than the factors by which a move changes a value: only one that is held to it stays inside.
+    low, high = 1e-3, 1.1e-3
     space = make_space(
-        parameters={"shac.actor_lr": {"loguniform": [1e-4, 1e-2]}},
+        parameters={"shac.actor_lr": {"loguniform": [low, high]}},
         samples=2,
-        scheduler={"kind": "pbt", "interval": 1e-4, "quantile": 0.5},
+        scheduler={"kind": "pbt", "interval": 1e-4, "quantile": 0.5, "resample": 0.0},
         overrides={"evaluation.interval": 100, "trial.checkpoint_interval": 1000, "trial.epochs": 1_000_000},
     )
     completed, records = go(space, tmp_path / "runs" / "pbt")
@@ -69,7 +71,7 @@ def test_population_stays_in_its_range(make_space: Any, tmp_path: Path, monkeypa
     before = [record.trial.config.shac.actor_lr for record in records]
     after = [read_yaml(record.folder / "config.yaml")["shac"]["actor_lr"] for record in records]
     assert before != after  # the worse one moved
-    assert all(1e-4 <= rate <= 1e-2 for rate in after)
+    assert all(low <= rate <= high for rate in after)
 
 
 def test_optuna_trials_enter_the_manifest(make_space: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
