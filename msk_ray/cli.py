@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import NamedTuple, NoReturn
 
 from msk_ray import signals
 from msk_ray.errors import MskRayError, StorageFailure, brief
@@ -25,6 +25,15 @@ _ADVICE = {
     errno.EACCES: "permission denied; name another file or folder, or ask its owner",
 }
 """What a user can do about errors of the operating system that any file may give."""
+
+
+class Command(NamedTuple):
+    """A command of `msk-ray`. Another package declares one in the entry-point group `msk_ray.commands`."""
+
+    module: str
+    """The module whose `main(argv)` runs it and returns the exit code."""
+    summary: str
+    """What it does, on one line."""
 
 
 class Parser(argparse.ArgumentParser):

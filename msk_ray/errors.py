@@ -1,38 +1,17 @@
 """Errors that a user can fix. Each message is one line that says what to write or do instead."""
 
 import errno
-import reprlib
-from enum import StrEnum
+
+from msk_ray.step.errors import ConfigError as ConfigError
+from msk_ray.step.errors import DeviceError as DeviceError
+from msk_ray.step.errors import Failure as Failure
+from msk_ray.step.errors import MskRayError as MskRayError
+from msk_ray.step.errors import SimulationError as SimulationError
+from msk_ray.step.errors import UnsupportedModelError as UnsupportedModelError
+from msk_ray.step.errors import brief as brief
+from msk_ray.step.errors import shortened as shortened
 
 _STORAGE_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS, errno.ESTALE}
-
-
-def shortened(text: str, limit: int = 80) -> str:
-    """A text cut to at most `limit` characters, ending in dots if something was left out."""
-    return text if len(text) <= limit else f"{text[: limit - 3]}..."
-
-
-_BRIEF = reprlib.Repr()
-_BRIEF.maxstring = _BRIEF.maxother = _BRIEF.maxlong = 60
-
-
-def brief(value: object) -> str:
-    """The `repr` of a value for an error message, short however large the value is."""
-    return shortened(_BRIEF.repr(value), 160)
-
-
-class MskRayError(Exception):
-    """Base of every error whose cause is outside the code; entry points print it as one line and exit with 2."""
-
-    exit_code = 2
-
-
-class ConfigError(MskRayError):
-    """A configuration, search space or command line asks for something that does not exist or is not possible."""
-
-
-class DeviceError(MskRayError):
-    """The requested device is missing or too small."""
 
 
 class CheckpointError(MskRayError):
@@ -89,30 +68,3 @@ class RankLost(MskRayError):
     """A process of a trial that has several died. The trial continues from its last checkpoint."""
 
     exit_code = 75  # EX_TEMPFAIL
-
-
-class UnsupportedModelError(MskRayError):
-    """A model feature cannot be differentiated by the chosen backward mode."""
-
-
-class Failure(StrEnum):
-    """How a simulation can fail; a trial's outcome has the same name."""
-
-    DIVERGED = "diverged"
-    """Worlds diverged, or contacts or constraint rows were lost."""
-    NONFINITE = "nonfinite"
-    """A gradient was NaN or infinite."""
-    OUT_OF_MEMORY = "out_of_memory"
-    """The device has less memory than the settings need."""
-
-
-class SimulationError(MskRayError):
-    """The physics could not be computed with these settings."""
-
-    def __init__(self, message: str, failure: Failure = Failure.DIVERGED) -> None:
-        super().__init__(message, failure)  # both, so that the error survives pickling between processes
-        self.message = message
-        self.failure = failure
-
-    def __str__(self) -> str:
-        return self.message

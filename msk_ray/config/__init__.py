@@ -26,7 +26,6 @@ from msk_ray.config.overlay import SET_HELP, combine, flattened, leaves, merge, 
 from msk_ray.config.physics import FdConfig, PhysicsConfig
 from msk_ray.config.randomize import Draw, RandomizeConfig
 from msk_ray.config.recorded import current_key, current_values, env_name, first_spelling
-from msk_ray.config.resolve import Registry, resolve, resolve_class
 from msk_ray.config.schema import (
     Config,
     ContactCurriculum,
@@ -37,6 +36,7 @@ from msk_ray.config.schema import (
 )
 from msk_ray.config.sections import EnvSettings, Reward
 from msk_ray.config.yaml_text import dump_yaml, parse_yaml, read_yaml
+from msk_ray.registry import Registry, resolve, resolve_class
 
 __all__ = [
     "ALGORITHMS",

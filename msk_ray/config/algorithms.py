@@ -23,9 +23,9 @@ from pydantic import (
 
 from msk_ray.config.horizons import AdaptiveHorizon, ContactHorizon, Horizon, HorizonSchedule
 from msk_ray.config.physics import GRADIENTS
-from msk_ray.config.resolve import Registry, resolve
 from msk_ray.config.sections import Count, Fraction, NonNegative, Section, Text
 from msk_ray.errors import ConfigError
+from msk_ray.registry import Registry, resolve
 
 if TYPE_CHECKING:
     from msk_ray.config.schema import Config

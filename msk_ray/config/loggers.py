@@ -3,8 +3,8 @@
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 
-from msk_ray.config.resolve import Registry
 from msk_ray.errors import ConfigError
+from msk_ray.registry import Registry
 
 LOGGERS = Registry(
     "trial.loggers",

@@ -5,7 +5,8 @@ from typing import Any
 from msk_ray.config import ENVIRONMENTS, EnvSettings, PhysicsConfig, resolve_class
 from msk_ray.envs.base import Env
 from msk_ray.errors import ConfigError
-from msk_ray.simulation.modes import configured_backward
+from msk_ray.step import Backward, FdJacobian, Hybrid, TapePerSubstep
+from msk_ray.step.autograd.modes import make_backward
 
 
 def env_class(config: EnvSettings) -> type[Env[Any]]:
@@ -53,3 +54,16 @@ def make_env(
     if not randomize:
         physics = physics.model_copy(update={"randomize": None})
     return env_class(config)(config, physics.in_order(deterministic), nworld, device, seed, backward)
+
+
+def configured_backward(physics: PhysicsConfig) -> Backward:
+    """The backward mode of a physics section."""
+    match physics.backward:
+        case "fd_jacobian":
+            return FdJacobian(**physics.fd.model_dump())
+        case "hybrid":
+            tape = TapePerSubstep(physics.substep_grad_clip, contact_reach=physics.contact_reach)
+            return Hybrid(tape, FdJacobian(**physics.fd.model_dump()))
+        case name:
+            clip, reach = physics.substep_grad_clip, physics.contact_reach
+            return make_backward(name, substep_grad_clip=clip, contact_reach=reach)

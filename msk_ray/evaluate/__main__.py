@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from msk_ray.cli import Parser, run
 from msk_ray.errors import CheckpointError, ConfigError, MskRayError
 from msk_ray.evaluate import zoo
-from msk_ray.evaluate.apart import PYTHON, find_python
+from msk_ray.evaluate.elsewhere import SCORINGS, Scorer, find_python, foreign_scoring
 from msk_ray.evaluate.stored import FORMAT, eval_file_of, store_evaluation
 from msk_ray.evaluate.targets import Kind, Target, best_checkpoint, best_of_trial, find_target
 from msk_ray.evaluate.vary import HELP, parse_vary, vary_text
@@ -28,8 +28,7 @@ from msk_ray.text import printable
 from msk_ray.text_table import text_table
 
 if TYPE_CHECKING:
-    from msk_ray.evaluate.measure import Bench, Request
-    from msk_ray.evaluate.myosuite import MyoSuiteBench
+    from msk_ray.evaluate.measure import Request
 
 DESCRIPTION = """\
 Evaluate a policy: without noise, from fixed initial states, under the environment's default reward weights.
@@ -80,15 +79,17 @@ def parser() -> Parser:
     p.add_argument(
         "--in",
         dest="elsewhere",
-        choices=("myosuite",),
-        help="evaluate a policy of env myosuite_walk in the unmodified CPU environment of MyoSuite 2.12: 20 episodes "
-        "with its own resets and 20 with random ones",
+        metavar="NAME",
+        help="evaluate in the unmodified environment of another package, in its own Python: "
+        + "; ".join(foreign_scoring(name).summary for name in SCORINGS.known()),
     )
     p.add_argument(
         "--python",
         type=Path,
         metavar="FILE",
-        help=f"the Python that has MyoSuite, for --in (default: {PYTHON})",
+        help="the Python that has that package, for --in (default: "
+        + ", ".join(f"{foreign_scoring(name).python}" for name in SCORINGS.known())
+        + ")",
     )
     p.add_argument("--device", help="cpu or cuda:N (default: the first GPU, or the CPU if there is none)")
     p.add_argument(
@@ -120,26 +121,28 @@ def main(argv: Sequence[str] | None = None) -> int:
         best_checkpoint(target)  # torch and Warp take seconds to load; a wrong path should not wait for them
     announce(f"evaluating {_what(target)}; {COMPILING}")
 
-    from msk_ray.evaluate import measure, myosuite
+    from msk_ray.evaluate import measure
 
-    bench: Bench | MyoSuiteBench
+    scorer: Scorer
+    requests: Sequence[Request]
     if python is not None:
-        bench = myosuite.MyoSuiteBench(python)
-        requests = myosuite.requests(args.worlds, seeds, args.steps)
+        scoring = foreign_scoring(args.elsewhere)
+        scorer = scoring.scorer(python)
+        requests = scoring.requests(args.worlds, seeds, args.steps)
     else:
-        from msk_ray.simulation.simulation import resolve_device
+        from msk_ray.step.autograd.simulation import resolve_device
 
         device = args.device or measure.default_device()
         resolve_device(device)  # a missing device is not the fault of any trial
-        bench = measure.Bench(device, tell=True)
+        scorer = measure.Bench(device, tell=True)
         requests = [measure.Request(name, args.worlds, seeds, args.steps, v) for name in names for v in varied]
         if args.conditions is not None:
             under = [None, *(condition.strip() for condition in args.conditions.split(","))]
             requests = [replace(request, condition=condition) for request in requests for condition in under]
             varied = under
     if target.kind is Kind.EXPERIMENT:
-        return evaluate_experiment(Experiment(target.path), bench, requests)
-    return _evaluate_one(target, bench, requests, len(varied))
+        return evaluate_experiment(Experiment(target.path), scorer, requests)
+    return _evaluate_one(target, scorer, requests, len(varied))
 
 
 def _evaluate_zoo(target: Target, args: argparse.Namespace) -> int:
@@ -152,7 +155,7 @@ def _evaluate_zoo(target: Target, args: argparse.Namespace) -> int:
     announce(f"evaluating the policies of {target.path} as recorded there; {COMPILING}")
 
     from msk_ray.evaluate import measure
-    from msk_ray.simulation.simulation import resolve_device
+    from msk_ray.step.autograd.simulation import resolve_device
 
     device = args.device or measure.default_device()
     resolve_device(device)
@@ -173,26 +176,26 @@ def _python_apart(args: argparse.Namespace) -> Path | None:
     """
     if args.elsewhere is None:
         if args.python is not None:
-            raise ConfigError("--python: only --in myosuite reads it; leave it out")
+            raise ConfigError("--python: only --in reads it; leave it out")
         return None
     for option in ("physics", "vary", "device", "conditions"):
         if getattr(args, option) is not None:
             option = {"conditions": "with"}.get(option, option)
             raise ConfigError(f"--{option}: --in {args.elsewhere} has its own physics, on the CPU; leave it out")
-    return find_python(args.python)
+    return find_python(foreign_scoring(args.elsewhere), args.python)
 
 
-def _evaluate_one(target: Target, bench: "Bench | MyoSuiteBench", requests: "Sequence[Request]", values: int) -> int:
+def _evaluate_one(target: Target, scorer: Scorer, requests: "Sequence[Request]", values: int) -> int:
     """Evaluate one policy; every `values` requests are of one physics, with different values of a parameter."""
     from msk_ray.training import load_policy
 
     path = best_checkpoint(target)
     policy = load_policy(path)
     for request in requests:
-        bench.check(policy.config, request)
+        scorer.check(policy.config, request)
     entries = []
     for request in requests:
-        entries.append(bench.evaluate(policy, request))
+        entries.append(scorer.evaluate(policy, request))
         if not is_shipped(path):
             store_evaluation(eval_file_of(path), entries[-1])
         if values == 1:
@@ -235,7 +238,7 @@ def figure_rows(entry: dict[str, Any]) -> list[tuple[str, dict[str, float]]]:
     ]
 
 
-def evaluate_experiment(experiment: Experiment, bench: "Bench | MyoSuiteBench", requests: "Sequence[Request]") -> int:
+def evaluate_experiment(experiment: Experiment, scorer: Scorer, requests: "Sequence[Request]") -> int:
     """Evaluate the best policy of each trial, store the results in its folder, and rank the trials of each
     environment.
 
@@ -251,7 +254,7 @@ def evaluate_experiment(experiment: Experiment, bench: "Bench | MyoSuiteBench", 
     groups = by_environment(trials, lambda trial: trial.environment)
     for request in requests:
         for group in groups.values():
-            bench.check(group[0].config, request)
+            scorer.check(group[0].config, request)
     rankings: dict[tuple[int, str], list[dict[str, Any]]] = {}
     failed: dict[str, str] = {}
     untrained: dict[str, str] = {}
@@ -263,7 +266,7 @@ def evaluate_experiment(experiment: Experiment, bench: "Bench | MyoSuiteBench", 
                     untrained[trial.id] = f"{path} is the untrained policy; it has no rank"
                     print(f"{number}/{len(trials)}  {trial.id}  {untrained[trial.id]}", flush=True)
                     continue
-                entry = bench.evaluate(load_policy(path), request)
+                entry = scorer.evaluate(load_policy(path), request)
                 store_evaluation(eval_file_of(path), entry)
             except MskRayError as error:
                 failed[trial.id] = str(error)

@@ -10,17 +10,17 @@ from pydantic import ValidationError
 
 from msk_ray.config import PhysicsConfig
 from msk_ray.envs import make_env
-from msk_ray.envs.legs import terms
-from msk_ray.envs.legs.clock import fourier, series, window
-from msk_ray.envs.legs.config import LegReward
-from msk_ray.envs.legs.metabolic import Fibres, muscle_masses, power
-from msk_ray.envs.legs.push import pushes
-from msk_ray.envs.legs.reference import people_angles, sway
-from msk_ray.envs.myoleg26.config import MyoLeg26Settings
-from msk_ray.envs.myoleg26.env import MyoLeg26
 from msk_ray.envs.records import EnvState
 from msk_ray.errors import ConfigError
-from msk_ray.simulation import StepState
+from msk_ray.legs import terms
+from msk_ray.legs.clock import fourier, series, window
+from msk_ray.legs.config import LegReward
+from msk_ray.legs.metabolic import Fibres, muscle_masses, power
+from msk_ray.legs.myoleg26.config import MyoLeg26Settings
+from msk_ray.legs.myoleg26.env import MyoLeg26
+from msk_ray.legs.push import pushes
+from msk_ray.legs.reference import people_angles, sway
+from msk_ray.step import StepState
 
 EVERY = dict.fromkeys(("metabolic", "fatigue", "head", "impact", "footfall", "clearance", "toes", "vault"), 0.1)
 EVERY |= {"out_of_plane": 0.1, "track": 0.5, "track_rate": 0.1, "landing": 0.1}
@@ -145,7 +145,7 @@ def test_legs_out_of_the_plane_of_walking_cost_their_angles() -> None:
 
 
 def test_a_model_without_joints_out_of_the_plane_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("msk_ray.envs.legs.env.OUT_OF_PLANE", ("elbow",))
+    monkeypatch.setattr("msk_ray.legs.env.OUT_OF_PLANE", ("elbow",))
     with pytest.raises(ConfigError, match=r"env\.reward\.out_of_plane: the model has none of the joints elbow"):
         make(1, reward={"out_of_plane": 1.0})
 

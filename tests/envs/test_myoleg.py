@@ -12,14 +12,14 @@ from needs import slow
 
 from msk_ray.config import PhysicsConfig
 from msk_ray.envs import make_env
-from msk_ray.envs.legs.gait.body import world_axes
-from msk_ray.envs.myoleg.config import MyoLegSettings
-from msk_ray.envs.myoleg.env import MyoLeg
-from msk_ray.envs.myoleg.model import SUBSTEPS, Couplings, build_myoleg, find_model
 from msk_ray.errors import ConfigError
-from msk_ray.gradcheck import check_chain, check_gradients, make_states
-from msk_ray.simulation import Simulation, StepState, TapePerSubstep
-from msk_ray.simulation.tangent import quat_exp, quat_multiply, quat_rotate
+from msk_ray.legs.gait.body import world_axes
+from msk_ray.legs.myoleg.config import MyoLegSettings
+from msk_ray.legs.myoleg.env import MyoLeg
+from msk_ray.legs.myoleg.model import SUBSTEPS, Couplings, build_myoleg, find_model
+from msk_ray.step import Simulation, StepState, TapePerSubstep
+from msk_ray.step.autograd.tangent import quat_exp, quat_multiply, quat_rotate
+from msk_ray.step.check import check_chain, check_gradients, make_states
 
 pytestmark = pytest.mark.long
 

@@ -9,14 +9,14 @@ import torch
 
 from msk_ray.config import PhysicsConfig, parse_config
 from msk_ray.envs import make_env
-from msk_ray.envs.legs.assistance import Assistance
-from msk_ray.envs.legs.config import AssistConfig, LegReward
-from msk_ray.envs.legs.muscles import MuscleCurves
-from msk_ray.envs.legs.terms import stride_error
-from msk_ray.envs.myoleg26.config import MyoLeg26Settings
-from msk_ray.envs.myoleg26.env import MyoLeg26
 from msk_ray.errors import ConfigError
-from msk_ray.simulation import StepState
+from msk_ray.legs.assistance import Assistance
+from msk_ray.legs.config import AssistConfig, LegReward
+from msk_ray.legs.muscles import MuscleCurves
+from msk_ray.legs.myoleg26.config import MyoLeg26Settings
+from msk_ray.legs.myoleg26.env import MyoLeg26
+from msk_ray.legs.terms import stride_error
+from msk_ray.step import StepState
 
 
 def make(nworld: int = 2, *, differentiable: bool = False, **settings: object) -> MyoLeg26:

@@ -7,11 +7,11 @@ import torch
 
 from msk_ray.config import PhysicsConfig
 from msk_ray.envs import make_env
-from msk_ray.envs.legs.config import LegReward
-from msk_ray.envs.myoleg26.config import MyoLeg26Settings
-from msk_ray.envs.myoleg26.model import SUBSTEPS, build_myoleg26
-from msk_ray.gradcheck import check_chain, check_gradients, make_states
-from msk_ray.simulation import Simulation, TapePerSubstep
+from msk_ray.legs.config import LegReward
+from msk_ray.legs.myoleg26.config import MyoLeg26Settings
+from msk_ray.legs.myoleg26.model import SUBSTEPS, build_myoleg26
+from msk_ray.step import Simulation, TapePerSubstep
+from msk_ray.step.check import check_chain, check_gradients, make_states
 
 pytestmark = pytest.mark.long
 

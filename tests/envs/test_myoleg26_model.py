@@ -6,13 +6,13 @@ import pytest
 import torch
 
 from msk_ray.config import PhysicsConfig
-from msk_ray.envs.myoleg26 import tables
-from msk_ray.envs.myoleg26.config import MyoLeg26Settings
-from msk_ray.envs.myoleg26.model import CURVE, WINDOW, build_myoleg26
-from msk_ray.envs.myoleg26.moment_arms import PUBLISHED, moment_arms
-from msk_ray.envs.myoleg26.terrain import Terrain
-from msk_ray.physics.adjoint.coverage import check_supported
-from msk_ray.simulation import Simulation
+from msk_ray.legs.myoleg26 import tables
+from msk_ray.legs.myoleg26.config import MyoLeg26Settings
+from msk_ray.legs.myoleg26.model import CURVE, WINDOW, build_myoleg26
+from msk_ray.legs.myoleg26.moment_arms import PUBLISHED, moment_arms
+from msk_ray.legs.myoleg26.terrain import Terrain
+from msk_ray.step import Simulation
+from msk_ray.step.adjoint.coverage.check import check_supported
 
 MIRROR = np.array([1, 1, -1, 1, -1, -1], dtype=float)
 """Pelvis coordinates in a mirror at its plane of symmetry."""

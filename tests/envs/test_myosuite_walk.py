@@ -13,15 +13,14 @@ from myosuite_model import walk_model
 
 from msk_ray.config import PhysicsConfig, load_config
 from msk_ray.envs import make_env
-from msk_ray.envs.myosuite_walk.config import MyoSuiteWalkReward, MyoSuiteWalkSettings
-from msk_ray.envs.myosuite_walk.env import MyoSuiteWalk
-from msk_ray.envs.myosuite_walk.model import KEYFRAMES, build_myosuite_walk, find_file
 from msk_ray.envs.records import EnvState
 from msk_ray.errors import ConfigError
-from msk_ray.gait.__main__ import main as gait
-from msk_ray.gradcheck import check_gradients
-from msk_ray.simulation import Simulation, StepState
-from msk_ray.simulation.tangent import quat_multiply
+from msk_ray.legs.gait.__main__ import main as gait
+from msk_ray.legs.myosuite_walk.config import MyoSuiteWalkReward, MyoSuiteWalkSettings
+from msk_ray.legs.myosuite_walk.env import MyoSuiteWalk
+from msk_ray.legs.myosuite_walk.model import KEYFRAMES, build_myosuite_walk, find_file
+from msk_ray.step import Simulation, StepState, check_gradients
+from msk_ray.step.autograd.tangent import quat_multiply
 from msk_ray.training import Trainer
 
 pytestmark = pytest.mark.long

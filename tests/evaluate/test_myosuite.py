@@ -14,8 +14,8 @@ from msk_ray.config import PhysicsConfig, load_config
 from msk_ray.envs import make_env
 from msk_ray.envs.base import Env
 from msk_ray.evaluate.__main__ import main
-from msk_ray.evaluate.myosuite import _acting
 from msk_ray.evaluate.stored import read_evaluations
+from msk_ray.legs.myosuite_walk.scoring import _acting
 from msk_ray.training import Trainer, load_policy
 
 pytestmark = pytest.mark.long

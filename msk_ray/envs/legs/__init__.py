@@ -1,1 +1,0 @@
-"""The shared part of the environments of muscle-driven legs."""

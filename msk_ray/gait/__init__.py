@@ -1,1 +1,0 @@
-"""How does a policy walk? Measures of gait analysis, compared with those of people."""
