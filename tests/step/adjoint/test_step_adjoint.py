@@ -11,8 +11,9 @@ from oracle import relative
 from scenes import ant, ant_points
 from test_adjoint_features import SCENES, random_points
 
-from msk_ray.step.adjoint import StepAdjoint, solve
+from msk_ray.step.adjoint import StepAdjoint
 from msk_ray.step.adjoint.groups import State, gather
+from msk_ray.step.adjoint.stages import solve
 from msk_ray.step.adjoint.stages.recompute import recompute_stages
 from msk_ray.step.forward import WorldBatch
 
