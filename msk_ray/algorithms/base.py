@@ -17,7 +17,7 @@ from msk_ray.errors import ConfigError
 from msk_ray.group import Group
 from msk_ray.networks import parameter_hash
 
-_OF_GRADIENTS = frozenset({"approximated_share", "reached_share"})
+_OF_GRADIENTS = frozenset({"approximated_share"})
 """Diagnostics of the simulation that concern its gradients; the others concern its physics."""
 
 _LARGEST = ("_max", "/contacts_share", "/rows_share", "fd_solver_limit_share")

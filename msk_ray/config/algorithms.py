@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from pydantic import (
     AfterValidator,
     BeforeValidator,
-    Field,
     PositiveFloat,
     SerializeAsAny,
     ValidationInfo,
@@ -118,22 +117,6 @@ class ExplorationSchedule(Section):
         return self.start + (self.end - self.start) * min(1.0, epoch / self.epochs)
 
 
-class PerturbedCopies(Section):
-    """Average the gradient over perturbed copies of a state: it is that of a smoothed return.
-
-    Worlds are in groups of `count`. At the beginning of an epoch, the first of each group goes on where it was, and the
-    others take its state with a uniform perturbation; the group's mean is the gradient of randomized smoothing (Suh et
-    al. 2022, arXiv:2202.00817). So W worlds hold W / `count` episodes.
-    """
-
-    count: Annotated[int, Field(ge=2, lt=2**31)]
-    """Worlds of a group; must divide env.nworld."""
-    qpos: NonNegative = 0.01
-    """Largest perturbation of positions along each degree of freedom [m, rad]."""
-    qvel: NonNegative = 0.05
-    """Largest perturbation of velocities [m/s, rad/s]."""
-
-
 def _off(value: Any) -> Any:
     """In YAML, a bare `off` is false."""
     return "off" if value is False else value
@@ -162,13 +145,6 @@ class ShacConfig(AlgorithmSettings):
     optimiser's steps of those after the stop."""
     critic_batches: Count = 4
     """Minibatches a pass."""
-    critic_products: Literal["float32", "tf32"] = "float32"
-    """Format of the factors in matrix products of the critic's fit; `tf32` has 10 bits of mantissa, for which recent
-    GPUs have faster units. Sums, and everything else, are in float32."""
-    critic_kernels: Literal["torch", "fused", "auto"] = "torch"
-    """`fused`: activation and norm of a layer are one kernel forward and two back in the critic's fit, where torch has
-    four and nine; the results differ by rounding. For elu with layer_norm, on a GPU: on a CPU it is slower. `auto`:
-    fused where it is meant for, else torch."""
     target_critic_alpha: Fraction = 0.2
     """target ← α·target + (1 − α)·critic after each epoch."""
     actor_lr: PositiveFloat = 2e-3
@@ -201,8 +177,6 @@ class ShacConfig(AlgorithmSettings):
     the mean for the actor."""
     exploration: ExplorationSchedule | None = None
     """Factor on the standard deviation of the actions by epoch; null: 1."""
-    copies: PerturbedCopies | None = None
-    """Average the gradient over perturbed copies of each state; null: every world has a state of its own."""
     normalize_obs: bool = True
     """Normalise observations by their running mean and variance."""
     normalize_return: bool = False
@@ -261,10 +235,6 @@ class ShacConfig(AlgorithmSettings):
                 raise ValueError("shac.exploration changes the noise that shac.entropy measures: leave one out")
         if self.actor_value == "mean" and config.critic.count == 1:
             raise ValueError("shac.actor_value: mean is of two critics: write critic.count: 2")
-        if self.critic_kernels == "fused" and not (config.critic.activation == "elu" and config.critic.layer_norm):
-            raise ValueError("shac.critic_kernels: fused is for elu with layer_norm: write torch")
-        if self.copies is not None and nworld // gpus % self.copies.count:
-            raise ValueError(f"shac.copies.count {self.copies.count}{also} must divide env.nworld ({nworld})")
         if isinstance(horizon, ContactHorizon) and "cone" not in config.env.reads_physics:
             raise ValueError(f"shac.horizon.contact: {config.env.name} has no contacts; write a number")
 

@@ -12,14 +12,14 @@ Vec5 = tuple[float, float, float, float, float]
 
 STEPPING = frozenset(
     (
-        *("backward", "substep_grad_clip", "contact_reach", "substeps", "timestep", "integrator"),
+        *("backward", "substep_grad_clip", "substeps", "timestep", "integrator"),
         *("fd.eps_ctrl", "fd.eps_qpos", "fd.eps_qvel", "fd.max_worlds"),
     )
 )
 """Settings that every environment reads."""
 GRADIENTS = frozenset(
     (
-        *("backward", "substep_grad_clip", "contact_reach"),
+        *("backward", "substep_grad_clip"),
         *("fd.eps_ctrl", "fd.eps_qpos", "fd.eps_qvel", "fd.eps_act", "fd.max_worlds"),
     )
 )
@@ -67,9 +67,6 @@ class PhysicsConfig(Section):
     `hybrid` takes the state's gradient from the tape and the control's from finite differences, for diagnosis."""
     substep_grad_clip: PositiveFloat | None = None
     """Bound on each world's state cotangent between substeps, in units of the loss; null: no bound. Tapes only."""
-    contact_reach: PositiveFloat | None = None
-    """Distance [m] within which two geoms that do not touch yet get a gradient of their approach; null: none. In the
-    backward pass only. Tapes only."""
     fd: FdConfig = FdConfig()
     substeps: Count | None = None
     """Physics steps per env step. Set this or `timestep`; 4 if neither is set."""

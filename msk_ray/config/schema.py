@@ -127,7 +127,7 @@ class SeedsConfig(Section):
     states: Seed | None = None
     """Initial states of episodes, and numbers that `physics.randomize` draws."""
     noise: Seed | None = None
-    """Exploration: noise of actions, and perturbed copies."""
+    """Exploration: noise of actions."""
     minibatches: Seed | None = None
     """Which rows each minibatch has."""
 

@@ -50,7 +50,7 @@ def _unread_by_backward(config: Config) -> list[str]:
     state = ["fd.eps_qpos", "fd.eps_qvel", "fd.eps_act"]
     match config.physics.backward:
         case "fd_jacobian":
-            return ["substep_grad_clip", "contact_reach"]
+            return ["substep_grad_clip"]
         case "hybrid":
             return state
         case _:

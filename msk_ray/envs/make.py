@@ -62,8 +62,6 @@ def configured_backward(physics: PhysicsConfig) -> Backward:
         case "fd_jacobian":
             return FdJacobian(**physics.fd.model_dump())
         case "hybrid":
-            tape = TapePerSubstep(physics.substep_grad_clip, contact_reach=physics.contact_reach)
-            return Hybrid(tape, FdJacobian(**physics.fd.model_dump()))
+            return Hybrid(TapePerSubstep(physics.substep_grad_clip), FdJacobian(**physics.fd.model_dump()))
         case name:
-            clip, reach = physics.substep_grad_clip, physics.contact_reach
-            return make_backward(name, substep_grad_clip=clip, contact_reach=reach)
+            return make_backward(name, substep_grad_clip=physics.substep_grad_clip)

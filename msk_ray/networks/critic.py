@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from msk_ray.config.schema import CriticConfig
-from msk_ray.networks.mlp import fused_forward, make_mlp
+from msk_ray.networks.mlp import make_mlp
 
 
 class Critic(nn.Module):
@@ -17,10 +17,6 @@ class Critic(nn.Module):
     def forward(self, obs: Tensor) -> Tensor:
         """Values (C, ...) of each of the C networks for observations (..., O)."""
         return torch.stack([member(obs).squeeze(-1) for member in self.members])
-
-    def fused(self, obs: Tensor) -> Tensor:
-        """The same for observations (N, O), with fewer kernels where a layer is ELU and LayerNorm; off by rounding."""
-        return torch.stack([fused_forward(member, obs).squeeze(-1) for member in self.members])
 
     def value(self, obs: Tensor) -> Tensor:
         """Value (...); with two networks, the smaller one."""

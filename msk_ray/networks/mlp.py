@@ -7,7 +7,6 @@ import torch
 from torch import Tensor, nn
 
 from msk_ray.config import NetworkConfig
-from msk_ray.step.autograd.hidden_layer import hidden_layer
 
 _ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "silu": nn.SiLU, "relu": nn.ReLU, "tanh": nn.Tanh}
 
@@ -43,18 +42,6 @@ def make_mlp(
             layers.append(nn.LayerNorm(fan_out))
     layers.append(_linear(sizes[-1], outputs, output_gain, generator))
     return Mlp(*layers)
-
-
-def fused_forward(network: nn.Module, x: Tensor) -> Tensor:
-    """A network of `make_mlp` whose hidden layers are ELU and LayerNorm, at rows (N, I), with `hidden_layer`."""
-    assert isinstance(network, nn.Sequential)
-    *hidden, last = network
-    for linear, _, norm in zip(hidden[::3], hidden[1::3], hidden[2::3], strict=True):
-        assert isinstance(linear, nn.Linear)
-        assert isinstance(norm, nn.LayerNorm)
-        x = hidden_layer(x, linear.weight, linear.bias, norm.weight, norm.bias, norm.eps)
-    out: Tensor = last(x)
-    return out
 
 
 def _linear(fan_in: int, fan_out: int, gain: float, generator: torch.Generator) -> nn.Linear:

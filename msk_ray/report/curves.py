@@ -68,7 +68,6 @@ HEALTH = {
     "grad/clipped_share": ("share of cotangents clipped", False),
     "grad/nonfinite_share": ("share of worlds without a gradient", False),
     "grad/approximated_share": ("share of substeps with an approximate gradient", False),
-    "grad/reached_share": ("share of substeps with a gradient before touching", False),
     "physics/solver_limit_share": ("share of worlds at the solver's limit", False),
     "train/diverged": ("worlds diverged an epoch", False),
 }

@@ -19,7 +19,6 @@ from msk_ray.step.autograd.modes import BACKWARD_MODES
 VALUES: dict[str, Any] = {
     "variant": "published",
     "substep_grad_clip": 5.0,
-    "contact_reach": 0.02,
     "substeps": 7,
     "timestep": 0.0025,
     "tolerance": 1e-9,
@@ -75,7 +74,7 @@ STATE_EPS = {"fd.eps_qpos", "fd.eps_qvel", "fd.eps_act"}
 UNREAD_BY = {
     "tape_per_substep": {"fd.eps_ctrl", "fd.max_worlds"} | STATE_EPS,
     "tape_all": {"fd.eps_ctrl", "fd.max_worlds"} | STATE_EPS,
-    "fd_jacobian": {"substep_grad_clip", "contact_reach"},
+    "fd_jacobian": {"substep_grad_clip"},
     "hybrid": STATE_EPS,
 }
 
@@ -123,10 +122,7 @@ def _backward(config: Config) -> list[tuple[Any, ...]]:
     """What the backward mode, and those it is made of, are told."""
     whole = vars(configured_backward(config.physics))
     parts = [whole, *(vars(whole[name]) for name in ("state", "ctrl") if name in whole)]
-    return [
-        (part.get("substep_grad_clip"), part.get("eps"), part.get("max_worlds"), part.get("contact_reach"))
-        for part in parts
-    ]
+    return [(part.get("substep_grad_clip"), part.get("eps"), part.get("max_worlds")) for part in parts]
 
 
 def test_every_field_is_tried() -> None:
@@ -150,7 +146,7 @@ def test_a_setting_does_something_or_is_refused(env: str, backward: str, legs: s
             assert "leave it out" in str(caught.value)
         elif field in ("nconmax", "njmax", "solver_kernels"):
             parse_config(settings)  # no part of the model: the next tests
-        elif field in ("substep_grad_clip", "contact_reach") or field.startswith("fd."):
+        elif field == "substep_grad_clip" or field.startswith("fd."):
             assert _backward(parse_config(settings)) != plain, f"{field} does nothing"
         else:
             parse_config(settings)

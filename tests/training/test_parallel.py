@@ -33,7 +33,6 @@ SETTINGS: dict[str, Any] = {
         "normalize_return": True,
         "state_grad_clip": 10.0,
         "entropy": {"target": -0.5},
-        "copies": {"count": 2, "qpos": 0.1, "qvel": 0.1},
         "actor_value": "mean",
         "critic_tolerance": 1e-6,
     },

@@ -12,8 +12,7 @@ from torch import Tensor, nn
 from msk_ray.algorithms.base import Algorithm, EpochResult, simulation_metrics
 from msk_ray.algorithms.episodes import EpisodeTracker
 from msk_ray.algorithms.shac.actor_update import ActorUpdate, EpochInputs
-from msk_ray.algorithms.shac.copies import from_first, spread
-from msk_ray.algorithms.shac.critic_fit import Arithmetic, CriticFit
+from msk_ray.algorithms.shac.critic_fit import CriticFit
 from msk_ray.algorithms.shac.curriculum import ContactSchedule
 from msk_ray.algorithms.shac.entropy import EntropyBonus
 from msk_ray.algorithms.shac.horizon import RolloutLength
@@ -60,7 +59,6 @@ class Shac(Algorithm):
             c.critic_grad_norm,
             weight_decay=c.weight_decay,
             tolerance=c.critic_tolerance,
-            arithmetic=_arithmetic(config, device),
             group=env.group,
         )
         self.noise_generator = torch.Generator(device=device).manual_seed(config.trial.seed_of("noise") + 1)
@@ -69,8 +67,7 @@ class Shac(Algorithm):
             own = np.random.SeedSequence((config.trial.seed_of("minibatches"), _MINIBATCHES)).generate_state(1)
             self.minibatch_generator = torch.Generator(device=device).manual_seed(int(own[0]))
         self._worlds = env.nworld * env.group.size
-        self._copies = 1 if c.copies is None else c.copies.count
-        self.episodes = EpisodeTracker(self._worlds // self._copies, device)
+        self.episodes = EpisodeTracker(self._worlds, device)
         self._horizon = RolloutLength(c.horizon)
         self._entropy = EntropyBonus(c.entropy, env.action_size, device) if c.entropy is not None else None
         self._contacts = ContactSchedule(config.curriculum, env) if config.curriculum is not None else None
@@ -126,9 +123,8 @@ class Shac(Algorithm):
         seconds = self._runner.seconds()
         self.env.sim.settle()
         cotangents = outcome.cotangents.statistics(1.0 / (horizon * self.env.nworld))
-        # Copies have no episodes of their own.
-        firsts = (outcome.rewards[:, :: self._copies], outcome.done[:, :: self._copies])
-        metrics = {**outcome.metrics, **cotangents.metrics(), **self.episodes.update(*firsts)}
+        episodes = self.episodes.update(outcome.rewards, outcome.done)
+        metrics = {**outcome.metrics, **cotangents.metrics(), **episodes}
         if self._runner.last_loss is not None:
             metrics["train/critic_loss"] = self._runner.last_loss
         # One transfer: reading each number would make the host wait as many times.
@@ -146,8 +142,7 @@ class Shac(Algorithm):
             **simulation_metrics(self.env),
         }
         self._runner.adapt()
-        ended = round(numbers["train/episodes"]) * self._copies  # tracked are the episodes of one copy of each
-        return EpochResult(horizon * self._worlds, numbers, ended)
+        return EpochResult(horizon * self._worlds, numbers, round(numbers["train/episodes"]))
 
     def note_state(self) -> None:
         """Let the witness, if there is one, note worlds and modules, once the critic's fit has ended."""
@@ -212,11 +207,7 @@ class Shac(Algorithm):
         noise = torch.randn((horizon, self._worlds, env.action_size), generator=self.noise_generator, device=env.device)
         if c.exploration is not None:
             noise *= c.exploration.at(epoch)
-        state = env.state.detach()
-        if c.copies is not None:
-            state = spread(state, c.copies, env, self.noise_generator)
-            self._actor_update.discounted.copy_(from_first(self._actor_update.discounted, self._copies))
-        return EpochInputs(state, env.draw_resets(horizon), env.group.own(noise, dim=1))
+        return EpochInputs(env.state.detach(), env.draw_resets(horizon), env.group.own(noise, dim=1))
 
     def _adapt(self, reward: float, entropy: float | None) -> dict[str, float]:
         """Advance entropy bonus and contacts after an epoch.
@@ -275,14 +266,6 @@ class Shac(Algorithm):
         """Let the target critic follow the critic."""
         for target, source in zip(self.target_critic.parameters(), self.critic.parameters(), strict=True):
             target.lerp_(source, 1.0 - self.settings.target_critic_alpha)
-
-
-def _arithmetic(config: Config, device: torch.device) -> Arithmetic:
-    c = config.algorithm_settings
-    assert isinstance(c, ShacConfig)
-    fits = device.type == "cuda" and config.critic.activation == "elu" and config.critic.layer_norm
-    fused = c.critic_kernels == "fused" or (c.critic_kernels == "auto" and fits)
-    return Arithmetic(tf32=c.critic_products == "tf32", fused=fused)
 
 
 def _network(config: Config, obs_size: int, action_size: int, generator: torch.Generator) -> PolicyNetwork:

@@ -1,32 +1,15 @@
 """Fit the critic to its targets, one minibatch at a time."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import NamedTuple
-
 import torch
 from torch import Tensor, nn
 
 from msk_ray.algorithms.shac.optimizer import RateAdam, clip, clip_flat, views_of
-from msk_ray.errors import ConfigError
 from msk_ray.group import ALONE, Group
 from msk_ray.networks import Critic
 from msk_ray.networks.chain import Chain
 
 _WINDOW = 4
 """Changes of the loss from pass to pass that count together."""
-
-
-class Arithmetic(NamedTuple):
-    """How a fit computes its networks."""
-
-    tf32: bool = False
-    """Whether matrix products multiply numbers of 10 bits of mantissa."""
-    fused: bool = False
-    """Whether hidden layers take few kernels; they must be ELU and LayerNorm."""
-
-
-EXACT = Arithmetic()
 
 
 class CriticFit:
@@ -39,14 +22,10 @@ class CriticFit:
         grad_norm: bound on each network's gradient norm; None for no bound.
         weight_decay: decoupled weight decay; 0 for none.
         tolerance: change of the loss a pass, relative to it, below which no further step is taken; None: all steps.
-        arithmetic: how the networks are computed.
         group: the processes that fit it together, each with its share of every minibatch.
 
     Attributes:
         optimizer: the critic's.
-
-    Raises:
-        ConfigError: tf32 on a device that has none.
     """
 
     def __init__(
@@ -58,21 +37,16 @@ class CriticFit:
         *,
         weight_decay: float = 0.0,
         tolerance: float | None = None,
-        arithmetic: Arithmetic = EXACT,
         group: Group = ALONE,
     ) -> None:
         device = next(critic.parameters()).device
-        if arithmetic.tf32 and (device.type != "cuda" or torch.cuda.get_device_capability(device) < (8, 0)):
-            raise ConfigError(f"shac.critic_products: {device.type} has no tf32 here: write float32")
         # Kept, because a module looks for its parameters everywhere below it each time.
         self._members = [list(member.parameters()) for member in critic.members]
         self._parameters = [parameter for member in self._members for parameter in member]
-        self._values = critic.fused if arithmetic.fused else critic
-        by_hand = device.type == "cpu" and not arithmetic.fused
-        self._passes = [_Pass(member) for member in critic.members] if by_hand else None
+        self._critic = critic
+        self._passes = [_Pass(member) for member in critic.members] if device.type == "cpu" else None
         self._grad_norm = grad_norm
         self._tolerance = tolerance
-        self._tf32 = arithmetic.tf32
         self._group = group
         self.optimizer = RateAdam(self._parameters, learning_rate, betas, weight_decay)
 
@@ -91,8 +65,7 @@ class CriticFit:
         settled: Tensor | None = None
         for order in orders:
             minibatches = self._group.own(order[: batches * size].view(batches, size), dim=1)
-            with _products(self._tf32):
-                losses = [self._step(obs[picked], targets[picked], settled) for picked in minibatches]
+            losses = [self._step(obs[picked], targets[picked], settled) for picked in minibatches]
             passes.append(torch.stack(losses).mean())
             if self._tolerance is not None:
                 settled = self._settled(passes, settled)
@@ -121,7 +94,7 @@ class CriticFit:
     def _by_autograd(self, obs: Tensor, targets: Tensor) -> tuple[Tensor, list[Tensor]]:
         """The loss of rows, and the gradient along which the step goes, by parameter."""
         with torch.enable_grad():
-            loss = (self._values(obs) - targets).square().mean()
+            loss = (self._critic(obs) - targets).square().mean()
             found = torch.autograd.grad(loss, self._parameters)
         mean, gradients = loss.detach(), list(found)
         self._group.mean([mean, *gradients])
@@ -165,14 +138,3 @@ class _Pass:
         loss = scale * error.square().sum()
         self._chain.backward(kept, error.mul_(2.0 * scale), self.parts)
         return loss
-
-
-@contextmanager
-def _products(tf32: bool) -> Iterator[None]:
-    """Within, torch's products of float32 matrices on a GPU round their factors to TF32, or do not."""
-    before = torch.backends.cuda.matmul.allow_tf32
-    torch.backends.cuda.matmul.allow_tf32 = tf32
-    try:
-        yield
-    finally:
-        torch.backends.cuda.matmul.allow_tf32 = before

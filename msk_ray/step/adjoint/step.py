@@ -60,9 +60,7 @@ class StepAdjoint:
     substep (as `mujoco_warp.step` leaves them, except qpos, qvel and act, which must be the state before it) and
     turns the cotangents below from those of the state after the substep into those of the state before.
 
-    `reach` is the distance [m] within which contacts get a gradient before they touch, as `adjoint.reach` says; the
-    model then has to find them (`physics.pairs.widened`). `stages` are those of the batch, mujoco_warp's own by
-    default.
+    `stages` are those of the batch, mujoco_warp's own by default.
 
     Attributes:
         work, integrator, laws, contacts, tendons: the stages' buffers and launches that parameters build on.
@@ -76,9 +74,7 @@ class StepAdjoint:
         inertia_address: place of M_ij (j ≤ i) in the sparse inertia, -1 where it is zero; shape (nv, nv).
     """
 
-    def __init__(
-        self, mjm: mujoco.MjModel, model: Any, data: Any, reach: float = 0.0, stages: Stages | None = None
-    ) -> None:
+    def __init__(self, mjm: mujoco.MjModel, model: Any, data: Any, stages: Stages | None = None) -> None:
         self.work = work = Workspace(mjm, model, data, stages or PackageStages())
         self.grad_qpos, self.grad_qvel = work.grad_qpos, work.grad_qvel
         self.grad_act, self.grad_ctrl = work.grad_act, work.grad_ctrl
@@ -88,7 +84,7 @@ class StepAdjoint:
         with wp.ScopedDevice(work.device):
             self.integrator = Integrator(work)
             self.laws = ConstraintLaws(work)
-            self.contacts = ContactForces(work, data.naconmax, reach)
+            self.contacts = ContactForces(work, data.naconmax)
             self._systems = LinearSystems(work, self.integrator, self.laws)
             self._bodies = Bodies(work, self.integrator.damping)
             self.tendons = Tendons(work) if mjm.ntendon else None
@@ -101,8 +97,6 @@ class StepAdjoint:
         """
         self.integrator.start(qpos, raw_qpos)
         self.touch_counter.start()
-        if self.contacts.reached is not None:
-            self.contacts.reached.start()
 
     def cover_applied(self) -> AppliedForces:
         """Allocate the gradients of applied forces, if they are not yet there."""

@@ -98,8 +98,6 @@ class Backward(ABC):
     """Whether it differentiates steps under applied forces, which `record` then gets."""
     covers_parameters: ClassVar[bool] = False
     """Whether `vjp` gives gradients of parameters of the model; their recorded values are in the model by then."""
-    contact_reach: float = 0.0
-    """Distance [m] within which the mode wants to see contacts that do not touch."""
 
     @abstractmethod
     def attach(self, batch: WorldBatch) -> None:

@@ -164,7 +164,6 @@ class Simulation:
             str(self.device),
             capacity=capacity,
             tolerance=tolerance,
-            contact_reach=mode.contact_reach if mode is not None else 0.0,
             kernels=kernels,
         )
         self._stepper = Stepper(batch, mode)

@@ -66,8 +66,6 @@ class _Tape(Backward):
             cotangent's own units; the direction is kept. None for no bound.
         residual_tolerance: a world is counted as unconverged where the solver left more than this share of its
             forces unbalanced, |Ma - τ - Jᵀf| / |(Ma, τ, Jᵀf)|.
-        contact_reach: distance [m] within which two geoms that do not touch yet get a gradient all the same, as if a
-            contact began there; None for none. The step itself stays as it is.
     """
 
     covers_applied = True
@@ -77,10 +75,8 @@ class _Tape(Backward):
         self,
         substep_grad_clip: float | None = None,
         residual_tolerance: float = 1e-3,
-        contact_reach: float | None = None,
     ) -> None:
         self.substep_grad_clip = substep_grad_clip
-        self.contact_reach = contact_reach or 0.0
         self.residual_tolerance = residual_tolerance
 
     def attach(self, batch: WorldBatch) -> None:
@@ -91,7 +87,7 @@ class _Tape(Backward):
         self._pulled = PullCounter(batch.device)
         self._warned = False
         with wp.ScopedDevice(batch.device):
-            self._adjoint = StepAdjoint(batch.structure, batch.model, batch.data, self.contact_reach, batch.stages)
+            self._adjoint = StepAdjoint(batch.structure, batch.model, batch.data, batch.stages)
             pool = Pool(batch.device)
             self._states: list[dict[str, wp.array]] = [{} for _ in range(batch.substeps)]
             self._last: dict[str, wp.array] = {}
@@ -208,7 +204,7 @@ class _Tape(Backward):
         size, worlds = state_size(end), self._batch.nworld
         width = max(1, min(size, JACOBIAN_WORLDS // worlds))
         if width not in self._rows:
-            self._rows[width] = TapePerSubstep(contact_reach=self.contact_reach)
+            self._rows[width] = TapePerSubstep()
             self._rows[width].attach(self._batch.resized(width * worlds))
         self._rows[width].load(ctrl, self.checkpoints, forces)
         found = []
@@ -255,17 +251,12 @@ class _Tape(Backward):
         if self._adjoint.touch_counter.present:
             of_rows = [rows.diagnostics()["approximated_share"] for rows in self._rows.values()]
             figures["approximated_share"] = max([self._approximated_share(substeps), *of_rows])
-        if self._adjoint.contacts.reached is not None:
-            figures["reached_share"] = self._adjoint.contacts.reached.read() / substeps
         return figures
 
     @property
     def _counts(self) -> bool:
         """Whether anything is reported as a share of the substeps that were pulled back."""
-        adjoint = self._adjoint
-        return (
-            self.substep_grad_clip is not None or adjoint.touch_counter.present or adjoint.contacts.reached is not None
-        )
+        return self.substep_grad_clip is not None or self._adjoint.touch_counter.present
 
     def _approximated_share(self, substeps: int) -> float:
         """Share of all worlds' substeps whose gradient went through a contact without a derivative of its own.
@@ -380,7 +371,6 @@ class Hybrid(Backward):
     def __init__(self, state: Backward, ctrl: Backward) -> None:
         self.state = state
         self.ctrl = ctrl
-        self.contact_reach = state.contact_reach
 
     def fresh(self) -> "Hybrid":
         return Hybrid(self.state.fresh(), self.ctrl.fresh())

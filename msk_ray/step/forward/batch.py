@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from msk_ray.step.errors import ConfigError, UnsupportedModelError
 from msk_ray.step.forward.capacity import UNKNOWN, Capacity, default_capacity, geometric_bound, scalar_rows
 from msk_ray.step.forward.fused import FusedSolver, check_fused
-from msk_ray.step.forward.geom_pairs import widened
 from msk_ray.step.forward.graph import joined_stream
 from msk_ray.step.forward.iterations import IterationWatch
 from msk_ray.step.forward.ordered import OrderedStages, check_ordered
@@ -74,7 +73,6 @@ class WorldBatch:
         capacity: contacts and constraint rows a world. Where it is 0, a bound from the geometry where that is small,
             else what a short probe in C MuJoCo needed and half as much again.
         tolerance: solver tolerance, below mujoco_warp's floor of 1e-6 if wanted.
-        contact_reach: distance [m] within which contacts are found before they touch, without any force.
         kernels: which kernels a step is made of.
 
     Attributes:
@@ -107,7 +105,6 @@ class WorldBatch:
         *,
         capacity: Capacity = UNKNOWN,
         tolerance: float | None = None,
-        contact_reach: float = 0.0,
         kernels: Kernels = PACKAGE,
     ) -> None:
         check_state(mjm)
@@ -120,7 +117,6 @@ class WorldBatch:
         self.substeps = substeps
         self.device = wp.get_device(device)
         self.parameters: tuple[str, ...] = ()
-        self._reach = contact_reach
         self.kernels = kernels
         self.structure = self._structure()
         self._tolerance = tolerance
@@ -134,9 +130,7 @@ class WorldBatch:
 
     def _structure(self) -> mujoco.MjModel:
         model = structure(self.mjm, self.parameters)
-        if self.kernels.dense:
-            model = dense(model)
-        return widened(model, self._reach) if self._reach > 0.0 else model
+        return dense(model) if self.kernels.dense else model
 
     def _load(self, nworld: int) -> tuple[Any, Stages]:
         """mujoco_warp's copy of the model, sealed, and the launches of its step."""

@@ -1,7 +1,5 @@
 """Pairs of geoms that a model lets collide, and the contacts that mujoco_warp can return for one of them."""
 
-import copy
-
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
@@ -67,16 +65,3 @@ def rows_per_contact(model: mujoco.MjModel, pairs: NDArray[np.int64]) -> NDArray
     if model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL:
         return np.where(dims == 1, 1, 2 * (dims - 1))
     return dims
-
-
-def widened(mjm: mujoco.MjModel, reach: float) -> mujoco.MjModel:
-    """A model that finds contacts within `reach` of touching, and steps as before.
-
-    Args:
-        mjm: the MjModel, which stays as it is.
-        reach: distance [m].
-    """
-    other = copy.copy(mjm)
-    other.geom_gap[:] = other.geom_gap + 0.5 * reach
-    other.pair_gap[:] = other.pair_gap + reach
-    return other

@@ -3,11 +3,8 @@
 import pytest
 import torch
 
-from msk_ray.algorithms.shac.algorithm import _arithmetic
-from msk_ray.algorithms.shac.critic_fit import Arithmetic, CriticFit
-from msk_ray.config import parse_config
+from msk_ray.algorithms.shac.critic_fit import CriticFit
 from msk_ray.config.schema import CriticConfig
-from msk_ray.errors import ConfigError
 from msk_ray.networks import Critic
 
 
@@ -92,49 +89,3 @@ def test_weight_decay_by_hand() -> None:
     # Adam's step of the rate, after a shrinkage by rate · decay = 1/16.
     for parameter, start in zip(critic.parameters(), before, strict=True):
         assert torch.allclose(parameter, 15 / 16 * start + 0.125, atol=1e-5)
-
-
-def test_tf32_is_refused_on_a_cpu() -> None:
-    critic = Critic(CriticConfig(hidden=(8,)), 1, torch.Generator().manual_seed(0))
-    with pytest.raises(ConfigError, match=r"shac\.critic_products: cpu has no tf32 here: write float32"):
-        CriticFit(critic, 1e-3, (0.9, 0.99), None, arithmetic=Arithmetic(tf32=True))
-
-
-@pytest.mark.gpu
-def test_tf32_rounds_the_factors_of_products_in_the_fit_alone() -> None:
-    """One step from the same start: the losses differ, by less than the 2⁻¹⁰ of the factors makes of them."""
-    # Large enough for cuBLAS to take the kernels that round.
-    rows, inputs = 8192, 128
-    obs = torch.randn(rows, inputs, generator=torch.Generator().manual_seed(0)).cuda()
-    losses = []
-    for tf32 in (False, True):
-        critic = Critic(CriticConfig(hidden=(512, 256)), inputs, torch.Generator().manual_seed(1)).cuda()
-        fit = CriticFit(critic, 1e-3, (0.9, 0.99), None, arithmetic=Arithmetic(tf32=tf32))
-        losses.append(float(fit.run(obs, obs[:, 0], torch.arange(rows, device="cuda")[None], 1)))
-        assert not torch.backends.cuda.matmul.allow_tf32
-    assert losses[0] != losses[1]
-    assert abs(losses[0] - losses[1]) < 1e-2 * losses[0]
-
-
-def test_fused_layers_fit_alike() -> None:
-    """Ten steps from the same start."""
-    obs = torch.randn(64, 3, generator=torch.Generator().manual_seed(0))
-    orders = torch.arange(64).expand(10, 64)
-    fitted = []
-    for fused in (False, True):
-        critic = Critic(CriticConfig(hidden=(16, 8), count=2), 3, torch.Generator().manual_seed(1))
-        loss = CriticFit(critic, 1e-2, (0.9, 0.99), 1.0, arithmetic=Arithmetic(fused=fused)).run(
-            obs, obs[:, 0], orders, 1
-        )
-        fitted.append((critic(obs), loss))
-    torch.testing.assert_close(*fitted, rtol=1e-3, atol=1e-4)
-    assert not torch.equal(fitted[0][0], fitted[1][0])
-
-
-@pytest.mark.parametrize(
-    ("device", "critic", "fused"),
-    [("cuda", {}, True), ("cpu", {}, False), ("cuda", {"activation": "silu"}, False)],
-)
-def test_auto_fuses_layers_where_that_is_faster_and_possible(device: str, critic: dict[str, str], fused: bool) -> None:
-    config = parse_config({"env": {"name": "cartpole"}, "shac": {"critic_kernels": "auto"}, "critic": critic})
-    assert _arithmetic(config, torch.device(device)) == Arithmetic(tf32=False, fused=fused)

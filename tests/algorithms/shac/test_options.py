@@ -1,17 +1,13 @@
 """Options of SHAC that are off by default: each changes what is learned, all resume, neutral values change nothing."""
 
-import copy
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
-from msk_ray.algorithms.shac.copies import spread
 from msk_ray.algorithms.shac.schedules import contact_horizon
-from msk_ray.config import ContactHorizon, PerturbedCopies, overlay, parse_config
-from msk_ray.envs import make_env
-from msk_ray.envs.hopper.env import Hopper
+from msk_ray.config import ContactHorizon, overlay, parse_config
 from msk_ray.errors import ConfigError
 from msk_ray.training import Trainer
 
@@ -31,7 +27,6 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "normalized entropy": {"shac.entropy": {"target": -0.5, "normalize": True}},
     "tolerance": {"shac.critic_tolerance": 1.0},
     "exploration": {"shac.exploration": {"start": 2.0, "end": 0.5, "epochs": 4}},
-    "copies": {"shac.copies": {"count": 2}},
 }
 NEUTRAL: dict[str, dict[str, Any]] = {
     "tolerance": {"shac.critic_tolerance": 1e-12},
@@ -122,35 +117,9 @@ def test_the_actor_may_believe_the_mean_of_two_critics(tmp_path: Path) -> None:
     assert rows["mean"]["train/value"] == rows["smaller"]["train/value"], "that of the targets"
 
 
-def test_copies_start_near_the_first_of_their_group() -> None:
-    config = parse_config(TINY)
-    env = make_env(config.env, config.physics, 6, "cpu", 0, differentiable=False)
-    before = copy.deepcopy(env.state)
-    copies = PerturbedCopies(count=3, qpos=0.01, qvel=0.0)
-    after = spread(env.state, copies, env, torch.Generator().manual_seed(0))
-    first = torch.tensor([0, 0, 0, 3, 3, 3])
-    shift = after.physics.qpos - before.physics.qpos[first]
-    assert torch.equal(shift[[0, 3]], torch.zeros(2, 6))
-    assert (shift[[1, 2, 4, 5]] != 0.0).all()
-    assert shift.abs().max() <= 0.01 + 1e-6
-    assert torch.equal(after.physics.qvel, before.physics.qvel[first])
-
-
-def test_the_episodes_of_copies_are_not_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Episodes of 12 env steps, cut at the third epoch of four: one of each of the two groups."""
-    told: list[float | None] = []
-    monkeypatch.setattr(Hopper, "end_epoch", lambda env, length: told.append(length) or {"train/told": length})
-    rows = trained({"shac.copies": {"count": 2}, "env.early_termination": False}, tmp_path, 3)[1]
-    assert told == [16, 16, 4], "env steps of an epoch over all of its episodes, and not divided where none ended"
-    assert rows[2]["train/told"] == 4
-    assert [row["train/episodes"] for row in rows] == [0, 0, 2]
-    assert rows[2]["train/episode_length"] == 12
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"shac.copies": {"count": 3}}, "shac.copies.count 3 must divide env.nworld"),
         ({"shac.actor_value": "mean"}, "write critic.count: 2"),
         ({"shac.exploration": {"start": 1, "end": 0, "epochs": 4}, "shac.entropy": {}}, "leave one out"),
         ({"shac.exploration": {"start": 1, "end": 0, "epochs": 4}, "actor.stochastic": False}, "actor.stochastic"),

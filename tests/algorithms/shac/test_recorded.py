@@ -39,7 +39,6 @@ OPTIONS = {
         "weight_decay": 0.01,
         "actor_value": "mean",
         "entropy": {"target": -0.5, "normalize": True},
-        "copies": {"count": 2},
         "horizon": {"start": 4, "shortest": 4, "longest": 4, "contact": 1.0},
     },
 }
@@ -60,7 +59,6 @@ LEGS = {
     },
     "physics": {},
 }
-FUSED = {**ANT, "shac": {**ANT["shac"], "critic_kernels": "fused"}}
 ONE_KERNEL = {**ANT, "physics": {"variant": "matched", "solver_kernels": "fused"}}
 CARTPOLE = {**ANT, "env": {"name": "cartpole", "nworld": 64}, "physics": {}}
 
@@ -107,8 +105,8 @@ def after(epochs: int, trainer: Trainer, state: dict[str, Any]) -> tuple[torch.T
 @pytest.mark.usefixtures("uncut")
 @pytest.mark.parametrize(
     "settings",
-    [ANT, CARTPOLE, OPTIONS, LEGS, FUSED, ONE_KERNEL],
-    ids=["ant", "cartpole", "options", "legs", "fused", "one_kernel"],
+    [ANT, CARTPOLE, OPTIONS, LEGS, ONE_KERNEL],
+    ids=["ant", "cartpole", "options", "legs", "one_kernel"],
 )
 def test_a_recorded_epoch_equals_one_operation_by_operation(settings: dict[str, Any], tmp_path: Path) -> None:
     recorded, eager = make(settings, tmp_path / "a"), make(settings, tmp_path / "b", capture="off")

@@ -15,7 +15,7 @@ def gradients(shape: str, ground: str, device: str) -> torch.Tensor:
     """Of one weighted sum of the state after 4 substeps, by (qpos, qvel), in 6 states in contact."""
     model = falling(shape, ground)
     points = landing_points(model, 6, ground == "hills")
-    sim = Simulation(model, 6, 4, TapePerSubstep(contact_reach=0.02), device, tolerance=1e-9)
+    sim = Simulation(model, 6, 4, TapePerSubstep(), device, tolerance=1e-9)
     inputs = [
         torch.tensor(np.stack([getattr(p, n) for p in points]), dtype=torch.float32, device=device) for n in INPUTS
     ]

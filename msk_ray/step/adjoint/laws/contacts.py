@@ -25,7 +25,6 @@ from msk_ray.step.adjoint.laws.contact_geometry.contact_order import contacts_en
 from msk_ray.step.adjoint.laws.contact_geometry.convex import ConvexContacts
 from msk_ray.step.adjoint.laws.contact_geometry.primitive_laws import CONVEX_PAIRS
 from msk_ray.step.adjoint.laws.contact_geometry.primitives import PairKinds, pull_geometry_kernel
-from msk_ray.step.adjoint.laws.reach import ReachedContacts
 from msk_ray.step.adjoint.laws.rows import cone_law, cone_slope, row_slopes, vec6
 from msk_ray.step.adjoint.spatial import carried, point_velocity, wrench
 from msk_ray.step.adjoint.workspace import Workspace
@@ -232,12 +231,10 @@ class ContactForces:
 
     Attributes:
         count: contacts of all worlds that there is room for.
-        reached: launches for contacts before they touch, None without a reach.
     """
 
-    def __init__(self, work: Workspace, contacts: int, reach: float) -> None:
+    def __init__(self, work: Workspace, contacts: int) -> None:
         self._work, self.count, self._keeps = work, contacts, False
-        self.reached = ReachedContacts(work, contacts, reach) if reach > 0.0 else None
         mjm = work.mjm
         types = {(int(mjm.geom_type[a]), int(mjm.geom_type[b])) for a, b in colliding_pairs(mjm)}
         self._pull_geometry = pull_geometry_kernel(PairKinds.of(types))
@@ -272,8 +269,6 @@ class ContactForces:
             ],
             outputs=[work.bars, self._bars],
         )
-        if self.reached is not None:
-            self.reached.launch(at, self._bars)
         wp.launch(
             self._pull_geometry,
             dim=self.count,
