@@ -1,7 +1,7 @@
 """How long an epoch of training takes, for several numbers of worlds, settings and checkouts of the project.
 
     python benchmarks/epoch.py --worlds 64 4096
-    python benchmarks/epoch.py --worlds 4096 --vary "shac.capture=off" --vary "physics.backward=tape_all"
+    python benchmarks/epoch.py --worlds 4096 --vary "execution.capture=off" --vary "physics.backward=tape_all"
     python benchmarks/epoch.py --trees . ../before        # the same on another checkout, in turn
     python benchmarks/epoch.py --worlds 4096 --epochs 796 --trees . ../before     # all of configs/ant.yaml
 

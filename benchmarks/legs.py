@@ -2,7 +2,7 @@
 myosuite.
 
 A control step is what the environment does for one action: 20 ms of physics, observation, reward and resets. `recorded`
-is forward and backward replayed as one CUDA graph, as training does; it needs `--set physics.solver_kernels=fused`,
+is forward and backward replayed as one CUDA graph, as training does; it needs `--set execution.solver_kernels=fused`,
 because the loop of mujoco_warp's solver cannot be part of such a graph.
 """
 

@@ -27,18 +27,18 @@ from msk_ray.train import train
 WARM_UP = 4
 """Epochs before those that are timed: kernels are compiled in the first and recorded in the next."""
 LEVERS = {
-    "rows": ["physics.njmax=40"],
+    "rows": ["execution.njmax=40"],
     "tape_all": ["physics.backward=tape_all"],
-    "sparse": ["physics.jacobian=sparse"],
+    "sparse": ["execution.jacobian=sparse"],
     "tf32": ["shac.critic_products=tf32"],
     "fused": ["shac.critic_kernels=fused"],
-    "fused solver": ["physics.solver_kernels=fused"],
+    "fused solver": ["execution.solver_kernels=fused"],
     "line search": ["physics.ls_iterations=10"],
     "iterations": ["physics.iterations=5"],
     "substeps": ["physics.substeps=2"],
     "batches": ["shac.critic_batches=2"],
     "passes": ["shac.critic_iterations=8"],
-    "eager": ["shac.capture=off"],
+    "eager": ["execution.capture=off"],
 }
 """Settings by the name of the lever. The last six change what is learned, or are there to compare with."""
 TOGETHER = ["rows", "tape_all", "tf32", "fused"]
@@ -94,7 +94,7 @@ def measure(worlds: int, settings: list[str], args: argparse.Namespace) -> dict[
     rare = ["evaluation.nworld=1", "evaluation.steps=1", f"evaluation.interval={epochs}"]
     config = load_config(
         args.config,
-        [*args.overrides, f"env.nworld={worlds}", f"trial.epochs={epochs}", "trial.loggers=[]", *rare, *settings],
+        [*args.overrides, f"env.nworld={worlds}", f"trial.epochs={epochs}", "execution.loggers=[]", *rare, *settings],
     )
     marks: list[float] = []
 

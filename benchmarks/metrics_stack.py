@@ -50,7 +50,8 @@ BASE: dict[str, Any] = {
     "env": {"name": "cartpole", "nworld": 8, "episode_length": 40},
     "shac": {"horizon": 8, "critic_iterations": 2, "critic_batches": 2},
     "evaluation": {"interval": 2, "nworld": 4, "steps": 20},
-    "trial": {"epochs": 1_000_000, "checkpoint_interval": 1000},
+    "trial": {"epochs": 1_000_000},
+    "execution": {"checkpoint_interval": 1000},
 }
 """Trials that run until they are stopped."""
 

@@ -90,7 +90,7 @@ def measure(gpus: int, args: argparse.Namespace) -> dict[str, Any]:
     """Mean and longest duration of an epoch [s], env steps per second, how many of the timed epochs were recorded, and
     the row of the first."""
     never = ["evaluation.nworld=1", "evaluation.steps=1", "evaluation.interval=1000000"]
-    overrides = [*never, "trial.epochs=1000000", "trial.checkpoint_interval=1000000", f"trial.gpus={gpus}"]
+    overrides = [*never, "trial.epochs=1000000", "execution.checkpoint_interval=1000000", f"execution.gpus={gpus}"]
     config = load_config(args.config, [*args.overrides, f"env.nworld={args.worlds}", *overrides])
     with tempfile.TemporaryDirectory() as folder:
         trainer = make_trainer(config, Path(folder), args.device)

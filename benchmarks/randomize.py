@@ -48,7 +48,7 @@ def main() -> None:
             "evaluation.steps=1",
             "evaluation.interval=1000000",
             f"trial.epochs={args.epochs + 100}",
-            "trial.checkpoint_interval=1000000",
+            "execution.checkpoint_interval=1000000",
         ]
         configs = [load_config(args.config, [*overrides, *more]) for more in ([], [args.randomize])]
         times: list[list[float]] = [[], []]

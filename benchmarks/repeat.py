@@ -3,7 +3,7 @@
     python benchmarks/repeat.py --configs cartpole ant ant_hard_friction ant_published myoleg26
     python benchmarks/repeat.py --devices cuda:0 cuda:1 --tune ant
 
-Each config is trained with `trial.deterministic` by processes of their own: once on the first device, again on the
+Each config is trained with `execution.deterministic` by processes of their own: once on the first device, again on the
 last, and once more by a process that is killed with SIGKILL halfway and by another that resumes it. For `--tune`, a
 space of four seeds runs on one GPU at once, and its trial of seed 0 is compared with the first run. Compared are the
 hashes of all weights and statistics at every evaluation, and those in the last checkpoint.
@@ -93,8 +93,8 @@ class Run:
         self._config, self._folder, self._epochs = config, folder, args.epochs
         # Run from the config's folder, where an environment from outside is found.
         self._base = (Path(config) if Path(config).suffix else Path("configs") / f"{config}.yaml").resolve()
-        self._settings = ["trial.deterministic=true", f"trial.epochs={args.epochs}", *args.overrides]
-        self._settings += [f"{key}={args.interval}" for key in ("evaluation.interval", "trial.checkpoint_interval")]
+        self._settings = ["execution.deterministic=true", f"trial.epochs={args.epochs}", *args.overrides]
+        self._settings += [f"{key}={args.interval}" for key in ("evaluation.interval", "execution.checkpoint_interval")]
 
     def whole(self, name: str, device: str) -> list[str]:
         """Hashes of a run in one go."""

@@ -36,7 +36,7 @@ SPACE = {
         "env.nworld": 64,
         "evaluation.interval": 5,
         "evaluation.steps": 32,
-        "trial.checkpoint_interval": 5,
+        "execution.checkpoint_interval": 5,
     },
     "seeds": f"0-{TRIALS - 1}",
 }

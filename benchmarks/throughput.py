@@ -51,7 +51,7 @@ def space(config: Path, seeds: int, seconds: float, overrides: dict[str, object]
     """A space of `seeds` seeds, each trained for `seconds`, with almost no evaluation and no checkpoints."""
     quiet: dict[str, object] = {
         "trial.epochs": 1_000_000,
-        "trial.checkpoint_interval": 1_000_000,
+        "execution.checkpoint_interval": 1_000_000,
         "evaluation.interval": 20,
         "evaluation.nworld": 1,
         "evaluation.steps": 1,

@@ -36,7 +36,7 @@ SPACE = {
         "evaluation.interval": 5,
         "evaluation.steps": 32,
         "trial.epochs": EPOCHS,
-        "trial.checkpoint_interval": 5,
+        "execution.checkpoint_interval": 5,
     },
     "seeds": "0-2",
 }

@@ -33,7 +33,7 @@ EXAMPLES = """\
   python -m msk_ray.doctor
   python -m msk_ray.doctor --device cuda:1 --storage /shared/runs
   python -m msk_ray.doctor --device cpu          # do not use the GPUs
-  python -m msk_ray.doctor --repeat ant --set trial.deterministic=true      # does this trial repeat bit for bit?"""
+  python -m msk_ray.doctor --repeat ant --set execution.deterministic=true      # does this trial repeat bit for bit?"""
 
 RAY_LIMIT_S = 90.0
 """Ray starts within seconds; on a loaded machine with a cold disk it may take ten times as long."""
@@ -147,13 +147,13 @@ def check_repeat(name: str, overrides: Sequence[str], device: str | None, epochs
     if epochs < 1:
         raise ConfigError(f"--epochs {epochs}: write 1 or more")
     config = load_config(name, overrides)
-    if config.trial.gpus > 1:
-        raise ConfigError("--repeat compares trials of one process: write --set trial.gpus=1")
+    if config.execution.gpus > 1:
+        raise ConfigError("--repeat compares trials of one process: write --set execution.gpus=1")
     place = device or _first_device()
     found, count = compare(config, place, epochs)
     if found is None:
         return Finding("repeat", f"{epochs} epoch(s) on {place} twice: {count} tensors are equal to the last bit")
-    cure = "" if config.trial.deterministic or place == "cpu" else "; write trial.deterministic: true"
+    cure = "" if config.execution.deterministic or place == "cpu" else "; write execution.deterministic: true"
     return Finding("repeat", f"two runs on {place} differ first {found}{cure}", True)
 
 

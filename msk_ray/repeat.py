@@ -69,8 +69,8 @@ def run_once(config: Config, device: str, epochs: int, threads: int) -> list[Not
     """
     changed = {
         "trial.epochs": max(epochs, config.trial.epochs),
-        "trial.checkpoint_interval": epochs + 1,
-        "trial.loggers": [],
+        "execution.checkpoint_interval": epochs + 1,
+        "execution.loggers": [],
     }
     whole = parse_config(overlay(config.as_dict(), changed), "a repeated trial")
     with tempfile.TemporaryDirectory(prefix="repeat_") as scratch:

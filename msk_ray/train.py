@@ -153,7 +153,7 @@ def train(
     Args:
         config: every setting, from `load_config`.
         logdir: folder of the trial.
-        device: cpu or cuda:N, the first of `trial.gpus`; by default the first GPU, or the CPU if there is none.
+        device: cpu or cuda:N, the first of `execution.gpus`; by default the first GPU, or the CPU if there is none.
         resume: continue from the newest complete checkpoint in `logdir`.
         force: take over the folder although its owner seems to be running.
         score_at_once: score each policy when it is due. Otherwise, on a GPU, several are scored together, at most two
@@ -212,7 +212,7 @@ def _trainer(
             )
     trainer = make_trainer(config, logdir, device, 1 if score_at_once or device == "cpu" else MOST_TOGETHER)
     if not resume:
-        facts = environment(device_name(device)) | {"deterministic": config.trial.deterministic}
+        facts = environment(device_name(device)) | {"deterministic": config.execution.deterministic}
         write_json(logdir / ENVIRONMENT_FILE, facts)
     return trainer
 
@@ -225,7 +225,7 @@ def _train(
         f"{config.env.name}: {config.trial.epochs} epochs, {config.env.nworld} worlds; log folder {logdir}", flush=True
     )
     device = _choose_device(args.device)
-    gpus = config.trial.gpus
+    gpus = config.execution.gpus
     place = device if gpus == 1 else f"{gpus} {'CPU processes' if device == 'cpu' else f'GPUs, the first {device}'}"
     announce(f"on {place}; {COMPILING}")
     trainer = _trainer(config, logdir, device, args.resume, args.score_at_once)

@@ -31,7 +31,8 @@ BASE = {
     "env": {"name": "cartpole", "nworld": 8},
     "shac": {"horizon": 8},
     "evaluation": {"interval": 2},
-    "trial": {"epochs": 20, "checkpoint_interval": 2, "loggers": []},
+    "trial": {"epochs": 20},
+    "execution": {"checkpoint_interval": 2, "loggers": []},
 }
 
 
@@ -101,7 +102,8 @@ def _tiny_settings() -> dict[str, Any]:
         "actor": {"hidden": [16, 16]},
         "critic": {"hidden": [16, 16]},
         "evaluation": {"interval": 2, "nworld": 4, "steps": 20},
-        "trial": {"epochs": 6, "checkpoint_interval": 2},
+        "trial": {"epochs": 6},
+        "execution": {"checkpoint_interval": 2},
     }
 
 

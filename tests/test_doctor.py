@@ -170,7 +170,7 @@ def small_trial(tmp_path: Path, tiny_settings: dict[str, Any]) -> str:
 def test_a_trial_repeats_in_another_process_with_more_threads(
     small_trial: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["--repeat", small_trial, "--device", "cpu", "--epochs", "1", "--set", "trial.deterministic=true"]
+    words = ["--repeat", small_trial, "--device", "cpu", "--epochs", "1", "--set", "execution.deterministic=true"]
     assert main(words) == 0
     assert "1 epoch(s) on cpu twice: " in capsys.readouterr().out
 
@@ -188,7 +188,7 @@ def test_a_trial_that_does_not_repeat(
     assert main(["--repeat", small_trial, "--device", "cuda:0"]) == 1
     line = capsys.readouterr().out.splitlines()[0]
     assert line.startswith("FIX")
-    assert "differ first in epoch 1, stage rollout: rewards, qpos; write trial.deterministic: true" in line
+    assert "differ first in epoch 1, stage rollout: rewards, qpos; write execution.deterministic: true" in line
 
 
 def test_where_two_runs_begin_to_differ() -> None:
@@ -205,4 +205,4 @@ def test_options_of_repeat_are_not_ignored(small_trial: str, capsys: pytest.Capt
         assert run(main, words) != 0
         assert "go with --repeat" in capsys.readouterr().err
     assert run(main, ["--repeat", small_trial, "--epochs", "0"]) != 0
-    assert run(main, ["--repeat", small_trial, "--set", "trial.gpus=2"]) != 0
+    assert run(main, ["--repeat", small_trial, "--set", "execution.gpus=2"]) != 0

@@ -12,7 +12,7 @@ SPACE = {
         "evaluation.steps": 32,
         "evaluation.interval": 2,
         "trial.epochs": EPOCHS,
-        "trial.checkpoint_interval": 2,
+        "execution.checkpoint_interval": 2,
     },
     "parameters": {"shac.actor_lr": {"grid": [5.0e-3, 1.0e-3]}},
     "seeds": "0-1",

@@ -11,6 +11,7 @@ from msk_ray.config.algorithms import (
     check_installed,
 )
 from msk_ray.config.environments import ENVIRONMENTS, settings_class
+from msk_ray.config.execution import AS_USUAL, ExecutionConfig
 from msk_ray.config.horizons import AdaptiveHorizon, ContactHorizon, HorizonSchedule
 from msk_ray.config.load import (
     describe_fault,
@@ -24,7 +25,7 @@ from msk_ray.config.loggers import logger_paths
 from msk_ray.config.overlay import SET_HELP, combine, flattened, leaves, merge, overlay, parse_override, parse_overrides
 from msk_ray.config.physics import FdConfig, PhysicsConfig
 from msk_ray.config.randomize import Draw, RandomizeConfig
-from msk_ray.config.recorded import current_key, current_values, env_name, first_spelling
+from msk_ray.config.recorded import SCHEMA, changed_settings, current_key, current_values, env_name
 from msk_ray.config.schema import (
     Config,
     ContactCurriculum,
@@ -39,7 +40,9 @@ from msk_ray.registry import Registry, resolve, resolve_class
 
 __all__ = [
     "ALGORITHMS",
+    "AS_USUAL",
     "ENVIRONMENTS",
+    "SCHEMA",
     "SET_HELP",
     "AdaptiveHorizon",
     "AlgorithmConfig",
@@ -52,6 +55,7 @@ __all__ = [
     "EntropyConfig",
     "EnvSettings",
     "EvaluationConfig",
+    "ExecutionConfig",
     "ExplorationSchedule",
     "FdConfig",
     "HorizonSchedule",
@@ -63,6 +67,7 @@ __all__ = [
     "Reward",
     "ShacConfig",
     "TrialConfig",
+    "changed_settings",
     "check_installed",
     "combine",
     "current_key",
@@ -70,7 +75,6 @@ __all__ = [
     "describe_fault",
     "dump_yaml",
     "env_name",
-    "first_spelling",
     "flattened",
     "leaves",
     "load_config",

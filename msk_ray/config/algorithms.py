@@ -12,7 +12,6 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import (
-    AfterValidator,
     BeforeValidator,
     PositiveFloat,
     SerializeAsAny,
@@ -49,7 +48,7 @@ class AlgorithmSettings(Section):
     length: ClassVar[str | None] = None
     """Its setting for the number of env steps that a world takes in an epoch."""
     parallel: ClassVar[bool] = False
-    """Whether several processes can train one trial (`trial.gpus`)."""
+    """Whether several processes can train one trial (`execution.gpus`)."""
 
     def env_steps(self, nworld: int, epochs: int) -> int:
         """The largest number of env steps that a number of epochs of W worlds can take.
@@ -117,11 +116,6 @@ class ExplorationSchedule(Section):
         return self.start + (self.end - self.start) * min(1.0, epoch / self.epochs)
 
 
-def _off(value: Any) -> Any:
-    """In YAML, a bare `off` is false."""
-    return "off" if value is False else value
-
-
 class ShacConfig(AlgorithmSettings):
     """Short-Horizon Actor-Critic."""
 
@@ -185,9 +179,6 @@ class ShacConfig(AlgorithmSettings):
     """Factor on the rewards of training; scores are without it."""
     max_nonfinite_share: Fraction = 0.05
     """Share of worlds whose gradient may be non-finite in an epoch before the trial stops with an error."""
-    capture: Annotated[Literal["auto", "off", False], AfterValidator(_off)] = "auto"
-    """`auto`: on CUDA, epochs are recorded as graphs and replayed; an environment that makes the host wait for the
-    device runs operation by operation, and a warning says where. `off`: always so, to debug. A CPU has no graphs."""
 
     def env_steps(self, nworld: int, epochs: int) -> int:
         """The sum over epochs of horizon × worlds; a horizon that follows something counts as its `longest`."""
@@ -219,8 +210,8 @@ class ShacConfig(AlgorithmSettings):
             shortest = min(horizon.start, horizon.end)
         else:
             shortest = horizon if isinstance(horizon, int) else horizon.shortest
-        gpus = config.trial.gpus
-        also = f" × trial.gpus {gpus}" if gpus > 1 else ""
+        gpus = config.execution.gpus
+        also = f" × execution.gpus {gpus}" if gpus > 1 else ""
         if (shortest * nworld) % (self.critic_batches * gpus):
             raise ValueError(
                 f"shac.critic_batches {self.critic_batches}{also} must divide shac.horizon × env.nworld "

@@ -11,9 +11,8 @@ from pydantic import BaseModel, Tag, ValidationError
 from msk_ray.config.algorithms import BUILT_IN, settings_from_outside
 from msk_ray.config.environments import settings_class
 from msk_ray.config.overlay import leaves, merge, overlay, parse_overrides
-from msk_ray.config.recorded import current_settings, env_name
-from msk_ray.config.schema import RECORDED, Config
-from msk_ray.config.unread import unread_settings
+from msk_ray.config.recorded import current_settings, env_name, newer_spelling
+from msk_ray.config.schema import Config
 from msk_ray.config.yaml_text import read_yaml
 from msk_ray.errors import ConfigError, brief, shortened
 from msk_ray.shipped import CONFIGS, find_shipped, is_name, shipped_names
@@ -34,18 +33,10 @@ def parse_config(data: Mapping[str, Any], source: str = "config") -> Config:
 def parse_recorded(data: Mapping[str, Any], source: str) -> Config:
     """The configuration in a trial's files, written by this version or an earlier one.
 
-    Settings that nothing read then, and that are refused now, get their defaults.
-
     Raises:
-        ConfigError: as for `parse_config`.
+        ConfigError: as for `parse_config`, or a setting that no longer exists had an effect.
     """
-    settings = current_settings(data, env_name(data)) if isinstance(data, Mapping) else data
-    try:
-        config = Config.model_validate(settings, context=RECORDED)
-        unread = {key: default for key, _, default in unread_settings(config)}
-        return Config.model_validate(overlay(config.as_dict(), unread)) if unread else config
-    except ValidationError as error:
-        raise ConfigError(f"{source}: {describe_fault(error, named=_named(settings))}") from None
+    return parse_config(current_settings(data) if isinstance(data, Mapping) else data, source)
 
 
 def read_config(path: Path) -> dict[str, Any]:
@@ -59,13 +50,12 @@ def read_config(path: Path) -> dict[str, Any]:
     data = read_yaml(path)
     base_name = data.pop("extends", None)
     if base_name is None:
-        return current_settings(data, env_name(data))
+        return current_settings(data)
     base_path = path.parent / str(base_name)
     base = read_yaml(base_path)
     if "extends" in base:
         raise ConfigError(f"{path} extends {base_path}, which extends another file: extend that one directly")
-    name = env_name(data) or env_name(base)
-    return merge(current_settings(base, name), current_settings(data, name))
+    return merge(current_settings(base), current_settings(data))
 
 
 def find_config(path: str | Path) -> Path:
@@ -150,7 +140,9 @@ def describe_fault(
         known = list(section.model_fields)
         near = difflib.get_close_matches(location[-1], known, n=1)
         below = _subsection_with(section, location[-1], (named or {}) if section is root else {})
-        if below is not None:
+        if root is Config and (newer := newer_spelling(where)) is not None:
+            hint = newer
+        elif below is not None:
             hint = f"write {'.'.join([*location[:-1], below, location[-1]])}"
         else:
             hint = f"did you mean {near[0]!r}?" if near else f"known keys: {', '.join(known)}"

@@ -1,4 +1,4 @@
-"""The loggers that `trial.loggers` can name."""
+"""The loggers that `execution.loggers` can name."""
 
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
@@ -7,7 +7,7 @@ from msk_ray.errors import ConfigError
 from msk_ray.registry import Registry
 
 LOGGERS = Registry(
-    "trial.loggers",
+    "execution.loggers",
     "msk_ray.loggers",
     {
         "tensorboard": "msk_ray.training.loggers.tensorboard:TensorBoard",
@@ -29,7 +29,7 @@ def logger_paths(names: Sequence[str]) -> list[str]:
     paths = [LOGGERS.path(name) for name in names]
     for name, path in zip(names, paths, strict=True):
         if paths.count(path) > 1:
-            raise ConfigError(f"trial.loggers: {name} is given twice; write it once")
+            raise ConfigError(f"execution.loggers: {name} is given twice; write it once")
         if name in _PACKAGES and find_spec(name) is None:
-            raise ConfigError(f"trial.loggers: {name} is not installed: pip install '{_PACKAGES[name]}'")
+            raise ConfigError(f"execution.loggers: {name} is not installed: pip install '{_PACKAGES[name]}'")
     return paths

@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from pydantic import PositiveFloat, PrivateAttr, model_validator
+from pydantic import PositiveFloat, model_validator
 
 from msk_ray.config.randomize import RandomizeConfig
 from msk_ray.config.sections import Count, NonNegative, Section, Text
@@ -24,12 +24,7 @@ GRADIENTS = frozenset(
     )
 )
 """Settings of how steps are differentiated."""
-SOLVING = frozenset(
-    (
-        *("tolerance", "iterations", "ls_iterations", "solver_kernels", "jacobian", "cone", "impratio"),
-        *("nconmax", "njmax"),
-    )
-)
+SOLVING = frozenset((*("tolerance", "iterations", "ls_iterations", "cone", "impratio"),))
 """Those of the constraint solver, which a model without contacts and limits does not need."""
 CONTACTS = frozenset(("solref", "solimp", "friction", "solreffriction"))
 """Those of contacts, in models that declare their own."""
@@ -78,12 +73,6 @@ class PhysicsConfig(Section):
     """Constraint solver iteration limit."""
     ls_iterations: Count | None = None
     """Line search iteration limit."""
-    solver_kernels: Literal["mujoco_warp", "fused"] = "mujoco_warp"
-    """Kernels of the constraint solver. `fused` is one for all iterations of Newton's method, with a warp for each
-    world: for models of up to 60 degrees of freedom. The results differ by rounding."""
-    jacobian: Literal["dense", "sparse"] | None = None
-    """How mujoco_warp stores the Jacobian of the constraints. The results differ by rounding; which one takes less time
-    and memory on a GPU depends on the model."""
     integrator: Literal["Euler", "implicitfast", "RK4"] | None = None
     cone: Literal["pyramidal", "elliptic"] | None = None
     """Friction cone. The pyramid's edges make contact gradients explode over long horizons; the ellipse has none."""
@@ -110,44 +99,8 @@ class PhysicsConfig(Section):
     """Impedance of joint limits."""
     gear: PositiveFloat | None = None
     """Force or torque of a motor at full control [N, N m]."""
-    nconmax: Count | None = None
-    """Contacts per world; null: a bound from the geometry or, if that is large, the result of a probe, which grows with
-    use. A given number does not grow."""
-    njmax: Count | None = None
-    """Constraint rows per world; null as for nconmax."""
     randomize: RandomizeConfig | None = None
     """Parameters of the model that are drawn for each world and episode, in training only; null: the model's own."""
-
-    _ordered: bool = PrivateAttr(default=False)
-
-    @property
-    def ordered(self) -> bool:
-        """Whether sums have a fixed order, which `trial.deterministic` decides."""
-        return self._ordered
-
-    def named(self, variant: str | None) -> "PhysicsConfig":
-        """A variant's physics, None for the model's own, with the buffers and kernels of this, which change none."""
-        return PhysicsConfig(
-            variant=variant, nconmax=self.nconmax, njmax=self.njmax, solver_kernels=self.solver_kernels
-        )
-
-    def in_order(self, ordered: bool) -> "PhysicsConfig":
-        """The same settings with sums in a fixed order, or not."""
-        changed = self.model_copy()
-        changed._ordered = ordered
-        return changed
-
-    @model_validator(mode="after")
-    def _fused_solver_steps_once(self) -> "PhysicsConfig":
-        if self.solver_kernels == "fused":
-            if self.jacobian == "sparse":
-                raise ValueError("solver_kernels fused reads dense Jacobians: leave physics.jacobian out")
-            if self.integrator == "RK4":
-                raise ValueError(
-                    "solver_kernels fused is for one solve a step: write integrator: Euler or implicitfast, or "
-                    "solver_kernels: mujoco_warp"
-                )
-        return self
 
     @model_validator(mode="after")
     def _friction_direction_needs_ellipse(self) -> "PhysicsConfig":

@@ -1,26 +1,34 @@
-"""Settings written by earlier versions: the one place that converts old spellings to the current one.
+"""Settings as earlier versions spelt them, and the content of a trial that its id is a hash of.
 
-Until November 2026 the reward weights were among the other settings of `env`; now they are `env.reward`. Files are read
-in either spelling; on the command line the old one is refused.
+Files and records of earlier versions are read in either spelling; on the command line the old one is refused.
 """
 
 from collections.abc import Mapping
 from typing import Any
 
-_LEGS = (
-    *("forward_vel", "speed_scale", "progress", "upright", "heading", "height", "alive", "effort", "joint_limit"),
-    *("smoothness", "capture", "capture_scale", "sway", "symmetry", "stride", "stride_angle", "cadence"),
-)
-_ONCE_FLAT: dict[str, tuple[str, ...]] = {
-    "cartpole": (
-        *("pole_angle_penalty", "pole_velocity_penalty", "cart_position_penalty", "cart_velocity_penalty"),
-        "cart_action_penalty",
-    ),
-    "ant": ("forward_vel", "heading", "up", "height", "action_penalty"),
-    "myoleg26": _LEGS,
-    "myoleg": _LEGS,
+from pydantic import BaseModel
+
+from msk_ray.errors import ConfigError, brief
+
+SCHEMA = 2
+"""Number of the scheme by which trials get their ids; it is part of what is hashed."""
+
+_EXECUTION = {
+    "trial": ("gpus", "threads", "deterministic", "checkpoint_interval", "keep_checkpoints", "loggers"),
+    "physics": ("solver_kernels", "jacobian", "nconmax", "njmax"),
+    "shac": ("capture",),
 }
-"""Settings of `env` that have moved into `env.reward`, by the environment's name."""
+"""Settings that have moved into `execution`, by the section that they were in until version 0.2."""
+_MOVED = {f"{section}.{name}": f"execution.{name}" for section, names in _EXECUTION.items() for name in names}
+
+_REMOVED: dict[str, Any] = {
+    "physics.contact_reach": None,
+    "shac.copies": None,
+    "shac.critic_kernels": ...,
+    "shac.critic_products": ...,
+}
+"""Settings that no longer exist, with the only value that can still be read; an ellipsis stands for any."""
+REMOVED = "has been removed, because it did not pay; leave it out, or use version 0.2"
 
 
 def env_name(settings: Mapping[str, Any]) -> str | None:
@@ -30,117 +38,72 @@ def env_name(settings: Mapping[str, Any]) -> str | None:
     return name if isinstance(name, str) else None
 
 
-def current_settings(settings: Mapping[str, Any], name: str | None) -> dict[str, Any]:
-    """Nested settings of environment `name` in the current spelling."""
-    moved = _ONCE_FLAT.get(name or "", ())
-    env = settings.get("env")
-    if not isinstance(env, Mapping) or "reward" in env or not any(key in env for key in moved):
-        return dict(settings)
-    rest = {key: value for key, value in env.items() if key not in moved}
-    reward = {key: value for key, value in env.items() if key in moved}
-    return {**settings, "env": {**rest, "reward": reward}}
+def current_key(dotted: str) -> str:
+    """A dotted key in the current spelling."""
+    return _MOVED.get(dotted, dotted)
 
 
-def current_key(dotted: str, name: str | None) -> str:
-    """A dotted key of environment `name` in the current spelling."""
-    section, _, key = dotted.partition(".")
-    return f"env.reward.{key}" if section == "env" and key in _ONCE_FLAT.get(name or "", ()) else dotted
+def current_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested settings in the current spelling.
 
-
-def current_values(values: Mapping[str, Any], name: str | None) -> dict[str, Any]:
-    """Dotted keys and their values, for environment `name`, in the current spelling."""
-    return {
-        current_key(key, name): current_settings({"env": value}, name)["env"] if key == "env" else value
-        for key, value in values.items()
-    }
-
-
-def first_spelling(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """A complete configuration's plain data in the form of the first version, whose hashes are the trials' ids.
-
-    This way a trial keeps its id in every version. A setting that was added later belongs in `_LATER`.
+    Raises:
+        ConfigError: one of them no longer exists and had an effect.
     """
-    env = dict(settings["env"])
-    if env["name"] in _ONCE_FLAT:
-        env |= env.pop("reward")
-    spelt = {**settings, "env": env}
-    for path, default in _LATER.items():
-        spelt = _without(spelt, path, default)
-    for path, default in _LATER_OF.get(env["name"], {}).items():
-        spelt = _without(spelt, path, default)
-    if not spelt["algorithm"]:
-        del spelt["algorithm"]
-    return spelt
+    result = {key: dict(value) if isinstance(value, Mapping) else value for key, value in settings.items()}
+    for dotted in (*_REMOVED, *_MOVED):
+        section, _, setting = dotted.partition(".")
+        owner = result.get(section)
+        if not (isinstance(owner, dict) and setting in owner):
+            continue
+        value = owner.pop(setting)
+        if dotted in _REMOVED:
+            _check_harmless(dotted, value)
+        else:
+            result["execution"] = {**(result.get("execution") or {}), setting: value}
+    return result
 
 
-def _without(settings: Mapping[str, Any], path: tuple[str, ...], default: Any) -> dict[str, Any]:
-    """`settings` without the one at `path`, if it has that value."""
-    name, *rest = path
-    found = dict(settings)
-    if rest and isinstance(found.get(name), Mapping):
-        found[name] = _without(found[name], tuple(rest), default)
-    elif not rest and name in found and found[name] == default:
-        del found[name]
-    return found
+def current_values(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Dotted keys and their values in the current spelling.
+
+    Raises:
+        ConfigError: one of them no longer exists and had an effect.
+    """
+    result: dict[str, Any] = {}
+    for key, value in values.items():
+        if key in _REMOVED:
+            _check_harmless(key, value)
+        elif "." in key or not isinstance(value, Mapping):
+            result[current_key(key)] = value
+        else:
+            result |= current_settings({**result, key: value})
+    return result
 
 
-_LATER: dict[tuple[str, ...], Any] = {
-    ("physics", "randomize"): None,
-    ("physics", "contact_reach"): None,
-    ("physics", "jacobian"): None,
-    ("physics", "solver_kernels"): "mujoco_warp",
-    ("trial", "seeds"): dict.fromkeys(("policy", "states", "noise", "minibatches")),
-    ("trial", "deterministic"): False,
-    ("trial", "threads"): 1,
-    ("trial", "gpus"): 1,
-    ("trial", "loggers"): ["tensorboard"],
-    ("algorithm", "name"): "shac",
-    ("shac", "capture"): "auto",
-    ("shac", "critic_tolerance"): None,
-    ("shac", "critic_products"): "float32",
-    ("shac", "critic_kernels"): "torch",
-    ("shac", "entropy", "normalize"): False,
-    ("shac", "weight_decay"): 0.0,
-    ("shac", "actor_value"): "smaller",
-    ("shac", "exploration"): None,
-    ("shac", "copies"): None,
-    ("actor", "state_std"): False,
-    ("env", "spread_resets"): False,
-    ("env", "speed_range"): None,
-    ("env", "clock"): False,
-    ("env", "symmetric"): False,
-    ("env", "gait_worlds"): 0,
-    ("env", "toe_stiffness"): 0.0,
-    ("env", "assist", "power"): 1.0,
-    ("env", "assist", "steady"): None,
-    ("env", "push"): {"speed": 0.0, "interval": 2.0},
-    ("env", "tracking"): {"start": 1.0, "end": 1.0, "epochs": 0},
-    **{
-        ("env", name): 0.0
-        for name in (
-            *("metabolic", "fatigue", "head", "impact", "footfall", "clearance", "toes", "vault"),
-            *("out_of_plane", "track", "track_rate", "landing"),
-        )
-    },
-    ("env", "clearance_height"): 0.01,
-    ("env", "track_scale"): 0.15,
-    ("env", "track_rate_scale"): 2.0,
-}
-"""Settings that the first version did not have, as (section, name), with the default that leaves ids unchanged."""
+def _check_harmless(dotted: str, value: Any) -> None:
+    harmless = _REMOVED[dotted]
+    if harmless is not ... and value != harmless:
+        raise ConfigError(f"{dotted}: {brief(value)} {REMOVED}")
 
-_NO_ASSISTANCE = {"epochs": 0, "share": 1.0, "balance": 800.0, "lateral": 800.0, "support": 0.0}
-_LATER_OF: dict[str, dict[tuple[str, ...], Any]] = {
-    "ant": {("env", "joint_limit"): 0.0, ("env", "joint_limit_epochs"): 0},
-    **{
-        name: {("env", "reward", "joint_limit"): 0.0, ("env", "joint_limit_epochs"): 0}
-        for name in ("hopper", "cheetah", "humanoid")
-    },
-    "myoleg": {("env", "assist"): _NO_ASSISTANCE, ("env", "reset"): "stand"},
-    "myosuite_walk": {
-        ("env", "assist"): _NO_ASSISTANCE,
-        ("env", "cycle"): 0.0,
-        **{("env", "reward", name): 0.0 for name in ("height", "effort", "footfall", "clearance")},
-        ("env", "reward", "clearance_height"): 0.02,
-    },
-}
-"""The same of one environment, by its name, where others had a setting of that name from the first."""
+
+def newer_spelling(dotted: str) -> str | None:
+    """What to write instead of a setting of an earlier version; None if it is not one."""
+    if dotted in _REMOVED:
+        return f"it {REMOVED}"
+    return f"write {_MOVED[dotted]}" if dotted in _MOVED else None
+
+
+def changed_settings(section: BaseModel) -> dict[str, Any]:
+    """Plain data of the settings that differ from the defaults of their section.
+
+    A setting that is added later, with a default that changes nothing, leaves it as it is.
+    """
+    changed: dict[str, Any] = {}
+    data = section.model_dump(mode="json")
+    for name, field in type(section).model_fields.items():
+        value = getattr(section, name)
+        required = field.is_required()
+        default = None if required else field.get_default(call_default_factory=True)
+        if required or value != default:
+            changed[name] = changed_settings(value) if isinstance(value, BaseModel) else data[name]
+    return changed

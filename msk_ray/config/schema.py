@@ -9,7 +9,6 @@ from pydantic import (
     PositiveFloat,
     SerializeAsAny,
     ValidationInfo,
-    field_validator,
     model_validator,
 )
 
@@ -22,7 +21,7 @@ from msk_ray.config.algorithms import (
     ignored_settings,
 )
 from msk_ray.config.environments import settings_class
-from msk_ray.config.loggers import LOGGERS
+from msk_ray.config.execution import ExecutionConfig
 from msk_ray.config.physics import PhysicsConfig, Vec5
 from msk_ray.config.sections import Count, EnvSettings, Section, Text, Whole
 from msk_ray.config.unread import unread_settings
@@ -133,31 +132,17 @@ class SeedsConfig(Section):
 
 
 class TrialConfig(Section):
-    """Length, seed, and saving of a trial."""
+    """Length, seed and start of a trial."""
 
     epochs: Count = 500
     """Updates of the policy."""
     seed: Seed = 0
     """Seed of everything that is drawn, except what `seeds` and `evaluation.seed` set."""
     seeds: SeedsConfig = SeedsConfig()
-    deterministic: bool = False
-    """Add everything up in a fixed order, so that a GPU repeats the trial bit for bit (docs/repeat.md)."""
     start_from: Text | None = None
     """Checkpoint of another trial, such as a best.pt, from whose networks and observation statistics this one starts;
     null starts from random networks. Optimisers and worlds are new either way; so is the critic if the file has only a
     policy, which may then get worse before it gets better."""
-    checkpoint_interval: Count = 10
-    """Epochs between checkpoints."""
-    keep_checkpoints: Annotated[int, Field(ge=2)] = 2
-    """Number of newest checkpoints kept, in addition to the best."""
-    loggers: Annotated[tuple[Text, ...], Field(max_length=16)] = ("tensorboard",)
-    """Loggers in addition to `metrics.jsonl`: `tensorboard`, `wandb`, `mlflow`, or package.module:Class."""
-    threads: Count = 1
-    """Number of CPU threads of torch. Sums, and so the results of a trial, depend on it; therefore it comes from this
-    setting, never from the machine. Networks of a few hundred units gain nothing from more than one."""
-    gpus: Annotated[int, Field(ge=1, le=64)] = 1
-    """Number of GPUs, all of one host, that the worlds are spread over, with a process for each; on the CPU, of
-    processes. It must divide `env.nworld`, and changes results only by rounding."""
 
     def seed_of(self, part: Literal["policy", "states", "noise", "minibatches"]) -> int:
         """The seed of a part of the trial."""
@@ -168,20 +153,6 @@ class TrialConfig(Section):
     def noise_apart(self) -> bool:
         """Whether noise and minibatches come from generators of their own."""
         return self.seeds.noise is not None or self.seeds.minibatches is not None
-
-    @field_validator("loggers")
-    @classmethod
-    def _known_loggers(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        try:
-            for name in names:
-                LOGGERS.path(name)
-        except ConfigError as error:
-            raise ValueError(str(error)) from error
-        return names
-
-
-RECORDED = "recorded"
-"""Context of validation in which settings that nothing reads are accepted, because earlier versions allowed them."""
 
 
 class Config(Section):
@@ -198,6 +169,7 @@ class Config(Section):
     critic: CriticConfig = CriticConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
     trial: TrialConfig = TrialConfig()
+    execution: ExecutionConfig = ExecutionConfig()
 
     @property
     def algorithm_settings(self) -> AlgorithmSettings:
@@ -238,7 +210,8 @@ class Config(Section):
     def _consistent(self) -> "Config":
         self.physics.resolve_substeps(self.env.control_timestep)
         self._check_gpus()
-        self._check_deterministic()
+        self.execution.check_integrator(self.physics.integrator)
+        self.execution.check_order(self.physics.integrator)
         self.algorithm_settings.check(self)
         if self.curriculum is not None:
             self._check_curriculum()
@@ -248,31 +221,16 @@ class Config(Section):
                 )
         return self
 
-    def _check_deterministic(self) -> None:
-        if not self.trial.deterministic:
-            return
-        wrong = {
-            "trial.gpus": (self.trial.gpus > 1, "1"),
-            "physics.jacobian": (self.physics.jacobian == "sparse", "dense"),
-            "physics.integrator": (self.physics.integrator == "RK4", "Euler or implicitfast"),
-        }
-        for key, (found, write) in wrong.items():
-            if found:
-                raise ValueError(
-                    f"trial.deterministic: with this {key} sums have no fixed order; write {key}: {write}, or "
-                    "trial.deterministic: false"
-                )
-
     def _check_gpus(self) -> None:
-        gpus, nworld = self.trial.gpus, self.env.nworld
+        gpus, nworld = self.execution.gpus, self.env.nworld
         if gpus > 1 and not self.algorithm_settings.parallel:
             raise ValueError(
-                f"trial.gpus {gpus}: {self.algorithm.name} trains in one process; write trial.gpus: 1, or "
+                f"execution.gpus {gpus}: {self.algorithm.name} trains in one process; write execution.gpus: 1, or "
                 "algorithm.name: shac"
             )
         if nworld % gpus:
             raise ValueError(
-                f"trial.gpus {gpus} must divide env.nworld {nworld}: write {nworld // gpus * gpus or gpus}"
+                f"execution.gpus {gpus} must divide env.nworld {nworld}: write {nworld // gpus * gpus or gpus}"
             )
 
     def _check_curriculum(self) -> None:
@@ -282,10 +240,9 @@ class Config(Section):
             raise ValueError("curriculum needs physics.backward: tape_per_substep or tape_all")
 
     @model_validator(mode="after")
-    def _everything_is_read(self, info: ValidationInfo) -> "Config":
-        if info.context != RECORDED:
-            for key, why, _ in unread_settings(self):
-                raise ValueError(f"{key}: {why} leave it out")
+    def _everything_is_read(self) -> "Config":
+        for key, why in unread_settings(self):
+            raise ValueError(f"{key}: {why} leave it out")
         return self
 
     def as_dict(self) -> dict[str, Any]:

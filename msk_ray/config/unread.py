@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from msk_ray.config.schema import Config
 
 
-def unread_settings(config: Config) -> Iterator[tuple[str, str, Any]]:
-    """(dotted key, why nothing reads it, its default) of each such setting that is not at its default."""
+def unread_settings(config: Config) -> Iterator[tuple[str, str]]:
+    """(dotted key, why nothing reads it) of each such setting that is not at its default."""
     for key, why in _unread(config).items():
         *sections, name = key.split(".")
         owner: Any = config
@@ -23,7 +23,7 @@ def unread_settings(config: Config) -> Iterator[tuple[str, str, Any]]:
             owner = getattr(owner, section)
         default = type(owner).model_fields[name].default
         if getattr(owner, name) != default:
-            yield key, why, default
+            yield key, why
 
 
 def _unread(config: Config) -> dict[str, str]:

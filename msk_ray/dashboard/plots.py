@@ -81,9 +81,8 @@ def _study(reading: Reading) -> tuple[Any, list[str]]:
         raise ConfigError(MISSING) from None
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     assert reading.space is not None  # as `can_plot` says
-    environment = reading.environments[0]
     written = reading.space.parameters
-    parameters = {current_key(key, environment): parse_operator(key, value) for key, value in written.items()}
+    parameters = {current_key(key): parse_operator(key, value) for key, value in written.items()}
     distributions = {key: distribution(key, op) for key, op in parameters.items()}
     study = optuna.create_study(direction="maximize")
     for trial in reading.trials:

@@ -14,8 +14,9 @@ import mujoco
 import torch
 from torch import Tensor
 
-from msk_ray.config import EnvSettings, PhysicsConfig
+from msk_ray.config import AS_USUAL, EnvSettings, ExecutionConfig, PhysicsConfig
 from msk_ray.envs.layout import Entry
+from msk_ray.envs.options import JACOBIANS
 from msk_ray.envs.randomize import Randomizer
 from msk_ray.envs.records import EnvState, Resets, Transition
 from msk_ray.errors import ConfigError
@@ -64,19 +65,22 @@ class Env(ABC, Generic[SettingsT]):
         device: str,
         seed: int,
         backward: Backward | None,
+        execution: ExecutionConfig = AS_USUAL,
     ) -> None:
         self.config = config
         self.nworld = nworld
         self.model = self.build_model(config, physics)
+        if execution.jacobian is not None:
+            self.model.opt.jacobian = JACOBIANS[execution.jacobian]
         self.sim = Simulation(
             self.model,
             nworld,
             round(config.control_timestep / self.model.opt.timestep),
             backward,
             device,
-            capacity=Capacity(physics.nconmax or 0, physics.njmax or 0),
+            capacity=Capacity(execution.nconmax or 0, execution.njmax or 0),
             tolerance=physics.tolerance,
-            kernels=Kernels(physics.ordered, fused_solver=physics.solver_kernels == "fused"),
+            kernels=Kernels(execution.deterministic, fused_solver=execution.solver_kernels == "fused"),
         )
         self.device = self.sim.device
         self.action_size = self.model.nu
@@ -106,7 +110,7 @@ class Env(ABC, Generic[SettingsT]):
     def reference_physics(cls, physics: PhysicsConfig, variant: str | None) -> PhysicsConfig:
         """The physics that policies are scored under: an unchanged named variant, or `physics` if there is none."""
         variants = cls.Settings.variants
-        return physics.named(variant or variants[0]) if variants else physics
+        return PhysicsConfig(variant=variant or variants[0]) if variants else physics
 
     def prepare(self) -> None:
         """Create constants on the device: copying one there in every step would make the host wait for the GPU."""

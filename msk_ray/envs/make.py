@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from msk_ray.config import ENVIRONMENTS, EnvSettings, PhysicsConfig, resolve_class
+from msk_ray.config import AS_USUAL, ENVIRONMENTS, EnvSettings, ExecutionConfig, PhysicsConfig, resolve_class
 from msk_ray.envs.base import Env
 from msk_ray.errors import ConfigError
 from msk_ray.step import Backward, FdJacobian, Hybrid, TapePerSubstep
@@ -32,7 +32,7 @@ def make_env(
     *,
     differentiable: bool = True,
     randomize: bool = False,
-    deterministic: bool = False,
+    execution: ExecutionConfig = AS_USUAL,
 ) -> Env[Any]:
     """Build the environment of a config section.
 
@@ -43,7 +43,7 @@ def make_env(
         seed: of initial states and of randomized parameters.
         differentiable: whether steps can be differentiated.
         randomize: whether `physics.randomize` applies, as in training; otherwise the model keeps its own parameters.
-        deterministic: whether sums of the physics have a fixed order.
+        execution: how steps are computed.
 
     Raises:
         ConfigError: as for `env_class`.
@@ -53,7 +53,7 @@ def make_env(
     backward = configured_backward(physics) if differentiable else None
     if not randomize:
         physics = physics.model_copy(update={"randomize": None})
-    return env_class(config)(config, physics.in_order(deterministic), nworld, device, seed, backward)
+    return env_class(config)(config, physics, nworld, device, seed, backward, execution)
 
 
 def configured_backward(physics: PhysicsConfig) -> Backward:

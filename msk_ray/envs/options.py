@@ -11,7 +11,7 @@ INTEGRATORS = {
 }
 """Integrators by the names that `physics.integrator` takes."""
 _CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
-_JACOBIANS = {"dense": mujoco.mjtJacobian.mjJAC_DENSE, "sparse": mujoco.mjtJacobian.mjJAC_SPARSE}
+JACOBIANS = {"dense": mujoco.mjtJacobian.mjJAC_DENSE, "sparse": mujoco.mjtJacobian.mjJAC_SPARSE}
 
 
 def add_sky(spec: mujoco.MjSpec) -> None:
@@ -66,7 +66,5 @@ def override_options(spec: mujoco.MjSpec, physics: PhysicsConfig) -> None:
         option.iterations = physics.iterations
     if physics.ls_iterations is not None:
         option.ls_iterations = physics.ls_iterations
-    if physics.jacobian is not None:
-        option.jacobian = _JACOBIANS[physics.jacobian]
     if physics.tolerance is not None:
         option.tolerance = physics.tolerance

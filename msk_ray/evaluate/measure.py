@@ -104,7 +104,7 @@ class Bench:
         config = config.model_copy(update={"evaluation": own})
         settings = env_class(config.env).reference_settings(config.env)
         sizes = (own.nworld, own.steps, own.seed)
-        key = repr((settings, physics, request.varied, sizes, config.trial.deterministic))
+        key = repr((settings, physics, request.varied, sizes, config.execution))
         if key not in self._evaluators:
             with named_out_of_memory(self._device, own.nworld, *_WORLDS):
                 self._evaluators[key] = Evaluator(config, self._device, physics, request.varied)

@@ -13,6 +13,7 @@ NOTES_FILE = "notes.json"
 STOP_FILE = "stop"
 """While this file is in the experiment's folder, trials save themselves and end at their next epoch."""
 
+CONFIG_FILE = "config.yaml"
 METRICS_FILE = "metrics.jsonl"
 OUTCOME_FILE = "outcome.json"
 HALVED_FILE = "halved.json"

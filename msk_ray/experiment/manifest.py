@@ -167,7 +167,7 @@ class Experiment:
         trials = []
         for entry in self.manifest()["trials"]:
             config = parse_recorded(entry["config"], f"{self.path / MANIFEST_FILE}: trial {entry['id']}")
-            changed, values = (current_values(entry[part], config.env.name) for part in ("changed", "values"))
+            changed, values = (current_values(entry[part]) for part in ("changed", "values"))
             trials.append(Trial(entry["index"], entry["id"], changed, values, config))
         return trials
 

@@ -125,7 +125,7 @@ def unlisted_trials(
         try:
             config = parse_recorded(read_yaml(path), str(path))
             settings = config.as_dict()
-            values = {key: _at(settings, key) for key in (current_key(key, config.env.name) for key in parameters)}
+            values = {key: _at(settings, key) for key in map(current_key, parameters)}
         except (MskRayError, KeyError, TypeError) as error:
             damages.append(Damage(path, cut(f"no settings of a trial: {error}")))
             continue

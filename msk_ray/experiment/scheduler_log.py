@@ -87,12 +87,5 @@ def _entry(data: dict[str, Any]) -> LogEntry:
         # It may be NaN, which is written as such and handled by the rule.
         float(data["score"]) if isinstance(data.get("score"), float) else number(data, "score"),
         field(data, "ended", bool),
-        _attempt(data),
+        field(data, "attempt", int),
     )
-
-
-def _attempt(data: dict[str, Any]) -> int:
-    """Counted from 1. Earlier versions recorded whether the trial had half its worlds."""
-    if "attempt" in data:
-        return field(data, "attempt", int)
-    return 2 if "halved" in data and field(data, "halved", bool) else 1

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
-from msk_ray.config import Config, first_spelling, flattened
+from msk_ray.config import SCHEMA, Config, changed_settings, flattened
 from msk_ray.text import describe, printable
 
 T = TypeVar("T")
@@ -74,9 +74,10 @@ def short_key(key: str) -> str:
 
 
 def trial_id(config: Config) -> str:
-    """First digits of the SHA-256 of a config's content. Equal configs have equal ids on every machine and in every
-    version."""
-    text = json.dumps(first_spelling(config.as_dict()), sort_keys=True, separators=(",", ":"))
+    """First digits of the SHA-256 of what differs from the defaults, apart from `execution`. What is trained alike has
+    the same id on every machine, and in every version with the same `SCHEMA`."""
+    trained = {name: value for name, value in changed_settings(config).items() if name != "execution"}
+    text = json.dumps({"schema": SCHEMA, **trained}, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()[:ID_DIGITS]
 
 

@@ -147,7 +147,7 @@ def _machine(folder: Path, recorded: Mapping[str, Any], config: Config) -> str |
     name = recorded.get("device") or read_trial(folder, time.time()).device.name
     if not name:
         return None
-    return "CPU" if name == "cpu" else f"{config.trial.gpus} × {name}"
+    return "CPU" if name == "cpu" else f"{config.execution.gpus} × {name}"
 
 
 def _portable(config: Config) -> tuple[Config, list[str]]:
@@ -172,7 +172,7 @@ def _payload(saved: SavedPolicy, state: Mapping[str, Any], config: Config) -> tu
         ConfigError: it is too large even so.
         CheckpointError: it does not say its sizes.
     """
-    sizes = saved.standalone_sizes
+    sizes = saved.sizes
     algorithm = algorithm_class(saved.config)
     parts = algorithm.policy_modules(algorithm.policy_network(saved.config, *sizes))
     modules = {name: state["algorithm"]["modules"][name] for name in parts}

@@ -83,10 +83,7 @@ def stored_best(trial: TrialReading, strips: Sequence[Path]) -> Best:
     except (MskRayError, KeyError) as error:
         return Best(trial, missing=(f"There is no policy to look at: {explain(error)}.",))
     if facts.get("epoch") == 0:
-        missing.append(
-            "Its best.pt is the untrained policy, which an older version kept because no trained one scored higher; "
-            "the following is about that policy."
-        )
+        missing.append("No trained policy has a score yet: the following is about the untrained one.")
     entries: list[dict[str, Any]] = []
     try:
         entries = _own(read_evaluations(trial.folder / EVAL_FILE), sha)

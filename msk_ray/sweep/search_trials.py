@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from msk_ray.config import current_values, env_name
+from msk_ray.config import current_values, parse_recorded, read_yaml
 from msk_ray.errors import ConfigError, StorageError
 from msk_ray.experiment.damage import DamagedFile, read_object
-from msk_ray.experiment.layout import PARAMS_FILE
+from msk_ray.experiment.layout import CONFIG_FILE, PARAMS_FILE
 from msk_ray.experiment.manifest import Experiment
-from msk_ray.experiment.trial import Trial
+from msk_ray.experiment.trial import Trial, trial_id
 from msk_ray.files import write_json
 from msk_ray.sweep.space import Space
 from msk_ray.sweep.trials import base_settings, make_trial
@@ -57,15 +57,27 @@ def recover(experiment: Experiment, space: Space) -> list[SearchTrial]:
             raise DamagedFile(error.damage, advice) from None
         if recorded is None:
             continue  # removed since it was found
-        params = current_values(recorded, env_name(base))
+        params = current_values(recorded)
         try:
             trial = search_trial(space, base, params)
         except (ConfigError, KeyError) as error:
             raise _changed(file, f"{error}") from error
         if trial.id != file.parent.name:
-            raise _changed(file, f"it gives {trial.id} for them")
+            trial = replace(trial, id=_recorded_id(file, trial))
         found.append(SearchTrial(replace(trial, index=len(found)), params))
     return found
+
+
+def _recorded_id(file: Path, trial: Trial) -> str:
+    """The id under which an equal trial is recorded: version 0.2 had others.
+
+    Raises:
+        StorageError: the recorded trial is another one.
+    """
+    config = file.parent / CONFIG_FILE
+    if not config.exists() or trial_id(parse_recorded(read_yaml(config), str(config))) != trial.id:
+        raise _changed(file, f"it gives {trial.id} for them")
+    return file.parent.name
 
 
 def _changed(file: Path, why: str) -> StorageError:

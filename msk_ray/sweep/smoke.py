@@ -65,8 +65,8 @@ def shorten(config: Config) -> dict[str, Any]:
     own = config.algorithm_settings.shortened(EPOCHS)
     return {
         "trial.epochs": min(config.trial.epochs, EPOCHS),
-        "trial.checkpoint_interval": 1,
-        "env.nworld": min(config.env.nworld, max(1, WORLDS // config.trial.gpus) * config.trial.gpus),
+        "execution.checkpoint_interval": 1,
+        "env.nworld": min(config.env.nworld, max(1, WORLDS // config.execution.gpus) * config.execution.gpus),
         **{f"{config.algorithm_section}.{key}": value for key, value in own.items()},
         "evaluation.interval": 1,
         "evaluation.nworld": min(config.evaluation.nworld, EVALUATION_WORLDS),

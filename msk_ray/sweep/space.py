@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, SerializeAsAny, ValidationError, model_validator
 
-from msk_ray.config import current_values, describe_fault, env_name, leaves, read_config, read_yaml
+from msk_ray.config import current_values, describe_fault, leaves, read_yaml
 from msk_ray.config.sections import Count, Section, Text, Whole
 from msk_ray.errors import ConfigError, brief
 from msk_ray.shipped import CONFIGS, SPACES, find_shipped, is_name, shipped_names
@@ -46,7 +46,7 @@ class ResourcesSpec(Section):
     gpus_per_trial: Annotated[float, Field(gt=0.0)] = 1.0
     """GPUs per trial if there are any; below 1, trials share a GPU."""
     cpus_per_trial: Count = 1
-    """CPU cores per trial; at least its `trial.threads`."""
+    """CPU cores per trial; at least its `execution.threads`."""
     max_concurrent: Count | None = None
     max_failures: Whole = 3
     """How often a trial whose process or node has died is retried from its checkpoint."""
@@ -157,18 +157,12 @@ def read_space(path: Path) -> dict[str, Any]:
     """The plain data of a space file, in today's spelling.
 
     Raises:
-        ConfigError: it or its base cannot be read.
+        ConfigError: it cannot be read, or sets what no longer exists.
     """
     data = read_yaml(path)
-    if not isinstance(data.get("base"), str):
-        return data  # and is refused for that
-    try:
-        name = env_name(read_config(_find_base(data["base"], path)))
-    except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from None
 
     def current(values: Any) -> Any:
-        return current_values(values, name) if isinstance(values, dict) else values
+        return current_values(values) if isinstance(values, dict) else values
 
     data |= {part: current(data[part]) for part in ("overrides", "parameters") if part in data}
     ablate, smoke = data.get("ablate"), data.get("smoke")

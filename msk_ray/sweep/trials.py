@@ -75,8 +75,8 @@ def make_trial(
 def with_recorded_ids(planned: Sequence[Trial], recorded: Sequence[Trial]) -> list[Trial]:
     """Planned trials under the ids that the same trials are recorded under.
 
-    Ids differ where an earlier version accepted, and hashed, settings that nothing reads; and after an extension,
-    which leaves ids but not epochs as they were.
+    Ids differ after an extension, which leaves ids but not epochs as they were, and in experiments of version 0.2,
+    which hashed whole settings.
     """
     one_length = len({trial.epochs for trial in recorded}) == 1 == len({trial.epochs for trial in planned})
 

@@ -1,4 +1,4 @@
-"""Torch's part of trials that repeat bit for bit: `trial.deterministic`."""
+"""Torch's part of trials that repeat bit for bit: `execution.deterministic`."""
 
 import os
 
@@ -21,12 +21,12 @@ def use_determinism(config: Config, device: str) -> None:
         ConfigError: CUDA has started in this process with a workspace of cuBLAS that does not repeat.
     """
     global _here
-    wanted = config.trial.deterministic
+    wanted = config.execution.deterministic
     if wanted and device != "cpu" and os.environ.get(_WORKSPACE) not in _SIZES:
         # cuBLAS reads it when it starts, which it does with the first product: something is allocated by then.
         if torch.cuda.is_initialized() and torch.cuda.memory_reserved(device) > 0:
             raise ConfigError(
-                f"trial.deterministic: CUDA runs already without {_WORKSPACE}: set {_WORKSPACE}={_SIZES[0]} in the "
+                f"execution.deterministic: CUDA runs already without {_WORKSPACE}: set {_WORKSPACE}={_SIZES[0]} in the "
                 "environment before the program starts"
             )
         os.environ[_WORKSPACE] = _SIZES[0]

@@ -104,7 +104,7 @@ class Evaluator:
             e.seed,
             differentiable=False,
             randomize=True,
-            deterministic=config.trial.deterministic,
+            execution=config.execution,
         )
         self.env.generator = torch.Generator()
         self.steps = steps

@@ -33,7 +33,7 @@ def make_algorithm(config: Config, device: str, group: Group = ALONE) -> Algorit
         config.trial.seed_of("states"),
         differentiable=config.algorithm_settings.differentiates,
         randomize=True,
-        deterministic=config.trial.deterministic,
+        execution=config.execution,
     )
     if group.size > 1:
         env.join(group)
@@ -46,7 +46,7 @@ def naming_memory(config: Config, device: str) -> AbstractContextManager[None]:
     """Name the settings to lower where the memory of the device does not suffice for a trial."""
     length = config.algorithm_settings.length
     other = [] if length is None else [f"{config.algorithm_section}.{length}"]
-    worlds = config.env.nworld // config.trial.gpus
+    worlds = config.env.nworld // config.execution.gpus
     return named_out_of_memory(device, worlds, "env.nworld", *other)
 
 

@@ -42,7 +42,7 @@ _END_S = 60.0
 
 
 def make_trainer(config: Config, logdir: Path, device: str, together: int = 1) -> "Trainer | ParallelTrainer":
-    """The trainer of a trial: in this process, or in `trial.gpus` others.
+    """The trainer of a trial: in this process, or in `execution.gpus` others.
 
     Args:
         config: every setting.
@@ -53,7 +53,7 @@ def make_trainer(config: Config, logdir: Path, device: str, together: int = 1) -
     Raises:
         MskRayError: as their messages say.
     """
-    return (Trainer if config.trial.gpus == 1 else ParallelTrainer)(config, logdir, device, together)
+    return (Trainer if config.execution.gpus == 1 else ParallelTrainer)(config, logdir, device, together)
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class _Failure:
 
 
 class ParallelTrainer(Place):
-    """A `Trainer` in `trial.gpus` processes, each with its GPU and an equal part of the worlds.
+    """A `Trainer` in `execution.gpus` processes, each with its GPU and an equal part of the worlds.
 
     Every error ends all of them; the trial continues from its newest checkpoint in another trainer. Call `close` at the
     end, from the thread that created this.
@@ -112,7 +112,7 @@ class ParallelTrainer(Place):
     def __init__(self, config: Config, logdir: Path, device: str, together: int = 1) -> None:
         super().__init__(config, logdir)
         self._best_score = -math.inf
-        devices = _devices(device, config.trial.gpus)
+        devices = _devices(device, config.execution.gpus)
         self._scratch = tempfile.TemporaryDirectory(prefix="msk_ray_")
         self._ranks: list[_Rank] = []
         meeting = Path(self._scratch.name) / "meeting"
@@ -277,7 +277,7 @@ def serve(connection: Connection) -> None:
     try:
         setup: _Setup = connection.recv()
         use_device(setup.device)
-        group = ProcessGroup(setup.rank, setup.config.trial.gpus, setup.device, setup.meeting)
+        group = ProcessGroup(setup.rank, setup.config.execution.gpus, setup.device, setup.meeting)
         if setup.rank > 0:
             warnings.simplefilter("ignore")  # process 0 gives the same
             follow(setup.config, setup.device, group)
@@ -316,8 +316,8 @@ def _devices(first: str, count: int) -> list[str]:
         raise DeviceError(f"unknown device {first!r}: write cpu, cuda or cuda:0") from None
     if start + count > there:
         raise DeviceError(
-            f"trial.gpus {count}, from {first} on: torch sees {there} CUDA device(s); lower trial.gpus, or write "
-            "--device cpu"
+            f"execution.gpus {count}, from {first} on: torch sees {there} CUDA device(s); lower execution.gpus, "
+            "or write --device cpu"
         )
     return [f"cuda:{start + rank}" for rank in range(count)]
 

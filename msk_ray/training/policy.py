@@ -42,41 +42,27 @@ class SavedPolicy:
     """Hash of the checkpoint's content, which identifies evaluations and pictures."""
     modules: dict[str, Any]
     """States of the policy's modules, by name; in a trial's full checkpoint, all modules of its algorithm."""
-    sizes: Sizes | None = None
-    """Sizes of observation and action; None if neither the checkpoint nor its weights say."""
+    sizes: Sizes
+    """Sizes of observation and action."""
 
     @torch.no_grad()
     def __call__(self, obs: Batch) -> Batch:
         """Actions (..., A) for raw observations (..., O).
 
         Raises:
-            CheckpointError: the checkpoint does not say its sizes, or the observations have another size.
+            CheckpointError: the observations have another size.
             ConfigError: its algorithm is not found, or not installed.
         """
-        size = self.standalone_sizes.obs
+        size = self.sizes.obs
         if obs.shape[-1] != size:
             raise CheckpointError(f"{self.path} takes observations of size {size}, not {obs.shape[-1]}")
         given = torch.as_tensor(obs, dtype=torch.float32)
         action: Tensor = self._standalone.to(given.device)(given)
         return action if isinstance(obs, Tensor) else action.numpy()
 
-    @property
-    def standalone_sizes(self) -> Sizes:
-        """Sizes of observation and action.
-
-        Raises:
-            CheckpointError: the checkpoint does not say them.
-        """
-        if self.sizes is None:
-            raise CheckpointError(
-                f"{self.path} was written before checkpoints said the sizes of observation and action, and its weights "
-                "do not show them: use `on(env)`"
-            )
-        return self.sizes
-
     @cached_property
     def _standalone(self) -> nn.Module:
-        return self._network(self.standalone_sizes)
+        return self._network(self.sizes)
 
     def network(self, env: Env[Any]) -> nn.Module:
         """The policy's network on an environment's device.
@@ -127,22 +113,9 @@ def load_policy(path: str | Path) -> SavedPolicy:
     path = Path(path)
     facts, state = load_checkpoint(path)
     try:
-        config, epoch, env_steps, modules = (
-            state["config"],
-            state["epoch"],
-            state["env_steps"],
-            state["algorithm"]["modules"],
-        )
+        config, epoch, env_steps = (state[name] for name in ("config", "epoch", "env_steps"))
+        sizes, modules = Sizes(*state["sizes"]), state["algorithm"]["modules"]
     except (KeyError, TypeError) as error:
         raise CheckpointError(f"{path} holds no policy: {error} is missing") from error
     settings = parse_recorded(config, f"{path}: its settings")
-    sizes = Sizes(*state["sizes"]) if "sizes" in state else _sizes_of(modules)
     return SavedPolicy(path, settings, epoch, env_steps, facts["sha256"], modules, sizes)
-
-
-def _sizes_of(modules: dict[str, Any]) -> Sizes | None:
-    """The sizes in a checkpoint of a version that did not record them: those of the first and last linear layer of our
-    algorithms' `actor`, or of `policy`, the name that others have without saying."""
-    actor = modules.get("actor", modules.get("policy", {}))
-    weights = [value for name, value in actor.items() if name.endswith(".weight") and value.dim() == 2]
-    return Sizes(weights[0].shape[1], weights[-1].shape[0]) if weights else None

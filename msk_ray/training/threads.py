@@ -10,5 +10,5 @@ from msk_ray.config import Config
 
 
 def use_threads(config: Config) -> None:
-    """Make torch use `trial.threads` threads in this process."""
-    torch.set_num_threads(config.trial.threads)
+    """Make torch use `execution.threads` threads in this process."""
+    torch.set_num_threads(config.execution.threads)

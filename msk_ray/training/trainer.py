@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from msk_ray.algorithms import algorithm_class
-from msk_ray.config import Config, dump_yaml, overlay, parse_config, parse_recorded
+from msk_ray.config import Config, ExecutionConfig, dump_yaml, overlay, parse_config, parse_recorded
 from msk_ray.errors import CheckpointError, ConfigError, SimulationError, StorageError
 from msk_ray.experiment.damage import Damage, describe_damages
 from msk_ray.experiment.layout import METRICS_FILE
@@ -36,15 +36,12 @@ from msk_ray.training.learner import load_state, make_algorithm, naming_memory, 
 from msk_ray.training.loggers import TrialLog
 from msk_ray.training.machine import machine_differences, record_machine
 from msk_ray.training.place import Place
-from msk_ray.training.policy import SavedPolicy
+from msk_ray.training.policy import SavedPolicy, Sizes
 from msk_ray.training.policy_group import Policy
 from msk_ray.training.unscored import UnscoredPolicies
 
 # Settings that may differ between a checkpoint and the trial that continues from it.
-_EXTENDABLE = {
-    "trial": {"epochs", "checkpoint_interval", "keep_checkpoints", "loggers", "gpus"},
-    "physics": {"nconmax", "njmax"},  # buffer sizes, which an error may ask for; results do not depend on them
-}
+_EXTENDABLE = {"trial": {"epochs"}, "execution": set(ExecutionConfig.model_fields)}
 _MILESTONES = 8
 """Number of policies saved during training in addition to the first, for `visualize --progression`."""
 MOST_TOGETHER = 32
@@ -83,10 +80,10 @@ class Trainer(Place):
     """
 
     def __init__(self, config: Config, logdir: Path, device: str, together: int = 1, group: Group = ALONE) -> None:
-        if config.trial.gpus != group.size:
+        if config.execution.gpus != group.size:
             raise ConfigError(
-                f"trial.gpus {config.trial.gpus}: a Trainer is one process; start this trial with msk_ray.train or "
-                "msk_ray.training.make_trainer"
+                f"execution.gpus {config.execution.gpus}: a Trainer is one process; start this trial with "
+                "msk_ray.train or msk_ray.training.make_trainer"
             )
         # What cannot be found is reported before anything is written.
         algorithm_class(config)
@@ -106,7 +103,7 @@ class Trainer(Place):
         if not epoch_checkpoints(self.checkpoints):
             # Otherwise the file describes what those were trained under, until one of them is resumed.
             self._write_config()
-            record_machine(logdir, device, config.trial.deterministic)
+            record_machine(logdir, device, config.execution.deterministic)
         self._device = device
         self.together = min(together, self._evaluations) if self._log.takes_late else 1
         self._unscored = UnscoredPolicies(self.checkpoints)
@@ -157,7 +154,7 @@ class Trainer(Place):
         self._seconds += time.perf_counter() - started
         row = self._row(metrics | {"env_steps_per_s": result.env_steps / elapsed})
         self._log.write(row)
-        if self.epoch % self.config.trial.checkpoint_interval == 0 or self.finished:
+        if self.epoch % self.config.execution.checkpoint_interval == 0 or self.finished:
             self.save()
         return row
 
@@ -179,7 +176,7 @@ class Trainer(Place):
         """Write a checkpoint of everything and return its path; an existing one is kept."""
         path = self.checkpoints / f"epoch_{self.epoch:06d}.pt"
         write_checkpoint(path, self._state(), {"epoch": self.epoch, "best_score": _finite(self.best_score)})
-        prune_checkpoints(self.checkpoints, self.config.trial.keep_checkpoints)
+        prune_checkpoints(self.checkpoints, self.config.execution.keep_checkpoints)
         return path
 
     def restore(self, path: Path, changed: Collection[str] = ()) -> None:
@@ -206,11 +203,9 @@ class Trainer(Place):
                 f"{self.config.trial.epochs}"
             )
         _check_generators(path, state["algorithm"]["env_generator"], self.algorithm.env.device)
-        before, now = recorded.trial.gpus, self.config.trial.gpus
-        if before != now:
+        if recomputed := _changed_rounding(recorded.execution, self.config.execution):
             warnings.warn(
-                f"{path.name} was written with trial.gpus {before}, now {now}: the same to rounding, not to the bit",
-                stacklevel=2,
+                f"{path.name} was written with {recomputed}: the same to rounding, not to the bit", stacklevel=2
             )
         if moved := machine_differences(self.logdir, self._device):
             warnings.warn(f"{path.name} is of another machine, so bits will differ: {moved}", stacklevel=2)
@@ -222,18 +217,9 @@ class Trainer(Place):
         self._damages = self._log.rewind(self.epoch)
         rows = read_metrics(self.logdir / METRICS_FILE)
         self._unreadable = self._unscored.rewind(self.epoch, {row["epoch"] for row in rows if SCORE in row})
-        self.best_score = self._trained_best(state["best_score"], rows)
-
-    @staticmethod
-    def _trained_best(recorded: float, rows: list[dict[str, Any]]) -> float:
-        """The best score so far: a checkpoint's, or that of a policy that got its score after the checkpoint.
-
-        Older versions counted the score of the untrained policy. Then `best.pt` is the untrained policy, and the next
-        evaluation replaces it.
-        """
-        untrained = [row.get(SCORE) for row in rows if row["epoch"] == 0]
-        trained = [row[SCORE] for row in rows if row["epoch"] > 0 and row.get(SCORE) is not None]
-        return -math.inf if recorded in untrained and recorded not in trained else max([recorded, *trained])
+        # A policy may have got its score after the checkpoint.
+        scores = (row[SCORE] for row in rows if row["epoch"] > 0 and row.get(SCORE) is not None)
+        self.best_score = max(state["best_score"], *scores, -math.inf)
 
     def restore_latest(self) -> tuple[Path | None, list[str]]:
         """Continue from the newest complete checkpoint, or from the start if there is none.
@@ -317,7 +303,8 @@ class Trainer(Place):
 
     def _waiting_policy(self, epoch: int, state: dict[str, Any]) -> Policy:
         path = unscored_path(self.checkpoints, epoch)
-        saved = SavedPolicy(path, self.config, epoch, state["env_steps"], "", state["algorithm"]["modules"])
+        sizes, modules = Sizes(*state["sizes"]), state["algorithm"]["modules"]
+        saved = SavedPolicy(path, self.config, epoch, state["env_steps"], "", modules, sizes)
         cuda = [self.env.device] if self.env.device.type == "cuda" else []
         with torch.random.fork_rng(cuda):  # new networks draw weights, which training must not notice
             return saved.on(self.evaluator.env)
@@ -398,13 +385,20 @@ def precompile(config: Config, device: str, logdir: Path) -> None:
         "evaluation.steps": 1,
         "evaluation.nworld": 2,
         "trial.epochs": 1,
-        "trial.gpus": 1,
+        "execution.gpus": 1,
         "trial.start_from": None,
-        "trial.loggers": [],
+        "execution.loggers": [],
     }
     trainer = Trainer(parse_config(overlay(config.as_dict(), tiny), "a short epoch"), logdir, device)
     trainer.run_epoch()
     trainer.close()
+
+
+def _changed_rounding(before: ExecutionConfig, now: ExecutionConfig) -> str:
+    """`execution.gpus 2, now 1; …`: the settings by which results now round otherwise; empty if none do."""
+    names = ("gpus", "threads", "deterministic", "solver_kernels", "jacobian")
+    values = ((name, getattr(before, name), getattr(now, name)) for name in names)
+    return "; ".join(f"execution.{name} {old}, now {new}" for name, old, new in values if old != new)
 
 
 def _check_generators(path: Path, saved: Tensor, device: torch.device) -> None:

@@ -59,8 +59,8 @@ def _resolve(space: Space) -> list[Trial]:
     """The space's trials; none for a search, whose settings are checked as far as they are known."""
     if space.file.searches:
         check_threads(extreme_configs(space), space.file.resources)
-        if "trial.gpus" in space.sampled:
-            raise ConfigError("trial.gpus: all trials of an experiment have as many GPUs each; write one number")
+        if "execution.gpus" in space.sampled:
+            raise ConfigError("execution.gpus: all trials of an experiment have as many GPUs each; write one number")
         return []
     trials = resolve_trials(space)
     check_threads((trial.config for trial in trials), space.file.resources)
@@ -69,7 +69,7 @@ def _resolve(space: Space) -> list[Trial]:
 
 
 def _processes(space: Space, trials: list[Trial]) -> int:
-    """`trial.gpus` of all trials; there are none if a search suggests them."""
+    """`execution.gpus` of all trials; there are none if a search suggests them."""
     return processes_of([trial.config for trial in trials] or extreme_configs(space))
 
 

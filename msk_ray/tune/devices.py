@@ -46,7 +46,7 @@ def choose_placement(
         gpus_per_trial: what the command line requests explicitly.
         cpu: whether it requests CPUs.
         gpus: number of GPUs available, where a trial has several of one host.
-        processes: `trial.gpus` of the trials.
+        processes: `execution.gpus` of the trials.
 
     Raises:
         ConfigError: the request makes no sense.
@@ -69,23 +69,23 @@ def choose_placement(
         raise DeviceError(f"{wanted:g} GPUs per trial requested, but there are {gpus}")
     if wanted != processes and max(wanted, processes) > 1:
         raise ConfigError(
-            f"{wanted:g} GPUs per trial, but trial.gpus is {processes}: leave out --gpus-per-trial and "
-            "resources.gpus_per_trial, and set trial.gpus alone"
+            f"{wanted:g} GPUs per trial, but execution.gpus is {processes}: leave out --gpus-per-trial and "
+            "resources.gpus_per_trial, and set execution.gpus alone"
         )
     return Placement(wanted, cpus)
 
 
 def processes_of(configs: Iterable[Config]) -> int:
-    """`trial.gpus` of an experiment's trials.
+    """`execution.gpus` of an experiment's trials.
 
     Raises:
         ConfigError: it is not the same in all of them.
     """
-    found = sorted({config.trial.gpus for config in configs})
+    found = sorted({config.execution.gpus for config in configs})
     if len(found) > 1:
         raise ConfigError(
-            f"trial.gpus is {' and '.join(map(str, found))}: trials of one experiment have as many GPUs each; start an "
-            "experiment for each number"
+            f"execution.gpus is {' and '.join(map(str, found))}: trials of one experiment have as many GPUs each; "
+            "start an experiment for each number"
         )
     return found[0] if found else 1
 
@@ -96,10 +96,11 @@ def check_threads(configs: Iterable[Config], resources: ResourcesSpec) -> None:
     Raises:
         ConfigError: the message says what to write.
     """
-    most = max((config.trial.threads for config in configs), default=1)
+    most = max((config.execution.threads for config in configs), default=1)
     if most > resources.cpus_per_trial:
         raise ConfigError(
-            f"trial.threads {most}, {resources.cpus_per_trial} cores per trial: write resources.cpus_per_trial: {most}"
+            f"execution.threads {most}, {resources.cpus_per_trial} cores per trial: write "
+            f"resources.cpus_per_trial: {most}"
         )
 
 

@@ -402,7 +402,8 @@ def with_kernels_of_their_own(trials: Iterable[Trial]) -> list[Trial]:
     found: dict[str, Trial] = {}
     for trial in trials:
         c = trial.config
-        found.setdefault(repr((c.env.name, c.physics, c.evaluation.variant, c.algorithm.name, c.trial.loggers)), trial)
+        key = (c.env.name, c.physics, c.evaluation.variant, c.algorithm.name, c.execution)
+        found.setdefault(repr(key), trial)
     return list(found.values())
 
 

@@ -24,7 +24,7 @@ def log_hparams(folder: Path, trial: Trial) -> None:
     Raises:
         StorageFailure: the disk is full or the folder not writable.
     """
-    if "tensorboard" not in trial.config.trial.loggers:
+    if "tensorboard" not in trial.config.execution.loggers:
         return
     # These load torch, which importing this module should not.
     from tensorboard.compat.proto.event_pb2 import Event

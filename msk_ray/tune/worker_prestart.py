@@ -25,7 +25,7 @@ _CALL_LIMIT_S = 10.0
 
 def import_all() -> None:
     """Run by every process of a trial as soon as it starts; the trial itself reports what cannot be imported."""
-    # Numerical libraries read this when they are imported; a trial sets its own number of threads (`trial.threads`).
+    # Numerical libraries read this when they are imported; a trial sets its own (`execution.threads`).
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # threads that wait for work sleep rather than spin
     # CUDA reads this once, when it is initialised. If an import did that, the trial should fail without a GPU rather

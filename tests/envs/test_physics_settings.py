@@ -162,7 +162,7 @@ def test_buffers_are_as_large_as_asked_for(env: str, field: str) -> None:
 
 
 def test_constraints_are_solved_by_the_kernels_asked_for() -> None:
-    settings = overlay(_settings("myosuite_walk", "tape_all", ""), {"physics.solver_kernels": "fused"})
+    settings = overlay(_settings("myosuite_walk", "tape_all", ""), {"execution.solver_kernels": "fused"})
     config = parse_config(settings)
     batch = make_env(config.env, config.physics, 2, "cpu", 0, deterministic=True).sim.batch
     assert batch.kernels == Kernels(ordered=True, fused_solver=True)
@@ -171,11 +171,11 @@ def test_constraints_are_solved_by_the_kernels_asked_for() -> None:
 
 @pytest.mark.parametrize(
     ("other", "write"),
-    [({"jacobian": "sparse"}, "leave physics.jacobian out"), ({"integrator": "RK4"}, "solver_kernels: mujoco_warp")],
+    [({"jacobian": "sparse"}, "leave execution.jacobian out"), ({"integrator": "RK4"}, "solver_kernels: mujoco_warp")],
 )
 def test_what_the_fused_solver_is_not_for_is_refused(other: dict[str, Any], write: str) -> None:
     with pytest.raises(ConfigError, match=write):
-        parse_config({"env": {"name": "ant"}, "physics": {"solver_kernels": "fused", **other}})
+        parse_config({"env": {"name": "ant"}, "physics": {**other}, "execution": {"solver_kernels": "fused"}})
 
 
 UNREAD: list[tuple[dict[str, Any], str, Any, dict[str, Any]]] = [

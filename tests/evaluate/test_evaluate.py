@@ -156,10 +156,8 @@ def test_physics_by_name(ant_trial: Path) -> None:
 
 def test_trials_share_a_simulation_unless_one_adds_up_in_a_fixed_order(tiny_settings: dict[str, Any]) -> None:
     bench = Bench("cpu")
-    trials = [{}, {"seed": 1}, {"deterministic": True}]
-    one, other, ordered = (
-        bench.evaluator(parse_config({**tiny_settings, "trial": trial}), Request())[0] for trial in trials
-    )
+    changes = [{}, {"trial": {"seed": 1}}, {"execution": {"deterministic": True}}]
+    one, other, ordered = (bench.evaluator(parse_config({**tiny_settings, **c}), Request())[0] for c in changes)
     assert one is other
     assert ordered is not one
     assert ordered.env.sim.batch.ordered

@@ -180,7 +180,7 @@ def _fall(env: BatchedEnv[Any], action: Any) -> None:
 
 
 def test_lost_contacts_are_an_error() -> None:
-    config = load_config("ant", ["physics.nconmax=1", "physics.njmax=4"])
+    config = load_config("ant", ["execution.nconmax=1", "execution.njmax=4"])
     env: BatchedEnv[np.ndarray] = BatchedEnv(config, 1)
     env.reset(seed=0)
     with pytest.raises(SimulationError, match=r"physics\.n(con|j)max"):
@@ -194,7 +194,7 @@ def test_tensors_stay_on_the_gpu_and_lost_contacts_are_an_error_there() -> None:
     obs, reward, terminated, *_ = env.step(torch.zeros(4, 8, device="cuda"))
     assert {t.device.type for t in (obs, reward, terminated)} == {"cuda"}
     tight: BatchedEnv[torch.Tensor] = BatchedEnv(
-        load_config("ant", ["physics.nconmax=1", "physics.njmax=4"]), 1, "cuda", arrays="torch"
+        load_config("ant", ["execution.nconmax=1", "execution.njmax=4"]), 1, "cuda", arrays="torch"
     )
     tight.reset(seed=0)
     with pytest.raises(SimulationError, match=r"physics\.n(con|j)max"):

@@ -33,7 +33,8 @@ SETTINGS = {
     "env": {"name": "cartpole", "nworld": 8, "episode_length": 40},
     "algorithm": {"name": "random_search:RandomSearch", "settings": {"noise": 0.2, "steps": 4}},
     "evaluation": {"interval": 1, "nworld": 4, "steps": 20},
-    "trial": {"epochs": 4, "checkpoint_interval": 2, "loggers": ["tensorboard", "table_logger:Table"]},
+    "trial": {"epochs": 4},
+    "execution": {"checkpoint_interval": 2, "loggers": ["tensorboard", "table_logger:Table"]},
 }
 
 
@@ -87,7 +88,7 @@ def test_its_settings_are_checked(tmp_path: Path, capsys: pytest.CaptureFixture[
         ("algorithm.settings.nois=1", "algorithm.settings.nois: unknown key; did you mean 'noise'?"),
         ("algorithm.name=random_search:RandomSerch", "did you mean 'RandomSearch'?"),
         ("shac.gamma=0.9", "nothing reads it while algorithm.name is random_search:RandomSearch"),
-        ("trial.loggers=[table_logger:Tables]", "did you mean 'Table'?"),
+        ("execution.loggers=[table_logger:Tables]", "did you mean 'Table'?"),
     ):
         assert run(train.main, [*command, said]) == 2
         assert message in capsys.readouterr().err

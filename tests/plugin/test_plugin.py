@@ -35,7 +35,8 @@ SETTINGS = {
     "actor": {"hidden": [16]},
     "critic": {"hidden": [16]},
     "evaluation": {"interval": 1, "nworld": 4, "steps": 20},
-    "trial": {"epochs": 2, "checkpoint_interval": 1},
+    "trial": {"epochs": 2},
+    "execution": {"checkpoint_interval": 1},
 }
 SPACE = {
     "question": "Which rate?",

@@ -197,18 +197,6 @@ def test_the_untrained_policy_counts_in_no_rule() -> None:
     assert rule.ending(History(rows[3], seen, 20, 3.0)) is None
 
 
-def test_a_journal_of_an_older_version_has_untrained_policies_in_it() -> None:
-    spec = Asha(kind="asha", grace=0.25, reduction=2)
-    old = [
-        LogEntry("a", 0, 0, 0.0, 100.0, False),
-        LogEntry("a", 3, 300, 3.0, 1.0, False),
-        LogEntry("b", 3, 300, 3.0, 2.0, False),
-    ]
-    pruner = spec.pruner(1000)
-    assert replay(pruner, "env_steps", old) is None, "b is the better of the two"
-    assert pruner.report("a", 310, 1.0) is not None
-
-
 def test_a_stop_is_found_again_only_if_it_was_the_last_word() -> None:
     spec = Asha(kind="asha", grace=0.25, reduction=2)
     stopped = [LogEntry("a", 3, 300, 3.0, 2.0, False), LogEntry("b", 3, 300, 3.0, 1.0, False)]

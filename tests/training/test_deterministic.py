@@ -1,4 +1,4 @@
-"""`trial.deterministic`: the same bits after any death; `tests/test_doctor.py` compares processes."""
+"""`execution.deterministic`: the same bits after any death; `tests/test_doctor.py` compares processes."""
 
 import json
 import re
@@ -24,7 +24,8 @@ ANT = {
     "actor": {"hidden": [16, 16]},
     "critic": {"hidden": [16, 16]},
     "evaluation": {"interval": 1, "nworld": 2, "steps": 5},
-    "trial": {"epochs": 3, "checkpoint_interval": 1, "deterministic": True},
+    "trial": {"epochs": 3},
+    "execution": {"checkpoint_interval": 1, "deterministic": True},
 }
 
 
@@ -79,7 +80,7 @@ def test_a_resumed_trial_learns_the_same_bits(whole: list[float], tmp_path: Path
 def test_a_gpu_repeats_a_trial_that_is_killed_in_between(config: str, tmp_path: Path, launcher: Launcher) -> None:
     own = {"horizon": 8, "critic_iterations": 4}
     settings = [
-        *("trial.deterministic=true", "trial.epochs=8", "trial.checkpoint_interval=1", "env.nworld=256"),
+        *("execution.deterministic=true", "trial.epochs=8", "execution.checkpoint_interval=1", "env.nworld=256"),
         *(f"shac.{key}={value}" for key, value in own.items()),
         *("evaluation.interval=2", "evaluation.nworld=16", "evaluation.steps=20"),
     ]
@@ -110,9 +111,9 @@ def test_torch_is_as_before_in_the_next_trial(tiny_settings: dict[str, Any]) -> 
 @pytest.mark.parametrize(
     ("change", "write"),
     [
-        ({"physics": {"jacobian": "sparse"}}, "physics.jacobian: dense"),
+        ({"execution": {"jacobian": "sparse"}}, "execution.jacobian: dense"),
         ({"physics": {"integrator": "RK4"}}, "physics.integrator: Euler or implicitfast"),
-        ({"trial": {"gpus": 2, "deterministic": True}}, "trial.gpus: 1"),
+        ({"execution": {"gpus": 2, "deterministic": True}}, "execution.gpus: 1"),
     ],
 )
 def test_what_has_no_fixed_order_is_refused_with_what_to_write(change: dict[str, Any], write: str) -> None:

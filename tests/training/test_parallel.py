@@ -39,7 +39,8 @@ SETTINGS: dict[str, Any] = {
     "actor": {"hidden": [16], "state_std": True},
     "critic": {"hidden": [16], "count": 2},
     "evaluation": {"interval": 2, "nworld": 2, "steps": 4},
-    "trial": {"epochs": 6, "checkpoint_interval": 2, "loggers": []},
+    "trial": {"epochs": 6},
+    "execution": {"checkpoint_interval": 2, "loggers": []},
 }
 ROUNDING = {"rel": 1e-4, "abs": 1e-5}
 NOISE = ("seconds", "env_steps_per_s", "time/", "physics/solver_residual", "hash/")
@@ -47,7 +48,7 @@ NOISE = ("seconds", "env_steps_per_s", "time/", "physics/solver_residual", "hash
 
 
 def config_of(gpus: int) -> Config:
-    return parse_config({**SETTINGS, "trial": {**SETTINGS["trial"], "gpus": gpus}})
+    return parse_config({**SETTINGS, "execution": {**SETTINGS["execution"], "gpus": gpus}})
 
 
 def comparable(row: dict[str, float]) -> dict[str, float]:
@@ -99,7 +100,7 @@ def test_two_processes_that_are_resumed_go_on_exactly(two: Recorded) -> None:
 
 def test_one_process_goes_on_where_two_stopped(two: Recorded, tmp_path: Path) -> None:
     alone = Trainer(config_of(1), tmp_path, "cpu")
-    with pytest.warns(UserWarning, match=r"epoch_000002\.pt was written with trial\.gpus 2, now 1"):
+    with pytest.warns(UserWarning, match=r"epoch_000002\.pt was written with execution\.gpus 2, now 1"):
         alone.restore(two.folder / "checkpoints" / "epoch_000002.pt")
     row = comparable(alone.run_epoch())
     alone.close()
@@ -193,18 +194,18 @@ def trainer_of(speakers: list[Speaker], monkeypatch: pytest.MonkeyPatch, folder:
     waiting = iter(speakers)
     monkeypatch.setattr(parallel, "_Rank", lambda number: next(waiting))
     speakers[0].other.send(_Answer(None, 0, 0.0))
-    config = parse_config({**SETTINGS, "env": {"name": "cartpole", "nworld": 6}, "trial": {"gpus": 3}})
+    config = parse_config({**SETTINGS, "env": {"name": "cartpole", "nworld": 6}, "execution": {"gpus": 3}})
     return ParallelTrainer(config, folder, "cpu")
 
 
-OVERFLOW = SimulationError("contacts were lost: raise physics.nconmax", Failure.DIVERGED)
+OVERFLOW = SimulationError("contacts were lost: raise execution.nconmax", Failure.DIVERGED)
 LOST = PeerLost("a collective operation failed")
 
 
 @pytest.mark.parametrize(
     ("said", "kind", "message"),
     [
-        ({2: OVERFLOW}, SimulationError, "^process 2 of the trial: contacts were lost: raise physics.nconmax$"),
+        ({2: OVERFLOW}, SimulationError, "^process 2 of the trial: contacts were lost: raise execution.nconmax$"),
         ({0: LOST, 1: LOST, 2: OVERFLOW}, SimulationError, "^process 2 of the trial: contacts were lost"),
         ({1: OVERFLOW, 0: OVERFLOW}, SimulationError, "^contacts were lost"),
         ({0: LOST, 1: None, 2: LOST}, RankLost, "^process 1 is dead"),
@@ -261,19 +262,23 @@ def test_an_error_that_cannot_be_sent_is_said_in_words() -> None:
 @pytest.mark.parametrize(
     ("section", "changes", "message"),
     [
-        ("algorithm", {"name": "ppo"}, r"trial\.gpus 2: ppo trains in one process; write trial\.gpus: 1, or"),
-        ("env", {"name": "cartpole", "nworld": 7}, r"trial\.gpus 2 must divide env\.nworld 7: write 6"),
-        ("shac", {"horizon": 1, "critic_batches": 8}, r"critic_batches 8 × trial\.gpus 2 must divide shac\.horizon"),
+        ("algorithm", {"name": "ppo"}, r"execution\.gpus 2: ppo trains in one process; write execution\.gpus: 1, or"),
+        ("env", {"name": "cartpole", "nworld": 7}, r"execution\.gpus 2 must divide env\.nworld 7: write 6"),
+        (
+            "shac",
+            {"horizon": 1, "critic_batches": 8},
+            r"critic_batches 8 × execution\.gpus 2 must divide shac",
+        ),
     ],
 )
 def test_what_several_processes_cannot_do_is_refused(section: str, changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        parse_config({**SETTINGS, section: changes, "trial": {"gpus": 2}})
+        parse_config({**SETTINGS, section: changes, "execution": {"gpus": 2}})
 
 
 def test_a_trial_of_several_gpus_needs_them_and_whoever_starts_its_processes(tmp_path: Path) -> None:
-    many = parse_config({"env": {"name": "cartpole", "nworld": 64}, "trial": {"gpus": 64}})
-    with pytest.raises(DeviceError, match=r"trial\.gpus 64, from cuda:1 on: torch sees \d+ CUDA device"):
+    many = parse_config({"env": {"name": "cartpole", "nworld": 64}, "execution": {"gpus": 64}})
+    with pytest.raises(DeviceError, match=r"execution\.gpus 64, from cuda:1 on: torch sees \d+ CUDA device"):
         make_trainer(many, tmp_path, "cuda:1")
     with pytest.raises(ConfigError, match=r"start this trial with msk_ray\.train"):
         Trainer(config_of(2), tmp_path, "cpu")

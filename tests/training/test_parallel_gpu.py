@@ -28,8 +28,9 @@ FIGURES = ("train/reward", "train/actor_loss", "train/value", "grad/actor_norm",
 
 
 def make(folder: Path, gpus: int) -> Any:
-    trial = {"epochs": 1000, "checkpoint_interval": 1000, "loggers": [], "gpus": gpus}
-    return make_trainer(parse_config({**SETTINGS, "trial": trial}), folder, "cuda:0")
+    execution = {"checkpoint_interval": 1000, "loggers": [], "gpus": gpus}
+    config = {**SETTINGS, "trial": {"epochs": 1000}, "execution": execution}
+    return make_trainer(parse_config(config), folder, "cuda:0")
 
 
 def figures(row: dict[str, float]) -> dict[str, float]:

@@ -28,7 +28,8 @@ def settings(**env: Any) -> Config:
     return parse_config(
         {
             "env": {"name": "ant", **env},
-            "physics": {"variant": "matched", "solver_kernels": "fused"},
+            "physics": {"variant": "matched"},
+            "execution": {"solver_kernels": "fused"},
             "evaluation": {"nworld": 3, "steps": 90},
         }
     )
@@ -75,9 +76,8 @@ def test_recorded_steps_on_a_gpu_have_the_bits_of_steps_one_by_one(
     config = parse_config(
         {
             "env": {"name": name},
-            "physics": {"solver_kernels": "fused"},
             "evaluation": {"nworld": 8, "steps": 120},
-            "trial": {"deterministic": True},
+            "execution": {"solver_kernels": "fused", "deterministic": True},
         }
     )
     evaluator = Evaluator(config, "cuda:0", policies=policies)

@@ -55,10 +55,10 @@ def test_a_hash_depends_on_names_types_shapes_and_bits_alone() -> None:
 
 
 def test_evaluations_and_checkpoints_have_the_hash_of_what_was_learned(tiny_settings: Settings, tmp_path: Path) -> None:
-    config = with_trial(tiny_settings, checkpoint_interval=2)
+    config = with_trial(tiny_settings)
     first = train(config, tmp_path / "first")
     train(config, tmp_path / "second")
-    train(with_trial(tiny_settings, checkpoint_interval=2, seed=1), tmp_path / "other")
+    train(with_trial(tiny_settings, seed=1), tmp_path / "other")
     ours = hashes(tmp_path / "first")
     assert len(set(ours)) == 2  # before training, and after two epochs
     assert hashes(tmp_path / "second") == ours
@@ -80,7 +80,7 @@ def test_a_checkpoint_of_other_weights_than_it_says_is_damaged(tmp_path: Path, m
 
 
 def test_a_trial_that_goes_on_elsewhere_says_that_bits_differ(tiny_settings: Settings, tmp_path: Path) -> None:
-    config = with_trial(tiny_settings, checkpoint_interval=2)
+    config = with_trial(tiny_settings)
     train(config, tmp_path)
     path = tmp_path / "env.json"
     facts = json.loads(path.read_text())
@@ -155,7 +155,7 @@ def test_one_number_sets_all_parts(start: Callable[..., dict[str, Any]]) -> None
 
 
 def test_parts_of_their_own_go_on_where_a_checkpoint_ends(tiny_settings: Settings, tmp_path: Path) -> None:
-    config = with_trial(tiny_settings, checkpoint_interval=2, seeds={"noise": 5})
+    config = with_trial(tiny_settings, seeds={"noise": 5})
     train(config, tmp_path / "whole", 4)
     train(config, tmp_path / "halves", 2)
     trainer = Trainer(config, tmp_path / "halves", "cpu")

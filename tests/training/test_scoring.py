@@ -31,7 +31,8 @@ def tiny() -> dict[str, Any]:
         "actor": {"hidden": [8]},
         "critic": {"hidden": [8]},
         "evaluation": {"interval": 2, "nworld": 2, "steps": 20},
-        "trial": {"epochs": 6, "checkpoint_interval": 2, "loggers": []},
+        "trial": {"epochs": 6},
+        "execution": {"checkpoint_interval": 2, "loggers": []},
     }
 
 
@@ -261,6 +262,6 @@ def test_other_policies_leave_random_numbers_of_training_as_they_are(
 
 
 def test_a_logger_that_takes_rows_once_has_each_policy_scored_at_once(tmp_path: Path) -> None:
-    trainer = Trainer(parse_config(overlay(tiny(), {"trial.loggers": ["table_logger:Table"]})), tmp_path, "cpu", 10)
+    trainer = Trainer(parse_config(overlay(tiny(), {"execution.loggers": ["table_logger:Table"]})), tmp_path, "cpu", 10)
     assert "eval/score" in [trainer.run_epoch(), trainer.run_epoch()][-1]
     trainer.close()

@@ -191,7 +191,8 @@ def test_a_signal_saves_and_says_resumable(
     number: signal.Signals, root: Path, tiny_cartpole: Config, tmp_path: Path, launcher: Launcher
 ) -> None:
     config = tiny_cartpole.as_dict()
-    config["trial"] |= {"epochs": 100000, "checkpoint_interval": 100000}
+    config["trial"] |= {"epochs": 100000}
+    config["execution"] |= {"checkpoint_interval": 100000}
     process = launcher.start(command_of(config, tmp_path, "run"), cwd=root, stdout=subprocess.PIPE)
     metrics = tmp_path / "run" / "metrics.jsonl"
     wait_until(lambda: rows_in(metrics) > 3, process)
@@ -315,21 +316,21 @@ def test_a_torn_checkpoint_falls_back_to_the_one_before(tiny_cartpole: Config, t
 
 
 def test_room_may_change_and_is_kept_in_checkpoints(tiny_settings: dict[str, Any], tmp_path: Path) -> None:
-    """An error that asks for physics.njmax can be followed; room that grew is there from the first step on."""
+    """An error that asks for execution.njmax can be followed; room that grew is there from the first step on."""
     tiny_settings["env"] = {"name": "ant", "nworld": 2, "episode_length": 4}
     tiny_settings["shac"] |= {"horizon": 2}
-    tiny_settings["physics"] = {"nconmax": 30}
+    tiny_settings["execution"] |= {"nconmax": 30}
     first = Trainer(parse_config(tiny_settings), tmp_path, "cpu")
     first.run_epoch()
     path = first.save()
     first.close()
-    tiny_settings["physics"] |= {"nconmax": None, "njmax": 100}
+    tiny_settings["execution"] |= {"nconmax": None, "njmax": 100}
     second = Trainer(parse_config(tiny_settings), tmp_path, "cpu")
     second.env.sim.reserve = (asked := []).append
     second.restore(path)
     second.close()
     assert asked == [(30, first.env.sim.capacity.rows)]
-    tiny_settings["physics"] |= {"tolerance": 1e-5}
+    tiny_settings["physics"] = {"tolerance": 1e-5}
     third = Trainer(parse_config(tiny_settings), tmp_path, "cpu")
     with pytest.raises(CheckpointError, match=r"physics\.tolerance"):
         third.restore(path)

@@ -90,7 +90,7 @@ class StubTrainer:
                 (self.logdir / "checkpoints" / "best.pt").write_text(str(score))
             row["eval/best_score"] = self.best_score
         self._write(row)
-        if self.epoch % self.config.trial.checkpoint_interval == 0 or self.finished:
+        if self.epoch % self.config.execution.checkpoint_interval == 0 or self.finished:
             self.save()
         return row
 

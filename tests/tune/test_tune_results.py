@@ -187,17 +187,17 @@ def test_placement_of_trials_of_several_gpus() -> None:
     with pytest.raises(DeviceError, match="4 GPUs per trial requested, but there are 2"):
         choose_placement(resources, None, cpu=False, gpus=2, processes=4)
     for asked, processes in ((2.0, 1), (0.5, 2), (1.0, 2)):
-        with pytest.raises(ConfigError, match=rf"{asked:g} GPUs per trial, but trial\.gpus is {processes}: leave out"):
+        with pytest.raises(ConfigError, match=rf"{asked:g} GPUs per trial, but execution\.gpus is {processes}"):
             choose_placement(ResourcesSpec(), asked, cpu=False, gpus=4, processes=processes)
 
 
 def test_trials_of_one_experiment_have_as_many_gpus_each(tiny_cartpole: Config) -> None:
-    two = tiny_cartpole.model_copy(update={"trial": tiny_cartpole.trial.model_copy(update={"gpus": 2})})
+    two = tiny_cartpole.model_copy(update={"execution": tiny_cartpole.execution.model_copy(update={"gpus": 2})})
     assert processes_of([two, two]) == 2
-    with pytest.raises(ConfigError, match=r"trial\.gpus is 1 and 2"):
+    with pytest.raises(ConfigError, match=r"execution\.gpus is 1 and 2"):
         processes_of([tiny_cartpole, two])
     assert shorten(two)["env.nworld"] == 8
-    three = two.model_copy(update={"trial": two.trial.model_copy(update={"gpus": 3})})
+    three = two.model_copy(update={"execution": two.execution.model_copy(update={"gpus": 3})})
     assert shorten(three)["env.nworld"] == 6
 
 

@@ -63,7 +63,7 @@ def test_population_stays_in_its_range(make_space: Any, tmp_path: Path, monkeypa
         parameters={"shac.actor_lr": {"loguniform": [low, high]}},
         samples=2,
         scheduler={"kind": "pbt", "interval": 1e-4, "quantile": 0.5, "resample": 0.0},
-        overrides={"evaluation.interval": 100, "trial.checkpoint_interval": 1000, "trial.epochs": 1_000_000},
+        overrides={"evaluation.interval": 100, "execution.checkpoint_interval": 1000, "trial.epochs": 1_000_000},
     )
     completed, records = go(space, tmp_path / "runs" / "pbt")
     assert completed

@@ -76,7 +76,7 @@ class Shac(Algorithm):
         )
         self._runner = (
             RecordedRunner(self._actor_update, self, env)
-            if c.capture == "auto" and device.type == "cuda"
+            if config.execution.capture == "auto" and device.type == "cuda"
             else EagerRunner(self._actor_update, self, env)
         )
 

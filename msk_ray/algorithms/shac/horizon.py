@@ -39,5 +39,5 @@ class RolloutLength:
         return {"horizon": self._length, "horizon_multiplier": self._multiplier}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from a `state_dict`; checkpoints of earlier versions have no multiplier."""
-        self._length, self._multiplier = state.get("horizon"), state.get("horizon_multiplier", 0.0)
+        """Continue from a `state_dict`."""
+        self._length, self._multiplier = state["horizon"], state["horizon_multiplier"]

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from msk_ray.config import PhysicsConfig
+from msk_ray.config import AS_USUAL, ExecutionConfig, PhysicsConfig
 from msk_ray.envs.base import Env
 from msk_ray.envs.mjcf.config import MjcfSettings
 from msk_ray.envs.options import override_options
@@ -54,8 +54,9 @@ class MjcfEnv(Env[AnyMjcfSettings], Generic[AnyMjcfSettings]):
         device: str,
         seed: int,
         backward: Backward | None,
+        execution: ExecutionConfig = AS_USUAL,
     ) -> None:
-        super().__init__(config, physics, nworld, device, seed, backward)
+        super().__init__(config, physics, nworld, device, seed, backward, execution)
         with torch.no_grad():
             controls = self.control(torch.zeros((nworld, self.action_size), device=self.device))
             obs = self.observation()

@@ -88,7 +88,7 @@ class MyoSuiteWalk(AssistedEnv[MyoSuiteWalkSettings]):
     @classmethod
     def reference_physics(cls, physics: PhysicsConfig, variant: str | None) -> PhysicsConfig:
         """MyoSuite's time step, contacts and solver."""
-        return physics.named(None)
+        return PhysicsConfig()
 
     def prepare(self) -> None:
         model = self.model

@@ -132,9 +132,9 @@ def loss_error(lost: int, now: Capacity, wanted: Capacity) -> SimulationError:
             return SimulationError(f"mujoco_warp lost contacts: {advice}")
     settings = []
     if lost & _CONTACT_BITS:
-        settings.append(f"physics.nconmax: {wanted.contacts} (now {now.contacts} contacts a world)")
+        settings.append(f"execution.nconmax: {wanted.contacts} (now {now.contacts} contacts a world)")
     if lost & _ROW_BITS:
-        settings.append(f"physics.njmax: {wanted.rows} (now {now.rows} constraint rows a world)")
+        settings.append(f"execution.njmax: {wanted.rows} (now {now.rows} constraint rows a world)")
     return SimulationError(
         f"a step lost contacts or constraint rows, so its results are no state: write {' and '.join(settings)}; in "
         "Python, give the Simulation a capacity, and on the command line of gradcheck --nconmax and --njmax"

@@ -8,7 +8,7 @@ from msk_ray.sweep.rules.early_stopping import Pruner
 
 
 def replay(pruner: Pruner, time_attr: str, reports: Sequence[LogEntry]) -> Ending | None:
-    """Replay recorded evaluations, except those of untrained policies, which older versions recorded.
+    """Replay recorded evaluations.
 
     Returns:
         The rule's answer to the last one, which the driver may have died before carrying out.
@@ -19,5 +19,5 @@ def replay(pruner: Pruner, time_attr: str, reports: Sequence[LogEntry]) -> Endin
         if report.attempt > attempts.setdefault(report.trial, report.attempt):
             attempts[report.trial] = report.attempt
             pruner.forget(report.trial)
-        ending = pruner.report(report.trial, report.time(time_attr), report.score) if report.epoch > 0 else None
+        ending = pruner.report(report.trial, report.time(time_attr), report.score)
     return None if not reports or reports[-1].ended else ending

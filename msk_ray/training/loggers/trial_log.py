@@ -22,9 +22,9 @@ class TrialLog:
     def __init__(self, folder: Path, config: Config) -> None:
         self._lines = JsonLines(folder)
         self._settings = config.as_dict()
-        paths = logger_paths(config.trial.loggers)
+        paths = logger_paths(config.execution.loggers)
         classes = [resolve_class(path, LOGGERS.key, Logger) for path in paths]  # type: ignore[type-abstract]
-        self._loggers = {name: kind(folder) for name, kind in zip(config.trial.loggers, classes, strict=True)}
+        self._loggers = {name: kind(folder) for name, kind in zip(config.execution.loggers, classes, strict=True)}
         self._told = False
 
     @property
@@ -105,9 +105,9 @@ def _named(name: str, error: Exception) -> Exception:
         # For example, the trial's folder has disappeared.
         stored = StorageFailure(f"{error.filename}: {error.strerror or error}")
     if stored is not None:
-        return StorageFailure(f"trial.loggers: {name} cannot write: {stored}")
+        return StorageFailure(f"execution.loggers: {name} cannot write: {stored}")
     text = (str(error).splitlines() or [""])[0]
     return LoggerError(
-        f"trial.loggers: {name} failed ({type(error).__name__}: {text}); the rows are in metrics.jsonl: leave it "
+        f"execution.loggers: {name} failed ({type(error).__name__}: {text}); the rows are in metrics.jsonl: leave it "
         "out, or fix it, to continue"
     )

@@ -17,7 +17,8 @@ TINY: dict[str, Any] = {
     "actor": {"hidden": [8]},
     "critic": {"hidden": [8]},
     "evaluation": {"interval": 1000, "nworld": 2, "steps": 2},
-    "trial": {"epochs": 8, "checkpoint_interval": 1000, "loggers": []},
+    "trial": {"epochs": 8},
+    "execution": {"checkpoint_interval": 1000, "loggers": []},
 }
 OPTIONS: dict[str, dict[str, Any]] = {
     "contact": {"shac.horizon": {"start": 4, "shortest": 2, "longest": 8, "contact": 0.2, "rate": 1.0}},

@@ -18,7 +18,7 @@ from msk_ray.training import Trainer
 from msk_ray.training.determinism import use_determinism
 
 pytestmark = pytest.mark.gpu
-# `trial.deterministic` needs it before CUDA starts, which it does in the first of these tests.
+# `execution.deterministic` needs it before CUDA starts, which it does in the first of these tests.
 os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
 
 ANT = {
@@ -26,7 +26,8 @@ ANT = {
     "physics": {"variant": "matched"},
     "shac": {"horizon": 4, "critic_iterations": 2, "state_grad_clip": 100.0, "normalize_return": True},
     "evaluation": {"interval": 1000, "nworld": 2, "steps": 2},
-    "trial": {"epochs": 1000, "checkpoint_interval": 1000, "loggers": []},
+    "trial": {"epochs": 1000},
+    "execution": {"checkpoint_interval": 1000, "loggers": []},
 }
 OPTIONS = {
     **ANT,
@@ -59,7 +60,7 @@ LEGS = {
     },
     "physics": {},
 }
-ONE_KERNEL = {**ANT, "physics": {"variant": "matched", "solver_kernels": "fused"}}
+ONE_KERNEL = {**ANT, "physics": {"variant": "matched"}, "execution": {"solver_kernels": "fused"}}
 CARTPOLE = {**ANT, "env": {"name": "cartpole", "nworld": 64}, "physics": {}}
 
 
@@ -148,7 +149,7 @@ def test_a_fit_beside_a_rollout_equals_one_after_the_other(tmp_path: Path) -> No
     To the bit: without a fixed order of sums, their noise grows from epoch to epoch by an amount no test can bound.
     """
     networks = {name: {"hidden": [400, 200, 100]} for name in ("actor", "critic")}
-    wide = {**ANT, **networks, "trial": {**ANT["trial"], "deterministic": True}}
+    wide = {**ANT, **networks, "trial": {**ANT["trial"]}, "execution": {"deterministic": True}}
     shac = {"horizon": 8, "critic_iterations": 16}
     recorded, eager = make(wide, tmp_path / "a", **shac), make(wide, tmp_path / "b", **shac, capture="off")
     for trainer in (recorded, eager):
@@ -221,9 +222,9 @@ def test_a_gradient_that_is_not_finite_is_reported_and_moves_nothing(
 
 
 def test_a_step_that_loses_rows_is_reported(tmp_path: Path) -> None:
-    settings = {**ANT, "physics": {"variant": "matched", "njmax": 12}}
+    settings = {**ANT, "physics": {"variant": "matched"}, "execution": {"njmax": 12}}
     trainer = make(settings, tmp_path)
-    with pytest.raises(SimulationError, match=r"physics\.njmax"):
+    with pytest.raises(SimulationError, match=r"execution\.njmax"):
         run_epochs(trainer, 40)
 
 

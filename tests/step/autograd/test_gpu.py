@@ -72,7 +72,8 @@ def test_a_trial_trains_and_resumes(tmp_path: Path) -> None:
             "env": {"name": "ant", "nworld": 16},
             "shac": {"horizon": 4, "critic_iterations": 2},
             "evaluation": {"nworld": 4, "steps": 10, "interval": 2},
-            "trial": {"epochs": 4, "checkpoint_interval": 2},
+            "trial": {"epochs": 4},
+            "execution": {"checkpoint_interval": 2},
         }
     )
     first = Trainer(config, tmp_path, "cuda")
@@ -157,7 +158,8 @@ def test_a_trial_that_scores_policies_together_has_all_scores(tmp_path: Path) ->
             "env": {"name": "ant", "nworld": 16},
             "shac": {"horizon": 4, "critic_iterations": 2},
             "evaluation": {"nworld": 4, "steps": 60, "interval": 2},
-            "trial": {"epochs": 9, "checkpoint_interval": 4},
+            "trial": {"epochs": 9},
+            "execution": {"checkpoint_interval": 4},
         }
     )
     trainer = Trainer(config, tmp_path, "cuda", 10)

@@ -93,7 +93,7 @@ def test_given_sizes_that_are_too_small_are_an_error_at_the_step(name):
         assert all(torch.isfinite(value).all() for value in state)
     lying = state.qpos.clone()
     lying[:, 2] = 0.049
-    with pytest.raises(SimulationError, match=r"physics\.njmax: \d+ \(now 64 ") as caught:
+    with pytest.raises(SimulationError, match=r"execution\.njmax: \d+ \(now 64 ") as caught:
         sim.step(ctrl, lying, state.qvel, state.act)
     assert "\n" not in str(caught.value)
 

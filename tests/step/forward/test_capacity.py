@@ -107,7 +107,7 @@ def test_only_the_world_that_lost_rows_becomes_nan_and_its_rows_are_counted():
     assert np.isnan(qvel[0]).all()
     assert np.isfinite(qvel[1:]).all()
     assert batch.losses.heard()
-    with pytest.raises(SimulationError, match=r"physics\.njmax: 320 \(now 64"):
+    with pytest.raises(SimulationError, match=r"execution\.njmax: 320 \(now 64"):
         batch.raise_losses()
     batch.raise_losses()  # said once
     assert np.isfinite(landing(WorldBatch(studded_plate(), 3, 2, "cpu", capacity=Capacity(200, 320)))).all()
@@ -116,7 +116,7 @@ def test_only_the_world_that_lost_rows_becomes_nan_and_its_rows_are_counted():
 def test_contacts_are_pooled_so_their_loss_takes_every_world():
     batch = WorldBatch(studded_plate(), 3, 2, "cpu", capacity=Capacity(20, 320))  # 60 for the 64 of world 0
     assert np.isnan(landing(batch)).all()
-    with pytest.raises(SimulationError, match=r"physics\.nconmax: 40 \(now 20"):
+    with pytest.raises(SimulationError, match=r"execution\.nconmax: 40 \(now 20"):
         batch.raise_losses()
 
 

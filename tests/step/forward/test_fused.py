@@ -221,7 +221,7 @@ def test_rows_that_were_lost_are_reported_and_leave_numbers_behind(cone: str) ->
     sim = Simulation(dropped_ant(cone), 1, 1, None, capacity=Capacity(9, 5), kernels=FUSED)
     qpos = sim.initial_state().qpos
     qpos[:, 2] = 0.02
-    with pytest.raises(SimulationError, match=r"physics\.njmax"):
+    with pytest.raises(SimulationError, match=r"execution\.njmax"):
         sim.step(torch.zeros(1, 8), qpos, torch.zeros(1, 14), torch.zeros(1, 0))
     data = sim.batch.data
     assert int(data.nefc.numpy()[0]) > 5
@@ -239,7 +239,7 @@ def test_rows_that_were_lost_are_reported_and_leave_numbers_behind(cone: str) ->
 )
 def test_models_that_need_another_solver_are_refused_in_one_line(option: str, named: str) -> None:
     mjm = mujoco.MjModel.from_xml_string(f"<mujoco><option {option}/></mujoco>")
-    with pytest.raises(UnsupportedModelError, match=rf"{named}.*write physics\.solver_kernels: mujoco_warp") as error:
+    with pytest.raises(UnsupportedModelError, match=rf"{named}.*write execution\.solver_kernels: mujoco_warp") as error:
         WorldBatch(mjm, 1, 1, "cpu", kernels=FUSED)
     assert "\n" not in str(error.value)
 

@@ -330,5 +330,5 @@ def test_a_sparse_jacobian_is_made_dense() -> None:
 def test_what_has_no_order_is_refused(change: Callable[[mujoco.MjModel], None], named: str) -> None:
     mjm = model("elliptic")
     change(mjm)
-    with pytest.raises(UnsupportedModelError, match=f"{named}.*trial.deterministic=false"):
+    with pytest.raises(UnsupportedModelError, match=f"{named}.*execution.deterministic=false"):
         WorldBatch(mjm, 1, 1, "cpu", kernels=Kernels(ordered=True))

@@ -55,7 +55,7 @@ def outside(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monkey
 
 
 def config(*loggers: str) -> Config:
-    return parse_config({"env": {"name": "cartpole"}, "trial": {"loggers": list(loggers)}})
+    return parse_config({"env": {"name": "cartpole"}, "execution": {"loggers": list(loggers)}})
 
 
 def row(epoch: int, **figures: float) -> dict[str, float]:
@@ -148,7 +148,7 @@ def test_a_command_that_fails_closes_its_loggers(
 
     monkeypatch.setattr(Trainer, "run_epoch", fail_in_the_second)
     (tmp_path / "tiny.yaml").write_text(dump_yaml(tiny_settings))
-    settings = ["--set", "trial.loggers=[loggers_outside:Heard]", "--device", "cpu"]
+    settings = ["--set", "execution.loggers=[loggers_outside:Heard]", "--device", "cpu"]
     with pytest.raises(SimulationError, match="made up"):
         train_command.main(["--config", str(tmp_path / "tiny.yaml"), "--logdir", str(tmp_path / "trial"), *settings])
     assert [call[0] for call in outside.Heard.calls] == ["config", "write", "write", "close"]
@@ -156,7 +156,7 @@ def test_a_command_that_fails_closes_its_loggers(
 
 def test_a_logger_that_fails_loses_no_row_and_is_named(outside: Any, tmp_path: Path) -> None:
     log = TrialLog(tmp_path, config("loggers_outside:Broken", "loggers_outside:Heard", "tensorboard"))
-    expected = r"trial\.loggers: loggers_outside:Broken failed \(ValueError: no such chart\); the rows are in metrics"
+    expected = r"execution\.loggers: loggers_outside:Broken failed \(ValueError: no such chart\); the rows are in"
     with pytest.raises(LoggerError, match=expected) as caught:
         log.write(row(0, a=1.0))
     assert "\n" not in str(caught.value)
@@ -183,8 +183,8 @@ def test_a_loggers_full_or_lost_disk_is_the_trials(outside: Any, tmp_path: Path,
 @pytest.mark.parametrize(
     ("loggers", "message"),
     [
-        (["tensorbord"], "trial.loggers: unknown name 'tensorbord'; did you mean 'tensorboard'"),
-        (["no_such_module:Log"], "trial.loggers: no module 'no_such_module'"),
+        (["tensorbord"], "execution.loggers: unknown name 'tensorbord'; did you mean 'tensorboard'"),
+        (["no_such_module:Log"], "execution.loggers: no module 'no_such_module'"),
         (["loggers_outside:Herd"], "did you mean 'Heard'"),
         (["loggers_outside:NoLogger"], "is not a subclass of msk_ray.training.loggers.base.Logger"),
         (["loggers_outside:Silent"], "loggers_outside:Silent lacks write"),
@@ -209,13 +209,13 @@ def test_loggers_may_change_when_a_trial_goes_on(tiny_settings: dict[str, Any], 
     for _ in range(2):
         first.run_epoch()
     first.close()
-    tiny_settings = tiny_settings | {"trial": tiny_settings["trial"] | {"loggers": []}}
+    tiny_settings = tiny_settings | {"execution": tiny_settings["execution"] | {"loggers": []}}
     second = Trainer(parse_config(tiny_settings), tmp_path, "cpu")
     assert second.restore_latest()[0] is not None
     second.run_epoch()
     second.close()
     assert max(step for step, _ in charts(tmp_path)["train/reward"]) == 2
-    assert load_config(tmp_path / "config.yaml").trial.loggers == ()
+    assert load_config(tmp_path / "config.yaml").execution.loggers == ()
 
 
 def resumed(folder: Path, name: str) -> None:

@@ -70,7 +70,7 @@ def make_scratch(worlds: int, rows: int, nv: int) -> Any:
     if worlds * WARP > _MOST:
         raise ConfigError(
             f"the fused solver has room for {_MOST // WARP} worlds: take fewer, or write "
-            "physics.solver_kernels: mujoco_warp"
+            "execution.solver_kernels: mujoco_warp"
         )
     width, contacts = padded(nv), rows // 3 + 1  # an elliptic contact has 3 rows or more
     widths = {"inertia": width * width, "factor": width * width, "rows": rows * width, "cones": CONE * contacts}

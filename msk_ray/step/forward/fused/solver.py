@@ -39,7 +39,7 @@ def check_fused(mjm: mujoco.MjModel) -> None:
     if names:
         raise UnsupportedModelError(
             f"the model uses {', '.join(names)}, for which there is no fused solver: write "
-            "physics.solver_kernels: mujoco_warp"
+            "execution.solver_kernels: mujoco_warp"
         )
 
 

@@ -33,7 +33,7 @@ def check_ordered(mjm: mujoco.MjModel) -> None:
     if names:
         raise UnsupportedModelError(
             f"the model uses {', '.join(names)}, whose sums have no fixed order on a GPU: write "
-            "trial.deterministic=false"
+            "execution.deterministic=false"
         )
 
 
