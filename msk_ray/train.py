@@ -47,7 +47,7 @@ highest evaluation score (until the first score, the untrained policy)."""
 EXAMPLES = """\
   python -m msk_ray.train --config cartpole
   python -m msk_ray.train --config configs/ant.yaml --device cuda:0 --seed 1 --set shac.horizon=32
-  python -m msk_ray.train --config configs/ant.yaml --set 'shac.horizon={start: 8, end: 32, epochs: 100}'
+  python -m msk_ray.train --config ant --set 'shac.horizon={kind: schedule, start: 8, end: 32, epochs: 100}'
   python -m msk_ray.train --config configs/cartpole.yaml --set algorithm.name=ppo
   python -m msk_ray.train --config configs/cartpole.yaml --logdir runs/mine --resume   # after a crash or Ctrl-C
   tensorboard --logdir runs"""

@@ -123,8 +123,8 @@ class ShacConfig(AlgorithmSettings):
     parallel: ClassVar[bool] = True
 
     horizon: Horizon = 32
-    """Env steps H of a rollout through which the gradient flows: constant, {start, end, epochs}, adapted to the
-    gradient by {start, target}, or to contact by {start, contact}."""
+    """Env steps H of a rollout through which the gradient flows: a number, {kind: schedule, start, end, epochs},
+    {kind: adaptive, start, target} to follow the gradient, or {kind: contact, start, contact} to follow contact."""
     gamma: Fraction = 0.99
     """Discount."""
     lam: Fraction = 0.95
@@ -196,7 +196,8 @@ class ShacConfig(AlgorithmSettings):
             lengths = {name: _quarter(getattr(horizon, name)) for name in ("start", "shortest", "longest")}
             horizon = {**horizon.model_dump(), **lengths}
         else:
-            horizon = {"start": _quarter(horizon.start), "end": _quarter(horizon.end), "epochs": epochs - 1}
+            ends = {"start": _quarter(horizon.start), "end": _quarter(horizon.end)}
+            horizon = {"kind": "schedule", **ends, "epochs": epochs - 1}
         return {"horizon": horizon, "critic_batches": 1, "critic_iterations": min(self.critic_iterations, 2)}
 
     def shortest(self) -> dict[str, Any]:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
-from pydantic import Discriminator, Field, PositiveFloat, Tag, model_validator
+from pydantic import BeforeValidator, Field, PositiveFloat, TypeAdapter, model_validator
 
 from msk_ray.config.sections import Count, Section
+from msk_ray.errors import ConfigError, brief
 
 
 class HorizonSchedule(Section):
     """Rollout length by epoch: `start` at epoch 0, `end` from epoch `epochs` on, linear between."""
 
+    kind: Literal["schedule"] = "schedule"
     start: Count
     end: Count
     epochs: Count
@@ -44,6 +47,7 @@ class AdaptiveHorizon(_BoundedHorizon):
     follows a constraint on contact forces; this one follows the cotangents themselves.
     """
 
+    kind: Literal["adaptive"] = "adaptive"
     target: PositiveFloat
     """Target for the 90th percentile of the cotangent norms, before any bound [reward]."""
     rate: Annotated[float, Field(gt=0.0, le=1.0)] = 0.1
@@ -59,25 +63,42 @@ class ContactHorizon(_BoundedHorizon):
     gait is the body's weight.
     """
 
+    kind: Literal["contact"] = "contact"
     contact: PositiveFloat
     """Contact force c above which rollouts become shorter [weight of the body]; a body at rest has 1."""
     rate: Annotated[float, Field(gt=0.0, le=1.0)] = 0.1
 
 
-def _kind_of_horizon(value: Any) -> str:
-    if isinstance(value, dict):
-        return "adaptive" if "target" in value else "contact" if "contact" in value else "schedule"
-    if isinstance(value, AdaptiveHorizon):
-        return "adaptive"
-    if isinstance(value, ContactHorizon):
-        return "contact"
-    return "schedule" if isinstance(value, HorizonSchedule) else "constant"
+HORIZONS: Mapping[str, type[Section]] = {
+    "schedule": HorizonSchedule,
+    "adaptive": AdaptiveHorizon,
+    "contact": ContactHorizon,
+}
+"""Settings of each kind of horizon that changes."""
 
 
-Horizon = Annotated[
-    Annotated[Count, Tag("constant")]
-    | Annotated[HorizonSchedule, Tag("schedule")]
-    | Annotated[AdaptiveHorizon, Tag("adaptive")]
-    | Annotated[ContactHorizon, Tag("contact")],
-    Discriminator(_kind_of_horizon),
-]
+def horizon_class(kind: Any) -> type[Section]:
+    """The settings of a kind of horizon.
+
+    Raises:
+        ConfigError: there is no such kind.
+    """
+    if kind not in HORIZONS:
+        what = "missing" if kind is None else f"unknown kind {brief(kind)}"
+        raise ConfigError(f"shac.horizon.kind: {what}; write one of {', '.join(HORIZONS)}, or a number as the horizon")
+    return HORIZONS[kind]
+
+
+def _read_horizon(value: Any) -> Any:
+    if isinstance(value, Section):
+        return value
+    if not isinstance(value, Mapping):
+        return _CONSTANT.validate_python(value)
+    try:
+        return horizon_class(value.get("kind")).model_validate(value)
+    except ConfigError as error:
+        raise ValueError(str(error)) from error
+
+
+_CONSTANT: TypeAdapter[int] = TypeAdapter(Count)
+Horizon = Annotated[int | HorizonSchedule | AdaptiveHorizon | ContactHorizon, BeforeValidator(_read_horizon)]

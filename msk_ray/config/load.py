@@ -4,12 +4,13 @@ import contextlib
 import difflib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, get_args, get_origin
+from typing import Any, get_args
 
-from pydantic import BaseModel, Tag, ValidationError
+from pydantic import BaseModel, ValidationError
 
 from msk_ray.config.algorithms import BUILT_IN, settings_from_outside
 from msk_ray.config.environments import settings_class
+from msk_ray.config.horizons import horizon_class
 from msk_ray.config.overlay import leaves, merge, overlay, parse_overrides
 from msk_ray.config.recorded import current_settings, env_name, newer_spelling
 from msk_ray.config.schema import Config
@@ -106,7 +107,7 @@ def refuse_ignored(values: Mapping[str, Any], configs: Iterable[Config], source:
 
 
 def _named(data: Any) -> dict[str, type[BaseModel]]:
-    """Sections, dotted, whose settings are declared by the class of the `name` beside them, if it can be found."""
+    """Sections, dotted, whose settings depend on the `name` or `kind` in or beside them, if it can be found."""
     found: dict[str, type[BaseModel]] = {}
     if not isinstance(data, Mapping):
         return found
@@ -117,6 +118,11 @@ def _named(data: Any) -> dict[str, type[BaseModel]]:
     if isinstance(name, str) and name not in BUILT_IN:
         with contextlib.suppress(ConfigError):
             found["algorithm.settings"] = settings_from_outside(name)
+    shac = data.get("shac")
+    horizon = shac.get("horizon") if isinstance(shac, Mapping) else None
+    if isinstance(horizon, Mapping):
+        with contextlib.suppress(ConfigError):
+            found["shac.horizon"] = horizon_class(horizon.get("kind"))
     return found
 
 
@@ -133,10 +139,10 @@ def describe_fault(
     faults = error.errors()
     # A misspelt key is often missing under its right name too; report the misspelling.
     first = min(faults, key=lambda fault: fault["type"] != "extra_forbidden")
-    location = [shortened(str(part)) for part in _without_tags(first["loc"])]
+    location = [shortened(str(part)) for part in first["loc"]]
     where = ".".join(location)
     if first["type"] == "extra_forbidden":
-        section = _model_at(root, location[:-1], first["loc"], named or {})
+        section = _model_at(root, location[:-1], named or {})
         known = list(section.model_fields)
         near = difflib.get_close_matches(location[-1], known, n=1)
         below = _subsection_with(section, location[-1], (named or {}) if section is root else {})
@@ -161,16 +167,6 @@ def describe_fault(
 _MAX_MESSAGE = 400
 
 
-_TAGGED = {"horizon": ("constant", "schedule", "adaptive", "contact")}
-"""Settings of several kinds, and the tags of these."""
-
-
-def _without_tags(location: tuple[Any, ...]) -> list[Any]:
-    """An error's location without the tags that pydantic puts behind a setting of several kinds: they are no keys."""
-    pairs = zip((None, *location), location, strict=False)
-    return [part for before, part in pairs if part not in _TAGGED.get(str(before), ())]
-
-
 def _is_model(kind: Any) -> bool:
     return isinstance(kind, type) and issubclass(kind, BaseModel)
 
@@ -184,20 +180,12 @@ def _subsection_with(section: type[BaseModel], key: str, named: Mapping[str, typ
     return None
 
 
-def _model_at(
-    root: type[BaseModel], sections: list[str], location: tuple[Any, ...], named: Mapping[str, type[BaseModel]]
-) -> type[BaseModel]:
+def _model_at(root: type[BaseModel], sections: list[str], named: Mapping[str, type[BaseModel]]) -> type[BaseModel]:
     """The section of `root` that contains an error."""
     model: Any = root
     for depth, section in enumerate(sections):
-        dotted = ".".join(sections[: depth + 1])
-        if dotted in named:
-            model = named[dotted]
-            continue
-        annotation = model.model_fields[section].annotation
-        # A member of a union is Annotated with its tag.
-        options = [get_args(a) if get_origin(a) is Annotated else (a,) for a in get_args(annotation) or (annotation,)]
-        models = [(o[0], [m.tag for m in o[1:] if isinstance(m, Tag)]) for o in options if _is_model(o[0])]
-        model = next((m for m, tags in models if any(tag in location for tag in tags)), models[0][0])
+        model = named.get(".".join(sections[: depth + 1]), model.model_fields[section].annotation)
+        if not _is_model(model):  # it may be null
+            model = next(option for option in get_args(model) if _is_model(option))
     found: type[BaseModel] = model
     return found

@@ -1,7 +1,7 @@
 """Merge settings: the one rule that `--set`, `extends` and search spaces follow.
 
 A mapping is merged into the existing section key by key; any other value replaces the existing one. Where a setting
-accepts mappings of several kinds (`shac.horizon`; `env` and `algorithm`, by their `name`), a mapping of another kind
+accepts mappings of several kinds (by their `kind`; `env` and `algorithm` by their `name`), a mapping of another kind
 replaces the old one, so that kinds never mix. `null` removes a section.
 """
 
@@ -9,7 +9,6 @@ import copy
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-from msk_ray.config.horizons import AdaptiveHorizon, ContactHorizon, HorizonSchedule
 from msk_ray.config.yaml_text import MAX_DEPTH, parse_yaml
 from msk_ray.errors import ConfigError, brief, shortened
 
@@ -103,19 +102,7 @@ def _laid_over(path: list[str], old: Any, new: Any) -> Any:
     return result | {key: _laid_over([*path, str(key)], old.get(key), value) for key, value in new.items()}
 
 
-_HORIZONS = {
-    "target": set(AdaptiveHorizon.model_fields),
-    "contact": set(ContactHorizon.model_fields),
-    "epochs": set(HorizonSchedule.model_fields),
-}
-"""Settings of each kind of horizon, by the one that tells it from the others."""
-
-
 def _another_kind(path: list[str], old: Mapping[str, Any], new: Mapping[str, Any]) -> bool:
     """Whether two mappings for the same setting describe different things."""
-    if path in (["env"], ["algorithm"]):
-        return "name" in new and "name" in old and new["name"] != old["name"]
-    if path == ["shac", "horizon"]:
-        own = next((fields for name, fields in _HORIZONS.items() if name in old), _HORIZONS["epochs"])
-        return any(set(new) & (fields - own) for fields in _HORIZONS.values())
-    return False
+    tag = "name" if path in (["env"], ["algorithm"]) else "kind"
+    return tag in new and tag in old and new[tag] != old[tag]

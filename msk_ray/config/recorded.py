@@ -60,6 +60,8 @@ def current_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
             _check_harmless(dotted, value)
         else:
             result["execution"] = {**(result.get("execution") or {}), setting: value}
+    if isinstance(shac := result.get("shac"), dict) and "horizon" in shac:
+        shac["horizon"] = _with_kind(shac["horizon"])
     return result
 
 
@@ -74,10 +76,24 @@ def current_values(values: Mapping[str, Any]) -> dict[str, Any]:
         if key in _REMOVED:
             _check_harmless(key, value)
         elif "." in key or not isinstance(value, Mapping):
-            result[current_key(key)] = value
+            result[current_key(key)] = _with_kind(value) if key == "shac.horizon" else value
         else:
             result |= current_settings({**result, key: value})
     return result
+
+
+def _with_kind(horizon: Any) -> Any:
+    """A horizon of before kinds had names, or the horizons of an operator; a mapping that only changes some settings is
+    left as it is."""
+    if isinstance(horizon, list):
+        return [_with_kind(item) for item in horizon]
+    if not isinstance(horizon, Mapping) or "kind" in horizon:
+        return horizon
+    signs = {"adaptive": {"target"}, "contact": {"contact"}, "schedule": {"start", "end", "epochs"}}
+    kind = next((kind for kind, keys in signs.items() if keys <= horizon.keys()), None)
+    if kind is None:
+        return {key: _with_kind(value) for key, value in horizon.items()}
+    return {"kind": kind, **horizon}
 
 
 def _check_harmless(dotted: str, value: Any) -> None:
@@ -104,6 +120,6 @@ def changed_settings(section: BaseModel) -> dict[str, Any]:
         value = getattr(section, name)
         required = field.is_required()
         default = None if required else field.get_default(call_default_factory=True)
-        if required or value != default:
+        if required or name == "kind" or value != default:
             changed[name] = changed_settings(value) if isinstance(value, BaseModel) else data[name]
     return changed

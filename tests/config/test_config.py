@@ -18,7 +18,7 @@ def test_every_shipped_config_loads(root: Path) -> None:
 
 
 def test_a_config_survives_a_round_trip() -> None:
-    config = parse_config({**CARTPOLE, "shac": {"horizon": {"start": 8, "end": 32, "epochs": 10}}})
+    config = parse_config({**CARTPOLE, "shac": {"horizon": {"kind": "schedule", "start": 8, "end": 32, "epochs": 10}}})
     assert parse_config(config.as_dict()) == config
 
 
@@ -38,7 +38,7 @@ def test_a_config_survives_a_round_trip() -> None:
         ({"env": {"name": "ant"}, "physics": {"cone": "pyramidal", "solreffriction": [1, 1]}}, "cone: elliptic"),
         (
             {"env": {"name": "swimmer"}},
-            "env.name: unknown name 'swimmer'; write cartpole, ant, hopper, cheetah, humanoid, myoleg26, myoleg, "
+            "env.name: unknown name 'swimmer'; write cartpole, ant, hopper, cheetah, humanoid, myoleg, myoleg26, "
             "myosuite_walk or package.module:Class",
         ),
         ({**CARTPOLE, "shac": {"critic_batches": 7}}, "critic_batches 7 must divide"),
@@ -53,7 +53,7 @@ def test_a_fault_is_named_on_one_line(data: dict, message: str) -> None:
 
 
 def test_overrides_reach_nested_settings() -> None:
-    key, value = parse_override("shac.horizon={start: 4, end: 8, epochs: 2}")
+    key, value = parse_override("shac.horizon={kind: schedule, start: 4, end: 8, epochs: 2}")
     data = overlay(CARTPOLE, {key: value, "env.nworld": 16})
     config = parse_config(data)
     assert config.env.nworld == 16
@@ -100,17 +100,26 @@ def test_substeps_follow_from_either_setting() -> None:
     ("override", "message"),
     [
         ("shac.horizon=half", "shac.horizon: Input should be a valid integer"),
-        ("shac.horizon={start: 4, ende: 8, epochs: 2}", "shac.horizon.ende: unknown key; did you mean 'end'?"),
         (
-            "shac.horizon={start: 4, target: 8, longset: 9}",
+            "shac.horizon={kind: schedule, start: 4, ende: 8, epochs: 2}",
+            "shac.horizon.ende: unknown key; did you mean 'end'?",
+        ),
+        (
+            "shac.horizon={kind: adaptive, start: 4, target: 8, longset: 9}",
             "shac.horizon.longset: unknown key; did you mean 'longest'?",
         ),
         (
-            "shac.horizon={start: 4, contact: 8, longset: 9}",
+            "shac.horizon={kind: contact, start: 4, contact: 8, longset: 9}",
             "shac.horizon.longset: unknown key; did you mean 'longest'?",
         ),
-        ("shac.horizon={start: 4, contact: -8}", "shac.horizon.contact: Input should be greater than 0"),
-        ("shac.horizon={start: 2, target: 8}", "shac.horizon: start 2 must be between shortest 4 and longest 64"),
+        (
+            "shac.horizon={kind: contact, start: 4, contact: -8}",
+            "shac.horizon.contact: Input should be greater than 0",
+        ),
+        (
+            "shac.horizon={kind: adaptive, start: 2, target: 8}",
+            "shac.horizon: start 2 must be between shortest 4 and longest 64",
+        ),
         ("curriculum={start: {}, epochs: 3}", "write at least one of solref"),
         ("curriculum={start: {friction: 2}, epochs: 3}", "curriculum: cartpole has no contacts"),
         ("shac.entropy={coefficient: 0}", "shac.entropy.coefficient: Input should be greater than 0"),

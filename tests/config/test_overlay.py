@@ -12,8 +12,8 @@ from msk_ray.sweep.trials import resolve_trials
 from msk_ray.tune import __main__ as tune
 from msk_ray.tune.options import read_options
 
-ADAPTIVE = {"start": 8, "target": 60.0}
-SCHEDULE = {"start": 4, "end": 16, "epochs": 50}
+ADAPTIVE = {"kind": "adaptive", "start": 8, "target": 60.0}
+SCHEDULE = {"kind": "schedule", "start": 4, "end": 16, "epochs": 50}
 BASE: dict[str, Any] = {
     "env": {"name": "cartpole", "nworld": 8},
     "shac": {"horizon": {**ADAPTIVE, "longest": 32}, "entropy": {"coefficient": 0.02}},
@@ -93,13 +93,13 @@ CASES: list[tuple[list[str], str, Any]] = [
     (
         ["shac.horizon={start: 4}"],
         "horizon",
-        {"start": 4, "shortest": 4, "longest": 32, "target": 60.0, "rate": 0.1},
+        {**ADAPTIVE, "start": 4, "shortest": 4, "longest": 32, "rate": 0.1},
     ),
-    (["shac.horizon={start: 4, end: 16, epochs: 50}"], "horizon", SCHEDULE),
+    (["shac.horizon={kind: schedule, start: 4, end: 16, epochs: 50}"], "horizon", SCHEDULE),
     (
         ["shac.horizon.longest=16"],
         "horizon",
-        {"start": 8, "shortest": 4, "longest": 16, "target": 60.0, "rate": 0.1},
+        {**ADAPTIVE, "shortest": 4, "longest": 16, "rate": 0.1},
     ),
     (["shac.horizon=16"], "horizon", 16),
 ]

@@ -18,19 +18,19 @@ RATE = {"shac.actor_lr": {"loguniform": [1e-3, 1e-2]}}
 
 def test_env_steps_budget_of_a_growing_horizon(make_space: Any) -> None:
     # Epochs 0..19 with horizons 4, 6, 8, 8, ...: (4 + 6 + 18 × 8) × 8 worlds = 1232.
-    grow = {"start": 4, "end": 8, "epochs": 2}
+    grow = {"kind": "schedule", "start": 4, "end": 8, "epochs": 2}
     (trial,) = resolve_trials(make_space(parameters={"shac.horizon": {"grid": [grow]}}))
     assert env_steps_budget(trial.config) == 1232
 
 
 def test_an_adaptive_horizon_counts_with_its_longest(make_space: Any) -> None:
-    adapt = {"start": 4, "shortest": 2, "longest": 16, "target": 1.0}
+    adapt = {"kind": "adaptive", "start": 4, "shortest": 2, "longest": 16, "target": 1.0}
     (trial,) = resolve_trials(make_space(parameters={"shac.horizon": {"grid": [adapt]}}))
     assert env_steps_budget(trial.config) == 8 * 20 * 16
 
 
-GROW = {"label": "grow", "value": {"start": 8, "end": 24, "epochs": 1}}
-ADAPT = {"label": "adapt", "value": {"start": 4, "shortest": 2, "longest": 20, "target": 1.0}}
+GROW = {"label": "grow", "value": {"kind": "schedule", "start": 8, "end": 24, "epochs": 1}}
+ADAPT = {"label": "adapt", "value": {"kind": "adaptive", "start": 4, "shortest": 2, "longest": 20, "target": 1.0}}
 
 
 @pytest.mark.parametrize(

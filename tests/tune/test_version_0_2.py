@@ -93,6 +93,11 @@ def test_moved_settings_are_read_where_they_were() -> None:
         "execution.gpus": 2,
         "trial.seed": 1,
     }
+    assert current_values({"shac.horizon": {"start": 4, "target": 2.0}})["shac.horizon"]["kind"] == "adaptive"
+    assert current_settings({"shac": {"horizon": {"start": 4, "end": 8, "epochs": 2}}})["shac"]["horizon"]["kind"] == (
+        "schedule"
+    )
+    assert current_values({"shac.horizon": {"longest": 9}}) == {"shac.horizon": {"longest": 9}}, "of any kind"
     with pytest.raises(ConfigError, match=r"shac\.copies: \{'count': 2\} has been removed"):
         current_settings({"shac": {"copies": {"count": 2}}})
 
@@ -113,7 +118,10 @@ def test_files_may_keep_the_old_spelling(tmp_path: Path) -> None:
     [
         ("trial.gpus=2", "trial.gpus: unknown key; write execution.gpus"),
         ("physics.solver_kernels=fused", "physics.solver_kernels: unknown key; write execution.solver_kernels"),
-        ("shac.copies={count: 2}", "shac.copies: unknown key; it has been removed, because it did not pay; leave it out"),
+        (
+            "shac.copies={count: 2}",
+            "shac.copies: unknown key; it has been removed, because it did not pay; leave it out",
+        ),
     ],
 )
 def test_what_is_typed_is_told_the_new_spelling(setting: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:

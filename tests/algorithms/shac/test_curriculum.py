@@ -86,7 +86,7 @@ def test_all_that_adapts_goes_on_from_a_checkpoint() -> None:
     config = settings(
         curriculum={"start": {"solreffriction": [1.0, 1.0]}, "epochs": 5},
         shac={
-            "horizon": {"start": 3, "shortest": 2, "longest": 6, "target": 1e3, "rate": 0.5},
+            "horizon": {"kind": "adaptive", "start": 3, "shortest": 2, "longest": 6, "target": 1e3, "rate": 0.5},
             "critic_batches": 1,
             "critic_iterations": 1,
             "entropy": {"coefficient": 0.01, "target": 0.3, "rate": 0.1},

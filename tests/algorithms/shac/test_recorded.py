@@ -40,7 +40,7 @@ OPTIONS = {
         "weight_decay": 0.01,
         "actor_value": "mean",
         "entropy": {"target": -0.5, "normalize": True},
-        "horizon": {"start": 4, "shortest": 4, "longest": 4, "contact": 1.0},
+        "horizon": {"kind": "contact", "start": 4, "shortest": 4, "longest": 4, "contact": 1.0},
     },
 }
 _WEIGHTS = (
@@ -162,7 +162,7 @@ def test_a_fit_beside_a_rollout_equals_one_after_the_other(tmp_path: Path) -> No
 
 
 def test_horizons_have_recordings_of_their_own(tmp_path: Path) -> None:
-    trainer = make(CARTPOLE, tmp_path, horizon={"start": 2, "end": 6, "epochs": 2})
+    trainer = make(CARTPOLE, tmp_path, horizon={"kind": "schedule", "start": 2, "end": 6, "epochs": 2})
     rows = [trainer.run_epoch() for _ in range(6)]
     assert [row["train/horizon"] for row in rows] == [2, 4, 6, 6, 6, 6]
     assert [row["train/recorded"] for row in rows] == [0, 0, 0, 1, 1, 1]
