@@ -3,6 +3,7 @@
 import sys
 import time
 
+from msk_ray.metrics import BEST_SCORE, REWARD, SCORE, STEPS_PER_SECOND
 from msk_ray.text import printable
 
 
@@ -22,14 +23,14 @@ class ProgressLine:
         epoch = int(row["epoch"])
         now = time.monotonic()
         left = (now - self._start) / max(1, epoch - self._first) * (self._epochs - epoch)
-        if "eval/score" in row:
-            best = f" (best {row['eval/best_score']:.1f})" if "eval/best_score" in row else ""
-            self._score = f"eval {row['eval/score']:.1f}{best}"
+        if SCORE in row:
+            best = f" (best {row[BEST_SCORE]:.1f})" if BEST_SCORE in row else ""
+            self._score = f"eval {row[SCORE]:.1f}{best}"
         parts = [
             f"epoch {epoch}/{self._epochs}",
-            f"{row['env_steps_per_s']:,.0f} env steps/s",
+            f"{row[STEPS_PER_SECOND]:,.0f} env steps/s",
             # An algorithm from outside need not have it.
-            f"reward {row['train/reward']:.3f}" if "train/reward" in row else "",
+            f"reward {row[REWARD]:.3f}" if REWARD in row else "",
             self._score,
             f"{format_duration(left)} left",
         ]

@@ -1,6 +1,5 @@
 """The interface between the trainer and an algorithm."""
 
-import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -15,13 +14,8 @@ from msk_ray.config import ALGORITHMS, AlgorithmSettings, Config, check_installe
 from msk_ray.envs import Env
 from msk_ray.errors import ConfigError
 from msk_ray.group import Group
+from msk_ray.metrics import diagnostic, of_all_processes
 from msk_ray.networks import parameter_hash
-
-_OF_GRADIENTS = frozenset({"approximated_share"})
-"""Diagnostics of the simulation that concern its gradients; the others concern its physics."""
-
-_LARGEST = ("_max", "/contacts_share", "/rows_share", "fd_solver_limit_share")
-"""How the names of diagnostics end that are the largest of a world or step, not a mean over worlds."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +25,7 @@ class EpochResult:
     env_steps: int
     """Env steps simulated, all worlds together."""
     metrics: dict[str, float]
-    """Metrics for the logs, by name; nothing in the program reads them back."""
+    """Figures for the logs, by name (`msk_ray.metrics`)."""
     episodes: int | None = None
     """Episodes that ended, all worlds together; None if the algorithm does not count them."""
 
@@ -234,21 +228,9 @@ def simulation_metrics(env: Env[Any]) -> dict[str, float]:
         SimulationError: contacts or constraint rows were lost to a full buffer.
     """
     drawn = {} if env.randomizer is None else env.randomizer.metrics(env.state.numbers[:, : env.randomizer.size])
-    found = drawn | {
-        f"{'grad' if name in _OF_GRADIENTS else 'physics'}/{name}": value
-        for name, value in env.sim.diagnostics().items()
-    }
-    every = env.group.collect(found)
-    return {name: _of_all(name, [figures[name] for figures in every]) for name in found}
-
-
-def _of_all(name: str, values: list[float]) -> float:
-    """A diagnostic of all worlds from those of equal parts of them; NaN if one of these is."""
-    if any(math.isnan(value) for value in values):
-        return math.nan
-    if name.endswith("_min"):
-        return min(values)
-    return max(values) if name.endswith(_LARGEST) else sum(values) / len(values)
+    here = drawn | {diagnostic(name): value for name, value in env.sim.diagnostics().items()}
+    every = env.group.collect(here)
+    return {name: of_all_processes(name, [figures[name] for figures in every]) for name in here}
 
 
 class Clock:

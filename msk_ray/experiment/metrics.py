@@ -9,9 +9,8 @@ from typing import Any
 
 from msk_ray.experiment.damage import Damage, field, is_number, number, read_lines, texts
 from msk_ray.experiment.layout import METRICS_FILE
+from msk_ray.metrics import SCORE
 
-SCORE = "eval/score"
-"""The canonical evaluation metric, by which trials are ranked; higher is better."""
 HASH = "hash/parameters"
 """The first 48 bits of the digest of the trial's weights and statistics when it was evaluated, as a whole number."""
 EPOCH_LIMIT = 10**9

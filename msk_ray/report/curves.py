@@ -16,6 +16,8 @@ from matplotlib.ticker import ScalarFormatter
 from msk_ray.errors import ConfigError
 from msk_ray.experiment.layout import SPACE_FILE
 from msk_ray.experiment.outcomes import Outcome
+from msk_ray.metrics import HEALTH
+from msk_ray.metrics import metric as describe
 from msk_ray.report.pictures import (
     DASHES,
     GREY,
@@ -62,17 +64,6 @@ _LOOK = {
     "waiting": (GREY, "."),
     "unreadable": ("#000000", "1"),
 }
-HEALTH = {
-    "grad/actor_norm": ("norm of the policy's gradient", True),
-    "grad/state_p90": ("state cotangent, 90th percentile [rewards]", True),
-    "grad/clipped_share": ("share of cotangents clipped", False),
-    "grad/nonfinite_share": ("share of worlds without a gradient", False),
-    "grad/approximated_share": ("share of substeps with an approximate gradient", False),
-    "physics/solver_limit_share": ("share of worlds at the solver's limit", False),
-    "train/diverged": ("worlds diverged an epoch", False),
-}
-"""Metric → what it is, and whether it is drawn on a logarithmic axis."""
-
 _OVER = {
     "env_steps": ("Learning curves", "env steps", ""),
     "seconds": (
@@ -269,7 +260,7 @@ def _colour(number: int) -> str:
 
 def gradient_health(reading: Reading, name: str, places: Places) -> Picture | None:
     """Norms, clipping and failures of gradients over training; None if no trial recorded any."""
-    recorded = [metric for metric in HEALTH if any(_health_curve(t, metric) for t in reading.trials)]
+    recorded = [m.name for m in HEALTH if any(_health_curve(t, m.name) for t in reading.trials)]
     if not recorded:
         return None
     # What stayed zero throughout is said in words.
@@ -304,8 +295,8 @@ def gradient_health(reading: Reading, name: str, places: Places) -> Picture | No
             "failed": [places[t.folder] for t in reading.trials if t.failed],
             "metrics": [
                 {
-                    "title": HEALTH[metric][0],
-                    "log": HEALTH[metric][1],
+                    "title": describe(metric).meaning,
+                    "log": describe(metric).logarithmic,
                     "lines": [
                         [places[t.folder], *map(plain, thin_peaks(*curve, count))]
                         for t in reading.trials
@@ -321,8 +312,8 @@ def gradient_health(reading: Reading, name: str, places: Places) -> Picture | No
         name,
         "Gradient health",
         f"{len(present)} measures of gradients and physics over env steps, a line a trial: "
-        f"{', '.join(HEALTH[m][0] for m in present)}.",
-        (f"Zero throughout: {', '.join(HEALTH[m][0] for m in zero)}. " if zero else "")
+        f"{', '.join(describe(m).meaning for m in present)}.",
+        (f"Zero throughout: {', '.join(describe(m).meaning for m in zero)}. " if zero else "")
         + "Of many points the largest of each stretch is drawn: peaks are not lost. A cotangent is in units of reward: "
         "1 is what one reward would send back.",
         lines(),
@@ -340,7 +331,7 @@ def _health_curve(trial: TrialReading, metric: str) -> Curve | None:
 
 
 def _draw_health(axes: Axes, reading: Reading, metric: str) -> None:
-    title, logarithmic = HEALTH[metric]
+    title, logarithmic = describe(metric).meaning, describe(metric).logarithmic
     best = reading.best
     lines: dict[bool, list[np.ndarray]] = {False: [], True: []}
     largest = 0.0

@@ -31,12 +31,12 @@ from msk_ray.experiment.layout import (
     best_checkpoint,
 )
 from msk_ray.experiment.manifest import Experiment
-from msk_ray.experiment.metrics import SCORE
 from msk_ray.experiment.notes import read_notes
 from msk_ray.experiment.outcomes import Ending
 from msk_ray.experiment.results import unlisted_trials
 from msk_ray.experiment.snapshot import State, TrialReader, TrialSnapshot, file_stamp
 from msk_ray.experiment.trial import Trial, by_environment
+from msk_ray.metrics import SCORE
 from msk_ray.sweep.space import SpaceFile, read_file
 
 _TAIL_LINES = 12

@@ -17,9 +17,10 @@ from msk_ray.config import Config, ExecutionConfig, dump_yaml, overlay, parse_co
 from msk_ray.errors import CheckpointError, ConfigError, SimulationError, StorageError
 from msk_ray.experiment.damage import Damage, describe_damages
 from msk_ray.experiment.layout import METRICS_FILE
-from msk_ray.experiment.metrics import HASH, SCORE, read_metrics, read_rows
+from msk_ray.experiment.metrics import HASH, read_metrics, read_rows
 from msk_ray.files import remove_stale, write_bytes
 from msk_ray.group import ALONE, Group
+from msk_ray.metrics import BEST_SCORE, SCORE
 from msk_ray.networks import as_number, parameter_hash
 from msk_ray.step.autograd.simulation import resolve_device
 from msk_ray.training.checkpoint import (
@@ -336,7 +337,7 @@ class Trainer(Place):
             self._write_policy(state(), score)
         row = {f"eval/{name}": value for name, value in figures.items()} | {HASH: as_number(parameters)}
         if math.isfinite(self.best_score):
-            row["eval/best_score"] = self.best_score
+            row[BEST_SCORE] = self.best_score
         return row
 
     def _at_milestone(self, epoch: int) -> bool:

@@ -10,14 +10,15 @@ from ray.util.metrics import Gauge
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.outcomes import read_ending
 from msk_ray.experiment.trial import Trial
+from msk_ray.metrics import BEST_SCORE, EPISODE_RETURN, SCORE, STEPS_PER_SECOND
 from msk_ray.text import printable
 
 FIGURES = {
-    "msk_ray_score": "eval/score",
-    "msk_ray_best_score": "eval/best_score",
+    "msk_ray_score": SCORE,
+    "msk_ray_best_score": BEST_SCORE,
     "msk_ray_epoch": "epoch",
-    "msk_ray_env_steps_per_s": "env_steps_per_s",
-    "msk_ray_episode_return": "train/episode_return",
+    "msk_ray_env_steps_per_s": STEPS_PER_SECOND,
+    "msk_ray_episode_return": EPISODE_RETURN,
 }
 """Gauge → metric. Ray serves a gauge as `ray_` and its name."""
 STATE = "msk_ray_trial_state"

@@ -5,8 +5,9 @@ from pathlib import Path
 
 from msk_ray.errors import StorageFailure
 from msk_ray.experiment.trial import Trial
+from msk_ray.metrics import BEST_SCORE, SCORE
 
-METRICS = ("eval/best_score", "eval/score", "progress/env_steps")
+METRICS = (BEST_SCORE, SCORE, "progress/env_steps")
 """Scalars of the trial that the table shows with its settings."""
 
 

@@ -9,11 +9,12 @@ import torch
 from torch import nn
 
 from msk_ray.algorithms import algorithm_class
-from msk_ray.algorithms.base import Algorithm, EpochResult, _of_all
+from msk_ray.algorithms.base import Algorithm, EpochResult
 from msk_ray.config import Config, PhysicsConfig
 from msk_ray.envs import make_env
 from msk_ray.errors import ConfigError
 from msk_ray.legs.myoleg26.config import MyoLeg26Settings
+from msk_ray.metrics import of_all_processes
 
 
 class Silent(Algorithm):
@@ -71,5 +72,5 @@ def test_an_algorithm_keeps_its_promise_to_count(tiny_cartpole: Config) -> None:
     ],
 )
 def test_shares_of_worlds_are_averaged_and_extremes_stay_extremes(name: str, expected: float) -> None:
-    assert _of_all(name, [0.25, 0.75]) == expected
-    assert math.isnan(_of_all(name, [0.25, math.nan]))
+    assert of_all_processes(name, [0.25, 0.75]) == expected
+    assert math.isnan(of_all_processes(name, [0.25, math.nan]))

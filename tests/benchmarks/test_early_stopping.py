@@ -8,10 +8,11 @@ from typing import Any
 
 import pytest
 
-from msk_ray.experiment.metrics import SCORE, Evaluation, progress_of
+from msk_ray.experiment.metrics import Evaluation, progress_of
 from msk_ray.experiment.outcomes import Ending, Outcome
 from msk_ray.experiment.results import TrialRecord
 from msk_ray.experiment.snapshot import Device, State, TrialSnapshot
+from msk_ray.metrics import SCORE
 from msk_ray.sweep.rules.asha import Asha, SuccessiveHalving
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"

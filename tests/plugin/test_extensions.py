@@ -18,7 +18,8 @@ from msk_ray.diagnose import __main__ as diagnose
 from msk_ray.errors import ConfigError
 from msk_ray.evaluate import __main__ as evaluate
 from msk_ray.experiment.manifest import Experiment
-from msk_ray.experiment.metrics import SCORE, read_metrics
+from msk_ray.experiment.metrics import read_metrics
+from msk_ray.metrics import SCORE
 from msk_ray.sweep.smoke import shorten
 from msk_ray.sweep.space import parse_space
 from msk_ray.sweep.trials import resolve_trials

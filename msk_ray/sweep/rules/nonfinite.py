@@ -3,8 +3,8 @@
 import math
 from collections.abc import Mapping
 
-from msk_ray.experiment.metrics import SCORE
 from msk_ray.experiment.outcomes import Outcome
+from msk_ray.metrics import SCORE
 from msk_ray.sweep.rules.stop_rule import History, StopRule
 
 

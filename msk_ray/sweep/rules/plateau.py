@@ -5,8 +5,8 @@ from typing import Annotated
 from pydantic import Field
 
 from msk_ray.config.sections import Count
-from msk_ray.experiment.metrics import SCORE
 from msk_ray.experiment.outcomes import Outcome
+from msk_ray.metrics import SCORE
 from msk_ray.sweep.rules.stop_rule import History, StopRule
 
 

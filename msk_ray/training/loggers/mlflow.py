@@ -9,8 +9,8 @@ from mlflow.entities import Metric, Param
 from mlflow.tracking import MlflowClient
 
 from msk_ray.config import flattened
-from msk_ray.experiment.metrics import SCORE
 from msk_ray.files import write_text
+from msk_ray.metrics import SCORE
 from msk_ray.training.loggers.base import Logger
 from msk_ray.training.loggers.run_name import run_name
 

@@ -17,7 +17,8 @@ from msk_ray.config import Config, dump_yaml, overlay, parse_config
 from msk_ray.envs import make_env
 from msk_ray.errors import CheckpointError, ConfigError, Failure, SimulationError
 from msk_ray.evaluate import __main__ as evaluate
-from msk_ray.experiment.metrics import SCORE, read_metrics
+from msk_ray.experiment.metrics import read_metrics
+from msk_ray.metrics import SCORE
 from msk_ray.training import Trainer, precompile
 from msk_ray.training.checkpoint import epoch_checkpoints, read_checkpoint
 from msk_ray.training.policy import load_policy
