@@ -192,10 +192,11 @@ class Config(Section):
     @model_validator(mode="after")
     def _without_what_the_algorithm_ignores(self) -> "Config":
         # A base config can serve several algorithms: settings for the others are not part of this trial.
+        config = self
         for key in self.ignored:
             section, *path = key.split(".")
-            self.__dict__[section] = _at_default(self, section, path)
-        return self
+            config = config.model_copy(update={section: _at_default(config, section, path)})
+        return config
 
     @model_validator(mode="after")
     def _physics_fits_env(self) -> "Config":
