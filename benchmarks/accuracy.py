@@ -8,9 +8,8 @@ from record import RESULTS, markdown_table, publish
 
 from msk_ray.config import load_config
 from msk_ray.envs import env_class
-from msk_ray.gradcheck import check_gradients
-from msk_ray.simulation import Simulation
-from msk_ray.simulation.modes import configured_backward
+from msk_ray.step import Simulation, check_gradients
+from msk_ray.step.autograd.modes import configured_backward
 
 
 def main() -> None:

@@ -29,9 +29,8 @@ import numpy as np
 from record import RESULTS, markdown_table, publish
 
 from msk_ray.errors import MskRayError
-from msk_ray.gradcheck import check_gradients
-from msk_ray.physics.adjoint.coverage import partly_exact, unsupported
-from msk_ray.simulation import Simulation
+from msk_ray.step import Simulation, check_gradients
+from msk_ray.step.adjoint.coverage.check import partly_exact, unsupported
 
 GROUPS = {
     "robots": ("gymnasium_robotics", "mjlab", "robosuite", "gym_aloha", "robopianist"),

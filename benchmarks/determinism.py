@@ -1,7 +1,7 @@
 """Which stages of a step a GPU repeats bit for bit, with which of mujoco_warp's options, and what repeating costs.
 
 Three tables a model and number of worlds. *Stages*: each stage of mujoco_warp's step, of the step with a fixed order
-(`msk_ray.physics.ordered`) and of the adjoint runs again and again from one and the same input, and every array it
+(`msk_ray.step.forward.ordered`) and of the adjoint runs again and again from one and the same input, and every array it
 leaves is compared by its bits. *Runs*: how many worlds differ after some steps from one state, and the step that they
 first differ in, for each subset of the options. *Cost*: milliseconds a step, replayed from a graph. On a CPU everything
 is equal.
@@ -26,10 +26,10 @@ from torch import Tensor
 import msk_ray
 from msk_ray.config import load_config
 from msk_ray.envs import make_env
-from msk_ray.physics import Graph, Kernels, WorldBatch
-from msk_ray.physics.ordered.solve import solve
-from msk_ray.physics.ordered.stages import OrderedStages, with_options
-from msk_ray.simulation import TapePerSubstep
+from msk_ray.step import TapePerSubstep
+from msk_ray.step.forward import Graph, Kernels, WorldBatch
+from msk_ray.step.forward.ordered.solve import solve
+from msk_ray.step.forward.ordered.stages import OrderedStages, with_options
 
 CONFIGS = Path(msk_ray.__file__).resolve().parents[1] / "configs"
 MODELS = {

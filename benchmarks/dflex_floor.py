@@ -24,7 +24,7 @@ from msk_ray.cli import run
 from msk_ray.config import PhysicsConfig
 from msk_ray.envs import Env, env_class, make_env
 from msk_ray.errors import ConfigError
-from msk_ray.simulation import StepState
+from msk_ray.step import StepState
 from msk_ray.training import load_policy
 
 SUBSTEPS = 64

@@ -17,7 +17,7 @@ import torch
 from record import RESULTS, markdown_table, publish, used_bytes
 from step_models import MODELS
 
-from msk_ray.simulation import Simulation, TapePerSubstep
+from msk_ray.step import Simulation, TapePerSubstep
 
 
 def seconds(sim: Simulation, steps: int, backward: bool) -> float:

@@ -15,9 +15,8 @@ import mujoco
 from record import RESULTS, markdown_table, publish
 
 from msk_ray.errors import MskRayError, UnsupportedModelError
-from msk_ray.gradcheck import GradientCheck, check_gradients
-from msk_ray.physics.capacity import default_capacity, geometric_bound
-from msk_ray.simulation import Simulation
+from msk_ray.step import GradientCheck, Simulation, check_gradients
+from msk_ray.step.forward.capacity import default_capacity, geometric_bound
 
 
 class Model(NamedTuple):

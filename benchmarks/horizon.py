@@ -8,8 +8,8 @@ from record import RESULTS, markdown_table, publish
 
 from msk_ray.config import load_config
 from msk_ray.envs import env_class
-from msk_ray.gradcheck import check_chain, make_states
-from msk_ray.simulation.modes import make_backward
+from msk_ray.step.autograd.modes import make_backward
+from msk_ray.step.check import check_chain, make_states
 
 
 def main() -> None:

@@ -7,7 +7,7 @@ import torch
 from record import RESULTS, markdown_table, publish
 from step_models import MODELS
 
-from msk_ray.simulation import Backward, FdJacobian, Simulation, TapePerSubstep
+from msk_ray.step import Backward, FdJacobian, Simulation, TapePerSubstep
 
 
 class OneRowAtATime(TapePerSubstep):

@@ -20,10 +20,10 @@ from record import RESULTS, markdown_table, publish
 
 from msk_ray.config import load_config
 from msk_ray.envs import env_class
-from msk_ray.gradcheck import GradientCheck, Oracle, check_gradients, make_states
-from msk_ray.gradcheck.check import compare
-from msk_ray.physics.parameters import names_of
-from msk_ray.simulation import Simulation
+from msk_ray.step import Simulation
+from msk_ray.step.check import GradientCheck, Oracle, check_gradients, make_states
+from msk_ray.step.check.check import compare
+from msk_ray.step.forward.parameters import names_of
 
 SERVO_ARM = """
 <mujoco>

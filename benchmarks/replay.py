@@ -4,7 +4,7 @@ import time
 
 import warp as wp
 
-from msk_ray.physics import Graph
+from msk_ray.step.forward import Graph
 
 
 def milliseconds(graph: Graph, device: wp.Device, repeats: int) -> float:

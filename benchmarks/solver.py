@@ -19,9 +19,9 @@ from replay import milliseconds
 
 from msk_ray.config import load_config
 from msk_ray.envs.make import env_class
-from msk_ray.physics import Graph, Kernels, WorldBatch
-from msk_ray.physics.fused import FusedSolver
-from msk_ray.physics.ordered.solve import solve as solve_ordered
+from msk_ray.step.forward import Graph, Kernels, WorldBatch
+from msk_ray.step.forward.fused import FusedSolver
+from msk_ray.step.forward.ordered.solve import solve as solve_ordered
 
 KERNELS = {
     "mujoco_warp": Kernels(),

@@ -13,8 +13,8 @@ from replay import milliseconds
 from step_models import MODELS
 
 from msk_ray.errors import UnsupportedModelError
-from msk_ray.physics import Graph, WorldBatch
-from msk_ray.simulation import TapeAll, TapePerSubstep
+from msk_ray.step import TapeAll, TapePerSubstep
+from msk_ray.step.forward import Graph, WorldBatch
 
 
 def settle(batch: WorldBatch, steps: int) -> dict[str, wp.array]:

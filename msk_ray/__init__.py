@@ -18,15 +18,15 @@ if TYPE_CHECKING:
     from msk_ray.envs import Env as Env
     from msk_ray.envs import MjcfEnv as MjcfEnv
     from msk_ray.envs import MjcfSettings as MjcfSettings
-    from msk_ray.gradcheck import check_gradients as check_gradients
-    from msk_ray.simulation import Backward as Backward
-    from msk_ray.simulation import Capacity as Capacity
-    from msk_ray.simulation import FdJacobian as FdJacobian
-    from msk_ray.simulation import Hybrid as Hybrid
-    from msk_ray.simulation import Simulation as Simulation
-    from msk_ray.simulation import StepState as StepState
-    from msk_ray.simulation import TapeAll as TapeAll
-    from msk_ray.simulation import TapePerSubstep as TapePerSubstep
+    from msk_ray.step import Backward as Backward
+    from msk_ray.step import Capacity as Capacity
+    from msk_ray.step import FdJacobian as FdJacobian
+    from msk_ray.step import Hybrid as Hybrid
+    from msk_ray.step import Simulation as Simulation
+    from msk_ray.step import StepState as StepState
+    from msk_ray.step import TapeAll as TapeAll
+    from msk_ray.step import TapePerSubstep as TapePerSubstep
+    from msk_ray.step import check_gradients as check_gradients
     from msk_ray.train import train as train
     from msk_ray.training.loggers import Logger as Logger
     from msk_ray.training.policy import load_policy as load_policy
@@ -36,23 +36,23 @@ __version__ = "0.2.0"
 _HOMES = {
     "Algorithm": "msk_ray.algorithms",
     "AlgorithmSettings": "msk_ray.config",
-    "Backward": "msk_ray.simulation",
-    "Capacity": "msk_ray.simulation",
+    "Backward": "msk_ray.step.autograd",
+    "Capacity": "msk_ray.step.autograd",
     "Config": "msk_ray.config",
     "Env": "msk_ray.envs",
     "EnvSettings": "msk_ray.config",
     "EpochResult": "msk_ray.algorithms",
-    "FdJacobian": "msk_ray.simulation",
-    "Hybrid": "msk_ray.simulation",
+    "FdJacobian": "msk_ray.step.autograd",
+    "Hybrid": "msk_ray.step.autograd",
     "Logger": "msk_ray.training.loggers",
     "MjcfEnv": "msk_ray.envs",
     "MjcfSettings": "msk_ray.envs",
     "Reward": "msk_ray.config",
-    "Simulation": "msk_ray.simulation",
-    "StepState": "msk_ray.simulation",
-    "TapeAll": "msk_ray.simulation",
-    "TapePerSubstep": "msk_ray.simulation",
-    "check_gradients": "msk_ray.gradcheck",
+    "Simulation": "msk_ray.step.autograd",
+    "StepState": "msk_ray.step.autograd",
+    "TapeAll": "msk_ray.step.autograd",
+    "TapePerSubstep": "msk_ray.step.autograd",
+    "check_gradients": "msk_ray.step.check",
     "load_config": "msk_ray.config",
     "load_policy": "msk_ray.training.policy",
     "train": "msk_ray.train",

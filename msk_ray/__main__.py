@@ -14,13 +14,13 @@ COMMANDS = {
     "evaluate": ("msk_ray.evaluate.__main__", "evaluate policies: fixed seeds, no noise, every reward term"),
     "visualize": ("msk_ray.visualize.__main__", "watch a policy: viewer, video, frames, film strip"),
     "export": ("msk_ray.export.__main__", "write a policy as ONNX or TorchScript, with its model and description"),
-    "gait": ("msk_ray.gait.__main__", "measure how a leg policy walks, compared with people"),
+    "gait": ("msk_ray.legs.gait.__main__", "measure how a leg policy walks, compared with people"),
     "report": ("msk_ray.report.__main__", "write an experiment's report: curves, tables, the best policy"),
     "dashboard": ("msk_ray.dashboard.__main__", "serve the experiments as live pages in a browser"),
     "status": ("msk_ray.status", "show the progress of experiments, read from their files"),
     "doctor": ("msk_ray.doctor", "check that this machine can run trials, and say what to fix"),
     "diagnose": ("msk_ray.diagnose.__main__", "compare a policy's gradients with float64 differences, by horizon"),
-    "gradcheck": ("msk_ray.gradcheck.__main__", "check a model's gradients against float64 finite differences"),
+    "gradcheck": ("msk_ray.gradcheck", "check a model's gradients against float64 finite differences"),
 }
 
 SAVING = ("train", "tune")

@@ -266,8 +266,7 @@ def check_gradient(device: str | None) -> Finding:
     from msk_ray.config import PhysicsConfig
     from msk_ray.envs import env_class
     from msk_ray.envs.cartpole.config import CartPoleSettings
-    from msk_ray.gradcheck import check_gradients
-    from msk_ray.simulation import Simulation
+    from msk_ray.step import Simulation, check_gradients
 
     where = device or ("cuda:0" if torch.cuda.is_available() else "cpu")
     env = CartPoleSettings(name="cartpole")
@@ -370,7 +369,7 @@ def _gpu_facts() -> GpuFacts:
     import warp as wp
 
     # The import sets Warp's log level, so that Warp does not list the devices when it starts.
-    import msk_ray.physics  # noqa: F401
+    import msk_ray.step.forward  # noqa: F401
 
     wp.init()
     view = ask_driver()

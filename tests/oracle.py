@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 import torch
 
-from msk_ray.simulation import Simulation
-from msk_ray.simulation.backward import Backward, StepState
+from msk_ray.step import Simulation
+from msk_ray.step.autograd.backward import Backward, StepState
 
 INPUTS = ("ctrl", "qpos", "qvel", "act")
 

@@ -13,7 +13,7 @@ from msk_ray.cli import run
 from msk_ray.diagnose.__main__ import main as diagnose
 from msk_ray.evaluate.__main__ import main as evaluate
 from msk_ray.experiment.manifest import Experiment
-from msk_ray.gradcheck.__main__ import main as gradcheck
+from msk_ray.gradcheck import main as gradcheck
 from msk_ray.progress import Pace, ProgressLine
 from msk_ray.visualize.__main__ import main as visualize
 
@@ -37,7 +37,7 @@ def test_progress_needs_no_more_of_a_row_than_every_algorithm_has(capsys: pytest
 def test_warp_starts_without_a_word_where_there_is_no_gpu() -> None:
     if Path("/dev/nvidiactl").exists():
         pytest.skip("there is a GPU")
-    code = "import msk_ray.physics, warp; print(warp.get_devices())"
+    code = "import msk_ray.step.forward, warp; print(warp.get_devices())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.stderr, done.stdout.strip()) == ("", "['cpu']")
 

@@ -14,7 +14,7 @@ import mujoco
 import torch
 from torch import Tensor
 
-from msk_ray.simulation import Simulation, StepState
+from msk_ray.step import Simulation, StepState
 
 MODEL = """
 <mujoco><option timestep="0.005"/><worldbody>

@@ -16,10 +16,10 @@ import numpy as np
 from matplotlib.patches import Rectangle
 
 from msk_ray.config import PhysicsConfig
-from msk_ray.envs.myoleg26.config import MyoLeg26Settings
-from msk_ray.envs.myoleg26.model import WINDOW, build_myoleg26
-from msk_ray.envs.myoleg26.moment_arms import PUBLISHED, moment_arms
-from msk_ray.envs.myoleg26.tables import MUSCLES
+from msk_ray.legs.myoleg26.config import MyoLeg26Settings
+from msk_ray.legs.myoleg26.model import WINDOW, build_myoleg26
+from msk_ray.legs.myoleg26.moment_arms import PUBLISHED, moment_arms
+from msk_ray.legs.myoleg26.tables import MUSCLES
 
 AXES = ("hip_flexion", "hip_adduction", "knee_angle", "ankle_angle")
 

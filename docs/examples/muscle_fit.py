@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from msk_ray.simulation import Simulation
+from msk_ray.step import Simulation
 
 MODEL = """
 <mujoco><option timestep="0.002" gravity="0 0 0"/><worldbody>

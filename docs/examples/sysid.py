@@ -18,7 +18,7 @@ import mujoco
 import torch
 from torch import Tensor
 
-from msk_ray.simulation import Simulation, StepState
+from msk_ray.step import Simulation, StepState
 
 MODEL = """
 <mujoco><option timestep="0.004"/><default><joint damping="1" armature="0.03" frictionloss="1"/>

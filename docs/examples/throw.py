@@ -4,7 +4,7 @@ import matplotlib.pyplot as plt
 import mujoco
 import torch
 
-from msk_ray.simulation import Simulation, TapePerSubstep
+from msk_ray.step import Simulation, TapePerSubstep
 
 model = mujoco.MjModel.from_xml_string("""
 <mujoco><option timestep="0.005" cone="elliptic"/><worldbody>

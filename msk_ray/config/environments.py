@@ -17,9 +17,9 @@ ENVIRONMENTS = Registry(
         "hopper": "msk_ray.envs.hopper.env:Hopper",
         "cheetah": "msk_ray.envs.cheetah.env:Cheetah",
         "humanoid": "msk_ray.envs.humanoid.env:Humanoid",
-        "myoleg26": "msk_ray.envs.myoleg26.env:MyoLeg26",
-        "myoleg": "msk_ray.envs.myoleg.env:MyoLeg",
-        "myosuite_walk": "msk_ray.envs.myosuite_walk.env:MyoSuiteWalk",
+        "myoleg26": "msk_ray.legs.myoleg26.env:MyoLeg26",
+        "myoleg": "msk_ray.legs.myoleg.env:MyoLeg",
+        "myosuite_walk": "msk_ray.legs.myosuite_walk.env:MyoSuiteWalk",
     },
 )
 """Classes of environments."""
@@ -32,9 +32,9 @@ SETTINGS = Registry(
         "hopper": "msk_ray.envs.hopper.config:HopperSettings",
         "cheetah": "msk_ray.envs.cheetah.config:CheetahSettings",
         "humanoid": "msk_ray.envs.humanoid.config:HumanoidSettings",
-        "myoleg26": "msk_ray.envs.myoleg26.config:MyoLeg26Settings",
-        "myoleg": "msk_ray.envs.myoleg.config:MyoLegSettings",
-        "myosuite_walk": "msk_ray.envs.myosuite_walk.config:MyoSuiteWalkSettings",
+        "myoleg26": "msk_ray.legs.myoleg26.config:MyoLeg26Settings",
+        "myoleg": "msk_ray.legs.myoleg.config:MyoLegSettings",
+        "myosuite_walk": "msk_ray.legs.myosuite_walk.config:MyoSuiteWalkSettings",
     },
 )
 """Settings that can be imported without their environment, which loads torch. A name that is only in `ENVIRONMENTS`

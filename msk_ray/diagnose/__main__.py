@@ -83,7 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     # torch and Warp take seconds to load; a wrong command line should not wait for them.
     from msk_ray.diagnose.probe import probe, read_subject
-    from msk_ray.simulation.simulation import resolve_device
+    from msk_ray.step.autograd.simulation import resolve_device
 
     subject = read_subject(args.subject, args.overrides)
     known = subject.config.env.variants

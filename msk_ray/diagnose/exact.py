@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from msk_ray.simulation.kinematics import Frames, Kinematics
-from msk_ray.simulation.tendons import Tendons
+from msk_ray.step.autograd.kinematics import Frames, Kinematics
+from msk_ray.step.autograd.tendon_lengths import Tendons
 
 
 class ExactKinematics(Kinematics):

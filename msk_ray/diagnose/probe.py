@@ -20,8 +20,8 @@ from msk_ray.config import Config, PhysicsConfig, load_config
 from msk_ray.diagnose.exact import ExactKinematics, ExactTendons
 from msk_ray.envs import Env, EnvState, make_env
 from msk_ray.errors import ConfigError, SimulationError
-from msk_ray.gradcheck import Oracle, Point
-from msk_ray.simulation import StepState
+from msk_ray.step import StepState
+from msk_ray.step.check import Oracle, Point
 from msk_ray.training import SavedPolicy, load_policy
 
 STATE_KINDS = ("reset", "standing", "gait")

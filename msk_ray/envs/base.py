@@ -20,12 +20,11 @@ from msk_ray.envs.randomize import Randomizer
 from msk_ray.envs.records import EnvState, Resets, Transition
 from msk_ray.errors import ConfigError
 from msk_ray.group import ALONE, Group
-from msk_ray.physics import Kernels
-from msk_ray.physics.capacity import Capacity
-from msk_ray.simulation import Backward, Simulation, StepState
-from msk_ray.simulation.flags import known_none
-from msk_ray.simulation.kinematics import Frames, Kinematics, Names, as_named
-from msk_ray.simulation.tendons import Tendons
+from msk_ray.step import Backward, Kernels, Simulation, StepState
+from msk_ray.step.autograd.flags import known_none
+from msk_ray.step.autograd.kinematics import Frames, Kinematics, Names, as_named
+from msk_ray.step.autograd.tendon_lengths import Tendons
+from msk_ray.step.forward.capacity import Capacity
 
 SettingsT = TypeVar("SettingsT", bound=EnvSettings)
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from msk_ray.config.sections import LimitedSettings
 from msk_ray.envs.base import Env
-from msk_ray.simulation import StepState
+from msk_ray.step import StepState
 
 _UNIT = 0.1
 """Overshoot of one joint that counts as 1 [rad]."""

@@ -5,7 +5,7 @@ from typing import Any
 from msk_ray.config import ENVIRONMENTS, EnvSettings, PhysicsConfig, resolve_class
 from msk_ray.envs.base import Env
 from msk_ray.errors import ConfigError
-from msk_ray.simulation.modes import configured_backward
+from msk_ray.step.autograd.modes import configured_backward
 
 
 def env_class(config: EnvSettings) -> type[Env[Any]]:

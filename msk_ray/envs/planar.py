@@ -6,7 +6,7 @@ from torch import Tensor
 
 from msk_ray.envs.layout import Entry
 from msk_ray.envs.limits import LimitedBody, LimitedT
-from msk_ray.simulation import StepState
+from msk_ray.step import StepState
 
 
 class PlanarBody(LimitedBody[LimitedT]):

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from msk_ray.simulation import StepState
+from msk_ray.step import StepState
 
 
 class EnvState(NamedTuple):

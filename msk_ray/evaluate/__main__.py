@@ -29,7 +29,7 @@ from msk_ray.text_table import text_table
 
 if TYPE_CHECKING:
     from msk_ray.evaluate.measure import Bench, Request
-    from msk_ray.evaluate.myosuite import MyoSuiteBench
+    from msk_ray.legs.myosuite_walk.scoring import MyoSuiteBench
 
 DESCRIPTION = """\
 Evaluate a policy: without noise, from fixed initial states, under the environment's default reward weights.
@@ -127,7 +127,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         bench = myosuite.MyoSuiteBench(python)
         requests = myosuite.requests(args.worlds, seeds, args.steps)
     else:
-        from msk_ray.simulation.simulation import resolve_device
+        from msk_ray.step.autograd.simulation import resolve_device
 
         device = args.device or measure.default_device()
         resolve_device(device)  # a missing device is not the fault of any trial
@@ -152,7 +152,7 @@ def _evaluate_zoo(target: Target, args: argparse.Namespace) -> int:
     announce(f"evaluating the policies of {target.path} as recorded there; {COMPILING}")
 
     from msk_ray.evaluate import measure
-    from msk_ray.simulation.simulation import resolve_device
+    from msk_ray.step.autograd.simulation import resolve_device
 
     device = args.device or measure.default_device()
     resolve_device(device)

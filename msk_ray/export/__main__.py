@@ -108,7 +108,7 @@ def _add_to_zoo(args: argparse.Namespace, checkpoint: Path, files: bool) -> int:
     make_folder(args.zoo.parent)
     from msk_ray.evaluate.measure import default_device
     from msk_ray.export.zoo import Origin, add_to_zoo
-    from msk_ray.simulation.simulation import resolve_device
+    from msk_ray.step.autograd.simulation import resolve_device
 
     device = args.device or default_device()
     resolve_device(device)

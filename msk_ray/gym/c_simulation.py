@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from msk_ray.errors import UnsupportedModelError
-from msk_ray.simulation import Simulation, StepState
+from msk_ray.step import Simulation, StepState
 
 
 class CSimulation(Simulation):

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from msk_ray.config import NetworkConfig
-from msk_ray.simulation.hidden_layer import hidden_layer
+from msk_ray.step.autograd.hidden_layer import hidden_layer
 
 _ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "silu": nn.SiLU, "relu": nn.ReLU, "tanh": nn.Tanh}
 

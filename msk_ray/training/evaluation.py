@@ -12,8 +12,8 @@ from msk_ray.config import Config, PhysicsConfig, RandomizeConfig
 from msk_ray.envs import Env, EnvState, env_class, make_env
 from msk_ray.envs.records import Resets, Transition
 from msk_ray.errors import ConfigError
-from msk_ray.simulation import StepState
-from msk_ray.simulation.capture import Recording, fill
+from msk_ray.step import StepState
+from msk_ray.step.autograd.capture import Recording, fill
 from msk_ray.training.policy_group import Policy, PolicyGroup, streams_for
 
 OnStep = Callable[[StepState, Tensor], None]

@@ -28,7 +28,7 @@ from msk_ray.config import Config
 from msk_ray.errors import DeviceError, MskRayError, RankLost, SimulationError
 from msk_ray.group import PeerLost, ProcessGroup
 from msk_ray.signals import NUMBERS
-from msk_ray.simulation import use_device
+from msk_ray.step import use_device
 from msk_ray.training.learner import follow
 from msk_ray.training.place import Place
 from msk_ray.training.trainer import Trainer

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from msk_ray.envs import Env
-from msk_ray.simulation.capture import Recording, fill
+from msk_ray.step.autograd.capture import Recording, fill
 
 Policy = Callable[[Tensor], Tensor]
 """Raw observations (W, O) to actions (W, A)."""

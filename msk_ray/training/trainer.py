@@ -21,7 +21,7 @@ from msk_ray.experiment.metrics import HASH, SCORE, read_metrics, read_rows
 from msk_ray.files import remove_stale, write_bytes
 from msk_ray.group import ALONE, Group
 from msk_ray.networks import as_number, parameter_hash
-from msk_ray.simulation.simulation import resolve_device
+from msk_ray.step.autograd.simulation import resolve_device
 from msk_ray.training.checkpoint import (
     epoch_checkpoints,
     milestone_path,

@@ -102,7 +102,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     target = _check(args)
     announce(f"running {_what(args, target)}; {COMPILING}")
     from msk_ray.evaluate.measure import Bench, Request, default_device
-    from msk_ray.simulation.simulation import resolve_device
+    from msk_ray.step.autograd.simulation import resolve_device
     from msk_ray.training import load_policy
 
     seeds = None if args.seed is None else (args.seed,)

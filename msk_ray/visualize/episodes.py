@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from msk_ray.evaluate.measure import Bench, Request
-from msk_ray.simulation import StepState
+from msk_ray.step import StepState
 from msk_ray.training import SavedPolicy
 from msk_ray.training.evaluation import Episodes
 from msk_ray.visualize.render import States

@@ -12,8 +12,8 @@ from msk_ray.algorithms import algorithm_class
 from msk_ray.algorithms.base import Algorithm, EpochResult, _of_all
 from msk_ray.config import Config, PhysicsConfig
 from msk_ray.envs import make_env
-from msk_ray.envs.myoleg26.config import MyoLeg26Settings
 from msk_ray.errors import ConfigError
+from msk_ray.legs.myoleg26.config import MyoLeg26Settings
 
 
 class Silent(Algorithm):

@@ -5,9 +5,9 @@ import numpy as np
 import torch
 
 from msk_ray.diagnose.exact import ExactKinematics, ExactTendons
-from msk_ray.physics import WorldBatch
-from msk_ray.simulation.kinematics import Kinematics
-from msk_ray.simulation.tendons import Tendons
+from msk_ray.step.autograd.kinematics import Kinematics
+from msk_ray.step.autograd.tendon_lengths import Tendons
+from msk_ray.step.forward import WorldBatch
 
 MODEL = """<mujoco><worldbody><site name="anchor" pos="0 0 1"/>
   <body name="trunk" pos="0 0 .5"><freejoint/><geom name="trunk" size=".1 .2" type="capsule" pos=".1 0 0" mass="2"/>

@@ -14,7 +14,7 @@ from msk_ray.envs.ant.env import Ant
 from msk_ray.envs.ant.model import VARIANTS, build_ant
 from msk_ray.envs.cartpole.config import CartPoleSettings
 from msk_ray.envs.cartpole.env import CartPole
-from msk_ray.simulation import StepState
+from msk_ray.step import StepState
 
 
 @pytest.fixture(scope="module")
@@ -191,7 +191,7 @@ def test_what_a_cpu_leaves_out_where_no_world_is_concerned_changes_nothing(
     for looks in (True, False):
         if not looks:  # as on a GPU
             monkeypatch.setattr("msk_ray.envs.base.known_none", lambda _: False)
-            monkeypatch.setattr("msk_ray.simulation.simulation.known_none", lambda _: False)
+            monkeypatch.setattr("msk_ray.step.autograd.simulation.known_none", lambda _: False)
         cartpole.generator.manual_seed(1)
         cartpole.state = cartpole.reset_state()
         actions = torch.linspace(-0.9, 0.8, 20).view(5, 4, 1).requires_grad_()

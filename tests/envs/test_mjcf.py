@@ -13,8 +13,8 @@ import torch
 from msk_ray.config import overlay, parse_config
 from msk_ray.envs import Env, env_class, make_env
 from msk_ray.errors import ConfigError, MskRayError, UnsupportedModelError
-from msk_ray.simulation import Simulation
-from msk_ray.simulation.modes import BACKWARD_MODES
+from msk_ray.step import Simulation
+from msk_ray.step.autograd.modes import BACKWARD_MODES
 
 MODEL = """<mujoco><option timestep="0.004" integrator="implicitfast" iterations="33"/>
   <worldbody><geom name="floor" type="plane" size="5 5 1"/>

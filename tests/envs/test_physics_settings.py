@@ -12,8 +12,8 @@ from msk_ray.config import Config, PhysicsConfig, overlay, parse_config
 from msk_ray.config.physics import FdConfig
 from msk_ray.envs import env_class, make_env
 from msk_ray.errors import ConfigError
-from msk_ray.physics import Kernels
-from msk_ray.simulation.modes import BACKWARD_MODES, configured_backward
+from msk_ray.step import Kernels
+from msk_ray.step.autograd.modes import BACKWARD_MODES, configured_backward
 
 VALUES: dict[str, Any] = {
     "variant": "published",

@@ -16,7 +16,7 @@ from msk_ray.envs import make_env
 from msk_ray.envs.randomize import Randomizer
 from msk_ray.errors import ConfigError
 from msk_ray.experiment.metrics import read_metrics
-from msk_ray.simulation import Simulation
+from msk_ray.step import Simulation
 from msk_ray.training import Trainer
 from msk_ray.training.evaluation import Evaluator
 

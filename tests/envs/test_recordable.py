@@ -59,7 +59,7 @@ def test_nothing_waits_in_an_env_step_and_its_gradient(name: str, monkeypatch: p
     """After one that has made what is made at the first use. Resets are drawn before, as for a recorded epoch.
 
     On a CPU the host may look at flags of worlds; here it takes the way of a GPU."""
-    for module in ("msk_ray.envs.base", "msk_ray.simulation.simulation"):
+    for module in ("msk_ray.envs.base", "msk_ray.step.autograd.simulation"):
         monkeypatch.setattr(f"{module}.known_none", lambda flags: False)
     config = parse_config({"env": {**ENVIRONMENTS[name], "nworld": 2}})
     env = make_env(config.env, config.physics, 2, "cpu", 0)

@@ -8,8 +8,8 @@ from msk_ray.config import EnvSettings, Reward, parse_config
 from msk_ray.config.physics import STEPPING
 from msk_ray.config.sections import Section
 from msk_ray.envs import Env, env_class
-from msk_ray.envs.legs.config import LegReward
-from msk_ray.envs.myoleg.config import MyoLegSettings
+from msk_ray.legs.config import LegReward
+from msk_ray.legs.myoleg.config import MyoLegSettings
 
 
 class _HopperReward(Reward):

@@ -11,11 +11,10 @@ import torch
 
 from msk_ray.config import parse_config
 from msk_ray.envs import Env, env_class, make_env
-from msk_ray.gradcheck import check_gradients
-from msk_ray.gradcheck.check import compare
-from msk_ray.gradcheck.oracle import Oracle, Point
-from msk_ray.gradcheck.pullback import simulated_gradients
-from msk_ray.simulation import Simulation, StepState
+from msk_ray.step import Simulation, StepState, check_gradients
+from msk_ray.step.check.check import compare
+from msk_ray.step.check.oracle import Oracle, Point
+from msk_ray.step.check.pullback import simulated_gradients
 
 SIZES = {"hopper": (6, 6, 3, 4), "cheetah": (9, 9, 6, 8), "humanoid": (28, 27, 21, 19)}
 """nq, nv, nu and pairs with the floor."""

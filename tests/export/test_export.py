@@ -27,7 +27,7 @@ from msk_ray.export.__main__ import main
 from msk_ray.export.description import describe
 from msk_ray.export.network import PolicyToControl, largest_difference
 from msk_ray.shipped import shipped_folder
-from msk_ray.simulation import StepState
+from msk_ray.step import StepState
 
 pytestmark = pytest.mark.long
 

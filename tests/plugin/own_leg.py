@@ -5,9 +5,9 @@ from torch import Tensor
 
 from msk_ray import StepState
 from msk_ray.config.sections import NonNegative
-from msk_ray.envs.legs.config import LegReward
-from msk_ray.envs.myoleg26.config import MyoLeg26Settings
-from msk_ray.envs.myoleg26.env import MyoLeg26
+from msk_ray.legs.config import LegReward
+from msk_ray.legs.myoleg26.config import MyoLeg26Settings
+from msk_ray.legs.myoleg26.env import MyoLeg26
 
 
 class Reward(LegReward):

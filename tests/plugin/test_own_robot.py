@@ -46,7 +46,7 @@ def test_the_files_of_the_page_make_an_environment_with_gradients_and_a_sweep(fo
 
 
 def test_what_the_page_says_can_be_measured_can_be(folder: Path, root: Path) -> None:
-    from msk_ray.simulation.kinematics import Frames
+    from msk_ray.step.autograd.kinematics import Frames
 
     page = (root / "docs" / "own_robot.md").read_text()
     rows = [line for line in page.splitlines() if line.startswith("| ")]

@@ -17,7 +17,7 @@ from msk_ray.config import ContactHorizon, ShacConfig
 from msk_ray.envs import Env, EnvState, Resets
 from msk_ray.networks import Critic, PolicyNetwork, RunningMeanStd
 from msk_ray.networks.calls import Calls
-from msk_ray.simulation import StepState
+from msk_ray.step import StepState
 
 
 class EpochInputs(NamedTuple):

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from msk_ray.config import PerturbedCopies
 from msk_ray.envs import Env, EnvState
-from msk_ray.simulation import StepState
+from msk_ray.step import StepState
 
 
 def from_first(values: Tensor, count: int) -> Tensor:

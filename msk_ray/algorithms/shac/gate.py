@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from msk_ray.group import ALONE, Group
-from msk_ray.simulation import StepState
+from msk_ray.step import StepState
 
 
 class Norms(NamedTuple):

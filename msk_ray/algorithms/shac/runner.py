@@ -14,9 +14,9 @@ from torch import Tensor
 from msk_ray.algorithms.base import Clock
 from msk_ray.algorithms.shac.actor_update import ActorOutcome, ActorUpdate, EpochInputs, Judged, Rolled
 from msk_ray.envs import Env
-from msk_ray.physics.iterations import limits_for, reached
-from msk_ray.simulation.capture import Recording, fill
-from msk_ray.simulation.stepper import Engine
+from msk_ray.step.autograd.capture import Recording, fill
+from msk_ray.step.autograd.stepper import Engine
+from msk_ray.step.forward.iterations import limits_for, reached
 
 
 class CriticWork(Protocol):

@@ -11,8 +11,8 @@ from msk_ray.envs.ant.config import AntSettings
 from msk_ray.envs.ant.model import STAND_HEIGHT, STAND_JOINTS, build_ant
 from msk_ray.envs.layout import Entry, entries, floating_body
 from msk_ray.envs.limits import LimitedBody
-from msk_ray.simulation import StepState
-from msk_ray.simulation.tangent import quat_exp, quat_multiply, quat_rotate
+from msk_ray.step import StepState
+from msk_ray.step.autograd.tangent import quat_exp, quat_multiply, quat_rotate
 
 _JOINT_VELOCITY_SCALE = 0.1
 

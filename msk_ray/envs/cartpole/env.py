@@ -11,7 +11,7 @@ from msk_ray.envs.base import Env, wrap_angle
 from msk_ray.envs.cartpole.config import CartPoleSettings
 from msk_ray.envs.cartpole.model import build_cartpole
 from msk_ray.envs.layout import Entry, entries
-from msk_ray.simulation import StepState
+from msk_ray.step import StepState
 
 UPRIGHT_ANGLE = 0.3
 """A pole within this angle of upright counts as held [rad]."""

@@ -8,7 +8,7 @@ from msk_ray.config import PhysicsConfig
 from msk_ray.envs.cheetah.config import CheetahSettings
 from msk_ray.envs.cheetah.model import build_cheetah
 from msk_ray.envs.planar import PlanarBody
-from msk_ray.simulation import StepState
+from msk_ray.step import StepState
 
 _START_HEIGHT = -0.2
 

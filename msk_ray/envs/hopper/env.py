@@ -10,7 +10,7 @@ from msk_ray.config import PhysicsConfig
 from msk_ray.envs.hopper.config import HopperSettings
 from msk_ray.envs.hopper.model import build_hopper
 from msk_ray.envs.planar import PlanarBody
-from msk_ray.simulation import StepState
+from msk_ray.step import StepState
 
 _FULL_ANGLE = math.pi / 6
 _TOP = 0.3

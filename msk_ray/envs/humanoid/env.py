@@ -11,8 +11,8 @@ from msk_ray.envs.humanoid.config import HumanoidSettings
 from msk_ray.envs.humanoid.model import START_HEIGHT, build_humanoid
 from msk_ray.envs.layout import Entry, entries, floating_body
 from msk_ray.envs.limits import LimitedBody
-from msk_ray.simulation import StepState
-from msk_ray.simulation.tangent import quat_exp, quat_rotate
+from msk_ray.step import StepState
+from msk_ray.step.autograd.tangent import quat_exp, quat_rotate
 
 _JOINT_VELOCITY_SCALE = 0.1
 _TARGET = 200.0

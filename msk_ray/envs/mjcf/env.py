@@ -18,7 +18,7 @@ from msk_ray.envs.base import Env
 from msk_ray.envs.mjcf.config import MjcfSettings
 from msk_ray.envs.options import override_options
 from msk_ray.errors import ConfigError, shortened
-from msk_ray.simulation import Backward, StepState
+from msk_ray.step import Backward, StepState
 
 AnyMjcfSettings = TypeVar("AnyMjcfSettings", bound=MjcfSettings)
 

@@ -3,7 +3,7 @@
 import torch
 
 from msk_ray.algorithms.shac.gate import CotangentGate
-from msk_ray.simulation import StepState
+from msk_ray.step import StepState
 
 
 def pulled(gate: CotangentGate, cotangent: torch.Tensor) -> torch.Tensor:

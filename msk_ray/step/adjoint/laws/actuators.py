@@ -1,0 +1,383 @@
+"""Actuators: slopes of force and activation with respect to control, activation, length and velocity."""
+
+import warp as wp
+from mujoco_warp import BiasType, DynType, GainType, JointType, TrnType
+
+from msk_ray.step.adjoint.groups import DofSlopes, Multipliers, State, Substep, TendonBars, allocate, gather
+from msk_ray.step.adjoint.workspace import Workspace
+from msk_ray.step.forward.mjw_private import muscle_bias, muscle_dynamics, muscle_gain, muscle_gain_vel_deriv, vec10
+from msk_ray.step.forward.model_tree import motors_apart
+
+wp.set_module_options({"enable_backward": False})
+
+_MINVAL = wp.constant(1.0e-15)
+
+
+@wp.struct
+class ActuatorLaw:
+    """What one actuator's force and activation depend on besides (ctrl, act, length, velocity)."""
+
+    dyntype: int
+    gaintype: int
+    biastype: int
+    early: int
+    clamp_ctrl: int
+    clamp_act: int
+    clamp_next: int
+    clamp_force: int
+    implicit: int
+    dynprm: vec10
+    gainprm: vec10
+    biasprm: vec10
+    ctrlrange: wp.vec2
+    actrange: wp.vec2
+    forcerange: wp.vec2
+    lengthrange: wp.vec2
+    acc0: float
+    timestep: float
+
+
+@wp.func
+def free_activation(law: ActuatorLaw, ctrl: wp.float32, act: wp.float32) -> wp.float32:
+    """act' of a stateful actuator before its own clamp, from the control after its clamp."""
+    rate = wp.float32(0.0)
+    step = law.timestep
+    if law.dyntype == DynType.INTEGRATOR:
+        rate = ctrl
+    elif law.dyntype == DynType.MUSCLE:
+        rate = muscle_dynamics(ctrl, act, law.dynprm)
+    else:
+        tau = wp.max(law.dynprm[0], _MINVAL)
+        rate = (ctrl - act) / tau
+        if law.dyntype == DynType.FILTEREXACT:
+            step = tau * (1.0 - wp.exp(-law.timestep / tau))
+    return act + step * rate
+
+
+@wp.func
+def actuator_force(law: ActuatorLaw, drive: wp.float32, length: wp.float32, velocity: wp.float32) -> wp.float32:
+    """Scalar force: gain(length, velocity)·drive + bias(length, velocity), clamped."""
+    gain = law.gainprm[0]
+    if law.gaintype == GainType.AFFINE:
+        gain = law.gainprm[0] + law.gainprm[1] * length + law.gainprm[2] * velocity
+    elif law.gaintype == GainType.MUSCLE:
+        gain = muscle_gain(length, velocity, law.lengthrange, law.acc0, law.gainprm)
+    bias = wp.float32(0.0)
+    if law.biastype == BiasType.AFFINE:
+        bias = law.biasprm[0] + law.biasprm[1] * length + law.biasprm[2] * velocity
+    elif law.biastype == BiasType.MUSCLE:
+        bias = muscle_bias(length, law.lengthrange, law.acc0, law.biasprm)
+    force = gain * drive + bias
+    if law.clamp_force == 1:
+        force = wp.clamp(force, law.forcerange[0], law.forcerange[1])
+    return force
+
+
+@wp.func
+def force_velocity_slope(
+    law: ActuatorLaw, ctrl: wp.float32, drive: wp.float32, length: wp.float32, velocity: wp.float32
+) -> wp.float32:
+    """dF/d(velocity) as mujoco_warp's implicit integrators take it: a stateless actuator's control is not clamped."""
+    gain = wp.float32(0.0)
+    if law.gaintype == GainType.AFFINE:
+        gain = law.gainprm[2]
+    elif law.gaintype == GainType.MUSCLE:
+        gain = muscle_gain_vel_deriv(length, velocity, law.lengthrange, law.acc0, law.gainprm)
+    bias = wp.float32(0.0)
+    if law.biastype == BiasType.AFFINE:
+        bias = law.biasprm[2]
+    push = drive
+    if law.dyntype == DynType.NONE:
+        push = ctrl
+    slope = gain * push + bias
+    if law.clamp_force == 1:
+        force = actuator_force(law, drive, length, velocity)
+        if force <= law.forcerange[0] or force >= law.forcerange[1]:
+            slope = wp.float32(0.0)
+    return slope
+
+
+@wp.func
+def actuator_score(
+    law: ActuatorLaw,
+    ctrl: wp.float32,
+    act: wp.float32,
+    length: wp.float32,
+    velocity: wp.float32,
+    act_weight: wp.float32,
+    force_weight: wp.float32,
+    slope_weight: wp.float32,
+) -> wp.float32:
+    """act_weight·act' + force_weight·F + slope_weight·dF/dv, whose slopes are the pullback of one actuator."""
+    command = ctrl
+    if law.clamp_ctrl == 1:
+        command = wp.clamp(ctrl, law.ctrlrange[0], law.ctrlrange[1])
+    drive = command
+    score = wp.float32(0.0)
+    if law.dyntype != DynType.NONE:
+        free = free_activation(law, command, act)
+        after = free
+        if law.clamp_act == 1:
+            after = wp.clamp(free, law.actrange[0], law.actrange[1])
+        drive = act
+        if law.early == 1:
+            drive = after
+        if law.clamp_next == 1:
+            score = act_weight * after
+        else:
+            score = act_weight * free
+    if law.implicit == 1:
+        score += slope_weight * force_velocity_slope(law, ctrl, drive, length, velocity)
+    return score + force_weight * actuator_force(law, drive, length, velocity)
+
+
+@wp.struct
+class ActuatorSettings:
+    """Parameters of actuators, and limits of the joints they act on."""
+
+    jnt_type: wp.array[int]
+    jnt_actfrclimited: wp.array[bool]
+    jnt_actfrcrange: wp.array2d[wp.vec2]
+    dof_jntid: wp.array[int]
+    actuator_trntype: wp.array[int]
+    actuator_trnid: wp.array[wp.vec2i]
+    actuator_gear: wp.array2d[wp.spatial_vector]
+    actuator_dyntype: wp.array[int]
+    actuator_gaintype: wp.array[int]
+    actuator_biastype: wp.array[int]
+    actuator_ctrladr: wp.array[int]
+    actuator_ctrlnum: wp.array[int]
+    actuator_actadr: wp.array[int]
+    actuator_actnum: wp.array[int]
+    actuator_dynprm: wp.array2d[vec10]
+    actuator_gainprm: wp.array2d[vec10]
+    actuator_biasprm: wp.array2d[vec10]
+    actuator_actlimited: wp.array[bool]
+    actuator_actrange: wp.array2d[wp.vec2]
+    actuator_actearly: wp.array[bool]
+    actuator_forcelimited: wp.array[bool]
+    actuator_forcerange: wp.array2d[wp.vec2]
+    actuator_ctrllimited: wp.array[bool]
+    actuator_ctrlrange: wp.array2d[wp.vec2]
+    actuator_acc0: wp.array2d[float]
+    actuator_lengthrange: wp.array2d[wp.vec2]
+
+
+@wp.struct
+class Drive:
+    """Controls and activations, and how actuators pull: lengths (W, U), sparse moments, total on every dof."""
+
+    ctrl: wp.array2d[float]
+    act: wp.array2d[float]
+    actuator_length: wp.array2d[float]
+    moment_rownnz: wp.array2d[int]
+    moment_rowadr: wp.array2d[int]
+    moment_colind: wp.array2d[int]
+    actuator_moment: wp.array2d[float]
+    qfrc_actuator: wp.array2d[float]
+
+
+@wp.func
+def actuator_law(
+    worldid: int, uid: int, timestep: float, clampctrl: bool, clampact: bool, actuators: ActuatorSettings
+) -> ActuatorLaw:
+    """The law of one actuator in one world."""
+    law = ActuatorLaw()
+    law.timestep = timestep
+    law.dyntype = actuators.actuator_dyntype[uid]
+    law.gaintype = actuators.actuator_gaintype[uid]
+    law.biastype = actuators.actuator_biastype[uid]
+    law.early = int(actuators.actuator_actearly[uid])
+    law.clamp_act = int(actuators.actuator_actlimited[uid])
+    law.clamp_next = int(clampact)
+    law.clamp_force = int(actuators.actuator_forcelimited[uid])
+    law.dynprm = actuators.actuator_dynprm[worldid % actuators.actuator_dynprm.shape[0], uid]
+    law.gainprm = actuators.actuator_gainprm[worldid % actuators.actuator_gainprm.shape[0], uid]
+    law.biasprm = actuators.actuator_biasprm[worldid % actuators.actuator_biasprm.shape[0], uid]
+    law.actrange = actuators.actuator_actrange[worldid % actuators.actuator_actrange.shape[0], uid]
+    law.forcerange = actuators.actuator_forcerange[worldid % actuators.actuator_forcerange.shape[0], uid]
+    law.lengthrange = actuators.actuator_lengthrange[worldid % actuators.actuator_lengthrange.shape[0], uid]
+    law.acc0 = actuators.actuator_acc0[worldid % actuators.actuator_acc0.shape[0], uid]
+    source = actuators.actuator_ctrladr[uid]
+    if actuators.actuator_ctrlnum[uid] > 0:
+        law.ctrlrange = actuators.actuator_ctrlrange[worldid % actuators.actuator_ctrlrange.shape[0], source]
+        law.clamp_ctrl = int(actuators.actuator_ctrllimited[source] and clampctrl)
+    return law
+
+
+@wp.func
+def is_held(worldid: int, dof: int, actuators: ActuatorSettings, drive_in: Drive) -> bool:
+    """Whether a dof's joint is at its actuator force limit and passes nothing on."""
+    jnt = actuators.dof_jntid[dof]
+    held = bool(False)
+    if actuators.jnt_actfrclimited[jnt]:
+        bounds = actuators.jnt_actfrcrange[worldid % actuators.jnt_actfrcrange.shape[0], jnt]
+        total = drive_in.qfrc_actuator[worldid, dof]
+        held = total <= bounds[0] or total >= bounds[1]
+    return held
+
+
+@wp.struct
+class ActuatorBars:
+    """∂Φ/∂(length), and ∂Φ/∂(m·λ, m·v, m·μ, m·â), (W, U)."""
+
+    length: wp.array2d[float]
+    rate: wp.array2d[wp.vec4]
+
+
+@wp.kernel
+def pull_actuators(
+    lanes: int,
+    count: int,
+    # Model:
+    opt_timestep: wp.array[float],
+    clampctrl: bool,
+    clampact: bool,
+    implicit_all: bool,
+    implicit_address: wp.array2d[int],
+    actuators: ActuatorSettings,
+    # In:
+    live_in: wp.array[int],
+    drive_in: Drive,
+    state_in: State,
+    multipliers_in: Multipliers,
+    # Out:
+    grad_act_out: wp.array2d[float],
+    grad_ctrl_out: wp.array2d[float],
+    slopes_out: DofSlopes,
+    tendon_bars_out: TendonBars,
+    actuator_bars_out: ActuatorBars,
+) -> None:
+    """Φ ∋ -(m·λ) F(len, m·v, act, ctrl) - h κ dF/dv and ḡ·act': gradients of ctrl and act, and those of len and rates.
+
+    With implicit integration κ = Σ m_i m_j μ_i â_j over the pairs that `implicit_address` has. A tendon's cotangents
+    go to its tendon. For other transmissions whose moment m turns with q, `rate_bar` keeps ∂Φ/∂(m·λ, m·v, m·μ, m·â).
+    `lanes` threads take all `count` actuators of a world in turn.
+    """
+    worldid, lane = wp.tid()
+    for uid in range(lane, count, lanes):
+        timestep = opt_timestep[worldid % opt_timestep.shape[0]]
+        law = actuator_law(worldid, uid, timestep, clampctrl, clampact, actuators)
+        ctrl = float(0.0)
+        source = actuators.actuator_ctrladr[uid]
+        if actuators.actuator_ctrlnum[uid] > 0:
+            ctrl = drive_in.ctrl[worldid, source]
+        act = float(0.0)
+        act_weight = float(0.0)
+        slot = actuators.actuator_actadr[uid] + actuators.actuator_actnum[uid] - 1
+        if law.dyntype != DynType.NONE:
+            act = drive_in.act[worldid, slot]
+            act_weight = grad_act_out[worldid, slot]
+
+        start = drive_in.moment_rowadr[worldid, uid]
+        end = start + drive_in.moment_rownnz[worldid, uid]
+        rate = float(0.0)
+        velocity = float(0.0)
+        for k in range(start, end):
+            dof = drive_in.moment_colind[worldid, k]
+            velocity += drive_in.actuator_moment[worldid, k] * state_in.qvel[worldid, dof]
+            if not is_held(worldid, dof, actuators, drive_in):
+                rate += drive_in.actuator_moment[worldid, k] * multipliers_in.lam[worldid, dof]
+
+        law.implicit = 0
+        h = law.timestep
+        kappa = float(0.0)
+        rate_mu = float(0.0)
+        rate_smooth = float(0.0)
+        if implicit_all:
+            law.implicit = 1
+            for k in range(start, end):
+                i = drive_in.moment_colind[worldid, k]
+                if implicit_address[i, i] < 0:
+                    continue
+                rate_mu += drive_in.actuator_moment[worldid, k] * multipliers_in.mu[worldid, i]
+                rate_smooth += drive_in.actuator_moment[worldid, k] * (
+                    state_in.qacc[worldid, i] - multipliers_in.excess[worldid, i]
+                )
+                for m in range(start, end):
+                    j = drive_in.moment_colind[worldid, m]
+                    if implicit_address[wp.max(i, j), wp.min(i, j)] >= 0:
+                        smooth = state_in.qacc[worldid, j] - multipliers_in.excess[worldid, j]
+                        kappa += (
+                            drive_in.actuator_moment[worldid, k]
+                            * drive_in.actuator_moment[worldid, m]
+                            * multipliers_in.mu[worldid, i]
+                            * smooth
+                        )
+
+        length = drive_in.actuator_length[worldid, uid]
+        _l, ctrl_slope, act_slope, length_slope, velocity_slope, _a, force, slope = wp.grad(actuator_score)(
+            law, ctrl, act, length, velocity, act_weight, rate, h * kappa
+        )
+        live = live_in[worldid] != 0
+        if law.dyntype != DynType.NONE:
+            grad_act_out[worldid, slot] = wp.where(live, act_slope, 0.0)
+        if live and actuators.actuator_ctrlnum[uid] > 0:
+            grad_ctrl_out[worldid, source] += ctrl_slope
+        actuator_bars_out.length[worldid, uid] = -length_slope
+        # ∂Φ/∂(m·λ) = -F ,  ∂Φ/∂(m·μ) = -h F' m·â ,  ∂Φ/∂(m·â) = -h F' m·μ
+        rate_bar = wp.vec4(-force, -velocity_slope, -h * slope * rate_smooth, -h * slope * rate_mu)
+        if not implicit_all:
+            rate_bar[2] = 0.0
+            rate_bar[3] = 0.0
+        actuator_bars_out.rate[worldid, uid] = rate_bar
+        kind = actuators.actuator_trntype[uid]
+        if kind == TrnType.TENDON:
+            t = actuators.actuator_trnid[uid][0]
+            gear = actuators.actuator_gear[worldid % actuators.actuator_gear.shape[0], uid][0]
+            wp.atomic_add(tendon_bars_out.length, worldid, t, -gear * length_slope)
+            wp.atomic_add(tendon_bars_out.qvel, worldid, t, gear * rate_bar[1])
+            wp.atomic_add(tendon_bars_out.lam, worldid, t, gear * rate_bar[0])
+            if implicit_all:
+                wp.atomic_add(tendon_bars_out.mu, worldid, t, gear * rate_bar[2])
+                wp.atomic_add(tendon_bars_out.smooth, worldid, t, gear * rate_bar[3])
+            continue
+        if kind == TrnType.SITE or kind == TrnType.SLIDERCRANK:
+            continue
+        # Length is the integral of the moment for hinges and slides; where it is not, `transmission` does it.
+        straight = bool(False)
+        if kind == TrnType.JOINT or kind == TrnType.JOINTINPARENT:
+            joint = actuators.jnt_type[actuators.actuator_trnid[uid][0]]
+            straight = joint == JointType.HINGE or joint == JointType.SLIDE
+        for k in range(start, end):
+            dof = drive_in.moment_colind[worldid, k]
+            wp.atomic_add(slopes_out.qvel, worldid, dof, rate_bar[1] * drive_in.actuator_moment[worldid, k])
+            if straight:
+                wp.atomic_add(slopes_out.qpos, worldid, dof, -length_slope * drive_in.actuator_moment[worldid, k])
+
+
+class ActuatorForces:
+    """Launches of what actuators give ∂Φ, and of the gradients of controls and activations.
+
+    Attributes:
+        bars: what `transmission` takes on.
+    """
+
+    def __init__(self, work: Workspace) -> None:
+        self._work = work
+        self._settings = gather(ActuatorSettings, work.model)
+        self.bars = allocate(ActuatorBars, work.nworld, work.model.nactuator)
+        self._lanes = work.lanes(work.model.nactuator, meet=not motors_apart(work.mjm))
+
+    def launch(self, at: Substep) -> None:
+        """Launch the pullback of all actuators."""
+        work, m, settings = self._work, self._work.model, self._work.settings
+        wp.launch(
+            pull_actuators,
+            dim=(work.nworld, self._lanes),
+            inputs=[
+                self._lanes,
+                m.nactuator,
+                m.opt.timestep,
+                settings.clampctrl,
+                settings.clampact,
+                settings.implicit_all,
+                work.tables.implicit_address,
+                self._settings,
+                work.live,
+                gather(Drive, at.data),
+                at.state,
+                work.multipliers,
+            ],
+            outputs=[work.grad_act, work.grad_ctrl, work.slopes, work.tendon_bars, self.bars],
+        )

@@ -1,0 +1,97 @@
+"""Springs of free and ball joints."""
+
+import warp as wp
+from mujoco_warp import JointType
+
+from msk_ray.step.adjoint.groups import Joints, Springs, Substep
+from msk_ray.step.adjoint.workspace import Workspace
+from msk_ray.step.forward.mjw_private import poly_force, quat_sub
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def log_rate_pullback(phi: wp.vec3, g: wp.vec3) -> wp.vec3:
+    """Jr(φ)⁻ᵀ g, where log(exp(φ) exp(w)) = φ + Jr⁻¹ w: g - ½ φ × g + c φ × (φ × g)."""
+    square = wp.dot(phi, phi)
+    c = 1.0 / 12.0 + square / 720.0
+    if square > 1.0e-2:
+        half = 0.5 * wp.sqrt(square)
+        c = (1.0 - half / wp.tan(half)) / square
+    cross = wp.cross(phi, g)
+    return g - 0.5 * cross + c * wp.cross(phi, cross)
+
+
+@wp.func
+def spring_slope(stiffness: float, poly: wp.vec2, dif: wp.vec3, lam: wp.vec3) -> wp.vec3:
+    """∂/∂d of k(|d|) λ·d, k = k₀ + p₀|d| + p₁|d|²."""
+    r = wp.length(dif)
+    out = poly_force(stiffness, poly, r, 0) * lam
+    if r > 0.0:
+        out += (poly[0] / r + 2.0 * poly[1]) * wp.dot(lam, dif) * dif
+    return out
+
+
+@wp.kernel
+def pull_turning_springs(
+    # Model:
+    joints: Joints,
+    springs: Springs,
+    # In:
+    qpos_in: wp.array2d[float],
+    lam_in: wp.array2d[float],
+    # Out:
+    phi_qpos_out: wp.array2d[float],
+) -> None:
+    """Φ ∋ λ·k(|d|) d: d the displacement from rest, for a rotation its logarithm."""
+    worldid, jntid = wp.tid()
+    kind = joints.jnt_type[jntid]
+    if kind != JointType.FREE and kind != JointType.BALL:
+        return
+    stiffness = springs.jnt_stiffness[worldid % springs.jnt_stiffness.shape[0], jntid]
+    poly = springs.jnt_stiffnesspoly[worldid % springs.jnt_stiffnesspoly.shape[0], jntid]
+    if stiffness == 0.0 and poly[0] == 0.0 and poly[1] == 0.0:
+        return
+    q = joints.jnt_qposadr[jntid]
+    v = joints.jnt_dofadr[jntid]
+    rest = worldid % springs.qpos_spring.shape[0]
+    if kind == JointType.FREE:
+        dif = wp.vec3(0.0)
+        lam = wp.vec3(0.0)
+        for i in range(3):
+            dif[i] = qpos_in[worldid, q + i] - springs.qpos_spring[rest, q + i]
+            lam[i] = lam_in[worldid, v + i]
+        slope = spring_slope(stiffness, poly, dif, lam)
+        for i in range(3):
+            wp.atomic_add(phi_qpos_out, worldid, v + i, slope[i])
+        q += 3
+        v += 3
+    now = wp.quat(qpos_in[worldid, q], qpos_in[worldid, q + 1], qpos_in[worldid, q + 2], qpos_in[worldid, q + 3])
+    still = wp.quat(
+        springs.qpos_spring[rest, q],
+        springs.qpos_spring[rest, q + 1],
+        springs.qpos_spring[rest, q + 2],
+        springs.qpos_spring[rest, q + 3],
+    )
+    phi = quat_sub(wp.normalize(now), still)
+    turn = wp.vec3(lam_in[worldid, v], lam_in[worldid, v + 1], lam_in[worldid, v + 2])
+    slope = log_rate_pullback(phi, spring_slope(stiffness, poly, phi, turn))
+    for i in range(3):
+        wp.atomic_add(phi_qpos_out, worldid, v + i, slope[i])
+
+
+class TurningSprings:
+    """Launches of what springs of free and ball joints give ∂Φ."""
+
+    def __init__(self, work: Workspace) -> None:
+        self._work = work
+
+    def launch(self, at: Substep) -> None:
+        """Launch the pullback of these springs."""
+        work = self._work
+        wp.launch(
+            pull_turning_springs,
+            dim=(work.nworld, work.model.njnt),
+            inputs=[work.joints, work.springs, at.state.qpos, work.multipliers.lam],
+            outputs=[work.slopes.qpos],
+        )

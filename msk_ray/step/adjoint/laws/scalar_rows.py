@@ -1,0 +1,307 @@
+"""Constraint rows of joints and tendons: limits, friction loss, and joint and tendon equalities."""
+
+import math
+
+import numpy as np
+import warp as wp
+from mujoco_warp import JointType
+
+from msk_ray.step.adjoint.groups import (
+    DofSlopes,
+    Joints,
+    RowLaws,
+    Rows,
+    State,
+    Substep,
+    TendonBars,
+    TendonRows,
+    gather,
+)
+from msk_ray.step.adjoint.laws.rows import ConstraintLaws, row_slopes
+from msk_ray.step.adjoint.laws.tendons import tendon_rate
+from msk_ray.step.adjoint.workspace import Workspace
+from msk_ray.step.forward.capacity import scalar_rows
+from msk_ray.step.forward.mjw_private import ConstraintType, EqType, vec5, vec12
+
+wp.set_module_options({"enable_backward": False})
+
+_PI = wp.constant(math.pi)
+
+
+@wp.func
+def add_joint_row(
+    worldid: int,
+    dof: int,
+    sign: float,
+    pos_bar: float,
+    vel_bar: float,
+    slopes_out: DofSlopes,
+) -> None:
+    """A row with ρ(x) = sign·x_j and d(pos) = sign·dq_j."""
+    wp.atomic_add(slopes_out.qpos, worldid, dof, sign * pos_bar)
+    wp.atomic_add(slopes_out.qvel, worldid, dof, sign * vel_bar)
+
+
+@wp.func
+def add_tendon_row(
+    worldid: int,
+    t: int,
+    sign: float,
+    bars: wp.vec4,
+    tendon_bars_out: TendonBars,
+) -> None:
+    """A row with ρ(x) = sign·J_t x and d(pos) = sign·dl; bars are cotangents of (pos, ρ(v), ρ(λ), ρ(a))."""
+    wp.atomic_add(tendon_bars_out.length, worldid, t, sign * bars[0])
+    wp.atomic_add(tendon_bars_out.qvel, worldid, t, sign * bars[1])
+    wp.atomic_add(tendon_bars_out.lam, worldid, t, sign * bars[2])
+    wp.atomic_add(tendon_bars_out.qacc, worldid, t, sign * bars[3])
+
+
+@wp.func
+def quat_angle_axis(q: wp.vec4) -> wp.vec4:
+    """(axis, angle in [0, π]) of a quaternion (w, x, y, z)."""
+    u = wp.vec3(q[1], q[2], q[3])
+    sine = wp.length(u)
+    if sine == 0.0:
+        return wp.vec4(0.0, 0.0, 0.0, 0.0)
+    axis = u / sine
+    angle = 2.0 * wp.atan2(sine, q[0])
+    if angle > _PI:
+        angle = 2.0 * _PI - angle
+        axis = -axis
+    return wp.vec4(axis[0], axis[1], axis[2], angle)
+
+
+@wp.struct
+class RowSettings:
+    """Parameters of the rows of joints, dofs, tendons and equalities."""
+
+    qpos0: wp.array2d[float]
+    jnt_solref: wp.array2d[wp.vec2]
+    jnt_solimp: wp.array2d[vec5]
+    dof_solref: wp.array2d[wp.vec2]
+    dof_solimp: wp.array2d[vec5]
+    tendon_solref_lim: wp.array2d[wp.vec2]
+    tendon_solimp_lim: wp.array2d[vec5]
+    tendon_solref_fri: wp.array2d[wp.vec2]
+    tendon_solimp_fri: wp.array2d[vec5]
+    tendon_range: wp.array2d[wp.vec2]
+    tendon_length0: wp.array2d[float]
+    eq_type: wp.array[int]
+    eq_obj1id: wp.array[int]
+    eq_obj2id: wp.array[int]
+    eq_solref: wp.array2d[wp.vec2]
+    eq_solimp: wp.array2d[vec5]
+    eq_data: wp.array2d[vec12]
+
+
+@wp.struct
+class RowSpring:
+    """Solver parameters of a row; `known` is false for rows of contacts."""
+
+    known: bool
+    solref: wp.vec2
+    solimp: vec5
+
+
+@wp.func
+def row_spring(worldid: int, kind: int, ident: int, settings: RowSettings) -> RowSpring:
+    """Solver parameters of the limit, friction loss or equality `ident` that makes a row."""
+    out = RowSpring()
+    out.known = True
+    if kind == ConstraintType.LIMIT_JOINT:
+        out.solref = settings.jnt_solref[worldid % settings.jnt_solref.shape[0], ident]
+        out.solimp = settings.jnt_solimp[worldid % settings.jnt_solimp.shape[0], ident]
+    elif kind == ConstraintType.FRICTION_DOF:
+        out.solref = settings.dof_solref[worldid % settings.dof_solref.shape[0], ident]
+        out.solimp = settings.dof_solimp[worldid % settings.dof_solimp.shape[0], ident]
+    elif kind == ConstraintType.LIMIT_TENDON:
+        out.solref = settings.tendon_solref_lim[worldid % settings.tendon_solref_lim.shape[0], ident]
+        out.solimp = settings.tendon_solimp_lim[worldid % settings.tendon_solimp_lim.shape[0], ident]
+    elif kind == ConstraintType.FRICTION_TENDON:
+        out.solref = settings.tendon_solref_fri[worldid % settings.tendon_solref_fri.shape[0], ident]
+        out.solimp = settings.tendon_solimp_fri[worldid % settings.tendon_solimp_fri.shape[0], ident]
+    elif kind == ConstraintType.EQUALITY:
+        out.solref = settings.eq_solref[worldid % settings.eq_solref.shape[0], ident]
+        out.solimp = settings.eq_solimp[worldid % settings.eq_solimp.shape[0], ident]
+    else:
+        out.known = False
+    return out
+
+
+@wp.kernel
+def pull_rows(
+    lanes: int,
+    count: int,
+    # Model:
+    opt_timestep: wp.array[float],
+    opt_disableflags: int,
+    joints: Joints,
+    tendons: TendonRows,
+    settings: RowSettings,
+    # In:
+    nefc_in: wp.array[int],
+    rows_in: Rows,
+    jacobian_in: wp.array3d[float],
+    laws_in: RowLaws,
+    state_in: State,
+    lam_in: wp.array2d[float],
+    ten_J_in: wp.array2d[float],
+    ten_length_in: wp.array2d[float],
+    # Out:
+    slopes_out: DofSlopes,
+    tendon_bars_out: TendonBars,
+) -> None:
+    """Φ ∋ -ρ(λ) f(ρ(a) + b ρ(v) + k imp pos) of every row that joints and tendons make; f also moves with D(pos).
+
+    `lanes` threads take the first `count` rows of a world in turn.
+    """
+    worldid, lane = wp.tid()
+    for row in range(lane, count, lanes):
+        if row >= wp.min(nefc_in[worldid], laws_in.slope.shape[1]):
+            continue
+        kind = rows_in.type[worldid, row]
+        s = laws_in.slope[worldid, row]
+        f = laws_in.force[worldid, row]
+        if s == 0.0 and f == 0.0:
+            continue
+        ident = rows_in.id[worldid, row]
+        if kind == ConstraintType.EQUALITY:
+            if settings.eq_type[ident] != EqType.JOINT and settings.eq_type[ident] != EqType.TENDON:
+                continue
+        spring = row_spring(worldid, kind, ident, settings)
+        if not spring.known:
+            continue
+
+        pos = rows_in.pos[worldid, row] - rows_in.margin[worldid, row]
+        timestep = opt_timestep[worldid % opt_timestep.shape[0]]
+        slopes = row_slopes(opt_disableflags, timestep, spring.solref, spring.solimp, pos)
+        rate = float(0.0)
+        for j in range(lam_in.shape[1]):
+            rate += jacobian_in[worldid, row, j] * lam_in[worldid, j]
+        # ∂Φ/∂jar = s ρ(λ) =: y
+        y = s * rate
+        vel_bar = slopes.damping * y
+        pos_bar = slopes.stiffness * y - slopes.mass * rate * f
+        bars = wp.vec4(pos_bar, vel_bar, -f, y)
+
+        if kind == ConstraintType.FRICTION_DOF:
+            add_joint_row(worldid, ident, 1.0, 0.0, vel_bar, slopes_out)
+        elif kind == ConstraintType.LIMIT_JOINT:
+            dof = joints.jnt_dofadr[ident]
+            if joints.jnt_type[ident] == JointType.BALL:
+                adr = joints.jnt_qposadr[ident]
+                turn = quat_angle_axis(
+                    wp.vec4(
+                        state_in.qpos[worldid, adr],
+                        state_in.qpos[worldid, adr + 1],
+                        state_in.qpos[worldid, adr + 2],
+                        state_in.qpos[worldid, adr + 3],
+                    )
+                )
+                axis = wp.vec3(turn[0], turn[1], turn[2])
+                # ρ(x) = -axis·x ,  d(pos) = -axis·w ,  d(axis) = ½ cot(θ/2) w⊥ + ½ axis × w
+                axis_bar = wp.vec3(0.0)
+                for i in range(3):
+                    v = state_in.qvel[worldid, dof + i]
+                    a = state_in.qacc[worldid, dof + i]
+                    axis_bar[i] = -(bars[2] * lam_in[worldid, dof + i] + vel_bar * v + y * a)
+                across = axis_bar - axis * wp.dot(axis, axis_bar)
+                moved = -pos_bar * axis + 0.5 * wp.cross(axis_bar, axis)
+                if turn[3] > 0.0:  # without a rotation there is no axis, and mujoco_warp's row is zero
+                    moved += 0.5 / wp.tan(0.5 * turn[3]) * across
+                for i in range(3):
+                    wp.atomic_add(slopes_out.qpos, worldid, dof + i, moved[i])
+                    wp.atomic_add(slopes_out.qvel, worldid, dof + i, -vel_bar * axis[i])
+            else:
+                sign = jacobian_in[worldid, row, dof]
+                add_joint_row(worldid, dof, sign, pos_bar, vel_bar, slopes_out)
+        elif kind == ConstraintType.FRICTION_TENDON:
+            bars[0] = 0.0
+            add_tendon_row(worldid, ident, 1.0, bars, tendon_bars_out)
+        elif kind == ConstraintType.LIMIT_TENDON:
+            bounds = settings.tendon_range[worldid % settings.tendon_range.shape[0], ident]
+            length = ten_length_in[worldid, ident]
+            sign = wp.where(length - bounds[0] < bounds[1] - length, 1.0, -1.0)
+            add_tendon_row(worldid, ident, sign, bars, tendon_bars_out)
+        else:
+            # pos = x₁ - p(x₂) ,  ρ(x) = ρ₁(x) - p' ρ₂(x) ,  d(p') = p'' dx₂
+            first = settings.eq_obj1id[ident]
+            second = settings.eq_obj2id[ident]
+            data = settings.eq_data[worldid % settings.eq_data.shape[0], ident]
+            x = float(0.0)
+            if second >= 0:
+                if settings.eq_type[ident] == EqType.JOINT:
+                    adr = joints.jnt_qposadr[second]
+                    x = state_in.qpos[worldid, adr] - settings.qpos0[worldid % settings.qpos0.shape[0], adr]
+                else:
+                    x = (
+                        ten_length_in[worldid, second]
+                        - settings.tendon_length0[worldid % settings.tendon_length0.shape[0], second]
+                    )
+            bend1 = data[1] + x * (2.0 * data[2] + x * (3.0 * data[3] + x * 4.0 * data[4]))
+            bend2 = 2.0 * data[2] + x * (6.0 * data[3] + x * 12.0 * data[4])
+            if settings.eq_type[ident] == EqType.JOINT:
+                add_joint_row(worldid, joints.jnt_dofadr[first], 1.0, pos_bar, vel_bar, slopes_out)
+                if second >= 0:
+                    dof = joints.jnt_dofadr[second]
+                    mixed = (
+                        bars[2] * lam_in[worldid, dof]
+                        + vel_bar * state_in.qvel[worldid, dof]
+                        + y * state_in.qacc[worldid, dof]
+                    )
+                    add_joint_row(worldid, dof, -bend1, pos_bar, vel_bar, slopes_out)
+                    wp.atomic_add(slopes_out.qpos, worldid, dof, -bend2 * mixed)
+            else:
+                add_tendon_row(worldid, first, 1.0, bars, tendon_bars_out)
+                if second >= 0:
+                    jac = ten_J_in[worldid]
+                    mixed = bars[2] * tendon_rate(tendons, second, jac, lam_in[worldid])
+                    mixed += vel_bar * tendon_rate(tendons, second, jac, state_in.qvel[worldid])
+                    mixed += y * tendon_rate(tendons, second, jac, state_in.qacc[worldid])
+                    add_tendon_row(worldid, second, -bend1, bars, tendon_bars_out)
+                    wp.atomic_add(tendon_bars_out.length, worldid, second, -bend2 * mixed)
+
+
+def foremost_rows(work: Workspace) -> int:
+    """How many rows may not be contacts'; those of contacts come after them."""
+    return min(scalar_rows(work.mjm), work.njmax)
+
+
+class ScalarRows:
+    """Launches of what the rows of joints, tendons and their equalities give ∂Φ."""
+
+    def __init__(self, work: Workspace, laws: ConstraintLaws) -> None:
+        self._work, self._laws = work, laws
+        self._settings = gather(RowSettings, work.model)
+        self._rows = foremost_rows(work)
+        mjm = work.mjm
+        # Limits of joints alone are rows of different dofs.
+        meet = bool(mjm.neq or mjm.ntendon or np.any(mjm.dof_frictionloss))
+        self._lanes = work.lanes(self._rows, meet=meet)
+
+    def launch(self, at: Substep) -> None:
+        """Launch the pullback of these rows."""
+        work, m, d = self._work, self._work.model, at.data
+        wp.launch(
+            pull_rows,
+            dim=(work.nworld, self._lanes),
+            inputs=[
+                self._lanes,
+                self._rows,
+                m.opt.timestep,
+                m.opt.disableflags,
+                work.joints,
+                work.tendon_rows,
+                self._settings,
+                d.nefc,
+                at.rows,
+                self._laws.jacobian(at),
+                work.laws,
+                at.state,
+                work.multipliers.lam,
+                d.ten_J,
+                d.ten_length,
+            ],
+            outputs=[work.slopes, work.tendon_bars],
+        )

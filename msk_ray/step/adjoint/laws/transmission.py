@@ -1,0 +1,180 @@
+"""Actuators whose moment turns with q: at sites, and in the parent's frame of ball and free joints."""
+
+import warp as wp
+from mujoco_warp import JointType, TrnType
+
+from msk_ray.step.adjoint.groups import FieldBars, Fields, Joints, Motion, Multipliers, State, Substep, gather
+from msk_ray.step.adjoint.laws.actuators import ActuatorBars
+from msk_ray.step.adjoint.laws.joint_springs import log_rate_pullback
+from msk_ray.step.adjoint.spatial import carried, point_velocity, wrench
+from msk_ray.step.adjoint.workspace import Workspace
+from msk_ray.step.forward.mjw_private import quat_to_vel
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Transmissions:
+    """What actuators act on."""
+
+    actuator_trntype: wp.array[int]
+    actuator_trnid: wp.array[wp.vec2i]
+    actuator_gear: wp.array2d[wp.spatial_vector]
+
+
+@wp.kernel
+def pull_turning_joints(
+    lanes: int,
+    count: int,
+    # Model:
+    joints: Joints,
+    transmissions: Transmissions,
+    # In:
+    state_in: State,
+    multipliers_in: Multipliers,
+    moment_rowadr_in: wp.array2d[int],
+    moment_in: wp.array2d[float],
+    actuator_bars_in: ActuatorBars,
+    # Out:
+    phi_qpos_out: wp.array2d[float],
+) -> None:
+    """len = gear·log(q) of a ball joint; in the parent's frame the moment is m = R(q)ᵀ gear.
+
+    `lanes` threads take all `count` actuators of a world in turn.
+    """
+    worldid, lane = wp.tid()
+    for uid in range(lane, count, lanes):
+        kind = transmissions.actuator_trntype[uid]
+        if kind != TrnType.JOINT and kind != TrnType.JOINTINPARENT:
+            continue
+        jnt = transmissions.actuator_trnid[uid][0]
+        joint = joints.jnt_type[jnt]
+        if joint != JointType.BALL and joint != JointType.FREE:
+            continue
+        dof = joints.jnt_dofadr[jnt]
+        first = moment_rowadr_in[worldid, uid]
+        slope = wp.vec3(0.0)
+        if joint == JointType.BALL:
+            q = joints.jnt_qposadr[jnt]
+            quat = wp.quat(
+                state_in.qpos[worldid, q],
+                state_in.qpos[worldid, q + 1],
+                state_in.qpos[worldid, q + 2],
+                state_in.qpos[worldid, q + 3],
+            )
+            phi = quat_to_vel(wp.normalize(quat))
+            gear = wp.spatial_top(transmissions.actuator_gear[worldid % transmissions.actuator_gear.shape[0], uid])
+            slope = actuator_bars_in.length[worldid, uid] * log_rate_pullback(phi, gear)
+        else:
+            dof += 3
+            first += 3
+        if kind == TrnType.JOINTINPARENT:
+            bars = actuator_bars_in.rate[worldid, uid]
+            moment = wp.vec3(moment_in[worldid, first], moment_in[worldid, first + 1], moment_in[worldid, first + 2])
+            x = wp.vec3(0.0)
+            for i in range(3):
+                smooth = state_in.qacc[worldid, dof + i] - multipliers_in.excess[worldid, dof + i]
+                x[i] = bars[0] * multipliers_in.lam[worldid, dof + i] + bars[1] * state_in.qvel[worldid, dof + i]
+                x[i] += bars[2] * multipliers_in.mu[worldid, dof + i] + bars[3] * smooth
+            # m·x = gear·R x ,  d(R x) = R (w × x)
+            slope += wp.cross(x, moment)
+        for i in range(3):
+            wp.atomic_add(phi_qpos_out, worldid, dof + i, slope[i])
+
+
+@wp.kernel
+def pull_sites(
+    lanes: int,
+    count: int,
+    # Model:
+    body_rootid: wp.array[int],
+    site_bodyid: wp.array[int],
+    transmissions: Transmissions,
+    # In:
+    site_xpos_in: wp.array2d[wp.vec3],
+    site_xmat_in: wp.array2d[wp.mat33],
+    motion_in: Motion,
+    actuator_bars_in: ActuatorBars,
+    fields_in: Fields,
+    # Out:
+    bars_out: FieldBars,
+) -> None:
+    """m·x = F·u(x) + T·ω(x) at the site, with force F and torque T fixed in the site's frame; len = 0.
+
+    `lanes` threads take all `count` actuators of a world in turn.
+    """
+    worldid, lane = wp.tid()
+    for uid in range(lane, count, lanes):
+        if transmissions.actuator_trntype[uid] != TrnType.SITE or transmissions.actuator_trnid[uid][1] >= 0:
+            continue
+        site = transmissions.actuator_trnid[uid][0]
+        body = site_bodyid[site]
+        if body == 0:
+            continue
+        gear = transmissions.actuator_gear[worldid % transmissions.actuator_gear.shape[0], uid]
+        mat = site_xmat_in[worldid, site]
+        force = mat @ wp.spatial_top(gear)
+        torque = mat @ wp.spatial_bottom(gear)
+        arm = site_xpos_in[worldid, site] - motion_in.subtree_com[worldid, body_rootid[body]]
+        load = wrench(force, torque, arm)
+        bars = actuator_bars_in.rate[worldid, uid]
+        smooth = fields_in.qacc[worldid, body] - fields_in.excess[worldid, body]
+        total = bars[0] * fields_in.lam[worldid, body] + bars[1] * motion_in.cvel[worldid, body]
+        total += bars[2] * fields_in.mu[worldid, body] + bars[3] * smooth
+        wp.atomic_add(bars_out.lam, worldid, body, bars[0] * load)
+        wp.atomic_add(bars_out.qvel, worldid, body, bars[1] * load)
+        wp.atomic_add(bars_out.mu, worldid, body, bars[2] * load)
+        # â = a - (a - â)
+        wp.atomic_add(bars_out.qacc, worldid, body, bars[3] * load)
+        wp.atomic_add(bars_out.excess, worldid, body, -bars[3] * load)
+        # The point moves (p̄ = F × ω), and F and T turn with the body: torques F × u and T × ω.
+        spin = wp.spatial_top(total)
+        turn = wp.cross(force, point_velocity(total, arm)) + wp.cross(torque, spin)
+        wp.atomic_add(bars_out.moved, worldid, body, carried(total, load) + wrench(wp.cross(force, spin), turn, arm))
+
+
+class TurningTransmissions:
+    """Launches of what the turning of moments gives ∂Φ."""
+
+    def __init__(self, work: Workspace, bars: ActuatorBars) -> None:
+        self._work, self._bars = work, bars
+        self._transmissions = gather(Transmissions, work.model)
+
+    def launch(self, at: Substep) -> None:
+        """Launch the pullback of such joints and of sites, as far as the model has them."""
+        work, m, d = self._work, self._work.model, at.data
+        if work.tables.has_turning_transmission:
+            wp.launch(
+                pull_turning_joints,
+                dim=(work.nworld, work.lanes(m.nactuator)),
+                inputs=[
+                    work.lanes(m.nactuator),
+                    m.nactuator,
+                    work.joints,
+                    self._transmissions,
+                    at.state,
+                    work.multipliers,
+                    d.moment_rowadr,
+                    d.actuator_moment,
+                    self._bars,
+                ],
+                outputs=[work.slopes.qpos],
+            )
+        if work.tables.has_site_transmission:
+            wp.launch(
+                pull_sites,
+                dim=(work.nworld, work.lanes(m.nactuator)),
+                inputs=[
+                    work.lanes(m.nactuator),
+                    m.nactuator,
+                    m.body_rootid,
+                    m.site_bodyid,
+                    self._transmissions,
+                    d.site_xpos,
+                    d.site_xmat,
+                    at.motion,
+                    self._bars,
+                    work.fields,
+                ],
+                outputs=[work.bars],
+            )

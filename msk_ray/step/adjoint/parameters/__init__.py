@@ -1,0 +1,77 @@
+"""Gradients of a substep by parameters of the model: one file a family, launched only if one of it is asked for."""
+
+import itertools
+from collections.abc import Iterable
+
+import warp as wp
+
+from msk_ray.step.adjoint.groups import Substep
+from msk_ray.step.adjoint.parameters.actuators import ActuatorStage
+from msk_ray.step.adjoint.parameters.base import GradientBuffer, ParameterStage, Parts
+from msk_ray.step.adjoint.parameters.contacts import MaterialStage
+from msk_ray.step.adjoint.parameters.geoms import GeomStage
+from msk_ray.step.adjoint.parameters.inertia import InertiaStage
+from msk_ray.step.adjoint.parameters.joints import JointStage
+from msk_ray.step.adjoint.parameters.paths import PathStage
+from msk_ray.step.adjoint.parameters.rows import RowStage
+from msk_ray.step.adjoint.parameters.tendon_springs import TendonStage
+from msk_ray.step.adjoint.parameters.timestep import TimestepStage
+from msk_ray.step.adjoint.step import StepAdjoint
+from msk_ray.step.forward.parameters import PARAMETERS
+
+STAGES: tuple[type[ParameterStage], ...] = (
+    *(TimestepStage, InertiaStage, JointStage, RowStage, MaterialStage, GeomStage),
+    *(ActuatorStage, TendonStage, PathStage),
+)
+"""The families, in the order in which they are launched."""
+_LANES = 3
+"""CUDA streams beside the main one that the families share: each fills a small part of a GPU, and none reads what
+another writes."""
+
+
+class ParameterAdjoint:
+    """Buffers and launches of the gradients of some parameters, beside a `StepAdjoint`.
+
+    Attributes:
+        rows: gradients of every substep since `start` together, (W, numbers of a world); those of quaternions in raw
+            coordinates.
+        columns: by name, where a parameter's are in a row.
+    """
+
+    def __init__(self, adjoint: StepAdjoint, names: Iterable[str]) -> None:
+        work = adjoint.work
+        fields = {name: PARAMETERS[name].field for name in names}
+        parts = Parts(work, adjoint.integrator, adjoint.laws, adjoint.contacts, adjoint.tendons)
+        chosen = [s for s in STAGES if any(not set(fields.values()).isdisjoint(kind.vars) for kind in s.kinds)]
+        with wp.ScopedDevice(work.device):
+            kinds = dict.fromkeys(kind for stage in chosen for kind in stage.kinds)
+            self._buffer = GradientBuffer(kinds, work.model, work.nworld)
+            self._stages = [stage(parts, self._buffer.groups) for stage in chosen if stage.applies(parts)]
+            self._lanes = [wp.Stream(work.device) for _ in range(_LANES)] if work.device.is_cuda else []
+        self._device = work.device
+        self.rows: wp.array = self._buffer.rows
+        self.columns = {name: self._buffer.columns[field] for name, field in fields.items()}
+
+    def start(self) -> None:
+        """Launch the start of an env step's pullback."""
+        self._buffer.clear()
+
+    def launch_first(self, at: Substep, qvel_next: wp.array) -> None:
+        """Launch what comes before the pullback of a substep."""
+        for stage in self._stages:
+            stage.launch_first(at, qvel_next)
+
+    def launch(self, at: Substep) -> None:
+        """Launch what one substep adds, when its cotangents are there; what is launched after it waits for all."""
+        if not self._lanes:
+            for stage in self._stages:
+                stage.launch(at)
+            return
+        main = wp.get_stream(self._device)
+        for lane in self._lanes:
+            lane.wait_stream(main)
+        for stage, lane in zip(self._stages, itertools.cycle((main, *self._lanes))):
+            with wp.ScopedStream(lane, sync_enter=False):
+                stage.launch(at)
+        for lane in self._lanes:
+            main.wait_stream(lane)

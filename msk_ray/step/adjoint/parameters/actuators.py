@@ -1,0 +1,326 @@
+"""Gear, gain, bias and activation parameters of actuators.
+
+What an actuator gives -Φ is the `actuator_score` of its law, whose slopes by the parameters of gain, bias and
+activation are read off; gear g enters through its length and its rates, which are linear in it.
+"""
+
+from typing import Any
+
+import warp as wp
+from mujoco_warp import DynType, JointType, TrnType
+
+from msk_ray.step.adjoint.groups import (
+    Fields,
+    Joints,
+    Motion,
+    Multipliers,
+    State,
+    Substep,
+    TendonRows,
+    gather,
+)
+from msk_ray.step.adjoint.laws.actuators import (
+    ActuatorSettings,
+    Drive,
+    actuator_law,
+    actuator_score,
+    is_held,
+)
+from msk_ray.step.adjoint.parameters.base import ParameterStage, Parts, TimestepGradient
+from msk_ray.step.adjoint.parameters.inertia import rotation
+from msk_ray.step.adjoint.spatial import point_velocity
+from msk_ray.step.forward.mjw_private import quat_to_vel, vec10
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class ActuatorGradients:
+    """Gradients by actuator, (W, U)."""
+
+    actuator_gear: wp.array2d[wp.spatial_vector]
+    actuator_gainprm: wp.array2d[vec10]
+    actuator_biasprm: wp.array2d[vec10]
+    actuator_dynprm: wp.array2d[vec10]
+
+
+@wp.struct
+class Levers:
+    """Sites that actuators act on."""
+
+    body_rootid: wp.array[int]
+    site_bodyid: wp.array[int]
+    site_xpos: wp.array2d[wp.vec3]
+    site_xmat: wp.array2d[wp.mat33]
+
+
+@wp.struct
+class GearRates:
+    """An actuator's length and its rates under λ, v, μ and â, each by component of its gear."""
+
+    length: wp.spatial_vectorf
+    lam: wp.spatial_vectorf
+    vel: wp.spatial_vectorf
+    mu: wp.spatial_vectorf
+    smooth: wp.spatial_vectorf
+
+
+@wp.func
+def gear_rates_of_joint(
+    worldid: int,
+    jnt: int,
+    in_parent: bool,
+    joints: Joints,
+    actuators: ActuatorSettings,
+    drive_in: Drive,
+    state_in: State,
+    multipliers_in: Multipliers,
+) -> GearRates:
+    """Those of an actuator on a joint; a joint at its actuator force limit has no rate under λ."""
+    out = GearRates()
+    kind = joints.jnt_type[jnt]
+    dof = joints.jnt_dofadr[jnt]
+    q = joints.jnt_qposadr[jnt]
+    count = int(1)
+    turn = int(-1)
+    if kind == JointType.BALL:
+        count = int(3)
+        turn = int(0)
+    elif kind == JointType.FREE:
+        count = int(6)
+        turn = int(3)
+        q += 3
+    else:
+        out.length[0] = state_in.qpos[worldid, q]
+    for i in range(count):
+        j = dof + i
+        if not is_held(worldid, j, actuators, drive_in):
+            out.lam[i] = multipliers_in.lam[worldid, j]
+        out.vel[i] = state_in.qvel[worldid, j]
+        out.mu[i] = multipliers_in.mu[worldid, j]
+        out.smooth[i] = state_in.qacc[worldid, j] - multipliers_in.excess[worldid, j]
+    if turn >= 0:
+        quat = wp.normalize(
+            wp.quat(
+                state_in.qpos[worldid, q],
+                state_in.qpos[worldid, q + 1],
+                state_in.qpos[worldid, q + 2],
+                state_in.qpos[worldid, q + 3],
+            )
+        )
+        if kind == JointType.BALL:
+            phi = quat_to_vel(quat)
+            for i in range(3):
+                out.length[i] = phi[i]
+        if in_parent:
+            mat = rotation(quat)
+            lam = mat @ wp.vec3(out.lam[turn], out.lam[turn + 1], out.lam[turn + 2])
+            vel = mat @ wp.vec3(out.vel[turn], out.vel[turn + 1], out.vel[turn + 2])
+            mu = mat @ wp.vec3(out.mu[turn], out.mu[turn + 1], out.mu[turn + 2])
+            smooth = mat @ wp.vec3(out.smooth[turn], out.smooth[turn + 1], out.smooth[turn + 2])
+            for i in range(3):
+                out.lam[turn + i] = lam[i]
+                out.vel[turn + i] = vel[i]
+                out.mu[turn + i] = mu[i]
+                out.smooth[turn + i] = smooth[i]
+    return out
+
+
+@wp.func
+def gear_rates_of_tendon(
+    worldid: int,
+    t: int,
+    tendons: TendonRows,
+    actuators: ActuatorSettings,
+    drive_in: Drive,
+    state_in: State,
+    multipliers_in: Multipliers,
+    ten_J_in: wp.array2d[float],
+    ten_length_in: wp.array2d[float],
+) -> GearRates:
+    """Those of an actuator on a tendon."""
+    out = GearRates()
+    out.length[0] = ten_length_in[worldid, t]
+    start = tendons.ten_J_rowadr[t]
+    for k in range(start, start + tendons.ten_J_rownnz[t]):
+        j = tendons.ten_J_colind[k]
+        lever = ten_J_in[worldid, k]
+        if not is_held(worldid, j, actuators, drive_in):
+            out.lam[0] += lever * multipliers_in.lam[worldid, j]
+        out.vel[0] += lever * state_in.qvel[worldid, j]
+        out.mu[0] += lever * multipliers_in.mu[worldid, j]
+        out.smooth[0] += lever * (state_in.qacc[worldid, j] - multipliers_in.excess[worldid, j])
+    return out
+
+
+@wp.func
+def site_rate(mat: wp.mat33, twist: wp.spatial_vectorf, arm: wp.vec3) -> wp.spatial_vectorf:
+    """Velocity and spin of a site in its own frame."""
+    turned = wp.transpose(mat)
+    return wp.spatial_vector(turned @ point_velocity(twist, arm), turned @ wp.spatial_top(twist))
+
+
+@wp.func
+def gear_rates_of_site(worldid: int, site: int, levers: Levers, motion_in: Motion, fields_in: Fields) -> GearRates:
+    """Those of an actuator on a site, whose length is zero."""
+    out = GearRates()
+    body = levers.site_bodyid[site]
+    mat = levers.site_xmat[worldid, site]
+    arm = levers.site_xpos[worldid, site] - motion_in.subtree_com[worldid, levers.body_rootid[body]]
+    out.lam = site_rate(mat, fields_in.lam[worldid, body], arm)
+    out.vel = site_rate(mat, motion_in.cvel[worldid, body], arm)
+    out.mu = site_rate(mat, fields_in.mu[worldid, body], arm)
+    out.smooth = site_rate(mat, fields_in.qacc[worldid, body] - fields_in.excess[worldid, body], arm)
+    return out
+
+
+@wp.kernel
+def pull_actuator_parameters(
+    # Model:
+    opt_timestep: wp.array[float],
+    clampctrl: bool,
+    clampact: bool,
+    implicit_all: bool,
+    implicit_address: wp.array2d[int],
+    joints: Joints,
+    tendons: TendonRows,
+    actuators: ActuatorSettings,
+    # In:
+    count: int,
+    lanes: int,
+    live_in: wp.array[int],
+    act_bar_in: wp.array2d[float],
+    drive_in: Drive,
+    levers_in: Levers,
+    state_in: State,
+    motion_in: Motion,
+    multipliers_in: Multipliers,
+    fields_in: Fields,
+    ten_J_in: wp.array2d[float],
+    ten_length_in: wp.array2d[float],
+    # Out:
+    gradients_out: ActuatorGradients,
+    timestep_out: TimestepGradient,
+) -> None:
+    """-Φ ∋ (m·λ) F + h κ dF/dv, and ḡ·act': slopes by one actuator's parameters, as in `actuation.pull_actuators`."""
+    worldid, lane = wp.tid()
+    if live_in[worldid] == 0:
+        return
+    for uid in range(lane, count, lanes):
+        h = opt_timestep[worldid % opt_timestep.shape[0]]
+        law = actuator_law(worldid, uid, h, clampctrl, clampact, actuators)
+        ctrl = float(0.0)
+        if actuators.actuator_ctrlnum[uid] > 0:
+            ctrl = drive_in.ctrl[worldid, actuators.actuator_ctrladr[uid]]
+        act = float(0.0)
+        act_weight = float(0.0)
+        if law.dyntype != DynType.NONE:
+            slot = actuators.actuator_actadr[uid] + actuators.actuator_actnum[uid] - 1
+            act = drive_in.act[worldid, slot]
+            act_weight = act_bar_in[worldid, slot]
+
+        start = drive_in.moment_rowadr[worldid, uid]
+        end = start + drive_in.moment_rownnz[worldid, uid]
+        rate = float(0.0)
+        velocity = float(0.0)
+        rate_mu = float(0.0)
+        rate_smooth = float(0.0)
+        kappa = float(0.0)
+        for k in range(start, end):
+            i = drive_in.moment_colind[worldid, k]
+            lever = drive_in.actuator_moment[worldid, k]
+            velocity += lever * state_in.qvel[worldid, i]
+            if not is_held(worldid, i, actuators, drive_in):
+                rate += lever * multipliers_in.lam[worldid, i]
+            if implicit_all and implicit_address[i, i] >= 0:
+                rate_mu += lever * multipliers_in.mu[worldid, i]
+                rate_smooth += lever * (state_in.qacc[worldid, i] - multipliers_in.excess[worldid, i])
+                for m in range(start, end):
+                    j = drive_in.moment_colind[worldid, m]
+                    if implicit_address[wp.max(i, j), wp.min(i, j)] >= 0:
+                        smooth = state_in.qacc[worldid, j] - multipliers_in.excess[worldid, j]
+                        kappa += lever * drive_in.actuator_moment[worldid, m] * multipliers_in.mu[worldid, i] * smooth
+        law.implicit = int(implicit_all)
+        length = drive_in.actuator_length[worldid, uid]
+        law_bar, _c, _a, length_slope, velocity_slope, _w, force, slope = wp.grad(actuator_score)(
+            law, ctrl, act, length, velocity, act_weight, rate, h * kappa
+        )
+        gradients_out.actuator_gainprm[worldid, uid] = gradients_out.actuator_gainprm[worldid, uid] + law_bar.gainprm
+        gradients_out.actuator_biasprm[worldid, uid] = gradients_out.actuator_biasprm[worldid, uid] + law_bar.biasprm
+        gradients_out.actuator_dynprm[worldid, uid] = gradients_out.actuator_dynprm[worldid, uid] + law_bar.dynprm
+        wp.atomic_add(timestep_out.timestep, worldid, law_bar.timestep)
+
+        kind = actuators.actuator_trntype[uid]
+        target = actuators.actuator_trnid[uid][0]
+        rates = GearRates()
+        if kind == TrnType.TENDON:
+            rates = gear_rates_of_tendon(
+                worldid, target, tendons, actuators, drive_in, state_in, multipliers_in, ten_J_in, ten_length_in
+            )
+        elif kind == TrnType.SITE:
+            rates = gear_rates_of_site(worldid, target, levers_in, motion_in, fields_in)
+        else:
+            rates = gear_rates_of_joint(
+                worldid,
+                target,
+                kind == TrnType.JOINTINPARENT,
+                joints,
+                actuators,
+                drive_in,
+                state_in,
+                multipliers_in,
+            )
+        gear_bar = force * rates.lam + velocity_slope * rates.vel + length_slope * rates.length
+        if implicit_all:
+            gear = actuators.actuator_gear[worldid % actuators.actuator_gear.shape[0], uid][0]
+            if kind == TrnType.TENDON and gear != 0.0:
+                # κ counts pairs that M couples, and is quadratic in the one gear
+                gear_bar[0] += 2.0 * h * slope * kappa / gear
+            elif kind != TrnType.TENDON:
+                gear_bar += h * slope * (rate_smooth * rates.mu + rate_mu * rates.smooth)
+        gradients_out.actuator_gear[worldid, uid] = gradients_out.actuator_gear[worldid, uid] + gear_bar
+
+
+class ActuatorStage(ParameterStage):
+    """Launches of the gradients of actuators' parameters."""
+
+    kinds = (ActuatorGradients, TimestepGradient)
+
+    def __init__(self, parts: Parts, gradients: dict[Any, Any]) -> None:
+        super().__init__(parts, gradients)
+        self._settings = gather(ActuatorSettings, parts.work.model)
+        self._act_bar = wp.zeros_like(parts.work.grad_act)
+
+    def launch_first(self, at: Substep, qvel_next: wp.array) -> None:
+        # `pull_actuators` replaces the cotangent of act' by that of act.
+        wp.copy(self._act_bar, self.parts.work.grad_act)
+
+    def launch(self, at: Substep) -> None:
+        work, m, d, settings = self.parts.work, self.parts.work.model, at.data, self.parts.work.settings
+        wp.launch(
+            pull_actuator_parameters,
+            dim=(work.nworld, work.lanes(m.nactuator)),
+            inputs=[
+                m.opt.timestep,
+                settings.clampctrl,
+                settings.clampact,
+                settings.implicit_all,
+                work.tables.implicit_address,
+                work.joints,
+                work.tendon_rows,
+                self._settings,
+                m.nactuator,
+                work.lanes(m.nactuator),
+                work.live,
+                self._act_bar,
+                gather(Drive, d),
+                gather(Levers, m, d),
+                at.state,
+                at.motion,
+                work.multipliers,
+                work.fields,
+                d.ten_J,
+                d.ten_length,
+            ],
+            outputs=self.gradients,
+        )

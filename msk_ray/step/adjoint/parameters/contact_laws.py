@@ -1,0 +1,129 @@
+"""Friction, solref and solimp of contacts: how the rows of one contact answer to them.
+
+`contact_score` is what a contact gives -Φ, Σ_r ρ_r(λ) f_r(ρ(a) - aref), as a function of its material alone. Kept apart
+from the kernel: Warp drops the derivative of a function that another kernel of the module runs forward only.
+"""
+
+import warp as wp
+
+from msk_ray.step.adjoint.laws.rows import vec6
+from msk_ray.step.adjoint.parameters.impedance import row_spring
+from msk_ray.step.forward.mjw_private import vec5, vec10
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class ContactMotion:
+    """What stays fixed in the score: rates under λ, a and v, the position, and the scale of D."""
+
+    lam: vec6
+    acc: vec6
+    vel: vec6
+    offset: vec10
+    """What the adjoint's own J a - aref of each row is beyond that of these rates: their rounding."""
+    pos: wp.float32
+    """dist - margin."""
+    weight: wp.float32
+    """1/D of the normal row without its impedance and friction."""
+    impratio_invsqrt: wp.float32
+    dim: wp.int32
+    elliptic: wp.int32
+    disableflags: wp.int32
+
+
+@wp.func
+def pyramid_weight(friction: wp.float32) -> wp.float32:
+    """Share of 1/D that a pyramid's friction makes: 2 μ² (1 + μ²)."""
+    square = friction * friction
+    return 2.0 * square * (1.0 + square)
+
+
+@wp.func
+def edge_score(
+    motion: ContactMotion,
+    stiffness: wp.float32,
+    damping: wp.float32,
+    mass: wp.float32,
+    lean: wp.float32,
+    k: wp.int32,
+    row: wp.int32,
+) -> wp.float32:
+    """One row of a pyramid, ρ = ρ₀ + lean ρ_k, or with k = 0 that of a frictionless contact."""
+    lam = motion.lam[0]
+    jar = motion.acc[0] + damping * motion.vel[0] + stiffness * motion.pos + motion.offset[row]
+    if k > 0:
+        lam += lean * motion.lam[k]
+        jar += lean * (motion.acc[k] + damping * motion.vel[k])
+    score = wp.float32(0.0)
+    if jar < 0.0:
+        score = -lam * mass * jar
+    return score
+
+
+@wp.func
+def cone_score(
+    motion: ContactMotion,
+    friction: vec5,
+    stiffness: wp.float32,
+    damping: wp.float32,
+    side_damping: wp.float32,
+    mass: wp.float32,
+) -> wp.float32:
+    """All rows of an elliptic contact; zones and laws as in `rows.cone_law`."""
+    mu = friction[0] * motion.impratio_invsqrt
+    normal = motion.acc[0] + damping * motion.vel[0] + stiffness * motion.pos + motion.offset[0]
+    square = wp.float32(0.0)
+    across = wp.float32(0.0)
+    stuck = wp.float32(0.0)
+    for i in range(1, 6):
+        if i < motion.dim:
+            phi = friction[i - 1]
+            jar = motion.acc[i] + side_damping * motion.vel[i] + motion.offset[i]
+            square += phi * phi * jar * jar
+            across += motion.lam[i] * phi * phi * jar
+            # D_i = D₀ (φᵢ / μ)²
+            stuck += motion.lam[i] * phi * phi * jar / (mu * mu)
+    score = wp.float32(0.0)
+    if square > 0.0:
+        side = wp.sqrt(square)
+        if mu * mu * normal + side <= 0.0:
+            score = -mass * (motion.lam[0] * normal + stuck)
+        elif normal < side:
+            outer = mass / (mu * mu * (1.0 + mu * mu))
+            push = outer * mu * mu * (side - normal)
+            score = push * (motion.lam[0] - across / side)
+    elif normal < 0.0:
+        score = -mass * motion.lam[0] * normal
+    return score
+
+
+@wp.func
+def contact_score(
+    motion: ContactMotion,
+    friction: vec5,
+    solref: wp.vec2,
+    solreffriction: wp.vec2,
+    solimp: vec5,
+    timestep: wp.float32,
+) -> wp.float32:
+    """Σ_r ρ_r(λ) f_r of one contact."""
+    kbi = row_spring(motion.disableflags, timestep, solref, solimp, motion.pos)
+    stiffness = kbi[0] * kbi[2]
+    mass = kbi[2] / ((1.0 - kbi[2]) * motion.weight)
+    score = wp.float32(0.0)
+    if motion.elliptic == 1:
+        side_damping = kbi[1]
+        if solreffriction[0] != 0.0 or solreffriction[1] != 0.0:
+            side = row_spring(motion.disableflags, timestep, solreffriction, solimp, motion.pos)
+            side_damping = side[1]
+        score = cone_score(motion, friction, stiffness, kbi[1], side_damping, mass)
+    elif motion.dim == 1:
+        score = edge_score(motion, stiffness, kbi[1], mass, 0.0, 0, 0)
+    else:
+        share = mass / pyramid_weight(friction[0])
+        for k in range(1, 6):
+            if k < motion.dim:
+                score += edge_score(motion, stiffness, kbi[1], share, friction[k - 1], k, 2 * k - 2)
+                score += edge_score(motion, stiffness, kbi[1], share, -friction[k - 1], k, 2 * k - 1)
+    return score

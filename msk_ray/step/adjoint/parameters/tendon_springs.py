@@ -1,0 +1,108 @@
+"""Stiffness, damping and rest length of tendons: Φ ∋ ρ(λ) (k(x) x + c ρ(v)), and h κ c with implicit integration."""
+
+from typing import Any
+
+import warp as wp
+
+from msk_ray.step.adjoint.groups import Multipliers, State, Substep, TendonRows, gather
+from msk_ray.step.adjoint.laws.tendons import PassiveTendons, tendon_rate
+from msk_ray.step.adjoint.parameters.base import ParameterStage, Parts
+from msk_ray.step.forward.mjw_private import poly_force_deriv
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class TendonGradients:
+    """Gradients by tendon, (W, T)."""
+
+    tendon_stiffness: wp.array2d[float]
+    tendon_damping: wp.array2d[float]
+    tendon_lengthspring: wp.array2d[wp.vec2]
+
+
+@wp.kernel
+def pull_tendon_parameters(
+    # Model:
+    opt_timestep: wp.array[float],
+    spring_on: bool,
+    damper_on: bool,
+    implicit_all: bool,
+    tendons: TendonRows,
+    passive: PassiveTendons,
+    inertia_address: wp.array2d[int],
+    # In:
+    live_in: wp.array[int],
+    state_in: State,
+    ten_J_in: wp.array2d[float],
+    ten_length_in: wp.array2d[float],
+    multipliers_in: Multipliers,
+    # Out:
+    gradients_out: TendonGradients,
+) -> None:
+    """θ̄ -= ∂Φ/∂θ of one tendon's spring and damper."""
+    worldid, t = wp.tid()
+    if live_in[worldid] == 0:
+        return
+    rate_l = tendon_rate(tendons, t, ten_J_in[worldid], multipliers_in.lam[worldid])
+    if spring_on:
+        rest = passive.tendon_lengthspring[worldid % passive.tendon_lengthspring.shape[0], t]
+        stiffness = passive.tendon_stiffness[worldid % passive.tendon_stiffness.shape[0], t]
+        poly = passive.tendon_stiffnesspoly[worldid % passive.tendon_stiffnesspoly.shape[0], t]
+        length = ten_length_in[worldid, t]
+        x = float(0.0)
+        bar = wp.vec2(0.0)
+        if length > rest[1]:
+            x = length - rest[1]
+            bar[1] = rate_l * poly_force_deriv(stiffness, poly, x, 0)
+        elif length < rest[0]:
+            x = length - rest[0]
+            bar[0] = rate_l * poly_force_deriv(stiffness, poly, x, 0)
+        gradients_out.tendon_stiffness[worldid, t] = gradients_out.tendon_stiffness[worldid, t] - rate_l * x
+        gradients_out.tendon_lengthspring[worldid, t] = gradients_out.tendon_lengthspring[worldid, t] + bar
+    if damper_on:
+        slope = rate_l * tendon_rate(tendons, t, ten_J_in[worldid], state_in.qvel[worldid])
+        if implicit_all:
+            h = opt_timestep[worldid % opt_timestep.shape[0]]
+            start = tendons.ten_J_rowadr[t]
+            for k in range(start, start + tendons.ten_J_rownnz[t]):
+                i = tendons.ten_J_colind[k]
+                for m in range(start, start + tendons.ten_J_rownnz[t]):
+                    j = tendons.ten_J_colind[m]
+                    if inertia_address[wp.max(i, j), wp.min(i, j)] >= 0:
+                        smooth = state_in.qacc[worldid, j] - multipliers_in.excess[worldid, j]
+                        pair = ten_J_in[worldid, k] * ten_J_in[worldid, m]
+                        slope += h * pair * multipliers_in.mu[worldid, i] * smooth
+        gradients_out.tendon_damping[worldid, t] = gradients_out.tendon_damping[worldid, t] - slope
+
+
+class TendonStage(ParameterStage):
+    """Launches of the gradients of tendons' springs and dampers."""
+
+    kinds = (TendonGradients,)
+
+    def __init__(self, parts: Parts, gradients: dict[Any, Any]) -> None:
+        super().__init__(parts, gradients)
+        self._passive = gather(PassiveTendons, parts.work.model)
+
+    def launch(self, at: Substep) -> None:
+        work, m, d, settings = self.parts.work, self.parts.work.model, at.data, self.parts.work.settings
+        wp.launch(
+            pull_tendon_parameters,
+            dim=(work.nworld, m.ntendon),
+            inputs=[
+                m.opt.timestep,
+                settings.spring,
+                settings.damper,
+                settings.implicit_all,
+                work.tendon_rows,
+                self._passive,
+                work.tables.inertia_address,
+                work.live,
+                at.state,
+                d.ten_J,
+                d.ten_length,
+                work.multipliers,
+            ],
+            outputs=self.gradients,
+        )

@@ -1,0 +1,38 @@
+"""Spatial algebra on MuJoCo's com-based vectors: motions [ω; v] and forces [torque; force] about one fixed point."""
+
+import warp as wp
+
+from msk_ray.step.forward.mjw_private import motion_cross_force
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def point_velocity(motion: wp.spatial_vectorf, arm: wp.vec3) -> wp.vec3:
+    """Velocity of the point at `arm` from the reference point: v + ω × r."""
+    return wp.spatial_bottom(motion) + wp.cross(wp.spatial_top(motion), arm)
+
+
+@wp.func
+def wrench(force: wp.vec3, torque: wp.vec3, arm: wp.vec3) -> wp.spatial_vectorf:
+    """Force at `arm` and a free torque, about the reference point: [t + r × f; f]."""
+    return wp.spatial_vector(torque + wp.cross(arm, force), force)
+
+
+@wp.func
+def carried(motion: wp.spatial_vectorf, force: wp.spatial_vectorf) -> wp.spatial_vectorf:
+    """Cotangent of a body's displacement w where f·(w × V) is the change of f·V: w·(V ×* f)."""
+    return motion_cross_force(motion, force)
+
+
+@wp.func
+def column(matrix: wp.mat33, k: int) -> wp.vec3:
+    """Column k of a matrix."""
+    return wp.vec3(matrix[0, k], matrix[1, k], matrix[2, k])
+
+
+@wp.func
+def turning_torque(mat: wp.mat33, bar: wp.mat33) -> wp.vec3:
+    """dR = [ω] R  ⇒  torque Σ_k R_k × R̄_k over the columns."""
+    out = wp.cross(column(mat, 0), column(bar, 0)) + wp.cross(column(mat, 1), column(bar, 1))
+    return out + wp.cross(column(mat, 2), column(bar, 2))

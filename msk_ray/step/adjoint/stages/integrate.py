@@ -1,0 +1,335 @@
+"""Pullback of q' = q ⊕ h v', and the two changes of coordinates between raw and tangent gradients.
+
+Rotations are perturbed on the right (body frame), as MuJoCo's ball and free joint velocities are.
+"""
+
+import warp as wp
+from mujoco_warp import JointType
+
+from msk_ray.step.adjoint.groups import DofSlopes, Joints, Substep, gather
+from msk_ray.step.adjoint.workspace import Workspace
+from msk_ray.step.forward.mjw_private import dof_damping_total, poly_force_deriv
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def rotation_pullback(phi: wp.vec3, g: wp.vec3) -> wp.vec3:
+    """Exp(φ) g: (exp(-φ) exp(δ) exp(φ)) is exp(Exp(φ)ᵀ δ), so the cotangent of δ is Exp(φ) g."""
+    square = wp.dot(phi, phi)
+    a = 1.0 - square / 6.0
+    b = 0.5 - square / 24.0
+    if square > 1.0e-4:
+        angle = wp.sqrt(square)
+        half = wp.sin(0.5 * angle)
+        a = wp.sin(angle) / angle
+        b = 2.0 * half * half / square
+    c = wp.cross(phi, g)
+    return g + a * c + b * wp.cross(phi, c)
+
+
+@wp.func
+def rate_pullback(phi: wp.vec3, g: wp.vec3) -> wp.vec3:
+    """Jr(φ)ᵀ g, with exp(φ + dφ) = exp(φ) exp(Jr dφ) and Jrᵀ = 1 + b[φ] + c[φ]²."""
+    square = wp.dot(phi, phi)
+    b = 0.5 - square / 24.0
+    c = 1.0 / 6.0 - square / 120.0
+    if square > 1.0e-2:
+        angle = wp.sqrt(square)
+        half = wp.sin(0.5 * angle)
+        b = 2.0 * half * half / square
+        c = (angle - wp.sin(angle)) / (square * angle)
+    cr = wp.cross(phi, g)
+    return g + b * cr + c * wp.cross(phi, cr)
+
+
+@wp.struct
+class DofDampers:
+    """Linear and higher-order damping of dofs, that of actuators included."""
+
+    jnt_actuatorid: wp.array[int]
+    dof_jntid: wp.array[int]
+    dof_damping: wp.array2d[float]
+    dof_dampingpoly: wp.array2d[wp.vec2]
+    actuator_trntype: wp.array[int]
+    actuator_trnid: wp.array[wp.vec2i]
+    actuator_damping: wp.array2d[float]
+    actuator_dampingpoly: wp.array2d[wp.vec2]
+    actuator_gear: wp.array2d[wp.spatial_vector]
+
+
+@wp.kernel
+def pull_position(
+    # Model:
+    opt_timestep: wp.array[float],
+    joints: Joints,
+    dampers: DofDampers,
+    implicit_damping: bool,
+    # In:
+    qvel_in: wp.array2d[float],
+    qvel_next_in: wp.array2d[float],
+    # Out:
+    damping_out: wp.array2d[wp.vec3],
+    step_out: wp.array2d[float],
+    grad_qpos_out: wp.array2d[float],
+    grad_qvel_out: wp.array2d[float],
+    rhs_out: wp.array2d[float],
+    slopes_out: DofSlopes,
+) -> None:
+    """Turns cotangents of (q', v') into those of (q, v') in place, and starts this substep's sums.
+
+    Also writes each dof's damping coefficients (c₀, c₁, c₂) of the force -v (c₀ + c₁|v| + c₂ v²), and hB.
+    """
+    worldid, jntid = wp.tid()
+    h = opt_timestep[worldid % opt_timestep.shape[0]]
+    kind = joints.jnt_type[jntid]
+    dof = joints.jnt_dofadr[jntid]
+    count = int(1)
+    turn = dof
+    if kind == JointType.FREE:
+        count = int(6)
+        turn = dof + 3
+    elif kind == JointType.BALL:
+        count = int(3)
+    if kind == JointType.FREE or kind == JointType.BALL:
+        g = wp.vec3(grad_qpos_out[worldid, turn], grad_qpos_out[worldid, turn + 1], grad_qpos_out[worldid, turn + 2])
+        phi = h * wp.vec3(qvel_next_in[worldid, turn], qvel_next_in[worldid, turn + 1], qvel_next_in[worldid, turn + 2])
+        # R' = R Exp(hω')  ⇒  δ̄ = Exp(hω') δ̄' ,  ω̄' += h Jr(hω')ᵀ δ̄'
+        back = rotation_pullback(phi, g)
+        rate = rate_pullback(phi, g)
+        for i in range(3):
+            grad_qpos_out[worldid, turn + i] = back[i]
+            grad_qvel_out[worldid, turn + i] += h * rate[i]
+    for i in range(count):
+        j = dof + i
+        # q' = q + h v'  ⇒  v̄' += h q̄'
+        if kind == JointType.HINGE or kind == JointType.SLIDE or (kind == JointType.FREE and i < 3):
+            grad_qvel_out[worldid, j] += h * grad_qpos_out[worldid, j]
+        # v' = v + h (M + hB)⁻¹ M a: the right-hand side of (M + hB) μ = h v̄'
+        rhs_out[worldid, j] = h * grad_qvel_out[worldid, j]
+        linear, poly = dof_damping_total(
+            dampers.jnt_actuatorid,
+            dampers.dof_jntid,
+            dampers.dof_damping,
+            dampers.dof_dampingpoly,
+            dampers.actuator_trntype,
+            dampers.actuator_trnid,
+            dampers.actuator_damping,
+            dampers.actuator_dampingpoly,
+            dampers.actuator_gear,
+            worldid,
+            j,
+        )
+        damping_out[worldid, j] = wp.vec3(linear, poly[0], poly[1])
+        # hB = h d(c(|v|) v)/dv, the damping that the Euler integrator treats implicitly
+        step_out[worldid, j] = 0.0
+        if implicit_damping:
+            step_out[worldid, j] = h * poly_force_deriv(linear, poly, qvel_in[worldid, j], 1)
+        slopes_out.qpos[worldid, j] = 0.0
+        slopes_out.qvel[worldid, j] = 0.0
+
+
+@wp.kernel
+def project(
+    # Model:
+    joints: Joints,
+    # In:
+    qpos_in: wp.array2d[float],
+    raw_in: wp.array2d[float],
+    # Out:
+    tangent_out: wp.array2d[float],
+) -> None:
+    """Raw gradient (W, nq) to tangent gradient (W, nv): the vector part of ½ q*⊗g for a quaternion."""
+    worldid, jntid = wp.tid()
+    kind = joints.jnt_type[jntid]
+    q = joints.jnt_qposadr[jntid]
+    v = joints.jnt_dofadr[jntid]
+    if kind == JointType.FREE:
+        for i in range(3):
+            tangent_out[worldid, v + i] = raw_in[worldid, q + i]
+        q += 3
+        v += 3
+    if kind == JointType.FREE or kind == JointType.BALL:
+        w = qpos_in[worldid, q]
+        u = wp.vec3(qpos_in[worldid, q + 1], qpos_in[worldid, q + 2], qpos_in[worldid, q + 3])
+        gw = raw_in[worldid, q]
+        gu = wp.vec3(raw_in[worldid, q + 1], raw_in[worldid, q + 2], raw_in[worldid, q + 3])
+        # d(q⊗exp δ)/dδ at 0 is ½ q⊗[0, ·]  ⇒  δ̄ = ½ (w ḡ - ḡ_w u - u × ḡ)
+        g = 0.5 * (w * gu - gw * u - wp.cross(u, gu))
+        for i in range(3):
+            tangent_out[worldid, v + i] = g[i]
+    else:
+        tangent_out[worldid, v] = raw_in[worldid, q]
+
+
+@wp.kernel
+def lift(
+    # Model:
+    joints: Joints,
+    # In:
+    qpos_in: wp.array2d[float],
+    tangent_in: wp.array2d[float],
+    # Out:
+    raw_out: wp.array2d[float],
+) -> None:
+    """Tangent gradient (W, nv) to the raw one (W, nq) without a component along q: 2 q⊗[0, g]."""
+    worldid, jntid = wp.tid()
+    kind = joints.jnt_type[jntid]
+    q = joints.jnt_qposadr[jntid]
+    v = joints.jnt_dofadr[jntid]
+    if kind == JointType.FREE:
+        for i in range(3):
+            raw_out[worldid, q + i] = tangent_in[worldid, v + i]
+        q += 3
+        v += 3
+    if kind == JointType.FREE or kind == JointType.BALL:
+        w = qpos_in[worldid, q]
+        u = wp.vec3(qpos_in[worldid, q + 1], qpos_in[worldid, q + 2], qpos_in[worldid, q + 3])
+        g = wp.vec3(tangent_in[worldid, v], tangent_in[worldid, v + 1], tangent_in[worldid, v + 2])
+        raw_out[worldid, q] = -2.0 * wp.dot(u, g)
+        r = 2.0 * (w * g + wp.cross(u, g))
+        for i in range(3):
+            raw_out[worldid, q + 1 + i] = r[i]
+    else:
+        raw_out[worldid, q] = tangent_in[worldid, v]
+
+
+@wp.kernel
+def mark_live(
+    # In:
+    qpos_in: wp.array2d[float],
+    qvel_in: wp.array2d[float],
+    act_in: wp.array2d[float],
+    # Out:
+    live_out: wp.array[int],
+) -> None:
+    """1 for a world whose cotangents are not all zero; only such worlds are given a gradient."""
+    worldid = wp.tid()
+    live = int(0)
+    for i in range(qpos_in.shape[1]):
+        if qpos_in[worldid, i] != 0.0:
+            live = int(1)
+    for i in range(qvel_in.shape[1]):
+        if qvel_in[worldid, i] != 0.0:
+            live = int(1)
+    for i in range(act_in.shape[1]):
+        if act_in[worldid, i] != 0.0:
+            live = int(1)
+    live_out[worldid] = live
+
+
+@wp.kernel
+def clip_norm(
+    # In:
+    bound_in: float,
+    # Out:
+    grad_qpos_out: wp.array2d[float],
+    grad_qvel_out: wp.array2d[float],
+    grad_act_out: wp.array2d[float],
+    clipped_out: wp.array[int],
+) -> None:
+    """Scales each world's state cotangent to at most `bound_in` in Euclidean norm, and counts where it did."""
+    worldid = wp.tid()
+    largest = float(0.0)
+    for i in range(grad_qpos_out.shape[1]):
+        largest = wp.max(largest, wp.max(wp.abs(grad_qpos_out[worldid, i]), wp.abs(grad_qvel_out[worldid, i])))
+    for i in range(grad_act_out.shape[1]):
+        largest = wp.max(largest, wp.abs(grad_act_out[worldid, i]))
+    if not (largest > 0.0):
+        return
+    # Scaled by the largest entry, so that squares of exploding gradients do not overflow.
+    total = float(0.0)
+    for i in range(grad_qpos_out.shape[1]):
+        a = grad_qpos_out[worldid, i] / largest
+        b = grad_qvel_out[worldid, i] / largest
+        total += a * a + b * b
+    for i in range(grad_act_out.shape[1]):
+        a = grad_act_out[worldid, i] / largest
+        total += a * a
+    norm = largest * wp.sqrt(total)
+    if norm > bound_in:
+        scale = bound_in / norm
+        for i in range(grad_qpos_out.shape[1]):
+            grad_qpos_out[worldid, i] = scale * grad_qpos_out[worldid, i]
+            grad_qvel_out[worldid, i] = scale * grad_qvel_out[worldid, i]
+        for i in range(grad_act_out.shape[1]):
+            grad_act_out[worldid, i] = scale * grad_act_out[worldid, i]
+        clipped_out[worldid] += 1
+
+
+@wp.kernel
+def add_into(
+    # In:
+    x_in: wp.array2d[float],
+    # Out:
+    y_out: wp.array2d[float],
+) -> None:
+    """y += x, as gradients add up."""
+    i, j = wp.tid()
+    y_out[i, j] = y_out[i, j] + x_in[i, j]
+
+
+class Integrator:
+    """Launches of the integration of positions, and of what begins and ends an env step's pullback.
+
+    Attributes:
+        rhs: h v̄', shape (W, nv).
+        damping: each dof's damping coefficients (c₀, c₁, c₂), shape (W, nv), vec3.
+        damping_step: hB where it is diagonal, shape (W, nv).
+    """
+
+    def __init__(self, work: Workspace) -> None:
+        self._work = work
+        shape = (work.nworld, work.mjm.nv)
+        self._dampers = gather(DofDampers, work.model)
+        self.rhs, self.damping_step = wp.zeros(shape, dtype=float), wp.zeros(shape, dtype=float)
+        self.damping = wp.zeros(shape, dtype=wp.vec3)
+
+    def start(self, qpos: wp.array, raw_qpos: wp.array) -> None:
+        """Launch the change of a raw cotangent (W, nq) at `qpos` to tangent coordinates, and find the live worlds."""
+        work = self._work
+        wp.launch(
+            project,
+            dim=(work.nworld, work.model.njnt),
+            inputs=[work.joints, qpos, raw_qpos],
+            outputs=[work.grad_qpos],
+        )
+        wp.launch(mark_live, dim=work.nworld, inputs=[raw_qpos, work.grad_qvel, work.grad_act], outputs=[work.live])
+        work.grad_ctrl.zero_()
+
+    def finish(self, qpos: wp.array, raw_qpos: wp.array) -> None:
+        """Launch the change of the tangent gradient at `qpos` to raw coordinates (W, nq)."""
+        work = self._work
+        wp.launch(
+            lift,
+            dim=(work.nworld, work.model.njnt),
+            inputs=[work.joints, qpos, work.grad_qpos],
+            outputs=[raw_qpos],
+        )
+
+    def clip(self, bound: float, clipped: wp.array) -> None:
+        """Launch the bound on each world's state cotangent; `clipped` (W,) counts where it acted."""
+        work = self._work
+        wp.launch(
+            clip_norm,
+            dim=work.nworld,
+            inputs=[bound],
+            outputs=[work.grad_qpos, work.grad_qvel, work.grad_act, clipped],
+        )
+
+    def launch(self, at: Substep, qvel_next: wp.array) -> None:
+        """Launch the pullback of q' = q ⊕ h v' and the right-hand side of the first linear system."""
+        work = self._work
+        wp.launch(
+            pull_position,
+            dim=(work.nworld, work.model.njnt),
+            inputs=[
+                work.model.opt.timestep,
+                work.joints,
+                self._dampers,
+                work.settings.euler_damping,
+                at.state.qvel,
+                qvel_next,
+            ],
+            outputs=[self.damping, self.damping_step, work.grad_qpos, work.grad_qvel, self.rhs, work.slopes],
+        )

@@ -1,0 +1,250 @@
+"""The two linear systems of a substep: (M + hB) μ = h v̄' and H λ = M μ with H = M + JᵀSJ."""
+
+from typing import Any
+
+import warp as wp
+
+from msk_ray.step.adjoint.groups import Substep
+from msk_ray.step.adjoint.laws.rows import ConstraintLaws
+from msk_ray.step.adjoint.stages.free_bodies import FreeBodySolves
+from msk_ray.step.adjoint.stages.integrate import Integrator
+from msk_ray.step.adjoint.stages.tiles import solve_tiled, solve_two_tiled
+from msk_ray.step.adjoint.workspace import Workspace
+
+wp.set_module_options({"enable_backward": False})
+
+# Largest nv whose matrices fit the shared memory of one block (two tiles of nv² floats).
+TILE_LIMIT = 64
+_BLOCK = 32
+
+
+@wp.kernel
+def build_matrices(
+    # Model:
+    coupled: bool,
+    inertia_address: wp.array2d[int],
+    # In:
+    nefc_in: wp.array[int],
+    inertia_in: wp.array2d[float],
+    step_in: wp.array2d[float],
+    step_dense: bool,
+    jacobian_in: wp.array3d[float],
+    slope_in: wp.array2d[float],
+    scaled_in: wp.array3d[float],
+    # Out:
+    implicit_out: wp.array3d[float],
+    hessian_out: wp.array3d[float],
+) -> None:
+    """M + hB and H = M + JᵀSJ as full matrices, one thread an entry of the lower triangle.
+
+    `step_in` is the diagonal hB, shape (W, nv), or with `step_dense` all of M + hB in M's sparse layout.
+    """
+    worldid, i, j = wp.tid()
+    if j > i:
+        return
+    address = inertia_address[i, j]
+    entry = float(0.0)
+    if address >= 0:
+        entry = inertia_in[worldid, address]
+    implicit = entry
+    if step_dense:
+        if address >= 0:
+            implicit = step_in[worldid, address]
+    elif i == j:
+        implicit += step_in[worldid, i]
+    implicit_out[worldid, i, j] = implicit
+    implicit_out[worldid, j, i] = implicit
+    # H_ij = M_ij + Σ_r J_ri (S J)_rj
+    for r in range(wp.min(nefc_in[worldid], slope_in.shape[1])):
+        if coupled:
+            entry += jacobian_in[worldid, r, i] * scaled_in[worldid, r, j]
+        else:
+            s = slope_in[worldid, r]
+            if s != 0.0:
+                entry += s * jacobian_in[worldid, r, i] * jacobian_in[worldid, r, j]
+    hessian_out[worldid, i, j] = entry
+    hessian_out[worldid, j, i] = entry
+
+
+@wp.kernel
+def solve_two_serial(
+    # Model:
+    nv: int,
+    # In:
+    matrix_in: wp.array3d[float],
+    first_in: wp.array2d[float],
+    second_in: wp.array2d[float],
+    # Out:
+    first_out: wp.array2d[float],
+    second_out: wp.array2d[float],
+) -> None:
+    """The same for any nv, one thread a world; the factor overwrites the matrix."""
+    worldid = wp.tid()
+    _factor(matrix_in[worldid], nv)
+    for i in range(nv):
+        first_out[worldid, i] = first_in[worldid, i]
+        second_out[worldid, i] = second_in[worldid, i]
+    _substitute(matrix_in[worldid], nv, first_out[worldid])
+    _substitute(matrix_in[worldid], nv, second_out[worldid])
+
+
+@wp.kernel
+def damping_product(
+    # Model:
+    inertia_address: wp.array2d[int],
+    # In:
+    inertia_in: wp.array2d[float],
+    step_in: wp.array2d[float],
+    x_in: wp.array2d[float],
+    start_in: wp.array2d[float],
+    scale_in: float,
+    # Out:
+    y_out: wp.array2d[float],
+) -> None:
+    """hB x, or with a negative scale start + scale · hB x; hB = (M + hB) - M in M's sparse layout."""
+    worldid, i = wp.tid()
+    total = float(0.0)
+    for j in range(x_in.shape[1]):
+        address = inertia_address[wp.max(i, j), wp.min(i, j)]
+        if address >= 0:
+            total += (step_in[worldid, address] - inertia_in[worldid, address]) * x_in[worldid, j]
+    y_out[worldid, i] = scale_in * total
+    if scale_in < 0.0:
+        y_out[worldid, i] = start_in[worldid, i] + scale_in * total
+
+
+@wp.func
+def _factor(matrix: wp.array2d[float], nv: int) -> None:
+    """Cholesky factor in the lower triangle, in place."""
+    for j in range(nv):
+        pivot = matrix[j, j]
+        for k in range(j):
+            pivot -= matrix[j, k] * matrix[j, k]
+        pivot = wp.sqrt(pivot)
+        matrix[j, j] = pivot
+        for i in range(j + 1, nv):
+            entry = matrix[i, j]
+            for k in range(j):
+                entry -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] = entry / pivot
+
+
+@wp.func
+def _substitute(factor: wp.array2d[float], nv: int, x: wp.array[float]) -> None:
+    """L Lᵀ x = x, in place."""
+    for i in range(nv):
+        entry = x[i]
+        for k in range(i):
+            entry -= factor[i, k] * x[k]
+        x[i] = entry / factor[i, i]
+    for s in range(nv):
+        i = nv - 1 - s
+        entry = x[i]
+        for k in range(i + 1, nv):
+            entry -= factor[k, i] * x[k]
+        x[i] = entry / factor[i, i]
+
+
+@wp.kernel
+def solve_serial(
+    # Model:
+    nv: int,
+    # In:
+    implicit_in: wp.array3d[float],
+    hessian_in: wp.array3d[float],
+    rhs_in: wp.array2d[float],
+    damping_in: wp.array2d[float],
+    qacc_in: wp.array2d[float],
+    # Out:
+    mu_out: wp.array2d[float],
+    excess_out: wp.array2d[float],
+    lam_out: wp.array2d[float],
+) -> None:
+    """The same two solves for any nv, one thread a world; factors overwrite the matrices."""
+    worldid = wp.tid()
+    _factor(implicit_in[worldid], nv)
+    for i in range(nv):
+        mu_out[worldid, i] = rhs_in[worldid, i]
+        excess_out[worldid, i] = damping_in[worldid, i] * qacc_in[worldid, i]
+    _substitute(implicit_in[worldid], nv, mu_out[worldid])
+    _substitute(implicit_in[worldid], nv, excess_out[worldid])
+    for i in range(nv):
+        lam_out[worldid, i] = rhs_in[worldid, i] - damping_in[worldid, i] * mu_out[worldid, i]
+    _factor(hessian_in[worldid], nv)
+    _substitute(hessian_in[worldid], nv, lam_out[worldid])
+
+
+class LinearSystems:
+    """Launches of the solves for μ, a - â and λ."""
+
+    def __init__(self, work: Workspace, integrator: Integrator, laws: ConstraintLaws) -> None:
+        self._work, self._integrator, self._laws = work, integrator, laws
+        worlds, nv = work.nworld, work.mjm.nv
+        self._implicit, self._hessian = (wp.zeros((worlds, nv, nv), dtype=float) for _ in range(2))
+        if work.settings.implicit_all:
+            self._step = wp.zeros((worlds, work.model.nC), dtype=float)
+            self._push = wp.zeros((worlds, nv), dtype=float)
+            alone = work.tables.free_body.size > 0
+            self._free = FreeBodySolves(work, integrator.damping, integrator.rhs) if alone else None
+
+    def launch(self, at: Substep) -> None:
+        """Launch the matrices and their solves."""
+        work, m, d, settings = self._work, self._work.model, at.data, self._work.settings
+        if settings.implicit_all:
+            # M - h ∂τ/∂v of the implicitfast integrator, in the sparse layout of M
+            work.stages.slopes(m, d, self._step)
+            if self._free is not None:
+                self._free.hold(at, self._step)
+        wp.launch(
+            build_matrices,
+            dim=(work.nworld, m.nv, m.nv),
+            inputs=[
+                settings.elliptic,
+                work.tables.inertia_address,
+                d.nefc,
+                d.M,
+                self._step if settings.implicit_all else self._integrator.damping_step,
+                settings.implicit_all,
+                self._laws.jacobian(at),
+                work.laws.slope,
+                self._laws.scaled,
+            ],
+            outputs=[self._implicit, self._hessian],
+        )
+        if settings.implicit_all:
+            self._solve_implicit(at)
+            return
+        inputs = [self._implicit, self._hessian, self._integrator.rhs, self._integrator.damping_step, d.qacc]
+        outputs = [work.multipliers.mu, work.multipliers.excess, work.multipliers.lam]
+        if m.nv <= TILE_LIMIT:
+            wp.launch_tiled(solve_tiled(m.nv), dim=work.nworld, inputs=inputs, outputs=outputs, block_dim=_BLOCK)
+        else:
+            wp.launch(solve_serial, dim=work.nworld, inputs=[m.nv, *inputs], outputs=outputs)
+
+    def _solve_implicit(self, at: Substep) -> None:
+        """μ, a - â and λ where B is a matrix: (M + hB)(a - â) = hB a ,  H λ = h v̄' - hB μ."""
+        d, found, rhs = at.data, self._work.multipliers, self._integrator.rhs
+        self._product(d, d.qacc, 1.0)
+        self._solve_two(self._implicit, rhs, self._push, [found.mu, found.excess])
+        if self._free is not None:
+            self._free.launch(at)
+        self._product(d, found.mu, -1.0)
+        if self._free is not None:
+            self._free.push(at, self._push)
+        self._solve_two(self._hessian, self._push, self._push, [found.lam, self._push])
+
+    def _product(self, d: Any, x: wp.array, scale: float) -> None:
+        work = self._work
+        wp.launch(
+            damping_product,
+            dim=(work.nworld, work.model.nv),
+            inputs=[work.tables.inertia_address, d.M, self._step, x, self._integrator.rhs, scale],
+            outputs=[self._push],
+        )
+
+    def _solve_two(self, matrix: wp.array, first: wp.array, second: wp.array, outputs: list[wp.array]) -> None:
+        worlds, nv, inputs = self._work.nworld, self._work.model.nv, [matrix, first, second]
+        if nv <= TILE_LIMIT:
+            wp.launch_tiled(solve_two_tiled(nv), dim=worlds, inputs=inputs, outputs=outputs, block_dim=_BLOCK)
+        else:
+            wp.launch(solve_two_serial, dim=worlds, inputs=[nv, *inputs], outputs=outputs)

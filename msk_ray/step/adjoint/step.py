@@ -1,0 +1,173 @@
+"""`StepAdjoint`: the exact vector-Jacobian product of one `mujoco_warp.step`, as a fixed sequence of launches.
+
+The implicit function theorem at the solver's optimum a (B: damping the integrator treats implicitly, S: minus the
+slope of the constraint forces):
+
+    (M + hB) μ = h v̄' ,  (M + JᵀSJ) λ = M μ ,
+    Φ(q, v, act, u) = λᵀ(M a - τ) - (Jλ)ᵀ f(J a - aref) - μᵀ(M (a - â) - h B â)   with a, â, λ, μ held fixed,
+    gradients of (q, v, act, u)  -=  ∂Φ/∂(q, v, act, u).
+"""
+
+from typing import Any, Protocol
+
+import mujoco
+import numpy as np
+import warp as wp
+
+from msk_ray.step.adjoint.groups import Substep
+from msk_ray.step.adjoint.laws.actuators import ActuatorForces
+from msk_ray.step.adjoint.laws.applied_forces import AppliedForces
+from msk_ray.step.adjoint.laws.bodies import Bodies
+from msk_ray.step.adjoint.laws.contacts import ContactForces
+from msk_ray.step.adjoint.laws.equality import AnchorRows
+from msk_ray.step.adjoint.laws.fluid import FluidForces
+from msk_ray.step.adjoint.laws.joint_springs import TurningSprings
+from msk_ray.step.adjoint.laws.rows import ConstraintLaws
+from msk_ray.step.adjoint.laws.scalar_rows import ScalarRows
+from msk_ray.step.adjoint.laws.site_pairs import SitePairForces
+from msk_ray.step.adjoint.laws.tendons import Tendons
+from msk_ray.step.adjoint.laws.transmission import TurningTransmissions
+from msk_ray.step.adjoint.stages.integrate import Integrator
+from msk_ray.step.adjoint.stages.solve import LinearSystems
+from msk_ray.step.adjoint.workspace import Workspace
+from msk_ray.step.forward.model_tree import between_sites
+from msk_ray.step.forward.stages import PackageStages, Stages
+
+_ANCHORED = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
+
+
+class _Stage(Protocol):
+    """One part of ∂Φ; fields of λ, μ, a and a - â, and the laws of the rows, must be there."""
+
+    def launch(self, at: Substep) -> None:
+        """Launch its kernels at one substep."""
+
+
+class Watcher(Protocol):
+    """What else is launched in a substep's pullback."""
+
+    def launch_first(self, at: Substep, qvel_next: wp.array) -> None:
+        """Launch its kernels while the cotangents are those of the state after the substep."""
+
+    def launch(self, at: Substep) -> None:
+        """Launch its kernels when the multipliers, and the cotangents of contacts and tendons, are there."""
+
+
+class StepAdjoint:
+    """Buffers and launches of one substep's pullback for `nworld` worlds.
+
+    `pull_back` reads a `mujoco_warp.Data` that holds the position and velocity stages of the state before the
+    substep (as `mujoco_warp.step` leaves them, except qpos, qvel and act, which must be the state before it) and
+    turns the cotangents below from those of the state after the substep into those of the state before.
+
+    `reach` is the distance [m] within which contacts get a gradient before they touch, as `adjoint.reach` says; the
+    model then has to find them (`physics.pairs.widened`). `stages` are those of the batch, mujoco_warp's own by
+    default.
+
+    Attributes:
+        work, integrator, laws, contacts, tendons: the stages' buffers and launches that parameters build on.
+        grad_qpos: cotangent of qpos in tangent coordinates, shape (W, nv).
+        grad_qvel: shape (W, nv).
+        grad_act: shape (W, na).
+        grad_ctrl: shape (W, nu); every substep adds to it.
+        touch_counter: how many substeps' gradients went through a contact without a derivative of its own.
+        live: worlds whose gradient is wanted; the others get exact zeros. Shape (W,), int.
+        applied: gradients of applied forces; None until `cover_applied` asks for them.
+        inertia_address: place of M_ij (j ≤ i) in the sparse inertia, -1 where it is zero; shape (nv, nv).
+    """
+
+    def __init__(
+        self, mjm: mujoco.MjModel, model: Any, data: Any, reach: float = 0.0, stages: Stages | None = None
+    ) -> None:
+        self.work = work = Workspace(mjm, model, data, stages or PackageStages())
+        self.grad_qpos, self.grad_qvel = work.grad_qpos, work.grad_qvel
+        self.grad_act, self.grad_ctrl = work.grad_act, work.grad_ctrl
+        self.live, self.touch_counter = work.live, work.touch_counter
+        self.inertia_address = work.tables.inertia_address
+        self.applied: AppliedForces | None = None
+        with wp.ScopedDevice(work.device):
+            self.integrator = Integrator(work)
+            self.laws = ConstraintLaws(work)
+            self.contacts = ContactForces(work, data.naconmax, reach)
+            self._systems = LinearSystems(work, self.integrator, self.laws)
+            self._bodies = Bodies(work, self.integrator.damping)
+            self.tendons = Tendons(work) if mjm.ntendon else None
+            self._forces = _forces(work, self.laws, self.contacts)
+
+    def start(self, qpos: wp.array, raw_qpos: wp.array) -> None:
+        """Launch the change of a raw cotangent (W, nq) at `qpos` to tangent coordinates, and find the live worlds.
+
+        The cotangents of qvel and act must be in place.
+        """
+        self.integrator.start(qpos, raw_qpos)
+        self.touch_counter.start()
+        if self.contacts.reached is not None:
+            self.contacts.reached.start()
+
+    def cover_applied(self) -> AppliedForces:
+        """Allocate the gradients of applied forces, if they are not yet there."""
+        if self.applied is None:
+            with wp.ScopedDevice(self.work.device):
+                self.applied = AppliedForces(self.work)
+        return self.applied
+
+    def finish(self, qpos: wp.array, raw_qpos: wp.array) -> None:
+        """Launch the change of the tangent gradient at `qpos` to raw coordinates (W, nq)."""
+        self.integrator.finish(qpos, raw_qpos)
+
+    def clip(self, bound: float, clipped: wp.array) -> None:
+        """Launch the bound on each world's state cotangent; `clipped` (W,) counts where it acted."""
+        self.integrator.clip(bound, clipped)
+
+    def pull_back(
+        self,
+        data: Any,
+        qvel_next: wp.array,
+        applied: AppliedForces | None = None,
+        parameters: Watcher | None = None,
+    ) -> None:
+        """Launch the pullback of one substep.
+
+        Args:
+            data: the stages of the state before it.
+            qvel_next: the velocity after it, (W, nv).
+            applied: gradients of applied forces, for a step that has some.
+            parameters: gradients of parameters of the model, if some are wanted.
+        """
+        self.touch_counter.substep += 1
+        at = Substep(data)
+        if parameters is not None:
+            parameters.launch_first(at, qvel_next)
+        self.integrator.launch(at, qvel_next)
+        self.laws.launch(at)
+        self._systems.launch(at)
+        self._bodies.launch_fields(at)
+        if self.tendons is not None:
+            self.tendons.launch_start(at)
+        for stage in self._forces if applied is None else (*self._forces, applied):
+            stage.launch(at)
+        if self.tendons is not None:
+            self.tendons.launch_pullback(at)
+        if parameters is not None:
+            parameters.launch(at)
+        self._bodies.launch_sweep(at)
+
+
+def _forces(work: Workspace, laws: ConstraintLaws, contacts: ContactForces) -> list[_Stage]:
+    """The stages that a model needs, in their order."""
+    stages: list[_Stage] = []
+    if np.any(np.isin(work.mjm.eq_type, _ANCHORED)):
+        stages.append(AnchorRows(work))
+    if work.tables.has_scalar_rows:
+        stages.append(ScalarRows(work, laws))
+    stages.append(contacts)
+    if work.settings.actuation:
+        actuators = ActuatorForces(work)
+        stages += [actuators, TurningTransmissions(work, actuators.bars)]
+        if np.any(between_sites(work.mjm)):
+            stages.append(SitePairForces(work, actuators.bars))
+    if work.tables.has_turning_spring:
+        stages.append(TurningSprings(work))
+    if work.settings.fluid:
+        stages.append(FluidForces(work))
+    return stages

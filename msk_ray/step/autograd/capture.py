@@ -1,0 +1,66 @@
+"""Torch's operations and the steps of simulations recorded together as one CUDA graph."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, Generic, TypeVar
+
+import torch
+from torch import Tensor
+
+from msk_ray.step.autograd.buffers import stream_of
+from msk_ray.step.forward import joining_capture, without_collecting
+
+T = TypeVar("T")
+
+
+class Recording(Generic[T]):
+    """Work recorded once as a CUDA graph. Recording it runs none of it.
+
+    The work must have run before, eagerly, so that kernels are compiled, lazily made buffers exist and libraries have
+    chosen their algorithms. It must do the same on the same memory every time: it reads inputs from tensors that exist
+    before, and leaves results in `result`, whose memory the next replay overwrites. It may differentiate, including
+    through the step of a Simulation.
+
+    Args:
+        work: what to record.
+        stream: where to record it. Recordings that run at the same time need different ones: libraries such as cuBLAS
+            keep a workspace for each stream, which both would write to.
+        pool: memory shared with recordings that are replayed one after the other in the order of their recording.
+
+    Attributes:
+        result: what `work` returned; its tensors have contents after the first replay.
+
+    Raises:
+        RuntimeError: the work waits for the device, for example with `.item()`, or draws numbers from a generator.
+    """
+
+    def __init__(self, work: Callable[[], T], stream: torch.cuda.Stream, pool: Any = None) -> None:
+        self._graph = torch.cuda.CUDAGraph()
+        # Backward passes stay on this thread, because Warp's current stream belongs to a thread.
+        with (
+            torch.cuda.device(stream.device),
+            torch.autograd.set_multithreading_enabled(False),
+            torch.cuda.graph(self._graph, pool=pool, stream=stream, capture_error_mode="thread_local"),
+            without_collecting(),
+        ):
+            own = stream_of(stream.device)
+            assert own is not None, f"{stream.device} has no graphs"
+            with joining_capture(own) as self._kept:
+                self.result = work()
+
+    def replay(self) -> T:
+        """Run the work on torch's current stream, and return `result`."""
+        self._graph.replay()
+        return self.result
+
+    @property
+    def pool(self) -> Any:
+        """Its memory, to share with another recording."""
+        return self._graph.pool()
+
+
+def fill(buffers: Sequence[Tensor], values: Sequence[Tensor]) -> None:
+    """Copy values into the tensors that a recording reads."""
+    with torch.no_grad():
+        for buffer, value in zip(buffers, values, strict=True):
+            if buffer is not value:
+                buffer.copy_(value)

@@ -1,0 +1,446 @@
+"""`tape_per_substep`, `tape_all` and `hybrid`: exact gradients by the adjoint of every substep.
+
+Both tapes checkpoint each substep's state and acceleration, in one buffer that is copied out per recorded env step.
+`tape_per_substep` recomputes the position and velocity stages in the backward pass (the acceleration is known, so
+nothing is solved); `tape_all` keeps them.
+"""
+
+import warnings
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import torch
+import warp as wp
+from msk_ray.step.errors import UnsupportedModelError
+from torch import Tensor
+
+from msk_ray.step.adjoint import StepAdjoint
+from msk_ray.step.adjoint.coverage.check import check_supported
+from msk_ray.step.adjoint.parameters import ParameterAdjoint
+from msk_ray.step.adjoint.stages.pull_counter import PullCounter
+from msk_ray.step.adjoint.stages.recomputed import recomputed
+from msk_ray.step.adjoint.stages.residual import ResidualGauge
+from msk_ray.step.autograd.backward import (
+    INPUTS,
+    Applied,
+    Backward,
+    InputGradients,
+    Needs,
+    StepState,
+)
+from msk_ray.step.autograd.buffers import applied_of, device_of, stream_of
+from msk_ray.step.autograd.jacobian import rows_of, state_size, unit_cotangents
+from msk_ray.step.autograd.pool import Pool
+from msk_ray.step.autograd.tangent import Tangent
+from msk_ray.step.forward import Graph, WorldBatch
+
+JACOBIAN_WORLDS = 131072
+"""Worlds in which `jacobian` pulls rows back at the same time; further rows follow."""
+
+# Arrays of mujoco_warp.Data that the adjoint of a substep reads, besides the checkpointed state.
+_KEPT_DATA = (
+    *("cdof", "cdof_dot", "cvel", "cinert", "M", "nefc", "nacon", "subtree_com", "xipos", "xpos", "xquat", "xmat"),
+    *("geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "ten_J", "ten_length", "ten_velocity", "act_dot"),
+    *("actuator_velocity", "actuator_force"),
+    *("actuator_length", "moment_rownnz", "moment_rowadr", "moment_colind", "actuator_moment", "qfrc_actuator"),
+)
+_KEPT_EFC = ("type", "id", "J", "J_rownnz", "J_rowadr", "J_colind", "D", "aref", "frictionloss", "pos", "margin")
+_KEPT_CONTACT = (
+    *("dist", "pos", "frame", "includemargin", "friction", "solref", "solreffriction", "solimp", "dim", "geom"),
+    *("efc_address", "worldid", "geomcollisionid"),
+)
+
+
+def _solved(data: Any, mjm: mujoco.MjModel) -> wp.array:
+    """The acceleration that the arrays of `data` belong to; after RK4, those of the last stage."""
+    return data.qacc_warmstart if mjm.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else data.qacc
+
+
+class _Tape(Backward):
+    """The shared part of the two tapes: checkpoints, the backward graph, and reading its results.
+
+    Args:
+        substep_grad_clip: bound on the Euclidean norm of each world's state cotangent between substeps, in the
+            cotangent's own units; the direction is kept. None for no bound.
+        residual_tolerance: a world is counted as unconverged where the solver left more than this share of its
+            forces unbalanced, |Ma - τ - Jᵀf| / |(Ma, τ, Jᵀf)|.
+        contact_reach: distance [m] within which two geoms that do not touch yet get a gradient all the same, as if a
+            contact began there; None for none. The step itself stays as it is.
+    """
+
+    covers_applied = True
+    covers_parameters = True
+
+    def __init__(
+        self,
+        substep_grad_clip: float | None = None,
+        residual_tolerance: float = 1e-3,
+        contact_reach: float | None = None,
+    ) -> None:
+        self.substep_grad_clip = substep_grad_clip
+        self.contact_reach = contact_reach or 0.0
+        self.residual_tolerance = residual_tolerance
+
+    def attach(self, batch: WorldBatch) -> None:
+        mjm, worlds = batch.mjm, batch.nworld
+        check_supported(batch.structure, self.name)
+        self._batch = batch
+        self._device = device_of(batch)
+        self._pulled = PullCounter(batch.device)
+        self._warned = False
+        with wp.ScopedDevice(batch.device):
+            self._adjoint = StepAdjoint(batch.structure, batch.model, batch.data, self.contact_reach, batch.stages)
+            pool = Pool(batch.device)
+            self._states: list[dict[str, wp.array]] = [{} for _ in range(batch.substeps)]
+            self._last: dict[str, wp.array] = {}
+            for state in (*self._states, self._last):
+                pool.floats(state, "qpos", worlds, mjm.nq)
+                pool.floats(state, "qvel", worlds, mjm.nv)
+            for state in self._states:
+                pool.floats(state, "act", worlds, mjm.na)
+                pool.floats(state, "qacc", worlds, mjm.nv)
+            self._prepare(pool)
+            self._saved = pool.allocate()
+            self._raw_qpos = wp.zeros((worlds, mjm.nq), dtype=float)
+            self._clipped = wp.zeros(worlds, dtype=int)
+            self._gauge = ResidualGauge(self._adjoint.inertia_address, worlds)
+        self._ctrl = wp.to_torch(batch.data.ctrl, requires_grad=False)
+        adjoint = self._adjoint
+        self.cotangent = StepState(
+            *(wp.to_torch(a, requires_grad=False) for a in (self._raw_qpos, adjoint.grad_qvel, adjoint.grad_act))
+        )
+        self._grad_ctrl = wp.to_torch(adjoint.grad_ctrl, requires_grad=False)
+        self._applied = applied_of(batch.data)
+        self._graphs: dict[tuple[bool, tuple[str, ...]], Graph] = {}
+        self._parameters: dict[tuple[str, ...], ParameterAdjoint] = {}
+        self._columns: dict[tuple[str, ...], Tensor] = {}
+        self._rows: dict[int, TapePerSubstep] = {}
+
+    def _prepare(self, pool: Pool) -> None:
+        """Claim further arrays in the buffer that is copied out per recorded step."""
+
+    @abstractmethod
+    def _pull_back(self, k: int, qvel_next: wp.array, *extras: Any) -> None:
+        """Launch the pullback of substep k; `qvel_next` (W, nv) is the velocity after it."""
+
+    def record(
+        self, ctrl: Tensor, start: StepState, end: StepState, applied: Applied | None = None
+    ) -> tuple[Tensor, ...]:
+        forces = () if applied is None else (force.detach().clone() for force in applied)
+        return (ctrl.detach().clone(), self._saved.clone(), *forces)
+
+    @torch.no_grad()
+    def vjp(self, saved: tuple[Tensor, ...], cotangent: StepState, needs: Needs) -> InputGradients:
+        ctrl, kept, *forces = saved
+        self.ready(bool(forces), needs.parameters)
+        self._ctrl.copy_(ctrl)
+        self._saved.copy_(kept)
+        for view, value in zip(self._applied, forces, strict=False):
+            view.copy_(value)
+        found = self.pull(cotangent, bool(forces), needs.parameters)
+        if forces:
+            for view in self._applied:  # the next step may have none
+                view.zero_()
+        return InputGradients.of(
+            {name: getattr(found, name).clone() for name in INPUTS if getattr(needs, name)},
+            found.parameters,
+        )
+
+    def ready(self, applied: bool, names: tuple[str, ...] = ()) -> None:
+        """Prepare the backward pass of steps with or without applied forces, with the gradients of some parameters.
+
+        On CUDA it runs once for that, which leaves the checkpoints undefined.
+        """
+        if (applied, names) not in self._graphs:
+            if names and self._batch.ordered:
+                raise UnsupportedModelError(
+                    f"gradients of {', '.join(names)} have no fixed order on a GPU: make the Simulation with "
+                    "kernels=Kernels(ordered=False)"
+                )
+            if names and names not in self._parameters:
+                self._parameters[names] = parameters = ParameterAdjoint(self._adjoint, names)
+                columns = [torch.arange(c.start, c.stop) for c in (parameters.columns[n] for n in names)]
+                self._columns[names] = torch.cat(columns).to(self._device)
+            launches = lambda: self.launch_backward(applied, names)  # noqa: E731
+            self._graphs[applied, names] = Graph(launches, self._batch.device)
+            self._clipped.zero_()
+            self._pulled.clear()
+            self._adjoint.touch_counter.clear()
+
+    def pull(self, cotangent: StepState, applied: bool, names: tuple[str, ...] = ()) -> InputGradients:
+        """Replay the backward pass of the step whose checkpoints are in place; the result lasts until the next."""
+        for view, value in zip(self.cotangent, cotangent, strict=True):
+            view.copy_(value)
+        self._graphs[applied, names].replay(stream_of(self._device))
+        found = InputGradients(self._grad_ctrl, *self.cotangent)
+        if applied:
+            forces = self._adjoint.cover_applied()
+            views = (wp.to_torch(a, requires_grad=False) for a in (forces.grad_qfrc, forces.grad_xfrc))
+            found = found._replace(**dict(zip(("qfrc_applied", "xfrc_applied"), views, strict=True)))
+        if names:
+            rows = wp.to_torch(self._parameters[names].rows, requires_grad=False)
+            found = found._replace(parameters=rows.index_select(1, self._columns[names]))
+        return found
+
+    def load(self, ctrl: Tensor, states: Sequence[dict[str, wp.array]], forces: Sequence[Tensor]) -> None:
+        """Take the step of a batch of w worlds, W / w copies of each: its control, checkpoints and applied forces."""
+        self.ready(bool(forces))
+        pairs = [(self._ctrl, ctrl), *zip(self._applied, forces, strict=False)]
+        for here, there in zip(self.checkpoints, states, strict=True):
+            pairs += [tuple(wp.to_torch(a, requires_grad=False) for a in (here[n], there[n])) for n in there]
+        for view, value in pairs:
+            view.unflatten(0, (-1, len(value))).copy_(value)
+
+    @property
+    def checkpoints(self) -> list[dict[str, wp.array]]:
+        """Checkpoints of a step: the states before each substep, and the last one."""
+        return [*self._states, self._last]
+
+    @torch.no_grad()
+    def jacobian(
+        self, saved: tuple[Tensor, ...], start: StepState, end: StepState, tangent: Tangent
+    ) -> tuple[Tensor, Tensor]:
+        """As many rows at once as fit in `JACOBIAN_WORLDS` worlds. Not clipped."""
+        ctrl, kept, *forces = saved
+        self._saved.copy_(kept)
+        size, worlds = state_size(end), self._batch.nworld
+        width = max(1, min(size, JACOBIAN_WORLDS // worlds))
+        if width not in self._rows:
+            self._rows[width] = TapePerSubstep(contact_reach=self.contact_reach)
+            self._rows[width].attach(self._batch.resized(width * worlds))
+        self._rows[width].load(ctrl, self.checkpoints, forces)
+        found = []
+        for first in range(0, size, width):
+            chunk = range(first, min(first + width, size))
+            cotangents = unit_cotangents(tangent, end, chunk, width)
+            gradients = self._rows[width].pull(StepState(*(part.flatten(0, 1) for part in cotangents)), bool(forces))
+            split = {n: getattr(gradients, n).clone().unflatten(0, (width, worlds)) for n in INPUTS[:4]}
+            found.append(rows_of(tangent, start, InputGradients.of(split)))
+        a, b = (torch.cat(parts)[:size].transpose(0, 1).contiguous() for parts in zip(*found, strict=True))
+        return a, b
+
+    def bytes_recorded(self) -> int:
+        """Size of the data of one recorded env step, for all worlds together, without its control."""
+        return self._saved.numel() * self._saved.element_size()
+
+    def launch_backward(self, with_applied: bool = False, names: tuple[str, ...] = ()) -> None:
+        """Launch the pullback of a whole env step: from `cotangent` of its end to the same buffers for its start."""
+        applied = self._adjoint.cover_applied() if with_applied else None
+        parameters = self._parameters[names] if names else None
+        for extra in (applied, parameters):
+            if extra is not None:
+                extra.start()
+        self._adjoint.start(self._last["qpos"], self._raw_qpos)
+        for k in reversed(range(self._batch.substeps)):
+            after = self._states[k + 1] if k + 1 < self._batch.substeps else self._last
+            self._pull_back(k, after["qvel"], applied, parameters)
+            if self.substep_grad_clip is not None and k > 0:
+                self._adjoint.clip(self.substep_grad_clip, self._clipped)
+        self._adjoint.finish(self._states[0]["qpos"], self._raw_qpos)
+        if self._counts:
+            self._pulled.launch()
+
+    def diagnostics(self) -> dict[str, float]:
+        figures = self._gauge.read(self.residual_tolerance)
+        if not self._counts:
+            return figures
+        pulled = self._pulled.read()
+        if self.substep_grad_clip is not None:
+            between = max(1, pulled * (self._batch.substeps - 1)) * self._batch.nworld
+            figures["substep_clip_share"] = float(self._clipped.numpy().sum()) / between
+            self._clipped.zero_()
+        substeps = max(1, pulled) * self._batch.substeps * self._batch.nworld
+        if self._adjoint.touch_counter.present:
+            of_rows = [rows.diagnostics()["approximated_share"] for rows in self._rows.values()]
+            figures["approximated_share"] = max([self._approximated_share(substeps), *of_rows])
+        if self._adjoint.contacts.reached is not None:
+            figures["reached_share"] = self._adjoint.contacts.reached.read() / substeps
+        return figures
+
+    @property
+    def _counts(self) -> bool:
+        """Whether anything is reported as a share of the substeps that were pulled back."""
+        adjoint = self._adjoint
+        return (
+            self.substep_grad_clip is not None or adjoint.touch_counter.present or adjoint.contacts.reached is not None
+        )
+
+    def _approximated_share(self, substeps: int) -> float:
+        """Share of all worlds' substeps whose gradient went through a contact without a derivative of its own.
+
+        Warns the first time it is above zero.
+        """
+        count, pairs = self._adjoint.touch_counter.read()
+        share = count / substeps
+        if count and not self._warned:
+            self._warned = True
+            warnings.warn(
+                f"the gradient is approximate in {share:.1%} of the substeps (grad/approximated_share), where it goes "
+                f"through contacts of {', '.join(pairs)}",
+                stacklevel=4,
+            )
+        return share
+
+
+class TapePerSubstep(_Tape):
+    """Checkpoints (qpos, qvel, act, qacc) of every substep; recomputes position and velocity stages in backward."""
+
+    name = "tape_per_substep"
+
+    def attach(self, batch: WorldBatch) -> None:
+        super().attach(batch)
+        self._substep = recomputed(self._adjoint)
+
+    def launch_step(self, batch: WorldBatch) -> None:
+        data = batch.data
+        batch.begin_step()
+        for k, state in enumerate(self._states):
+            for name in ("qpos", "qvel", "act"):
+                wp.copy(state[name], getattr(data, name))
+            batch.launch_substep(data, k)
+            wp.copy(state["qacc"], data.qacc)
+            self._gauge.launch(data, _solved(data, batch.mjm))
+        for name, array in self._last.items():
+            wp.copy(array, getattr(data, name))
+        batch.end_step(data)
+
+    def _pull_back(self, k: int, qvel_next: wp.array, *extras: Any) -> None:
+        data = self._batch.data
+        for name, array in self._states[k].items():
+            wp.copy(getattr(data, name), array)
+        self._substep.pull_back(data, qvel_next, *extras)
+
+
+class TapeAll(_Tape):
+    """Keeps everything that the adjoint of every substep reads: nothing is recomputed, at the cost of memory."""
+
+    name = "tape_all"
+
+    def attach(self, batch: WorldBatch) -> None:
+        if batch.mjm.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+            raise UnsupportedModelError(
+                "tape_all does not differentiate integrator RK4, whose stages mujoco_warp does not keep: write "
+                "physics.backward=tape_per_substep in a config, --mode tape_per_substep of gradcheck"
+            )
+        super().attach(batch)
+
+    def _prepare(self, pool: Pool) -> None:
+        batch = self._batch
+        self._datas = []
+        for _ in self._states:
+            data = batch.resized(batch.nworld).data
+            data.overflow = batch.data.overflow
+            data.ctrl = batch.data.ctrl
+            data.qfrc_applied, data.xfrc_applied = batch.data.qfrc_applied, batch.data.xfrc_applied
+            for holder, names in ((data, _KEPT_DATA), (data.efc, _KEPT_EFC), (data.contact, _KEPT_CONTACT)):
+                for name in names:
+                    pool.adopt(holder, name)
+            self._datas.append(data)
+
+    def launch_step(self, batch: WorldBatch) -> None:
+        before = batch.data
+        batch.begin_step()
+        for k, (state, data) in enumerate(zip(self._states, self._datas, strict=True)):
+            for name in ("qpos", "qvel", "act", "qacc_warmstart", "time"):
+                wp.copy(getattr(data, name), getattr(before, name))
+            for name in ("qpos", "qvel", "act"):
+                wp.copy(state[name], getattr(before, name))
+            batch.launch_substep(data, k)
+            wp.copy(state["qacc"], data.qacc)
+            self._gauge.launch(data, _solved(data, batch.mjm))
+            before = data
+        for name in ("qpos", "qvel", "act"):
+            wp.copy(getattr(batch.data, name), getattr(before, name))
+        for name, array in self._last.items():
+            wp.copy(array, getattr(before, name))
+        batch.end_step(before)
+
+    def last_data(self, batch: WorldBatch) -> Any:
+        return self._datas[-1]
+
+    def _pull_back(self, k: int, qvel_next: wp.array, *extras: Any) -> None:
+        data = self._datas[k]
+        for name, array in self._states[k].items():
+            wp.copy(getattr(data, name), array)
+        self._adjoint.pull_back(data, qvel_next, *extras)
+
+
+class Hybrid(Backward):
+    """Gradients of the state from one mode and of the control from another, for diagnosis.
+
+    Args:
+        state: the mode that gives the gradients of (qpos, qvel, act). Its `launch_step` runs.
+        ctrl: the mode that gives the gradient of ctrl; one that needs no `launch_step` of its own (fd_jacobian).
+    """
+
+    name = "hybrid"
+
+    def __init__(self, state: Backward, ctrl: Backward) -> None:
+        self.state = state
+        self.ctrl = ctrl
+        self.contact_reach = state.contact_reach
+
+    def fresh(self) -> "Hybrid":
+        return Hybrid(self.state.fresh(), self.ctrl.fresh())
+
+    def attach(self, batch: WorldBatch) -> None:
+        self._splits: dict[int, int] = {}
+        self.state.attach(batch)
+        self.ctrl.attach(batch)
+
+    def launch_step(self, batch: WorldBatch) -> None:
+        self._stepping().launch_step(batch)
+
+    def last_data(self, batch: WorldBatch) -> Any:
+        return self._stepping().last_data(batch)
+
+    def _stepping(self) -> Backward:
+        """The mode whose launches compute the step."""
+        own = [m for m in (self.state, self.ctrl) if type(m).launch_step is not Backward.launch_step]
+        assert len(own) <= 1, "two modes that each launch the step in their own way cannot be combined"
+        return own[0] if own else self.state
+
+    @property
+    def covers_applied(self) -> bool:  # type: ignore[override]
+        """Whether both modes do."""
+        return self.state.covers_applied and self.ctrl.covers_applied
+
+    @property
+    def covers_parameters(self) -> bool:  # type: ignore[override]
+        """Whether the mode of the state does."""
+        return self.state.covers_parameters
+
+    def record(
+        self, ctrl: Tensor, start: StepState, end: StepState, applied: Applied | None = None
+    ) -> tuple[Tensor, ...]:
+        forces = () if applied is None else (applied,)
+        first, second = (mode.record(ctrl, start, end, *forces) for mode in (self.state, self.ctrl))
+        self._splits[len(first) + len(second)] = len(first)
+        return (*first, *second)
+
+    def _split(self, saved: tuple[Tensor, ...]) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+        """What each of the modes has recorded."""
+        first = self._splits[len(saved)]  # steps with and without applied forces differ in length
+        return saved[:first], saved[first:]
+
+    def vjp(self, saved: tuple[Tensor, ...], cotangent: StepState, needs: Needs) -> InputGradients:
+        first, second = self._split(saved)
+        state = self.state.vjp(first, cotangent, needs._replace(ctrl=False))
+        ctrl = self.ctrl.vjp(second, cotangent, Needs(needs.ctrl, False, False, False))
+        return state._replace(ctrl=ctrl.ctrl)
+
+    def jacobian(
+        self, saved: tuple[Tensor, ...], start: StepState, end: StepState, tangent: Tangent
+    ) -> tuple[Tensor, Tensor]:
+        first, second = self._split(saved)
+        a, _ = self.state.jacobian(first, start, end, tangent)
+        _, b = self.ctrl.jacobian(second, start, end, tangent)
+        return a, b
+
+    def diagnostics(self) -> dict[str, float]:
+        return self.state.diagnostics() | self.ctrl.diagnostics()
+
+
+__all__ = ["Hybrid", "TapeAll", "TapePerSubstep"]

@@ -1,0 +1,44 @@
+"""Check gradients of a model against float64 central differences of C MuJoCo."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from msk_ray.step.check.chain import ChainComparison, check_chain
+    from msk_ray.step.check.check import Comparison, GradientCheck, Limits, check_gradients
+    from msk_ray.step.check.nonfinite import NonFinite
+    from msk_ray.step.check.oracle import Linearization, Oracle, Point
+    from msk_ray.step.check.states import STATE_KINDS, make_states
+
+__all__ = [
+    "STATE_KINDS",
+    "ChainComparison",
+    "Comparison",
+    "GradientCheck",
+    "Limits",
+    "Linearization",
+    "NonFinite",
+    "Oracle",
+    "Point",
+    "check_chain",
+    "check_gradients",
+    "make_states",
+]
+
+_HOMES = {
+    "chain": ("ChainComparison", "check_chain"),
+    "check": ("Comparison", "GradientCheck", "Limits", "check_gradients"),
+    "nonfinite": ("NonFinite",),
+    "oracle": ("Linearization", "Oracle", "Point"),
+    "states": ("STATE_KINDS", "make_states"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Names are loaded where they are first used: the command says what it does before torch is there."""
+    for home, names in _HOMES.items():
+        if name in names:
+            found = getattr(import_module(f"{__name__}.{home}"), name)
+            globals()[name] = found
+            return found
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,82 @@
+"""Fields of an MjModel, displaced element by element."""
+
+import copy
+from collections.abc import Iterator
+from contextlib import contextmanager
+from operator import attrgetter
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from msk_ray.step.forward.parameters import PARAMETERS
+
+_INERTIAL = ("body_mass", "body_inertia", "dof_armature")
+_TYPICAL = 0.1
+"""An element is displaced in proportion to itself, but at least to this share of the largest in its place."""
+
+_ABSENT = 100.0
+"""Scale of a spring, damper or friction loss that is zero in the whole model: one of 1e-6 drowns in the rounding of a
+step, and in what C MuJoCo's solver resolves."""
+
+
+class ParameterField:
+    """One parameter of a model, whose elements are columns; a quaternion has three, its rotations in the local frame.
+
+    C MuJoCo takes short cuts where frames coincide with their body's: they are switched off in the model.
+    """
+
+    def __init__(self, model: mujoco.MjModel, name: str) -> None:
+        self._model = model
+        self._quaternion = PARAMETERS[name].quaternion
+        self._scalar = not np.ndim(attrgetter(name)(model))
+        self._name = name
+        values = np.atleast_1d(attrgetter(name)(model))
+        self._values = values.reshape(-1, values.shape[-1]) if values.ndim > 1 else values[:, None]
+        if name == "opt.gravity":
+            self._values = values[None, :]
+        largest = np.abs(self._values).max(axis=0, initial=0.0)
+        unset = 1.0 if PARAMETERS[name].in_use is None else _ABSENT
+        self._scale = np.maximum(np.abs(self._values), np.where(largest > 0.0, _TYPICAL * largest, unset))
+        for shortcut in (model.body_sameframe, model.geom_sameframe, model.site_sameframe):
+            shortcut[:] = 0
+
+    @property
+    def columns(self) -> int:
+        """Number of elements, or of rotations of quaternions."""
+        rows, width = self._values.shape
+        return rows * (3 if self._quaternion else width)
+
+    def scale(self, column: int) -> float:
+        """Size of one element, in whose proportion it is displaced."""
+        return 1.0 if self._quaternion else float(self._scale.flat[column])
+
+    @contextmanager
+    def displaced(self, column: int, amount: float) -> Iterator[None]:
+        """The model with one element moved by `amount`."""
+        row, part = divmod(column, 3 if self._quaternion else self._values.shape[1])
+        before: NDArray[np.float64] = self._values[row].copy()
+        moved = before.copy()
+        if self._quaternion:
+            turn = np.zeros(3)
+            turn[part] = 1.0
+            mujoco.mju_quatIntegrate(moved, turn, amount)
+        else:
+            moved[part] += amount
+        try:
+            self._write(row, moved)
+            yield
+        finally:
+            self._write(row, before)
+
+    def _write(self, row: int, values: NDArray[np.float64]) -> None:
+        model = self._model
+        if self._scalar:
+            setattr(model.opt, self._name.rpartition(".")[2], float(values[0]))
+            return
+        self._values[row] = values
+        if self._name in _INERTIAL and np.any(model.dof_simplenum):
+            # The inertia of such dofs is not computed but stored.
+            fresh = copy.copy(model)
+            mujoco.mj_setConst(fresh, mujoco.MjData(fresh))
+            model.dof_M0[:] = fresh.dof_M0

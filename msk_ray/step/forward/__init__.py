@@ -1,0 +1,26 @@
+"""Batched MuJoCo Warp physics. Warp only: nothing here imports torch."""
+
+import warp as wp
+
+# Before anything initialises Warp: a line for each of some thirty modules loaded would bury what a user wants to see.
+wp.config.log_level = wp.LOG_WARNING
+
+from msk_ray.step.forward.no_gpu import start_quietly  # noqa: E402
+
+start_quietly()
+
+from msk_ray.step.adjoint.taped_step import TapedStep, WarpState  # noqa: E402
+from msk_ray.step.forward.batch import WorldBatch  # noqa: E402
+from msk_ray.step.forward.graph import Graph, joined_stream, joining_capture, without_collecting  # noqa: E402
+from msk_ray.step.forward.stages import Kernels  # noqa: E402
+
+__all__ = [
+    "Graph",
+    "Kernels",
+    "TapedStep",
+    "WarpState",
+    "WorldBatch",
+    "joined_stream",
+    "joining_capture",
+    "without_collecting",
+]

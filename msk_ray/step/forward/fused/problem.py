@@ -1,0 +1,180 @@
+"""The constraint problem of one world: min over a of ½ (a - a⁰)ᵀ M (a - a⁰) + Σ s(J a - aref), s being costs of rows.
+
+Axes: W worlds, R rows, C contacts.
+"""
+
+import warp as wp
+
+from msk_ray.step.forward import mjw_private as private
+from msk_ray.step.forward.fused.cones import QUADRATIC, SATISFIED, lean_rows, update_contact
+from msk_ray.step.forward.fused.dense import column_sum, factorize, pair_sum
+from msk_ray.step.forward.fused.lanes import at, four, lane_count, lane_sum, lane_sync, put, put_whole, whole
+from msk_ray.step.forward.fused.scratch import Scratch
+from msk_ray.step.forward.mjw_private import ConstraintType, vec5
+
+wp.set_module_options({"enable_backward": False})
+
+_ELLIPTIC = wp.constant(int(ConstraintType.CONTACT_ELLIPTIC))
+_LINEARNEG = wp.constant(int(private.ConstraintState.LINEARNEG))
+_LINEARPOS = wp.constant(int(private.ConstraintState.LINEARPOS))
+
+
+@wp.struct
+class Rows:
+    """mujoco_warp's rows, (W, R), with what contacts add to them, (C,)."""
+
+    type: wp.array2d[int]
+    id: wp.array2d[int]
+    D: wp.array2d[float]
+    aref: wp.array2d[float]
+    frictionloss: wp.array2d[float]
+    jacobian: wp.array2d[float]
+    """J, (W, ...), row by row."""
+    stride: int
+    """Numbers of its rows, more than there are degrees of freedom."""
+    force: wp.array2d[float]
+    """Written."""
+    state: wp.array2d[int]
+    """Written."""
+    friction: wp.array[vec5]
+    dim: wp.array[int]
+
+
+@wp.struct
+class World:
+    """Sizes of one world's problem, known to all of its lanes."""
+
+    id: int
+    lane: int
+    nv: int
+    width: int
+    """nv in whole fours."""
+    rows: int
+    equalities: int
+    frictions: int
+    contacts: int
+    """Elliptic ones."""
+
+
+@wp.func
+def find_contacts(rows: Rows, scratch: Scratch, w: World, begin: int, impratio: float) -> int:
+    """Number of elliptic contacts among the rows from `begin` on; one of which rows are lost is left out."""
+    kind = rows.type[w.id]
+    bound = scratch.bound[w.id]
+    count = int(0)
+    r = int(begin)
+    while r < w.rows:
+        if whole(kind, r) != _ELLIPTIC:
+            r += 1
+        else:
+            contact = whole(rows.id[w.id], r)
+            end = r + rows.dim[contact]
+            if end <= w.rows:
+                friction = rows.friction[contact]
+                if w.lane == 0:
+                    put_whole(scratch.first[w.id], count, r)
+                    put_whole(scratch.end[w.id], count, end)
+                    put(scratch.leaning[w.id], count, 0.0)
+                    put(bound, r, friction[0] * impratio)
+                    for i in range(r + 1, end):
+                        put(bound, i, friction[i - r - 1])
+                count += 1
+            else:
+                for i in range(r + w.lane, w.rows, lane_count()):
+                    put(rows.force[w.id], i, 0.0)
+            r = end
+    return count
+
+
+@wp.func
+def read_rows(rows: Rows, scratch: Scratch, w: World) -> None:
+    """J a - aref, and the rows as they add to the Hessian."""
+    jacobian = rows.jacobian[w.id]
+    acc = scratch.acc[w.id]
+    for r in range(w.lane, w.rows, lane_count()):
+        total = float(0.0)
+        for k in range(0, w.width, 4):
+            total += wp.dot(four(jacobian, r * rows.stride + k), four(acc, k))
+        put(scratch.jar[w.id], r, total - at(rows.aref[w.id], r))
+        put(scratch.weight[w.id], r, 0.0)
+        put_whole(rows.state[w.id], r, SATISFIED)
+    copies = scratch.rows[w.id]
+    for r in range(w.rows):
+        for i in range(w.lane, w.nv, lane_count()):
+            put(copies, r * w.width + i, at(jacobian, r * rows.stride + i))
+    lane_sync()
+
+
+@wp.func
+def update_rows(rows: Rows, scratch: Scratch, w: World) -> bool:
+    """Forces, states and weights of all rows at their J a - aref; whether the Hessian may have changed."""
+    stiffness = rows.D[w.id]
+    force = rows.force[w.id]
+    state = rows.state[w.id]
+    changed = float(0.0)
+    for r in range(w.lane, w.rows, lane_count()):
+        if whole(rows.type[w.id], r) != _ELLIPTIC:
+            jar = at(scratch.jar[w.id], r)
+            d = at(stiffness, r)
+            now = QUADRATIC
+            push = -d * jar
+            if r >= w.equalities:
+                if r < w.equalities + w.frictions:
+                    loss = at(rows.frictionloss[w.id], r)
+                    if push >= loss:
+                        now = _LINEARNEG
+                        push = loss
+                    elif push <= -loss:
+                        now = _LINEARPOS
+                        push = -loss
+                elif jar >= 0.0:
+                    now = SATISFIED
+                    push = 0.0
+            weight = wp.where(now == QUADRATIC, d, 0.0)
+            if weight != at(scratch.weight[w.id], r):
+                changed = 1.0
+            put(force, r, push)
+            put(scratch.weight[w.id], r, weight)
+            put_whole(state, r, now)
+    for contact in range(w.lane, w.contacts, lane_count()):
+        if update_contact(scratch, w.id, contact, stiffness, force, state):
+            changed = 1.0
+    lane_sync()
+    for contact in range(w.contacts):
+        if at(scratch.leaning[w.id], contact) != 0.0:
+            lean_rows(scratch, w.id, contact, rows.jacobian[w.id], rows.stride, w.nv, w.width, w.lane)
+    lane_sync()
+    return lane_sum(changed) > 0.0
+
+
+@wp.func
+def update_gradient(rows: Rows, scratch: Scratch, smooth: wp.array[float], w: World) -> float:
+    """Jᵀ f and the gradient M a - τ - Jᵀ f; returns its square."""
+    force = rows.force[w.id]
+    jacobian = rows.jacobian[w.id]
+    square = float(0.0)
+    for i in range(w.lane, w.nv, lane_count()):
+        push = column_sum(force, jacobian, i, rows.stride, w.rows)
+        slope = at(scratch.inertial[w.id], i) - at(smooth, i) - push
+        put(scratch.push[w.id], i, push)
+        put(scratch.gradient[w.id], i, slope)
+        square += slope * slope
+    lane_sync()
+    return lane_sum(square)
+
+
+@wp.func
+def factor_hessian(scratch: Scratch, w: World, tri_row: wp.array[int], tri_col: wp.array[int]) -> None:
+    """Factors of the Hessian, M plus the weighted squares of the rows, of which each lane adds up some entries."""
+    rows = scratch.rows[w.id]
+    weight = scratch.weight[w.id]
+    factor = scratch.factor[w.id]
+    for e in range(w.lane, tri_row.shape[0], lane_count()):
+        row = whole(tri_row, e)
+        col = whole(tri_col, e)
+        i = wp.max(row, col)
+        j = wp.min(row, col)
+        total = at(scratch.inertia[w.id], j * w.width + i) + pair_sum(weight, rows, i, j, w.width, w.rows)
+        put(factor, j * w.width + i, total)
+    lane_sync()
+    factorize(factor, scratch.pivot[w.id], w.nv, w.width, w.lane)

@@ -1,0 +1,202 @@
+"""Derivatives of contacts of boxes against central differences of MuJoCo Warp's own collision detection.
+
+Two faces that lie on each other collide differently in MuJoCo Warp and in C MuJoCo, so here the oracle is MuJoCo Warp:
+weighted sums of distance, point and normal, over all twelve displacements of two free bodies.
+"""
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import pytest
+import warp as wp
+from displacements import displaced, turned
+from mujoco_warp import GeomType
+
+from msk_ray.step.adjoint.groups import Meshes, Shapes, gather
+from msk_ray.step.adjoint.laws.contact_geometry.capsule_box import capsule_box_wrenches
+from msk_ray.step.adjoint.laws.contact_geometry.convex import convex_wrenches, solid_of
+from msk_ray.step.adjoint.laws.contact_geometry.convex_laws import Bars, Seen
+
+EPS = 2e-3
+SIZES = {"box": (0.1, 0.07, 0.05), "capsule": (0.04, 0.15, 0.0), "ground": (0.2, 0.15, 0.1)}
+
+
+@wp.kernel(enable_backward=False)
+def wrenches(
+    shapes: Shapes,
+    meshes: Meshes,
+    native_ccd: int,
+    world: wp.array[int],
+    index: wp.array[int],
+    xpos: wp.array2d[wp.vec3],
+    xmat: wp.array2d[wp.mat33],
+    dist: wp.array[float],
+    point: wp.array[wp.vec3],
+    frame: wp.array[wp.mat33],
+    dist_bar: wp.array[float],
+    pos_bar: wp.array[wp.vec3],
+    normal_bar: wp.array[wp.vec3],
+    out: wp.array2d[wp.vec3],
+):
+    i = wp.tid()
+    solid1 = solid_of(0, world[i], shapes, meshes, xpos, xmat)
+    solid2 = solid_of(1, world[i], shapes, meshes, xpos, xmat)
+    if solid1.type == GeomType.CAPSULE:
+        f1, t1, f2, t2 = capsule_box_wrenches(
+            index[i],
+            solid1.pos,
+            solid1.mat,
+            solid1.size,
+            solid2.pos,
+            solid2.mat,
+            solid2.size,
+            dist[i],
+            point[i],
+            frame[i][0],
+            dist_bar[i],
+            pos_bar[i],
+            normal_bar[i],
+        )
+        out[i, 0] = f1
+        out[i, 1] = t1
+        out[i, 2] = f2
+        out[i, 3] = t2
+    else:
+        seen = Seen()
+        seen.dist = dist[i]
+        seen.point = point[i]
+        seen.normal = frame[i][0]
+        bars = Bars()
+        bars.dist = dist_bar[i]
+        bars.point = pos_bar[i]
+        bars.normal = normal_bar[i]
+        push, _exact = convex_wrenches(solid1, solid2, meshes, seen, bars, native_ccd, 1)
+        out[i, 0] = push.force1
+        out[i, 1] = push.torque1 + wp.cross(point[i] - solid1.pos, push.force1)
+        out[i, 2] = push.force2
+        out[i, 3] = push.torque2 + wp.cross(point[i] - solid2.pos, push.force2)
+
+
+def two_bodies(shape: str, flag: str, margin: float) -> mujoco.MjModel:
+    """A capsule or box above a larger box, both free."""
+    size = " ".join(str(s) for s in SIZES[shape][: 2 if shape == "capsule" else 3])
+    ground = " ".join(str(s) for s in SIZES["ground"])
+    return mujoco.MjModel.from_xml_string(
+        f"""<mujoco><option><flag {flag}/></option><default><geom margin="{margin}"/></default><worldbody>
+        <body><freejoint/><geom type="{shape}" size="{size}"/></body>
+        <body><freejoint/><geom type="box" size="{ground}"/></body></worldbody></mujoco>"""
+    )
+
+
+def touching(model: mujoco.MjModel, shape: str, tilt: float, rng: np.random.Generator) -> np.ndarray:
+    """A pose in which the upper body has been lowered onto the lower one until it touches, tilted a little."""
+    data = mujoco.MjData(model)
+    quat = np.array([np.sqrt(0.5), 0, np.sqrt(0.5), 0]) if shape == "capsule" else np.array([1.0, 0, 0, 0])
+    quat = turned(turned(quat, np.array([0, 0, rng.uniform(0, 6.28)])), tilt * np.array([*rng.normal(size=2), 0.0]))
+    # The pair as a whole is turned too: nothing may depend on the world's axes.
+    whole = rng.normal(size=3)
+    for height in np.arange(0.35, 0.05, -5e-4):
+        data.qpos[:3] = (
+            [0.08 * rng.normal(), 0.08 * rng.normal(), height] if height == 0.35 else [*data.qpos[:2], height]
+        )
+        data.qpos[3:7] = quat
+        data.qpos[7:] = [0, 0, 0, 1, 0, 0, 0]
+        mujoco.mj_forward(model, data)
+        if data.ncon and float(np.min(data.contact.dist)) < -0.008:
+            break
+    rotation = np.zeros(9)
+    whole_quat = turned(np.array([1.0, 0, 0, 0]), whole)
+    mujoco.mju_quat2Mat(rotation, whole_quat)
+    data.qpos[:3] = rotation.reshape(3, 3) @ data.qpos[:3]
+    for address in (3, 10):
+        data.qpos[address : address + 4] = turned(data.qpos[address : address + 4], whole)
+    return np.array(data.qpos)
+
+
+def contacts(model: mujoco.MjModel, poses: np.ndarray) -> tuple[list[dict[int, np.ndarray]], np.ndarray, np.ndarray]:
+    """By world: contact index to (dist, point, frame) in 13 numbers; and the geoms' positions and rotations."""
+    m = mjw.put_model(model)
+    d = mjw.make_data(model, nworld=len(poses), nconmax=16, njmax=64)
+    d.qpos.assign(poses.astype(np.float32))
+    mjw.kinematics(m, d)
+    mjw.com_pos(m, d)
+    mjw.collision(m, d)
+    count = int(d.nacon.numpy()[0])
+    found: list[dict[int, np.ndarray]] = [{} for _ in poses]
+    for world, index, dist, point, frame in zip(
+        d.contact.worldid.numpy()[:count],
+        d.contact.geomcollisionid.numpy()[:count],
+        d.contact.dist.numpy()[:count],
+        d.contact.pos.numpy()[:count],
+        d.contact.frame.numpy()[:count],
+        strict=True,
+    ):
+        found[world][int(index)] = np.concatenate([[dist], point, frame.ravel()])
+    return found, d.geom_xpos.numpy(), d.geom_xmat.numpy()
+
+
+@pytest.mark.parametrize(
+    ("shape", "tilt", "flag", "margin"),
+    [
+        ("box", 0.02, "", 0.0),
+        ("box", 0.3, "", 0.0),
+        ("box", 0.3, "", 0.03),
+        ("box", 0.02, 'nativeccd="disable"', 0.0),
+        ("box", 0.5, 'nativeccd="disable"', 0.0),
+        ("capsule", 0.05, "", 0.0),
+        ("capsule", 0.4, "", 0.0),
+        ("capsule", 0.4, "", 0.03),
+    ],
+)
+def test_contact_follows_both_bodies(shape, tilt, flag, margin):
+    rng = np.random.default_rng(1)
+    model = two_bodies(shape, flag, margin)
+    poses = [touching(model, shape, tilt, rng) for _ in range(24)]
+    found, geom_pos, geom_mat = contacts(model, np.array([moved for p in poses for moved in (p, *displaced(p, EPS))]))
+    rows, differences, weights = [], [], []
+    for i in range(len(poses)):
+        worlds = found[25 * i : 25 * (i + 1)]
+        for index, contact in worlds[0].items():
+            # A contact that begins, ends or changes its place in the list inside the differences has no derivative.
+            if any(index not in w or len(w) != len(worlds[0]) for w in worlds):
+                continue
+            weight = np.concatenate([[3.0 * rng.normal()], rng.normal(size=6)])
+            moved = np.array([weight @ w[index][:7] for w in worlds[1:]]).reshape(12, 2)
+            curved = np.abs(moved.sum(1) - 2 * weight @ contact[:7]).max() / EPS
+            if curved > 0.05:  # a kink inside the differences
+                continue
+            rows.append((25 * i, index, contact))
+            differences.append((moved[:, 0] - moved[:, 1]) / (2 * EPS))
+            weights.append(weight)
+    assert len(rows) >= 12
+    base = np.array([r[0] for r in rows])
+    contact = np.array([r[2] for r in rows], np.float32)
+    weight = np.array(weights, np.float32)
+    out, m = wp.zeros((len(rows), 4), dtype=wp.vec3), mjw.put_model(model)
+    wp.launch(
+        wrenches,
+        dim=len(rows),
+        inputs=[
+            gather(Shapes, m),
+            gather(Meshes, m),
+            int(not flag),
+            wp.array(base, dtype=int),
+            wp.array([r[1] for r in rows], dtype=int),
+            wp.array(geom_pos, dtype=wp.vec3),
+            wp.array(geom_mat, dtype=wp.mat33),
+            wp.array(contact[:, 0], dtype=float),
+            wp.array(contact[:, 1:4], dtype=wp.vec3),
+            wp.array(contact[:, 4:].reshape(-1, 3, 3), dtype=wp.mat33),
+            wp.array(weight[:, 0], dtype=float),
+            wp.array(weight[:, 1:4], dtype=wp.vec3),
+            wp.array(weight[:, 4:], dtype=wp.vec3),
+        ],
+        outputs=[out],
+    )
+    got = out.numpy().reshape(len(rows), 12)
+    expected = np.array(differences)
+    error = np.linalg.norm(got - expected, axis=1) / np.linalg.norm(expected, axis=1)
+    print(f"{len(rows)} contacts, median {np.median(error):.1e}, largest {error.max():.1e}")
+    # Float32 differences: 1e-3 of rounding, and curvature times the step.
+    assert np.median(error) < 2e-3
+    assert error.max() < 2e-2
