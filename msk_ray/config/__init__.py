@@ -36,7 +36,7 @@ from msk_ray.config.schema import (
     TrialConfig,
 )
 from msk_ray.config.sections import EnvSettings, Reward
-from msk_ray.config.yaml_text import dump_yaml, parse_yaml, read_yaml
+from msk_ray.config.yaml_text import dump_yaml, parse_settings, parse_yaml, read_yaml
 
 __all__ = [
     "ALGORITHMS",
@@ -83,6 +83,7 @@ __all__ = [
     "parse_override",
     "parse_overrides",
     "parse_recorded",
+    "parse_settings",
     "parse_yaml",
     "read_config",
     "read_yaml",

@@ -24,7 +24,7 @@ from pydantic import (
 from msk_ray.config.horizons import AdaptiveHorizon, ContactHorizon, Horizon, HorizonSchedule
 from msk_ray.config.physics import GRADIENTS
 from msk_ray.config.resolve import Registry, resolve
-from msk_ray.config.sections import Count, Fraction, NonNegative, Section, Text
+from msk_ray.config.sections import SHOWN, Count, Fraction, NonNegative, Section, Text, Undeclared
 from msk_ray.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -81,6 +81,12 @@ class AlgorithmSettings(Section):
     def unread(self) -> dict[str, str]:
         """Settings of this section, dotted, that nothing reads because of others, and the reason for each."""
         return {}
+
+
+class UndeclaredAlgorithm(AlgorithmSettings, Undeclared):
+    """The recorded settings of an algorithm that cannot be found here."""
+
+    parallel = True
 
 
 class EntropyConfig(Section):
@@ -385,6 +391,8 @@ def _settings_from_outside(value: Any, info: ValidationInfo) -> Any:
     try:
         settings = settings_from_outside(name)
     except ConfigError as error:
+        if info.context == SHOWN:
+            return UndeclaredAlgorithm.because(str(error), value)
         raise ValueError(str(error)) from error
     return settings.model_validate(value, context=info.context)
 

@@ -2,9 +2,9 @@
 
 from collections.abc import Mapping
 from functools import cache
-from typing import Annotated, Any, ClassVar, get_args
+from typing import Annotated, Any, ClassVar, Self, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PrivateAttr, model_validator
 
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 NonNegative = Annotated[float, Field(ge=0.0)]
@@ -13,6 +13,12 @@ Count = Annotated[int, Field(gt=0, lt=2**31)]
 Whole = Annotated[int, Field(ge=0, lt=2**31)]
 """A whole number of at least 0."""
 Text = Annotated[str, Field(max_length=4096)]
+
+
+RECORDED = "recorded"
+"""Context of validation in which settings that nothing reads are accepted, because earlier versions allowed them."""
+SHOWN = "shown"
+"""The same, for settings that are only shown: a class that cannot be found does not hide them."""
 
 
 class Section(BaseModel):
@@ -61,6 +67,29 @@ def _takes_truth(annotation: Any) -> bool:
         or isinstance(annotation, bool)
         or any(_takes_truth(part) for part in get_args(annotation))
     )
+
+
+class Undeclared(Section):
+    """Recorded settings of a class that cannot be found here: enough to show the trials that had them.
+
+    It is the last of several bases, which decides whether unknown keys are accepted.
+    """
+
+    model_config = ConfigDict(extra="allow")
+
+    _why: str = PrivateAttr("")
+
+    @classmethod
+    def because(cls, why: str, settings: Any) -> Self:
+        """The settings, and why their declaration cannot be found."""
+        found = cls.model_validate(settings)
+        found._why = why
+        return found
+
+    @property
+    def why(self) -> str:
+        """Why their declaration cannot be found."""
+        return self._why
 
 
 class Reward(Section):

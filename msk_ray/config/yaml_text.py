@@ -132,9 +132,18 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8"
         raise ConfigError(f"cannot read {path}: {reason or error}") from error
-    settings = parse_yaml(text, str(path))
+    return parse_settings(text, str(path))
+
+
+def parse_settings(text: str, source: str) -> dict[str, Any]:
+    """The mapping in YAML text. `source` names it in errors.
+
+    Raises:
+        ConfigError: as for `parse_yaml`, or it is not a mapping.
+    """
+    settings = parse_yaml(text, source)
     if not isinstance(settings, dict):
-        raise ConfigError(f"{path} must hold a mapping of settings at its top level")
+        raise ConfigError(f"{source} must hold a mapping of settings at its top level")
     return settings
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from msk_ray.experiment.damage import Damage, field, is_number, number, read_lines, texts
+from msk_ray.experiment.damage import Damage, DamagedFile, field, is_number, number, read_lines, texts
 from msk_ray.experiment.layout import METRICS_FILE
 
 SCORE = "eval/score"
@@ -58,9 +58,13 @@ def load_metrics(path: Path) -> Metrics:
     """A trial's metrics, without the lines that are damaged; none if there is no such file.
 
     Raises:
+        DamagedFile: it is no regular file, or too large.
         StorageFailure: the storage does not give it.
     """
-    found, damages = read_lines(path, _row)
+    try:
+        found, damages = read_lines(path, _row)
+    except DamagedFile as error:
+        raise DamagedFile(error.damage, "remove it, and the trial continues without its earlier rows") from None
     rows = {row["epoch"]: row for row in found}
     return Metrics(tuple(rows[epoch] for epoch in sorted(rows)), damages)
 

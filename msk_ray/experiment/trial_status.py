@@ -5,10 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from msk_ray.config import read_yaml
 from msk_ray.errors import MskRayError
 from msk_ray.experiment.attempts import FIRST, Attempt
-from msk_ray.experiment.damage import Damage, describe_damages
+from msk_ray.experiment.damage import Damage, describe_damages, read_settings
 from msk_ray.experiment.eta import eta
 from msk_ray.experiment.layout import ENVIRONMENT_FILE, MANIFEST_FILE, SPACE_FILE
 from msk_ray.experiment.manifest import Experiment
@@ -75,7 +74,7 @@ class StatusReader:
     def _known(self) -> list[Trial]:
         stamp = file_stamp(self.experiment.path / MANIFEST_FILE)
         if stamp is None or stamp != self._manifest:
-            self._trials, self._manifest = self.experiment.trials(), stamp
+            self._trials, self._manifest = self.experiment.trials(shown=True), stamp
         return self._trials
 
     def _unlisted(self, listed: set[str], now: float) -> list[TrialStatus]:
@@ -83,7 +82,7 @@ class StatusReader:
         if all(path.name in listed for path in _subfolders(self.experiment.path / "trials")):
             return []
         try:
-            varied = list(read_yaml(self.experiment.path / SPACE_FILE).get("parameters") or {})
+            varied = list(read_settings(self.experiment.path / SPACE_FILE).get("parameters") or {})
         except (MskRayError, TypeError):
             varied = []  # their settings are known all the same; only what sets them apart is not
         trials, damages = unlisted_trials(self.experiment, listed, varied)

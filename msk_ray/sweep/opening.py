@@ -4,8 +4,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from msk_ray.config import dump_yaml, read_yaml
+from msk_ray.config import dump_yaml
 from msk_ray.errors import MskRayError, StorageError
+from msk_ray.experiment.damage import read_settings
 from msk_ray.experiment.environment import environment
 from msk_ray.experiment.layout import ENVIRONMENT_FILE, SPACE_FILE
 from msk_ray.experiment.manifest import Experiment, refuse_old
@@ -84,7 +85,7 @@ def check_scheduler(experiment: Experiment, space: Space) -> None:
     """
     try:
         path = experiment.path / SPACE_FILE
-        recorded = read_file(read_yaml(path), str(path), recorded=True).scheduler.model_dump()
+        recorded = read_file(read_settings(path), str(path), recorded=True).scheduler.model_dump()
     except MskRayError as error:
         # Only this check and the report depend on it.
         text = " ".join(str(error).split())

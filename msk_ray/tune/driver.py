@@ -19,10 +19,10 @@ from ray.tune import Callback
 from ray.tune.stopper import Stopper
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from msk_ray.config import Config, parse_recorded, read_yaml
+from msk_ray.config import Config, parse_recorded
 from msk_ray.errors import ClusterLost, MskRayError, OwnershipLost, StorageFailure, storage_failure
 from msk_ray.experiment.attempts import read_attempt
-from msk_ray.experiment.damage import describe_damages
+from msk_ray.experiment.damage import describe_damages, read_settings
 from msk_ray.experiment.layout import SCHEDULER_LOG_FILE
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import last_figures
@@ -357,7 +357,7 @@ def _current_params(job: Job, trial: Trial) -> dict[str, Any]:
     written = job.experiment.trial_folder(trial.id) / "config.yaml"
     if not written.is_file():
         return params
-    settings = parse_recorded(read_yaml(written), str(written)).as_dict()
+    settings = parse_recorded(read_settings(written), str(written)).as_dict()
     for key in params:
         node: Any = settings
         for part in key.split("."):

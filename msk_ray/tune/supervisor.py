@@ -16,6 +16,7 @@ from msk_ray.experiment.layout import ERROR_FILE, HANG_FILE
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.outcomes import Ending, Outcome, read_ending, write_ending
 from msk_ray.experiment.trial import Trial
+from msk_ray.files import last_lines
 from msk_ray.signals import StopRequest
 from msk_ray.text import printable
 from msk_ray.tune.console import Console
@@ -197,7 +198,7 @@ def _reason(folder: Path, trial: Any) -> str:
     if hang_file.is_file() and hang_file.stat().st_size:
         return f"it hung; its stacks are in {hang_file}"
     if error_file.is_file():
-        return error_file.read_text(encoding="utf-8", errors="replace").strip().splitlines()[-1]
+        return next(iter(last_lines(error_file, 1)), "its error was not recorded")
     error = _error_of(trial)
     if error is None or isinstance(error, RayActorError):
         times = "" if trial.num_failures < 2 else f", {trial.num_failures} times now"
