@@ -95,7 +95,7 @@ def test_a_gpu_repeats_a_trial_that_is_killed_in_between(config: str, tmp_path: 
     def command(folder: Path, *more: str) -> list[str]:
         sets = [word for setting in settings for word in ("--set", setting)]
         start = [sys.executable, "-m", "msk_ray.train", "--config", config, "--score-at-once"]
-        return [*start, "--logdir", str(folder), *sets, *more]
+        return [*start, "--device", "cuda:0", "--logdir", str(folder), *sets, *more]
 
     # Beside each other: most of their time passes while each loads libraries and compiles.
     names = ("first", "second", "killed")
