@@ -54,7 +54,53 @@ def typed_command(argv: Sequence[str], *more: str) -> str:
         words = ["python", "-m", module]
     else:
         words = ["python", program.name] if program.suffix == ".py" else [program.name]
-    return shlex.join([*words, *argv[1:], *(option for option in more if option not in argv)])
+    return " ".join(_quoted(word) for word in [*words, *argv[1:], *(option for option in more if option not in argv)])
+
+
+def option_value(words: Sequence[str], option: str) -> str | None:
+    """The value of a long option among the words of a command line, also abbreviated; the last one counts."""
+    value = None
+    for place, word in enumerate(words):
+        head, separator, attached = word.partition("=")
+        if _means(head, option):
+            value = attached if separator else next(iter(words[place + 1 :]), None)
+    return value
+
+
+def with_option(words: Sequence[str], option: str, value: str) -> list[str]:
+    """The words of a command line with another value for a long option, where it was or at their end."""
+    changed, rest, place = [], iter(words), None
+    for word in rest:
+        head, separator, _ = word.partition("=")
+        if not _means(head, option):
+            changed.append(word)
+            continue
+        place = len(changed) if place is None else place
+        if not separator:
+            next(rest, None)
+    place = len(changed) if place is None else place
+    return [*changed[:place], option, value, *changed[place:]]
+
+
+def _means(word: str, option: str) -> bool:
+    """Whether a word is an option, or as much of it as argparse needs to tell it from others."""
+    return len(word) > len("--x") and option.startswith(word)
+
+
+def _quoted(word: str) -> str:
+    r"""A word as a shell reads it. What cannot be seen is written as bash and zsh do: `$'a\x1bb'`."""
+    if word.isprintable():
+        return shlex.quote(word)
+    return f"$'{''.join(_escaped(character) for character in word)}'"
+
+
+def _escaped(character: str) -> str:
+    """A character between `$'` and `'`."""
+    if character.isprintable() and character not in "'\\":
+        return character
+    # Python keeps a byte that is not UTF-8 as half a character.
+    kept = "surrogateescape" if "\udc80" <= character <= "\udcff" else "surrogatepass"
+    return "".join(f"\\x{byte:02x}" for byte in character.encode(errors=kept))
 
 
 def _module_of(program: Path) -> str | None:

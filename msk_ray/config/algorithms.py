@@ -8,7 +8,6 @@ Differentiable Simulation", arXiv:2204.07137, and the hyperparameters published 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import (
@@ -411,19 +410,6 @@ def settings_from_outside(name: Any) -> type[AlgorithmSettings]:
     if not (isinstance(declared, type) and issubclass(declared, AlgorithmSettings)):
         raise ConfigError(f"algorithm.name: {path} declares no settings: write `class Settings(AlgorithmSettings)`")
     return declared
-
-
-def check_installed(algorithm: AlgorithmConfig, settings: AlgorithmSettings) -> None:
-    """Refuse an algorithm whose packages are not installed.
-
-    Raises:
-        ConfigError: the message names what to install.
-    """
-    for module, install in settings.packages.items():
-        if find_spec(module) is None:
-            raise ConfigError(
-                f"algorithm.name: {algorithm.name} needs {module}, which is not installed: pip install '{install}'"
-            )
 
 
 def ignored_settings(name: str, settings: AlgorithmSettings) -> list[str]:

@@ -96,6 +96,13 @@ class EnvSettings(Section):
     the same env steps. Evaluations always begin at age 0."""
     reward: Reward = Reward()
 
+    def check_installed(self) -> None:
+        """Refuse an environment whose packages or files are not on this machine.
+
+        Raises:
+            ConfigError: the message names what to install.
+        """
+
     def unread(self) -> dict[str, str]:
         """Settings of this section, dotted, that nothing reads because of others, and the reason for each."""
         return {}
