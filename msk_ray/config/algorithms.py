@@ -23,7 +23,7 @@ from pydantic import (
 from msk_ray.config.horizons import AdaptiveHorizon, ContactHorizon, Horizon, HorizonSchedule
 from msk_ray.config.physics import GRADIENTS
 from msk_ray.config.resolve import Registry, resolve
-from msk_ray.config.sections import Count, Fraction, NonNegative, Section, Text
+from msk_ray.config.sections import Count, Fraction, NonNegative, Rate, Section, Text
 from msk_ray.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -170,13 +170,13 @@ class ShacConfig(AlgorithmSettings):
     fused where it is meant for, else torch."""
     target_critic_alpha: Fraction = 0.2
     """target ← α·target + (1 − α)·critic after each epoch."""
-    actor_lr: PositiveFloat = 2e-3
+    actor_lr: Rate = 2e-3
     """Learning rate of the actor."""
-    critic_lr: PositiveFloat = 2e-3
+    critic_lr: Rate = 2e-3
     """Learning rate of the critic."""
     lr_schedule: Literal["linear", "constant"] = "linear"
     """`linear` decreases from the given rate towards `final_lr`, which would follow the last epoch."""
-    final_lr: PositiveFloat = 1e-5
+    final_lr: Rate = 1e-5
     """Learning rate at which the linear schedule ends; a lower given rate stays as it is."""
     betas: tuple[Fraction, Fraction] = (0.7, 0.95)
     """Adam's moment decays."""
@@ -206,7 +206,7 @@ class ShacConfig(AlgorithmSettings):
     """Normalise observations by their running mean and variance."""
     normalize_return: bool = False
     """Divide rewards by the running standard deviation of the return."""
-    reward_scale: PositiveFloat = 1.0
+    reward_scale: Annotated[float, Field(ge=1e-6, le=1e6)] = 1.0
     """Factor on the rewards of training; scores are without it."""
     max_nonfinite_share: Fraction = 0.05
     """Share of worlds whose gradient may be non-finite in an epoch before the trial stops with an error."""
@@ -312,7 +312,7 @@ class PpoConfig(AlgorithmSettings):
     """Discount."""
     lam: Fraction = 0.95
     """λ of the generalised advantage estimate."""
-    lr: PositiveFloat = 1e-3
+    lr: Rate = 1e-3
     """Adam's rate, or its initial value if it is adaptive."""
     lr_schedule: Literal["adaptive", "constant"] = "adaptive"
     """`adaptive` divides or multiplies the rate by 1.5, between 1e-5 and 1e-2, to hold `desired_kl`."""
