@@ -54,7 +54,12 @@ def typed_command(argv: Sequence[str], *more: str) -> str:
         words = ["python", "-m", module]
     else:
         words = ["python", program.name] if program.suffix == ".py" else [program.name]
-    return " ".join(_quoted(word) for word in [*words, *argv[1:], *(option for option in more if option not in argv)])
+    return shell_join([*words, *argv[1:], *(option for option in more if option not in argv)])
+
+
+def shell_join(words: Sequence[str]) -> str:
+    """Words as one types them into a shell, all of them visible."""
+    return " ".join(_quoted(word) for word in words)
 
 
 def option_value(words: Sequence[str], option: str) -> str | None:

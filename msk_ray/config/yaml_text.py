@@ -99,8 +99,8 @@ def _check_keys(node: yaml.MappingNode) -> None:
             raise _NotSettings("a key must be a name, not a list or a mapping")
         if key.tag in _NO_NAMES:
             raise _NotSettings(
-                f"key {shortened(key.value, 60)!r} is {_NO_NAMES[key.tag]} in YAML, not a name; write a name, in quotes "
-                "if it is one"
+                f"key {shortened(key.value, 60)!r} is {_NO_NAMES[key.tag]} in YAML, not a name; write a name, in "
+                "quotes if it is one"
             )
         if (key.tag, key.value) in seen:
             raise _NotSettings(f"key {brief(key.value)} is written twice; leave one of them out")

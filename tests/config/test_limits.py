@@ -38,7 +38,9 @@ BOMB = "a: &a [x,x,x,x,x,x,x,x,x,x]\n" + "".join(
         pytest.param("a: 0x" + "f" * 5000, "below 2^63", id="a huge hexadecimal number"),
         pytest.param("a: " + "9" * 5000, "not valid YAML", id="a huge decimal number"),
         pytest.param("? [1]\n: 2", "a key must be a name", id="a list as key"),
-        pytest.param("overrides: {5: 64}", "key '5' is a whole number in YAML, not a name; write a", id="a number as key"),
+        pytest.param(
+            "overrides: {5: 64}", "key '5' is a whole number in YAML, not a name; write a", id="a number as key"
+        ),
         pytest.param("a: {on: 1}", "key 'on' is true or false in YAML, .* write a name, in quotes", id="on as key"),
         pytest.param("a: {~: 1}", "key '~' is null in YAML", id="null as key"),
         pytest.param("a: {.5: 1}", "key '.5' is a number in YAML", id="a fraction as key"),
