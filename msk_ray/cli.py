@@ -1,6 +1,7 @@
 """Helpers shared by the command-line entry points."""
 
 import argparse
+import bdb
 import contextlib
 import errno
 import io
@@ -145,6 +146,9 @@ def run(main: Callable[[Sequence[str] | None], int], argv: Sequence[str] | None 
             print(f"stopped by {stop.signal.name}", file=sys.stderr)
             return signals.RESUMABLE
         print("interrupted", file=sys.stderr)
+        return 130
+    except bdb.BdbQuit:
+        print("quit at a breakpoint", file=sys.stderr)
         return 130
     except BrokenPipeError:
         # The reader of our output, such as `head`, has exited.

@@ -238,7 +238,7 @@ def _train(
         print(f"resumed from {path}" if path else "no complete checkpoint yet: starting from the beginning")
     if trainer.together > 1:
         print(f"policies are scored {trainer.together} at a time, after two minutes at most (or --score-at-once)")
-    progress = ProgressLine(config.trial.epochs, trainer.epoch)
+    progress = ProgressLine(config.trial.epochs)
     # However it ends, loggers write out the rows that they still hold.
     with stop.deferred(), closing(trainer):
         while not trainer.finished and not stop:

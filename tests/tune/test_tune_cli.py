@@ -1,5 +1,6 @@
 """The command line without Ray: dry runs, and refusals that cost one line and no work."""
 
+import bdb
 import importlib.util
 import json
 import os
@@ -295,3 +296,18 @@ def test_a_storage_that_is_not_utf_8_is_refused_before_anything_is_written(
     assert "its path is not UTF-8; rename it, or choose another folder\n" in capsys.readouterr().err
     assert not plans
     assert not storage.exists()
+
+
+def test_who_leaves_the_debugger_of_a_trial_sees_one_line(
+    space_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def make_trainer(*_: object) -> None:
+        raise bdb.BdbQuit
+
+    monkeypatch.setattr("msk_ray.tune.trial_run.make_trainer", make_trainer)
+    command = ["--space", str(space_file), "--storage", str(tmp_path / "runs"), "--cpu", "--debug-trial", "0"]
+    assert run(main, command) == 130
+    assert capsys.readouterr().err == "quit at a breakpoint\n"
+    (folder,) = (tmp_path / "runs" / "debug").iterdir()
+    assert not (folder / "error.txt").exists()
+    assert not (folder / "outcome.json").exists(), "it has not ended"
