@@ -3,6 +3,7 @@
 import argparse
 import bdb
 import contextlib
+import difflib
 import errno
 import io
 import os
@@ -11,10 +12,10 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from msk_ray import signals
-from msk_ray.errors import MskRayError, StorageFailure, brief
+from msk_ray.errors import MskRayError, StorageFailure, brief, shortened
 from msk_ray.text import printable
 
 TERMINAL_LOG = "terminal.log"
@@ -38,10 +39,23 @@ class Parser(argparse.ArgumentParser):
             epilog=f"examples:\n{examples}",
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
+        self._words: list[str] = []
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        self._words = list(sys.argv[1:] if args is None else args)
+        return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
         """Print what is wrong with the command line, on one line that is safe for a terminal, and exit with 2."""
-        super().error(printable(message))
+        # argparse would first name what it misses because of an option that it does not know.
+        heads = [word.partition("=")[0] for word in self._words if word.startswith("--") and word != "--"]
+        options = [option for option in self._option_string_actions if option.startswith("--")]
+        for head in heads:
+            if not any(option.startswith(head) for option in options):
+                near = difflib.get_close_matches(head, options, n=1)
+                message = f"no option {shortened(head)}" + (f"; did you mean {near[0]}?" if near else "")
+                break
+        self.exit(2, f"error: {printable(message)} (all options: {self.prog} --help)\n")
 
 
 def typed_command(argv: Sequence[str], *more: str) -> str:
