@@ -19,7 +19,7 @@ from record import RESULTS, markdown_table, publish
 
 from msk_ray.config import Config, load_config
 from msk_ray.envs import make_env
-from msk_ray.envs.myoleg.model import find_model
+from msk_ray.envs.myoleg.source import find_model
 from msk_ray.errors import ConfigError
 from msk_ray.simulation.capture import Recording
 

@@ -130,8 +130,9 @@ def make_folder(path: Path) -> None:
     """Create a folder and its parents if they do not exist, and check that files can be written to it.
 
     Raises:
-        StorageError: it cannot be created or written to.
+        StorageError: it cannot be created or written to, or its path is not UTF-8.
     """
+    _check_text(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -143,14 +144,25 @@ def check_writable(path: Path) -> None:
     """Check a folder by writing a file: permissions alone do not reveal full disks or read-only mounts.
 
     Raises:
-        StorageError: the folder cannot be written to or does not exist.
+        StorageError: the folder cannot be written to or does not exist, or its path is not UTF-8.
     """
+    _check_text(path)
     probe = path / f".probe.{socket.gethostname()}.{os.getpid()}"
     try:
         probe.write_bytes(b"0" * 4096)
         probe.unlink()
     except OSError as error:
         raise _cannot_write(path, error) from error
+
+
+def _check_text(path: Path) -> None:
+    """Refuse a folder whose path is not text: libraries that write below it would fail once the work has begun."""
+    try:
+        str(path.absolute()).encode()
+    except UnicodeEncodeError:
+        raise StorageError(
+            f"cannot write to {path}: its path is not UTF-8; rename it, or choose another folder"
+        ) from None
 
 
 def _cannot_write(path: Path, error: OSError) -> StorageError:

@@ -9,7 +9,6 @@ from msk_ray.config.algorithms import (
     PerturbedCopies,
     PpoConfig,
     ShacConfig,
-    check_installed,
 )
 from msk_ray.config.environments import ENVIRONMENTS, settings_class
 from msk_ray.config.horizons import AdaptiveHorizon, ContactHorizon, HorizonSchedule
@@ -65,7 +64,6 @@ __all__ = [
     "Reward",
     "ShacConfig",
     "TrialConfig",
-    "check_installed",
     "combine",
     "current_key",
     "current_values",

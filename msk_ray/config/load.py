@@ -163,7 +163,7 @@ def describe_fault(
     elif first["type"] == "value_error":
         text = str(first["ctx"]["error"]) if "ctx" in first else first["msg"]
     elif first["type"] == "missing":
-        text = f"{where}: missing"
+        text = f"{where}: missing; write it"
     else:
         text = f"{where}: {first['msg']}, not {brief(first['input'])}"
     more = len(faults) - 1

@@ -22,7 +22,8 @@ from msk_ray.config.algorithms import (
     ignored_settings,
 )
 from msk_ray.config.environments import UndeclaredEnv, settings_class
-from msk_ray.config.loggers import LOGGERS
+from msk_ray.config.loggers import LOGGERS, logger_paths
+from msk_ray.config.packages import require
 from msk_ray.config.physics import PhysicsConfig, Vec5
 from msk_ray.config.sections import RECORDED, SHOWN, Count, EnvSettings, Section, Text, Undeclared, Whole
 from msk_ray.config.unread import unread_settings
@@ -206,6 +207,16 @@ class Config(Section):
             section: AlgorithmSettings = getattr(self, self.algorithm.name)
             return section
         return self.algorithm.settings
+
+    def check_installed(self) -> None:
+        """Refuse settings that need packages, or a model, that are not on this machine. Loads none of them.
+
+        Raises:
+            ConfigError: the message names what to install.
+        """
+        require(self.algorithm_settings.packages, f"algorithm.name: {self.algorithm.name}")
+        logger_paths(self.trial.loggers)
+        self.env.check_installed()
 
     @property
     def algorithm_section(self) -> str:

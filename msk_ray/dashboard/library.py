@@ -20,6 +20,7 @@ from msk_ray.errors import ConfigError, MskRayError, StorageError
 from msk_ray.experiment.layout import EVAL_FILE
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.snapshot import file_stamp
+from msk_ray.experiment.trainings import TrainingReader
 from msk_ray.experiment.trial_status import StatusReader, counts, describe_bests, find_experiments
 from msk_ray.files import UnusableFile, open_file
 from msk_ray.report.best import STRIP, stored_best
@@ -71,6 +72,7 @@ class Library:
         """
         self.storage = storage
         self._root = storage.resolve()
+        self._trainings = TrainingReader(self._root)
         self._refresh = refresh
         self._may_write = may_write
         self._films = films
@@ -82,7 +84,7 @@ class Library:
     def index(self) -> Page:
         """The list of experiments."""
         with self._lock:
-            return self._kept((), lambda: ((self._rows(),), []), self._render_index)
+            return self._kept((), lambda: ((self._rows(), self._training_rows()), []), self._render_index)
 
     def page(self, names: Sequence[str]) -> Page:
         """The page of one experiment, or of several side by side.
@@ -279,12 +281,30 @@ class Library:
             rows.append((path.name, str(len(statuses)), score, state, question))
         return rows
 
+    def _training_rows(self) -> tuple[tuple[str, ...], ...]:
+        """What `train` has run: folder, environment, epochs, best score and state of each."""
+        return tuple(
+            (
+                training.name,
+                training.environment,
+                f"{training.progress.epoch}/{training.epochs or '?'}",
+                "" if training.progress.best is None else f"{training.progress.best:.5g}",
+                "; ".join(filter(None, (str(training.state), training.note))),
+            )
+            for training in self._trainings.look(time.time())
+        )
+
     def _render_index(self, seen: tuple[Any, ...], version: str) -> str:
         return (
             _templates()
             .get_template("index.html.j2")
             .render(
-                rows=seen[0], storage=str(self.storage), version=version, refresh=self._refresh, written=__version__
+                rows=seen[0],
+                trainings=seen[1],
+                storage=str(self.storage),
+                version=version,
+                refresh=self._refresh,
+                written=__version__,
             )
         )
 

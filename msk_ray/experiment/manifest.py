@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from msk_ray.cli import typed_command
+from msk_ray.cli import option_value, typed_command, with_option
 from msk_ray.config import current_values, parse_recorded
 from msk_ray.errors import ConfigError, StorageError, StorageFailure, brief
 from msk_ray.experiment.damage import CATALOGUE, DamagedFile, field, read_object, texts
@@ -36,6 +36,8 @@ from msk_ray.files import check_writable, make_folder, write_json
 FORMAT = 1
 MAX_TRIALS = 100_000
 """Trials of an experiment."""
+STORAGE = "runs"
+"""Folder of experiments unless another is given."""
 REMEMBERED = ("halve_worlds", "early_stopping")
 """Options that --resume keeps unless it overrides them."""
 
@@ -53,23 +55,20 @@ class Experiment:
 
     def resume_command(self) -> str:
         """The command that continues the experiment: the original one with --resume, which keeps the latest values of
-        `REMEMBERED`, and with the folder that the experiment is in now."""
+        `REMEMBERED`, and with the name and the storage folder that the experiment has now."""
         flags = {f"--{no}{option.replace('_', '-')}" for option in REMEMBERED for no in ("", "no-")}
         argv = read_environment(self.path / ENVIRONMENT_FILE)[0].get("command")
         if not argv:
             # The command is lost, or was never complete; its options are not recorded anywhere else.
             return "python -m msk_ray.tune --resume, with the options it was started with"
         words = [word for word in argv if word not in flags]
-        for place, word in enumerate(words):
-            if word == "--storage" and place + 1 < len(words):
-                words[place + 1] = self._storage(words[place + 1])
-            elif word.startswith("--storage="):
-                words[place] = f"--storage={self._storage(word.partition('=')[2])}"
+        if Path(option_value(words, "--storage") or STORAGE).resolve() != self.path.parent.resolve():
+            words = with_option(words, "--storage", str(self.path.parent))
+        space = option_value(words, "--space")
+        named = option_value(words, "--name") or (space and default_name(space, "--smoke" in words))
+        if named is not None and named != self.name:
+            words = with_option(words, "--name", self.name)
         return typed_command(words, "--resume")
-
-    def _storage(self, given: str) -> str:
-        """The storage folder as it was given, or where the experiment has been moved to since."""
-        return given if Path(given).resolve() == self.path.parent.resolve() else str(self.path.parent)
 
     @property
     def tune(self) -> Path:
@@ -232,6 +231,16 @@ def refuse_old(path: Path) -> None:
     """Raise StorageError where there is an experiment already."""
     if has_begun(path):
         raise StorageError(f"{path} already holds an experiment: add --resume to continue it, or pass another --name")
+
+
+def default_name(space: str, smoke: bool) -> str:
+    """The name of an experiment that was given none.
+
+    Args:
+        space: name or file of its space, as given.
+        smoke: whether it is a smoke run.
+    """
+    return Path(space).stem + ("-smoke" if smoke else "")
 
 
 def check_name(name: str) -> str:

@@ -142,7 +142,7 @@ class TrialProgress:
     env_steps_per_s: float | None = None
     """Median over the newest rows."""
     seconds_per_epoch: float | None = None
-    """Mean over the newest rows [s]."""
+    """Mean over the newest rows [s]; None while only the first epoch is known, which includes compilation."""
 
 
 def progress_of(rows: Sequence[Mapping[str, float]]) -> TrialProgress:
@@ -152,7 +152,7 @@ def progress_of(rows: Sequence[Mapping[str, float]]) -> TrialProgress:
     scores = [e.score for e in evaluations_of(rows) if math.isfinite(e.score)]
     recent = [row for row in rows[-RECENT - 1 :] if row["epoch"] > 0]
     speeds = [row["env_steps_per_s"] for row in recent if math.isfinite(row.get("env_steps_per_s", math.nan))]
-    first, last = rows[-RECENT - 1 :][0], rows[-1]
+    first, last = next(iter(recent), rows[-1]), rows[-1]
     epochs = last["epoch"] - first["epoch"]
     seconds = last.get("seconds", math.nan) - first.get("seconds", math.nan)
     return TrialProgress(

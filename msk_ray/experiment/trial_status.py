@@ -9,7 +9,7 @@ from msk_ray.errors import MskRayError
 from msk_ray.experiment.attempts import FIRST, Attempt
 from msk_ray.experiment.damage import Damage, describe_damages, read_settings
 from msk_ray.experiment.eta import eta
-from msk_ray.experiment.layout import ENVIRONMENT_FILE, MANIFEST_FILE, SPACE_FILE
+from msk_ray.experiment.layout import ENVIRONMENT_FILE, MANIFEST_FILE, METRICS_FILE, SPACE_FILE
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import TrialProgress
 from msk_ray.experiment.results import unlisted_trials
@@ -38,7 +38,7 @@ class TrialStatus:
     outcome: str = ""
     """Name of its ending, if it has one."""
     note: str = ""
-    """Why it ended, or what is wrong with its files."""
+    """Why it ended, what it does before its first epoch has ended, or what is wrong with its files."""
     attempt: Attempt = FIRST
     damages: tuple[Damage, ...] = ()
     """What was skipped in its files."""
@@ -50,6 +50,10 @@ class TrialStatus:
         if self.state is not State.RUNNING or speed is None:
             return None
         return max(0, self.epochs - self.progress.epoch) * speed
+
+
+FIRST_EPOCH = "compiles kernels that are not in Warp's cache, records and trains its first epoch"
+"""What a running trial does that has no epoch yet."""
 
 
 class StatusReader:
@@ -98,6 +102,8 @@ class StatusReader:
     def _status(self, trial: Trial, now: float) -> TrialStatus:
         seen = self._reader.read(self.experiment.trial_folder(trial.id), now)
         why = [] if seen.ending is None else [seen.ending.why]
+        if seen.state is State.RUNNING and seen.progress.epoch == 0:
+            why = [FIRST_EPOCH]
         return TrialStatus(
             trial.id,
             trial.variant,
@@ -161,6 +167,7 @@ def find_experiments(storage: Path) -> list[Path]:
         path
         for path in _subfolders(storage)
         if any((path / part).exists() for part in (MANIFEST_FILE, SPACE_FILE, ENVIRONMENT_FILE))
+        and not (path / METRICS_FILE).exists()  # a trial on its own
     ]
     return sorted(found, key=lambda path: (path.stat().st_mtime, path.name))
 

@@ -146,6 +146,7 @@ def _draw(path: Path, out: Path, sha: str, device: str | None) -> None:
     from msk_ray.training import load_policy
     from msk_ray.visualize.episodes import record
     from msk_ray.visualize.film import grid, strip
+    from msk_ray.visualize.look import describe_groups, geom_groups
     from msk_ray.visualize.render import View, headless_backend
     from msk_ray.visualize.strips import episode_frames, log_strip
 
@@ -159,6 +160,8 @@ def _draw(path: Path, out: Path, sha: str, device: str | None) -> None:
         f"{float(recording.episodes.score[0]):.5g} in {recording.length(0) * recording.timestep:.1f} s, "
         f"ended by {recording.ending(0)}"
     )
+    if drawn := describe_groups(geom_groups(recording.model)):
+        text += f"; {drawn}"
     stamp = PngImagePlugin.PngInfo()
     stamp.add_text(_STAMP, sha)
     stamp.add_text("Description", text)

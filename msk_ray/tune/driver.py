@@ -92,7 +92,7 @@ def run_trials(plan: Plan) -> bool:
 
     Raises:
         StorageFailure: the disk is full or gone; the experiment can be resumed once it is back.
-        MskRayError: kernels could not be compiled for a trial, or the search is not installed.
+        MskRayError: kernels could not be compiled for a trial.
     """
     experiment, space = plan.experiment, plan.space
     _finish_pruning(plan)

@@ -5,7 +5,6 @@ import json
 import os
 import platform
 import shutil
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -31,6 +30,7 @@ from msk_ray.sweep.space import Space
 from msk_ray.tune.devices import wait_for_memory
 from msk_ray.tune.gauges import TrialGauges
 from msk_ray.tune.hparams import log_hparams
+from msk_ray.tune.output import limit_output, redirect_output
 from msk_ray.tune.schedulers import BEST, METRIC
 from msk_ray.tune.trial_run import Handed, Hooks, MakeTrainer, TrainerLike, run_trial
 
@@ -97,7 +97,8 @@ def make_trainable(job: Job, resources: dict[str, float]) -> type[tune.Trainable
             raise failure from error
 
     def work(trial: Trial, folder: Path) -> None:
-        _redirect_output(folder / OUTPUT_FILE)
+        output = folder / OUTPUT_FILE
+        redirect_output(output)
         _record_device(folder / DEVICE_FILE, job.gpus)
         attempt = read_attempt(folder)
         log_hparams(folder, attempt.effective(trial))
@@ -111,6 +112,7 @@ def make_trainable(job: Job, resources: dict[str, float]) -> type[tune.Trainable
 
             def on_epoch(row: Mapping[str, float]) -> None:
                 watch.alive()
+                limit_output(output)
                 gauges.show(row)
 
             report = _report_with_checkpoint if job.population else _reporter(attempt.number)
@@ -216,16 +218,6 @@ def _handed_checkpoint(job: Job, scratch: Path) -> Handed | None:
         return None
     handed.to_directory(str(scratch))
     return Handed(min(scratch.glob("epoch_*.pt")), frozenset((*job.space.sampled, "trial.seed")))
-
-
-def _redirect_output(path: Path) -> None:
-    """Append everything that this process prints, from any language, to a file."""
-    file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os.dup2(file, 1)
-    os.dup2(file, 2)
-    os.close(file)
 
 
 class _Watch:

@@ -1,5 +1,6 @@
 """Run one trial from its current state to its end. Independent of Ray, so it can be stepped through in a debugger."""
 
+import bdb
 import math
 import traceback
 from collections.abc import Callable, Collection, Mapping
@@ -133,8 +134,8 @@ def run_trial(
             ending = _out_of_memory(trial, folder, str(error), attempt, may_halve)
         else:
             ending = Ending(Outcome(error.failure.value), str(error))
-    except (StorageFailure, RankLost):
-        # The trial has not ended: it continues once the disk has space, or in new processes.
+    except (StorageFailure, RankLost, bdb.BdbQuit):
+        # The trial has not ended: it continues once the disk has space, or in new processes, or who debugs it is done.
         raise
     except MskRayError as error:
         ending = Ending(Outcome.ERROR, str(error))

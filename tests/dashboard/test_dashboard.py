@@ -184,6 +184,17 @@ def test_a_page_follows_its_experiment(page: Any, served: Server, experiment: Ex
     assert page.evaluate(fits)
 
 
+def test_single_trials_are_listed(served: Server, experiment: Experiment) -> None:
+    folder = experiment.path.parent / "train" / "mine"
+    fill(folder, [1.0, 13.0], ended=False)
+    (folder / "config.yaml").write_text("env: {name: cartpole}\ntrial: {epochs: 8}\n")
+    status, page, _ = served.ask("/")
+    row = page.partition("Single trials")[2]
+    assert status == 200
+    assert all(part in row for part in (">train/mine<", ">cartpole<", ">1/8<", ">13<"))
+    assert served.ask("/e/train/")[0] == 404
+
+
 def test_experiments_are_listed_and_compared(page: Any, served: Server, experiment: Experiment) -> None:
     make(experiment.path.parent, "f g")
     page.goto(f"http://127.0.0.1:{served.port}/")

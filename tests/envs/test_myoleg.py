@@ -15,7 +15,8 @@ from msk_ray.envs import make_env
 from msk_ray.envs.legs.gait.body import world_axes
 from msk_ray.envs.myoleg.config import MyoLegSettings
 from msk_ray.envs.myoleg.env import MyoLeg
-from msk_ray.envs.myoleg.model import SUBSTEPS, Couplings, build_myoleg, find_model
+from msk_ray.envs.myoleg.model import SUBSTEPS, Couplings, build_myoleg
+from msk_ray.envs.myoleg.source import find_model
 from msk_ray.errors import ConfigError
 from msk_ray.gradcheck import check_chain, check_gradients, make_states
 from msk_ray.simulation import Simulation, StepState, TapePerSubstep

@@ -15,7 +15,8 @@ from msk_ray.config import PhysicsConfig, load_config
 from msk_ray.envs import make_env
 from msk_ray.envs.myosuite_walk.config import MyoSuiteWalkReward, MyoSuiteWalkSettings
 from msk_ray.envs.myosuite_walk.env import MyoSuiteWalk
-from msk_ray.envs.myosuite_walk.model import KEYFRAMES, build_myosuite_walk, find_file
+from msk_ray.envs.myosuite_walk.model import KEYFRAMES, build_myosuite_walk
+from msk_ray.envs.myosuite_walk.source import find_file
 from msk_ray.envs.records import EnvState
 from msk_ray.errors import ConfigError
 from msk_ray.gait.__main__ import main as gait

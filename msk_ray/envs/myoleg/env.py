@@ -16,7 +16,8 @@ from msk_ray.envs.legs.gait.body import world_axes
 from msk_ray.envs.legs.muscles import columns
 from msk_ray.envs.legs.root import Root
 from msk_ray.envs.myoleg.config import MyoLegSettings
-from msk_ray.envs.myoleg.model import Couplings, build_myoleg, cycle_states, find_model, ground_height
+from msk_ray.envs.myoleg.model import Couplings, build_myoleg, cycle_states, ground_height
+from msk_ray.envs.myoleg.source import find_model
 from msk_ray.simulation import StepState
 from msk_ray.simulation.tangent import quat_rotate
 
