@@ -24,6 +24,7 @@ class Hopper(MjcfEnv):
         reward: HopperReward = HopperReward()
 
     reward_names = ("forward", "upright", "effort", "impact")
+    without_gradient = ("impact",)
     mjcf = """
     <mujoco model="hopper"><option timestep=".005" integrator="implicitfast" cone="elliptic"/>
       <default><joint damping="1" armature=".02"/><geom contype="0" conaffinity="0" density="900" rgba=".8 .5 .2 1"/>
