@@ -34,6 +34,7 @@ class ProgressLine:
             # An algorithm from outside need not have it.
             f"reward {row['train/reward']:.3f}" if "train/reward" in row else "",
             self._score,
+            "not recorded: two to three times as slow" if row.get("train/unrecordable") else "",
             f"{format_duration(left)} left" if left is not None else "",
         ]
         text = "  ".join(filter(None, parts))

@@ -251,6 +251,8 @@ def _train(
             if waiting := _waiting(logdir):
                 announce(f"stopping: {waiting} to score first; a second Ctrl-C leaves that to --resume")
             trainer.score_waiting()
+        for remark in trainer.remarks():
+            print(printable(remark))
     if not trainer.finished:
         assert stop.signal is not None
         command = printable(resume_command)

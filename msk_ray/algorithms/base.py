@@ -132,6 +132,10 @@ class Algorithm(ABC):
         action: Tensor = self.network(obs)
         return action
 
+    def remarks(self) -> list[str]:
+        """What makes training worse or slower than it could be, a line on each, to be repeated when it ends."""
+        return []
+
     def note_state(self) -> None:
         """Let the witness, if there is one, note the worlds and everything that is saved as a module."""
         if self.witness is None:

@@ -85,6 +85,12 @@ class TrialReading:
         epochs = self.columns.get("epoch")
         return int(epochs[-1]) if epochs is not None and len(epochs) else 0
 
+    @property
+    def unrecordable(self) -> bool:
+        """Whether its last epoch ran operation by operation because it could not be recorded."""
+        column = self.columns.get("train/unrecordable")
+        return column is not None and len(column) > 0 and column[-1] == 1.0
+
     @cached_property
     def curve(self) -> tuple[np.ndarray, np.ndarray]:
         """Env steps and scores of the evaluations with a finite score, both (N,), including that of the untrained
@@ -309,6 +315,12 @@ class ExperimentReader:
             lines = describe_damages(damages, experiment.path)
             more = f"; and {len(lines) - _NOTED} more files" if len(lines) > _NOTED else ""
             warnings.append(f"Skipped: {count_damages(damages)}. {'; '.join(lines[:_NOTED])}{more}.")
+        if slow := [reading.trial.id for reading in readings if reading.unrecordable]:
+            more = f" and {len(slow) - _NOTED} more" if len(slow) > _NOTED else ""
+            warnings.append(
+                f"Epochs of {', '.join(slow[:_NOTED])}{more} could not be recorded as graphs, and took two to three "
+                f"times as long: their {OUTPUT_FILE} says why."
+            )
         return Reading(
             experiment,
             str(manifest.get("question") or (space.question.strip() if space else "")),

@@ -254,6 +254,10 @@ class Trainer(Place):
     def _write_config(self) -> None:
         write_bytes(self.logdir / "config.yaml", dump_yaml(self.config.as_dict()).encode())
 
+    def remarks(self) -> list[str]:
+        """What made training worse or slower than it could be, a line on each."""
+        return self.algorithm.remarks()
+
     def close(self) -> None:
         """Flush the logs."""
         self._log.close()
