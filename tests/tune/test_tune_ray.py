@@ -24,7 +24,7 @@ from stub_trainer import (
     StubTrainer,
 )
 
-from msk_ray.errors import ClusterLost, StorageFailure
+from msk_ray.errors import StorageFailure
 from msk_ray.experiment.attempts import Attempt, Reduced, read_attempt
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import read_rows
@@ -32,7 +32,6 @@ from msk_ray.experiment.outcomes import Outcome
 from msk_ray.sweep import opening
 from msk_ray.sweep.rules.stopping import StopSpec
 from msk_ray.sweep.trials import resolve_trials
-from msk_ray.tune import driver
 from msk_ray.tune.trial_run import Hooks, run_trial
 
 pytestmark = [pytest.mark.usefixtures("stub_session"), pytest.mark.long]
@@ -217,15 +216,3 @@ def test_a_driver_killed_after_the_decision_goes_on_with_half_the_worlds(make_sp
     assert outcomes([record]) == ["finished"]
     assert record.attempt == Attempt(Reduced(8, 4, "out_of_memory: made up", cleared=True)) == read_attempt(folder)
     assert [row["epoch"] for row in read_rows(folder)] == list(range(21))
-
-
-def test_a_dead_node_of_ones_own_ends_the_experiment_resumably(monkeypatch: pytest.MonkeyPatch) -> None:
-    node = driver._OwnNode()
-    monkeypatch.setattr(driver._OwnNode, "INTERVAL_S", 0.0)
-    node.on_step_end(0, [])
-    alive = driver.ray.nodes()
-    monkeypatch.setattr(driver.ray, "nodes", lambda: [{**facts, "Alive": False} for facts in alive])
-    with pytest.raises(ClusterLost, match="has died"):
-        node.on_step_end(1, [])
-    assert node.lost is not None
-    assert node.lost.exit_code == 75
