@@ -1,6 +1,7 @@
 """Real Ray, a trainer of milliseconds: faults, what has gone, and memory."""
 
 import json
+import re
 import threading
 from pathlib import Path
 from typing import Any
@@ -10,11 +11,15 @@ from needs import slow
 from stub_runs import go, outcomes
 from stub_trainer import (
     BEHAVIOUR,
+    BROKEN_CONNECTION,
     BUG,
     CROWD,
     DOOMED_CROWD,
+    EXIT,
+    EXIT_ZERO,
     FULL_DISK,
     HANG,
+    INTERRUPT,
     KILL,
     LATE_CROWD,
     MEMORY,
@@ -40,18 +45,29 @@ pytestmark = [pytest.mark.usefixtures("stub_session"), pytest.mark.long]
 def test_faults_are_named_and_killed_or_hung_trials_go_on(
     make_space: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    behaviours = [0.0, KILL, NAN, SIMULATION_ERROR, BUG, HANG]
+    behaviours = [0.0, KILL, NAN, SIMULATION_ERROR, BUG, HANG, EXIT, EXIT_ZERO, INTERRUPT, BROKEN_CONNECTION]
     space = make_space(
         parameters={BEHAVIOUR: {"grid": behaviours}},
         resources={"max_failures": 1, "hang_s": 3.0},
     )
     completed, records = go(space, tmp_path / "runs" / "faults")
     assert completed
-    assert outcomes(records) == ["finished", "finished", "nonfinite", "nonfinite", "error", "finished"]
-    assert [record.epochs_done for record in records] == [20, 20, 5, 4, 4, 20]
+    named = ["finished", "finished", "nonfinite", "nonfinite", "error", "finished", *["error"] * 3, "finished"]
+    assert outcomes(records) == named
+    assert [record.epochs_done for record in records] == [20, 20, 5, 4, 4, 20, 4, 4, 4, 20]
     assert "train/actor_loss is nan at epoch 5" in records[2].ending.why  # type: ignore[union-attr]
-    assert records[4].ending.why == "RuntimeError: made up"  # type: ignore[union-attr]
+    reasons = {4: "RuntimeError: made up", 6: "sys.exit(3) was called", 7: "sys.exit(0) was called"}
+    reasons[8] = "KeyboardInterrupt"
     shown = capsys.readouterr()
+    for index, reason in reasons.items():
+        record = records[index]
+        # Another process would meet it again.
+        assert processes_in(record.folder) == 1
+        why = record.ending.why  # type: ignore[union-attr]
+        assert re.fullmatch(rf"{re.escape(reason)} \(stub_trainer\.py:\d+, in _misbehave\)", why)
+        assert f"{record.trial.id} error: {why}; see {record.folder}" in shown.out
+        assert (record.folder / "error.txt").is_file()
+    assert f"{records[9].trial.id} ConnectionResetError: [Errno 104] made up; retrying" in shown.out
     assert "its process died (killed, or out of memory); retrying" in shown.out
     assert "raylet" not in shown.out + shown.err  # Ray's own notices are in ray.log
     assert "it hung; its stacks are in" in shown.out
