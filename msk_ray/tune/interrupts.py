@@ -7,7 +7,7 @@ control group (`timeout`, systemd, `kill -- -PGID`): trials are asked to save th
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 
 import ray
 
@@ -32,25 +32,28 @@ _LAST_POLL_S = 2.0
 @contextmanager
 def starting_ray() -> Iterator[None]:
     """For `ray.init`: the processes it starts do not receive the signals above, and this program's handlers are
-    restored.
+    restored. It is not interrupted: an exception between a `fork` and its end can leave a lock behind, or be lost.
 
     Raises:
         KeyboardInterrupt: this program was asked to stop in the meantime.
     """
     stop = current()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, KEPT_FROM_CHILDREN)
-    try:
-        yield
-    except SystemExit as error:
-        # Ray's own handler, installed at the start of `ray.init`, exits like this.
-        if stop is None or error.code != signal.SIGTERM:
-            raise
-        stop.receive(signal.SIGTERM)
-    finally:
-        if stop is not None:
-            stop.install()
-        # A signal that arrived in the meantime is handled now.
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    with nullcontext() if stop is None else stop.deferred():
+        try:
+            yield
+        except SystemExit as error:
+            # Ray's own handler, installed at the start of `ray.init`, exits like this.
+            if stop is None or error.code != signal.SIGTERM:
+                raise
+            stop.receive(signal.SIGTERM)
+        finally:
+            if stop is not None:
+                stop.install()
+            # A signal that arrived in the meantime is handled now.
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    if stop:
+        raise KeyboardInterrupt
 
 
 def end_ray(folder: SessionFolder | None, lost: bool = False, keep: bool = False) -> None:

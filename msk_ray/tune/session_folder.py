@@ -7,6 +7,7 @@ service files. So it gets a folder inside one that other users of the machine ca
 import fcntl
 import os
 import shutil
+import signal
 import stat
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from msk_ray.errors import StorageError
+from msk_ray.signals import NUMBERS
 from msk_ray.tune import cleanup
 
 VARIABLE = "RAY_TMPDIR"
@@ -81,15 +83,13 @@ class SessionFolder:
         self._cleanup.stdin = None
         try:
             code = self._cleanup.wait(_CLEANUP_LIMIT_S)
-        except subprocess.TimeoutExpired:
-            code = None
+        except subprocess.TimeoutExpired:  # somebody has stopped it
+            self._cleanup.kill()
+            code = self._cleanup.wait()
         if code:
-            # It was killed before its turn.
             cleanup.end_processes(self.path, {os.getpid()})
             if not keep:
                 shutil.rmtree(self.path, ignore_errors=True)
-        elif code is None:
-            print(f"processes of Ray did not end within {_CLEANUP_LIMIT_S:.0f} s; their files: {self.path}", flush=True)
         if self._before is None:
             os.environ.pop(VARIABLE, None)
         else:
@@ -197,11 +197,16 @@ def _remove_abandoned(parent: Path) -> None:
 
 def _start_cleanup(path: Path, lock: int) -> "subprocess.Popen[bytes]":
     """The process that cleans up; it keeps the lock, and imports nothing but the standard library."""
-    return subprocess.Popen(
-        [sys.executable, "-I", "-S", cleanup.__file__, str(path), str(os.getpid())],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        pass_fds=[lock],
-        cwd="/",
-    )
+    # It ignores signals, but not from its first moment on.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {*NUMBERS, signal.SIGTSTP})
+    try:
+        return subprocess.Popen(
+            [sys.executable, "-I", "-S", cleanup.__file__, str(path), str(os.getpid())],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            pass_fds=[lock],
+            cwd="/",
+        )
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

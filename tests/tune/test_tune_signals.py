@@ -225,6 +225,43 @@ def test_a_signal_while_the_report_is_written(start: Start, experiment: Experime
     assert has_ended_in_order(output, driver, experiment)
 
 
+def test_ctrl_c_twice_leaves_no_process(start: Start, experiment: Experiment) -> None:
+    driver = start()
+    wait_until(lambda: held(experiment), driver)
+    for pid in [pid for pid, name in members_of(driver.pid).items() if name == "ray::TrialActor"]:
+        os.kill(pid, signal.SIGSTOP)  # so that no trial has saved itself before the second one
+    os.kill(driver.pid, signal.SIGINT)
+    assert driver.stdout is not None
+    seen = ""
+    while "save themselves" not in seen:
+        seen += (line := driver.stdout.readline())
+        assert line, seen
+    os.kill(driver.pid, signal.SIGINT)
+    driver.wait()
+    # The driver has waited for them.
+    assert members_of(driver.pid) == {}
+    output = seen + driver.stdout.read()
+    assert driver.returncode == 130, output
+    assert output.endswith("interrupted\n")
+    assert "Traceback" not in output
+
+
+def test_the_start_of_ray_is_not_interrupted() -> None:
+    """An exception raised between a fork and its end once left the lock of `logging` behind."""
+    done = []
+
+    def start_ray() -> None:
+        with interrupts.starting_ray():
+            os.kill(os.getpid(), signal.SIGINT)
+            done.append(True)
+
+    with listening() as stop:
+        with pytest.raises(KeyboardInterrupt):
+            start_ray()
+        assert done
+        assert stop.signal is signal.SIGINT
+
+
 def test_rays_own_handler_is_heard_as_a_request() -> None:
     with listening() as stop, pytest.raises(KeyboardInterrupt), interrupts.starting_ray():
         sys.exit(signal.SIGTERM)
