@@ -10,6 +10,7 @@ import os
 import shlex
 import sys
 import time
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
@@ -138,11 +139,37 @@ def _module_of(program: Path) -> str | None:
     return None
 
 
+_at_once = False
+
+
+def end_at_once() -> None:
+    """Have `run` end this process itself, as something in it would wait for ever at the interpreter's end."""
+    global _at_once
+    _at_once = True
+
+
 def run(main: Callable[[Sequence[str] | None], int], argv: Sequence[str] | None = None) -> int:
     """Run an entry point: an error that the user can fix becomes one line on stderr and a non-zero exit code.
 
     In a program that listens to `signals`, a request to stop for which `main` had nothing to save ends it with 75.
     """
+    code = 1
+    try:
+        code = _run(main, argv)
+        return code
+    except Exception:
+        if _at_once:
+            traceback.print_exc()
+        raise
+    finally:
+        if _at_once:
+            for stream in (sys.stdout, sys.stderr):
+                with contextlib.suppress(OSError, ValueError):  # nobody reads it
+                    stream.flush()
+            os._exit(code)
+
+
+def _run(main: Callable[[Sequence[str] | None], int], argv: Sequence[str] | None) -> int:
     # `python -m` looks for modules in the current folder, a console script does not. A class that a configuration names
     # by import path must be found either way.
     if "" not in sys.path:

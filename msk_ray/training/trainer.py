@@ -345,7 +345,7 @@ class Trainer(Place):
             parameters: digest of the trial's modules then.
         """
         score = figures["score"]
-        if epoch > 0 and score > self.best_score:
+        if epoch > 0 and math.isfinite(score) and score > self.best_score:
             self.best_score = score
             facts = {"epoch": epoch, "best_score": score}
             write_checkpoint(self.best_checkpoint, state() | {"best_score": score}, facts)

@@ -16,7 +16,7 @@ from typing import Any
 from msk_ray.cli import TERMINAL_LOG, outliving, run
 from msk_ray.config import Config, combine, dump_yaml, parse_overrides
 from msk_ray.config.packages import require
-from msk_ray.errors import ConfigError, MskRayError
+from msk_ray.errors import ClusterLost, ConfigError, MskRayError
 from msk_ray.experiment.manifest import Experiment, own
 from msk_ray.experiment.outcomes import read_ending
 from msk_ray.experiment.trial import Trial
@@ -210,6 +210,9 @@ def _run(
             if stop.signal is None or stop.insisted:
                 raise
             return _stopped(stop, experiment)
+        except ClusterLost:
+            print(f"continue with: {printable(experiment.resume_command())}", flush=True)
+            raise
     return 1 if errors else 0
 
 

@@ -89,7 +89,9 @@ class Console:
             self.say(f"{trial.id} best so far{where}: score {run.best:.5g}{when}{self._suffix(trial)}")
 
     def retried(self, trial: Trial, why: str) -> None:
-        """A trial's process has ended early, and another one takes its place."""
+        """A trial's process has ended early, and another one will take its place."""
+        self._running.pop(trial.id, None)
+        self._waiting[trial.id] = trial
         self.say(f"{trial.id} {why}; retrying from its newest checkpoint")
 
     def attempted_again(self, trial: Trial, attempt: Attempt) -> None:

@@ -74,7 +74,7 @@ class Supervisor(Callback):
         return {}
 
     def waiting(self) -> int:
-        """How many trials have not started yet, as far as they are known."""
+        """How many trials are to start or to start again, as far as they are known."""
         return len(self._waiting)
 
     @property
@@ -113,6 +113,10 @@ class Supervisor(Callback):
     def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         if not self._meet_storage_failure(trial):
             mine = self._trial_of(trial.config)
+            # It has no process until Tune starts another one, which may take as long as the other trials.
+            self._attempts.pop(mine.id, None)
+            self._saving.discard(mine.id)
+            self._waiting.add(mine.id)
             self.console.retried(mine, self._reason(mine, trial))
 
     def on_trial_complete(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
@@ -121,7 +125,9 @@ class Supervisor(Callback):
         self._saving.discard(mine.id)
         before = self._attempts.pop(mine.id, None)
         ending, attempt = read_ending(folder), read_attempt(folder)
-        if ending is not None:
+        if ending is not None and ending.outcome is Outcome.ERROR and (folder / ERROR_FILE).is_file():
+            self.console.failed(mine, ending.why, folder)
+        elif ending is not None:
             self.console.ended(mine, ending)
         elif before is not None and attempt.number > before:
             self._waiting.add(mine.id)

@@ -88,6 +88,8 @@ def make_trainable(job: Job, resources: dict[str, float]) -> type[tune.Trainable
                 write_params(folder, config["params"])
             with _owned(folder, job):
                 in_frame_named(trial.label, lambda: work(trial, folder))
+        except _StoppedByTune:
+            sys.exit(0)  # how Tune ends the thread of a trial
         except Exception as error:
             # Whatever failed first on a full disk, perhaps a line of output: the driver must be told about the disk.
             # The same holds for a missing file when the whole folder is missing.
@@ -119,7 +121,10 @@ def make_trainable(job: Job, resources: dict[str, float]) -> type[tune.Trainable
 
             def on_evaluation(evaluation: Evaluation, ended: bool, trainer: TrainerLike) -> None:
                 with watch.suspended():
-                    report(evaluation, ended, trainer)
+                    try:
+                        report(evaluation, ended, trainer)
+                    except SystemExit as stopped:
+                        raise _StoppedByTune from stopped
 
             hooks = Hooks(
                 on_epoch=on_epoch,
@@ -145,6 +150,10 @@ def make_trainable(job: Job, resources: dict[str, float]) -> type[tune.Trainable
 
     TrialActor.__qualname__ = TrialActor.__name__
     return TrialActor
+
+
+class _StoppedByTune(BaseException):
+    """Tune has ended this trial, by `sys.exit`, which a trial's own code may call too."""
 
 
 def in_frame_named(name: str, call: Callable[[], None]) -> None:
