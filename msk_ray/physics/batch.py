@@ -20,6 +20,7 @@ from msk_ray.physics.overflow import LossWatch, cured, loss_error, needed
 from msk_ray.physics.pairs import widened
 from msk_ray.physics.parameters import check_names, open_arrays, structure
 from msk_ray.physics.sealed import ModelWatch, seal
+from msk_ray.physics.solver_limits import choose_limits, tell_raised
 from msk_ray.physics.stages import PACKAGE, ComposedStages, Kernels, PackageStages, Stages, dense, with_options
 
 
@@ -76,6 +77,8 @@ class WorldBatch:
         tolerance: solver tolerance, below mujoco_warp's floor of 1e-6 if wanted.
         contact_reach: distance [m] within which contacts are found before they touch, without any force.
         kernels: which kernels a step is made of.
+        iterations, ls_iterations: most iterations of the solver and of each line search; None: the model's, but at
+            least 100 and 50, with a warning where that is more.
 
     Attributes:
         mjm: the C MuJoCo model.
@@ -87,6 +90,7 @@ class WorldBatch:
         substeps: physics steps an env step.
         device: the Warp device.
         stages: launches of a step and of its parts.
+        limits: most iterations of the solver and of each line search.
         capacity: contacts and rows per world that fit into `data`.
         losses: what steps lost to full buffers; check it between steps.
         iterations: how many iterations the solver took in each substep.
@@ -96,6 +100,7 @@ class WorldBatch:
 
     Raises:
         UnsupportedModelError: mujoco_warp cannot load the model, or it has state outside (qpos, qvel, act).
+        ConfigError: a limit of the solver is below 1.
     """
 
     def __init__(
@@ -109,6 +114,8 @@ class WorldBatch:
         tolerance: float | None = None,
         contact_reach: float = 0.0,
         kernels: Kernels = PACKAGE,
+        iterations: int | None = None,
+        ls_iterations: int | None = None,
     ) -> None:
         check_state(mjm)
         check_ignored(mjm)
@@ -124,8 +131,11 @@ class WorldBatch:
         self.kernels = kernels
         self.structure = self._structure()
         self._tolerance = tolerance
+        self.limits = choose_limits(mjm, iterations, ls_iterations)
         self.stages: Stages
         self._model, self.stages = self._load(nworld)
+        if self._solves:
+            tell_raised(mjm, iterations, ls_iterations)
         self.unrolled_iterations: tuple[int, ...] | None = None
         self._watch = ModelWatch(mjm)
         self._given = capacity
@@ -138,6 +148,11 @@ class WorldBatch:
             model = dense(model)
         return widened(model, self._reach) if self._reach > 0.0 else model
 
+    @property
+    def _solves(self) -> bool:
+        """Whether there can be contacts or constraint rows."""
+        return geometric_bound(self.structure) != Capacity(0, 0)
+
     def _load(self, nworld: int) -> tuple[Any, Stages]:
         """mujoco_warp's copy of the model, sealed, and the launches of its step."""
         with wp.ScopedDevice(self.device):
@@ -148,12 +163,11 @@ class WorldBatch:
             if self._tolerance is not None:
                 # put_model clamps to 1e-6; the adjoint holds at the optimum only, so it may ask for less.
                 model.opt.tolerance = wp.array([self._tolerance], dtype=float)
+            model.opt.iterations, model.opt.ls_iterations = self.limits
             model.opt.warn_overflow = 0  # read back by `losses`, not printed from kernels
             model.ncam = model.nlight = 0  # nothing looks: two launches less a substep
-            if geometric_bound(self.structure) == Capacity(0, 0):
-                model.opt.disableflags |= (
-                    mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-                )  # nothing looks for rows that cannot be
+            if not self._solves:
+                model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT  # nothing looks for what cannot be
             open_arrays(self.mjm, model, self.parameters, nworld)
             stages = self._make_stages(model)
         seal(model, "batch.model")
@@ -278,7 +292,7 @@ class WorldBatch:
 
     def _limited(self, k: int, conditional: bool) -> Any:
         """The model with the iteration limit of substep k, with or without conditional graph nodes; the same arrays."""
-        limit = int(self.model.opt.iterations)
+        limit = self.model.opt.iterations
         if self.unrolled_iterations is not None:
             limit = min(self.unrolled_iterations[k], limit)
         conditional = conditional and bool(self.model.opt.graph_conditional)
