@@ -11,6 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from msk_ray.errors import ConfigError, UnsupportedModelError
+from msk_ray.physics.accepted import check_accepted
 from msk_ray.physics.capacity import UNKNOWN, Capacity, default_capacity, geometric_bound, scalar_rows
 from msk_ray.physics.fused import FusedSolver, check_fused
 from msk_ray.physics.graph import joined_stream
@@ -22,34 +23,6 @@ from msk_ray.physics.parameters import check_names, open_arrays, structure
 from msk_ray.physics.sealed import ModelWatch, seal
 from msk_ray.physics.solver_limits import choose_limits, tell_raised
 from msk_ray.physics.stages import PACKAGE, ComposedStages, Kernels, PackageStages, Stages, dense, with_options
-
-
-def check_state(model: mujoco.MjModel) -> None:
-    """Raise UnsupportedModelError where a step depends on more state than (qpos, qvel, act)."""
-    hidden = {
-        "actuator or sensor delay (nhistory > 0)": getattr(model, "nhistory", 0) > 0,
-        "plastic springs (nplastic > 0)": getattr(model, "nplastic", 0) > 0,
-        "sleeping (<flag sleep='enable'/>)": bool(model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP),
-    }
-    found = [name for name, present in hidden.items() if present]
-    if found:
-        raise UnsupportedModelError(
-            f"the model uses {', '.join(found)}: its step depends on state outside (qpos, qvel, act); "
-            "remove it from the model"
-        )
-
-
-def check_ignored(model: mujoco.MjModel) -> None:
-    """Raise UnsupportedModelError where mujoco_warp would step another model than C MuJoCo without a word."""
-    groups = np.asarray(model.actuator_group)
-    # C MuJoCo has a bit for each of 31 groups.
-    off = [u for u in range(len(groups)) if 0 <= groups[u] < 31 and model.opt.disableactuator >> int(groups[u]) & 1]
-    if off:
-        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, off[0]) or off[0]
-        raise UnsupportedModelError(
-            f"actuator {name} is in a group that option actuatorgroupdisable turns off, which mujoco_warp ignores: "
-            "remove such actuators from the model"
-        )
 
 
 def refresh_velocity(mjm: mujoco.MjModel, model: Any, data: Any) -> None:
@@ -99,7 +72,7 @@ class WorldBatch:
             iteration costs time even where no world needs it. None: the model's limit.
 
     Raises:
-        UnsupportedModelError: mujoco_warp cannot load the model, or it has state outside (qpos, qvel, act).
+        UnsupportedModelError: mujoco_warp cannot load the model, or would step it unlike C MuJoCo.
         ConfigError: a limit of the solver is below 1.
     """
 
@@ -117,8 +90,7 @@ class WorldBatch:
         iterations: int | None = None,
         ls_iterations: int | None = None,
     ) -> None:
-        check_state(mjm)
-        check_ignored(mjm)
+        check_accepted(mjm)
         if kernels.ordered:
             check_ordered(mjm)
         if kernels.fused_solver:
