@@ -233,7 +233,7 @@ FEATURES: tuple[Feature, ...] = (
         "contact with signed distance fields",
         False,
         pairs_of(None, EXACT_PAIRS | FIELD_PAIRS),
-        "the distance is a function of the user's, and the contact's place is where a search has ended",
+        "the contact's place is where a search has ended",
     ),
     Feature(
         "contact adhesion and surface velocity", False, _odd_surfaces, "slopes of these forces at contacts are missing"
