@@ -55,7 +55,7 @@ def fallen(mjm: mujoco.MjModel, worlds: int, substeps: int, device: str, steps: 
     Controls are at most 1 from zero; with a keyframe, at most 0.3 from the first one's, where the worlds start.
     """
     few = min(worlds, 64)
-    batch = WorldBatch(mjm, few, substeps, device, **own_limits(mjm)._asdict())
+    batch = WorldBatch(mjm, few, substeps, device, kernels=Kernels(**own_limits(mjm)._asdict()))
     qpos, middle, width = (mjm.key_qpos[0], mjm.key_ctrl[0], 0.3) if mjm.nkey else (mjm.qpos0, 0.0, 1.0)
     rng = np.random.default_rng(0)
     data = batch.data
@@ -139,7 +139,7 @@ def main() -> None:
                 launch = FusedSolver() if kernels.fused_solver else solve_ordered if kernels.ordered else mjw.solve
                 for limits in args.limits:
                     kept = own_limits(mjm)._asdict() if limits == "own" else {}
-                    batch = WorldBatch(mjm, worlds, substeps, args.device, kernels=kernels, **kept)
+                    batch = WorldBatch(mjm, worlds, substeps, args.device, kernels=kernels._replace(**kept))
                     row, end = measure(batch, start, launch, args.repeats)
                     wanted = end if wanted is None else wanted
                     said = " / ".join(str(limit) for limit in batch.limits)

@@ -80,8 +80,9 @@ class Env(ABC, Generic[SettingsT]):
             device,
             capacity=Capacity(physics.nconmax or 0, physics.njmax or 0),
             tolerance=physics.tolerance,
-            kernels=Kernels(physics.ordered, fused_solver=physics.solver_kernels == "fused"),
-            **self.solver_limits(self.model, physics),
+            kernels=Kernels(
+                physics.ordered, physics.solver_kernels == "fused", **self.solver_limits(self.model, physics)
+            ),
         )
         self.device = self.sim.device
         self.action_size = self.model.nu

@@ -175,6 +175,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
     # torch and Warp take seconds to load; a wrong command line should not wait for them.
     from msk_ray.gradcheck.check import GradientCheck, Limits, check_gradients, check_request
+    from msk_ray.physics import Kernels
     from msk_ray.physics.capacity import Capacity
     from msk_ray.physics.parameters import check_names, names_of
     from msk_ray.simulation import Simulation
@@ -200,8 +201,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             args.device,
             capacity=Capacity(args.nconmax or 0, args.njmax or 0),
             tolerance=args.solver_tolerance,
-            iterations=args.iterations or kept.get("iterations"),
-            ls_iterations=args.ls_iterations or kept.get("ls_iterations"),
+            kernels=Kernels(
+                iterations=args.iterations or kept.get("iterations"),
+                ls_iterations=args.ls_iterations or kept.get("ls_iterations"),
+            ),
         )
         pace = None if args.json else Pace("states", args.worlds * len(set(states)))
         result = check_gradients(sim, states=states, seed=args.seed, limits=limits, parameters=parameters, pace=pace)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from msk_ray.errors import UnsupportedModelError
+from msk_ray.physics import Kernels
 from msk_ray.physics.solver_limits import SolverLimits, own_limits
 from msk_ray.simulation import Simulation, StepState
 
@@ -25,7 +26,7 @@ class CSimulation(Simulation):
     """
 
     def __init__(self, model: mujoco.MjModel, substeps: int, limits: SolverLimits | None = None) -> None:
-        super().__init__(model, 1, substeps, None, "cpu", **(limits._asdict() if limits else {}))
+        super().__init__(model, 1, substeps, None, "cpu", kernels=Kernels(**(limits._asdict() if limits else {})))
         self.data = mujoco.MjData(model)
 
     def step(

@@ -49,9 +49,7 @@ class WorldBatch:
             else what a short probe in C MuJoCo needed and half as much again.
         tolerance: solver tolerance, below mujoco_warp's floor of 1e-6 if wanted.
         contact_reach: distance [m] within which contacts are found before they touch, without any force.
-        kernels: which kernels a step is made of.
-        iterations, ls_iterations: most iterations of the solver and of each line search; None: the model's, but at
-            least 100 and 50, with a warning where that is more.
+        kernels: which kernels a step is made of, and how many iterations its solver may take.
 
     Attributes:
         mjm: the C MuJoCo model.
@@ -87,8 +85,6 @@ class WorldBatch:
         tolerance: float | None = None,
         contact_reach: float = 0.0,
         kernels: Kernels = PACKAGE,
-        iterations: int | None = None,
-        ls_iterations: int | None = None,
     ) -> None:
         check_accepted(mjm)
         if kernels.ordered:
@@ -103,11 +99,11 @@ class WorldBatch:
         self.kernels = kernels
         self.structure = self._structure()
         self._tolerance = tolerance
-        self.limits = choose_limits(mjm, iterations, ls_iterations)
+        self.limits = choose_limits(mjm, kernels.iterations, kernels.ls_iterations)
         self.stages: Stages
         self._model, self.stages = self._load(nworld)
         if self._solves:
-            tell_raised(mjm, iterations, ls_iterations)
+            tell_raised(mjm, kernels.iterations, kernels.ls_iterations)
         self.unrolled_iterations: tuple[int, ...] | None = None
         self._watch = ModelWatch(mjm)
         self._given = capacity

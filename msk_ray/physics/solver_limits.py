@@ -53,7 +53,7 @@ def tell_raised(model: mujoco.MjModel, iterations: int | None, ls_iterations: in
     options = " ".join(f"--{name.replace('_', '-')} {getattr(own, name)}" for name in raised)
     warnings.warn(
         "the model may stop the constraint solver before it has converged, where gradients are wrong: it runs with "
-        f"{allowed}; to keep the model's own, write {settings} in a config, {arguments} in Simulation(...), "
-        f"{options} in gradcheck",
+        f"{allowed}; to keep the model's own, write {settings} in a config, "
+        f"kernels=Kernels({arguments}) in Python, {options} in gradcheck",
         stacklevel=1,
     )

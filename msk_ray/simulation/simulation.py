@@ -120,11 +120,10 @@ class Simulation:
         capacity: contacts and constraint rows per world. Where it is 0, a bound from the geometry if that is small,
             otherwise 1.5 times what a short probe in C MuJoCo needed, which grows with use.
         tolerance: solver tolerance, which may be below mujoco_warp's floor of 1e-6.
-        iterations, ls_iterations: most iterations of the constraint solver, and of each of its line searches. None: the
-            model's, but at least 100 and 50, with a warning where the model has fewer: gradients need a solver that has
-            converged.
         kernels: which kernels steps are made of: `Kernels(ordered=True)` adds everything up in a fixed order, so that a
-            GPU repeats steps and gradients bit for bit; `Kernels(fused_solver=True)` solves constraints in one launch.
+            GPU repeats steps and gradients bit for bit; `Kernels(fused_solver=True)` solves constraints in one launch;
+            `Kernels(iterations=1, ls_iterations=5)` stops the solver early. Otherwise it gets the model's limits of
+            iterations, but at least 100 and 50: gradients need a solver that has converged.
 
     The model must not be edited while the simulation exists; if it was, the next step or backward pass raises an error.
 
@@ -143,8 +142,6 @@ class Simulation:
         *,
         capacity: Capacity = UNKNOWN,
         tolerance: float | None = None,
-        iterations: int | None = None,
-        ls_iterations: int | None = None,
         kernels: Kernels = PACKAGE,
     ) -> None:
         if nworld < 1 or substeps < 1:
@@ -171,8 +168,6 @@ class Simulation:
             tolerance=tolerance,
             contact_reach=mode.contact_reach if mode is not None else 0.0,
             kernels=kernels,
-            iterations=iterations,
-            ls_iterations=ls_iterations,
         )
         self._stepper = Stepper(batch, mode)
 

@@ -301,7 +301,7 @@ class _Tape(Backward):
             f"the constraint solver stopped before it had converged in {share:.1%} of the substeps "
             "(physics/solver_unconverged_substeps), where gradients are wrong: raise physics.iterations (now "
             f"{limits.iterations}) and physics.ls_iterations (now {limits.ls_iterations}) or lower physics.tolerance "
-            f"(now {tolerance:g}); they are arguments of Simulation(...) too",
+            f"(now {tolerance:g}); in Python, kernels=Kernels(iterations=...) and tolerance of Simulation",
             stacklevel=4,
         )
 

@@ -6,7 +6,7 @@ import mujoco
 import pytest
 
 from msk_ray.errors import ConfigError
-from msk_ray.physics import WorldBatch
+from msk_ray.physics import Kernels, WorldBatch
 from msk_ray.physics.solver_limits import SolverLimits
 
 
@@ -24,8 +24,8 @@ def _limits(batch: WorldBatch) -> SolverLimits:
 def test_a_solver_that_stops_early_gets_more_iterations_and_says_so() -> None:
     said = (
         r"iterations 100 instead of 1 and ls_iterations 50 instead of 5; to keep the model's own, write "
-        r"physics\.iterations: 1 and physics\.ls_iterations: 5 in a config, iterations=1, ls_iterations=5 in "
-        r"Simulation\(\.\.\.\), --iterations 1 --ls-iterations 5 in gradcheck"
+        r"physics\.iterations: 1 and physics\.ls_iterations: 5 in a config, kernels=Kernels\(iterations=1, "
+        r"ls_iterations=5\) in Python, --iterations 1 --ls-iterations 5 in gradcheck"
     )
     model = _model('iterations="1" ls_iterations="5"')
     with pytest.warns(UserWarning, match=said) as found:
@@ -62,10 +62,10 @@ def test_nothing_is_said_of_limits_that_are_meant_or_without_effect(
 ) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert _limits(WorldBatch(_model(options, geom), 1, 1, "cpu", **given)) == expected
+        assert _limits(WorldBatch(_model(options, geom), 1, 1, "cpu", kernels=Kernels(**given))) == expected
 
 
 @pytest.mark.parametrize("name", ["iterations", "ls_iterations"])
 def test_a_limit_below_one_is_refused(name: str) -> None:
     with pytest.raises(ConfigError, match=f"{name} must be at least 1, not 0"):
-        WorldBatch(_model(""), 1, 1, "cpu", **{name: 0})
+        WorldBatch(_model(""), 1, 1, "cpu", kernels=Kernels(**{name: 0}))

@@ -13,6 +13,7 @@ from scenes import ant, ant_points, random_weights
 from msk_ray.algorithms.base import simulation_metrics
 from msk_ray.config import parse_config
 from msk_ray.envs.make import make_env
+from msk_ray.physics import Kernels
 from msk_ray.simulation import Simulation
 
 UNCONVERGED = r"constraint solver stopped before it had converged in .*%.*raise physics\.iterations \(now 1\)"
@@ -54,7 +55,7 @@ def test_a_model_that_stops_its_solver_early_has_the_gradient_of_the_converged_s
 def test_a_solver_that_has_not_converged_is_reported_once(mode: str) -> None:
     model = _hasty()
     points = ant_points(ant("elliptic"), 4, seed=1)
-    sim = Simulation(model, len(points), 2, mode, iterations=1, ls_iterations=5)
+    sim = Simulation(model, len(points), 2, mode, kernels=Kernels(iterations=1, ls_iterations=5))
     with pytest.warns(UserWarning, match=UNCONVERGED):
         _backward(sim, points)
     share = sim.diagnostics()["solver_unconverged_substeps"]
@@ -68,7 +69,7 @@ def test_a_solver_that_has_not_converged_is_reported_once(mode: str) -> None:
 
 def test_linearize_reports_it_too() -> None:
     points = ant_points(ant("elliptic"), 2, seed=1)
-    sim = Simulation(_hasty(), len(points), 2, iterations=1, ls_iterations=5)
+    sim = Simulation(_hasty(), len(points), 2, kernels=Kernels(iterations=1, ls_iterations=5))
     inputs = [torch.tensor(np.stack([getattr(p, n) for p in points]), dtype=torch.float32) for n in INPUTS]
     with pytest.warns(UserWarning, match=UNCONVERGED):
         sim.linearize(*inputs)
