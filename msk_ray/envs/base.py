@@ -22,6 +22,7 @@ from msk_ray.errors import ConfigError
 from msk_ray.group import ALONE, Group
 from msk_ray.physics import Kernels
 from msk_ray.physics.capacity import Capacity
+from msk_ray.physics.solver_limits import own_limits
 from msk_ray.simulation import Backward, Simulation, StepState
 from msk_ray.simulation.flags import known_none
 from msk_ray.simulation.kinematics import Frames, Kinematics, Names, as_named
@@ -57,6 +58,8 @@ class Env(ABC, Generic[SettingsT]):
     """Names of the T parts of the reward."""
     without_gradient: ClassVar[tuple[str, ...]] = ()
     """Names of those that are meant to have no gradient to state and action; others without one are warned of."""
+    keeps_iterations: ClassVar[bool] = False
+    """Whether the solver keeps to the iterations of the model that `build_model` returns, even if they are few."""
     begin_epoch_in_place: ClassVar[bool] = False
     """Whether `begin_epoch`, where a class has its own, only changes the contents of tensors."""
     Settings: ClassVar[type[EnvSettings]]
@@ -82,7 +85,9 @@ class Env(ABC, Generic[SettingsT]):
             device,
             capacity=Capacity(physics.nconmax or 0, physics.njmax or 0),
             tolerance=physics.tolerance,
-            kernels=Kernels(physics.ordered, fused_solver=physics.solver_kernels == "fused"),
+            kernels=Kernels(
+                physics.ordered, physics.solver_kernels == "fused", **self.solver_limits(self.model, physics)
+            ),
         )
         self.device = self.sim.device
         self.action_size = self.model.nu
@@ -106,6 +111,14 @@ class Env(ABC, Generic[SettingsT]):
     @abstractmethod
     def build_model(cls, config: SettingsT, physics: PhysicsConfig) -> mujoco.MjModel:
         """Compile the model that these settings describe."""
+
+    @classmethod
+    def solver_limits(cls, model: mujoco.MjModel, physics: PhysicsConfig) -> dict[str, int]:
+        """Limits of iterations that the solver of a model by `build_model` has to keep to, by their setting."""
+        own = own_limits(model)._asdict()
+        return {
+            name: limit for name, limit in own.items() if cls.keeps_iterations or getattr(physics, name) is not None
+        }
 
     @classmethod
     def reference_settings(cls, config: SettingsT) -> SettingsT:

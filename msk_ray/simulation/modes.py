@@ -7,7 +7,8 @@ from msk_ray.config import PhysicsConfig
 from msk_ray.errors import ConfigError
 from msk_ray.simulation.backward import Backward
 from msk_ray.simulation.fd_jacobian import FdJacobian
-from msk_ray.simulation.tape import Hybrid, TapeAll, TapePerSubstep
+from msk_ray.simulation.hybrid import Hybrid
+from msk_ray.simulation.tape import TapeAll, TapePerSubstep
 
 
 def _hybrid() -> Hybrid:

@@ -114,6 +114,13 @@ def _model(name: str = "Ball", **values: Any) -> mujoco.MjModel:
     return env_class(config.env).build_model(config.env, config.physics)
 
 
+@pytest.mark.filterwarnings("ignore:the model may stop the constraint solver")
+def test_iterations_of_the_file_are_raised_and_those_of_the_physics_section_kept(home: Path) -> None:
+    assert _make().sim.batch.limits == (100, 50)
+    assert _make(physics__iterations=33).sim.batch.limits == (33, 50)
+    assert _make(physics__iterations=200, physics__ls_iterations=9).sim.batch.limits == (200, 9)
+
+
 def test_options_are_the_files_unless_the_physics_section_says_otherwise(home: Path) -> None:
     model = _model()
     assert (model.opt.timestep, model.opt.iterations) == (pytest.approx(0.004), 33)

@@ -11,7 +11,8 @@ from msk_ray.physics import capacity
 from msk_ray.physics.capacity import Capacity
 from msk_ray.simulation import FdJacobian, Simulation
 from msk_ray.simulation.backward import Backward
-from msk_ray.simulation.tape import Hybrid, TapeAll, TapePerSubstep
+from msk_ray.simulation.hybrid import Hybrid
+from msk_ray.simulation.tape import TapeAll, TapePerSubstep
 
 MODES = {
     "tape_per_substep": TapePerSubstep,

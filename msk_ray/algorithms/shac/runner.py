@@ -261,7 +261,7 @@ class RecordedRunner(EagerRunner):
             return
         # Empty, if a batch with larger buffers has just taken the place of the one that the epoch ran in.
         counts = batch.iterations.read()
-        before, most = batch.unrolled_iterations, int(batch.mjm.opt.iterations)
+        before, most = batch.unrolled_iterations, batch.limits.iterations
         limits = before or (_FEWEST_ITERATIONS,) * batch.substeps
         # A trial that is resumed starts with an epoch that is not recorded, and must adapt as if it were.
         resumed = batch.ordered and before is not None

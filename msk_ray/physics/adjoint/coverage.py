@@ -51,5 +51,5 @@ def table() -> str:
     rows = ["| feature | tape_all, tape_per_substep | fd_jacobian | note |", "|---|---|---|---|"]
     for f in FEATURES:
         state = ("partly exact" if f.partly else "exact") if f.exact else "raises"
-        rows.append(f"| {f.name} | {state} | approximate | {f.note} |")
+        rows.append(f"| {f.name} | {state} | {'approximate' if f.steps else 'raises'} | {f.note} |")
     return "\n".join(rows)

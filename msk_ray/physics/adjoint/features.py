@@ -35,6 +35,8 @@ class Feature:
     """Whether some slopes are approximated, as the note says."""
     instead: str = ""
     """What to write in the model where it is refused."""
+    steps: bool = True
+    """Whether there is a step at all, which finite differences differentiate."""
 
 
 def _joint_type(*kinds: int) -> Finder:
@@ -231,7 +233,7 @@ FEATURES: tuple[Feature, ...] = (
         "contact with signed distance fields",
         False,
         pairs_of(None, EXACT_PAIRS | FIELD_PAIRS),
-        "the distance is a function of the user's, and the contact's place is where a search has ended",
+        "the contact's place is where a search has ended",
     ),
     Feature(
         "contact adhesion and surface velocity", False, _odd_surfaces, "slopes of these forces at contacts are missing"
@@ -342,5 +344,11 @@ FEATURES: tuple[Feature, ...] = (
         "flags diagexact, speculative, ipc", False, _odd_flags, "they change which constraints there are and their laws"
     ),
     Feature("flexes", False, option(lambda m: m.nflex > 0, "flex"), "soft bodies are not covered"),
-    Feature("plugins", False, option(lambda m: m.nplugin > 0, "plugin"), "they are programs of their own"),
+    Feature(
+        "plugins",
+        False,
+        option(lambda m: m.nplugin > 0, "plugin"),
+        "they are programs of their own, which mujoco_warp does not run",
+        steps=False,
+    ),
 )
