@@ -21,6 +21,7 @@ from msk_ray.physics.pairs import widened
 from msk_ray.physics.parameters import check_names, open_arrays, structure
 from msk_ray.physics.sealed import ModelWatch, seal
 from msk_ray.physics.stages import PACKAGE, ComposedStages, Kernels, PackageStages, Stages, dense, with_options
+from msk_ray.physics.standing import StandingCylinders, stands_on_planes
 
 
 def check_state(model: mujoco.MjModel) -> None:
@@ -155,6 +156,8 @@ class WorldBatch:
                     mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
                 )  # nothing looks for rows that cannot be
             open_arrays(self.mjm, model, self.parameters, nworld)
+            if stands_on_planes(self.structure):
+                model.callback.contactfilter = StandingCylinders(self.structure).launch
             stages = self._make_stages(model)
         seal(model, "batch.model")
         return model, stages
