@@ -82,7 +82,9 @@ def measure(model: mujoco.MjModel, args: argparse.Namespace) -> list[str]:
         except MskRayError as error:
             return [*sizes, "failed", "-", "-", "-", str(error)]
     partly = any("partly exact" in str(warning.message) for warning in caught)
-    return [*sizes, "partly exact" if partly else "exact", *_errors(report), _noteworthy(report)]
+    counted = report.diagnostics.get("approximated_share", 0.0) > 0.0
+    verdict = "partly exact" if partly else "approximated" if counted else "exact"
+    return [*sizes, verdict, *_errors(report), _noteworthy(report)]
 
 
 def _errors(report: GradientCheck) -> list[str]:

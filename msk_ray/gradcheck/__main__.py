@@ -324,7 +324,7 @@ def print_table(result: "GradientCheck", model: str, tolerance: float) -> None:
         pairs = f"{', '.join(result.approximated[:3])}{' …' if count > 3 else ''}"
         console.print(f"contacts only partly exact: {pairs} ({count} pair(s) may touch)", markup=False)
     if share := result.diagnostics.get("approximated_share", 0.0):
-        console.print(f"contacts without a derivative: that of the nearest law in {share:.1%} of the substeps")
+        console.print(f"approximated contacts, by the nearest law: in {share:.1%} of the substeps")
     if note := _unconverged(result):
         console.print(note, markup=False)
     for lost in result.nonfinite:

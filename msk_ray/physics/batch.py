@@ -23,6 +23,7 @@ from msk_ray.physics.parameters import check_names, open_arrays, structure
 from msk_ray.physics.sealed import ModelWatch, seal
 from msk_ray.physics.solver_limits import choose_limits, tell_raised
 from msk_ray.physics.stages import PACKAGE, ComposedStages, Kernels, PackageStages, Stages, dense, with_options
+from msk_ray.physics.standing import StandingCylinders, stands_on_planes
 
 
 def refresh_velocity(mjm: mujoco.MjModel, model: Any, data: Any) -> None:
@@ -137,6 +138,8 @@ class WorldBatch:
             if not self._solves:
                 model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT  # nothing looks for what cannot be
             open_arrays(self.mjm, model, self.parameters, nworld)
+            if stands_on_planes(self.structure):
+                model.callback.contactfilter = StandingCylinders(self.structure).launch
             stages = self._make_stages(model)
         seal(model, "batch.model")
         return model, stages

@@ -285,7 +285,7 @@ class _Tape(Backward):
         if count and "approximated" not in self._warned:
             self._warned.add("approximated")
             warnings.warn(
-                f"the gradient is approximate in {share:.1%} of the substeps (grad/approximated_share), where it goes "
+                f"the gradient is approximated in {share:.1%} of the substeps (grad/approximated_share), where it goes "
                 f"through contacts of {', '.join(pairs)}",
                 stacklevel=4,
             )

@@ -33,6 +33,8 @@ class Feature:
     """What is approximated or assumed, or why it is refused."""
     partly: bool = False
     """Whether some slopes are approximated, as the note says."""
+    counted: bool = False
+    """Whether single contacts may be approximated, each of which is counted."""
     instead: str = ""
     """What to write in the model where it is refused."""
     steps: bool = True
@@ -219,8 +221,9 @@ FEATURES: tuple[Feature, ...] = (
         "contact of plane, sphere, capsule, ellipsoid, cylinder, box, mesh, with each other",
         True,
         pairs_of(EXACT_PAIRS, set()),
-        "contacts without a derivative of their own (parallel edges, the side of a cylinder clipped by a face) get "
-        "that of the nearest law; `grad/approximated_share` counts how often",
+        "contacts without a derivative of their own (parallel edges, the side of a cylinder clipped by a face, a "
+        "cylinder upright on a plane) get that of the nearest law; `grad/approximated_share` counts how often",
+        counted=True,
     ),
     Feature(
         "contact of height fields with sphere, capsule, ellipsoid, cylinder, box, mesh",
@@ -228,6 +231,7 @@ FEATURES: tuple[Feature, ...] = (
         pairs_of(FIELD_PAIRS, set()),
         "exact for each triangle that touches; what lies flat on a triangle, or has sunk into it beyond its sides, has "
         "no derivative of its own and is counted as above",
+        counted=True,
     ),
     Feature(
         "contact with signed distance fields",
