@@ -23,7 +23,7 @@ def nonfinite_observation(env: Env[Any], observations: Tensor, epoch: int, done:
         return None
     step, world, entry = place
     layout = env.observation_layout()
-    name = f"entry {entry}" if layout is None else f"entry {entry} ({layout[entry].name})"
+    name = f"entry {entry}" + (f" ({layout[entry].name})" if layout and entry < len(layout) else "")
     return SimulationError(
         f"nonfinite_observation: {name} of observe is {float(observations[place])} in world {world} before env step "
         f"{done + step + 1} of epoch {epoch + 1}; look for {_CAUSES}",
