@@ -46,6 +46,7 @@ class Env(ABC, Generic[SettingsT]):
         group: the processes that the trial's worlds are spread over; here are those of this one.
     """
 
+    state: EnvState
     group: Group = ALONE
     policies: int = 1
     """Number of policies that act side by side, each in an equal part of the worlds, for which the same is drawn."""
@@ -101,11 +102,7 @@ class Env(ABC, Generic[SettingsT]):
         self._reached: StepState | None = None
         self._measured: dict[str, tuple[StepState, bool, Any]] = {}
         self._contract = Contract(self)
-        with self._contract.during("prepare"):
-            self.prepare()
-        with self._contract.during(self._contract.start):
-            self.state = self.reset_state()
-        self._contract.rehearse()
+        self._contract.begin()
 
     @classmethod
     @abstractmethod
@@ -463,8 +460,3 @@ class Env(ABC, Generic[SettingsT]):
 def _where(worlds: Tensor, chosen: Tensor, others: Tensor) -> Tensor:
     """Rows (W, n) of `chosen` in the given worlds (W,), else of `others`."""
     return torch.where(worlds[:, None], chosen, others) if others.shape[1] else others
-
-
-def wrap_angle(angle: Tensor) -> Tensor:
-    """The same angle [rad] in [-π, π)."""
-    return torch.remainder(angle + math.pi, 2.0 * math.pi) - math.pi

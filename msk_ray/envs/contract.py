@@ -54,6 +54,18 @@ class Contract:
         self._name = type(env).__qualname__
         self._generators = GlobalGenerators(env.device)
 
+    def begin(self) -> None:
+        """Prepare the environment, draw the initial states of its worlds, and rehearse.
+
+        Raises:
+            ConfigError: as for `rehearse`.
+        """
+        with self.during("prepare"):
+            self._env.prepare()
+        with self.during(self.start):
+            self._env.state = self._env.reset_state()
+        self.rehearse()
+
     def rehearse(self) -> None:
         """Call every method once, in the initial state, and check what it gives; take `obs_size` from the observation
         where the class does not set it. Nothing that is drawn later changes.
