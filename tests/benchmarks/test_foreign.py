@@ -14,7 +14,7 @@ EXACT = {
     "mismatches": 0,
     "nonfinite": 0,
     "errors": [1e-5, 2e-4],
-    "rounding": 0.0,
+    "doubts": [0.0, 0.0],
     "approximated_share": 0.0,
     "solver_unconverged_share": 0.0,
     "solver_residual_max": 1e-6,
@@ -39,15 +39,16 @@ def foreign(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         (OFF, [], "WRONG"),
         (OFF, ["the model may stop the solver: it runs with iterations 100 instead of 1"], "WRONG"),
         (OFF | {"approximated_share": 0.25}, [], "counted"),
-        (OFF | {"rounding": 0.1}, [], "rounding"),
-        (OFF | {"rounding": 0.1, "nonfinite": 1}, [], "WRONG"),
+        (OFF | {"doubts": [0.0, 0.5]}, [], "rounding"),
+        (OFF | {"doubts": [0.0, 0.5], "nonfinite": 1}, [], "WRONG"),
+        (OFF | {"doubts": [0.0, 0.2]}, [], "WRONG"),
         (OFF | {"solver_residual_max": 0.1}, [], "rounding"),
         (OFF | UNSOLVED, [], "WRONG"),
         (OFF | UNSOLVED, [SAID], "told"),
         (OFF, [SAID], "WRONG"),
-        (UNSOLVED | {"checked": 0, "mismatches": 2, "errors": []}, [], "WRONG"),
-        (UNSOLVED | {"checked": 0, "mismatches": 2, "errors": []}, [SAID], "told"),
-        ({"checked": 0, "kinks": 2, "errors": []}, [], "not compared"),
+        (UNSOLVED | {"checked": 0, "mismatches": 2, "errors": [], "doubts": []}, [], "WRONG"),
+        (UNSOLVED | {"checked": 0, "mismatches": 2, "errors": [], "doubts": []}, [SAID], "told"),
+        ({"checked": 0, "kinks": 2, "errors": [], "doubts": []}, [], "not compared"),
     ],
 )
 def test_verdicts(foreign: dict[str, Any], figures: dict[str, Any], told: list[str], verdict: str) -> None:
@@ -94,6 +95,15 @@ def test_a_file_that_is_included_may_be_in_another_folder(foreign: dict[str, Any
     assert "ball.xml" in foreign["compiled"](path, foreign["Files"]([tmp_path / "scene"]))
     model = foreign["compiled"](path, foreign["Files"]([tmp_path]))
     assert (model.nv, model.ngeom) == (6, 2)
+
+
+def test_only_what_floats_stands_on_a_floor(foreign: dict[str, Any], tmp_path: Path) -> None:
+    """One through the base of a hand would clamp it."""
+    path = tmp_path / "hand.xml"
+    path.write_text(BALL.format("", 'size=".1"'))
+    assert foreign["compiled"](path, foreign["Files"]([])).ngeom == 2
+    path.write_text(BALL.format("", 'size=".1"').replace("<freejoint/>", '<joint axis="0 1 0"/>'))
+    assert foreign["compiled"](path, foreign["Files"]([])).ngeom == 1
 
 
 def test_models_that_differ_in_the_solver_only_are_two(foreign: dict[str, Any]) -> None:
