@@ -164,18 +164,10 @@ def measured(model: mujoco.MjModel, args: argparse.Namespace) -> Row:
         except UnsupportedModelError as error:
             return row | {"verdict": "refused", "note": str(error).partition(". ")[0]}
         except MskRayError as error:
-<<<<<<< HEAD
-            return [*sizes, "failed", "-", "-", "-", str(error)]
-    partly = any("partly exact" in str(warning.message) for warning in caught)
-    counted = report.diagnostics.get("approximated_share", 0.0) > 0.0
-    verdict = "partly exact" if partly else "approximated" if counted else "exact"
-    return [*sizes, verdict, *_errors(report), _noteworthy(report)]
-=======
             return row | {"verdict": "failed", "note": str(error)}
         kinds = {kind: _at(sim, kind, args.bound) for kind in args.states}
     told = sorted({str(warning.message) for warning in caught if issubclass(warning.category, UserWarning)})
     return row | {"kinds": kinds, "told": told} | judged(kinds, told, args.bound)
->>>>>>> foreign
 
 
 def _at(sim: Simulation, kind: str, bound: float) -> Row:
