@@ -9,7 +9,6 @@ from msk_ray.config.algorithms import (
     PerturbedCopies,
     PpoConfig,
     ShacConfig,
-    check_installed,
 )
 from msk_ray.config.environments import ENVIRONMENTS, settings_class
 from msk_ray.config.horizons import AdaptiveHorizon, ContactHorizon, HorizonSchedule
@@ -36,7 +35,7 @@ from msk_ray.config.schema import (
     TrialConfig,
 )
 from msk_ray.config.sections import EnvSettings, Reward
-from msk_ray.config.yaml_text import dump_yaml, parse_yaml, read_yaml
+from msk_ray.config.yaml_text import dump_yaml, parse_settings, parse_yaml, read_yaml
 
 __all__ = [
     "ALGORITHMS",
@@ -65,7 +64,6 @@ __all__ = [
     "Reward",
     "ShacConfig",
     "TrialConfig",
-    "check_installed",
     "combine",
     "current_key",
     "current_values",
@@ -83,6 +81,7 @@ __all__ = [
     "parse_override",
     "parse_overrides",
     "parse_recorded",
+    "parse_settings",
     "parse_yaml",
     "read_config",
     "read_yaml",

@@ -12,7 +12,8 @@ from msk_ray.config.algorithms import BUILT_IN, settings_from_outside
 from msk_ray.config.environments import settings_class
 from msk_ray.config.overlay import leaves, merge, overlay, parse_overrides
 from msk_ray.config.recorded import current_settings, env_name
-from msk_ray.config.schema import RECORDED, Config
+from msk_ray.config.schema import Config
+from msk_ray.config.sections import RECORDED, SHOWN
 from msk_ray.config.unread import unread_settings
 from msk_ray.config.yaml_text import read_yaml
 from msk_ray.errors import ConfigError, brief, shortened
@@ -31,19 +32,23 @@ def parse_config(data: Mapping[str, Any], source: str = "config") -> Config:
         raise ConfigError(f"{source}: {describe_fault(error, named=_named(data))}") from None
 
 
-def parse_recorded(data: Mapping[str, Any], source: str) -> Config:
+def parse_recorded(data: Mapping[str, Any], source: str, *, shown: bool = False) -> Config:
     """The configuration in a trial's files, written by this version or an earlier one.
 
     Settings that nothing read then, and that are refused now, get their defaults.
+
+    Args:
+        shown: it is only shown: of a class that cannot be found here (`Config.undeclared`), take what is recorded.
 
     Raises:
         ConfigError: as for `parse_config`.
     """
     settings = current_settings(data, env_name(data)) if isinstance(data, Mapping) else data
     try:
-        config = Config.model_validate(settings, context=RECORDED)
+        config = Config.model_validate(settings, context=SHOWN if shown else RECORDED)
         unread = {key: default for key, _, default in unread_settings(config)}
-        return Config.model_validate(overlay(config.as_dict(), unread)) if unread else config
+        context = SHOWN if shown else None
+        return Config.model_validate(overlay(config.as_dict(), unread), context=context) if unread else config
     except ValidationError as error:
         raise ConfigError(f"{source}: {describe_fault(error, named=_named(settings))}") from None
 
@@ -158,7 +163,7 @@ def describe_fault(
     elif first["type"] == "value_error":
         text = str(first["ctx"]["error"]) if "ctx" in first else first["msg"]
     elif first["type"] == "missing":
-        text = f"{where}: missing"
+        text = f"{where}: missing; write it"
     else:
         text = f"{where}: {first['msg']}, not {brief(first['input'])}"
     more = len(faults) - 1

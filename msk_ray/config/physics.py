@@ -78,9 +78,10 @@ class PhysicsConfig(Section):
     tolerance: PositiveFloat | None = None
     """Constraint solver tolerance; mujoco_warp's default is 1e-6."""
     iterations: Count | None = None
-    """Constraint solver iteration limit."""
+    """Constraint solver iteration limit; null: that of the environment, for a model from a file its own but at least
+    100."""
     ls_iterations: Count | None = None
-    """Line search iteration limit."""
+    """Line search iteration limit; null: likewise, but at least 50."""
     solver_kernels: Literal["mujoco_warp", "fused"] = "mujoco_warp"
     """Kernels of the constraint solver. `fused` is one for all iterations of Newton's method, with a warp for each
     world: for models of up to 60 degrees of freedom. The results differ by rounding."""

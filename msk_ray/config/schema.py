@@ -21,10 +21,11 @@ from msk_ray.config.algorithms import (
     ShacConfig,
     ignored_settings,
 )
-from msk_ray.config.environments import settings_class
-from msk_ray.config.loggers import LOGGERS
+from msk_ray.config.environments import UndeclaredEnv, settings_class
+from msk_ray.config.loggers import LOGGERS, logger_paths
+from msk_ray.config.packages import require
 from msk_ray.config.physics import PhysicsConfig, Vec5
-from msk_ray.config.sections import Count, EnvSettings, Section, Text, Whole
+from msk_ray.config.sections import RECORDED, SHOWN, Count, EnvSettings, Section, Text, Undeclared, Whole
 from msk_ray.config.unread import unread_settings
 from msk_ray.errors import ConfigError, brief
 
@@ -36,6 +37,8 @@ def _declared_settings(value: Any, info: ValidationInfo) -> Any:
     try:
         settings = settings_class(value.get("name"))
     except ConfigError as error:
+        if info.context == SHOWN:
+            return UndeclaredEnv.because(str(error), value)
         raise ValueError(str(error)) from error
     return settings.model_validate(value, context=info.context)
 
@@ -171,17 +174,15 @@ class TrialConfig(Section):
 
     @field_validator("loggers")
     @classmethod
-    def _known_loggers(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+    def _known_loggers(cls, names: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
+        if info.context == SHOWN:
+            return names
         try:
             for name in names:
                 LOGGERS.path(name)
         except ConfigError as error:
             raise ValueError(str(error)) from error
         return names
-
-
-RECORDED = "recorded"
-"""Context of validation in which settings that nothing reads are accepted, because earlier versions allowed them."""
 
 
 class Config(Section):
@@ -207,10 +208,25 @@ class Config(Section):
             return section
         return self.algorithm.settings
 
+    def check_installed(self) -> None:
+        """Refuse settings that need packages, or a model, that are not on this machine. Loads none of them.
+
+        Raises:
+            ConfigError: the message names what to install.
+        """
+        require(self.algorithm_settings.packages, f"algorithm.name: {self.algorithm.name}")
+        logger_paths(self.trial.loggers)
+        self.env.check_installed()
+
     @property
     def algorithm_section(self) -> str:
         """The section of those settings, dotted."""
         return self.algorithm.name if self.algorithm.name in BUILT_IN else "algorithm.settings"
+
+    @property
+    def undeclared(self) -> str:
+        """Why the class of its environment, or of its algorithm, cannot be found; empty if both are there."""
+        return next((s.why for s in (self.env, self.algorithm_settings) if isinstance(s, Undeclared)), "")
 
     @property
     def ignored(self) -> list[str]:
@@ -228,6 +244,8 @@ class Config(Section):
     @model_validator(mode="after")
     def _physics_fits_env(self) -> "Config":
         variants = self.env.variants
+        if isinstance(self.env, UndeclaredEnv):
+            return self
         for field, name in (("physics.variant", self.physics.variant), ("evaluation.variant", self.evaluation.variant)):
             if name is not None and name not in variants:
                 known = f"write one of {', '.join(variants)}" if variants else "leave it out"
@@ -283,7 +301,7 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _everything_is_read(self, info: ValidationInfo) -> "Config":
-        if info.context != RECORDED:
+        if info.context not in (RECORDED, SHOWN):
             for key, why, _ in unread_settings(self):
                 raise ValueError(f"{key}: {why} leave it out")
         return self

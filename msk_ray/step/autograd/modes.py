@@ -8,7 +8,8 @@ from msk_ray.step.errors import ConfigError
 from msk_ray.config import PhysicsConfig
 from msk_ray.step.autograd.backward import Backward
 from msk_ray.step.autograd.fd_jacobian import FdJacobian
-from msk_ray.step.autograd.tape import Hybrid, TapeAll, TapePerSubstep
+from msk_ray.step.autograd.hybrid import Hybrid
+from msk_ray.step.autograd.tape import TapeAll, TapePerSubstep
 
 
 def _hybrid() -> Hybrid:

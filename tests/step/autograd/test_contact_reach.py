@@ -7,8 +7,8 @@ import torch
 
 from msk_ray.config import PhysicsConfig
 from msk_ray.step import Simulation, TapeAll, TapePerSubstep
+from msk_ray.step.autograd.hybrid import Hybrid
 from msk_ray.step.autograd.modes import configured_backward
-from msk_ray.step.autograd.tape import Hybrid
 
 REACH = 0.05
 SHAPES = {"sphere": "size='.1'", "mesh": "type='mesh' mesh='wedge'", "ellipsoid": "type='ellipsoid' size='.1 .1 .1'"}
