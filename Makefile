@@ -9,7 +9,7 @@ PYTEST := OMP_NUM_THREADS=1 $(RUN) -m pytest --dist loadfile
 # Whatever people read; tests misspell on purpose.
 PROSE   := README.md CONTRIBUTING.md Makefile benchmarks cluster configs docs msk_ray policies tune_spaces
 
-.PHONY: help env demo test test-fast test-all check unit gpu-test site notebooks bench clean
+.PHONY: help env demo test test-fast test-all check unit gpu-test gpu-test-all site notebooks bench clean
 
 help:                ## this list
 	@grep -hE '^[a-z-]+: .*##|^[a-z-]+:  *##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 14
@@ -31,10 +31,10 @@ demo: env            ## a real small Ray Tune sweep (GPU if there is one), endin
 test: check unit     ## everything that CI runs
 
 test-fast: env       ## the short tests, before every commit: two minutes on two cores
-	$(PYTEST) -n 2 -m 'not gpu and not slow and not long'
+	$(PYTEST) -n 2 -m 'not gpu and not gpu_slow and not slow and not long'
 
 test-all: check      ## `test`, and tests that take long and repeat a shorter one with other values
-	$(PYTEST) -n $(WORKERS) --no-loadscope-reorder -m 'not gpu'
+	$(PYTEST) -n $(WORKERS) --no-loadscope-reorder -m 'not gpu and not gpu_slow'
 
 check: env           ## formatting, lint, spelling, layers and types
 	$(VENV)/bin/ruff format --check .
@@ -46,8 +46,11 @@ check: env           ## formatting, lint, spelling, layers and types
 unit: env            ## the tests that need no GPU, in as many processes as WORKERS says
 	$(PYTEST) -n $(WORKERS) --no-loadscope-reorder
 
-gpu-test: env        ## the tests that need a CUDA device
-	$(RUN) -m pytest -m gpu
+gpu-test: env        ## the tests that need a CUDA device, within ten minutes
+	$(RUN) -m pytest -m gpu --durations 20
+
+gpu-test-all: env    ## these, and those that take minutes and repeat one with other settings
+	$(RUN) -m pytest -m 'gpu or gpu_slow' --durations 20
 
 site: env            ## the documentation site, in build/site
 	NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --strict --quiet --config-file docs/site/mkdocs.yml

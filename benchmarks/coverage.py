@@ -1,4 +1,4 @@
-"""Every model of some PyPI packages: is its gradient exact, partly exact or refused, and how large is its error?
+"""Every model of some PyPI packages: is its gradient exact, approximated or refused, and how large is its error?
 
 Reads all MJCF files of the packages named in GROUPS and compiles those that are whole models with degrees of freedom;
 myo_sim also composes models in Python, which are read from its registry. Equal models count once. The packages are only
@@ -131,6 +131,8 @@ def row_of(group: str, name: str, model: mujoco.MjModel, args: argparse.Namespac
     if not refused and model.nv <= args.largest:
         begin = time.process_time()
         row["errors"] = {str(n): errors_at(model, n, args) for n in args.substeps}
+        if verdict == "exact" and any(found["approximated_share"] for found in row["errors"].values()):
+            row["verdict"] = "approximated"
         row["seconds"] = round(time.process_time() - begin, 1)
     return row
 
@@ -171,7 +173,7 @@ def _worst(row: dict[str, Any], substeps: int) -> str:
 def tables(rows: list[dict[str, Any]], substeps: list[int]) -> str:
     """Shares by group, what is refused and how often, and every model."""
     models = [row for row in rows if row["verdict"] not in ("no model", "twice")]
-    verdicts = ("exact", "partly exact", "refused")
+    verdicts = ("exact", "approximated", "partly exact", "refused")
     shares = []
     for group in (*GROUPS, None):
         own = [row for row in models if group in (row["group"], None)]

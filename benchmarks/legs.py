@@ -20,7 +20,7 @@ from record import RESULTS, markdown_table, publish
 from msk_ray.config import Config, load_config
 from msk_ray.envs import make_env
 from msk_ray.errors import ConfigError
-from msk_ray.legs.myoleg.model import find_model
+from msk_ray.legs.myoleg.source import find_model
 from msk_ray.step.autograd.capture import Recording
 
 MODELS = {"myoleg26": ("configs/myoleg26.yaml", "env.assist.epochs=0"), "myolegs": ("configs/myoleg.yaml",)}

@@ -21,7 +21,7 @@ import urllib.error
 import urllib.parse
 import urllib.request
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,12 +29,13 @@ from typing import Any
 from record import markdown_table, publish
 
 from msk_ray.config import dump_yaml
+from msk_ray.tune.session_folder import PREFIX
 
 ROOT = Path(__file__).resolve().parent.parent
 DASHBOARD = ROOT / "cluster" / "grafana" / "dashboards" / "msk_ray.json"
 CONFIG = ROOT / "cluster" / "prometheus.yml"
 RAY_FOLDER = "/tmp/ray"
-"""Where Ray keeps its files unless RAY_TMPDIR says otherwise, as `CONFIG` has it."""
+"""Where the Ray of a cluster keeps its files, as `CONFIG` has it."""
 PAUSE_S = 2.0
 LASTING_S = 60.0
 """Panels must still show something after this time [s]: Ray drops gauges that are not set again."""
@@ -163,6 +164,15 @@ def ask_until_all_answer(
     raise SystemExit(f"after {limit_s:.0f} s, empty: {', '.join(empty) or 'none, but not every trial has one state'}")
 
 
+def ray_files(folder: Path, driver: "subprocess.Popen[bytes]") -> Path:
+    """Where the sweep's Ray keeps its files."""
+    while not (found := list(folder.glob(f"{PREFIX}*/ray"))):
+        if driver.poll() is not None:
+            raise SystemExit(f"the sweep ended with {driver.returncode}")
+        time.sleep(PAUSE_S)
+    return found[0]
+
+
 def shows(values: list[float]) -> bool:
     """Whether a panel shows these as something."""
     return bool(values) and all(map(math.isfinite, values))
@@ -178,11 +188,10 @@ def main() -> int:
         print("error: prometheus is not installed: apt install prometheus", file=sys.stderr)
         return 2
     # Below /tmp because Ray's sockets lie there, whose paths may have 107 bytes.
-    with tempfile.TemporaryDirectory(prefix="stack_", dir="/tmp") as top:
+    with tempfile.TemporaryDirectory(prefix="st_", dir="/tmp") as top:
         folder, port = Path(top), free_port()
         text = CONFIG.read_text()
         assert RAY_FOLDER in text
-        (folder / "prometheus.yml").write_text(text.replace(RAY_FOLDER, f"{top}/ray"))
         scraper = [
             path,
             f"--config.file={folder / 'prometheus.yml'}",
@@ -190,7 +199,11 @@ def main() -> int:
             f"--web.listen-address=127.0.0.1:{port}",
         ]
         sweep_log, log = folder / "sweep.log", folder / "prometheus.log"
-        with program(sweep(folder), sweep_log, RAY_TMPDIR=top) as driver, program(scraper, log):
+        with ExitStack() as stack:
+            driver = stack.enter_context(program(sweep(folder), sweep_log, RAY_TMPDIR=top))
+            files = ray_files(folder, driver)
+            (folder / "prometheus.yml").write_text(text.replace(RAY_FOLDER, str(files)))
+            stack.enter_context(program(scraper, log))
             prometheus = Prometheus(port)
             try:
                 found = ask_until_all_answer(prometheus, driver, args.limit)

@@ -111,6 +111,30 @@ def muscle_arms(arms: int = 4) -> mujoco.MjModel:
     )
 
 
+def quadruped() -> mujoco.MjModel:
+    """A walking robot as large as a Go1 (nv 18) that stops its solver early, as models made for MJX do."""
+    legs = "".join(
+        f"""<body pos="{0.188 * x} {0.047 * y} 0"><inertial pos="0 0 0" mass=".68" diaginertia="5e-4 5e-4 5e-4"/>
+        <joint name="roll{i}" axis="1 0 0" range="-.86 .86"/><body pos="0 {0.08 * y} 0">
+        <inertial pos="0 0 -.03" mass="1" diaginertia="5e-3 5e-3 9e-4"/>
+        <joint name="hip{i}" axis="0 1 0" range="-.69 4.5"/><body pos="0 0 -.213">
+        <inertial pos="0 0 -.1" mass=".2" diaginertia="3e-3 3e-3 4e-5"/>
+        <joint name="knee{i}" axis="0 1 0" range="-2.8 -.89"/>
+        <geom size=".023" pos="0 0 -.213" contype="0" conaffinity="1" solimp=".9 .95 .023"/></body></body></body>"""
+        for i, (x, y) in enumerate([(1, 1), (-1, 1), (-1, -1), (1, -1)])
+    )
+    motors = "".join(f'<position joint="{j}{i}" kp="35"/>' for i in range(4) for j in ("roll", "hip", "knee"))
+    pose = 4 * "0 .9 -1.8 "
+    return mujoco.MjModel.from_xml_string(
+        f"""<mujoco><compiler autolimits="true"/><option timestep=".004" iterations="1" ls_iterations="5">
+        <flag eulerdamp="disable"/></option><default><joint damping=".5" armature=".005" frictionloss=".1"/></default>
+        <worldbody><geom type="plane" size="9 9 1" priority="1" friction=".6"/>
+        <body pos="0 0 .28"><freejoint/><inertial pos="0 0 0" mass="5.2" diaginertia=".017 .06 .065"/>{legs}</body>
+        </worldbody><actuator>{motors}</actuator>
+        <keyframe><key qpos="0 0 .278 1 0 0 0 {pose}" ctrl="{pose}"/></keyframe></mujoco>"""
+    )
+
+
 def heap(shape: str) -> mujoco.MjModel:
     """Six free bodies dropped into a tray of boxes: boxes, or meshes of 400 corners."""
     spread = np.random.default_rng(0).normal(size=(400, 3))

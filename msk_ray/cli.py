@@ -1,19 +1,22 @@
 """Helpers shared by the command-line entry points."""
 
 import argparse
+import bdb
 import contextlib
+import difflib
 import errno
 import io
 import os
 import shlex
 import sys
 import time
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 from msk_ray import signals
-from msk_ray.errors import MskRayError, StorageFailure, brief
+from msk_ray.errors import MskRayError, StorageFailure, brief, shortened
 from msk_ray.text import printable
 
 TERMINAL_LOG = "terminal.log"
@@ -46,10 +49,23 @@ class Parser(argparse.ArgumentParser):
             epilog=f"examples:\n{examples}",
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
+        self._words: list[str] = []
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        self._words = list(sys.argv[1:] if args is None else args)
+        return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
         """Print what is wrong with the command line, on one line that is safe for a terminal, and exit with 2."""
-        super().error(printable(message))
+        # argparse would first name what it misses because of an option that it does not know.
+        heads = [word.partition("=")[0] for word in self._words if word.startswith("--") and word != "--"]
+        options = [option for option in self._option_string_actions if option.startswith("--")]
+        for head in heads:
+            if not any(option.startswith(head) for option in options):
+                near = difflib.get_close_matches(head, options, n=1)
+                message = f"no option {shortened(head)}" + (f"; did you mean {near[0]}?" if near else "")
+                break
+        self.exit(2, f"error: {printable(message)} (all options: {self.prog} --help)\n")
 
 
 def typed_command(argv: Sequence[str], *more: str) -> str:
@@ -63,7 +79,58 @@ def typed_command(argv: Sequence[str], *more: str) -> str:
         words = ["python", "-m", module]
     else:
         words = ["python", program.name] if program.suffix == ".py" else [program.name]
-    return shlex.join([*words, *argv[1:], *(option for option in more if option not in argv)])
+    return shell_join([*words, *argv[1:], *(option for option in more if option not in argv)])
+
+
+def shell_join(words: Sequence[str]) -> str:
+    """Words as one types them into a shell, all of them visible."""
+    return " ".join(_quoted(word) for word in words)
+
+
+def option_value(words: Sequence[str], option: str) -> str | None:
+    """The value of a long option among the words of a command line, also abbreviated; the last one counts."""
+    value = None
+    for place, word in enumerate(words):
+        head, separator, attached = word.partition("=")
+        if _means(head, option):
+            value = attached if separator else next(iter(words[place + 1 :]), None)
+    return value
+
+
+def with_option(words: Sequence[str], option: str, value: str) -> list[str]:
+    """The words of a command line with another value for a long option, where it was or at their end."""
+    changed, rest, place = [], iter(words), None
+    for word in rest:
+        head, separator, _ = word.partition("=")
+        if not _means(head, option):
+            changed.append(word)
+            continue
+        place = len(changed) if place is None else place
+        if not separator:
+            next(rest, None)
+    place = len(changed) if place is None else place
+    return [*changed[:place], option, value, *changed[place:]]
+
+
+def _means(word: str, option: str) -> bool:
+    """Whether a word is an option, or as much of it as argparse needs to tell it from others."""
+    return len(word) > len("--x") and option.startswith(word)
+
+
+def _quoted(word: str) -> str:
+    r"""A word as a shell reads it. What cannot be seen is written as bash and zsh do: `$'a\x1bb'`."""
+    if word.isprintable():
+        return shlex.quote(word)
+    return f"$'{''.join(_escaped(character) for character in word)}'"
+
+
+def _escaped(character: str) -> str:
+    """A character between `$'` and `'`."""
+    if character.isprintable() and character not in "'\\":
+        return character
+    # Python keeps a byte that is not UTF-8 as half a character.
+    kept = "surrogateescape" if "\udc80" <= character <= "\udcff" else "surrogatepass"
+    return "".join(f"\\x{byte:02x}" for byte in character.encode(errors=kept))
 
 
 def _module_of(program: Path) -> str | None:
@@ -81,11 +148,37 @@ def _module_of(program: Path) -> str | None:
     return None
 
 
+_at_once = False
+
+
+def end_at_once() -> None:
+    """Have `run` end this process itself, as something in it would wait for ever at the interpreter's end."""
+    global _at_once
+    _at_once = True
+
+
 def run(main: Callable[[Sequence[str] | None], int], argv: Sequence[str] | None = None) -> int:
     """Run an entry point: an error that the user can fix becomes one line on stderr and a non-zero exit code.
 
     In a program that listens to `signals`, a request to stop for which `main` had nothing to save ends it with 75.
     """
+    code = 1
+    try:
+        code = _run(main, argv)
+        return code
+    except Exception:
+        if _at_once:
+            traceback.print_exc()
+        raise
+    finally:
+        if _at_once:
+            for stream in (sys.stdout, sys.stderr):
+                with contextlib.suppress(OSError, ValueError):  # nobody reads it
+                    stream.flush()
+            os._exit(code)
+
+
+def _run(main: Callable[[Sequence[str] | None], int], argv: Sequence[str] | None) -> int:
     # `python -m` looks for modules in the current folder, a console script does not. A class that a configuration names
     # by import path must be found either way.
     if "" not in sys.path:
@@ -103,6 +196,9 @@ def run(main: Callable[[Sequence[str] | None], int], argv: Sequence[str] | None 
             print(f"stopped by {stop.signal.name}", file=sys.stderr)
             return signals.RESUMABLE
         print("interrupted", file=sys.stderr)
+        return 130
+    except bdb.BdbQuit:
+        print("quit at a breakpoint", file=sys.stderr)
         return 130
     except BrokenPipeError:
         # The reader of our output, such as `head`, has exited.

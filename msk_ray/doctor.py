@@ -306,7 +306,7 @@ def check_ray(limit_s: float = RAY_LIMIT_S) -> Finding:
             process.wait()
             return Finding(
                 "ray",
-                f"did not start within {limit_s:.0f} s: look into /tmp/ray/session_latest/logs; "
+                f"did not start within {limit_s:.0f} s: look into ~/.ray/latest/session_latest/logs; "
                 "a proxy, a firewall on 127.0.0.1 or a full /tmp are common causes",
                 True,
             )

@@ -1,26 +1,138 @@
-"""Write files completely or not at all, and check that folders are writable."""
+"""Read and write regular files only, within limits, and completely or not at all; check that folders are writable.
+
+A folder of experiments may come from anywhere: where a file should be, there may be a pipe or a device, which would
+block a reader for good or fill its memory, or a link to a file that is nobody's business.
+"""
 
 import contextlib
+import errno
 import json
 import os
 import socket
+import stat
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from msk_ray.errors import StorageError, StorageFailure
 
 STALE_S = 3600.0
 """Age [s] after which a temporary file counts as abandoned by its writer."""
 _PART = ".part"
+_TAIL = 1 << 16
+"""Bytes in which the last lines of a file are looked for."""
+_KINDS = {
+    stat.S_IFIFO: "a pipe",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFDIR: "a folder",
+    stat.S_IFLNK: "a symbolic link",
+    stat.S_IFSOCK: "a socket",
+}
+
+
+class UnusableFile(ValueError):
+    """What has a file's name is no regular file, or too large to be read. The message says which."""
+
+
+def open_file(path: Path, *, follow: bool = False) -> BinaryIO:
+    """A regular file, opened for reading; nothing else can block or be read.
+
+    Args:
+        follow: open what a symbolic link leads to, where a user names the file.
+
+    Raises:
+        UnusableFile: it is something else.
+        OSError: it does not exist, or cannot be opened.
+    """
+    return os.fdopen(_open(path, os.O_RDONLY, follow), "rb")
+
+
+def read_file(path: Path, limit: int, *, follow: bool = False) -> bytes:
+    """The content of a regular file.
+
+    Args:
+        limit: bytes that it may have.
+        follow: read what a symbolic link leads to, where a user names the file.
+
+    Raises:
+        UnusableFile: it is something else, or larger.
+        OSError: it does not exist, or cannot be read.
+    """
+    with open_file(path, follow=follow) as file:
+        if os.fstat(file.fileno()).st_size <= limit:
+            data = file.read(limit + 1)  # it may grow meanwhile
+            if len(data) <= limit:
+                return data
+    raise UnusableFile(f"larger than {_in_words(limit)}")
+
+
+def last_lines(path: Path, count: int) -> list[str]:
+    """The last lines of a text file, however large it is; what is not UTF-8 is replaced.
+
+    Raises:
+        UnusableFile: it is no regular file.
+        OSError: it does not exist, or cannot be read.
+    """
+    with open_file(path) as file:
+        file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL))
+        return file.read(_TAIL).decode("utf-8", errors="replace").splitlines()[-count:]
+
+
+def append_text(path: Path, text: str, *, sync: bool = False) -> None:
+    """Add text to a regular file, which is created if there is none.
+
+    Args:
+        sync: return only when it would survive a loss of power.
+
+    Raises:
+        StorageFailure: the disk is full, or something else has the file's name.
+    """
+    try:
+        with os.fdopen(_open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, False), "ab") as file:
+            file.write(text.encode())
+            file.flush()
+            if sync:
+                os.fsync(file.fileno())
+    except OSError as error:
+        raise StorageFailure(f"cannot write {path}: {error.strerror or error}") from error
+    except UnusableFile as error:
+        raise StorageFailure(f"cannot write {path}: {error}") from error
+
+
+def _open(path: Path, flags: int, follow: bool) -> int:
+    """A descriptor of a regular file. Opening does not wait for another end, as a pipe's would."""
+    flags |= os.O_NONBLOCK | os.O_CLOEXEC | (0 if follow else os.O_NOFOLLOW)
+    try:
+        descriptor = os.open(path, flags, 0o644)
+    except OSError as error:
+        if error.errno in (errno.ELOOP, errno.ENXIO, errno.ENODEV, errno.EISDIR):
+            _check_regular(os.lstat(path).st_mode)
+        raise
+    try:
+        _check_regular(os.fstat(descriptor).st_mode)
+    except UnusableFile:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+def _check_regular(mode: int) -> None:
+    if not stat.S_ISREG(mode):
+        raise UnusableFile(f"{_KINDS.get(stat.S_IFMT(mode), 'something')} instead of a regular file")
+
+
+def _in_words(size: int) -> str:
+    return f"{size >> 20} MiB" if size >= 1 << 20 else f"{size} bytes"
 
 
 def make_folder(path: Path) -> None:
     """Create a folder and its parents if they do not exist, and check that files can be written to it.
 
     Raises:
-        StorageError: it cannot be created or written to.
+        StorageError: it cannot be created or written to, or its path is not UTF-8.
     """
+    _check_text(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -32,14 +144,25 @@ def check_writable(path: Path) -> None:
     """Check a folder by writing a file: permissions alone do not reveal full disks or read-only mounts.
 
     Raises:
-        StorageError: the folder cannot be written to or does not exist.
+        StorageError: the folder cannot be written to or does not exist, or its path is not UTF-8.
     """
+    _check_text(path)
     probe = path / f".probe.{socket.gethostname()}.{os.getpid()}"
     try:
         probe.write_bytes(b"0" * 4096)
         probe.unlink()
     except OSError as error:
         raise _cannot_write(path, error) from error
+
+
+def _check_text(path: Path) -> None:
+    """Refuse a folder whose path is not text: libraries that write below it would fail once the work has begun."""
+    try:
+        str(path.absolute()).encode()
+    except UnicodeEncodeError:
+        raise StorageError(
+            f"cannot write to {path}: its path is not UTF-8; rename it, or choose another folder"
+        ) from None
 
 
 def _cannot_write(path: Path, error: OSError) -> StorageError:

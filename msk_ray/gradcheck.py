@@ -103,6 +103,17 @@ def parser() -> Parser:
         metavar="T",
         help="tolerance of Warp's solver (default: the model's)",
     )
+    for option, what in (
+        ("--iterations", "iterations of Warp's solver"),
+        ("--ls-iterations", "those of a line search"),
+    ):
+        p.add_argument(
+            option,
+            type=_positive(int),
+            metavar="N",
+            help=f"most {what} (default: the model's, at least {'50' if 'ls' in option else '100'}; a trial's .yaml: "
+            "the trial's)",
+        )
     p.add_argument(
         "--forward-tolerance",
         type=_positive(float),
@@ -124,8 +135,8 @@ def _listed(text: str) -> list[str]:
     return [word.strip() for word in text.split(",") if word.strip()]
 
 
-def load_model(path: Path) -> "mujoco.MjModel":
-    """Compile a model file.
+def load_model(path: Path) -> "tuple[mujoco.MjModel, dict[str, int]]":
+    """Compile a model file; with it, limits of iterations that a trial's solver has to keep to.
 
     Raises:
         ConfigError: MuJoCo does not accept it.
@@ -137,11 +148,13 @@ def load_model(path: Path) -> "mujoco.MjModel":
         from msk_ray.envs import env_class
 
         config = load_config(path)
-        return env_class(config.env).build_model(config.env, config.physics)
+        env = env_class(config.env)
+        model = env.build_model(config.env, config.physics)
+        return model, env.solver_limits(model, config.physics)
     try:
         if path.suffix == ".mjb":
-            return mujoco.MjModel.from_binary_path(str(path))
-        return mujoco.MjModel.from_xml_path(str(path))
+            return mujoco.MjModel.from_binary_path(str(path)), {}
+        return mujoco.MjModel.from_xml_path(str(path)), {}
     except (ValueError, mujoco.FatalError) as error:
         raise ConfigError(f"MuJoCo cannot load {path}: {' '.join(str(error).split())}") from error
 
@@ -161,14 +174,14 @@ def main(argv: Sequence[str] | None = None) -> int:
             f"{args.substeps} substep(s), by {args.mode}; {COMPILING}"
         )
     # torch and Warp take seconds to load; a wrong command line should not wait for them.
-    from msk_ray.step import Simulation
+    from msk_ray.step import Kernels, Simulation
     from msk_ray.step.autograd.modes import make_backward
     from msk_ray.step.check.check import GradientCheck, Limits, check_gradients, check_request
     from msk_ray.step.forward.capacity import Capacity
     from msk_ray.step.forward.parameters import check_names, names_of
 
     backward = make_backward(args.mode)
-    model = load_model(args.model)
+    model, kept = load_model(args.model)
     if args.integrator is not None:
         from msk_ray.envs.options import INTEGRATORS
 
@@ -187,6 +200,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             args.device,
             capacity=Capacity(args.nconmax or 0, args.njmax or 0),
             tolerance=args.solver_tolerance,
+            kernels=Kernels(
+                iterations=args.iterations or kept.get("iterations"),
+                ls_iterations=args.ls_iterations or kept.get("ls_iterations"),
+            ),
         )
         pace = None if args.json else Pace("states", args.worlds * len(set(states)))
         result = check_gradients(sim, states=states, seed=args.seed, limits=limits, parameters=parameters, pace=pace)
@@ -201,7 +218,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print_table(result, str(args.model), args.tolerance)
     if not result.checked and not result.nonfinite:
         raise ConfigError(
-            f"nothing could be compared: {_excluded(result)}; try other --states, more --worlds or --forward-tolerance"
+            f"nothing could be compared: {_excluded(result)}; "
+            + (_unconverged(result) or "try other --states, more --worlds or --forward-tolerance")
         )
     return 0 if result.max_rel_error <= args.tolerance else 1
 
@@ -256,6 +274,17 @@ def _excluded(result: "GradientCheck") -> str:
     )
 
 
+def _unconverged(result: "GradientCheck") -> str:
+    """What to change where the solver has not converged; empty where it has."""
+    if not result.unconverged:
+        return ""
+    return (
+        f"the solver had not converged in {result.diagnostics['solver_unconverged_substeps']:.1%} of the substeps, "
+        f"where gradients are wrong: raise --iterations (now {result.limits.iterations}) and --ls-iterations (now "
+        f"{result.limits.ls_iterations}) or lower --solver-tolerance"
+    )
+
+
 def print_table(result: "GradientCheck", model: str, tolerance: float) -> None:
     """Print one row per kind of state and input, over the states compared."""
     import numpy as np
@@ -294,7 +323,9 @@ def print_table(result: "GradientCheck", model: str, tolerance: float) -> None:
         pairs = f"{', '.join(result.approximated[:3])}{' …' if count > 3 else ''}"
         console.print(f"contacts only partly exact: {pairs} ({count} pair(s) may touch)", markup=False)
     if share := result.diagnostics.get("approximated_share", 0.0):
-        console.print(f"contacts without a derivative: that of the nearest law in {share:.1%} of the substeps")
+        console.print(f"approximated contacts, by the nearest law: in {share:.1%} of the substeps")
+    if note := _unconverged(result):
+        console.print(note, markup=False)
     for lost in result.nonfinite:
         console.print(f"non-finite: {lost}", markup=False)
     verdict = "ok" if result.max_rel_error <= tolerance else "above the tolerance"

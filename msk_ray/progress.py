@@ -10,10 +10,10 @@ from msk_ray.text import printable
 class ProgressLine:
     """Shows epoch, speed, scores and time left: updated in place on a terminal, a line every ten seconds elsewhere."""
 
-    def __init__(self, epochs: int, done: int) -> None:
+    def __init__(self, epochs: int) -> None:
         self._epochs = epochs
-        self._first = done
-        self._start = time.monotonic()
+        self._first: tuple[int, float] | None = None
+        """The first epoch shown, and when: the time before it includes compilation."""
         self._last_line = -1e9
         self._terminal = sys.stdout.isatty()
         self._score = ""
@@ -22,7 +22,10 @@ class ProgressLine:
         """Show a row of metrics."""
         epoch = int(row["epoch"])
         now = time.monotonic()
-        left = (now - self._start) / max(1, epoch - self._first) * (self._epochs - epoch)
+        if self._first is None:
+            self._first = epoch, now
+        ran, since = epoch - self._first[0], now - self._first[1]
+        left = since / ran * (self._epochs - epoch) if ran else None
         if SCORE in row:
             best = f" (best {row[BEST_SCORE]:.1f})" if BEST_SCORE in row else ""
             self._score = f"eval {row[SCORE]:.1f}{best}"
@@ -32,7 +35,8 @@ class ProgressLine:
             # An algorithm from outside need not have it.
             f"reward {row[REWARD]:.3f}" if REWARD in row else "",
             self._score,
-            f"{format_duration(left)} left",
+            "not recorded: two to three times as slow" if row.get("train/unrecordable") else "",
+            f"{format_duration(left)} left" if left is not None else "",
         ]
         text = "  ".join(filter(None, parts))
         if self._terminal:

@@ -85,6 +85,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser().parse_args(argv)
     overrides = [*args.overrides, *([] if args.seed is None else [f"trial.seed={args.seed}"])]
     config = load_config(args.config, overrides)
+    config.check_installed()
     logdir = args.logdir or Path("runs") / "train" / f"{args.config.stem}_seed{config.trial.seed}"
     _check_logdir(logdir, args.resume)
     logdir = logdir.resolve()
@@ -169,6 +170,7 @@ def train(
     """
     if not isinstance(config, Config):
         raise ConfigError(f"config must be a Config, not {type(config).__name__}: write msk_ray.load_config(...)")
+    config.check_installed()
     folder = Path(logdir)
     _check_logdir(folder, resume)
     with owned(folder.resolve(), force) as ownership:
@@ -237,7 +239,7 @@ def _train(
         print(f"resumed from {path}" if path else "no complete checkpoint yet: starting from the beginning")
     if trainer.together > 1:
         print(f"policies are scored {trainer.together} at a time, after two minutes at most (or --score-at-once)")
-    progress = ProgressLine(config.trial.epochs, trainer.epoch)
+    progress = ProgressLine(config.trial.epochs)
     # However it ends, loggers write out the rows that they still hold.
     with stop.deferred(), closing(trainer):
         while not trainer.finished and not stop:
@@ -250,6 +252,8 @@ def _train(
             if waiting := _waiting(logdir):
                 announce(f"stopping: {waiting} to score first; a second Ctrl-C leaves that to --resume")
             trainer.score_waiting()
+        for remark in trainer.remarks():
+            print(printable(remark))
     if not trainer.finished:
         assert stop.signal is not None
         command = printable(resume_command)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from needs import need_program
+from needs import need_cpu_kernels, need_program, need_what_caused
 from processes import Launcher
 
 from msk_ray import signals
@@ -39,6 +39,52 @@ BASE = {
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Files with tests of minutes, which mostly wait, come first: beside them there is room for the many short ones."""
     items.sort(key=lambda item: item.path.parent.name not in ("plugin", "tune"))
+
+
+class _Module(pytest.Module):
+    """A file of tests, which are skipped by name where a package is missing that the file imports."""
+
+    def _getobj(self) -> Any:
+        try:
+            return super()._getobj()  # type: ignore[no-untyped-call]
+        except self.CollectError as error:
+            need_what_caused(error)
+            raise
+
+
+def pytest_pycollect_makemodule(module_path: Path, parent: pytest.Collector) -> pytest.Module:
+    return _Module.from_parent(parent, path=module_path)
+
+
+def pytest_addoption(parser: pytest.Parser, pluginmanager: pytest.PytestPluginManager) -> None:
+    """A machine with a GPU may lack the plugin that ends hanging tests; its settings are known all the same."""
+    if not pluginmanager.hasplugin("timeout"):
+        parser.addini("timeout", "read by pytest-timeout, which is not installed")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if not config.pluginmanager.hasplugin("timeout"):
+        config.addinivalue_line("markers", "timeout: read by pytest-timeout, which is not installed")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_setup(item: pytest.Item) -> Iterator[None]:
+    """A fixture that imports a package that is missing skips its tests by name."""
+    try:
+        return (yield)
+    except Exception as error:
+        need_what_caused(error)
+        raise
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
+    """So does a test."""
+    try:
+        return (yield)
+    except Exception as error:
+        need_what_caused(error)
+        raise
 
 
 @pytest.fixture
@@ -141,7 +187,13 @@ def make_space(tmp_path: Path, space_data: dict[str, Any]) -> MakeSpace:
 
 
 @pytest.fixture(scope="session")
-def sweep(tmp_path_factory: pytest.TempPathFactory) -> Experiment:
+def cpu_kernels() -> None:
+    """Physics on the CPU, also for a test that compares a GPU with it."""
+    need_cpu_kernels()
+
+
+@pytest.fixture(scope="session")
+def sweep(cpu_kernels: None, tmp_path_factory: pytest.TempPathFactory) -> Experiment:
     """A real small sweep of CartPole, two rates by two seeds, trained here one after the other. Not to be changed."""
     from msk_ray.training import Trainer
 
@@ -166,7 +218,7 @@ def sweep(tmp_path_factory: pytest.TempPathFactory) -> Experiment:
 
 
 @pytest.fixture(scope="session")
-def ant_trial(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def ant_trial(cpu_kernels: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of an ant's trial of one epoch. Not to be changed."""
     from msk_ray.training import Trainer
 
@@ -178,7 +230,7 @@ def ant_trial(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def myoleg26_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def myoleg26_checkpoint(cpu_kernels: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A checkpoint of the leg model before any training."""
     from msk_ray.training import Trainer
 

@@ -1,5 +1,6 @@
 """Commands as one would type them again."""
 
+import bdb
 import errno
 import os
 import subprocess
@@ -58,6 +59,14 @@ def test_an_error_is_one_harmless_line(capsys: pytest.CaptureFixture[str]) -> No
     with pytest.raises(SystemExit):
         Parser("x", "", "").parse_args(["\x1b[2J"])
     assert "\x1b" not in capsys.readouterr().err
+
+
+def test_leaving_the_debugger_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    def main(argv: Sequence[str] | None) -> int:
+        raise bdb.BdbQuit
+
+    assert run(main) == 130
+    assert capsys.readouterr().err == "quit at a breakpoint\n"
 
 
 def test_what_may_not_be_read_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:

@@ -29,8 +29,31 @@ def test_they_speak_before_torch_is_loaded() -> None:
 
 
 def test_progress_needs_no_more_of_a_row_than_every_algorithm_has(capsys: pytest.CaptureFixture[str]) -> None:
-    ProgressLine(1, 0).show({"epoch": 1, "env_steps": 8, "seconds": 0.1, "env_steps_per_s": 1234.5})
-    assert capsys.readouterr().out == "epoch 1/1  1,234 env steps/s  0s left\n"
+    ProgressLine(1).show({"epoch": 1, "env_steps": 8, "seconds": 0.1, "env_steps_per_s": 1234.5})
+    assert capsys.readouterr().out == "epoch 1/1  1,234 env steps/s\n"
+
+
+def test_the_time_left_is_told_without_the_compilation(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """42 s for the first epoch, of which 40 are compilation, and then 2 s each."""
+    now = [0.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    line = ProgressLine(40)
+    for epoch in range(1, 8):
+        now[0] = 40.0 + 2.0 * epoch
+        line.show({"epoch": epoch, "env_steps_per_s": 1.0})
+    assert capsys.readouterr().out.splitlines() == [
+        "epoch 1/40  1 env steps/s",
+        "epoch 6/40  1 env steps/s  1m08s left",
+    ]
+
+
+def test_progress_says_that_epochs_could_be_faster(capsys: pytest.CaptureFixture[str]) -> None:
+    row = {"epoch": 1, "env_steps": 8, "seconds": 0.1, "env_steps_per_s": 1234.5, "train/unrecordable": 1.0}
+    ProgressLine(1, 0).show(row)
+    line = capsys.readouterr().out
+    assert line == "epoch 1/1  1,234 env steps/s  not recorded: two to three times as slow  0s left\n"
 
 
 @pytest.mark.long

@@ -4,7 +4,9 @@ import json
 import subprocess
 import sys
 
+import mujoco
 import pytest
+from scenes import ant
 
 from msk_ray.cli import run
 from msk_ray.gradcheck import main
@@ -101,7 +103,9 @@ def test_contacts_without_a_derivative_are_counted(tmp_path, capsys, height, sha
     run(main, [str(path), "--states", "standing", "--worlds", "2", "--json"])
     assert json.loads(capsys.readouterr().out)["diagnostics"]["approximated_share"] == share
     run(main, [str(path), "--states", "standing", "--worlds", "2"])
-    assert (f"that of the nearest law in {share:.1%} of the substeps" in capsys.readouterr().out) == (share > 0.0)
+    assert (
+        f"approximated contacts, by the nearest law: in {share:.1%} of the substeps" in capsys.readouterr().out
+    ) == (share > 0.0)
 
 
 def test_json(cartpole_file):
@@ -211,3 +215,19 @@ def test_parameters_are_compared_too(cartpole_file, capsys):
     assert all(any(name in row for row in rows) for name in ("body_mass", "actuator_gear"))
     assert run(main, [str(cartpole_file), *FAST, "--parameters", "bodymass"]) == 2
     assert "did you mean body_mass?" in capsys.readouterr().err
+
+
+def test_a_solver_that_has_not_converged_is_the_reason_that_nothing_could_be_compared(tmp_path, capsys):
+    path = tmp_path / "hasty.xml"
+    model = ant("elliptic")
+    model.opt.iterations, model.opt.ls_iterations = 1, 5
+    mujoco.mj_saveLastXML(str(path), model)
+    command = [str(path), "--worlds", "2", "--states", "standing"]
+    with pytest.warns(UserWarning, match="--iterations 1 --ls-iterations 5 in gradcheck"):
+        assert run(main, command) == 0
+    assert "had not converged" not in capsys.readouterr().out
+    with pytest.warns(UserWarning, match="stopped before it had converged"):
+        assert run(main, [*command, "--iterations", "1", "--ls-iterations", "5"]) == 2
+    printed = capsys.readouterr()
+    assert "the solver had not converged in " in printed.out
+    assert "raise --iterations (now 1) and --ls-iterations (now 5)" in printed.err.splitlines()[-1]

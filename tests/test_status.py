@@ -14,17 +14,18 @@ from processes import Launcher, wait_until
 
 from msk_ray.cli import run
 from msk_ray.config import dump_yaml
-from msk_ray.experiment.attempts import Attempt, Reduced
+from msk_ray.experiment.attempts import FIRST, Attempt, Reduced
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import progress_of
 from msk_ray.experiment.outcomes import Ending, Outcome, write_ending
 from msk_ray.experiment.ownership import owned
 from msk_ray.experiment.snapshot import State
-from msk_ray.experiment.trial_status import StatusReader, bests_of, remaining
+from msk_ray.experiment.trial_status import FIRST_EPOCH, StatusReader, bests_of, remaining
 from msk_ray.status import main, short_number
 from msk_ray.sweep import opening
 from msk_ray.sweep.space import parse_space
 from msk_ray.sweep.trials import resolve_trials
+from msk_ray.tune.console import BEFORE_FIRST, Console
 
 NOW = time.time()
 GPU = {"host": "node7", "pid": 1, "visible": "3", "count": 1, "name": "NVIDIA H200"}
@@ -66,7 +67,7 @@ def experiment(now: None, tmp_path: Path) -> Experiment:
     made = opening.create(tmp_path / "runs" / "rates", space, trials, {})
     folders = [made.trial_folder(trial.id) for trial in trials]
     fill(folders[0], [row(0, 1.0), row(5, 7.0), row(8)], age=5.0)
-    fill(folders[1], [row(0, 1.0), row(4, 3.0)], age=41.0 * 4)  # ten epochs are 40 s, but never less than 60 s
+    fill(folders[1], [row(0, 1.0), row(3), row(4, 3.0)], age=41.0 * 4)  # ten epochs are 40 s, but never less than 60 s
     fill(folders[2], [row(0), row(20, 9.0)], age=999.0, device=GPU | {"count": 0})
     write_ending(folders[2], Ending(Outcome.FINISHED, "all done"))
     fill(folders[3], [row(0), row(4, 2.0)], age=999.0)
@@ -183,9 +184,23 @@ def test_trials_a_search_makes_up_are_found_before_the_manifest_knows_them(exper
     assert (found.state, found.variant, found.epochs) == (State.RUNNING, "actor_lr=0.01", 20)
 
 
+def test_what_a_trial_does_before_its_first_epoch_is_said(
+    driven: Experiment, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = driven.trial_folder(driven.trials()[4].id)
+    fill(folder, [row(0, 1.0)], age=5.0)
+    (found,) = [s for s in StatusReader(driven).look(NOW) if s.id == folder.name]
+    assert (found.state, found.note, found.seconds_left) == (State.RUNNING, FIRST_EPOCH, None)
+    console = Console(driven.trials(), 1)
+    console.started(driven.trials()[4], FIRST)
+    console.say(console.status())
+    assert f"0/20  no evaluation in 0s: {BEFORE_FIRST}" in capsys.readouterr().out
+
+
 def test_progress_of_nothing_and_of_scores_that_are_no_numbers() -> None:
     assert progress_of([]).best is None
-    rows = [row(1, float("nan")), row(2, float("nan"))]
+    rows = [row(0), row(1, float("nan")), row(2, float("nan"))]
+    assert progress_of(rows[:2]).seconds_per_epoch is None, "the first one includes compilation"
     assert (progress_of(rows).best, progress_of(rows).epoch, progress_of(rows).seconds_per_epoch) == (None, 2, 4.0)
 
 

@@ -1,11 +1,15 @@
 """`python -m msk_ray.train` with inputs a user may get wrong: one line, a non-zero exit, nothing written."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from msk_ray.algorithms.shac.runner import EagerRunner
 from msk_ray.cli import run
+from msk_ray.config import dump_yaml
 from msk_ray.errors import DeviceError
+from msk_ray.experiment.metrics import read_metrics
 from msk_ray.train import main
 
 pytestmark = pytest.mark.long
@@ -41,6 +45,25 @@ def test_bad_input_is_one_line(
     assert error.startswith("error: ")
     assert message in error
     assert not list(tmp_path.rglob("metrics.jsonl"))
+
+
+def test_what_made_it_slow_is_said_to_the_end(
+    tiny_settings: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As on a GPU where something cannot be recorded."""
+    monkeypatch.setattr(EagerRunner, "refusal", "walker.py:3 cannot be recorded (it waits)")
+    tiny_settings["trial"] |= {"epochs": 2, "loggers": []}
+    (tmp_path / "tiny.yaml").write_text(dump_yaml(tiny_settings))
+    words = ["--config", str(tmp_path / "tiny.yaml"), "--logdir", str(tmp_path / "out"), "--device", "cpu"]
+    assert run(main, words) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "epoch 2/2" in lines[-4]
+    assert "not recorded: two to three times as slow" in lines[-4]
+    assert lines[-3] == (
+        "epochs run operation by operation, not as recorded graphs, and take two to three times as long: walker.py:3 "
+        "cannot be recorded (it waits)"
+    )
+    assert read_metrics(tmp_path / "out" / "metrics.jsonl")[-1]["train/unrecordable"] == 1.0
 
 
 def test_a_folder_that_holds_a_trial_is_left_alone(

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from msk_ray.algorithms.witness import Witness
-from msk_ray.config import ALGORITHMS, AlgorithmSettings, Config, check_installed, resolve_class
+from msk_ray.config import ALGORITHMS, AlgorithmSettings, Config, resolve_class
+from msk_ray.config.packages import require
 from msk_ray.envs import Env
 from msk_ray.errors import ConfigError
 from msk_ray.group import Group
@@ -125,6 +126,10 @@ class Algorithm(ABC):
         action: Tensor = self.network(obs)
         return action
 
+    def remarks(self) -> list[str]:
+        """What makes training worse or slower than it could be, a line on each, to be repeated when it ends."""
+        return []
+
     def note_state(self) -> None:
         """Let the witness, if there is one, note the worlds and everything that is saved as a module."""
         if self.witness is None:
@@ -210,7 +215,7 @@ def algorithm_class(config: Config) -> type[Algorithm]:
         ConfigError: there is none of that name, it lacks a method, has settings of another type, or needs a package
             that is not installed.
     """
-    check_installed(config.algorithm, config.algorithm_settings)
+    require(config.algorithm_settings.packages, f"algorithm.name: {config.algorithm.name}")
     path = ALGORITHMS.path(config.algorithm.name)
     found: type[Algorithm] = resolve_class(path, ALGORITHMS.key, Algorithm)  # type: ignore[type-abstract]
     if not isinstance(config.algorithm_settings, found.Settings):

@@ -8,7 +8,6 @@ from msk_ray.config.algorithms import (
     ExplorationSchedule,
     PpoConfig,
     ShacConfig,
-    check_installed,
 )
 from msk_ray.config.environments import ENVIRONMENTS, settings_class
 from msk_ray.config.execution import AS_USUAL, ExecutionConfig
@@ -35,7 +34,7 @@ from msk_ray.config.schema import (
     TrialConfig,
 )
 from msk_ray.config.sections import EnvSettings, Reward
-from msk_ray.config.yaml_text import dump_yaml, parse_yaml, read_yaml
+from msk_ray.config.yaml_text import dump_yaml, parse_settings, parse_yaml, read_yaml
 from msk_ray.registry import Registry, resolve, resolve_class
 
 __all__ = [
@@ -68,7 +67,6 @@ __all__ = [
     "ShacConfig",
     "TrialConfig",
     "changed_settings",
-    "check_installed",
     "combine",
     "current_key",
     "current_values",
@@ -85,6 +83,7 @@ __all__ = [
     "parse_override",
     "parse_overrides",
     "parse_recorded",
+    "parse_settings",
     "parse_yaml",
     "read_config",
     "read_yaml",

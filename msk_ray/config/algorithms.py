@@ -8,11 +8,11 @@ Differentiable Simulation", arXiv:2204.07137, and the hyperparameters published 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import (
     BeforeValidator,
+    Field,
     PositiveFloat,
     SerializeAsAny,
     ValidationInfo,
@@ -21,7 +21,7 @@ from pydantic import (
 
 from msk_ray.config.horizons import AdaptiveHorizon, ContactHorizon, Horizon, HorizonSchedule
 from msk_ray.config.physics import GRADIENTS
-from msk_ray.config.sections import Count, Fraction, NonNegative, Section, Text
+from msk_ray.config.sections import SHOWN, Count, Fraction, NonNegative, Rate, Section, Text, Undeclared
 from msk_ray.errors import ConfigError
 from msk_ray.registry import Registry, resolve
 
@@ -79,6 +79,12 @@ class AlgorithmSettings(Section):
     def unread(self) -> dict[str, str]:
         """Settings of this section, dotted, that nothing reads because of others, and the reason for each."""
         return {}
+
+
+class UndeclaredAlgorithm(AlgorithmSettings, Undeclared):
+    """The recorded settings of an algorithm that cannot be found here."""
+
+    parallel = True
 
 
 class EntropyConfig(Section):
@@ -141,13 +147,13 @@ class ShacConfig(AlgorithmSettings):
     """Minibatches a pass."""
     target_critic_alpha: Fraction = 0.2
     """target ← α·target + (1 − α)·critic after each epoch."""
-    actor_lr: PositiveFloat = 2e-3
+    actor_lr: Rate = 2e-3
     """Learning rate of the actor."""
-    critic_lr: PositiveFloat = 2e-3
+    critic_lr: Rate = 2e-3
     """Learning rate of the critic."""
     lr_schedule: Literal["linear", "constant"] = "linear"
     """`linear` decreases from the given rate towards `final_lr`, which would follow the last epoch."""
-    final_lr: PositiveFloat = 1e-5
+    final_lr: Rate = 1e-5
     """Learning rate at which the linear schedule ends; a lower given rate stays as it is."""
     betas: tuple[Fraction, Fraction] = (0.7, 0.95)
     """Adam's moment decays."""
@@ -175,7 +181,7 @@ class ShacConfig(AlgorithmSettings):
     """Normalise observations by their running mean and variance."""
     normalize_return: bool = False
     """Divide rewards by the running standard deviation of the return."""
-    reward_scale: PositiveFloat = 1.0
+    reward_scale: Annotated[float, Field(ge=1e-6, le=1e6)] = 1.0
     """Factor on the rewards of training; scores are without it."""
     max_nonfinite_share: Fraction = 0.05
     """Share of worlds whose gradient may be non-finite in an epoch before the trial stops with an error."""
@@ -275,7 +281,7 @@ class PpoConfig(AlgorithmSettings):
     """Discount."""
     lam: Fraction = 0.95
     """λ of the generalised advantage estimate."""
-    lr: PositiveFloat = 1e-3
+    lr: Rate = 1e-3
     """Adam's rate, or its initial value if it is adaptive."""
     lr_schedule: Literal["adaptive", "constant"] = "adaptive"
     """`adaptive` divides or multiplies the rate by 1.5, between 1e-5 and 1e-2, to hold `desired_kl`."""
@@ -347,6 +353,8 @@ def _settings_from_outside(value: Any, info: ValidationInfo) -> Any:
     try:
         settings = settings_from_outside(name)
     except ConfigError as error:
+        if info.context == SHOWN:
+            return UndeclaredAlgorithm.because(str(error), value)
         raise ValueError(str(error)) from error
     return settings.model_validate(value, context=info.context)
 
@@ -373,19 +381,6 @@ def settings_from_outside(name: Any) -> type[AlgorithmSettings]:
     if not (isinstance(declared, type) and issubclass(declared, AlgorithmSettings)):
         raise ConfigError(f"algorithm.name: {path} declares no settings: write `class Settings(AlgorithmSettings)`")
     return declared
-
-
-def check_installed(algorithm: AlgorithmConfig, settings: AlgorithmSettings) -> None:
-    """Refuse an algorithm whose packages are not installed.
-
-    Raises:
-        ConfigError: the message names what to install.
-    """
-    for module, install in settings.packages.items():
-        if find_spec(module) is None:
-            raise ConfigError(
-                f"algorithm.name: {algorithm.name} needs {module}, which is not installed: pip install '{install}'"
-            )
 
 
 def ignored_settings(name: str, settings: AlgorithmSettings) -> list[str]:

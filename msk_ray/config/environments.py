@@ -4,7 +4,7 @@ import difflib
 from typing import Any
 
 from msk_ray.config.physics import PhysicsConfig
-from msk_ray.config.sections import EnvSettings
+from msk_ray.config.sections import EnvSettings, Reward, Undeclared
 from msk_ray.errors import ConfigError
 from msk_ray.registry import Registry, resolve, resolve_class
 
@@ -33,6 +33,18 @@ SETTINGS = Registry(
 )
 """Settings that can be imported without their environment, which loads torch. A name that is only in `ENVIRONMENTS`
 uses the settings of its class."""
+
+
+class UndeclaredReward(Reward, Undeclared):
+    """Whatever is recorded."""
+
+
+class UndeclaredEnv(EnvSettings, Undeclared):
+    """The recorded settings of an environment that cannot be found here."""
+
+    reads_physics = frozenset(PhysicsConfig.names())
+
+    reward: UndeclaredReward = UndeclaredReward()
 
 
 def settings_class(name: Any) -> type[EnvSettings]:

@@ -2,10 +2,10 @@
 
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
 from msk_ray.config.loggers import LOGGERS
-from msk_ray.config.sections import Count, Section, Text
+from msk_ray.config.sections import SHOWN, Count, Section, Text
 from msk_ray.errors import ConfigError
 
 
@@ -48,7 +48,9 @@ class ExecutionConfig(Section):
 
     @field_validator("loggers")
     @classmethod
-    def _known_loggers(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+    def _known_loggers(cls, names: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
+        if info.context == SHOWN:
+            return names
         try:
             for name in names:
                 LOGGERS.path(name)

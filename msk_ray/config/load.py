@@ -14,6 +14,7 @@ from msk_ray.config.horizons import horizon_class
 from msk_ray.config.overlay import leaves, merge, overlay, parse_overrides
 from msk_ray.config.recorded import current_settings, env_name, newer_spelling
 from msk_ray.config.schema import Config
+from msk_ray.config.sections import SHOWN
 from msk_ray.config.yaml_text import read_yaml
 from msk_ray.errors import ConfigError, brief, shortened
 from msk_ray.shipped import CONFIGS, find_shipped, is_name, shipped_names
@@ -31,13 +32,22 @@ def parse_config(data: Mapping[str, Any], source: str = "config") -> Config:
         raise ConfigError(f"{source}: {describe_fault(error, named=_named(data))}") from None
 
 
-def parse_recorded(data: Mapping[str, Any], source: str) -> Config:
+def parse_recorded(data: Mapping[str, Any], source: str, *, shown: bool = False) -> Config:
     """The configuration in a trial's files, written by this version or an earlier one.
+
+    Args:
+        shown: it is only shown: of a class that cannot be found here (`Config.undeclared`), take what is recorded.
 
     Raises:
         ConfigError: as for `parse_config`, or a setting that no longer exists had an effect.
     """
-    return parse_config(current_settings(data) if isinstance(data, Mapping) else data, source)
+    settings = current_settings(data) if isinstance(data, Mapping) else data
+    if not shown:
+        return parse_config(settings, source)
+    try:
+        return Config.model_validate(settings, context=SHOWN)
+    except ValidationError as error:
+        raise ConfigError(f"{source}: {describe_fault(error, named=_named(settings))}") from None
 
 
 def read_config(path: Path) -> dict[str, Any]:
@@ -156,7 +166,7 @@ def describe_fault(
     elif first["type"] == "value_error":
         text = str(first["ctx"]["error"]) if "ctx" in first else first["msg"]
     elif first["type"] == "missing":
-        text = f"{where}: missing"
+        text = f"{where}: missing; write it"
     else:
         text = f"{where}: {first['msg']}, not {brief(first['input'])}"
     more = len(faults) - 1

@@ -1,8 +1,8 @@
 """The loggers that `execution.loggers` can name."""
 
 from collections.abc import Mapping, Sequence
-from importlib.util import find_spec
 
+from msk_ray.config.packages import require
 from msk_ray.errors import ConfigError
 from msk_ray.registry import Registry
 
@@ -16,8 +16,11 @@ LOGGERS = Registry(
     },
 )
 """Classes of loggers."""
-_PACKAGES: Mapping[str, str] = {"wandb": "msk-ray[wandb]", "mlflow": "msk-ray[mlflow]"}
-"""Optional packages with the same name as their logger, and what to install."""
+_PACKAGES: Mapping[str, Mapping[str, str]] = {
+    "wandb": {"wandb": "msk-ray[wandb]"},
+    "mlflow": {"mlflow": "msk-ray[mlflow]"},
+}
+"""Optional modules of loggers, and what to install for each."""
 
 
 def logger_paths(names: Sequence[str]) -> list[str]:
@@ -30,6 +33,5 @@ def logger_paths(names: Sequence[str]) -> list[str]:
     for name, path in zip(names, paths, strict=True):
         if paths.count(path) > 1:
             raise ConfigError(f"execution.loggers: {name} is given twice; write it once")
-        if name in _PACKAGES and find_spec(name) is None:
-            raise ConfigError(f"execution.loggers: {name} is not installed: pip install '{_PACKAGES[name]}'")
+        require(_PACKAGES.get(name, {}), f"execution.loggers: {name}")
     return paths

@@ -70,9 +70,10 @@ class PhysicsConfig(Section):
     tolerance: PositiveFloat | None = None
     """Constraint solver tolerance; mujoco_warp's default is 1e-6."""
     iterations: Count | None = None
-    """Constraint solver iteration limit."""
+    """Constraint solver iteration limit; null: that of the environment, for a model from a file its own but at least
+    100."""
     ls_iterations: Count | None = None
-    """Line search iteration limit."""
+    """Line search iteration limit; null: likewise, but at least 50."""
     integrator: Literal["Euler", "implicitfast", "RK4"] | None = None
     cone: Literal["pyramidal", "elliptic"] | None = None
     """Friction cone. The pyramid's edges make contact gradients explode over long horizons; the ellipse has none."""

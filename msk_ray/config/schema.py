@@ -20,10 +20,12 @@ from msk_ray.config.algorithms import (
     ShacConfig,
     ignored_settings,
 )
-from msk_ray.config.environments import settings_class
+from msk_ray.config.environments import UndeclaredEnv, settings_class
 from msk_ray.config.execution import ExecutionConfig
+from msk_ray.config.loggers import logger_paths
+from msk_ray.config.packages import require
 from msk_ray.config.physics import PhysicsConfig, Vec5
-from msk_ray.config.sections import Count, EnvSettings, Section, Text, Whole
+from msk_ray.config.sections import SHOWN, Count, EnvSettings, Section, Text, Undeclared, Whole
 from msk_ray.config.unread import unread_settings
 from msk_ray.errors import ConfigError, brief
 
@@ -35,6 +37,8 @@ def _declared_settings(value: Any, info: ValidationInfo) -> Any:
     try:
         settings = settings_class(value.get("name"))
     except ConfigError as error:
+        if info.context == SHOWN:
+            return UndeclaredEnv.because(str(error), value)
         raise ValueError(str(error)) from error
     return settings.model_validate(value, context=info.context)
 
@@ -179,10 +183,25 @@ class Config(Section):
             return section
         return self.algorithm.settings
 
+    def check_installed(self) -> None:
+        """Refuse settings that need packages, or a model, that are not on this machine. Loads none of them.
+
+        Raises:
+            ConfigError: the message names what to install.
+        """
+        require(self.algorithm_settings.packages, f"algorithm.name: {self.algorithm.name}")
+        logger_paths(self.execution.loggers)
+        self.env.check_installed()
+
     @property
     def algorithm_section(self) -> str:
         """The section of those settings, dotted."""
         return self.algorithm.name if self.algorithm.name in BUILT_IN else "algorithm.settings"
+
+    @property
+    def undeclared(self) -> str:
+        """Why the class of its environment, or of its algorithm, cannot be found; empty if both are there."""
+        return next((s.why for s in (self.env, self.algorithm_settings) if isinstance(s, Undeclared)), "")
 
     @property
     def ignored(self) -> list[str]:
@@ -201,6 +220,8 @@ class Config(Section):
     @model_validator(mode="after")
     def _physics_fits_env(self) -> "Config":
         variants = self.env.variants
+        if isinstance(self.env, UndeclaredEnv):
+            return self
         for field, name in (("physics.variant", self.physics.variant), ("evaluation.variant", self.evaluation.variant)):
             if name is not None and name not in variants:
                 known = f"write one of {', '.join(variants)}" if variants else "leave it out"
@@ -241,9 +262,10 @@ class Config(Section):
             raise ValueError("curriculum needs physics.backward: tape_per_substep or tape_all")
 
     @model_validator(mode="after")
-    def _everything_is_read(self) -> "Config":
-        for key, why in unread_settings(self):
-            raise ValueError(f"{key}: {why} leave it out")
+    def _everything_is_read(self, info: ValidationInfo) -> "Config":
+        if info.context != SHOWN:
+            for key, why in unread_settings(self):
+                raise ValueError(f"{key}: {why} leave it out")
         return self
 
     def as_dict(self) -> dict[str, Any]:

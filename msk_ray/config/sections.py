@@ -2,9 +2,10 @@
 
 from collections.abc import Mapping
 from functools import cache
-from typing import Annotated, Any, ClassVar, get_args
+from typing import Annotated, Any, ClassVar, Self, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PrivateAttr, field_validator, model_validator
+from pydantic_core import PydanticCustomError
 
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 NonNegative = Annotated[float, Field(ge=0.0)]
@@ -12,11 +13,20 @@ Count = Annotated[int, Field(gt=0, lt=2**31)]
 """A count of at least one, within the range of Warp and CUDA."""
 Whole = Annotated[int, Field(ge=0, lt=2**31)]
 """A whole number of at least 0."""
+Rate = Annotated[float, Field(ge=1e-10, le=100.0)]
+"""A learning rate. A smaller one would change no weight that is kept in float32."""
 Text = Annotated[str, Field(max_length=4096)]
+SMALLEST, LARGEST = 1e-30, 1e30
+"""Range of the size of numbers other than 0: what is computed from them has to fit into float32."""
+
+
+SHOWN = "shown"
+"""Context of validation of settings that are only shown: a class that cannot be found does not hide them."""
 
 
 class Section(BaseModel):
-    """A frozen group of settings that refuses unknown keys, numbers that are not finite, and `true` for a number."""
+    """A frozen group of settings that refuses unknown keys, `true` for a number, and numbers that are not finite or
+    beyond `SMALLEST` and `LARGEST`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False)
 
@@ -29,6 +39,14 @@ class Section(BaseModel):
         numeric = _without_truth(cls)
         return {key: _no_number(value) if key in numeric else value for key, value in data.items()}
 
+    @field_validator("*")
+    @classmethod
+    def _of_sensible_size(cls, value: Any) -> Any:
+        if not _sensible(value):
+            text = "Input should be 0 or between {smallest:g} and {largest:g} in size"
+            raise PydanticCustomError("size", text.format(smallest=SMALLEST, largest=LARGEST))
+        return value
+
 
 class _NotANumber:
     """Stands for a `true` or `false` where neither is allowed, until it is refused."""
@@ -38,6 +56,12 @@ class _NotANumber:
 
     def __repr__(self) -> str:
         return str(self._value).lower()
+
+
+def _sensible(value: Any) -> bool:
+    if isinstance(value, float):
+        return value == 0.0 or SMALLEST <= abs(value) <= LARGEST
+    return all(map(_sensible, value)) if isinstance(value, list | tuple) else True
 
 
 def _no_number(value: Any) -> Any:
@@ -61,6 +85,29 @@ def _takes_truth(annotation: Any) -> bool:
         or isinstance(annotation, bool)
         or any(_takes_truth(part) for part in get_args(annotation))
     )
+
+
+class Undeclared(Section):
+    """Recorded settings of a class that cannot be found here: enough to show the trials that had them.
+
+    It is the last of several bases, which decides whether unknown keys are accepted.
+    """
+
+    model_config = ConfigDict(extra="allow")
+
+    _why: str = PrivateAttr("")
+
+    @classmethod
+    def because(cls, why: str, settings: Any) -> Self:
+        """The settings, and why their declaration cannot be found."""
+        found = cls.model_validate(settings)
+        found._why = why
+        return found
+
+    @property
+    def why(self) -> str:
+        """Why their declaration cannot be found."""
+        return self._why
 
 
 class Reward(Section):
@@ -95,6 +142,13 @@ class EnvSettings(Section):
     """Begin training with episodes of ages spread over `episode_length`; otherwise all worlds that do not fall reset in
     the same env steps. Evaluations always begin at age 0."""
     reward: Reward = Reward()
+
+    def check_installed(self) -> None:
+        """Refuse an environment whose packages or files are not on this machine.
+
+        Raises:
+            ConfigError: the message names what to install.
+        """
 
     def unread(self) -> dict[str, str]:
         """Settings of this section, dotted, that nothing reads because of others, and the reason for each."""

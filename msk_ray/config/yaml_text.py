@@ -79,12 +79,29 @@ _Loader.yaml_implicit_resolvers = {
 }
 
 
+_NO_NAMES = {
+    f"tag:yaml.org,2002:{kind}": shown
+    for kind, shown in (
+        ("bool", "true or false"),
+        ("int", "a whole number"),
+        ("float", "a number"),
+        ("null", "null"),
+    )
+}
+"""What a key may be read as if it is not in quotes, by its tag."""
+
+
 def _check_keys(node: yaml.MappingNode) -> None:
-    """Refuse a duplicate key, of which YAML would take the last value."""
+    """Refuse keys that are no text, and a duplicate key, of which YAML would take the last value."""
     seen: set[tuple[str, str]] = set()
     for key, _ in node.value:
         if not isinstance(key, yaml.ScalarNode):
             raise _NotSettings("a key must be a name, not a list or a mapping")
+        if key.tag in _NO_NAMES:
+            raise _NotSettings(
+                f"key {shortened(key.value, 60)!r} is {_NO_NAMES[key.tag]} in YAML, not a name; write a name, in "
+                "quotes if it is one"
+            )
         if (key.tag, key.value) in seen:
             raise _NotSettings(f"key {brief(key.value)} is written twice; leave one of them out")
         seen.add((key.tag, key.value))
@@ -132,9 +149,18 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8"
         raise ConfigError(f"cannot read {path}: {reason or error}") from error
-    settings = parse_yaml(text, str(path))
+    return parse_settings(text, str(path))
+
+
+def parse_settings(text: str, source: str) -> dict[str, Any]:
+    """The mapping in YAML text. `source` names it in errors.
+
+    Raises:
+        ConfigError: as for `parse_yaml`, or it is not a mapping.
+    """
+    settings = parse_yaml(text, source)
     if not isinstance(settings, dict):
-        raise ConfigError(f"{path} must hold a mapping of settings at its top level")
+        raise ConfigError(f"{source} must hold a mapping of settings at its top level")
     return settings
 
 

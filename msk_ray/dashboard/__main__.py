@@ -12,7 +12,7 @@ from pathlib import Path
 from aiohttp import web
 
 from msk_ray.cli import Parser, run
-from msk_ray.dashboard.app import make_app
+from msk_ray.dashboard.app import make_runner
 from msk_ray.dashboard.films import Films
 from msk_ray.dashboard.guard import Access
 from msk_ray.dashboard.library import Library
@@ -122,7 +122,7 @@ async def _serve(library: Library, access: Access, host: str, port: int) -> None
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    runner = web.AppRunner(make_app(library, access), access_log=None, shutdown_timeout=1.0)
+    runner = make_runner(library, access)
     await runner.setup()
     try:
         site = web.TCPSite(runner, host, port)

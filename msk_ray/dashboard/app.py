@@ -1,9 +1,10 @@
 """The addresses of the dashboard and what they answer."""
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 from urllib.parse import quote, urlencode
 
@@ -13,11 +14,14 @@ from msk_ray.dashboard.guard import Access, guard, set_headers
 from msk_ray.dashboard.library import Library, Unknown
 from msk_ray.dashboard.plots import plotly_library
 from msk_ray.errors import ConfigError, MskRayError
+from msk_ray.experiment.damage import Limits, cut, field, parse_object
 from msk_ray.experiment.notes import write_note
 from msk_ray.report.page import FILES
 
 _LARGEST = 64 * 1024
 """Bytes of a request's body."""
+_NOTE = Limits(_LARGEST, _LARGEST)
+_MEDIA = {".mp4": "video/mp4", ".png": "image/png"}
 _REPORT, _DASHBOARD = "msk_ray.report", "msk_ray.dashboard"
 _STATIC = {
     "style.css": (_REPORT, "page/style.css"),
@@ -29,8 +33,13 @@ _STATIC = {
 }
 
 
-def make_app(library: Library, access: Access) -> web.Application:
-    """The server's application."""
+def make_runner(library: Library, access: Access, shutdown_timeout: float = 1.0) -> web.AppRunner:
+    """The server, which is not listening yet. It unpacks no body: those of refused requests would be too."""
+    app = _make_app(library, access)
+    return web.AppRunner(app, access_log=None, shutdown_timeout=shutdown_timeout, auto_decompress=False)
+
+
+def _make_app(library: Library, access: Access) -> web.Application:
     app = web.Application(middlewares=[guard(access), _errors], client_max_size=_LARGEST)
     app.on_response_prepare.append(set_headers)
     pages = _Pages(library)
@@ -99,30 +108,35 @@ class _Pages:
 
     async def report_file(self, request: web.Request) -> web.StreamResponse:
         name, file = request.match_info["name"], request.match_info["file"]
-        return web.FileResponse(await asyncio.to_thread(self._library.report_file, name, file))
+        path = await asyncio.to_thread(self._library.report_file, name, file)
+        return await self._send(request, path, {"Content-Type": _MEDIA[path.suffix]})
 
     async def trial_file(self, request: web.Request) -> web.StreamResponse:
         name, trial, file = (request.match_info[part] for part in ("name", "trial", "file"))
         if file not in FILES:
             raise Unknown(f"no file {file} of a trial; there are {', '.join(FILES)}")
         path = await asyncio.to_thread(self._library.trial_folder, name, trial) / file
-        if not path.is_file():
-            raise Unknown(f"trial {trial} has no {file}")
         if path.suffix == ".pt":
             attached = {"Content-Disposition": f'attachment; filename="{trial}_{path.name}"'}
-            return web.FileResponse(path, headers={**attached, "Content-Type": "application/octet-stream"})
+            return await self._send(request, path, {**attached, "Content-Type": "application/octet-stream"})
         # Never as a page: its text may come from anywhere.
-        return web.FileResponse(path, headers={"Content-Type": "text/plain; charset=utf-8"})
+        return await self._send(request, path, {"Content-Type": "text/plain; charset=utf-8"})
+
+    async def _send(self, request: web.Request, path: Path, headers: Mapping[str, str]) -> web.StreamResponse:
+        """Send a file of the storage."""
+        opened = await asyncio.to_thread(self._library.open, path)
+        with opened as file:
+            # By its descriptor: what was checked is what is sent, whatever has the path by now.
+            response = web.FileResponse(f"/proc/self/fd/{file.fileno()}", headers=headers)
+            await response.prepare(request)
+        return response
 
     async def note(self, request: web.Request) -> web.Response:
         name, trial = request.match_info["name"], request.match_info["trial"]
         try:
-            data = await request.json()
-        except ValueError:
-            raise web.HTTPBadRequest(text="not JSON\n") from None
-        text = data.get("text") if isinstance(data, dict) else None
-        if not isinstance(text, str):
-            raise web.HTTPBadRequest(text='write {"text": "..."}\n')
+            text = field(parse_object(await request.read(), _NOTE), "text", str)
+        except ValueError as error:
+            raise web.HTTPBadRequest(text=f'write {{"text": "..."}}: {cut(error)}\n') from None
         await asyncio.to_thread(self._library.write, write_note, name, trial, text)
         return web.json_response({})
 

@@ -1,6 +1,7 @@
 """Who may ask the dashboard for what. Every answer passes here."""
 
 import ipaddress
+import re
 from dataclasses import dataclass
 
 from aiohttp import web
@@ -45,11 +46,13 @@ class Access:
         return address.is_loopback or not self.local
 
 
+_HOST = re.compile(r"(?:\[([0-9A-Fa-f:.]+)\]|([A-Za-z0-9_-]+(?:\.[A-Za-z0-9_-]+)*)\.?)(?::[0-9]{1,5})?")
+
+
 def _name_of(host: str) -> str:
-    """The name in a Host header: without the port, brackets and a final dot, in lower case."""
-    if host.startswith("["):
-        return host[1:].partition("]")[0]
-    return host.rpartition(":")[0].lower().rstrip(".") if ":" in host else host.lower().rstrip(".")
+    """The name in a Host header: without the port, brackets and a final dot, in lower case; empty if it is none."""
+    found = _HOST.fullmatch(host)
+    return "" if found is None else (found[1] or found[2]).lower()
 
 
 def guard(access: Access) -> Middleware:
@@ -57,7 +60,8 @@ def guard(access: Access) -> Middleware:
 
     @web.middleware
     async def check(request: web.Request, handler: Handler) -> web.StreamResponse:
-        host = request.headers.get("Host", "")
+        hosts = request.headers.getall("Host", [""])
+        host = hosts[0] if len(hosts) == 1 else ""
         if not access.knows(host):
             name = _name_of(host) or "NAME"
             raise web.HTTPMisdirectedRequest(
@@ -76,8 +80,10 @@ def _check_writing(request: web.Request, host: str, access: Access) -> None:
     # A page of another site may send requests here too, with its own Origin; a form cannot send JSON.
     if request.headers.get("Origin") not in (f"http://{host}", f"https://{host}"):
         raise web.HTTPForbidden(text="not from a page of this dashboard\n")
-    if request.content_type != "application/json":
-        raise web.HTTPUnsupportedMediaType(text="write application/json\n")
+    # JSON is UTF-8 (RFC 8259). A body is not unpacked for anybody: a few bytes may become gigabytes.
+    utf8 = (request.charset or "utf-8").lower() in ("utf-8", "utf8")
+    if request.content_type != "application/json" or not utf8 or "Content-Encoding" in request.headers:
+        raise web.HTTPUnsupportedMediaType(text="write application/json in UTF-8, not compressed\n")
 
 
 async def set_headers(request: web.Request, response: web.StreamResponse) -> None:

@@ -1,5 +1,6 @@
 """The experiments of a storage folder, read and drawn again only where something has changed."""
 
+import os
 import threading
 import time
 from collections import OrderedDict
@@ -8,18 +9,20 @@ from dataclasses import dataclass, replace
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from msk_ray import __version__
 from msk_ray.dashboard.films import FOLDER, PREFIX, Film, Films
 from msk_ray.dashboard.plots import can_plot, figures
-from msk_ray.errors import ConfigError, MskRayError
+from msk_ray.errors import ConfigError, MskRayError, StorageError
 from msk_ray.experiment.layout import EVAL_FILE
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.snapshot import file_stamp
+from msk_ray.experiment.trainings import TrainingReader
 from msk_ray.experiment.trial_status import StatusReader, counts, describe_bests, find_experiments
+from msk_ray.files import UnusableFile, open_file
 from msk_ray.report.best import STRIP, stored_best
 from msk_ray.report.page import Live, Section, command_of, compare, make_section, places_of, render_page
 from msk_ray.report.reading import ExperimentReader, Reading, TrialReading, explain
@@ -69,6 +72,7 @@ class Library:
         """
         self.storage = storage
         self._root = storage.resolve()
+        self._trainings = TrainingReader(self._root)
         self._refresh = refresh
         self._may_write = may_write
         self._films = films
@@ -80,7 +84,7 @@ class Library:
     def index(self) -> Page:
         """The list of experiments."""
         with self._lock:
-            return self._kept((), lambda: ((self._rows(),), []), self._render_index)
+            return self._kept((), lambda: ((self._rows(), self._training_rows()), []), self._render_index)
 
     def page(self, names: Sequence[str]) -> Page:
         """The page of one experiment, or of several side by side.
@@ -149,11 +153,43 @@ class Library:
             for kept in self._pages.values():
                 kept.due = 0.0
 
+    def open(self, path: Path) -> BinaryIO:
+        """A file of the storage, opened.
+
+        Raises:
+            Unknown: there is no such file, or it is not in the storage.
+        """
+        try:
+            file = open_file(path)
+        except (OSError, UnusableFile) as error:
+            raise Unknown(
+                f"no file {path.name} here: {error if isinstance(error, UnusableFile) else error.strerror}"
+            ) from None
+        # Where it really is: a folder above it may be a link.
+        if not Path(f"/proc/self/fd/{file.fileno()}").readlink().is_relative_to(self._root):
+            file.close()
+            raise Unknown(f"no file {path.name} here: a link leads out of the storage")
+        return file
+
     def _find(self, name: str) -> Experiment:
         found = {path.name: path for path in find_experiments(self._root)}
         if name not in found:
             raise Unknown(f"no experiment {name!r} here")
+        self._check_inside(found[name])
         return Experiment(found[name])
+
+    def _check_inside(self, path: Path) -> None:
+        """Refuse an experiment of which a folder is elsewhere: whoever may write it could have anything shown.
+
+        Raises:
+            StorageError: a link leads out of the storage.
+        """
+        trials = path / "trials"
+        inner = [Path(entry) for entry in os.scandir(trials) if entry.is_symlink()] if trials.is_dir() else []
+        for folder in (path, trials, path / FOLDER, *inner):
+            if not folder.resolve().is_relative_to(self._root):
+                relative = folder.relative_to(self._root)
+                raise StorageError(f"{relative} is a link out of the storage: put the folder itself there")
 
     def _trial_folder(self, name: str, trial: str) -> Path:
         found = {t.trial.id: t.folder for t in self._read(self._find(name)).trials}
@@ -234,6 +270,7 @@ class Library:
         for path in reversed(find_experiments(self._root)):
             observer = self._statuses.setdefault(path.name, StatusReader(Experiment(path)))
             try:
+                self._check_inside(path)
                 statuses = observer.look(time.time())
                 question = str(Experiment(path).manifest().get("question") or "")
             except MskRayError as error:
@@ -244,12 +281,30 @@ class Library:
             rows.append((path.name, str(len(statuses)), score, state, question))
         return rows
 
+    def _training_rows(self) -> tuple[tuple[str, ...], ...]:
+        """What `train` has run: folder, environment, epochs, best score and state of each."""
+        return tuple(
+            (
+                training.name,
+                training.environment,
+                f"{training.progress.epoch}/{training.epochs or '?'}",
+                "" if training.progress.best is None else f"{training.progress.best:.5g}",
+                "; ".join(filter(None, (str(training.state), training.note))),
+            )
+            for training in self._trainings.look(time.time())
+        )
+
     def _render_index(self, seen: tuple[Any, ...], version: str) -> str:
         return (
             _templates()
             .get_template("index.html.j2")
             .render(
-                rows=seen[0], storage=str(self.storage), version=version, refresh=self._refresh, written=__version__
+                rows=seen[0],
+                trainings=seen[1],
+                storage=str(self.storage),
+                version=version,
+                refresh=self._refresh,
+                written=__version__,
             )
         )
 

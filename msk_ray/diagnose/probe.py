@@ -145,15 +145,18 @@ def _starting_state(env: Env[Any], network: nn.Module, kind: str) -> EnvState:
 
 def _returns(env: Env[Any], network: nn.Module, step: Step, start: EnvState, horizons: Sequence[int]) -> list[Tensor]:
     """Return (W,) of the first H env steps for each horizon."""
-    physics, action = start.physics, start.action
-    total = torch.zeros(len(action), dtype=action.dtype, device=action.device)
+    total = torch.zeros_like(start.action[:, 0])
     found = []
+    env.state = start
     for t in range(1, horizons[-1] + 1):
-        action = network(env.observe(physics, action))
-        physics = step(env.control(action), physics)
-        total = total + env.reward_terms(physics, action, env.observe(physics, action)).sum(-1)
+        action = network(env.observation())
+        physics = step(env.control(action), env.state.physics)
+        reached = EnvState(physics, action, env.state.age + 1, env.state.numbers)
+        total = total + env.reward_terms(physics, action, env.observation_of(reached)).sum(-1)
+        env.state = reached
         if t in horizons:
             found.append(total)
+    env.state = start
     return found
 
 

@@ -4,7 +4,6 @@ Axes: W worlds, O observation, A action.
 """
 
 import math
-import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
@@ -15,6 +14,7 @@ import torch
 from torch import Tensor
 
 from msk_ray.config import AS_USUAL, EnvSettings, ExecutionConfig, PhysicsConfig
+from msk_ray.envs.contract import Contract, versions
 from msk_ray.envs.layout import Entry
 from msk_ray.envs.options import JACOBIANS
 from msk_ray.envs.randomize import Randomizer
@@ -26,6 +26,7 @@ from msk_ray.step.autograd.flags import known_none
 from msk_ray.step.autograd.kinematics import Frames, Kinematics, Names, as_named
 from msk_ray.step.autograd.tendon_lengths import Tendons
 from msk_ray.step.forward.capacity import Capacity
+from msk_ray.step.forward.solver_limits import own_limits
 
 SettingsT = TypeVar("SettingsT", bound=EnvSettings)
 
@@ -45,13 +46,21 @@ class Env(ABC, Generic[SettingsT]):
         group: the processes that the trial's worlds are spread over; here are those of this one.
     """
 
+    state: EnvState
     group: Group = ALONE
+    policies: int = 1
+    """Number of policies that act side by side, each in an equal part of the worlds, for which the same is drawn."""
     recorded_worlds: int = 0
     """Worlds of every evaluation whose states `trajectory_figures` is given."""
     action_size: int
     obs_size: int
+    """Entries of an observation; that of the first one unless a class sets it."""
     reward_names: tuple[str, ...]
     """Names of the T parts of the reward."""
+    without_gradient: ClassVar[tuple[str, ...]] = ()
+    """Names of those that are meant to have no gradient to state and action; others without one are warned of."""
+    keeps_iterations: ClassVar[bool] = False
+    """Whether the solver keeps to the iterations of the model that `build_model` returns, even if they are few."""
     begin_epoch_in_place: ClassVar[bool] = False
     """Whether `begin_epoch`, where a class has its own, only changes the contents of tensors."""
     Settings: ClassVar[type[EnvSettings]]
@@ -80,7 +89,11 @@ class Env(ABC, Generic[SettingsT]):
             device,
             capacity=Capacity(execution.nconmax or 0, execution.njmax or 0),
             tolerance=physics.tolerance,
-            kernels=Kernels(execution.deterministic, fused_solver=execution.solver_kernels == "fused"),
+            kernels=Kernels(
+                execution.deterministic,
+                execution.solver_kernels == "fused",
+                **self.solver_limits(self.model, physics),
+            ),
         )
         self.device = self.sim.device
         self.action_size = self.model.nu
@@ -93,13 +106,21 @@ class Env(ABC, Generic[SettingsT]):
         self.ignore_contact_forces = False
         self._reached: StepState | None = None
         self._measured: dict[str, tuple[StepState, bool, Any]] = {}
-        self.prepare()
-        self.state = self.reset_state()
+        self._contract = Contract(self)
+        self._contract.begin()
 
     @classmethod
     @abstractmethod
     def build_model(cls, config: SettingsT, physics: PhysicsConfig) -> mujoco.MjModel:
         """Compile the model that these settings describe."""
+
+    @classmethod
+    def solver_limits(cls, model: mujoco.MjModel, physics: PhysicsConfig) -> dict[str, int]:
+        """Limits of iterations that the solver of a model by `build_model` has to keep to, by their setting."""
+        own = own_limits(model)._asdict()
+        return {
+            name: limit for name, limit in own.items() if cls.keeps_iterations or getattr(physics, name) is not None
+        }
 
     @classmethod
     def reference_settings(cls, config: SettingsT) -> SettingsT:
@@ -149,11 +170,19 @@ class Env(ABC, Generic[SettingsT]):
 
     @abstractmethod
     def observe(self, state: StepState, action: Tensor) -> Tensor:
-        """Observation (W, O) of a state and the action that led to it."""
+        """Observation (W, O) of a state and the action that led to it.
+
+        Both are those of `self.state` meanwhile, whose `age` and `numbers` are therefore those of the observed state,
+        in `step` as in `observation`.
+        """
 
     @abstractmethod
     def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
-        """Weighted parts (W, T) that sum to the reward for reaching `state`, observed as `obs`, by `action`."""
+        """Weighted parts (W, T) that sum to the reward for reaching `state`, observed as `obs`, by `action`.
+
+        `self.state` is the state that the step began in, with the action before and the age at which `action` was
+        chosen; so it is in `control`, `disturbed`, `applied_force` and `fell`.
+        """
 
     def fell(self, state: StepState) -> Tensor:
         """Worlds (W,) bool whose episode ends by itself in `state`."""
@@ -225,6 +254,7 @@ class Env(ABC, Generic[SettingsT]):
     def draw_episodes(self, count: int) -> Resets:
         """What `count` episodes begin with."""
         physics, task = self.draw_start(count)
+        self._contract.check_start(physics, count)
         if self.randomizer is None:
             return Resets(physics, task)
         return Resets(physics, torch.cat((self.randomizer.draw(count), task), dim=-1))
@@ -301,6 +331,14 @@ class Env(ABC, Generic[SettingsT]):
         """Observation (W, O) of the current state."""
         return self.observe(self.state.physics, self.state.action)
 
+    def observation_of(self, reached: EnvState) -> Tensor:
+        """Observation (W, O) of another state; the current one stays what it is."""
+        current, self.state = self.state, reached
+        try:
+            return self.observation()
+        finally:
+            self.state = current
+
     def step(self, action: Tensor, *, auto_reset: bool = True) -> Transition:
         """Advance all worlds under actions (W, A) in [-1, 1] and reset those whose episode ended.
 
@@ -315,27 +353,18 @@ class Env(ABC, Generic[SettingsT]):
             # `where` sends no cotangent into a diverged world's step, so its gradient cannot reach the batch.
             after = StepState(*(_where(diverged, b.detach(), a) for b, a in zip(before, after, strict=True)))
         self._reached, self._diverged = after, diverged
-        obs = self.observe(after, action)
+        reached = EnvState(after, action, self.state.age + 1, self.state.numbers)
+        given = versions(after, action)
+        obs = self.observation_of(reached)
         terms = self.reward_terms(after, action, obs)
-        if terms.shape != (self.nworld, len(self.reward_names)):
-            raise ConfigError(
-                f"reward_terms of {type(self).__qualname__} has shape {tuple(terms.shape)}, but reward_names has "
-                f"{len(self.reward_names)} names for {self.nworld} worlds: return torch.stack(terms, dim=-1)"
-            )
-        if after.qpos.requires_grad and not terms.requires_grad:
-            # Legitimate only where the critic alone is to teach the policy.
-            warnings.warn(
-                f"reward_terms of {type(self).__qualname__} has no gradient to the state or the action: compute it "
-                "with torch from state, frames, tendons and action, without .detach(), .item() or numpy",
-                stacklevel=2,
-            )
+        fell = self.fell(after)
+        self._contract.check_results(obs, terms, fell)
+        self._contract.check_unchanged("observe, reward_terms or fell", given, after, action)
         if not all_valid:
             terms = terms.masked_fill(diverged[:, None], 0.0)
         reward = terms.sum(-1)
-        age = self.state.age + 1
-        terminated = diverged | self.fell(after)
-        truncated = (age >= self.config.episode_length) & ~terminated
-        reached = EnvState(after, action, age, self.state.numbers)
+        terminated = diverged | fell
+        truncated = (reached.age >= self.config.episode_length) & ~terminated
         self.state = self._reset_where(terminated | truncated, reached) if auto_reset else reached
         return Transition(reward, terms.detach(), obs, terminated, truncated, diverged)
 
@@ -402,8 +431,18 @@ class Env(ABC, Generic[SettingsT]):
         """Uniform numbers in [-1, 1) from the environment's generator; zeros if resets are not stochastic."""
         if not self.config.stochastic_reset:
             return torch.zeros(shape, device=self.device)
-        drawn = torch.rand(shape, generator=self.generator, device=self.generator.device)
-        return 2.0 * drawn.to(self.device) - 1.0
+        return 2.0 * self._draw(torch.rand, shape) - 1.0
+
+    def normal(self, *shape: int) -> Tensor:
+        """Standard normal numbers from the environment's generator, for example noise of sensors."""
+        return self._draw(torch.randn, shape)
+
+    def _draw(self, draw: Callable[..., Tensor], shape: tuple[int, ...]) -> Tensor:
+        if self.policies > 1 and shape and shape[0] == self.nworld:
+            # Each policy gets the numbers that it gets alone.
+            shape = (self.nworld // self.policies, *shape[1:])
+            return self._draw(draw, shape).repeat(self.policies, *[1] * (len(shape) - 1))
+        return draw(shape, generator=self.generator, device=self.generator.device).to(self.device)
 
     def _reset_where(self, done: Tensor, reached: EnvState) -> EnvState:
         if known_none(done):
@@ -426,8 +465,3 @@ class Env(ABC, Generic[SettingsT]):
 def _where(worlds: Tensor, chosen: Tensor, others: Tensor) -> Tensor:
     """Rows (W, n) of `chosen` in the given worlds (W,), else of `others`."""
     return torch.where(worlds[:, None], chosen, others) if others.shape[1] else others
-
-
-def wrap_angle(angle: Tensor) -> Tensor:
-    """The same angle [rad] in [-π, π)."""
-    return torch.remainder(angle + math.pi, 2.0 * math.pi) - math.pi

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from msk_ray.config import Draw, RandomizeConfig
+from msk_ray.envs.friction import friction_without_effect
 from msk_ray.errors import ConfigError
 
 
@@ -211,8 +212,7 @@ def _refuse_without_effect(model: mujoco.MjModel, name: str, draw: Draw, rows: l
     if draw.mode == "scale" and not np.any(base if field.element is None else base[rows]):
         hint = "leave it out" if type(draw) is not Draw else "write mode: value"
         raise ConfigError(f"{key}: it is 0 in the model, which a scale does not change; {hint}")
-    masks = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    if name == "geom_friction" and not masks.any():
-        raise ConfigError(
-            f"{key}: the model's contacts are pairs, which have their own friction; write pair_friction instead"
-        )
+    if name == "geom_friction" and (why := friction_without_effect(model, draw, rows)) is not None:
+        raise ConfigError(f"{key}: {why}")
+    if name == "pair_friction" and (model.pair_dim[rows] == 1).all():
+        raise ConfigError(f"{key}: these pairs have no friction (condim 1); leave it out")

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from msk_ray.evaluate.targets import trial_folder_of
-from msk_ray.experiment.damage import DamagedFile, field, is_number, number, read_object
+from msk_ray.experiment.damage import CATALOGUE, DamagedFile, field, is_number, number, read_object
 from msk_ray.experiment.layout import EVAL_FILE
 from msk_ray.files import write_json
 
@@ -24,7 +24,7 @@ def read_evaluations(path: Path) -> list[dict[str, Any]]:
         StorageError: the file holds something else.
     """
     try:
-        return read_object(path, _evaluations) or []
+        return read_object(path, _evaluations, CATALOGUE) or []
     except DamagedFile as error:
         raise DamagedFile(error.damage, "remove it to have it written again") from None
 

@@ -11,15 +11,17 @@ Checkpoints of format 1 are a payload and a separate `<name>.json` with its SHA-
 read.
 """
 
+import contextlib
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from msk_ray.errors import CheckpointError
-from msk_ray.files import write_bytes
+from msk_ray.experiment.damage import LINE, RECORD, cut, field, parse_object
+from msk_ray.files import UnusableFile, open_file, read_file, write_bytes
 
 FORMAT = 2
 _NAME = b"msk_ray checkpoint "
@@ -27,6 +29,8 @@ _DIGEST = 64
 """Hexadecimal digits of a SHA-256."""
 _HEAD_LIMIT = 1 << 16
 """Maximum length of a head [bytes]."""
+_LIMIT = 1 << 36
+"""Maximum size of a checkpoint [bytes]: a hundred times that of two million ants."""
 
 
 def write_checkpoint_file(path: Path, payload: bytes, facts: Mapping[str, Any]) -> None:
@@ -61,42 +65,64 @@ def read_facts(path: Path) -> dict[str, Any]:
     The payload is not read, but the length of the file is checked.
 
     Raises:
-        CheckpointError: it is missing, incomplete, or of another format.
+        CheckpointError: it is missing, incomplete, of another format, or no regular file.
     """
-    try:
-        with path.open("rb") as file:
-            facts, begin = _read_head(path, file)
-            size = os.fstat(file.fileno()).st_size
-    except OSError as error:
-        raise _unreadable(path, error) from None
-    if size - begin != facts.get("bytes"):
-        raise _torn(path, size - begin, facts)
-    return facts
+    with _opened(path) as file:
+        return _read_head(path, file)[0]
 
 
 def read_checkpoint_file(path: Path) -> tuple[dict[str, Any], bytes]:
     """Facts and payload of a checkpoint.
 
     Raises:
-        CheckpointError: it is missing, incomplete, or of another format.
+        CheckpointError: it is missing, incomplete, of another format, no regular file, or larger than the memory.
     """
-    try:
-        with path.open("rb") as file:
-            facts, begin = _read_head(path, file)
-            file.seek(begin)
-            payload = file.read()
-    except OSError as error:
-        raise _unreadable(path, error) from None
-    if hashlib.sha256(payload).hexdigest() != facts.get("sha256"):
+    with _opened(path) as file:
+        facts, begin = _read_head(path, file)
+        file.seek(begin)
+        try:
+            payload = file.read(facts["bytes"])
+        except MemoryError:
+            raise CheckpointError(f"{path} has {facts['bytes']} bytes, more than fit into memory") from None
+    if hashlib.sha256(payload).hexdigest() != facts["sha256"]:
         raise _torn(path, len(payload), facts)
     return facts, payload
 
 
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[BinaryIO]:
+    try:
+        with open_file(path, follow=True) as file:
+            yield file
+    except UnusableFile as error:
+        raise CheckpointError(f"cannot read checkpoint {path}: {error}") from None
+    except OSError as error:
+        raise _unreadable(path, error) from None
+
+
 def _read_head(path: Path, file: BinaryIO) -> tuple[dict[str, Any], int]:
-    """The facts in the head of an open checkpoint, and where its payload begins."""
+    """The checked facts in the head of an open checkpoint, and where its payload begins."""
+    facts, begin = _find_head(path, file)
+    try:
+        size = field(facts, "bytes", int)
+        field(facts, "sha256", str)
+        if "epoch" in facts:
+            field(facts, "epoch", int)
+    except ValueError as error:
+        raise CheckpointError(f"{path} is no checkpoint of a trial: {error}") from None
+    found = os.fstat(file.fileno()).st_size - begin
+    if found != size:
+        raise _torn(path, found, facts)
+    if size > _LIMIT:
+        raise CheckpointError(f"{path} has {size} bytes, more than any checkpoint")
+    return facts, begin
+
+
+def _find_head(path: Path, file: BinaryIO) -> tuple[dict[str, Any], int]:
     head = file.read(_HEAD_LIMIT)
     if not head.startswith(_NAME):
-        return _read_old_manifest(path), 0
+        # Not all manifests have the size.
+        return {"bytes": os.fstat(file.fileno()).st_size, **_read_old_manifest(path)}, 0
     first, _, rest = head.partition(b"\n")
     line, newline, _ = rest.partition(b"\n")
     number, _, digest = first[len(_NAME) :].partition(b" ")
@@ -105,8 +131,10 @@ def _read_head(path: Path, file: BinaryIO) -> tuple[dict[str, Any], int]:
     whole = len(digest) == _DIGEST and newline and hashlib.sha256(line).hexdigest().encode() == digest
     if number != b"%d" % FORMAT or not whole:
         raise CheckpointError(f"{path} is torn: the checksum of its head differs; use an older one of {path.parent}")
-    facts: dict[str, Any] = json.loads(line)
-    return facts, len(first) + len(line) + 2
+    try:
+        return parse_object(line, LINE), len(first) + len(line) + 2
+    except ValueError as error:
+        raise CheckpointError(f"{path} is no checkpoint of a trial: its head is {cut(error)}") from None
 
 
 def _old_manifest(path: Path) -> Path:
@@ -116,18 +144,17 @@ def _old_manifest(path: Path) -> Path:
 
 def _read_old_manifest(path: Path) -> dict[str, Any]:
     try:
-        facts = json.loads(_old_manifest(path).read_text(encoding="utf-8"))
+        facts = parse_object(read_file(_old_manifest(path), RECORD.size, follow=True))
     except FileNotFoundError:
         raise CheckpointError(
             f"{path} is torn: it has neither a head nor a manifest; use an older one of {path.parent}"
         ) from None
-    except (ValueError, RecursionError) as error:
-        raise CheckpointError(f"cannot read {_old_manifest(path)}: {error}") from None
-    found = facts.get("format") if isinstance(facts, dict) else None
-    if found != 1:
-        raise CheckpointError(f"{_old_manifest(path)} has checkpoint format {found!r:.40}, this version reads 1 there")
-    manifest: dict[str, Any] = facts
-    return manifest
+    except ValueError as error:
+        raise CheckpointError(f"cannot read {_old_manifest(path)}: {cut(error)}") from None
+    if facts.get("format") != 1:
+        found = f"{facts.get('format')!r:.40}"
+        raise CheckpointError(f"{_old_manifest(path)} has checkpoint format {found}, this version reads 1 there")
+    return facts
 
 
 def _torn(path: Path, found: int, facts: Mapping[str, Any]) -> CheckpointError:

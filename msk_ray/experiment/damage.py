@@ -1,4 +1,7 @@
-"""Read JSON files that may be damaged: unusable parts are named with file and line, and do not hide the rest.
+"""The one reader of an experiment's files, which may be damaged or come from anywhere: unusable parts are named with
+file and line, and do not hide the rest.
+
+Every file is a regular one, and within `Limits`; what is not counts as damaged, and neither blocks nor fills memory.
 
 The consequences of a damaged file:
 
@@ -7,6 +10,8 @@ The consequences of a damaged file:
 | `metrics.jsonl` | a line | the line is skipped and counted; a trial that continues rewrites the file without it |
 | `reports.jsonl` | a line | the line is skipped and counted; the stopping rule is told the others |
 | both | the last line, incomplete | left by a killed writer: dropped silently |
+| both | the file (no regular file, too large) | tables go without it; what continues from it is refused |
+| `owner.json` | the file | its owner is judged by the file's age alone |
 | `outcome.json` | the file | the trial counts as not ended: it continues from its newest checkpoint and ends again |
 | `device.json` | the file | the device is unknown |
 | `halved.json` | the file | the trial ends in an error until it is repaired: its number of worlds is unknown |
@@ -25,17 +30,48 @@ import contextlib
 import json
 import math
 import os
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar
 
 import orjson
 
+from msk_ray.config import parse_settings
 from msk_ray.errors import StorageError, StorageFailure
+from msk_ray.files import UnusableFile, read_file
 
 T = TypeVar("T")
 _TEXT_LIMIT = 100
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How much a file may hold."""
+
+    size: int
+    """Bytes."""
+    count: int
+    """Values, or lines of a file of lines."""
+    undecodable: bool = False
+    """Whether a text may stand for bytes that are no UTF-8, as an argument of a command line may."""
+
+
+RECORD = Limits(16 << 20, 200_000)
+"""Of a file about one trial, one owner, one machine."""
+WITH_COMMAND = Limits(16 << 20, 200_000, undecodable=True)
+"""The same with a command line in it."""
+CATALOGUE = Limits(512 << 20, 20_000_000)
+"""Of a file with an entry for each of an experiment's trials."""
+LOG = Limits(512 << 20, 4_000_000)
+"""Of a file of lines."""
+LINE = Limits(1 << 20, 10_000)
+"""Of one of its lines."""
+_SURROGATE = re.compile(rb"\\u[dD][89A-Fa-f]")
+DEPTH = 32
+"""Objects and lists inside each other, in any file."""
 
 
 @dataclass(frozen=True)
@@ -88,21 +124,51 @@ def count_damages(damages: Sequence[Damage]) -> str:
     return " and ".join(f"{n} damaged {what}{'' if n == 1 else 's'}" for n, what in counts if n)
 
 
-def read_bytes(path: Path) -> bytes | None:
+def read_bytes(path: Path, limits: Limits = RECORD) -> bytes | None:
     """The content of a file; None if there is no such file.
 
     Raises:
+        DamagedFile: it is no regular file, or larger than the limit.
         StorageFailure: the storage does not give it.
     """
     try:
-        return path.read_bytes()
+        return read_file(path, limits.size)
     except (FileNotFoundError, NotADirectoryError):
         return None
+    except UnusableFile as error:
+        raise DamagedFile(Damage(path, str(error))) from None
     except OSError as error:
         raise StorageFailure(f"cannot read {path}: {error.strerror or error}") from error
 
 
-def read_object(path: Path, build: Callable[[dict[str, Any]], T]) -> T | None:
+def read_text(path: Path) -> str:
+    """The text in a file.
+
+    Raises:
+        DamagedFile: there is no such file, it cannot be used, or it is not UTF-8.
+        StorageFailure: the storage does not give it.
+    """
+    data = read_bytes(path)
+    if data is None:
+        raise DamagedFile(Damage(path, "missing"))
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise DamagedFile(Damage(path, _not_text(error))) from None
+
+
+def read_settings(path: Path) -> dict[str, Any]:
+    """The settings in a YAML file of an experiment or trial.
+
+    Raises:
+        DamagedFile: as for `read_text`.
+        ConfigError: it is not YAML, or holds something else.
+        StorageFailure: the storage does not give it.
+    """
+    return parse_settings(read_text(path), str(path))
+
+
+def read_object(path: Path, build: Callable[[dict[str, Any]], T], limits: Limits = RECORD) -> T | None:
     """The value stored as a JSON object in a file; None if there is no such file.
 
     Args:
@@ -112,11 +178,11 @@ def read_object(path: Path, build: Callable[[dict[str, Any]], T]) -> T | None:
         DamagedFile: it cannot be used.
         StorageFailure: the storage does not give it.
     """
-    data = read_bytes(path)
+    data = read_bytes(path, limits)
     if data is None:
         return None
     try:
-        return build(parse_object(data))
+        return build(parse_object(data, limits))
     except ValueError as error:
         raise DamagedFile(Damage(path, cut(error))) from error
 
@@ -131,48 +197,83 @@ def read_lines(path: Path, build: Callable[[dict[str, Any]], T]) -> tuple[list[T
         build: creates a value from a line's object; raises ValueError that says what is wrong.
 
     Raises:
+        DamagedFile: it is no regular file, or larger than the limits.
         StorageFailure: the storage does not give it.
     """
-    lines = (read_bytes(path) or b"").split(b"\n")
+    data = read_bytes(path, LOG) or b""
+    if data.count(b"\n") > LOG.count:
+        raise DamagedFile(Damage(path, f"more than {LOG.count} lines"))
+    lines = data.split(b"\n")
     unfinished = lines.pop()
     found: list[T] = []
     damages = []
     for number, line in enumerate(lines, start=1):
         try:
-            found.append(build(parse_object(line)))
+            found.append(build(parse_object(line, LINE)))
         except ValueError as error:
             damages.append(Damage(path, cut(error), number))
     if unfinished:
         with contextlib.suppress(ValueError):  # not written, as said above
-            found.append(build(parse_object(unfinished)))
+            found.append(build(parse_object(unfinished, LINE)))
     return found, tuple(damages)
 
 
-def _load(data: bytes) -> Any:
+def _load(data: bytes, undecodable: bool) -> Any:
     try:
         return orjson.loads(data)
     except orjson.JSONDecodeError:
         # It does not accept NaN either, and its messages are less precise.
-        return json.loads(data.decode("utf-8"))
+        value = json.loads(data.decode("utf-8"))
+    if not undecodable and _SURROGATE.search(data):
+        try:
+            json.dumps(value, ensure_ascii=False).encode()
+        except UnicodeEncodeError:
+            raise ValueError("half a character, which no page could show") from None
+    return value
 
 
-def parse_object(data: bytes) -> dict[str, Any]:
+def parse_object(data: bytes, limits: Limits = RECORD) -> dict[str, Any]:
     """A JSON object. NaN and infinity, which JSON does not have, are accepted as numbers that are not finite.
 
     Raises:
-        ValueError: it is not a JSON object; the message says why.
+        ValueError: it is not a JSON object, or exceeds the limits; the message says why.
     """
+    if len(data) > limits.size:
+        raise ValueError(f"larger than {limits.size} bytes")
+    opened = data.count(b"[") + data.count(b"{")
+    # There cannot be more values than these; commas in texts make it fewer. Counted before any of them is made.
+    if opened + data.count(b",") > limits.count:
+        raise ValueError(f"more than {limits.count} values")
     try:
-        value = _load(data)
+        value = _load(data, limits.undecodable)
     except UnicodeDecodeError as error:
-        raise ValueError(f"not UTF-8 text: byte {error.start} is {data[error.start]:#04x}") from None
+        raise ValueError(_not_text(error)) from None
     except json.JSONDecodeError as error:
         raise ValueError(f"not JSON: {error}") from None
     except RecursionError:
-        raise ValueError("not JSON of ours: nested too deep") from None
+        raise ValueError(_TOO_DEEP) from None
     if not isinstance(value, dict):
         raise ValueError(f"{_kind(value)} instead of a JSON object")
+    if opened > DEPTH and _deeper_than(DEPTH, value):
+        raise ValueError(_TOO_DEEP)
     return value
+
+
+_TOO_DEEP = f"more than {DEPTH} objects and lists inside each other"
+
+
+def _deeper_than(limit: int, value: dict[str, Any]) -> bool:
+    level: list[dict[str, Any] | list[Any]] = [value]
+    for _ in range(limit):
+        parts = chain.from_iterable(part.values() if isinstance(part, dict) else part for part in level)
+        level = [part for part in parts if isinstance(part, dict | list)]
+        if not level:
+            return False
+    return True
+
+
+def _not_text(error: UnicodeDecodeError) -> str:
+    return f"not UTF-8 text: byte {error.start} is {error.object[error.start]:#04x}"
 
 
 def field(data: Mapping[str, Any], name: str, kind: type[T]) -> T:

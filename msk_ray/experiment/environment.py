@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import msk_ray
-from msk_ray.experiment.damage import Damage, DamagedFile, cut, field, read_object, texts
+from msk_ray.experiment.damage import WITH_COMMAND, Damage, DamagedFile, cut, field, read_object, texts
 from msk_ray.experiment.versions import installed_versions
 from msk_ray.nvidia_smi import ask_driver
 
@@ -52,7 +52,7 @@ def read_environment(path: Path) -> tuple[dict[str, Any], list[Damage]]:
         return {name: found[name] for name in _ENVIRONMENT if name in found}
 
     try:
-        return read_object(path, usable) or {}, damages
+        return read_object(path, usable, WITH_COMMAND) or {}, damages
     except DamagedFile as error:
         return {}, [error.damage]
 

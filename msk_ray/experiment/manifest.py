@@ -13,6 +13,7 @@ runs/<experiment>/
 """
 
 import contextlib
+import os
 import re
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -20,10 +21,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from msk_ray.cli import typed_command
+from msk_ray.cli import option_value, typed_command, with_option
 from msk_ray.config import current_values, parse_recorded
-from msk_ray.errors import StorageError, StorageFailure, brief
-from msk_ray.experiment.damage import DamagedFile, field, read_object, texts
+from msk_ray.errors import ConfigError, StorageError, StorageFailure, brief
+from msk_ray.experiment.damage import CATALOGUE, DamagedFile, field, read_object, texts
 from msk_ray.experiment.environment import read_environment
 from msk_ray.experiment.layout import ENVIRONMENT_FILE, MANIFEST_FILE, METRICS_FILE, OUTCOME_FILE, STOP_FILE
 from msk_ray.experiment.metrics import read_metrics
@@ -33,6 +34,10 @@ from msk_ray.experiment.trial import Trial
 from msk_ray.files import check_writable, make_folder, write_json
 
 FORMAT = 1
+MAX_TRIALS = 100_000
+"""Trials of an experiment."""
+STORAGE = "runs"
+"""Folder of experiments unless another is given."""
 REMEMBERED = ("halve_worlds", "early_stopping")
 """Options that --resume keeps unless it overrides them."""
 
@@ -50,23 +55,20 @@ class Experiment:
 
     def resume_command(self) -> str:
         """The command that continues the experiment: the original one with --resume, which keeps the latest values of
-        `REMEMBERED`, and with the folder that the experiment is in now."""
+        `REMEMBERED`, and with the name and the storage folder that the experiment has now."""
         flags = {f"--{no}{option.replace('_', '-')}" for option in REMEMBERED for no in ("", "no-")}
         argv = read_environment(self.path / ENVIRONMENT_FILE)[0].get("command")
         if not argv:
             # The command is lost, or was never complete; its options are not recorded anywhere else.
             return "python -m msk_ray.tune --resume, with the options it was started with"
         words = [word for word in argv if word not in flags]
-        for place, word in enumerate(words):
-            if word == "--storage" and place + 1 < len(words):
-                words[place + 1] = self._storage(words[place + 1])
-            elif word.startswith("--storage="):
-                words[place] = f"--storage={self._storage(word.partition('=')[2])}"
+        if Path(option_value(words, "--storage") or STORAGE).resolve() != self.path.parent.resolve():
+            words = with_option(words, "--storage", str(self.path.parent))
+        space = option_value(words, "--space")
+        named = option_value(words, "--name") or (space and default_name(space, "--smoke" in words))
+        if named is not None and named != self.name:
+            words = with_option(words, "--name", self.name)
         return typed_command(words, "--resume")
-
-    def _storage(self, given: str) -> str:
-        """The storage folder as it was given, or where the experiment has been moved to since."""
-        return given if Path(given).resolve() == self.path.parent.resolve() else str(self.path.parent)
 
     @property
     def tune(self) -> Path:
@@ -135,7 +137,7 @@ class Experiment:
             StorageError: missing, unreadable, or of another format.
         """
         try:
-            manifest = read_object(self.path / MANIFEST_FILE, _manifest)
+            manifest = read_object(self.path / MANIFEST_FILE, _manifest, CATALOGUE)
         except DamagedFile as error:
             raise DamagedFile(error.damage, "restore it, or start again under another --name") from None
         if manifest is None:
@@ -158,15 +160,19 @@ class Experiment:
             "question": question,
             "created": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
             "options": dict(options),
-            "trials": [_entry(trial) for trial in trials],
+            "trials": _entries(trials),
         }
         write_json(self.path / MANIFEST_FILE, manifest)
 
-    def trials(self) -> list[Trial]:
-        """The trials of the manifest."""
+    def trials(self, *, shown: bool = False) -> list[Trial]:
+        """The trials of the manifest.
+
+        Args:
+            shown: they are only shown, as far as they are known: see `parse_recorded`.
+        """
         trials = []
         for entry in self.manifest()["trials"]:
-            config = parse_recorded(entry["config"], f"{self.path / MANIFEST_FILE}: trial {entry['id']}")
+            config = parse_recorded(entry["config"], f"{self.path / MANIFEST_FILE}: trial {entry['id']}", shown=shown)
             changed, values = (current_values(entry[part]) for part in ("changed", "values"))
             trials.append(Trial(entry["index"], entry["id"], changed, values, config))
         return trials
@@ -198,9 +204,7 @@ class Experiment:
     def extend(self, trials: Iterable[Trial], extension: Mapping[str, Any]) -> None:
         """Replace the manifest's list of trials by a longer one, and record the extension."""
         extended = {"extended": self.extension() | dict(extension)}
-        write_json(
-            self.path / MANIFEST_FILE, self.manifest() | extended | {"trials": [_entry(trial) for trial in trials]}
-        )
+        write_json(self.path / MANIFEST_FILE, self.manifest() | extended | {"trials": _entries(trials)})
 
     def clear_outgrown(self) -> None:
         """Take back the endings of trials that finished before their epochs were extended."""
@@ -215,18 +219,28 @@ class Experiment:
 
     def set_trials(self, trials: Iterable[Trial]) -> None:
         """Replace the manifest's list of trials."""
-        write_json(self.path / MANIFEST_FILE, self.manifest() | {"trials": [_entry(trial) for trial in trials]})
+        write_json(self.path / MANIFEST_FILE, self.manifest() | {"trials": _entries(trials)})
 
 
 def has_begun(path: Path) -> bool:
-    """Whether the folder holds a whole experiment, which --resume goes on with."""
-    return (path / MANIFEST_FILE).is_file()
+    """Whether the folder holds a whole experiment, which --resume goes on with, or whose manifest it refuses."""
+    return os.path.lexists(path / MANIFEST_FILE)
 
 
 def refuse_old(path: Path) -> None:
     """Raise StorageError where there is an experiment already."""
     if has_begun(path):
         raise StorageError(f"{path} already holds an experiment: add --resume to continue it, or pass another --name")
+
+
+def default_name(space: str, smoke: bool) -> str:
+    """The name of an experiment that was given none.
+
+    Args:
+        space: name or file of its space, as given.
+        smoke: whether it is a smoke run.
+    """
+    return Path(space).stem + ("-smoke" if smoke else "")
 
 
 def check_name(name: str) -> str:
@@ -248,7 +262,10 @@ def _manifest(data: dict[str, Any]) -> dict[str, Any]:
     """
     if data.get("format") != FORMAT:
         raise ValueError(f"it has format {data.get('format')!r:.40}, this version reads {FORMAT}")
-    for number, entry in enumerate(field(data, "trials", list)):
+    entries = field(data, "trials", list)
+    if len(entries) > MAX_TRIALS:
+        raise ValueError(f"{len(entries)} trials, more than {MAX_TRIALS}")
+    for number, entry in enumerate(entries):
         if not isinstance(entry, dict):
             raise ValueError(f"trial {number} is no object")
         try:
@@ -265,6 +282,13 @@ def _manifest(data: dict[str, Any]) -> dict[str, Any]:
         if data.get(name) is not None:
             field(data, name, kind)
     return data
+
+
+def _entries(trials: Iterable[Trial]) -> list[dict[str, Any]]:
+    entries = [_entry(trial) for trial in trials]
+    if len(entries) > MAX_TRIALS:
+        raise ConfigError(f"{len(entries)} trials, more than an experiment's {MAX_TRIALS}: make several of them")
+    return entries
 
 
 def _entry(trial: Trial) -> dict[str, Any]:

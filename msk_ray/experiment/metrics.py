@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from msk_ray.experiment.damage import Damage, field, is_number, number, read_lines, texts
+from msk_ray.experiment.damage import Damage, DamagedFile, field, is_number, number, read_lines, texts
 from msk_ray.experiment.layout import METRICS_FILE
 from msk_ray.metrics import SCORE
 
@@ -57,9 +57,13 @@ def load_metrics(path: Path) -> Metrics:
     """A trial's metrics, without the lines that are damaged; none if there is no such file.
 
     Raises:
+        DamagedFile: it is no regular file, or too large.
         StorageFailure: the storage does not give it.
     """
-    found, damages = read_lines(path, _row)
+    try:
+        found, damages = read_lines(path, _row)
+    except DamagedFile as error:
+        raise DamagedFile(error.damage, "remove it, and the trial continues without its earlier rows") from None
     rows = {row["epoch"]: row for row in found}
     return Metrics(tuple(rows[epoch] for epoch in sorted(rows)), damages)
 
@@ -137,7 +141,7 @@ class TrialProgress:
     env_steps_per_s: float | None = None
     """Median over the newest rows."""
     seconds_per_epoch: float | None = None
-    """Mean over the newest rows [s]."""
+    """Mean over the newest rows [s]; None while only the first epoch is known, which includes compilation."""
 
 
 def progress_of(rows: Sequence[Mapping[str, float]]) -> TrialProgress:
@@ -147,7 +151,7 @@ def progress_of(rows: Sequence[Mapping[str, float]]) -> TrialProgress:
     scores = [e.score for e in evaluations_of(rows) if math.isfinite(e.score)]
     recent = [row for row in rows[-RECENT - 1 :] if row["epoch"] > 0]
     speeds = [row["env_steps_per_s"] for row in recent if math.isfinite(row.get("env_steps_per_s", math.nan))]
-    first, last = rows[-RECENT - 1 :][0], rows[-1]
+    first, last = next(iter(recent), rows[-1]), rows[-1]
     epochs = last["epoch"] - first["epoch"]
     seconds = last.get("seconds", math.nan) - first.get("seconds", math.nan)
     return TrialProgress(

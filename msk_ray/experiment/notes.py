@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from msk_ray.errors import ConfigError
-from msk_ray.experiment.damage import Damage, DamagedFile, field, read_object, texts
+from msk_ray.experiment.damage import CATALOGUE, Damage, DamagedFile, field, read_object, texts
 from msk_ray.experiment.layout import NOTES_FILE
 from msk_ray.files import write_json
 
@@ -31,7 +31,7 @@ def load_notes(experiment: Path) -> dict[str, str]:
         DamagedFile: the file cannot be used.
         StorageFailure: the storage does not give it.
     """
-    return read_object(experiment / NOTES_FILE, _notes) or {}
+    return read_object(experiment / NOTES_FILE, _notes, CATALOGUE) or {}
 
 
 def write_note(experiment: Path, trial: str, text: str) -> None:

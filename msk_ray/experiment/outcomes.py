@@ -1,13 +1,17 @@
 """How a trial ended: a name and a reason, recorded in the trial's folder."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
+from msk_ray.errors import shortened
 from msk_ray.experiment.damage import DamagedFile, field, read_object
 from msk_ray.experiment.layout import OUTCOME_FILE
 from msk_ray.files import write_json
+
+_LONGEST = 10_000
+"""Characters of a reason."""
 
 
 class Outcome(StrEnum):
@@ -58,8 +62,8 @@ class Ending:
 
 
 def write_ending(folder: Path, ending: Ending) -> None:
-    """Write `ending` to a trial's folder, completely or not at all."""
-    write_json(folder / OUTCOME_FILE, asdict(ending))
+    """Write `ending` to a trial's folder, completely or not at all; of an endless reason, the beginning."""
+    write_json(folder / OUTCOME_FILE, asdict(replace(ending, why=shortened(ending.why, _LONGEST))))
 
 
 def load_ending(folder: Path) -> Ending | None:

@@ -26,6 +26,8 @@ from pathlib import Path
 from typing import Any
 
 from msk_ray.errors import OwnershipLost, StorageError, StorageFailure
+from msk_ray.experiment.damage import RECORD, field, parse_object
+from msk_ray.files import UnusableFile, open_file
 
 LOCK_FILE = "owner.json"
 BEAT_S = 5.0
@@ -97,7 +99,7 @@ class Ownership:
         self._above = above
         self._on_loss = on_loss
         # Touch the file that was created, not whatever has its name now, so that another's lock is never kept alive.
-        self._file = os.open(folder / LOCK_FILE, os.O_RDONLY)
+        self._file = os.open(folder / LOCK_FILE, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW)
         self._lost: OwnershipLost | None = None
         self._seen = time.monotonic()
         self._done = threading.Event()
@@ -246,12 +248,11 @@ def has_living_owner(folder: Path, now: float) -> bool | None:
     Returns:
         None if there is no lock.
     """
-    path = folder / LOCK_FILE
     try:
-        touched, data = path.stat().st_mtime, path.read_bytes()
+        owner, touched = _read_lock(folder / LOCK_FILE)
     except OSError:
         return None
-    return not _Found(_owner_in(data), max(0.0, now - touched)).stale
+    return not _Found(owner, max(0.0, now - touched)).stale
 
 
 @contextlib.contextmanager
@@ -265,8 +266,10 @@ def owned(folder: Path, force: bool = False) -> Iterator[Ownership]:
 
 
 def _refusal(folder: Path, found: _Found) -> str:
-    known_alive = found.owner is not None and found.owner.alive_here()
-    left = "" if known_alive else f"if it is dead, wait {max(1.0, STALE_S - found.age_s):.0f} s; "
+    wait = f"wait {max(1.0, STALE_S - found.age_s):.0f} s; "
+    if found.owner is None:
+        return f"{folder}: {found}: if nothing is at work there, {wait}--force takes it over"
+    left = "" if found.owner.alive_here() else f"if it is dead, {wait}"
     return f"{folder} is in use by {found}: stop that first; {left}--force takes it over"
 
 
@@ -299,12 +302,9 @@ def _link(folder: Path, owner: Owner) -> bool:
 
 def _find(folder: Path) -> _Found | None:
     """The lock in a folder, and how long ago it was touched; None if there is none."""
-    path = folder / LOCK_FILE
     probe = folder / f".{LOCK_FILE}.{uuid.uuid4().hex}.part"
     try:
-        with path.open("rb") as file:  # opening asks the file server again
-            data = file.read()
-            touched = os.fstat(file.fileno()).st_mtime
+        owner, touched = _read_lock(folder / LOCK_FILE)
     except FileNotFoundError:
         return None
     try:
@@ -312,14 +312,26 @@ def _find(folder: Path) -> _Found | None:
         now = probe.stat().st_mtime
     finally:
         probe.unlink(missing_ok=True)
-    return _Found(_owner_in(data), max(0.0, now - touched))
+    return _Found(owner, max(0.0, now - touched))
+
+
+def _read_lock(lock: Path) -> tuple[Owner | None, float]:
+    """The owner that a lock names, None if it is damaged or no regular file; and when it was touched last."""
+    try:
+        with open_file(lock) as file:  # opening asks the file server again
+            return _owner_in(file.read(RECORD.size)), os.fstat(file.fileno()).st_mtime
+    except UnusableFile:
+        return None, lock.lstat().st_mtime
 
 
 def _owner_in(data: bytes) -> Owner | None:
-    """The owner that a lock's content names; None if it is damaged."""
     try:
-        return Owner(**json.loads(data))
-    except (ValueError, TypeError):
+        found = parse_object(data)
+        texts = (field(found, name, str) for name in ("host", "birth", "machine", "token", "began"))
+        host, birth, machine, token, began = texts
+        serves = None if found.get("serves") is None else field(found, "serves", str)
+        return Owner(host, field(found, "pid", int), birth, machine, token, began, serves)
+    except ValueError:
         return None
 
 
@@ -342,12 +354,8 @@ def _remove(folder: Path, found: _Found) -> None:
 
 def _token_in(lock: Path) -> str | None:
     """None if it is damaged."""
-    data = lock.read_bytes()
-    try:
-        token: str = json.loads(data)["token"]
-    except (ValueError, TypeError, KeyError):
-        return None
-    return token
+    owner, _ = _read_lock(lock)
+    return None if owner is None else owner.token
 
 
 def _birth_of(pid: int) -> str:

@@ -1,16 +1,17 @@
 """The trials of an experiment with the content of their folders, for tables and for resuming."""
 
 import math
+import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from msk_ray.config import current_key, parse_recorded, read_yaml
+from msk_ray.config import current_key, parse_recorded
 from msk_ray.errors import MskRayError
 from msk_ray.experiment.attempts import Attempt
-from msk_ray.experiment.damage import Damage, cut
+from msk_ray.experiment.damage import Damage, cut, read_settings
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import Evaluation
 from msk_ray.experiment.outcomes import Ending
@@ -120,10 +121,10 @@ def unlisted_trials(
     damages = []
     for folder in sorted(folders):
         path = folder / "config.yaml"
-        if not path.is_file():
+        if not os.path.lexists(path):
             continue  # made, but nothing was written into it
         try:
-            config = parse_recorded(read_yaml(path), str(path))
+            config = parse_recorded(read_settings(path), str(path), shown=True)
             settings = config.as_dict()
             values = {key: _at(settings, key) for key in map(current_key, parameters)}
         except (MskRayError, KeyError, TypeError) as error:

@@ -10,10 +10,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from msk_ray.errors import StorageFailure
-from msk_ray.experiment.damage import Damage, field, number, read_bytes, read_lines
+from msk_ray.experiment.damage import LOG, Damage, field, number, read_bytes, read_lines
 from msk_ray.experiment.metrics import EPOCH_LIMIT, Evaluation
-from msk_ray.files import write_bytes
+from msk_ray.files import append_text, write_bytes
 
 
 @dataclass(frozen=True)
@@ -53,7 +52,7 @@ class SchedulerLog:
         Raises:
             StorageFailure: the storage does not give it, or the torn line cannot be cut off.
         """
-        data = read_bytes(self._path) or b""
+        data = read_bytes(self._path, LOG) or b""
         whole, newline, torn = data.rpartition(b"\n")
         if torn:
             write_bytes(self._path, whole + newline)
@@ -66,11 +65,7 @@ class SchedulerLog:
             StorageFailure: the disk is full or gone, or the guard raises it.
         """
         self._guard()
-        try:
-            with self._path.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(asdict(entry)) + "\n")
-        except OSError as error:
-            raise StorageFailure(f"cannot write {self._path}: {error.strerror or error}") from error
+        append_text(self._path, json.dumps(asdict(entry)) + "\n")
 
 
 def _entry(data: dict[str, Any]) -> LogEntry:

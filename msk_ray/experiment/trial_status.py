@@ -5,12 +5,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from msk_ray.config import read_yaml
 from msk_ray.errors import MskRayError
 from msk_ray.experiment.attempts import FIRST, Attempt
-from msk_ray.experiment.damage import Damage, describe_damages
+from msk_ray.experiment.damage import Damage, describe_damages, read_settings
 from msk_ray.experiment.eta import eta
-from msk_ray.experiment.layout import ENVIRONMENT_FILE, MANIFEST_FILE, SPACE_FILE
+from msk_ray.experiment.layout import ENVIRONMENT_FILE, MANIFEST_FILE, METRICS_FILE, SPACE_FILE
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import TrialProgress
 from msk_ray.experiment.results import unlisted_trials
@@ -39,7 +38,7 @@ class TrialStatus:
     outcome: str = ""
     """Name of its ending, if it has one."""
     note: str = ""
-    """Why it ended, or what is wrong with its files."""
+    """Why it ended, what it does before its first epoch has ended, or what is wrong with its files."""
     attempt: Attempt = FIRST
     damages: tuple[Damage, ...] = ()
     """What was skipped in its files."""
@@ -51,6 +50,10 @@ class TrialStatus:
         if self.state is not State.RUNNING or speed is None:
             return None
         return max(0, self.epochs - self.progress.epoch) * speed
+
+
+FIRST_EPOCH = "compiles kernels that are not in Warp's cache, records and trains its first epoch"
+"""What a running trial does that has no epoch yet."""
 
 
 class StatusReader:
@@ -75,7 +78,7 @@ class StatusReader:
     def _known(self) -> list[Trial]:
         stamp = file_stamp(self.experiment.path / MANIFEST_FILE)
         if stamp is None or stamp != self._manifest:
-            self._trials, self._manifest = self.experiment.trials(), stamp
+            self._trials, self._manifest = self.experiment.trials(shown=True), stamp
         return self._trials
 
     def _unlisted(self, listed: set[str], now: float) -> list[TrialStatus]:
@@ -83,7 +86,7 @@ class StatusReader:
         if all(path.name in listed for path in _subfolders(self.experiment.path / "trials")):
             return []
         try:
-            varied = list(read_yaml(self.experiment.path / SPACE_FILE).get("parameters") or {})
+            varied = list(read_settings(self.experiment.path / SPACE_FILE).get("parameters") or {})
         except (MskRayError, TypeError):
             varied = []  # their settings are known all the same; only what sets them apart is not
         trials, damages = unlisted_trials(self.experiment, listed, varied)
@@ -99,6 +102,8 @@ class StatusReader:
     def _status(self, trial: Trial, now: float) -> TrialStatus:
         seen = self._reader.read(self.experiment.trial_folder(trial.id), now)
         why = [] if seen.ending is None else [seen.ending.why]
+        if seen.state is State.RUNNING and seen.progress.epoch == 0:
+            why = [FIRST_EPOCH]
         return TrialStatus(
             trial.id,
             trial.variant,
@@ -162,6 +167,7 @@ def find_experiments(storage: Path) -> list[Path]:
         path
         for path in _subfolders(storage)
         if any((path / part).exists() for part in (MANIFEST_FILE, SPACE_FILE, ENVIRONMENT_FILE))
+        and not (path / METRICS_FILE).exists()  # a trial on its own
     ]
     return sorted(found, key=lambda path: (path.stat().st_mtime, path.name))
 

@@ -16,9 +16,9 @@ DESCRIPTION = """\
 Export a policy for programs that do not have msk_ray: as ONNX, as TorchScript, or both.
 
 The network takes raw observations (batch, O), float32, and returns `action` (batch, A) in [-1, 1] and `ctrl` (batch,
-nu), the controls of the model; normalisation and squashing are inside. `ctrl` is left out where controls depend on more
-than the action. Each file is compared with the checkpoint's policy on 1000 observations, and not written if one of them
-differs by more than 1e-5.
+nu), the controls of the model; normalisation and squashing are inside. Where controls depend on the action before, the
+network also takes `previous_action` (batch, A); where they depend on the state, `ctrl` is left out. Each file is
+compared with the checkpoint's policy on 1000 observations, and not written if one of them differs by more than 1e-5.
 
 Beside p.onnx stand p.json (order and units of observation and action, control period, joints, origin) and p.mjb, the
 model, which MuJoCo of the same version loads (mujoco.MjModel.from_binary_path).

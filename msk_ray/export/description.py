@@ -41,6 +41,14 @@ def describe(
         "format": FORMAT,
         "files": dict(files),
         "input": {"name": "obs", "shape": ["batch", env.obs_size], "dtype": "float32"},
+        "previous_action": {
+            "name": "previous_action",
+            "shape": ["batch", env.action_size],
+            "dtype": "float32",
+            "meaning": "the action of the step before; 0 in the first step of an episode",
+        }
+        if policy.takes_previous
+        else None,
         "outputs": policy.outputs,
         "observation": {
             "size": env.obs_size,

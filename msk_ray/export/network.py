@@ -15,7 +15,9 @@ import torch
 from torch import Tensor, nn
 
 from msk_ray.envs import Env
+from msk_ray.envs.records import EnvState
 from msk_ray.errors import ConfigError, ExportError
+from msk_ray.step import StepState
 
 TOLERANCE = 1e-5
 """Largest difference from the checkpoint's policy that is accepted, in actions and in controls divided by their
@@ -27,37 +29,114 @@ WORLDS = 8
 _NOISE = 0.1
 _PACKAGES = ("onnx", "onnxscript", "onnxruntime")
 
-Runner = Callable[[Tensor], list[Tensor]]
+Runner = Callable[..., list[Tensor]]
+"""Runs an exported policy on its inputs."""
 
 
 class PolicyToControl(nn.Module):
     """Raw observations (N, O) to actions (N, A) in [-1, 1] and, where they do not depend on the state, controls (N, U).
 
-    The normalisation of the observation and the squashing of the action are inside.
+    Where controls depend on the action before, it is a second input (N, A), 0 in the first step of an episode. The
+    normalisation of the observation and the squashing of the action are inside.
+
+    Raises:
+        ExportError: the environment's `control` takes only as many actions as the environment has worlds.
     """
 
     def __init__(self, network: nn.Module, env: Env[Any]) -> None:
         super().__init__()
+        if env.nworld < 2:
+            raise ValueError("several worlds are needed to compare their controls")
         self.network = network
-        self._control = env.control
-        self.gives_control = not _control_depends_on_state(env)
+        self._env = env
+        self.gives_control = not _depends_on_state(env)
+        self.takes_previous = self.gives_control and _depends_on_previous(env)
+        if self.gives_control:
+            self._try_control()
+
+    @property
+    def inputs(self) -> list[str]:
+        """Names of what it takes."""
+        return ["obs", "previous_action"] if self.takes_previous else ["obs"]
 
     @property
     def outputs(self) -> list[str]:
         """Names of what it returns."""
         return ["action", "ctrl"] if self.gives_control else ["action"]
 
-    def forward(self, obs: Tensor) -> tuple[Tensor, ...]:
+    def forward(self, obs: Tensor, previous_action: Tensor | None = None) -> tuple[Tensor, ...]:
         action = self.network(obs)
-        return (action, self._control(action)) if self.gives_control else (action,)
+        return (action, self._control(action, previous_action)) if self.gives_control else (action,)
+
+    def examples(self, obs: Tensor, seed: int) -> tuple[Tensor, ...]:
+        """Its inputs for some observations, with actions before them drawn with this seed."""
+        if not self.takes_previous:
+            return (obs,)
+        generator = torch.Generator().manual_seed(seed)
+        return obs, 2.0 * torch.rand((len(obs), self._env.action_size), generator=generator) - 1.0
+
+    def _control(self, action: Tensor, previous: Tensor | None) -> Tensor:
+        if previous is None:
+            return self._env.control(action)
+        with _state(self._env, self._env.state._replace(action=previous)):
+            return self._env.control(action)
+
+    def _try_control(self) -> None:
+        """Control one action, and more of them than there are worlds."""
+        for count in (1, self._env.nworld + 1):
+            actions = torch.zeros((count, self._env.action_size), device=self._env.device)
+            try:
+                control = self._control(actions, actions if self.takes_previous else None)
+            except Exception as error:
+                text = (str(error).splitlines() or [""])[0]
+                raise self._refused(count, f"{type(error).__name__}: {text}") from error
+            if control.shape != (count, self._env.model.nu):
+                raise self._refused(count, f"it returns shape {tuple(control.shape)}")
+
+    def _refused(self, count: int, why: str) -> ExportError:
+        return ExportError(
+            f"not written: {type(self._env).__qualname__}.control fails for {count} rows of actions ({why}): compute "
+            "it from `action` and `self.state.action` alone, whatever their number of rows"
+        )
 
 
-def _control_depends_on_state(env: Env[Any]) -> bool:
+@contextmanager
+def _state(env: Env[Any], state: EnvState) -> Iterator[None]:
+    """With another state of the environment's worlds."""
+    before, env.state = env.state, state
+    try:
+        yield
+    finally:
+        env.state = before
+
+
+@torch.no_grad()
+def _depends_on_state(env: Env[Any]) -> bool:
     """Whether one action means other controls in other states, as with an assisting force or a feedback law."""
-    if env.nworld < 2:
-        raise ValueError("several worlds are needed to compare their controls")
+    generator = torch.Generator().manual_seed(0)
+
+    def varied(part: Tensor) -> Tensor:
+        return part + _NOISE * torch.randn(part.shape, generator=generator).to(part)
+
+    state = env.state
+    others = state._replace(
+        physics=StepState(*map(varied, state.physics)), age=state.age + torch.arange(env.nworld, device=env.device)
+    )
+    return _controls_differ(env, others)
+
+
+@torch.no_grad()
+def _depends_on_previous(env: Env[Any]) -> bool:
+    """Whether one action means other controls after other actions, as with a limited rate."""
+    spread = torch.linspace(-0.9, 0.9, env.nworld, device=env.device)
+    return _controls_differ(env, env.state._replace(action=spread[:, None].repeat(1, env.action_size)))
+
+
+def _controls_differ(env: Env[Any], state: EnvState) -> bool:
+    """Whether worlds in these states have different controls for the same action."""
     action = torch.linspace(-0.9, 0.9, env.action_size, device=env.device).expand(env.nworld, -1)
-    control = env.control(action)
+    with _state(env, state):
+        control = env.control(action)
     return not bool((control == control[:1]).all())
 
 
@@ -82,62 +161,65 @@ def check_packages() -> None:
 
 
 @torch.no_grad()
-def to_torchscript(policy: PolicyToControl, obs: Tensor) -> tuple[bytes, Runner]:
+def to_torchscript(policy: PolicyToControl, *inputs: Tensor) -> tuple[bytes, Runner]:
     """TorchScript of a policy, and a function that runs it as another program would."""
     buffer = io.BytesIO()
     with _quiet():
-        torch.jit.save(torch.jit.trace(policy, (obs[:2],)), buffer)
+        torch.jit.save(torch.jit.trace(policy, tuple(part[:2] for part in inputs)), buffer)
         loaded = torch.jit.load(io.BytesIO(buffer.getvalue()))
 
-    def run(obs: Tensor) -> list[Tensor]:
+    def run(*inputs: Tensor) -> list[Tensor]:
         with torch.no_grad():
-            return list(loaded(obs))
+            return list(loaded(*inputs))
 
     return buffer.getvalue(), run
 
 
 @torch.no_grad()
-def to_onnx(policy: PolicyToControl, obs: Tensor) -> tuple[bytes, Runner]:
+def to_onnx(policy: PolicyToControl, *inputs: Tensor) -> tuple[bytes, Runner]:
     """ONNX of a policy, and a function that runs it with onnxruntime."""
     import onnxruntime
 
+    batch = torch.export.Dim("batch")
     with _quiet():
         program = torch.onnx.export(
             policy,
-            (obs[:2],),
+            tuple(part[:2] for part in inputs),
             dynamo=True,
             verbose=False,
-            input_names=["obs"],
+            input_names=policy.inputs,
             output_names=policy.outputs,
-            dynamic_shapes=({0: torch.export.Dim("batch")},),
+            dynamic_shapes=tuple({0: batch} for _ in inputs),
         )
     assert program is not None
     payload: bytes = program.model_proto.SerializeToString()
     session = onnxruntime.InferenceSession(payload, providers=["CPUExecutionProvider"])
 
-    def run(obs: Tensor) -> list[Tensor]:
-        return [torch.as_tensor(part) for part in session.run(None, {"obs": obs.numpy()})]
+    def run(*inputs: Tensor) -> list[Tensor]:
+        given = {name: part.numpy() for name, part in zip(policy.inputs, inputs, strict=True)}
+        return [torch.as_tensor(part) for part in session.run(None, given)]
 
     return payload, run
 
 
 @torch.no_grad()
-def largest_difference(policy: PolicyToControl, run: Runner, obs: Tensor) -> float:
+def largest_difference(policy: PolicyToControl, run: Runner, *inputs: Tensor) -> float:
     """Largest difference between what an exported policy computes and the checkpoint's, one by one and in a batch.
 
     Raises:
         ExportError: it is above `TOLERANCE`, or not a number.
     """
-    wanted = policy(obs)
-    single = [torch.cat(parts) for parts in zip(*(run(row[None]) for row in obs[:WORLDS]), strict=True)]
-    found = [(name, ours, theirs) for name, ours, theirs in zip(policy.outputs, wanted, run(obs), strict=True)]
+    wanted = policy(*inputs)
+    rows = zip(*(part[:WORLDS].split(1) for part in inputs), strict=True)
+    single = [torch.cat(parts) for parts in zip(*(run(*row) for row in rows), strict=True)]
+    found = [(name, ours, theirs) for name, ours, theirs in zip(policy.outputs, wanted, run(*inputs), strict=True)]
     found += [(name, ours[:WORLDS], theirs) for name, ours, theirs in zip(policy.outputs, wanted, single, strict=True)]
     worst = 0.0
     for name, ours, theirs in found:
         difference = float((ours - theirs).abs().max() / ours.abs().max().clamp_min(1.0))
         if not difference <= TOLERANCE:
             raise ExportError(
-                f"not written: its {name} differs from the checkpoint's by {difference:.1e} on one of {len(obs)} "
+                f"not written: its {name} differs from the checkpoint's by {difference:.1e} on one of {len(inputs[0])} "
                 f"observations, more than {TOLERANCE:.0e}"
             )
         worst = max(worst, difference)

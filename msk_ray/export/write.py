@@ -33,16 +33,17 @@ def export(checkpoint: Path, paths: Mapping[str, Path], physics: str) -> Iterato
         physics: of the model: `reference`, `own`, or a named one of the environment.
 
     Raises:
-        ExportError: an exported policy differs from the checkpoint's; nothing is written.
+        ExportError: an exported policy differs from the checkpoint's, or cannot be made; nothing is written.
         ConfigError, CheckpointError, UnsupportedModelError, StorageFailure: as their messages say.
     """
     saved = load_policy(checkpoint)
     policy, env, shown = policy_to_control(saved, physics)
-    obs = observations(env, saved.config.evaluation.seed)
+    seed = saved.config.evaluation.seed
+    inputs = policy.examples(observations(env, seed), seed)
     made = {}
     for kind in paths:
-        payload, runner = _WRITERS[kind](policy, obs)
-        made[kind] = payload, largest_difference(policy, runner, obs)
+        payload, runner = _WRITERS[kind](policy, *inputs)
+        made[kind] = payload, largest_difference(policy, runner, *inputs)
     descriptions: dict[Path, dict[str, str]] = {}
     for kind, path in paths.items():
         payload, difference = made[kind]
@@ -68,7 +69,7 @@ def policy_to_control(saved: SavedPolicy, physics: str) -> tuple[PolicyToControl
     """The network to export, the environment that it acts in, on the CPU, and the name of its physics.
 
     Raises:
-        ConfigError, CheckpointError, UnsupportedModelError: as their messages say.
+        ConfigError, CheckpointError, UnsupportedModelError, ExportError: as their messages say.
     """
     shown, chosen = named_physics(saved.config, physics)
     settings = env_class(saved.config.env).reference_settings(saved.config.env)

@@ -202,8 +202,9 @@ def _parity(stored: SavedPolicy) -> float:
         ExportError: it is above the tolerance.
     """
     policy, env, _ = policy_to_control(stored, REFERENCE)
-    obs = observations(env, stored.config.evaluation.seed)
-    return largest_difference(policy, to_torchscript(policy, obs)[1], obs)
+    seed = stored.config.evaluation.seed
+    inputs = policy.examples(observations(env, seed), seed)
+    return largest_difference(policy, to_torchscript(policy, *inputs)[1], *inputs)
 
 
 def _renew(folder: Path) -> str:

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from msk_ray.errors import UnsupportedModelError
-from msk_ray.step import Simulation, StepState
+from msk_ray.step import Kernels, Simulation, StepState
+from msk_ray.step.forward.solver_limits import SolverLimits, own_limits
 
 
 class CSimulation(Simulation):
@@ -16,12 +17,15 @@ class CSimulation(Simulation):
 
     A step continues in float64 where the one before ended, if it is given the state that that one returned.
 
+    Args:
+        limits: most iterations of the solver; None: the model's, but at least 100 and 50.
+
     Attributes:
         data: MuJoCo's state, as the last step left it.
     """
 
-    def __init__(self, model: mujoco.MjModel, substeps: int) -> None:
-        super().__init__(model, 1, substeps, None, "cpu")
+    def __init__(self, model: mujoco.MjModel, substeps: int, limits: SolverLimits | None = None) -> None:
+        super().__init__(model, 1, substeps, None, "cpu", kernels=Kernels(**(limits._asdict() if limits else {})))
         self.data = mujoco.MjData(model)
 
     def step(
@@ -47,8 +51,14 @@ class CSimulation(Simulation):
             mujoco.mj_resetData(self.model, data)
             data.qpos[:], data.qvel[:], data.act[:] = (part[0].numpy() for part in given)
         data.ctrl[:] = ctrl[0].numpy()
+        own = own_limits(self.model)
+        self._limit(self.batch.limits)
         mujoco.mj_step(self.model, data, self.substeps)
+        self._limit(own)
         return self._state()
+
+    def _limit(self, limits: SolverLimits) -> None:
+        self.model.opt.iterations, self.model.opt.ls_iterations = limits
 
     def _state(self) -> StepState:
         parts = (self.data.qpos, self.data.qvel, self.data.act)

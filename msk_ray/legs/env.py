@@ -80,6 +80,7 @@ class LegEnv(AssistedEnv[AnyLegSettings], Generic[AnyLegSettings]):
         *("forward_vel", "progress", "upright", "heading", "height", "alive", "effort", "joint_limit"),
         *("smoothness", "capture", "sway", "symmetry", "stride"),
     )
+    without_gradient = ("alive",)
     pose_signs: ClassVar[tuple[float, ...]]
     """Signs of the mirror image of `Root.pose`."""
     stand_height: float
@@ -252,15 +253,10 @@ class LegEnv(AssistedEnv[AnyLegSettings], Generic[AnyLegSettings]):
             return action
         return self._mirror_action.where(self._exchanged(self.task_numbers(self.state.numbers), age), action)
 
-    def observation(self) -> Tensor:
-        state = self.state
-        # The last action was chosen one step before.
-        action = self._own_sides(state.action, state.age - 1)
-        return self._observed(state.physics, action, self.task_numbers(state.numbers), state.age)
-
     def observe(self, state: StepState, action: Tensor) -> Tensor:
-        action = self._own_sides(action, self.state.age)
-        return self._observed(state, action, self.task_numbers(self.state.numbers), self.state.age + 1)
+        age = self.state.age
+        # The action was chosen one step before.
+        return self._observed(state, self._own_sides(action, age - 1), self.task_numbers(self.state.numbers), age)
 
     def _observed(self, state: StepState, action: Tensor, task: Tensor, age: Tensor) -> Tensor:
         """Observation (W, O) of a state at an age, after an action for the body as it is."""

@@ -13,13 +13,15 @@ from msk_ray.evaluate.stored import eval_file_of, read_evaluations, store_evalua
 from msk_ray.evaluate.targets import best_of_trial
 from msk_ray.experiment.checkpoint_file import read_facts
 from msk_ray.experiment.layout import EVAL_FILE
-from msk_ray.files import write_bytes
+from msk_ray.files import read_file, write_bytes
 from msk_ray.report.reading import TrialReading, explain
 
 STRIP = "strip"
 FRAMES = 8
 _FRAME = (256, 192)
 _STAMP = "checkpoint"
+_LARGEST = 16 << 20
+"""Bytes of a strip."""
 
 
 @dataclass(frozen=True)
@@ -101,15 +103,25 @@ def narrow_strip(strip: Path) -> Path:
     return strip.with_name(f"{strip.stem}_narrow.png")
 
 
+def strip_bytes(path: Path) -> bytes:
+    """The content of a strip.
+
+    Raises:
+        UnusableFile: it is no regular file, or too large.
+        OSError: it cannot be read.
+    """
+    return read_file(path, _LARGEST)
+
+
 def strip_text(path: Path, sha: str) -> str | None:
     """Description of a strip; None if there is none of the checkpoint with this hash."""
     if not path.is_file() or not narrow_strip(path).is_file():
         return None
     try:
-        with Image.open(path) as image:
+        with Image.open(io.BytesIO(strip_bytes(path))) as image:
             facts = dict(image.info)
-    except OSError:
-        return None  # incomplete: it is drawn again
+    except (OSError, ValueError, Image.DecompressionBombError):
+        return None  # incomplete, or none of ours: it is drawn again
     return str(facts.get("Description", "")) if facts.get(_STAMP) == sha else None
 
 
@@ -131,6 +143,7 @@ def _draw(path: Path, out: Path, sha: str, device: str | None) -> None:
     from msk_ray.training import load_policy
     from msk_ray.visualize.episodes import record
     from msk_ray.visualize.film import grid, strip
+    from msk_ray.visualize.look import describe_groups, geom_groups
     from msk_ray.visualize.render import View, headless_backend
     from msk_ray.visualize.strips import episode_frames, log_strip
 
@@ -144,6 +157,8 @@ def _draw(path: Path, out: Path, sha: str, device: str | None) -> None:
         f"{float(recording.episodes.score[0]):.5g} in {recording.length(0) * recording.timestep:.1f} s, "
         f"ended by {recording.ending(0)}"
     )
+    if drawn := describe_groups(geom_groups(recording.model)):
+        text += f"; {drawn}"
     stamp = PngImagePlugin.PngInfo()
     stamp.add_text(_STAMP, sha)
     stamp.add_text("Description", text)

@@ -21,7 +21,7 @@ from msk_ray.errors import StorageFailure
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.files import write_text
 from msk_ray.progress import format_duration
-from msk_ray.report.best import Best
+from msk_ray.report.best import Best, strip_bytes
 from msk_ray.report.curves import gradient_health, learning_curves, stopping_map
 from msk_ray.report.influence import parallel_coordinates, parameter_effects, ranked_effects
 from msk_ray.report.pictures import Picture, format_steps
@@ -224,7 +224,7 @@ def render_page(
     ]
     matrix = _matrix(sections)
     data = {"trials": trials, "figures": {picture.name: picture.chart for picture in pictures}}
-    return (
+    page = (
         _templates()
         .get_template("report.html.j2")
         .render(
@@ -238,12 +238,14 @@ def render_page(
             written=time.strftime("%Y-%m-%d %H:%M:%S %Z", time.localtime(now)),
             command=command,
             version=__version__,
-            strip_uri=lambda path: _uri(path.read_bytes()),
+            strip_uri=lambda path: _uri(strip_bytes(path)),
             live=live,
             # Inside a script element, only "</script" and "<!--" would end or change it.
             data=Markup(orjson.dumps(data).decode().replace("<", "\\u003c")),
         )
     )
+    # An argument of the recorded command that is no UTF-8, such as a path, is shown escaped.
+    return page.encode("utf-8", "backslashreplace").decode()
 
 
 @cache

@@ -3,7 +3,9 @@
 What cannot be read is named in `warnings`, or in its trial, and does not hide the rest.
 """
 
+import contextlib
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
@@ -13,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from msk_ray.config import read_yaml
+from msk_ray.config import parse_settings
 from msk_ray.errors import MskRayError, StorageError
 from msk_ray.experiment.attempts import FIRST, Attempt
-from msk_ray.experiment.damage import Damage, count_damages, describe_damages
+from msk_ray.experiment.damage import Damage, count_damages, describe_damages, read_text
 from msk_ray.experiment.environment import read_environment
 from msk_ray.experiment.layout import (
     DEVICE_FILE,
@@ -36,6 +38,7 @@ from msk_ray.experiment.outcomes import Ending
 from msk_ray.experiment.results import unlisted_trials
 from msk_ray.experiment.snapshot import State, TrialReader, TrialSnapshot, file_stamp
 from msk_ray.experiment.trial import Trial, by_environment
+from msk_ray.files import UnusableFile, last_lines
 from msk_ray.metrics import SCORE
 from msk_ray.sweep.space import SpaceFile, read_file
 
@@ -81,6 +84,12 @@ class TrialReading:
     def epochs_done(self) -> int:
         epochs = self.columns.get("epoch")
         return int(epochs[-1]) if epochs is not None and len(epochs) else 0
+
+    @property
+    def unrecordable(self) -> bool:
+        """Whether its last epoch ran operation by operation because it could not be recorded."""
+        column = self.columns.get("train/unrecordable")
+        return column is not None and len(column) > 0 and column[-1] == 1.0
 
     @cached_property
     def curve(self) -> tuple[np.ndarray, np.ndarray]:
@@ -164,10 +173,11 @@ class TrialReading:
     def tail(self) -> str:
         """The last lines of its error, or otherwise of its output."""
         for name in (ERROR_FILE, OUTPUT_FILE):
-            path = self.folder / name
-            if path.is_file():
-                lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-                return "\n".join(lines[-_TAIL_LINES:])
+            with contextlib.suppress(FileNotFoundError):
+                try:
+                    return "\n".join(last_lines(self.folder / name, _TAIL_LINES))
+                except UnusableFile as error:
+                    return f"({name}: {error})"
         return ""
 
 
@@ -294,6 +304,8 @@ class ExperimentReader:
         damages += damaged
         unlisted, unreadable = self._others({trial.id for trial in trials}, list(space.parameters) if space else [])
         warnings += [f"A trial is left out: {line}." for line in describe_damages(unreadable, experiment.path)]
+        unknown = dict.fromkeys(trial.config.undeclared for trial in [*trials, *unlisted] if trial.config.undeclared)
+        warnings += [f"Trials are shown as recorded, and cannot be evaluated here: {why}." for why in unknown]
         readings = []
         for trial in [*trials, *unlisted]:
             reading, found = self._trial(trial, notes.get(trial.id, ""), now)
@@ -303,6 +315,12 @@ class ExperimentReader:
             lines = describe_damages(damages, experiment.path)
             more = f"; and {len(lines) - _NOTED} more files" if len(lines) > _NOTED else ""
             warnings.append(f"Skipped: {count_damages(damages)}. {'; '.join(lines[:_NOTED])}{more}.")
+        if slow := [reading.trial.id for reading in readings if reading.unrecordable]:
+            more = f" and {len(slow) - _NOTED} more" if len(slow) > _NOTED else ""
+            warnings.append(
+                f"Epochs of {', '.join(slow[:_NOTED])}{more} could not be recorded as graphs, and took two to three "
+                f"times as long: their {OUTPUT_FILE} says why."
+            )
         return Reading(
             experiment,
             str(manifest.get("question") or (space.question.strip() if space else "")),
@@ -317,7 +335,7 @@ class ExperimentReader:
     def _plan(self) -> list[Trial]:
         stamp = file_stamp(self.experiment.path / MANIFEST_FILE)
         if self._planned is None or self._planned[0] != stamp:
-            self._planned = stamp, self.experiment.trials()
+            self._planned = stamp, self.experiment.trials(shown=True)
         return self._planned[1]
 
     def _others(self, listed: set[str], parameters: list[str]) -> tuple[list[Trial], list[Damage]]:
@@ -370,19 +388,19 @@ def columns_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
 
 
 def _read_space(path: Path, warnings: list[str]) -> tuple[str, SpaceFile | None]:
-    if not path.is_file():
+    if not os.path.lexists(path):
         warnings.append("space.yaml is missing.")
         return "", None
     try:
-        text = path.read_text(encoding="utf-8")
-        return text, read_file(read_yaml(path), "space.yaml", recorded=True)
-    except (MskRayError, OSError, ValueError) as error:
+        text = read_text(path)
+        return text, read_file(parse_settings(text, "space.yaml"), "space.yaml", recorded=True)
+    except MskRayError as error:
         warnings.append(f"space.yaml cannot be read: {explain(error)}.")
     return "", None
 
 
 def _read_environment(folder: Path, warnings: list[str]) -> tuple[dict[str, Any], list[Damage]]:
-    if not (folder / ENVIRONMENT_FILE).is_file():
+    if not os.path.lexists(folder / ENVIRONMENT_FILE):
         warnings.append("env.json is missing: versions and command are not known.")
         return {}, []
     return read_environment(folder / ENVIRONMENT_FILE)

@@ -1,11 +1,12 @@
 """Start an experiment of a space, or open one to continue it."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from msk_ray.config import dump_yaml, read_yaml
+from msk_ray.config import dump_yaml
 from msk_ray.errors import MskRayError, StorageError
+from msk_ray.experiment.damage import read_settings
 from msk_ray.experiment.environment import environment
 from msk_ray.experiment.layout import ENVIRONMENT_FILE, SPACE_FILE
 from msk_ray.experiment.manifest import Experiment, refuse_old
@@ -33,13 +34,19 @@ def create(path: Path, space: Space, trials: list[Trial], options: dict[str, Any
     return experiment
 
 
-def reopen(path: Path, trials: list[Trial] | None, extension: Mapping[str, Any] | None = None) -> Experiment:
+def reopen(
+    path: Path,
+    trials: list[Trial] | None,
+    extension: Mapping[str, Any] | None = None,
+    own_trials: Callable[[], list[Trial]] | None = None,
+) -> Experiment:
     """Open an experiment to continue it.
 
     Args:
         path: its folder.
         trials: the current trials of the (extended) space, for comparison; None trusts the manifest.
         extension: what to extend: epochs, samples, seeds.
+        own_trials: the trials that the command line which started it would give now.
 
     Raises:
         StorageError: there is none, it cannot be written, or its trials are not those of the current space.
@@ -58,10 +65,15 @@ def reopen(path: Path, trials: list[Trial] | None, extension: Mapping[str, Any] 
         experiment.extend(recorded, extension)
     difference = difference_of(recorded, trials) if trials is not None else None
     if difference:
+        other = "pass another --name (--extend adds samples, seeds or epochs)"
+        if own_trials is not None and difference_of(recorded, with_recorded_ids(own_trials(), recorded)) is None:
+            raise StorageError(
+                f"--resume: this command line does not give the trials of {path}: {difference}; {other}, or continue "
+                f"it as it was started: {experiment.resume_command()}"
+            )
         raise StorageError(
-            f"--resume: the space no longer gives the trials of {path}: {difference}; undo that, or pass another "
-            f"--name (--extend adds samples, seeds or epochs). To continue it with its original settings: "
-            f"{experiment.resume_command()}"
+            f"--resume: the space no longer gives the trials of {path}: {difference}; undo that in the space or its "
+            f"base, or {other}"
         )
     # Also without a new extension: an earlier one may have been interrupted right after writing its manifest.
     experiment.clear_outgrown()
@@ -84,7 +96,7 @@ def check_scheduler(experiment: Experiment, space: Space) -> None:
     """
     try:
         path = experiment.path / SPACE_FILE
-        recorded = read_file(read_yaml(path), str(path), recorded=True).scheduler.model_dump()
+        recorded = read_file(read_settings(path), str(path), recorded=True).scheduler.model_dump()
     except MskRayError as error:
         # Only this check and the report depend on it.
         text = " ".join(str(error).split())

@@ -11,6 +11,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, SerializeAsA
 from msk_ray.config import current_values, describe_fault, leaves, read_yaml
 from msk_ray.config.sections import Count, Section, Text, Whole
 from msk_ray.errors import ConfigError, brief
+from msk_ray.experiment.manifest import MAX_TRIALS
 from msk_ray.shipped import CONFIGS, SPACES, find_shipped, is_name, shipped_names
 from msk_ray.sweep.operators import Operator, Range, parse_operator
 from msk_ray.sweep.rules.early_stopping import SchedulerSpec
@@ -77,7 +78,7 @@ class SpaceFile(Section):
     ablate: AblateSpec | None = None
     seeds: str | int | list[int] = "0"
     """Seeds every trial is run with: "0-4", "0,3", 7 or [0, 3]."""
-    max_trials: Count = 2000
+    max_trials: Annotated[Count, Field(le=MAX_TRIALS)] = 2000
     """Largest number of trials of the space; more are refused before any is created."""
     samples: Count = 1
     """Random draws of the sampled parameters (choice, uniform, loguniform, randint) for each point of the grid."""

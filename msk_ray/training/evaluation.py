@@ -10,6 +10,7 @@ from torch import Tensor
 
 from msk_ray.config import Config, PhysicsConfig, RandomizeConfig
 from msk_ray.envs import Env, EnvState, env_class, make_env
+from msk_ray.envs.generators import GlobalGenerators
 from msk_ray.envs.records import Resets, Transition
 from msk_ray.errors import ConfigError
 from msk_ray.step import StepState
@@ -107,6 +108,8 @@ class Evaluator:
             execution=config.execution,
         )
         self.env.generator = torch.Generator()
+        self.env.policies = policies
+        self._generators = GlobalGenerators(self.env.device, python=False)
         self.steps = steps
         self._policies = policies
         self._streams = streams_for(self.env.device)
@@ -195,6 +198,7 @@ class Evaluator:
     ) -> list[Episodes]:
         """The episodes of each of at most as many policies as there is room for."""
         env = self.env
+        before = self._generators.state()
         env.generator.manual_seed(self._seed if seed is None else seed)
         self._reset()
         policy = PolicyGroup(policies, self._worlds, env, self._streams)
@@ -223,6 +227,12 @@ class Evaluator:
         if on_step is not None:
             on_step(env.state.physics, control)
         env.sim.diagnostics()  # raises if contacts were lost
+        if (drawn := self._generators.changed(before)) is not None:
+            warnings.warn(
+                f"the evaluation drew from {drawn}, so its score does not repeat: draw with self.uniform(...) or "
+                f"self.normal(...) in {type(env).__qualname__}, and nothing in the policy",
+                stacklevel=2,
+            )
         return record.episodes()
 
     def _records_steps(self) -> bool:
@@ -299,10 +309,12 @@ def _tensors(state: EnvState) -> list[Tensor]:
 def _recorded_step(
     env: Env[Any], policy: PolicyGroup, record: "_Record", stream: torch.cuda.Stream
 ) -> _RecordedStep | None:
+    drawn = env.generator.get_state()
     try:
         return _RecordedStep(env, policy, record, stream)
     except RuntimeError as error:
         torch.cuda.empty_cache()
+        env.generator.set_state(drawn)  # so that the next step draws what it would without the attempt
         warnings.warn(
             f"an evaluation runs operation by operation: its steps cannot be recorded ({str(error).splitlines()[0]})",
             stacklevel=2,

@@ -5,6 +5,9 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
+import torch
+from torch import Tensor
+
 from msk_ray.algorithms import Algorithm, algorithm_class
 from msk_ray.config import Config
 from msk_ray.envs import make_env
@@ -74,6 +77,17 @@ def start_from(algorithm: Algorithm, path: str) -> list[str]:
             "and networks"
         ) from error
     return [name for name in algorithm.modules() if name not in state["algorithm"]["modules"]]
+
+
+def check_generators(path: Path, saved: Tensor, device: torch.device) -> None:
+    """Refuse generators of the other kind of device: they draw other numbers, and their states do not fit."""
+    if len(saved) == len(torch.Generator(device=device).get_state()):
+        return
+    there, here, option = ("CPU", "GPU", "cpu") if device.type == "cuda" else ("GPU", "CPU", "cuda:0")
+    raise CheckpointError(
+        f"{path} was written on a {there}, and a {here} draws other random numbers; use --device {option}, or begin "
+        f"another trial with its networks: --set trial.start_from={path}"
+    )
 
 
 def load_state(algorithm: Algorithm, checkpoint: Mapping[str, Any]) -> None:

@@ -158,6 +158,11 @@ class ParallelTrainer(Place):
         found: tuple[Path | None, list[str]] = self._call("restore_latest")
         return found
 
+    def remarks(self) -> list[str]:
+        """As `Trainer.remarks`."""
+        found: list[str] = self._call("remarks")
+        return found
+
     def close(self) -> None:
         """Flush the logs and end the processes; nothing if they have ended."""
         if self._ranks:

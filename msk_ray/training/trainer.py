@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from msk_ray.algorithms import algorithm_class
 from msk_ray.config import Config, ExecutionConfig, dump_yaml, overlay, parse_config, parse_recorded
@@ -33,7 +32,7 @@ from msk_ray.training.checkpoint import (
     write_checkpoint,
 )
 from msk_ray.training.evaluation import Evaluator
-from msk_ray.training.learner import load_state, make_algorithm, naming_memory, start_from
+from msk_ray.training.learner import check_generators, load_state, make_algorithm, naming_memory, start_from
 from msk_ray.training.loggers import TrialLog
 from msk_ray.training.machine import machine_differences, record_machine
 from msk_ray.training.place import Place
@@ -203,7 +202,7 @@ class Trainer(Place):
                 f"{path} has {state['epoch']} epochs already: set trial.epochs to the new total, not "
                 f"{self.config.trial.epochs}"
             )
-        _check_generators(path, state["algorithm"]["env_generator"], self.algorithm.env.device)
+        check_generators(path, state["algorithm"]["env_generator"], self.algorithm.env.device)
         if recomputed := _changed_rounding(recorded.execution, self.config.execution):
             warnings.warn(
                 f"{path.name} was written with {recomputed}: the same to rounding, not to the bit", stacklevel=2
@@ -240,6 +239,10 @@ class Trainer(Place):
 
     def _write_config(self) -> None:
         write_bytes(self.logdir / "config.yaml", dump_yaml(self.config.as_dict()).encode())
+
+    def remarks(self) -> list[str]:
+        """What made training worse or slower than it could be, a line on each."""
+        return self.algorithm.remarks()
 
     def close(self) -> None:
         """Flush the logs."""
@@ -329,7 +332,7 @@ class Trainer(Place):
             parameters: digest of the trial's modules then.
         """
         score = figures["score"]
-        if epoch > 0 and score > self.best_score:
+        if epoch > 0 and math.isfinite(score) and score > self.best_score:
             self.best_score = score
             facts = {"epoch": epoch, "best_score": score}
             write_checkpoint(self.best_checkpoint, state() | {"best_score": score}, facts)
@@ -400,17 +403,6 @@ def _changed_rounding(before: ExecutionConfig, now: ExecutionConfig) -> str:
     names = ("gpus", "threads", "deterministic", "solver_kernels", "jacobian")
     values = ((name, getattr(before, name), getattr(now, name)) for name in names)
     return "; ".join(f"execution.{name} {old}, now {new}" for name, old, new in values if old != new)
-
-
-def _check_generators(path: Path, saved: Tensor, device: torch.device) -> None:
-    """Refuse generators of the other kind of device: they draw other numbers, and their states do not fit."""
-    if len(saved) == len(torch.Generator(device=device).get_state()):
-        return
-    there, here, option = ("CPU", "GPU", "cpu") if device.type == "cuda" else ("GPU", "CPU", "cuda:0")
-    raise CheckpointError(
-        f"{path} was written on a {there}, and a {here} draws other random numbers; use --device {option}, or begin "
-        f"another trial with its networks: --set trial.start_from={path}"
-    )
 
 
 def _expect(path: Path, state: dict[str, Any]) -> dict[str, Any]:

@@ -14,8 +14,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from msk_ray.cli import TERMINAL_LOG, outliving, run
-from msk_ray.config import combine, dump_yaml, parse_overrides
-from msk_ray.errors import ConfigError
+from msk_ray.config import Config, combine, dump_yaml, parse_overrides
+from msk_ray.config.packages import require
+from msk_ray.errors import ClusterLost, ConfigError, MskRayError
 from msk_ray.experiment.manifest import Experiment, own
 from msk_ray.experiment.outcomes import read_ending
 from msk_ray.experiment.trial import Trial
@@ -24,6 +25,7 @@ from msk_ray.signals import RESUMABLE, StopRequest, listening
 from msk_ray.sweep import opening
 from msk_ray.sweep.budget import extreme_configs
 from msk_ray.sweep.extend import extended_space
+from msk_ray.sweep.search import search_class
 from msk_ray.sweep.search_trials import recover
 from msk_ray.sweep.smoke import shrink, without_early_stopping
 from msk_ray.sweep.space import Space, parse_space, read_space
@@ -43,10 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if options.extension and (space.file.searches or space.file.scheduler.exchanges):
         kind = space.file.search if space.file.searches else space.file.scheduler.kind
         raise ConfigError(f"--extend: {kind} cannot continue a recorded experiment; pass another --name")
-    trials = _resolve(space)
-    if options.smoke:
-        trials = shrink(space, trials) if trials else []
-        space = without_early_stopping(space)
+    space, trials = _trials_of(options, space)
     if options.dry_run:
         _print_trials(space, trials)
         return 0
@@ -55,17 +54,38 @@ def main(argv: Sequence[str] | None = None) -> int:
     return _run(options, space, trials, recorded)
 
 
+def _trials_of(options: Options, space: Space) -> tuple[Space, list[Trial]]:
+    """The space and its trials, smaller for a smoke run."""
+    trials = _resolve(space)
+    if not options.smoke:
+        return space, trials
+    return without_early_stopping(space), shrink(space, trials) if trials else []
+
+
 def _resolve(space: Space) -> list[Trial]:
-    """The space's trials; none for a search, whose settings are checked as far as they are known."""
+    """The space's trials; none for a search, whose settings are checked as far as they are known.
+
+    Raises:
+        ConfigError: also where a package is missing, which would otherwise be found after Ray has started.
+    """
     if space.file.searches:
-        check_threads(extreme_configs(space), space.file.resources)
+        require(search_class(space.file.search).packages, f"search: {space.file.search}")
+        configs = extreme_configs(space)
+        _check_all(configs, space)
         if "execution.gpus" in space.sampled:
             raise ConfigError("execution.gpus: all trials of an experiment have as many GPUs each; write one number")
         return []
     trials = resolve_trials(space)
-    check_threads((trial.config for trial in trials), space.file.resources)
+    _check_all([trial.config for trial in trials], space)
     _processes(space, trials)
     return trials
+
+
+def _check_all(configs: Sequence[Config], space: Space) -> None:
+    """Refuse trials for which this machine lacks a package, or that ask for more threads than they get."""
+    for config in configs:
+        config.check_installed()
+    check_threads(configs, space.file.resources)
 
 
 def _processes(space: Space, trials: list[Trial]) -> int:
@@ -190,6 +210,9 @@ def _run(
             if stop.signal is None or stop.insisted:
                 raise
             return _stopped(stop, experiment)
+        except ClusterLost:
+            print(f"continue with: {printable(experiment.resume_command())}", flush=True)
+            raise
     return 1 if errors else 0
 
 
@@ -204,7 +227,12 @@ def _go_on(
     another_rule = recorded is not None and options.early_stopping != recorded.said("early_stopping")
     if recorded is not None and not another_rule:
         opening.check_scheduler(recorded, space)
-    experiment = opening.reopen(options.path, None if searching else trials, options.extension)
+    experiment = opening.reopen(
+        options.path,
+        None if searching else trials,
+        options.extension,
+        None if recorded is None else lambda: _as_started(options, recorded),
+    )
     if searching:
         # Otherwise the manifest would contain them only at the end.
         experiment.set_trials(made.trial for made in recover(experiment, space))
@@ -218,6 +246,15 @@ def _go_on(
         _name_stopped(experiment)
     experiment.say(**options.remembered())
     return experiment, trials
+
+
+def _as_started(options: Options, recorded: Experiment) -> list[Trial]:
+    """The trials that the command line which started an experiment would give now; none if it would be refused."""
+    original = options.as_started(recorded)
+    try:
+        return [] if original is None else _trials_of(original, _read_space(original, recorded.extension()))[1]
+    except MskRayError:
+        return []
 
 
 def _stopped(stop: StopRequest, experiment: Experiment) -> int:

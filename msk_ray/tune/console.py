@@ -14,6 +14,8 @@ from msk_ray.progress import format_duration
 from msk_ray.text import printable, printable_lines
 
 STATUS_INTERVAL_S = 30.0
+BEFORE_FIRST = "compiles kernels that are not in Warp's cache, records, then trains"
+"""What a trial does before its first evaluation."""
 
 
 @dataclass
@@ -87,7 +89,9 @@ class Console:
             self.say(f"{trial.id} best so far{where}: score {run.best:.5g}{when}{self._suffix(trial)}")
 
     def retried(self, trial: Trial, why: str) -> None:
-        """A trial's process has ended early, and another one takes its place."""
+        """A trial's process has ended early, and another one will take its place."""
+        self._running.pop(trial.id, None)
+        self._waiting[trial.id] = trial
         self.say(f"{trial.id} {why}; retrying from its newest checkpoint")
 
     def attempted_again(self, trial: Trial, attempt: Attempt) -> None:
@@ -142,7 +146,10 @@ class Console:
             parts.append(f"at most {format_duration(left)} left")
         lines = [" · ".join(parts)]
         for run in self._running.values():
-            score = "no evaluation yet" if math.isnan(run.score) else f"score {run.score:.5g} (best {run.best:.5g})"
+            score = f"score {run.score:.5g} (best {run.best:.5g})"
+            if math.isnan(run.score):
+                since = format_duration(time.monotonic() - run.since)
+                score = f"no evaluation in {since}: {BEFORE_FIRST}" if run.epoch == 0 else "no evaluation yet"
             lines.append(
                 f"    {run.trial.id}  epoch {run.epoch:>4}/{run.trial.epochs}  {score}  {self._name(run.trial)}"
             )

@@ -15,14 +15,13 @@ from typing import Any
 import ray
 from ray import tune
 from ray.exceptions import RayTaskError
-from ray.tune import Callback
 from ray.tune.stopper import Stopper
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from msk_ray.config import Config, parse_recorded, read_yaml
+from msk_ray.config import Config, parse_recorded
 from msk_ray.errors import ClusterLost, MskRayError, OwnershipLost, StorageFailure, storage_failure
 from msk_ray.experiment.attempts import read_attempt
-from msk_ray.experiment.damage import describe_damages
+from msk_ray.experiment.damage import describe_damages, read_settings
 from msk_ray.experiment.layout import SCHEDULER_LOG_FILE
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import last_figures
@@ -49,6 +48,7 @@ from msk_ray.tune.gauges import StateGauge
 from msk_ray.tune.interrupts import run_in_thread
 from msk_ray.tune.presence import Presence, remove_remains
 from msk_ray.tune.queue import Identify, Suggestions, TrialList
+from msk_ray.tune.ray_watch import RayWatch
 from msk_ray.tune.schedulers import METRIC, Population, PruningScheduler
 from msk_ray.tune.supervisor import Supervisor
 from msk_ray.tune.trainable import Job, make_trainable
@@ -92,7 +92,7 @@ def run_trials(plan: Plan) -> bool:
 
     Raises:
         StorageFailure: the disk is full or gone; the experiment can be resumed once it is back.
-        MskRayError: kernels could not be compiled for a trial, or the search is not installed.
+        MskRayError: kernels could not be compiled for a trial.
     """
     experiment, space = plan.experiment, plan.space
     _finish_pruning(plan)
@@ -126,18 +126,18 @@ def run_trials(plan: Plan) -> bool:
         flush=True,
     )
     announce("starting the first trials")
-    with listening() as stop, stop.deferred():
+    with listening() as stop, stop.deferred(), RayWatch() as watch:
         console = Console(remaining, concurrent)
         supervisor = Supervisor(
             experiment,
             job.trial_of,
             console,
             stop,
-            plan.guard,
+            watch.guarding(plan.guard),
             waiting=remaining,
             started=[s.trial for s in suggested],
         )
-        _fit(plan, job, supervisor, stop, remaining, suggested)
+        _fit(plan, job, supervisor, stop, watch, remaining, suggested)
         if not plan.trials:
             # A search suggests trials as it goes; they enter the manifest once they are known.
             experiment.set_trials(supervisor.started)
@@ -170,6 +170,7 @@ def _fit(
     job: Job,
     supervisor: Supervisor,
     stop: StopRequest,
+    watch: RayWatch,
     remaining: list[Trial],
     suggested: list[SearchTrial],
 ) -> None:
@@ -177,7 +178,7 @@ def _fit(
 
     Raises:
         StorageFailure: the disk is full or gone, also where only a trial has noticed.
-        ClusterLost: the Ray node of this process has died.
+        ClusterLost: Ray has died or does not answer.
         Exception: whatever else ends Tune's loop.
     """
     file = plan.space.file
@@ -189,7 +190,6 @@ def _fit(
         search, samples = _suggestions(plan, suggested, identify), -1
     else:
         search, samples = TrialList(plan.experiment, identify, plan.max_concurrent), 1
-    node = _OwnNode()
     ahead = WorkerPrestart(plan.placement, plan.max_concurrent, supervisor.waiting, supervisor.console.say)
     states = StateGauge(plan.experiment, remaining, job.trial_of)
     tuner = tune.Tuner(
@@ -213,8 +213,7 @@ def _fit(
             callbacks=[
                 supervisor,
                 states,
-                node,
-                Presence(plan.experiment, plan.guard),
+                Presence(plan.experiment, watch.guarding(plan.guard)),
                 *([ahead] if plan.prestart else []),
             ],
             stop=_StopWhen(supervisor),
@@ -225,11 +224,13 @@ def _fit(
     )
     try:
         with closing(states), _log_to(plan.experiment.path / "ray.log"):
-            run_in_thread(tuner.fit, stop)
+            run_in_thread(tuner.fit, stop, watch)
+    except ClusterLost:
+        raise
     except Exception as error:
         remove_remains(plan.experiment)
-        if node.lost is not None:
-            raise node.lost from error
+        if watch.lost is not None:
+            raise watch.lost from error
         # The driver may meet a full disk before any trial does.
         failure = supervisor.storage_failure or storage_failure(error) or plan.experiment.lost()
         if failure is None:
@@ -278,25 +279,6 @@ def _suggestions(plan: Plan, suggested: list[SearchTrial], identify: Identify) -
             search.tell(params, None if record.best is None else record.best.score)
     left = file.samples - len(scored)
     return Suggestions(plan.experiment, identify, search, begun, left, tuple(file.objectives))
-
-
-class _OwnNode(Callback):
-    """Ends the experiment when this process's Ray node has died: Ray itself would wait for ever for another one."""
-
-    INTERVAL_S = 2.0
-
-    def __init__(self) -> None:
-        self._id = ray.get_runtime_context().get_node_id()
-        self._checked = time.monotonic()
-        self.lost: ClusterLost | None = None
-
-    def on_step_end(self, iteration: int, trials: list[Any], **info: Any) -> None:
-        if time.monotonic() - self._checked < self.INTERVAL_S:
-            return
-        self._checked = time.monotonic()
-        if any(node["NodeID"] == self._id and not node["Alive"] for node in ray.nodes()):
-            self.lost = ClusterLost("the Ray node of this machine has died (raylet killed?); continue with --resume")
-            raise self.lost
 
 
 def _advised(failure: StorageFailure) -> StorageFailure:
@@ -357,7 +339,7 @@ def _current_params(job: Job, trial: Trial) -> dict[str, Any]:
     written = job.experiment.trial_folder(trial.id) / "config.yaml"
     if not written.is_file():
         return params
-    settings = parse_recorded(read_yaml(written), str(written)).as_dict()
+    settings = parse_recorded(read_settings(written), str(written)).as_dict()
     for key in params:
         node: Any = settings
         for part in key.split("."):

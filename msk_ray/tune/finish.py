@@ -1,10 +1,10 @@
 """The results at the end of an experiment: a table on the terminal, summary.json, table.md, and the report."""
 
-import shlex
 import shutil
 import subprocess
 import sys
 
+from msk_ray.cli import shell_join
 from msk_ray.experiment.damage import count_damages, describe_damages
 from msk_ray.experiment.layout import SUMMARY_FILE
 from msk_ray.experiment.manifest import Experiment
@@ -73,7 +73,5 @@ def write_report(experiment: Experiment) -> None:
     command = [sys.executable, "-m", "msk_ray.report", str(experiment.path)]
     code = subprocess.run(command).returncode
     if code:
-        again = shlex.join(
-            ["python", "-m", "msk_ray.report", experiment.name, "--storage", str(experiment.path.parent)]
-        )
-        print(printable(f"no report (exit code {code}); to try again: {again}"), flush=True)
+        words = ["python", "-m", "msk_ray.report", experiment.name, "--storage", str(experiment.path.parent)]
+        print(f"no report (exit code {code}); to try again: {shell_join(words)}", flush=True)

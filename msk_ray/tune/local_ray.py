@@ -33,7 +33,6 @@ def start_local(dashboard: bool | None, options: Mapping[str, Any]) -> Any:
         The result of `ray.init`.
 
     Raises:
-        StorageError: its token cannot be stored.
         ClusterLost: its daemons do not start, because the machine is too busy.
     """
     # Workers must import the package this process runs, wherever it was started from.
@@ -43,7 +42,6 @@ def start_local(dashboard: bool | None, options: Mapping[str, Any]) -> Any:
     # The dashboard finds its profiler among the programs of this environment, activated or not.
     programs = [*os.environ.get("PATH", os.defpath).split(os.pathsep), str(Path(sys.executable).parent)]
     os.environ["PATH"] = os.pathsep.join(dict.fromkeys(programs))
-    make_token_private()
     timed_out: Exception | None = None
     for _ in range(STARTS):
         if timed_out is not None:

@@ -10,7 +10,8 @@ from typing import Any
 from msk_ray.cli import Parser
 from msk_ray.config import SET_HELP
 from msk_ray.errors import ConfigError
-from msk_ray.experiment.manifest import REMEMBERED, Experiment, check_name, has_begun
+from msk_ray.experiment.damage import texts
+from msk_ray.experiment.manifest import REMEMBERED, Experiment, check_name, default_name, has_begun
 from msk_ray.experiment.outcomes import Outcome
 from msk_ray.sweep.extend import parse_extension
 from msk_ray.sweep.space import find_space, parse_seeds
@@ -163,6 +164,17 @@ class Options:
         }
         return replace(self, **known)
 
+    def as_started(self, experiment: Experiment) -> "Options | None":
+        """These options, with what the command line that started the experiment said of its trials; None if that is
+        not recorded."""
+        said = experiment.manifest().get("options") or {}
+        space, overrides, seeds, smoke = (said.get(name) for name in ("space", "overrides", "seeds", "smoke"))
+        if not (isinstance(space, str) and isinstance(overrides, list) and texts(overrides)):
+            return None
+        if not (isinstance(seeds, str | None) and isinstance(smoke, bool)):
+            return None
+        return replace(self, space=Path(space), overrides=tuple(overrides), seeds=seeds, smoke=smoke)
+
     def remembered(self) -> dict[str, bool | None]:
         """The options that an experiment remembers, by name."""
         return {name: getattr(self, name) for name in REMEMBERED}
@@ -182,7 +194,7 @@ def read_options(argv: Sequence[str] | None) -> Options:
     """
     args = parser().parse_args(argv)
     space = find_space(args.space)
-    name = args.name or space.stem + ("-smoke" if args.smoke else "")
+    name = args.name or default_name(args.space, args.smoke)
     path = (args.storage / check_name(name)).resolve()
     resume = args.resume or (args.start_or_resume and has_begun(path))
     if args.max_concurrent is not None and args.max_concurrent < 1:

@@ -7,12 +7,13 @@ from typing import Any
 
 import ray
 
-from msk_ray.errors import DeviceError
+from msk_ray.errors import ClusterLost, DeviceError, MskRayError
 from msk_ray.progress import announce
 from msk_ray.tune import worker_prestart
 from msk_ray.tune.addresses import check_reachable
 from msk_ray.tune.interrupts import end_ray, starting_ray
-from msk_ray.tune.local_ray import start_local, way_in
+from msk_ray.tune.local_ray import make_token_private, start_local, way_in
+from msk_ray.tune.session_folder import SessionFolder
 
 
 @contextmanager
@@ -26,6 +27,8 @@ def ray_session(address: str | None, dashboard: bool | None = None, trials: bool
 
     Raises:
         DeviceError: the cluster at `address` cannot be reached.
+        StorageError: our own Ray has no place for its files or its token.
+        ClusterLost: it does not start, or does not end.
     """
     os.environ.update(
         RAY_AIR_NEW_OUTPUT="0",
@@ -46,9 +49,12 @@ def ray_session(address: str | None, dashboard: bool | None = None, trials: bool
         "log_to_driver": False,
         "runtime_env": {"worker_process_setup_hook": worker_prestart.HOOK} if trials else None,
     }
+    if address is None:
+        announce("starting Ray")
+        make_token_private()
+    folder = SessionFolder() if address is None else None
+    lost = keep = False
     try:
-        if address is None:
-            announce("starting Ray")
         with starting_ray():
             context = _init(address, dashboard, common)
         if context.dashboard_url:
@@ -56,8 +62,14 @@ def ray_session(address: str | None, dashboard: bool | None = None, trials: bool
         elif dashboard is None:
             print("no Ray dashboard: pip install 'ray[default]' to have one", flush=True)
         yield
+    except Exception as error:
+        lost = isinstance(error, ClusterLost)
+        keep = folder is not None and (lost or not isinstance(error, MskRayError))
+        raise
     finally:
-        end_ray()
+        end_ray(folder, lost, keep)
+        if folder is not None and keep:
+            print(f"Ray's logs, until the next sweep starts: {folder.logs}", flush=True)
 
 
 def _init(address: str | None, dashboard: bool | None, common: dict[str, Any]) -> Any:

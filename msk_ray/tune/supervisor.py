@@ -16,6 +16,7 @@ from msk_ray.experiment.layout import ERROR_FILE, HANG_FILE
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.outcomes import Ending, Outcome, read_ending, write_ending
 from msk_ray.experiment.trial import Trial
+from msk_ray.files import last_lines
 from msk_ray.signals import StopRequest
 from msk_ray.text import printable
 from msk_ray.tune.console import Console
@@ -73,7 +74,7 @@ class Supervisor(Callback):
         return {}
 
     def waiting(self) -> int:
-        """How many trials have not started yet, as far as they are known."""
+        """How many trials are to start or to start again, as far as they are known."""
         return len(self._waiting)
 
     @property
@@ -112,6 +113,10 @@ class Supervisor(Callback):
     def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         if not self._meet_storage_failure(trial):
             mine = self._trial_of(trial.config)
+            # It has no process until Tune starts another one, which may take as long as the other trials.
+            self._attempts.pop(mine.id, None)
+            self._saving.discard(mine.id)
+            self._waiting.add(mine.id)
             self.console.retried(mine, self._reason(mine, trial))
 
     def on_trial_complete(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
@@ -120,7 +125,9 @@ class Supervisor(Callback):
         self._saving.discard(mine.id)
         before = self._attempts.pop(mine.id, None)
         ending, attempt = read_ending(folder), read_attempt(folder)
-        if ending is not None:
+        if ending is not None and ending.outcome is Outcome.ERROR and (folder / ERROR_FILE).is_file():
+            self.console.failed(mine, ending.why, folder)
+        elif ending is not None:
             self.console.ended(mine, ending)
         elif before is not None and attempt.number > before:
             self._waiting.add(mine.id)
@@ -197,7 +204,7 @@ def _reason(folder: Path, trial: Any) -> str:
     if hang_file.is_file() and hang_file.stat().st_size:
         return f"it hung; its stacks are in {hang_file}"
     if error_file.is_file():
-        return error_file.read_text(encoding="utf-8", errors="replace").strip().splitlines()[-1]
+        return next(iter(last_lines(error_file, 1)), "its error was not recorded")
     error = _error_of(trial)
     if error is None or isinstance(error, RayActorError):
         times = "" if trial.num_failures < 2 else f", {trial.num_failures} times now"

@@ -31,6 +31,7 @@ from msk_ray.sweep.space import Space
 from msk_ray.tune.devices import wait_for_memory
 from msk_ray.tune.gauges import TrialGauges
 from msk_ray.tune.hparams import log_hparams
+from msk_ray.tune.output import limit_output, redirect_output
 from msk_ray.tune.schedulers import BEST, METRIC
 from msk_ray.tune.trial_run import Handed, Hooks, MakeTrainer, TrainerLike, run_trial
 
@@ -88,6 +89,8 @@ def make_trainable(job: Job, resources: dict[str, float]) -> type[tune.Trainable
                 write_params(folder, config["params"])
             with _owned(folder, job):
                 in_frame_named(trial.label, lambda: work(trial, folder))
+        except _StoppedByTune:
+            sys.exit(0)  # how Tune ends the thread of a trial
         except Exception as error:
             # Whatever failed first on a full disk, perhaps a line of output: the driver must be told about the disk.
             # The same holds for a missing file when the whole folder is missing.
@@ -97,7 +100,8 @@ def make_trainable(job: Job, resources: dict[str, float]) -> type[tune.Trainable
             raise failure from error
 
     def work(trial: Trial, folder: Path) -> None:
-        _redirect_output(folder / OUTPUT_FILE)
+        output = folder / OUTPUT_FILE
+        redirect_output(output)
         _record_device(folder / DEVICE_FILE, job.gpus)
         attempt = read_attempt(folder)
         log_hparams(folder, attempt.effective(trial))
@@ -111,13 +115,17 @@ def make_trainable(job: Job, resources: dict[str, float]) -> type[tune.Trainable
 
             def on_epoch(row: Mapping[str, float]) -> None:
                 watch.alive()
+                limit_output(output)
                 gauges.show(row)
 
             report = _report_with_checkpoint if job.population else _reporter(attempt.number)
 
             def on_evaluation(evaluation: Evaluation, ended: bool, trainer: TrainerLike) -> None:
                 with watch.suspended():
-                    report(evaluation, ended, trainer)
+                    try:
+                        report(evaluation, ended, trainer)
+                    except SystemExit as stopped:
+                        raise _StoppedByTune from stopped
 
             hooks = Hooks(
                 on_epoch=on_epoch,
@@ -143,6 +151,10 @@ def make_trainable(job: Job, resources: dict[str, float]) -> type[tune.Trainable
 
     TrialActor.__qualname__ = TrialActor.__name__
     return TrialActor
+
+
+class _StoppedByTune(BaseException):
+    """Tune has ended this trial, by `sys.exit`, which a trial's own code may call too."""
 
 
 def in_frame_named(name: str, call: Callable[[], None]) -> None:
@@ -216,16 +228,6 @@ def _handed_checkpoint(job: Job, scratch: Path) -> Handed | None:
         return None
     handed.to_directory(str(scratch))
     return Handed(min(scratch.glob("epoch_*.pt")), frozenset((*job.space.sampled, "trial.seed")))
-
-
-def _redirect_output(path: Path) -> None:
-    """Append everything that this process prints, from any language, to a file."""
-    file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os.dup2(file, 1)
-    os.dup2(file, 2)
-    os.close(file)
 
 
 class _Watch:

@@ -1,5 +1,6 @@
 """Run one trial from its current state to its end. Independent of Ray, so it can be stepped through in a debugger."""
 
+import bdb
 import math
 import traceback
 from collections.abc import Callable, Collection, Mapping
@@ -8,7 +9,15 @@ from pathlib import Path
 from typing import Protocol
 
 from msk_ray.config import Config
-from msk_ray.errors import ConfigError, Failure, MskRayError, RankLost, SimulationError, StorageFailure
+from msk_ray.errors import (
+    ConfigError,
+    Failure,
+    MskRayError,
+    RankLost,
+    SimulationError,
+    StorageFailure,
+    storage_failure,
+)
 from msk_ray.experiment.attempts import FIRST, Attempt, load_attempt, read_attempt
 from msk_ray.experiment.damage import DamagedFile
 from msk_ray.experiment.layout import ABANDONED, ERROR_FILE
@@ -16,8 +25,10 @@ from msk_ray.experiment.metrics import Evaluation, evaluations_of, read_rows
 from msk_ray.experiment.outcomes import Ending, Outcome, load_ending, write_ending
 from msk_ray.experiment.trial import Trial
 from msk_ray.files import write_text
+from msk_ray.signals import current
 from msk_ray.sweep.rules.stop_rule import History
 from msk_ray.sweep.rules.stopping import StopSpec
+from msk_ray.tune.failures import described, repeats
 
 
 class TrainerLike(Protocol):
@@ -107,8 +118,9 @@ def run_trial(
     Raises:
         StorageFailure: the disk is full, or the disk or folder is gone; the trial can continue once it is back.
         RankLost: one of the trial's processes has died; the trial may be retried.
-        Exception: anything that is neither a failed simulation nor an error that the user can fix. Its traceback is
-            written to `error.txt`, and the trial may be retried.
+        KeyboardInterrupt: this process was asked to stop.
+        Exception: an error of the machine, which another process may not meet. Its traceback is written to `error.txt`,
+            and the trial may be retried.
     """
     if not folder.is_dir():
         raise StorageFailure(f"{folder} does not exist: moved, removed or not mounted")
@@ -133,15 +145,19 @@ def run_trial(
             ending = _out_of_memory(trial, folder, str(error), attempt, may_halve)
         else:
             ending = Ending(Outcome(error.failure.value), str(error))
-    except (StorageFailure, RankLost):
-        # The trial has not ended: it continues once the disk has space, or in new processes.
+    except (StorageFailure, RankLost, bdb.BdbQuit):
+        # The trial has not ended: it continues once the disk has space, or in new processes, or who debugs it is done.
         raise
     except MskRayError as error:
         ending = Ending(Outcome.ERROR, str(error))
-    except Exception:
+    except (Exception, SystemExit, KeyboardInterrupt) as error:
+        if isinstance(error, KeyboardInterrupt) and current():
+            raise
         traceback.print_exc()
         write_text(folder / ERROR_FILE, traceback.format_exc())
-        raise
+        if storage_failure(error) is not None or not repeats(error):
+            raise
+        ending = Ending(Outcome.ERROR, described(error))
     if ending is not None:
         write_ending(folder, ending)
     return ending

@@ -17,6 +17,7 @@ from msk_ray.sweep.space import parse_seeds
 from msk_ray.text_table import text_table
 
 if TYPE_CHECKING:
+    import mujoco
     import numpy as np
 
     from msk_ray.evaluate.measure import Bench, Request
@@ -81,6 +82,12 @@ def parser() -> Parser:
     )
     how.add_argument("--size", type=_size, metavar="WxH", help="size of a frame, such as 640x480; both even")
     how.add_argument("--camera", default="", metavar="NAME", help="a camera of the model (default: its first)")
+    how.add_argument(
+        "--geom-groups",
+        type=_groups,
+        metavar="LIST",
+        help="groups of geoms to draw, such as 0,3 (default: 0,1,2, and others if the robot has none in these)",
+    )
     how.add_argument("--tensorboard", action="store_true", help="add the strip to the trial's TensorBoard too")
     how.add_argument("--device", help="for the simulation: cpu or cuda:N (default: the first GPU, or the CPU)")
     how.add_argument(
@@ -94,6 +101,12 @@ def _size(text: str) -> tuple[int, int]:
     if match is None or any(int(n) < 16 or int(n) % 2 for n in match.groups()):
         raise argparse.ArgumentTypeError(f"write WIDTHxHEIGHT, both even and at least 16, such as 640x480, not {text}")
     return int(match[1]), int(match[2])
+
+
+def _groups(text: str) -> tuple[int, ...]:
+    if re.fullmatch(r"[0-5](,[0-5])*", text) is None:
+        raise argparse.ArgumentTypeError(f"write numbers from 0 to 5, such as 0,3, not {text}")
+    return tuple(sorted({int(group) for group in text.split(",")}))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -118,7 +131,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         request = Request(args.physics, 1, seeds, args.steps)
         print(f"{policy.path}, epoch {policy.epoch}; close the window to end", flush=True)
-        done = watch(bench, policy, request, args.episodes, args.speed)
+        _say_groups(args, bench.evaluator(policy.config, request)[0].env.model)
+        done = watch(bench, policy, request, args.episodes, args.speed, args.geom_groups)
         print(f"{done} episodes")
         return 0
     from msk_ray.visualize.episodes import record
@@ -132,6 +146,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(f"{policy.path}, epoch {policy.epoch}, under {recording.physics} physics")
     print(episode_table(recording))
     if drawing:
+        _say_groups(args, recording.model)
         _draw(args, recording, policy.path, policy.epoch)
     return 0
 
@@ -153,6 +168,8 @@ def _check(args: argparse.Namespace) -> Target:
         raise ConfigError(
             "--no-render draws nothing: leave it out, or leave out --video, --save-frames, --strip and --progression"
         )
+    if args.no_render and args.geom_groups is not None:
+        raise ConfigError("--geom-groups: --no-render draws nothing; leave out one of the two")
     if args.tensorboard and not args.strip:
         raise ConfigError("--tensorboard needs --strip FILE")
     _check_files(args)
@@ -214,13 +231,21 @@ def episode_table(recording: "Recording") -> str:
     return text_table(("episode", "score", "steps", "seconds", *names, "ended by"), rows, 160)
 
 
+def _say_groups(args: argparse.Namespace, model: "mujoco.MjModel") -> None:
+    """Say so where more geoms are drawn than MuJoCo would draw."""
+    from msk_ray.visualize.look import describe_groups, geom_groups
+
+    if args.geom_groups is None and (drawn := describe_groups(geom_groups(model))):
+        print(f"{drawn}; --geom-groups chooses")
+
+
 def _draw(args: argparse.Namespace, recording: "Recording", checkpoint: Path, epoch: int) -> None:
     from msk_ray.visualize.film import save_image, strip, write_frames, write_video
     from msk_ray.visualize.render import View
     from msk_ray.visualize.strips import episode_frames
 
     width, height = args.size or (640, 480)
-    view = View(width, height, args.camera)
+    view = View(width, height, args.camera, args.geom_groups)
     if args.video:
         args.video.parent.mkdir(parents=True, exist_ok=True)
         print(f"{write_video(_film(recording, args.fps, view), args.video, args.fps)} frames in {args.video}")
@@ -228,7 +253,7 @@ def _draw(args: argparse.Namespace, recording: "Recording", checkpoint: Path, ep
         print(f"{write_frames(_film(recording, args.fps, view), args.save_frames)} frames in {args.save_frames}/")
     if args.strip:
         width, height = args.size or (320, 240)
-        image = strip(*episode_frames(recording, args.frames or 8, View(width, height, args.camera)))
+        image = strip(*episode_frames(recording, args.frames or 8, View(width, height, args.camera, args.geom_groups)))
         save_image(image, args.strip)
         print(f"strip of {args.frames or 8} frames in {args.strip}")
         if args.tensorboard:
@@ -251,6 +276,7 @@ def _film(recording: "Recording", fps: float, view: "View") -> Iterator["np.ndar
 
 
 def _progression(args: argparse.Namespace, target: Target, bench: "Bench", request: "Request") -> int:
+    from msk_ray.training import load_policy
     from msk_ray.visualize.film import save_image
     from msk_ray.visualize.render import View
     from msk_ray.visualize.strips import progression
@@ -258,10 +284,11 @@ def _progression(args: argparse.Namespace, target: Target, bench: "Bench", reque
     folder = best_trial_folder(target)
     width, height = args.size or (240, 180)
     out = args.strip or Path("progression.png")
-    view = View(width, height, args.camera)
+    view = View(width, height, args.camera, args.geom_groups)
     image, rows = progression(bench, folder, request, args.frames or PROGRESSION_FRAMES, view)
     if image is None:
         raise CheckpointError(f"{folder / 'checkpoints'} has no policies saved during training (policy_*.pt)")
+    _say_groups(args, bench.evaluator(load_policy(best_checkpoint(target)).config, request)[0].env.model)
     save_image(image, out)
     print("\n".join(rows))
     print(f"{len(rows)} policies of {folder} in {out}")

@@ -3,8 +3,8 @@
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path
+from types import ModuleType
 
-import av
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
@@ -24,9 +24,11 @@ def write_video(frames: Iterable[np.ndarray], path: Path, fps: float) -> int:
 
     Raises:
         StorageFailure: the file cannot be written.
+        ConfigError: the package that encodes films is not installed.
     """
     if path.suffix == ".gif":
         return _write_gif(frames, path, fps)
+    av = _encoder(path)
     count = 0
     stream = None
     try:
@@ -64,13 +66,27 @@ def _write_gif(frames: Iterable[np.ndarray], path: Path, fps: float) -> int:
 
 
 def check_video_path(path: Path) -> None:
-    """Refuse a file name whose suffix has no container format, before anything is computed.
+    """Refuse a film that could not be written, before anything is computed.
 
     Raises:
-        ConfigError: the message names the suffixes that work.
+        ConfigError: the message names the suffixes that work, or the package to install.
     """
     if path.suffix not in (".mp4", ".mkv", ".mov", ".gif"):
         raise ConfigError(f"--video {path}: write a name that ends in .mp4, .mkv, .mov or .gif")
+    if path.suffix != ".gif":
+        _encoder(path)
+
+
+def _encoder(path: Path) -> ModuleType:
+    """The package that encodes films. Pictures, and the report with its film strips, do without it."""
+    try:
+        import av
+    except ImportError as error:
+        raise ConfigError(
+            f"--video {path}: films need the package av ({error}): pip install av, or write a .gif"
+        ) from None
+    module: ModuleType = av
+    return module
 
 
 def check_image_path(path: Path) -> None:

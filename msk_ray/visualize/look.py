@@ -1,5 +1,7 @@
 """How a scene is drawn: contact forces as arrows, muscles in the colour of their activation. Uses only MuJoCo."""
 
+from collections.abc import Sequence
+
 import mujoco
 import numpy as np
 
@@ -16,6 +18,8 @@ _ARROW = 2.0
 """Size of an arrow for a force equal to the whole weight, in units of the model's extent. MuJoCo draws half of it."""
 
 
+DRAWN_GROUPS = (0, 1, 2)
+"""Groups of geoms that MuJoCo draws by default."""
 _MARGIN = 0.97
 """Share of the picture's half width and height within which arrows end."""
 _HEADLIGHT = {"ambient": 0.35, "diffuse": 0.55, "specular": 0.2}
@@ -50,8 +54,10 @@ class Look:
     def has_muscles(self) -> bool:
         return bool(self._muscles)
 
-    def switch_on(self, option: mujoco.MjvOption) -> None:
-        """Draw contact forces, and tendons if there are any; bodies of models with muscles are transparent."""
+    def switch_on(self, option: mujoco.MjvOption, groups: Sequence[int]) -> None:
+        """Draw contact forces, tendons if there are any, and the geoms of these groups; bodies of models with muscles
+        are transparent."""
+        option.geomgroup = [number in groups for number in range(mujoco.mjNGROUP)]
         option.flags[mujoco.mjtVisFlag.mjVIS_TRANSPARENT] = self.has_muscles
         option.flags[mujoco.mjtVisFlag.mjVIS_CONTACTFORCE] = True
         option.flags[mujoco.mjtVisFlag.mjVIS_CONTACTPOINT] = True
@@ -67,6 +73,26 @@ class Look:
             share = float(np.clip(act[addresses].max(), 0.0, 1.0))
             self._model.tendon_rgba[tendon, :3] = (1.0 - share) * RELAXED + share * ACTIVE
             self._model.tendon_rgba[tendon, 3] = 1.0
+
+
+def geom_groups(model: mujoco.MjModel) -> tuple[int, ...]:
+    """The groups of geoms to draw: those that MuJoCo draws, and if no moving body has a geom in these, those in which
+    it has some."""
+    moving = model.geom_group[model.body_weldid[model.geom_bodyid] > 0].clip(0, mujoco.mjNGROUP - 1)
+    if moving.size == 0 or np.isin(moving, DRAWN_GROUPS).any():
+        return DRAWN_GROUPS
+    return (*DRAWN_GROUPS, *sorted({int(group) for group in moving}))
+
+
+def describe_groups(groups: Sequence[int]) -> str:
+    """Which groups of geoms are drawn although MuJoCo would not, and why, in words; empty if there are none."""
+    further = [str(group) for group in groups if group not in DRAWN_GROUPS]
+    if not further:
+        return ""
+    return (
+        f"geom group{'s' if len(further) > 1 else ''} {', '.join(further)} drawn too: no moving body has a geom in "
+        "groups 0 to 2, which MuJoCo draws by default"
+    )
 
 
 def has_sky(model: mujoco.MjModel) -> bool:

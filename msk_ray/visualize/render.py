@@ -14,6 +14,7 @@ import numpy as np
 
 import msk_ray
 from msk_ray.errors import DeviceError
+from msk_ray.visualize.look import geom_groups
 
 BACKENDS = ("egl", "osmesa")
 """Headless OpenGL platforms, the faster one first."""
@@ -51,6 +52,8 @@ class View:
     height: int = 480
     camera: str = ""
     """Name of one of the model's cameras; empty: the first, or one that follows the body."""
+    groups: tuple[int, ...] | None = None
+    """Groups of geoms to draw; None: as `geom_groups` says."""
 
 
 @cache
@@ -101,8 +104,9 @@ def frames(states: States, view: View) -> Iterator[np.ndarray]:
         mujoco.mj_saveModel(states.model, str(model))
         np.savez(arrays, qpos=states.qpos, qvel=states.qvel, act=states.act, ctrl=states.ctrl)
         command = [sys.executable, "-m", "msk_ray.visualize.worker", str(model), str(arrays)]
+        groups = "".join(map(str, geom_groups(states.model) if view.groups is None else view.groups))
         process = subprocess.Popen(
-            [*command, str(view.width), str(view.height), *([view.camera] if view.camera else [])],
+            [*command, str(view.width), str(view.height), groups, *([view.camera] if view.camera else [])],
             env=_environment(backend),
             stdout=subprocess.PIPE,
             stderr=errors,

@@ -15,7 +15,7 @@ import torch
 from msk_ray.errors import DeviceError
 from msk_ray.evaluate.measure import Bench, Request
 from msk_ray.training import SavedPolicy
-from msk_ray.visualize.look import Look, default_camera
+from msk_ray.visualize.look import Look, default_camera, geom_groups
 
 
 def check_display() -> None:
@@ -41,12 +41,20 @@ def window(model: mujoco.MjModel, data: mujoco.MjData) -> Iterator[Any]:
         thread.join(timeout=10.0)
 
 
-def watch(bench: Bench, policy: SavedPolicy, request: Request, episodes: int | None, speed: float) -> int:
+def watch(
+    bench: Bench,
+    policy: SavedPolicy,
+    request: Request,
+    episodes: int | None,
+    speed: float,
+    groups: tuple[int, ...] | None = None,
+) -> int:
     """Show episodes until the window is closed, or a given number of them.
 
     Args:
         episodes: how many; None continues until the window is closed.
         speed: simulated seconds per second.
+        groups: of geoms to draw at first; None: as `geom_groups` says.
 
     Returns:
         How many episodes ended.
@@ -62,7 +70,7 @@ def watch(bench: Bench, policy: SavedPolicy, request: Request, episodes: int | N
     done = 0
     with window(model, data) as viewer:
         with viewer.lock():
-            look.switch_on(viewer.opt)
+            look.switch_on(viewer.opt, geom_groups(model) if groups is None else groups)
             camera = default_camera(model)
             for field in ("type", "fixedcamid", "trackbodyid", "distance", "azimuth", "elevation", "lookat"):
                 setattr(viewer.cam, field, getattr(camera, field))

@@ -4,11 +4,12 @@ It is a separate process because a broken OpenGL library ends the process that t
 OpenGL platform when it is first imported.
 
     MUJOCO_GL=egl python -m msk_ray.visualize.worker --probe
-    MUJOCO_GL=egl python -m msk_ray.visualize.worker MODEL.mjb STATES.npz WIDTH HEIGHT [CAMERA]
+    MUJOCO_GL=egl python -m msk_ray.visualize.worker MODEL.mjb STATES.npz WIDTH HEIGHT GROUPS [CAMERA]
 """
 
 import os
 import sys
+from collections.abc import Sequence
 from typing import BinaryIO
 
 import mujoco
@@ -30,12 +31,19 @@ def probe() -> int:
 
 
 def draw(
-    model: mujoco.MjModel, states: dict[str, np.ndarray], width: int, height: int, camera: str, out: BinaryIO
+    model: mujoco.MjModel,
+    states: dict[str, np.ndarray],
+    width: int,
+    height: int,
+    groups: Sequence[int],
+    camera: str,
+    out: BinaryIO,
 ) -> None:
     """Write a frame (height, width, 3) of bytes for each state.
 
     Args:
         states: `qpos` (F, nq), `qvel` (F, nv), `act` (F, na), `ctrl` (F, nu).
+        groups: of geoms to draw.
         camera: name; empty for the default one.
     """
     model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
@@ -43,7 +51,7 @@ def draw(
     data = mujoco.MjData(model)
     look = Look(model)
     option = mujoco.MjvOption()
-    look.switch_on(option)
+    look.switch_on(option, groups)
     view: str | mujoco.MjvCamera = camera or default_camera(model)
     sky, far = has_sky(model), float(model.vis.map.zfar * model.stat.extent)
     with mujoco.Renderer(model, height, width) as renderer:
@@ -72,13 +80,14 @@ def main() -> int:
     os.dup2(2, 1)
     if sys.argv[1:] == ["--probe"]:
         return probe()
-    path, states, width, height, *camera = sys.argv[1:]
+    path, states, width, height, groups, *camera = sys.argv[1:]
     with np.load(states) as arrays:
         draw(
             mujoco.MjModel.from_binary_path(path),
             {name: arrays[name] for name in arrays.files},
             int(width),
             int(height),
+            [int(group) for group in groups],
             camera[0] if camera else "",
             frames,
         )

@@ -123,6 +123,10 @@ def test_substeps_follow_from_either_setting() -> None:
         ("curriculum={start: {}, epochs: 3}", "write at least one of solref"),
         ("curriculum={start: {friction: 2}, epochs: 3}", "curriculum: cartpole has no contacts"),
         ("shac.entropy={coefficient: 0}", "shac.entropy.coefficient: Input should be greater than 0"),
+        ("shac.reward_scale=1.0e+308", "shac.reward_scale: Input should be less than or equal to 1000000, not 1e+308"),
+        ("shac.actor_lr=1.0e-320", "shac.actor_lr: Input should be greater than or equal to 0.0000000001, not 1e-320"),
+        ("shac.entropy={coefficient: 1.0e-320}", "shac.entropy.coefficient: Input should be 0 or between 1e-30 and"),
+        ("env.reward.pole_angle_penalty=1.0e+300", "env.reward.pole_angle_penalty: Input should be 0 or between"),
     ],
 )
 def test_faults_in_what_adapts_are_named(override, message):

@@ -38,6 +38,12 @@ BOMB = "a: &a [x,x,x,x,x,x,x,x,x,x]\n" + "".join(
         pytest.param("a: 0x" + "f" * 5000, "below 2^63", id="a huge hexadecimal number"),
         pytest.param("a: " + "9" * 5000, "not valid YAML", id="a huge decimal number"),
         pytest.param("? [1]\n: 2", "a key must be a name", id="a list as key"),
+        pytest.param(
+            "overrides: {5: 64}", "key '5' is a whole number in YAML, not a name; write a", id="a number as key"
+        ),
+        pytest.param("a: {on: 1}", "key 'on' is true or false in YAML, .* write a name, in quotes", id="on as key"),
+        pytest.param("a: {~: 1}", "key '~' is null in YAML", id="null as key"),
+        pytest.param("a: {.5: 1}", "key '.5' is a number in YAML", id="a fraction as key"),
         pytest.param("a: !!bool maybe", "leave out the tag", id="a tag"),
         pytest.param("a: !!python/object/apply:os.getpid []", "leave out the tag", id="an object"),
         pytest.param('a: "\\ud800"', "surrogates not allowed", id="half a character"),
@@ -57,7 +63,8 @@ def test_yaml_that_no_setting_needs_is_refused(text: str, message: str, tmp_path
 
 
 def test_yaml_that_settings_use_is_read() -> None:
-    data = parse_yaml("a: &x {p: 1, q: .5}\nb: {<<: *x, p: 2}\nc: [*x, *x]\nwhen: 2026-01-01", "here")
+    data = parse_yaml("a: &x {p: 1, q: .5}\nb: {<<: *x, p: 2}\nc: [*x, *x]\nwhen: 2026-01-01\n'on': 1", "here")
+    assert data["on"] == 1
     assert data["b"] == {"p": 2, "q": 0.5}
     assert data["c"] == [{"p": 1, "q": 0.5}] * 2
     assert data["when"] == "2026-01-01", "a date is text, here and as a label"

@@ -1,25 +1,21 @@
 """The live page: what it serves to whom, and that it follows an experiment in a real browser."""
 
-import asyncio
 import http.client
 import json
 import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from aiohttp import web
 from processes import Launcher, wait_until
+from serving import Server, fill, make
 
 from msk_ray.cli import run
-from msk_ray.config import dump_yaml
 from msk_ray.dashboard import films, plots
 from msk_ray.dashboard.__main__ import main
-from msk_ray.dashboard.app import make_app
 from msk_ray.dashboard.films import Films
 from msk_ray.dashboard.guard import Access
 from msk_ray.dashboard.library import Library, Unknown
@@ -27,80 +23,12 @@ from msk_ray.errors import ConfigError
 from msk_ray.experiment import snapshot
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.notes import load_notes
-from msk_ray.experiment.outcomes import Ending, Outcome, write_ending
 from msk_ray.report.reading import read_experiment
-from msk_ray.sweep import opening
-from msk_ray.sweep.space import parse_space
-from msk_ray.sweep.trials import resolve_trials
-
-
-def fill(folder: Path, scores: list[float], ended: bool = True) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    rows = [
-        {"epoch": n, "env_steps": 100 * n, "seconds": 2.0 * n, "eval/score": score, "grad/actor_norm": 1.0 + n}
-        for n, score in enumerate(scores)
-    ]
-    (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    if ended:
-        write_ending(folder, Ending(Outcome.FINISHED, "all done"))
-
-
-def make(storage: Path, name: str) -> Experiment:
-    """Four trials of a sampled rate and a listed horizon; the last still runs."""
-    (storage.parent / "base.yaml").write_text(dump_yaml({"env": {"name": "cartpole"}, "trial": {"epochs": 8}}))
-    data = {
-        "question": "Which <i>rate</i>?",
-        "base": "base.yaml",
-        "parameters": {"shac.actor_lr": {"loguniform": [1e-4, 1e-2]}, "shac.horizon": {"choice": [4, 8]}},
-        "samples": 4,
-    }
-    space = parse_space(data, storage.parent / "small.yaml")
-    trials = resolve_trials(space)
-    made = opening.create(storage / name, space, trials, {})
-    for trial in trials:
-        fill(made.trial_folder(trial.id), [1.0, 10.0 + trial.index], ended=trial.index < 3)
-    return made
 
 
 @pytest.fixture
 def experiment(tmp_path: Path) -> Experiment:
     return make(tmp_path / "runs", "e")
-
-
-class Server:
-    """A dashboard in a thread of this process."""
-
-    def __init__(self, library: Library, access: Access) -> None:
-        self.port = 0
-        self._ready, self._loop = threading.Event(), asyncio.new_event_loop()
-        self._end = asyncio.Event()
-        self._thread = threading.Thread(target=self._loop.run_until_complete, args=[self._run(library, access)])
-        self._thread.start()
-        self._ready.wait()
-
-    async def _run(self, library: Library, access: Access) -> None:
-        runner = web.AppRunner(make_app(library, access), shutdown_timeout=0.1)
-        await runner.setup()
-        await web.TCPSite(runner, "127.0.0.1", 0).start()
-        self.port = runner.addresses[0][1]
-        self._ready.set()
-        await self._end.wait()
-        await runner.cleanup()
-
-    def close(self) -> None:
-        self._loop.call_soon_threadsafe(self._end.set)
-        self._thread.join()
-        self._loop.close()
-
-    def ask(self, path: str, method: str = "GET", body: str | None = None, **headers: str) -> Any:
-        """(status, body, headers) of a request whose path is sent as it is."""
-        connection = http.client.HTTPConnection("127.0.0.1", self.port)
-        named = {name.replace("_", "-"): value for name, value in headers.items()}
-        connection.request(method, path, body, named)
-        answer = connection.getresponse()
-        found = answer.status, answer.read().decode(), answer.headers
-        connection.close()
-        return found
 
 
 @pytest.fixture
@@ -254,6 +182,17 @@ def test_a_page_follows_its_experiment(page: Any, served: Server, experiment: Ex
     page.click("#filter button")
     assert first.is_visible()
     assert page.evaluate(fits)
+
+
+def test_single_trials_are_listed(served: Server, experiment: Experiment) -> None:
+    folder = experiment.path.parent / "train" / "mine"
+    fill(folder, [1.0, 13.0], ended=False)
+    (folder / "config.yaml").write_text("env: {name: cartpole}\ntrial: {epochs: 8}\n")
+    status, page, _ = served.ask("/")
+    row = page.partition("Single trials")[2]
+    assert status == 200
+    assert all(part in row for part in (">train/mine<", ">cartpole<", ">1/8<", ">13<"))
+    assert served.ask("/e/train/")[0] == 404
 
 
 def test_experiments_are_listed_and_compared(page: Any, served: Server, experiment: Experiment) -> None:

@@ -228,8 +228,80 @@ def test_what_the_model_does_not_have_is_refused() -> None:
         randomizer(ant(), pair_friction=section)
     with pytest.raises(ConfigError, match=r"gravity: .*leave out only and each"):
         randomizer(ant(), gravity=section | {"each": True})
-    model = ant()
-    model.geom_contype[:] = model.geom_conaffinity[:] = 0
-    with pytest.raises(ConfigError, match="write pair_friction instead"):
-        randomizer(model, geom_friction=section)
     assert drawn(ant(), geom_friction=section)["geom_friction"].isfinite().all()
+
+
+FLOOR, BALL = "floor", "ball"
+SLIDING: dict[str, tuple[dict[str, str], dict[str, Any], str | None]] = {
+    "the same priority": ({}, {"only": [BALL], "low": 1.1, "high": 2.0}, None),
+    "the larger of both": (
+        {},
+        {"only": [BALL], "low": 0.5, "high": 1.0},
+        "'floor', at least 1, over that of 'ball', at",
+    ),
+    "both": ({}, {"low": 0.5, "high": 0.9}, None),
+    "one of them first": ({BALL: 'priority="1"'}, {"only": [BALL], "low": 0.5, "high": 0.9}, None),
+    "the other one first": (
+        {BALL: 'priority="1"'},
+        {"only": [FLOOR], "low": 2.0, "high": 4.0},
+        "'ball' has priority ov",
+    ),
+    "both, one of them first": ({BALL: 'priority="1"'}, {"low": 2.0, "high": 4.0}, None),
+    "each of two, one of them first": (
+        {BALL: 'priority="1"'},
+        {"only": [FLOOR, BALL], "each": True, "low": 2.0, "high": 4.0},
+        "'ball' has priority over 'floor', so that its own friction counts; draw that",
+    ),
+    "each of all": ({BALL: 'priority="1"'}, {"each": True, "low": 2.0, "high": 4.0}, None),
+    "no friction": ({BALL: 'condim="1"', FLOOR: 'condim="1"'}, {"low": 2.0, "high": 4.0}, r"no friction \(condim 1\)"),
+    "friction by the other": ({BALL: 'condim="1"'}, {"low": 2.0, "high": 4.0}, None),
+    "no friction by the first": ({BALL: 'condim="1" priority="1"'}, {"low": 2.0, "high": 4.0}, "condim 1"),
+    "a body's own parts": (
+        {},
+        {"only": ["hat"], "low": 2.0, "high": 4.0},
+        "no contact reads the friction of hat; .*ball",
+    ),
+    "a pair": ({"pair": ""}, {"low": 2.0, "high": 4.0}, "write pair_friction instead"),
+}
+
+
+@pytest.mark.parametrize(("extra", "section", "why"), SLIDING.values(), ids=list(SLIDING))
+def test_friction_that_no_contact_reads_is_refused(
+    extra: dict[str, str], section: dict[str, Any], why: str | None
+) -> None:
+    """What is refused changes no bit of what C MuJoCo computes, and what is accepted does."""
+    pair = '<contact><pair geom1="floor" geom2="ball"/></contact>' if "pair" in extra else ""
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><worldbody><geom name="floor" type="plane" size="5 5 1" {extra.get(FLOOR, "")}/>
+        <body pos="0 0 .099"><freejoint/><geom name="ball" size=".1" {extra.get(BALL, "")}/>
+        <geom name="hat" size=".02" pos="0 0 .1" contype="2" conaffinity="2"/></body></worldbody>{pair}</mujoco>"""
+    )
+    if why is not None:
+        with pytest.raises(ConfigError, match=f"physics.randomize.geom_friction: .*{why}") as caught:
+            randomizer(model, geom_friction=section)
+        assert "\n" not in str(caught.value)
+    else:
+        randomizer(model, geom_friction=section)
+    if section.get("each"):
+        return
+    ends = []
+    for factor in (section["low"], section["high"]):
+        other = copy.copy(model)
+        for name in section.get("only", (FLOOR, BALL, "hat")):
+            other.geom(name).friction[0] *= factor
+        data = mujoco.MjData(other)
+        data.qvel[:3] = 3.0, 0.0, -1.0
+        for _ in range(5):
+            mujoco.mj_step(other, data)
+        ends.append(data.qvel.copy())
+    assert np.array_equal(*ends) == (why is not None)
+
+
+def test_a_pair_without_friction_is_refused() -> None:
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><geom name="floor" type="plane" size="5 5 1"/><body pos="0 0 1"><freejoint/>
+        <geom name="ball" size=".1"/></body></worldbody>
+        <contact><pair name="touch" geom1="floor" geom2="ball" condim="1"/></contact></mujoco>"""
+    )
+    with pytest.raises(ConfigError, match=r"pair_friction: these pairs have no friction \(condim 1\); leave it out"):
+        randomizer(model, pair_friction={"low": 0.5, "high": 1.5})

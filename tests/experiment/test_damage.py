@@ -1,6 +1,7 @@
 """Whatever is done to a file, what is whole in it stays, and what is not is named."""
 
 import contextlib
+import errno
 import json
 import random
 import shutil
@@ -16,6 +17,7 @@ from hypothesis import strategies as st
 
 from msk_ray.config import dump_yaml
 from msk_ray.errors import MskRayError, StorageFailure
+from msk_ray.experiment import damage
 from msk_ray.experiment.attempts import Attempt, Reduced, load_attempt
 from msk_ray.experiment.damage import DamagedFile, read_object
 from msk_ray.experiment.manifest import Experiment
@@ -68,11 +70,11 @@ def test_an_odd_line_is_named_and_hides_no_other(odd: bytes, tmp_path: Path) -> 
     path.write_bytes(b"\n".join([rows[0], rows[1], odd, rows[2], rows[3], b""]))
     found = load_metrics(path)
     assert [r["epoch"] for r in found.rows] == [0, 1, 2, 3]
-    (damage,) = found.damages
-    assert (damage.path, damage.line) == (path, 3)
-    assert str(damage).startswith(f"{path}, line 3: ")
-    assert "\n" not in str(damage)
-    assert len(damage.what) <= 100
+    (named,) = found.damages
+    assert (named.path, named.line) == (path, 3)
+    assert str(named).startswith(f"{path}, line 3: ")
+    assert "\n" not in str(named)
+    assert len(named.what) <= 100
 
 
 @pytest.mark.long
@@ -107,13 +109,18 @@ def test_a_file_of_anything_is_read_or_refused_in_one_line(data: bytes) -> None:
         read_ending(folder)
         seen = read_trial(folder, time.time())
         assert seen.folder == folder
-        for damage in seen.damages:
-            assert "\n" not in str(damage)
+        for found in seen.damages:
+            assert "\n" not in str(found)
 
 
-def test_what_the_storage_does_not_give_is_no_damage(tmp_path: Path) -> None:
+def test_what_the_storage_does_not_give_is_no_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Otherwise a trial that continues would write its metrics again without what could not be read for a moment."""
-    (tmp_path / "metrics.jsonl").mkdir()
+
+    def unreachable(path: Path, limit: int) -> bytes:
+        raise (OSError(errno.EIO, "Input/output error") if path.exists() else FileNotFoundError)
+
+    (tmp_path / "metrics.jsonl").touch()
+    monkeypatch.setattr(damage, "read_file", unreachable)
     with pytest.raises(StorageFailure, match="cannot read"):
         load_metrics(tmp_path / "metrics.jsonl")
     assert "cannot read" in str(read_trial(tmp_path).damages[0])

@@ -65,6 +65,7 @@ def test_description_and_model_say_what_another_program_needs(exported: Path) ->
         ("cart_velocity", "m/s"),
     ]
     assert about["files"] == {"onnx": "p.onnx", "model": "p.mjb"}
+    assert about["previous_action"] is None
     assert about["action"]["names"] == about["ctrl"]["names"] == ["force"]
     assert about["ctrl"]["ranges"] == [[-1.0, 1.0]]
     assert about["model"]["start"]["qpos"] == pytest.approx([0.0, np.pi])
@@ -128,6 +129,24 @@ class Braked(CartPole):
         return action - 0.1 * self.state.physics.qvel[: len(action), :1]
 
 
+class Smoothed(CartPole):
+    """A cart whose motor takes a while."""
+
+    def control(self, action: torch.Tensor) -> torch.Tensor:
+        return 0.7 * action + 0.3 * self.state.action
+
+
+class Buffered(CartPole):
+    """A cart with a constant for each of its worlds."""
+
+    def prepare(self) -> None:
+        super().prepare()
+        self.gain = torch.full((self.nworld, 1), 0.5)
+
+    def control(self, action: torch.Tensor) -> torch.Tensor:
+        return self.gain * action
+
+
 class Mislaid(CartPole):
     def observation_layout(self) -> list[Entry]:
         return [Entry("cart_position", "m")]
@@ -139,6 +158,34 @@ def test_controls_that_depend_on_the_state_are_left_out(env: CartPole) -> None:
     assert policy.outputs == ["action"]
     about = describe(msk_ray.load_policy(CHECKPOINT), policy, braked, "own", {})
     assert about["ctrl"] is None
+
+
+def test_controls_that_depend_on_the_action_before_take_it_as_an_input(env: CartPole) -> None:
+    smoothed = Smoothed(env.config, PhysicsConfig(), 4, "cpu", 0, None)
+    policy = PolicyToControl(torch.nn.Sequential(torch.nn.Linear(5, 1), torch.nn.Tanh()), smoothed).eval()
+    inputs = policy.examples(network.observations(smoothed, 0), 0)
+    for write in (network.to_onnx, network.to_torchscript):
+        run_exported = write(policy, *inputs)[1]
+        assert largest_difference(policy, run_exported, *inputs) <= 1e-5
+        # Fed back step by step, they are the controls of the environment's own steps.
+        smoothed.state = smoothed.reset_state()
+        previous = torch.zeros(4, 1)
+        for _ in range(3):
+            action, ctrl = run_exported(smoothed.observation(), previous)
+            assert torch.equal(ctrl, 0.7 * action + 0.3 * previous)
+            assert torch.allclose(ctrl, smoothed.control(action))
+            smoothed.step(action, auto_reset=False)
+            previous = action
+    about = describe(msk_ray.load_policy(CHECKPOINT), policy, smoothed, "own", {})
+    assert about["previous_action"]["shape"] == ["batch", 1]
+    assert about["ctrl"]["size"] == 1
+
+
+def test_a_control_for_so_many_worlds_alone_is_refused_in_one_line(env: CartPole) -> None:
+    buffered = Buffered(env.config, PhysicsConfig(), 4, "cpu", 0, None)
+    wanted = r"Buffered\.control fails for 1 rows of actions \(it returns shape \(4, 1\)\): .*`self.state.action`"
+    with pytest.raises(ExportError, match=wanted):
+        PolicyToControl(torch.nn.Linear(5, 1), buffered)
 
 
 def test_a_layout_of_another_length_is_refused(env: CartPole) -> None:

@@ -1,5 +1,6 @@
 """Gymnasium's interfaces: its own checks, the same physics and rewards, and an algorithm from elsewhere that learns."""
 
+import copy
 import importlib.util
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
+from scenes import ant, ant_points
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -19,6 +21,7 @@ from msk_ray.errors import ConfigError, SimulationError
 from msk_ray.gym import BatchedEnv, SingleEnv
 from msk_ray.gym.c_simulation import CSimulation
 from msk_ray.gym.stable_baselines import StableBaselinesEnv
+from msk_ray.step.forward.solver_limits import SolverLimits
 
 pytestmark = pytest.mark.long
 
@@ -127,6 +130,21 @@ def test_contact_forces_are_those_of_the_batch() -> None:
     expected, found = env.sim.contact_forces(), simulation.contact_forces()
     assert expected.abs().max() > 10.0
     assert found == pytest.approx(expected, abs=0.02 * float(expected.abs().max()))
+
+
+@pytest.mark.filterwarnings("ignore:the model may stop the constraint solver")
+def test_a_model_that_stops_its_solver_early_is_solved_to_the_end() -> None:
+    """As in a batch, unless limits are given."""
+    model, (point,) = ant("elliptic"), ant_points(ant("elliptic"), 3, seed=1)[2:]
+    hasty = copy.copy(model)
+    hasty.opt.iterations = hasty.opt.ls_iterations = 1
+    given = (torch.tensor(v[None], dtype=torch.float32) for v in (point.ctrl, point.qpos, point.qvel, point.act))
+    control, *state = given
+    expected = CSimulation(model, 2).step(control, *state).qvel
+    torch.testing.assert_close(CSimulation(hasty, 2).step(control, *state).qvel, expected)
+    early = CSimulation(hasty, 2, SolverLimits(1, 1)).step(control, *state).qvel
+    assert (early - expected).abs().max() > 0.05
+    assert (hasty.opt.iterations, hasty.opt.ls_iterations) == (1, 1)
 
 
 def test_a_step_goes_on_in_float64_where_the_last_one_ended() -> None:

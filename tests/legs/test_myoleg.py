@@ -16,7 +16,8 @@ from msk_ray.errors import ConfigError
 from msk_ray.legs.gait.body import world_axes
 from msk_ray.legs.myoleg.config import MyoLegSettings
 from msk_ray.legs.myoleg.env import MyoLeg
-from msk_ray.legs.myoleg.model import SUBSTEPS, Couplings, build_myoleg, find_model
+from msk_ray.legs.myoleg.model import SUBSTEPS, Couplings, build_myoleg
+from msk_ray.legs.myoleg.source import find_model
 from msk_ray.step import Simulation, StepState, TapePerSubstep
 from msk_ray.step.autograd.tangent import quat_exp, quat_multiply, quat_rotate
 from msk_ray.step.check import check_chain, check_gradients, make_states

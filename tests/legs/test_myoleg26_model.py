@@ -8,6 +8,7 @@ import torch
 from msk_ray.config import PhysicsConfig
 from msk_ray.legs.myoleg26 import tables
 from msk_ray.legs.myoleg26.config import MyoLeg26Settings
+from msk_ray.legs.myoleg26.env import MyoLeg26
 from msk_ray.legs.myoleg26.model import CURVE, WINDOW, build_myoleg26
 from msk_ray.legs.myoleg26.moment_arms import PUBLISHED, moment_arms
 from msk_ray.legs.myoleg26.terrain import Terrain
@@ -45,6 +46,10 @@ def test_layout(model: mujoco.MjModel) -> None:
     touching = {int(g) for g in np.concatenate((model.pair_geom1, model.pair_geom2))}
     assert not any(model.geom_type[g] == mujoco.mjtGeom.mjGEOM_MESH for g in touching)
     assert np.all(model.actuator_dynprm[:, 2] > 0), "a hard switch of time constants has no slope"
+
+
+def test_its_own_limit_of_iterations_is_kept(model: mujoco.MjModel) -> None:
+    assert MyoLeg26.solver_limits(model, PhysicsConfig()) == {"iterations": 20, "ls_iterations": 50}
 
 
 def test_the_left_side_mirrors_the_right(model: mujoco.MjModel) -> None:

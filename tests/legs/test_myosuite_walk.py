@@ -18,7 +18,8 @@ from msk_ray.errors import ConfigError
 from msk_ray.legs.gait.__main__ import main as gait
 from msk_ray.legs.myosuite_walk.config import MyoSuiteWalkReward, MyoSuiteWalkSettings
 from msk_ray.legs.myosuite_walk.env import MyoSuiteWalk
-from msk_ray.legs.myosuite_walk.model import KEYFRAMES, build_myosuite_walk, find_file
+from msk_ray.legs.myosuite_walk.model import KEYFRAMES, build_myosuite_walk
+from msk_ray.legs.myosuite_walk.source import find_file
 from msk_ray.step import Simulation, StepState, check_gradients
 from msk_ray.step.autograd.tangent import quat_multiply
 from msk_ray.training import Trainer

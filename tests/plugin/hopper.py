@@ -24,6 +24,7 @@ class Hopper(MjcfEnv):
         reward: HopperReward = HopperReward()
 
     reward_names = ("forward", "upright", "effort", "impact")
+    without_gradient = ("impact",)
     mjcf = """
     <mujoco model="hopper"><option timestep=".005" integrator="implicitfast" cone="elliptic"/>
       <default><joint damping="1" armature=".02"/><geom contype="0" conaffinity="0" density="900" rgba=".8 .5 .2 1"/>
@@ -52,9 +53,8 @@ class Hopper(MjcfEnv):
     def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
         r, frames = self.config.reward, self.frames(state)
         speed, up = frames.com_velocity()[:, 0], frames.axis("torso", 2)[:, 2]
-        impact = self.contact_forces(state, "foot").norm(dim=-1) / 1000.0
-        effort = action.square().mean(-1)
-        return torch.stack((r.forward * speed, r.upright * up, -r.effort * effort, -r.impact * impact), dim=-1)
+        impact = -r.impact * self.contact_forces(state, "foot").norm(dim=-1) / 1000.0
+        return torch.stack((r.forward * speed, r.upright * up, -r.effort * action.square().mean(-1), impact), dim=-1)
 
     def fell(self, state: StepState) -> Tensor:
         return self.frames(state).position("torso")[:, 2] < self.config.min_height

@@ -295,6 +295,21 @@ def test_half_the_worlds_are_said_wherever_a_score_is(experiment: Experiment) ->
     assert "half the worlds: 32 of 64; all 4 epochs done</td>" in page
 
 
+def test_trials_that_could_be_faster_are_named_first(experiment: Experiment) -> None:
+    trial = experiment.trials()[0]
+    rows = [row(epoch) | {"train/recorded": 0.0, "train/unrecordable": float(epoch > 1)} for epoch in range(1, 4)]
+    path = experiment.trial_folder(trial.id) / "metrics.jsonl"
+    path.write_text("".join(json.dumps(r) + "\n" for r in rows))
+    (warning,) = read_experiment(experiment, time.time()).warnings
+    assert warning == (
+        f"Epochs of {trial.id} could not be recorded as graphs, and took two to three times as long: their output.log "
+        "says why."
+    )
+    assert warning in page_of(experiment)
+    path.write_text("".join(json.dumps(r | {"train/unrecordable": 0.0}) + "\n" for r in rows))
+    assert not read_experiment(experiment, time.time()).warnings
+
+
 def test_the_baseline_can_be_chosen(experiment: Experiment, capsys: pytest.CaptureFixture[str]) -> None:
     assert "Differences are from: fast" in page_of(experiment, "--baseline", "fas")
     assert run(main, [str(experiment.path), "--baseline", "slow"]) == 2

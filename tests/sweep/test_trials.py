@@ -1,10 +1,11 @@
 """From a space to its trials."""
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from msk_ray.config import overlay
+from msk_ray.config import dump_yaml, overlay
 from msk_ray.errors import ConfigError
 from msk_ray.sweep.smoke import cover, shrink
 from msk_ray.sweep.space import find_space, load_space, parse_seeds
@@ -163,3 +164,21 @@ def test_shipped_spaces_resolve(root: Any) -> None:
         assert len(trials) >= 3, name
         assert 2 <= len(shrink(space, trials)) <= 8, name
         assert (root / "tune_spaces" / f"{name}.yaml").read_text().startswith("# "), name
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "overrides: {5: 64}",
+        "parameters: {on: {grid: [1, 2]}}",
+        "ablate: {variants: {small: {5: 1}}}",
+        "ablate: {baseline: {null: 1}, variants: {small: {shac.gamma: 0.9}}}",
+        "smoke: {overrides: {1.5: 1}}",
+    ],
+)
+def test_a_key_that_is_no_text_is_refused_by_name(text: str, space_data: dict[str, Any], tmp_path: Path) -> None:
+    space_data.pop("parameters")
+    path = tmp_path / "keys.yaml"
+    path.write_text(dump_yaml(space_data) + text)
+    with pytest.raises(ConfigError, match=r"keys\.yaml: key '[^']*' is [a-z ]* in YAML, not a name; write a name"):
+        load_space(path)

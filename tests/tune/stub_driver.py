@@ -1,6 +1,6 @@
 """`python -m msk_ray.tune` whose trials take milliseconds; for a process of its own.
 
-It starts a dashboard if STUB_DASHBOARD is set.
+It starts a dashboard if STUB_DASHBOARD is set, and Ray may be silent for STUB_SILENCE seconds.
 """
 
 from msk_ray import signals
@@ -23,6 +23,7 @@ from stub_trainer import StubTrainer
 from msk_ray.cli import run
 from msk_ray.tune import driver, session
 from msk_ray.tune.__main__ import main
+from msk_ray.tune.ray_watch import RayWatch
 
 
 def compile_for_ever(*of_trial: Any) -> None:
@@ -37,6 +38,7 @@ if __name__ == "__main__":
     driver.Plan = functools.partial(  # type: ignore[assignment,misc]
         driver.Plan, make_trainer=StubTrainer, precompile=precompile, prestart=False
     )
+    RayWatch.LIMIT_S = float(os.environ.get("STUB_SILENCE", RayWatch.LIMIT_S))
     shown = bool(os.environ.get("STUB_DASHBOARD"))
     session.ray_session = functools.partial(session.ray_session, dashboard=None if shown else False, trials=False)
     with lean_ray(dashboard=shown):

@@ -3,7 +3,8 @@
 Which way is chosen by `env.reward.cart_position_penalty`: 1 kills its own process once, 2 gives NaN, 3 raises
 SimulationError, 4 raises an unforeseen error every time, 5 hangs once, 6 finds the disk full once, 7 runs out of
 memory, 8 does so with more than `ROOM` worlds, 9 does so before its first epoch, 10 too, and kills its own process once
-when it has begun with fewer. Anything else trains.
+when it has begun with fewer, 11 and 12 exit with 3 and with 0, 13 raises KeyboardInterrupt, 14 has a connection broken
+once. Anything else trains.
 
 While the file named by the environment variable `STUB_HOLD` exists, no trial gets past epoch `HELD_AT`, unless its
 experiment is asked to stop.
@@ -14,6 +15,7 @@ import json
 import math
 import os
 import signal
+import sys
 import time
 from collections.abc import Collection
 from pathlib import Path
@@ -24,6 +26,7 @@ from msk_ray.errors import CheckpointError, Failure, SimulationError
 BEHAVIOUR = "env.reward.cart_position_penalty"
 KILL, NAN, SIMULATION_ERROR, BUG, HANG, FULL_DISK, MEMORY = 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0
 LATE_CROWD, CROWD, DOOMED_CROWD = 8.0, 9.0, 10.0
+EXIT, EXIT_ZERO, INTERRUPT, BROKEN_CONNECTION = 11.0, 12.0, 13.0, 14.0
 MISBEHAVE_AT = 5
 HELD_AT = 10
 ROOM = 4
@@ -114,6 +117,13 @@ class StubTrainer:
         if self.behaviour == FULL_DISK and not marker.exists():
             marker.touch()
             raise OSError(errno.ENOSPC, "No space left on device")
+        if self.behaviour == BROKEN_CONNECTION and not marker.exists():
+            marker.touch()
+            raise ConnectionResetError(errno.ECONNRESET, "made up")
+        if self.behaviour in (EXIT, EXIT_ZERO):
+            sys.exit(3 if self.behaviour == EXIT else 0)
+        if self.behaviour == INTERRUPT:
+            raise KeyboardInterrupt
         if self.behaviour == MEMORY or (self.behaviour == LATE_CROWD and self.config.env.nworld > ROOM):
             raise SimulationError("out_of_memory: made up", Failure.OUT_OF_MEMORY)
         if self.behaviour == NAN:

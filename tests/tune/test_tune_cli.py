@@ -1,7 +1,11 @@
 """The command line without Ray: dry runs, and refusals that cost one line and no work."""
 
+import bdb
+import importlib.util
 import json
 import os
+import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -10,7 +14,7 @@ from typing import Any
 import pytest
 
 from msk_ray.cli import run
-from msk_ray.config import dump_yaml, read_yaml
+from msk_ray.config import dump_yaml, packages, read_yaml
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.outcomes import Ending, Outcome, write_ending
 from msk_ray.signals import RESUMABLE
@@ -18,6 +22,7 @@ from msk_ray.sweep.rules.nonfinite import NonFinite
 from msk_ray.sweep.rules.wall_time import WallTime
 from msk_ray.tune import driver
 from msk_ray.tune.__main__ import main
+from msk_ray.tune.options import read_options
 
 
 @pytest.fixture
@@ -140,8 +145,8 @@ def test_every_trial_to_its_end_on_request(
     assert "still stopped early: 1 trials; --retry stopped_asha lets them continue" in capsys.readouterr().out
     facts = json.loads((made.path / "env.json").read_text())
     (made.path / "env.json").write_text(json.dumps(facts | {"command": ["msk-ray", "tune", "--no-early-stopping"]}))
-    assert made.resume_command() == "msk-ray tune --resume", "not what would undo a later word"
     here = tmp_path / "runs"
+    assert made.resume_command() == f"msk-ray tune --storage {here} --resume", "not what would undo a later word"
     for words, now in (
         (["--storage", "/elsewhere"], f"--storage {here}"),
         ([f"--storage={here}/../runs"], f"--storage={here}/../runs"),
@@ -200,3 +205,112 @@ def test_another_rule_is_refused(
 def drawn_rate() -> dict[str, Any]:
     """What pbt can exchange."""
     return {"parameters": {"shac.actor_lr": {"loguniform": [1e-4, 1e-2]}}, "samples": 4}
+
+
+@pytest.mark.parametrize("setting", ["search", "algorithm", "logger", "model"])
+def test_a_missing_package_is_named_by_a_dry_run_and_before_ray_starts(
+    setting: str,
+    space_data: dict[str, Any],
+    tmp_path: Path,
+    plans: list[driver.Plan],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    changes, message = {
+        "search": (
+            {"search": "optuna", **drawn_rate()},
+            "search: optuna needs the package optuna, .*'msk-ray[optuna]'",
+        ),
+        "algorithm": (
+            {"parameters": {"ppo.lr": {"grid": [0.1, 0.01]}}, "overrides": {"algorithm.name": "ppo"}},
+            "algorithm.name: ppo needs the package rsl_rl, .*'msk-ray[ppo]'",
+        ),
+        "logger": (
+            {"overrides": {"execution.loggers": ["mlflow"]}},
+            "execution.loggers: mlflow needs .*'msk-ray[mlflow]'",
+        ),
+        "model": ({"overrides": {"env": {"name": "myoleg"}}}, "env.model: none of myosuite 2, .*pip install myo-sim"),
+    }[setting]
+    space = tmp_path / "small.yaml"
+    space.write_text(dump_yaml(space_data | changes))
+    arguments = ["--space", str(space), "--storage", str(tmp_path / "runs"), "--cpu"]
+    with monkeypatch.context() as patch:
+        for place in (packages, importlib.util):
+            patch.setattr(place, "find_spec", lambda name: None)
+        for how in (["--dry-run"], []):
+            assert run(main, [*arguments, *how]) == 2
+            error = capsys.readouterr().err
+            assert re.search(message.replace("[", r"\["), error), error
+            assert error.count("\n") == 1
+    assert not plans
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_space_that_was_edited_is_not_told_to_run_the_command_that_was_refused(
+    space_data: dict[str, Any], tmp_path: Path, plans: list[driver.Plan], capsys: pytest.CaptureFixture[str]
+) -> None:
+    space = tmp_path / "small.yaml"
+    space.write_text(dump_yaml(space_data))
+    arguments = ["--space", str(space), "--storage", str(tmp_path / "runs"), "--cpu"]
+    assert run(main, arguments) == RESUMABLE
+    command = Experiment(tmp_path / "runs" / "small").resume_command()
+    capsys.readouterr()
+    # Another command line: the one that started it still works, and is shown.
+    assert run(main, [*arguments, "--resume", "--seeds", "0-1"]) == 2
+    assert f"or continue it as it was started: {command}\n" in capsys.readouterr().err
+    # Another file: no command line works.
+    space.write_text(dump_yaml(space_data | {"parameters": {"shac.actor_lr": {"grid": [0.01, 0.002]}}}))
+    for more in ([], ["--seeds", "0-1"]):
+        assert run(main, [*arguments, "--resume", *more]) == 2
+        error = capsys.readouterr().err
+        assert "trial 1 changed: shac.actor_lr 0.001 → 0.002; undo that in the space or its base, or pass" in error
+        assert "--resume" not in error.partition("--resume")[2]
+    space.write_text(dump_yaml(space_data))
+    assert run(main, [*arguments, "--resume"]) == RESUMABLE
+
+
+@pytest.mark.parametrize("storage", ["plain", "a b", "it's\x1b[31m\n\u202e\\x"])
+def test_the_command_to_continue_is_that_of_a_copy_under_another_name(
+    storage: str, space_file: Path, tmp_path: Path, plans: list[driver.Plan], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / storage
+    arguments = ["--space", str(space_file), "--cpu", f"--storage={folder}", "--na", "first"]
+    monkeypatch.setattr(sys, "argv", ["msk-ray", *arguments])
+    assert run(main, arguments) == RESUMABLE
+    shutil.copytree(folder / "first", folder / "second")
+    shutil.copytree(folder / "first", tmp_path / "elsewhere" / "first")
+    for copy in (folder / "first", folder / "second", tmp_path / "elsewhere" / "first"):
+        command = Experiment(copy).resume_command()
+        assert command.isprintable()
+        # As a shell would read it.
+        words = subprocess.run(
+            ["bash", "-c", f"printf '%s\\0' {command}"], capture_output=True, text=True, check=True
+        ).stdout.split("\0")
+        assert words[0] == "msk-ray"
+        assert read_options(words[1:-1]).path == copy
+        assert words.count("--name") + words.count("--na") == 1
+
+
+def test_a_storage_that_is_not_utf_8_is_refused_before_anything_is_written(
+    space_file: Path, tmp_path: Path, plans: list[driver.Plan], capsys: pytest.CaptureFixture[str]
+) -> None:
+    storage = tmp_path / os.fsdecode(b"runs\xff")
+    assert run(main, ["--space", str(space_file), "--cpu", "--storage", str(storage)]) == 2
+    assert "its path is not UTF-8; rename it, or choose another folder\n" in capsys.readouterr().err
+    assert not plans
+    assert not storage.exists()
+
+
+def test_who_leaves_the_debugger_of_a_trial_sees_one_line(
+    space_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def make_trainer(*_: object) -> None:
+        raise bdb.BdbQuit
+
+    monkeypatch.setattr("msk_ray.tune.trial_run.make_trainer", make_trainer)
+    command = ["--space", str(space_file), "--storage", str(tmp_path / "runs"), "--cpu", "--debug-trial", "0"]
+    assert run(main, command) == 130
+    assert capsys.readouterr().err == "quit at a breakpoint\n"
+    (folder,) = (tmp_path / "runs" / "debug").iterdir()
+    assert not (folder / "error.txt").exists()
+    assert not (folder / "outcome.json").exists(), "it has not ended"

@@ -1,6 +1,7 @@
 """Real Ray, a trainer of milliseconds: faults, what has gone, and memory."""
 
 import json
+import re
 import threading
 from pathlib import Path
 from typing import Any
@@ -10,11 +11,15 @@ from needs import slow
 from stub_runs import go, outcomes
 from stub_trainer import (
     BEHAVIOUR,
+    BROKEN_CONNECTION,
     BUG,
     CROWD,
     DOOMED_CROWD,
+    EXIT,
+    EXIT_ZERO,
     FULL_DISK,
     HANG,
+    INTERRUPT,
     KILL,
     LATE_CROWD,
     MEMORY,
@@ -24,7 +29,7 @@ from stub_trainer import (
     StubTrainer,
 )
 
-from msk_ray.errors import ClusterLost, StorageFailure
+from msk_ray.errors import StorageFailure
 from msk_ray.experiment.attempts import Attempt, Reduced, read_attempt
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import read_rows
@@ -32,7 +37,6 @@ from msk_ray.experiment.outcomes import Outcome
 from msk_ray.sweep import opening
 from msk_ray.sweep.rules.stopping import StopSpec
 from msk_ray.sweep.trials import resolve_trials
-from msk_ray.tune import driver
 from msk_ray.tune.trial_run import Hooks, run_trial
 
 pytestmark = [pytest.mark.usefixtures("stub_session"), pytest.mark.long]
@@ -41,18 +45,29 @@ pytestmark = [pytest.mark.usefixtures("stub_session"), pytest.mark.long]
 def test_faults_are_named_and_killed_or_hung_trials_go_on(
     make_space: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    behaviours = [0.0, KILL, NAN, SIMULATION_ERROR, BUG, HANG]
+    behaviours = [0.0, KILL, NAN, SIMULATION_ERROR, BUG, HANG, EXIT, EXIT_ZERO, INTERRUPT, BROKEN_CONNECTION]
     space = make_space(
         parameters={BEHAVIOUR: {"grid": behaviours}},
         resources={"max_failures": 1, "hang_s": 3.0},
     )
     completed, records = go(space, tmp_path / "runs" / "faults")
     assert completed
-    assert outcomes(records) == ["finished", "finished", "nonfinite", "nonfinite", "error", "finished"]
-    assert [record.epochs_done for record in records] == [20, 20, 5, 4, 4, 20]
+    named = ["finished", "finished", "nonfinite", "nonfinite", "error", "finished", *["error"] * 3, "finished"]
+    assert outcomes(records) == named
+    assert [record.epochs_done for record in records] == [20, 20, 5, 4, 4, 20, 4, 4, 4, 20]
     assert "train/actor_loss is nan at epoch 5" in records[2].ending.why  # type: ignore[union-attr]
-    assert records[4].ending.why == "RuntimeError: made up"  # type: ignore[union-attr]
+    reasons = {4: "RuntimeError: made up", 6: "sys.exit(3) was called", 7: "sys.exit(0) was called"}
+    reasons[8] = "KeyboardInterrupt"
     shown = capsys.readouterr()
+    for index, reason in reasons.items():
+        record = records[index]
+        # Another process would meet it again.
+        assert processes_in(record.folder) == 1
+        why = record.ending.why  # type: ignore[union-attr]
+        assert re.fullmatch(rf"{re.escape(reason)} \(stub_trainer\.py:\d+, in _misbehave\)", why)
+        assert f"{record.trial.id} error: {why}; see {record.folder}" in shown.out
+        assert (record.folder / "error.txt").is_file()
+    assert f"{records[9].trial.id} ConnectionResetError: [Errno 104] made up; retrying" in shown.out
     assert "its process died (killed, or out of memory); retrying" in shown.out
     assert "raylet" not in shown.out + shown.err  # Ray's own notices are in ray.log
     assert "it hung; its stacks are in" in shown.out
@@ -217,15 +232,3 @@ def test_a_driver_killed_after_the_decision_goes_on_with_half_the_worlds(make_sp
     assert outcomes([record]) == ["finished"]
     assert record.attempt == Attempt(Reduced(8, 4, "out_of_memory: made up", cleared=True)) == read_attempt(folder)
     assert [row["epoch"] for row in read_rows(folder)] == list(range(21))
-
-
-def test_a_dead_node_of_ones_own_ends_the_experiment_resumably(monkeypatch: pytest.MonkeyPatch) -> None:
-    node = driver._OwnNode()
-    monkeypatch.setattr(driver._OwnNode, "INTERVAL_S", 0.0)
-    node.on_step_end(0, [])
-    alive = driver.ray.nodes()
-    monkeypatch.setattr(driver.ray, "nodes", lambda: [{**facts, "Alive": False} for facts in alive])
-    with pytest.raises(ClusterLost, match="has died"):
-        node.on_step_end(1, [])
-    assert node.lost is not None
-    assert node.lost.exit_code == 75

@@ -39,7 +39,7 @@ def test_a_stale_note_of_a_cluster_does_not_matter(ray_folder: Path) -> None:
     result = start("msk_ray.tune.ray_probe", RAY_TMPDIR=str(ray_folder))
     assert result.returncode == 0, result.stderr
     assert '"cpus"' in result.stdout
-    assert (ray_folder / "ray" / "session_latest").exists()  # where the note was
+    assert [path.name for path in ray_folder.rglob("*")] == ["ray", "ray_current_cluster"]  # as it was
 
 
 def test_a_named_cluster_that_is_not_there_is_refused(tmp_path: Path, root: Path) -> None:

@@ -8,6 +8,7 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -108,11 +109,16 @@ def test_a_signal_before_the_first_trial_is_a_request_to_stop_too(
     wait_until(lambda: not members_of(driver.pid))
 
 
+def well() -> Any:
+    """Stands for a watch over a Ray that is well."""
+    return SimpleNamespace(look=lambda passed_s: None)
+
+
 def test_tune_takes_no_signal() -> None:
     from ray.tune.tune import _setup_signal_catching
 
     with listening() as stop:
-        interrupts.run_in_thread(_setup_signal_catching, stop)
+        interrupts.run_in_thread(_setup_signal_catching, stop, well())
         assert [signal.getsignal(number) for number in NUMBERS] == [stop.receive] * len(NUMBERS)
 
 
@@ -121,7 +127,7 @@ def test_what_the_loop_raises_is_raised() -> None:
         raise ZeroDivisionError
 
     with listening() as stop, pytest.raises(ZeroDivisionError):
-        interrupts.run_in_thread(fail, stop)
+        interrupts.run_in_thread(fail, stop, well())
 
 
 def test_a_loop_that_does_not_end_when_it_should_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -131,8 +137,129 @@ def test_a_loop_that_does_not_end_when_it_should_is_left(monkeypatch: pytest.Mon
     with listening() as stop, stop.deferred():
         stop.receive(signal.SIGTERM)
         with pytest.raises(ClusterLost, match="did not answer"):
-            interrupts.run_in_thread(released.wait, stop)
+            interrupts.run_in_thread(released.wait, stop, well())
     released.set()
+
+
+def test_a_loop_that_waits_for_a_lost_ray_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(interrupts, "_TICK_S", 0.01)
+    released = threading.Event()
+    watch: Any = SimpleNamespace(look=lambda passed_s: ClusterLost("it has died"))
+    with listening() as stop, pytest.raises(ClusterLost, match="it has died"):
+        interrupts.run_in_thread(released.wait, stop, watch)
+    released.set()
+
+
+def daemon_of(driver: "subprocess.Popen[str]", name: str) -> int:
+    (pid,) = [pid for pid, of in members_of(driver.pid).items() if of == name]
+    return pid
+
+
+@pytest.mark.parametrize("name", ["gcs_server", *slow("raylet")])
+def test_a_daemon_of_ray_that_dies_ends_the_sweep_resumably(
+    name: str, start: Start, experiment: Experiment, tmp_path: Path
+) -> None:
+    driver = start()
+    wait_until(lambda: held(experiment), driver)
+    os.kill(daemon_of(driver, name), signal.SIGKILL)
+    output, _ = driver.communicate()
+    assert driver.returncode == RESUMABLE, output
+    assert f"error: Ray's process {name} on this machine has died; continue with --resume\n" in output
+    assert has_ended_in_order(output, driver, experiment)
+    (tmp_path / "hold").unlink()
+    again = start("--resume")
+    output, _ = again.communicate()
+    assert again.returncode == 0, output
+    assert [str(record.ending and record.ending.outcome) for record in read_records(experiment)] == ["finished"] * 2
+
+
+@pytest.mark.parametrize("asked", [True, *slow(False)])
+def test_a_ray_that_is_frozen_ends_the_sweep_resumably(asked: bool, start: Start, experiment: Experiment) -> None:
+    driver = start(STUB_SILENCE="8")
+    wait_until(lambda: held(experiment), driver)
+    os.kill(daemon_of(driver, "gcs_server"), signal.SIGSTOP)
+    if asked:
+        os.kill(driver.pid, signal.SIGTERM)
+    output, _ = driver.communicate()
+    assert driver.returncode == RESUMABLE, output
+    assert has_ended_in_order(output, driver, experiment)
+
+
+def has_ended_in_order(output: str, driver: "subprocess.Popen[str]", experiment: Experiment) -> bool:
+    """Whether a sweep has said how it goes on, and nothing of it is left."""
+    wait_until(lambda: not members_of(driver.pid))
+    assert not (experiment.path / "owner.json").exists()
+    assert "Traceback" not in output
+    return "continue with: python stub_driver.py" in output
+
+
+def test_a_ray_that_does_not_end_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    ended: list[bool] = []
+    released = threading.Event()
+    monkeypatch.setattr(interrupts, "_SHUTDOWN_LIMIT_S", 0.05)
+    monkeypatch.setattr(interrupts, "_LAST_POLL_S", 0.05)
+    monkeypatch.setattr(interrupts.ray, "shutdown", released.wait)
+    monkeypatch.setattr(interrupts.ray, "is_initialized", lambda: True)
+    monkeypatch.setattr(interrupts.cli, "end_at_once", lambda: ended.append(True))
+    folder: Any = SimpleNamespace(end_processes=lambda keep: ended.append(keep))
+    with pytest.raises(ClusterLost, match="Ray did not end within"):
+        interrupts.end_ray(folder)
+    released.set()
+    assert ended == [False, True]
+
+
+def test_a_signal_while_the_report_is_written(start: Start, experiment: Experiment, tmp_path: Path) -> None:
+    """Ray's end takes the handler of SIGTERM away, in the kernel."""
+    (tmp_path / "hold").unlink()
+    driver = start()
+    wait_until(lambda: (experiment.path / "summary.json").exists(), driver)
+    assert driver.stdout is not None
+    seen = ""
+    while "writing the report" not in seen:
+        seen += (line := driver.stdout.readline())
+        assert line, seen
+    os.kill(driver.pid, signal.SIGTERM)
+    output, _ = driver.communicate()
+    assert driver.returncode == RESUMABLE, seen + output
+    assert "stopped by SIGTERM" in output
+    assert has_ended_in_order(output, driver, experiment)
+
+
+def test_ctrl_c_twice_leaves_no_process(start: Start, experiment: Experiment) -> None:
+    driver = start()
+    wait_until(lambda: held(experiment), driver)
+    for pid in [pid for pid, name in members_of(driver.pid).items() if name == "ray::TrialActor"]:
+        os.kill(pid, signal.SIGSTOP)  # so that no trial has saved itself before the second one
+    os.kill(driver.pid, signal.SIGINT)
+    assert driver.stdout is not None
+    seen = ""
+    while "save themselves" not in seen:
+        seen += (line := driver.stdout.readline())
+        assert line, seen
+    os.kill(driver.pid, signal.SIGINT)
+    driver.wait()
+    # The driver has waited for them.
+    assert members_of(driver.pid) == {}
+    output = seen + driver.stdout.read()
+    assert driver.returncode == 130, output
+    assert output.endswith("interrupted\n")
+    assert "Traceback" not in output
+
+
+def test_the_start_of_ray_is_not_interrupted() -> None:
+    """An exception raised between a fork and its end once left the lock of `logging` behind."""
+    done = []
+
+    def start_ray() -> None:
+        with interrupts.starting_ray():
+            os.kill(os.getpid(), signal.SIGINT)
+            done.append(True)
+
+    with listening() as stop:
+        with pytest.raises(KeyboardInterrupt):
+            start_ray()
+        assert done
+        assert stop.signal is signal.SIGINT
 
 
 def test_rays_own_handler_is_heard_as_a_request() -> None:

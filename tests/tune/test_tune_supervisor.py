@@ -40,6 +40,47 @@ def test_time_in_which_the_driver_was_frozen_is_not_the_trials(
         assert driver.stopped
 
 
+def test_a_trial_that_waits_for_another_process_does_not_run(
+    make_space: Callable[..., Space], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    space = make_space()
+    trials = resolve_trials(space)
+    experiment = opening.create(tmp_path / "runs" / "small", space, trials, {})
+    ray_trials = [SimpleNamespace(config={"id": t.id}, pickled_error_file=None, num_failures=1) for t in trials]
+    with listening() as stop, stop.deferred():
+        console = Console(trials, 2)
+        known = {trial.id: trial for trial in trials}
+        driver = Supervisor(experiment, lambda config: known[config["id"]], console, stop, lambda: None, trials)
+        for trial in ray_trials:
+            driver.on_trial_start(0, [], trial)
+        assert console.status().startswith("2 running · 0 waiting · 0 ended")
+        driver.on_trial_recover(0, [], ray_trials[0])
+        assert console.status().startswith("1 running · 1 waiting · 0 ended")
+        assert driver.waiting() == 1
+        stop.receive(signal.SIGINT)
+        driver.on_step_end(0, [])
+        assert "SIGINT: 1 trials save themselves" in capsys.readouterr().out
+        driver.on_trial_complete(0, [], ray_trials[1])
+        assert driver.stopped  # there is no process to wait for
+
+
+def test_a_trial_that_had_no_process_while_others_saved_themselves_is_not_waited_for(
+    make_space: Callable[..., Space], tmp_path: Path
+) -> None:
+    space = make_space()
+    trials = resolve_trials(space)
+    experiment = opening.create(tmp_path / "runs" / "small", space, trials, {})
+    trial = SimpleNamespace(config={}, pickled_error_file=None, num_failures=1)
+    with listening() as stop, stop.deferred():
+        driver = Supervisor(experiment, lambda config: trials[0], Console(trials, 1), stop, lambda: None, trials)
+        driver.on_trial_start(0, [], trial)
+        stop.receive(signal.SIGINT)
+        driver.on_step_end(0, [])
+        assert not driver.stopped
+        driver.on_trial_recover(0, [], trial)  # it died instead
+        assert driver.stopped
+
+
 def test_nothing_is_written_into_a_folder_made_in_place_of_an_experiment(
     make_space: Callable[..., Space], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

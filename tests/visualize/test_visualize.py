@@ -1,6 +1,7 @@
 """Pictures without a display, for CartPole and the ant, on the CPU; the viewer under a virtual display."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -15,6 +16,9 @@ from needs import need_drawing, need_program
 from PIL import Image
 
 from msk_ray.cli import run
+from msk_ray.config import PhysicsConfig
+from msk_ray.envs.cartpole.config import CartPoleSettings
+from msk_ray.envs.cartpole.env import CartPole
 from msk_ray.errors import DeviceError
 from msk_ray.evaluate.measure import Bench, Request
 from msk_ray.experiment.manifest import Experiment
@@ -23,7 +27,7 @@ from msk_ray.visualize import render
 from msk_ray.visualize.__main__ import main
 from msk_ray.visualize.episodes import record
 from msk_ray.visualize.film import write_video
-from msk_ray.visualize.look import ACTIVE, RELAXED, Look, muscle_tendons
+from msk_ray.visualize.look import ACTIVE, RELAXED, Look, describe_groups, geom_groups, muscle_tendons
 from msk_ray.visualize.render import States, View, frames, headless_backend
 
 pytestmark = pytest.mark.long
@@ -200,6 +204,77 @@ def test_models_without_sky_or_light_are_drawn_on_a_bright_day(drawing: str) -> 
     assert made[48, 80].min() > 90
 
 
+def test_a_robot_in_groups_that_are_not_drawn_is_shown(drawing: str) -> None:
+    body = np.array([[0, 0, 0.3, 1, 0, 0, 0]], dtype=float)
+
+    def shot(box_group: int, groups: tuple[int, ...] | None) -> np.ndarray:
+        model = mujoco.MjModel.from_xml_string(RESTING.replace('type="box"', f'type="box" group="{box_group}"'))
+        states = States(model, body, np.zeros((1, 6)), np.zeros((1, 0)), np.zeros((1, 0)))
+        (frame,) = frames(states, View(96, 64, groups=groups))
+        return frame
+
+    visible, hidden = shot(0, None), shot(0, (1, 2))
+    assert not np.array_equal(visible, hidden)
+    for group in (3, 5):
+        assert np.array_equal(shot(group, None), visible)
+        assert np.array_equal(shot(group, (0,)), shot(group, (0, 1, 2)))
+        assert not np.array_equal(shot(group, (0,)), visible)
+
+
+def test_which_groups_are_drawn() -> None:
+    def groups(*of_bodies: int) -> tuple[int, ...]:
+        bodies = "".join(f'<body><freejoint/><geom size=".1" group="{group}"/></body>' for group in of_bodies)
+        floor = '<geom type="plane" size="1 1 1"/>'
+        return geom_groups(mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{floor}{bodies}</worldbody></mujoco>"))
+
+    assert groups() == groups(0) == groups(2, 3) == (0, 1, 2)
+    assert groups(3) == (0, 1, 2, 3)
+    assert groups(5, 3, 5) == (0, 1, 2, 3, 5)
+    assert describe_groups(groups(2, 3)) == ""
+    assert describe_groups(groups(5, 3)).startswith("geom groups 3, 5 drawn too: no moving body has a geom in")
+
+
+def test_the_commands_say_which_groups_they_draw(
+    sweep: Experiment,
+    drawing: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    build = CartPole.build_model
+
+    def hidden(config: CartPoleSettings, physics: PhysicsConfig) -> mujoco.MjModel:
+        model = build(config, physics)
+        model.geom_group[:] = 4
+        return model
+
+    monkeypatch.setattr(CartPole, "build_model", staticmethod(hidden))
+    trial = sweep.trial_folder(sweep.trials()[0].id)
+    words = [str(trial), "--strip", str(tmp_path / "s.png"), "--steps", "2", "--frames", "2", "--device", "cpu"]
+    assert run(main, words) == 0
+    assert "geom group 4 drawn too" in capsys.readouterr().out
+    assert run(main, [*words, "--geom-groups", "4"]) == 0
+    assert "drawn too" not in capsys.readouterr().out
+
+
+def test_without_the_encoder_films_are_refused_and_everything_else_is_made(
+    sweep: Experiment, drawing: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = Path(shutil.copytree(sweep.path, tmp_path / "runs" / "small"))
+    monkeypatch.setitem(sys.modules, "av", None)
+    trial = str(copy / "trials" / sweep.trials()[0].id)
+    assert run(main, [trial, "--video", str(tmp_path / "a.mp4")]) == 2
+    assert re.search("films need the package av .*: pip install av, or write a .gif\n$", capsys.readouterr().err)
+    assert run(main, [trial, "--video", str(tmp_path / "a.gif"), "--steps", "3", "--size", "32x32"]) == 0
+    # As a program: the report must not load it on its way either.
+    code = (
+        "import sys; sys.modules['av'] = None; from msk_ray.report.__main__ import main; sys.exit(main(sys.argv[1:]))"
+    )
+    subprocess.run([sys.executable, "-c", code, str(copy), "--device", "cpu"], check=True)
+    assert (copy / "report" / "index.html").is_file()
+    assert (copy / "report" / "strip.png").is_file()
+
+
 def test_without_opengl_the_packages_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     fault = render.probe("nonsense")  # a real process, which MuJoCo refuses to draw in
     assert fault is not None
@@ -237,6 +312,7 @@ def test_a_drawing_process_that_dies_is_reported(drawing: str) -> None:
         (["small", "--no-render", "--seed", f"{10**20}"], f"seeds {10**20}: write whole numbers"),
         (["small", "--progression", "small"], "name one thing to watch"),
         (["smal", "--no-render"], "did you mean 'small'?"),
+        (["small", "--no-render", "--geom-groups", "3"], "--geom-groups: --no-render draws nothing"),
     ],
 )
 def test_bad_input_is_one_line(

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from msk_ray.algorithms.base import Algorithm, Clock, EpochResult, simulation_metrics
 from msk_ray.algorithms.episodes import EpisodeTracker
+from msk_ray.algorithms.nonfinite import nonfinite_observation, nonfinite_reward
 from msk_ray.algorithms.streams import GlobalStreams
 from msk_ray.config import Config, NetworkConfig, PpoConfig
 from msk_ray.envs import Env
@@ -118,7 +119,7 @@ class Ppo(Algorithm):
         clock = Clock(self.env.device)
         try:
             with self._drawing("noise"):
-                rewards, done, diverged = self._collect()
+                rewards, done, diverged = self._collect(epoch)
             clock.mark("rollout")
             if self.witness is not None:
                 storage = self.ppo.storage
@@ -127,8 +128,11 @@ class Ppo(Algorithm):
             with self._drawing("minibatches"):
                 losses = self.ppo.update()
         except (RuntimeError, ValueError):
-            # What torch raises for a standard deviation that is NaN, for one.
+            # What torch raises for a mean or standard deviation that is NaN, for one.
             self._check("weights", self._weights())
+            seen, done = self.env.observation()[None], self.ppo.storage.step
+            if (fault := nonfinite_observation(self.env, seen, epoch, done)) is not None:
+                raise fault from None
             raise
         self._check("losses and weights", [*losses.values(), *self._weights()])
         clock.mark("learning")
@@ -173,12 +177,12 @@ class Ppo(Algorithm):
         return nullcontext() if self._streams is None else self._streams.drawing(what)
 
     @torch.no_grad()
-    def _collect(self) -> tuple[Tensor, Tensor, Tensor]:
+    def _collect(self, epoch: int) -> tuple[Tensor, Tensor, Tensor]:
         """Fill rsl_rl's storage; rewards (H, W), ends of episodes (H, W) bool, and how many worlds diverged."""
         env, ppo = self.env, self.ppo
         env.state = env.state.detach()
         env.stock_resets(env.draw_resets(self.settings.steps))
-        rewards, ends = [], []
+        rewards, terms, ends = [], [], []
         diverged = torch.zeros((), dtype=torch.int64, device=env.device)
         obs = self._observe()
         for _ in range(self.settings.steps):
@@ -188,9 +192,13 @@ class Ppo(Algorithm):
             # A time limit does not end the task: rsl_rl adds the value of the state in which the episode was cut.
             ppo.process_env_step(obs, transition.reward, done, {"time_outs": transition.truncated})
             rewards.append(transition.reward)
+            terms.append(transition.terms)
             ends.append(done)
             diverged += transition.diverged.sum()
-        self._check("observations and rewards", [*ppo.storage.observations.values(), *rewards])
+        if (error := nonfinite_observation(env, ppo.storage.observations[_GROUP], epoch)) is not None:
+            raise error
+        if not bool(torch.stack(rewards).isfinite().all()):
+            raise nonfinite_reward(env, terms, epoch)
         ppo.compute_returns(obs)
         return torch.stack(rewards), torch.stack(ends), diverged
 
@@ -206,7 +214,7 @@ class Ppo(Algorithm):
         finite = [torch.as_tensor(value, device=self.env.device).isfinite().all() for value in values]
         if not bool(torch.stack(finite).all()):
             raise SimulationError(
-                f"nonfinite_update: PPO's {what} are not finite; lower ppo.lr or ppo.desired_kl, or look at the reward",
+                f"nonfinite_update: PPO's {what} are not finite; lower ppo.lr or ppo.desired_kl",
                 Failure.NONFINITE,
             )
 

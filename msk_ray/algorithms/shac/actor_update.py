@@ -80,7 +80,7 @@ class Judged:
 
 @dataclass(frozen=True)
 class ActorOutcome:
-    """The results of one epoch, all detached, on the device; of all worlds of the group, but for the state."""
+    """The results of one epoch, all detached, on the device; of all worlds of the group, but for state and terms."""
 
     state: EnvState
     """Of this process's worlds."""
@@ -90,6 +90,8 @@ class ActorOutcome:
     """The critic's targets for them, (H·W,)."""
     rewards: Tensor
     """Shape (H, W)."""
+    terms: tuple[Tensor, ...]
+    """Parts of the reward in each step in this process's worlds, H tensors of shape (W, T)."""
     done: Tensor
     """Shape (H, W) bool."""
     cotangents: CotangentRecord
@@ -215,6 +217,7 @@ class ActorUpdate:
             rolled.state,
             *judged.for_critic,
             detached,
+            rollout.terms,
             gather(rollout.done, dim=1),
             cotangents,
             metrics,

@@ -11,13 +11,14 @@ from torch import Tensor, nn
 
 from msk_ray.algorithms.base import Algorithm, EpochResult, simulation_metrics
 from msk_ray.algorithms.episodes import EpisodeTracker
-from msk_ray.algorithms.shac.actor_update import ActorUpdate, EpochInputs
+from msk_ray.algorithms.nonfinite import nonfinite_observation, nonfinite_reward
+from msk_ray.algorithms.shac.actor_update import ActorOutcome, ActorUpdate, EpochInputs
 from msk_ray.algorithms.shac.critic_fit import CriticFit
 from msk_ray.algorithms.shac.curriculum import ContactSchedule
 from msk_ray.algorithms.shac.entropy import EntropyBonus
 from msk_ray.algorithms.shac.horizon import RolloutLength
 from msk_ray.algorithms.shac.optimizer import RateAdam
-from msk_ray.algorithms.shac.runner import EagerRunner, RecordedRunner
+from msk_ray.algorithms.shac.runner import UNRECORDED, EagerRunner, RecordedRunner
 from msk_ray.algorithms.shac.schedules import learning_rate_at
 from msk_ray.config import Config, ShacConfig
 from msk_ray.envs import Env
@@ -104,8 +105,8 @@ class Shac(Algorithm):
             time of the critic are those of the epoch before, because its fit still runs.
 
         Raises:
-            SimulationError: too many worlds had a non-finite gradient, the policy's gradient is not finite, or the
-                physics ran out of buffer space.
+            SimulationError: an observation or a reward is not finite, too many worlds had a gradient that is not, the
+                policy's gradient is not, or the physics ran out of buffer space.
         """
         c = self.settings
         horizon = self._horizon.at(epoch)
@@ -130,7 +131,7 @@ class Shac(Algorithm):
         # One transfer: reading each number would make the host wait as many times.
         values = torch.stack([value.float() for value in metrics.values()]).tolist()
         numbers = dict(zip(metrics, values, strict=True))
-        self._check_gradient(numbers["grad/nonfinite_share"], numbers["grad/actor_norm"])
+        self._check_finite(outcome, numbers, epoch)
         self._horizon.follow(cotangents.norms, numbers.get("train/contact"))
         numbers |= self._adapt(numbers["train/reward"], numbers.get("train/entropy"))
         numbers |= {
@@ -138,11 +139,16 @@ class Shac(Algorithm):
             "train/horizon": float(horizon),
             "train/actor_lr": actor_lr,
             "train/recorded": float(self._runner.recorded),
+            **({} if self._runner.refusal is None else {"train/unrecordable": 1.0}),
             **{f"time/{part}_s": value for part, value in seconds.items()},
             **simulation_metrics(self.env),
         }
         self._runner.adapt()
         return EpochResult(horizon * self._worlds, numbers, round(numbers["train/episodes"]))
+
+    def remarks(self) -> list[str]:
+        """Why epochs are not recorded, if they should be."""
+        return [] if self._runner.refusal is None else [f"{UNRECORDED}: {self._runner.refusal}"]
 
     def note_state(self) -> None:
         """Let the witness, if there is one, note worlds and modules, once the critic's fit has ended."""
@@ -229,25 +235,34 @@ class Shac(Algorithm):
             self._contacts.advance(reward)
         return stood
 
-    def _check_gradient(self, lost: float, norm: float) -> None:
-        """Raise SimulationError for a gradient along which no step was taken.
+    def _check_finite(self, outcome: ActorOutcome, numbers: Mapping[str, float], epoch: int) -> None:
+        """Raise SimulationError for a reward that is not finite, or a gradient along which no step was taken.
 
         Args:
-            lost: share of the worlds without a finite gradient.
-            norm: of the policy's gradient, before clipping.
+            outcome: of the epoch.
+            numbers: its metrics, by name.
+            epoch: counted from 0.
         """
+        lost, norm = numbers["grad/nonfinite_share"], numbers["grad/actor_norm"]
         allowed = self.settings.max_nonfinite_share
+        rewarded = math.isfinite(numbers["train/reward"])
+        if rewarded and lost <= allowed and math.isfinite(norm):
+            return
+        seen = outcome.obs.unflatten(0, (-1, self._worlds))
+        if (error := nonfinite_observation(self.env, seen, epoch)) is not None:
+            raise error
+        if not rewarded:
+            raise nonfinite_reward(self.env, outcome.terms, epoch)
         if lost > allowed:
             raise SimulationError(
                 f"nonfinite_gradient: the state cotangent of {lost:.1%} of the worlds was not finite "
                 f"(shac.max_nonfinite_share allows {allowed:.1%}); shorten shac.horizon, set shac.state_grad_clip or "
-                "soften the contacts",
+                "soften the contacts; or look in observe and reward_terms for the slope of a root or norm at 0",
                 Failure.NONFINITE,
             )
-        if not math.isfinite(norm):
-            raise SimulationError(
-                "nonfinite_gradient: the policy gradient is not finite; lower shac.actor_lr", Failure.NONFINITE
-            )
+        raise SimulationError(
+            "nonfinite_gradient: the policy gradient is not finite; lower shac.actor_lr", Failure.NONFINITE
+        )
 
     def prepare_fit(self, rows: int, rate: float) -> Tensor:
         """Set the critic's rate, and draw the orders in which a fit passes over so many rows, (passes, rows).

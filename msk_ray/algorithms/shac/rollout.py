@@ -20,6 +20,8 @@ class Rollout:
     """Normalised observations of the states reached, before any reset, attached, shape (H, W, O)."""
     rewards: Tensor
     """Attached, shape (H, W)."""
+    terms: tuple[Tensor, ...]
+    """Parts of the reward in each step, detached, H tensors of shape (W, T)."""
     terminated: Tensor
     """Shape (H, W) bool."""
     done: Tensor
@@ -50,7 +52,7 @@ def collect(
     action's gradient comes only from its own step. `normalizer` is held fixed during the rollout.
     """
     env.state = env.state.detach()
-    raw, reached, rewards, terminated, done, diverged = [], [], [], [], [], []
+    raw, reached, rewards, terms, terminated, done, diverged = [], [], [], [], [], [], []
     neg_log_probs, contacts = [], []
     normalize = normalizer.fixed() if normalizer is not None else lambda x: x
     for step_noise in noise:
@@ -69,6 +71,7 @@ def collect(
         raw.append(obs.detach())
         reached.append(transition.obs)
         rewards.append(transition.reward)
+        terms.append(transition.terms)
         terminated.append(transition.terminated)
         done.append(transition.terminated | transition.truncated)
         diverged.append(transition.diverged)
@@ -76,6 +79,7 @@ def collect(
         torch.stack(raw),
         normalize(torch.stack(reached)),
         torch.stack(rewards),
+        tuple(terms),
         torch.stack(terminated),
         torch.stack(done),
         torch.stack(diverged),

@@ -32,6 +32,7 @@ class CriticWork(Protocol):
         """Let the target critic follow the critic that was fitted."""
 
 
+UNRECORDED = "epochs run operation by operation, not as recorded graphs, and take two to three times as long"
 _MOST_HORIZONS = 3
 """Recordings kept of epochs, and of fits, one for each horizon: each holds the memory of all its work."""
 _FEWEST_ITERATIONS = 6
@@ -52,9 +53,11 @@ class EagerRunner:
     Attributes:
         recorded: whether the last epoch was replayed from a recording.
         last_loss: the critic's loss, as far as it is known; None before the first fit.
+        refusal: why epochs are no longer recorded although they should be; None if they may be.
     """
 
     recorded = False
+    refusal: str | None = None
 
     def __init__(self, actor: ActorUpdate, critic: CriticWork, env: Env[Any]) -> None:
         self._actor = actor
@@ -165,7 +168,6 @@ class RecordedRunner(EagerRunner):
         self._fit_clock: Clock | None = None
         self._fit_s: float | None = None
         self._newest_loss: Tensor | None = None
-        self._refused = False
         own = type(env).begin_epoch is not Env.begin_epoch and not env.begin_epoch_in_place
         if own:
             self._refuse(
@@ -255,11 +257,11 @@ class RecordedRunner(EagerRunner):
 
     def adapt(self) -> None:
         batch = self._env.sim.batch
-        if self._refused or not batch.stages.unrolls:
+        if self.refusal is not None or not batch.stages.unrolls:
             return
         # Empty, if a batch with larger buffers has just taken the place of the one that the epoch ran in.
         counts = batch.iterations.read()
-        before, most = batch.unrolled_iterations, int(batch.mjm.opt.iterations)
+        before, most = batch.unrolled_iterations, batch.limits.iterations
         limits = before or (_FEWEST_ITERATIONS,) * batch.substeps
         # A trial that is resumed starts with an epoch that is not recorded, and must adapt as if it were.
         resumed = batch.ordered and before is not None
@@ -284,7 +286,10 @@ class RecordedRunner(EagerRunner):
             epoch = record()
         except RuntimeError as error:
             first = _first(error)
-            why = f"{_place(first)} cannot be recorded ({str(first).splitlines()[0]})"
+            why = (
+                f"{_place(first)} cannot be recorded ({str(first).splitlines()[0]}): make constants in `prepare`, and "
+                "leave out .item(), .cpu() and conditions on tensors"
+            )
         every = self._group.collect(why)
         if not any(every):
             return epoch
@@ -293,13 +298,13 @@ class RecordedRunner(EagerRunner):
         return None
 
     def _refuse(self, why: str) -> None:
-        self._refused = True
+        self.refusal = why
         self._kept.epochs.clear()
-        warnings.warn(f"epochs run operation by operation, not as recorded graphs: {why}", stacklevel=2)
+        warnings.warn(f"{UNRECORDED}: {why}", stacklevel=2)
 
     def _epoch(self, inputs: EpochInputs) -> _Epoch | None:
         """The recording of an epoch with this horizon; None if it has to run eagerly."""
-        if self._refused:
+        if self.refusal is not None:
             return None
         engine, horizon = self._env.sim.engine, len(inputs.noise)
         if self._group.any(self._kept.engine is not engine):

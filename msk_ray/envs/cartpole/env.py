@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
-from msk_ray.envs.base import Env, wrap_angle
+from msk_ray.envs.base import Env
 from msk_ray.envs.cartpole.config import CartPoleSettings
 from msk_ray.envs.cartpole.model import build_cartpole
 from msk_ray.envs.layout import Entry, entries
@@ -71,3 +71,8 @@ class CartPole(Env[CartPoleSettings]):
 
     def success(self, tail: dict[str, Tensor]) -> Tensor | None:
         return (tail["upright"] > 0).all(0)
+
+
+def wrap_angle(angle: Tensor) -> Tensor:
+    """The same angle [rad] in [-π, π)."""
+    return torch.remainder(angle + math.pi, 2.0 * math.pi) - math.pi

@@ -13,12 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from msk_ray.config import AS_USUAL, ExecutionConfig, PhysicsConfig
+from msk_ray.config import PhysicsConfig
 from msk_ray.envs.base import Env
 from msk_ray.envs.mjcf.config import MjcfSettings
 from msk_ray.envs.options import override_options
 from msk_ray.errors import ConfigError, shortened
-from msk_ray.step import Backward, StepState
+from msk_ray.step import StepState
 
 AnyMjcfSettings = TypeVar("AnyMjcfSettings", bound=MjcfSettings)
 
@@ -45,29 +45,6 @@ class MjcfEnv(Env[AnyMjcfSettings], Generic[AnyMjcfSettings]):
     Settings = MjcfSettings
     mjcf: ClassVar[str]
     """Path of the model's file, relative to the folder of the class that sets it; or the MJCF text itself."""
-
-    def __init__(
-        self,
-        config: AnyMjcfSettings,
-        physics: PhysicsConfig,
-        nworld: int,
-        device: str,
-        seed: int,
-        backward: Backward | None,
-        execution: ExecutionConfig = AS_USUAL,
-    ) -> None:
-        super().__init__(config, physics, nworld, device, seed, backward, execution)
-        with torch.no_grad():
-            controls = self.control(torch.zeros((nworld, self.action_size), device=self.device))
-            obs = self.observation()
-        name = type(self).__qualname__
-        if controls.shape != (nworld, self.model.nu):
-            raise ConfigError(f"control of {name} has shape {tuple(controls.shape)}, not ({nworld}, {self.model.nu})")
-        if obs.dim() != 2 or len(obs) != nworld:
-            raise ConfigError(
-                f"observe of {name} has shape {tuple(obs.shape)}, not (worlds, entries) with {nworld} worlds"
-            )
-        self.obs_size = obs.shape[-1]
 
     @classmethod
     def build_model(cls, config: AnyMjcfSettings, physics: PhysicsConfig) -> mujoco.MjModel:

@@ -31,6 +31,11 @@ class MyoLegSettings(LegSettings):
             raise ValueError("env.reset: cycle starts at the clock's phase: write env.clock: true")
         return self
 
+    def check_installed(self) -> None:
+        from msk_ray.legs.myoleg.source import find_model  # loads MuJoCo
+
+        find_model(self.model, self.source)
+
     def unread(self) -> dict[str, str]:
         unread = super().unread()
         if self.model not in (None, *PACKAGED_MODELS):

@@ -15,7 +15,8 @@ from msk_ray.legs.env import LegEnv
 from msk_ray.legs.gait.body import world_axes
 from msk_ray.legs.muscles import columns
 from msk_ray.legs.myoleg.config import MyoLegSettings
-from msk_ray.legs.myoleg.model import Couplings, build_myoleg, cycle_states, find_model, ground_height
+from msk_ray.legs.myoleg.model import Couplings, build_myoleg, cycle_states, ground_height
+from msk_ray.legs.myoleg.source import find_model
 from msk_ray.legs.root import Root
 from msk_ray.step import StepState
 from msk_ray.step.autograd.tangent import quat_rotate

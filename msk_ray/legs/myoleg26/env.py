@@ -32,6 +32,7 @@ class MyoLeg26(LegEnv[MyoLeg26Settings]):
 
     Settings = MyoLeg26Settings
     pose_signs = (-1.0, 1.0, -1.0, -1.0)
+    keeps_iterations = True
 
     @classmethod
     def build_model(cls, config: MyoLeg26Settings, physics: PhysicsConfig) -> mujoco.MjModel:

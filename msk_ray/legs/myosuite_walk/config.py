@@ -65,6 +65,11 @@ class MyoSuiteWalkSettings(EnvSettings):
     taken with 0, MyoSuite's own hard switch."""
     reward: MyoSuiteWalkReward = MyoSuiteWalkReward()
 
+    def check_installed(self) -> None:
+        from msk_ray.legs.myosuite_walk.source import find_file  # loads MuJoCo
+
+        find_file(self.model)
+
     def unread(self) -> dict[str, str]:
         unread = self.assist.unread()
         if self.reset != "random" and not self.cycle:

@@ -74,6 +74,7 @@ class MyoSuiteWalk(AssistedEnv[MyoSuiteWalkSettings]):
 
     Settings = MyoSuiteWalkSettings
     reward_names: tuple[str, ...] = ("vel_reward", "cyclic_hip", "ref_rot", "joint_angle_rew", "done")
+    without_gradient = ("done",)
 
     @classmethod
     def build_model(cls, config: MyoSuiteWalkSettings, physics: PhysicsConfig) -> mujoco.MjModel:
@@ -176,18 +177,11 @@ class MyoSuiteWalk(AssistedEnv[MyoSuiteWalkSettings]):
             action = self._mirror.action(self._phase(self._observed_steps()) >= 0.5, action)
         return torch.sigmoid(5.0 * (action - 0.5))
 
-    def observation(self) -> Tensor:
-        return self._observe(self.state.physics, self._observed_steps())
-
-    def observe(self, state: StepState, action: Tensor) -> Tensor:
-        """Observation (W, O) of a state to which a step from the current one has led."""
-        return self._observe(state, self.state.age)
-
     def _observed_steps(self) -> Tensor:
         """Steps (W,) whose phase the current state is observed with."""
         return (self.state.age - 1).clamp_min(0)
 
-    def _observe(self, state: StepState, steps: Tensor) -> Tensor:
+    def observe(self, state: StepState, action: Tensor) -> Tensor:
         q, v = state.qpos, state.qvel
         frames = self.frames(state)
         feet = frames.position(_FEET)
@@ -203,7 +197,7 @@ class MyoSuiteWalk(AssistedEnv[MyoSuiteWalkSettings]):
                 feet[..., 2],
                 frames.center_of_mass()[:, 2:],
                 (feet - frames.position("pelvis")[:, None]).flatten(1),
-                self._phase(steps)[:, None],
+                self._phase(self._observed_steps())[:, None],
                 length,
                 rate,
                 -1e-3 * self._muscles.peak * pull,

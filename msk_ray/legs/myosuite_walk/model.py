@@ -1,6 +1,5 @@
 """The model of MyoSuite's walking task: legs with 80 muscles under a rigid torso, from the package's own file."""
 
-from pathlib import Path
 from typing import Final
 
 import mujoco
@@ -8,12 +7,10 @@ import mujoco
 from msk_ray.config import PhysicsConfig
 from msk_ray.envs.options import apply_options
 from msk_ray.errors import ConfigError
-from msk_ray.legs.myoleg.model import INSTALL_OF, package_folder, spec_of_file
+from msk_ray.legs.myoleg.source import spec_of_file
 from msk_ray.legs.myosuite_walk.config import MyoSuiteWalkSettings
+from msk_ray.legs.myosuite_walk.source import INSTALL, find_file
 
-VERSION: Final = "2.12"
-"""Version of MyoSuite whose task this is."""
-INSTALL: Final = f"{INSTALL_OF['myosuite2']}, or set env.model to the path of its myolegs.xml"
 SUBSTEPS: Final = 10
 """Physics steps of an env step: MyoSuite's frame_skip."""
 KEYFRAMES: Final = ("stand", "crouch", "right_knee_flexed", "left_knee_flexed")
@@ -22,27 +19,6 @@ BODIES: Final = ("torso", "pelvis", "talus_l", "talus_r")
 """Bodies that the observation measures."""
 HINGES: Final = tuple(f"hip_{angle}_{side}" for angle in ("flexion", "adduction", "rotation") for side in "lr")
 """Joints that the reward measures."""
-_FILE: Final = Path("simhive/myo_sim/leg/myolegs.xml")
-
-
-def find_file(model: str | None) -> Path:
-    """The model's file.
-
-    Raises:
-        ConfigError: there is no such file, or no MyoSuite of this version.
-    """
-    if model is not None:
-        path = Path(model)
-        if not path.is_file():
-            raise ConfigError(f"env.model: no file {model}; {INSTALL}")
-        return path
-    found = package_folder("myosuite")
-    if found is None:
-        raise ConfigError(f"env.model: MyoSuite {VERSION} is not installed: {INSTALL}")
-    folder, version = found
-    if not version.startswith(f"{VERSION}.") or not (folder / _FILE).is_file():
-        raise ConfigError(f"env.model: this is the task of MyoSuite {VERSION}, but {version} is installed: {INSTALL}")
-    return folder / _FILE
 
 
 def build_myosuite_walk(env: MyoSuiteWalkSettings, physics: PhysicsConfig) -> mujoco.MjModel:

@@ -2,9 +2,10 @@
 
 from msk_ray.step.autograd.backward import Backward, InputGradients, StepState
 from msk_ray.step.autograd.fd_jacobian import FdJacobian
+from msk_ray.step.autograd.hybrid import Hybrid
 from msk_ray.step.autograd.jacobian import Linearization
 from msk_ray.step.autograd.simulation import Simulation, WarpSimStep, use_device
-from msk_ray.step.autograd.tape import Hybrid, TapeAll, TapePerSubstep
+from msk_ray.step.autograd.tape import TapeAll, TapePerSubstep
 from msk_ray.step.forward.capacity import Capacity
 
 __all__ = [

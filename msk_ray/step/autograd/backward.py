@@ -42,7 +42,7 @@ class InputGradients(NamedTuple):
     ctrl: Tensor | None
     """Shape (W, nu)."""
     qpos: Tensor | None
-    """In raw coordinates, shape (W, nq): for a unit quaternion q with tangent gradient g, 2 q⊗[0, g]."""
+    """In raw coordinates, shape (W, nq): for a quaternion q with tangent gradient g, 2 q⊗[0, g] / |q|²."""
     qvel: Tensor | None
     """Shape (W, nv)."""
     act: Tensor | None
@@ -154,6 +154,9 @@ class Backward(ABC):
             found = self.vjp(saved, StepState(*(part[0] for part in cotangents)), needs)
             rows.append(rows_of(tangent, start, found))
         return torch.stack([a for a, _ in rows], dim=1), torch.stack([b for _, b in rows], dim=1)
+
+    def forget(self) -> None:  # noqa: B027 - a mode that gathers nothing has nothing to forget
+        """Forget what diagnostics were gathered."""
 
     def diagnostics(self) -> dict[str, float]:
         """Diagnostics gathered since the last call, by metric name."""

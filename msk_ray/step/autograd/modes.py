@@ -5,7 +5,8 @@ from typing import Any
 
 from msk_ray.step.autograd.backward import Backward
 from msk_ray.step.autograd.fd_jacobian import FdJacobian
-from msk_ray.step.autograd.tape import Hybrid, TapeAll, TapePerSubstep
+from msk_ray.step.autograd.hybrid import Hybrid
+from msk_ray.step.autograd.tape import TapeAll, TapePerSubstep
 from msk_ray.step.errors import ConfigError
 
 

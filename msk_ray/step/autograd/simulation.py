@@ -121,7 +121,9 @@ class Simulation:
             otherwise 1.5 times what a short probe in C MuJoCo needed, which grows with use.
         tolerance: solver tolerance, which may be below mujoco_warp's floor of 1e-6.
         kernels: which kernels steps are made of: `Kernels(ordered=True)` adds everything up in a fixed order, so that a
-            GPU repeats steps and gradients bit for bit; `Kernels(fused_solver=True)` solves constraints in one launch.
+            GPU repeats steps and gradients bit for bit; `Kernels(fused_solver=True)` solves constraints in one launch;
+            `Kernels(iterations=1, ls_iterations=5)` stops the solver early. Otherwise it gets the model's limits of
+            iterations, but at least 100 and 50: gradients need a solver that has converged.
 
     The model must not be edited while the simulation exists; if it was, the next step or backward pass raises an error.
 

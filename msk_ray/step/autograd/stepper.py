@@ -41,6 +41,8 @@ class Engine:
         self._limits = self.batch.unrolled_iterations
         for watch in (self.batch.losses, self.batch.iterations):
             watch.read()  # of that run, whose state is nobody's
+        if self.backward is not None:
+            self.backward.forget()
 
     def contact_forces(self) -> Tensor:
         """Force of the contacts on every geom [N] in the last substep of the last step, (W, G, 3)."""

@@ -7,6 +7,8 @@ import mujoco
 import torch
 from torch import Tensor
 
+from msk_ray.step.adjoint.stages.integrate import UNIT_ROUNDING
+
 
 def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
     """Hamilton product of quaternions (w, x, y, z), shape (..., 4)."""
@@ -104,10 +106,14 @@ class Tangent:
         return out
 
     def lift(self, qpos: Tensor, gradient: Tensor) -> Tensor:
-        """Gradient in tangent coordinates (..., nv) to raw ones (..., nq) without a component along q: 2 q⊗[0, g]."""
+        """Gradient in tangent coordinates (..., nv) to raw ones (..., nq) without a component along q, for functions
+        that normalise quaternions: 2 q⊗[0, g] / |q|².
+        """
         out = gradient.new_zeros((*gradient.shape[:-1], self.nq))
         out[..., self._linear_q] = gradient[..., self._linear_v]
         for q, v in self._rotations:
             pure = torch.cat((torch.zeros_like(gradient[..., v][..., :1]), gradient[..., v]), dim=-1)
-            out[..., q] = 2.0 * quat_multiply(qpos[..., q], pure)
+            square = qpos[..., q].square().sum(-1, keepdim=True)
+            unit = (square - 1.0).abs() <= UNIT_ROUNDING
+            out[..., q] = 2.0 * quat_multiply(qpos[..., q], torch.where(unit, pure, pure / square))
         return out

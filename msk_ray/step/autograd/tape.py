@@ -1,4 +1,4 @@
-"""`tape_per_substep`, `tape_all` and `hybrid`: exact gradients by the adjoint of every substep.
+"""`tape_per_substep` and `tape_all`: exact gradients by the adjoint of every substep.
 
 Both tapes checkpoint each substep's state and acceleration, in one buffer that is copied out per recorded env step.
 `tape_per_substep` recomputes the position and velocity stages in the backward pass (the acceleration is known, so
@@ -36,6 +36,8 @@ from msk_ray.step.autograd.tangent import Tangent
 from msk_ray.step.errors import UnsupportedModelError
 from msk_ray.step.forward import Graph, WorldBatch
 
+UNCONVERGED_BOUND = 0.01
+"""Share of the substeps of all worlds that may be unconverged before there is a warning."""
 JACOBIAN_WORLDS = 131072
 """Worlds in which `jacobian` pulls rows back at the same time; further rows follow."""
 
@@ -64,8 +66,8 @@ class _Tape(Backward):
     Args:
         substep_grad_clip: bound on the Euclidean norm of each world's state cotangent between substeps, in the
             cotangent's own units; the direction is kept. None for no bound.
-        residual_tolerance: a world is counted as unconverged where the solver left more than this share of its
-            forces unbalanced, |Ma - τ - Jᵀf| / |(Ma, τ, Jᵀf)|.
+        residual_tolerance: a world's substep is counted as unconverged where the solver left more than this share of
+            its forces unbalanced, |Ma - τ - Jᵀf| / |(Ma, τ, Jᵀf)|. There is a warning, once, when a hundredth are.
     """
 
     covers_applied = True
@@ -78,6 +80,7 @@ class _Tape(Backward):
     ) -> None:
         self.substep_grad_clip = substep_grad_clip
         self.residual_tolerance = residual_tolerance
+        self._warned: set[str] = set()  # shared with the modes that take the place of this one
 
     def attach(self, batch: WorldBatch) -> None:
         mjm, worlds = batch.mjm, batch.nworld
@@ -85,7 +88,6 @@ class _Tape(Backward):
         self._batch = batch
         self._device = device_of(batch)
         self._pulled = PullCounter(batch.device)
-        self._warned = False
         with wp.ScopedDevice(batch.device):
             self._adjoint = StepAdjoint(batch.structure, batch.model, batch.data, batch.stages)
             pool = Pool(batch.device)
@@ -101,7 +103,7 @@ class _Tape(Backward):
             self._saved = pool.allocate()
             self._raw_qpos = wp.zeros((worlds, mjm.nq), dtype=float)
             self._clipped = wp.zeros(worlds, dtype=int)
-            self._gauge = ResidualGauge(self._adjoint.inertia_address, worlds)
+            self._gauge = ResidualGauge(self._adjoint.inertia_address, worlds, self.residual_tolerance)
         self._ctrl = wp.to_torch(batch.data.ctrl, requires_grad=False)
         adjoint = self._adjoint
         self.cotangent = StepState(
@@ -129,6 +131,7 @@ class _Tape(Backward):
 
     @torch.no_grad()
     def vjp(self, saved: tuple[Tensor, ...], cotangent: StepState, needs: Needs) -> InputGradients:
+        self._warn_of_unconverged(self._gauge.unconverged())
         ctrl, kept, *forces = saved
         self.ready(bool(forces), needs.parameters)
         self._ctrl.copy_(ctrl)
@@ -199,6 +202,7 @@ class _Tape(Backward):
         self, saved: tuple[Tensor, ...], start: StepState, end: StepState, tangent: Tangent
     ) -> tuple[Tensor, Tensor]:
         """As many rows at once as fit in `JACOBIAN_WORLDS` worlds. Not clipped."""
+        self._warn_of_unconverged(self._gauge.unconverged())
         ctrl, kept, *forces = saved
         self._saved.copy_(kept)
         size, worlds = state_size(end), self._batch.nworld
@@ -238,8 +242,12 @@ class _Tape(Backward):
         if self._counts:
             self._pulled.launch()
 
+    def forget(self) -> None:
+        self._gauge.clear()
+
     def diagnostics(self) -> dict[str, float]:
-        figures = self._gauge.read(self.residual_tolerance)
+        figures = self._gauge.read()
+        self._warn_of_unconverged(figures["solver_unconverged_substeps"])
         if not self._counts:
             return figures
         pulled = self._pulled.read()
@@ -265,14 +273,28 @@ class _Tape(Backward):
         """
         count, pairs = self._adjoint.touch_counter.read()
         share = count / substeps
-        if count and not self._warned:
-            self._warned = True
+        if count and "approximated" not in self._warned:
+            self._warned.add("approximated")
             warnings.warn(
-                f"the gradient is approximate in {share:.1%} of the substeps (grad/approximated_share), where it goes "
+                f"the gradient is approximated in {share:.1%} of the substeps (grad/approximated_share), where it goes "
                 f"through contacts of {', '.join(pairs)}",
                 stacklevel=4,
             )
         return share
+
+    def _warn_of_unconverged(self, share: float) -> None:
+        """Warn the first time that a share of the substeps is above the bound."""
+        if share <= UNCONVERGED_BOUND or "unconverged" in self._warned:
+            return
+        self._warned.add("unconverged")
+        limits, tolerance = self._batch.limits, float(self._batch.model.opt.tolerance.numpy()[0])
+        warnings.warn(
+            f"the constraint solver stopped before it had converged in {share:.1%} of the substeps "
+            "(physics/solver_unconverged_substeps), where gradients are wrong: raise physics.iterations (now "
+            f"{limits.iterations}) and physics.ls_iterations (now {limits.ls_iterations}) or lower physics.tolerance "
+            f"(now {tolerance:g}); in Python, kernels=Kernels(iterations=...) and tolerance of Simulation",
+            stacklevel=4,
+        )
 
 
 class TapePerSubstep(_Tape):
@@ -293,6 +315,7 @@ class TapePerSubstep(_Tape):
             batch.launch_substep(data, k)
             wp.copy(state["qacc"], data.qacc)
             self._gauge.launch(data, _solved(data, batch.mjm))
+        self._gauge.launch_end(batch.substeps)
         for name, array in self._last.items():
             wp.copy(array, getattr(data, name))
         batch.end_step(data)
@@ -342,6 +365,7 @@ class TapeAll(_Tape):
             wp.copy(state["qacc"], data.qacc)
             self._gauge.launch(data, _solved(data, batch.mjm))
             before = data
+        self._gauge.launch_end(batch.substeps)
         for name in ("qpos", "qvel", "act"):
             wp.copy(getattr(batch.data, name), getattr(before, name))
         for name, array in self._last.items():
@@ -358,79 +382,4 @@ class TapeAll(_Tape):
         self._adjoint.pull_back(data, qvel_next, *extras)
 
 
-class Hybrid(Backward):
-    """Gradients of the state from one mode and of the control from another, for diagnosis.
-
-    Args:
-        state: the mode that gives the gradients of (qpos, qvel, act). Its `launch_step` runs.
-        ctrl: the mode that gives the gradient of ctrl; one that needs no `launch_step` of its own (fd_jacobian).
-    """
-
-    name = "hybrid"
-
-    def __init__(self, state: Backward, ctrl: Backward) -> None:
-        self.state = state
-        self.ctrl = ctrl
-
-    def fresh(self) -> "Hybrid":
-        return Hybrid(self.state.fresh(), self.ctrl.fresh())
-
-    def attach(self, batch: WorldBatch) -> None:
-        self._splits: dict[int, int] = {}
-        self.state.attach(batch)
-        self.ctrl.attach(batch)
-
-    def launch_step(self, batch: WorldBatch) -> None:
-        self._stepping().launch_step(batch)
-
-    def last_data(self, batch: WorldBatch) -> Any:
-        return self._stepping().last_data(batch)
-
-    def _stepping(self) -> Backward:
-        """The mode whose launches compute the step."""
-        own = [m for m in (self.state, self.ctrl) if type(m).launch_step is not Backward.launch_step]
-        assert len(own) <= 1, "two modes that each launch the step in their own way cannot be combined"
-        return own[0] if own else self.state
-
-    @property
-    def covers_applied(self) -> bool:  # type: ignore[override]
-        """Whether both modes do."""
-        return self.state.covers_applied and self.ctrl.covers_applied
-
-    @property
-    def covers_parameters(self) -> bool:  # type: ignore[override]
-        """Whether the mode of the state does."""
-        return self.state.covers_parameters
-
-    def record(
-        self, ctrl: Tensor, start: StepState, end: StepState, applied: Applied | None = None
-    ) -> tuple[Tensor, ...]:
-        forces = () if applied is None else (applied,)
-        first, second = (mode.record(ctrl, start, end, *forces) for mode in (self.state, self.ctrl))
-        self._splits[len(first) + len(second)] = len(first)
-        return (*first, *second)
-
-    def _split(self, saved: tuple[Tensor, ...]) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
-        """What each of the modes has recorded."""
-        first = self._splits[len(saved)]  # steps with and without applied forces differ in length
-        return saved[:first], saved[first:]
-
-    def vjp(self, saved: tuple[Tensor, ...], cotangent: StepState, needs: Needs) -> InputGradients:
-        first, second = self._split(saved)
-        state = self.state.vjp(first, cotangent, needs._replace(ctrl=False))
-        ctrl = self.ctrl.vjp(second, cotangent, Needs(needs.ctrl, False, False, False))
-        return state._replace(ctrl=ctrl.ctrl)
-
-    def jacobian(
-        self, saved: tuple[Tensor, ...], start: StepState, end: StepState, tangent: Tangent
-    ) -> tuple[Tensor, Tensor]:
-        first, second = self._split(saved)
-        a, _ = self.state.jacobian(first, start, end, tangent)
-        _, b = self.ctrl.jacobian(second, start, end, tangent)
-        return a, b
-
-    def diagnostics(self) -> dict[str, float]:
-        return self.state.diagnostics() | self.ctrl.diagnostics()
-
-
-__all__ = ["Hybrid", "TapeAll", "TapePerSubstep"]
+__all__ = ["TapeAll", "TapePerSubstep"]

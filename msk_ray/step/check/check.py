@@ -12,12 +12,14 @@ import numpy as np
 
 from msk_ray.step.adjoint.coverage.check import partly_exact
 from msk_ray.step.autograd import Simulation
+from msk_ray.step.autograd.tape import UNCONVERGED_BOUND
 from msk_ray.step.check.nonfinite import NonFinite, find_nonfinite
 from msk_ray.step.check.oracle import Array, Linearization, Oracle, Point
 from msk_ray.step.check.pullback import simulated_gradients
 from msk_ray.step.check.states import STATE_KINDS, make_states
 from msk_ray.step.errors import ConfigError
 from msk_ray.step.forward.parameters import check_names
+from msk_ray.step.forward.solver_limits import ENOUGH, SolverLimits
 
 _VANISHING = 1e-9
 """A reference gradient below this share of its cotangent is zero up to the rounding of the differences."""
@@ -67,6 +69,8 @@ class GradientCheck:
     substeps: int
     worlds: int
     """States of each kind."""
+    limits: SolverLimits = ENOUGH
+    """Most iterations of the solver and of each line search."""
     results: list[Comparison] = field(default_factory=list)
     kinks: int = 0
     """States left out because the step is not differentiable there."""
@@ -87,6 +91,11 @@ class GradientCheck:
     def excluded(self) -> int:
         """States left out."""
         return self.kinks + self.forward_mismatches
+
+    @property
+    def unconverged(self) -> bool:
+        """Whether the solver had not converged in more of the substeps than may be."""
+        return self.diagnostics.get("solver_unconverged_substeps", 0.0) > UNCONVERGED_BOUND
 
     @property
     def max_rel_error(self) -> float:
@@ -179,7 +188,7 @@ def check_gradients(
         raise ConfigError("this Simulation has no gradient to check: make it with a backward mode")
     check_names(model, parameters)
     oracle, limits = Oracle(model, substeps, parameters), limits or Limits()
-    result = GradientCheck(sim.backward.name, substeps, worlds)
+    result = GradientCheck(sim.backward.name, substeps, worlds, sim.batch.limits)
     done = 0
     for kind in dict.fromkeys(states):
         points = make_states(model, kind, worlds, seed)

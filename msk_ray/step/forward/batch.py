@@ -11,6 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from msk_ray.step.errors import ConfigError, UnsupportedModelError
+from msk_ray.step.forward.accepted import check_accepted
 from msk_ray.step.forward.capacity import UNKNOWN, Capacity, default_capacity, geometric_bound, scalar_rows
 from msk_ray.step.forward.fused import FusedSolver, check_fused
 from msk_ray.step.forward.graph import joined_stream
@@ -19,35 +20,9 @@ from msk_ray.step.forward.ordered import OrderedStages, check_ordered
 from msk_ray.step.forward.overflow import LossWatch, cured, loss_error, needed
 from msk_ray.step.forward.parameters import check_names, open_arrays, structure
 from msk_ray.step.forward.sealed import ModelWatch, seal
+from msk_ray.step.forward.solver_limits import choose_limits, tell_raised
 from msk_ray.step.forward.stages import PACKAGE, ComposedStages, Kernels, PackageStages, Stages, dense, with_options
-
-
-def check_state(model: mujoco.MjModel) -> None:
-    """Raise UnsupportedModelError where a step depends on more state than (qpos, qvel, act)."""
-    hidden = {
-        "actuator or sensor delay (nhistory > 0)": getattr(model, "nhistory", 0) > 0,
-        "plastic springs (nplastic > 0)": getattr(model, "nplastic", 0) > 0,
-        "sleeping (<flag sleep='enable'/>)": bool(model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP),
-    }
-    found = [name for name, present in hidden.items() if present]
-    if found:
-        raise UnsupportedModelError(
-            f"the model uses {', '.join(found)}: its step depends on state outside (qpos, qvel, act); "
-            "remove it from the model"
-        )
-
-
-def check_ignored(model: mujoco.MjModel) -> None:
-    """Raise UnsupportedModelError where mujoco_warp would step another model than C MuJoCo without a word."""
-    groups = np.asarray(model.actuator_group)
-    # C MuJoCo has a bit for each of 31 groups.
-    off = [u for u in range(len(groups)) if 0 <= groups[u] < 31 and model.opt.disableactuator >> int(groups[u]) & 1]
-    if off:
-        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, off[0]) or off[0]
-        raise UnsupportedModelError(
-            f"actuator {name} is in a group that option actuatorgroupdisable turns off, which mujoco_warp ignores: "
-            "remove such actuators from the model"
-        )
+from msk_ray.step.forward.standing import StandingCylinders, stands_on_planes
 
 
 def refresh_velocity(mjm: mujoco.MjModel, model: Any, data: Any) -> None:
@@ -73,7 +48,7 @@ class WorldBatch:
         capacity: contacts and constraint rows a world. Where it is 0, a bound from the geometry where that is small,
             else what a short probe in C MuJoCo needed and half as much again.
         tolerance: solver tolerance, below mujoco_warp's floor of 1e-6 if wanted.
-        kernels: which kernels a step is made of.
+        kernels: which kernels a step is made of, and how many iterations its solver may take.
 
     Attributes:
         mjm: the C MuJoCo model.
@@ -85,6 +60,7 @@ class WorldBatch:
         substeps: physics steps an env step.
         device: the Warp device.
         stages: launches of a step and of its parts.
+        limits: most iterations of the solver and of each line search.
         capacity: contacts and rows per world that fit into `data`.
         losses: what steps lost to full buffers; check it between steps.
         iterations: how many iterations the solver took in each substep.
@@ -93,7 +69,8 @@ class WorldBatch:
             iteration costs time even where no world needs it. None: the model's limit.
 
     Raises:
-        UnsupportedModelError: mujoco_warp cannot load the model, or it has state outside (qpos, qvel, act).
+        UnsupportedModelError: mujoco_warp cannot load the model, or would step it unlike C MuJoCo.
+        ConfigError: a limit of the solver is below 1.
     """
 
     def __init__(
@@ -107,8 +84,7 @@ class WorldBatch:
         tolerance: float | None = None,
         kernels: Kernels = PACKAGE,
     ) -> None:
-        check_state(mjm)
-        check_ignored(mjm)
+        check_accepted(mjm)
         if kernels.ordered:
             check_ordered(mjm)
         if kernels.fused_solver:
@@ -120,8 +96,11 @@ class WorldBatch:
         self.kernels = kernels
         self.structure = self._structure()
         self._tolerance = tolerance
+        self.limits = choose_limits(mjm, kernels.iterations, kernels.ls_iterations)
         self.stages: Stages
         self._model, self.stages = self._load(nworld)
+        if self._solves:
+            tell_raised(mjm, kernels.iterations, kernels.ls_iterations)
         self.unrolled_iterations: tuple[int, ...] | None = None
         self._watch = ModelWatch(mjm)
         self._given = capacity
@@ -131,6 +110,11 @@ class WorldBatch:
     def _structure(self) -> mujoco.MjModel:
         model = structure(self.mjm, self.parameters)
         return dense(model) if self.kernels.dense else model
+
+    @property
+    def _solves(self) -> bool:
+        """Whether there can be contacts or constraint rows."""
+        return geometric_bound(self.structure) != Capacity(0, 0)
 
     def _load(self, nworld: int) -> tuple[Any, Stages]:
         """mujoco_warp's copy of the model, sealed, and the launches of its step."""
@@ -142,13 +126,14 @@ class WorldBatch:
             if self._tolerance is not None:
                 # put_model clamps to 1e-6; the adjoint holds at the optimum only, so it may ask for less.
                 model.opt.tolerance = wp.array([self._tolerance], dtype=float)
+            model.opt.iterations, model.opt.ls_iterations = self.limits
             model.opt.warn_overflow = 0  # read back by `losses`, not printed from kernels
             model.ncam = model.nlight = 0  # nothing looks: two launches less a substep
-            if geometric_bound(self.structure) == Capacity(0, 0):
-                model.opt.disableflags |= (
-                    mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-                )  # nothing looks for rows that cannot be
+            if not self._solves:
+                model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT  # nothing looks for what cannot be
             open_arrays(self.mjm, model, self.parameters, nworld)
+            if stands_on_planes(self.structure):
+                model.callback.contactfilter = StandingCylinders(self.structure).launch
             stages = self._make_stages(model)
         seal(model, "batch.model")
         return model, stages
@@ -272,7 +257,7 @@ class WorldBatch:
 
     def _limited(self, k: int, conditional: bool) -> Any:
         """The model with the iteration limit of substep k, with or without conditional graph nodes; the same arrays."""
-        limit = int(self.model.opt.iterations)
+        limit = self.model.opt.iterations
         if self.unrolled_iterations is not None:
             limit = min(self.unrolled_iterations[k], limit)
         conditional = conditional and bool(self.model.opt.graph_conditional)

@@ -7,6 +7,7 @@ where they are used.
 
 from mujoco_warp._src.collision_primitive_core import (
     capsule_capsule,
+    plane_cylinder,
     plane_ellipsoid,
     plane_sphere,
     sphere_box,
@@ -97,6 +98,7 @@ __all__ = [
     "muscle_gain",
     "muscle_gain_vel_deriv",
     "padding_h",
+    "plane_cylinder",
     "plane_ellipsoid",
     "plane_sphere",
     "poly_force",

@@ -13,12 +13,16 @@ Solver = Callable[[Any, Any], None]
 
 
 class Kernels(NamedTuple):
-    """Which kernels a step is made of."""
+    """What a step is made of: which kernels, and how many iterations of the constraint solver at most."""
 
     ordered: bool = False
     """Add everything up in a fixed order, so that a GPU repeats a step bit for bit; the Jacobian is dense."""
     fused_solver: bool = False
     """Solve the constraints in one launch, for small models; the Jacobian is dense."""
+    iterations: int | None = None
+    """Most iterations of the solver; None: the model's, but at least 100, with a warning where that is more."""
+    ls_iterations: int | None = None
+    """Most iterations of each of its line searches; None: the model's, but at least 50, likewise."""
 
     @property
     def dense(self) -> bool:

@@ -15,6 +15,8 @@ class Search(ABC):
     `search: package.module:Class`.
     """
 
+    packages: ClassVar[Mapping[str, str]] = {}
+    """Optional modules that it needs, and what `pip install` takes for each: looked for before anything starts."""
     name: ClassVar[str] = ""
     """Name in messages; by default that of the class."""
     several_objectives: ClassVar[bool] = False
@@ -28,7 +30,7 @@ class Search(ABC):
             seed: seed of its draws, a new one each time an experiment is resumed.
 
         Raises:
-            ConfigError: a required package is not installed, or it cannot search such values.
+            ConfigError: it cannot search such values.
         """
         self.parameters = dict(parameters)
         self.seed = seed

@@ -1,7 +1,7 @@
 """Optuna's tree-structured Parzen estimator."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 from msk_ray.errors import ConfigError
 from msk_ray.sweep.operators import Listed, Operator, Range
@@ -12,6 +12,7 @@ class OptunaSearch(Search):
     """Suggests values that resemble the better half of those tried; with several objectives, those that no other trial
     beats in all of them count as best."""
 
+    packages: ClassVar[Mapping[str, str]] = {"optuna": "msk-ray[optuna]"}
     name = "optuna"
     several_objectives = True
 
@@ -19,10 +20,8 @@ class OptunaSearch(Search):
         self, parameters: Mapping[str, Operator], seed: int, objectives: Mapping[str, str] | None = None
     ) -> None:
         super().__init__(parameters, seed)
-        try:
-            import optuna
-        except ImportError:
-            raise ConfigError("search: optuna needs the optuna package: pip install optuna") from None
+        import optuna
+
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         self._distributions = {key: distribution(key, op) for key, op in self.parameters.items()}
         directions = [*objectives.values()] if objectives else ["maximize"]

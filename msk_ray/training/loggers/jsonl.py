@@ -6,11 +6,10 @@ import os
 from pathlib import Path
 from typing import Any
 
-from msk_ray.errors import StorageFailure
 from msk_ray.experiment.damage import Damage
 from msk_ray.experiment.layout import METRICS_FILE
 from msk_ray.experiment.metrics import load_metrics
-from msk_ray.files import write_bytes
+from msk_ray.files import append_text, write_bytes
 
 
 class JsonLines:
@@ -29,9 +28,9 @@ class JsonLines:
             The damaged lines.
 
         Raises:
-            StorageFailure: the rows cannot be read or written.
+            StorageError: the rows cannot be read or written.
         """
-        if not self._path.is_file():
+        if not os.path.lexists(self._path):
             return ()
         metrics = load_metrics(self._path)
         rows = [row for row in metrics.rows if row["epoch"] <= epoch]
@@ -49,10 +48,4 @@ class JsonLines:
         clean["epoch"] = int(row["epoch"])
         if bad:
             clean["nonfinite"] = bad
-        try:
-            with self._path.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(clean) + "\n")
-                file.flush()
-                os.fsync(file.fileno())
-        except OSError as error:
-            raise StorageFailure(f"cannot write {self._path}: {error.strerror or error}") from error
+        append_text(self._path, json.dumps(clean) + "\n", sync=True)

@@ -13,6 +13,7 @@ import torch
 
 from msk_ray.algorithms.shac.runner import RecordedRunner, _Recordings
 from msk_ray.group import Group
+from msk_ray.step.forward.solver_limits import SolverLimits
 
 
 class Two(Group):
@@ -40,7 +41,7 @@ def runner_of(
         unrolled_iterations=unrolled,
         substeps=2,
         iterations=SimpleNamespace(read=lambda: counts),
-        mjm=SimpleNamespace(opt=SimpleNamespace(iterations=100)),
+        limits=SolverLimits(100, 50),
     )
     runner._env = SimpleNamespace(sim=SimpleNamespace(engine=engine, batch=batch))  # type: ignore[assignment]
     runner._kept = _Recordings("engine", warm={2})  # type: ignore[arg-type]

@@ -221,6 +221,37 @@ def test_a_contact_follows_a_height_field(shape: str) -> None:
     assert errors[exact].max() < (1e-3 if flat else 2e-2)
 
 
+def test_a_sphere_on_edges_of_a_smooth_height_field() -> None:
+    """Triangles at some hundredths of a radian, and normals that are nearly those of one of them."""
+    rng, n = np.random.default_rng(0), 21
+    x, y = np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n))
+    heights = np.round(1 - 0.4 * (x**2 + 0.7 * y**2 + 0.3 * x * y), 4)
+    grid = 0.1 * (heights - heights.min()) / (heights.max() - heights.min())
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><option ccd_tolerance="1e-16" ccd_iterations="400"/><asset>
+        <hfield name="hill" nrow="{n}" ncol="{n}" size=".5 .5 .1 .05"
+        elevation="{" ".join(map(str, heights.ravel()))}"/>
+        </asset><worldbody><body><freejoint/><geom type="hfield" hfield="hill"/></body>
+        <body><freejoint/><geom size=".05"/></body></worldbody></mujoco>"""
+    )
+    poses = []
+    for _ in range(40):
+        i, j = rng.integers(5, n - 6, 2)
+        places = ((i, j), (i, j + 1), (i - 1, j), (i + 1, j + 1))
+        corner, after, below, above = (np.array([0.05 * (b - 10), 0.05 * (a - 10), grid[a, b]]) for a, b in places)
+        normals = [np.cross(after - corner, p - corner) for p in (above, below)]
+        normals = [m * np.sign(m[2]) / np.linalg.norm(m) for m in normals]
+        share = rng.choice([0.01, 0.03, 0.5, 0.97])
+        normal = (1 - share) * normals[0] + share * normals[1]
+        place = corner + rng.uniform(0.3, 0.7) * (after - corner)
+        level = [1.0, 0, 0, 0]
+        poses.append(np.array([0, 0, 0, *level, *(place + 0.04998 * normal / np.linalg.norm(normal)), *level]))
+    errors, exact = compare(model, poses, FINE)
+    assert len(errors) >= 30
+    assert np.all(exact)
+    assert errors.max() < 1e-3
+
+
 @pytest.mark.parametrize("flush", [False, True])
 @pytest.mark.parametrize(
     ("first", "second", "flag"),

@@ -42,7 +42,7 @@ def test_each_world_and_substep_counts_once(mode: type[Backward]) -> None:
     for _ in range(2):
         pull_back(sim, [0.198, falling, 0.5], [0.0, -0.4, 0.0])
     with pytest.warns(
-        UserWarning, match=r"approximate in 50\.0% .* geom bar \(capsule\) with geom can \(cylinder\)"
+        UserWarning, match=r"approximated in 50\.0% .* geom bar \(capsule\) with geom can \(cylinder\)"
     ) as told:
         assert sim.diagnostics()["approximated_share"] == pytest.approx(6 / 12)
     assert len(told) == 1

@@ -26,6 +26,7 @@ def gradients(shape: str, ground: str, device: str) -> torch.Tensor:
     return torch.cat(found, dim=1).cpu()
 
 
+@pytest.mark.usefixtures("cpu_kernels")
 @pytest.mark.parametrize(
     ("shape", "ground"),
     [("mesh", "mesh"), ("mesh", "box"), ("capsule", "cylinder"), ("box", "box"), ("sphere", "hills")],

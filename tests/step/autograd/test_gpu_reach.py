@@ -45,6 +45,7 @@ def measured(device: str) -> dict[str, torch.Tensor]:
     return {"A": a.cpu(), "B": b.cpu(), "xfrc": gradient.cpu(), "A of the model's own friction": again.cpu()}
 
 
+@pytest.mark.usefixtures("cpu_kernels")
 def test_jacobians_and_forces_are_those_of_the_cpu() -> None:
     here, there = measured("cuda"), measured("cpu")
     for name, value in there.items():
@@ -65,6 +66,7 @@ def of_all_parameters(device: str) -> dict[str, torch.Tensor]:
     return {name: value.grad.cpu() for name, value in values.items() if value.grad is not None}
 
 
+@pytest.mark.usefixtures("cpu_kernels")
 def test_gradients_of_parameters_are_those_of_the_cpu() -> None:
     here, there = of_all_parameters("cuda"), of_all_parameters("cpu")
     assert here.keys() == there.keys()

@@ -9,7 +9,8 @@ from scenes import random_weights, studded_plate
 from msk_ray.errors import SimulationError
 from msk_ray.step import FdJacobian, Simulation
 from msk_ray.step.autograd.backward import Backward
-from msk_ray.step.autograd.tape import Hybrid, TapeAll, TapePerSubstep
+from msk_ray.step.autograd.hybrid import Hybrid
+from msk_ray.step.autograd.tape import TapeAll, TapePerSubstep
 from msk_ray.step.forward import capacity
 from msk_ray.step.forward.capacity import Capacity
 

@@ -79,3 +79,22 @@ def test_rotation_of_a_product_is_rotation_twice() -> None:
     torch.manual_seed(0)
     a, b, v = quat_exp(torch.randn(4, 3)), quat_exp(torch.randn(4, 3)), torch.randn(4, 3)
     assert torch.allclose(quat_rotate(quat_multiply(a, b), v), quat_rotate(a, quat_rotate(b, v)), atol=1e-6)
+
+
+def test_a_lifted_gradient_is_that_of_a_function_that_normalises_quaternions(model: mujoco.MjModel) -> None:
+    """By automatic differentiation of ⟨w, q/|q|⟩, at quaternions of lengths from 0.5 to 1.5."""
+    rng = np.random.default_rng(2)
+    tangent = Tangent(model, torch.device("cpu"))
+    qpos = torch.tensor(np.stack([random_qpos(model, rng) for _ in range(5)]))
+    weights = torch.randn(5, model.nq, dtype=torch.float64)
+    scale = torch.linspace(0.5, 1.5, 5, dtype=torch.float64)[:, None]
+    raw = qpos.clone()
+    for quaternion in (slice(3, 7), slice(7, 11)):
+        raw[:, quaternion] *= scale
+    raw.requires_grad_()
+    parts = (raw[:, :3], *(torch.nn.functional.normalize(raw[:, q], dim=-1) for q in (slice(3, 7), slice(7, 11))))
+    unit = torch.cat((*parts, raw[:, 11:]), dim=-1)
+    (expected,) = torch.autograd.grad((weights * unit).sum(), raw)
+    found = tangent.lift(raw.detach(), tangent.project(qpos, weights))
+    assert torch.allclose(found, expected)
+    assert torch.allclose(tangent.lift(raw.detach(), tangent.project(raw.detach(), expected)), expected)

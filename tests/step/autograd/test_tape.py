@@ -10,7 +10,8 @@ from test_adjoint_features import SCENES, random_points
 
 from msk_ray.errors import UnsupportedModelError
 from msk_ray.step import FdJacobian, Simulation
-from msk_ray.step.autograd.tape import Hybrid, TapeAll, TapePerSubstep
+from msk_ray.step.autograd.hybrid import Hybrid
+from msk_ray.step.autograd.tape import TapeAll, TapePerSubstep
 
 
 def float32(*values: np.ndarray) -> Point:
@@ -134,6 +135,45 @@ def test_residual_is_reported(integrator):
     assert 0.0 < figures["solver_residual_max"] < 1e-4
     assert figures["solver_unconverged_share"] == 0.0
     assert sim.diagnostics()["solver_residual_max"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("mode", "length", "tolerance"),
+    [
+        *((mode, length, 1e-4) for mode in ("tape_per_substep", "tape_all", "hybrid") for length in (0.5, 1.01, 1.3)),
+        *(("fd_jacobian", length, 3e-2) for length in (0.5, 1.3)),
+    ],
+)
+def test_quaternions_that_are_not_of_unit_length(mode: str, length: float, tolerance: float) -> None:
+    """Gradients in raw qpos, free and ball joint, against central differences of C MuJoCo, which normalises them."""
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><geom type="plane" size="3 3 1"/><body pos="0 0 .1"><freejoint/><geom size="0.11"/>
+        <body pos="0.3 0 0.3"><joint type="ball" stiffness="3" damping=".1"/>
+        <geom type="capsule" fromto="0 0 0 .2 0 0" size="0.05"/></body></body></worldbody></mujoco>"""
+    )
+    model.opt.tolerance = 1e-12
+    rng = np.random.default_rng(0)
+    qpos = model.qpos0.copy()
+    mujoco.mj_integratePos(model, qpos, 0.3 * rng.normal(size=model.nv), 1.0)
+    qpos[2] = 0.1
+    qpos[3:11] *= length
+    start = float32(qpos, 0.3 * rng.normal(size=model.nv), np.zeros(0), np.zeros(0))
+    weights = rng.normal(size=model.nq + model.nv)
+
+    def score(moved: np.ndarray) -> float:
+        data = rollout(model, Point(moved, start.qvel, start.act, start.ctrl), 2)
+        return float(weights @ np.concatenate((data.qpos, data.qvel)))
+
+    expected = np.array([score(start.qpos + e) - score(start.qpos - e) for e in 1e-6 * np.eye(model.nq)]) / 2e-6
+    sim = Simulation(model, 1, 2, mode, tolerance=1e-9)
+    inputs = [torch.tensor(v[None], dtype=torch.float32) for v in (start.ctrl, start.qpos, start.qvel, start.act)]
+    inputs[1].requires_grad_()
+    inputs[0].requires_grad_()
+    end = sim.step(*inputs)
+    (torch.cat((end.qpos, end.qvel), dim=1) @ torch.tensor(weights, dtype=torch.float32)).sum().backward()
+    found = inputs[1].grad[0].numpy()
+    assert relative(found[3:11], expected[3:11]) < tolerance
+    assert relative(found, expected) < tolerance
 
 
 def test_backward_through_two_env_steps():

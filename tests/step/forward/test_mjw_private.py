@@ -36,6 +36,8 @@ SIGNATURES = {
     "muscle_dynamics": "control float, activation float, prm vec10f -> float",
     "muscle_gain": "len float, vel float, lengthrange vec2f, acc0 float, prm vec10f -> float",
     "muscle_gain_vel_deriv": "len float, vel float, lengthrange vec2f, acc0 float, prm vec10f -> float",
+    "plane_cylinder": "plane_normal vec3f, plane_pos vec3f, cylinder_center vec3f, cylinder_axis vec3f, "
+    "cylinder_radius float, cylinder_half_height float -> (vec4f, mat43f, vec3f)",
     "plane_ellipsoid": "plane_normal vec3f, plane_pos vec3f, ellipsoid_pos vec3f, ellipsoid_rot mat33f, "
     "ellipsoid_size vec3f -> (float, vec3f, vec3f)",
     "plane_sphere": "plane_normal vec3f, plane_pos vec3f, sphere_pos vec3f, sphere_radius float -> (float, vec3f)",

@@ -199,8 +199,8 @@ def test_faults_are_named_before_the_first_step(loggers: list[str], message: str
 
 
 def test_a_package_that_is_not_installed_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("msk_ray.config.loggers.find_spec", lambda name: None)
-    with pytest.raises(ConfigError, match=r"wandb is not installed: pip install 'msk-ray\[wandb\]'"):
+    monkeypatch.setattr("msk_ray.config.packages.find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match=r"package wandb, which is not installed: pip install 'msk-ray\[wandb\]'"):
         TrialLog(tmp_path, config("wandb"))
 
 

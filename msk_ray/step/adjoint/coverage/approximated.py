@@ -5,14 +5,14 @@ import numpy as np
 import warp as wp
 
 from msk_ray.step.adjoint.coverage.contact_kinds import contact_types, geom_pair_name
-from msk_ray.step.adjoint.laws.contact_geometry.primitive_laws import CONVEX_PAIRS
+from msk_ray.step.adjoint.laws.contact_geometry.primitive_laws import CONVEX_PAIRS, STANDING_PAIRS
 
 _TYPES = wp.constant(int(mujoco.mjtGeom.mjNGEOMTYPES))
 
 
 @wp.struct
 class Touches:
-    """Where `pull_convex` counts."""
+    """Where `pull_convex` and `pull_geometry` count."""
 
     last: wp.array[int]
     """Substep counted last, from 1, in the env step that is pulled back, shape (W,)."""
@@ -42,7 +42,7 @@ class TouchCounter:
 
     def __init__(self, mjm: mujoco.MjModel, nworld: int) -> None:
         self._mjm = mjm
-        self.present = bool(contact_types(mjm) & CONVEX_PAIRS)
+        self.present = bool(contact_types(mjm) & (CONVEX_PAIRS | STANDING_PAIRS))
         self.substep = 0
         self.touches = Touches()
         self.touches.last = wp.zeros(nworld if self.present else 0, dtype=int)

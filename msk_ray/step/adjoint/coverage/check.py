@@ -50,6 +50,8 @@ def table() -> str:
     """The table as Markdown, feature by mode."""
     rows = ["| feature | tape_all, tape_per_substep | fd_jacobian | note |", "|---|---|---|---|"]
     for f in FEATURES:
-        state = ("partly exact" if f.partly else "exact") if f.exact else "raises"
-        rows.append(f"| {f.name} | {state} | approximate | {f.note} |")
+        kept = "partly exact" if f.partly else "exact, approximated where counted" if f.counted else "exact"
+        rows.append(
+            f"| {f.name} | {kept if f.exact else 'raises'} | {'approximate' if f.steps else 'raises'} | {f.note} |"
+        )
     return "\n".join(rows)

@@ -33,8 +33,12 @@ class Feature:
     """What is approximated or assumed, or why it is refused."""
     partly: bool = False
     """Whether some slopes are approximated, as the note says."""
+    counted: bool = False
+    """Whether single contacts may be approximated, each of which is counted."""
     instead: str = ""
     """What to write in the model where it is refused."""
+    steps: bool = True
+    """Whether there is a step at all, which finite differences differentiate."""
 
 
 def _joint_type(*kinds: int) -> Finder:
@@ -217,8 +221,9 @@ FEATURES: tuple[Feature, ...] = (
         "contact of plane, sphere, capsule, ellipsoid, cylinder, box, mesh, with each other",
         True,
         pairs_of(EXACT_PAIRS, set()),
-        "contacts without a derivative of their own (parallel edges, the side of a cylinder clipped by a face) get "
-        "that of the nearest law; `grad/approximated_share` counts how often",
+        "contacts without a derivative of their own (parallel edges, the side of a cylinder clipped by a face, a "
+        "cylinder upright on a plane) get that of the nearest law; `grad/approximated_share` counts how often",
+        counted=True,
     ),
     Feature(
         "contact of height fields with sphere, capsule, ellipsoid, cylinder, box, mesh",
@@ -226,12 +231,13 @@ FEATURES: tuple[Feature, ...] = (
         pairs_of(FIELD_PAIRS, set()),
         "exact for each triangle that touches; what lies flat on a triangle, or has sunk into it beyond its sides, has "
         "no derivative of its own and is counted as above",
+        counted=True,
     ),
     Feature(
         "contact with signed distance fields",
         False,
         pairs_of(None, EXACT_PAIRS | FIELD_PAIRS),
-        "the distance is a function of the user's, and the contact's place is where a search has ended",
+        "the contact's place is where a search has ended",
     ),
     Feature(
         "contact adhesion and surface velocity", False, _odd_surfaces, "slopes of these forces at contacts are missing"
@@ -342,5 +348,11 @@ FEATURES: tuple[Feature, ...] = (
         "flags diagexact, speculative, ipc", False, _odd_flags, "they change which constraints there are and their laws"
     ),
     Feature("flexes", False, option(lambda m: m.nflex > 0, "flex"), "soft bodies are not covered"),
-    Feature("plugins", False, option(lambda m: m.nplugin > 0, "plugin"), "they are programs of their own"),
+    Feature(
+        "plugins",
+        False,
+        option(lambda m: m.nplugin > 0, "plugin"),
+        "they are programs of their own, which mujoco_warp does not run",
+        steps=False,
+    ),
 )

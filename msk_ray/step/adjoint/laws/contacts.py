@@ -275,6 +275,7 @@ class ContactForces:
             inputs=[
                 work.stages.ordered,
                 self._shapes,
+                work.touch_counter.substep,
                 d.nacon,
                 at.contacts,
                 d.geom_xpos,
@@ -282,7 +283,7 @@ class ContactForces:
                 d.subtree_com,
                 self._bars,
             ],
-            outputs=[work.bars.moved, work.contact_wrenches],
+            outputs=[work.bars.moved, work.touch_counter.touches, work.contact_wrenches],
         )
         if self._convex is not None:
             self._convex.launch(at, self._bars)

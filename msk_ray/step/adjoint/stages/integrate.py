@@ -12,6 +12,9 @@ from msk_ray.step.forward.mjw_private import dof_damping_total, poly_force_deriv
 
 wp.set_module_options({"enable_backward": False})
 
+UNIT_ROUNDING = wp.constant(1.0e-6)
+"""A quaternion whose squared length differs from 1 by no more is one of unit length in float32."""
+
 
 @wp.func
 def rotation_pullback(phi: wp.vec3, g: wp.vec3) -> wp.vec3:
@@ -172,7 +175,10 @@ def lift(
     # Out:
     raw_out: wp.array2d[float],
 ) -> None:
-    """Tangent gradient (W, nv) to the raw one (W, nq) without a component along q: 2 q⊗[0, g]."""
+    """Tangent gradient (W, nv) to the raw one (W, nq) without a component along q: 2 q⊗[0, g] / |q|².
+
+    A step normalises quaternions, so that its gradient gets the smaller the longer they are.
+    """
     worldid, jntid = wp.tid()
     kind = joints.jnt_type[jntid]
     q = joints.jnt_qposadr[jntid]
@@ -186,6 +192,9 @@ def lift(
         w = qpos_in[worldid, q]
         u = wp.vec3(qpos_in[worldid, q + 1], qpos_in[worldid, q + 2], qpos_in[worldid, q + 3])
         g = wp.vec3(tangent_in[worldid, v], tangent_in[worldid, v + 1], tangent_in[worldid, v + 2])
+        square = w * w + wp.dot(u, u)
+        if wp.abs(square - 1.0) > UNIT_ROUNDING:
+            g /= square
         raw_out[worldid, q] = -2.0 * wp.dot(u, g)
         r = 2.0 * (w * g + wp.cross(u, g))
         for i in range(3):

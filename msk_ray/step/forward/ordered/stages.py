@@ -91,7 +91,7 @@ class OrderedStages(ComposedStages):
     Args:
         mjm: the MjModel.
         model: mujoco_warp's model of it, with a dense Jacobian, before it is sealed. Contacts are sorted by its public
-            hook `callback.contactfilter`, which ends collision detection.
+            hook `callback.contactfilter`, which ends collision detection, after what was there before.
         fused: a solver whose sums have an order by themselves; None for mujoco_warp's with an order.
     """
 
@@ -100,6 +100,7 @@ class OrderedStages(ComposedStages):
     def __init__(self, mjm: mujoco.MjModel, model: Any, fused: Solver | None = None) -> None:
         super().__init__(fused or self._solve_ordered, unrolls=fused is None)
         assert not model.is_sparse, "only dense Jacobians have ordered rows"
+        self._correct_contacts = model.callback.contactfilter
         model.callback.contactfilter = self.sort_contacts
         self.racing = racing(mjm, model)
         off = bool(mjm.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_ACTUATION)
@@ -115,6 +116,8 @@ class OrderedStages(ComposedStages):
 
     def sort_contacts(self, model: Any, data: Any) -> None:
         """Launch the sort of the contacts that collision detection has found."""
+        if self._correct_contacts is not None:
+            self._correct_contacts(model, data)
         size = (data.nworld, data.naconmax)
         if size not in self._contacts:
             self._contacts[size] = ContactOrder(data)

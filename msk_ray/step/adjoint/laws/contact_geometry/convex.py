@@ -206,8 +206,14 @@ def convex_wrenches(
         # The second geom's face is clipped against the first's, and gives the normal.
         push, miss = standing_wrenches(solid1, solid2, meshes, below, face2, 1, seen, bars, is_clipped)
     else:
-        patch1 = patch_at(solid1, meshes, seen.point - 0.5 * seen.dist * n, n, face1, sine1, slack)
-        patch2 = patch_at(solid2, meshes, seen.point + 0.5 * seen.dist * n, -n, face2, sine2, slack)
+        # Flat faces, and edges along them, have been clipped; whether a capsule has been tells where it lies.
+        clipped = is_clipped and not (long1 or long2)
+        level1 = wp.where(clipped or solid1.type == GeomType.CYLINDER, slack, 0.0)
+        level2 = wp.where(clipped or solid2.type == GeomType.CYLINDER, slack, 0.0)
+        place1 = seen.point - 0.5 * seen.dist * n
+        place2 = seen.point + 0.5 * seen.dist * n
+        patch1 = patch_at(solid1, solid2, meshes, place1, n, seen.dist, face1, sine1, level1)
+        patch2 = patch_at(solid2, solid1, meshes, place2, -n, seen.dist, face2, sine2, level2)
         # Boxes of their own collision are clipped at any angle.
         clip1 = wp.where(own_boxes, face1, -1)
         clip2 = wp.where(own_boxes, face2, -1)

@@ -27,7 +27,13 @@ POINT, EDGE, FACE = wp.constant(0), wp.constant(1), wp.constant(2)
 """Directions in which the radius of curvature is infinite: none, one, both."""
 
 _NEAR = wp.constant(5.0e-4)
-"""Distance from a corner, an edge or a rim, in sizes, below which a contact is at it."""
+"""Distance from a rim, in sizes, below which a contact is at it."""
+_ROUNDING = wp.constant(2.0e-7)
+"""Rounding of a place in float32, in sizes of the numbers it is computed from."""
+_SAME = wp.constant(3.0e-6)
+"""Sine of an angle between equal normals, from rounding."""
+_BESIDE_CORE = wp.constant(1.0e-4)
+"""How far from its radius off its core, in radii, the surface of a sphere or a capsule may be."""
 _FLAT = wp.constant(5.0e-2)
 """Sine of the angle from a face's normal beyond which a contact away from its edges is still not the face's."""
 _BESIDE = wp.constant(2.0e-2)
@@ -104,28 +110,88 @@ def nearest_feature(
 
 
 @wp.func
+def rounding_of(solid: Solid, other: Solid) -> float:
+    """Rounding of places on two geoms in float32 [m]."""
+    return _ROUNDING * (scale(solid) + scale(other) + wp.length(solid.pos - other.pos) + wp.length(solid.pos))
+
+
+@wp.func
+def core_place(solid: Solid, point: wp.vec3) -> wp.vec3:
+    """The point of a sphere's centre or a capsule's axis that is nearest a point of the world."""
+    axis = column(solid.mat, 2)
+    half = wp.where(solid.type == GeomType.CAPSULE, solid.size[1], 0.0)
+    return solid.pos + axis * wp.clamp(wp.dot(axis, point - solid.pos), -half, half)
+
+
+@wp.func
+def core_reach(other: Solid, dist: float) -> float:
+    """Distance of a contact's witness point from the other geom's core: the normal is the direction between them."""
+    rounded = other.type == GeomType.SPHERE or other.type == GeomType.CAPSULE
+    return wp.abs(dist + wp.where(rounded, other.size[0], 0.0))
+
+
+@wp.func
+def misses_face(solid: Solid, other: Solid, plane: wp.vec3, point: wp.vec3, outward: wp.vec3, dist: float) -> float:
+    """How far a contact is from one with a face of its normal, beyond what it is from one of its own normal [m].
+
+    Witness points lie on one normal. A sphere or a capsule touches with a point that is its radius off its core, along
+    the normal. Where MuJoCo clips a capsule's side, that need not hold for either normal.
+
+    Args:
+        plane: outward normal of the face.
+        point: where the contact is on the solid.
+        outward: normal of the contact.
+        dist: distance.
+    """
+    miss = wp.abs(dist) * wp.length(plane - outward)
+    if other.type == GeomType.SPHERE or other.type == GeomType.CAPSULE:
+        place = point + dist * outward
+        own = wp.length(place + other.size[0] * outward - core_place(other, place + other.size[0] * outward))
+        of_face = wp.length(place + other.size[0] * plane - core_place(other, place + other.size[0] * plane))
+        miss = wp.where(own < of_face and own < _BESIDE_CORE * other.size[0], of_face, 0.0)
+    return miss
+
+
+@wp.func
 def patch_at(
-    solid: Solid, meshes: Meshes, point: wp.vec3, outward: wp.vec3, face: int, sine: float, slack: float
+    solid: Solid,
+    other: Solid,
+    meshes: Meshes,
+    point: wp.vec3,
+    outward: wp.vec3,
+    dist: float,
+    face: int,
+    sine: float,
+    slack: float,
 ) -> Patch:
     """The patch of a solid around a point of the world where its outward normal is `outward`.
 
+    On a face the normal is the face's, and the point anywhere within it; on an edge the point is on the edge, and the
+    normal anywhere between those of its faces; at a corner both are looser and stricter by one more step. So the point
+    and the normal tell how far, in lengths, the contact is from one of each kind, and the nearer kind is taken. No
+    angle can tell, because there are edges of any angle.
+
     Args:
+        other: the geom that it touches.
+        dist: distance of the contact.
         face: the one whose normal is nearest `outward`, -1 for none.
         sine: of the angle between that normal and `outward`.
-        slack: what it may be from rounding.
+        slack: below this angle a face has been clipped, or the normal is the face's up to rounding.
     """
     patch = Patch()
     patch.face = -1
     size = solid.size
     axis = column(solid.mat, 2)
     local = into(solid, point)
+    rounding = rounding_of(solid, other)
     if solid.type == GeomType.SPHERE:
         patch.bend = size[0] * tangential(outward)
     elif solid.type == GeomType.ELLIPSOID:
         patch.bend = ellipsoid_bend(solid.mat, size, outward)
     elif solid.type == GeomType.CAPSULE:
         patch.bend = size[0] * tangential(outward)
-        if wp.abs(wp.dot(point - size[0] * outward - solid.pos, axis)) < (1.0 - _NEAR) * size[1]:
+        to_end = size[1] - wp.abs(wp.dot(point - size[0] * outward - solid.pos, axis))
+        if to_end > wp.max(size[0] * wp.abs(wp.dot(outward, axis)), rounding):
             patch.kind = EDGE
             patch.run = axis
     elif solid.type == GeomType.CYLINDER:
@@ -140,16 +206,19 @@ def patch_at(
                 patch.kind = EDGE
                 patch.run = axis
     elif has_corners(solid):
-        if sine < slack:
+        if face >= 0 and sine < _SAME:
             patch.kind = FACE
             patch.face = face
         else:
             to_corner, to_edge, run = nearest_feature(solid, meshes, local, wp.transpose(solid.mat) @ outward)
-            near = _NEAR * scale(solid)
-            if to_corner > near:
+            run = wp.normalize(solid.mat @ run)
+            off_face = float(1.0e30)
+            if face >= 0:
+                off_face = misses_face(solid, other, solid.mat @ face_normal(solid, meshes, face), point, outward, dist)
+            if sine < slack or (sine < _FLAT and off_face <= wp.max(to_edge, rounding)):
+                patch.kind = FACE
+                patch.face = face
+            elif to_corner > wp.max(wp.abs(wp.dot(run, outward)) * core_reach(other, dist), rounding):
                 patch.kind = EDGE
-                patch.run = wp.normalize(solid.mat @ run)
-                if to_edge > near and sine < _FLAT:
-                    patch.kind = FACE
-                    patch.face = face
+                patch.run = run
     return patch

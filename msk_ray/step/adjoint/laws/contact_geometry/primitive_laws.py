@@ -30,11 +30,10 @@ _SAME_END = wp.constant(1.0e-5)
 """Share of a capsule's length within which two ends lie side by side: float32 cannot tell which one is inside."""
 _COINCIDENT = wp.constant(2.0e-6)
 """Distance, as a share of the size of the numbers it is computed from, that is their rounding in float32."""
-_LEAST_TILT = wp.constant(2.5e-4)
-"""Sine of a cylinder's tilt below which its rim points are fixed to it: there float32 takes axis·normal as 1.
+_LEAST_TILT = wp.constant(5.0e-6)
+"""Sine of a cylinder's tilt below which its rim points are taken as fixed to it.
 
-The lowest point runs around the rim at 1/tilt. What all contacts of a standing cylinder do together does not depend on
-where on the rim they are, up to terms of the order of the tilt, but a difference of large numbers drowns in rounding.
+The lowest point runs around the rim at 1/tilt, and float32 knows the angle between two directions up to 1e-7.
 """
 
 
@@ -169,8 +168,9 @@ def sphere_box_contact(
 
 
 @wp.func
-def rim_torque(normal: wp.vec3, axis: wp.vec3, arm: wp.vec3, core_bar: wp.vec3) -> wp.vec3:
-    """Torque on a cylinder, and its opposite on the plane, that turns the lowest point of the rim around.
+def rim_torque(normal: wp.vec3, axis: wp.vec3, arm: wp.vec3, core_bar: wp.vec3) -> tuple[wp.vec3, wp.bool]:
+    """Torque on a cylinder, and its opposite on the plane, that turns the lowest point of the rim around; whether it is
+    exact.
 
     Args:
         normal: of the plane.
@@ -178,13 +178,12 @@ def rim_torque(normal: wp.vec3, axis: wp.vec3, arm: wp.vec3, core_bar: wp.vec3) 
         arm: of the contact's point on the rim from the cylinder's centre.
         core_bar: cotangent of that point.
     """
-    lowest = axis * wp.dot(normal, axis) - normal
-    tilt = wp.length(lowest)
+    aside = wp.cross(normal, axis)
+    tilt = wp.length(aside)
     if tilt < _LEAST_TILT:
-        return wp.vec3(0.0)
-    aside = wp.cross(axis, lowest / tilt)
-    # The rim points turn about the axis by ψ = ω·(n × t) / sin(tilt), t the way of the lowest one: dp = ψ axis × arm
-    return wp.cross(normal, aside) * (wp.dot(core_bar, wp.cross(axis, arm)) / tilt)
+        return wp.vec3(0.0), False
+    # The rim points turn about the axis by ψ = ω·(n × s) / sin(tilt), s = n × axis / sin(tilt): dp = ψ axis × arm
+    return wp.cross(normal, aside / tilt) * (wp.dot(core_bar, wp.cross(axis, arm)) / tilt), True
 
 
 @wp.func
@@ -274,3 +273,6 @@ CONVEX_PAIRS = frozenset(
     - {(int(GeomType.CAPSULE), int(GeomType.BOX))}
 )
 """Those for which `is_convex_pair` holds."""
+
+STANDING_PAIRS = frozenset({(int(GeomType.PLANE), int(GeomType.CYLINDER))})
+"""Those in which a point runs around a rim, the faster the less it is tilted."""

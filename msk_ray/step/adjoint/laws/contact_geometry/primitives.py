@@ -12,11 +12,13 @@ from typing import Any, NamedTuple
 import warp as wp
 from mujoco_warp import GeomType
 
+from msk_ray.step.adjoint.coverage.approximated import Touches, count_touch
 from msk_ray.step.adjoint.groups import ContactBars, Contacts, Shapes
 from msk_ray.step.adjoint.laws.contact_geometry.capsule_box import capsule_box_wrenches
 from msk_ray.step.adjoint.laws.contact_geometry.contact_order import contacts_end
 from msk_ray.step.adjoint.laws.contact_geometry.primitive_laws import (
     SCORED_PAIRS,
+    STANDING_PAIRS,
     ParallelLaw,
     cores_coincide,
     is_convex_pair,
@@ -53,23 +55,30 @@ class PairKinds(NamedTuple):
     scored: bool
     """A pair that `pair_score` knows."""
     capsule_box: bool
+    standing: bool
+    """A cylinder and a plane."""
 
     @classmethod
     def of(cls, types: set[tuple[int, int]]) -> "PairKinds":
         """Those of a model whose colliding geometry types (ascending) are `types`."""
-        return cls(bool(types & SCORED_PAIRS), (int(GeomType.CAPSULE), int(GeomType.BOX)) in types)
+        return cls(
+            bool(types & SCORED_PAIRS),
+            (int(GeomType.CAPSULE), int(GeomType.BOX)) in types,
+            bool(types & STANDING_PAIRS),
+        )
 
 
 @cache
 def pull_geometry_kernel(kinds: PairKinds) -> Any:
     """The kernel for models with these kinds of pairs."""
-    scored, capsule_box = kinds.scored, kinds.capsule_box
+    scored, capsule_box, standing = kinds
 
     @wp.kernel(module="unique", enable_backward=False)
     def pull_geometry(
         in_turn: bool,
         # Model:
         shapes: Shapes,
+        substep: int,
         # In:
         nacon_in: wp.array[int],
         contacts_in: Contacts,
@@ -79,6 +88,7 @@ def pull_geometry_kernel(kinds: PairKinds) -> Any:
         contact_bars_in: ContactBars,
         # Out:
         moved_bar_out: wp.array2d[wp.spatial_vector],
+        touches_out: Touches,
         wrenches_out: wp.array2d[wp.spatial_vector],
     ) -> None:
         """Cotangents of (dist, pos, frame) to wrenches on the two bodies whose displacement moves them."""
@@ -199,10 +209,14 @@ def pull_geometry_kernel(kinds: PairKinds) -> Any:
                 # n turns with the plane: dn = ω × n  ⇒  torque n × n̄
                 force1 = -reach * normal
                 torque1 = wp.cross(normal, turned)
-                if type2 == GeomType.CYLINDER:
-                    around = rim_torque(normal, column(mat2, 2), core - pos2, force2)
-                    torque2 += around
-                    torque1 -= around
+                if wp.static(standing):
+                    if type2 == GeomType.CYLINDER:
+                        around, exact = rim_torque(normal, column(mat2, 2), core - pos2, force2)
+                        torque2 += around
+                        torque1 -= around
+                        if not exact and (dist_bar != 0.0 or wp.dot(pos_bar, pos_bar) != 0.0):
+                            ngeom = shapes.geom_type.shape[0]
+                            count_touch(touches_out, worldid, substep, ngeom, geoms[0], geoms[1], type1, type2)
             if wrenches_out.shape[0] > 0:
                 wrenches_out[con, 0] = wrench(force1, torque1, place1 - pos1)
                 wrenches_out[con, 1] = wrench(force2, torque2, place2 - pos2)

@@ -64,31 +64,30 @@ def line_wrenches(
     patch2 = Patch()
     patch2.bend = radius * tangential(normal)
     corner = farthest(below, meshes, normal)
-    tied, other = tied_corner(below, meshes, normal, corner)
-    run = wp.vec3(0.0)
-    if tied:
-        patch1.kind = EDGE
-        run = wp.normalize(other - corner)
-        patch1.run = run
-    if below.type == GeomType.CYLINDER:
-        patch1.bend = rim_bend(below.size[0], column(below.mat, 2), normal)
+    on_side = wp.abs(wp.dot(axis, normal)) < _ON_SIDE
     up = wp.where(wp.dot(axis, normal) < 0.0, 1.0, -1.0)
     core = capsule.pos + up * capsule.size[1] * axis
-    from_corner = tangential(normal) @ (corner - core)
-    if wp.abs(wp.dot(axis, normal)) < _ON_SIDE:
+    flat_axis = wp.vec3(0.0)
+    if on_side:
         patch2.kind = EDGE
         patch2.run = axis
-        core = capsule.pos
-        from_corner = tangential(normal) @ (corner - core)
         flat_axis = wp.normalize(tangential(normal) @ axis)
-        if tied:
+        core = capsule.pos + wp.dot(flat_axis, corner - capsule.pos) * flat_axis
+    from_corner = tangential(normal) @ (corner - core)
+    # At a corner the capsule is straight above it, on an edge m is across the edge: the nearer of both.
+    tied, other = tied_corner(below, meshes, normal, corner)
+    run = wp.normalize(other - corner)
+    tied = tied and radius * wp.abs(wp.dot(run, normal)) < wp.length(from_corner)
+    if tied:
+        patch1.kind = EDGE
+        patch1.run = run
+        if on_side:
             # Where the two lines cross, seen along m.
             b = wp.dot(flat_axis, run)
-            along = (wp.dot(flat_axis, from_corner) - b * wp.dot(run, from_corner)) / wp.max(1.0 - b * b, 1.0e-9)
-            core += along * flat_axis
-        else:
-            core += wp.dot(flat_axis, from_corner) * flat_axis
-        from_corner = tangential(normal) @ (corner - core)
+            core += (b * wp.dot(run, from_corner) / wp.min(b * b - 1.0, -1.0e-9)) * flat_axis
+            from_corner = tangential(normal) @ (corner - core)
+    if below.type == GeomType.CYLINDER:
+        patch1.bend = rim_bend(below.size[0], column(below.mat, 2), normal)
     at = corner
     if tied:
         at = corner - wp.dot(run, from_corner) * run

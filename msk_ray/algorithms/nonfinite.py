@@ -1,0 +1,62 @@
+"""Where an observation or a reward was not finite, in words.
+
+Axes: H env steps of a rollout, W worlds, O observation, T reward terms.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from msk_ray.envs import Env
+from msk_ray.errors import Failure, SimulationError
+
+_CAUSES = "a division by 0, or a root or logarithm of what can be 0 or less"
+
+
+def nonfinite_observation(env: Env[Any], observations: Tensor, epoch: int, done: int = 0) -> SimulationError | None:
+    """The error for observations (H, W, O) of an epoch, counted from 0, after so many env steps of it; None if all are
+    finite. Waits for the device."""
+    place = _first(observations)
+    if place is None:
+        return None
+    step, world, entry = place
+    layout = env.observation_layout()
+    name = f"entry {entry}" + (f" ({layout[entry].name})" if layout and entry < len(layout) else "")
+    return SimulationError(
+        f"nonfinite_observation: {name} of observe is {float(observations[place])} in world {world} before env step "
+        f"{done + step + 1} of epoch {epoch + 1}; look for {_CAUSES}",
+        Failure.NONFINITE,
+    )
+
+
+def nonfinite_reward(env: Env[Any], terms: Sequence[Tensor], epoch: int) -> SimulationError:
+    """The error for an epoch, counted from 0, whose mean reward is not finite, from the terms (W, T) of each of its H
+    steps. Waits for the device.
+
+    In a group, they are those of this process.
+    """
+    values = torch.stack(list(terms))
+    place = _first(values)
+    if place is None:
+        what = "the mean reward is not finite, although no term is"
+        what = f"{what} in the worlds of this process" if env.group.size > 1 else f"{what}: they are too large"
+        return SimulationError(f"nonfinite_reward: {what}", Failure.NONFINITE)
+    step, world, term = place
+    affected = int((~values[step, :, term].isfinite()).sum()) - 1
+    more = f" (and in {affected} more)" if affected else ""
+    return SimulationError(
+        f"nonfinite_reward: term {env.reward_names[term]!r} of reward_terms is {float(values[place])} in world {world}"
+        f"{more} at env step {step + 1} of epoch {epoch + 1}; look for {_CAUSES}",
+        Failure.NONFINITE,
+    )
+
+
+def _first(values: Tensor) -> tuple[int, int, int] | None:
+    """The place (step, world, column) of the first value that is not finite."""
+    places = (~values.isfinite()).nonzero()
+    if not len(places):
+        return None
+    step, world, column = places[0].tolist()
+    return step, world, column

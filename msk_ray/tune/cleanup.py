@@ -1,0 +1,93 @@
+"""Ends the processes of a Ray and removes its folder. As a program, it does so once the driver has ended, by whatever.
+
+As a program it imports only the standard library. Its arguments are the folder, and the driver's process id; the driver
+holds the other end of its standard input.
+"""
+
+import os
+import shutil
+import signal
+import sys
+import time
+from collections.abc import Collection, Iterator
+from contextlib import suppress
+from pathlib import Path
+
+KEEP = b"keep"
+"""What the driver writes to have the folder kept."""
+_POLL_S = 0.02
+
+
+def end_processes(folder: Path, spared: Collection[int], limit_s: float = 20.0) -> None:
+    """Kill all processes of a folder, and wait until they have ended: those in whose environment it is Ray's folder,
+    and those that have a file in it open for writing.
+
+    Args:
+        folder: Ray's folder.
+        spared: processes that are left alone.
+        limit_s: how long to wait at most [s]; a process may be held up in the kernel.
+    """
+    deadline = time.monotonic() + limit_s
+    while time.monotonic() < deadline:
+        found = [pid for pid in _own_processes() if pid not in spared and _belongs(pid, folder)]
+        if not found:
+            return
+        for pid in found:
+            _kill(pid, folder)
+        time.sleep(_POLL_S)
+
+
+def _own_processes() -> Iterator[int]:
+    for entry in Path("/proc").iterdir():
+        with suppress(OSError):  # it has ended meanwhile
+            if entry.name.isdigit() and entry.stat().st_uid == os.geteuid():
+                yield int(entry.name)
+
+
+def _belongs(pid: int, folder: Path) -> bool:
+    """Whether a living process belongs to a folder.
+
+    Some of Ray's processes write their name over their environment; their logs are open.
+    """
+    with suppress(OSError):  # it has ended meanwhile
+        if f"RAY_TMPDIR={folder}".encode() in Path(f"/proc/{pid}/environ").read_bytes().split(b"\0"):
+            return True
+        for entry in Path(f"/proc/{pid}/fd").iterdir():
+            with suppress(OSError):  # it has been closed meanwhile
+                if os.readlink(entry).startswith(f"{folder}/") and _writes(pid, entry.name):
+                    return True
+    return False
+
+
+def _writes(pid: int, descriptor: str) -> bool:
+    """Whether a descriptor of a process is open for writing; somebody may be reading the logs."""
+    lines = Path(f"/proc/{pid}/fdinfo/{descriptor}").read_text().splitlines()
+    facts = dict(line.split(":", 1) for line in lines if ":" in line)
+    return int(facts["flags"], 8) & os.O_ACCMODE != os.O_RDONLY
+
+
+def _kill(pid: int, folder: Path) -> None:
+    """Kill a process that belongs to a folder, and no other one that has been given its number since."""
+    with suppress(ProcessLookupError):
+        handle = os.pidfd_open(pid)
+        try:
+            if _belongs(pid, folder):
+                signal.pidfd_send_signal(handle, signal.SIGKILL)
+        finally:
+            os.close(handle)
+
+
+def main() -> None:
+    """Wait for the driver's end, or for its word that it is time."""
+    # They are meant for the driver, whose end is the only reason to end.
+    for number in signal.valid_signals() - {signal.SIGKILL, signal.SIGSTOP, signal.SIGCHLD}:
+        signal.signal(number, signal.SIG_IGN)
+    folder, driver = Path(sys.argv[1]), int(sys.argv[2])
+    word = sys.stdin.buffer.read()
+    end_processes(folder, {driver, os.getpid()})
+    if word != KEEP:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+if __name__ == "__main__":
+    main()
