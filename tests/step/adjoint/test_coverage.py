@@ -10,7 +10,7 @@ from msk_ray.errors import UnsupportedModelError
 from msk_ray.step.adjoint.coverage.check import check_supported, table, unsupported
 from msk_ray.step.forward import WorldBatch
 
-_DOC = Path(__file__).resolve().parents[3] / "docs" / "differentiation.md"
+_DOC = Path(__file__).resolve().parents[3] / "docs" / "step" / "coverage.md"
 
 
 def test_the_docs_print_the_table_of_the_code():
