@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from msk_ray import __main__ as any_command
-from msk_ray import status, train
+from msk_ray import gradcheck, status, train
 from msk_ray.cli import run
 from msk_ray.config import packages
 from msk_ray.dashboard import __main__ as dashboard
@@ -20,7 +20,6 @@ from msk_ray.evaluate import __main__ as evaluate
 from msk_ray.export import __main__ as export
 from msk_ray.legs.gait import __main__ as gait
 from msk_ray.report import __main__ as report
-from msk_ray.step.check import __main__ as gradcheck
 from msk_ray.tune import __main__ as tune
 from msk_ray.visualize import __main__ as visualize
 

@@ -9,10 +9,10 @@ import mujoco
 import numpy as np
 from msk_ray.gradcheck.check import compare, forward_mismatch
 from msk_ray.gradcheck.pullback import simulated_gradients
+from msk_ray.simulation import Simulation, TapePerSubstep
 from record import RESULTS, markdown_table, publish
 
 from msk_ray.gradcheck import Limits, Oracle, Point
-from msk_ray.simulation import Simulation, TapePerSubstep
 
 PAIRS = [("mesh", "mesh"), ("box", "mesh"), ("cylinder", "capsule"), ("cylinder", "box")]
 TABLES = {"mesh": 'mesh="slab"', "box": 'size=".4 .4 .1"', "cylinder": 'size=".4 .1"'}

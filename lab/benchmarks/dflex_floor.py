@@ -18,13 +18,13 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
+from msk_ray.simulation import StepState
 from record import markdown_table, publish
 
 from msk_ray.cli import run
 from msk_ray.config import PhysicsConfig
 from msk_ray.envs import Env, env_class, make_env
 from msk_ray.errors import ConfigError
-from msk_ray.simulation import StepState
 from msk_ray.training import load_policy
 
 SUBSTEPS = 64

@@ -4,10 +4,9 @@ import argparse
 import time
 
 import torch
+from msk_ray.simulation import Backward, FdJacobian, Simulation, TapePerSubstep
 from record import RESULTS, markdown_table, publish
 from step_models import MODELS
-
-from msk_ray.simulation import Backward, FdJacobian, Simulation, TapePerSubstep
 
 
 class OneRowAtATime(TapePerSubstep):

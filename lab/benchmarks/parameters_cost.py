@@ -11,11 +11,10 @@ from pathlib import Path
 import mujoco
 import torch
 from msk_ray.physics.parameters import PARAMETERS, names_of
+from msk_ray.simulation import Simulation
 from parameters import MODELS
 from record import RESULTS, markdown_table, publish, used_bytes
 from torch import Tensor
-
-from msk_ray.simulation import Simulation
 
 
 def values_of(model: mujoco.MjModel, names: list[str], worlds: int | None, device: torch.device) -> dict[str, Tensor]:

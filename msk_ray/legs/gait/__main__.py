@@ -1,4 +1,4 @@
-"""`python -m msk_ray.legs.gait`: how does a policy walk, compared with people?"""
+"""`msk-ray gait`: how does a policy walk, compared with people?"""
 
 import argparse
 import math
@@ -29,16 +29,16 @@ are compared in one table; with --speeds, each is told these speeds one after th
 and step length against speed."""
 
 EXAMPLES = """\
-  python -m msk_ray.legs.gait runs/train/myoleg26_seed0
-  python -m msk_ray.legs.gait myoleg26_reward --worlds 64 --out gait/          # the best trial of an experiment
-  python -m msk_ray.legs.gait runs/train/myoleg26_seed0 --film stride.gif       # beside people's, as stick figures
-  python -m msk_ray.legs.gait runs/a runs/b/checkpoints/epoch_000400.pt        # side by side
-  python -m msk_ray.legs.gait runs/train/fast_seed0 --speeds 0.7,1,1.25,1.6    # a policy that is told its speed"""
+  msk-ray gait runs/train/myoleg26_seed0
+  msk-ray gait myoleg26_reward --worlds 64 --out gait/          # the best trial of an experiment
+  msk-ray gait runs/train/myoleg26_seed0 --film stride.gif       # beside people's, as stick figures
+  msk-ray gait runs/a runs/b/checkpoints/epoch_000400.pt        # side by side
+  msk-ray gait runs/train/fast_seed0 --speeds 0.7,1,1.25,1.6    # a policy that is told its speed"""
 
 
 def parser() -> Parser:
     """The command line."""
-    p = Parser("python -m msk_ray.legs.gait", DESCRIPTION, EXAMPLES)
+    p = Parser("msk-ray gait", DESCRIPTION, EXAMPLES)
     p.add_argument(
         "targets",
         nargs="+",
