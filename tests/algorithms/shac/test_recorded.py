@@ -60,12 +60,13 @@ LEGS = {
     },
     "physics": {},
 }
-ONE_KERNEL = {**ANT, "physics": {"variant": "matched"}, "execution": {"solver_kernels": "fused"}}
+ONE_KERNEL = {**ANT, "physics": {"variant": "matched"}, "execution": {**ANT["execution"], "solver_kernels": "fused"}}
 CARTPOLE = {**ANT, "env": {"name": "cartpole", "nworld": 64}, "physics": {}}
 
 
-def make(settings: dict[str, Any], folder: Path, **shac: Any) -> Trainer:
-    return Trainer(parse_config({**settings, "shac": {**settings["shac"], **shac}}), folder, "cuda:0")
+def make(settings: dict[str, Any], folder: Path, capture: str = "auto", **shac: Any) -> Trainer:
+    parts = {"shac": {**settings["shac"], **shac}, "execution": {**settings["execution"], "capture": capture}}
+    return Trainer(parse_config({**settings, **parts}), folder, "cuda:0")
 
 
 @pytest.fixture
@@ -149,7 +150,7 @@ def test_a_fit_beside_a_rollout_equals_one_after_the_other(tmp_path: Path) -> No
     To the bit: without a fixed order of sums, their noise grows from epoch to epoch by an amount no test can bound.
     """
     networks = {name: {"hidden": [400, 200, 100]} for name in ("actor", "critic")}
-    wide = {**ANT, **networks, "trial": {**ANT["trial"]}, "execution": {"deterministic": True}}
+    wide = {**ANT, **networks, "execution": {**ANT["execution"], "deterministic": True}}
     shac = {"horizon": 8, "critic_iterations": 16}
     recorded, eager = make(wide, tmp_path / "a", **shac), make(wide, tmp_path / "b", **shac, capture="off")
     for trainer in (recorded, eager):
@@ -227,7 +228,7 @@ def test_a_gradient_that_is_not_finite_is_reported_and_moves_nothing(
 
 
 def test_a_step_that_loses_rows_is_reported(tmp_path: Path) -> None:
-    settings = {**ANT, "physics": {"variant": "matched"}, "execution": {"njmax": 12}}
+    settings = {**ANT, "physics": {"variant": "matched"}, "execution": {**ANT["execution"], "njmax": 12}}
     trainer = make(settings, tmp_path)
     with pytest.raises(SimulationError, match=r"execution\.njmax"):
         run_epochs(trainer, 40)
