@@ -7,7 +7,7 @@ WORKERS ?= 4
 # Beside each other, each with a thread of its own: those of torch would wait for each other.
 PYTEST := OMP_NUM_THREADS=1 $(RUN) -m pytest --dist loadfile
 # Whatever people read; tests misspell on purpose.
-PROSE   := README.md CONTRIBUTING.md Makefile benchmarks cluster configs docs msk_ray policies tune_spaces
+PROSE   := README.md CONTRIBUTING.md Makefile benchmarks cluster configs docs lab msk_ray policies tune_spaces
 
 .PHONY: help env demo test test-fast test-all check unit gpu-test gpu-test-all site notebooks bench clean
 

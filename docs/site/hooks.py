@@ -25,6 +25,7 @@ def _pages() -> dict[str, str]:
         "CONTRIBUTING.md": "contributing.md",
         "cluster/README.md": "cluster.md",
         "policies/README.md": "policies.md",
+        "lab/README.md": "lab.md",
     }
     results = sorted((ROOT / RESULTS).glob("*.md"))
     notebooks = sorted((ROOT / TUTORIALS).glob("*.ipynb"))
