@@ -60,6 +60,7 @@ def test_the_source_distribution_builds_the_same_wheel(wheel: Path, root: Path, 
         archive.extractall(tmp_path / "source", filter="data")
     (source,) = (tmp_path / "source").iterdir()
     assert source.name == f"msk_ray-{msk_ray.__version__}"
+    assert not (source / "lab").exists(), "finished questions are not shipped"
     again = _build(source, "wheel", tmp_path / "again")
     with zipfile.ZipFile(wheel) as first, zipfile.ZipFile(again) as second:
         assert first.namelist() == second.namelist()
