@@ -7,9 +7,9 @@
 *Lines* are those of Python files: a line is blank, a comment, part of a docstring (of a module, class, function or
 attribute), or code. *Settings* are the leaves of the config with every environment and algorithm of the package, and of
 a space file, counted once where they are declared. One is *set* if a config, a space, an example or a page of the
-manual gives it a value. *Words* are counted as `wc -w` does. *Edits of an extension* are the places in existing files
-that a new one of its kind has to change, and *files from ctrl to kernel* those that the path of a control goes through:
-both are lists of patterns below, each of which is looked for in the checkout, wherever it may be.
+manual gives it a value. *Words* stand between blanks and have a letter or digit. *Edits of an extension* are the places
+in existing files that a new one of its kind has to change, and *files from ctrl to kernel* those that the path of a
+control goes through: both are lists of patterns below, each of which is looked for in the checkout, wherever it may be.
 """
 
 import argparse
@@ -271,7 +271,8 @@ def places(checkout: Path, patterns: tuple[str, ...]) -> list[str]:
 
 
 def words(paths: list[Path]) -> int:
-    return sum(len(path.read_text(encoding="utf-8").split()) for path in paths)
+    """Words of files: what stands between blanks and has a letter or digit."""
+    return sum(len(re.findall(r"\S*\w\S*", path.read_text(encoding="utf-8"))) for path in paths)
 
 
 def measures(checkout: Path) -> tuple[dict[str, str], list[str]]:

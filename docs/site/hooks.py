@@ -22,6 +22,7 @@ def _pages() -> dict[str, str]:
     """Files of the repository that become pages, other than those of docs/ that are ones, by their path in it."""
     fixed = {
         "README.md": "index.md",
+        "CHANGELOG.md": "changelog.md",
         "CONTRIBUTING.md": "contributing.md",
         "cluster/README.md": "cluster.md",
         "policies/README.md": "policies.md",

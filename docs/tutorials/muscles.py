@@ -183,5 +183,5 @@ plt.show()
 
 # %% [markdown]
 # The same works for a muscle's path, its range and its fibres at once, where Gauss-Newton needs fewer iterations:
-# [muscle_fit.py](../examples/muscle_fit.py). [Parameters](../parameters.md) lists the fields that have gradients, and
-# [legs with muscles](../myoleg.md) learn to walk with them.
+# [muscle_fit.py](../examples/muscle_fit.py). [Parameters](../step/parameters.md) lists the fields that have gradients,
+# and [legs with muscles](../legs/README.md) learn to walk with them.

@@ -71,13 +71,13 @@ def code_of(page: str) -> str:
 @pytest.mark.long
 def test_the_code_on_identification_finds_the_damping(capsys: pytest.CaptureFixture[str]) -> None:
     found: dict[str, Any] = {}
-    exec(code_of("identification.md"), found)
+    exec(code_of("step/identification.md"), found)
     assert found["guess"].exp().item() == pytest.approx(0.03, rel=0.02)
 
 
 def test_the_code_on_muscles_has_a_gradient(capsys: pytest.CaptureFixture[str]) -> None:
     found: dict[str, Any] = {}
-    exec(code_of("muscles.md"), found)
+    exec(code_of("legs/muscles.md"), found)
     assert found["excitation"].grad.item() > 0.01
 
 
@@ -92,7 +92,7 @@ def test_the_commands_on_faults_run(
 ) -> None:
     """Those that train; sweeps that are interrupted and resumed have tests of their own (tests/tune)."""
     monkeypatch.chdir(tmp_path)
-    trained = [words for name, words in commands_of(ROOT / "docs" / "faults.md") if name == "train"]
+    trained = [words for name, words in commands_of(ROOT / "docs" / "runner" / "faults.md") if name == "train"]
     assert [("--resume" in words) for words in trained] == [False, True]
     settings = [word for setting in TINY for word in ("--set", setting)]
     for words in trained:

@@ -37,14 +37,15 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_it_has_every_page_and_the_reference(site: Path, root: Path) -> None:
-    pages = [*(root / "docs").glob("*.md"), *(root / "benchmarks" / "results").glob("*.md")]
+    pages = {path.relative_to(root / "docs") for path in (root / "docs").rglob("*.md")}
+    pages |= {Path("benchmarks", path.name) for path in (root / "benchmarks" / "results").glob("*.md")}
     for page in pages:
-        folder = site / "benchmarks" if page.parent.name == "results" else site
-        assert (folder / f"{page.stem}.html").is_file(), page
+        name = "index" if page.stem == "README" else page.stem
+        assert (site / page.parent / f"{name}.html").is_file(), page
     reference = (site / "api.html").read_text()
     for name in ("simulation.Simulation.step", "policy.load_policy", "batched.BatchedEnv", "schema.Config.env"):
         assert f'.{name}"' in reference, name
-    assert 'href="benchmarks/epoch.html"' in (site / "index.html").read_text(), "links between files became links"
+    assert 'href="benchmarks/accuracy.html"' in (site / "index.html").read_text(), "links between files became links"
     assert "<code>lab/ant.md</code>" in (site / "lab.html").read_text(), "a file that is no page"
 
 
@@ -127,7 +128,7 @@ def test_the_commands_of_the_tour_run(
 
 
 def test_the_code_of_the_page_on_gradients_runs(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code = (root / "docs" / "gradients.md").read_text().split("```python\n")[1].split("```")[0]
+    code = (root / "docs" / "step" / "gradients.md").read_text().split("```python\n")[1].split("```")[0]
     found: dict[str, Any] = {}
     exec(code, found)
     assert found["speed"].grad.item() == pytest.approx(0.5, rel=1e-4)

@@ -10,7 +10,7 @@ from msk_ray.errors import UnsupportedModelError
 from msk_ray.physics import WorldBatch
 from msk_ray.physics.adjoint.coverage import check_supported, table, unsupported
 
-_DOC = Path(__file__).resolve().parents[2] / "docs" / "differentiation.md"
+_DOC = Path(__file__).resolve().parents[2] / "docs" / "step" / "coverage.md"
 
 
 def test_the_docs_print_the_table_of_the_code():

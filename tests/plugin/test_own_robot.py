@@ -1,4 +1,4 @@
-"""The page docs/own_robot.md: its files are right as they stand there."""
+"""The page docs/runner/own_robot.md: its files are right as they stand there."""
 
 import re
 import sys
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.long
 @pytest.fixture
 def folder(tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with the files of the page."""
-    page = (root / "docs" / "own_robot.md").read_text()
+    page = (root / "docs" / "runner" / "own_robot.md").read_text()
     found = re.findall(r"`(\w+\.(?:xml|py|yaml))`:?\n\n```\w+\n(.*?)\n```", page, re.DOTALL)
     assert [name for name, _ in found] == ["hopper.xml", "hopper.py", "hopper.yaml", "hopper_lr.yaml"]
     for name, text in found:
@@ -48,7 +48,7 @@ def test_the_files_of_the_page_make_an_environment_with_gradients_and_a_sweep(fo
 def test_what_the_page_says_can_be_measured_can_be(folder: Path, root: Path) -> None:
     from msk_ray.simulation.kinematics import Frames
 
-    page = (root / "docs" / "own_robot.md").read_text()
+    page = (root / "docs" / "runner" / "own_robot.md").read_text()
     rows = [line for line in page.splitlines() if line.startswith("| ")]
     named = {name for row in rows for name in re.findall(r"`\.(\w+)\(", row)}
     assert named == {name for name in vars(Frames) if not name.startswith("_")}
