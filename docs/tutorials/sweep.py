@@ -124,5 +124,5 @@ plt.show()
 # - **Then stops.** Trials that were stopped early look worse than they are; the report compares them where they
 #   stopped.
 #
-# [Reports](../runner/report.md) describes every part, [spaces](../runner/tune.md) what else a sweep can vary, and how it is
-# stopped and resumed.
+# [Reports](../runner/report.md) describes every part, [spaces](../runner/tune.md) what else a sweep can vary, and how
+# it is stopped and resumed.
