@@ -14,6 +14,8 @@ from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = "benchmarks/results"
+LAB = "lab"
+"""Not part of the source distribution."""
 TUTORIALS = "docs/tutorials"
 _LINK = re.compile(r"(\]\()(?!https?://|mailto:|#)([^)#\s]+)(#[^)\s]*)?(\))")
 
@@ -26,8 +28,9 @@ def _pages() -> dict[str, str]:
         "CONTRIBUTING.md": "contributing.md",
         "cluster/README.md": "cluster.md",
         "policies/README.md": "policies.md",
-        "lab/README.md": "lab.md",
     }
+    if (ROOT / LAB).is_dir():
+        fixed[f"{LAB}/README.md"] = "lab.md"
     results = sorted((ROOT / RESULTS).glob("*.md"))
     notebooks = sorted((ROOT / TUTORIALS).glob("*.ipynb"))
     return {
@@ -46,6 +49,8 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
     assert config.nav is not None
     measured = [page for page in PAGES.values() if page.startswith("benchmarks/")]
     config.nav.insert(-1, {"Measurements": measured})
+    if "lab.md" in PAGES.values():
+        config.nav.append({"Lab": "lab.md"})
     return config
 
 
@@ -105,7 +110,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
     def rewrite(match: re.Match[str]) -> str:
         target = posixpath.normpath(posixpath.join(posixpath.dirname(source), match[2]))
-        if not (ROOT / target).exists():
+        if not (ROOT / target).exists() and not target.startswith(f"{LAB}/"):
             return match[0]  # for `--strict` to find
         found = PAGES.get(target, target.removeprefix("docs/") if target.startswith("docs/") else None)
         if found is None or files.get_file_from_path(found) is None:

@@ -46,7 +46,9 @@ def test_it_has_every_page_and_the_reference(site: Path, root: Path) -> None:
     for name in ("simulation.Simulation.step", "policy.load_policy", "batched.BatchedEnv", "schema.Config.env"):
         assert f'.{name}"' in reference, name
     assert 'href="benchmarks/accuracy.html"' in (site / "index.html").read_text(), "links between files became links"
-    assert "<code>lab/ant.md</code>" in (site / "lab.html").read_text(), "a file that is no page"
+    assert "<code>tune_spaces/algorithms.yaml</code>" in (site / "runner" / "tune.html").read_text(), (
+        "a file that is no page"
+    )
 
 
 def test_it_loads_nothing_from_elsewhere(site: Path) -> None:
