@@ -3,7 +3,8 @@ compared with undisturbed trials.
 
 The reference is `Trainer` in a loop, without Ray. After its faults, every sweep is completed with `--resume` (if that
 is needed). Then every trial must have finished, each row of the reference must be present exactly once with equal
-values (except timings), and the last checkpoint must hold equal tensors.
+values (except timings), and the last checkpoint and the best policy must hold equal tensors. Drivers print no
+traceback, and end with the exit codes that docs/faults.md promises.
 
 Faults inside a trial's process happen once each, at a chosen epoch (`FaultyTrainer`); those from outside (driver,
 raylet, files, disk) when the trials have written a number of rows drawn from the seed.
@@ -15,7 +16,7 @@ import sys
 import time
 from pathlib import Path
 
-from fault_campaign import campaigns, drivers
+from fault_campaign import campaigns, drivers, endings, other_user
 from fault_campaign.reference import Reference
 from fault_campaign.space import EPOCHS, SPACE
 from fault_campaign.sweep import scratch_folder
@@ -27,7 +28,7 @@ from msk_ray.config import dump_yaml
 from msk_ray.sweep.space import load_space
 from msk_ray.sweep.trials import resolve_trials
 
-CAMPAIGNS = campaigns.CAMPAIGNS | drivers.CAMPAIGNS
+CAMPAIGNS = campaigns.CAMPAIGNS | drivers.CAMPAIGNS | endings.CAMPAIGNS | other_user.CAMPAIGNS
 
 
 def main() -> int:
@@ -55,21 +56,15 @@ def main() -> int:
                 for note in tally.notes:
                     print(f"  {note}", flush=True)
             tallies += found
-    header = ["fault", "injected", "survived", "lost rows", "lost trials", "sweep s", "ended by"]
+    losses = ("lost_rows", "lost_trials", "lost_policies", "tracebacks")
+    header = ["fault", "injected", "survived", *(name.replace("_", " ") for name in losses), "exit codes", "sweep s"]
+    header.append("ended by")
+    counts = ("injected", "survived", *losses)
     cells = [
-        [
-            t.fault,
-            f"{t.injected}",
-            f"{t.survived}",
-            f"{t.lost_rows}",
-            f"{t.lost_trials}",
-            f"{t.seconds:.0f}",
-            t.ended_by,
-        ]
-        for t in tallies
+        [t.fault, *(f"{getattr(t, name)}" for name in counts), t.codes, f"{t.seconds:.0f}", t.ended_by] for t in tallies
     ]
-    sums = [sum(getattr(t, name) for t in tallies) for name in ("injected", "survived", "lost_rows", "lost_trials")]
-    cells.append(["all", *map(str, sums), f"{time.monotonic() - started:.0f}", ""])
+    sums = [sum(getattr(t, name) for t in tallies) for name in counts]
+    cells.append(["all", *map(str, sums), "", f"{time.monotonic() - started:.0f}", ""])
     title = f"Faults survived, {len(trials)} CartPole trials of {EPOCHS} epochs a sweep, seed {args.seed}"
     notes = [f"- {tally.fault}: {note}" for tally in tallies for note in tally.notes]
     publish(

@@ -51,9 +51,9 @@ def test_the_time_left_is_told_without_the_compilation(
 
 def test_progress_says_that_epochs_could_be_faster(capsys: pytest.CaptureFixture[str]) -> None:
     row = {"epoch": 1, "env_steps": 8, "seconds": 0.1, "env_steps_per_s": 1234.5, "train/unrecordable": 1.0}
-    ProgressLine(1, 0).show(row)
+    ProgressLine(1).show(row)
     line = capsys.readouterr().out
-    assert line == "epoch 1/1  1,234 env steps/s  not recorded: two to three times as slow  0s left\n"
+    assert line == "epoch 1/1  1,234 env steps/s  not recorded: two to three times as slow\n"
 
 
 @pytest.mark.long

@@ -73,13 +73,13 @@ def killed(
     name: str,
     times: int,
     number: signal.Signals,
-    raylet: bool = False,
+    daemon: str | None = None,
 ) -> list[Tally]:
-    """The driver or its raylet dies several times in one sweep."""
+    """The driver or a daemon of its Ray dies several times in one sweep."""
     sweep = Sweep(name.replace(" ", "_"), scratch, reference.trials)
-    injected, codes = strike(sweep, rng, times, lambda: sweep.kill(number, raylet))
+    injected, codes = strike(sweep, rng, times, lambda: sweep.kill(number, daemon))
     tally = judge(reference, sweep, name, injected, "--resume")
-    if number == signal.SIGTERM and set(codes) != {RESUMABLE}:
+    if (number == signal.SIGTERM or daemon is not None) and set(codes) != {RESUMABLE}:
         tally.notes.append(f"exit codes {codes} instead of {RESUMABLE}")
     return [tally]
 
@@ -166,7 +166,8 @@ CAMPAIGNS: dict[str, Callable[[Reference, Path, random.Random], list[Tally]]] = 
     "gone": gone,
     "read-only": read_only,
     "disk": full_disk,
-    "raylet": lambda *a: killed(*a, "raylet SIGKILL", 3, signal.SIGKILL, True),
+    "raylet": lambda *a: killed(*a, "raylet SIGKILL", 3, signal.SIGKILL, "raylet"),
+    "gcs": lambda *a: killed(*a, "gcs_server SIGKILL", 3, signal.SIGKILL, "gcs_server"),
     "nan": nan,
     "workers": inside_workers,
     "checkpoints": damaged,

@@ -1,5 +1,6 @@
 """What sweeps are compared with: every trial trained alone."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,17 @@ from msk_ray.experiment.metrics import read_rows
 from msk_ray.experiment.outcomes import read_ending
 from msk_ray.experiment.trial import Trial
 from msk_ray.training import Trainer, read_checkpoint
+
+LAST, BEST = f"epoch_{EPOCHS:06d}.pt", "best.pt"
+
+
+@dataclass
+class Lost:
+    """How much is missing or differs."""
+
+    rows: int = 0
+    trials: int = 0
+    policies: int = 0
 
 
 class Reference:
@@ -26,9 +38,9 @@ class Reference:
         """Of a trial that was left alone."""
         return self._folder / trial.id
 
-    def compare(self, experiment: Path, trials: list[Trial]) -> tuple[int, int, list[str]]:
-        """Rows and trials of an experiment that are missing or differ, and what is wrong with them."""
-        lost_rows = lost_trials = 0
+    def compare(self, experiment: Path, trials: list[Trial]) -> tuple[Lost, list[str]]:
+        """What of an experiment is missing or differs, and what is wrong with it."""
+        lost = Lost()
         notes = []
         for trial in trials:
             folder = experiment / "trials" / trial.id
@@ -37,25 +49,30 @@ class Reference:
             by_epoch = {row["epoch"]: _without_timing(row) for row in found}
             wrong = [row["epoch"] for row in expected if by_epoch.get(row["epoch"]) != _without_timing(row)]
             wrong += [row["epoch"] for row in found if row["epoch"] > EPOCHS]
-            lost_rows += len(wrong)
+            lost.rows += len(wrong)
             ending = read_ending(folder)
             whole = (
                 ending is not None
                 and ending.outcome == "finished"
-                and _same(_last_state(self._folder / trial.id), _last_state(folder))
+                and _same(_state(self._folder / trial.id, LAST), _state(folder, LAST))
             )
-            lost_trials += not whole
-            if wrong or not whole:
-                notes.append(f"{trial.id}: rows {wrong} missing or different, ended {ending}")
-        return lost_rows, lost_trials, notes
+            lost.trials += not whole
+            best = _same(_state(self._folder / trial.id, BEST), _state(folder, BEST))
+            lost.policies += not best
+            if wrong or not whole or not best:
+                notes.append(
+                    f"{trial.id}: rows {wrong} missing or different, ended {ending}, best policy "
+                    f"{'the same' if best else 'missing or different'}"
+                )
+        return lost, notes
 
 
 def _without_timing(row: dict[str, float]) -> dict[str, Any]:
     return {key: repr(value) for key, value in row.items() if not key.startswith(TIMING)}
 
 
-def _last_state(folder: Path) -> dict[str, Any] | None:
-    path = folder / "checkpoints" / f"epoch_{EPOCHS:06d}.pt"
+def _state(folder: Path, name: str) -> dict[str, Any] | None:
+    path = folder / "checkpoints" / name
     return {k: v for k, v in read_checkpoint(path).items() if k not in TIMING} if path.is_file() else None
 
 

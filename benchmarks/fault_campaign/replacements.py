@@ -76,7 +76,7 @@ def replacements(reference: Reference, scratch: Path, rng: random.Random) -> lis
                 found = error
             if found not in (before, after):
                 tally.lost_rows += not writer.best
-                tally.lost_trials += writer.best
+                tally.lost_policies += writer.best
                 tally.notes.append(f"killed before call {place}: {found!s:.200}")
         tally.seconds = time.monotonic() - started
         shutil.rmtree(folder)

@@ -1,12 +1,13 @@
 """What became of the sweeps that faults struck."""
 
 import random
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from fault_campaign.reference import Reference
 from fault_campaign.space import EPOCHS
-from fault_campaign.sweep import Sweep
+from fault_campaign.sweep import PATIENCE_S, Sweep
 from msk_ray.experiment.trial import Trial
 
 RESUMABLE = 75
@@ -21,12 +22,18 @@ class Tally:
     ended_by: str
     lost_rows: int = 0
     lost_trials: int = 0
+    lost_policies: int = 0
+    """Best policies that differ or are missing."""
+    tracebacks: int = 0
+    """In what the drivers printed."""
+    codes: str = ""
+    """Exit codes of the drivers, as often as they occurred."""
     seconds: float = 0.0
     notes: list[str] = field(default_factory=list)
 
     @property
     def survived(self) -> int:
-        return 0 if self.lost_rows or self.lost_trials else self.injected
+        return 0 if self.lost_rows or self.lost_trials or self.lost_policies else self.injected
 
 
 def strike(sweep: Sweep, rng: random.Random, times: int, blow: Callable[[], int]) -> tuple[int, list[int]]:
@@ -56,8 +63,14 @@ def judge(
     reference: Reference, sweep: Sweep, fault: str, injected: int, ended_by: str, trials: list[Trial] | None = None
 ) -> Tally:
     """Compare a sweep that has been brought to its end with trials that were left alone."""
-    rows, lost, notes = reference.compare(sweep.path, trials or sweep.trials)
+    lost, notes = reference.compare(sweep.path, trials or sweep.trials)
     left = sweep.leftovers()
     if left:
-        notes.append(f"processes of killed drivers were still there 30 s later: {', '.join(left)}")
-    return Tally(fault, injected, ended_by, rows, lost, sweep.seconds, notes)
+        notes.append(f"processes of killed drivers were still there {PATIENCE_S:.0f} s later: {', '.join(left)}")
+    tracebacks = sweep.tracebacks()
+    if tracebacks:
+        notes.append(f"{tracebacks} tracebacks on the terminal")
+    codes = ", ".join(f"{code} ({times})" for code, times in sorted(Counter(sweep.codes).items()))
+    return Tally(
+        fault, injected, ended_by, lost.rows, lost.trials, lost.policies, tracebacks, codes, sweep.seconds, notes
+    )

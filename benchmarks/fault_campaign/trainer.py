@@ -1,5 +1,6 @@
 """A trainer whose process can be shot at from the inside, and the driver of a sweep of such trials."""
 
+import errno
 import functools
 import json
 import math
@@ -39,6 +40,19 @@ class FaultyTrainer(Trainer):
                 self._crowd()
             case "nan":
                 next(self.algorithm.network.parameters()).data.fill_(math.nan)
+            case "infinite":
+                run = self.evaluator.run
+                self.evaluator.run = lambda policies: [f | {"score": math.inf} for f in run(policies)]  # type: ignore[method-assign]
+            case "exit 3":
+                sys.exit(3)
+            case "exit 0":
+                sys.exit(0)
+            case "interrupt":
+                raise KeyboardInterrupt
+            case "bug":
+                raise ValueError("made up")
+            case "broken connection":
+                raise ConnectionResetError(errno.ECONNRESET, "made up")
         row = super().run_epoch()
         match kind:
             case "torn_row":

@@ -18,7 +18,7 @@ from msk_ray.envs.contract import Contract, versions
 from msk_ray.envs.layout import Entry
 from msk_ray.envs.options import JACOBIANS
 from msk_ray.envs.randomize import Randomizer
-from msk_ray.envs.records import EnvState, Resets, Transition
+from msk_ray.envs.records import EnvState, Resets, Transition, rows_where
 from msk_ray.errors import ConfigError
 from msk_ray.group import ALONE, Group
 from msk_ray.step import Backward, Kernels, Simulation, StepState
@@ -118,9 +118,7 @@ class Env(ABC, Generic[SettingsT]):
     def solver_limits(cls, model: mujoco.MjModel, physics: PhysicsConfig) -> dict[str, int]:
         """Limits of iterations that the solver of a model by `build_model` has to keep to, by their setting."""
         own = own_limits(model)._asdict()
-        return {
-            name: limit for name, limit in own.items() if cls.keeps_iterations or getattr(physics, name) is not None
-        }
+        return {n: limit for n, limit in own.items() if cls.keeps_iterations or getattr(physics, n) is not None}
 
     @classmethod
     def reference_settings(cls, config: SettingsT) -> SettingsT:
@@ -351,7 +349,7 @@ class Env(ABC, Generic[SettingsT]):
         diverged = ~self._is_valid(after)
         if not (all_valid := known_none(diverged)):
             # `where` sends no cotangent into a diverged world's step, so its gradient cannot reach the batch.
-            after = StepState(*(_where(diverged, b.detach(), a) for b, a in zip(before, after, strict=True)))
+            after = StepState(*(rows_where(diverged, b.detach(), a) for b, a in zip(before, after, strict=True)))
         self._reached, self._diverged = after, diverged
         reached = EnvState(after, action, self.state.age + 1, self.state.numbers)
         given = versions(after, action)
@@ -448,20 +446,9 @@ class Env(ABC, Generic[SettingsT]):
         if known_none(done):
             self._next_resets()  # every step takes some, whether a world needs them or not
             return reached
-        fresh = self.reset_state()
-        return EnvState(
-            StepState(*(_where(done, f, r) for f, r in zip(fresh.physics, reached.physics, strict=True))),
-            _where(done, fresh.action, reached.action),
-            torch.where(done, fresh.age, reached.age),
-            _where(done, fresh.numbers, reached.numbers),
-        )
+        return reached.replaced(done, self.reset_state())
 
     @torch.no_grad()
     def _is_valid(self, state: StepState) -> Tensor:
         # NaN compares false, so one comparison finds both non-finite values and those out of bounds.
         return (torch.cat(state, dim=-1).abs() < _STATE_BOUND).all(-1)
-
-
-def _where(worlds: Tensor, chosen: Tensor, others: Tensor) -> Tensor:
-    """Rows (W, n) of `chosen` in the given worlds (W,), else of `others`."""
-    return torch.where(worlds[:, None], chosen, others) if others.shape[1] else others

@@ -5,6 +5,7 @@ Axes: W worlds, N episodes, O observation, A action.
 
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from msk_ray.step import StepState
@@ -25,6 +26,15 @@ class EnvState(NamedTuple):
     def detach(self) -> "EnvState":
         """The same state, cut from the graph."""
         return EnvState(StepState(*(t.detach() for t in self.physics)), self.action.detach(), self.age, self.numbers)
+
+    def replaced(self, worlds: Tensor, fresh: "EnvState") -> "EnvState":
+        """The same state, but in the given worlds (W,) that of `fresh`."""
+        return EnvState(
+            StepState(*(rows_where(worlds, f, own) for f, own in zip(fresh.physics, self.physics, strict=True))),
+            rows_where(worlds, fresh.action, self.action),
+            torch.where(worlds, fresh.age, self.age),
+            rows_where(worlds, fresh.numbers, self.numbers),
+        )
 
 
 class Resets(NamedTuple):
@@ -52,3 +62,8 @@ class Transition(NamedTuple):
     """The time limit cut the episode: the value of later steps still counts, shape (W,) bool."""
     diverged: Tensor
     """The physics exceeded all bounds, shape (W,) bool; included in `terminated`."""
+
+
+def rows_where(worlds: Tensor, chosen: Tensor, others: Tensor) -> Tensor:
+    """Rows (W, n) of `chosen` in the given worlds (W,), else of `others`."""
+    return torch.where(worlds[:, None], chosen, others) if others.shape[1] else others

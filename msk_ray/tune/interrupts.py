@@ -85,12 +85,14 @@ def end_ray(folder: SessionFolder | None, lost: bool = False, keep: bool = False
             if stop is not None:
                 stop.install()  # Ray's end takes SIGTERM's handler away, in the kernel where Python does not see it
             if folder is not None and not ray.is_initialized():
-                folder.end_processes(keep)
+                folder.end_processes()
     finally:
         if folder is not None:
-            folder.end_processes(keep)
+            folder.end_processes()
         if thread.ident is not None:
             thread.join(_LAST_POLL_S)
+        if folder is not None:
+            folder.close(keep)  # until then, Ray's end still writes into it
         if lost or thread.is_alive():
             cli.end_at_once()
         if stop is not None:

@@ -68,7 +68,11 @@ class SessionFolder:
         """Where Ray keeps its logs."""
         return self.path / "ray" / "session_latest" / "logs"
 
-    def end_processes(self, keep: bool = False) -> None:
+    def end_processes(self) -> None:
+        """End the processes that belong to this folder, except this one."""
+        cleanup.end_processes(self.path, {os.getpid(), self._cleanup.pid})
+
+    def close(self, keep: bool = False) -> None:
         """End the processes that belong to this folder, and remove it; does nothing the second time.
 
         Args:
@@ -87,7 +91,7 @@ class SessionFolder:
             self._cleanup.kill()
             code = self._cleanup.wait()
         if code:
-            cleanup.end_processes(self.path, {os.getpid()})
+            self.end_processes()
             if not keep:
                 shutil.rmtree(self.path, ignore_errors=True)
         if self._before is None:

@@ -1,6 +1,6 @@
 """Whatever lies where a record should be, every command answers in one line, soon, and shows what is whole.
 
-The consequences are those of the table "Damaged and hostile records" in docs/faults.md.
+The consequences are those of the table "Damaged and hostile records" in docs/runner/faults.md.
 """
 
 import contextlib
@@ -126,7 +126,7 @@ def without_ray(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def codes(record: str, damage: str) -> dict[str, int]:
-    """The exit code of each command, as the table in docs/faults.md has it."""
+    """The exit code of each command, as the table in docs/runner/faults.md has it."""
     refused = {layout.MANIFEST_FILE: ("status", "tune"), LOCK_FILE: ("tune",)}.get(record, ())
     if record == layout.METRICS_FILE and damage in IRREGULAR:
         refused = ("tune",)

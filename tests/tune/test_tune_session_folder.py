@@ -1,9 +1,7 @@
 """The folder of a Ray of our own: closed to other users of the machine, and gone afterwards."""
 
-import json
 import os
 import signal
-import socket
 import stat
 import subprocess
 import sys
@@ -12,14 +10,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from fault_campaign.other_user import as_another_user, attempts
 from fault_campaign.processes import name_of
 from processes import Launcher, members_of, wait_until
 
 from msk_ray.errors import StorageError
 from msk_ray.tune.session_folder import LINK, SessionFolder
 
-OTHER = 65534
-"""Another user of the machine (nobody)."""
 SESSION = """
 import os, sys
 import ray
@@ -70,50 +67,6 @@ def session(top: Path, home: Path, root: Path, launcher: Launcher) -> "subproces
         assert line, "".join(seen)
         seen.append(line)
     return process
-
-
-def as_another_user(work: Callable[[], list[str]]) -> list[str]:
-    """What a function returns when another user of the machine calls it, in a process of its own."""
-    reader, writer = os.pipe()
-    child = os.fork()
-    if child == 0:
-        try:
-            os.setgroups([])
-            os.setgid(OTHER)
-            os.setuid(OTHER)
-            os.write(writer, json.dumps(work()).encode())
-        finally:
-            os._exit(0)
-    os.close(writer)
-    with os.fdopen(reader) as file:
-        told: list[str] = json.loads(file.read())
-    os.waitpid(child, 0)
-    return told
-
-
-def attempts(paths: list[Path], victim: Path) -> list[str]:
-    """What this user can do with files and folders of another one."""
-    done = []
-    for path in paths:
-        trials: dict[str, Callable[[], object]] = {
-            "renamed": lambda path=path: path.rename(path.with_name(f"{path.name}.mine")),
-            "removed": lambda path=path: path.unlink(),
-        }
-        if os.path.isdir(path):
-            trials |= {
-                "listed": lambda path=path: os.listdir(path),
-                "planted in": lambda path=path: (path / "planted").symlink_to(victim),
-            }
-        trials["read"] = lambda path=path: os.open(path, os.O_RDONLY)
-        trials["written"] = lambda path=path: os.open(path, os.O_WRONLY)
-        trials["connected to"] = lambda path=path: socket.socket(socket.AF_UNIX).connect(str(path))
-        for name, trial in trials.items():
-            try:
-                trial()
-            except OSError:
-                continue
-            done.append(f"{name}: {path}")
-    return done
 
 
 @pytest.mark.long
@@ -175,8 +128,8 @@ def test_what_was_killed_together_with_its_keeper_is_removed_by_the_next_one(
     os.killpg(session.pid, signal.SIGKILL)
     session.wait()
     assert left.is_dir()
-    held.end_processes()
-    SessionFolder().end_processes()
+    held.close()
+    SessionFolder().close()
     assert list(top.iterdir()) == []
     wait_until(lambda: not members_of(session.pid))
 
@@ -185,12 +138,12 @@ def test_a_folder_is_ones_own(top: Path, home: Path) -> None:
     folder = SessionFolder()
     assert private(folder.path)
     assert os.environ["RAY_TMPDIR"] == str(folder.path)
-    folder.end_processes()
+    folder.close()
     assert os.environ["RAY_TMPDIR"] == str(top)
     assert not folder.path.exists()
     kept = SessionFolder()
-    kept.end_processes(keep=True)
-    kept.end_processes()
+    kept.close(keep=True)
+    kept.close()
     assert kept.path.is_dir()
     assert os.readlink(home / LINK) == str(kept.path / "ray")
 
@@ -206,7 +159,7 @@ def test_processes_of_the_folder_end_with_it_and_readers_do_not(top: Path, home:
     with log.open("w") as file:
         writer = launcher.start(sleep, env={}, stdout=file)
     wait_until(lambda: all(name_of(p.pid).startswith("python") for p in (started_with_it, reader, writer)))
-    folder.end_processes()
+    folder.close()
     assert (started_with_it.wait(), writer.wait()) == (-signal.SIGKILL, -signal.SIGKILL)
     assert reader.poll() is None
 
@@ -216,7 +169,7 @@ def test_a_cleanup_that_was_killed_is_done_here(top: Path, home: Path, launcher:
     folder._cleanup.kill()
     started_with_it = launcher.start([sys.executable, "-c", "import time; time.sleep(3600)"])
     wait_until(lambda: name_of(started_with_it.pid).startswith("python"))
-    folder.end_processes()
+    folder.close()
     assert started_with_it.wait() == -signal.SIGKILL
     assert list(top.iterdir()) == []
 
@@ -262,5 +215,5 @@ def test_a_path_too_long_for_sockets_is_refused_or_passed_over(
     monkeypatch.setenv("TMPDIR", str(place))
     folder = SessionFolder()
     assert folder.path.parent == Path("/tmp")
-    folder.end_processes()
+    folder.close()
     assert "RAY_TMPDIR" not in os.environ

@@ -194,18 +194,36 @@ def has_ended_in_order(output: str, driver: "subprocess.Popen[str]", experiment:
 
 
 def test_a_ray_that_does_not_end_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
-    ended: list[bool] = []
+    done: list[str] = []
     released = threading.Event()
     monkeypatch.setattr(interrupts, "_SHUTDOWN_LIMIT_S", 0.05)
     monkeypatch.setattr(interrupts, "_LAST_POLL_S", 0.05)
     monkeypatch.setattr(interrupts.ray, "shutdown", released.wait)
     monkeypatch.setattr(interrupts.ray, "is_initialized", lambda: True)
-    monkeypatch.setattr(interrupts.cli, "end_at_once", lambda: ended.append(True))
-    folder: Any = SimpleNamespace(end_processes=lambda keep: ended.append(keep))
+    monkeypatch.setattr(interrupts.cli, "end_at_once", lambda: done.append("left"))
+    folder: Any = SimpleNamespace(
+        end_processes=lambda: done.append("processes ended"), close=lambda keep: done.append("closed")
+    )
     with pytest.raises(ClusterLost, match="Ray did not end within"):
         interrupts.end_ray(folder)
     released.set()
-    assert ended == [False, True]
+    assert done == ["processes ended", "closed", "left"]
+
+
+def test_a_folder_is_not_removed_before_ray_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It makes a folder in there at its end, when this process counts as disconnected."""
+    done: list[str] = []
+    gone = threading.Event()
+
+    def shut_down() -> None:
+        gone.wait()  # for its daemons
+        done.append("Ray ended")
+
+    monkeypatch.setattr(interrupts.ray, "shutdown", shut_down)
+    monkeypatch.setattr(interrupts.ray, "is_initialized", lambda: False)
+    folder: Any = SimpleNamespace(end_processes=gone.set, close=lambda keep: done.append("closed"))
+    interrupts.end_ray(folder)
+    assert done == ["Ray ended", "closed"]
 
 
 def test_a_signal_while_the_report_is_written(start: Start, experiment: Experiment, tmp_path: Path) -> None:
