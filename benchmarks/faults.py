@@ -4,7 +4,7 @@ compared with undisturbed trials.
 The reference is `Trainer` in a loop, without Ray. After its faults, every sweep is completed with `--resume` (if that
 is needed). Then every trial must have finished, each row of the reference must be present exactly once with equal
 values (except timings), and the last checkpoint and the best policy must hold equal tensors. Drivers print no
-traceback, and end with the exit codes that docs/faults.md promises.
+traceback, and end with the exit codes that docs/runner/faults.md promises.
 
 Faults inside a trial's process happen once each, at a chosen epoch (`FaultyTrainer`); those from outside (driver,
 raylet, files, disk) when the trials have written a number of rows drawn from the seed.

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from msk_ray.training.loggers import Logger as Logger
     from msk_ray.training.policy import load_policy as load_policy
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 _HOMES = {
     "Algorithm": "msk_ray.algorithms",

@@ -24,7 +24,7 @@ class ExecutionConfig(Section):
     """Number of CPU threads of torch. Sums depend on it by rounding; therefore it comes from this setting, never from
     the machine. Networks of a few hundred units gain nothing from more than one."""
     deterministic: bool = False
-    """Add everything up in a fixed order, so that a GPU repeats the trial bit for bit (docs/repeat.md)."""
+    """Add everything up in a fixed order, so that a GPU repeats the trial bit for bit (docs/runner/repeat.md)."""
     solver_kernels: Literal["mujoco_warp", "fused"] = "mujoco_warp"
     """Kernels of the constraint solver. `fused` is one for all iterations of Newton's method, with a warp for each
     world: for models of up to 60 degrees of freedom."""

@@ -11,7 +11,7 @@ depends on the body, so that every pair of a geom with the floor has its own k =
 k_d·(1 cm) / D and k_f / D, and every joint its own k = k_l / (d D). A small impedance leaves little of the inertia D;
 what remains are dflex's springs and dampers, but for the damping of the approach, which here neither grows with depth
 nor ends when the point leaves. Light bodies have as much impedance as keeps their friction stable at the time step.
-`benchmarks/dflex_floor.py` scores policies under both.
+`lab/benchmarks/dflex_floor.py` scores policies under both.
 """
 
 from collections.abc import Mapping

@@ -43,7 +43,7 @@ class AntPhysics:
 
 # Masses, joints and motors of `matched` are those of the dflex ant, with which SHAC's reference results were obtained.
 # Its contacts and limits imitate dflex's, with an impedance of 0.9, which resists acceleration too; policies of one do
-# not run on the other (docs/ant.md).
+# not run on the other (lab/ant.md).
 _MATCHED = AntPhysics(
     cone="elliptic",
     solref=(0.065, 1.0),
