@@ -41,7 +41,7 @@ def commands_of(page: Path) -> list[tuple[str, list[str]]]:
 
 
 def parser_of(name: str) -> Any:
-    module = "msk_ray.tune.options" if name == "tune" else commands.COMMANDS[name][0]
+    module = "msk_ray.tune.options" if name == "tune" else commands.commands()[name].module
     return import_module(module).parser()
 
 

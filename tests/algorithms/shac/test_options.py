@@ -98,7 +98,7 @@ def test_the_horizon_follows_contact(tmp_path: Path) -> None:
 
 
 def test_a_body_at_rest_has_a_contact_force_of_its_weight(tmp_path: Path) -> None:
-    horizon = {"start": 4, "shortest": 4, "longest": 4, "contact": 1.0}
+    horizon = {"kind": "contact", "start": 4, "shortest": 4, "longest": 4, "contact": 1.0}
     still = {"env": {"name": "cheetah", "nworld": 2, "stochastic_reset": False}, "shac.horizon": horizon}
     trainer = Trainer(
         parse_config(overlay(TINY, still | {"actor.log_std": -9.0, "shac.actor_lr": 1e-9})), tmp_path, "cpu"
