@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from msk_ray import progress
+from msk_ray.__main__ import commands
 from msk_ray.cli import run
 from msk_ray.diagnose.__main__ import main as diagnose
 from msk_ray.evaluate.__main__ import main as evaluate
@@ -23,7 +24,7 @@ PGS = """<mujoco><option solver="PGS"/><worldbody><body><joint/><geom size=".1"/
 
 def test_they_speak_before_torch_is_loaded() -> None:
     """Which takes seconds."""
-    modules = ", ".join(f"msk_ray.{name}.__main__" for name in COMMANDS)
+    modules = ", ".join(commands()[name].module for name in COMMANDS)
     code = f"import sys, {modules}; print([name for name in ('torch', 'warp', 'mujoco_warp') if name in sys.modules])"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "[]\n"
 
