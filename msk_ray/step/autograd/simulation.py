@@ -222,8 +222,8 @@ class Simulation:
                 (W, nbody, 6), held likewise.
             parameters: values of fields of the model for this step, by their name in MjModel (body_mass, opt.gravity),
                 each in the field's shape for all worlds, or with a row per world in front. Everything else is as in
-                the model; what MuJoCo has computed from it stays as it is (docs/step/parameters.md). The first step with
-                another name is recorded again.
+                the model; what MuJoCo has computed from it stays as it is (docs/step/parameters.md). The first step
+                with another name is recorded again.
 
         Returns:
             New tensors (qpos, qvel, act).
