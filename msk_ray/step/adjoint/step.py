@@ -63,7 +63,7 @@ class StepAdjoint:
     `stages` are those of the batch, mujoco_warp's own by default.
 
     Attributes:
-        work, integrator, laws, contacts, tendons: the stages' buffers and launches that parameters build on.
+        work, integrator, laws, contacts, tendons, actuators: the stages' buffers and launches that parameters build on.
         grad_qpos: cotangent of qpos in tangent coordinates, shape (W, nv).
         grad_qvel: shape (W, nv).
         grad_act: shape (W, na).
@@ -88,7 +88,8 @@ class StepAdjoint:
             self._systems = LinearSystems(work, self.integrator, self.laws)
             self._bodies = Bodies(work, self.integrator.damping)
             self.tendons = Tendons(work) if mjm.ntendon else None
-            self._forces = _forces(work, self.laws, self.contacts)
+            self.actuators = ActuatorForces(work) if work.settings.actuation else None
+            self._forces = _forces(work, self.laws, self.contacts, self.actuators)
 
     def start(self, qpos: wp.array, raw_qpos: wp.array) -> None:
         """Launch the change of a raw cotangent (W, nq) at `qpos` to tangent coordinates, and find the live worlds.
@@ -147,7 +148,9 @@ class StepAdjoint:
         self._bodies.launch_sweep(at)
 
 
-def _forces(work: Workspace, laws: ConstraintLaws, contacts: ContactForces) -> list[_Stage]:
+def _forces(
+    work: Workspace, laws: ConstraintLaws, contacts: ContactForces, actuators: ActuatorForces | None
+) -> list[_Stage]:
     """The stages that a model needs, in their order."""
     stages: list[_Stage] = []
     if np.any(np.isin(work.mjm.eq_type, _ANCHORED)):
@@ -155,8 +158,7 @@ def _forces(work: Workspace, laws: ConstraintLaws, contacts: ContactForces) -> l
     if work.tables.has_scalar_rows:
         stages.append(ScalarRows(work, laws))
     stages.append(contacts)
-    if work.settings.actuation:
-        actuators = ActuatorForces(work)
+    if actuators is not None:
         stages += [actuators, TurningTransmissions(work, actuators.bars)]
         if np.any(between_sites(work.mjm)):
             stages.append(SitePairForces(work, actuators.bars))

@@ -14,7 +14,6 @@ from mujoco_warp._src.collision_primitive_core import (
     sphere_capsule,
     sphere_sphere,
 )
-from mujoco_warp._src.constraint import _contact_kbimp as contact_kbimp
 from mujoco_warp._src.derivative import _qderiv_actuator_passive_vel as actuator_velocity_slopes
 from mujoco_warp._src.math import (
     deriv_expmap,
@@ -80,7 +79,6 @@ __all__ = [
     "actuator_velocity_slopes",
     "capsule_capsule",
     "cholesky_factorize_solve",
-    "contact_kbimp",
     "create_solver_context",
     "deriv_expmap",
     "dof_damping_total",

@@ -72,6 +72,8 @@ _FEATURES = {
     "implicit_servo": ("fast_fixed_tendon", ["opt.timestep", "tendon_damping", "actuator_gear", "actuator_biasprm"]),
     "site": ("site", ["actuator_gear"]),
     "ball_servo": ("ball_in_parent", ["actuator_gear", "actuator_biasprm"]),
+    "slider_crank": ("slider_crank", ["actuator_gainprm", "actuator_biasprm"]),
+    "implicit_ball_servo": ("fast_refsite", ["actuator_biasprm"]),
     "rk4_muscle": ("rk4_muscle", ["actuator_gainprm", "actuator_dynprm", "dof_damping", "body_mass"]),
     "muscle": ("muscle", ["actuator_gainprm", "actuator_biasprm", "actuator_dynprm", "actuator_gear"]),
     "tendon_servo": ("fast_site_tendon", ["actuator_gear", "actuator_gainprm", "actuator_biasprm", "dof_damping"]),

@@ -1,4 +1,16 @@
-"""Actuators: slopes of force and activation with respect to control, activation, length and velocity."""
+"""Actuators: slopes of force and activation by control, activation, length, velocity and the actuator's parameters.
+
+With m the moment, ρ(x) = m·x and κ = Σ m_i m_j μ_i â_j over the pairs of dofs that M couples,
+
+    Φ ∋ -ρ(λ) F(len, ρ(v), act, ctrl) - h κ ∂F/∂v (with implicit integration) ,  act' = act + h · rate(act, ctrl)
+    F = gain(len, v) · drive + bias(len, v)   clamped; drive is the clamped control, act or act'.
+
+`actuator_score` is that law, act' included, and Warp differentiates it once, in `pull_actuators`: for the state, and
+for the law's own parameters if gradients of parameters are wanted.
+"""
+
+from functools import cache
+from typing import Any
 
 import warp as wp
 from mujoco_warp import BiasType, DynType, GainType, JointType, TrnType
@@ -77,7 +89,7 @@ def actuator_force(law: ActuatorLaw, drive: wp.float32, length: wp.float32, velo
 def force_velocity_slope(
     law: ActuatorLaw, ctrl: wp.float32, drive: wp.float32, length: wp.float32, velocity: wp.float32
 ) -> wp.float32:
-    """dF/d(velocity) as mujoco_warp's implicit integrators take it: a stateless actuator's control is not clamped."""
+    """∂F/∂v as mujoco_warp's implicit integrators take it: a stateless actuator's control is not clamped."""
     gain = wp.float32(0.0)
     if law.gaintype == GainType.AFFINE:
         gain = law.gainprm[2]
@@ -108,7 +120,7 @@ def actuator_score(
     force_weight: wp.float32,
     slope_weight: wp.float32,
 ) -> wp.float32:
-    """act_weight·act' + force_weight·F + slope_weight·dF/dv, whose slopes are the pullback of one actuator."""
+    """act_weight·act' + force_weight·F + slope_weight·∂F/∂v, whose slopes are the pullback of one actuator."""
     command = ctrl
     if law.clamp_ctrl == 1:
         command = wp.clamp(ctrl, law.ctrlrange[0], law.ctrlrange[1])
@@ -219,151 +231,239 @@ def is_held(worldid: int, dof: int, actuators: ActuatorSettings, drive_in: Drive
 
 @wp.struct
 class ActuatorBars:
-    """∂Φ/∂(length), and ∂Φ/∂(m·λ, m·v, m·μ, m·â), (W, U)."""
+    """What an actuator gives Φ, (W, U)."""
 
     length: wp.array2d[float]
+    """∂Φ/∂len."""
     rate: wp.array2d[wp.vec4]
+    """∂Φ/∂(ρ(λ), ρ(v), ρ(μ), ρ(â))."""
+    implicit: wp.array2d[float]
+    """h κ ∂F/∂v."""
 
 
-@wp.kernel
-def pull_actuators(
-    lanes: int,
-    count: int,
-    # Model:
-    opt_timestep: wp.array[float],
-    clampctrl: bool,
-    clampact: bool,
+@wp.struct
+class ActuatorLawBars:
+    """-∂Φ by what the law of one actuator has of its own, (W, U); of no size unless they are wanted."""
+
+    gainprm: wp.array2d[vec10]
+    biasprm: wp.array2d[vec10]
+    dynprm: wp.array2d[vec10]
+    timestep: wp.array2d[float]
+
+
+@wp.struct
+class ActuatorRates:
+    """Rates of an actuator's length under plain fields; λ does not move a joint at its force limit."""
+
+    lam: float
+    qvel: float
+    mu: float
+    smooth: float
+    """Under â."""
+    kappa: float
+    """κ."""
+
+
+@wp.func
+def rates_of(
+    worldid: int,
+    start: int,
+    end: int,
     implicit_all: bool,
     implicit_address: wp.array2d[int],
     actuators: ActuatorSettings,
-    # In:
-    live_in: wp.array[int],
     drive_in: Drive,
     state_in: State,
     multipliers_in: Multipliers,
-    # Out:
-    grad_act_out: wp.array2d[float],
-    grad_ctrl_out: wp.array2d[float],
+) -> ActuatorRates:
+    """Rates of the actuator whose moment is in the places from `start` to `end`.
+
+    Those under μ and â, and κ, count entries that `implicit_address` has, with implicit integration alone.
+    """
+    out = ActuatorRates()
+    for k in range(start, end):
+        i = drive_in.moment_colind[worldid, k]
+        lever = drive_in.actuator_moment[worldid, k]
+        out.qvel += lever * state_in.qvel[worldid, i]
+        if not is_held(worldid, i, actuators, drive_in):
+            out.lam += lever * multipliers_in.lam[worldid, i]
+        if implicit_all and implicit_address[i, i] >= 0:
+            out.mu += lever * multipliers_in.mu[worldid, i]
+            out.smooth += lever * (state_in.qacc[worldid, i] - multipliers_in.excess[worldid, i])
+            for m in range(start, end):
+                j = drive_in.moment_colind[worldid, m]
+                if implicit_address[wp.max(i, j), wp.min(i, j)] >= 0:
+                    smooth = state_in.qacc[worldid, j] - multipliers_in.excess[worldid, j]
+                    pair = lever * drive_in.actuator_moment[worldid, m]
+                    out.kappa += pair * multipliers_in.mu[worldid, i] * smooth
+    return out
+
+
+@wp.func
+def is_straight(uid: int, actuators: ActuatorSettings) -> bool:
+    """Whether the length is the integral of the moment, as for hinges and slides; `transmission` does the others."""
+    kind = actuators.actuator_trntype[uid]
+    straight = bool(False)
+    if kind == TrnType.JOINT or kind == TrnType.JOINTINPARENT:
+        joint = actuators.jnt_type[actuators.actuator_trnid[uid][0]]
+        straight = joint == JointType.HINGE or joint == JointType.SLIDE
+    return straight
+
+
+@wp.func
+def add_to_transmission(
+    worldid: int,
+    uid: int,
+    start: int,
+    end: int,
+    length_bar: float,
+    rate_bar: wp.vec4,
+    implicit_all: bool,
+    actuators: ActuatorSettings,
+    drive_in: Drive,
     slopes_out: DofSlopes,
     tendon_bars_out: TendonBars,
-    actuator_bars_out: ActuatorBars,
 ) -> None:
-    """Φ ∋ -(m·λ) F(len, m·v, act, ctrl) - h κ dF/dv and ḡ·act': gradients of ctrl and act, and those of len and rates.
-
-    With implicit integration κ = Σ m_i m_j μ_i â_j over the pairs that `implicit_address` has. A tendon's cotangents
-    go to its tendon. For other transmissions whose moment m turns with q, `rate_bar` keeps ∂Φ/∂(m·λ, m·v, m·μ, m·â).
-    `lanes` threads take all `count` actuators of a world in turn.
-    """
-    worldid, lane = wp.tid()
-    for uid in range(lane, count, lanes):
-        timestep = opt_timestep[worldid % opt_timestep.shape[0]]
-        law = actuator_law(worldid, uid, timestep, clampctrl, clampact, actuators)
-        ctrl = float(0.0)
-        source = actuators.actuator_ctrladr[uid]
-        if actuators.actuator_ctrlnum[uid] > 0:
-            ctrl = drive_in.ctrl[worldid, source]
-        act = float(0.0)
-        act_weight = float(0.0)
-        slot = actuators.actuator_actadr[uid] + actuators.actuator_actnum[uid] - 1
-        if law.dyntype != DynType.NONE:
-            act = drive_in.act[worldid, slot]
-            act_weight = grad_act_out[worldid, slot]
-
-        start = drive_in.moment_rowadr[worldid, uid]
-        end = start + drive_in.moment_rownnz[worldid, uid]
-        rate = float(0.0)
-        velocity = float(0.0)
-        for k in range(start, end):
-            dof = drive_in.moment_colind[worldid, k]
-            velocity += drive_in.actuator_moment[worldid, k] * state_in.qvel[worldid, dof]
-            if not is_held(worldid, dof, actuators, drive_in):
-                rate += drive_in.actuator_moment[worldid, k] * multipliers_in.lam[worldid, dof]
-
-        law.implicit = 0
-        h = law.timestep
-        kappa = float(0.0)
-        rate_mu = float(0.0)
-        rate_smooth = float(0.0)
+    """Adds an actuator's cotangents to its tendon or its dofs; those of sites are left to `transmission`."""
+    kind = actuators.actuator_trntype[uid]
+    if kind == TrnType.SITE or kind == TrnType.SLIDERCRANK:
+        return
+    if kind == TrnType.TENDON:
+        t = actuators.actuator_trnid[uid][0]
+        gear = actuators.actuator_gear[worldid % actuators.actuator_gear.shape[0], uid][0]
+        wp.atomic_add(tendon_bars_out.length, worldid, t, gear * length_bar)
+        wp.atomic_add(tendon_bars_out.qvel, worldid, t, gear * rate_bar[1])
+        wp.atomic_add(tendon_bars_out.lam, worldid, t, gear * rate_bar[0])
         if implicit_all:
-            law.implicit = 1
-            for k in range(start, end):
-                i = drive_in.moment_colind[worldid, k]
-                if implicit_address[i, i] < 0:
-                    continue
-                rate_mu += drive_in.actuator_moment[worldid, k] * multipliers_in.mu[worldid, i]
-                rate_smooth += drive_in.actuator_moment[worldid, k] * (
-                    state_in.qacc[worldid, i] - multipliers_in.excess[worldid, i]
-                )
-                for m in range(start, end):
-                    j = drive_in.moment_colind[worldid, m]
-                    if implicit_address[wp.max(i, j), wp.min(i, j)] >= 0:
-                        smooth = state_in.qacc[worldid, j] - multipliers_in.excess[worldid, j]
-                        kappa += (
-                            drive_in.actuator_moment[worldid, k]
-                            * drive_in.actuator_moment[worldid, m]
-                            * multipliers_in.mu[worldid, i]
-                            * smooth
-                        )
+            wp.atomic_add(tendon_bars_out.mu, worldid, t, gear * rate_bar[2])
+            wp.atomic_add(tendon_bars_out.smooth, worldid, t, gear * rate_bar[3])
+        return
+    straight = is_straight(uid, actuators)
+    for k in range(start, end):
+        dof = drive_in.moment_colind[worldid, k]
+        wp.atomic_add(slopes_out.qvel, worldid, dof, rate_bar[1] * drive_in.actuator_moment[worldid, k])
+        if straight:
+            wp.atomic_add(slopes_out.qpos, worldid, dof, length_bar * drive_in.actuator_moment[worldid, k])
 
-        length = drive_in.actuator_length[worldid, uid]
-        _l, ctrl_slope, act_slope, length_slope, velocity_slope, _a, force, slope = wp.grad(actuator_score)(
-            law, ctrl, act, length, velocity, act_weight, rate, h * kappa
-        )
+
+@cache
+def pull_actuators_kernel(keeps_law: bool) -> Any:
+    """The kernel that also leaves `ActuatorLawBars`, or the one that pays nothing for them."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def pull_actuators(
+        lanes: int,
+        count: int,
+        # Model:
+        opt_timestep: wp.array[float],
+        clampctrl: bool,
+        clampact: bool,
+        implicit_all: bool,
+        implicit_address: wp.array2d[int],
+        actuators: ActuatorSettings,
+        # In:
+        live_in: wp.array[int],
+        drive_in: Drive,
+        state_in: State,
+        multipliers_in: Multipliers,
+        # Out:
+        grad_act_out: wp.array2d[float],
+        grad_ctrl_out: wp.array2d[float],
+        slopes_out: DofSlopes,
+        tendon_bars_out: TendonBars,
+        bars_out: ActuatorBars,
+        law_bars_out: ActuatorLawBars,
+    ) -> None:
+        """Gradients of ctrl and act, and cotangents of length and rates; `lanes` threads take all `count` actuators."""
+        worldid, lane = wp.tid()
         live = live_in[worldid] != 0
-        if law.dyntype != DynType.NONE:
-            grad_act_out[worldid, slot] = wp.where(live, act_slope, 0.0)
-        if live and actuators.actuator_ctrlnum[uid] > 0:
-            grad_ctrl_out[worldid, source] += ctrl_slope
-        actuator_bars_out.length[worldid, uid] = -length_slope
-        # ∂Φ/∂(m·λ) = -F ,  ∂Φ/∂(m·μ) = -h F' m·â ,  ∂Φ/∂(m·â) = -h F' m·μ
-        rate_bar = wp.vec4(-force, -velocity_slope, -h * slope * rate_smooth, -h * slope * rate_mu)
-        if not implicit_all:
-            rate_bar[2] = 0.0
-            rate_bar[3] = 0.0
-        actuator_bars_out.rate[worldid, uid] = rate_bar
-        kind = actuators.actuator_trntype[uid]
-        if kind == TrnType.TENDON:
-            t = actuators.actuator_trnid[uid][0]
-            gear = actuators.actuator_gear[worldid % actuators.actuator_gear.shape[0], uid][0]
-            wp.atomic_add(tendon_bars_out.length, worldid, t, -gear * length_slope)
-            wp.atomic_add(tendon_bars_out.qvel, worldid, t, gear * rate_bar[1])
-            wp.atomic_add(tendon_bars_out.lam, worldid, t, gear * rate_bar[0])
-            if implicit_all:
-                wp.atomic_add(tendon_bars_out.mu, worldid, t, gear * rate_bar[2])
-                wp.atomic_add(tendon_bars_out.smooth, worldid, t, gear * rate_bar[3])
-            continue
-        if kind == TrnType.SITE or kind == TrnType.SLIDERCRANK:
-            continue
-        # Length is the integral of the moment for hinges and slides; where it is not, `transmission` does it.
-        straight = bool(False)
-        if kind == TrnType.JOINT or kind == TrnType.JOINTINPARENT:
-            joint = actuators.jnt_type[actuators.actuator_trnid[uid][0]]
-            straight = joint == JointType.HINGE or joint == JointType.SLIDE
-        for k in range(start, end):
-            dof = drive_in.moment_colind[worldid, k]
-            wp.atomic_add(slopes_out.qvel, worldid, dof, rate_bar[1] * drive_in.actuator_moment[worldid, k])
-            if straight:
-                wp.atomic_add(slopes_out.qpos, worldid, dof, -length_slope * drive_in.actuator_moment[worldid, k])
+        h = opt_timestep[worldid % opt_timestep.shape[0]]
+        for uid in range(lane, count, lanes):
+            law = actuator_law(worldid, uid, h, clampctrl, clampact, actuators)
+            law.implicit = int(implicit_all)
+            ctrl = float(0.0)
+            source = actuators.actuator_ctrladr[uid]
+            if actuators.actuator_ctrlnum[uid] > 0:
+                ctrl = drive_in.ctrl[worldid, source]
+            act = float(0.0)
+            act_weight = float(0.0)
+            slot = actuators.actuator_actadr[uid] + actuators.actuator_actnum[uid] - 1
+            if law.dyntype != DynType.NONE:
+                act = drive_in.act[worldid, slot]
+                act_weight = grad_act_out[worldid, slot]
+            start = drive_in.moment_rowadr[worldid, uid]
+            end = start + drive_in.moment_rownnz[worldid, uid]
+            rates = rates_of(
+                worldid, start, end, implicit_all, implicit_address, actuators, drive_in, state_in, multipliers_in
+            )
+            length = drive_in.actuator_length[worldid, uid]
+
+            # The score is -Φ and act': force and slope are its derivatives by the weights ρ(λ) and h κ.
+            law_bar, ctrl_bar, act_bar, length_slope, velocity_slope, _act, force, slope = wp.grad(actuator_score)(
+                law, ctrl, act, length, rates.qvel, act_weight, rates.lam, h * rates.kappa
+            )
+            if law.dyntype != DynType.NONE:
+                grad_act_out[worldid, slot] = wp.where(live, act_bar, 0.0)
+            if live and actuators.actuator_ctrlnum[uid] > 0:
+                grad_ctrl_out[worldid, source] += ctrl_bar
+            # ∂Φ/∂ρ(λ) = -F ,  ∂Φ/∂ρ(μ) = -h F' ρ(â) ,  ∂Φ/∂ρ(â) = -h F' ρ(μ)
+            rate_bar = wp.vec4(-force, -velocity_slope, -h * slope * rates.smooth, -h * slope * rates.mu)
+            if not implicit_all:
+                rate_bar[2] = 0.0
+                rate_bar[3] = 0.0
+            bars_out.length[worldid, uid] = -length_slope
+            bars_out.rate[worldid, uid] = rate_bar
+            bars_out.implicit[worldid, uid] = h * slope * rates.kappa
+            if wp.static(keeps_law):
+                law_bars_out.gainprm[worldid, uid] = law_bar.gainprm
+                law_bars_out.biasprm[worldid, uid] = law_bar.biasprm
+                law_bars_out.dynprm[worldid, uid] = law_bar.dynprm
+                law_bars_out.timestep[worldid, uid] = law_bar.timestep
+            add_to_transmission(
+                worldid,
+                uid,
+                start,
+                end,
+                -length_slope,
+                rate_bar,
+                implicit_all,
+                actuators,
+                drive_in,
+                slopes_out,
+                tendon_bars_out,
+            )
+
+    return pull_actuators
 
 
 class ActuatorForces:
     """Launches of what actuators give ∂Φ, and of the gradients of controls and activations.
 
     Attributes:
-        bars: what `transmission` takes on.
+        settings: their parameters.
+        bars: what `transmission` and the gradient of gears take on.
+        law_bars: what the gradients of gain, bias and activation take on, once `keep_law` has been called.
     """
 
     def __init__(self, work: Workspace) -> None:
         self._work = work
-        self._settings = gather(ActuatorSettings, work.model)
+        self.settings = gather(ActuatorSettings, work.model)
         self.bars = allocate(ActuatorBars, work.nworld, work.model.nactuator)
+        self.law_bars = allocate(ActuatorLawBars, 0, 0)
+        self._keeps_law = False
         self._lanes = work.lanes(work.model.nactuator, meet=not motors_apart(work.mjm))
+
+    def keep_law(self) -> None:
+        """Let launches recorded from now on write `law_bars`."""
+        if not self._keeps_law:
+            self._keeps_law = True
+            self.law_bars = allocate(ActuatorLawBars, self._work.nworld, self._work.model.nactuator)
 
     def launch(self, at: Substep) -> None:
         """Launch the pullback of all actuators."""
         work, m, settings = self._work, self._work.model, self._work.settings
         wp.launch(
-            pull_actuators,
+            pull_actuators_kernel(self._keeps_law),
             dim=(work.nworld, self._lanes),
             inputs=[
                 self._lanes,
@@ -373,11 +473,11 @@ class ActuatorForces:
                 settings.clampact,
                 settings.implicit_all,
                 work.tables.implicit_address,
-                self._settings,
+                self.settings,
                 work.live,
                 gather(Drive, at.data),
                 at.state,
                 work.multipliers,
             ],
-            outputs=[work.grad_act, work.grad_ctrl, work.slopes, work.tendon_bars, self.bars],
+            outputs=[work.grad_act, work.grad_ctrl, work.slopes, work.tendon_bars, self.bars, self.law_bars],
         )

@@ -21,13 +21,15 @@ from msk_ray.step.adjoint.groups import (
     allocate,
     gather,
 )
+from msk_ray.step.adjoint.laws.cones import cone_law, cone_slope, vec6
 from msk_ray.step.adjoint.laws.contact_geometry.contact_order import contacts_end
 from msk_ray.step.adjoint.laws.contact_geometry.convex import ConvexContacts
 from msk_ray.step.adjoint.laws.contact_geometry.primitive_laws import CONVEX_PAIRS
 from msk_ray.step.adjoint.laws.contact_geometry.primitives import PairKinds, pull_geometry_kernel
-from msk_ray.step.adjoint.laws.rows import cone_law, cone_slope, row_slopes, vec6
+from msk_ray.step.adjoint.laws.impedance import row_slopes, stiffness_damping
 from msk_ray.step.adjoint.spatial import carried, point_velocity, wrench
 from msk_ray.step.adjoint.workspace import Workspace
+from msk_ray.step.forward.cone_law import SATISFIED
 from msk_ray.step.forward.mjw_private import ConstraintType
 
 wp.set_module_options({"enable_backward": False})
@@ -58,6 +60,47 @@ def frame_weight(frame: wp.mat33, weight: vec6, slide: wp.vec3, spin: wp.vec3) -
     for k in range(3):
         out[k] = weight[k] * slide + weight[k + 3] * spin
     return out
+
+
+@wp.struct
+class RelativeRates:
+    """Velocity of the second body past the first at the contact point, and its spin against it, under plain fields."""
+
+    lam_slide: wp.vec3
+    acc_slide: wp.vec3
+    vel_slide: wp.vec3
+    lam_spin: wp.vec3
+    acc_spin: wp.vec3
+    vel_spin: wp.vec3
+
+
+@wp.func
+def relative_rates(
+    worldid: int, body1: int, body2: int, arm1: wp.vec3, arm2: wp.vec3, motion_in: Motion, fields_in: Fields
+) -> RelativeRates:
+    """Those of two bodies at a point with these arms about the centres of mass of their trees."""
+    lam1 = fields_in.lam[worldid, body1]
+    lam2 = fields_in.lam[worldid, body2]
+    acc1 = fields_in.qacc[worldid, body1]
+    acc2 = fields_in.qacc[worldid, body2]
+    vel1 = motion_in.cvel[worldid, body1]
+    vel2 = motion_in.cvel[worldid, body2]
+    out = RelativeRates()
+    out.lam_slide = point_velocity(lam2, arm2) - point_velocity(lam1, arm1)
+    out.acc_slide = point_velocity(acc2, arm2) - point_velocity(acc1, arm1)
+    out.vel_slide = point_velocity(vel2, arm2) - point_velocity(vel1, arm1)
+    out.lam_spin = wp.spatial_top(lam2) - wp.spatial_top(lam1)
+    out.acc_spin = wp.spatial_top(acc2) - wp.spatial_top(acc1)
+    out.vel_spin = wp.spatial_top(vel2) - wp.spatial_top(vel1)
+    return out
+
+
+@wp.func
+def row_count(dim: int, elliptic: bool) -> int:
+    """Rows of a contact: one an axis, or two edges of the pyramid for each axis but the normal."""
+    if elliptic or dim == 1:
+        return dim
+    return 2 * (dim - 1)
 
 
 @wp.kernel
@@ -91,9 +134,7 @@ def pull_contacts(
         worldid = contacts_in.worldid[con]
         dim = contacts_in.dim[con]
         elliptic = rows_in.type[worldid, first] == ConstraintType.CONTACT_ELLIPTIC
-        count = dim
-        if not elliptic and dim > 1:
-            count = 2 * (dim - 1)
+        count = row_count(dim, elliptic)
         if contacts_in.efc_address[con, count - 1] < 0:
             continue
         friction = contacts_in.friction[con]
@@ -109,7 +150,7 @@ def pull_contacts(
                 mass[i] = rows_in.D[worldid, first + i]
         cone = cone_law(jar, mass, friction, mu, dim)
         if elliptic:
-            active = cone.zone != 0
+            active = cone.zone != SATISFIED
         else:
             for i in range(count):
                 active = active or laws_in.slope[worldid, first + i] != 0.0
@@ -123,19 +164,8 @@ def pull_contacts(
         frame = contacts_in.frame[con]
         arm1 = point - motion_in.subtree_com[worldid, shapes.body_rootid[body1]]
         arm2 = point - motion_in.subtree_com[worldid, shapes.body_rootid[body2]]
-        lam1 = fields_in.lam[worldid, body1]
-        lam2 = fields_in.lam[worldid, body2]
-        acc1 = fields_in.qacc[worldid, body1]
-        acc2 = fields_in.qacc[worldid, body2]
-        vel1 = motion_in.cvel[worldid, body1]
-        vel2 = motion_in.cvel[worldid, body2]
-        lam_slide = point_velocity(lam2, arm2) - point_velocity(lam1, arm1)
-        acc_slide = point_velocity(acc2, arm2) - point_velocity(acc1, arm1)
-        vel_slide = point_velocity(vel2, arm2) - point_velocity(vel1, arm1)
-        lam_spin = wp.spatial_top(lam2) - wp.spatial_top(lam1)
-        acc_spin = wp.spatial_top(acc2) - wp.spatial_top(acc1)
-        vel_spin = wp.spatial_top(vel2) - wp.spatial_top(vel1)
-        rate = components(frame, lam_slide, lam_spin, dim)
+        rates = relative_rates(worldid, body1, body2, arm1, arm2, motion_in, fields_in)
+        rate = components(frame, rates.lam_slide, rates.lam_spin, dim)
 
         timestep = opt_timestep[worldid % opt_timestep.shape[0]]
         pos = contacts_in.dist[con] - contacts_in.includemargin[con]
@@ -150,14 +180,14 @@ def pull_contacts(
             sideways = contacts_in.solreffriction[con]
             if sideways[0] == 0.0 and sideways[1] == 0.0:
                 sideways = solref
-            side_row = row_slopes(opt_disableflags, timestep, sideways, solimp, pos)
+            side_damping = stiffness_damping(opt_disableflags, timestep, sideways, solimp[1])[1]
             # ∂Φ/∂jar = S ρ(λ) =: y ,  jar = ρ(a) + b ρ(v) + k imp pos (normal row only)
             y = cone_slope(cone, mass, friction, dim, rate)
             work = float(0.0)
             for i in range(dim):
                 lam_bar[i] = -cone.force[i]
                 acc_bar[i] = y[i]
-                vel_bar[i] = wp.where(i == 0, normal_row.damping, side_row.damping) * y[i]
+                vel_bar[i] = wp.where(i == 0, normal_row.damping, side_damping) * y[i]
                 work += rate[i] * cone.force[i]
             # f is of degree one in D, whose ratios are fixed: ∂Φ/∂pos ∋ -ρ(λ)·f d(log D)
             dist_bar = normal_row.stiffness * y[0] - normal_row.mass * work
@@ -194,28 +224,27 @@ def pull_contacts(
         contact_bars_out.dist[con] = dist_bar
         # ρ moves with the point as ω × dp  ⇒  p̄ = Σ_x ū(x) × ω(x)
         contact_bars_out.pos[con] = (
-            wp.cross(lam_force, lam_spin) + wp.cross(acc_force, acc_spin) + wp.cross(vel_force, vel_spin)
+            wp.cross(lam_force, rates.lam_spin)
+            + wp.cross(acc_force, rates.acc_spin)
+            + wp.cross(vel_force, rates.vel_spin)
         )
         contact_bars_out.frame[con] = (
-            frame_weight(frame, lam_bar, lam_slide, lam_spin)
-            + frame_weight(frame, acc_bar, acc_slide, acc_spin)
-            + frame_weight(frame, vel_bar, vel_slide, vel_spin)
+            frame_weight(frame, lam_bar, rates.lam_slide, rates.lam_spin)
+            + frame_weight(frame, acc_bar, rates.acc_slide, rates.acc_spin)
+            + frame_weight(frame, vel_bar, rates.vel_slide, rates.vel_spin)
         )
         for side in range(2):
             body = body1
             arm = arm1
             sign = float(-1.0)
-            lam = lam1
-            acc = acc1
-            vel = vel1
             if side == 1:
                 body = body2
                 arm = arm2
                 sign = float(1.0)
-                lam = lam2
-                acc = acc2
-                vel = vel2
             if body > 0:
+                lam = fields_in.lam[worldid, body]
+                acc = fields_in.qacc[worldid, body]
+                vel = motion_in.cvel[worldid, body]
                 lam_wrench = sign * wrench(lam_force, lam_torque, arm)
                 acc_wrench = sign * wrench(acc_force, acc_torque, arm)
                 vel_wrench = sign * wrench(vel_force, vel_torque, arm)

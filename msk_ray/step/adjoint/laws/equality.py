@@ -11,7 +11,7 @@ import warp as wp
 from mujoco_warp import ObjType
 
 from msk_ray.step.adjoint.groups import FieldBars, Fields, Motion, RowLaws, Rows, Substep, gather
-from msk_ray.step.adjoint.laws.rows import row_slopes
+from msk_ray.step.adjoint.laws.impedance import row_slopes
 from msk_ray.step.adjoint.spatial import carried, point_velocity, wrench
 from msk_ray.step.adjoint.workspace import Workspace
 from msk_ray.step.forward.mjw_private import ConstraintType, EqType, vec5, vec12

@@ -1,15 +1,16 @@
-"""Constraint rows at the known acceleration: their laws f(J a - aref), and slopes of impedance with position.
+"""Constraint rows at the known acceleration: their laws f(J a - aref).
 
 Row laws (design of MuJoCo's solver): limits, frictionless and pyramidal rows f = -D·jar where jar < 0; equality
-f = -D·jar; friction loss the same, clamped. Elliptic contacts couple their rows through N = μ jar₀ and
-T = |φᵢ jarᵢ| and are finished in `contacts`.
+f = -D·jar; friction loss the same, clamped. Elliptic contacts couple their rows (`cones`) and are finished in
+`contacts`.
 """
 
 import warp as wp
 
 from msk_ray.step.adjoint.groups import Contacts, RowLaws, Rows, Substep
+from msk_ray.step.adjoint.laws.cones import cone_law, cone_slope, vec6
 from msk_ray.step.adjoint.workspace import Workspace
-from msk_ray.step.forward.mjw_private import ConstraintType, contact_kbimp, vec5
+from msk_ray.step.forward.mjw_private import ConstraintType
 
 wp.set_module_options({"enable_backward": False})
 
@@ -18,58 +19,6 @@ _SLOTS = 32
 _LANES = 2
 """Threads of a GPU that share a row of S J, each of which works out the law of the row's contact. A thread for each
 entry of the whole buffer took 150 µs for 4096 ants on an H200, and two for each of its rows 75."""
-
-_MINIMP = wp.constant(1.0e-4)
-_MAXIMP = wp.constant(0.9999)
-
-
-class vec6(wp.types.vector(length=6, dtype=wp.float32)):
-    """One number per contact dimension: normal, two tangents, torsion, two rolls."""
-
-
-@wp.func
-def impedance_slope(solimp: vec5, pos: float) -> float:
-    """d(impedance)/d(pos) of the piecewise power curve dmin + y(|pos|/width) (dmax - dmin)."""
-    low = wp.clamp(solimp[0], _MINIMP, _MAXIMP)
-    high = wp.clamp(solimp[1], _MINIMP, _MAXIMP)
-    width = solimp[2]
-    mid = wp.clamp(solimp[3], _MINIMP, _MAXIMP)
-    power = wp.max(1.0, solimp[4])
-    if low == high or width <= 1.0e-15:
-        return 0.0
-    x = wp.abs(pos) / width
-    if x <= 0.0 or x >= 1.0:
-        return 0.0
-    slope = float(1.0)
-    if power > 1.0:
-        if x <= mid:
-            slope = power * wp.pow(x / mid, power - 1.0)
-        else:
-            slope = power * wp.pow((1.0 - x) / (1.0 - mid), power - 1.0)
-    return wp.sign(pos) * slope * (high - low) / width
-
-
-@wp.struct
-class RowSlopes:
-    """How aref = -b·vel - k·imp·pos and D of one row answer to its position."""
-
-    damping: float  # b = -∂aref/∂vel [1/s]
-    spring: float  # k imp [1/s²]
-    stiffness: float  # -∂aref/∂pos, with the slope of imp [1/s²]
-    mass: float  # d(log D)/d(pos) [1/m]
-
-
-@wp.func
-def row_slopes(disableflags: int, timestep: float, solref: wp.vec2, solimp: vec5, pos: float) -> RowSlopes:
-    """Slopes of one row. D = imp / ((1 - imp) w)  ⇒  d(log D) = d(imp) / (imp (1 - imp))."""
-    kbi = contact_kbimp(disableflags, timestep, solref, solimp, pos, False)
-    slope = impedance_slope(solimp, pos)
-    out = RowSlopes()
-    out.damping = kbi[1]
-    out.spring = kbi[0] * kbi[2]
-    out.stiffness = kbi[0] * (kbi[2] + slope * pos)
-    out.mass = slope / (kbi[2] * (1.0 - kbi[2]))
-    return out
 
 
 @wp.kernel
@@ -134,67 +83,6 @@ def row_laws(
         laws_out.jar[worldid, row] = jar
         laws_out.force[worldid, row] = force
         laws_out.slope[worldid, row] = slope
-
-
-@wp.struct
-class Cone:
-    """Elliptic contact law at one jar: f and what S = -∂f/∂jar needs."""
-
-    zone: int  # 0 separating, 1 sticking, 2 sliding
-    force: vec6
-    tangent: vec6  # tᵢ = φᵢ² jarᵢ / T, zero at the normal
-    outer: float  # Dm: S holds Dm·g gᵀ with g = μ (1, -t)
-    inner: float  # κ: S holds κ (diag(φ²) - t tᵀ) over the tangents
-    mu: float
-
-
-@wp.func
-def cone_law(jar: vec6, mass: vec6, friction: vec5, mu: float, dim: int) -> Cone:
-    """Force of an elliptic contact. N = μ jar₀, T = |φ jar|; zones as in MuJoCo's solver."""
-    out = Cone()
-    out.mu = mu
-    normal = mu * jar[0]
-    square = float(0.0)
-    for i in range(1, dim):
-        u = friction[i - 1] * jar[i]
-        square += u * u
-    side = wp.sqrt(square)
-    if normal >= mu * side or (side <= 0.0 and normal >= 0.0):
-        out.zone = 0
-    elif mu * normal + side <= 0.0 or (side <= 0.0 and normal < 0.0):
-        out.zone = 1
-        for i in range(dim):
-            out.force[i] = -mass[i] * jar[i]
-    else:
-        out.zone = 2
-        out.outer = mass[0] / (mu * mu * (1.0 + mu * mu))
-        gap = normal - mu * side
-        # f₀ = -Dm (N - μT) μ ,  fᵢ = -f₀ φᵢ² jarᵢ / T
-        out.force[0] = -out.outer * gap * mu
-        for i in range(1, dim):
-            out.tangent[i] = friction[i - 1] * friction[i - 1] * jar[i] / side
-            out.force[i] = -out.force[0] * out.tangent[i]
-        out.inner = -out.outer * mu * gap / side
-    return out
-
-
-@wp.func
-def cone_slope(cone: Cone, mass: vec6, friction: vec5, dim: int, x: vec6) -> vec6:
-    """S x = -∂f/∂jar · x. Sliding: Dm g (g·x) + κ (φ² x - t (t·x)), g = μ (1, -t)."""
-    out = vec6()
-    if cone.zone == 1:
-        for i in range(dim):
-            out[i] = mass[i] * x[i]
-    elif cone.zone == 2:
-        along = float(0.0)
-        for i in range(1, dim):
-            along += cone.tangent[i] * x[i]
-        lead = cone.outer * cone.mu * cone.mu * (x[0] - along)
-        out[0] = lead
-        for i in range(1, dim):
-            phi = friction[i - 1]
-            out[i] = -lead * cone.tangent[i] + cone.inner * (phi * phi * x[i] - cone.tangent[i] * along)
-    return out
 
 
 @wp.func

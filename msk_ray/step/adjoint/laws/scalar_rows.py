@@ -17,7 +17,8 @@ from msk_ray.step.adjoint.groups import (
     TendonRows,
     gather,
 )
-from msk_ray.step.adjoint.laws.rows import ConstraintLaws, row_slopes
+from msk_ray.step.adjoint.laws.impedance import row_slopes
+from msk_ray.step.adjoint.laws.rows import ConstraintLaws
 from msk_ray.step.adjoint.laws.tendons import tendon_rate
 from msk_ray.step.adjoint.workspace import Workspace
 from msk_ray.step.forward.capacity import scalar_rows
@@ -96,8 +97,8 @@ class RowSettings:
 
 
 @wp.struct
-class RowSpring:
-    """Solver parameters of a row; `known` is false for rows of contacts."""
+class SolverParameters:
+    """Those of a row; `known` is false for rows of contacts."""
 
     known: bool
     solref: wp.vec2
@@ -105,9 +106,9 @@ class RowSpring:
 
 
 @wp.func
-def row_spring(worldid: int, kind: int, ident: int, settings: RowSettings) -> RowSpring:
-    """Solver parameters of the limit, friction loss or equality `ident` that makes a row."""
-    out = RowSpring()
+def solver_parameters(worldid: int, kind: int, ident: int, settings: RowSettings) -> SolverParameters:
+    """Those of the limit, friction loss or equality `ident` that makes a row."""
+    out = SolverParameters()
     out.known = True
     if kind == ConstraintType.LIMIT_JOINT:
         out.solref = settings.jnt_solref[worldid % settings.jnt_solref.shape[0], ident]
@@ -169,13 +170,13 @@ def pull_rows(
         if kind == ConstraintType.EQUALITY:
             if settings.eq_type[ident] != EqType.JOINT and settings.eq_type[ident] != EqType.TENDON:
                 continue
-        spring = row_spring(worldid, kind, ident, settings)
-        if not spring.known:
+        solver = solver_parameters(worldid, kind, ident, settings)
+        if not solver.known:
             continue
 
         pos = rows_in.pos[worldid, row] - rows_in.margin[worldid, row]
         timestep = opt_timestep[worldid % opt_timestep.shape[0]]
-        slopes = row_slopes(opt_disableflags, timestep, spring.solref, spring.solimp, pos)
+        slopes = row_slopes(opt_disableflags, timestep, solver.solref, solver.solimp, pos)
         rate = float(0.0)
         for j in range(lam_in.shape[1]):
             rate += jacobian_in[worldid, row, j] * lam_in[worldid, j]

@@ -25,6 +25,41 @@ def tendon_rate(tendons: TendonRows, t: int, jacobian: wp.array[float], x: wp.ar
     return rate
 
 
+@wp.func
+def implicit_pairs(
+    worldid: int,
+    t: int,
+    tendons: TendonRows,
+    address: wp.array2d[int],
+    ten_J_in: wp.array2d[float],
+    state_in: State,
+    multipliers_in: Multipliers,
+) -> float:
+    """κ = Σ J_i J_j μ_i â_j of one tendon, over the pairs of dofs that have an address."""
+    kappa = float(0.0)
+    start = tendons.ten_J_rowadr[t]
+    end = start + tendons.ten_J_rownnz[t]
+    for k in range(start, end):
+        i = tendons.ten_J_colind[k]
+        for m in range(start, end):
+            j = tendons.ten_J_colind[m]
+            if address[wp.max(i, j), wp.min(i, j)] >= 0:
+                smooth = state_in.qacc[worldid, j] - multipliers_in.excess[worldid, j]
+                kappa += ten_J_in[worldid, k] * ten_J_in[worldid, m] * multipliers_in.mu[worldid, i] * smooth
+    return kappa
+
+
+@wp.func
+def stretch_of(length: float, rest: wp.vec2) -> float:
+    """x: how far a tendon is out of the dead band of its spring, negative where it is shorter."""
+    x = float(0.0)
+    if length > rest[1]:
+        x = length - rest[1]
+    elif length < rest[0]:
+        x = length - rest[0]
+    return x
+
+
 @wp.struct
 class PassiveTendons:
     """Springs and dampers of tendons, the damping of actuators included."""
@@ -76,12 +111,7 @@ def start_tendons(
         rest = passive.tendon_lengthspring[worldid % passive.tendon_lengthspring.shape[0], t]
         stiffness = passive.tendon_stiffness[worldid % passive.tendon_stiffness.shape[0], t]
         poly = passive.tendon_stiffnesspoly[worldid % passive.tendon_stiffnesspoly.shape[0], t]
-        length = ten_length_in[worldid, t]
-        x = float(0.0)
-        if length > rest[1]:
-            x = length - rest[1]
-        elif length < rest[0]:
-            x = length - rest[0]
+        x = stretch_of(ten_length_in[worldid, t], rest)
         # A spring without a dead band has its stiffness at rest too.
         if x != 0.0 or rest[0] == rest[1]:
             lam_bar += x * (stiffness + poly[0] * x + poly[1] * x * x)
@@ -110,15 +140,7 @@ def start_tendons(
             held = implicit_address[tendons.ten_J_colind[start], tendons.ten_J_colind[start]] < 0
         if implicit_all and not held and (c != 0.0 or bend[0] != 0.0 or bend[1] != 0.0):
             h = opt_timestep[worldid % opt_timestep.shape[0]]
-            # κ = Σ J_i J_j μ_i â_j over the pairs that M couples
-            kappa = float(0.0)
-            for k in range(start, start + tendons.ten_J_rownnz[t]):
-                i = tendons.ten_J_colind[k]
-                for m in range(start, start + tendons.ten_J_rownnz[t]):
-                    j = tendons.ten_J_colind[m]
-                    if implicit_address[wp.max(i, j), wp.min(i, j)] >= 0:
-                        smooth = state_in.qacc[worldid, j] - multipliers_in.excess[worldid, j]
-                        kappa += ten_J_in[worldid, k] * ten_J_in[worldid, m] * multipliers_in.mu[worldid, i] * smooth
+            kappa = implicit_pairs(worldid, t, tendons, implicit_address, ten_J_in, state_in, multipliers_in)
             qvel_bar += h * kappa * wp.sign(rate_v) * (2.0 * bend[0] + 6.0 * bend[1] * speed)
             rate_mu = tendon_rate(tendons, t, ten_J_in[worldid], multipliers_in.mu[worldid])
             rate_a = tendon_rate(tendons, t, ten_J_in[worldid], state_in.qacc[worldid])

@@ -41,7 +41,7 @@ class ParameterAdjoint:
     def __init__(self, adjoint: StepAdjoint, names: Iterable[str]) -> None:
         work = adjoint.work
         fields = {name: PARAMETERS[name].field for name in names}
-        parts = Parts(work, adjoint.integrator, adjoint.laws, adjoint.contacts, adjoint.tendons)
+        parts = Parts(work, adjoint.integrator, adjoint.laws, adjoint.contacts, adjoint.tendons, adjoint.actuators)
         chosen = [s for s in STAGES if any(not set(fields.values()).isdisjoint(kind.vars) for kind in s.kinds)]
         with wp.ScopedDevice(work.device):
             kinds = dict.fromkeys(kind for stage in chosen for kind in stage.kinds)

@@ -1,13 +1,15 @@
 """Gear, gain, bias and activation parameters of actuators.
 
-What an actuator gives -Φ is the `actuator_score` of its law, whose slopes by the parameters of gain, bias and
-activation are read off; gear g enters through its length and its rates, which are linear in it.
+Slopes by the parameters of gain, bias and activation come from `laws.actuators`, which differentiates the law. The gear
+g enters through the length and its rates, which are linear in it:
+
+    ḡ = -(∂Φ/∂len · len/g + Σ_x ∂Φ/∂ρ(x) · ρ(x)/g) ,  x = λ, v, μ, â .
 """
 
 from typing import Any
 
 import warp as wp
-from mujoco_warp import DynType, JointType, TrnType
+from mujoco_warp import JointType, TrnType
 
 from msk_ray.step.adjoint.groups import (
     Fields,
@@ -20,10 +22,10 @@ from msk_ray.step.adjoint.groups import (
     gather,
 )
 from msk_ray.step.adjoint.laws.actuators import (
+    ActuatorBars,
+    ActuatorLawBars,
     ActuatorSettings,
     Drive,
-    actuator_law,
-    actuator_score,
     is_held,
 )
 from msk_ray.step.adjoint.parameters.base import ParameterStage, Parts, TimestepGradient
@@ -177,11 +179,6 @@ def gear_rates_of_site(worldid: int, site: int, levers: Levers, motion_in: Motio
 @wp.kernel
 def pull_actuator_parameters(
     # Model:
-    opt_timestep: wp.array[float],
-    clampctrl: bool,
-    clampact: bool,
-    implicit_all: bool,
-    implicit_address: wp.array2d[int],
     joints: Joints,
     tendons: TendonRows,
     actuators: ActuatorSettings,
@@ -189,7 +186,8 @@ def pull_actuator_parameters(
     count: int,
     lanes: int,
     live_in: wp.array[int],
-    act_bar_in: wp.array2d[float],
+    bars_in: ActuatorBars,
+    law_bars_in: ActuatorLawBars,
     drive_in: Drive,
     levers_in: Levers,
     state_in: State,
@@ -202,53 +200,15 @@ def pull_actuator_parameters(
     gradients_out: ActuatorGradients,
     timestep_out: TimestepGradient,
 ) -> None:
-    """-Φ ∋ (m·λ) F + h κ dF/dv, and ḡ·act': slopes by one actuator's parameters, as in `actuation.pull_actuators`."""
+    """θ̄ -= ∂Φ/∂θ: what `pull_actuators` has left of the law's own, and gears through length and rates."""
     worldid, lane = wp.tid()
     if live_in[worldid] == 0:
         return
     for uid in range(lane, count, lanes):
-        h = opt_timestep[worldid % opt_timestep.shape[0]]
-        law = actuator_law(worldid, uid, h, clampctrl, clampact, actuators)
-        ctrl = float(0.0)
-        if actuators.actuator_ctrlnum[uid] > 0:
-            ctrl = drive_in.ctrl[worldid, actuators.actuator_ctrladr[uid]]
-        act = float(0.0)
-        act_weight = float(0.0)
-        if law.dyntype != DynType.NONE:
-            slot = actuators.actuator_actadr[uid] + actuators.actuator_actnum[uid] - 1
-            act = drive_in.act[worldid, slot]
-            act_weight = act_bar_in[worldid, slot]
-
-        start = drive_in.moment_rowadr[worldid, uid]
-        end = start + drive_in.moment_rownnz[worldid, uid]
-        rate = float(0.0)
-        velocity = float(0.0)
-        rate_mu = float(0.0)
-        rate_smooth = float(0.0)
-        kappa = float(0.0)
-        for k in range(start, end):
-            i = drive_in.moment_colind[worldid, k]
-            lever = drive_in.actuator_moment[worldid, k]
-            velocity += lever * state_in.qvel[worldid, i]
-            if not is_held(worldid, i, actuators, drive_in):
-                rate += lever * multipliers_in.lam[worldid, i]
-            if implicit_all and implicit_address[i, i] >= 0:
-                rate_mu += lever * multipliers_in.mu[worldid, i]
-                rate_smooth += lever * (state_in.qacc[worldid, i] - multipliers_in.excess[worldid, i])
-                for m in range(start, end):
-                    j = drive_in.moment_colind[worldid, m]
-                    if implicit_address[wp.max(i, j), wp.min(i, j)] >= 0:
-                        smooth = state_in.qacc[worldid, j] - multipliers_in.excess[worldid, j]
-                        kappa += lever * drive_in.actuator_moment[worldid, m] * multipliers_in.mu[worldid, i] * smooth
-        law.implicit = int(implicit_all)
-        length = drive_in.actuator_length[worldid, uid]
-        law_bar, _c, _a, length_slope, velocity_slope, _w, force, slope = wp.grad(actuator_score)(
-            law, ctrl, act, length, velocity, act_weight, rate, h * kappa
-        )
-        gradients_out.actuator_gainprm[worldid, uid] = gradients_out.actuator_gainprm[worldid, uid] + law_bar.gainprm
-        gradients_out.actuator_biasprm[worldid, uid] = gradients_out.actuator_biasprm[worldid, uid] + law_bar.biasprm
-        gradients_out.actuator_dynprm[worldid, uid] = gradients_out.actuator_dynprm[worldid, uid] + law_bar.dynprm
-        wp.atomic_add(timestep_out.timestep, worldid, law_bar.timestep)
+        gradients_out.actuator_gainprm[worldid, uid] += law_bars_in.gainprm[worldid, uid]
+        gradients_out.actuator_biasprm[worldid, uid] += law_bars_in.biasprm[worldid, uid]
+        gradients_out.actuator_dynprm[worldid, uid] += law_bars_in.dynprm[worldid, uid]
+        wp.atomic_add(timestep_out.timestep, worldid, law_bars_in.timestep[worldid, uid])
 
         kind = actuators.actuator_trntype[uid]
         target = actuators.actuator_trnid[uid][0]
@@ -259,7 +219,7 @@ def pull_actuator_parameters(
             )
         elif kind == TrnType.SITE:
             rates = gear_rates_of_site(worldid, target, levers_in, motion_in, fields_in)
-        else:
+        elif kind == TrnType.JOINT or kind == TrnType.JOINTINPARENT:  # a slider-crank's gear is no parameter
             rates = gear_rates_of_joint(
                 worldid,
                 target,
@@ -270,15 +230,16 @@ def pull_actuator_parameters(
                 state_in,
                 multipliers_in,
             )
-        gear_bar = force * rates.lam + velocity_slope * rates.vel + length_slope * rates.length
-        if implicit_all:
+        bar = bars_in.rate[worldid, uid]
+        gear_bar = -(bar[0] * rates.lam + bar[1] * rates.vel + bars_in.length[worldid, uid] * rates.length)
+        if kind == TrnType.TENDON:
+            # κ counts pairs that M couples, and is quadratic in the one gear
             gear = actuators.actuator_gear[worldid % actuators.actuator_gear.shape[0], uid][0]
-            if kind == TrnType.TENDON and gear != 0.0:
-                # κ counts pairs that M couples, and is quadratic in the one gear
-                gear_bar[0] += 2.0 * h * slope * kappa / gear
-            elif kind != TrnType.TENDON:
-                gear_bar += h * slope * (rate_smooth * rates.mu + rate_mu * rates.smooth)
-        gradients_out.actuator_gear[worldid, uid] = gradients_out.actuator_gear[worldid, uid] + gear_bar
+            if gear != 0.0:
+                gear_bar[0] += 2.0 * bars_in.implicit[worldid, uid] / gear
+        else:
+            gear_bar -= bar[2] * rates.mu + bar[3] * rates.smooth
+        gradients_out.actuator_gear[worldid, uid] += gear_bar
 
 
 class ActuatorStage(ParameterStage):
@@ -288,31 +249,29 @@ class ActuatorStage(ParameterStage):
 
     def __init__(self, parts: Parts, gradients: dict[Any, Any]) -> None:
         super().__init__(parts, gradients)
-        self._settings = gather(ActuatorSettings, parts.work.model)
-        self._act_bar = wp.zeros_like(parts.work.grad_act)
+        assert parts.actuators is not None  # `applies`
+        self._actuators = parts.actuators
+        self._actuators.keep_law()
 
-    def launch_first(self, at: Substep, qvel_next: wp.array) -> None:
-        # `pull_actuators` replaces the cotangent of act' by that of act.
-        wp.copy(self._act_bar, self.parts.work.grad_act)
+    @classmethod
+    def applies(cls, parts: Parts) -> bool:
+        return parts.actuators is not None
 
     def launch(self, at: Substep) -> None:
-        work, m, d, settings = self.parts.work, self.parts.work.model, at.data, self.parts.work.settings
+        work, m, d = self.parts.work, self.parts.work.model, at.data
+        lanes = work.lanes(m.nactuator)
         wp.launch(
             pull_actuator_parameters,
-            dim=(work.nworld, work.lanes(m.nactuator)),
+            dim=(work.nworld, lanes),
             inputs=[
-                m.opt.timestep,
-                settings.clampctrl,
-                settings.clampact,
-                settings.implicit_all,
-                work.tables.implicit_address,
                 work.joints,
                 work.tendon_rows,
-                self._settings,
+                self._actuators.settings,
                 m.nactuator,
-                work.lanes(m.nactuator),
+                lanes,
                 work.live,
-                self._act_bar,
+                self._actuators.bars,
+                self._actuators.law_bars,
                 gather(Drive, d),
                 gather(Levers, m, d),
                 at.state,

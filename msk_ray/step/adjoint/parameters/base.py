@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 import warp as wp
 
 from msk_ray.step.adjoint.groups import Substep
+from msk_ray.step.adjoint.laws.actuators import ActuatorForces
 from msk_ray.step.adjoint.laws.contacts import ContactForces
 from msk_ray.step.adjoint.laws.rows import ConstraintLaws
 from msk_ray.step.adjoint.laws.tendons import Tendons
@@ -39,6 +40,7 @@ class Parts:
     laws: ConstraintLaws
     contacts: ContactForces
     tendons: Tendons | None
+    actuators: ActuatorForces | None
 
 
 @wp.struct

@@ -6,8 +6,9 @@ from the kernel: Warp drops the derivative of a function that another kernel of 
 
 import warp as wp
 
-from msk_ray.step.adjoint.laws.rows import vec6
-from msk_ray.step.adjoint.parameters.impedance import row_spring
+from msk_ray.step.adjoint.laws.cones import vec6
+from msk_ray.step.adjoint.laws.impedance import impedance, stiffness_damping
+from msk_ray.step.forward.cone_law import QUADRATIC, SLIDING, cone_mass, zone
 from msk_ray.step.forward.mjw_private import vec5, vec10
 
 wp.set_module_options({"enable_backward": False})
@@ -70,9 +71,9 @@ def cone_score(
     side_damping: wp.float32,
     mass: wp.float32,
 ) -> wp.float32:
-    """All rows of an elliptic contact; zones and laws as in `rows.cone_law`."""
+    """All rows of an elliptic contact."""
     mu = friction[0] * motion.impratio_invsqrt
-    normal = motion.acc[0] + damping * motion.vel[0] + stiffness * motion.pos + motion.offset[0]
+    jar0 = motion.acc[0] + damping * motion.vel[0] + stiffness * motion.pos + motion.offset[0]
     square = wp.float32(0.0)
     across = wp.float32(0.0)
     stuck = wp.float32(0.0)
@@ -84,17 +85,17 @@ def cone_score(
             across += motion.lam[i] * phi * phi * jar
             # D_i = D₀ (φᵢ / μ)²
             stuck += motion.lam[i] * phi * phi * jar / (mu * mu)
-    score = wp.float32(0.0)
-    if square > 0.0:
+    side = wp.float32(0.0)
+    if square > 0.0:  # at 0 the root has no slope
         side = wp.sqrt(square)
-        if mu * mu * normal + side <= 0.0:
-            score = -mass * (motion.lam[0] * normal + stuck)
-        elif normal < side:
-            outer = mass / (mu * mu * (1.0 + mu * mu))
-            push = outer * mu * mu * (side - normal)
-            score = push * (motion.lam[0] - across / side)
-    elif normal < 0.0:
-        score = -mass * motion.lam[0] * normal
+    normal = mu * jar0
+    now = zone(normal, side, mu)
+    score = wp.float32(0.0)
+    if now == QUADRATIC:
+        score = -mass * (motion.lam[0] * jar0 + stuck)
+    elif now == SLIDING:
+        push = cone_mass(mass, mu) * mu * (mu * side - normal)
+        score = push * (motion.lam[0] - across / side)
     return score
 
 
@@ -108,22 +109,23 @@ def contact_score(
     timestep: wp.float32,
 ) -> wp.float32:
     """Σ_r ρ_r(λ) f_r of one contact."""
-    kbi = row_spring(motion.disableflags, timestep, solref, solimp, motion.pos)
-    stiffness = kbi[0] * kbi[2]
-    mass = kbi[2] / ((1.0 - kbi[2]) * motion.weight)
+    kb = stiffness_damping(motion.disableflags, timestep, solref, solimp[1])
+    imp = impedance(solimp, motion.pos)
+    stiffness = kb[0] * imp
+    mass = imp / ((1.0 - imp) * motion.weight)
     score = wp.float32(0.0)
     if motion.elliptic == 1:
-        side_damping = kbi[1]
+        side_damping = kb[1]
         if solreffriction[0] != 0.0 or solreffriction[1] != 0.0:
-            side = row_spring(motion.disableflags, timestep, solreffriction, solimp, motion.pos)
+            side = stiffness_damping(motion.disableflags, timestep, solreffriction, solimp[1])
             side_damping = side[1]
-        score = cone_score(motion, friction, stiffness, kbi[1], side_damping, mass)
+        score = cone_score(motion, friction, stiffness, kb[1], side_damping, mass)
     elif motion.dim == 1:
-        score = edge_score(motion, stiffness, kbi[1], mass, 0.0, 0, 0)
+        score = edge_score(motion, stiffness, kb[1], mass, 0.0, 0, 0)
     else:
         share = mass / pyramid_weight(friction[0])
         for k in range(1, 6):
             if k < motion.dim:
-                score += edge_score(motion, stiffness, kbi[1], share, friction[k - 1], k, 2 * k - 2)
-                score += edge_score(motion, stiffness, kbi[1], share, -friction[k - 1], k, 2 * k - 1)
+                score += edge_score(motion, stiffness, kb[1], share, friction[k - 1], k, 2 * k - 2)
+                score += edge_score(motion, stiffness, kb[1], share, -friction[k - 1], k, 2 * k - 1)
     return score

@@ -10,11 +10,11 @@ import numpy as np
 import warp as wp
 
 from msk_ray.step.adjoint.groups import Contacts, Fields, Motion, RowLaws, Rows, Shapes, Substep, gather
-from msk_ray.step.adjoint.laws.contacts import components
+from msk_ray.step.adjoint.laws.contacts import components, relative_rates, row_count
+from msk_ray.step.adjoint.laws.impedance import impedance, stiffness_damping
 from msk_ray.step.adjoint.parameters.base import ParameterStage, Parts, TimestepGradient
 from msk_ray.step.adjoint.parameters.contact_laws import ContactMotion, contact_score, pyramid_weight
-from msk_ray.step.adjoint.spatial import point_velocity
-from msk_ray.step.forward.mjw_private import ConstraintType, contact_kbimp, vec5
+from msk_ray.step.forward.mjw_private import ConstraintType, vec5
 
 wp.set_module_options({"enable_backward": False})
 
@@ -140,9 +140,7 @@ def pull_materials(
     motion = ContactMotion()
     motion.dim = contacts_in.dim[con]
     motion.elliptic = int(rows_in.type[worldid, first] == ConstraintType.CONTACT_ELLIPTIC)
-    count = motion.dim
-    if motion.elliptic == 0 and motion.dim > 1:
-        count = 2 * (motion.dim - 1)
+    count = row_count(motion.dim, motion.elliptic == 1)
     if contacts_in.efc_address[con, count - 1] < 0:
         return
     active = bool(False)
@@ -157,18 +155,10 @@ def pull_materials(
     frame = contacts_in.frame[con]
     arm1 = contacts_in.pos[con] - motion_in.subtree_com[worldid, shapes.body_rootid[body1]]
     arm2 = contacts_in.pos[con] - motion_in.subtree_com[worldid, shapes.body_rootid[body2]]
-    lam1 = fields_in.lam[worldid, body1]
-    lam2 = fields_in.lam[worldid, body2]
-    acc1 = fields_in.qacc[worldid, body1]
-    acc2 = fields_in.qacc[worldid, body2]
-    vel1 = motion_in.cvel[worldid, body1]
-    vel2 = motion_in.cvel[worldid, body2]
-    lam_slide = point_velocity(lam2, arm2) - point_velocity(lam1, arm1)
-    acc_slide = point_velocity(acc2, arm2) - point_velocity(acc1, arm1)
-    vel_slide = point_velocity(vel2, arm2) - point_velocity(vel1, arm1)
-    motion.lam = components(frame, lam_slide, wp.spatial_top(lam2) - wp.spatial_top(lam1), motion.dim)
-    motion.acc = components(frame, acc_slide, wp.spatial_top(acc2) - wp.spatial_top(acc1), motion.dim)
-    motion.vel = components(frame, vel_slide, wp.spatial_top(vel2) - wp.spatial_top(vel1), motion.dim)
+    rates = relative_rates(worldid, body1, body2, arm1, arm2, motion_in, fields_in)
+    motion.lam = components(frame, rates.lam_slide, rates.lam_spin, motion.dim)
+    motion.acc = components(frame, rates.acc_slide, rates.acc_spin, motion.dim)
+    motion.vel = components(frame, rates.vel_slide, rates.vel_spin, motion.dim)
     motion.pos = contacts_in.dist[con] - contacts_in.includemargin[con]
     motion.disableflags = opt_disableflags
     motion.impratio_invsqrt = opt_impratio_invsqrt[worldid % opt_impratio_invsqrt.shape[0]]
@@ -176,20 +166,20 @@ def pull_materials(
     solref = contacts_in.solref[con]
     solimp = contacts_in.solimp[con]
     timestep = opt_timestep[worldid % opt_timestep.shape[0]]
-    kbi = contact_kbimp(opt_disableflags, timestep, solref, solimp, motion.pos, False)
-    imp = kbi[2]
-    side_damping = kbi[1]
+    kb = stiffness_damping(opt_disableflags, timestep, solref, solimp[1])
+    imp = impedance(solimp, motion.pos)
+    side_damping = kb[1]
     sideways = contacts_in.solreffriction[con]
     if sideways[0] != 0.0 or sideways[1] != 0.0:
-        side_damping = contact_kbimp(opt_disableflags, timestep, sideways, solimp, motion.pos, False)[1]
-    normal = motion.acc[0] + kbi[1] * motion.vel[0] + kbi[0] * imp * motion.pos
+        side_damping = stiffness_damping(opt_disableflags, timestep, sideways, solimp[1])[1]
+    normal = motion.acc[0] + kb[1] * motion.vel[0] + kb[0] * imp * motion.pos
     for i in range(count):
         jar = normal
         if motion.elliptic == 1 and i > 0:
             jar = motion.acc[i] + side_damping * motion.vel[i]
         elif motion.elliptic == 0 and motion.dim > 1:
             k = i / 2 + 1
-            jar += friction[k - 1] * wp.where(i % 2 == 0, 1.0, -1.0) * (motion.acc[k] + kbi[1] * motion.vel[k])
+            jar += friction[k - 1] * wp.where(i % 2 == 0, 1.0, -1.0) * (motion.acc[k] + kb[1] * motion.vel[k])
         motion.offset[i] = laws_in.jar[worldid, first + i] - jar
     motion.weight = imp / ((1.0 - imp) * rows_in.D[worldid, first])
     if motion.elliptic == 0 and motion.dim > 1:

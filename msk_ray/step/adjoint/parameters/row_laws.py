@@ -5,7 +5,7 @@ Kept apart from the kernel: Warp drops the derivative of a function that another
 
 import warp as wp
 
-from msk_ray.step.adjoint.parameters.impedance import row_spring
+from msk_ray.step.adjoint.laws.impedance import impedance, stiffness_damping
 from msk_ray.step.forward.mjw_private import vec5
 
 wp.set_module_options({"enable_backward": False})
@@ -38,11 +38,12 @@ def row_score(
     timestep: wp.float32,
 ) -> wp.float32:
     """-Φ ∋ ρ(λ) f(ρ(a) + b ρ(v) + k imp pos) of one row."""
-    kbi = row_spring(motion.disableflags, timestep, solref, solimp, pos)
-    mass = kbi[2] / ((1.0 - kbi[2]) * motion.weight)
-    jar = motion.rest + kbi[1] * motion.vel
+    kb = stiffness_damping(motion.disableflags, timestep, solref, solimp[1])
+    imp = impedance(solimp, pos)
+    mass = imp / ((1.0 - imp) * motion.weight)
+    jar = motion.rest + kb[1] * motion.vel
     if motion.law != FRICTION:
-        jar += kbi[0] * kbi[2] * pos
+        jar += kb[0] * imp * pos
     force = -mass * jar
     if motion.law == FRICTION:
         force = wp.clamp(force, -loss, loss)

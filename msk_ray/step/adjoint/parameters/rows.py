@@ -6,11 +6,12 @@ import warp as wp
 from mujoco_warp import DisableBit, JointType
 
 from msk_ray.step.adjoint.groups import Joints, RowLaws, Rows, State, Substep, TendonRows, gather
-from msk_ray.step.adjoint.laws.scalar_rows import RowSettings, foremost_rows, row_spring
+from msk_ray.step.adjoint.laws.impedance import row_slopes, stiffness_damping
+from msk_ray.step.adjoint.laws.scalar_rows import RowSettings, foremost_rows, solver_parameters
 from msk_ray.step.adjoint.laws.tendons import tendon_rate
 from msk_ray.step.adjoint.parameters.base import ParameterStage, Parts, TimestepGradient
 from msk_ray.step.adjoint.parameters.row_laws import FRICTION, ONE_SIDED, TWO_SIDED, RowMotion, row_score
-from msk_ray.step.forward.mjw_private import ConstraintType, EqType, contact_kbimp, vec5
+from msk_ray.step.forward.mjw_private import ConstraintType, EqType, vec5
 
 wp.set_module_options({"enable_backward": False})
 
@@ -50,12 +51,12 @@ class Losses:
 
 @wp.func
 def bounded_step_slope(
-    disableflags: int, timestep: float, solref: wp.vec2, solimp: vec5, vel: float, aref: float
+    disableflags: int, timestep: float, solref: wp.vec2, dmax: float, vel: float, aref: float
 ) -> float:
     """∂jar/∂h of a row, from its aref = -b ρ(v) - k imp pos: the time constant is held above 2 h."""
     if disableflags & DisableBit.REFSAFE or solref[0] <= 0.0 or solref[0] > 2.0 * timestep:
         return 0.0
-    damping = contact_kbimp(disableflags, timestep, solref, solimp, 0.0, False)[1]
+    damping = stiffness_damping(disableflags, timestep, solref, dmax)[1]
     # b ∝ 1/h and k ∝ 1/h²
     slope = 2.0 * (aref + damping * vel) / timestep
     if solref[1] > 0.0:
@@ -97,11 +98,11 @@ def pull_row_parameters(
         ident = rows_in.id[worldid, row]
         motion = RowMotion()
         motion.law = ONE_SIDED
-        spring = row_spring(worldid, kind, ident, settings)
-        if not spring.known:
+        solver = solver_parameters(worldid, kind, ident, settings)
+        if not solver.known:
             continue
-        solref = spring.solref
-        solimp = spring.solimp
+        solref = solver.solref
+        solimp = solver.solimp
         shared = bool(False)
         if kind == ConstraintType.FRICTION_DOF or kind == ConstraintType.FRICTION_TENDON:
             motion.law = FRICTION
@@ -117,16 +118,16 @@ def pull_row_parameters(
         aref = rows_in.aref[worldid, row]
         if shared:
             y = laws_in.slope[worldid, row] * motion.lam
-            step = bounded_step_slope(opt_disableflags, timestep, solref, solimp, motion.vel, aref)
+            step = bounded_step_slope(opt_disableflags, timestep, solref, solimp[1], motion.vel, aref)
             wp.atomic_sub(timestep_out.timestep, worldid, y * step)
             continue
         pos = rows_in.pos[worldid, row] - rows_in.margin[worldid, row]
-        kbi = contact_kbimp(opt_disableflags, timestep, solref, solimp, pos, False)
+        slopes = row_slopes(opt_disableflags, timestep, solref, solimp, pos)
         motion.disableflags = opt_disableflags
-        motion.weight = kbi[2] / ((1.0 - kbi[2]) * rows_in.D[worldid, row])
-        motion.rest = laws_in.jar[worldid, row] - kbi[1] * motion.vel
+        motion.weight = slopes.impedance / ((1.0 - slopes.impedance) * rows_in.D[worldid, row])
+        motion.rest = laws_in.jar[worldid, row] - slopes.damping * motion.vel
         if motion.law != FRICTION:
-            motion.rest -= kbi[0] * kbi[2] * pos
+            motion.rest -= slopes.spring * pos
         loss = rows_in.frictionloss[worldid, row]
         _m, solref_bar, solimp_bar, pos_bar, loss_bar, timestep_bar = wp.grad(row_score)(
             motion, solref, solimp, pos, loss, timestep
@@ -216,7 +217,7 @@ def pull_absent_friction(
         if loss > 0.0:
             continue
         timestep = opt_timestep[worldid % opt_timestep.shape[0]]
-        jar = acc + contact_kbimp(opt_disableflags, timestep, solref, solimp, 0.0, False)[1] * vel
+        jar = acc + stiffness_damping(opt_disableflags, timestep, solref, solimp[1])[1] * vel
         slope = float(0.0)
         if jar != 0.0:
             slope = -lam * wp.sign(jar)

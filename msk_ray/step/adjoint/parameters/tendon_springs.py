@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from msk_ray.step.adjoint.groups import Multipliers, State, Substep, TendonRows, gather
-from msk_ray.step.adjoint.laws.tendons import PassiveTendons, tendon_rate
+from msk_ray.step.adjoint.laws.tendons import PassiveTendons, implicit_pairs, stretch_of, tendon_rate
 from msk_ray.step.adjoint.parameters.base import ParameterStage, Parts
 from msk_ray.step.forward.mjw_private import poly_force_deriv
 
@@ -49,14 +49,11 @@ def pull_tendon_parameters(
         rest = passive.tendon_lengthspring[worldid % passive.tendon_lengthspring.shape[0], t]
         stiffness = passive.tendon_stiffness[worldid % passive.tendon_stiffness.shape[0], t]
         poly = passive.tendon_stiffnesspoly[worldid % passive.tendon_stiffnesspoly.shape[0], t]
-        length = ten_length_in[worldid, t]
-        x = float(0.0)
+        x = stretch_of(ten_length_in[worldid, t], rest)
         bar = wp.vec2(0.0)
-        if length > rest[1]:
-            x = length - rest[1]
+        if x > 0.0:
             bar[1] = rate_l * poly_force_deriv(stiffness, poly, x, 0)
-        elif length < rest[0]:
-            x = length - rest[0]
+        elif x < 0.0:
             bar[0] = rate_l * poly_force_deriv(stiffness, poly, x, 0)
         gradients_out.tendon_stiffness[worldid, t] = gradients_out.tendon_stiffness[worldid, t] - rate_l * x
         gradients_out.tendon_lengthspring[worldid, t] = gradients_out.tendon_lengthspring[worldid, t] + bar
@@ -64,15 +61,7 @@ def pull_tendon_parameters(
         slope = rate_l * tendon_rate(tendons, t, ten_J_in[worldid], state_in.qvel[worldid])
         if implicit_all:
             h = opt_timestep[worldid % opt_timestep.shape[0]]
-            start = tendons.ten_J_rowadr[t]
-            for k in range(start, start + tendons.ten_J_rownnz[t]):
-                i = tendons.ten_J_colind[k]
-                for m in range(start, start + tendons.ten_J_rownnz[t]):
-                    j = tendons.ten_J_colind[m]
-                    if inertia_address[wp.max(i, j), wp.min(i, j)] >= 0:
-                        smooth = state_in.qacc[worldid, j] - multipliers_in.excess[worldid, j]
-                        pair = ten_J_in[worldid, k] * ten_J_in[worldid, m]
-                        slope += h * pair * multipliers_in.mu[worldid, i] * smooth
+            slope += h * implicit_pairs(worldid, t, tendons, inertia_address, ten_J_in, state_in, multipliers_in)
         gradients_out.tendon_damping[worldid, t] = gradients_out.tendon_damping[worldid, t] - slope
 
 

@@ -1,20 +1,15 @@
 """Elliptic friction cones: their forces, what they add to the Hessian, and their cost along a line.
 
-With N = μ jar₀ and uᵢ = φᵢ jarᵢ, T = |u|, the cone is circular. Its dual is satisfied where N >= μ T; where
-μ N + T <= 0 all rows are springs; between, the contact slides and costs ½ m (N - μ T)², m = D₀ / (μ² (1 + μ²)).
+Their law, with the meaning of N, T, u and m, is in `cone_law`.
 """
 
 import warp as wp
 
-from msk_ray.step.forward import mjw_private as private
+from msk_ray.step.forward.cone_law import QUADRATIC, SATISFIED, SLIDING, cone_mass, zone
 from msk_ray.step.forward.fused.lanes import at, lane_count, put, put_whole, whole
 from msk_ray.step.forward.fused.scratch import CONE, Scratch
 
 wp.set_module_options({"enable_backward": False})
-
-SATISFIED = wp.constant(int(private.ConstraintState.SATISFIED))
-QUADRATIC = wp.constant(int(private.ConstraintState.QUADRATIC))
-SLIDING = wp.constant(int(private.ConstraintState.CONE))
 
 
 @wp.struct
@@ -40,21 +35,6 @@ class Cone:
     """Its derivative there."""
     half_curvature: float
     """Half of its second derivative."""
-
-
-@wp.func
-def zone(normal: float, tangent: float, mu: float) -> int:
-    """State of a contact with these N and T."""
-    if normal >= mu * tangent:
-        return SATISFIED
-    if mu * normal + tangent <= 0.0:
-        return QUADRATIC
-    return SLIDING
-
-
-@wp.func
-def cone_mass(stiffness: float, mu: float) -> float:
-    return stiffness / (mu * mu * (1.0 + mu * mu))
 
 
 @wp.func

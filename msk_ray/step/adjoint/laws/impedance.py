@@ -1,7 +1,10 @@
-"""Stiffness, damping and impedance of a constraint row, differentiable by all solver parameters.
+"""Impedance, stiffness and damping of a constraint row, as functions of its solver parameters and its position.
 
-As in mujoco_warp, whose function takes another branch where dmin = dmax and has other slopes there. Only for scores
-that are differentiated: Warp drops the derivative of a function that a kernel of the module runs forward only.
+    aref = -b ρ(v) - k imp(pos) pos ,    D = imp / ((1 - imp) w)
+    imp = dmin + y(|pos| / width) (dmax - dmin) ,  y a power curve from 0 to 1 through (mid, mid)
+
+They are mujoco_warp's, except where dmin = dmax: there its function takes another branch, which has other slopes by
+dmin and dmax. `row_slopes` differentiates them by position, the scores in `parameters` by everything else too.
 """
 
 import warp as wp
@@ -18,7 +21,7 @@ _MAXIMP = wp.constant(0.9999)
 
 @wp.func
 def impedance(solimp: vec5, pos: wp.float32) -> wp.float32:
-    """dmin + y(|pos|/width) (dmax - dmin), y a power curve from 0 to 1 through (mid, mid)."""
+    """imp."""
     low = wp.clamp(solimp[0], _MINIMP, _MAXIMP)
     high = wp.clamp(solimp[1], _MINIMP, _MAXIMP)
     mid = wp.clamp(solimp[3], _MINIMP, _MAXIMP)
@@ -41,7 +44,7 @@ def impedance(solimp: vec5, pos: wp.float32) -> wp.float32:
 
 @wp.func
 def stiffness_damping(disableflags: wp.int32, timestep: wp.float32, solref: wp.vec2, dmax: wp.float32) -> wp.vec2:
-    """(k, b) of aref = -b ρ(v) - k imp pos."""
+    """(k, b)."""
     high = wp.clamp(dmax, _MINIMP, _MAXIMP)
     timeconst = solref[0]
     if not (disableflags & DisableBit.REFSAFE):
@@ -59,8 +62,32 @@ def stiffness_damping(disableflags: wp.int32, timestep: wp.float32, solref: wp.v
     return wp.vec2(k, b)
 
 
+@wp.struct
+class RowSlopes:
+    """How aref and D of one row answer to its velocity and position."""
+
+    damping: float
+    """b = -∂aref/∂ρ(v) [1/s]."""
+    spring: float
+    """k imp [1/s²]."""
+    impedance: float
+    """imp."""
+    stiffness: float
+    """-∂aref/∂pos, with the slope of imp [1/s²]."""
+    mass: float
+    """d(log D)/d(pos) = imp' / (imp (1 - imp)) [1/m]."""
+
+
 @wp.func
-def row_spring(disableflags: wp.int32, timestep: wp.float32, solref: wp.vec2, solimp: vec5, pos: wp.float32) -> wp.vec3:
-    """(k, b, impedance) of a row."""
+def row_slopes(disableflags: int, timestep: float, solref: wp.vec2, solimp: vec5, pos: float) -> RowSlopes:
+    """Slopes of one row."""
     kb = stiffness_damping(disableflags, timestep, solref, solimp[1])
-    return wp.vec3(kb[0], kb[1], impedance(solimp, pos))
+    imp = impedance(solimp, pos)
+    _solimp, slope = wp.grad(impedance)(solimp, pos)
+    out = RowSlopes()
+    out.damping = kb[1]
+    out.spring = kb[0] * imp
+    out.impedance = imp
+    out.stiffness = kb[0] * (imp + slope * pos)
+    out.mass = slope / (imp * (1.0 - imp))
+    return out
