@@ -30,7 +30,7 @@ from record import RESULTS, markdown_table, publish
 
 from msk_ray.errors import MskRayError
 from msk_ray.step import Simulation, check_gradients
-from msk_ray.step.adjoint.coverage.check import partly_exact, unsupported
+from msk_ray.step.adjoint.coverage.check import unsupported
 
 GROUPS = {
     "robots": ("gymnasium_robotics", "mjlab", "robosuite", "gym_aloha", "robopianist"),
@@ -126,7 +126,7 @@ def row_of(group: str, name: str, model: mujoco.MjModel, args: argparse.Namespac
     """What is known of one model."""
     row: dict[str, Any] = {"group": group, "model": name, "nv": model.nv, "digest": digest(model)}
     refused = refusals(model)
-    verdict = "refused" if refused else "partly exact" if partly_exact(model) else "exact"
+    verdict = "refused" if refused else "exact"
     row |= {"verdict": verdict, "refused": refused}
     if not refused and model.nv <= args.largest:
         begin = time.process_time()
@@ -173,7 +173,7 @@ def _worst(row: dict[str, Any], substeps: int) -> str:
 def tables(rows: list[dict[str, Any]], substeps: list[int]) -> str:
     """Shares by group, what is refused and how often, and every model."""
     models = [row for row in rows if row["verdict"] not in ("no model", "twice")]
-    verdicts = ("exact", "approximated", "partly exact", "refused")
+    verdicts = ("exact", "approximated", "refused")
     shares = []
     for group in (*GROUPS, None):
         own = [row for row in models if group in (row["group"], None)]

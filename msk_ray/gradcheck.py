@@ -252,7 +252,6 @@ def as_json(result: "GradientCheck", model: str, tolerance: float, unsupported: 
             }
             for r in result.results
         ],
-        "approximated": result.approximated,
         "nonfinite": [asdict(lost) for lost in result.nonfinite],
         "max_rel_error": _finite(result.max_rel_error),
         "tolerance": tolerance,
@@ -318,10 +317,6 @@ def print_table(result: "GradientCheck", model: str, tolerance: float) -> None:
         console.print(f"{result.parameter_kinks} elements of parameters left out at a kink of their own")
     if result.checked and result.excluded > MANY_EXCLUDED * (result.checked + result.excluded):
         console.print("note: many states were left out; the result only covers the others")
-    if result.approximated:
-        count = len(result.approximated)
-        pairs = f"{', '.join(result.approximated[:3])}{' …' if count > 3 else ''}"
-        console.print(f"contacts only partly exact: {pairs} ({count} pair(s) may touch)", markup=False)
     if share := result.diagnostics.get("approximated_share", 0.0):
         console.print(f"approximated contacts, by the nearest law: in {share:.1%} of the substeps")
     if note := _unconverged(result):

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 import mujoco
 import numpy as np
 
-from msk_ray.step.adjoint.coverage.check import partly_exact
 from msk_ray.step.autograd import Simulation
 from msk_ray.step.autograd.tape import UNCONVERGED_BOUND
 from msk_ray.step.check.nonfinite import NonFinite, find_nonfinite
@@ -82,8 +81,6 @@ class GradientCheck:
     """Elements of parameters left out at such states, because the step is not differentiable by them there."""
     diagnostics: dict[str, float] = field(default_factory=dict)
     """Diagnostics of the simulation and its backward mode, the largest over the kinds of state."""
-    approximated: list[str] = field(default_factory=list)
-    """Pairs of geoms whose contacts the mode differentiates only in part."""
     nonfinite: list[NonFinite] = field(default_factory=list)
     """States, compared or left out, at which the step or its gradient is not finite."""
 
@@ -215,8 +212,6 @@ def check_gradients(
             done += 1
             if pace is not None:
                 pace(done)
-    if "approximated_share" in result.diagnostics:
-        result.approximated = partly_exact(model)
     return result
 
 

@@ -13,12 +13,23 @@ from displacements import displaced, turned
 from mujoco_warp import GeomType
 
 from msk_ray.step.adjoint.groups import Meshes, Shapes, gather
-from msk_ray.step.adjoint.laws.contact_geometry.capsule_box import capsule_box_wrenches
+from msk_ray.step.adjoint.laws.contact_geometry.capsule_box import capsule_box_push
+from msk_ray.step.adjoint.laws.contact_geometry.contact_point import Bars, ContactPoint, Geom
 from msk_ray.step.adjoint.laws.contact_geometry.convex import convex_wrenches, solid_of
-from msk_ray.step.adjoint.laws.contact_geometry.convex_laws import Bars, Seen
+from msk_ray.step.adjoint.laws.contact_geometry.solids import Solid
 
 EPS = 2e-3
 SIZES = {"box": (0.1, 0.07, 0.05), "capsule": (0.04, 0.15, 0.0), "ground": (0.2, 0.15, 0.1)}
+
+
+@wp.func
+def geom_of(solid: Solid) -> Geom:
+    geom = Geom()
+    geom.type = solid.type
+    geom.pos = solid.pos
+    geom.mat = solid.mat
+    geom.size = solid.size
+    return geom
 
 
 @wp.kernel(enable_backward=False)
@@ -41,36 +52,22 @@ def wrenches(
     i = wp.tid()
     solid1 = solid_of(0, world[i], shapes, meshes, xpos, xmat)
     solid2 = solid_of(1, world[i], shapes, meshes, xpos, xmat)
+    contact = ContactPoint()
+    contact.dist = dist[i]
+    contact.point = point[i]
+    contact.normal = frame[i][0]
+    bars = Bars()
+    bars.dist = dist_bar[i]
+    bars.point = pos_bar[i]
+    bars.normal = normal_bar[i]
     if solid1.type == GeomType.CAPSULE:
-        f1, t1, f2, t2 = capsule_box_wrenches(
-            index[i],
-            solid1.pos,
-            solid1.mat,
-            solid1.size,
-            solid2.pos,
-            solid2.mat,
-            solid2.size,
-            dist[i],
-            point[i],
-            frame[i][0],
-            dist_bar[i],
-            pos_bar[i],
-            normal_bar[i],
-        )
-        out[i, 0] = f1
-        out[i, 1] = t1
-        out[i, 2] = f2
-        out[i, 3] = t2
+        forces = capsule_box_push(index[i], geom_of(solid1), geom_of(solid2), contact, bars)
+        out[i, 0] = forces.force1
+        out[i, 1] = forces.torque1
+        out[i, 2] = forces.force2
+        out[i, 3] = forces.torque2
     else:
-        seen = Seen()
-        seen.dist = dist[i]
-        seen.point = point[i]
-        seen.normal = frame[i][0]
-        bars = Bars()
-        bars.dist = dist_bar[i]
-        bars.point = pos_bar[i]
-        bars.normal = normal_bar[i]
-        push, _exact = convex_wrenches(solid1, solid2, meshes, seen, bars, native_ccd, 1)
+        push, _exact = convex_wrenches(solid1, solid2, meshes, contact, bars, native_ccd, 1)
         out[i, 0] = push.force1
         out[i, 1] = push.torque1 + wp.cross(point[i] - solid1.pos, push.force1)
         out[i, 2] = push.force2

@@ -15,8 +15,8 @@ import warp as wp
 from displacements import displaced, turned
 
 from msk_ray.step.adjoint.groups import Meshes, Shapes, gather
+from msk_ray.step.adjoint.laws.contact_geometry.contact_point import Bars, ContactPoint
 from msk_ray.step.adjoint.laws.contact_geometry.convex import convex_wrenches, solid_of
-from msk_ray.step.adjoint.laws.contact_geometry.convex_laws import Bars, Seen
 
 pytestmark = pytest.mark.long
 
@@ -59,17 +59,17 @@ def wrenches(
     exact_out: wp.array[wp.bool],
 ):
     i = wp.tid()
-    seen = Seen()
-    seen.dist = dist[i]
-    seen.point = point[i]
-    seen.normal = normal[i]
+    contact = ContactPoint()
+    contact.dist = dist[i]
+    contact.point = point[i]
+    contact.normal = normal[i]
     bars = Bars()
     bars.dist = dist_bar[i]
     bars.point = point_bar[i]
     bars.normal = normal_bar[i]
     solid1 = solid_of(0, i, shapes, meshes, xpos, xmat)
     solid2 = solid_of(1, i, shapes, meshes, xpos, xmat)
-    push, exact = convex_wrenches(solid1, solid2, meshes, seen, bars, native_ccd, multi_ccd)
+    push, exact = convex_wrenches(solid1, solid2, meshes, contact, bars, native_ccd, multi_ccd)
     out[i, 0] = push.force1
     out[i, 1] = push.torque1
     out[i, 2] = push.force2

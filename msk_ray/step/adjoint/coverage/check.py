@@ -1,7 +1,5 @@
 """The check of a model against the table of features before the first step, and the table for the docs."""
 
-import warnings
-
 import mujoco
 
 from msk_ray.step.adjoint.coverage.features import FEATURES, Feature
@@ -14,32 +12,20 @@ def unsupported(model: mujoco.MjModel) -> dict[str, list[str]]:
 
 
 def _refused(model: mujoco.MjModel) -> list[tuple[Feature, list[str]]]:
-    found = [(feature, feature.find(model)) for feature in FEATURES if not feature.exact]
-    return [(feature, elements) for feature, elements in found if elements]
+    inexact = [(feature, feature.find(model)) for feature in FEATURES if not feature.exact]
+    return [(feature, elements) for feature, elements in inexact if elements]
 
 
 def check_supported(model: mujoco.MjModel, mode: str) -> None:
-    """Raise UnsupportedModelError naming every element that `mode` cannot differentiate, and warn of each one whose
-    gradient it only approximates.
-    """
-    found = _refused(model)
-    if found:
-        lines = [f"{feature.name} ({_few(elements)})" for feature, elements in found]
-        instead = [f" Write {feature.instead}." for feature, _ in found if feature.instead]
+    """Raise UnsupportedModelError naming every element that `mode` cannot differentiate."""
+    refused = _refused(model)
+    if refused:
+        lines = [f"{feature.name} ({_few(elements)})" for feature, elements in refused]
+        instead = [f" Write {feature.instead}." for feature, _ in refused if feature.instead]
         raise UnsupportedModelError(
             f"{mode} does not differentiate {'; '.join(lines)}.{''.join(instead)} Finite differences do: "
             "physics.backward=fd_jacobian in a config, --mode fd_jacobian of gradcheck, backward=FdJacobian() in Python"
         )
-    for feature in FEATURES:
-        if feature.partly and (elements := feature.find(model)):
-            warnings.warn(
-                f"{mode} is only partly exact for {feature.name} ({_few(elements)}): {feature.note}", stacklevel=3
-            )
-
-
-def partly_exact(model: mujoco.MjModel) -> list[str]:
-    """Elements of `model` whose gradient is approximated in part."""
-    return [element for feature in FEATURES if feature.partly for element in feature.find(model)]
 
 
 def _few(elements: list[str]) -> str:
@@ -50,7 +36,7 @@ def table() -> str:
     """The table as Markdown, feature by mode."""
     rows = ["| feature | tape_all, tape_per_substep | fd_jacobian | note |", "|---|---|---|---|"]
     for f in FEATURES:
-        kept = "partly exact" if f.partly else "exact, approximated where counted" if f.counted else "exact"
+        kept = "exact, approximated where counted" if f.counted else "exact"
         rows.append(
             f"| {f.name} | {kept if f.exact else 'raises'} | {'approximate' if f.steps else 'raises'} | {f.note} |"
         )

@@ -31,8 +31,6 @@ class Feature:
     """Names of the elements of a model that use it."""
     note: str = ""
     """What is approximated or assumed, or why it is refused."""
-    partly: bool = False
-    """Whether some slopes are approximated, as the note says."""
     counted: bool = False
     """Whether single contacts may be approximated, each of which is counted."""
     instead: str = ""

@@ -8,8 +8,9 @@ than rounding. Local axes are signed unit vectors of the box's frame, q points i
 
 import warp as wp
 
+from msk_ray.step.adjoint.laws.contact_geometry.contact_point import Bars, ContactPoint, Geom, PairPush
 from msk_ray.step.adjoint.laws.contact_geometry.primitive_laws import sphere_box_contact
-from msk_ray.step.adjoint.spatial import turning_torque
+from msk_ray.step.adjoint.spatial import column, turning_torque
 from msk_ray.step.forward.mjw_private import safe_div
 
 wp.set_module_options({"enable_backward": False})
@@ -119,7 +120,7 @@ def corner(size: wp.vec3, i: int, si: float, j: int, sj: float, k: int, sk: floa
 @wp.func
 def axis_law(
     index: int,
-    seen: float,
+    actual: float,
     pos: wp.vec3,
     axis: wp.vec3,
     half: float,
@@ -129,9 +130,9 @@ def axis_law(
 ) -> AxisLaw:
     """Law of the sphere of contact `index` (0 or 1) seen at a place on the capsule's axis."""
     best = AxisLaw()
-    best.end = wp.where(seen > 0.0, half, -half)
+    best.end = wp.where(actual > 0.0, half, -half)
     gain = ROUNDING * (half + wp.max(box_size))
-    miss = wp.abs(seen - best.end)
+    miss = wp.abs(actual - best.end)
     # Features of the box that can be nearest: 12 edges and their corners, each with the segments' clamping.
     nearest = float(1.0e10)
     base = AxisLaw()
@@ -162,7 +163,7 @@ def axis_law(
                 law.end = side_of(place) * half
                 place = law.end
                 along = wp.clamp(b * place - wp.dot(run, gap), -box_size[k], box_size[k])
-            error = wp.abs(place - seen)
+            error = wp.abs(place - actual)
             if index == 0 and error < miss - gain:
                 miss = error
                 best = law
@@ -182,7 +183,7 @@ def axis_law(
             law.cut = wp.where(signs == 0, box_size[k], -box_size[k])
             if wp.abs(wp.dot(box_mat @ law.side, axis)) < PARALLEL:
                 continue
-            error = wp.abs(axis_place(pos, axis, box_pos, box_mat, law) - seen)
+            error = wp.abs(axis_place(pos, axis, box_pos, box_mat, law) - actual)
             if error < miss - gain:
                 miss = error
                 best = law
@@ -201,7 +202,7 @@ def axis_law(
                     continue
                 law.shift = sign * box_size[k]
                 law.shift_along_edge = sign * wp.where(way < 4, 1.0, -1.0)
-            error = wp.abs(axis_place(pos, axis, box_pos, box_mat, law) - seen)
+            error = wp.abs(axis_place(pos, axis, box_pos, box_mat, law) - actual)
             if error < miss - gain:
                 miss = error
                 best = law
@@ -209,33 +210,22 @@ def axis_law(
 
 
 @wp.func
-def capsule_seen_at(pos: wp.vec3, axis: wp.vec3, radius: float, dist: float, point: wp.vec3, normal: wp.vec3) -> float:
-    """Place on the capsule's axis of the sphere whose contact with a box this is."""
-    # point = centre + n (r + dist / 2)
-    return safe_div(wp.dot(point - normal * (radius + 0.5 * dist) - pos, axis), wp.dot(axis, axis))
-
-
-@wp.func
-def capsule_box_wrenches(
-    index: int,
-    pos: wp.vec3,
-    mat: wp.mat33,
-    size: wp.vec3,
-    box_pos: wp.vec3,
-    box_mat: wp.mat33,
-    box_size: wp.vec3,
-    dist: float,
-    point: wp.vec3,
-    normal: wp.vec3,
-    dist_bar: float,
-    pos_bar: wp.vec3,
-    normal_bar: wp.vec3,
-) -> tuple[wp.vec3, wp.vec3, wp.vec3, wp.vec3]:
-    """Forces at the centres of capsule and box and torques on them: (force1, torque1, force2, torque2)."""
-    axis = wp.vec3(mat[0, 2], mat[1, 2], mat[2, 2])
-    seen = capsule_seen_at(pos, axis, size[0], dist, point, normal)
-    law = axis_law(index, seen, pos, axis, size[1], box_pos, box_mat, box_size)
-    pos1_bar, axis_bar, _r, pos2_bar, mat2_bar, _s, _l, _d, _p, _n = wp.grad(capsule_score)(
-        pos, axis, size[0], box_pos, box_mat, box_size, law, dist_bar, pos_bar, normal_bar
+def capsule_box_push(index: int, capsule: Geom, box: Geom, contact: ContactPoint, bars: Bars) -> PairPush:
+    """Push of contact `index` (0 or 1) of a capsule and a box, at their centres."""
+    axis = column(capsule.mat, 2)
+    radius = capsule.size[0]
+    # Place on the axis of the sphere whose contact this is: point = centre + n (r + dist / 2)
+    centre = contact.point - contact.normal * (radius + 0.5 * contact.dist)
+    place = safe_div(wp.dot(centre - capsule.pos, axis), wp.dot(axis, axis))
+    law = axis_law(index, place, capsule.pos, axis, capsule.size[1], box.pos, box.mat, box.size)
+    pos_bar, axis_bar, _radius, box_pos_bar, box_mat_bar, _size, _law, _dist, _point, _normal = wp.grad(capsule_score)(
+        capsule.pos, axis, radius, box.pos, box.mat, box.size, law, bars.dist, bars.point, bars.normal
     )
-    return pos1_bar, wp.cross(axis, axis_bar), pos2_bar, turning_torque(box_mat, mat2_bar)
+    out = PairPush()
+    out.force1 = pos_bar
+    out.torque1 = wp.cross(axis, axis_bar)
+    out.place1 = capsule.pos
+    out.force2 = box_pos_bar
+    out.torque2 = turning_torque(box.mat, box_mat_bar)
+    out.place2 = box.pos
+    return out

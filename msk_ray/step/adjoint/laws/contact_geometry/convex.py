@@ -11,10 +11,9 @@ from mujoco_warp import GeomType
 from msk_ray.step.adjoint.coverage.approximated import Touches, count_touch
 from msk_ray.step.adjoint.groups import ContactBars, Contacts, Meshes, Shapes, Substep, gather
 from msk_ray.step.adjoint.laws.contact_geometry.contact_order import contacts_end
+from msk_ray.step.adjoint.laws.contact_geometry.contact_point import Bars, ContactPoint
 from msk_ray.step.adjoint.laws.contact_geometry.convex_laws import (
-    Bars,
     Push,
-    Seen,
     added,
     flat_wrenches,
     height_wrenches,
@@ -61,7 +60,7 @@ _LOST = wp.constant(1.0e-4)
 
 
 @wp.func
-def clipping_face(below: Solid, above: Solid, other_face: int, meshes: Meshes, seen: Seen) -> int:
+def clipping_face(below: Solid, above: Solid, other_face: int, meshes: Meshes, contact: ContactPoint) -> int:
     """The face of the geom below against which one of the geom above was clipped, -1 for none.
 
     Where the contact is on the side of a face, or over its corner, it is on others too; the law tells which it was.
@@ -69,14 +68,14 @@ def clipping_face(below: Solid, above: Solid, other_face: int, meshes: Meshes, s
     best = int(-1)
     least = float(1.0e30)
     length = unit_of_length(below, above)
-    at = seen.point - 0.5 * seen.dist * seen.normal
+    at = contact.point - 0.5 * contact.dist * contact.normal
     local = wp.transpose(below.mat) @ (above.mat @ face_normal(above, meshes, other_face))
     for face in range(face_count(below, meshes)):
         if wp.dot(face_normal(below, meshes, face), local) < -_LYING:
             off = off_face(below, meshes, face, at)
             if off < _TOUCHED * length:
                 ground = ground_of(below, meshes, face, length)
-                _foot, miss = foot_of(above, other_face, ground, meshes, seen, True)
+                _foot, miss = foot_of(above, other_face, ground, meshes, contact, True)
                 if miss + off < least:
                     least = miss + off
                     best = face
@@ -111,17 +110,17 @@ def standing_wrenches(
     face: int,
     other_face: int,
     turns_with_other: int,
-    seen: Seen,
+    contact: ContactPoint,
     bars: Bars,
     is_clipped: bool,
 ) -> tuple[Push, wp.float32]:
     """Pullback of a contact of the geom above with a face of the geom below, and how far the law misses it [sizes].
 
-    Both `seen` and `bars` have the normal away from the geom below.
+    Both `contact` and `bars` have the normal away from the geom below.
     """
     length = unit_of_length(below, above)
     ground = ground_of(below, meshes, face, length)
-    at = seen
+    at = contact
     if turns_with_other == 0:
         at.normal = ground.normal
     foot, miss = foot_of(above, other_face, ground, meshes, at, is_clipped)
@@ -160,7 +159,7 @@ def standing_wrenches(
 
 @wp.func
 def convex_wrenches(
-    first: Solid, solid2: Solid, meshes: Meshes, seen: Seen, bars: Bars, native_ccd: int, multi_ccd: int
+    first: Solid, solid2: Solid, meshes: Meshes, contact: ContactPoint, bars: Bars, native_ccd: int, multi_ccd: int
 ) -> tuple[Push, wp.bool]:
     """Forces and torques of one contact, and whether they are exact.
 
@@ -168,18 +167,18 @@ def convex_wrenches(
         first: the first geom, a height field or convex.
         solid2: the second, convex.
         meshes: hulls of meshes.
-        seen: the contact.
+        contact: as mujoco_warp returned it.
         bars: its cotangents.
         native_ccd: 1 if boxes collide by convex collision too, 0 if by their own.
         multi_ccd: 1 if convex collision clips faces to find several contacts.
     """
-    n = seen.normal
+    n = contact.normal
     solid1 = first
     field = first.type == GeomType.HFIELD
     if field:
-        solid1 = looked_at(first, meshes, seen.point - 0.5 * seen.dist * n)
+        solid1 = looked_at(first, meshes, contact.point - 0.5 * contact.dist * n)
     length = unit_of_length(solid1, solid2)
-    slack = wp.min(_SLACK + _WITNESS_ROUNDING * length / wp.max(wp.abs(seen.dist), 1.0e-9), _MOST_SLACK)
+    slack = wp.min(_SLACK + _WITNESS_ROUNDING * length / wp.max(wp.abs(contact.dist), 1.0e-9), _MOST_SLACK)
     face1, sine1 = face_along(solid1, meshes, n)
     face2, sine2 = face_along(solid2, meshes, -n)
     boxes = solid1.type == GeomType.BOX and solid2.type == GeomType.BOX
@@ -190,7 +189,7 @@ def convex_wrenches(
     long2 = solid2.type == GeomType.CAPSULE
     is_clipped = boxes or (multi_ccd == 1 and ((faced1 and (faced2 or long2)) or (long1 and faced2)))
 
-    flipped = seen
+    flipped = contact
     flipped.normal = -n
     flipped_bars = bars
     flipped_bars.normal = -bars.normal
@@ -201,24 +200,24 @@ def convex_wrenches(
     miss = float(0.0)
     below = int(-1)
     if is_clipped and not own_boxes and face2 >= 0 and sine2 < slack:
-        below = clipping_face(solid1, solid2, face2, meshes, seen)
+        below = clipping_face(solid1, solid2, face2, meshes, contact)
     if below >= 0:
         # The second geom's face is clipped against the first's, and gives the normal.
-        push, miss = standing_wrenches(solid1, solid2, meshes, below, face2, 1, seen, bars, is_clipped)
+        push, miss = standing_wrenches(solid1, solid2, meshes, below, face2, 1, contact, bars, is_clipped)
     else:
         # Flat faces, and edges along them, have been clipped; whether a capsule has been tells where it lies.
         clipped = is_clipped and not (long1 or long2)
         level1 = wp.where(clipped or solid1.type == GeomType.CYLINDER, slack, 0.0)
         level2 = wp.where(clipped or solid2.type == GeomType.CYLINDER, slack, 0.0)
-        place1 = seen.point - 0.5 * seen.dist * n
-        place2 = seen.point + 0.5 * seen.dist * n
-        patch1 = patch_at(solid1, solid2, meshes, place1, n, seen.dist, face1, sine1, level1)
-        patch2 = patch_at(solid2, solid1, meshes, place2, -n, seen.dist, face2, sine2, level2)
+        place1 = contact.point - 0.5 * contact.dist * n
+        place2 = contact.point + 0.5 * contact.dist * n
+        patch1 = patch_at(solid1, solid2, meshes, place1, n, contact.dist, face1, sine1, level1)
+        patch2 = patch_at(solid2, solid1, meshes, place2, -n, contact.dist, face2, sine2, level2)
         # Boxes of their own collision are clipped at any angle.
         clip1 = wp.where(own_boxes, face1, -1)
         clip2 = wp.where(own_boxes, face2, -1)
         if patch1.kind == FACE and (patch2.kind != FACE or sine1 <= sine2 + _SLACK):
-            push, miss = standing_wrenches(solid1, solid2, meshes, patch1.face, clip2, 0, seen, bars, is_clipped)
+            push, miss = standing_wrenches(solid1, solid2, meshes, patch1.face, clip2, 0, contact, bars, is_clipped)
             exact = exact and not (flat and sine1 > slack)
         elif patch2.kind == FACE:
             push, miss = standing_wrenches(
@@ -230,7 +229,7 @@ def convex_wrenches(
             # Edges of flat faces meet exactly; curved surfaces only as MuJoCo's tolerance says.
             tilt = wp.where(flat, slack, _MOST_SLACK)
             exact = exact and is_supported(solid1, patch1, n, tilt) and is_supported(solid2, patch2, n, tilt)
-            push, regular = touching_wrenches(patch1, patch2, seen, bars, length)
+            push, regular = touching_wrenches(patch1, patch2, contact, bars, length)
             exact = exact and regular and not side_by_side(solid1, solid2, n)
     return push, exact and miss < _LOST
 
@@ -296,28 +295,28 @@ def pull_convex(
         # A contact that pushes nothing, or whose world has no cotangent, has none either.
         if bars.dist == 0.0 and wp.dot(bars.point, bars.point) == 0.0:
             continue
-        seen = Seen()
-        seen.dist = contacts_in.dist[con]
-        seen.point = contacts_in.pos[con]
-        seen.normal = contacts_in.frame[con][0]
-        normal_bar, _weight = wp.grad(framed)(seen.normal, contact_bars_in.frame[con])
+        contact = ContactPoint()
+        contact.dist = contacts_in.dist[con]
+        contact.point = contacts_in.pos[con]
+        contact.normal = contacts_in.frame[con][0]
+        normal_bar, _weight = wp.grad(framed)(contact.normal, contact_bars_in.frame[con])
         bars.normal = normal_bar
         worldid = contacts_in.worldid[con]
         solid1 = solid_of(geoms[0], worldid, shapes, meshes, geom_xpos_in, geom_xmat_in)
         solid2 = solid_of(geoms[1], worldid, shapes, meshes, geom_xpos_in, geom_xmat_in)
-        push, exact = convex_wrenches(solid1, solid2, meshes, seen, bars, native_ccd, multi_ccd)
+        push, exact = convex_wrenches(solid1, solid2, meshes, contact, bars, native_ccd, multi_ccd)
         if not exact:
             count_touch(touches_out, worldid, substep, shapes.geom_type.shape[0], geoms[0], geoms[1], type1, type2)
         if wrenches_out.shape[0] > 0:
-            wrenches_out[con, 0] = wrench(push.force1, push.torque1, seen.point - solid1.pos)
-            wrenches_out[con, 1] = wrench(push.force2, push.torque2, seen.point - solid2.pos)
+            wrenches_out[con, 0] = wrench(push.force1, push.torque1, contact.point - solid1.pos)
+            wrenches_out[con, 1] = wrench(push.force2, push.torque2, contact.point - solid2.pos)
         body1 = shapes.geom_bodyid[geoms[0]]
         body2 = shapes.geom_bodyid[geoms[1]]
         if body1 > 0:
-            arm = seen.point - subtree_com_in[worldid, shapes.body_rootid[body1]]
+            arm = contact.point - subtree_com_in[worldid, shapes.body_rootid[body1]]
             wp.atomic_add(moved_bar_out, worldid, body1, wrench(push.force1, push.torque1, arm))
         if body2 > 0:
-            arm = seen.point - subtree_com_in[worldid, shapes.body_rootid[body2]]
+            arm = contact.point - subtree_com_in[worldid, shapes.body_rootid[body2]]
             wp.atomic_add(moved_bar_out, worldid, body2, wrench(push.force2, push.torque2, arm))
 
 

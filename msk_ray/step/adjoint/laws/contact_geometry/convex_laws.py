@@ -11,6 +11,7 @@ s of each point along its surface, and g = u₂(b) - u₁(a) in the tangent plan
 
 import warp as wp
 
+from msk_ray.step.adjoint.laws.contact_geometry.contact_point import Bars, ContactPoint
 from msk_ray.step.adjoint.laws.contact_geometry.patches import EDGE, Patch
 from msk_ray.step.forward.mjw_private import make_frame
 
@@ -18,24 +19,6 @@ wp.set_module_options({"enable_backward": False})
 
 _SINGULAR = wp.constant(1.0e-5)
 """Pivot, of rows of order one, below which the laws leave a motion open."""
-
-
-@wp.struct
-class Seen:
-    """A contact as mujoco_warp returned it."""
-
-    dist: wp.float32
-    point: wp.vec3
-    normal: wp.vec3
-
-
-@wp.struct
-class Bars:
-    """Cotangents of a contact's distance, point and normal."""
-
-    dist: wp.float32
-    point: wp.vec3
-    normal: wp.vec3
 
 
 @wp.struct
@@ -130,7 +113,9 @@ def radii(patch: Patch, t1: wp.vec3, t2: wp.vec3, length: float) -> tuple[wp.mat
 
 
 @wp.func
-def touching_wrenches(patch1: Patch, patch2: Patch, seen: Seen, bars: Bars, length: float) -> tuple[Push, wp.bool]:
+def touching_wrenches(
+    patch1: Patch, patch2: Patch, contact: ContactPoint, bars: Bars, length: float
+) -> tuple[Push, wp.bool]:
     """Pullback of two patches' contact, none of them a face, and whether the contact has a derivative.
 
     It has none where two edges are parallel, or where the centres of curvature meet.
@@ -138,11 +123,11 @@ def touching_wrenches(patch1: Patch, patch2: Patch, seen: Seen, bars: Bars, leng
     Args:
         length: unit of length, of the order of the geoms' sizes.
     """
-    n = seen.normal
+    n = contact.normal
     frame = make_frame(n)
     t1 = frame[1]
     t2 = frame[2]
-    d = seen.dist
+    d = contact.dist
     c1, q1 = radii(patch1, t1, t2, length)
     c2, q2 = radii(patch2, t1, t2, length)
     # Unknowns l δn and s₂; s₁ = g - d δn - s₂ :
@@ -192,19 +177,19 @@ class Foot:
 
 
 @wp.func
-def flat_wrenches(foot: Foot, plane: wp.vec3, seen: Seen, bars: Bars, turns_with_other: int) -> Push:
+def flat_wrenches(foot: Foot, plane: wp.vec3, contact: ContactPoint, bars: Bars, turns_with_other: int) -> Push:
     """Pullback of a contact whose first geom has the face.
 
     Args:
         foot: of the second geom.
         plane: outward normal of the face, N.
-        seen: the contact; its normal n, which points from the first geom to the second, is N or nearly.
+        contact: its normal n, which points from the first geom to the second, is N or nearly.
         bars: cotangents.
         turns_with_other: 1 where n belongs to the second geom, a face of which lies on the first's.
     """
-    n = seen.normal
+    n = contact.normal
     cosine = wp.dot(plane, n)
-    d = seen.dist
+    d = contact.dist
     height = d / cosine
     # dist = h N·n ,  point = v - h N + ½ d n ,  δh = N·r ,  r = T (g + B δm) ,  δm = -(ω₁ - ω₂)×N
     reach = bars.dist + 0.5 * wp.dot(bars.point, n)
@@ -215,7 +200,7 @@ def flat_wrenches(foot: Foot, plane: wp.vec3, seen: Seen, bars: Bars, turns_with
     push = Push()
     push.force1 = bars.point - gap_bar
     push.force2 = gap_bar
-    arm = foot.place - seen.point
+    arm = foot.place - contact.point
     push.torque1 = wp.cross(arm, push.force1) - turn + tilt - height * wp.cross(plane, bars.point)
     push.torque2 = wp.cross(arm, push.force2) + turn
     normal_torque = wp.cross(n, bars.normal + 0.5 * d * bars.point) - tilt
@@ -227,11 +212,11 @@ def flat_wrenches(foot: Foot, plane: wp.vec3, seen: Seen, bars: Bars, turns_with
 
 
 @wp.func
-def height_wrenches(place: wp.vec3, plane: wp.vec3, seen: Seen, dist_bar: float) -> Push:
+def height_wrenches(place: wp.vec3, plane: wp.vec3, contact: ContactPoint, dist_bar: float) -> Push:
     """Pullback of a distance that is the height of a point of the second geom above a face of the first."""
     push = Push()
     push.force2 = dist_bar * plane
     push.force1 = -push.force2
-    push.torque2 = wp.cross(place - seen.point, push.force2)
+    push.torque2 = wp.cross(place - contact.point, push.force2)
     push.torque1 = -push.torque2
     return push

@@ -8,6 +8,7 @@ ends lie side by side.
 import warp as wp
 from mujoco_warp import GeomType
 
+from msk_ray.step.adjoint.laws.contact_geometry.contact_point import Bars, Geom
 from msk_ray.step.adjoint.spatial import column
 from msk_ray.step.forward.mjw_private import (
     capsule_capsule,
@@ -187,23 +188,20 @@ def rim_torque(normal: wp.vec3, axis: wp.vec3, arm: wp.vec3, core_bar: wp.vec3) 
 
 
 @wp.func
-def pair_score(
-    type1: wp.int32,
-    type2: wp.int32,
-    pos1: wp.vec3,
-    mat1: wp.mat33,
-    size1: wp.vec3,
-    pos2: wp.vec3,
-    mat2: wp.mat33,
-    size2: wp.vec3,
-    law: ParallelLaw,
-    dist_weight: wp.float32,
-    pos_weight: wp.vec3,
-    normal_weight: wp.vec3,
-) -> wp.float32:
+def pair_score(geom1: Geom, geom2: Geom, law: ParallelLaw, weights: Bars) -> wp.float32:
     """Weighted sum of (dist, pos, normal) of a contact of a pair; `law` counts for two capsules only."""
-    axis1 = column(mat1, 2)
-    axis2 = column(mat2, 2)
+    type1 = geom1.type
+    type2 = geom2.type
+    pos1 = geom1.pos
+    pos2 = geom2.pos
+    size1 = geom1.size
+    size2 = geom2.size
+    mat2 = geom2.mat
+    dist_weight = weights.dist
+    pos_weight = weights.point
+    normal_weight = weights.normal
+    axis1 = column(geom1.mat, 2)
+    axis2 = column(geom2.mat, 2)
     score = wp.float32(0.0)
     if type1 == GeomType.SPHERE and type2 == GeomType.SPHERE:
         dist_a, pos_a, normal_a = sphere_sphere(pos1, size1[0], pos2, size2[0])

@@ -3,7 +3,11 @@
 Plane against sphere, capsule, box or mesh: the core of the other geom that is nearest the plane (centre, end, corner,
 vertex) is fixed to its body; against a cylinder it also runs around the rim. Sphere against sphere, capsule, cylinder
 or box, capsule against capsule, and plane against ellipsoid: the collision function itself is differentiated
-(`pair_laws`). Capsule against box: the law of the features that touch (`capsule_box`). All others: `convex`.
+(`primitive_laws`). Capsule against box: the law of the features that touch (`capsule_box`). All others: `convex`.
+
+With o a point of the plane, n its normal, r the core's radius and c the core,
+
+    dist = n·(c - o) - r ,  pos = c - n (r + dist/2) ,  frame = frame(n, the capsule's axis) .
 """
 
 from functools import cache
@@ -14,8 +18,9 @@ from mujoco_warp import GeomType
 
 from msk_ray.step.adjoint.coverage.approximated import Touches, count_touch
 from msk_ray.step.adjoint.groups import ContactBars, Contacts, Shapes
-from msk_ray.step.adjoint.laws.contact_geometry.capsule_box import capsule_box_wrenches
+from msk_ray.step.adjoint.laws.contact_geometry.capsule_box import capsule_box_push
 from msk_ray.step.adjoint.laws.contact_geometry.contact_order import contacts_end
+from msk_ray.step.adjoint.laws.contact_geometry.contact_point import Bars, ContactPoint, Geom, PairPush
 from msk_ray.step.adjoint.laws.contact_geometry.primitive_laws import (
     SCORED_PAIRS,
     STANDING_PAIRS,
@@ -33,20 +38,104 @@ from msk_ray.step.forward.mjw_private import make_frame
 wp.set_module_options({"enable_backward": False})
 
 
+BUILT, ALONG_AXIS, BESIDE_AXIS = (wp.constant(i) for i in range(3))
+"""Contact frames: built from the normal alone; with a capsule's axis, made orthogonal to the normal, as second axis;
+with a fixed second axis, where the capsule is steep."""
+
+
+@wp.struct
+class FrameGuide:
+    """What a contact's frame is built from besides its normal."""
+
+    kind: wp.int32
+    axis: wp.vec3
+
+
 @wp.func
-def frame_score(normal: wp.vec3, axis: wp.vec3, along_axis: wp.int32, weight: wp.mat33) -> wp.float32:
-    """⟨weight, frame⟩ of the contact frame built from a normal, and from a capsule's axis where that guides it."""
+def frame_guide(plane: Geom, other: Geom, frame: wp.mat33) -> FrameGuide:
+    """That of a pair, which has an axis where a capsule meets a plane."""
+    out = FrameGuide()
+    if plane.type == GeomType.PLANE and other.type == GeomType.CAPSULE:
+        normal = frame[0]
+        out.axis = column(other.mat, 2)
+        out.kind = ALONG_AXIS
+        if wp.length(out.axis - normal * wp.dot(normal, out.axis)) < 0.5:
+            out.axis = frame[1]
+            out.kind = BESIDE_AXIS
+    return out
+
+
+@wp.func
+def frame_score(normal: wp.vec3, guide: FrameGuide, weight: wp.mat33) -> wp.float32:
+    """⟨weight, frame⟩ of the contact frame built from a normal and its guide."""
+    axis = guide.axis
     score = wp.float32(0.0)
-    if along_axis == 1:
+    if guide.kind == ALONG_AXIS:
         b = wp.normalize(axis - normal * wp.dot(normal, axis))
         score = wp.dot(weight[0], normal) + wp.dot(weight[1], b) + wp.dot(weight[2], wp.cross(normal, b))
-    elif along_axis == 2:
-        # Steep capsule: a fixed second axis, not made orthogonal to the normal.
+    elif guide.kind == BESIDE_AXIS:
         score = wp.dot(weight[0], normal) + wp.dot(weight[1], axis) + wp.dot(weight[2], wp.cross(normal, axis))
     else:
         frame = make_frame(normal)
         score = wp.dot(weight[0], frame[0]) + wp.dot(weight[1], frame[1]) + wp.dot(weight[2], frame[2])
     return score
+
+
+@wp.func
+def geom_of(worldid: int, geomid: int, shapes: Shapes, xpos: wp.array2d[wp.vec3], xmat: wp.array2d[wp.mat33]) -> Geom:
+    """A geom of one world."""
+    out = Geom()
+    out.type = shapes.geom_type[geomid]
+    out.pos = xpos[worldid, geomid]
+    out.mat = xmat[worldid, geomid]
+    out.size = shapes.geom_size[worldid % shapes.geom_size.shape[0], geomid]
+    return out
+
+
+@wp.func
+def scored_push(index: int, geom1: Geom, geom2: Geom, contact: ContactPoint, bars: Bars) -> PairPush:
+    """Push of contact `index` of a pair that `pair_score` knows, at the geoms' centres."""
+    law = ParallelLaw()
+    if geom1.type == GeomType.CAPSULE:
+        axis1 = column(geom1.mat, 2)
+        axis2 = column(geom2.mat, 2)
+        law = parallel_law(index, geom1.pos, axis1, geom1.size[1], geom2.pos, axis2, geom2.size[1])
+    weights = bars
+    if cores_coincide(geom1.type, geom2.type, geom1.pos, geom1.size, geom2.pos, geom2.size, contact.dist):
+        weights.normal = wp.vec3(0.0)
+    geom1_bar, geom2_bar, _law, _weights = wp.grad(pair_score)(geom1, geom2, law, weights)
+    out = PairPush()
+    out.force1 = geom1_bar.pos
+    out.torque1 = turning_torque(geom1.mat, geom1_bar.mat)
+    out.place1 = geom1.pos
+    out.force2 = geom2_bar.pos
+    out.torque2 = turning_torque(geom2.mat, geom2_bar.mat)
+    out.place2 = geom2.pos
+    return out
+
+
+@wp.func
+def plane_push(
+    plane: Geom, other: Geom, contact: ContactPoint, bars: Bars, guide: FrameGuide, axis_bar: wp.vec3
+) -> PairPush:
+    """Push of a plane and the geom whose nearest core is fixed to its body: c and o as above, acting at c and at o."""
+    normal = contact.normal
+    radius = float(0.0)
+    if other.type == GeomType.SPHERE or other.type == GeomType.CAPSULE:
+        radius = other.size[0]
+    core = contact.point + normal * (radius + 0.5 * contact.dist)
+    reach = bars.dist - 0.5 * wp.dot(normal, bars.point)
+    out = PairPush()
+    out.force2 = bars.point + reach * normal
+    out.place2 = core
+    if guide.kind == ALONG_AXIS:
+        out.torque2 = wp.cross(guide.axis, axis_bar)
+    # n turns with the plane: dn = ω × n  ⇒  torque n × n̄
+    normal_bar = bars.normal + reach * (core - plane.pos) - (radius + 0.5 * contact.dist) * bars.point
+    out.force1 = -reach * normal
+    out.torque1 = wp.cross(normal, normal_bar)
+    out.place1 = plane.pos
+    return out
 
 
 class PairKinds(NamedTuple):
@@ -71,7 +160,6 @@ class PairKinds(NamedTuple):
 @cache
 def pull_geometry_kernel(kinds: PairKinds) -> Any:
     """The kernel for models with these kinds of pairs."""
-    scored, capsule_box, standing = kinds
 
     @wp.kernel(module="unique", enable_backward=False)
     def pull_geometry(
@@ -98,131 +186,56 @@ def pull_geometry_kernel(kinds: PairKinds) -> Any:
                 continue
             worldid = contacts_in.worldid[con]
             geoms = contacts_in.geom[con]
-            type1 = shapes.geom_type[geoms[0]]
-            type2 = shapes.geom_type[geoms[1]]
-            if is_convex_pair(type1, type2):
+            geom1 = geom_of(worldid, geoms[0], shapes, geom_xpos_in, geom_xmat_in)
+            geom2 = geom_of(worldid, geoms[1], shapes, geom_xpos_in, geom_xmat_in)
+            if is_convex_pair(geom1.type, geom2.type):
                 continue
+            contact = ContactPoint()
+            contact.dist = contacts_in.dist[con]
+            contact.point = contacts_in.pos[con]
+            contact.normal = contacts_in.frame[con][0]
+            guide = frame_guide(geom1, geom2, contacts_in.frame[con])
+            normal_bar, guide_bar, _weight = wp.grad(frame_score)(contact.normal, guide, contact_bars_in.frame[con])
+            bars = Bars()
+            bars.dist = contact_bars_in.dist[con]
+            bars.point = contact_bars_in.pos[con]
+            bars.normal = normal_bar
+
+            index = contacts_in.geomcollisionid[con]
+            push = PairPush()
+            known = bool(False)
+            if wp.static(kinds.scored):
+                if is_scored(geom1.type, geom2.type):
+                    known = bool(True)
+                    push = scored_push(index, geom1, geom2, contact, bars)
+            if wp.static(kinds.capsule_box):
+                if geom1.type == GeomType.CAPSULE and geom2.type == GeomType.BOX:
+                    known = bool(True)
+                    push = capsule_box_push(index, geom1, geom2, contact, bars)
+            if not known and geom1.type == GeomType.PLANE:
+                push = plane_push(geom1, geom2, contact, bars, guide, guide_bar.axis)
+                if wp.static(kinds.standing):
+                    if geom2.type == GeomType.CYLINDER:
+                        arm = push.place2 - geom2.pos
+                        around, exact = rim_torque(contact.normal, column(geom2.mat, 2), arm, push.force2)
+                        push.torque2 += around
+                        push.torque1 -= around
+                        if not exact and (bars.dist != 0.0 or wp.dot(bars.point, bars.point) != 0.0):
+                            ngeom = shapes.geom_type.shape[0]
+                            count_touch(
+                                touches_out, worldid, substep, ngeom, geoms[0], geoms[1], geom1.type, geom2.type
+                            )
+
+            if wrenches_out.shape[0] > 0:
+                wrenches_out[con, 0] = wrench(push.force1, push.torque1, push.place1 - geom1.pos)
+                wrenches_out[con, 1] = wrench(push.force2, push.torque2, push.place2 - geom2.pos)
             body1 = shapes.geom_bodyid[geoms[0]]
             body2 = shapes.geom_bodyid[geoms[1]]
-            dist = contacts_in.dist[con]
-            point = contacts_in.pos[con]
-            frame = contacts_in.frame[con]
-            normal = frame[0]
-            dist_bar = contact_bars_in.dist[con]
-            pos_bar = contact_bars_in.pos[con]
-            weight = contact_bars_in.frame[con]
-            com1 = subtree_com_in[worldid, shapes.body_rootid[body1]]
-            com2 = subtree_com_in[worldid, shapes.body_rootid[body2]]
-            pos1 = geom_xpos_in[worldid, geoms[0]]
-            pos2 = geom_xpos_in[worldid, geoms[1]]
-            mat1 = geom_xmat_in[worldid, geoms[0]]
-            mat2 = geom_xmat_in[worldid, geoms[1]]
-            zero = wp.vec3(0.0)
-
-            along_axis = int(0)
-            axis = zero
-            if type1 == GeomType.PLANE and type2 == GeomType.CAPSULE:
-                axis = column(mat2, 2)
-                along_axis = 1
-                if wp.length(axis - normal * wp.dot(normal, axis)) < 0.5:
-                    axis = frame[1]
-                    along_axis = 2
-            normal_bar, axis_bar, _kind, _weight = wp.grad(frame_score)(normal, axis, along_axis, weight)
-
-            # Wrenches on the bodies: force at a point, and torque.
-            force1 = zero
-            torque1 = zero
-            place1 = pos1
-            force2 = zero
-            torque2 = zero
-            place2 = pos2
-            known = bool(False)
-            if wp.static(scored):
-                known = is_scored(type1, type2)
-            if wp.static(scored):
-                if known:
-                    size1 = shapes.geom_size[worldid % shapes.geom_size.shape[0], geoms[0]]
-                    size2 = shapes.geom_size[worldid % shapes.geom_size.shape[0], geoms[1]]
-                    law = ParallelLaw()
-                    if type1 == GeomType.CAPSULE:
-                        law = parallel_law(
-                            contacts_in.geomcollisionid[con],
-                            pos1,
-                            column(mat1, 2),
-                            size1[1],
-                            pos2,
-                            column(mat2, 2),
-                            size2[1],
-                        )
-                    if cores_coincide(type1, type2, pos1, size1, pos2, size2, dist):
-                        normal_bar = zero
-                    _t1, _t2, pos1_bar, mat1_bar, _s1, pos2_bar, mat2_bar, _s2, _l, _d, _p, _n = wp.grad(pair_score)(
-                        type1,
-                        type2,
-                        pos1,
-                        mat1,
-                        size1,
-                        pos2,
-                        mat2,
-                        size2,
-                        law,
-                        dist_bar,
-                        pos_bar,
-                        normal_bar,
-                    )
-                    force1 = pos1_bar
-                    force2 = pos2_bar
-                    torque1 = turning_torque(mat1, mat1_bar)
-                    torque2 = turning_torque(mat2, mat2_bar)
-            if wp.static(capsule_box):
-                if type1 == GeomType.CAPSULE and type2 == GeomType.BOX:
-                    known = bool(True)
-                    force1, torque1, force2, torque2 = capsule_box_wrenches(
-                        contacts_in.geomcollisionid[con],
-                        pos1,
-                        mat1,
-                        shapes.geom_size[worldid % shapes.geom_size.shape[0], geoms[0]],
-                        pos2,
-                        mat2,
-                        shapes.geom_size[worldid % shapes.geom_size.shape[0], geoms[1]],
-                        dist,
-                        point,
-                        normal,
-                        dist_bar,
-                        pos_bar,
-                        normal_bar,
-                    )
-            if not known and type1 == GeomType.PLANE:
-                # The core of the other geom that is nearest the plane is fixed to its body: a sphere's centre, a
-                # capsule's end, a box's corner, a mesh's vertex; a cylinder's rim point also runs around the rim.
-                radius = float(0.0)
-                if type2 == GeomType.SPHERE or type2 == GeomType.CAPSULE:
-                    radius = shapes.geom_size[worldid % shapes.geom_size.shape[0], geoms[1]][0]
-                core = point + normal * (radius + 0.5 * dist)
-                # pos = core - n (r + dist/2) ,  dist = n·(core - o) - r
-                reach = dist_bar - 0.5 * wp.dot(normal, pos_bar)
-                turned = normal_bar + reach * (core - pos1) - (radius + 0.5 * dist) * pos_bar
-                force2 = pos_bar + reach * normal
-                place2 = core
-                if along_axis == 1:
-                    torque2 = wp.cross(axis, axis_bar)
-                # n turns with the plane: dn = ω × n  ⇒  torque n × n̄
-                force1 = -reach * normal
-                torque1 = wp.cross(normal, turned)
-                if wp.static(standing):
-                    if type2 == GeomType.CYLINDER:
-                        around, exact = rim_torque(normal, column(mat2, 2), core - pos2, force2)
-                        torque2 += around
-                        torque1 -= around
-                        if not exact and (dist_bar != 0.0 or wp.dot(pos_bar, pos_bar) != 0.0):
-                            ngeom = shapes.geom_type.shape[0]
-                            count_touch(touches_out, worldid, substep, ngeom, geoms[0], geoms[1], type1, type2)
-            if wrenches_out.shape[0] > 0:
-                wrenches_out[con, 0] = wrench(force1, torque1, place1 - pos1)
-                wrenches_out[con, 1] = wrench(force2, torque2, place2 - pos2)
             if body1 > 0:
-                wp.atomic_add(moved_bar_out, worldid, body1, wrench(force1, torque1, place1 - com1))
+                arm1 = push.place1 - subtree_com_in[worldid, shapes.body_rootid[body1]]
+                wp.atomic_add(moved_bar_out, worldid, body1, wrench(push.force1, push.torque1, arm1))
             if body2 > 0:
-                wp.atomic_add(moved_bar_out, worldid, body2, wrench(force2, torque2, place2 - com2))
+                arm2 = push.place2 - subtree_com_in[worldid, shapes.body_rootid[body2]]
+                wp.atomic_add(moved_bar_out, worldid, body2, wrench(push.force2, push.torque2, arm2))
 
     return pull_geometry

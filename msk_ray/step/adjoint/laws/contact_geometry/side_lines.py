@@ -10,7 +10,8 @@ import warp as wp
 from mujoco_warp import GeomType
 
 from msk_ray.step.adjoint.groups import Meshes
-from msk_ray.step.adjoint.laws.contact_geometry.convex_laws import Bars, Push, Seen, touching_wrenches
+from msk_ray.step.adjoint.laws.contact_geometry.contact_point import Bars, ContactPoint
+from msk_ray.step.adjoint.laws.contact_geometry.convex_laws import Push, touching_wrenches
 from msk_ray.step.adjoint.laws.contact_geometry.patches import EDGE, Patch, rim_bend, tangential
 from msk_ray.step.adjoint.laws.contact_geometry.solids import Solid, farthest, tied_corner
 from msk_ray.step.adjoint.spatial import column
@@ -43,7 +44,13 @@ def first_normal(capsule: Solid, offset: wp.vec3, plane: wp.vec3) -> wp.vec3:
 
 @wp.func
 def line_wrenches(
-    below: Solid, capsule: Solid, meshes: Meshes, normal: wp.vec3, seen: Seen, gap_bar: wp.vec3, length: float
+    below: Solid,
+    capsule: Solid,
+    meshes: Meshes,
+    normal: wp.vec3,
+    contact: ContactPoint,
+    gap_bar: wp.vec3,
+    length: float,
 ) -> tuple[Push, wp.bool]:
     """What the line's motion adds to the pullback of a clipped point, and whether the law of m is known.
 
@@ -52,7 +59,7 @@ def line_wrenches(
         capsule: the other one.
         meshes: hulls of meshes.
         normal: m.
-        seen: the contact.
+        contact: as mujoco_warp returned it.
         gap_bar: cotangent of the foot's motion relative to the ground.
         length: unit of length.
     """
@@ -92,7 +99,7 @@ def line_wrenches(
     if tied:
         at = corner - wp.dot(run, from_corner) * run
     surface = core - radius * normal
-    first = Seen()
+    first = ContactPoint()
     first.normal = normal
     first.dist = wp.dot(normal, surface - at)
     first.point = 0.5 * (surface + at)
@@ -100,7 +107,7 @@ def line_wrenches(
     bars = Bars()
     bars.normal = turn_bar
     push, regular = touching_wrenches(patch1, patch2, first, bars, length)
-    arm = first.point - seen.point
+    arm = first.point - contact.point
     push.torque1 += wp.cross(arm, push.force1)
     push.torque2 += wp.cross(arm, push.force2)
     # δm relative to the capsule: δm - ω₂×m

@@ -10,7 +10,8 @@ import warp as wp
 from mujoco_warp import GeomType
 
 from msk_ray.step.adjoint.groups import Meshes
-from msk_ray.step.adjoint.laws.contact_geometry.convex_laws import Foot, Seen
+from msk_ray.step.adjoint.laws.contact_geometry.contact_point import ContactPoint
+from msk_ray.step.adjoint.laws.contact_geometry.convex_laws import Foot
 from msk_ray.step.adjoint.laws.contact_geometry.patches import ellipsoid_bend, rim_bend, tangential
 from msk_ray.step.adjoint.laws.contact_geometry.side_lines import side_offset
 from msk_ray.step.adjoint.laws.contact_geometry.solids import (
@@ -54,12 +55,12 @@ class Ground:
 
 
 @wp.func
-def miss_of(place: wp.vec3, ground: Ground, seen: Seen) -> float:
-    """How far the contact that a candidate would give is from the one seen [m]."""
-    foot = seen.point - 0.5 * seen.dist * seen.normal
+def miss_of(place: wp.vec3, ground: Ground, contact: ContactPoint) -> float:
+    """How far the contact that a candidate would give is from the actual one [m]."""
+    foot = contact.point - 0.5 * contact.dist * contact.normal
     height = wp.dot(ground.normal, place - ground.origin)
     aside = tangential(ground.normal) @ (place - foot)
-    return wp.length(aside) + wp.abs(height * wp.dot(ground.normal, seen.normal) - seen.dist)
+    return wp.length(aside) + wp.abs(height * wp.dot(ground.normal, contact.normal) - contact.dist)
 
 
 @wp.func
@@ -74,12 +75,12 @@ def fixed_foot(place: wp.vec3, bend: wp.mat33) -> Foot:
 
 @wp.func
 def cut_foot(
-    start: wp.vec3, run: wp.vec3, bend: wp.mat33, ground: Ground, meshes: Meshes, seen: Seen
+    start: wp.vec3, run: wp.vec3, bend: wp.mat33, ground: Ground, meshes: Meshes, contact: ContactPoint
 ) -> tuple[Foot, wp.float32]:
     """The best point of a line along `run` where a side plane of the face cuts it, and its miss."""
     best = Foot()
     least = float(1.0e30)
-    at = seen.point - 0.5 * seen.dist * seen.normal
+    at = contact.point - 0.5 * contact.dist * contact.normal
     count = corner_count(ground.solid, meshes, ground.face)
     begin = out_of(ground.solid, face_corner(ground.solid, meshes, ground.face, 0))
     for k in range(count):
@@ -89,7 +90,7 @@ def cut_foot(
         if wp.abs(wp.dot(side, at - begin)) < _NEAR * ground.length and wp.abs(slope) > _PARALLEL:
             foot = fixed_foot(start + run * (wp.dot(side, begin - start) / slope), bend)
             foot.slide = foot.slide - wp.outer(run, side) / slope
-            miss = miss_of(foot.place, ground, seen)
+            miss = miss_of(foot.place, ground, contact)
             if miss < least:
                 least = miss
                 best = foot
@@ -98,7 +99,9 @@ def cut_foot(
 
 
 @wp.func
-def corner_foot(other: Solid, other_face: int, ground: Ground, meshes: Meshes, seen: Seen) -> tuple[Foot, wp.float32]:
+def corner_foot(
+    other: Solid, other_face: int, ground: Ground, meshes: Meshes, contact: ContactPoint
+) -> tuple[Foot, wp.float32]:
     """The best point of the other geom's face above a corner of the ground, and its miss."""
     best = Foot()
     least = float(1.0e30)
@@ -110,7 +113,7 @@ def corner_foot(other: Solid, other_face: int, ground: Ground, meshes: Meshes, s
             corner = out_of(ground.solid, face_corner(ground.solid, meshes, ground.face, k))
             foot = fixed_foot(corner + ground.normal * (wp.dot(normal, through - corner) / slope), wp.mat33())
             foot.slide = wp.outer(ground.normal, normal) / slope
-            miss = miss_of(foot.place, ground, seen)
+            miss = miss_of(foot.place, ground, contact)
             if miss < least:
                 least = miss
                 best = foot
@@ -119,14 +122,14 @@ def corner_foot(other: Solid, other_face: int, ground: Ground, meshes: Meshes, s
 
 @wp.func
 def cornered_foot(
-    other: Solid, other_face: int, ground: Ground, meshes: Meshes, seen: Seen, is_clipped: bool
+    other: Solid, other_face: int, ground: Ground, meshes: Meshes, contact: ContactPoint, is_clipped: bool
 ) -> tuple[Foot, wp.float32]:
     """The best foot of a geom with corners: of one of its faces, or with -1 of all that look at the ground."""
     best = Foot()
     least = float(1.0e30)
     rounding = _ROUNDING * ground.length
-    height = seen.dist / wp.dot(ground.normal, seen.normal)
-    at = seen.point - 0.5 * seen.dist * seen.normal
+    height = contact.dist / wp.dot(ground.normal, contact.normal)
+    at = contact.point - 0.5 * contact.dist * contact.normal
     above = at + height * ground.normal
     first = int(0)
     last = face_count(other, meshes)
@@ -146,7 +149,7 @@ def cornered_foot(
                 for k in range(count):
                     end = out_of(other, face_corner(other, meshes, face, (k + 1) % count))
                     if step == 0:
-                        miss = miss_of(begin, ground, seen)
+                        miss = miss_of(begin, ground, contact)
                         if miss < least - rounding:
                             least = miss
                             best = fixed_foot(begin, wp.mat33())
@@ -156,13 +159,13 @@ def cornered_foot(
                         flat_run = tangential(ground.normal) @ run
                         gap = wp.cross(aside, flat_run)
                         if wp.length(gap) < _NEAR * ground.length * wp.length(flat_run):
-                            foot, miss = cut_foot(begin, run, wp.mat33(), ground, meshes, seen)
+                            foot, miss = cut_foot(begin, run, wp.mat33(), ground, meshes, contact)
                             if miss < least - rounding:
                                 least = miss
                                 best = foot
                     begin = end
     if is_clipped and other_face >= 0:
-        foot, miss = corner_foot(other, other_face, ground, meshes, seen)
+        foot, miss = corner_foot(other, other_face, ground, meshes, contact)
         if miss < least - rounding:
             least = miss
             best = foot
@@ -170,7 +173,9 @@ def cornered_foot(
 
 
 @wp.func
-def long_foot(other: Solid, ground: Ground, meshes: Meshes, seen: Seen, is_clipped: bool) -> tuple[Foot, wp.float32]:
+def long_foot(
+    other: Solid, ground: Ground, meshes: Meshes, contact: ContactPoint, is_clipped: bool
+) -> tuple[Foot, wp.float32]:
     """The best foot of a capsule or of a cylinder's rims and side."""
     best = Foot()
     least = float(1.0e30)
@@ -189,8 +194,8 @@ def long_foot(other: Solid, ground: Ground, meshes: Meshes, seen: Seen, is_clipp
             bend = rim_bend(radius, axis, down)
     line = int(0)
     if other.type == GeomType.CAPSULE and is_clipped:
-        height = seen.dist / wp.dot(ground.normal, seen.normal)
-        offset = side_offset(other, seen.point - 0.5 * seen.dist * seen.normal + height * ground.normal)
+        height = contact.dist / wp.dot(ground.normal, contact.normal)
+        offset = side_offset(other, contact.point - 0.5 * contact.dist * contact.normal + height * ground.normal)
         if wp.length(offset - across) > _BY_OTHERS:
             line = 1
             side = radius * offset
@@ -199,19 +204,19 @@ def long_foot(other: Solid, ground: Ground, meshes: Meshes, seen: Seen, is_clipp
         centre = other.pos + axis * wp.where(end == 0, other.size[1], -other.size[1])
         if other.type == GeomType.CAPSULE:
             foot = fixed_foot(centre + radius * down, radius * tangential(down))
-            miss = miss_of(foot.place, ground, seen)
+            miss = miss_of(foot.place, ground, contact)
             if miss < least - rounding:
                 least = miss
                 best = foot
         if other.type == GeomType.CYLINDER or is_clipped:
             foot = fixed_foot(centre + side, bend)
             foot.line = line
-            miss = miss_of(foot.place, ground, seen)
+            miss = miss_of(foot.place, ground, contact)
             if miss < least - rounding:
                 least = miss
                 best = foot
     if is_clipped:
-        foot, miss = cut_foot(other.pos + side, axis, bend, ground, meshes, seen)
+        foot, miss = cut_foot(other.pos + side, axis, bend, ground, meshes, contact)
         foot.line = line
         if miss < least - rounding:
             least = miss
@@ -221,9 +226,9 @@ def long_foot(other: Solid, ground: Ground, meshes: Meshes, seen: Seen, is_clipp
 
 @wp.func
 def foot_of(
-    other: Solid, other_face: int, ground: Ground, meshes: Meshes, seen: Seen, is_clipped: bool
+    other: Solid, other_face: int, ground: Ground, meshes: Meshes, contact: ContactPoint, is_clipped: bool
 ) -> tuple[Foot, wp.float32]:
-    """The foot of a geom on the ground that gives the contact seen, and how far it misses it [m].
+    """The foot of a geom on the ground that makes the contact, and how far it misses it [m].
 
     A sphere and an ellipsoid have but one point that can be it.
 
@@ -232,7 +237,7 @@ def foot_of(
         other_face: its face that is clipped, -1 for none.
         ground: the face below it.
         meshes: hulls of meshes.
-        seen: the contact, its normal away from the ground.
+        contact: its normal points away from the ground.
         is_clipped: whether the collision clips against the ground's sides.
     """
     foot = Foot()
@@ -243,9 +248,9 @@ def foot_of(
     elif other.type == GeomType.ELLIPSOID:
         foot = fixed_foot(farthest(other, meshes, down), ellipsoid_bend(other.mat, other.size, down))
     elif other.type == GeomType.CAPSULE or (other.type == GeomType.CYLINDER and other_face < 0):
-        foot, miss = long_foot(other, ground, meshes, seen, is_clipped)
+        foot, miss = long_foot(other, ground, meshes, contact, is_clipped)
     else:
-        foot, miss = cornered_foot(other, other_face, ground, meshes, seen, is_clipped)
+        foot, miss = cornered_foot(other, other_face, ground, meshes, contact, is_clipped)
     return foot, miss
 
 
