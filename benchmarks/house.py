@@ -50,6 +50,10 @@ EDITS: dict[str, tuple[str, ...]] = {
         *(r'^    Feature\("drag of a fluid', r"^    if work\.settings\.fluid", r"^    fluid: bool$"),
         r"^            fluid=bool\(mjm",
     ),
+    "actuator type": (
+        *(r"^def free_activation\(", r"^def actuator_force\(", r"^def force_velocity_slope\(", r"^def act_step\("),
+        *(r"^def _foreign_actuator\(", r'^        "actuators: motor, position', r"^def _depends_on_velocity\("),
+    ),
     "parameter of the model": (r"^PARAMETERS: dict", r"^class RandomizeConfig", r'^    "pair_friction": _Field'),
     "search": (r"^SEARCHES = Registry",),
     "scheduler": (r"^SCHEDULERS = Registry",),
@@ -69,7 +73,7 @@ the checkout does not ask for; one that appears as the code changes has to be ad
 FROM_CTRL_TO_KERNEL = (
     *(r"^class WarpSimStep\(", r"^class Stepper\b", r"^class Engine\b", r"^class BatchTensors\b", r"^class Graph\b"),
     *(r"^class TapePerSubstep\b", r"^class WorldBatch\b", r"^class Stages\b", r"^def recomputed\("),
-    *(r"^class StepAdjoint\b", r"^def pull_actuators\("),
+    *(r"^class StepAdjoint\b", r"^ *def pull_actuators\("),
 )
 """What the path of a control's tensor goes through, to the kernel of actuators and back."""
 

@@ -96,7 +96,7 @@ class TapedStep:
                 self._substep.pull_back(data, qvel_next)
                 qvel_next = saved["qvel"]
             adjoint.finish(kept[0]["qpos"], self._raw)
-            found = (adjoint.grad_ctrl, self._raw, adjoint.grad_qvel, adjoint.grad_act)
-            for gradient, array in zip(found, (ctrl, *start), strict=True):
+            gradients = (adjoint.grad_ctrl, self._raw, adjoint.grad_qvel, adjoint.grad_act)
+            for gradient, array in zip(gradients, (ctrl, *start), strict=True):
                 if array.requires_grad and array.size:
                     wp.launch(add_into, dim=array.shape, inputs=[gradient], outputs=[array.grad])

@@ -44,7 +44,7 @@ class Settings:
 
     @staticmethod
     def of(mjm: mujoco.MjModel) -> "Settings":
-        """Those of a model."""
+        """The settings of a model."""
         disabled, bit = mjm.opt.disableflags, mujoco.mjtDisableBit
         euler = mjm.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
         smooth = bit.mjDSBL_ACTUATION | bit.mjDSBL_SPRING | bit.mjDSBL_DAMPER

@@ -122,12 +122,12 @@ def _odd_flags(m: mujoco.MjModel) -> list[str]:
 
 
 def _odd_surfaces(m: mujoco.MjModel) -> list[str]:
-    found: set[int] = set()
+    geoms: set[int] = set()
     for field in ("geom_adhesion", "geom_surfacevel"):
         values = getattr(m, field, None)
         if values is not None:
-            found |= {int(i) for i in np.flatnonzero(np.any(values != 0, axis=tuple(range(1, values.ndim))))}
-    return named(m, _OBJ.mjOBJ_GEOM, "geom", sorted(found))
+            geoms |= {int(i) for i in np.flatnonzero(np.any(values != 0, axis=tuple(range(1, values.ndim))))}
+    return named(m, _OBJ.mjOBJ_GEOM, "geom", sorted(geoms))
 
 
 _EXACT_INTEGRATORS = (_INTEGRATOR.mjINT_EULER, _INTEGRATOR.mjINT_IMPLICITFAST, _INTEGRATOR.mjINT_RK4)

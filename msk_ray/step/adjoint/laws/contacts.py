@@ -78,7 +78,7 @@ class RelativeRates:
 def relative_rates(
     worldid: int, body1: int, body2: int, arm1: wp.vec3, arm2: wp.vec3, motion_in: Motion, fields_in: Fields
 ) -> RelativeRates:
-    """Those of two bodies at a point with these arms about the centres of mass of their trees."""
+    """Rates of two bodies at a point with these arms about the centres of mass of their trees."""
     lam1 = fields_in.lam[worldid, body1]
     lam2 = fields_in.lam[worldid, body2]
     acc1 = fields_in.qacc[worldid, body1]

@@ -99,12 +99,12 @@ def inside_score(
     plane = inside_plane(first, last, kind)
     point = radius * wp.normalize(plane.end0 + plane.end1)
     if place[2] != 0.0:
-        found = wp.vec2(place[0], place[1])
-        found = found * (radius / wp.length(found))  # the circle may grow
-        tangent = wp.vec2(-found[1], found[0])
-        g = -pull_along(plane.end0, found, tangent) - pull_along(plane.end1, found, tangent)
+        rim = wp.vec2(place[0], place[1])
+        rim = rim * (radius / wp.length(rim))  # the circle may grow
+        tangent = wp.vec2(-rim[1], rim[0])
+        g = -pull_along(plane.end0, rim, tangent) - pull_along(plane.end1, rim, tangent)
         # To first order in g, which is zero here but for rounding.
-        point = found - tangent * (g / place[2])
+        point = rim - tangent * (g / place[2])
     local = plane.axis0 * point[0] + plane.axis1 * point[1]
     if kind == WrapType.CYLINDER:
         length0 = wp.length(plane.end0 - point)

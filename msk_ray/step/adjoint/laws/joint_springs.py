@@ -1,4 +1,7 @@
-"""Springs of free and ball joints."""
+"""Springs of free and ball joints: Φ ∋ k(|d|) λ·d, k = k₀ + p₀|d| + p₁|d|².
+
+d is the displacement from rest, for a rotation its logarithm; that of hinges and slides is in `bodies.sweep_up`.
+"""
 
 import warp as wp
 from mujoco_warp import JointType

@@ -98,7 +98,7 @@ class RowSettings:
 
 @wp.struct
 class SolverParameters:
-    """Those of a row; `known` is false for rows of contacts."""
+    """What sets a row's aref and D; `known` is false for rows of contacts."""
 
     known: bool
     solref: wp.vec2
@@ -107,7 +107,7 @@ class SolverParameters:
 
 @wp.func
 def solver_parameters(worldid: int, kind: int, ident: int, settings: RowSettings) -> SolverParameters:
-    """Those of the limit, friction loss or equality `ident` that makes a row."""
+    """Solver parameters of the limit, friction loss or equality `ident` that makes a row."""
     out = SolverParameters()
     out.known = True
     if kind == ConstraintType.LIMIT_JOINT:

@@ -61,7 +61,7 @@ class Twists:
 
 @wp.func
 def rates_of(worldid: int, t: int, share: float, tendon_bars_in: TendonBars) -> Rates:
-    """Those of a tendon on a stretch of path that has this share of its length."""
+    """Cotangents of a tendon's rates on a stretch of path that has this share of its length."""
     out = Rates()
     out.lam = share * tendon_bars_in.lam[worldid, t]
     out.qacc = share * tendon_bars_in.qacc[worldid, t]

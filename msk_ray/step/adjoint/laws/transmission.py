@@ -1,4 +1,7 @@
-"""Actuators whose moment turns with q: at sites, and in the parent's frame of ball and free joints."""
+"""Actuators whose moment m turns with q: at sites, and in the parent's frame of ball and free joints.
+
+∂Φ/∂q ∋ Σ_x ∂Φ/∂ρ(x) ∂(m·x)/∂q ,  x = λ, v, μ, â ,  and ∂Φ/∂len ∂len/∂q where m is not ∂len/∂q .
+"""
 
 import warp as wp
 from mujoco_warp import JointType, TrnType

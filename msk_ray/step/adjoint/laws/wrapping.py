@@ -1,6 +1,6 @@
 """Tangent points of tendon paths on wrapping geoms.
 
-Kept apart from `paths`: Warp drops the derivative of a function that another kernel of the module runs forward only.
+In a module of its own, because it calls forward what `tendon_paths` differentiates (CONTRIBUTING, "a new law").
 """
 
 import warp as wp

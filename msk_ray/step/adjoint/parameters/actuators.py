@@ -78,7 +78,7 @@ def gear_rates_of_joint(
     state_in: State,
     multipliers_in: Multipliers,
 ) -> GearRates:
-    """Those of an actuator on a joint; a joint at its actuator force limit has no rate under λ."""
+    """Rates of an actuator on a joint; a joint at its actuator force limit has none under λ."""
     out = GearRates()
     kind = joints.jnt_type[jnt]
     dof = joints.jnt_dofadr[jnt]
@@ -140,7 +140,7 @@ def gear_rates_of_tendon(
     ten_J_in: wp.array2d[float],
     ten_length_in: wp.array2d[float],
 ) -> GearRates:
-    """Those of an actuator on a tendon."""
+    """Rates of an actuator on a tendon."""
     out = GearRates()
     out.length[0] = ten_length_in[worldid, t]
     start = tendons.ten_J_rowadr[t]
@@ -164,7 +164,7 @@ def site_rate(mat: wp.mat33, twist: wp.spatial_vectorf, arm: wp.vec3) -> wp.spat
 
 @wp.func
 def gear_rates_of_site(worldid: int, site: int, levers: Levers, motion_in: Motion, fields_in: Fields) -> GearRates:
-    """Those of an actuator on a site, whose length is zero."""
+    """Rates of an actuator on a site, whose length is zero."""
     out = GearRates()
     body = levers.site_bodyid[site]
     mat = levers.site_xmat[worldid, site]

@@ -1,7 +1,7 @@
 """Friction, solref and solimp of contacts: how the rows of one contact answer to them.
 
-`contact_score` is what a contact gives -Φ, Σ_r ρ_r(λ) f_r(ρ(a) - aref), as a function of its material alone. Kept apart
-from the kernel: Warp drops the derivative of a function that another kernel of the module runs forward only.
+`contact_score` is what a contact gives -Φ, Σ_r ρ_r(λ) f_r(ρ(a) - aref), as a function of its material alone. The law of
+an elliptic contact is in `forward.cone_law`.
 """
 
 import warp as wp

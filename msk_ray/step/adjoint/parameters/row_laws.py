@@ -1,6 +1,6 @@
-"""One uncoupled constraint row: how its force answers to its solver parameters, bound, position and the time step.
+"""The work of one uncoupled constraint row, which Warp differentiates by solver parameters, bound, position and h.
 
-Kept apart from the kernel: Warp drops the derivative of a function that another kernel of the module runs forward only.
+-Φ ∋ ρ(λ) f(jar) ,  jar = ρ(a) + b ρ(v) + k imp pos ,  f = -D jar (limits where jar < 0, friction loss clamped)
 """
 
 import warp as wp

@@ -223,15 +223,15 @@ class LinearSystems:
 
     def _solve_implicit(self, at: Substep) -> None:
         """μ, a - â and λ where B is a matrix: (M + hB)(a - â) = hB a ,  H λ = h v̄' - hB μ."""
-        d, found, rhs = at.data, self._work.multipliers, self._integrator.rhs
+        d, multipliers, rhs = at.data, self._work.multipliers, self._integrator.rhs
         self._product(d, d.qacc, 1.0)
-        self._solve_two(self._implicit, rhs, self._push, [found.mu, found.excess])
+        self._solve_two(self._implicit, rhs, self._push, [multipliers.mu, multipliers.excess])
         if self._free is not None:
             self._free.launch(at)
-        self._product(d, found.mu, -1.0)
+        self._product(d, multipliers.mu, -1.0)
         if self._free is not None:
             self._free.push(at, self._push)
-        self._solve_two(self._hessian, self._push, self._push, [found.lam, self._push])
+        self._solve_two(self._hessian, self._push, self._push, [multipliers.lam, self._push])
 
     def _product(self, d: Any, x: wp.array, scale: float) -> None:
         work = self._work

@@ -53,7 +53,7 @@ class FrameGuide:
 
 @wp.func
 def frame_guide(plane: Geom, other: Geom, frame: wp.mat33) -> FrameGuide:
-    """That of a pair, which has an axis where a capsule meets a plane."""
+    """The guide of a pair, which has an axis where a capsule meets a plane."""
     out = FrameGuide()
     if plane.type == GeomType.PLANE and other.type == GeomType.CAPSULE:
         normal = frame[0]
@@ -149,7 +149,7 @@ class PairKinds(NamedTuple):
 
     @classmethod
     def of(cls, types: set[tuple[int, int]]) -> "PairKinds":
-        """Those of a model whose colliding geometry types (ascending) are `types`."""
+        """The kinds in a model whose colliding geometry types (ascending) are `types`."""
         return cls(
             bool(types & SCORED_PAIRS),
             (int(GeomType.CAPSULE), int(GeomType.BOX)) in types,
