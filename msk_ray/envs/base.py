@@ -133,9 +133,9 @@ class Env(ABC, Generic[SettingsT]):
         self._weights = self.weights(reward)
         self._shares = torch.ones_like(self._weights)
         self._scheduled = any(term.schedule for term in self.active_terms)
-        self._set_shares(0)
 
     def _set_shares(self, epoch: int) -> None:
+        """Set the factors on the weights of terms with a schedule; they are 1 before the first epoch, and in scores."""
         for share, term in zip(self._shares, self.active_terms, strict=True):
             if term.schedule is not None:
                 share.fill_(term.schedule(self.config, epoch))
