@@ -44,7 +44,7 @@ EDITS: dict[str, tuple[str, ...]] = {
     "algorithm": (r"^ALGORITHMS = Registry", r"^BUILT_IN\b", r"^    ppo: PpoConfig", r'^    "PpoConfig",'),
     "reward term of the legs": (
         *(r"^FURTHER = ", r"^CLOCKED = ", r"^_GAINS = ", r"^class LegReward\(", r'^ +case "footfall":'),
-        *(r'\{"impact", "footfall", "landing"', r"^REWARD_TERMS\b", r"^TERMS\b"),
+        *(r'\{"impact", "footfall", "landing"', r'^    Cost\("footfall", 0\.0, needs', r"^def footfall\(env: LegEnv"),
     ),
     "physics feature": (
         *(r'^    Feature\("drag of a fluid', r"^    if work\.settings\.fluid", r"^    fluid: bool$"),

@@ -12,8 +12,10 @@ if TYPE_CHECKING:
     from msk_ray.algorithms import EpochResult as EpochResult
     from msk_ray.config import AlgorithmSettings as AlgorithmSettings
     from msk_ray.config import Config as Config
+    from msk_ray.config import Cost as Cost
     from msk_ray.config import EnvSettings as EnvSettings
     from msk_ray.config import Reward as Reward
+    from msk_ray.config import Term as Term
     from msk_ray.config import load_config as load_config
     from msk_ray.envs import Env as Env
     from msk_ray.envs import MjcfEnv as MjcfEnv
@@ -39,6 +41,7 @@ _HOMES = {
     "Backward": "msk_ray.step.autograd",
     "Capacity": "msk_ray.step.autograd",
     "Config": "msk_ray.config",
+    "Cost": "msk_ray.config",
     "Env": "msk_ray.envs",
     "EnvSettings": "msk_ray.config",
     "EpochResult": "msk_ray.algorithms",
@@ -52,6 +55,7 @@ _HOMES = {
     "StepState": "msk_ray.step.autograd",
     "TapeAll": "msk_ray.step.autograd",
     "TapePerSubstep": "msk_ray.step.autograd",
+    "Term": "msk_ray.config",
     "check_gradients": "msk_ray.step.check",
     "load_config": "msk_ray.config",
     "load_policy": "msk_ray.training.policy",

@@ -34,6 +34,7 @@ from msk_ray.config.schema import (
     TrialConfig,
 )
 from msk_ray.config.sections import EnvSettings, Reward
+from msk_ray.config.terms import Cost, Term
 from msk_ray.config.yaml_text import dump_yaml, parse_settings, parse_yaml, read_yaml
 from msk_ray.registry import Registry, resolve, resolve_class
 
@@ -50,6 +51,7 @@ __all__ = [
     "ContactCurriculum",
     "ContactHorizon",
     "ContactStart",
+    "Cost",
     "Draw",
     "EntropyConfig",
     "EnvSettings",
@@ -65,6 +67,7 @@ __all__ = [
     "Registry",
     "Reward",
     "ShacConfig",
+    "Term",
     "TrialConfig",
     "changed_settings",
     "combine",

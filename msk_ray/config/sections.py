@@ -7,6 +7,8 @@ from typing import Annotated, Any, ClassVar, Self, get_args
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PrivateAttr, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
+from msk_ray.config.terms import Term, check_switches
+
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 NonNegative = Annotated[float, Field(ge=0.0)]
 Count = Annotated[int, Field(gt=0, lt=2**31)]
@@ -114,6 +116,11 @@ class Reward(Section):
     """The weights and shapes of an environment's reward. Their defaults are the reference reward, under which policies
     are scored whatever they were trained on."""
 
+    terms: ClassVar[tuple[Term, ...]] = ()
+    """The terms whose weights it has; empty if its environment computes them in one method."""
+    without_weights: ClassVar[type["Reward"]]
+    """The section without the weights of its terms, if it has any."""
+
 
 class EnvSettings(Section):
     """The settings of every environment, and what it declares."""
@@ -151,23 +158,13 @@ class EnvSettings(Section):
         """
 
     def unread(self) -> dict[str, str]:
-        """Settings of this section, dotted, that nothing reads because of others, and the reason for each."""
+        """Settings of this section, dotted, that nothing reads because of others, and the reason for each.
+
+        Those that terms of the reward need are not among them.
+        """
         return {}
 
-
-class LimitedReward(Reward):
-    """The weights of a body whose training can charge for joints past their ranges."""
-
-    joint_limit: NonNegative = 0.0
-    """Weight of the summed squared overshoot past the joints' ranges, in units of 0.1 rad."""
-
-
-class LimitedSettings(EnvSettings):
-    """The settings of such a body."""
-
-    reward: LimitedReward = LimitedReward()
-    joint_limit_epochs: Whole = 0
-    """Epochs over which the weight `reward.joint_limit` falls linearly to 0; 0: it stays."""
-
-    def unread(self) -> dict[str, str]:
-        return {"joint_limit_epochs": "env.reward.joint_limit is 0"} if self.reward.joint_limit == 0.0 else {}
+    @model_validator(mode="after")
+    def _switches_of_terms(self) -> Self:
+        check_switches(self)
+        return self

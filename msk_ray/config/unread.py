@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from msk_ray.config.physics import PhysicsConfig
+from msk_ray.config.sections import EnvSettings
+from msk_ray.config.terms import unread_without_weight
 
 if TYPE_CHECKING:
     from msk_ray.config.schema import Config
@@ -36,13 +38,17 @@ def _unread(config: Config) -> dict[str, str]:
             unread["curriculum.start.solreffriction"] = why
     alien = [name for name in PhysicsConfig.names() if name not in env.reads_physics]
     unread |= {f"physics.{name}": f"env {env.name} does not read it;" for name in alien}
-    unread |= {f"env.{name}": f"nothing reads it while {why};" for name, why in env.unread().items()}
+    unread |= {f"env.{name}": f"nothing reads it while {why};" for name, why in _unread_of(env).items()}
     section = config.algorithm_section
     own = config.algorithm_settings.unread()
     unread |= {f"{section}.{name}": f"nothing reads it while {section}.{why};" for name, why in own.items()}
     if not config.actor.stochastic:
         unread |= dict.fromkeys(("actor.log_std", "actor.state_std"), _while("actor.stochastic", "false"))
     return unread
+
+
+def _unread_of(env: EnvSettings) -> dict[str, str]:
+    return env.unread() | unread_without_weight(env)
 
 
 def _unread_by_backward(config: Config) -> list[str]:

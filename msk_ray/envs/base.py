@@ -13,7 +13,8 @@ import mujoco
 import torch
 from torch import Tensor
 
-from msk_ray.config import AS_USUAL, EnvSettings, ExecutionConfig, PhysicsConfig
+from msk_ray.config import AS_USUAL, EnvSettings, ExecutionConfig, PhysicsConfig, Reward, Term
+from msk_ray.config.rewards import settings_with
 from msk_ray.envs.contract import Contract, versions
 from msk_ray.envs.layout import Entry
 from msk_ray.envs.options import JACOBIANS
@@ -41,6 +42,7 @@ class Env(ABC, Generic[SettingsT]):
         state: current state of all worlds; `detach` it to start a new graph.
         generator: source of reset states, on the environment's device; replace it by one on the CPU to draw the same
             states on every device.
+        active_terms: the terms that are computed.
         randomizer: parameters of the model that differ between worlds; None for the model's own.
         ignore_contact_forces: whether contact forces read as 0, for comparisons of gradients, because they carry none.
         group: the processes that the trial's worlds are spread over; here are those of this one.
@@ -55,6 +57,9 @@ class Env(ABC, Generic[SettingsT]):
     action_size: int
     obs_size: int
     """Entries of an observation; that of the first one unless a class sets it."""
+    terms: ClassVar[tuple[Term, ...]] = ()
+    """The terms of the reward. Their weights are settings: a class whose `Settings` lack them gets such that have them.
+    A class without terms has `reward_terms`, `reward_names`, `without_gradient` and a reward section of its own."""
     reward_names: tuple[str, ...]
     """Names of the T parts of the reward."""
     without_gradient: ClassVar[tuple[str, ...]] = ()
@@ -65,6 +70,13 @@ class Env(ABC, Generic[SettingsT]):
     """Whether `begin_epoch`, where a class has its own, only changes the contents of tensors."""
     Settings: ClassVar[type[EnvSettings]]
     """Its section of the configuration, which also lists its named physics and the physics settings it reads."""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if cls.terms and hasattr(cls, "Settings"):
+            cls.Settings = settings_with(cls.terms, cls.Settings, cls)
+        if "terms" in vars(cls) and "reward_names" not in vars(cls):
+            cls.reward_names = tuple(term.name for term in cls.terms if not term.optional)
 
     def __init__(
         self,
@@ -102,12 +114,35 @@ class Env(ABC, Generic[SettingsT]):
         if physics.randomize is not None:
             self.randomizer = Randomizer(physics.randomize, self.model, self.device, seed)
             self.sim.open_parameters(self.randomizer.parameters)
+        self._begin_terms()
         self._fresh: list[Resets] = []
         self.ignore_contact_forces = False
         self._reached: StepState | None = None
         self._measured: dict[str, tuple[StepState, bool, Any]] = {}
         self._contract = Contract(self)
         self._contract.begin()
+
+    def _begin_terms(self) -> None:
+        """Choose the terms that are computed: all but optional ones without a weight."""
+        reward, always = self.config.reward, tuple(term.name for term in self.terms if not term.optional)
+        self.active_terms = tuple(term for term in self.terms if not term.optional or term.weight_in(reward))
+        if self.active_terms and self.reward_names[: len(always)] == always:
+            # A class may have appended parts of its own.
+            self.reward_names = (*(term.name for term in self.active_terms), *self.reward_names[len(always) :])
+        self._measures = [term.measure for term in self.active_terms]
+        self._weights = self.weights(reward)
+        self._shares = torch.ones_like(self._weights)
+        self._scheduled = any(term.schedule for term in self.active_terms)
+
+    def _set_shares(self, epoch: int) -> None:
+        """Set the factors on the weights of terms with a schedule; they are 1 before the first epoch, and in scores."""
+        for share, term in zip(self._shares, self.active_terms, strict=True):
+            if term.schedule is not None:
+                share.fill_(term.schedule(self.config, epoch))
+
+    def weights(self, reward: Reward) -> Tensor:
+        """The weight of each of `active_terms` in a reward section, negative for costs."""
+        return torch.tensor([term.sign * term.weight_in(reward) for term in self.active_terms], device=self.device)
 
     @classmethod
     @abstractmethod
@@ -143,8 +178,9 @@ class Env(ABC, Generic[SettingsT]):
         """Called before each training epoch, counted from 0: change here what depends on the progress of training.
 
         Keep what changes in tensors, change them in place and set `begin_epoch_in_place`: a recorded epoch reads
-        tensors again each time, but a number only once.
+        tensors again each time, but a number only once. Call this one too: it sets the schedules of terms.
         """
+        self._set_shares(epoch)
 
     def end_epoch(self, length: float | None) -> dict[str, float]:
         """Called after each training epoch with its env steps per episode that ended, if known; figures for logs."""
@@ -174,13 +210,15 @@ class Env(ABC, Generic[SettingsT]):
         in `step` as in `observation`.
         """
 
-    @abstractmethod
     def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
         """Weighted parts (W, T) that sum to the reward for reaching `state`, observed as `obs`, by `action`.
 
         `self.state` is the state that the step began in, with the action before and the age at which `action` was
         chosen; so it is in `control`, `disturbed`, `applied_force` and `fell`.
         """
+        values = [measure(self, state, action, obs) for measure in self._measures]
+        weighted = torch.stack(values, dim=-1) * self._weights
+        return weighted * self._shares if self._scheduled else weighted
 
     def fell(self, state: StepState) -> Tensor:
         """Worlds (W,) bool whose episode ends by itself in `state`."""

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from msk_ray.config import Reward
+from msk_ray.config import Reward, Term
 from msk_ray.envs.generators import GlobalGenerators
 from msk_ray.envs.records import EnvState
 from msk_ray.envs.terms import terms_without_gradient
@@ -109,6 +109,8 @@ class Contract:
         obs = self.call("observe", lambda: env.observation_of(reached), after, action)
         # No step has led to `after`, so that it has no contact forces.
         env.ignore_contact_forces = True
+        for term in env.active_terms:
+            self._check_term(term, after, action, obs)
         terms = self.call("reward_terms", lambda: env.reward_terms(after, action, obs), after, action, obs)
         fell = self.call("fell", lambda: env.fell(after), after, action)
         self.check_results(obs, terms, fell)
@@ -117,6 +119,11 @@ class Contract:
         self._check_outcomes(outcomes)
         if differentiable:
             self._warn_of_cut_terms(terms)
+
+    def _check_term(self, term: Term, state: StepState, action: Tensor, obs: Tensor) -> None:
+        what = f"term {term.name!r}"
+        value = self.call(what, lambda: term.measure(self._env, state, action, obs), state, action, obs)
+        self._check(what, value, (self._env.nworld,), "one number for each world")
 
     @contextmanager
     def during(self, method: str) -> Iterator[None]:
@@ -196,6 +203,11 @@ class Contract:
         self._env.obs_size = width
 
     def _check_names(self) -> None:
+        if not self._env.terms and type(self._env).reward_terms.__module__ == _BASE:
+            raise ConfigError(
+                f"{self._name} has no reward: write terms = (Term(name, weight, function), ...) in the class, or "
+                "reward_names and the method reward_terms"
+            )
         names = getattr(self._env, "reward_names", None)
         right = isinstance(names, tuple | list) and all(isinstance(name, str) for name in names)
         if not right or len(set(names or ())) != len(names or ()):
@@ -256,15 +268,17 @@ class Contract:
     def _warn_of_cut_terms(self, terms: Tensor) -> None:
         env = self._env
         names = [env.reward_names[k] for k in terms_without_gradient(terms)]
-        cut = [name for name in names if name not in env.without_gradient]
+        meant = {*env.without_gradient, *(term.name for term in env.terms if not term.gradient)}
+        cut = [name for name in names if name not in meant]
         if not cut:
             return
+        instead = "gradient=False in its Term" if env.terms else f"without_gradient = {tuple(cut)!r} in the class"
         which = "" if len(names) == len(env.reward_names) else f": {', '.join(cut)}"
         has = "have" if which and len(cut) > 1 else "has"
         warnings.warn(
             f"reward_terms of {self._name}{which} {has} no gradient to the state or the action: compute it with torch "
             "from state, frames, tendons and action, without comparisons, .detach(), .item() or numpy; if that is "
-            f"meant, write without_gradient = {tuple(cut)!r} in the class",
+            f"meant, write {instead}",
             stacklevel=2,
         )
 

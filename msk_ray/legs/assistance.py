@@ -141,6 +141,7 @@ class AssistedEnv(Env[AnySettings], Generic[AnySettings]):
         return self.assistance.reads_episode_lengths
 
     def begin_epoch(self, epoch: int) -> None:
+        super().begin_epoch(epoch)
         self.assistance.begin_epoch(epoch)
 
     def end_epoch(self, length: float | None) -> dict[str, float]:

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from msk_ray.legs import terms as costs
+from msk_ray.legs import costs
 from msk_ray.legs.gait.body import SIDES, world_axes
 from msk_ray.step.autograd.kinematics import Frames
 from msk_ray.step.autograd.tangent import quat_rotate

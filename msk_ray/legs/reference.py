@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from msk_ray.legs.clock import fourier, polynomial, series
+from msk_ray.legs.costs import SWING
 from msk_ray.legs.gait.body import JOINTS, SIDES, flexion_sign
 from msk_ray.legs.gait.people import curve, pace_polynomials
-from msk_ray.legs.terms import SWING
 
 MEASURED_AT = 1.25
 """Speed at which the measured angles are taken to hold [m/s]; hips swing in proportion to the step length."""

@@ -1,122 +1,183 @@
-"""Costs of a walk, as pure functions. W worlds, U muscles, F points of the feet."""
+"""The terms of the legs' reward, in the order of `config.TERMS`, which has their weights.
+
+Each gives a value (W,) for the `state` that a step has led to, observed as `obs`, by `action`. Axes: W worlds.
+"""
+
+import math
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from msk_ray.legs.clock import window
+from msk_ray.envs.limits import squared_overshoot
+from msk_ray.legs import costs
+from msk_ray.legs.env import LegEnv
+from msk_ray.step import StepState
 
-HEEL_DOWN = (0.02, 0.40)
-"""Phases of the own leg between which the heel stands on the ground [turns], with flanks inside. These and the next two
-are those at which the feet of `people_angles` move by less than 0.3 m/s, or are 1 cm above the ground."""
-TOES_DOWN = (0.10, 0.60)
-"""The same of the toes."""
-SWING = (0.64, 0.92)
-"""The same of the swing."""
-LANDED = (-0.04, 0.12)
-"""Phases of the own leg, with flanks inside, at which the heel should have landed; people's strike is at 0. It opens
-earlier because the toes of these legs leave the ground up to 5 % of the cycle before people's, and a stance as long as
-theirs has to begin earlier, too."""
-_HOVERING = 0.002
-"""Height of a heel that should have landed beyond which its cost grows linearly [m]."""
-_SLIDING = 0.3
-"""Speed of a foot that should stand beyond which its cost grows linearly [m/s]."""
-_BENT = 0.15
-"""Angle of the toes beyond which its cost grows linearly [rad]."""
-_VAULTING = 0.1
-"""Error of the pelvis's vertical velocity beyond which its cost grows linearly [m/s]."""
-_TURNED = 0.15
-"""Angle out of the plane of walking beyond which its cost grows linearly [rad]."""
-_NEAR = 0.03
-"""Height above the ground at which an approaching foot counts 1/e [m]."""
+_TRUNK_LEVER = 0.18
+"""How far the centre of mass moves with the trunk's up axis [m]: 34 kg of 75 kg, 0.4 m above the pelvis."""
+_HEAD_LEVER = 0.65
+"""Height of the head above the pelvis [m]."""
+_LEG_LENGTH = 0.9
+"""Leg whose steps have the length of people's [m]."""
 
 
-def soft(squares: Tensor) -> Tensor:
-    """√(1 + x²) − 1 of squares x²: half of it while small, then |x|."""
-    return torch.sqrt(1.0 + squares) - 1.0
+def forward_vel(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """exp(-((v - env.target_speed) / speed_scale)²) of the forward speed v."""
+    return torch.exp(-((env.speed(state) - env.target) / env.config.reward.speed_scale).square())
 
 
-def sliding(phase: Tensor, heel: Tensor, toes: Tensor) -> Tensor:
-    """Cost (W,) of a foot that moves while it should stand.
-
-    Args:
-        phase: of its leg [turns], (W,).
-        heel, toes: their velocities [m/s], (W, 3).
-    """
-    down = window(phase, *HEEL_DOWN), window(phase, *TOES_DOWN)
-    speeds = ((velocity / _SLIDING).square().sum(-1) for velocity in (heel, toes))
-    return sum((on * soft(speed) for on, speed in zip(down, speeds, strict=True)), torch.zeros_like(phase))
+def progress(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """The forward speed, up to env.target_speed [m/s]: a slope where the term above is flat."""
+    speed, target = env.speed(state), env.target
+    return torch.minimum(speed, target) if isinstance(target, Tensor) else speed.clamp_max(target)
 
 
-def hovering(phase: Tensor, heel: Tensor) -> Tensor:
-    """Cost (W,) of a heel that is above the ground when it should have landed.
-
-    Args:
-        phase: of its leg [turns], (W,).
-        heel: its height above its place in standing [m], (W,).
-    """
-    return window(phase, *LANDED) * soft((torch.relu(heel) / _HOVERING).square())
+def upright(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """Cosine between the trunk's up axis and +z."""
+    return env.root(state).up.unbind(-1)[2]
 
 
-def dragging(phase: Tensor, heights: Tensor, clearance: float) -> Tensor:
-    """Cost (W,) of a foot that is too low in its swing: the mean of (missing height / clearance)².
-
-    Args:
-        phase: of its leg [turns], (W,).
-        heights: of heel and toes above their place in standing [m], (W, 2).
-        clearance: height that is asked for [m].
-    """
-    missing = torch.relu(clearance - heights) / clearance
-    return window(phase, *SWING) * missing.square().mean(-1)
+def heading(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """Cosine between the pelvis's forward axis and +x."""
+    return env.root(state).heading
 
 
-def lifted_toes(phase: Tensor, slope: Tensor, bend: Tensor) -> Tensor:
-    """Cost (W,) of a foot's toes that are not level while on the ground, or bent against their foot in the air.
-
-    Args:
-        phase: of its leg [turns], (W,).
-        slope: sine of the toes' angle to the ground, (W,).
-        bend: 2 (1 - cos) of their angle to the foot, which is the angle squared while small, (W,).
-    """
-    down = window(phase, *TOES_DOWN)
-    return soft((down * slope.square() + (1.0 - down) * bend) / _BENT**2)
+def height(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """(Drop below the standing height)² [m²]."""
+    return torch.relu(env.stand_height - env.root(state).height).square()
 
 
-def impact(heights: Tensor, fall: Tensor) -> Tensor:
-    """Cost (W,) of points of the feet that come down [m²/s²]: Σ v² e^(-h/3 cm) over those moving down.
-
-    Args:
-        heights: above the ground [m], (W, F).
-        fall: upward velocities [m/s], (W, F).
-    """
-    return (torch.relu(-fall).square() * torch.exp(-heights.clamp_min(0.0) / _NEAR)).sum(-1)
+def alive(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """1 for every step without a fall."""
+    return torch.ones_like(env.root(state).height)
 
 
-def vaulting(velocity: Tensor, wanted: Tensor) -> Tensor:
-    """Cost (W,) of vertical velocities (W,) [m/s] of the pelvis apart from those of a vaulting body."""
-    return soft(((velocity - wanted) / _VAULTING).square())
+def effort(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """Mean squared activation; zero at rest."""
+    return state.act.square().mean(-1)
 
 
-def out_of_plane(angles: Tensor) -> Tensor:
-    """Cost (W,) of angles (W, n) [rad] of joints that turn legs out of the plane they walk in."""
-    return soft((angles / _TURNED).square().mean(-1))
+def joint_limit(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """Summed squared overshoot past the joint limits, minus a margin of 0.05 rad, in units of 0.1 rad."""
+    return squared_overshoot(state.qpos[:, env.hinge_qpos], *env.hinge_limits)
 
 
-def deviation(values: Tensor, reference: Tensor, scale: float) -> Tensor:
-    """Cost (W,) of values (W, n) apart from a reference: √(1 + mean ((x - r)/scale)²) - 1."""
-    return soft(((values - reference) / scale).square().mean(-1))
+def smoothness(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """Mean squared change of the action."""
+    age = env.state.age
+    return (env.own_sides(action, age) - env.own_sides(env.state.action, age - 1)).square().mean(-1)
 
 
-def stride_error(angles: Tensor, rates: Tensor, amplitude: float | Tensor, rate: float | Tensor) -> Tensor:
-    """(r - 1)², shape (W,), of the angle d between both hips as a pendulum: r² = (d/A)² + (d'/(Aω))².
+def capture(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """√(1 + (d / capture_scale)²) - 1, where d is the distance of the capture point from the walking line, or from the
+    start when standing. The capture point is where the body would come to rest as a pendulum, x + v / √(g / height),
+    with x and v of its centre of mass estimated from pelvis and lean of the trunk."""
+    root = env.root(state)
+    # The trunk is half of the body: the centre of mass moves with its lean.
+    velocity = root.velocity + _TRUNK_LEVER * torch.linalg.cross(root.spin, root.up)
+    place = root.place + (velocity * env.pendulum_time + _TRUNK_LEVER * (root.up - env.standing_up))[:, :2]
+    distance = place if env.config.target_speed == 0.0 else place[:, 1:]
+    return torch.sqrt(1.0 + (distance / env.config.reward.capture_scale).square().sum(-1)) - 1.0
 
-    Args:
-        angles: right and left hip flexion [rad], (W, 2).
-        rates: their velocities [rad/s], (W, 2).
-        amplitude: A [rad], of all worlds or (W, 1).
-        rate: ω [rad/s], of all worlds or (W,).
-    """
-    (right, left), (right_rate, left_rate) = angles.unbind(-1), rates.unbind(-1)
-    swing = torch.stack((right - left, (right_rate - left_rate) / rate), dim=-1) / amplitude
-    # The square root has no slope where the legs stand still together.
-    radius = torch.sqrt(swing.square().sum(-1) + 1e-4)
-    return (radius - 1.0).square()
+
+def sway(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """Squared angular velocity of the pelvis [rad²/s²]."""
+    return env.root(state).spin.square().sum(-1)
+
+
+def symmetry(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """Squared sum of both hips' flexion rates [rad²/s²]: legs in antiphase, without a reference gait."""
+    return env.flexion_rates(state).sum(-1).square()
+
+
+def stride(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """(r - 1)² with r² = (d / stride_angle)² + (d' / (stride_angle ω))², where d is the angle between both hips'
+    flexions, d' its rate and ω = 2π cadence / 120 s. It is zero if the legs swing against each other like a pendulum of
+    that angle and cadence, in any phase; quick small steps are penalised at each turning point."""
+    r, target = env.config.reward, env.target
+    amplitude: float | Tensor = r.stride_angle
+    turn: float | Tensor = math.tau * r.cadence / 120.0
+    if env.config.clock and isinstance(target, Tensor):
+        pace = env.reference.pace
+        amplitude = pace.hip_swing(target, _LEG_LENGTH)[:, None]
+        turn = math.tau * pace.strides_per_second(target)
+    return costs.stride_error(state.qpos[:, env.flexion_qpos], env.flexion_rates(state), amplitude, turn)
+
+
+def metabolic(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """Metabolic power of all muscles per kg of body mass, without that of rest [W/kg]; walking people have about 3. The
+    model is that of Bhargava et al. 2004 (`msk_ray/legs/metabolic.py`)."""
+    return env.metabolic_power(state, action) / env.mass
+
+
+def fatigue(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """Mean cubed activation."""
+    return state.act.pow(3).mean(-1)
+
+
+def head(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """Squared speed of the head up and to the side [m²/s²]; it moves with pelvis and trunk, 0.65 m above the pelvis."""
+    root = env.root(state)
+    velocity = root.velocity + _HEAD_LEVER * torch.linalg.cross(root.spin, root.up)
+    return velocity[:, 1:].square().sum(-1)
+
+
+def impact(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """Squared downward speed of heels and toes close to the ground [m²/s²]. (Contact forces carry no gradient.)"""
+    feet = env.foot_motion(state)
+    return costs.impact(feet.height, feet.rise)
+
+
+def footfall(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """Speed of heel and toes while the clock wants them on the ground: in people the heel is down until 40 % of the
+    cycle, the toes from 10 to 60 %."""
+    return env.foot_motion(state).sliding(env.leg_phase())
+
+
+def clearance(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """((clearance_height - height) / clearance_height)² of heel and toes below that height while the clock wants the
+    foot in the air."""
+    return env.foot_motion(state).dragging(env.leg_phase(), env.config.reward.clearance_height)
+
+
+def toes(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """Angle of the toes from level while the clock wants them on the ground, and from straight otherwise, linear beyond
+    0.15 rad. Without it they stay lifted, and the foot has no lever for the end of the push-off."""
+    right, (slope, bend) = env.leg_phase(), env.feet.toes(env.frames(state))
+    left = right + 0.5
+    return costs.lifted_toes(right, slope[:, 0], bend[:, 0]) + costs.lifted_toes(left, slope[:, 1], bend[:, 1])
+
+
+def vault(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """√(1 + (Δv / 0.1 m/s)²) - 1, where Δv is how far the pelvis's vertical velocity is from that of a body that vaults
+    over each leg: lowest in the middle of double support, highest half a step later, by as much as people's centre of
+    mass rises at that speed. It decides when feet push off."""
+    rise = env.reference.pace.vault(env.leg_phase(), env.task_speed())
+    return costs.vaulting(env.root(state).velocity[:, 2], rise)
+
+
+def out_of_plane(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """√(1 + mean (q / 0.15 rad)²) - 1 of hip adduction, hip rotation and subtalar angle q, as far as the model has
+    them: joints that turn people's legs out of the plane they walk in, by less than 10° either way."""
+    return costs.out_of_plane(state.qpos[:, env.sideways_qpos])
+
+
+def track(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """√(1 + mean (Δq / track_scale)²) - 1, where Δq is how far hip flexion, knee and ankle of both legs are from the
+    mean of people at the clock's phase."""
+    angles, _ = env.reference(env.leg_phase(), env.task_speed())
+    return costs.deviation(state.qpos[:, env.track_qpos], angles, env.config.reward.track_scale)
+
+
+def track_rate(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """The same for their rates."""
+    _, rates = env.reference(env.leg_phase(), env.task_speed())
+    return costs.deviation(state.qvel[:, env.track_dofs], rates, env.config.reward.track_rate_scale)
+
+
+def landing(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """√(1 + (h / 2 mm)²) - 1, where h is how far a heel is above its place in standing, from 4 % of the cycle before
+    the clock wants it to strike to 12 % after. Without it a heel may hover a few millimetres above the ground, slowly
+    enough for `footfall`, and land late."""
+    return env.foot_motion(state).hovering(env.leg_phase())

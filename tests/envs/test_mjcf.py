@@ -72,6 +72,10 @@ class Unfinished(MjcfEnv):
     mjcf = "models/ball.xml"
     reward_names = ()
 
+class Aimless(MjcfEnv):
+    mjcf = "models/ball.xml"
+    observe = Ball.observe
+
 class Free(Ball):
     mjcf = "models/free.xml"
 
@@ -204,7 +208,12 @@ def test_a_world_that_diverged_has_no_forces(home: Path) -> None:
         ("Flat", {}, r"observe of Flat has shape \(4,\), not \(worlds, entries\) with 4 worlds"),
         ("Strung", {}, "the model has no tendons"),
         ("Homeless", {}, "Homeless has no model: write `mjcf = 'model.xml'` in the class"),
-        ("Unfinished", {}, "ball:Unfinished lacks observe, reward_terms"),
+        (
+            "Aimless",
+            {},
+            r"Aimless has no reward: write terms = \(Term\(name, weight, function\), \.\.\.\) in the class",
+        ),
+        ("Unfinished", {}, "ball:Unfinished lacks observe:"),
     ],
 )
 def test_what_does_not_fit_is_refused_before_the_first_step(

@@ -12,7 +12,7 @@ from msk_ray.config import PhysicsConfig
 from msk_ray.envs import make_env
 from msk_ray.envs.records import EnvState
 from msk_ray.errors import ConfigError
-from msk_ray.legs import terms
+from msk_ray.legs import costs
 from msk_ray.legs.clock import fourier, series, window
 from msk_ray.legs.config import LegReward
 from msk_ray.legs.metabolic import Fibres, muscle_masses, power
@@ -20,6 +20,7 @@ from msk_ray.legs.myoleg26.config import MyoLeg26Settings
 from msk_ray.legs.myoleg26.env import MyoLeg26
 from msk_ray.legs.push import pushes
 from msk_ray.legs.reference import people_angles, sway
+from msk_ray.legs.terms import toes, track, track_rate
 from msk_ray.step import StepState
 
 EVERY = dict.fromkeys(("metabolic", "fatigue", "head", "impact", "footfall", "clearance", "toes", "vault"), 0.1)
@@ -66,20 +67,20 @@ def test_costs_by_hand() -> None:
     phase = torch.tensor([0.2, 0.5, 0.8])
     moving, still = torch.tensor([[0.4, 0.0, 0.0]] * 3), torch.zeros(3, 3)
     once = math.hypot(1.0, 0.4 / 0.3) - 1.0
-    assert terms.sliding(phase, moving, still).tolist() == pytest.approx([once, 0.0, 0.0])
-    assert terms.sliding(phase, still, moving).tolist() == pytest.approx([once, once, 0.0])
+    assert costs.sliding(phase, moving, still).tolist() == pytest.approx([once, 0.0, 0.0])
+    assert costs.sliding(phase, still, moving).tolist() == pytest.approx([once, once, 0.0])
     heights = torch.tensor([[0.005, 0.02]] * 3)
-    assert terms.dragging(phase, heights, 0.01).tolist() == pytest.approx([0.0, 0.0, 0.125])
+    assert costs.dragging(phase, heights, 0.01).tolist() == pytest.approx([0.0, 0.0, 0.125])
     # 3.46 mm are √3 × 2 mm; half a flank before the window is open, and in the air for the rest of the cycle.
     struck = torch.tensor([0.05, -0.02, 0.05, 0.5, 0.95])
     heel = torch.tensor([0.002 * math.sqrt(3.0)] * 2 + [-0.002] + [0.01] * 2)
-    assert terms.hovering(struck, heel).tolist() == pytest.approx([1.0, 0.5, 0.0, 0.0, 0.0], abs=1e-6)
+    assert costs.hovering(struck, heel).tolist() == pytest.approx([1.0, 0.5, 0.0, 0.0, 0.0], abs=1e-6)
     slope, bend = torch.full((3,), 0.2), torch.full((3,), 0.09)
-    toes = terms.lifted_toes(phase, slope, bend).tolist()
+    toes = costs.lifted_toes(phase, slope, bend).tolist()
     assert toes == pytest.approx([math.hypot(1.0, angle / 0.15) - 1.0 for angle in (0.2, 0.2, 0.3)])
-    down = terms.impact(torch.tensor([[0.0, 0.03, 0.0]]), torch.tensor([[-2.0, -1.0, 1.0]]))
+    down = costs.impact(torch.tensor([[0.0, 0.03, 0.0]]), torch.tensor([[-2.0, -1.0, 1.0]]))
     assert down.item() == pytest.approx(4.0 + math.exp(-1.0))
-    apart = terms.deviation(torch.tensor([[0.3, 0.0]]), torch.zeros(1, 2), 0.1)
+    apart = costs.deviation(torch.tensor([[0.3, 0.0]]), torch.zeros(1, 2), 0.1)
     assert apart.item() == pytest.approx(math.sqrt(5.5) - 1.0)
 
 
@@ -125,14 +126,14 @@ def test_a_vaulting_body_rises_half_a_step_after_double_support(env: MyoLeg26) -
     assert velocity[:500].tolist() == pytest.approx(velocity[500:].tolist(), abs=1e-5), "the same for both legs"
     assert phases[velocity[:500].argmax()].item() == pytest.approx(0.06 + 0.125, abs=2e-3)
     assert pace.vault(torch.tensor([0.06, 0.31]), torch.tensor([0.7, 1.6])).abs().max() < 1e-5
-    assert terms.vaulting(torch.tensor([0.3, 0.0]), torch.tensor([0.1, 0.0])).tolist() == pytest.approx(
+    assert costs.vaulting(torch.tensor([0.3, 0.0]), torch.tensor([0.1, 0.0])).tolist() == pytest.approx(
         [math.sqrt(5.0) - 1.0, 0.0]
     )
 
 
 def test_legs_out_of_the_plane_of_walking_cost_their_angles() -> None:
     """0.3 and 0 rad, twice and no times 0.15: √(1 + (4 + 0)/2) - 1; the model has hip rotations too, at 0 here."""
-    found = terms.out_of_plane(torch.tensor([[0.3, 0.0], [0.0, 0.0]]))
+    found = costs.out_of_plane(torch.tensor([[0.3, 0.0], [0.0, 0.0]]))
     assert found.tolist() == pytest.approx([math.sqrt(3.0) - 1.0, 0.0])
     env = make(1, reward={"out_of_plane": 2.0})
     state = env.state.physics
@@ -179,12 +180,13 @@ def test_toes_are_level_on_the_ground_and_straight_in_the_air(env: MyoLeg26) -> 
     numbers = torch.tensor([[1.25, phase] for phase in (0.2, 0.3, 0.7, 0.8)])
     start = env.draw_phase(numbers[:, 1], numbers[:, 0])
     lifted = start.qpos.clone()
-    toes = [env.model.joint(f"mtp_angle_{side}").qposadr[0] for side in "rl"]
-    start.qpos[:, toes] = torch.tensor(env.people_poses()[[20, 30, 70, 80]][:, toes], dtype=torch.float32)
-    lifted[:, toes] = start.qpos[:, toes] + 0.4
+    joints = [env.model.joint(f"mtp_angle_{side}").qposadr[0] for side in "rl"]
+    start.qpos[:, joints] = torch.tensor(env.people_poses()[[20, 30, 70, 80]][:, joints], dtype=torch.float32)
+    lifted[:, joints] = start.qpos[:, joints] + 0.4
     env.state = env.state._replace(numbers=numbers, age=torch.full((4,), -1))
-    assert env._lifted_toes(start).max() < 0.1
-    cost = env._lifted_toes(start._replace(qpos=lifted))
+    still = torch.zeros(4, 26)
+    assert toes(env, start, still, still).max() < 0.1
+    cost = toes(env, start._replace(qpos=lifted), still, still)
     assert cost.tolist() == pytest.approx([2.0 * (math.hypot(1.0, 0.4 / 0.15) - 1.0)] * 4, rel=0.12)
 
 
@@ -193,13 +195,13 @@ def test_initial_states_track_the_reference(env: MyoLeg26) -> None:
     fresh(env)
     age = env.state.age.clone()
     env.state = env.state._replace(age=age - 1)  # rewards are for the state that a step leads to
-    apart, rates_apart = env._tracking(env.state.physics)
-    assert apart.max() < 0.02
-    assert rates_apart.max() < 0.2
+    still = torch.zeros(4, 26)
+    assert track(env, env.state.physics, still, still).max() < 0.02
+    assert track_rate(env, env.state.physics, still, still).max() < 0.2
     behind = env.state.numbers.clone()
     behind[:, 1] += 0.2
     env.state = env.state._replace(numbers=behind)
-    assert env._tracking(env.state.physics)[0].min() > 0.2
+    assert track(env, env.state.physics, still, still).min() > 0.2
 
 
 def test_the_clock_turns_at_the_cadence_of_people_at_that_speed(env: MyoLeg26) -> None:
@@ -276,12 +278,17 @@ def test_a_heel_that_hovers_pulls_the_pelvis_down() -> None:
 
 
 def test_a_schedule_fades_the_reference() -> None:
-    env = make(1, clock=True, reward={"track": 1.0}, tracking={"start": 2.0, "end": 0.5, "epochs": 10})
-    found = []
+    env = make(1, clock=True, reward={"track": 3.0}, tracking={"start": 2.0, "end": 0.5, "epochs": 10})
+    state, still = env.state.physics, torch.zeros(1, 26)
+    behind = state._replace(qpos=state.qpos + 0.1)
+    worth = []
     for epoch in (0, 5, 10, 50):
         env.begin_epoch(epoch)
-        found.append(env._tracking_share.item())
-    assert found == pytest.approx([2.0, 1.25, 0.5, 0.5])
+        worth.append(env.reward_terms(behind, still, env.observation())[0])
+    apart = track(env, behind, still, still).item()
+    assert apart > 0.1
+    assert [terms[-1].item() for terms in worth] == pytest.approx([-3.0 * apart * f for f in (2.0, 1.25, 0.5, 0.5)])
+    assert all(torch.equal(terms[:-1], worth[0][:-1]) for terms in worth)
 
 
 def test_scores_are_at_the_target_speed_under_the_reference_reward(env: MyoLeg26) -> None:
@@ -303,7 +310,7 @@ def test_a_resumed_trial_keeps_speeds_and_phases(env: MyoLeg26) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"reward": {"track": 1.0}}, "env.reward.track needs the phase of the walk: write env.clock: true"),
+        ({"reward": {"track": 1.0}}, "env.reward.track needs env.clock: write env.clock: true"),
         ({"symmetric": True}, "env.symmetric needs the phase of the walk"),
         ({"clock": True, "target_speed": 0.0}, "write an env.target_speed above 0"),
         ({"clock": True, "reset": "mixed"}, "write env.reset: cycle or stand"),
@@ -320,9 +327,9 @@ def test_metabolic_power_of_standing_is_that_of_its_muscles(env: MyoLeg26) -> No
     state = fresh(env)
     still = StepState(state.physics.qpos, torch.zeros_like(state.physics.qvel), state.physics.act)
     action = torch.zeros((4, 26))
-    heat = env.metabolic_power(still, action) / env._mass
+    heat = env.metabolic_power(still, action) / env.mass
     assert ((heat > 0.5) & (heat < 4.0)).all()
-    harder = env.metabolic_power(still._replace(act=torch.full_like(still.act, 0.5)), action) / env._mass
+    harder = env.metabolic_power(still._replace(act=torch.full_like(still.act, 0.5)), action) / env.mass
     assert (harder > heat + 5.0).all()
 
 

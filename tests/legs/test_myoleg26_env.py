@@ -12,10 +12,10 @@ from msk_ray.envs import make_env
 from msk_ray.errors import ConfigError
 from msk_ray.legs.assistance import Assistance
 from msk_ray.legs.config import AssistConfig, LegReward
+from msk_ray.legs.costs import stride_error
 from msk_ray.legs.muscles import MuscleCurves
 from msk_ray.legs.myoleg26.config import MyoLeg26Settings
 from msk_ray.legs.myoleg26.env import MyoLeg26
-from msk_ray.legs.terms import stride_error
 from msk_ray.step import StepState
 
 

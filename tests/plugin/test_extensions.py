@@ -122,7 +122,9 @@ def budget(described: dict[str, object], folder: Path) -> float:
     return driver._budget(driver.Plan(experiment, space, resolve_trials(space), Placement(0.0, 1), None))
 
 
-@pytest.mark.parametrize(("page", "file"), [("algorithms", "random_search"), ("loggers", "table_logger")])
+@pytest.mark.parametrize(
+    ("page", "file"), [("algorithms", "random_search"), ("environments", "own_ant"), ("loggers", "table_logger")]
+)
 def test_the_pages_show_these_files(page: str, file: str, root: Path) -> None:
     (shown,) = re.findall(r"```python\n(.*?)```", (root / "docs" / "runner" / f"{page}.md").read_text(), re.DOTALL)
     assert shown == (HERE / f"{file}.py").read_text()

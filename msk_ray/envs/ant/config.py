@@ -1,24 +1,24 @@
 """The settings of the ant."""
 
 from msk_ray.config.physics import CONTACTS, JOINTS, LIMITS, SOLVING, STEPPING
-from msk_ray.config.sections import Count, LimitedReward, LimitedSettings, NonNegative
+from msk_ray.config.rewards import reward_section, with_reward
+from msk_ray.config.sections import Count
+from msk_ray.config.terms import Cost, Term, terms_in
+from msk_ray.envs.limited import EFFORT, JOINT_LIMIT, LimitedSettings
+
+TERMS = terms_in(
+    "msk_ray.envs.ant.env",
+    Term("forward_vel", 1.0),
+    Term("up", 0.1),
+    Term("heading", 1.0),
+    Term("height", 1.0),
+    Cost("action", 0.0, EFFORT, setting="action_penalty"),
+    JOINT_LIMIT,
+)
+AntReward = reward_section("AntReward", __name__, TERMS)
 
 
-class AntReward(LimitedReward):
-    """Weights per env step."""
-
-    forward_vel: float = 1.0
-    """Weight of the torso's velocity along +x [s/m]."""
-    heading: float = 1.0
-    """Weight of the cosine between the torso's forward axis and +x."""
-    up: float = 0.1
-    """Weight of the cosine between the torso's up axis and +z."""
-    height: float = 1.0
-    """Weight of the torso's height above `env.termination_height` [1/m]."""
-    action_penalty: NonNegative = 0.0
-    """Weight of the summed squared action."""
-
-
+@with_reward(AntReward)
 class AntSettings(LimitedSettings):
     """A four-legged walker whose reward asks for forward velocity."""
 
@@ -27,7 +27,6 @@ class AntSettings(LimitedSettings):
     reads_physics = STEPPING | SOLVING | CONTACTS | LIMITS | JOINTS | {"variant", "gear"}
 
     episode_length: Count = 1000
-    reward: AntReward = AntReward()
     termination_height: float = 0.27
     """Torso height below which an episode ends [m]."""
     early_termination: bool = True

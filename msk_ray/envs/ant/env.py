@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
-from msk_ray.envs.ant.config import AntSettings
+from msk_ray.envs.ant.config import TERMS, AntSettings
 from msk_ray.envs.ant.model import STAND_HEIGHT, STAND_JOINTS, build_ant
 from msk_ray.envs.layout import Entry, entries, floating_body
 from msk_ray.envs.limits import LimitedBody
@@ -35,7 +35,7 @@ class Ant(LimitedBody[AntSettings]):
 
     obs_size = 37
     Settings = AntSettings
-    reward_names: tuple[str, ...] = ("forward_vel", "up", "heading", "height", "action")
+    terms = TERMS
 
     @classmethod
     def build_model(cls, config: AntSettings, physics: PhysicsConfig) -> mujoco.MjModel:
@@ -43,15 +43,8 @@ class Ant(LimitedBody[AntSettings]):
 
     def prepare(self) -> None:
         super().prepare()
-        r = self.config.reward
         # World z of the torso's z axis and world x of its x axis are w² - x² - y² + z² and w² + x² - y² - z².
         self._axes = torch.tensor(((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)), device=self.device)
-        # All terms but the costs of actions and of joint limits are linear in the observation.
-        linear = torch.zeros(self.obs_size, len(type(self).reward_names))
-        for term, (entry, weight) in enumerate(((5, r.forward_vel), (27, r.up), (28, r.heading), (0, r.height))):
-            linear[entry, term] = weight
-        offset = torch.tensor((0.0, 0.0, 0.0, -r.height * self.config.termination_height, 0.0))
-        self._linear, self._offset = linear.to(self.device), offset.to(self.device)
         self._stand = torch.tensor((0.0, 0.0, STAND_HEIGHT, 1.0, 0.0, 0.0, 0.0, *STAND_JOINTS), device=self.device)
 
     def draw_physics(self, count: int) -> StepState:
@@ -85,14 +78,6 @@ class Ant(LimitedBody[AntSettings]):
             *entries(f"last_action_{i}" for i in range(self.action_size)),
         ]
 
-    def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
-        r = self.config.reward
-        terms = torch.addmm(self._offset, obs, self._linear)
-        if r.action_penalty > 0.0:
-            effort = -r.action_penalty * action.square().sum(-1, keepdim=True)
-            terms = torch.cat((terms[:, :-1], effort), dim=-1)
-        return self.with_limit_cost(terms, state)
-
     def fell(self, state: StepState) -> Tensor:
         if not self.config.early_termination:
             return super().fell(state)
@@ -100,3 +85,23 @@ class Ant(LimitedBody[AntSettings]):
 
     def outcome_terms(self, state: StepState) -> dict[str, Tensor]:
         return {"vx": state.qvel[:, 0]}
+
+
+def forward_vel(env: Ant, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """The torso's velocity along +x [m/s]."""
+    return obs[:, 5]
+
+
+def up(env: Ant, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """Cosine between the torso's up axis and +z."""
+    return obs[:, 27]
+
+
+def heading(env: Ant, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """Cosine between the torso's forward axis and +x."""
+    return obs[:, 28]
+
+
+def height(env: Ant, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """The torso's height above `env.termination_height` [m]."""
+    return obs[:, 0] - env.config.termination_height

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
 from msk_ray.envs.base import Env
-from msk_ray.envs.cartpole.config import CartPoleSettings
+from msk_ray.envs.cartpole.config import TERMS, CartPoleSettings
 from msk_ray.envs.cartpole.model import build_cartpole
 from msk_ray.envs.layout import Entry, entries
 from msk_ray.step import StepState
@@ -25,22 +25,13 @@ class CartPole(Env[CartPoleSettings]):
 
     Settings = CartPoleSettings
     obs_size = 5
-    reward_names = ("pole_angle", "pole_velocity", "cart_position", "cart_velocity", "action")
+    terms = TERMS
 
     @classmethod
     def build_model(cls, config: CartPoleSettings, physics: PhysicsConfig) -> mujoco.MjModel:
         return build_cartpole(config, physics)
 
     def prepare(self) -> None:
-        r = self.config.reward
-        penalties = (
-            r.pole_angle_penalty,
-            r.pole_velocity_penalty,
-            r.cart_position_penalty,
-            r.cart_velocity_penalty,
-            r.cart_action_penalty,
-        )
-        self._weights = -torch.tensor(penalties, device=self.device)
         self._hanging = torch.tensor((0.0, math.pi), device=self.device)
         self._spread = torch.tensor((0.5, math.pi / 2), device=self.device)
 
@@ -61,11 +52,6 @@ class CartPole(Env[CartPoleSettings]):
             Entry("pole_rate", "rad/s"),
         ]
 
-    def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
-        x, angle = state.qpos.unbind(-1)
-        speed, rate = state.qvel.unbind(-1)
-        return self._weights * torch.stack((wrap_angle(angle), rate, x, speed, action[:, 0]), dim=-1) ** 2
-
     def outcome_terms(self, state: StepState) -> dict[str, Tensor]:
         return {"upright": (wrap_angle(state.qpos[:, 1]).abs() < UPRIGHT_ANGLE).float()}
 
@@ -76,3 +62,28 @@ class CartPole(Env[CartPoleSettings]):
 def wrap_angle(angle: Tensor) -> Tensor:
     """The same angle [rad] in [-π, π)."""
     return torch.remainder(angle + math.pi, 2.0 * math.pi) - math.pi
+
+
+def pole_angle(env: CartPole, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """Squared angle [rad²], wrapped to ±π."""
+    return wrap_angle(state.qpos[:, 1]).square()
+
+
+def pole_velocity(env: CartPole, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """Squared angular velocity [rad²/s²]."""
+    return state.qvel[:, 1].square()
+
+
+def cart_position(env: CartPole, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """Squared position [m²]."""
+    return state.qpos[:, 0].square()
+
+
+def cart_velocity(env: CartPole, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """Squared velocity [m²/s²]."""
+    return state.qvel[:, 0].square()
+
+
+def effort(env: CartPole, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """Squared action."""
+    return action[:, 0].square()

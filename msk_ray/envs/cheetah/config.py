@@ -1,18 +1,21 @@
 """The settings of the cheetah."""
 
 from msk_ray.config.physics import CONTACTS, JOINTS, LIMITS, SOLVING, STEPPING
-from msk_ray.config.sections import Count, LimitedReward, LimitedSettings, NonNegative
+from msk_ray.config.rewards import reward_section, with_reward
+from msk_ray.config.sections import Count
+from msk_ray.config.terms import Cost, Term, terms_in
+from msk_ray.envs.limited import EFFORT, JOINT_LIMIT, LimitedSettings
+
+TERMS = terms_in(
+    "msk_ray.envs.cheetah.env",
+    Term("forward_vel", 1.0),
+    Cost("action", 0.1, EFFORT, setting="action_penalty"),
+    JOINT_LIMIT,
+)
+CheetahReward = reward_section("CheetahReward", __name__, TERMS)
 
 
-class CheetahReward(LimitedReward):
-    """Weights per env step."""
-
-    forward_vel: float = 1.0
-    """Weight of the torso's velocity along +x [s/m]."""
-    action_penalty: NonNegative = 0.1
-    """Weight of the summed squared action."""
-
-
+@with_reward(CheetahReward)
 class CheetahSettings(LimitedSettings):
     """A planar body on two legs whose reward asks for forward velocity; its episodes end only at the time limit."""
 
@@ -21,4 +24,3 @@ class CheetahSettings(LimitedSettings):
     reads_physics = STEPPING | SOLVING | CONTACTS | LIMITS | JOINTS | {"variant", "gear"}
 
     episode_length: Count = 1000
-    reward: CheetahReward = CheetahReward()

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
-from msk_ray.envs.cheetah.config import CheetahSettings
+from msk_ray.envs.cheetah.config import TERMS, CheetahSettings
 from msk_ray.envs.cheetah.model import build_cheetah
 from msk_ray.envs.planar import PlanarBody
 from msk_ray.step import StepState
@@ -28,7 +28,7 @@ class Cheetah(PlanarBody[CheetahSettings]):
 
     obs_size = 17
     Settings = CheetahSettings
-    reward_names = ("forward_vel", "action")
+    terms = TERMS
 
     @classmethod
     def build_model(cls, config: CheetahSettings, physics: PhysicsConfig) -> mujoco.MjModel:
@@ -43,7 +43,7 @@ class Cheetah(PlanarBody[CheetahSettings]):
         qpos, qvel = self._start + 0.1 * self.uniform(count, 9), 0.25 * self.uniform(count, 9)
         return StepState(qpos, qvel, torch.zeros((count, 0), device=self.device))
 
-    def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
-        r = self.config.reward
-        terms = torch.stack((r.forward_vel * obs[:, 8], -r.action_penalty * action.square().sum(-1)), dim=-1)
-        return self.with_limit_cost(terms, state)
+
+def forward_vel(env: Cheetah, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """The torso's velocity along +x [m/s]."""
+    return obs[:, 8]

@@ -1,26 +1,35 @@
 """The settings of the hopper."""
 
 from msk_ray.config.physics import CONTACTS, JOINTS, LIMITS, SOLVING, STEPPING
-from msk_ray.config.sections import Count, LimitedReward, LimitedSettings, NonNegative
+from msk_ray.config.rewards import reward_section, with_reward
+from msk_ray.config.sections import Count, NonNegative, Reward
+from msk_ray.config.terms import Cost, Term, terms_in
+from msk_ray.envs.limited import EFFORT, JOINT_LIMIT, LimitedSettings
 
 
-class HopperReward(LimitedReward):
-    """Weights per env step."""
+class HopperHeight(Reward):
+    """The shape of the term `height`, which has two weights."""
 
-    forward_vel: float = 1.0
-    """Weight of the torso's velocity along +x [s/m]."""
     height: float = 1.0
     """Weight of the torso's height above `full_height`, up to 0.3 m [1/m]."""
     drop: NonNegative = 200.0
     """Weight of (depth below `full_height`)², up to 1 m [1/m²]."""
     full_height: float = -0.3
     """Height of the torso, from 1.25 m, that costs and earns nothing [m]."""
-    upright: float = 1.0
-    """Weight of 1 − (pitch / 30°)²."""
-    action_penalty: NonNegative = 0.1
-    """Weight of the summed squared action."""
 
 
+TERMS = terms_in(
+    "msk_ray.envs.hopper.env",
+    Term("forward_vel", 1.0),
+    Term("height", None),
+    Term("upright", 1.0),
+    Cost("action", 0.1, EFFORT, setting="action_penalty"),
+    JOINT_LIMIT,
+)
+HopperReward = reward_section("HopperReward", __name__, TERMS, HopperHeight)
+
+
+@with_reward(HopperReward)
 class HopperSettings(LimitedSettings):
     """A planar body on one leg whose reward asks for forward velocity."""
 
@@ -29,12 +38,11 @@ class HopperSettings(LimitedSettings):
     reads_physics = STEPPING | SOLVING | CONTACTS | LIMITS | JOINTS | {"variant", "gear"}
 
     episode_length: Count = 1000
-    reward: HopperReward = HopperReward()
+    reward: HopperHeight = HopperHeight()
     termination_height: float = -0.45
     """Height of the torso, from 1.25 m, below which an episode ends [m]."""
     early_termination: bool = True
     """End an episode on falling below `termination_height`."""
 
     def unread(self) -> dict[str, str]:
-        heights = {} if self.early_termination else {"termination_height": "env.early_termination is false"}
-        return super().unread() | heights
+        return {} if self.early_termination else {"termination_height": "env.early_termination is false"}

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
-from msk_ray.envs.hopper.config import HopperSettings
+from msk_ray.envs.hopper.config import TERMS, HopperSettings
 from msk_ray.envs.hopper.model import build_hopper
 from msk_ray.envs.planar import PlanarBody
 from msk_ray.step import StepState
@@ -32,7 +32,7 @@ class Hopper(PlanarBody[HopperSettings]):
 
     obs_size = 11
     Settings = HopperSettings
-    reward_names = ("forward_vel", "height", "upright", "action")
+    terms = TERMS
 
     @classmethod
     def build_model(cls, config: HopperSettings, physics: PhysicsConfig) -> mujoco.MjModel:
@@ -42,21 +42,24 @@ class Hopper(PlanarBody[HopperSettings]):
         qpos, qvel = 0.05 * self.uniform(count, 6), 0.05 * self.uniform(count, 6)
         return StepState(qpos, qvel, torch.zeros((count, 0), device=self.device))
 
-    def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
-        r = self.config.reward
-        above = (obs[:, 0] - r.full_height).clamp(_BOTTOM, _TOP)
-        terms = torch.stack(
-            (
-                r.forward_vel * obs[:, 5],
-                torch.where(above < 0.0, -r.drop * above.square(), r.height * above),
-                r.upright * (1.0 - (obs[:, 1] / _FULL_ANGLE).square()),
-                -r.action_penalty * action.square().sum(-1),
-            ),
-            dim=-1,
-        )
-        return self.with_limit_cost(terms, state)
-
     def fell(self, state: StepState) -> Tensor:
         if not self.config.early_termination:
             return super().fell(state)
         return state.qpos[:, 1] < self.config.termination_height
+
+
+def forward_vel(env: Hopper, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """The torso's velocity along +x [m/s]."""
+    return obs[:, 5]
+
+
+def height(env: Hopper, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """What the torso's height above or below `full_height` is worth."""
+    r = env.config.reward
+    above = (obs[:, 0] - r.full_height).clamp(_BOTTOM, _TOP)
+    return torch.where(above < 0.0, -r.drop * above.square(), r.height * above)
+
+
+def upright(env: Hopper, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """1 − (pitch / 30°)²."""
+    return 1.0 - (obs[:, 1] / _FULL_ANGLE).square()

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
-from msk_ray.envs.humanoid.config import HumanoidSettings
+from msk_ray.envs.humanoid.config import TERMS, HumanoidSettings
 from msk_ray.envs.humanoid.model import START_HEIGHT, build_humanoid
 from msk_ray.envs.layout import Entry, entries, floating_body
 from msk_ray.envs.limits import LimitedBody
@@ -39,7 +39,7 @@ class Humanoid(LimitedBody[HumanoidSettings]):
 
     obs_size = 76
     Settings = HumanoidSettings
-    reward_names = ("forward_vel", "up", "heading", "height", "action")
+    terms = TERMS
 
     @classmethod
     def build_model(cls, config: HumanoidSettings, physics: PhysicsConfig) -> mujoco.MjModel:
@@ -84,21 +84,6 @@ class Humanoid(LimitedBody[HumanoidSettings]):
             *entries(f"last_action_{i}" for i in range(self.action_size)),
         ]
 
-    def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
-        r = self.config.reward
-        above = (obs[:, 0] - r.full_height).clamp(_BOTTOM, _TOP)
-        terms = torch.stack(
-            (
-                r.forward_vel * obs[:, 5],
-                r.up * obs[:, 53],
-                r.heading * obs[:, 54],
-                torch.where(above < 0.0, -r.drop * above.square(), r.height * above),
-                -r.action_penalty * action.square().sum(-1),
-            ),
-            dim=-1,
-        )
-        return self.with_limit_cost(terms, state)
-
     def fell(self, state: StepState) -> Tensor:
         if not self.config.early_termination:
             return super().fell(state)
@@ -106,3 +91,25 @@ class Humanoid(LimitedBody[HumanoidSettings]):
 
     def outcome_terms(self, state: StepState) -> dict[str, Tensor]:
         return {"vx": state.qvel[:, 0]}
+
+
+def forward_vel(env: Humanoid, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """The torso's velocity along +x [m/s]."""
+    return obs[:, 5]
+
+
+def up(env: Humanoid, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """Cosine between the torso's up axis and +z."""
+    return obs[:, 53]
+
+
+def heading(env: Humanoid, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """Cosine between the torso's forward axis and the way to a point 200 m ahead of the start."""
+    return obs[:, 54]
+
+
+def height(env: Humanoid, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """What the torso's height above or below `full_height` is worth."""
+    r = env.config.reward
+    above = (obs[:, 0] - r.full_height).clamp(_BOTTOM, _TOP)
+    return torch.where(above < 0.0, -r.drop * above.square(), r.height * above)

@@ -92,8 +92,8 @@ class MyoLeg(LegEnv[MyoLegSettings]):
     def _near(self, qpos: Tensor, qvel: Tensor) -> StepState:
         """These initial states with noise."""
         noise, count = self.config.reset_noise, len(qpos)
-        angles = qpos[:, self._hinge_qpos] + noise * self.uniform(count, len(self.hinges))
-        qpos[:, self._hinge_qpos] = angles.clamp(*self._ranges)
+        angles = qpos[:, self.hinge_qpos] + noise * self.uniform(count, len(self.hinges))
+        qpos[:, self.hinge_qpos] = angles.clamp(*self._ranges)
         qpos[:, 2] += 0.2 * noise * (1.0 + self.uniform(count, 1)[:, 0])
         qvel[:, self._hinge_dofs] += 10.0 * noise * self.uniform(count, len(self.hinges))
         # Coupled joints follow those they are coupled to, in position and velocity.

@@ -5,41 +5,37 @@ from typing import Literal
 from pydantic import PositiveFloat
 
 from msk_ray.config.physics import ACTIVATION, SOLVING, STEPPING
-from msk_ray.config.sections import Count, EnvSettings, Fraction, NonNegative, Reward, Text
+from msk_ray.config.rewards import reward_section, with_reward
+from msk_ray.config.sections import Count, EnvSettings, Fraction, Reward, Text
+from msk_ray.config.terms import Cost, Term, terms_in
 from msk_ray.legs.config import AssistConfig
 
-FURTHER = ("height", "effort", "footfall", "clearance")
-"""Weights of terms that MyoSuite does not have; they are there only where they are not zero."""
 
+class MyoSuiteWalkShape(Reward):
+    """The settings of terms other than their weights."""
 
-class MyoSuiteWalkReward(Reward):
-    """MyoSuite's weights, under its names, where those of costs are negative; then costs with the weights of other
-    legs, which are positive and which MyoSuite does not have."""
-
-    vel_reward: float = 5.0
-    """Weight of exp(−(1.2 m/s − v)²) + exp(−u²), where v is the velocity forward and u that to the side [m/s]."""
-    cyclic_hip: float = -10.0
-    """Weight of the distance between the flexion of both hips and 0.8 cos(φ + π) (left), 0.8 cos φ (right) [1/rad],
-    where φ makes a turn in 100 env steps."""
-    ref_rot: float = 10.0
-    """Weight of exp(−5 d), where d is the distance between the quaternion of the root and that of standing."""
-    joint_angle_rew: float = 5.0
-    """Weight of exp(−5 m), where m is the mean size of both hips' adduction and rotation [rad]."""
-    done: float = -100.0
-    """Reward for the step in which it falls."""
-    height: NonNegative = 0.0
-    """Weight of (drop of the centre of mass below its height in standing)² [1/m²]."""
-    effort: NonNegative = 0.0
-    """Weight of the mean squared activation."""
-    footfall: NonNegative = 0.0
-    """Weight of the speed of heel and toes while people have them on the ground, if their hips swing with the phase."""
-    clearance: NonNegative = 0.0
-    """Weight of ((clearance_height - height) / clearance_height)² of heel and toes below that height while people have
-    the foot in the air."""
     clearance_height: PositiveFloat = 0.02
     """Height above their place in standing that feet should have in swing [m]."""
 
 
+TERMS = terms_in(
+    "msk_ray.legs.myosuite_walk.terms",
+    # MyoSuite's weights, under its names.
+    Term("vel_reward", 5.0),
+    Term("cyclic_hip", -10.0),
+    Term("ref_rot", 10.0),
+    Term("joint_angle_rew", 5.0),
+    Term("done", -100.0, gradient=False),
+    # Costs that MyoSuite does not have.
+    Cost("height", 0.0, optional=True),
+    Cost("effort", 0.0, optional=True),
+    Cost("footfall", 0.0, optional=True),
+    Cost("clearance", 0.0, needs=("reward.clearance_height",), optional=True),
+)
+MyoSuiteWalkReward = reward_section("MyoSuiteWalkReward", __name__, TERMS, MyoSuiteWalkShape)
+
+
+@with_reward(MyoSuiteWalkReward)
 class MyoSuiteWalkSettings(EnvSettings):
     """MyoSuite's `myoLegWalk-v0`, with settings that make it easier to learn; scores are without them."""
 
@@ -63,7 +59,7 @@ class MyoSuiteWalkSettings(EnvSettings):
     smoothing: Fraction = 0.2
     """Width, in excitation, of the blend between activation and deactivation, which has no slope without it. Scores are
     taken with 0, MyoSuite's own hard switch."""
-    reward: MyoSuiteWalkReward = MyoSuiteWalkReward()
+    reward: MyoSuiteWalkShape = MyoSuiteWalkShape()
 
     def check_installed(self) -> None:
         from msk_ray.legs.myosuite_walk.source import find_file  # loads MuJoCo
@@ -77,6 +73,4 @@ class MyoSuiteWalkSettings(EnvSettings):
             unread["stochastic_reset"] = fixed
         if not self.stochastic_reset:
             unread["cycle"] = "env.stochastic_reset is false"
-        if not self.reward.clearance:
-            unread["reward.clearance_height"] = "env.reward.clearance is 0"
         return unread

@@ -5,6 +5,7 @@ Axes: W worlds, U muscles.
 
 import math
 from collections.abc import Callable
+from functools import cached_property
 
 import mujoco
 import numpy as np
@@ -19,7 +20,7 @@ from msk_ray.legs.config import AssistConfig
 from msk_ray.legs.feet import Feet
 from msk_ray.legs.muscles import MuscleCurves
 from msk_ray.legs.myoleg.model import cycle_states
-from msk_ray.legs.myosuite_walk.config import FURTHER, MyoSuiteWalkSettings
+from msk_ray.legs.myosuite_walk.config import TERMS, MyoSuiteWalkSettings
 from msk_ray.legs.myosuite_walk.mirror import WalkMirror
 from msk_ray.legs.myosuite_walk.model import HINGES, build_myosuite_walk
 from msk_ray.legs.reference import people_angles
@@ -73,8 +74,7 @@ class MyoSuiteWalk(AssistedEnv[MyoSuiteWalkSettings]):
     """
 
     Settings = MyoSuiteWalkSettings
-    reward_names: tuple[str, ...] = ("vel_reward", "cyclic_hip", "ref_rot", "joint_angle_rew", "done")
-    without_gradient = ("done",)
+    terms = TERMS
 
     @classmethod
     def build_model(cls, config: MyoSuiteWalkSettings, physics: PhysicsConfig) -> mujoco.MjModel:
@@ -108,38 +108,40 @@ class MyoSuiteWalk(AssistedEnv[MyoSuiteWalkSettings]):
         }
         keys = [model.key(name) for name in starts[self.config.reset]]
         self._starts = tensor([key.qpos for key in keys]), tensor([key.qvel for key in keys])
-        self._upright = tensor(model.key("stand").qpos[3:7])
+        self.upright = tensor(model.key("stand").qpos[3:7])
         hinges = torch.tensor([model.joint(name).qposadr[0] for name in HINGES], device=self.device)
-        self._flexions, self._others = hinges[:2], hinges[2:]
-        self._swing = tensor([-_SWING, _SWING])
+        self.flexions, self.others = hinges[:2], hinges[2:]
+        self.swing = tensor([-_SWING, _SWING])
         self._mirror = WalkMirror(model, self.device) if self.config.symmetric else None
         # The phase of people's right leg where MyoSuite's is 0: where the first harmonic of their hip is largest.
         even, odd = fourier(people_angles()[0])[:, 1]
-        self._hip_lag = math.atan2(odd, even) / math.tau
+        self.hip_lag = math.atan2(odd, even) / math.tau
         self.assistance = Assistance(self.config.assist, self.config.control_timestep, self.device)
         self._springs = FreeSprings(model, _AXES, self.config.assist, self.device)
         self._starts_in_cycle = self.config.cycle > 0.0 and self.config.stochastic_reset
         if self._starts_in_cycle:
             self._cycle = self._cycle_starts(tensor)
-        self._prepare_terms()
 
-    def _prepare_terms(self) -> None:
-        """The terms that MyoSuite does not have, and what they need."""
-        self._further = [name for name in FURTHER if getattr(self.config.reward, name) > 0.0]
-        self.reward_names = (*type(self).reward_names, *self._further)
+    @cached_property
+    def standing_center(self) -> float:
+        """Height of the centre of mass in standing [m]."""
         data = mujoco.MjData(self.model)
         mujoco.mj_resetDataKeyframe(self.model, data, self.model.key("stand").id)
         mujoco.mj_kinematics(self.model, data)
         mujoco.mj_comPos(self.model, data)
-        self._standing_center = float(data.subtree_com[0, 2])
-        self._feet = Feet(self.model, float(self.model.key("stand").qpos[2]), self.device)
+        return float(data.subtree_com[0, 2])
+
+    @cached_property
+    def feet(self) -> Feet:
+        """The heels and toes."""
+        return Feet(self.model, float(self.model.key("stand").qpos[2]), self.device)
 
     def _cycle_starts(self, tensor: Callable[[object], Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """qpos (N, nq), qvel (N, nv) and steps ahead (N, 1) of starts over the gait cycle."""
         qpos, qvel = cycle_states(self.model)
         qvel /= _PERIOD * self.config.control_timestep
         qvel[:, :3] += SPEED * _AXES[0]
-        ahead = np.arange(len(qpos)) / len(qpos) - self._hip_lag
+        ahead = np.arange(len(qpos)) / len(qpos) - self.hip_lag
         return tensor(qpos), tensor(qvel), tensor(np.round(_PERIOD * (ahead % 1.0))[:, None])
 
     def draw_start(self, count: int) -> tuple[StepState, Tensor]:
@@ -174,7 +176,7 @@ class MyoSuiteWalk(AssistedEnv[MyoSuiteWalkSettings]):
     def control(self, action: Tensor) -> Tensor:
         """Excitations 1/(1 + exp(−5 (a − ½))): 0.08 at action 0, and 0.0006 to 0.92 over [−1, 1]."""
         if self._mirror is not None:
-            action = self._mirror.action(self._phase(self._observed_steps()) >= 0.5, action)
+            action = self._mirror.action(self.phase(self._observed_steps()) >= 0.5, action)
         return torch.sigmoid(5.0 * (action - 0.5))
 
     def _observed_steps(self) -> Tensor:
@@ -192,12 +194,12 @@ class MyoSuiteWalk(AssistedEnv[MyoSuiteWalkSettings]):
             (
                 q[:, 2:],
                 self.config.control_timestep * v,
-                self._velocity(state),
+                self.velocity(state),
                 frames.orientation("torso"),
                 feet[..., 2],
                 frames.center_of_mass()[:, 2:],
                 (feet - frames.position("pelvis")[:, None]).flatten(1),
-                self._phase(self._observed_steps())[:, None],
+                self.phase(self._observed_steps())[:, None],
                 length,
                 rate,
                 -1e-3 * self._muscles.peak * pull,
@@ -207,13 +209,13 @@ class MyoSuiteWalk(AssistedEnv[MyoSuiteWalkSettings]):
         )
         return obs if self._mirror is None else self._mirror.observation(obs)
 
-    def _phase(self, steps: Tensor) -> Tensor:
+    def phase(self, steps: Tensor) -> Tensor:
         """Phase [turns] after so many steps of MyoSuite's, (W,)."""
         if self._starts_in_cycle:
             steps = steps + self.task_numbers(self.state.numbers)[:, 0]
         return torch.remainder(steps, _PERIOD) / _PERIOD
 
-    def _velocity(self, state: StepState) -> Tensor:
+    def velocity(self, state: StepState) -> Tensor:
         """Minus the mean of `cvel` along x and y, weighted with mass [m/s], (W, 2)."""
         frames = self.frames(state)
         arms = frames.center_of_mass()[:, None] - frames.position(self._bodies)
@@ -248,34 +250,6 @@ class MyoSuiteWalk(AssistedEnv[MyoSuiteWalkSettings]):
             *each(muscles, "activation"),
         ]
 
-    def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
-        r = self.config.reward
-        velocity = self._velocity(state)
-        toward = torch.exp(-(SPEED - velocity[:, 1]).square()) + torch.exp(-velocity[:, 0].square())
-        wave = torch.cos(2.0 * math.pi * self._phase(self.state.age))
-        flexions = self._swing * wave[:, None] - state.qpos[:, self._flexions]
-        turned = state.qpos[:, 3:7] - self._upright
-        others = state.qpos[:, self._others].abs().mean(-1)
-        terms = [
-            r.vel_reward * toward,
-            r.cyclic_hip * torch.linalg.vector_norm(flexions, dim=-1),
-            r.ref_rot * torch.exp(-5.0 * torch.linalg.vector_norm(turned, dim=-1)),
-            r.joint_angle_rew * torch.exp(-5.0 * others),
-            r.done * self.fell(state).float(),
-        ]
-        terms += [-getattr(r, name) * self._further_cost(name, state) for name in self._further]
-        return torch.stack(terms, dim=-1)
-
-    def _further_cost(self, name: str, state: StepState) -> Tensor:
-        """One of the terms of `FURTHER`, without its weight, (W,)."""
-        if name == "height":
-            return torch.relu(self._standing_center - self.frames(state).center_of_mass()[:, 2]).square()
-        if name == "effort":
-            return state.act.square().mean(-1)
-        phase = self._phase(self.state.age) + self._hip_lag
-        feet = self._feet.motion(self.frames(state), state.qpos[:, 2])
-        return feet.sliding(phase) if name == "footfall" else feet.dragging(phase, self.config.reward.clearance_height)
-
     def fell(self, state: StepState) -> Tensor:
         low = self.frames(state).center_of_mass()[:, 2] < _MIN_HEIGHT
         y, z = state.qpos[:, 5], state.qpos[:, 6]
@@ -283,4 +257,4 @@ class MyoSuiteWalk(AssistedEnv[MyoSuiteWalkSettings]):
 
     def outcome_terms(self, state: StepState) -> dict[str, Tensor]:
         """`vx` is the velocity forward [m/s]."""
-        return {"vx": self._velocity(state)[:, 1], "activation": state.act.square().mean(-1)}
+        return {"vx": self.velocity(state)[:, 1], "activation": state.act.square().mean(-1)}

@@ -1,0 +1,26 @@
+"""The settings and terms that bodies with motors share."""
+
+from msk_ray.config.sections import EnvSettings, Whole
+from msk_ray.config.terms import Cost
+
+
+class LimitedSettings(EnvSettings):
+    """The settings of a body that training can charge for joints past their ranges."""
+
+    joint_limit_epochs: Whole = 0
+    """Epochs over which the weight `reward.joint_limit` falls linearly to 0; 0: it stays."""
+
+    def joint_limit_share(self, epoch: int) -> float:
+        """What is left of the weight at `epoch`, counted from 0."""
+        return max(0.0, 1.0 - epoch / self.joint_limit_epochs) if self.joint_limit_epochs else 1.0
+
+
+EFFORT = "msk_ray.envs.limits:effort"
+JOINT_LIMIT = Cost(
+    "joint_limit",
+    0.0,
+    "msk_ray.envs.limits:joint_limit",
+    needs=("joint_limit_epochs",),
+    schedule=LimitedSettings.joint_limit_share,
+    optional=True,
+)
