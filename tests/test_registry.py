@@ -145,7 +145,7 @@ def test_a_name_of_the_package_cannot_be_taken(outside: Path) -> None:
 def test_reading_a_config_of_ours_loads_neither_torch_nor_warp() -> None:
     code = (
         "import sys; from msk_ray.config import parse_config\n"
-        "names = ('cartpole', 'ant', 'myoleg26', 'myoleg', 'myosuite_walk')\n"
+        "names = ('cartpole', 'ant', 'hopper', 'cheetah', 'humanoid', 'myoleg26', 'myoleg', 'myosuite_walk')\n"
         "for name in names: parse_config({'env': {'name': name}})\n"
         "print(sorted({'torch', 'warp', 'mujoco', 'ray'} & set(sys.modules)))"
     )
