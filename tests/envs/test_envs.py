@@ -253,5 +253,5 @@ def test_scores_are_taken_under_reference_weights_and_physics() -> None:
     trained = AntSettings(name="ant", reward=AntReward(forward_vel=5.0, up=0.0), nworld=7)
     reference = Ant.reference_settings(trained)
     assert (reference.reward.forward_vel, reference.reward.up, reference.nworld) == (1.0, 0.1, 7)
-    physics = Ant.reference_physics(PhysicsConfig(variant="published", friction=0.1), None)
+    physics = Ant.reference_physics(PhysicsConfig(variant="published", solref=(0.1, 1.0)), None)
     assert physics == PhysicsConfig(variant="matched")

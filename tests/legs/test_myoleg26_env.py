@@ -303,7 +303,7 @@ def test_scores_use_reference_weights_and_contacts_but_the_same_task() -> None:
     reference = MyoLeg26.reference_settings(trained)
     assert (reference.reward.forward_vel, reference.reward.effort) == (1.0, 0.2)
     assert (reference.target_speed, reference.reset) == (0.7, "walk")
-    physics = MyoLeg26.reference_physics(PhysicsConfig(friction=0.1, substeps=4), None)
+    physics = MyoLeg26.reference_physics(PhysicsConfig(solref=(0.1, 1.0), substeps=4), None)
     assert physics == PhysicsConfig(substeps=4)
 
 

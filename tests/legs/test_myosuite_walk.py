@@ -202,7 +202,7 @@ def test_scores_are_without_what_makes_training_easier() -> None:
     rewards = MyoSuiteWalkReward(done=-10.0, height=200.0, footfall=1.0)
     trained = settings(reset="random", smoothing=0.4, cycle=0.5, assist={"epochs": 9}, reward=rewards)
     assert MyoSuiteWalk.reference_settings(trained) == settings(reset="random", smoothing=0.0)
-    physics = PhysicsConfig(cone="elliptic", substeps=5, njmax=300)
+    physics = PhysicsConfig(cone="elliptic", substeps=5, solimp=(0.8, 0.9, 0.02, 0.5, 2.0))
     model = build_myosuite_walk(settings(smoothing=0.0), MyoSuiteWalk.reference_physics(physics, None))
     assert (model.opt.timestep, int(model.opt.cone), set(model.actuator_dynprm[:, 2])) == (1e-3, 0, {0.0})
 
