@@ -50,8 +50,6 @@ class Algorithm(ABC):
 
     witness: Witness | None = None
     Settings: ClassVar[type[AlgorithmSettings]] = AlgorithmSettings
-    draws_apart: ClassVar[bool] = False
-    """Whether first weights, noise and minibatches come from generators of their own where `trial.seeds` names them."""
     counts_episodes: ClassVar[bool] = False
     """Whether the result of every epoch says how many episodes ended, which some settings of environments need."""
 
@@ -65,19 +63,13 @@ class Algorithm(ABC):
         Raises:
             ConfigError: a setting asks for what the algorithm does not do.
         """
-        seeds = config.trial.seeds
-        if not self.draws_apart and (config.trial.noise_apart or seeds.policy is not None):
-            raise ConfigError(
-                f"trial.seeds: {config.algorithm.name} draws everything but states from one generator: write "
-                "trial.seeds.states alone"
-            )
         if env.reads_episode_lengths and not self.counts_episodes:
             raise ConfigError(
                 f"{env.reads_episode_lengths} needs an algorithm that counts the episodes that end, and "
                 f"{config.algorithm.name} does not: write {env.reads_episode_lengths}: null, or return "
                 "EpochResult(..., episodes=N) and set counts_episodes = True in its class"
             )
-        torch.manual_seed(config.trial.seed_of("policy"))
+        torch.manual_seed(config.trial.seed)
         self.config = config
         self.settings: Any = config.algorithm_settings
         self.env = env

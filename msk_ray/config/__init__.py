@@ -24,7 +24,7 @@ from msk_ray.config.loggers import logger_paths
 from msk_ray.config.overlay import SET_HELP, combine, flattened, leaves, merge, overlay, parse_override, parse_overrides
 from msk_ray.config.physics import FdConfig, PhysicsConfig
 from msk_ray.config.randomize import Draw, RandomizeConfig
-from msk_ray.config.recorded import SCHEMA, changed_settings, current_key, current_values, env_name
+from msk_ray.config.recorded import SCHEMA, changed_settings, current_key, current_space, current_values, env_name
 from msk_ray.config.schema import (
     Config,
     ContactCurriculum,
@@ -72,6 +72,7 @@ __all__ = [
     "changed_settings",
     "combine",
     "current_key",
+    "current_space",
     "current_values",
     "describe_fault",
     "dump_yaml",

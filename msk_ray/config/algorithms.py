@@ -94,8 +94,6 @@ class EntropyConfig(Section):
     """α [reward per nat], or its initial value if there is a target."""
     target: float | None = None
     """Entropy per action dimension [nat] to which α is adapted; null keeps α. Uniform actions have ln 2 = 0.69."""
-    rate: PositiveFloat = 5e-3
-    """Change of log α per epoch and nat of missing entropy."""
     normalize: bool = False
     """Pay α for (H + |T|) / 2|T| in place of the entropy H, where T is the target of all action dimensions together: 0
     at T = −|T|, as in SAPO, so that α does not depend on the number of actions."""
@@ -135,8 +133,6 @@ class ShacConfig(AlgorithmSettings):
     """Discount."""
     lam: Fraction = 0.95
     """λ of the TD(λ) targets."""
-    critic_method: Literal["td-lambda", "one-step"] = "td-lambda"
-    """Targets of the critic."""
     critic_iterations: Count = 16
     """Passes over the rollout per epoch; with `critic_tolerance`, the largest number of them."""
     critic_tolerance: PositiveFloat | None = None
@@ -155,8 +151,6 @@ class ShacConfig(AlgorithmSettings):
     """`linear` decreases from the given rate towards `final_lr`, which would follow the last epoch."""
     final_lr: Rate = 1e-5
     """Learning rate at which the linear schedule ends; a lower given rate stays as it is."""
-    betas: tuple[Fraction, Fraction] = (0.7, 0.95)
-    """Adam's moment decays."""
     weight_decay: NonNegative = 0.0
     """Decoupled weight decay of AdamW, for actor and critic; 0: Adam. SAPO has 0.01."""
     actor_grad_norm: PositiveFloat | None = 1.0
@@ -177,14 +171,10 @@ class ShacConfig(AlgorithmSettings):
     the mean for the actor."""
     exploration: ExplorationSchedule | None = None
     """Factor on the standard deviation of the actions by epoch; null: 1."""
-    normalize_obs: bool = True
-    """Normalise observations by their running mean and variance."""
     normalize_return: bool = False
     """Divide rewards by the running standard deviation of the return."""
     reward_scale: Annotated[float, Field(ge=1e-6, le=1e6)] = 1.0
     """Factor on the rewards of training; scores are without it."""
-    max_nonfinite_share: Fraction = 0.05
-    """Share of worlds whose gradient may be non-finite in an epoch before the trial stops with an error."""
 
     def env_steps(self, nworld: int, epochs: int) -> int:
         """The sum over epochs of horizon × worlds; a horizon that follows something counts as its `longest`."""
@@ -224,13 +214,8 @@ class ShacConfig(AlgorithmSettings):
                 f"shac.critic_batches {self.critic_batches}{also} must divide shac.horizon × env.nworld "
                 f"({shortest} × {nworld})"
             )
-        if self.entropy is not None and not config.actor.stochastic:
-            raise ValueError("shac.entropy needs a stochastic policy: write actor.stochastic: true")
-        if self.exploration is not None:
-            if not config.actor.stochastic:
-                raise ValueError("shac.exploration needs a stochastic policy: write actor.stochastic: true")
-            if self.entropy is not None:
-                raise ValueError("shac.exploration changes the noise that shac.entropy measures: leave one out")
+        if self.exploration is not None and self.entropy is not None:
+            raise ValueError("shac.exploration changes the noise that shac.entropy measures: leave one out")
         if self.actor_value == "mean" and config.critic.count == 1:
             raise ValueError("shac.actor_value: mean is of two critics: write critic.count: 2")
         if isinstance(horizon, ContactHorizon) and "cone" not in config.env.reads_physics:
@@ -241,12 +226,8 @@ class ShacConfig(AlgorithmSettings):
         unread = {}
         if self.lr_schedule == "constant":
             unread["final_lr"] = "lr_schedule is constant"
-        if self.critic_method == "one-step":
-            unread["lam"] = "critic_method is one-step"
         if not self.state_bptt:
             unread["state_grad_clip"] = "state_bptt is false"
-        if self.entropy is not None and self.entropy.target is None:
-            unread["entropy.rate"] = "entropy.target is null"
         return unread
 
 
@@ -256,11 +237,9 @@ class PpoConfig(AlgorithmSettings):
     differentiates: ClassVar[bool] = False
     reads_not: ClassVar[frozenset[str]] = frozenset(
         (
-            "actor.layer_norm",
             "actor.log_std",
             "actor.state_std",
             "actor.output_gain",
-            "critic.layer_norm",
             "critic.count",
         )
     )
@@ -275,8 +254,6 @@ class PpoConfig(AlgorithmSettings):
     """Minibatches a pass."""
     clip: PositiveFloat = 0.2
     """Bound on how much the ratio of new to old probabilities, and the value, may change in an epoch."""
-    clip_value: bool = True
-    """Whether the value is bounded too."""
     gamma: Fraction = 0.99
     """Discount."""
     lam: Fraction = 0.95
@@ -287,16 +264,8 @@ class PpoConfig(AlgorithmSettings):
     """`adaptive` divides or multiplies the rate by 1.5, between 1e-5 and 1e-2, to hold `desired_kl`."""
     desired_kl: PositiveFloat = 0.01
     """Divergence of the new policy from the old one [nat]."""
-    value_coefficient: PositiveFloat = 1.0
-    """Weight of the value's loss relative to the policy's."""
     entropy_coefficient: NonNegative = 0.0
     """Weight of the bonus for the policy's entropy."""
-    grad_norm: PositiveFloat = 1.0
-    """Norm to which the gradients of policy and value are each clipped."""
-    init_std: PositiveFloat = 1.0
-    """Initial standard deviation of actions."""
-    normalize_obs: bool = True
-    """Normalise observations by their running mean and variance."""
 
     def env_steps(self, nworld: int, epochs: int) -> int:
         """Worlds × steps × epochs."""
@@ -317,8 +286,6 @@ class PpoConfig(AlgorithmSettings):
                 f"ppo.minibatches {self.minibatches} must divide ppo.steps × env.nworld "
                 f"({self.steps} × {config.env.nworld})"
             )
-        if not config.actor.stochastic:
-            raise ValueError("ppo explores by its policy's noise: write actor.stochastic: true")
         for name, network in (("actor", config.actor), ("critic", config.critic)):
             if not network.hidden:
                 raise ValueError(f"ppo needs hidden layers: write {name}.hidden: [64, 64]")

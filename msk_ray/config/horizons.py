@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, PositiveFloat, TypeAdapter, model_validator
+from pydantic import BeforeValidator, PositiveFloat, TypeAdapter, model_validator
 
 from msk_ray.config.sections import Count, Section
 from msk_ray.errors import ConfigError, brief
@@ -42,7 +42,7 @@ class _BoundedHorizon(Section):
 class AdaptiveHorizon(_BoundedHorizon):
     """Rollout length that follows the gradient: longer while cotangents stay small, shorter when they grow.
 
-    After each epoch H ← H (target / p90)^rate within bounds, where p90 is the 90th percentile of the state cotangents'
+    After each epoch H ← H (target / p90)^0.1 within bounds, where p90 is the 90th percentile of the state cotangents'
     norms in units of reward. Adaptive horizons are the idea of AHAC (Georgiev et al. 2024, arXiv:2405.17784), which
     follows a constraint on contact forces; this one follows the cotangents themselves.
     """
@@ -50,13 +50,12 @@ class AdaptiveHorizon(_BoundedHorizon):
     kind: Literal["adaptive"] = "adaptive"
     target: PositiveFloat
     """Target for the 90th percentile of the cotangent norms, before any bound [reward]."""
-    rate: Annotated[float, Field(gt=0.0, le=1.0)] = 0.1
 
 
 class ContactHorizon(_BoundedHorizon):
     """Rollout length that follows contact, as AHAC's does: longer while contact forces stay below `contact`.
 
-    After each epoch φ ← φ + rate (c / contact − 1), within ±1, and H ← H (1 − rate·φ) within bounds, where c is the
+    After each epoch φ ← φ + 0.1 (c / contact − 1), within ±1, and H ← H (1 − 0.1 φ) within bounds, where c is the
     root mean square, over worlds and steps, of the force of all contacts. φ is AHAC's multiplier of the constraint on
     contact (Georgiev et al. 2024, arXiv:2405.17784), which its code keeps equal for all steps of a rollout. AHAC
     divides forces by accelerations; here the mean square tells impacts from standing, because the mean force of any
@@ -66,7 +65,6 @@ class ContactHorizon(_BoundedHorizon):
     kind: Literal["contact"] = "contact"
     contact: PositiveFloat
     """Contact force c above which rollouts become shorter [weight of the body]; a body at rest has 1."""
-    rate: Annotated[float, Field(gt=0.0, le=1.0)] = 0.1
 
 
 HORIZONS: Mapping[str, type[Section]] = {

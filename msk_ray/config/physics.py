@@ -5,7 +5,7 @@ from typing import Literal
 from pydantic import PositiveFloat, model_validator
 
 from msk_ray.config.randomize import RandomizeConfig
-from msk_ray.config.sections import Count, NonNegative, Section, Text
+from msk_ray.config.sections import Count, Section, Text
 
 Vec2 = tuple[float, float]
 Vec5 = tuple[float, float, float, float, float]
@@ -13,25 +13,21 @@ Vec5 = tuple[float, float, float, float, float]
 STEPPING = frozenset(
     (
         *("backward", "substep_grad_clip", "substeps", "timestep", "integrator"),
-        *("fd.eps_ctrl", "fd.eps_qpos", "fd.eps_qvel", "fd.max_worlds"),
+        *("fd.eps_ctrl", "fd.eps_qpos", "fd.eps_qvel"),
     )
 )
 """Settings that every environment reads."""
 GRADIENTS = frozenset(
     (
         *("backward", "substep_grad_clip"),
-        *("fd.eps_ctrl", "fd.eps_qpos", "fd.eps_qvel", "fd.eps_act", "fd.max_worlds"),
+        *("fd.eps_ctrl", "fd.eps_qpos", "fd.eps_qvel", "fd.eps_act"),
     )
 )
 """Settings of how steps are differentiated."""
-SOLVING = frozenset((*("tolerance", "iterations", "ls_iterations", "cone", "impratio"),))
+SOLVING = frozenset((*("tolerance", "iterations", "ls_iterations", "cone"),))
 """Those of the constraint solver, which a model without contacts and limits does not need."""
-CONTACTS = frozenset(("solref", "solimp", "friction", "solreffriction"))
+CONTACTS = frozenset(("solref", "solimp", "solreffriction"))
 """Those of contacts, in models that declare their own."""
-LIMITS = frozenset(("solref_limit", "solimp_limit"))
-"""Those of joint limits."""
-JOINTS = frozenset(("joint_damping", "armature"))
-"""Those of joints."""
 ACTIVATION = frozenset(("fd.eps_act",))
 """Those of models whose actuators have a state."""
 
@@ -47,8 +43,6 @@ class FdConfig(Section):
     """Perturbation of qvel [m/s, rad/s]."""
     eps_act: PositiveFloat = 5e-4
     """Perturbation of act [its own unit]."""
-    max_worlds: Count = 131072
-    """Number of perturbed copies that run at the same time; more are processed in chunks."""
 
 
 class PhysicsConfig(Section):
@@ -77,29 +71,15 @@ class PhysicsConfig(Section):
     integrator: Literal["Euler", "implicitfast", "RK4"] | None = None
     cone: Literal["pyramidal", "elliptic"] | None = None
     """Friction cone. The pyramid's edges make contact gradients explode over long horizons; the ellipse has none."""
-    impratio: PositiveFloat | None = None
-    """Ratio of frictional to normal constraint impedance."""
     solref: Vec2 | None = None
     """Contact time constant [s] and damping ratio."""
     solimp: Vec5 | None = None
     """Contact impedance d0, dwidth, width [m], midpoint, power."""
-    friction: PositiveFloat | None = None
-    """Sliding friction coefficient."""
     solreffriction: Vec2 | None = None
     """Solver reference of only the friction directions [s, ratio], set on contact pairs; needs the elliptic cone.
 
     Friction acts like a damper with this time constant: (0.02, 1) sticks, (1, 1) is viscous. `(0, 0)` uses solref.
     """
-    joint_damping: NonNegative | None = None
-    """Damping of every actuated joint [N m s/rad]."""
-    armature: NonNegative | None = None
-    """Rotor inertia of every actuated joint [kg m²]."""
-    solref_limit: Vec2 | None = None
-    """Solver reference of joint limits; two negative values are -stiffness and -damping."""
-    solimp_limit: Vec5 | None = None
-    """Impedance of joint limits."""
-    gear: PositiveFloat | None = None
-    """Force or torque of a motor at full control [N, N m]."""
     randomize: RandomizeConfig | None = None
     """Parameters of the model that are drawn for each world and episode, in training only; null: the model's own."""
 

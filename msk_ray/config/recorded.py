@@ -3,7 +3,8 @@
 Files and records of earlier versions are read in either spelling; on the command line the old one is refused.
 """
 
-from collections.abc import Mapping
+import copy
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from pydantic import BaseModel
@@ -22,13 +23,66 @@ _EXECUTION = {
 _MOVED = {f"{section}.{name}": f"execution.{name}" for section, names in _EXECUTION.items() for name in names}
 
 _REMOVED: dict[str, Any] = {
+    "actor.layer_norm": True,
+    "actor.stochastic": True,
+    "critic.layer_norm": True,
+    "curriculum.reward": None,
+    "curriculum.start.friction": None,
+    "curriculum.start.solimp": None,
+    "physics.armature": None,
     "physics.contact_reach": None,
+    "physics.fd.max_worlds": 131072,
+    "physics.friction": None,
+    "physics.gear": None,
+    "physics.impratio": None,
+    "physics.joint_damping": None,
+    "physics.solimp_limit": None,
+    "physics.solref_limit": None,
+    "ppo.clip_value": True,
+    "ppo.grad_norm": 1.0,
+    "ppo.init_std": 1.0,
+    "ppo.normalize_obs": True,
+    "ppo.value_coefficient": 1.0,
+    "shac.betas": [0.7, 0.95],
     "shac.copies": None,
     "shac.critic_kernels": ...,
+    "shac.critic_method": "td-lambda",
     "shac.critic_products": ...,
+    "shac.entropy.rate": 5e-3,
+    "shac.horizon.rate": 0.1,
+    "shac.max_nonfinite_share": 0.05,
+    "shac.normalize_obs": True,
+    "trial.seeds": dict.fromkeys(("policy", "states", "noise", "minibatches")),
 }
-"""Settings that no longer exist, with the only value that can still be read; an ellipsis stands for any."""
-REMOVED = "has been removed, because it did not pay; leave it out, or use version 0.2"
+"""Settings that no longer exist, with the only value that can still be read: what is done now. An ellipsis stands for
+any value."""
+_REMOVED_FROM_LEGS: dict[str, Any] = {
+    "assist.balance": 800.0,
+    "assist.lateral": 800.0,
+    "assist.support": 0.0,
+    "min_height": 0.65,
+    "min_upright": 0.5,
+    "rest_excitation": 0.02,
+    "reward.cadence": 112.0,
+    "reward.capture_scale": 0.1,
+    "reward.fatigue": 0.0,
+    "reward.stride_angle": 0.75,
+    "reward.track_rate_scale": 2.0,
+    "reward.track_scale": 0.15,
+    "success_speed": 0.8,
+    "tracking": {"start": 1.0, "end": 1.0, "epochs": 0},
+}
+_REMOVED_FROM_ENVS: dict[str, dict[str, Any]] = {
+    "hopper": {"reward.drop": 200.0, "reward.full_height": -0.3},
+    "humanoid": {"reward.drop": 200.0, "reward.full_height": 0.84},
+    "myoleg": _REMOVED_FROM_LEGS,
+    "myoleg26": {**_REMOVED_FROM_LEGS, "terrain.seed": 0, "terrain.start": 0.8, "terrain.step_depth": 0.6},
+    "myosuite_walk": {"assist.balance": 800.0, "assist.lateral": 800.0, "assist.support": 0.0},
+}
+"""The same of the section of each environment of the package, dotted within it."""
+_REMOVED_FROM_SPACES: dict[str, Any] = {"smoke": {"overrides": {}, "max_trials": 8}}
+"""The same of a space file's own settings."""
+REMOVED = "has been removed; leave it out, or use version 0.2"
 
 
 def env_name(settings: Mapping[str, Any]) -> str | None:
@@ -49,20 +103,23 @@ def current_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         ConfigError: one of them no longer exists and had an effect.
     """
-    result = {key: dict(value) if isinstance(value, Mapping) else value for key, value in settings.items()}
-    for dotted in (*_REMOVED, *_MOVED):
-        section, _, setting = dotted.partition(".")
-        owner = result.get(section)
-        if not (isinstance(owner, dict) and setting in owner):
-            continue
-        value = owner.pop(setting)
-        if dotted in _REMOVED:
-            _check_harmless(dotted, value)
-        else:
-            result["execution"] = {**(result.get("execution") or {}), setting: value}
+    of_env = _REMOVED_FROM_ENVS.get(env_name(settings) or "", {})
+    result = _without({**_REMOVED, **{f"env.{name}": value for name, value in of_env.items()}}, settings)
+    for dotted in _MOVED:
+        for value in _taken(result, dotted):
+            result["execution"] = {**(result.get("execution") or {}), dotted.rpartition(".")[2]: value}
     if isinstance(shac := result.get("shac"), dict) and "horizon" in shac:
         shac["horizon"] = _with_kind(shac["horizon"])
     return result
+
+
+def current_space(data: Mapping[str, Any]) -> dict[str, Any]:
+    """A space file's own settings in the current spelling; its trials' settings are left as they are.
+
+    Raises:
+        ConfigError: one of them no longer exists and had an effect.
+    """
+    return _without(_REMOVED_FROM_SPACES, data)
 
 
 def current_values(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -74,12 +131,45 @@ def current_values(values: Mapping[str, Any]) -> dict[str, Any]:
     result: dict[str, Any] = {}
     for key, value in values.items():
         if key in _REMOVED:
-            _check_harmless(key, value)
-        elif "." in key or not isinstance(value, Mapping):
-            result[current_key(key)] = _with_kind(value) if key == "shac.horizon" else value
-        else:
+            _check_harmless(key, value, _REMOVED[key])
+        elif key in _MOVED or not isinstance(value, Mapping):
+            result[current_key(key)] = value
+        elif "." not in key:
             result |= current_settings({**result, key: value})
+        else:
+            result[key] = _current_section(key, value)
     return result
+
+
+def _current_section(dotted: str, values: Mapping[str, Any]) -> Any:
+    """A section within sections, in the current spelling."""
+    sections = dotted.split(".")
+    settings = values
+    for section in reversed(sections):
+        settings = {section: settings}
+    current: Any = current_settings(settings)
+    for section in sections:
+        current = current[section]
+    return current
+
+
+def _without(removed: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, Any]:
+    """A copy of nested settings without those removed, if these had no effect."""
+    result: dict[str, Any] = copy.deepcopy(dict(settings))
+    for dotted, harmless in removed.items():
+        for value in _taken(result, dotted):
+            _check_harmless(dotted, value, harmless)
+    return result
+
+
+def _taken(settings: dict[str, Any], dotted: str) -> Iterator[Any]:
+    """The value of a setting, which is taken out of nested settings in place; nothing if it is not there."""
+    *sections, name = dotted.split(".")
+    owner: Any = settings
+    for section in sections:
+        owner = owner.get(section) if isinstance(owner, dict) else None
+    if isinstance(owner, dict) and name in owner:
+        yield owner.pop(name)
 
 
 def _with_kind(horizon: Any) -> Any:
@@ -96,15 +186,16 @@ def _with_kind(horizon: Any) -> Any:
     return {"kind": kind, **horizon}
 
 
-def _check_harmless(dotted: str, value: Any) -> None:
-    harmless = _REMOVED[dotted]
-    if harmless is not ... and value != harmless:
+def _check_harmless(dotted: str, value: Any, harmless: Any) -> None:
+    part = isinstance(harmless, Mapping) and isinstance(value, Mapping) and value.items() <= harmless.items()
+    if harmless is not ... and value != harmless and not part:
         raise ConfigError(f"{dotted}: {brief(value)} {REMOVED}")
 
 
 def newer_spelling(dotted: str) -> str | None:
     """What to write instead of a setting of an earlier version; None if it is not one."""
-    if dotted in _REMOVED:
+    section, _, setting = dotted.partition(".")
+    if dotted in _REMOVED or (section == "env" and any(setting in names for names in _REMOVED_FROM_ENVS.values())):
         return f"it {REMOVED}"
     return f"write {_MOVED[dotted]}" if dotted in _MOVED else None
 

@@ -24,7 +24,7 @@ from msk_ray.config.environments import UndeclaredEnv, settings_class
 from msk_ray.config.execution import ExecutionConfig
 from msk_ray.config.loggers import logger_paths
 from msk_ray.config.packages import require
-from msk_ray.config.physics import PhysicsConfig, Vec5
+from msk_ray.config.physics import PhysicsConfig
 from msk_ray.config.sections import SHOWN, Count, EnvSettings, Section, Text, Undeclared, Whole
 from msk_ray.config.unread import unread_settings
 from msk_ray.errors import ConfigError, brief
@@ -48,17 +48,13 @@ class ContactStart(Section):
 
     solref: tuple[PositiveFloat, PositiveFloat] | None = None
     """Contact time constant [s] and damping ratio."""
-    solimp: Vec5 | None = None
-    """Contact impedance d0, dwidth, width [m], midpoint, power."""
     solreffriction: tuple[PositiveFloat, PositiveFloat] | None = None
     """Time constant [s] and damping ratio of the friction directions; (1, 1) is viscous."""
-    friction: PositiveFloat | None = None
-    """Sliding friction coefficient."""
 
     @model_validator(mode="after")
     def _something(self) -> "ContactStart":
         if not self.model_dump(exclude_none=True):
-            raise ValueError("write at least one of solref, solimp, solreffriction, friction")
+            raise ValueError("write solref, solreffriction or both")
         return self
 
 
@@ -68,25 +64,19 @@ class ContactCurriculum(Section):
     start: ContactStart
     epochs: Count
     """Steps from `start` to the trial's physics, one per epoch."""
-    reward: float | None = None
-    """Mean reward per env step that an epoch must reach for a step to be taken; null: one step every epoch."""
 
 
 class NetworkConfig(Section):
-    """A multilayer perceptron."""
+    """A multilayer perceptron with normalised hidden layers."""
 
     hidden: Annotated[tuple[Annotated[int, Field(gt=0, le=65536)], ...], Field(max_length=64)] = (64, 64)
     """Sizes of the hidden layers."""
     activation: Literal["elu", "silu", "relu", "tanh"] = "elu"
-    layer_norm: bool = True
-    """Normalise each hidden layer."""
 
 
 class ActorConfig(NetworkConfig):
-    """Policy network. Its output is squashed by tanh."""
+    """Policy network. In training, actions are drawn from a Gaussian; tanh squashes them."""
 
-    stochastic: bool = True
-    """Draw actions from a Gaussian; False: a deterministic policy."""
     log_std: float = -1.0
     """Initial log standard deviation, before tanh."""
     state_std: bool = False
@@ -116,47 +106,17 @@ class EvaluationConfig(Section):
     """Physics of the score; null: the env's reference physics."""
 
 
-Seed = Annotated[int, Field(ge=0, lt=2**31)]
-
-
-class SeedsConfig(Section):
-    """Seeds of parts of a trial, so that one can be varied and the others held. A part left null uses `trial.seed`.
-
-    Noise and minibatches come from one generator until one of them is given: then each has its own.
-    """
-
-    policy: Seed | None = None
-    """First weights of all networks."""
-    states: Seed | None = None
-    """Initial states of episodes, and numbers that `physics.randomize` draws."""
-    noise: Seed | None = None
-    """Exploration: noise of actions."""
-    minibatches: Seed | None = None
-    """Which rows each minibatch has."""
-
-
 class TrialConfig(Section):
     """Length, seed and start of a trial."""
 
     epochs: Count = 500
     """Updates of the policy."""
-    seed: Seed = 0
-    """Seed of everything that is drawn, except what `seeds` and `evaluation.seed` set."""
-    seeds: SeedsConfig = SeedsConfig()
+    seed: Whole = 0
+    """Seed of everything that is drawn but the episodes of evaluations (`evaluation.seed`)."""
     start_from: Text | None = None
     """Checkpoint of another trial, such as a best.pt, from whose networks and observation statistics this one starts;
     null starts from random networks. Optimisers and worlds are new either way; so is the critic if the file has only a
     policy, which may then get worse before it gets better."""
-
-    def seed_of(self, part: Literal["policy", "states", "noise", "minibatches"]) -> int:
-        """The seed of a part of the trial."""
-        own: int | None = getattr(self.seeds, part)
-        return self.seed if own is None else own
-
-    @property
-    def noise_apart(self) -> bool:
-        """Whether noise and minibatches come from generators of their own."""
-        return self.seeds.noise is not None or self.seeds.minibatches is not None
 
 
 class Config(Section):
@@ -237,10 +197,6 @@ class Config(Section):
         self.algorithm_settings.check(self)
         if self.curriculum is not None:
             self._check_curriculum()
-            if self.physics.randomize is not None and self.physics.randomize.pair_friction is not None:
-                raise ValueError(
-                    "curriculum and physics.randomize.pair_friction both set the friction of pairs; leave one out"
-                )
         return self
 
     def _check_gpus(self) -> None:

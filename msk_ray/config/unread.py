@@ -42,8 +42,6 @@ def _unread(config: Config) -> dict[str, str]:
     section = config.algorithm_section
     own = config.algorithm_settings.unread()
     unread |= {f"{section}.{name}": f"nothing reads it while {section}.{why};" for name, why in own.items()}
-    if not config.actor.stochastic:
-        unread |= dict.fromkeys(("actor.log_std", "actor.state_std"), _while("actor.stochastic", "false"))
     return unread
 
 
@@ -60,7 +58,7 @@ def _unread_by_backward(config: Config) -> list[str]:
         case "hybrid":
             return state
         case _:
-            return [*state, "fd.eps_ctrl", "fd.max_worlds"]
+            return [*state, "fd.eps_ctrl"]
 
 
 def _while(key: str, value: str) -> str:

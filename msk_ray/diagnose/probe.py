@@ -52,7 +52,7 @@ class Subject:
         if self.saved is not None:
             return self.saved.network(env)
         # Some algorithms draw their networks from the global generator.
-        torch.manual_seed(self.config.trial.seed_of("policy"))
+        torch.manual_seed(self.config.trial.seed)
         algorithm = algorithm_class(self.config)
         return algorithm.policy_network(self.config, env.obs_size, env.action_size).to(env.device)
 

@@ -84,11 +84,6 @@ def compile_on_floor(
         else:
             sliding = contacts.friction
         pair.friction = [sliding, sliding, 0.005, 0.0001, 0.0001]
-    for joint in _actuated(spec):
-        if physics.joint_damping is not None:
-            joint.damping[0] = physics.joint_damping
-        if physics.armature is not None:
-            joint.armature = physics.armature
     if isinstance(contacts, SpringContacts):
         match_springs(spec, contacts)
     override(spec, physics)
@@ -136,7 +131,7 @@ def _constant(impedance: float) -> list[float]:
 
 
 def override(spec: mujoco.MjSpec, physics: PhysicsConfig) -> None:
-    """Set what `physics` overrides of pairs, limits and motors."""
+    """Set what `physics` overrides of pairs."""
     for pair in spec.pairs:
         if physics.solref is not None:
             pair.solref = list(physics.solref)
@@ -144,13 +139,3 @@ def override(spec: mujoco.MjSpec, physics: PhysicsConfig) -> None:
             pair.solimp = list(physics.solimp)
         if physics.solreffriction is not None:
             pair.solreffriction = list(physics.solreffriction)
-        if physics.friction is not None:
-            pair.friction = [physics.friction, physics.friction, 0.005, 0.0001, 0.0001]
-    for joint in _actuated(spec):
-        if physics.solref_limit is not None:
-            joint.solref_limit = list(physics.solref_limit)
-        if physics.solimp_limit is not None:
-            joint.solimp_limit = list(physics.solimp_limit)
-    for actuator in spec.actuators:
-        if physics.gear is not None:
-            actuator.gear[0] = physics.gear

@@ -60,8 +60,6 @@ def override_options(spec: mujoco.MjSpec, physics: PhysicsConfig) -> None:
         option.integrator = INTEGRATORS[physics.integrator]
     if physics.cone is not None:
         option.cone = _CONES[physics.cone]
-    if physics.impratio is not None:
-        option.impratio = physics.impratio
     if physics.iterations is not None:
         option.iterations = physics.iterations
     if physics.ls_iterations is not None:

@@ -57,7 +57,7 @@ class BatchedEnv(VectorEnv[Array, Array, Array], Generic[Array]):
             config.physics,
             self.num_envs,
             device,
-            config.trial.seed_of("states"),
+            config.trial.seed,
             differentiable=False,
             randomize=True,
         )

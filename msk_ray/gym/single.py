@@ -37,7 +37,7 @@ class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
                 "physics.randomize: a single environment has the model's own parameters; set it to null, or use "
                 "BatchedEnv"
             )
-        self.env = make_env(config.env, config.physics, 1, "cpu", config.trial.seed_of("states"), differentiable=False)
+        self.env = make_env(config.env, config.physics, 1, "cpu", config.trial.seed, differentiable=False)
         self.env.sim = self._simulation = CSimulation(self.env.model, self.env.sim.substeps, self.env.sim.batch.limits)
         self.observation_space = observation_space(self.env)
         self.action_space = action_space(self.env)

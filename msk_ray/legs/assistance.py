@@ -21,6 +21,10 @@ from msk_ray.step.autograd.tangent import quat_conjugate, quat_log, quat_multipl
 
 AnySettings = TypeVar("AnySettings", bound=EnvSettings)
 
+RIGHTING = 800.0
+"""Righting torque of tilt and list [N m/rad]; that of rotation is smaller in proportion to its inertia."""
+LATERAL = 800.0
+"""Force towards the walking line [N/m]."""
 _TRUNK_INERTIA = (7.0, 7.0, 0.85)
 """About the forward, left and up axes [kg m²] of myoleg26's pelvis and trunk with hanging legs: what the springs
 turn."""
@@ -76,46 +80,43 @@ class Assistance:
 
 
 class FreeSprings:
-    """Springs and dampers at full strength on a pelvis that is a free joint, the first of its model.
+    """Springs and critical dampers at full strength on a pelvis that is a free joint, the first of its model.
 
     They turn it to its orientation in the keyframe `stand`, and pull it onto the line that leads forward from there.
     Forward, left and up are the rows of `axes` (3, 3) in the world.
     """
 
-    def __init__(
-        self, model: mujoco.MjModel, axes: NDArray[np.float64], config: AssistConfig, device: torch.device
-    ) -> None:
+    def __init__(self, model: mujoco.MjModel, axes: NDArray[np.float64], device: torch.device) -> None:
         stand = model.key("stand").qpos
 
         def tensor(values: object) -> Tensor:
             return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=device)
 
         self._local, self._stand = tensor(in_root(model, axes)), tensor(stand[3:7])
-        self._righting, self._turning = map(tensor, righting(config))
+        self._righting, self._turning = map(tensor, righting())
         mass = float(model.body_subtreemass[0])
-        self._lateral, self._lateral_damping = config.lateral, 2.0 * math.sqrt(config.lateral * mass)
+        self._lateral_damping = 2.0 * math.sqrt(LATERAL * mass)
         self._left, self._rest = tensor(axes[1]), float(stand[:3] @ axes[1])
-        self._lift = tensor(axes[2] * config.support * mass * float(np.linalg.norm(model.opt.gravity)))
 
     def force(self, state: StepState) -> Tensor:
         """Forces on the degrees of freedom [N, N m], (W, nv)."""
         q, v = state.qpos, state.qvel
         aside, drift = (q[:, :3] * self._left).sum(-1) - self._rest, (v[:, :3] * self._left).sum(-1)
-        push = -(self._lateral * aside + self._lateral_damping * drift)
+        push = -(LATERAL * aside + self._lateral_damping * drift)
         # Forces on a free joint's rotation are in the body's frame, as its velocity is.
         error = quat_multiply(quat_conjugate(self._stand.expand(len(q), 4)), q[:, 3:7])
         along, spin = quat_log(error) @ self._local.T, v[:, 3:6] @ self._local.T
         torque = -(self._righting * along + self._turning * spin) @ self._local
-        root = torch.cat((push[:, None] * self._left + self._lift, torque), dim=-1)
+        root = torch.cat((push[:, None] * self._left, torque), dim=-1)
         return torch.nn.functional.pad(root, (0, v.shape[1] - 6))
 
 
-def righting(config: AssistConfig) -> tuple[list[float], list[float]]:
+def righting() -> tuple[list[float], list[float]]:
     """Stiffness [N m/rad] and critical damping, 2 √(k m), [N m s/rad] about the forward, left and up axes.
 
     The frequency is the same about all three; otherwise the light one would oscillate within a control step.
     """
-    stiffness = [config.balance * inertia / _TRUNK_INERTIA[0] for inertia in _TRUNK_INERTIA]
+    stiffness = [RIGHTING * inertia / _TRUNK_INERTIA[0] for inertia in _TRUNK_INERTIA]
     return stiffness, [2.0 * math.sqrt(k * inertia) for k, inertia in zip(stiffness, _TRUNK_INERTIA, strict=True)]
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
-from msk_ray.config.physics import CONTACTS, LIMITS
+from msk_ray.config.physics import CONTACTS
 from msk_ray.envs.layout import Entry, entries
 from msk_ray.errors import ConfigError
 from msk_ray.legs.assistance import Assistance, AssistedEnv
@@ -36,6 +36,13 @@ AnyLegSettings = TypeVar("AnyLegSettings", bound=LegSettings)
 _GRAVITY = 9.81
 _LIMIT_MARGIN = 0.05
 """Distance from a joint limit at which the penalty starts [rad]."""
+_LOWEST, _MOST_TILTED = 0.65, 0.5
+"""Share of the standing height of the pelvis, and cosine between the trunk's up axis and +z, below which it has
+fallen."""
+_REST_EXCITATION = 0.02
+"""Smallest excitation of a muscle at action 0, unless the standing keyframe has a larger one."""
+_SUCCESS_SPEED = 0.8
+"""Mean speed over the episode from which walking counts as a success [m/s]."""
 _VELOCITY_SCALE = 0.1
 """Scale of joint velocities in the observation [s/rad]."""
 
@@ -60,7 +67,7 @@ class LegEnv(AssistedEnv[AnyLegSettings], Generic[AnyLegSettings]):
     All entries carry gradients: lengths and rates have exact ones, forces are computed from them.
 
     Actions are squashed into excitations by the logistic curve that maps action 0 to the excitation of standing
-    (at least `rest_excitation`) and ±1 to 0 and 1, with a slope that is never zero.
+    (at least `_REST_EXCITATION`) and ±1 to 0 and 1, with a slope that is never zero.
 
     With `clock` or `speed_range`, the numbers of an episode's task are its target speed [m/s] and the phase [turns] it
     starts with. With `symmetric`, observations and actions are those of the mirrored body while the phase is in its
@@ -78,7 +85,7 @@ class LegEnv(AssistedEnv[AnyLegSettings], Generic[AnyLegSettings]):
         self.action_size = len(self.curves.actuators)
         self.prepare_model()
         held = torch.tensor(self.model.key("stand").ctrl, dtype=torch.float32, device=self.device)
-        rest = held[self.curves.actuators].clamp_min(self.config.rest_excitation)
+        rest = held[self.curves.actuators].clamp_min(_REST_EXCITATION)
         self._odds = (1.0 - rest) / rest
         self.hinge_qpos = columns(self.model.jnt_qposadr[self.hinges], self.device)
         self._hinge_dofs = columns(self.model.jnt_dofadr[self.hinges], self.device)
@@ -303,7 +310,7 @@ class LegEnv(AssistedEnv[AnyLegSettings], Generic[AnyLegSettings]):
         if not self.config.early_termination:
             return super().fell(state)
         root = self.root(state)
-        return (root.height < self.config.min_height * self.stand_height) | (root.up[:, 2] < self.config.min_upright)
+        return (root.height < _LOWEST * self.stand_height) | (root.up[:, 2] < _MOST_TILTED)
 
     def outcome_terms(self, state: StepState) -> dict[str, Tensor]:
         root = self.root(state)
@@ -326,12 +333,12 @@ class LegEnv(AssistedEnv[AnyLegSettings], Generic[AnyLegSettings]):
         return summary(measure(found, []))
 
     def success(self, tail: dict[str, Tensor]) -> Tensor | None:
-        """Upright at the end and, when walking, with a mean speed of at least `success_speed` over the episode."""
-        standing = tail["upright"][-1] > self.config.min_upright
+        """Upright at the end and, when walking, with a mean speed of at least `_SUCCESS_SPEED` over the episode."""
+        standing = tail["upright"][-1] > _MOST_TILTED
         if self.config.target_speed == 0.0:
             return standing
         seconds = self.config.episode_length * self.config.control_timestep
-        return standing & (tail["distance"][-1] >= self.config.success_speed * seconds)
+        return standing & (tail["distance"][-1] >= _SUCCESS_SPEED * seconds)
 
     @classmethod
     def reference_settings(cls, config: AnyLegSettings) -> AnyLegSettings:
@@ -340,5 +347,5 @@ class LegEnv(AssistedEnv[AnyLegSettings], Generic[AnyLegSettings]):
 
     @classmethod
     def reference_physics(cls, physics: PhysicsConfig, variant: str | None) -> PhysicsConfig:
-        """`physics` with the model's own contacts and limits."""
-        return physics.model_copy(update=dict.fromkeys({"cone", "impratio"} | CONTACTS | LIMITS))
+        """`physics` with the model's own contacts."""
+        return physics.model_copy(update=dict.fromkeys({"cone"} | CONTACTS))

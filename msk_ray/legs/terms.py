@@ -18,6 +18,14 @@ _TRUNK_LEVER = 0.18
 """How far the centre of mass moves with the trunk's up axis [m]: 34 kg of 75 kg, 0.4 m above the pelvis."""
 _HEAD_LEVER = 0.65
 """Height of the head above the pelvis [m]."""
+_CAPTURE = 0.1
+"""Distance of the capture point beyond which its cost grows linearly [m], so that the cost of a fall stays moderate."""
+_STRIDE = 0.75
+"""Largest angle between the hips' flexions [rad]: 2 asin(step length / (2 leg length)) for 0.67 m and 0.9 m."""
+_CADENCE = 112.0
+"""Steps per minute, about as many as people take at 1.25 m/s [1/min]."""
+_TRACK, _TRACK_RATE = 0.15, 2.0
+"""Distances from people's joint angles [rad] and their rates [rad/s] beyond which the cost grows linearly."""
 _LEG_LENGTH = 0.9
 """Leg whose steps have the length of people's [m]."""
 
@@ -70,7 +78,7 @@ def smoothness(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) 
 
 
 def capture(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
-    """√(1 + (d / capture_scale)²) - 1, where d is the distance of the capture point from the walking line, or from the
+    """√(1 + (d / 0.1 m)²) - 1, where d is the distance of the capture point from the walking line, or from the
     start when standing. The capture point is where the body would come to rest as a pendulum, x + v / √(g / height),
     with x and v of its centre of mass estimated from pelvis and lean of the trunk."""
     root = env.root(state)
@@ -78,7 +86,7 @@ def capture(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> 
     velocity = root.velocity + _TRUNK_LEVER * torch.linalg.cross(root.spin, root.up)
     place = root.place + (velocity * env.pendulum_time + _TRUNK_LEVER * (root.up - env.standing_up))[:, :2]
     distance = place if env.config.target_speed == 0.0 else place[:, 1:]
-    return torch.sqrt(1.0 + (distance / env.config.reward.capture_scale).square().sum(-1)) - 1.0
+    return torch.sqrt(1.0 + (distance / _CAPTURE).square().sum(-1)) - 1.0
 
 
 def sway(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
@@ -92,12 +100,14 @@ def symmetry(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) ->
 
 
 def stride(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
-    """(r - 1)² with r² = (d / stride_angle)² + (d' / (stride_angle ω))², where d is the angle between both hips'
-    flexions, d' its rate and ω = 2π cadence / 120 s. It is zero if the legs swing against each other like a pendulum of
-    that angle and cadence, in any phase; quick small steps are penalised at each turning point."""
-    r, target = env.config.reward, env.target
-    amplitude: float | Tensor = r.stride_angle
-    turn: float | Tensor = math.tau * r.cadence / 120.0
+    """(r - 1)² with r² = (d / a)² + (d' / (a ω))², where d is the angle between both hips' flexions and d' its rate.
+
+    It is zero if the legs swing against each other like a pendulum of the angle a and frequency ω of people at 1.25 m/s
+    (with the clock, at the target speed), in any phase; quick small steps are penalised at each turning point.
+    """
+    target = env.target
+    amplitude: float | Tensor = _STRIDE
+    turn: float | Tensor = math.tau * _CADENCE / 120.0
     if env.config.clock and isinstance(target, Tensor):
         pace = env.reference.pace
         amplitude = pace.hip_swing(target, _LEG_LENGTH)[:, None]
@@ -109,11 +119,6 @@ def metabolic(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -
     """Metabolic power of all muscles per kg of body mass, without that of rest [W/kg]; walking people have about 3. The
     model is that of Bhargava et al. 2004 (`msk_ray/legs/metabolic.py`)."""
     return env.metabolic_power(state, action) / env.mass
-
-
-def fatigue(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
-    """Mean cubed activation."""
-    return state.act.pow(3).mean(-1)
 
 
 def head(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
@@ -164,16 +169,16 @@ def out_of_plane(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor
 
 
 def track(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
-    """√(1 + mean (Δq / track_scale)²) - 1, where Δq is how far hip flexion, knee and ankle of both legs are from the
+    """√(1 + mean (Δq / 0.15 rad)²) - 1, where Δq is how far hip flexion, knee and ankle of both legs are from the
     mean of people at the clock's phase."""
     angles, _ = env.reference(env.leg_phase(), env.task_speed())
-    return costs.deviation(state.qpos[:, env.track_qpos], angles, env.config.reward.track_scale)
+    return costs.deviation(state.qpos[:, env.track_qpos], angles, _TRACK)
 
 
 def track_rate(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
-    """The same for their rates."""
+    """The same for their rates, with 2 rad/s."""
     _, rates = env.reference(env.leg_phase(), env.task_speed())
-    return costs.deviation(state.qvel[:, env.track_dofs], rates, env.config.reward.track_rate_scale)
+    return costs.deviation(state.qvel[:, env.track_dofs], rates, _TRACK_RATE)
 
 
 def landing(env: LegEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:

@@ -19,16 +19,15 @@ class Actor(nn.Module):
     at the same value everywhere.
 
     Attributes:
-        log_std: log σ (A,) for all observations; None if it depends on them, or there is none.
+        log_std: log σ (A,) for all observations; None if it depends on them.
     """
 
     def __init__(self, config: ActorConfig, obs_size: int, action_size: int, generator: torch.Generator) -> None:
         super().__init__()
         self.mean = make_mlp(config, obs_size, action_size, generator, config.output_gain)
-        constant = config.stochastic and not config.state_std
-        self.log_std = nn.Parameter(torch.full((action_size,), config.log_std)) if constant else None
+        self.log_std = None if config.state_std else nn.Parameter(torch.full((action_size,), config.log_std))
         self.log_std_layer: nn.Linear | None = None
-        if config.stochastic and config.state_std:
+        if config.state_std:
             last = self.mean[-1]
             assert isinstance(last, nn.Linear)
             self.log_std_layer = nn.Linear(last.in_features, action_size)
@@ -43,18 +42,19 @@ class Actor(nn.Module):
                 deterministic action.
         """
         mean, log_std = self._gaussian(obs)
-        if noise is not None and log_std is not None:
+        if noise is not None:
             mean = mean + log_std.exp() * noise
         return torch.tanh(mean)
 
-    def std(self, obs: Tensor) -> Tensor | None:
-        """σ (A,) or (..., A), before tanh, for normalised observations (..., O); None if deterministic."""
-        _, log_std = self._gaussian(obs) if self.log_std is None else (None, self.log_std)
-        return None if log_std is None else log_std.exp()
+    def std(self, obs: Tensor) -> Tensor:
+        """σ (A,) or (..., A), before tanh, for normalised observations (..., O)."""
+        log_std = self._gaussian(obs)[1] if self.log_std is None else self.log_std
+        return log_std.exp()
 
-    def _gaussian(self, obs: Tensor) -> tuple[Tensor, Tensor | None]:
+    def _gaussian(self, obs: Tensor) -> tuple[Tensor, Tensor]:
         """μ (..., A) and log σ, (A,) or (..., A)."""
         if self.log_std_layer is None:
+            assert self.log_std is not None
             return self.mean(obs), self.log_std
         hidden = self.mean[:-1](obs)
         return self.mean[-1](hidden), self.log_std_layer(hidden).clamp(*_LOG_STD_RANGE)
@@ -66,7 +66,6 @@ class Actor(nn.Module):
         (Haarnoja et al. 2018, arXiv:1801.01290, appendix C). Differentiable in both results.
         """
         mean, log_std = self._gaussian(obs)
-        assert log_std is not None
         raw = mean + log_std.exp() * noise
         # log(1 − tanh² u) = 2 (log 2 − u − softplus(−2u)); this form stays finite where tanh² rounds to 1.
         squash = 2.0 * (math.log(2.0) - raw - nn.functional.softplus(-2.0 * raw))

@@ -29,7 +29,7 @@ class Mlp(nn.Sequential):
 def make_mlp(
     config: NetworkConfig, inputs: int, outputs: int, generator: torch.Generator, output_gain: float = 1.0
 ) -> Mlp:
-    """Linear, activation and optional LayerNorm per hidden layer; a linear last layer.
+    """Linear, activation and LayerNorm per hidden layer; a linear last layer.
 
     Weights are orthogonal, drawn from `generator`, with gain √2 in hidden layers and `output_gain` in the last; biases
     are zero.
@@ -37,9 +37,8 @@ def make_mlp(
     layers: list[nn.Module] = []
     sizes = (inputs, *config.hidden)
     for fan_in, fan_out in pairwise(sizes):
-        layers += [_linear(fan_in, fan_out, 2**0.5, generator), _ACTIVATIONS[config.activation]()]
-        if config.layer_norm:
-            layers.append(nn.LayerNorm(fan_out))
+        linear = _linear(fan_in, fan_out, 2**0.5, generator)
+        layers += [linear, _ACTIVATIONS[config.activation](), nn.LayerNorm(fan_out)]
     layers.append(_linear(sizes[-1], outputs, output_gain, generator))
     return Mlp(*layers)
 

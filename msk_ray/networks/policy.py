@@ -9,13 +9,13 @@ from msk_ray.networks.normalizer import RunningMeanStd
 class PolicyNetwork(nn.Module):
     """Raw observations (..., O) to deterministic actions (..., A), differentiable."""
 
-    def __init__(self, actor: Actor, normalizer: RunningMeanStd | None) -> None:
+    def __init__(self, actor: Actor, normalizer: RunningMeanStd) -> None:
         super().__init__()
         self.actor = actor
         self.normalizer = normalizer
 
     def forward(self, obs: Tensor) -> Tensor:
-        action: Tensor = self.actor(obs if self.normalizer is None else self.normalizer.normalize(obs))
+        action: Tensor = self.actor(self.normalizer.normalize(obs))
         return action
 
     def parts(self) -> dict[str, nn.Module]:

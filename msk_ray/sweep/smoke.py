@@ -8,6 +8,8 @@ from msk_ray.sweep.rules.no_scheduler import NoScheduler
 from msk_ray.sweep.space import Space
 from msk_ray.sweep.trials import base_settings, make_trial
 
+TRIALS = 8
+"""The largest number of trials."""
 EPOCHS = 3
 WORLDS = 8
 EVALUATION_WORLDS = 4
@@ -24,21 +26,17 @@ def without_early_stopping(space: Space) -> Space:
 
 
 def shrink(space: Space, trials: list[Trial]) -> list[Trial]:
-    """A few short trials in which every value of every factor occurs at least once.
-
-    Raises:
-        ConfigError: the space's own `smoke.overrides` do not fit.
-    """
+    """A few short trials in which every value of every factor occurs at least once."""
     base = base_settings(space)
     short: dict[str, Trial] = {}
-    chosen = cover(trials)[: space.file.smoke.max_trials]
+    chosen = cover(trials)[:TRIALS]
     # Two variants that differ only in what is shortened become equal, and one of them is enough. A single trial would
     # test neither concurrency nor comparison, so further ones join until there are two.
     spare = [trial for trial in trials if trial not in chosen]
     for place, trial in enumerate([*chosen, *spare]):
-        if place >= len(chosen) and len(short) >= min(2, space.file.smoke.max_trials):
+        if place >= len(chosen) and len(short) >= 2:
             break
-        values = {**trial.values, **shorten(trial.config), **space.file.smoke.overrides}
+        values = {**trial.values, **shorten(trial.config)}
         small = make_trial(space, base, trial.changed, values, trial.seed, len(short))
         short.setdefault(small.id, small)
     return list(short.values())

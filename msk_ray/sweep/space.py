@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, SerializeAsAny, ValidationError, model_validator
 
-from msk_ray.config import current_values, describe_fault, leaves, read_yaml
+from msk_ray.config import current_space, current_values, describe_fault, leaves, read_yaml
 from msk_ray.config.sections import Count, Section, Text, Whole
 from msk_ray.errors import ConfigError, brief
 from msk_ray.experiment.manifest import MAX_TRIALS
@@ -57,13 +57,6 @@ class ResourcesSpec(Section):
     """Restart a trial that runs out of memory once, from the beginning, with half its worlds."""
 
 
-class SmokeSpec(Section):
-    """What `--smoke` changes in addition to its general rule."""
-
-    overrides: dict[str, Any] = Field(default_factory=dict)
-    max_trials: Count = 8
-
-
 class SpaceFile(Section):
     """The content of a search space file."""
 
@@ -91,7 +84,6 @@ class SpaceFile(Section):
     scheduler: Annotated[SerializeAsAny[SchedulerSpec], BeforeValidator(read_scheduler)] = NoScheduler()
     stop: StopSpec = StopSpec()
     resources: ResourcesSpec = ResourcesSpec()
-    smoke: SmokeSpec = SmokeSpec()
 
     @property
     def searches(self) -> bool:
@@ -160,15 +152,13 @@ def read_space(path: Path) -> dict[str, Any]:
     Raises:
         ConfigError: it cannot be read, or sets what no longer exists.
     """
-    data = read_yaml(path)
+    data = current_space(read_yaml(path))
 
     def current(values: Any) -> Any:
         return current_values(values) if isinstance(values, dict) else values
 
     data |= {part: current(data[part]) for part in ("overrides", "parameters") if part in data}
-    ablate, smoke = data.get("ablate"), data.get("smoke")
-    if isinstance(smoke, dict) and "overrides" in smoke:
-        data["smoke"] = smoke | {"overrides": current(smoke["overrides"])}
+    ablate = data.get("ablate")
     if isinstance(ablate, dict):
         data["ablate"] = ablate = {part: current(values) for part, values in ablate.items()}
         if isinstance(variants := ablate.get("variants"), dict):
@@ -264,7 +254,7 @@ def _check_count(file: SpaceFile, parameters: Mapping[str, Operator]) -> None:
 
 def _check_seeds(file: SpaceFile, parameters: Mapping[str, Operator]) -> None:
     """Refuse `trial.seed` where the section `seeds` would replace it."""
-    places = [("overrides", file.overrides), ("smoke.overrides", file.smoke.overrides)]
+    places = [("overrides", file.overrides)]
     places += [("parameters", {key: level.value}) for key, op in parameters.items() for level in op.extremes()]
     if file.ablate is not None:
         places.append(("ablate.baseline", file.ablate.baseline))

@@ -119,7 +119,6 @@ def check_algorithms_read(space: Space, configs: Iterable[Config]) -> None:
     configs = list({config.algorithm.name: config for config in configs}.values())
     file, ablate = space.file, space.file.ablate
     refuse_ignored(file.overrides, configs, f"{space.name}: overrides:")
-    refuse_ignored(file.smoke.overrides, configs, f"{space.name}: smoke.overrides:")
     for key, op in space.parameters.items():
         for level in op.extremes():
             refuse_ignored({key: level.value}, configs, f"{space.name}: parameters:")

@@ -33,7 +33,7 @@ def make_algorithm(config: Config, device: str, group: Group = ALONE) -> Algorit
         config.physics,
         config.env.nworld // group.size,
         device,
-        config.trial.seed_of("states"),
+        config.trial.seed,
         differentiable=config.algorithm_settings.differentiates,
         randomize=True,
         execution=config.execution,

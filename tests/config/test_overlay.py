@@ -33,7 +33,7 @@ def test_anything_else_replaces() -> None:
     assert overlay(BASE, {"shac.entropy": None})["shac"]["entropy"] is None
     assert _horizon(16) == 16
     assert overlay({"shac": {"horizon": 16}}, {"shac.horizon": SCHEDULE})["shac"]["horizon"] == SCHEDULE
-    assert overlay({"shac": {"betas": [0.1, 0.2]}}, {"shac.betas": [0.3]})["shac"]["betas"] == [0.3]
+    assert overlay({"actor": {"hidden": [8, 4]}}, {"actor.hidden": [2]})["actor"]["hidden"] == [2]
 
 
 def test_kinds_of_mapping_do_not_mix() -> None:
@@ -76,30 +76,30 @@ def test_what_is_said_last_holds() -> None:
     assert overlay({}, parse_overrides(["a.b={x: 1}", "a.b.x=2", "a.b={x: 5}"])) == {"a": {"b": {"x": 5}}}
 
 
-_ENTROPY = {"coefficient": 0.02, "target": 0.5, "rate": 5e-3, "normalize": False}
+_ENTROPY = {"coefficient": 0.02, "target": 0.5, "normalize": False}
 CASES: list[tuple[list[str], str, Any]] = [
     (["shac.entropy={target: 0.5}"], "entropy", _ENTROPY),
     (
-        ["shac.entropy={target: 0.5}", "shac.entropy={rate: 0.1}"],
+        ["shac.entropy={target: 0.5}", "shac.entropy={coefficient: 0.1}"],
         "entropy",
-        _ENTROPY | {"rate": 0.1},
+        _ENTROPY | {"coefficient": 0.1},
     ),
     (
         ["shac={entropy: {target: 0.5}}"],
         "entropy",
-        {"coefficient": 0.02, "target": 0.5, "rate": 5e-3, "normalize": False},
+        {"coefficient": 0.02, "target": 0.5, "normalize": False},
     ),
     (["shac.entropy=null"], "entropy", None),
     (
         ["shac.horizon={start: 4}"],
         "horizon",
-        {**ADAPTIVE, "start": 4, "shortest": 4, "longest": 32, "rate": 0.1},
+        {**ADAPTIVE, "start": 4, "shortest": 4, "longest": 32},
     ),
     (["shac.horizon={kind: schedule, start: 4, end: 16, epochs: 50}"], "horizon", SCHEDULE),
     (
         ["shac.horizon.longest=16"],
         "horizon",
-        {**ADAPTIVE, "shortest": 4, "longest": 16, "rate": 0.1},
+        {**ADAPTIVE, "shortest": 4, "longest": 16},
     ),
     (["shac.horizon=16"], "horizon", 16),
 ]

@@ -224,28 +224,20 @@ def test_every_ant_variant_has_the_documented_layout(variant: str) -> None:
 
 def test_physics_knobs_reach_the_model() -> None:
     knobs = PhysicsConfig(
-        variant="published", cone="elliptic", solref=(0.05, 1.0), friction=0.4, solreffriction=(0.33, 1.0),
-        joint_damping=3.0, armature=0.2, gear=77.0, substeps=8, impratio=2.0,
+        variant="published", cone="elliptic", solref=(0.05, 1.0), solreffriction=(0.33, 1.0), substeps=8,
     )  # fmt: skip
     model = build_ant(AntSettings(name="ant"), knobs)
     assert model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
     assert model.opt.timestep == pytest.approx(1 / 480)
-    assert model.opt.impratio == 2.0
     assert (model.pair_solref == [0.05, 1.0]).all()
-    assert (model.pair_friction[:, :2] == 0.4).all()
     assert (model.pair_solreffriction == [0.33, 1.0]).all()
-    assert (model.dof_damping[6:] == 3.0).all()
-    assert (model.dof_damping[:6] == 0.0).all()
-    assert (model.dof_armature[6:] == 0.2).all()
-    assert (model.actuator_gear[:, 0] == 77.0).all()
 
 
 def test_settings_override_what_springs_would_set() -> None:
     own = PhysicsConfig(variant="matched_springs")
-    other = PhysicsConfig(variant="matched_springs", solref=(0.05, 1.0), friction=0.4, solreffriction=(0.33, 1.0))
+    other = PhysicsConfig(variant="matched_springs", solref=(0.05, 1.0), solreffriction=(0.33, 1.0))
     springs, changed = (build_ant(AntSettings(name="ant"), physics) for physics in (own, other))
     assert (changed.pair_solref == [0.05, 1.0]).all()
-    assert (changed.pair_friction[:, :2] == 0.4).all()
     assert (changed.pair_solreffriction == [0.33, 1.0]).all()
     assert (changed.pair_solimp == springs.pair_solimp).all()
     assert (changed.jnt_solref == springs.jnt_solref).all()
@@ -261,5 +253,5 @@ def test_scores_are_taken_under_reference_weights_and_physics() -> None:
     trained = AntSettings(name="ant", reward=AntReward(forward_vel=5.0, up=0.0), nworld=7)
     reference = Ant.reference_settings(trained)
     assert (reference.reward.forward_vel, reference.reward.up, reference.nworld) == (1.0, 0.1, 7)
-    physics = Ant.reference_physics(PhysicsConfig(variant="published", friction=0.1), None)
+    physics = Ant.reference_physics(PhysicsConfig(variant="published", solref=(0.1, 1.0)), None)
     assert physics == PhysicsConfig(variant="matched")

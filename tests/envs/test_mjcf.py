@@ -129,8 +129,8 @@ def test_options_are_the_files_unless_the_physics_section_says_otherwise(home: P
     model = _model()
     assert (model.opt.timestep, model.opt.iterations) == (pytest.approx(0.004), 33)
     assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    changed = _model(physics__substeps=2, physics__integrator="Euler", physics__cone="elliptic", physics__impratio=3.0)
-    assert (changed.opt.timestep, changed.opt.impratio) == (pytest.approx(0.01), 3.0)
+    changed = _model(physics__substeps=2, physics__integrator="Euler", physics__cone="elliptic")
+    assert changed.opt.timestep == pytest.approx(0.01)
     assert changed.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
     assert changed.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
     assert _model("Edited").body("ball").mass[0] == 7.0

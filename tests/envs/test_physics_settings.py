@@ -24,27 +24,15 @@ VALUES: dict[str, Any] = {
     "tolerance": 1e-9,
     "iterations": 7,
     "ls_iterations": 3,
-    "solver_kernels": "fused",
-    "jacobian": "sparse",
     "integrator": "RK4",
     "cone": "pyramidal",
-    "impratio": 3.0,
     "solref": [0.03, 0.9],
     "solimp": [0.8, 0.9, 0.02, 0.5, 2.0],
-    "friction": 0.33,
     "solreffriction": [0.5, 1.0],
-    "joint_damping": 3.3,
-    "armature": 0.77,
-    "solref_limit": [0.03, 0.9],
-    "solimp_limit": [0.8, 0.9, 0.02, 0.5, 2.0],
-    "gear": 33.0,
-    "nconmax": 9,
-    "njmax": 61,
     "fd.eps_ctrl": 0.01,
     "fd.eps_qpos": 0.01,
     "fd.eps_qvel": 0.01,
     "fd.eps_act": 0.01,
-    "fd.max_worlds": 64,
 }
 REFUSED = {
     "cartpole": {
@@ -52,28 +40,24 @@ REFUSED = {
         "tolerance",
         "iterations",
         "ls_iterations",
-        "solver_kernels",
-        "jacobian",
         "cone",
-        "impratio",
         "solref",
         "solimp",
     }
-    | {"friction", "solreffriction", "solref_limit", "solimp_limit", "nconmax", "njmax", "fd.eps_act"},
+    | {"solreffriction", "fd.eps_act"},
     "ant": {"fd.eps_act"},
     "hopper": {"fd.eps_act"},
     "cheetah": {"fd.eps_act"},
-    "humanoid": {"fd.eps_act", "gear"},
-    "myoleg26": {"variant", "gear"},
-    "myoleg": {"variant", "gear", "solref", "solimp", "friction", "solreffriction", "solref_limit", "solimp_limit"}
-    | {"joint_damping", "armature"},
+    "humanoid": {"fd.eps_act"},
+    "myoleg26": {"variant"},
+    "myoleg": {"variant", "solref", "solimp", "solreffriction"},
 }
 REFUSED["myosuite_walk"] = REFUSED["myoleg"]
 """What each environment does not read whatever the backward mode."""
 STATE_EPS = {"fd.eps_qpos", "fd.eps_qvel", "fd.eps_act"}
 UNREAD_BY = {
-    "tape_per_substep": {"fd.eps_ctrl", "fd.max_worlds"} | STATE_EPS,
-    "tape_all": {"fd.eps_ctrl", "fd.max_worlds"} | STATE_EPS,
+    "tape_per_substep": {"fd.eps_ctrl"} | STATE_EPS,
+    "tape_all": {"fd.eps_ctrl"} | STATE_EPS,
     "fd_jacobian": {"substep_grad_clip"},
     "hybrid": STATE_EPS,
 }
@@ -122,7 +106,7 @@ def _backward(config: Config) -> list[tuple[Any, ...]]:
     """What the backward mode, and those it is made of, are told."""
     whole = vars(configured_backward(config.physics))
     parts = [whole, *(vars(whole[name]) for name in ("state", "ctrl") if name in whole)]
-    return [(part.get("substep_grad_clip"), part.get("eps"), part.get("max_worlds")) for part in parts]
+    return [(part.get("substep_grad_clip"), part.get("eps")) for part in parts]
 
 
 def test_every_field_is_tried() -> None:
@@ -144,8 +128,6 @@ def test_a_setting_does_something_or_is_refused(env: str, backward: str, legs: s
                 parse_config(settings)
             assert f"physics.{field}:" in str(caught.value)
             assert "leave it out" in str(caught.value)
-        elif field in ("nconmax", "njmax", "solver_kernels"):
-            parse_config(settings)  # no part of the model: the next tests
         elif field == "substep_grad_clip" or field.startswith("fd."):
             assert _backward(parse_config(settings)) != plain, f"{field} does nothing"
         else:
@@ -156,46 +138,50 @@ def test_a_setting_does_something_or_is_refused(env: str, backward: str, legs: s
 @pytest.mark.parametrize("env", ["ant", "myoleg26"])
 @pytest.mark.parametrize("field", ["nconmax", "njmax"])
 def test_buffers_are_as_large_as_asked_for(env: str, field: str) -> None:
-    config = parse_config(overlay(_settings(env, "tape_all", ""), {f"physics.{field}": 61}))
-    batch = make_env(config.env, config.physics, 1, "cpu", 0, differentiable=False).sim.batch
+    config = parse_config(overlay(_settings(env, "tape_all", ""), {f"execution.{field}": 61}))
+    execution = config.execution
+    batch = make_env(config.env, config.physics, 1, "cpu", 0, differentiable=False, execution=execution).sim.batch
     assert 61 in (batch.data.naconmax, batch.data.njmax)
 
 
 def test_constraints_are_solved_by_the_kernels_asked_for() -> None:
-    settings = overlay(_settings("myosuite_walk", "tape_all", ""), {"execution.solver_kernels": "fused"})
-    config = parse_config(settings)
-    batch = make_env(config.env, config.physics, 2, "cpu", 0, deterministic=True).sim.batch
+    execution = {"solver_kernels": "fused", "deterministic": True}
+    config = parse_config(_settings("myosuite_walk", "tape_all", "") | {"execution": execution})
+    batch = make_env(config.env, config.physics, 2, "cpu", 0, execution=config.execution).sim.batch
     assert batch.kernels == Kernels(ordered=True, fused_solver=True)
     assert not batch.stages.unrolls
 
 
 @pytest.mark.parametrize(
     ("other", "write"),
-    [({"jacobian": "sparse"}, "leave execution.jacobian out"), ({"integrator": "RK4"}, "solver_kernels: mujoco_warp")],
+    [
+        ({"execution.jacobian": "sparse"}, "leave execution.jacobian out"),
+        ({"physics.integrator": "RK4"}, "solver_kernels: mujoco_warp"),
+    ],
 )
 def test_what_the_fused_solver_is_not_for_is_refused(other: dict[str, Any], write: str) -> None:
     with pytest.raises(ConfigError, match=write):
-        parse_config({"env": {"name": "ant"}, "physics": {**other}, "execution": {"solver_kernels": "fused"}})
+        parse_config(overlay({"env": {"name": "ant"}, "execution": {"solver_kernels": "fused"}}, other))
 
 
 UNREAD: list[tuple[dict[str, Any], str, Any, dict[str, Any]]] = [
     ({"shac.lr_schedule": "constant"}, "shac.final_lr", 1e-4, {"shac.lr_schedule": "linear"}),
-    ({"shac.critic_method": "one-step"}, "shac.lam", 0.5, {"shac.critic_method": "td-lambda"}),
     ({"shac.state_bptt": False}, "shac.state_grad_clip", 10.0, {"shac.state_bptt": True}),
-    ({"shac.entropy": {}}, "shac.entropy.rate", 0.1, {"shac.entropy.target": 0.5}),
-    ({"actor.stochastic": False}, "actor.log_std", 0.0, {"actor.stochastic": True}),
     ({"physics.variant": "published"}, "physics.solreffriction", [1.0, 1.0], {"physics.cone": "elliptic"}),
     (
-        {"physics.variant": "published", "curriculum": {"start": {"friction": 2.0}, "epochs": 3}},
+        {"physics.variant": "published", "curriculum": {"start": {"solref": [0.1, 1.0]}, "epochs": 3}},
         "curriculum.start.solreffriction",
         [1.0, 1.0],
         {"physics.cone": "elliptic"},
     ),
-    ({"env": {"name": "myoleg26", "terrain": {"kind": "slope"}}}, "env.terrain.seed", 3, {"env.terrain.kind": "rough"}),
+    (
+        {"env": {"name": "myoleg26", "terrain": {"kind": "slope"}}},
+        "env.terrain.roughness",
+        0.1,
+        {"env.terrain.kind": "rough"},
+    ),
     ({"env": {"name": "myoleg26"}}, "env.terrain.slope", 0.2, {"env.terrain.kind": "slope"}),
-    ({"env": {"name": "myoleg26"}}, "env.assist.balance", 100.0, {"env.assist.epochs": 10}),
-    ({"env": {"name": "myoleg26", "target_speed": 0.0}}, "env.success_speed", 0.5, {"env.target_speed": 1.0}),
-    ({"env": {"name": "myoleg", "early_termination": False}}, "env.min_height", 0.5, {"env.early_termination": True}),
+    ({"env": {"name": "myoleg26"}}, "env.assist.power", 2.0, {"env.assist.epochs": 10}),
     ({"env": {"name": "myoleg", "model": "legs.xml"}}, "env.source", "myo_sim", {"env.model": "myolegs26"}),
 ]
 

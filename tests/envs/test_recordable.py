@@ -10,7 +10,7 @@ from msk_ray.config import parse_config
 from msk_ray.envs import make_env
 
 _LEG_TERMS = (
-    *("metabolic", "fatigue", "head", "impact", "footfall", "clearance", "toes", "vault", "out_of_plane", "track"),
+    *("metabolic", "head", "impact", "footfall", "clearance", "toes", "vault", "out_of_plane", "track"),
     *("track_rate", "landing"),
 )
 ENVIRONMENTS: dict[str, dict[str, Any]] = {

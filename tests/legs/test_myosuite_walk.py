@@ -107,7 +107,7 @@ def test_episodes_may_start_anywhere_in_the_cycle_of_people() -> None:
 
 
 def test_springs_turn_the_pelvis_to_standing_and_fade() -> None:
-    env = make(2, reset="none", assist={"epochs": 4, "steady": 0.5, "balance": 700.0, "lateral": 100.0})
+    env = make(2, reset="none", assist={"epochs": 4, "steady": 0.5})
     q, v, act = env.state.physics
     # The right world is 10 cm aside, and turned by 0.1 rad about the vertical.
     turn = torch.tensor([np.cos(0.05), 0.0, 0.0, np.sin(0.05)], dtype=torch.float32)
@@ -116,11 +116,11 @@ def test_springs_turn_the_pelvis_to_standing_and_fade() -> None:
     force = env.applied_force(StepState(q, v, act))
     assert force is not None
     assert force[0].numpy() == pytest.approx(np.zeros(34), abs=1e-4)
-    assert force[1].numpy() == pytest.approx([-10.0, 0.0, 0.0, 0.0, 0.0, -8.5, *[0.0] * 28], abs=1e-2)
+    assert force[1].numpy() == pytest.approx([-80.0, 0.0, 0.0, 0.0, 0.0, -9.714, *[0.0] * 28], abs=1e-2)
     assert env.end_epoch(49.0) == {"train/assist": 1.0}
     assert env.end_epoch(51.0) == {"train/assist": 1.0}
     env.begin_epoch(2)
-    assert env.applied_force(StepState(q, v, act))[1, 0].item() == pytest.approx(-7.5)  # type: ignore[index]
+    assert env.applied_force(StepState(q, v, act))[1, 0].item() == pytest.approx(-60.0)  # type: ignore[index]
     assert env.state_dict()["assist_epochs"] == 1
 
 

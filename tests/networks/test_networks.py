@@ -27,13 +27,6 @@ def test_actions_are_bounded_and_differentiable_through_the_noise_scale() -> Non
     assert torch.equal(actor(obs), actor(obs)), "without noise the policy is deterministic"
 
 
-def test_a_deterministic_actor_has_no_noise_scale() -> None:
-    actor = Actor(ActorConfig(hidden=(8,), stochastic=False), 4, 2, torch.Generator().manual_seed(0))
-    assert actor.log_std is None
-    obs = torch.randn(5, 4)
-    assert torch.equal(actor(obs, torch.randn(5, 2)), actor(obs))
-
-
 def test_a_noise_scale_that_depends_on_the_observation_starts_the_same_everywhere() -> None:
     actor = Actor(ActorConfig(hidden=(8,), log_std=-0.5, state_std=True), 4, 2, torch.Generator().manual_seed(0))
     plain = Actor(ActorConfig(hidden=(8,), log_std=-0.5), 4, 2, torch.Generator().manual_seed(0))

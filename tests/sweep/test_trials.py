@@ -93,7 +93,6 @@ def test_a_mapping_is_laid_over_a_section_and_replaces_a_number() -> None:
         ({"parameters": {"trial": {"grid": [{"seed": 1}]}}}, r"parameters\.trial\.seed"),
         ({"overrides": {"trial.seed": 1}}, r"overrides\.trial\.seed: seeds have a section .* write seeds"),
         ({"overrides": {"trial": {"seed": 1}}}, r"overrides\.trial\.seed"),
-        ({"smoke": {"overrides": {"trial.seed": 1}}}, r"smoke\.overrides\.trial\.seed"),
         ({"parameters": {}, "ablate": {"variants": {"a": {"trial.seed": 1}}}}, r"ablate\.variants\.a\.trial\.seed"),
         ({"overrides": {"shac.gamm": 1}}, "did you mean 'gamma'"),
         ({"seeds": "4-0"}, "runs backwards; write 0-4"),
@@ -141,9 +140,9 @@ def test_cover_shows_every_level_with_few_trials(make_space: Any) -> None:
 
 
 def test_smoke_is_short_and_keeps_horizons_apart(make_space: Any) -> None:
-    space = make_space(parameters={"shac.horizon": {"grid": [16, 32]}}, smoke={"overrides": {"trial.epochs": 2}})
+    space = make_space(parameters={"shac.horizon": {"grid": [16, 32]}})
     trials = shrink(space, resolve_trials(space))
-    assert [(t.config.shac.horizon, t.epochs, t.config.env.nworld) for t in trials] == [(4, 2, 8), (8, 2, 8)]
+    assert [(t.config.shac.horizon, t.epochs, t.config.env.nworld) for t in trials] == [(4, 3, 8), (8, 3, 8)]
 
 
 def test_smoke_of_variants_that_become_equal_adds_a_seed(make_space: Any) -> None:
@@ -151,8 +150,6 @@ def test_smoke_of_variants_that_become_equal_adds_a_seed(make_space: Any) -> Non
     space = make_space(parameters={"shac.horizon": {"grid": [4, 8]}}, seeds="0-4")
     trials = shrink(space, resolve_trials(space))
     assert [(t.config.shac.horizon, t.seed) for t in trials] == [(2, 0), (2, 1)]
-    alone = make_space(parameters={"shac.horizon": {"grid": [4, 8]}}, seeds="0-4", smoke={"max_trials": 1})
-    assert len(shrink(alone, resolve_trials(alone))) == 1
 
 
 def test_shipped_spaces_resolve(root: Any) -> None:

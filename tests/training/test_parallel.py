@@ -27,7 +27,7 @@ SETTINGS: dict[str, Any] = {
     "env": {"name": "cartpole", "nworld": 8, "episode_length": 10},
     "physics": {"randomize": {"dof_damping": {"low": 0.5, "high": 2.0, "mode": "value"}}},
     "shac": {
-        "horizon": {"kind": "adaptive", "start": 6, "shortest": 4, "longest": 12, "target": 5.0, "rate": 0.5},
+        "horizon": {"kind": "adaptive", "start": 6, "shortest": 4, "longest": 12, "target": 5.0},
         "critic_iterations": 2,
         "critic_batches": 2,
         "normalize_return": True,

@@ -1,23 +1,20 @@
-"""What tells whether two runs are the same, what their bits depend on, and seeds of parts of a trial."""
+"""What tells whether two runs are the same, and what their bits depend on."""
 
 import json
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
-from msk_ray.algorithms.ppo.algorithm import Ppo
-from msk_ray.algorithms.shac.algorithm import Shac
 from msk_ray.config import Config, parse_config
-from msk_ray.errors import CheckpointError, ConfigError
+from msk_ray.errors import CheckpointError
 from msk_ray.experiment.checkpoint_file import read_facts
 from msk_ray.networks import as_number, parameter_hash
 from msk_ray.training import Trainer, read_metrics
 from msk_ray.training.checkpoint import read_checkpoint, write_checkpoint
-from msk_ray.training.learner import make_algorithm
 
 Settings = dict[str, Any]
 
@@ -99,77 +96,3 @@ def test_a_trial_that_goes_on_elsewhere_says_that_bits_differ(tiny_settings: Set
     path.write_text(json.dumps(facts | {"device": "NVIDIA H200", "packages": facts["packages"] | {"torch": "2.0"}}))
     (line,) = resumed()
     assert "NVIDIA H200, now cpu; torch 2.0, now " in line
-
-
-def drawn(algorithm: Shac | Ppo) -> dict[str, Any]:
-    """What each part of a trial's start has drawn, in a form that can be compared."""
-    states = [t.tolist() for t in algorithm.env.state.physics]
-    if isinstance(algorithm, Shac):
-        inputs = algorithm._draw(3, 0)
-        orders = algorithm.critic_fit.draw_orders(24, 2, algorithm.minibatch_generator)
-        found = {"noise": inputs.noise.tolist(), "minibatches": orders.tolist()}
-    else:
-        found = {}
-        for part in ("noise", "minibatches"):
-            with algorithm._drawing(part):
-                found[part] = torch.rand(4).tolist()
-    return {
-        "policy": parameter_hash({n: m.state_dict() for n, m in algorithm.modules().items()}),
-        "states": states,
-    } | found
-
-
-@pytest.fixture(params=["shac", "ppo"])
-def start(request: pytest.FixtureRequest, tiny_settings: Settings) -> Callable[..., dict[str, Any]]:
-    """What a trial with these seeds draws at its start."""
-    network = {"hidden": [16, 16], "layer_norm": False}
-    own = {"algorithm": {"name": "ppo"}, "ppo": {"steps": 8}, "actor": network, "critic": network}
-    settings = tiny_settings | own if request.param == "ppo" else tiny_settings
-
-    def made(seed: int = 3, **seeds: int) -> dict[str, Any]:
-        algorithm = make_algorithm(with_trial(settings, seed=seed, seeds=seeds), "cpu")
-        assert isinstance(algorithm, (Shac, Ppo))
-        return drawn(algorithm)
-
-    return made
-
-
-ALL = ("policy", "states", "noise", "minibatches")
-
-
-def test_each_seed_varies_its_part_and_holds_the_others(start: Callable[..., dict[str, Any]]) -> None:
-    held = dict.fromkeys(ALL, 7)
-    before = start(**held)
-    for part in ALL:
-        after = start(**held | {part: 8})
-        assert {name for name in ALL if after[name] != before[name]} == {part}
-    # Every part is named: the number that sets all does nothing.
-    assert start(seed=4, **held) == before
-
-
-def test_one_number_sets_all_parts(start: Callable[..., dict[str, Any]]) -> None:
-    one, other = start(seed=3), start(seed=4)
-    assert all(one[part] != other[part] for part in ALL)
-    named = start(seed=4, policy=3, states=3)
-    assert (named["policy"], named["states"]) == (one["policy"], one["states"])
-
-
-def test_parts_of_their_own_go_on_where_a_checkpoint_ends(tiny_settings: Settings, tmp_path: Path) -> None:
-    config = with_trial(tiny_settings, seeds={"noise": 5})
-    train(config, tmp_path / "whole", 4)
-    train(config, tmp_path / "halves", 2)
-    trainer = Trainer(config, tmp_path / "halves", "cpu")
-    trainer.restore_latest()
-    for _ in range(2):
-        trainer.run_epoch()
-    trainer.close()
-    assert hashes(tmp_path / "halves") == hashes(tmp_path / "whole")
-
-
-def test_an_algorithm_that_draws_from_one_generator_refuses_them(
-    tiny_settings: Settings, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(Shac, "draws_apart", False)
-    make_algorithm(with_trial(tiny_settings, seeds={"states": 1}), "cpu")
-    with pytest.raises(ConfigError, match=r"write trial\.seeds\.states alone"):
-        make_algorithm(with_trial(tiny_settings, seeds={"policy": 1}), "cpu")

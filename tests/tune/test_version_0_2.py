@@ -6,11 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from msk_ray import status, train
 from msk_ray.cli import run
 from msk_ray.config import changed_settings, dump_yaml, load_config, parse_config, parse_recorded, read_yaml
-from msk_ray.config.recorded import current_settings, current_values
+from msk_ray.config.recorded import current_settings, current_space, current_values
 from msk_ray.config.sections import Section
 from msk_ray.errors import ConfigError
 from msk_ray.evaluate import __main__ as evaluate
@@ -102,6 +103,60 @@ def test_moved_settings_are_read_where_they_were() -> None:
         current_settings({"shac": {"copies": {"count": 2}}})
 
 
+REMOVED: list[tuple[dict[str, Any], dict[str, Any], dict[str, Any], str]] = [
+    (
+        {"shac": {"entropy": {"rate": 0.005, "target": 1.0}, "betas": [0.7, 0.95]}},
+        {"shac": {"entropy": {"target": 1.0}}},
+        {"shac": {"entropy": {"rate": 0.1}}},
+        "shac.entropy.rate: 0.1",
+    ),
+    (
+        {"shac": {"horizon": {"start": 4, "target": 2.0, "rate": 0.1}}},
+        {"shac": {"horizon": {"kind": "adaptive", "start": 4, "target": 2.0}}},
+        {"shac": {"horizon": {"start": 4, "target": 2.0, "rate": 0.5}}},
+        "shac.horizon.rate: 0.5",
+    ),
+    (
+        {"trial": {"seeds": {"noise": None, "policy": None}}, "actor": {"stochastic": True}},
+        {"trial": {}, "actor": {}},
+        {"trial": {"seeds": {"noise": 1}}},
+        r"trial.seeds: \{'noise': 1\}",
+    ),
+    (
+        {"env": {"name": "hopper", "reward": {"full_height": -0.3, "drop": 200.0}}},
+        {"env": {"name": "hopper", "reward": {}}},
+        {"env": {"name": "humanoid", "reward": {"full_height": -0.3}}},
+        "env.reward.full_height: -0.3",
+    ),
+    (
+        {"env": {"name": "own:Robot", "min_height": 0.7}},
+        {"env": {"name": "own:Robot", "min_height": 0.7}},
+        {"env": {"name": "myoleg26", "min_height": 0.7}},
+        "env.min_height: 0.7",
+    ),
+]
+
+
+@pytest.mark.parametrize(("harmless", "current", "gone", "message"), REMOVED, ids=[case[3] for case in REMOVED])
+def test_removed_settings_are_read_where_they_changed_nothing(
+    harmless: dict[str, Any], current: dict[str, Any], gone: dict[str, Any], message: str
+) -> None:
+    assert current_settings(harmless) == current
+    assert current_settings(current) == current
+    with pytest.raises(ConfigError, match=rf"{message} has been removed; leave it out, or use version 0.2"):
+        current_settings(gone)
+
+
+def test_removed_settings_within_a_value_of_a_space() -> None:
+    values = {"shac.entropy": {"coefficient": 0.1, "rate": 0.005}, "shac.horizon": {"grid": [4, 8]}}
+    assert current_values(values) == {"shac.entropy": {"coefficient": 0.1}, "shac.horizon": {"grid": [4, 8]}}
+    with pytest.raises(ConfigError, match=r"trial\.seeds: unknown key; it has been removed"):
+        parse_config({"env": {"name": "ant"}, "trial": {"seeds": {"noise": 1}}})
+    assert current_space({"smoke": {"max_trials": 8}, "samples": 2}) == {"samples": 2}
+    with pytest.raises(ConfigError, match=r"smoke: .* has been removed"):
+        current_space({"smoke": {"max_trials": 4}})
+
+
 def test_files_may_keep_the_old_spelling(tmp_path: Path) -> None:
     (tmp_path / "base.yaml").write_text("env: {name: ant}\ntrial: {deterministic: true}\n")
     (tmp_path / "child.yaml").write_text("extends: base.yaml\nphysics: {njmax: 90}\n")
@@ -120,7 +175,7 @@ def test_files_may_keep_the_old_spelling(tmp_path: Path) -> None:
         ("physics.solver_kernels=fused", "physics.solver_kernels: unknown key; write execution.solver_kernels"),
         (
             "shac.copies={count: 2}",
-            "shac.copies: unknown key; it has been removed, because it did not pay; leave it out",
+            "shac.copies: unknown key; it has been removed; leave it out",
         ),
     ],
 )
@@ -176,3 +231,4 @@ def test_shipped_policies_are_read(root: Path) -> None:
     for path in sorted((root / "policies").glob("*.pt")):
         config: Any = load_policy(path).config
         assert config.execution.gpus == 1
+        assert parse_recorded(yaml.safe_load(path.with_suffix(".yaml").read_text())["config"], path.name) == config

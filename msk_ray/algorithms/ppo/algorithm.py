@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -12,7 +11,6 @@ from torch import Tensor, nn
 from msk_ray.algorithms.base import Algorithm, Clock, EpochResult, simulation_metrics
 from msk_ray.algorithms.episodes import EpisodeTracker
 from msk_ray.algorithms.nonfinite import nonfinite_observation, nonfinite_reward
-from msk_ray.algorithms.streams import GlobalStreams
 from msk_ray.config import Config, NetworkConfig, PpoConfig
 from msk_ray.envs import Env
 from msk_ray.errors import Failure, SimulationError
@@ -41,13 +39,11 @@ class GaussianPolicy(nn.Module):
 class Ppo(Algorithm):
     """Actor, critic and optimiser of rsl_rl's PPO, trained in one environment, with actions clamped to [-1, 1].
 
-    Noise and minibatches are drawn from torch's global generators, from streams of their own where `trial.seeds` names
-    one of them or the policy.
+    Noise and minibatches are drawn from torch's global generators.
     """
 
     Settings = PpoConfig
     counts_episodes = True
-    draws_apart = True
     settings: PpoConfig
     network: GaussianPolicy
 
@@ -57,7 +53,7 @@ class Ppo(Algorithm):
 
         super().__init__(config, env)
         c, device = self.settings, str(env.device)
-        critic = _network(config.critic, c, "critic", env.obs_size, 1).to(env.device)
+        critic = _network(config.critic, "critic", env.obs_size, 1).to(env.device)
         storage = RolloutStorage("rl", env.nworld, c.steps, self._observe(), [env.action_size], device)
         self.ppo = PPO(
             self.network.actor,
@@ -66,35 +62,25 @@ class Ppo(Algorithm):
             num_learning_epochs=c.passes,
             num_mini_batches=c.minibatches,
             clip_param=c.clip,
-            use_clipped_value_loss=c.clip_value,
+            use_clipped_value_loss=True,
             gamma=c.gamma,
             lam=c.lam,
             learning_rate=c.lr,
             schedule="adaptive" if c.lr_schedule == "adaptive" else "fixed",
             desired_kl=c.desired_kl,
-            value_loss_coef=c.value_coefficient,
+            value_loss_coef=1.0,
             entropy_coef=c.entropy_coefficient,
-            max_grad_norm=c.grad_norm,
+            max_grad_norm=1.0,
             device=device,
         )
         self.ppo.train_mode()
         self.episodes = EpisodeTracker(env.nworld, env.device)
-        trial = config.trial
-        self._streams = (
-            GlobalStreams(
-                {"noise": trial.seed_of("noise") + 1, "minibatches": trial.seed_of("minibatches") + 2}, env.device
-            )
-            if trial.noise_apart or trial.seeds.policy is not None
-            else None
-        )
 
     @classmethod
     def policy_network(cls, config: Config, obs_size: int, action_size: int) -> GaussianPolicy:
         """A policy with weights drawn from torch's global generator, and statistics without any observation yet."""
-        settings = config.algorithm_settings
-        assert isinstance(settings, PpoConfig)
-        noise = {"class_name": "GaussianDistribution", "init_std": settings.init_std, "std_type": "log"}
-        return GaussianPolicy(_network(config.actor, settings, "actor", obs_size, action_size, noise))
+        noise = {"class_name": "GaussianDistribution", "init_std": 1.0, "std_type": "log"}
+        return GaussianPolicy(_network(config.actor, "actor", obs_size, action_size, noise))
 
     @classmethod
     def policy_modules(cls, network: nn.Module) -> dict[str, nn.Module]:
@@ -118,15 +104,13 @@ class Ppo(Algorithm):
         """
         clock = Clock(self.env.device)
         try:
-            with self._drawing("noise"):
-                rewards, done, diverged = self._collect(epoch)
+            rewards, done, diverged = self._collect(epoch)
             clock.mark("rollout")
             if self.witness is not None:
                 storage = self.ppo.storage
                 self.witness.note("rollout", {**storage.observations, "rewards": rewards, "actions": storage.actions})
             values = self.ppo.storage.values.mean()
-            with self._drawing("minibatches"):
-                losses = self.ppo.update()
+            losses = self.ppo.update()
         except (RuntimeError, ValueError):
             # What torch raises for a mean or standard deviation that is NaN, for one.
             self._check("weights", self._weights())
@@ -161,7 +145,6 @@ class Ppo(Algorithm):
             "optimizer": self.ppo.optimizer.state_dict(),
             "learning_rate": self.ppo.learning_rate,
             "episodes": self.episodes.state_dict(),
-            **({} if self._streams is None else {"streams": self._streams.state_dict()}),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -170,11 +153,6 @@ class Ppo(Algorithm):
         self.ppo.optimizer.load_state_dict(state["optimizer"])
         self.ppo.learning_rate = state["learning_rate"]
         self.episodes.load_state_dict(state["episodes"])
-        if self._streams is not None:
-            self._streams.load_state_dict(state["streams"])
-
-    def _drawing(self, what: str) -> AbstractContextManager[None]:
-        return nullcontext() if self._streams is None else self._streams.drawing(what)
 
     @torch.no_grad()
     def _collect(self, epoch: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -221,13 +199,13 @@ class Ppo(Algorithm):
 
 def _network(
     config: NetworkConfig,
-    settings: PpoConfig,
     name: str,
     inputs: int,
     outputs: int,
     noise: dict[str, Any] | None = None,
 ) -> MLPModel:
-    """rsl_rl's multilayer perceptron, with torch's default initial weights of linear layers."""
+    """rsl_rl's multilayer perceptron, with torch's default initial weights of linear layers and observations normalised
+    by their running mean and variance."""
     from rsl_rl.models import MLPModel
 
     return MLPModel(
@@ -237,6 +215,6 @@ def _network(
         outputs,
         hidden_dims=list(config.hidden),
         activation=_ACTIVATIONS.get(config.activation, config.activation),
-        obs_normalization=settings.normalize_obs,
+        obs_normalization=True,
         distribution_cfg=noise,
     )

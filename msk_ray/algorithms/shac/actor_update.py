@@ -19,6 +19,9 @@ from msk_ray.networks import Critic, PolicyNetwork, RunningMeanStd
 from msk_ray.networks.calls import Calls
 from msk_ray.step import StepState
 
+MAX_NONFINITE_SHARE = 0.05
+"""Share of worlds whose gradient may be non-finite in an epoch before the trial stops with an error."""
+
 
 class EpochInputs(NamedTuple):
     """What an epoch starts from and draws; H horizon, W worlds."""
@@ -165,18 +168,15 @@ class ActorUpdate:
         c, rollout, gather = self._settings, rolled.rollout, self._group.gather
         loss, next_values, rewards = self._loss(rollout)
         values = next_values.detach()
-        if c.critic_method == "td-lambda":
-            targets = returns.td_lambda_targets(rewards, values, rollout.terminated, rollout.done, c.gamma, c.lam)
-        else:
-            targets = returns.one_step_targets(rewards, values, rollout.terminated, c.gamma)
+        targets = returns.td_lambda_targets(rewards, values, rollout.terminated, rollout.done, c.gamma, c.lam)
         raw = gather(rollout.obs, dim=1)
-        normalised = raw if self._normalizer is None else self._normalizer.normalize(raw)
+        normalised = self._normalizer.normalize(raw)
         return Judged(loss, values.mean(), raw, normalised, gather(targets, dim=1))
 
     def learn(self, rolled: Rolled, judged: Judged) -> ActorOutcome:
         """Take the actor's step along the rollout's gradient, and update the statistics.
 
-        The step is left out where more worlds than `max_nonfinite_share` had a gradient that was not finite, or the
+        The step is left out where more worlds than `MAX_NONFINITE_SHARE` had a gradient that was not finite, or the
         policy's gradient is not finite: the metrics say so.
 
         Outside a group `gather` and `mean` change nothing. In one, each process sent back the gradient of the mean over
@@ -191,10 +191,9 @@ class ActorUpdate:
         cotangents = rolled.gate.record(self._group)
         limit = float("inf") if c.actor_grad_norm is None else c.actor_grad_norm
         norm = clip_gradients(list(self._actor.parameters()), limit)
-        failed = (cotangents.nonfinite_share > c.max_nonfinite_share) | ~norm.isfinite()
+        failed = (cotangents.nonfinite_share > MAX_NONFINITE_SHARE) | ~norm.isfinite()
         self._optimizer.step(skip=failed)
-        if self._normalizer is not None:
-            self._normalizer.update(judged.raw.flatten(0, 1))
+        self._normalizer.update(judged.raw.flatten(0, 1))
         detached = gather(rollout.rewards.detach(), dim=1)
         means = {"train/actor_loss": judged.loss.detach(), "train/value": judged.value}
         if rollout.neg_log_prob is not None:
@@ -206,10 +205,8 @@ class ActorUpdate:
             "train/diverged": gather(rollout.diverged, dim=1).sum(),
             "grad/actor_norm": norm,
             "grad/halves_cosine": rolled.halves.cosine(),
+            "train/std": self._actor.std(judged.normalised).detach().mean(),
         }
-        std = self._actor.std(judged.normalised)
-        if std is not None:
-            metrics["train/std"] = std.detach().mean()
         if rollout.contact is not None:
             weight = float(self._env.model.body_mass.sum() * -self._env.model.opt.gravity[2])
             metrics["train/contact"] = (gather(rollout.contact, dim=1) / weight).square().mean().sqrt()

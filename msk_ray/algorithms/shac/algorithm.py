@@ -5,14 +5,13 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from msk_ray.algorithms.base import Algorithm, EpochResult, simulation_metrics
 from msk_ray.algorithms.episodes import EpisodeTracker
 from msk_ray.algorithms.nonfinite import nonfinite_observation, nonfinite_reward
-from msk_ray.algorithms.shac.actor_update import ActorOutcome, ActorUpdate, EpochInputs
+from msk_ray.algorithms.shac.actor_update import MAX_NONFINITE_SHARE, ActorOutcome, ActorUpdate, EpochInputs
 from msk_ray.algorithms.shac.critic_fit import CriticFit
 from msk_ray.algorithms.shac.curriculum import ContactSchedule
 from msk_ray.algorithms.shac.entropy import EntropyBonus
@@ -25,8 +24,8 @@ from msk_ray.envs import Env
 from msk_ray.errors import Failure, SimulationError
 from msk_ray.networks import Actor, Critic, PolicyNetwork, RunningMeanStd
 
-_MINIBATCHES = 1
-"""What makes the seed of the minibatches' generator another one than that of others of the same number."""
+_BETAS = (0.7, 0.95)
+"""Adam's moment decays, as published with SHAC."""
 
 
 class Shac(Algorithm):
@@ -34,17 +33,16 @@ class Shac(Algorithm):
 
     Attributes:
         actor, critic, target_critic: the networks.
-        normalizer: observation statistics, or None if raw observations are used.
+        normalizer: observation statistics.
     """
 
     Settings = ShacConfig
     settings: ShacConfig
-    draws_apart = True
     counts_episodes = True
     network: PolicyNetwork
 
     def __init__(self, config: Config, env: Env[Any]) -> None:
-        init = torch.Generator().manual_seed(config.trial.seed_of("policy"))
+        init = torch.Generator().manual_seed(config.trial.seed)
         super().__init__(config, env, _network(config, env.obs_size, env.action_size, init))
         c = self.settings
         device = env.device
@@ -52,21 +50,17 @@ class Shac(Algorithm):
         self.critic = Critic(config.critic, env.obs_size, init).to(device)
         self.target_critic = copy.deepcopy(self.critic).requires_grad_(False)
         self.return_statistics = RunningMeanStd(()).to(device) if c.normalize_return else None
-        self.actor_optimizer = RateAdam(self.actor.parameters(), c.actor_lr, c.betas, c.weight_decay)
+        self.actor_optimizer = RateAdam(self.actor.parameters(), c.actor_lr, _BETAS, c.weight_decay)
         self.critic_fit = CriticFit(
             self.critic,
             c.critic_lr,
-            c.betas,
+            _BETAS,
             c.critic_grad_norm,
             weight_decay=c.weight_decay,
             tolerance=c.critic_tolerance,
             group=env.group,
         )
-        self.noise_generator = torch.Generator(device=device).manual_seed(config.trial.seed_of("noise") + 1)
-        self.minibatch_generator = self.noise_generator
-        if config.trial.noise_apart:
-            own = np.random.SeedSequence((config.trial.seed_of("minibatches"), _MINIBATCHES)).generate_state(1)
-            self.minibatch_generator = torch.Generator(device=device).manual_seed(int(own[0]))
+        self.generator = torch.Generator(device=device).manual_seed(config.trial.seed + 1)
         self._worlds = env.nworld * env.group.size
         self.episodes = EpisodeTracker(self._worlds, device)
         self._horizon = RolloutLength(c.horizon)
@@ -84,7 +78,7 @@ class Shac(Algorithm):
     @classmethod
     def policy_network(cls, config: Config, obs_size: int, action_size: int) -> PolicyNetwork:
         """An untrained actor drawn from the trial's seed, with statistics that leave observations unchanged."""
-        return _network(config, obs_size, action_size, torch.Generator().manual_seed(config.trial.seed_of("policy")))
+        return _network(config, obs_size, action_size, torch.Generator().manual_seed(config.trial.seed))
 
     @classmethod
     def policy_modules(cls, network: nn.Module) -> dict[str, nn.Module]:
@@ -133,7 +127,7 @@ class Shac(Algorithm):
         numbers = dict(zip(metrics, values, strict=True))
         self._check_finite(outcome, numbers, epoch)
         self._horizon.follow(cotangents.norms, numbers.get("train/contact"))
-        numbers |= self._adapt(numbers["train/reward"], numbers.get("train/entropy"))
+        numbers |= self._adapt(numbers.get("train/entropy"))
         numbers |= {
             **({} if c.exploration is None else {"train/exploration": c.exploration.at(epoch)}),
             "train/horizon": float(horizon),
@@ -168,8 +162,7 @@ class Shac(Algorithm):
             "actor_optimizer": self.actor_optimizer.state_dict(),
             "critic_optimizer": self.critic_fit.optimizer.state_dict(),
             "critic_loss": self._runner.newest_loss,
-            "noise_generator": self.noise_generator.get_state(),
-            **({"minibatch_generator": self.minibatch_generator.get_state()} if self._apart else {}),
+            "noise_generator": self.generator.get_state(),
             "episodes": self.episodes.state_dict(),
             "discounted": self._actor_update.discounted.clone(),
             **self._horizon.state_dict(),
@@ -186,9 +179,7 @@ class Shac(Algorithm):
         self.critic_fit.optimizer.load_state_dict(state["critic_optimizer"])
         self._runner.resume(state.get("critic_loss"))
         # Generator states are host tensors on every device.
-        self.noise_generator.set_state(state["noise_generator"].cpu())
-        if self._apart:
-            self.minibatch_generator.set_state(state["minibatch_generator"].cpu())
+        self.generator.set_state(state["noise_generator"].cpu())
         self.episodes.load_state_dict(state["episodes"])
         self._actor_update.discounted.copy_(state["discounted"])
         self._horizon.load_state_dict(state)
@@ -199,10 +190,6 @@ class Shac(Algorithm):
         if self.env.sim.batch.ordered:
             self.env.sim.batch.unrolled_iterations = state["iterations"]
 
-    @property
-    def _apart(self) -> bool:
-        return self.minibatch_generator is not self.noise_generator
-
     def _rate(self, rate: float, epoch: int) -> float:
         """The learning rate at an epoch that was `rate` at the first."""
         c = self.settings
@@ -210,17 +197,16 @@ class Shac(Algorithm):
 
     def _draw(self, horizon: int, epoch: int) -> EpochInputs:
         env, c = self.env, self.settings
-        noise = torch.randn((horizon, self._worlds, env.action_size), generator=self.noise_generator, device=env.device)
+        noise = torch.randn((horizon, self._worlds, env.action_size), generator=self.generator, device=env.device)
         if c.exploration is not None:
             noise *= c.exploration.at(epoch)
         return EpochInputs(env.state.detach(), env.draw_resets(horizon), env.group.own(noise, dim=1))
 
-    def _adapt(self, reward: float, entropy: float | None) -> dict[str, float]:
+    def _adapt(self, entropy: float | None) -> dict[str, float]:
         """Advance entropy bonus and contacts after an epoch.
 
         Args:
-            reward: the epoch's mean reward per env step.
-            entropy: its mean entropy of the policy [nat], if there is a bonus for it.
+            entropy: the epoch's mean entropy of the policy [nat], if there is a bonus for it.
 
         Returns:
             Their values before, by metric name.
@@ -232,7 +218,7 @@ class Shac(Algorithm):
             self._entropy.adapt(entropy)
         if self._contacts is not None:
             stood["train/curriculum"] = self._contacts.progress
-            self._contacts.advance(reward)
+            self._contacts.advance()
         return stood
 
     def _check_finite(self, outcome: ActorOutcome, numbers: Mapping[str, float], epoch: int) -> None:
@@ -244,7 +230,7 @@ class Shac(Algorithm):
             epoch: counted from 0.
         """
         lost, norm = numbers["grad/nonfinite_share"], numbers["grad/actor_norm"]
-        allowed = self.settings.max_nonfinite_share
+        allowed = MAX_NONFINITE_SHARE
         rewarded = math.isfinite(numbers["train/reward"])
         if rewarded and lost <= allowed and math.isfinite(norm):
             return
@@ -256,7 +242,7 @@ class Shac(Algorithm):
         if lost > allowed:
             raise SimulationError(
                 f"nonfinite_gradient: the state cotangent of {lost:.1%} of the worlds was not finite "
-                f"(shac.max_nonfinite_share allows {allowed:.1%}); shorten shac.horizon, set shac.state_grad_clip or "
+                f"({allowed:.0%} may be); shorten shac.horizon, set shac.state_grad_clip or "
                 "soften the contacts; or look in observe and reward_terms for the slope of a root or norm at 0",
                 Failure.NONFINITE,
             )
@@ -270,7 +256,7 @@ class Shac(Algorithm):
         The fit before must have ended: it reads its rate until then.
         """
         self.critic_fit.optimizer.set_rate(rate)
-        return self.critic_fit.draw_orders(rows, self.settings.critic_iterations, self.minibatch_generator)
+        return self.critic_fit.draw_orders(rows, self.settings.critic_iterations, self.generator)
 
     def fit_critic(self, obs: Tensor, targets: Tensor, orders: Tensor) -> Tensor:
         """Fit the critic, and return the last pass's mean loss."""
@@ -284,9 +270,4 @@ class Shac(Algorithm):
 
 
 def _network(config: Config, obs_size: int, action_size: int, generator: torch.Generator) -> PolicyNetwork:
-    settings = config.algorithm_settings
-    assert isinstance(settings, ShacConfig)
-    return PolicyNetwork(
-        Actor(config.actor, obs_size, action_size, generator),
-        RunningMeanStd((obs_size,)) if settings.normalize_obs else None,
-    )
+    return PolicyNetwork(Actor(config.actor, obs_size, action_size, generator), RunningMeanStd((obs_size,)))

@@ -44,16 +44,13 @@ class ContactSchedule:
             raise ConfigError(f"curriculum: env {env.config.name} has no contact pairs to soften; leave it out")
         self._ends = {
             "solref": np.array(model.pair_solref),
-            "solimp": np.array(model.pair_solimp),
             "solreffriction": np.array(model.pair_solreffriction),
-            "friction": np.array(model.pair_friction),
         }
         self._apply()
 
-    def advance(self, reward: float) -> None:
-        """Process an epoch's mean reward per env step, and advance if the curriculum does."""
-        if self.config.reward is None or reward >= self.config.reward:
-            self.set_progress(self.progress + 1.0 / self.config.epochs)
+    def advance(self) -> None:
+        """Take the step that follows an epoch."""
+        self.set_progress(self.progress + 1.0 / self.config.epochs)
 
     def set_progress(self, progress: float) -> None:
         """Go to a point of the curriculum."""
@@ -72,7 +69,6 @@ class ContactSchedule:
             for row, solref in zip(end, self._ends["solref"], strict=True):
                 # A zero solreffriction stands for solref.
                 target = solref if name == "solreffriction" and not row.any() else row
-                first = [start[name]] * 2 + list(row[2:]) if name == "friction" else list(start[name])
-                rows.append(between(first, list(target), self.progress))
+                rows.append(between(list(start[name]), list(target), self.progress))
             fields[name] = np.array(rows)
         self._env.sim.batch.set_contact_pairs(fields)

@@ -7,6 +7,9 @@ from torch import Tensor
 
 from msk_ray.config import EntropyConfig
 
+RATE = 5e-3
+"""Change of log α per epoch and nat of missing entropy."""
+
 
 class EntropyBonus:
     """The coefficient α of −log π in the reward, constant or adapted to hold a target entropy.
@@ -40,10 +43,10 @@ class EntropyBonus:
         return self.weight * ((neg_log_prob + whole) / (2.0 * whole))
 
     def adapt(self, entropy: float) -> None:
-        """Update with an epoch's mean entropy of the policy [nat]: log α += rate (target − entropy), by dual ascent.
+        """Update with an epoch's mean entropy of the policy [nat]: log α += RATE (target − entropy), by dual ascent.
 
         The temperature's gradient step of Haarnoja et al. 2018 (arXiv:1812.05905, equation 18), on log α.
         """
         if self._config.target is not None:
             missing = self._config.target * self._action_size - entropy
-            self.coefficient *= math.exp(self._config.rate * missing)
+            self.coefficient *= math.exp(RATE * missing)

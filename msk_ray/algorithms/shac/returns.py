@@ -48,8 +48,3 @@ def td_lambda_targets(
         following = rewards[t] + gamma * torch.where(done[t], values[t], mixed)
         targets[t] = following
     return targets
-
-
-def one_step_targets(rewards: Tensor, next_values: Tensor, terminated: Tensor, gamma: float) -> Tensor:
-    """Critic targets (H, W): r + γ V(s'), where a terminated state has value 0."""
-    return rewards + gamma * next_values.masked_fill(terminated, 0.0)

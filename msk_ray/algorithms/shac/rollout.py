@@ -37,7 +37,7 @@ class Rollout:
 def collect(
     env: Env,
     actor: Actor,
-    normalizer: RunningMeanStd | None,
+    normalizer: RunningMeanStd,
     noise: Tensor,
     gate: CotangentGate,
     *,
@@ -54,7 +54,7 @@ def collect(
     env.state = env.state.detach()
     raw, reached, rewards, terms, terminated, done, diverged = [], [], [], [], [], [], []
     neg_log_probs, contacts = [], []
-    normalize = normalizer.fixed() if normalizer is not None else lambda x: x
+    normalize = normalizer.fixed()
     for step_noise in noise:
         env.state = env.state._replace(physics=gate(env.state.physics)) if state_bptt else env.state.detach()
         obs = env.observation()

@@ -4,6 +4,9 @@ import math
 
 from msk_ray.config import AdaptiveHorizon, ContactHorizon, HorizonSchedule
 
+ADAPTATION = 0.1
+"""Exponent, or share, by which a horizon that follows something changes in an epoch."""
+
 
 def horizon_at(schedule: int | HorizonSchedule, epoch: int) -> int:
     """Rollout length H in env steps at `epoch`."""
@@ -20,16 +23,16 @@ def learning_rate_at(initial: float, final: float, schedule: str, epoch: int, ep
 def adapted_horizon(config: AdaptiveHorizon, horizon: float, cotangent: float) -> float:
     """Horizon after an epoch at `horizon` (not rounded) whose cotangents had this 90th percentile [reward].
 
-    H ← H (target / p90)^rate within bounds. A percentile that is not finite shrinks H by 2^rate.
+    H ← H (target / p90)^ADAPTATION within bounds. A percentile that is not finite shrinks H by 2^ADAPTATION.
     """
     ratio = config.target / cotangent if math.isfinite(cotangent) and cotangent > 0.0 else 0.5
-    return min(max(horizon * ratio**config.rate, config.shortest), config.longest)
+    return min(max(horizon * ratio**ADAPTATION, config.shortest), config.longest)
 
 
 def contact_horizon(config: ContactHorizon, horizon: float, multiplier: float, contact: float) -> tuple[float, float]:
     """Horizon and multiplier after an epoch at `horizon` (not rounded) with this contact force [weight of the body].
 
-    φ ← φ + rate (contact / config.contact − 1) within ±1, then H ← H (1 − rate·φ) within bounds.
+    φ ← φ + ADAPTATION (contact / config.contact − 1) within ±1, then H ← H (1 − ADAPTATION·φ) within bounds.
     """
-    multiplier = min(max(multiplier + config.rate * (contact / config.contact - 1.0), -1.0), 1.0)
-    return min(max(horizon * (1.0 - config.rate * multiplier), config.shortest), config.longest), multiplier
+    multiplier = min(max(multiplier + ADAPTATION * (contact / config.contact - 1.0), -1.0), 1.0)
+    return min(max(horizon * (1.0 - ADAPTATION * multiplier), config.shortest), config.longest), multiplier

@@ -1,6 +1,6 @@
 """The settings of the ant."""
 
-from msk_ray.config.physics import CONTACTS, JOINTS, LIMITS, SOLVING, STEPPING
+from msk_ray.config.physics import CONTACTS, SOLVING, STEPPING
 from msk_ray.config.rewards import reward_section, with_reward
 from msk_ray.config.sections import Count
 from msk_ray.config.terms import Cost, Term, terms_in
@@ -24,7 +24,7 @@ class AntSettings(LimitedSettings):
 
     variants = ("matched", "matched_hard_friction", "matched_springs", "published")
     pyramidal_variants = frozenset(("published",))
-    reads_physics = STEPPING | SOLVING | CONTACTS | LIMITS | JOINTS | {"variant", "gear"}
+    reads_physics = STEPPING | SOLVING | CONTACTS | {"variant"}
 
     episode_length: Count = 1000
     termination_height: float = 0.27

@@ -120,8 +120,8 @@ def ant_spec(env: AntSettings, physics: PhysicsConfig) -> mujoco.MjSpec:
     torso.add_geom(name="torso", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.25, 0, 0], **body_look)
     joint = {
         "type": mujoco.mjtJoint.mjJNT_HINGE,
-        "damping": p.joint_damping if physics.joint_damping is None else physics.joint_damping,
-        "armature": p.armature if physics.armature is None else physics.armature,
+        "damping": p.joint_damping,
+        "armature": p.armature,
         "limited": True,
         "solref_limit": list(p.solref_limit),
         "solimp_limit": list(p.solimp_limit),

@@ -1,6 +1,6 @@
 """The settings of CartPole."""
 
-from msk_ray.config.physics import JOINTS, STEPPING
+from msk_ray.config.physics import STEPPING
 from msk_ray.config.rewards import reward_section, with_reward
 from msk_ray.config.sections import Count, EnvSettings
 from msk_ray.config.terms import Cost, terms_in
@@ -20,6 +20,6 @@ CartPoleReward = reward_section("CartPoleReward", __name__, TERMS)
 class CartPoleSettings(EnvSettings):
     """Swing up a pole on a cart and keep it there. Angle 0 is upright."""
 
-    reads_physics = STEPPING | JOINTS | {"gear"}
+    reads_physics = STEPPING
 
     episode_length: Count = 240

@@ -41,8 +41,6 @@ def build_cartpole(env: CartPoleSettings, physics: PhysicsConfig) -> mujoco.MjMo
         name="slider",
         type=mujoco.mjtJoint.mjJNT_SLIDE,
         axis=[1, 0, 0],
-        damping=physics.joint_damping or 0.0,
-        armature=physics.armature or 0.0,
     )
     cart.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.15, 0.08, 0.06], mass=CART_MASS, rgba=[0.2, 0.35, 0.6, 1])
     cart.add_camera(
@@ -58,7 +56,7 @@ def build_cartpole(env: CartPoleSettings, physics: PhysicsConfig) -> mujoco.MjMo
         rgba=[0.85, 0.5, 0.2, 1],
     )
     motor = spec.add_actuator(name="force", trntype=mujoco.mjtTrn.mjTRN_JOINT, target="slider")
-    motor.gear[0] = physics.gear or GEAR
+    motor.gear[0] = GEAR
     motor.ctrllimited = True
     motor.ctrlrange = [-1.0, 1.0]
     return spec.compile()

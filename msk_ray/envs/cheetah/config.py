@@ -1,6 +1,6 @@
 """The settings of the cheetah."""
 
-from msk_ray.config.physics import CONTACTS, JOINTS, LIMITS, SOLVING, STEPPING
+from msk_ray.config.physics import CONTACTS, SOLVING, STEPPING
 from msk_ray.config.rewards import reward_section, with_reward
 from msk_ray.config.sections import Count
 from msk_ray.config.terms import Cost, Term, terms_in
@@ -21,6 +21,6 @@ class CheetahSettings(LimitedSettings):
 
     variants = ("matched", "published")
     pyramidal_variants = frozenset(("published",))
-    reads_physics = STEPPING | SOLVING | CONTACTS | LIMITS | JOINTS | {"variant", "gear"}
+    reads_physics = STEPPING | SOLVING | CONTACTS | {"variant"}
 
     episode_length: Count = 1000

@@ -1,21 +1,17 @@
 """The settings of the hopper."""
 
-from msk_ray.config.physics import CONTACTS, JOINTS, LIMITS, SOLVING, STEPPING
+from msk_ray.config.physics import CONTACTS, SOLVING, STEPPING
 from msk_ray.config.rewards import reward_section, with_reward
-from msk_ray.config.sections import Count, NonNegative, Reward
+from msk_ray.config.sections import Count, Reward
 from msk_ray.config.terms import Cost, Term, terms_in
 from msk_ray.envs.limited import EFFORT, JOINT_LIMIT, LimitedSettings
 
 
 class HopperHeight(Reward):
-    """The shape of the term `height`, which has two weights."""
+    """The weight of the term `height` above the full height; below it, the weight is DiffRL's."""
 
     height: float = 1.0
-    """Weight of the torso's height above `full_height`, up to 0.3 m [1/m]."""
-    drop: NonNegative = 200.0
-    """Weight of (depth below `full_height`)², up to 1 m [1/m²]."""
-    full_height: float = -0.3
-    """Height of the torso, from 1.25 m, that costs and earns nothing [m]."""
+    """Weight of the torso's height above 0.95 m, up to 0.3 m [1/m]; (depth below)², up to 1 m, costs 200 /m²."""
 
 
 TERMS = terms_in(
@@ -35,7 +31,7 @@ class HopperSettings(LimitedSettings):
 
     variants = ("matched", "published")
     pyramidal_variants = frozenset(("published",))
-    reads_physics = STEPPING | SOLVING | CONTACTS | LIMITS | JOINTS | {"variant", "gear"}
+    reads_physics = STEPPING | SOLVING | CONTACTS | {"variant"}
 
     episode_length: Count = 1000
     reward: HopperHeight = HopperHeight()

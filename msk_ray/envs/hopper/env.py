@@ -13,8 +13,12 @@ from msk_ray.envs.planar import PlanarBody
 from msk_ray.step import StepState
 
 _FULL_ANGLE = math.pi / 6
+_FULL_HEIGHT = -0.3
+"""Height of the torso, from 1.25 m, that costs and earns nothing [m]."""
 _TOP = 0.3
 _BOTTOM = -1.0
+_DROP = 200.0
+"""Weight of the squared depth below it [1/m²]."""
 
 
 class Hopper(PlanarBody[HopperSettings]):
@@ -54,10 +58,9 @@ def forward_vel(env: Hopper, state: StepState, action: Tensor, obs: Tensor) -> T
 
 
 def height(env: Hopper, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
-    """What the torso's height above or below `full_height` is worth."""
-    r = env.config.reward
-    above = (obs[:, 0] - r.full_height).clamp(_BOTTOM, _TOP)
-    return torch.where(above < 0.0, -r.drop * above.square(), r.height * above)
+    """What the torso's height above or below the full height is worth."""
+    above = (obs[:, 0] - _FULL_HEIGHT).clamp(_BOTTOM, _TOP)
+    return torch.where(above < 0.0, -_DROP * above.square(), env.config.reward.height * above)
 
 
 def upright(env: Hopper, state: StepState, action: Tensor, obs: Tensor) -> Tensor:

@@ -16,8 +16,12 @@ from msk_ray.step.autograd.tangent import quat_exp, quat_rotate
 
 _JOINT_VELOCITY_SCALE = 0.1
 _TARGET = 200.0
+_FULL_HEIGHT = 0.84
+"""Height of the torso that costs and earns nothing [m]."""
 _TOP = 0.1
 _BOTTOM = -1.0
+_DROP = 200.0
+"""Weight of the squared depth below it [1/m²]."""
 
 
 class Humanoid(LimitedBody[HumanoidSettings]):
@@ -109,7 +113,6 @@ def heading(env: Humanoid, state: StepState, action: Tensor, obs: Tensor) -> Ten
 
 
 def height(env: Humanoid, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
-    """What the torso's height above or below `full_height` is worth."""
-    r = env.config.reward
-    above = (obs[:, 0] - r.full_height).clamp(_BOTTOM, _TOP)
-    return torch.where(above < 0.0, -r.drop * above.square(), r.height * above)
+    """What the torso's height above or below the full height is worth."""
+    above = (obs[:, 0] - _FULL_HEIGHT).clamp(_BOTTOM, _TOP)
+    return torch.where(above < 0.0, -_DROP * above.square(), env.config.reward.height * above)

@@ -72,7 +72,7 @@ class MyoLeg(LegEnv[MyoLegSettings]):
 
         if self.config.reset == "cycle":
             self._cycle = tuple(map(tensor, cycle_states(model, swaying=True)))
-        self._springs = FreeSprings(model, axes, self.config.assist, self.device)
+        self._springs = FreeSprings(model, axes, self.device)
 
     def applied_force(self, state: StepState) -> Tensor | None:
         return self.assistance.share * self._springs.force(state) if self.config.assist.epochs else None

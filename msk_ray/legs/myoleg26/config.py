@@ -3,10 +3,10 @@
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
-from pydantic import PositiveFloat, model_validator
+from pydantic import model_validator
 
-from msk_ray.config.physics import ACTIVATION, CONTACTS, JOINTS, LIMITS, SOLVING, STEPPING
-from msk_ray.config.sections import NonNegative, Section, Whole
+from msk_ray.config.physics import ACTIVATION, CONTACTS, SOLVING, STEPPING
+from msk_ray.config.sections import NonNegative, Section
 from msk_ray.legs.config import LegSettings
 
 
@@ -19,22 +19,16 @@ class TerrainConfig(Section):
     """Rise over run of `slope`; negative goes down."""
     step_height: NonNegative = 0.05
     """Rise of each of the `steps` [m]."""
-    step_depth: PositiveFloat = 0.6
-    """Length along x of each step or rough strip [m]."""
     roughness: NonNegative = 0.03
     """Largest height of `rough` strips and `height_field` [m]."""
-    start: NonNegative = 0.8
-    """Position at which the flat ground ends [m]; a slope starts at the origin."""
-    seed: Whole = 0
-    """Seed of the heights of `rough` and `height_field`."""
 
 
 _TERRAIN_READS: dict[str, tuple[str, ...]] = {
     "flat": (),
     "slope": ("slope",),
-    "steps": ("step_height", "step_depth", "start"),
-    "rough": ("step_depth", "roughness", "start", "seed"),
-    "height_field": ("roughness", "start", "seed"),
+    "steps": ("step_height",),
+    "rough": ("roughness",),
+    "height_field": ("roughness",),
 }
 """The settings that each kind of ground reads."""
 
@@ -42,7 +36,7 @@ _TERRAIN_READS: dict[str, tuple[str, ...]] = {
 class MyoLeg26Settings(LegSettings):
     """Two legs under one trunk, 13 Hill-type muscles each."""
 
-    reads_physics = STEPPING | SOLVING | CONTACTS | LIMITS | JOINTS | ACTIVATION
+    reads_physics = STEPPING | SOLVING | CONTACTS | ACTIVATION
 
     conditions: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         **LegSettings.conditions,

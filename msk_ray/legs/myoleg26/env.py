@@ -10,7 +10,7 @@ from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
 from msk_ray.envs.layout import Entry
-from msk_ray.legs.assistance import righting
+from msk_ray.legs.assistance import LATERAL, righting
 from msk_ray.legs.env import LegEnv
 from msk_ray.legs.myoleg26.config import MyoLeg26Settings
 from msk_ray.legs.myoleg26.model import SIDES, build_myoleg26
@@ -19,8 +19,6 @@ from msk_ray.legs.myoleg26.tables import JOINTS
 from msk_ray.legs.myoleg26.terrain import Terrain
 from msk_ray.legs.root import Root
 from msk_ray.step import StepState
-
-_GRAVITY = 9.81
 
 
 class MyoLeg26(LegEnv[MyoLeg26Settings]):
@@ -58,11 +56,9 @@ class MyoLeg26(LegEnv[MyoLeg26Settings]):
         if self.config.reset == "cycle":
             self._cycle = StepState(*map(self._tensor, cycle_states(model)))
         mass = float(model.body_subtreemass[0])
-        a = self.config.assist
-        stiffness, damping = righting(a)
-        self._springs = self._tensor([0.0, 0.0, a.lateral, *stiffness])
-        self._dampers = self._tensor([0.0, 0.0, 2.0 * math.sqrt(a.lateral * mass), *damping])
-        self._lift = self._tensor([0.0, a.support * mass * _GRAVITY, 0.0, 0.0, 0.0, 0.0])
+        stiffness, damping = righting()
+        self._springs = self._tensor([0.0, 0.0, LATERAL, *stiffness])
+        self._dampers = self._tensor([0.0, 0.0, 2.0 * math.sqrt(LATERAL * mass), *damping])
         self._upright_pose = self._tensor(model.key("stand").qpos[:6])
 
     def _tensor(self, values: object) -> Tensor:
@@ -73,7 +69,7 @@ class MyoLeg26(LegEnv[MyoLeg26Settings]):
         if not self.config.assist.epochs:
             return excitation
         qpos, qvel, _ = self.state.physics
-        force = self._lift - self._springs * (qpos[:, :6] - self._upright_pose) - self._dampers * qvel[:, :6]
+        force = -self._springs * (qpos[:, :6] - self._upright_pose) - self._dampers * qvel[:, :6]
         return torch.cat((excitation, self.assistance.share * force), dim=-1)
 
     def draw_physics(self, count: int) -> StepState:

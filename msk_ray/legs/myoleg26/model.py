@@ -41,6 +41,12 @@ LENGTHENING = 1.4
 TIME_CONSTANTS = (0.01, 0.04, 0.2)
 """Activation and deactivation [s] of the sources; width of the blend between them, in excitation."""
 ASSIST_PREFIX = "assist_"
+_JOINT_DAMPING = 0.5
+"""Of every joint of the legs [N m s/rad]."""
+_ARMATURE = 0.005
+"""Of the same [kg m²]."""
+_FRICTION = 0.9
+"""Sliding friction of feet and ground."""
 
 _MUSCLE_JOINTS = {
     "hip": ("hip_flexion", "hip_adduction", "hip_rotation", "knee_angle"),
@@ -57,11 +63,6 @@ def resolve_physics(physics: PhysicsConfig) -> PhysicsConfig:
         cone="elliptic",
         solref=(0.02, 1.0),
         solimp=(0.9, 0.95, 0.005, 0.5, 2.0),
-        friction=0.9,
-        joint_damping=0.5,
-        armature=0.005,
-        solref_limit=(0.02, 1.0),
-        solimp_limit=(0.9, 0.95, 0.05, 0.5, 2.0),
         iterations=20,
     )
     given = {name for name in type(own).model_fields if getattr(physics, name) is not None}
@@ -198,11 +199,11 @@ def _body_spec(env: MyoLeg26Settings, p: PhysicsConfig) -> mujoco.MjSpec:
                 axis=_mirrored_axis(hinge.axis, side),
                 range=[hinge.lower, hinge.upper],
                 limited=True,
-                damping=p.joint_damping,
+                damping=_JOINT_DAMPING,
                 stiffness=env.toe_stiffness if hinge.segment == "toes" else 0.0,
-                armature=p.armature,
-                solref_limit=list(p.solref_limit or ()),
-                solimp_limit=list(p.solimp_limit or ()),
+                armature=_ARMATURE,
+                solref_limit=[0.02, 1.0],
+                solimp_limit=[0.9, 0.95, 0.05, 0.5, 2.0],
             )
         touching += _leg_geoms(bodies, side)
         _add_paths(spec, bodies, side)
@@ -263,10 +264,9 @@ def _add_contact(spec: mujoco.MjSpec, first: str, second: str, p: PhysicsConfig,
     pair = spec.add_pair(geomname1=first, geomname2=second, condim=condim, margin=0.0)
     assert p.solref is not None
     assert p.solimp is not None
-    assert p.friction is not None
     pair.solref = list(p.solref)
     pair.solimp = list(p.solimp)
-    pair.friction = [p.friction, p.friction, 0.005, 0.0001, 0.0001]
+    pair.friction = [_FRICTION, _FRICTION, 0.005, 0.0001, 0.0001]
     if p.solreffriction is not None and condim > 1:
         pair.solreffriction = list(p.solreffriction)
 

@@ -10,6 +10,12 @@ from msk_ray.legs.myoleg26.config import TerrainConfig
 
 _PIECES = 20
 """Boxes of stepped and rough ground; with more, the number of contact pairs could no longer be bounded tightly."""
+_START = 0.8
+"""Position at which the flat ground ends [m]; a slope starts at the origin."""
+_STEP = 0.6
+"""Length along x of each step or rough strip [m]."""
+_SEED = 0
+"""Of the heights of rough ground."""
 _HALF_WIDTH = 4.0
 _DEPTH = 2.0
 """Thickness of the boxes [m]: nothing slips between or under them."""
@@ -30,20 +36,20 @@ class Terrain:
     def __init__(self, config: TerrainConfig) -> None:
         self.config = config
         self.slope = config.slope if config.kind == "slope" else 0.0
-        rng = np.random.default_rng(config.seed)
+        rng = np.random.default_rng(_SEED)
         self._field: NDArray[np.float64] | None = None
         self.edges: NDArray[np.floating] = np.zeros(0)
         self.levels: NDArray[np.floating] = np.zeros(1)
-        strips = config.start + config.step_depth * np.arange(_PIECES)
+        strips = _START + _STEP * np.arange(_PIECES)
         if config.kind == "steps":
             self.edges, self.levels = strips, config.step_height * np.arange(_PIECES + 1)
         elif config.kind == "rough":
-            self.edges = np.append(strips, strips[-1] + config.step_depth)
+            self.edges = np.append(strips, strips[-1] + _STEP)
             self.levels = np.concatenate(([0.0], config.roughness * rng.uniform(size=_PIECES), [0.0]))
         elif config.kind == "height_field":
             field = rng.uniform(size=_FIELD_SHAPE)
             xs = np.linspace(-_FIELD[0], _FIELD[0], _FIELD_SHAPE[1])
-            field[:, xs < config.start] = 0.0
+            field[:, xs < _START] = 0.0
             self._field = field
             # Rows run along y; the walking line is the middle one.
             self.edges = (xs[:-1] + xs[1:]) / 2.0

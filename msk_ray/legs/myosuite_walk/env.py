@@ -117,7 +117,7 @@ class MyoSuiteWalk(AssistedEnv[MyoSuiteWalkSettings]):
         even, odd = fourier(people_angles()[0])[:, 1]
         self.hip_lag = math.atan2(odd, even) / math.tau
         self.assistance = Assistance(self.config.assist, self.config.control_timestep, self.device)
-        self._springs = FreeSprings(model, _AXES, self.config.assist, self.device)
+        self._springs = FreeSprings(model, _AXES, self.device)
         self._starts_in_cycle = self.config.cycle > 0.0 and self.config.stochastic_reset
         if self._starts_in_cycle:
             self._cycle = self._cycle_starts(tensor)

@@ -26,7 +26,7 @@ def test_the_loss_falls_and_both_networks_learn() -> None:
 
 
 def test_the_first_adam_step_is_the_learning_rate_long() -> None:
-    critic = Critic(CriticConfig(hidden=(), layer_norm=False), 1, torch.Generator().manual_seed(0))
+    critic = Critic(CriticConfig(hidden=()), 1, torch.Generator().manual_seed(0))
     before = [p.detach().clone() for p in critic.parameters()]
     obs = torch.ones(4, 1)
     order = torch.arange(4)[None]
@@ -82,7 +82,7 @@ def test_gradients_without_autograd_are_its_own(grad_norm: float | None) -> None
 
 
 def test_weight_decay_by_hand() -> None:
-    critic = Critic(CriticConfig(hidden=(), layer_norm=False), 1, torch.Generator().manual_seed(0))
+    critic = Critic(CriticConfig(hidden=()), 1, torch.Generator().manual_seed(0))
     before = [p.detach().clone() for p in critic.parameters()]
     fit = CriticFit(critic, 0.125, (0.9, 0.999), None, weight_decay=0.5)
     fit.run(torch.ones(4, 1), torch.full((4,), 100.0), torch.arange(4)[None], 1)

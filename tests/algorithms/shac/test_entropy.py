@@ -42,8 +42,8 @@ def test_the_bonus_is_constant_without_a_target_and_rises_while_entropy_is_missi
     fixed = EntropyBonus(EntropyConfig(coefficient=0.1), 2)
     fixed.adapt(-50.0)
     assert fixed.coefficient == 0.1
-    held = EntropyBonus(EntropyConfig(coefficient=0.1, target=-0.5, rate=0.1), 2)
+    held = EntropyBonus(EntropyConfig(coefficient=0.1, target=-0.5), 2)
     held.adapt(-3.0)  # wanted -1: 2 nat missing
-    assert held.coefficient == pytest.approx(0.1 * math.exp(0.2))
+    assert held.coefficient == pytest.approx(0.1 * math.exp(0.01))
     held.adapt(1.0)
     assert held.coefficient == pytest.approx(0.1)

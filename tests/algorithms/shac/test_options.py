@@ -21,9 +21,7 @@ TINY: dict[str, Any] = {
     "execution": {"checkpoint_interval": 1000, "loggers": []},
 }
 OPTIONS: dict[str, dict[str, Any]] = {
-    "contact": {
-        "shac.horizon": {"kind": "contact", "start": 4, "shortest": 2, "longest": 8, "contact": 0.2, "rate": 1.0}
-    },
+    "contact": {"shac.horizon": {"kind": "contact", "start": 4, "shortest": 2, "longest": 8, "contact": 0.2}},
     "state std": {"actor.state_std": True},
     "weight decay": {"shac.weight_decay": 0.5},
     "mean": {"shac.actor_value": "mean", "critic.count": 2},
@@ -125,12 +123,10 @@ def test_the_actor_may_believe_the_mean_of_two_critics(tmp_path: Path) -> None:
     [
         ({"shac.actor_value": "mean"}, "write critic.count: 2"),
         ({"shac.exploration": {"start": 1, "end": 0, "epochs": 4}, "shac.entropy": {}}, "leave one out"),
-        ({"shac.exploration": {"start": 1, "end": 0, "epochs": 4}, "actor.stochastic": False}, "actor.stochastic"),
         (
             {"env": {"name": "cartpole"}, "shac.horizon": {"kind": "contact", "start": 4, "contact": 1.0}},
             "cartpole has no contacts",
         ),
-        ({"actor.state_std": True, "actor.stochastic": False}, "actor.state_std: nothing reads it"),
     ],
 )
 def test_options_without_a_meaning_are_refused(changes: dict[str, Any], message: str) -> None:

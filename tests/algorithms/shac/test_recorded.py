@@ -44,7 +44,7 @@ OPTIONS = {
     },
 }
 _WEIGHTS = (
-    *("metabolic", "fatigue", "head", "impact", "footfall", "landing", "clearance", "toes", "vault", "track"),
+    *("metabolic", "head", "impact", "footfall", "landing", "clearance", "toes", "vault", "track"),
     "track_rate",
 )
 LEGS = {

@@ -2,7 +2,7 @@
 
 import torch
 
-from msk_ray.algorithms.shac.returns import actor_loss, discounts, one_step_targets, td_lambda_targets
+from msk_ray.algorithms.shac.returns import actor_loss, discounts, td_lambda_targets
 
 
 def column(*values: float | bool) -> torch.Tensor:
@@ -49,7 +49,6 @@ def test_td_lambda_between_its_extremes() -> None:
     # γ = 0.5. λ = 0 is one-step: 1 + 5, 2 + 10, 3 + 15. λ = 1 is Monte Carlo: 3 + 15 = 18, 2 + 9 = 11, 1 + 5.5 = 6.5.
     one_step = column(6.0, 12.0, 18.0)
     assert torch.allclose(td_lambda_targets(REWARDS, VALUES, NEVER, NEVER, 0.5, 0.0), one_step)
-    assert torch.allclose(one_step_targets(REWARDS, VALUES, NEVER, 0.5), one_step)
     assert torch.allclose(td_lambda_targets(REWARDS, VALUES, NEVER, NEVER, 0.5, 1.0), column(6.5, 11.0, 18.0))
     # λ = ½: G₂ = 18; G₁ = 2 + ½(½·20 + ½·18) = 11.5; G₀ = 1 + ½(½·10 + ½·11.5) = 6.375
     assert torch.allclose(td_lambda_targets(REWARDS, VALUES, NEVER, NEVER, 0.5, 0.5), column(6.375, 11.5, 18.0))
@@ -61,4 +60,3 @@ def test_td_lambda_tells_truncation_from_termination() -> None:
     assert torch.allclose(td_lambda_targets(REWARDS, VALUES, NEVER, done, 0.5, 0.5), column(6.5, 12.0, 18.0))
     # terminated at 1: G₁ = 2, G₀ = 1 + ½(½·10 + ½·2) = 4
     assert torch.allclose(td_lambda_targets(REWARDS, VALUES, done, done, 0.5, 0.5), column(4.0, 2.0, 18.0))
-    assert torch.allclose(one_step_targets(REWARDS, VALUES, done, 0.5), column(6.0, 2.0, 18.0))

@@ -21,23 +21,24 @@ def test_learning_rate_is_linear_or_constant() -> None:
 
 
 def test_an_adaptive_horizon_follows_the_cotangents_within_bounds():
-    adaptive = AdaptiveHorizon(start=16, shortest=8, longest=32, target=10.0, rate=0.5)
+    adaptive = AdaptiveHorizon(start=16, shortest=8, longest=32, target=10.0)
     assert adapted_horizon(adaptive, 16.0, 10.0) == 16.0
-    assert adapted_horizon(adaptive, 16.0, 40.0) == pytest.approx(8.0)  # sqrt(1/4)
-    assert adapted_horizon(adaptive, 16.0, 4.9) == pytest.approx(16.0 * (10 / 4.9) ** 0.5)
+    assert adapted_horizon(adaptive, 16.0, 40.0) == pytest.approx(16.0 / 4**0.1)
+    assert adapted_horizon(adaptive, 16.0, 4.9) == pytest.approx(16.0 * (10 / 4.9) ** 0.1)
     assert adapted_horizon(adaptive, 16.0, 1e-6) == 32
+    assert adapted_horizon(adaptive, 9.0, 1e6) == 8
     for unknown in (math.nan, math.inf, 0.0):
-        assert adapted_horizon(adaptive, 16.0, unknown) == pytest.approx(16.0 / 2**0.5)
+        assert adapted_horizon(adaptive, 16.0, unknown) == pytest.approx(16.0 / 2**0.1)
 
 
 def test_a_horizon_that_follows_contact_by_hand() -> None:
-    config = ContactHorizon(start=16, shortest=8, longest=32, contact=2.0, rate=0.5)
-    # φ = 0.5 (3/2 − 1) = 1/4, then 1/4 + 0.5 (1/2 − 1) = 0; H = 16 (1 − 1/8) = 14
-    horizon, multiplier = contact_horizon(config, 16.0, 0.0, 3.0)
-    assert (horizon, multiplier) == (14.0, 0.25)
-    assert contact_horizon(config, horizon, multiplier, 1.0) == (14.0, 0.0)
-    assert contact_horizon(config, 16.0, -1.0, 0.0) == (24.0, -1.0)
-    assert contact_horizon(config, 9.0, 1.0, 99.0) == (8.0, 1.0)
+    config = ContactHorizon(start=16, shortest=8, longest=32, contact=2.0)
+    # φ = 0.1 (12/2 − 1) = 1/2, then 1/2 + 0.1 (1/2 − 1) = 0.45; H = 16 (1 − 0.05) = 15.2
+    horizon, multiplier = contact_horizon(config, 16.0, 0.0, 12.0)
+    assert (horizon, multiplier) == pytest.approx((15.2, 0.5))
+    assert contact_horizon(config, 16.0, 0.5, 1.0) == pytest.approx((16.0 * (1.0 - 0.045), 0.45))
+    assert contact_horizon(config, 16.0, -1.0, 0.0) == pytest.approx((17.6, -1.0))
+    assert contact_horizon(config, 8.5, 1.0, 99.0) == (8.0, 1.0)
     assert contact_horizon(config, 30.0, -1.0, 0.0) == (32.0, -1.0)
 
 
