@@ -22,9 +22,10 @@ from msk_ray.experiment.manifest import Experiment
 from msk_ray.files import write_text
 from msk_ray.progress import format_duration
 from msk_ray.report.best import Best, strip_bytes
+from msk_ray.report.charts import Picture, format_steps
 from msk_ray.report.curves import gradient_health, learning_curves, stopping_map
 from msk_ray.report.influence import parallel_coordinates, parameter_effects, ranked_effects
-from msk_ray.report.pictures import Picture, format_steps
+from msk_ray.report.png import png
 from msk_ray.report.reading import Condition, Reading, TrialReading
 from msk_ray.report.tables import (
     VariantRow,
@@ -127,15 +128,15 @@ def make_section(
         ConfigError: there is no variant with the requested name.
     """
     chosen = baseline_of(reading, baseline)
-    found = ranked_effects(reading, places)
+    ranked = ranked_effects(reading, places)
     several = len(reading.algorithms) > 1
     times = learning_curves(reading.variants, chosen, f"{prefix}times", places, over="seconds") if several else None
     made = {
         "curves": learning_curves(reading.variants, chosen, f"{prefix}curves", places),
         # An env step of one algorithm costs another time than one of another.
         "times": times,
-        "effects": parameter_effects(found, f"{prefix}effects"),
-        "parallel": parallel_coordinates(reading, found, f"{prefix}parallel", places),
+        "effects": parameter_effects(ranked, f"{prefix}effects"),
+        "parallel": parallel_coordinates(reading, ranked, f"{prefix}parallel", places),
         "stops": stopping_map(reading, f"{prefix}stops", places),
         "health": gradient_health(reading, f"{prefix}health", places),
     }
@@ -223,7 +224,7 @@ def render_page(
         for t in section.reading.trials
     ]
     matrix = _matrix(sections)
-    data = {"trials": trials, "figures": {picture.name: picture.chart for picture in pictures}}
+    data = {"trials": trials, "charts": {picture.name: picture.chart for picture in pictures}}
     page = (
         _templates()
         .get_template("report.html.j2")
@@ -276,7 +277,7 @@ def write_page(sections: Sequence[Section], together: Picture | None, folder: Pa
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for picture in [*pictures, *([together] if together is not None else [])]:
-            (folder / f"{picture.name}.png").write_bytes(picture.png())
+            (folder / f"{picture.name}.png").write_bytes(png(picture.chart))
     except OSError as error:
         raise StorageFailure(f"cannot write {folder}: {error.strerror or error}") from error
     write_text(folder / PAGE, render_page(sections, together, now, command))

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from msk_ray.report.pictures import POINTS, thin_peaks
+from msk_ray.report.charts import POINTS, thin_peaks
 from msk_ray.report.statistics import Scored, difference_interval, effects, levels_of, mean_interval, variance_share
 
 
