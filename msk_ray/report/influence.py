@@ -30,7 +30,7 @@ from msk_ray.report.charts import (
     rounded,
 )
 from msk_ray.report.reading import Reading, TrialReading
-from msk_ray.report.statistics import LEAST, Effect, Scored, effects, mean_interval
+from msk_ray.report.statistics import LEAST, Effect, TrialScore, effects, mean_interval
 from msk_ray.text import printable
 
 PANELS = 4
@@ -63,7 +63,7 @@ def ranked_effects(reading: Reading, places: Mapping[Path, int]) -> list[Effect]
     """
     return effects(
         [
-            Scored(t.trial.changed, t.trial.values, t.trial.seed, t.score, t.cut, places[t.folder])
+            TrialScore(t.trial.changed, t.trial.values, t.trial.seed, t.score, t.cut, places[t.folder])
             for t in reading.trials
         ]
     )
@@ -127,9 +127,9 @@ def _share_text(effect: Effect) -> str:
     return f"{effect.share:.2f}" if effect.share > 0.0 else "≤ 0"
 
 
-def _drawn_levels(effect: Effect) -> tuple[str, list[tuple[str, list[Scored]]]]:
+def _drawn_levels(effect: Effect) -> tuple[str, list[tuple[str, list[TrialScore]]]]:
     """A parameter's name, and its levels with their trials; of many, the best and the worst."""
-    levels = [(level, effect.scored(level)) for level in effect.levels]
+    levels = [(level, effect.with_score(level)) for level in effect.levels]
     title = short_key(effect.factor)
     if len(levels) > LEVELS:
         # Too many to tell apart.
