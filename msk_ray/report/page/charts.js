@@ -88,7 +88,7 @@ const page = (() => {
     const floor = panel.y.floor && !whole.has(name) ? { min: panel.y.floor.at } : {};
     return {
       height: alone ? 400 : panel.x.labels.length ? 260 : 230, half: !alone,
-      option: base({ grid: { ...GRID, left: panel.y.name ? 34 : 12 }, xAxis: scale(panel.x), yAxis: scale(panel.y, { nameGap: 56, ...floor }), series }),
+      option: base({ grid: { ...GRID, left: panel.y.name ? 44 : 12 }, xAxis: scale(panel.x), yAxis: scale(panel.y, { nameGap: 56, ...floor }), series }),
     };
   }
 
