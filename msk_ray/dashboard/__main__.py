@@ -21,12 +21,12 @@ from msk_ray.experiment.layout import MANIFEST_FILE, SPACE_FILE
 from msk_ray.text import printable
 
 DESCRIPTION = """\
-Serve the report of every experiment in a folder as a page that follows its trials while they run: curves, effects,
-stops, gradients, failures and trials as in the report, a film of the best policy so far, several experiments side by
-side, notes on trials, and Optuna's plots (with the extra msk-ray[dashboard]).
+Serve the report of every experiment in a folder as a page that follows its trials while they run. In addition to the
+report it shows a film of the best policy so far and Optuna's plots (with the extra msk-ray[dashboard]), takes notes on
+trials, and puts several experiments side by side.
 
-It reads the experiments' files and never touches the sweep. Only this machine can reach it, unless --host says
-otherwise; others can then read everything in the folder, and write notes only with --allow-notes. From another machine,
+It only reads the experiments' files and never disturbs a sweep. Only this machine can reach it, unless --host says
+otherwise: then others can read everything in the folder, and write notes only with --allow-notes. From another machine,
 an ssh tunnel is safer: ssh -L 8321:127.0.0.1:8321 HOST."""
 
 EXAMPLES = """\
@@ -47,24 +47,26 @@ def parser() -> Parser:
         help="folder of experiments (default: runs/)",
     )
     p.add_argument("--host", default="127.0.0.1", metavar="ADDRESS", help="address to listen on (default: %(default)s)")
+    p.add_argument("--port", type=_port, default=8321, metavar="N", help="port (default: %(default)s; 0: any free one)")
     p.add_argument(
-        "--port", type=_port, default=8321, metavar="N", help="port (default: %(default)s; 0: any that is free)"
-    )
-    p.add_argument(
-        "--refresh", type=_seconds, default=5.0, metavar="S", help="seconds between looks at the files (default: 5)"
+        "--refresh",
+        type=_seconds,
+        default=5.0,
+        metavar="S",
+        help="check the files for changes every S seconds (default: 5)",
     )
     p.add_argument(
         "--no-films",
         action="store_true",
-        help="do not simulate and film the best policies, which takes one CPU core at low priority now and then",
+        help="make no films of the best policies; each takes one CPU core for a while, at low priority",
     )
-    p.add_argument("--allow-notes", action="store_true", help="with --host: whoever reaches it may write notes")
+    p.add_argument("--allow-notes", action="store_true", help="with --host: everyone who can reach it may write notes")
     p.add_argument(
         "--allow-host",
         action="append",
         default=[],
         metavar="NAME",
-        help="a name under which a proxy, or the network, reaches it; addresses need none",
+        help="accept requests for this host name, such as a proxy's; IP addresses are always accepted",
     )
     return p
 

@@ -19,7 +19,7 @@ from msk_ray.experiment.notes import write_note
 from msk_ray.report.page import FILES
 
 _LARGEST = 64 * 1024
-"""Bytes of a request's body."""
+"""Maximum size of a request's body [B]."""
 _NOTE = Limits(_LARGEST, _LARGEST)
 _MEDIA = {".mp4": "video/mp4", ".png": "image/png"}
 _REPORT, _DASHBOARD = "msk_ray.report", "msk_ray.dashboard"
@@ -34,7 +34,7 @@ _STATIC = {
 
 
 def make_runner(library: Library, access: Access, shutdown_timeout: float = 1.0) -> web.AppRunner:
-    """The server, which is not listening yet. It unpacks no body: those of refused requests would be too."""
+    """The server, not listening yet. It decompresses no bodies, because it would do so even for refused requests."""
     app = _make_app(library, access)
     return web.AppRunner(app, access_log=None, shutdown_timeout=shutdown_timeout, auto_decompress=False)
 
@@ -63,20 +63,20 @@ def _make_app(library: Library, access: Access) -> web.Application:
 
 @web.middleware
 async def _errors(request: web.Request, handler: Any) -> web.StreamResponse:
-    """What went wrong, in words; anything unexpected is logged by aiohttp and answered with 500."""
+    """Turn this package's errors into responses; anything else is logged by aiohttp and answered with 500."""
     try:
-        found: web.StreamResponse = await handler(request)
+        response: web.StreamResponse = await handler(request)
     except Unknown as error:
         raise web.HTTPNotFound(text=f"{error}\n") from None
     except ConfigError as error:
         raise web.HTTPBadRequest(text=f"{error}\n") from None
     except MskRayError as error:
         raise web.HTTPConflict(text=f"{error}\n") from None
-    return found
+    return response
 
 
 class _Pages:
-    """The handlers. What reads files does so in a thread, so that other requests are answered meanwhile."""
+    """The handlers. They read files in a thread, so that other requests are answered meanwhile."""
 
     def __init__(self, library: Library) -> None:
         self._library = library
@@ -119,14 +119,14 @@ class _Pages:
         if path.suffix == ".pt":
             attached = {"Content-Disposition": f'attachment; filename="{trial}_{path.name}"'}
             return await self._send(request, path, {**attached, "Content-Type": "application/octet-stream"})
-        # Never as a page: its text may come from anywhere.
+        # Never as HTML: the text may come from anywhere.
         return await self._send(request, path, {"Content-Type": "text/plain; charset=utf-8"})
 
     async def _send(self, request: web.Request, path: Path, headers: Mapping[str, str]) -> web.StreamResponse:
         """Send a file of the storage."""
         opened = await asyncio.to_thread(self._library.open, path)
         with opened as file:
-            # By its descriptor: what was checked is what is sent, whatever has the path by now.
+            # By its descriptor: this is the file that was checked, even if the path now leads elsewhere.
             response = web.FileResponse(f"/proc/self/fd/{file.fileno()}", headers=headers)
             await response.prepare(request)
         return response

@@ -1,4 +1,4 @@
-"""Films of the best policies so far, made one at a time by `python -m msk_ray.visualize` in the background."""
+"""Films of the best policies so far, made in the background, one at a time, by `python -m msk_ray.visualize`."""
 
 import os
 import subprocess
@@ -13,14 +13,14 @@ from msk_ray.experiment.snapshot import file_stamp
 from msk_ray.files import make_folder
 
 FOLDER = "report"
-"""Subfolder of an experiment, as that of its report."""
+"""Subfolder of an experiment that also holds its report."""
 PREFIX = "film_"
 _SIZE, _FPS = "480x360", "25"
 
 
 @dataclass(frozen=True)
 class Film:
-    """What there is to show of a policy."""
+    """A film of a policy, or why there is none."""
 
     link: str
     """Path relative to the experiment; empty if there is no film."""
@@ -29,7 +29,7 @@ class Film:
 
 
 class Films:
-    """Makes films of checkpoints. One of an older checkpoint is removed once the newer one has its own."""
+    """Makes films of checkpoints. A film is removed once there is one of a newer checkpoint."""
 
     def __init__(self) -> None:
         self._condition = threading.Condition()
@@ -41,10 +41,10 @@ class Films:
         self._thread.start()
 
     def of(self, experiment: Experiment, part: str, checkpoint: Path) -> Film:
-        """The film of a checkpoint, or of an earlier one while it is made.
+        """The film of a checkpoint; while it is being made, the film of an earlier one.
 
         Args:
-            part: the environment, where an experiment has several.
+            part: the environment, if the experiment has several.
         """
         stamp = file_stamp(checkpoint)
         if stamp is None:
@@ -66,7 +66,7 @@ class Films:
         return Film(link, f"{words}; this is an earlier one." if link else f"{words}.")
 
     def close(self) -> None:
-        """End the process at work, if there is one."""
+        """End the running process, if there is one."""
         with self._condition:
             self._closed = True
             self._wanted.clear()
@@ -87,12 +87,12 @@ class Films:
             with self._condition:
                 if why is not None:
                     self._failed[film] = why
-                # A newer checkpoint of the same may have been asked for meanwhile.
+                # Meanwhile, a film of a newer checkpoint may have been requested.
                 if self._wanted.get(wish) == (checkpoint, film):
                     del self._wanted[wish]
 
     def _make(self, checkpoint: Path, film: Path) -> str | None:
-        """Make a film; why it could not be made, on one line, or None."""
+        """Make a film. Returns why that failed, on one line, or None."""
         # ".part" before the suffix, which names the format.
         part = film.with_name(f".{film.stem}.{os.getpid()}.part.mp4")
         try:

@@ -1,4 +1,4 @@
-"""Who may ask the dashboard for what. Every answer passes here."""
+"""Which requests the dashboard answers. Every request passes through here."""
 
 import ipaddress
 import re
@@ -26,15 +26,15 @@ class Access:
     local: bool
     """Whether it listens to this machine only."""
     names: tuple[str, ...]
-    """Further names under which it is reached, in lower case."""
+    """Additional host names that it answers to, in lower case."""
     may_write: bool
     """Whether notes may be written."""
 
     def knows(self, host: str) -> bool:
         """Whether a request with this Host header was meant for this server.
 
-        A web site of somebody else may resolve its own name to this machine's address (DNS rebinding): the browser then
-        sends that name. Addresses and `localhost` cannot be taken over like this.
+        A foreign web site may let its own name resolve to this machine's address (DNS rebinding); a browser then sends
+        that name here. This cannot happen with IP addresses and `localhost`.
         """
         name = _name_of(host)
         if name == "localhost" or name in self.names:
@@ -50,13 +50,14 @@ _HOST = re.compile(r"(?:\[([0-9A-Fa-f:.]+)\]|([A-Za-z0-9_-]+(?:\.[A-Za-z0-9_-]+)
 
 
 def _name_of(host: str) -> str:
-    """The name in a Host header: without the port, brackets and a final dot, in lower case; empty if it is none."""
-    found = _HOST.fullmatch(host)
-    return "" if found is None else (found[1] or found[2]).lower()
+    """The name in a Host header, in lower case, without port, brackets and final dot; empty if it is malformed."""
+    match = _HOST.fullmatch(host)
+    return "" if match is None else (match[1] or match[2]).lower()
 
 
 def guard(access: Access) -> Middleware:
-    """A middleware that refuses requests for another server, and writing that is not allowed or from elsewhere."""
+    """A middleware that refuses requests meant for another server, and writes that are not allowed or come from
+    another site."""
 
     @web.middleware
     async def check(request: web.Request, handler: Handler) -> web.StreamResponse:
@@ -87,6 +88,6 @@ def _check_writing(request: web.Request, host: str, access: Access) -> None:
 
 
 async def set_headers(request: web.Request, response: web.StreamResponse) -> None:
-    """Headers of every answer, refusals included."""
+    """Set the headers of every response, including refusals."""
     response.headers.update(_HEADERS)
     response.headers.setdefault("Cache-Control", "no-store")

@@ -1,4 +1,4 @@
-"""The experiments of a storage folder, read and drawn again only where something has changed."""
+"""The experiments of a storage folder; files are read and pages made again only after changes."""
 
 import os
 import threading
@@ -30,7 +30,7 @@ from msk_ray.report.reading import ExperimentReader, Reading, TrialReading, expl
 _READERS, _PAGES = 8, 16
 """How many experiments and pages are kept in memory."""
 _REST = 3.0
-"""A page that took t seconds to make is not made again for this many times t."""
+"""A page that took t seconds to make is made again after this many times t at the earliest."""
 
 
 class Unknown(Exception):
@@ -46,15 +46,15 @@ class Page:
 
 
 @dataclass
-class _Kept:
+class _CachedPage:
     page: Page
     seen: tuple[Any, ...]
     trials: list[TrialReading]
     due: float
-    """Monotonic time [s] from which it is checked again."""
+    """When it is checked again, as monotonic time [s]."""
 
     def fits(self, seen: tuple[Any, ...], trials: list[TrialReading]) -> bool:
-        """Whether the page shows this. A reader returns the same object for a trial that has not changed."""
+        """Whether the page is still current. A reader returns the same object for a trial that has not changed."""
         same = len(trials) == len(self.trials) and all(a is b for a, b in zip(trials, self.trials, strict=True))
         return same and seen == self.seen
 
@@ -68,7 +68,7 @@ class Library:
             storage: folder of experiments.
             refresh: seconds between looks at the files.
             may_write: whether pages have fields for notes.
-            films: makes films; None: there are none.
+            films: makes the films; None: no films.
         """
         self.storage = storage
         self._root = storage.resolve()
@@ -79,12 +79,12 @@ class Library:
         self._lock = threading.Lock()
         self._readers: OrderedDict[str, ExperimentReader] = OrderedDict()
         self._statuses: dict[str, StatusReader] = {}
-        self._pages: OrderedDict[tuple[str, ...], _Kept] = OrderedDict()
+        self._pages: OrderedDict[tuple[str, ...], _CachedPage] = OrderedDict()
 
     def index(self) -> Page:
         """The list of experiments."""
         with self._lock:
-            return self._kept((), lambda: ((self._rows(), self._training_rows()), []), self._render_index)
+            return self._cached((), lambda: ((self._rows(), self._training_rows()), []), self._render_index)
 
     def page(self, names: Sequence[str]) -> Page:
         """The page of one experiment, or of several side by side.
@@ -94,7 +94,7 @@ class Library:
         """
         with self._lock:
             experiments = [self._find(name) for name in names]
-            return self._kept(
+            return self._cached(
                 tuple(names),
                 lambda: self._look(experiments),
                 lambda seen, version: self._render(experiments, version),
@@ -125,11 +125,11 @@ class Library:
         """
         with self._lock:
             folder = self._find(name).path / FOLDER
-        # Among the files there are: a name never becomes a path.
-        found = {path.name: path for pattern in (f"{PREFIX}*.mp4", f"*{STRIP}*.png") for path in folder.glob(pattern)}
-        if file not in found:
+        # Chosen among existing files: a name from a request never becomes a path.
+        files = {path.name: path for pattern in (f"{PREFIX}*.mp4", f"*{STRIP}*.png") for path in folder.glob(pattern)}
+        if file not in files:
             raise Unknown(f"{name} has no {file}")
-        return found[file]
+        return files[file]
 
     def trial_folder(self, name: str, trial: str) -> Path:
         """The folder of a trial.
@@ -165,21 +165,21 @@ class Library:
             raise Unknown(
                 f"no file {path.name} here: {error if isinstance(error, UnusableFile) else error.strerror}"
             ) from None
-        # Where it really is: a folder above it may be a link.
+        # Checked on the open file, because a folder above it may be a link.
         if not Path(f"/proc/self/fd/{file.fileno()}").readlink().is_relative_to(self._root):
             file.close()
             raise Unknown(f"no file {path.name} here: a link leads out of the storage")
         return file
 
     def _find(self, name: str) -> Experiment:
-        found = {path.name: path for path in find_experiments(self._root)}
-        if name not in found:
+        paths = {path.name: path for path in find_experiments(self._root)}
+        if name not in paths:
             raise Unknown(f"no experiment {name!r} here")
-        self._check_inside(found[name])
-        return Experiment(found[name])
+        self._check_inside(paths[name])
+        return Experiment(paths[name])
 
     def _check_inside(self, path: Path) -> None:
-        """Refuse an experiment of which a folder is elsewhere: whoever may write it could have anything shown.
+        """Refuse an experiment with a folder outside the storage: a link must not make other files readable.
 
         Raises:
             StorageError: a link leads out of the storage.
@@ -192,18 +192,18 @@ class Library:
                 raise StorageError(f"{relative} is a link out of the storage: put the folder itself there")
 
     def _trial_folder(self, name: str, trial: str) -> Path:
-        found = {t.trial.id: t.folder for t in self._read(self._find(name)).trials}
-        if trial not in found:
+        folders = {t.trial.id: t.folder for t in self._read(self._find(name)).trials}
+        if trial not in folders:
             raise Unknown(f"{name} has no trial {trial!r}")
-        return found[trial]
+        return folders[trial]
 
-    def _kept(
+    def _cached(
         self,
         key: tuple[str, ...],
         look: Callable[[], tuple[tuple[Any, ...], list[TrialReading]]],
         render: Callable[[tuple[Any, ...], str], str],
     ) -> Page:
-        """The page kept under `key`, made again if `look` finds something new."""
+        """The page cached under `key`, made again if `look` sees a change."""
         kept = self._pages.get(key)
         if kept is not None and time.monotonic() < kept.due:
             return kept.page
@@ -211,7 +211,7 @@ class Library:
         seen, trials = look()
         if kept is None or not kept.fits(seen, trials):
             version = sha256(f"{key}{time.time_ns()}".encode()).hexdigest()[:16]
-            kept = _Kept(Page(version, render(seen, version)), seen, trials, 0.0)
+            kept = _CachedPage(Page(version, render(seen, version)), seen, trials, 0.0)
             self._pages[key] = kept
             while len(self._pages) > _PAGES:
                 self._pages.popitem(last=False)
@@ -282,7 +282,7 @@ class Library:
         return rows
 
     def _training_rows(self) -> tuple[tuple[str, ...], ...]:
-        """What `train` has run: folder, environment, epochs, best score and state of each."""
+        """Folder, environment, epochs, best score and state of each run of `train`."""
         return tuple(
             (
                 training.name,

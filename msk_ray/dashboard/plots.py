@@ -33,8 +33,8 @@ def plotly_library() -> str:
         from plotly.offline import get_plotlyjs
     except ImportError:
         raise ConfigError(MISSING) from None
-    found: str = get_plotlyjs()
-    return found
+    script: str = get_plotlyjs()
+    return script
 
 
 def figures(reading: Reading) -> list[tuple[str, str]]:
@@ -59,17 +59,17 @@ def figures(reading: Reading) -> list[tuple[str, str]]:
 
         makers["Contour of the two most important"] = contour
     makers["Slices"] = lambda: visualization.plot_slice(study, target_name="best score")
-    found = []
+    plots = []
     for title, make in makers.items():
         try:
             figure = make()
         except (ValueError, RuntimeError) as error:  # such as importances where all scores are equal
-            found.append((title, f"({' '.join(str(error).split())})"))
+            plots.append((title, f"({' '.join(str(error).split())})"))
         else:
-            # Without the template, which is as large as the rest, and a fixed size.
+            # Without the template, which is as large as the rest, and without a fixed size.
             figure.update_layout(template="none", width=None, height=None, autosize=True, title=None)
-            found.append((title, json.dumps(json.loads(figure.to_json())).replace("<", "\\u003c")))
-    return found
+            plots.append((title, json.dumps(json.loads(figure.to_json())).replace("<", "\\u003c")))
+    return plots
 
 
 def _study(reading: Reading) -> tuple[Any, list[str]]:
@@ -80,7 +80,7 @@ def _study(reading: Reading) -> tuple[Any, list[str]]:
     except ImportError:
         raise ConfigError(MISSING) from None
     optuna.logging.set_verbosity(optuna.logging.ERROR)
-    assert reading.space is not None  # as `can_plot` says
+    assert reading.space is not None  # see `can_plot`
     written = reading.space.parameters
     parameters = {current_key(key): parse_operator(key, value) for key, value in written.items()}
     distributions = {key: distribution(key, op) for key, op in parameters.items()}
@@ -96,17 +96,17 @@ def _study(reading: Reading) -> tuple[Any, list[str]]:
 
 
 def _params(trial: Trial, parameters: Mapping[str, Operator]) -> dict[str, Any] | None:
-    """A trial's values as Optuna knows them; None if it has others than the space."""
-    found: dict[str, Any] = {}
+    """A trial's values in Optuna's form; None if the space does not allow one of them."""
+    params: dict[str, Any] = {}
     for key, op in parameters.items():
         if isinstance(op, Listed):
             label = trial.changed.get(key)
             if label not in [level.label for level in op.levels]:
                 return None
-            found[key] = label
+            params[key] = label
         elif isinstance(op, Range):
             value = trial.values.get(key)
             if not isinstance(value, int | float) or not op.low <= value <= op.high:
                 return None
-            found[key] = value
-    return found
+            params[key] = value
+    return params

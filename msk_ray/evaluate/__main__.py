@@ -34,10 +34,10 @@ DESCRIPTION = """\
 Evaluate a policy: without noise, from fixed initial states, under the environment's default reward weights.
 
 Prints score, speed, falls, episode length and every reward term with its spread over episodes, and stores them in the
-trial's eval.json (those of a policy of policies/ are only printed). For an experiment it evaluates the best policy of
-each trial, ranks them, and writes the ranking into the experiment's eval.json. Without options the score is the one by
-which trials are ranked (eval/score), to the last digit on the same device. For policies/, or another folder that export
---zoo wrote, it evaluates each policy as recorded there and prints the table of its README."""
+trial's eval.json (for the policies in policies/ it only prints). For an experiment it evaluates the best policy of each
+trial, ranks the trials, and writes the ranking to the experiment's eval.json. Without options it repeats the evaluation
+that gave eval/score, by which trials are ranked: on the same device, every digit is the same. For policies/, or another
+folder that export --zoo wrote, it repeats the recorded evaluation of each policy and prints the table of its README."""
 
 EXAMPLES = """\
   python -m msk_ray.evaluate runs/demo                                   # every trial's best policy, ranked
@@ -50,7 +50,7 @@ EXAMPLES = """\
   python -m msk_ray.evaluate runs/train/myosuite_walk_seed0 --in myosuite   # in MyoSuite's own environment
   python -m msk_ray.evaluate policies/                                   # do the trained policies score as recorded?
 
-exit codes: 0 done, 1 a policy could not be evaluated, or one of a zoo does not score what is recorded, 2 refused."""
+exit codes: 0 done, 1 a policy could not be evaluated, or a zoo's score does not agree with the record, 2 refused."""
 
 
 def parser() -> Parser:
@@ -65,29 +65,29 @@ def parser() -> Parser:
     p.add_argument(
         "--physics",
         metavar="LIST",
-        help="comma-separated: reference (the physics of scores), own (that of training), or named ones of the "
-        "environment (default: reference)",
+        help="comma-separated: reference (used for scores), own (used in training), or names from the environment "
+        "(default: reference)",
     )
     p.add_argument("--vary", metavar="FIELD=LIST", help=HELP)
     p.add_argument(
         "--with",
         dest="conditions",
         metavar="LIST",
-        help="comma-separated harder circumstances, to evaluate in addition to the usual ones: for legs push, weak, "
-        "and on myoleg26 uphill, downhill, rough",
+        help="comma-separated harder conditions, evaluated in addition to the usual one: push and weak for legs, and "
+        "uphill, downhill and rough on myoleg26",
     )
     p.add_argument(
         "--in",
         dest="elsewhere",
         metavar="NAME",
-        help="evaluate in the unmodified environment of another package, in its own Python: "
+        help="evaluate in another package's unmodified environment, which runs in its own Python: "
         + "; ".join(foreign_scoring(name).summary for name in SCORINGS.known()),
     )
     p.add_argument(
         "--python",
         type=Path,
         metavar="FILE",
-        help="the Python that has that package, for --in (default: "
+        help="with --in: the Python that has the package (default: "
         + ", ".join(f"{foreign_scoring(name).python}" for name in SCORINGS.known())
         + ")",
     )
@@ -112,7 +112,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     seeds = parse_seeds(args.seeds) if args.seeds is not None else None
     names = [name.strip() for name in (args.physics or "reference").split(",")]
     varied = [None, *(parse_vary(args.vary) if args.vary is not None else [])]
-    python = _python_apart(args)
+    python = _other_python(args)
     if args.vary is not None and args.conditions is not None:
         raise ConfigError("--with: it is for the model's own values; leave --vary out")
     if target.kind is Kind.ZOO:
@@ -168,8 +168,8 @@ def _what(target: Target) -> str:
     return f"the best policy of each of the {len(Experiment(target.path).trials())} trials of {target.path}"
 
 
-def _python_apart(args: argparse.Namespace) -> Path | None:
-    """The Python in which policies are evaluated; None: this one.
+def _other_python(args: argparse.Namespace) -> Path | None:
+    """The Python of the environment that `--in` names; None without `--in`.
 
     Raises:
         ConfigError: there is none, or an option does not apply there.
@@ -186,7 +186,7 @@ def _python_apart(args: argparse.Namespace) -> Path | None:
 
 
 def _evaluate_one(target: Target, scorer: Scorer, requests: "Sequence[Request]", values: int) -> int:
-    """Evaluate one policy; every `values` requests are of one physics, with different values of a parameter."""
+    """Evaluate one policy; each `values` successive requests have one physics and different values of a parameter."""
     from msk_ray.training import load_policy
 
     path = best_checkpoint(target)
@@ -242,8 +242,8 @@ def evaluate_experiment(experiment: Experiment, scorer: Scorer, requests: "Seque
     """Evaluate the best policy of each trial, store the results in its folder, and rank the trials of each
     environment.
 
-    A trial whose policy cannot be evaluated is listed and does not stop the others. A trial that has only its untrained
-    policy is listed too, without a rank.
+    A trial whose policy cannot be evaluated, or that has only its untrained policy, is listed without a rank and does
+    not stop the others.
 
     Returns:
         The exit code: 1 if a policy could not be evaluated.

@@ -1,6 +1,6 @@
 """`evaluate --in NAME`: scoring in another package's environment, which has an interpreter of its own.
 
-A package declares one in the entry-point group `msk_ray.scoring`. Read before torch is loaded.
+A package declares one in the entry-point group `msk_ray.scoring`. Imports no torch: the command line reads it.
 """
 
 from collections.abc import Sequence
@@ -30,12 +30,12 @@ class Scorer(Protocol):
 
 
 class ForeignScoring(Protocol):
-    """What an entry point of the group `msk_ray.scoring` names."""
+    """An entry point in the group `msk_ray.scoring` names an object with these members."""
 
     summary: str
-    """Which policies it evaluates in what, for `--help`."""
+    """For `--help`: which policies it evaluates, and in which environment."""
     python: Path
-    """Where its interpreter is looked for unless `--python` names one."""
+    """Path of its interpreter, unless `--python` names another."""
     install: str
     """How a user installs it."""
 
@@ -43,10 +43,10 @@ class ForeignScoring(Protocol):
         """The scorer that runs in this interpreter."""
 
     def requests(self, worlds: int | None, seeds: tuple[int, ...] | None, steps: int | None) -> "Sequence[Request]":
-        """What to evaluate with these numbers of episodes, seeds and steps; None: as usual there.
+        """Requests for these numbers of worlds, seeds and steps; None: as is usual there.
 
         Raises:
-            ConfigError: a number is not possible there.
+            ConfigError: it does not support one of the numbers.
         """
 
 
@@ -61,7 +61,7 @@ def foreign_scoring(name: str) -> ForeignScoring:
 
 
 def find_python(scoring: ForeignScoring, path: Path | None) -> Path:
-    """The interpreter at `path`, or where the scoring looks for its own.
+    """The interpreter at `path`, or the scoring's own.
 
     Raises:
         ConfigError: there is no such file.

@@ -27,7 +27,7 @@ _PACKAGES = ("msk-ray", "torch", "warp-lang", "mujoco", "mujoco-warp")
 
 @dataclass(frozen=True)
 class Request:
-    """How to evaluate. None stands for the setting of the trial's own evaluation."""
+    """How to evaluate. None: as in the trial's own evaluation."""
 
     physics: str = REFERENCE
     """`reference`, `own` (what the trial trains on), or a named physics of the environment."""
@@ -35,13 +35,13 @@ class Request:
     seeds: tuple[int, ...] | None = None
     steps: int | None = None
     varied: RandomizeConfig | None = None
-    """Parameters of the model that are other than its own."""
+    """Parameters of the model to change."""
     condition: str | None = None
-    """Harder circumstances, one of the environment's `conditions`."""
+    """One of the environment's `conditions`, which make the task harder."""
 
 
 def under_condition(config: Config, name: str) -> tuple[Config, RandomizeConfig | None]:
-    """A config under one of its environment's conditions, and parameters of the model that belong to it.
+    """A config changed to one of its environment's conditions, and the parameters of the model that it changes.
 
     Raises:
         ConfigError: the environment has no such condition.
@@ -57,7 +57,7 @@ def under_condition(config: Config, name: str) -> tuple[Config, RandomizeConfig 
 
 
 def named_physics(config: Config, name: str) -> tuple[str, PhysicsConfig]:
-    """The physics that a name stands for in a trial, and the name to show.
+    """The name to show of a trial's physics, and the physics.
 
     Raises:
         ConfigError: the environment has no physics of that name.
@@ -80,13 +80,13 @@ _WORLDS = ("--worlds", "evaluation.nworld")
 
 
 class Bench:
-    """Evaluates policies on one device; trials of equal environment, physics and size share one simulation."""
+    """Evaluates policies on one device; trials with the same environment, physics and size share one simulation."""
 
     def __init__(self, device: str, tell: bool = False) -> None:
         """
         Args:
             device: "cpu" or "cuda:N".
-            tell: whether to print how far it is while it works.
+            tell: whether to print progress.
         """
         self._device = device
         self._tell = tell
@@ -111,8 +111,8 @@ class Bench:
         return self._evaluators[key], shown if request.varied is None else f"{shown}, {request.varied}"
 
     def check(self, config: Config, request: Request) -> None:
-        """Raise ConfigError if a trial does not have the physics of a request, or its model not what the request
-        varies. Runs nothing."""
+        """Raise ConfigError if a trial's environment does not have the requested physics, or its model not the
+        parameter to change. Runs nothing."""
         _, physics = named_physics(config, request.physics)
         if request.varied is None:
             return
@@ -123,7 +123,7 @@ class Bench:
             raise ConfigError(f"--vary {str(error).removeprefix('physics.randomize.')}") from None
 
     def pace(self, total: int, unit: str = "env steps at most") -> Pace | None:
-        """What says how far it is with so many of a unit; None if nothing is to be printed."""
+        """Prints progress towards a total; None if nothing should be printed."""
         return Pace(unit, total) if self._tell else None
 
     def evaluate(self, policy: SavedPolicy, request: Request) -> dict[str, Any]:
@@ -155,12 +155,14 @@ class Bench:
             and request.steps in (None, own.steps or policy.config.env.episode_length)
             and named_physics(policy.config, request.physics)[1] == reference
         )
-        made = Made(physics, canonical, evaluator.env.nworld, seeds, evaluator.steps, device_name(self._device))
-        return entry_of(policy, made, runs, evaluator.env.reward_names)
+        setup = EvaluationSetup(
+            physics, canonical, evaluator.env.nworld, seeds, evaluator.steps, device_name(self._device)
+        )
+        return entry_of(policy, setup, runs, evaluator.env.reward_names)
 
 
-class Made(NamedTuple):
-    """How an evaluation was made, by the names of `eval.json`."""
+class EvaluationSetup(NamedTuple):
+    """How an evaluation was done; the fields are named as in `eval.json`."""
 
     physics: str
     canonical: bool
@@ -171,9 +173,11 @@ class Made(NamedTuple):
     device: str
 
 
-def entry_of(policy: SavedPolicy, made: Made, runs: Sequence[Episodes], reward_names: Sequence[str]) -> dict[str, Any]:
+def entry_of(
+    policy: SavedPolicy, setup: EvaluationSetup, runs: Sequence[Episodes], reward_names: Sequence[str]
+) -> dict[str, Any]:
     """One entry of `eval.json`: what was evaluated, how, and the results of one run for each seed."""
-    how = made._asdict()
+    how = setup._asdict()
     device = how.pop("device")
     return {
         "checkpoint": policy.path.name,
@@ -181,10 +185,10 @@ def entry_of(policy: SavedPolicy, made: Made, runs: Sequence[Episodes], reward_n
         "epoch": policy.epoch,
         "env_steps": policy.env_steps,
         **how,
-        "seeds": list(made.seeds),
+        "seeds": list(setup.seeds),
         **figures(runs, reward_names),
         "scores": [round(float(s), 6) for run in runs for s in run.score],
-        "score_by_seed": {str(seed): float(run.score.mean()) for seed, run in zip(made.seeds, runs, strict=True)},
+        "score_by_seed": {str(seed): float(run.score.mean()) for seed, run in zip(setup.seeds, runs, strict=True)},
         "device": device,
         "packages": installed_versions(_PACKAGES),
         "python": platform.python_version(),

@@ -1,4 +1,4 @@
-"""The evaluations that a trial's folder keeps in its `eval.json`, read and written without simulating anything."""
+"""A trial's `eval.json`: its evaluations, read and written without torch."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -65,7 +65,7 @@ def _check_evaluation(entry: dict[str, Any]) -> None:
 
 
 def store_evaluation(path: Path, entry: Mapping[str, Any]) -> None:
-    """Put an entry into an `eval.json`, replacing the one for the same checkpoint, physics and size.
+    """Add an entry to an `eval.json`; it replaces the one with the same checkpoint, physics, worlds, seeds and steps.
 
     Raises:
         StorageError: the file exists and holds something else, or cannot be written.

@@ -1,4 +1,4 @@
-"""What a user may name: a checkpoint, a trial's folder, or an experiment."""
+"""What commands take as a target: a checkpoint, a trial's folder, an experiment, or a folder of policies."""
 
 import difflib
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True)
 class Target:
-    """Something on disk to look at."""
+    """What a user named."""
 
     kind: Kind
     path: Path
@@ -78,7 +78,7 @@ def best_checkpoint(target: Target) -> Path:
     """The checkpoint that a target stands for: the target itself, a trial's best, or the best trial's best.
 
     Raises:
-        CheckpointError: there is none yet, or there is one for each of several environments.
+        CheckpointError: there is none yet, or there are several, one for each environment.
     """
     if target.kind is Kind.CHECKPOINT:
         return target.path

@@ -1,4 +1,4 @@
-"""`evaluate --vary`: the same policy under several values of a parameter of the model."""
+"""`evaluate --vary`: one policy with several values of a parameter of the model."""
 
 import math
 from collections.abc import Sequence
@@ -11,13 +11,13 @@ from msk_ray.errors import ConfigError, brief
 from msk_ray.text_table import text_table
 
 HELP = (
-    "evaluate with the model's own value of a field, and with these: geom_friction=0.4,0.8,1.2, or multiples of its "
-    "own: body_mass=0.8x,1.2x"
+    "evaluate with the model unchanged, and with each of these values of one field: geom_friction=0.4,0.8,1.2, or "
+    "multiples of the model's values: body_mass=0.8x,1.2x"
 )
 
 
 def parse_vary(text: str) -> list[RandomizeConfig]:
-    """The values that `--vary` asks for, one section each.
+    """One section for each value of `--vary`.
 
     Raises:
         ConfigError: there is no such field, or a value is no positive number.
@@ -46,15 +46,15 @@ def _at(name: str, value: str) -> RandomizeConfig:
 
 
 def share_of_own(own: float, score: float) -> str:
-    """A score as a share of that under the model's own value."""
+    """A score as a share of the score with the unchanged model."""
     return f"{score / own:.0%}" if own > 0.0 else "-"
 
 
 def vary_text(entries: Sequence[dict[str, Any]]) -> str:
-    """Evaluations under the model's own value and others, for a terminal.
+    """Evaluations with the unchanged model and with other values, for a terminal.
 
     Args:
-        entries: of one policy; the first is under the model's own value.
+        entries: of one policy; the first is with the unchanged model.
     """
     own = entries[0]["score"]["mean"]
     rows = [

@@ -1,5 +1,5 @@
-"""A folder of policies to take along: beside each NAME.pt stands a NAME.yaml with what it scores, over which seeds, and
-how it was trained."""
+"""A zoo is a folder of trained policies: beside each NAME.pt, a NAME.yaml records its score, the seeds of that score,
+and how it was trained."""
 
 import math
 from collections.abc import Mapping
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 MAX_BYTES = 1_000_000
 """Largest policy [B]."""
 BEST_EVALUATION = "the best evaluation"
-"""How the checkpoint best.pt of a trial is chosen."""
+"""How a trial's best.pt is chosen."""
 BEGIN, END = "<!-- Begin of what `msk-ray export --zoo` writes. -->", "<!-- End. -->"
 _AGREEMENT = 3.0
-"""Standard errors by which scores on different machines may differ: episodes are chaotic, and rounding differs."""
+"""Scores on different machines may differ by this many standard errors: rounding differs, and episodes are chaotic."""
 
 
 class Score(Section):
@@ -37,7 +37,7 @@ class Score(Section):
     worlds: Count
     """Episodes for each seed."""
     steps: Count
-    """Most env steps in an episode."""
+    """Maximum env steps of an episode."""
     length: NonNegative
     """Mean env steps of an episode."""
     physics: str
@@ -75,28 +75,28 @@ class Training(Section):
     seconds: NonNegative | None = None
     """Training time up to the policy [s]; null: not recorded."""
     sha256: str
-    """Of the payload of the checkpoint that it was taken from."""
+    """Hash of the trial's checkpoint that it was taken from."""
 
 
 class Entry(Section):
-    """What NAME.yaml says of NAME.pt."""
+    """The content of NAME.yaml."""
 
     format: Literal[1] = 1
     env: str
     sha256: str
-    """Of the payload of NAME.pt."""
+    """Hash of the content of NAME.pt."""
     weights: Literal["float32", "float16"] = "float32"
-    """How the weights are stored; they compute in float32, and the score is that of the stored ones."""
+    """How the weights are stored. They compute in float32; the score is of the stored weights."""
     score: Score
     trained: Training
     packages: dict[str, str]
-    """Versions with which it was evaluated; those of msk_ray itself are commits."""
+    """Versions with which it was evaluated, without msk_ray, whose commit is in `trained`."""
     config: dict[str, Any]
     """Every setting of the trial."""
 
 
 def read_entry(policy: Path) -> Entry:
-    """What is recorded of a policy.
+    """What is recorded about a policy.
 
     Raises:
         StorageError: the file beside it is about another policy, or holds something else.
@@ -165,7 +165,7 @@ def zoo_table(entries: Mapping[str, Entry]) -> str:
 
 
 def zoo_text(entries: Mapping[str, Entry]) -> str:
-    """What a zoo's README says of its policies: the table, and the command of each."""
+    """The part of a zoo's README about its policies: a table, and the command of each."""
     commands = [
         f"- `{name}`: `{printable(entry.trained.command)}`; {printable(entry.trained.chosen)} (epoch "
         f"{entry.trained.epoch} of {entry.trained.epochs})"
@@ -177,15 +177,15 @@ def zoo_text(entries: Mapping[str, Entry]) -> str:
 
 
 def evaluate_zoo(folder: Path, bench: "Bench") -> int:
-    """Evaluate every policy of a zoo as its entry says, and print the table with the scores found here.
+    """Evaluate every policy of a zoo as its entry says, and print the table with these scores.
 
     Returns:
-        The exit code: 1 if a policy could not be evaluated, or its score is another than the recorded one.
+        The exit code: 1 if a policy could not be evaluated, or its score does not agree with the recorded one.
     """
     from msk_ray.evaluate.measure import Request
     from msk_ray.training import load_policy
 
-    found: dict[str, Entry] = {}
+    evaluated: dict[str, Entry] = {}
     code = 0
     for name, entry in read_zoo(folder).items():
         recorded = entry.score
@@ -197,13 +197,13 @@ def evaluate_zoo(folder: Path, bench: "Bench") -> int:
             print(f"{name}: {printable(str(error))}", flush=True)
             code = 1
             continue
-        found[name] = entry.model_copy(update={"score": score})
+        evaluated[name] = entry.model_copy(update={"score": score})
         same = score.model_dump(exclude={"device"}) == recorded.model_dump(exclude={"device"})
         verdict = "as recorded" if same else f"recorded {recorded.mean:.6g} on {printable(recorded.device)}"
         if not recorded.agrees(score):
             verdict += f", which is more than {_AGREEMENT:g} standard errors away"
             code = 1
         print(f"{name}: {score.mean:.6g} on {printable(score.device)}; {verdict}", flush=True)
-    if found:
-        print(f"\n{zoo_table(found)}")
+    if evaluated:
+        print(f"\n{zoo_table(evaluated)}")
     return code

@@ -1,1 +1,1 @@
-"""Policies as files that other programs run: ONNX or TorchScript, with a description and the model beside them."""
+"""Policies as files for other programs: ONNX or TorchScript, with a description and the model."""

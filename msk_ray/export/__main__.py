@@ -1,4 +1,4 @@
-"""`python -m msk_ray.export`: take a policy along."""
+"""`python -m msk_ray.export`: policies for other programs, and for other people."""
 
 import argparse
 import sys
@@ -16,16 +16,16 @@ DESCRIPTION = """\
 Export a policy for programs that do not have msk_ray: as ONNX, as TorchScript, or both.
 
 The network takes raw observations (batch, O), float32, and returns `action` (batch, A) in [-1, 1] and `ctrl` (batch,
-nu), the controls of the model; normalisation and squashing are inside. Where controls depend on the action before, the
-network also takes `previous_action` (batch, A); where they depend on the state, `ctrl` is left out. Each file is
-compared with the checkpoint's policy on 1000 observations, and not written if one of them differs by more than 1e-5.
+nu), the controls of the model; normalisation and squashing are inside. If controls depend on the previous action, the
+network also takes `previous_action` (batch, A); if they depend on the state, it has no `ctrl`. Each file is compared
+with the checkpoint's policy on 1000 observations; if any output differs by more than 1e-5, nothing is written.
 
-Beside p.onnx stand p.json (order and units of observation and action, control period, joints, origin) and p.mjb, the
-model, which MuJoCo of the same version loads (mujoco.MjModel.from_binary_path).
+With p.onnx come p.json (order and units of observation and action, control period, joints, origin) and p.mjb, the
+model, for the same version of MuJoCo (mujoco.MjModel.from_binary_path).
 
---zoo keeps the policy itself, for evaluate, visualize and export: NAME.pt without the means to train it, and NAME.yaml
-with its settings, its score over --seeds, the commit, the command and the GPU. The table in the folder's README.md is
-renewed."""
+--zoo keeps the policy for evaluate, visualize and export: NAME.pt, which cannot be trained further, and NAME.yaml with
+its settings, its score over --seeds, the commit, the command and the GPU. It updates the table in the folder's
+README.md."""
 
 EXAMPLES = """\
   python -m msk_ray.export runs/demo --onnx policy.onnx                     # the best policy of an experiment
@@ -40,14 +40,16 @@ def parser() -> Parser:
     """The command line."""
     p = Parser("python -m msk_ray.export", DESCRIPTION, EXAMPLES)
     p.add_argument(
-        "target", metavar="CHECKPOINT|TRIAL|EXPERIMENT", help="a .pt file, a folder, or a name; its best policy"
+        "target",
+        metavar="CHECKPOINT|TRIAL|EXPERIMENT",
+        help="a .pt file, a folder, or a name; its best policy is exported",
     )
     p.add_argument("--onnx", type=Path, metavar="FILE", help="an .onnx file; needs msk-ray[export]")
     p.add_argument("--torchscript", type=Path, metavar="FILE", help="a .pt file")
     p.add_argument(
         "--physics",
         metavar="NAME",
-        help="physics of the model: reference (that of scores), own (that of training), or a named one (default: "
+        help="physics of the model: reference (used for scores), own (used in training), or the name of one (default: "
         "reference)",
     )
     p.add_argument(
@@ -55,17 +57,15 @@ def parser() -> Parser:
     )
     zoo = p.add_argument_group("a policy for others to use")
     zoo.add_argument("--zoo", type=Path, metavar="FOLDER/NAME", help="write FOLDER/NAME.pt and FOLDER/NAME.yaml")
-    zoo.add_argument(
-        "--seeds", metavar="LIST", help="seeds of the initial states that it is scored from (default: 0-4)"
-    )
-    zoo.add_argument("--device", help="for its score: cpu or cuda:N (default: the first GPU, or the CPU)")
-    zoo.add_argument("--command", metavar="TEXT", help="how it was trained, if its trial does not say")
-    zoo.add_argument("--commit", metavar="HASH", help="with which commit")
-    zoo.add_argument("--machine", metavar="TEXT", help="on what, such as '1 × NVIDIA H200'")
+    zoo.add_argument("--seeds", metavar="LIST", help="seeds of the initial states for its score (default: 0-4)")
+    zoo.add_argument("--device", help="cpu or cuda:N, to compute its score (default: the first GPU, or the CPU)")
+    zoo.add_argument("--command", metavar="TEXT", help="the command that trained it, if its trial does not record one")
+    zoo.add_argument("--commit", metavar="HASH", help="the commit it was trained with")
+    zoo.add_argument("--machine", metavar="TEXT", help="the machine it was trained on, such as '1 × NVIDIA H200'")
     zoo.add_argument(
         "--chosen",
         metavar="TEXT",
-        help="how the checkpoint was chosen, if it is not a trial's best.pt, such as 'the newest checkpoint'",
+        help="how the checkpoint was chosen, if it is not a trial's best.pt: 'the newest checkpoint'",
     )
     return p
 

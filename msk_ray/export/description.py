@@ -1,4 +1,4 @@
-"""What another program must know to run an exported policy: order, units, periods, model, origin."""
+"""The .json beside an exported policy: what another program must know to run it."""
 
 import inspect
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ FORMAT = 1
 def describe(
     saved: SavedPolicy, policy: PolicyToControl, env: Env[Any], physics: str, files: Mapping[str, str]
 ) -> dict[str, Any]:
-    """Plain data for the file beside an exported policy.
+    """The description as plain data.
 
     Args:
         saved: the checkpoint's policy.
@@ -83,7 +83,7 @@ def describe(
 
 
 def _own_docstring(of: type) -> str | None:
-    """A class's docstring; None if it only inherits one, which describes another class."""
+    """A class's own docstring; None if it has none. An inherited one would describe another class."""
     return None if of.__doc__ is None else inspect.cleandoc(of.__doc__)
 
 

@@ -20,8 +20,8 @@ from msk_ray.errors import ConfigError, ExportError
 from msk_ray.step import StepState
 
 TOLERANCE = 1e-5
-"""Largest difference from the checkpoint's policy that is accepted, in actions and in controls divided by their
-largest size if that is above 1."""
+"""Largest accepted difference from the checkpoint's policy, in actions and in controls; controls are divided by their
+largest magnitude if that is above 1."""
 CHECKED = 1000
 """Observations on which an exported policy is compared with the checkpoint's."""
 WORLDS = 8
@@ -34,13 +34,13 @@ Runner = Callable[..., list[Tensor]]
 
 
 class PolicyToControl(nn.Module):
-    """Raw observations (N, O) to actions (N, A) in [-1, 1] and, where they do not depend on the state, controls (N, U).
+    """Raw observations (N, O) to actions (N, A) in [-1, 1] and, unless they depend on the state, controls (N, U).
 
-    Where controls depend on the action before, it is a second input (N, A), 0 in the first step of an episode. The
+    If controls depend on the previous action, that is a second input (N, A), 0 in the first step of an episode. The
     normalisation of the observation and the squashing of the action are inside.
 
     Raises:
-        ExportError: the environment's `control` takes only as many actions as the environment has worlds.
+        ExportError: the environment's `control` only works for one action per world.
     """
 
     def __init__(self, network: nn.Module, env: Env[Any]) -> None:
@@ -56,12 +56,12 @@ class PolicyToControl(nn.Module):
 
     @property
     def inputs(self) -> list[str]:
-        """Names of what it takes."""
+        """Names of its inputs."""
         return ["obs", "previous_action"] if self.takes_previous else ["obs"]
 
     @property
     def outputs(self) -> list[str]:
-        """Names of what it returns."""
+        """Names of its outputs."""
         return ["action", "ctrl"] if self.gives_control else ["action"]
 
     def forward(self, obs: Tensor, previous_action: Tensor | None = None) -> tuple[Tensor, ...]:
@@ -69,7 +69,7 @@ class PolicyToControl(nn.Module):
         return (action, self._control(action, previous_action)) if self.gives_control else (action,)
 
     def examples(self, obs: Tensor, seed: int) -> tuple[Tensor, ...]:
-        """Its inputs for some observations, with actions before them drawn with this seed."""
+        """Its inputs for some observations, with random previous actions."""
         if not self.takes_previous:
             return (obs,)
         generator = torch.Generator().manual_seed(seed)
@@ -82,18 +82,18 @@ class PolicyToControl(nn.Module):
             return self._env.control(action)
 
     def _try_control(self) -> None:
-        """Control one action, and more of them than there are worlds."""
+        """Try `control` on one action, and on more actions than there are worlds."""
         for count in (1, self._env.nworld + 1):
             actions = torch.zeros((count, self._env.action_size), device=self._env.device)
             try:
                 control = self._control(actions, actions if self.takes_previous else None)
             except Exception as error:
                 text = (str(error).splitlines() or [""])[0]
-                raise self._refused(count, f"{type(error).__name__}: {text}") from error
+                raise self._control_error(count, f"{type(error).__name__}: {text}") from error
             if control.shape != (count, self._env.model.nu):
-                raise self._refused(count, f"it returns shape {tuple(control.shape)}")
+                raise self._control_error(count, f"it returns shape {tuple(control.shape)}")
 
-    def _refused(self, count: int, why: str) -> ExportError:
+    def _control_error(self, count: int, why: str) -> ExportError:
         return ExportError(
             f"not written: {type(self._env).__qualname__}.control fails for {count} rows of actions ({why}): compute "
             "it from `action` and `self.state.action` alone, whatever their number of rows"
@@ -102,7 +102,7 @@ class PolicyToControl(nn.Module):
 
 @contextmanager
 def _state(env: Env[Any], state: EnvState) -> Iterator[None]:
-    """With another state of the environment's worlds."""
+    """The environment in another state, inside the block."""
     before, env.state = env.state, state
     try:
         yield
@@ -112,7 +112,7 @@ def _state(env: Env[Any], state: EnvState) -> Iterator[None]:
 
 @torch.no_grad()
 def _depends_on_state(env: Env[Any]) -> bool:
-    """Whether one action means other controls in other states, as with an assisting force or a feedback law."""
+    """Whether the same action gives different controls in different states, as with a feedback law."""
     generator = torch.Generator().manual_seed(0)
 
     def varied(part: Tensor) -> Tensor:
@@ -127,7 +127,7 @@ def _depends_on_state(env: Env[Any]) -> bool:
 
 @torch.no_grad()
 def _depends_on_previous(env: Env[Any]) -> bool:
-    """Whether one action means other controls after other actions, as with a limited rate."""
+    """Whether the same action gives different controls after different actions, as with a limited rate."""
     spread = torch.linspace(-0.9, 0.9, env.nworld, device=env.device)
     return _controls_differ(env, env.state._replace(action=spread[:, None].repeat(1, env.action_size)))
 
@@ -142,7 +142,7 @@ def _controls_differ(env: Env[Any], state: EnvState) -> bool:
 
 @torch.no_grad()
 def observations(env: Env[Any], seed: int) -> Tensor:
-    """`CHECKED` observations (N, O): those of initial states, with noise so that no two are equal."""
+    """`CHECKED` observations (N, O) of initial states, with noise so that no two are equal."""
     generator = torch.Generator().manual_seed(seed)
     rounds = -(-CHECKED // env.nworld)
     drawn = []
@@ -204,7 +204,7 @@ def to_onnx(policy: PolicyToControl, *inputs: Tensor) -> tuple[bytes, Runner]:
 
 @torch.no_grad()
 def largest_difference(policy: PolicyToControl, run: Runner, *inputs: Tensor) -> float:
-    """Largest difference between what an exported policy computes and the checkpoint's, one by one and in a batch.
+    """Largest difference between the outputs of an exported policy and the checkpoint's, one by one and in a batch.
 
     Raises:
         ExportError: it is above `TOLERANCE`, or not a number.
@@ -212,10 +212,12 @@ def largest_difference(policy: PolicyToControl, run: Runner, *inputs: Tensor) ->
     wanted = policy(*inputs)
     rows = zip(*(part[:WORLDS].split(1) for part in inputs), strict=True)
     single = [torch.cat(parts) for parts in zip(*(run(*row) for row in rows), strict=True)]
-    found = [(name, ours, theirs) for name, ours, theirs in zip(policy.outputs, wanted, run(*inputs), strict=True)]
-    found += [(name, ours[:WORLDS], theirs) for name, ours, theirs in zip(policy.outputs, wanted, single, strict=True)]
+    outputs = [(name, ours, theirs) for name, ours, theirs in zip(policy.outputs, wanted, run(*inputs), strict=True)]
+    outputs += [
+        (name, ours[:WORLDS], theirs) for name, ours, theirs in zip(policy.outputs, wanted, single, strict=True)
+    ]
     worst = 0.0
-    for name, ours, theirs in found:
+    for name, ours, theirs in outputs:
         difference = float((ours - theirs).abs().max() / ours.abs().max().clamp_min(1.0))
         if not difference <= TOLERANCE:
             raise ExportError(
@@ -228,8 +230,7 @@ def largest_difference(policy: PolicyToControl, run: Runner, *inputs: Tensor) ->
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Without torch's remarks on its own parts: that TorchScript is no longer developed, and on packages it can do
-    without."""
+    """Without torch's warnings that TorchScript is no longer developed, and about optional packages."""
     exporter = logging.getLogger("torch.onnx")
     level = exporter.level
     exporter.setLevel(logging.ERROR)

@@ -26,11 +26,11 @@ _WRITERS = {"onnx": to_onnx, "torchscript": to_torchscript}
 
 
 def export(checkpoint: Path, paths: Mapping[str, Path], physics: str) -> Iterator[str]:
-    """Write the policy of a checkpoint to each of `paths`, by kind (`onnx`, `torchscript`), with a .json and an .mjb of
-    the same name beside it. Yields a line on each file.
+    """Write the policy of a checkpoint to each of `paths`, by kind (`onnx`, `torchscript`), and a .json and an .mjb of
+    the same name. Yields a line about each file.
 
     Args:
-        physics: of the model: `reference`, `own`, or a named one of the environment.
+        physics: of the model: `reference`, `own`, or the name of one of the environment's.
 
     Raises:
         ExportError: an exported policy differs from the checkpoint's, or cannot be made; nothing is written.
@@ -40,13 +40,13 @@ def export(checkpoint: Path, paths: Mapping[str, Path], physics: str) -> Iterato
     policy, env, shown = policy_to_control(saved, physics)
     seed = saved.config.evaluation.seed
     inputs = policy.examples(observations(env, seed), seed)
-    made = {}
+    checked = {}
     for kind in paths:
         payload, runner = _WRITERS[kind](policy, *inputs)
-        made[kind] = payload, largest_difference(policy, runner, *inputs)
+        checked[kind] = payload, largest_difference(policy, runner, *inputs)
     descriptions: dict[Path, dict[str, str]] = {}
     for kind, path in paths.items():
-        payload, difference = made[kind]
+        payload, difference = checked[kind]
         write_bytes(path, payload)
         yield f"{path}: {len(payload)} bytes, differs by at most {difference:.0e} on {CHECKED} observations"
         descriptions.setdefault(path.with_suffix(".json"), {})[kind] = path.name

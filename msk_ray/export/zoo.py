@@ -1,4 +1,4 @@
-"""Put a trained policy into a zoo: a folder of policies to take along (`evaluate.zoo`)."""
+"""Add a trained policy to a zoo (`evaluate.zoo`)."""
 
 import io
 import tempfile
@@ -34,7 +34,7 @@ README = "README.md"
 
 @dataclass(frozen=True)
 class Origin:
-    """How a policy was trained; None where its trial does not say."""
+    """How a policy was trained; None: as its trial records."""
 
     command: str | None = None
     commit: str | None = None
@@ -44,22 +44,22 @@ class Origin:
 
 
 def add_to_zoo(checkpoint: Path, target: Path, given: Origin, seeds: Sequence[int], device: str) -> Iterator[str]:
-    """Write the policy of a checkpoint as `target`.pt and what is known of it as `target`.yaml, and renew the table in
-    the folder's README.md, if there is one. Yields a line on each step.
+    """Write the policy of a checkpoint to `target`.pt and its record to `target`.yaml, and update the table in the
+    folder's README.md, if there is one. Yields a line about each step.
 
-    The policy is exported and compared with the checkpoint's, then evaluated from the initial states of `seeds`, as it
-    is stored. Nothing is written before that.
+    Before anything is written, the policy as it will be stored is exported, compared with that export, and evaluated
+    from the initial states of `seeds`.
 
     Args:
         checkpoint: of a finished or running trial.
         target: path of the entry without a suffix.
-        given: replaces what the trial says of its origin.
+        given: replaces what the trial records of its origin.
         seeds: of the initial states.
         device: for the evaluation.
 
     Raises:
-        ConfigError: the trial does not say how it was trained, or it is not known how its checkpoint was chosen; its
-            policy is untrained or too large, or its settings name files of this machine.
+        ConfigError: it is not recorded how the policy was trained or how its checkpoint was chosen; the policy is
+            untrained or too large; or the settings name files of this machine.
         ExportError: the exported policy differs from the stored one.
         CheckpointError, UnsupportedModelError, SimulationError, StorageError: as their messages say.
     """
@@ -96,7 +96,7 @@ def add_to_zoo(checkpoint: Path, target: Path, given: Origin, seeds: Sequence[in
     write_text(target.with_name(f"{target.name}.yaml"), dump_yaml(entry.model_dump()))
     score = entry.score
     yield f"{path}: {path.stat().st_size} bytes, score {score.mean:.5g} ± {score.std:.3g}, fell {score.fell:.0%}"
-    yield _renew(target.parent)
+    yield _update_table(target.parent)
 
 
 def _training(saved: SavedPolicy, given: Origin) -> Training:
@@ -105,7 +105,7 @@ def _training(saved: SavedPolicy, given: Origin) -> Training:
     recorded, damages = read_environment((folder.parent.parent if inner else folder) / ENVIRONMENT_FILE)
     if damages:
         raise StorageError(f"{damages[0]}; correct the file, or remove it and give --command, --commit and --machine")
-    command = given.command or (_typed(recorded["command"]) if "command" in recorded else None)
+    command = given.command or (_without_folders(recorded["command"]) if "command" in recorded else None)
     if command is not None and given.command is None and inner:
         trial = next((t for t in Experiment(folder.parent.parent).trials() if t.id == folder.name), None)
         command += f"  # trial {folder.name}" + (f": {trial.variant}, seed {trial.seed}" if trial is not None else "")
@@ -137,8 +137,8 @@ def _training(saved: SavedPolicy, given: Origin) -> Training:
     )
 
 
-def _typed(words: Sequence[str]) -> str:
-    """A recorded command line, without the folders of the machine it was typed on."""
+def _without_folders(words: Sequence[str]) -> str:
+    """A recorded command line, with file names in place of this machine's absolute paths."""
     return typed_command([words[0], *(Path(word).name if Path(word).is_absolute() else word for word in words[1:])])
 
 
@@ -151,7 +151,7 @@ def _machine(folder: Path, recorded: Mapping[str, Any], config: Config) -> str |
 
 
 def _portable(config: Config) -> tuple[Config, list[str]]:
-    """Settings without paths of this machine, and a line on each that was left out.
+    """Settings without paths of this machine, and a line about each path that was left out.
 
     Raises:
         ConfigError: without such a path, the settings would mean something else.
@@ -166,11 +166,11 @@ def _portable(config: Config) -> tuple[Config, list[str]]:
 
 
 def _payload(saved: SavedPolicy, state: Mapping[str, Any], config: Config) -> tuple[bytes, Any]:
-    """The policy alone, and how its weights are stored: as float16 if it is too large otherwise.
+    """The policy alone, and how its weights are stored: as float16 if float32 is too large.
 
     Raises:
-        ConfigError: it is too large even so.
-        CheckpointError: it does not say its sizes.
+        ConfigError: it is too large as float16 too.
+        CheckpointError: it does not record its sizes.
     """
     sizes = saved.sizes
     algorithm = algorithm_class(saved.config)
@@ -183,12 +183,12 @@ def _payload(saved: SavedPolicy, state: Mapping[str, Any], config: Config) -> tu
         torch.save({**facts, "algorithm": {"modules": modules}}, buffer)
         if len(buffer.getvalue()) <= room:
             return buffer.getvalue(), weights
-        modules = {name: {key: _halved(value) for key, value in part.items()} for name, part in modules.items()}
+        modules = {name: {key: _half_precision(value) for key, value in part.items()} for name, part in modules.items()}
     raise ConfigError(f"{saved.path}: its policy takes more than {MAX_BYTES} bytes; use a smaller actor.hidden")
 
 
-def _halved(value: Any) -> Any:
-    """A matrix of weights in half the bytes. Vectors, among them the statistics of observations, stay: they are small,
+def _half_precision(value: Any) -> Any:
+    """A matrix of weights as float16. Vectors stay as they are, such as the statistics of observations: they are small
     and need more digits."""
     return (
         value.half() if isinstance(value, torch.Tensor) and value.dtype == torch.float32 and value.dim() > 1 else value
@@ -207,8 +207,8 @@ def _parity(stored: SavedPolicy) -> float:
     return largest_difference(policy, to_torchscript(policy, *inputs)[1], *inputs)
 
 
-def _renew(folder: Path) -> str:
-    """Put the table of all entries into a zoo's README between its marks, if it has them."""
+def _update_table(folder: Path) -> str:
+    """Write the table of all entries between the marks in a zoo's README, if it has them."""
     path = folder / README
     text = zoo_text(read_zoo(folder))
     old = path.read_text(encoding="utf-8") if path.is_file() else ""

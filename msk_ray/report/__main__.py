@@ -20,8 +20,8 @@ Write one self-contained page about an experiment, or several side by side: lear
 confidence intervals, the effect of each parameter, which trial stopped when and why, gradient health, failures by
 outcome, the best policy with its evaluation and film strip, and the command that repeats the experiment.
 
-It only reads files, so it works while the sweep runs and after it has died, and says what is missing. Writes
-EXPERIMENT/report/index.html and every figure as PNG beside it."""
+It only reads files, so it also works while the sweep runs or after it has crashed, and says what is missing. Writes
+EXPERIMENT/report/index.html, with every figure as a PNG file beside it."""
 
 EXAMPLES = """\
   python -m msk_ray.report demo                            # runs/demo/report/index.html
@@ -37,18 +37,18 @@ def parser() -> Parser:
     p.add_argument(
         "--baseline",
         metavar="TEXT",
-        help="variant to compare with: (part of) its name (default: `baseline`, or the first)",
+        help="compare with the variant whose name contains this (default: `baseline`, or the first variant)",
     )
     p.add_argument(
         "--best",
         choices=("auto", "always", "never"),
         default="auto",
-        help="evaluate the best policy and draw its film strip; auto leaves that out while trials run",
+        help="whether to evaluate the best policy and draw its film strip; auto: only if no trial is running",
     )
     p.add_argument(
         "--out", type=Path, metavar="DIR", help="folder to write to (default: report/ in the first experiment)"
     )
-    p.add_argument("--device", help="for the best policy: cpu or cuda:N (default: the first GPU, or the CPU)")
+    p.add_argument("--device", help="cpu or cuda:N, to run the best policy (default: the first GPU, or the CPU)")
     p.add_argument(
         "--storage", type=Path, default=Path("runs"), metavar="DIR", help="folder of experiments (default: runs/)"
     )

@@ -21,7 +21,7 @@ FRAMES = 8
 _FRAME = (256, 192)
 _STAMP = "checkpoint"
 _LARGEST = 16 << 20
-"""Bytes of a strip."""
+"""Maximum size of a strip [B]."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Best:
     sha: str | None = None
     """Of the policy's checkpoint; None if there is none that can be read."""
     evaluations: tuple[Mapping[str, Any], ...] = ()
-    """Entries of its `eval.json` that belong to this checkpoint, the canonical one first."""
+    """Its evaluations in `eval.json`, the canonical one first."""
     strip: Path | None = None
     strip_text: str = ""
     narrow_strip: Path | None = None
@@ -47,36 +47,36 @@ def look_at_best(trial: TrialReading, folder: Path, prefix: str, make: bool, dev
     Args:
         folder: folder of the report's pictures.
         prefix: prefix of the strip's file name.
-        make: evaluate and draw what does not exist yet; otherwise only show what exists.
+        make: whether to evaluate and draw what is missing.
         device: device of the simulation; None: the first GPU, or the CPU.
     """
-    found = stored_best(trial, [folder / f"{prefix}{STRIP}.png"])
-    if found.sha is None:
-        return found
+    best = stored_best(trial, [folder / f"{prefix}{STRIP}.png"])
+    if best.sha is None:
+        return best
     path, strip = best_of_trial(trial.folder), folder / f"{prefix}{STRIP}.png"
     missing = []
     if make:
         try:
-            if not any(entry["canonical"] for entry in found.evaluations):
+            if not any(entry["canonical"] for entry in best.evaluations):
                 _evaluate(path, device)
         except (MskRayError, OSError) as error:
             missing.append(f"It could not be evaluated: {explain(error)}.")
         try:
-            if found.strip is None:
-                _draw(path, strip, found.sha, device)
+            if best.strip is None:
+                _draw(path, strip, best.sha, device)
         except (MskRayError, OSError) as error:
             missing.append(f"Its film strip could not be drawn: {explain(error)}.")
-        found = stored_best(trial, [strip])
-    elif found.strip is None:
+        best = stored_best(trial, [strip])
+    elif best.strip is None:
         missing.append("Its film strip has not been drawn yet: add --best always.")
-    return replace(found, missing=(*found.missing, *missing))
+    return replace(best, missing=(*best.missing, *missing))
 
 
 def stored_best(trial: TrialReading, strips: Sequence[Path]) -> Best:
-    """What is on disk about a trial's best policy.
+    """What is stored about a trial's best policy.
 
     Args:
-        strips: film strips, of which that of this policy is taken.
+        strips: film strips; the one that shows this policy is used.
     """
     missing = []
     try:
@@ -88,7 +88,7 @@ def stored_best(trial: TrialReading, strips: Sequence[Path]) -> Best:
         missing.append("No trained policy has a score yet: the following is about the untrained one.")
     entries: list[dict[str, Any]] = []
     try:
-        entries = _own(read_evaluations(trial.folder / EVAL_FILE), sha)
+        entries = _of_checkpoint(read_evaluations(trial.folder / EVAL_FILE), sha)
     except MskRayError as error:
         missing.append(f"Its evaluations cannot be read: {explain(error)}.")
     for strip in strips:
@@ -114,18 +114,18 @@ def strip_bytes(path: Path) -> bytes:
 
 
 def strip_text(path: Path, sha: str) -> str | None:
-    """Description of a strip; None if there is none of the checkpoint with this hash."""
+    """Description of a strip; None if it is missing or shows another checkpoint than the one with this hash."""
     if not path.is_file() or not narrow_strip(path).is_file():
         return None
     try:
         with Image.open(io.BytesIO(strip_bytes(path))) as image:
             facts = dict(image.info)
     except (OSError, ValueError, Image.DecompressionBombError):
-        return None  # incomplete, or none of ours: it is drawn again
+        return None  # incomplete, or not written by us: it is drawn again
     return str(facts.get("Description", "")) if facts.get(_STAMP) == sha else None
 
 
-def _own(entries: list[dict[str, Any]], sha: str) -> list[dict[str, Any]]:
+def _of_checkpoint(entries: list[dict[str, Any]], sha: str) -> list[dict[str, Any]]:
     return sorted((e for e in entries if e["sha256"] == sha), key=lambda entry: not entry["canonical"])
 
 

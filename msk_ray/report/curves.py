@@ -1,33 +1,36 @@
-"""Pictures over training: learning curves, gradient health, and which trial stopped when."""
+"""Charts over training: learning curves, gradient health, and which trial stopped when."""
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.ticker import ScalarFormatter
 
 from msk_ray.errors import ConfigError
 from msk_ray.experiment.layout import SPACE_FILE
 from msk_ray.experiment.outcomes import Outcome
 from msk_ray.metrics import HEALTH
 from msk_ray.metrics import metric as describe
-from msk_ray.report.pictures import (
+from msk_ray.report.charts import (
+    BLUE,
     DASHES,
     GREY,
     PALETTE,
     POINTS,
+    Axis,
+    Bars,
+    Chart,
+    Floor,
+    Line,
     Picture,
+    Plot,
+    Point,
+    Row,
+    Style,
+    format_steps,
     plain,
     points_each,
-    shorten,
-    steps_axis,
+    rounded,
     thin_evenly,
     thin_peaks,
 )
@@ -38,8 +41,8 @@ from msk_ray.text import printable
 
 NAMED = 8
 """Number of variants that are drawn in their own colour."""
-LABELLED = 60
-"""Maximum number of trials that are named at their bar."""
+CROWD = 60
+"""From this number of variants, those without a colour of their own are fainter."""
 _STOPPED = {
     Outcome.STOPPED_ASHA,
     Outcome.STOPPED_MEDIAN,
@@ -47,7 +50,7 @@ _STOPPED = {
     Outcome.NONFINITE,
     Outcome.DIVERGED,
 }
-_LOOK = {
+_LOOKS = {
     "finished": ("#009E73", "o"),
     "stopped_target": ("#009E73", "*"),
     "stopped_asha": ("#E69F00", "x"),
@@ -64,15 +67,16 @@ _LOOK = {
     "waiting": (GREY, "."),
     "unreadable": ("#000000", "1"),
 }
+"""How a trial ended → its colour, and its marker on paper."""
+STEPS = Axis("env steps", "count", low=0.0)
 _OVER = {
-    "env_steps": ("Learning curves", "env steps", ""),
+    "env_steps": (STEPS, ""),
     "seconds": (
-        "Learning curves over time",
-        "seconds of training",
+        Axis("seconds of training", low=0.0),
         " Times compare where trials ran on equal devices, each alone on its own.",
     ),
 }
-"""Column of the metrics → the picture's title, the axis' name, and what to know about it."""
+"""Column of the metrics → the axis, and what to know about it."""
 
 Curve = tuple[np.ndarray, np.ndarray]
 Places = Mapping[Path, int]
@@ -99,86 +103,52 @@ def learning_curves(
     means = {v: float(np.mean(scores)) for v, trials in groups.items() if (scores := _best_scores(trials))}
     curves = {v: [t.curve_over(over) for t in groups[v] if len(t.curve[0])] for v in means}
     until = {v: _first_end(groups[v], over) for v in means}
-    title, axis, more = _OVER[over]
+    axis, more = _OVER[over]
     ranked = sorted(curves, key=lambda v: -means[v])
     if not ranked:
         return None
     named = ranked[:NAMED] + ([baseline] if baseline in ranked[NAMED:] else [])
-    rest = [v for v in ranked if v not in named]
+    rest = len(ranked) - len(named)
+    styles = [
+        Style(PALETTE[n % len(PALETTE)], printable(variant), DASHES[n // len(PALETTE)], 2.0, marker="x")
+        for n, variant in enumerate(named)
+    ]
+    if rest:
+        styles.append(Style(GREY, f"{rest} more", width=0.8, opacity=0.6 if len(ranked) < CROWD else 0.35))
+    count = points_each(sum(len(own) for own in curves.values()))
+    lines: list[Line] = []
+    crosses: list[Point] = []
+    for variant in [v for v in reversed(ranked) if v not in named] + [v for v in reversed(ranked) if v in named]:
+        style = named.index(variant) if variant in named else len(named)
+        # A single seed is its own mean.
+        averaged = variant in named and len(curves[variant]) > 1
+        if averaged:
+            x, mean, low, high = map(plain, _mean_and_range(curves[variant], until[variant]))
+            text = f"{printable(variant)}\nmean of {len(curves[variant])} seeds"
+            lines.append(Line(style, x, mean, text=text, low=low, high=high, when="unfiltered"))
+        for trial in groups[variant]:
+            curve = trial.curve_over(over)
+            if not len(curve[0]):
+                continue
+            x, y = map(plain, thin_evenly(*curve, count))
+            place = places[trial.folder]
+            lines.append(Line(style, x, y, place, when="filtered" if averaged else "always"))
+            if variant in named and trial.ending is not None and trial.ending.outcome in _STOPPED:
+                crosses.append(Point(style, rounded(curve[0][-1]), rounded(curve[1][-1]), place, "ended here"))
     floor = _floor([curve for own in curves.values() for curve in own])
-    ended = {
-        t.folder: t.curve_over(over)
-        for variant in ranked
-        for t in groups[variant]
-        if t.ending is not None and t.ending.outcome in _STOPPED and len(t.curve[0])
-    }
-
-    def draw(figure: Figure) -> None:
-        axes = figure.add_subplot()
-        for variant in rest:
-            steps, mean, *_ = _mean_and_range(curves[variant], until[variant])
-            axes.plot(steps, mean, color=GREY, linewidth=0.7, alpha=0.6, zorder=1)
-        for number, variant in enumerate(named):
-            _draw_variant(axes, _mean_and_range(curves[variant], until[variant]), number, shorten(variant, 44))
-            for trial in groups[variant]:
-                if trial.folder in ended:
-                    x, y = ended[trial.folder]
-                    axes.plot(x[-1], y[-1], "x", color=_colour(number), markersize=7, markeredgewidth=2)
-        steps_axis(axes)
-        if floor is not None:
-            axes.set_ylim(bottom=floor.at)
-            axes.text(0.01, 0.01, floor.text, transform=axes.transAxes, fontsize=8, color="#a03000")
-        if over == "seconds":
-            axes.xaxis.set_major_formatter(ScalarFormatter())  # "100m" would be read as minutes
-        axes.set_xlabel(axis)
-        axes.set_ylabel("evaluation score")
-        axes.grid(alpha=0.3)
-        handles, labels = axes.get_legend_handles_labels()
-        if rest:
-            handles.append(Line2D([], [], color=GREY, linewidth=0.7))
-            labels.append(f"{len(rest)} more")
-        figure.legend(handles, labels, fontsize=8, title="best first", title_fontsize=8, loc="outside right upper")
-
-    def lines() -> dict[str, Any]:
-        shown = [(v, t) for v in ranked for t in groups[v] if len(t.curve[0])]
-        count = points_each(len(shown))
-        return {
-            "kind": "curves",
-            "x": axis,
-            "y": "evaluation score",
-            "floor": None if floor is None else {"at": floor.at, "text": floor.text},
-            "variants": [
-                {
-                    "name": printable(variant),
-                    "colour": _colour(named.index(variant)) if variant in named else None,
-                    "dash": DASHES[named.index(variant) // len(PALETTE)] if variant in named else "-",
-                    "trials": [places[t.folder] for t in groups[variant] if len(t.curve[0])],
-                    # A single seed is its own mean.
-                    "mean": [plain(line) for line in _mean_and_range(curves[variant], until[variant])]
-                    if variant in named and len(curves[variant]) > 1
-                    else None,
-                }
-                for variant in ranked
-            ],
-            "lines": [
-                [places[t.folder], *map(plain, thin_evenly(*t.curve_over(over), count)), t.folder in ended]
-                for _, t in shown
-            ],
-        }
-
+    plot = Plot(axis, Axis("evaluation score", floor=floor), tuple(lines), tuple(crosses))
     seeds = max(len(own) for own in curves.values())
     best = means[ranked[0]]
     return Picture(
         name,
-        title,
-        f"Evaluation score over {axis} of {len(ranked)} variants; the best is {ranked[0]} with a mean best score of "
-        f"{best:.5g}.",
-        ("Mean over seeds up to the end of the first that ran to its end, band: their range. " if seeds > 1 else "")
+        f"Evaluation score over {axis.name} of {len(ranked)} variants; the best is {ranked[0]} with a mean best score "
+        f"of {best:.5g}.",
+        ("The best variant is named first. " if len(ranked) > 1 else "")
+        + ("Mean over seeds up to the end of the first that ran to its end, band: their range. " if seeds > 1 else "")
         + "A cross ends a trial that was stopped before its time; from there the mean is over those that went on."
         + more
         + _randomized([groups[variant] for variant in ranked]),
-        lines(),
-        draw,
+        Chart(tuple(styles), (plot,), zoom=True),
     )
 
 
@@ -191,15 +161,6 @@ def _randomized(groups: Sequence[Sequence[TrialReading]]) -> str:
     some = f"{len(drawn)} of {len(sections)} variants are" if len(drawn) < len(sections) else "All variants are"
     kinds = "; or ".join(dict.fromkeys(map(str, drawn)))
     return f" {some} trained with {kinds}, drawn for every episode; every score is of the model as it is."
-
-
-def _draw_variant(
-    axes: Axes, means: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], number: int, label: str
-) -> None:
-    steps, mean, low, high = means
-    axes.plot(steps, mean, DASHES[number // len(PALETTE)], color=_colour(number), label=label, linewidth=1.9, zorder=3)
-    if (low < high).any():
-        axes.fill_between(steps, low, high, color=_colour(number), alpha=0.16, linewidth=0, zorder=2)
 
 
 def _first_end(trials: Sequence[TrialReading], over: str) -> float:
@@ -226,15 +187,6 @@ def _mean_and_range(curves: Sequence[Curve], until: float) -> tuple[np.ndarray, 
     return steps, np.nanmean(values, 0), np.nanmin(values, 0), np.nanmax(values, 0)
 
 
-@dataclass(frozen=True)
-class Floor:
-    """Where an axis of scores ends although curves go lower."""
-
-    at: float
-    text: str
-    """How many do, and how far."""
-
-
 def _floor(curves: Sequence[Curve]) -> Floor | None:
     """The axis reaches down to the worst first or best score: policies that fall apart leave it. None if none does,
     or if an axis half as long again shows all.
@@ -254,10 +206,6 @@ def _best_scores(trials: Sequence[TrialReading]) -> list[float]:
     return [trial.score for trial in trials if trial.score is not None]
 
 
-def _colour(number: int) -> str:
-    return PALETTE[number % len(PALETTE)]
-
-
 def gradient_health(reading: Reading, name: str, places: Places) -> Picture | None:
     """Norms, clipping and failures of gradients over training; None if no trial recorded any."""
     recorded = [m.name for m in HEALTH if any(_health_curve(t, m.name) for t in reading.trials)]
@@ -271,54 +219,48 @@ def gradient_health(reading: Reading, name: str, places: Places) -> Picture | No
     ]
     present = [metric for metric in recorded if metric not in zero] or recorded[:1]
     zero = [metric for metric in zero if metric not in present]
-    best = reading.best
-
-    def draw(figure: Figure) -> None:
-        grid = figure.subplots(math.ceil(len(present) / 2), 2, squeeze=False).ravel()
-        for axes in grid[len(present) :]:
-            axes.set_axis_off()
-        for axes, metric in zip(grid, present, strict=False):
-            _draw_health(axes, reading, metric)
-        handles = [
-            Line2D([], [], color=GREY, label="a trial"),
-            Line2D([], [], color="#D55E00", linestyle="--", label="a trial that failed"),
-        ]
-        if best is not None:
-            handles.append(Line2D([], [], color="#0072B2", linewidth=2, label="the best trial"))
-        figure.legend(handles=handles, loc="outside upper center", ncols=3, fontsize=8)
-
-    def lines() -> dict[str, Any]:
-        count = points_each(len(present) * len(reading.trials))
-        return {
-            "kind": "health",
-            "best": None if best is None else places[best.folder],
-            "failed": [places[t.folder] for t in reading.trials if t.failed],
-            "metrics": [
-                {
-                    "title": describe(metric).meaning,
-                    "log": describe(metric).logarithmic,
-                    "lines": [
-                        [places[t.folder], *map(plain, thin_peaks(*curve, count))]
-                        for t in reading.trials
-                        if (curve := _health_curve(t, metric)) is not None
-                    ],
-                }
-                for metric in present
-            ],
-        }
-
-    rows = math.ceil(len(present) / 2)
+    opacity = max(0.25, min(0.8, 12 / max(1, len(reading.trials))))
+    styles = (
+        Style(GREY, "a trial", width=0.9, opacity=opacity),
+        Style("#D55E00", "a trial that failed", "--", 1.1),
+        Style(BLUE, "the best trial", width=1.8),
+    )
+    count = points_each(len(present) * len(reading.trials))
     return Picture(
         name,
-        "Gradient health",
         f"{len(present)} measures of gradients and physics over env steps, a line a trial: "
         f"{', '.join(describe(m).meaning for m in present)}.",
         (f"Zero throughout: {', '.join(describe(m).meaning for m in zero)}. " if zero else "")
         + "Of many points the largest of each stretch is drawn: peaks are not lost. A cotangent is in units of reward: "
         "1 is what one reward would send back.",
-        lines(),
-        draw,
-        (9.0, 1.0 + 2.3 * rows),
+        Chart(
+            styles if reading.best is not None else styles[:2],
+            tuple(_health_plot(reading, metric, count, places) for metric in present),
+            zoom=True,
+        ),
+    )
+
+
+def _health_plot(reading: Reading, metric: str, count: int, places: Places) -> Plot:
+    """A metric of all trials: those that failed above the others, the best one above all."""
+    lines = []
+    logarithmic = False
+    for trial in reading.trials:
+        curve = _health_curve(trial, metric)
+        if curve is not None:
+            x, y = thin_peaks(*curve, count)
+            logarithmic |= describe(metric).logarithmic and bool((y > 0.0).any())
+            style = 2 if trial is reading.best else 1 if trial.failed else 0
+            lines.append((style, x, y, places[trial.folder]))
+    return Plot(
+        STEPS,
+        Axis(scale="log" if logarithmic else "linear"),
+        tuple(
+            # A logarithm has no place for zeros.
+            Line(style, plain(x), plain(np.where(y > 0.0, y, np.nan) if logarithmic else y), place)
+            for style, x, y, place in sorted(lines, key=lambda line: line[0])
+        ),
+        title=describe(metric).meaning,
     )
 
 
@@ -330,35 +272,6 @@ def _health_curve(trial: TrialReading, metric: str) -> Curve | None:
     return trial.columns["env_steps"][keep], values[keep]
 
 
-def _draw_health(axes: Axes, reading: Reading, metric: str) -> None:
-    title, logarithmic = describe(metric).meaning, describe(metric).logarithmic
-    best = reading.best
-    lines: dict[bool, list[np.ndarray]] = {False: [], True: []}
-    largest = 0.0
-    for trial in reading.trials:
-        curve = _health_curve(trial, metric)
-        if curve is None:
-            continue
-        x, y = thin_peaks(*curve)
-        largest = max(largest, float(y.max()))
-        if trial is best:
-            axes.plot(x, y, color="#0072B2", linewidth=1.6, zorder=4)
-        else:
-            lines[trial.failed].append(np.column_stack((x, y)))
-    alpha = max(0.25, min(0.8, 12 / max(1, len(reading.trials))))
-    axes.add_collection(LineCollection(lines[False], colors=GREY, linewidths=0.8, alpha=alpha, zorder=2))
-    axes.add_collection(LineCollection(lines[True], colors="#D55E00", linewidths=1.0, linestyles="--", zorder=3))
-    axes.autoscale_view()
-    if logarithmic and largest > 0.0:
-        axes.set_yscale("log")
-    elif largest == 0.0:
-        axes.set_ylim(-0.05, 1.0)
-    axes.set_title(title, fontsize=9)
-    axes.tick_params(labelsize=8)
-    steps_axis(axes)
-    axes.grid(alpha=0.3)
-
-
 def stopping_map(reading: Reading, name: str, places: Places) -> Picture | None:
     """A bar a trial, as long as it ran, its end marked by how it ended; None if none has begun."""
     begun = [trial for trial in reading.trials if trial.epochs_done]
@@ -366,54 +279,30 @@ def stopping_map(reading: Reading, name: str, places: Places) -> Picture | None:
         return None
     ordered = sorted(begun, key=lambda t: (t.score is None, -(t.score or 0.0), t.trial.index))
     seeds = len(reading.seeds) > 1
-    lines, unknown = rung_steps(reading)
-
-    def draw(figure: Figure) -> None:
-        axes = figure.add_subplot()
-        for place, trial in enumerate(ordered):
-            colour, marker = _LOOK.get(trial.outcome, (GREY, "."))
-            end = float(trial.columns["env_steps"][-1])
-            axes.plot(
-                [0.0, end], [place, place], color=colour, linewidth=1.2 if len(ordered) > LABELLED else 2.5, alpha=0.7
-            )
-            axes.plot(end, place, marker, color=colour, markersize=4 if len(ordered) > LABELLED else 7)
-        for step in lines:
-            axes.axvline(step, color="black", linestyle=":", linewidth=0.9)
-        axes.set_ylim(len(ordered) - 0.4, -0.6)
-        if len(ordered) <= LABELLED:
-            labels = [t.trial.variant + (f", seed {t.trial.seed}" if seeds else "") for t in ordered]
-            axes.set_yticks(range(len(ordered)), [shorten(label, 48) for label in labels], fontsize=7)
-        else:
-            axes.set_ylabel("trials, the best score first")
-        steps_axis(axes)
-        shown = list(dict.fromkeys(t.outcome for t in ordered))
-        handles = [
-            Line2D([], [], color=_LOOK.get(o, (GREY, "."))[0], marker=_LOOK.get(o, (GREY, "."))[1], label=o)
-            for o in shown
-        ]
-        if lines:
-            handles.append(Line2D([], [], color="black", linestyle=":", label="rung of asha"))
-        figure.legend(handles=handles, loc="outside upper center", ncols=5, fontsize=8)
-
+    rungs, unknown = rung_steps(reading)
     counts: dict[str, int] = {}
     for trial in ordered:
         counts[trial.outcome] = counts.get(trial.outcome, 0) + 1
-    height = 1.6 + (0.24 * len(ordered) if len(ordered) <= LABELLED else min(9.0, 0.04 * len(ordered)))
+    outcomes = list(counts)
+    looks = [_LOOKS.get(outcome, (GREY, ".")) for outcome in outcomes]
+    rows = []
+    for trial in ordered:
+        end = float(trial.columns["env_steps"][-1])
+        score = "" if trial.score is None else f", best score {trial.score:.5g}"
+        label = trial.trial.variant + (f", seed {trial.trial.seed}" if seeds else "")
+        text = f"ended at {format_steps(end)} env steps{score}"
+        rows.append(Row(outcomes.index(trial.outcome), printable(label), end, "", places[trial.folder], text))
     return Picture(
         name,
-        "Which trial stopped when",
         f"{len(ordered)} trials as bars of env steps, the best score on top: "
         + ", ".join(f"{n} {outcome}" for outcome, n in counts.items())
         + ".",
         f"The best score on top. {unknown}Why each one stopped is in the table of trials.",
-        {
-            "kind": "stops",
-            "bars": [[places[t.folder], float(t.columns["env_steps"][-1])] for t in ordered],
-            "outcomes": {o: _LOOK.get(o, (GREY, "."))[0] for o in counts},
-            "rungs": lines,
-        },
-        draw,
-        (9.0, height),
+        Chart(
+            tuple(Style(colour, o, marker=marker) for o, (colour, marker) in zip(outcomes, looks, strict=True)),
+            (Bars(STEPS, tuple(rows), tuple(rungs), "rung"),),
+            zoom=True,
+        ),
     )
 
 

@@ -22,9 +22,10 @@ from msk_ray.experiment.manifest import Experiment
 from msk_ray.files import write_text
 from msk_ray.progress import format_duration
 from msk_ray.report.best import Best, strip_bytes
+from msk_ray.report.charts import Picture, format_steps
 from msk_ray.report.curves import gradient_health, learning_curves, stopping_map
 from msk_ray.report.influence import parallel_coordinates, parameter_effects, ranked_effects
-from msk_ray.report.pictures import Picture, format_steps
+from msk_ray.report.png import png
 from msk_ray.report.reading import Condition, Reading, TrialReading
 from msk_ray.report.tables import (
     VariantRow,
@@ -100,7 +101,7 @@ class Section:
         return quote(Path(os.path.relpath(path, self.folder)).as_posix())
 
     def command(self) -> str:
-        """The command line that was run, as a user would type it."""
+        """The command that ran the experiment, as a user would type it."""
         argv = self.reading.environment.get("command")
         if not isinstance(argv, list) or not argv:
             return ""
@@ -127,15 +128,15 @@ def make_section(
         ConfigError: there is no variant with the requested name.
     """
     chosen = baseline_of(reading, baseline)
-    found = ranked_effects(reading, places)
+    ranked = ranked_effects(reading, places)
     several = len(reading.algorithms) > 1
     times = learning_curves(reading.variants, chosen, f"{prefix}times", places, over="seconds") if several else None
     made = {
         "curves": learning_curves(reading.variants, chosen, f"{prefix}curves", places),
-        # An env step of one algorithm costs another time than one of another.
+        # Algorithms take different times for an env step.
         "times": times,
-        "effects": parameter_effects(found, f"{prefix}effects"),
-        "parallel": parallel_coordinates(reading, found, f"{prefix}parallel", places),
+        "effects": parameter_effects(ranked, f"{prefix}effects"),
+        "parallel": parallel_coordinates(reading, ranked, f"{prefix}parallel", places),
         "stops": stopping_map(reading, f"{prefix}stops", places),
         "health": gradient_health(reading, f"{prefix}health", places),
     }
@@ -164,13 +165,13 @@ def command_of(experiments: Sequence[Experiment], storage: Path) -> str:
 
 
 def _openers(sections: Sequence[Section]) -> dict[str, Section]:
-    """Slug of each section → the first section of its experiment, which has what its environments share."""
+    """Slug of each section → the first section of the same experiment, which shows what all its sections share."""
     first: dict[Path, Section] = {}
     return {s.slug: first.setdefault(s.reading.experiment.path, s) for s in sections}
 
 
 def _matrix(sections: Sequence[Section]) -> dict[str, list[VariantRow | None]]:
-    """Scores by variant and environment, if the page is of one experiment over several environments."""
+    """Scores by variant and environment, if the page shows one experiment in several environments."""
     parts = [section.reading for section in sections if section.reading.part]
     one = len({section.reading.experiment.path for section in sections}) == 1
     return by_variant_and_environment(parts) if one else {}
@@ -189,12 +190,12 @@ def _several_environments(readings: Sequence[Reading]) -> bool:
 
 @dataclass(frozen=True)
 class Live:
-    """What the page of the dashboard has in addition to a file's."""
+    """What a page of the dashboard has in addition to one in a file."""
 
     refresh: float
-    """Seconds between its questions whether something has changed."""
+    """Seconds between checks for changes."""
     version: str
-    """Of the content: the page is fetched again when there is another one."""
+    """Version of the content; the page fetches itself again when it changes."""
     may_write: bool
     """Whether notes can be written."""
     films: Mapping[str, tuple[str, str]]
@@ -212,7 +213,7 @@ def render_page(
         together: the figure of all sections.
         now: seconds since the epoch.
         command: what wrote it.
-        live: given by the dashboard, which serves styles and scripts as files of their own.
+        live: given by the dashboard, which serves styles and scripts as separate files.
     """
     pictures = [picture for section in sections for picture in section.pictures.values()]
     if together is not None:
@@ -223,7 +224,7 @@ def render_page(
         for t in section.reading.trials
     ]
     matrix = _matrix(sections)
-    data = {"trials": trials, "figures": {picture.name: picture.chart for picture in pictures}}
+    data = {"trials": trials, "charts": {picture.name: picture.chart for picture in pictures}}
     page = (
         _templates()
         .get_template("report.html.j2")
@@ -240,11 +241,11 @@ def render_page(
             version=__version__,
             strip_uri=lambda path: _uri(strip_bytes(path)),
             live=live,
-            # Inside a script element, only "</script" and "<!--" would end or change it.
+            # In a script element, "</script" would end it and "<!--" would change its meaning.
             data=Markup(orjson.dumps(data).decode().replace("<", "\\u003c")),
         )
     )
-    # An argument of the recorded command that is no UTF-8, such as a path, is shown escaped.
+    # The recorded command may hold paths that are not UTF-8: their bytes are shown escaped.
     return page.encode("utf-8", "backslashreplace").decode()
 
 
@@ -276,7 +277,7 @@ def write_page(sections: Sequence[Section], together: Picture | None, folder: Pa
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for picture in [*pictures, *([together] if together is not None else [])]:
-            (folder / f"{picture.name}.png").write_bytes(picture.png())
+            (folder / f"{picture.name}.png").write_bytes(png(picture.chart))
     except OSError as error:
         raise StorageFailure(f"cannot write {folder}: {error.strerror or error}") from error
     write_text(folder / PAGE, render_page(sections, together, now, command))

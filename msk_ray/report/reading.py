@@ -1,6 +1,6 @@
 """Read an experiment from its files, in any condition: running, finished, crashed, half-written, empty.
 
-What cannot be read is named in `warnings`, or in its trial, and does not hide the rest.
+Whatever cannot be read is named in `warnings` or in its trial; the rest is shown.
 """
 
 import contextlib
@@ -44,9 +44,9 @@ from msk_ray.sweep.space import SpaceFile, read_file
 
 _TAIL_LINES = 12
 _READ = (METRICS_FILE, OUTCOME_FILE, HALVED_FILE, DEVICE_FILE)
-"""The files of a trial that its reading is made of."""
+"""A trial is read again when one of these files changes."""
 _NOTED = 10
-"""Number of damaged files that are named; the others are counted."""
+"""Damaged files that are named; further ones are only counted."""
 
 
 class Condition(StrEnum):
@@ -55,7 +55,7 @@ class Condition(StrEnum):
     RUNNING = "running"
     FINISHED = "finished"
     INTERRUPTED = "interrupted"
-    """Trials are left, but none has written anything lately: stopped on request, or crashed."""
+    """Trials are unfinished, but none has written anything lately: stopped on request, or crashed."""
     WAITING = "not started"
     EMPTY = "empty"
     """No trial is known."""
@@ -76,7 +76,7 @@ class TrialReading:
     device: str = ""
     """GPU model, or cpu; empty if it was not recorded."""
     attempt: Attempt = FIRST
-    """The scores of one with fewer worlds do not compare with the others'."""
+    """Scores of an attempt with fewer worlds cannot be compared with the others."""
     note: str = ""
     """What its owner has written about it."""
 
@@ -93,8 +93,8 @@ class TrialReading:
 
     @cached_property
     def curve(self) -> tuple[np.ndarray, np.ndarray]:
-        """Env steps and scores of the evaluations with a finite score, both (N,), including that of the untrained
-        policy, with which a curve starts."""
+        """Env steps and scores of all evaluations with a finite score, both (N,); the first is that of the untrained
+        policy."""
         return self.curve_over("env_steps")
 
     def curve_over(self, column: str) -> tuple[np.ndarray, np.ndarray]:
@@ -106,7 +106,7 @@ class TrialReading:
 
     @cached_property
     def trained(self) -> tuple[np.ndarray, np.ndarray]:
-        """The same for the trained policy only, both (N,), from which its score is taken."""
+        """The same without the untrained policy, both (N,); the best of them is the trial's score."""
         if SCORE not in self.columns:
             return np.zeros(0), np.zeros(0)
         keep = np.isfinite(self.columns[SCORE]) & (self.columns["epoch"] > 0)
@@ -146,12 +146,12 @@ class TrialReading:
         trained = (self.columns["epoch"] > 0) & np.isfinite(self.columns[SCORE])
         row = int(np.argmax(np.where(trained, self.columns[SCORE], -np.inf)))
         kept = ("epoch", "env_steps", "seconds")
-        found = {name: float(v[row]) for name, v in self.columns.items() if name.startswith("eval/") or name in kept}
-        return {name: value for name, value in found.items() if math.isfinite(value)}
+        values = {name: float(v[row]) for name, v in self.columns.items() if name.startswith("eval/") or name in kept}
+        return {name: value for name, value in values.items() if math.isfinite(value)}
 
     @property
     def outcome(self) -> str:
-        """Name of its ending, or what it is doing."""
+        """How it ended, or what it is doing."""
         if self.state is State.ENDED and self.ending is not None:
             return str(self.ending.outcome)
         return str(self.state)
@@ -195,7 +195,7 @@ class Reading:
     warnings: tuple[str, ...] = ()
     """What is missing or broken."""
     part: str = ""
-    """Environment of all its trials, if it is one of several parts of the experiment."""
+    """The environment, if this is the part of the experiment that runs in it."""
 
     @property
     def name(self) -> str:
@@ -237,14 +237,15 @@ class Reading:
         return list(dict.fromkeys(trial.trial.environment for trial in self.trials))
 
     def parts(self) -> list["Reading"]:
-        """One reading for each environment, whose scores alone can be compared; itself if there is only one.
+        """One reading for each environment, because scores of different environments cannot be compared; itself if
+        there is only one.
 
-        A variant of a part is named without its environment, which they all share.
+        Variants of a part are named without the environment that they share.
         """
         groups = by_environment(self.trials, lambda trial: trial.trial.environment)
         if len(groups) < 2:
             return [self]
-        return [replace(self, part=name, trials=_within(trials)) for name, trials in groups.items()]
+        return [replace(self, part=name, trials=_without_environment(trials)) for name, trials in groups.items()]
 
     @property
     def reduced(self) -> list[TrialReading]:
@@ -256,8 +257,8 @@ class Reading:
         return {trial.trial.seed for trial in self.trials}
 
 
-def _within(trials: Sequence[TrialReading]) -> tuple[TrialReading, ...]:
-    """Trials of one environment, without the parameter that chooses it unless it sets something else too."""
+def _without_environment(trials: Sequence[TrialReading]) -> tuple[TrialReading, ...]:
+    """Trials of one environment, without the parameter that chooses it, unless that parameter sets something else."""
     shared = {key for key in ("env", "env.name") if len({trial.trial.changed.get(key) for trial in trials}) == 1}
     own = ({key: text for key, text in trial.trial.changed.items() if key not in shared} for trial in trials)
     return tuple(
@@ -269,13 +270,13 @@ def read_experiment(experiment: Experiment, now: float) -> Reading:
     """Read everything there is.
 
     Args:
-        now: seconds since the epoch, to tell running trials from silent ones.
+        now: seconds since the epoch; tells running trials from silent ones.
     """
     return ExperimentReader(experiment).read(now)
 
 
 class ExperimentReader:
-    """Reads an experiment again and again; what has not changed is not read twice."""
+    """Reads an experiment repeatedly, and each time only what has changed."""
 
     def __init__(self, experiment: Experiment) -> None:
         self.experiment = experiment
@@ -285,7 +286,7 @@ class ExperimentReader:
         self._seen: dict[Path, tuple[Any, TrialReading, tuple[Damage, ...]]] = {}
 
     def read(self, now: float) -> Reading:
-        """The experiment at `now` [s since the epoch]; no content of it makes this fail."""
+        """The experiment at `now` [s since the epoch]. Never fails because of what its files hold."""
         experiment = self.experiment
         warnings: list[str] = []
         manifest: Mapping[str, Any] = {}
@@ -308,9 +309,9 @@ class ExperimentReader:
         warnings += [f"Trials are shown as recorded, and cannot be evaluated here: {why}." for why in unknown]
         readings = []
         for trial in [*trials, *unlisted]:
-            reading, found = self._trial(trial, notes.get(trial.id, ""), now)
+            reading, damage = self._trial(trial, notes.get(trial.id, ""), now)
             readings.append(reading)
-            damages += found
+            damages += damage
         if damages:
             lines = describe_damages(damages, experiment.path)
             more = f"; and {len(lines) - _NOTED} more files" if len(lines) > _NOTED else ""
@@ -348,20 +349,20 @@ class ExperimentReader:
 
     def _trial(self, trial: Trial, note: str, now: float) -> tuple[TrialReading, tuple[Damage, ...]]:
         folder = self.experiment.trial_folder(trial.id)
-        # With the planned trial itself: `--extend` gives it more epochs.
+        # The planned trial is part of the key because `--extend` gives it more epochs.
         key = (trial, note, [file_stamp(folder / name) for name in _READ])
         seen = self._seen.get(folder)
         if seen is not None and seen[0] == key and seen[1].state is State.ENDED:
             return seen[1:]
-        found = self._reader.read(folder, now)
+        snapshot = self._reader.read(folder, now)
         if seen is not None and seen[0] == key:
-            # Whether a trial that has not ended is running depends on the time too.
-            same = seen[1].state is found.state
-            reading = seen[1] if same else replace(seen[1], state=found.state)
+            # Whether an unfinished trial counts as running also depends on the time.
+            same = seen[1].state is snapshot.state
+            reading = seen[1] if same else replace(seen[1], state=snapshot.state)
         else:
-            reading = _reading_of(trial, found, note)
-        self._seen[folder] = key, reading, found.damages
-        return reading, found.damages
+            reading = _reading_of(trial, snapshot, note)
+        self._seen[folder] = key, reading, snapshot.damages
+        return reading, snapshot.damages
 
 
 def explain(error: Exception) -> str:

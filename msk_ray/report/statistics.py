@@ -13,9 +13,9 @@ T = TypeVar("T")
 DRAWS = 10_000
 CONFIDENCE = 0.95
 LEAST = 2
-"""Scores that each level needs for the share of the variance that a parameter explains."""
+"""A share of the variance needs this many scores at each level."""
 BINS = 4
-"""Number of equal groups into which drawn numbers are sorted."""
+"""Groups into which numbers with many values are sorted."""
 
 
 @dataclass(frozen=True)
@@ -63,8 +63,8 @@ def _interval(statistic: np.ndarray) -> Interval:
 
 
 @dataclass(frozen=True)
-class Scored:
-    """A trial's best score, if its trained policy has one, and its parameters."""
+class TrialScore:
+    """A trial's parameters and its best score; None before its first evaluation."""
 
     changed: Mapping[str, str]
     """Its parameters as text."""
@@ -73,32 +73,32 @@ class Scored:
     seed: int
     score: float | None
     cut: bool = False
-    """It ended early: the score might still have risen."""
+    """It did not run to its end: the score might have risen further."""
     place: int = 0
-    """Its position in the list of whoever asks."""
+    """Its position in the caller's list."""
 
 
 @dataclass(frozen=True)
 class Effect:
-    """How the score depends on one parameter, whatever the others are."""
+    """How the score depends on one parameter, averaged over the others."""
 
     factor: str
-    trials: dict[str, list[Scored]]
+    trials: dict[str, list[TrialScore]]
     """Trials at each level, in order of the level, including those without a score."""
 
     @property
     def levels(self) -> dict[str, list[float]]:
-        """Scores at each level that has any."""
-        found = {level: [t.score for t in trials if t.score is not None] for level, trials in self.trials.items()}
-        return {level: scores for level, scores in found.items() if scores}
+        """Scores at each level, without levels that have none."""
+        scores_of = {level: [t.score for t in trials if t.score is not None] for level, trials in self.trials.items()}
+        return {level: scores for level, scores in scores_of.items() if scores}
 
-    def scored(self, level: str) -> list[Scored]:
+    def with_score(self, level: str) -> list[TrialScore]:
         """Trials at a level that have a score."""
         return [trial for trial in self.trials[level] if trial.score is not None]
 
     @property
     def too_few(self) -> str:
-        """The level with fewer than LEAST scores; empty if there is none."""
+        """Which level has fewer than LEAST scores, in words; empty if none has."""
         levels = self.levels
         counts = {level: len(levels.get(level, ())) for level in self.trials}
         short = {level: count for level, count in counts.items() if count < LEAST}
@@ -120,35 +120,36 @@ class Effect:
         return max(means) - min(means) if len(means) > 1 else None
 
 
-def effects(trials: Sequence[Scored]) -> list[Effect]:
+def effects(trials: Sequence[TrialScore]) -> list[Effect]:
     """Parameters ranked by the share of the scores' variance that they explain, the largest first; then those with too
-    few scores for that, by their spread.
+    few scores, by their spread.
 
     Args:
-        trials: all planned trials, including those without a score: levels that happen to have scores are not enough.
+        trials: all planned trials, including those without a score: a level must not vanish because none of its
+            trials has one.
 
     Returns:
         An effect for each parameter with at least two levels, and one called `seed` for comparison if there are
         several seeds.
     """
     factors = list(dict.fromkeys(key for trial in trials for key in trial.changed))
-    found = []
+    all_effects = []
     for factor in factors:
         rows = [(trial.changed[factor], trial.values.get(factor), trial) for trial in trials if factor in trial.changed]
-        found.append(Effect(factor, levels_of(rows)))
-    by_seed: dict[str, list[Scored]] = {}
+        all_effects.append(Effect(factor, levels_of(rows)))
+    by_seed: dict[str, list[TrialScore]] = {}
     for trial in sorted(trials, key=lambda trial: trial.seed):
         by_seed.setdefault(str(trial.seed), []).append(trial)
-    found.append(Effect("seed", by_seed))
-    kept = [effect for effect in found if len(effect.trials) > 1]
+    all_effects.append(Effect("seed", by_seed))
+    kept = [effect for effect in all_effects if len(effect.trials) > 1]
     return sorted(kept, key=lambda e: (math.inf if e.share is None else -e.share, -(e.spread or 0.0)))
 
 
 def levels_of(rows: Sequence[tuple[str, Any, T]]) -> dict[str, list[T]]:
-    """Trials, or their scores, by level. For numbers with many values, such as drawn ones, the levels are quartiles.
+    """Items by level. Numbers with many different values, such as random ones, are sorted into quartiles.
 
     Args:
-        rows: the level as text and as data, and the item to sort by it.
+        rows: (level as text, level as data, item).
     """
     numbers = [value for _, value, _ in rows if isinstance(value, int | float) and not isinstance(value, bool)]
     levels: dict[str, list[T]] = {}
@@ -167,7 +168,7 @@ def levels_of(rows: Sequence[tuple[str, Any, T]]) -> dict[str, list[T]]:
 
 
 def _bin_labels(bins: Sequence[tuple[float, float]]) -> list[str]:
-    """`low … high` of each, with three digits or as many as tell them apart."""
+    """`low … high` of each, with three digits, or as many as make them all different."""
     for digits in range(3, 18):
         labels = [f"{low:.{digits}g} … {high:.{digits}g}" for low, high in bins]
         if len(set(labels)) == len(labels):

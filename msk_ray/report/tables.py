@@ -36,19 +36,18 @@ class VariantRow:
     mean: float | None
     interval: Interval | None
     difference: float | None
-    """Difference of the mean from the baseline's, over the env steps of `compared_at`; None for the baseline itself, or
-    without scores."""
+    """Mean minus the baseline's mean, over the env steps of `compared_at`; None for the baseline itself, or without
+    scores."""
     difference_interval: Interval | None
     compared_at: float | None
-    """If trials of this variant or of the baseline have not run to their end: the env steps at which they are compared.
-    None if all ran to their end."""
+    """Env steps at which this variant and the baseline are compared; None if all their trials ran to their end."""
     is_baseline: bool
     figures: dict[str, float]
-    """Mean over seeds of further outcomes at the best evaluation, such as the speed."""
+    """Other outcomes at the best evaluation, such as the speed, mean over seeds."""
     reduced: int = 0
-    """How many of the scores are of trials with half their worlds."""
+    """How many of the scores come from trials with half their worlds."""
     cut: int = 0
-    """How many are of trials that were stopped or interrupted before their end, without having failed."""
+    """How many come from trials that were stopped or interrupted early, but did not fail."""
     env_steps: float | None = None
     """Env steps at which the best scores were reached, mean over seeds."""
     seconds: float | None = None
@@ -88,21 +87,21 @@ def baseline_of(reading: Reading, asked: str | None) -> str | None:
     """
     variants = list(reading.variants)
     if asked is not None:
-        found = [v for v in variants if v == asked] or [v for v in variants if asked in v]
-        if len(found) != 1:
-            known = "; ".join((found or variants)[:8])
+        matches = [v for v in variants if v == asked] or [v for v in variants if asked in v]
+        if len(matches) != 1:
+            known = "; ".join((matches or variants)[:8])
             raise ConfigError(
-                f"--baseline {asked!r}: {'more than one' if found else 'no'} variant of {reading.name} has this name; "
-                f"write one of: {known}"
+                f"--baseline {asked!r}: {'more than one' if matches else 'no'} variant of {reading.name} has this "
+                f"name; write one of: {known}"
             )
-        return found[0]
+        return matches[0]
     if BASELINE in variants:
         return BASELINE
     return variants[0] if variants else None
 
 
 def outcome_figures(trials: Sequence[TrialReading]) -> list[str]:
-    """Names of the evaluation's outcome figures, such as `vx` and `success_rate`; without the plain ones and terms."""
+    """Names of the environment's own outcomes in evaluations, such as `vx` and `success_rate`."""
     names: dict[str, None] = {}
     for trial in trials:
         names.update(dict.fromkeys(name for name in trial.columns if name.startswith("eval/")))
@@ -149,9 +148,9 @@ def _on_equal_terms(
 ) -> tuple[float | None, tuple[list[float], list[float]] | None]:
     """The env steps at which two groups are compared, and their best scores up to there.
 
-    Compared with a complete run, a stopped trial looks worse than it is. So if any trial has not run to its end, all
-    are compared up to the latest evaluation that all have reached; failed trials count with the best score they had,
-    and trials without an evaluation do not count.
+    A stopped trial looks worse than it is beside a complete run. So if any trial did not run to its end, all are
+    compared up to the latest evaluation that all have reached. Failed trials count with their best score; trials
+    without an evaluation do not count.
 
     Returns:
         Env steps, None if all ran to their end; and the scores of both groups, None if one has none.
@@ -162,12 +161,12 @@ def _on_equal_terms(
     if any(t.cut for t in begun):
         going = [t for t in begun if t.score is not None and not t.failed]
         limit = min(t.last_within(math.inf) or 0.0 for t in going if t.cut)
-        # Otherwise a trial that is evaluated at other env steps would be ahead or behind by the difference.
+        # Trials may be evaluated at different env steps: this is the last step that all of them cover.
         limit = min(t.last_within(limit) or 0.0 for t in going)
 
     def within(group: Sequence[TrialReading]) -> list[float]:
-        found = [trial.score_within(limit) for trial in group if id(trial) in counted]
-        return [score for score in found if score is not None]
+        scores = [trial.score_within(limit) for trial in group if id(trial) in counted]
+        return [score for score in scores if score is not None]
 
     pair = (within(trials), within(reference))
     return (limit if limit < math.inf else None), (pair if limit > 0.0 and all(pair) else None)
@@ -179,25 +178,24 @@ def _mean(scores: Sequence[float]) -> float:
 
 def _mean_of(rows: Sequence[Mapping[str, float]], name: str) -> float | None:
     """Mean of a metric over the rows that have it; None if none has."""
-    found = [row[name] for row in rows if name in row]
-    return _mean(found) if found else None
+    values = [row[name] for row in rows if name in row]
+    return _mean(values) if values else None
 
 
 def by_variant_and_environment(parts: Sequence[Reading]) -> dict[str, list[VariantRow | None]]:
-    """Each variant's rows in the parts of one experiment, None where it has no trial; in the order of the
-    experiment."""
+    """Each variant's row in each part of an experiment, in the experiment's order; None where it has no trial."""
     rows = [{row.variant: row for row in variant_rows(part, None)} for part in parts]
     names = dict.fromkeys(variant for part in parts for variant in part.variants)
-    return {name: [found.get(name) for found in rows] for name in names}
+    return {name: [by_variant.get(name) for by_variant in rows] for name in names}
 
 
 def failures(reading: Reading) -> list[tuple[str, str, list[TrialReading]]]:
-    """(name, meaning, trials) of each kind of failure, the most frequent first; interrupted trials too."""
-    found: dict[str, list[TrialReading]] = {}
+    """(name, meaning, trials) of each kind of failure, the most frequent first; interrupted trials are included."""
+    by_outcome: dict[str, list[TrialReading]] = {}
     for trial in reading.trials:
         if trial.failed or trial.state in (State.INTERRUPTED, State.STALE):
-            found.setdefault(trial.outcome, []).append(trial)
-    ordered = sorted(found.items(), key=lambda item: -len(item[1]))
+            by_outcome.setdefault(trial.outcome, []).append(trial)
+    ordered = sorted(by_outcome.items(), key=lambda item: -len(item[1]))
     return [(name, MEANINGS.get(name, ""), trials) for name, trials in ordered]
 
 

@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 DESCRIPTION = """\
 Watch a policy: in MuJoCo's viewer if there is a display, or as video, frames, film strip or statistics without one.
 
-Episodes are those of the evaluation: without noise, from fixed initial states, under reference physics unless
---physics says otherwise. Contact forces are drawn as arrows (a force of the model's weight is as long as the model),
-muscles from blue (relaxed) to red (active). A trial stands for its best policy, an experiment for its best trial."""
+Episodes are as in evaluation: without noise, from fixed initial states, under reference physics unless --physics says
+otherwise. Contact forces are arrows (a force equal to the model's weight is as long as the model is large), muscles go
+from blue (relaxed) to red (active). A trial stands for its best policy, an experiment for its best trial."""
 
 EXAMPLES = """\
   python -m msk_ray.visualize runs/demo                                  # the viewer
@@ -48,18 +48,18 @@ def parser() -> Parser:
     """The command line."""
     p = Parser("python -m msk_ray.visualize", DESCRIPTION, EXAMPLES)
     p.add_argument("target", nargs="?", metavar="CHECKPOINT|TRIAL|EXPERIMENT", help="what to watch")
-    what = p.add_argument_group("instead of the viewer")
-    what.add_argument("--no-render", action="store_true", help="statistics of the episodes, no pictures")
-    what.add_argument("--video", type=Path, metavar="FILE", help="an .mp4, .mkv, .mov or .gif")
-    what.add_argument("--save-frames", type=Path, metavar="DIR", help="numbered .png files")
-    what.add_argument("--strip", type=Path, metavar="FILE", help="frames side by side, evenly spaced over an episode")
-    what.add_argument(
+    output = p.add_argument_group("instead of the viewer")
+    output.add_argument("--no-render", action="store_true", help="print statistics of the episodes, draw nothing")
+    output.add_argument("--video", type=Path, metavar="FILE", help="an .mp4, .mkv, .mov or .gif")
+    output.add_argument("--save-frames", type=Path, metavar="DIR", help="numbered .png files")
+    output.add_argument("--strip", type=Path, metavar="FILE", help="frames side by side, evenly spaced over an episode")
+    output.add_argument(
         "--progression",
         metavar="EXPERIMENT|TRIAL",
-        help="a row for each policy saved during training (of the best trial), written to the FILE of --strip or to "
-        "progression.png",
+        help="one row of frames for each policy that a trial (or the best trial) saved during training, in the FILE of "
+        "--strip or progression.png",
     )
-    how = p.add_argument_group("how")
+    how = p.add_argument_group("episodes and drawing")
     how.add_argument(
         "--episodes",
         type=positive,
@@ -71,25 +71,31 @@ def parser() -> Parser:
     )
     how.add_argument("--steps", type=positive, metavar="N", help="maximum env steps per episode")
     how.add_argument(
-        "--physics", default="reference", metavar="NAME", help="reference, own, or a named one (default: reference)"
+        "--physics",
+        default="reference",
+        metavar="NAME",
+        help="reference (used for scores), own (used in training), or the name of one (default: reference)",
     )
     how.add_argument(
-        "--frames", type=positive, metavar="N", help="frames in a strip (default: 8) or a row of --progression (6)"
+        "--frames",
+        type=positive,
+        metavar="N",
+        help="frames in a strip (default: 8) or in a row of --progression (default: 6)",
     )
     how.add_argument("--fps", type=float, default=30.0, metavar="F", help="frames per simulated second (default: 30)")
     how.add_argument(
         "--speed", type=float, default=1.0, metavar="X", help="speed of the viewer (default: 1, real time)"
     )
-    how.add_argument("--size", type=_size, metavar="WxH", help="size of a frame, such as 640x480; both even")
+    how.add_argument("--size", type=_size, metavar="WxH", help="size of a frame, such as 640x480; both numbers even")
     how.add_argument("--camera", default="", metavar="NAME", help="a camera of the model (default: its first)")
     how.add_argument(
         "--geom-groups",
         type=_groups,
         metavar="LIST",
-        help="groups of geoms to draw, such as 0,3 (default: 0,1,2, and others if the robot has none in these)",
+        help="groups of geoms to draw, such as 0,3 (default: 0,1,2, and the robot's own if it has no geom in these)",
     )
-    how.add_argument("--tensorboard", action="store_true", help="add the strip to the trial's TensorBoard too")
-    how.add_argument("--device", help="for the simulation: cpu or cuda:N (default: the first GPU, or the CPU)")
+    how.add_argument("--tensorboard", action="store_true", help="also add the strip to the trial's TensorBoard")
+    how.add_argument("--device", help="cpu or cuda:N, to simulate (default: the first GPU, or the CPU)")
     how.add_argument(
         "--storage", type=Path, default=Path("runs"), metavar="DIR", help="folder of experiments (default: runs/)"
     )
@@ -152,7 +158,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _check(args: argparse.Namespace) -> Target:
-    """The target of the command line, which is refused before anything slow if it cannot be shown."""
+    """The target. Refuses a command line that cannot work, before anything slow starts."""
     given = args.progression if args.progression is not None else args.target
     if given is None or (args.progression is not None and args.target is not None):
         raise ConfigError("name one thing to watch: a checkpoint, a trial, or an experiment")
@@ -232,7 +238,7 @@ def episode_table(recording: "Recording") -> str:
 
 
 def _say_groups(args: argparse.Namespace, model: "mujoco.MjModel") -> None:
-    """Say so where more geoms are drawn than MuJoCo would draw."""
+    """Tell the user if more geoms are drawn than MuJoCo would draw."""
     from msk_ray.visualize.look import describe_groups, geom_groups
 
     if args.geom_groups is None and (drawn := describe_groups(geom_groups(model))):
@@ -263,7 +269,7 @@ def _draw(args: argparse.Namespace, recording: "Recording", checkpoint: Path, ep
 
 
 def _film(recording: "Recording", fps: float, view: "View") -> Iterator["np.ndarray"]:
-    """Frames (height, width, 3), uint8, of all episodes, one after the other; says how far it is."""
+    """Frames (height, width, 3), uint8, of all episodes, one after the other; prints progress."""
     from msk_ray.visualize.render import frames
 
     episodes = [recording.frames_at(world, fps) for world in range(recording.count)]

@@ -24,7 +24,7 @@ class Recording:
     """Duration of an env step [s]."""
     model: Any
     states: StepState
-    """Shapes (T + 1, W, ·), on the CPU. A state that a step begins with after a push has the velocity after it."""
+    """Shapes (T + 1, W, ·), on the CPU. If a push precedes a step, its state has the velocity after the push."""
     controls: Tensor
     """Shape (T + 1, W, nu); the last row repeats the one before."""
     applied: Tensor | None
@@ -40,7 +40,7 @@ class Recording:
         return int(self.episodes.length[world])
 
     def world(self, world: int) -> States:
-        """The states of one episode, from its first to the one it ended in."""
+        """The states of one episode, the first and the last included."""
         steps = slice(0, self.length(world) + 1)
         qpos, qvel, act, ctrl = (t[steps, world].double().numpy() for t in (*self.states, self.controls))
         return States(self.model, qpos, qvel, act, ctrl)

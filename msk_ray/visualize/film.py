@@ -66,7 +66,7 @@ def _write_gif(frames: Iterable[np.ndarray], path: Path, fps: float) -> int:
 
 
 def check_video_path(path: Path) -> None:
-    """Refuse a film that could not be written, before anything is computed.
+    """Refuse a film that cannot be written, before anything is computed.
 
     Raises:
         ConfigError: the message names the suffixes that work, or the package to install.
@@ -78,7 +78,7 @@ def check_video_path(path: Path) -> None:
 
 
 def _encoder(path: Path) -> ModuleType:
-    """The package that encodes films. Pictures, and the report with its film strips, do without it."""
+    """The package that encodes films; pictures and film strips do not need it."""
     try:
         import av
     except ImportError as error:
@@ -90,7 +90,7 @@ def _encoder(path: Path) -> ModuleType:
 
 
 def check_image_path(path: Path) -> None:
-    """Refuse a file name whose suffix has no picture format, before anything is computed.
+    """Refuse a file name without a picture's suffix, before anything is computed.
 
     Raises:
         ConfigError: the message names the suffixes that work.

@@ -10,7 +10,7 @@ RELAXED, ACTIVE = np.array([0.16, 0.35, 0.75]), np.array([0.90, 0.10, 0.08])
 FORCE = (0.95, 0.15, 0.55, 1.0)
 """Colour of contact forces."""
 CUT_FORCE = (1.0, 0.6, 0.1, 1.0)
-"""Colour of those whose arrows end at the edge of the picture because they would leave it."""
+"""Colour of contact forces whose arrows are shortened because they would leave the picture."""
 _BODY_ALPHA = 0.4
 _TENDON_WIDTH = 0.005
 """Smallest radius of a muscle's tendon, in units of the model's extent."""
@@ -23,7 +23,7 @@ DRAWN_GROUPS = (0, 1, 2)
 _MARGIN = 0.97
 """Share of the picture's half width and height within which arrows end."""
 _HEADLIGHT = {"ambient": 0.35, "diffuse": 0.55, "specular": 0.2}
-"""Light from the camera for models without lights, which MuJoCo draws rather dark."""
+"""Light from the camera for models without lights, which would be rather dark."""
 _SKY_TOP, _SKY_BOTTOM = np.array([237.0, 242.0, 250.0]), np.array([158.0, 178.0, 204.0])
 """Background of models without a sky, whose colours are those of `envs.options.add_sky`."""
 
@@ -55,8 +55,7 @@ class Look:
         return bool(self._muscles)
 
     def switch_on(self, option: mujoco.MjvOption, groups: Sequence[int]) -> None:
-        """Draw contact forces, tendons if there are any, and the geoms of these groups; bodies of models with muscles
-        are transparent."""
+        """Draw contact forces, tendons, and the geoms of these groups; if there are muscles, bodies are transparent."""
         option.geomgroup = [number in groups for number in range(mujoco.mjNGROUP)]
         option.flags[mujoco.mjtVisFlag.mjVIS_TRANSPARENT] = self.has_muscles
         option.flags[mujoco.mjtVisFlag.mjVIS_CONTACTFORCE] = True
@@ -76,8 +75,8 @@ class Look:
 
 
 def geom_groups(model: mujoco.MjModel) -> tuple[int, ...]:
-    """The groups of geoms to draw: those that MuJoCo draws, and if no moving body has a geom in these, those in which
-    it has some."""
+    """The groups of geoms to draw: those that MuJoCo draws, and if no moving body has a geom in these, also the groups
+    of the moving bodies."""
     moving = model.geom_group[model.body_weldid[model.geom_bodyid] > 0].clip(0, mujoco.mjNGROUP - 1)
     if moving.size == 0 or np.isin(moving, DRAWN_GROUPS).any():
         return DRAWN_GROUPS
@@ -85,7 +84,7 @@ def geom_groups(model: mujoco.MjModel) -> tuple[int, ...]:
 
 
 def describe_groups(groups: Sequence[int]) -> str:
-    """Which groups of geoms are drawn although MuJoCo would not, and why, in words; empty if there are none."""
+    """Which groups are drawn that MuJoCo would not draw, and why, in words; empty if there are none."""
     further = [str(group) for group in groups if group not in DRAWN_GROUPS]
     if not further:
         return ""
@@ -114,7 +113,7 @@ def add_background(frame: np.ndarray, depth: np.ndarray, far: float) -> np.ndarr
 
 
 def fit_arrows(scene: mujoco.MjvScene, aspect: float) -> None:
-    """Shorten the arrows of contact forces that start in the picture and would leave it; they get another colour.
+    """Shorten arrows of contact forces that start in the picture and would leave it, and change their colour.
 
     Args:
         scene: updated for the frame to draw.
@@ -163,14 +162,14 @@ class _View:
 
 def muscle_tendons(model: mujoco.MjModel) -> dict[int, list[int]]:
     """Tendon → addresses in `act` of the stateful actuators that pull on it."""
-    found: dict[int, list[int]] = {}
+    addresses: dict[int, list[int]] = {}
     for actuator in range(model.nu):
         # An actuator with several states has its activation last.
         address = int(model.actuator_actadr[actuator]) + int(model.actuator_actnum[actuator]) - 1
         pulls = model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_TENDON
         if pulls and model.actuator_actadr[actuator] >= 0:
-            found.setdefault(int(model.actuator_trnid[actuator, 0]), []).append(address)
-    return found
+            addresses.setdefault(int(model.actuator_trnid[actuator, 0]), []).append(address)
+    return addresses
 
 
 def default_camera(model: mujoco.MjModel) -> mujoco.MjvCamera:

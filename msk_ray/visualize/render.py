@@ -1,4 +1,4 @@
-"""Frames of a trajectory, drawn in a separate process with an OpenGL platform that works here."""
+"""Draw frames of a trajectory in a separate process, on an OpenGL platform that works here."""
 
 import os
 import subprocess
@@ -58,7 +58,7 @@ class View:
 
 @cache
 def headless_backend() -> str:
-    """The OpenGL platform that works without a display here: `egl`, `osmesa`, or that of MUJOCO_GL.
+    """The OpenGL platform that works here without a display: `egl`, `osmesa`, or the one in MUJOCO_GL.
 
     Raises:
         DeviceError: none works; the message names the packages to install.
@@ -92,7 +92,7 @@ def probe(backend: str) -> str | None:
 
 
 def frames(states: States, view: View) -> Iterator[np.ndarray]:
-    """A frame (height, width, 3), uint8, for each state, as they are drawn.
+    """A frame (height, width, 3), uint8, for each state, yielded as soon as it is drawn.
 
     Raises:
         DeviceError: no OpenGL platform works, or the drawing process failed.
@@ -129,7 +129,7 @@ def frames(states: States, view: View) -> Iterator[np.ndarray]:
 
 
 def check_camera(model: mujoco.MjModel, camera: str) -> None:
-    """Raise DeviceError if a model has no camera of this name; it has a default one, without a name."""
+    """Raise DeviceError if a model has no camera of this name; the empty name is the default camera."""
     names = [model.camera(number).name for number in range(model.ncam)]
     if camera and camera not in names:
         raise DeviceError(f"--camera {camera!r}: the model has {', '.join(names) or 'no cameras'}")
@@ -139,8 +139,8 @@ def _environment(backend: str) -> dict[str, str]:
     """Environment of the drawing process: the platform, and the path of this package."""
     package = str(Path(msk_ray.__file__).resolve().parent.parent)
     paths = [package, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
-    found = os.environ | {"PYTHONPATH": os.pathsep.join(dict.fromkeys(paths))}
-    return found | ({"MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend} if backend else {})
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(dict.fromkeys(paths))}
+    return environment | ({"MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend} if backend else {})
 
 
 def _last_line(errors: str, code: int) -> str:

@@ -16,8 +16,8 @@ from msk_ray.visualize.film import grid
 from msk_ray.visualize.render import View, frames
 
 STRIP_FOLDER = "film"
-"""Subfolder of a trial with separate events: TensorBoard reads the files of a folder one after the other, and would
-stop following the trial's own."""
+"""Subfolder of a trial for strips: TensorBoard follows only the newest event file of a folder, so here they do not stop
+it following the trial's own."""
 
 
 def episode_frames(recording: Recording, count: int, view: View, world: int = 0) -> tuple[list[np.ndarray], list[str]]:
@@ -36,7 +36,7 @@ def progression(
 ) -> tuple[Image.Image | None, list[str]]:
     """A row of `count` frames for each policy that a trial saved during training, and for its best.
 
-    All rows show the same times, those of the longest episode; a row ends with its episode.
+    All rows show the same times, chosen for the longest episode; a row ends where its episode does.
 
     Returns:
         The picture, or None if the trial saved no such policies, and the title of each row.

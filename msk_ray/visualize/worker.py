@@ -1,7 +1,7 @@
 """The drawing process: reads states from a file and writes raw frames to its standard output.
 
-It is a separate process because a broken OpenGL library ends the process that tries it, and because MuJoCo chooses its
-OpenGL platform when it is first imported.
+It is a separate process because a broken OpenGL library crashes the process that tries it, and because MuJoCo chooses
+its OpenGL platform when it is first imported.
 
     MUJOCO_GL=egl python -m msk_ray.visualize.worker --probe
     MUJOCO_GL=egl python -m msk_ray.visualize.worker MODEL.mjb STATES.npz WIDTH HEIGHT GROUPS [CAMERA]
@@ -65,7 +65,7 @@ def draw(
             fit_arrows(renderer.scene, width / height)
             frame = renderer.render()
             if not sky:
-                # Drawn twice: where the depth is that of nothing, there is sky.
+                # Drawn again as depth, which tells where nothing was drawn: there goes the sky.
                 renderer.enable_depth_rendering()
                 frame = add_background(frame, renderer.render(), far)
                 renderer.disable_depth_rendering()

@@ -80,13 +80,13 @@ def test_charts_are_filtered_hovered_and_zoomed(page: Page) -> None:
     page.fill("#words", "seed=1 actor_lr=0.01")
     assert (rows.count(), page.locator("#shown").text_content()) == (1, "1 of 4")
     chart = page.locator("[data-figure=curves] .chart")
-    shown = "box => page.chart(box).getOption().series.map(one => one.place).filter(place => place !== undefined)"
+    shown = "box => page.chart(box).getOption().series.map(one => one.trial).filter(trial => trial !== undefined)"
     (place,) = chart.evaluate(shown)
     trial = rows.first.locator("code").text_content()
     assert str(place) == rows.first.get_attribute("data-trial")
     # The pointer on the curve's last point names the trial.
     spot = """box => { const chart = page.chart(box);
-        const data = chart.getOption().series.find(s => s.place !== undefined).data;
+        const data = chart.getOption().series.find(s => s.trial !== undefined).data;
         return chart.convertToPixel({gridIndex: 0}, data[data.length - 1]); }"""
     chart.scroll_into_view_if_needed()
     frame, (x, y) = chart.bounding_box(), chart.evaluate(spot)

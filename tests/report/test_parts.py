@@ -8,6 +8,7 @@ import pytest
 from bodies import make_bodies
 
 from msk_ray.report.__main__ import main
+from msk_ray.report.charts import Plot
 from msk_ray.report.curves import learning_curves
 from msk_ray.report.page import places_of
 from msk_ray.report.reading import read_experiment
@@ -37,10 +38,12 @@ def test_each_environment_is_a_part_of_the_page(tmp_path: Path) -> None:
     # Seed 0 ends after half the time of seed 1; a mean beyond would be of seed 1 alone.
     times = learning_curves(parts[0].variants, None, "times", places_of(parts), over="seconds")
     assert times is not None
-    means = {variant["name"]: variant["mean"] for variant in times.chart["variants"]}
-    assert {name: mean[0][-1] for name, mean in means.items()} == {"fast": 8.0, "SHAC": 4.0}
+    (plot,) = times.chart.panels
+    assert isinstance(plot, Plot)
+    means = {times.chart.styles[line.style].name: line for line in plot.lines if line.when == "unfiltered"}
+    assert {name: line.x[-1] for name, line in means.items()} == {"fast": 8.0, "SHAC": 4.0}
     # Seed 0 has its last score, 4, where seed 1 is half way to 6.
-    assert means["SHAC"][1][-1] == 3.5
+    assert means["SHAC"].y[-1] == 3.5
     assert main([str(made.path), "--best", "never"]) == 0
     page = (made.path / "report" / "index.html").read_text()
     assert "<h1>bodies</h1>" in page

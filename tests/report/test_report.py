@@ -10,23 +10,22 @@ from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from msk_ray.cli import run
 from msk_ray.config import dump_yaml
 from msk_ray.errors import ConfigError
 from msk_ray.experiment import snapshot
 from msk_ray.experiment.attempts import Attempt, Reduced
-from msk_ray.experiment.checkpoint_file import write_checkpoint_file
 from msk_ray.experiment.damage import DamagedFile
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.notes import load_notes, write_note
 from msk_ray.experiment.outcomes import Ending, Outcome, write_ending
 from msk_ray.report.__main__ import main
+from msk_ray.report.charts import Axis, Chart, Floor, Picture, Plot, Style, thin_evenly
 from msk_ray.report.curves import learning_curves, rung_steps
 from msk_ray.report.influence import ranked_effects
 from msk_ray.report.page import make_section, places_of
-from msk_ray.report.pictures import Picture, shorten, thin_evenly
+from msk_ray.report.png import png, shorten
 from msk_ray.report.reading import Condition, ExperimentReader, read_experiment
 from msk_ray.report.tables import failures, variant_rows
 from msk_ray.sweep import opening
@@ -166,15 +165,6 @@ def test_nothing_is_told_from_untrained_policies(experiment: Experiment) -> None
     assert "needs 2 at each level: seed (0 has 1, and 1 more), variant (fast has none, and 1 more)." in page
 
 
-def test_a_best_policy_that_was_never_trained_is_called_so(experiment: Experiment) -> None:
-    """Older versions kept the untrained policy where no trained one scored higher."""
-    best = read_experiment(experiment, time.time()).best
-    assert best is not None
-    (best.folder / "checkpoints").mkdir()
-    write_checkpoint_file(best.folder / "checkpoints" / "best.pt", b"policy", {"epoch": 0})
-    assert "Its best.pt is the untrained policy" in page_of(experiment, "--best", "never")
-
-
 def test_evaluations_at_other_env_steps_are_compared_at_the_newest_common_ones(
     experiment: Experiment,
 ) -> None:
@@ -208,38 +198,51 @@ def test_an_axis_says_what_leaves_it(experiment: Experiment) -> None:
     """Policies that fall apart would press all other curves together at the top."""
     reading = read_experiment(experiment, time.time())
     places = places_of([reading])
-    whole = learning_curves(reading.variants, None, "x", places)
-    assert whole is not None
-    assert whole.chart["floor"] is None
+    assert floor_of(learning_curves(reading.variants, None, "x", places)) is None
     fill(reading.trials[0].folder, [0.0, 34.0, -5000.0], Ending(Outcome.FINISHED, "all 4 epochs done"))
-    cut = learning_curves(read_experiment(experiment, time.time()).variants, None, "x", places)
-    assert cut is not None
     # First and best scores lie between 0 and 34: a tenth of that is left below them.
-    assert cut.chart["floor"] == {
-        "at": pytest.approx(-3.4),
-        "text": "▼ 1 trial goes below this axis, down to -5000",
-    }
+    cut = learning_curves(read_experiment(experiment, time.time()).variants, None, "x", places)
+    assert floor_of(cut) == Floor(-3.4, "▼ 1 trial goes below this axis, down to -5000")
     fill(reading.trials[0].folder, [0.0, 34.0, -10.0], Ending(Outcome.FINISHED, "all 4 epochs done"))
     near = learning_curves(read_experiment(experiment, time.time()).variants, None, "x", places)
-    assert near is not None
-    assert near.chart["floor"] is None, "little is won by cutting off what is near"
+    assert floor_of(near) is None, "little is won by cutting off what is near"
+
+
+def floor_of(picture: Picture | None) -> Floor | None:
+    assert picture is not None
+    (plot,) = picture.chart.panels
+    assert isinstance(plot, Plot)
+    return plot.y.floor
 
 
 def test_charts_have_the_numbers_of_their_trials(experiment: Experiment) -> None:
     reading = read_experiment(experiment, time.time())
     section = make_section(reading, experiment.path / "report", "", None, places_of([reading]))
-    charts = {name: picture.chart for name, picture in section.pictures.items()}
-    fast = next(v for v in charts["curves"]["variants"] if v["name"] == "fast")
-    assert fast["mean"] == [[0.0, 200.0, 400.0], [0.0, 32.0, 31.0], [0.0, 30.0, 29.0], [0.0, 34.0, 33.0]]
-    lines = {line[0]: line[1:] for line in charts["curves"]["lines"]}
+    charts: Any = {name: picture.chart for name, picture in section.pictures.items()}
+    (curves,) = charts["curves"].panels
+    names = [style.name for style in charts["curves"].styles]
+    (fast,) = [line for line in curves.lines if names[line.style] == "fast" and line.when == "unfiltered"]
+    assert (fast.x, fast.y) == ([0.0, 200.0, 400.0], [0.0, 32.0, 31.0])
+    assert (fast.low, fast.high) == ([0.0, 30.0, 29.0], [0.0, 34.0, 33.0])
+    lines = {line.trial: line for line in curves.lines}
     ids = [trial.trial.id for trial in reading.trials]
     second = next(t for t in reading.trials if (t.trial.variant, t.trial.seed) == ("fast", 1))
-    assert lines[ids.index(second.trial.id)] == [[0.0, 200.0, 400.0], [0.0, 34.0, 33.0], False]
-    levels = {level["label"]: level for level in charts["effects"]["panels"][0]["levels"]}
-    assert levels["fast"]["mean"] == 32.0
-    assert [point[1:] for point in levels["fast"]["points"]] == [[30.0, False], [34.0, False]]
-    assert charts["parallel"]["axes"][0]["levels"] == ["baseline", "fast", "deep"]
-    assert [bar[1] for bar in charts["stops"]["bars"]] == [400.0] * 5 + [200.0]
+    own = lines[ids.index(second.trial.id)]
+    assert (own.x, own.y, own.when) == ([0.0, 200.0, 400.0], [0.0, 34.0, 33.0], "filtered")
+    (cross,) = curves.points
+    assert (names[cross.style], cross.x, cross.y, cross.trial) == ("deep", 200.0, 2.0, 5), "the trial that failed"
+    ranking, levels, *_ = charts["effects"].panels
+    assert [row.label for row in ranking.rows] == ["variant", "seed"]
+    place = levels.x.labels.index("fast")
+    at_fast = [point for point in levels.points if abs(point.x - place) < 0.5]
+    assert [point.y for point in at_fast if point.trial is None] == [32.0]
+    assert [(point.y, point.hollow) for point in at_fast if point.trial is not None] == [(30.0, False), (34.0, False)]
+    (parallel,) = charts["parallel"].panels
+    assert parallel.axes[0].labels == ("baseline", "fast", "deep")
+    assert {line.trial: line.values for line in parallel.lines}[ids.index(second.trial.id)] == [1.0, 34.0]
+    (stops,) = charts["stops"].panels
+    assert [row.value for row in stops.rows] == [400.0] * 5 + [200.0]
+    assert [charts["stops"].styles[row.style].name for row in stops.rows] == ["finished"] * 5 + ["nonfinite"]
 
 
 def test_a_long_curve_keeps_its_ends_and_extremes() -> None:
@@ -494,10 +497,9 @@ def test_rungs_of_a_search_are_drawn_where_trials_were_judged(tmp_path: Path) ->
 def test_a_dollar_in_a_label_is_no_formula() -> None:
     """Between two of them, matplotlib would read TeX, and fail where it is none."""
 
-    def draw(figure: Figure) -> None:
-        figure.suptitle(shorten("cost $\\frac$ \x1b[1m", 40))
-
-    assert Picture("x", "", "", "", {}, draw).png()
+    wild = "cost $\\frac$ \x1b[1m"
+    plot = Plot(Axis(wild, labels=(wild,), low=-1.0, high=1.0), Axis(wild), title=wild)
+    assert png(Chart((Style("red", wild),), (plot,)))
     assert shorten("a$b\n", 40) == "a\\$b\\n"
 
 

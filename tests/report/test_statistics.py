@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from msk_ray.report.pictures import POINTS, thin_peaks
-from msk_ray.report.statistics import Scored, difference_interval, effects, levels_of, mean_interval, variance_share
+from msk_ray.report.charts import POINTS, thin_peaks
+from msk_ray.report.statistics import TrialScore, difference_interval, effects, levels_of, mean_interval, variance_share
 
 
 def test_interval_of_a_mean() -> None:
@@ -70,18 +70,18 @@ def test_the_parameter_that_matters_comes_first() -> None:
         for rate in (0.1, 0.01):
             for horizon in (8, 16):
                 score = (100.0 if rate == 0.1 else 0.0) + rng.normal()
-                trials.append(Scored({"lr": f"{rate}", "h": f"{horizon}"}, {"lr": rate, "h": horizon}, seed, score))
+                trials.append(TrialScore({"lr": f"{rate}", "h": f"{horizon}"}, {"lr": rate, "h": horizon}, seed, score))
     found = effects(trials)
     assert found[0].factor == "lr"
     assert {effect.factor for effect in found} == {"lr", "h", "seed"}
     assert found[0].share == pytest.approx(1.0, abs=0.01)
     assert found[0].spread == pytest.approx(100.0, abs=2.0)
     assert max(effect.share or 0.0 for effect in found[1:]) < 0.1
-    assert effects([Scored({"lr": "1"}, {"lr": 1}, 0, 5.0)]) == []
+    assert effects([TrialScore({"lr": "1"}, {"lr": 1}, 0, 5.0)]) == []
 
 
-def scored(level: float, *scores: float | None) -> list[Scored]:
-    return [Scored({"lr": f"{level}"}, {"lr": level}, 0, score) for score in scores]
+def scored(level: float, *scores: float | None) -> list[TrialScore]:
+    return [TrialScore({"lr": f"{level}"}, {"lr": level}, 0, score) for score in scores]
 
 
 def test_too_few_scores_give_no_share_and_say_where() -> None:

@@ -55,8 +55,8 @@ const live = (() => {
     try {
       const answer = await fetch(here);
       if (!answer.ok) throw new Error(await answer.text());
-      const found = (await answer.json()).version;
-      if (found !== version) {
+      const newest = (await answer.json()).version;
+      if (newest !== version) {
         const page = await fetch(location.href);
         if (!page.ok) throw new Error(await page.text());
         const next = new DOMParser().parseFromString(await page.text(), "text/html");

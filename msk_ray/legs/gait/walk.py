@@ -7,7 +7,7 @@ import numpy as np
 
 from msk_ray.envs import Env
 from msk_ray.errors import ConfigError
-from msk_ray.evaluate.measure import Bench, Made, Request, device_name, entry_of
+from msk_ray.evaluate.measure import Bench, EvaluationSetup, Request, device_name, entry_of
 from msk_ray.legs.config import LegSettings
 from msk_ray.legs.gait.body import Array, Episode, Motion, analyse, between, check_legs
 from msk_ray.legs.gait.measure import measure
@@ -69,10 +69,10 @@ def walk(bench: Bench, policy: SavedPolicy, request: Request) -> Walk:
             pace(world + 1)
     gait = measure(episodes, recording.episodes.fell.tolist())
     seeds = request.seeds or (policy.config.evaluation.seed,)
-    made = Made(
+    setup = EvaluationSetup(
         recording.physics, False, recording.count, seeds[:1], evaluator.steps, device_name(str(evaluator.env.device))
     )
-    entry = entry_of(policy, made, [recording.episodes], evaluator.env.reward_names)
+    entry = entry_of(policy, setup, [recording.episodes], evaluator.env.reward_names)
     return Walk(gait, entry | {"gait": {name: gait[name] for name in _KEPT}}, episodes, positions, env)
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from msk_ray.config import Config
 from msk_ray.errors import ConfigError, SimulationError
-from msk_ray.evaluate.measure import Made, Request, entry_of
+from msk_ray.evaluate.measure import EvaluationSetup, Request, entry_of
 from msk_ray.legs.myosuite_walk import scoring_worker as worker
 from msk_ray.legs.myosuite_walk.config import MyoSuiteWalkSettings
 from msk_ray.legs.myosuite_walk.elsewhere import MYOSUITE
@@ -94,8 +94,8 @@ class MyoSuiteScorer:
             with _Worker(self._python, {**asked, "episodes": request.worlds, "steps": request.steps}) as running:
                 runs.append(running.episodes(act, request.worlds, request.steps))
                 versions = running.versions
-        made = Made(request.physics, False, request.worlds, seeds, request.steps, "cpu")
-        return entry_of(policy, made, runs, worker.TERMS) | {"myosuite": versions}
+        setup = EvaluationSetup(request.physics, False, request.worlds, seeds, request.steps, "cpu")
+        return entry_of(policy, setup, runs, worker.TERMS) | {"myosuite": versions}
 
 
 def _acting(policy: SavedPolicy) -> _Act:
