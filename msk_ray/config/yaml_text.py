@@ -27,6 +27,7 @@ class _Loader(yaml.SafeLoader):
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
+        self.number_keys = False
         self._depth = 0
         self._extent: dict[yaml.Node, tuple[int, int]] = {}
         """Number of values in, and depth below, each node that has been read, with aliases expanded."""
@@ -52,7 +53,7 @@ class _Loader(yaml.SafeLoader):
             if isinstance(node, yaml.SequenceNode):
                 children = node.value
             elif isinstance(node, yaml.MappingNode):
-                _check_keys(node)
+                _check_keys(node, self.number_keys)
                 children = [part for pair in node.value for part in pair]
             below = [self._extent[child] for child in children]
             size = 1 + sum(count for count, _ in below)
@@ -79,6 +80,7 @@ _Loader.yaml_implicit_resolvers = {
 }
 
 
+_WHOLE_NUMBER = "tag:yaml.org,2002:int"
 _NO_NAMES = {
     f"tag:yaml.org,2002:{kind}": shown
     for kind, shown in (
@@ -91,13 +93,13 @@ _NO_NAMES = {
 """What a key may be read as if it is not in quotes, by its tag."""
 
 
-def _check_keys(node: yaml.MappingNode) -> None:
-    """Refuse keys that are no text, and a duplicate key, of which YAML would take the last value."""
+def _check_keys(node: yaml.MappingNode, numbers: bool) -> None:
+    """Refuse keys that are no text, unless they may be whole numbers, and a duplicate key, of which YAML would take the last value."""
     seen: set[tuple[str, str]] = set()
     for key, _ in node.value:
         if not isinstance(key, yaml.ScalarNode):
             raise _NotSettings("a key must be a name, not a list or a mapping")
-        if key.tag in _NO_NAMES:
+        if key.tag in _NO_NAMES and not (numbers and key.tag == _WHOLE_NUMBER):
             raise _NotSettings(
                 f"key {shortened(key.value, 60)!r} is {_NO_NAMES[key.tag]} in YAML, not a name; write a name, in "
                 "quotes if it is one"
@@ -107,8 +109,8 @@ def _check_keys(node: yaml.MappingNode) -> None:
         seen.add((key.tag, key.value))
 
 
-def parse_yaml(text: str, source: str) -> Any:
-    """Plain data from YAML text. `source` names it in errors.
+def parse_yaml(text: str, source: str, *, number_keys: bool = False) -> Any:
+    """Plain data from YAML text. `source` names it in errors; keys may be whole numbers only with `number_keys`.
 
     Raises:
         ConfigError: it is not YAML, holds anything but plain data, has a duplicate key, or exceeds the limits.
@@ -117,6 +119,7 @@ def parse_yaml(text: str, source: str) -> Any:
         raise ConfigError(f"{source} is larger than {MAX_BYTES} bytes: too large for settings")
     try:
         loader = _Loader(text)
+        loader.number_keys = number_keys
         try:
             return loader.get_single_data()
         finally:
@@ -129,8 +132,8 @@ def parse_yaml(text: str, source: str) -> Any:
         raise ConfigError(f"{source} is not valid YAML: {reason}") from error
 
 
-def read_yaml(path: Path) -> dict[str, Any]:
-    """The mapping in a YAML file.
+def read_yaml(path: Path, *, number_keys: bool = False) -> dict[str, Any]:
+    """The mapping in a YAML file; its keys may be whole numbers only with `number_keys`.
 
     Raises:
         ConfigError: the file is missing, unreadable, not YAML, too large, or not a mapping.
@@ -149,16 +152,16 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8"
         raise ConfigError(f"cannot read {path}: {reason or error}") from error
-    return parse_settings(text, str(path))
+    return parse_settings(text, str(path), number_keys=number_keys)
 
 
-def parse_settings(text: str, source: str) -> dict[str, Any]:
+def parse_settings(text: str, source: str, *, number_keys: bool = False) -> dict[str, Any]:
     """The mapping in YAML text. `source` names it in errors.
 
     Raises:
         ConfigError: as for `parse_yaml`, or it is not a mapping.
     """
-    settings = parse_yaml(text, source)
+    settings = parse_yaml(text, source, number_keys=number_keys)
     if not isinstance(settings, dict):
         raise ConfigError(f"{source} must hold a mapping of settings at its top level")
     return settings

@@ -105,7 +105,7 @@ def read_entry(policy: Path) -> Entry:
     """
     path = policy.with_suffix(".yaml")
     try:
-        entry = Entry.model_validate(read_yaml(path))
+        entry = Entry.model_validate(read_yaml(path, number_keys=True))
     except ValidationError as error:
         raise StorageError(f"{path}: {describe_fault(error)}") from None
     if read_facts(policy).get("sha256") != entry.sha256:
