@@ -10,9 +10,16 @@ Faults inside a trial's process happen once each, at a chosen epoch (`FaultyTrai
 raylet, files, disk) when the trials have written a number of rows drawn from the seed.
 """
 
+import sys
+
+if sys.argv[1:2] == ["drive"]:
+    # Before the imports that take time to load, as `python -m msk_ray.tune` does.
+    from msk_ray import signals
+
+    signals.listen()
+
 import argparse
 import random
-import sys
 import time
 from pathlib import Path
 

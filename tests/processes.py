@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from fault_campaign.processes import catches as catches
 from fault_campaign.processes import stat_of
 
 
@@ -19,14 +20,6 @@ def members_of(session: int) -> dict[int, str]:
         if entry.name.isdigit() and (stat := stat_of(int(entry.name))) and stat[4] == str(session):
             found[int(entry.name)] = stat[0]
     return found
-
-
-def catches(pid: int, number: signal.Signals) -> bool:
-    """Whether a process has a handler of its own for a signal."""
-    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
-        if line.startswith("SigCgt:"):
-            return bool(int(line.split()[1], 16) >> (number - 1) & 1)
-    return False
 
 
 class Launcher:

@@ -123,7 +123,8 @@ def early(reference: Reference, scratch: Path, rng: random.Random) -> list[Tally
     codes = []
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1) * 3:
         sweep.launch()
-        # The first of them at moments of the start of Ray, the others also while modules are imported.
+        # Most of them while Ray starts, the others while modules are imported.
+        sweep.wait_until_it_listens()
         if rng.random() < 0.7 and not sweep.wait_for_line("starting Ray"):
             break
         time.sleep(rng.uniform(0.3, 4.0))

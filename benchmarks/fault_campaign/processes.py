@@ -1,5 +1,6 @@
 """Processes as /proc shows them."""
 
+import signal
 from pathlib import Path
 
 
@@ -43,3 +44,11 @@ def descendants_of(pid: int) -> list[int]:
         level = [child for child, above in parent.items() if above in level]
         found += level
     return found
+
+
+def catches(pid: int, number: signal.Signals) -> bool:
+    """Whether a process has a handler of its own for a signal."""
+    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+        if line.startswith("SigCgt:"):
+            return bool(int(line.split()[1], 16) >> (number - 1) & 1)
+    return False

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import msk_ray
-from fault_campaign.processes import birth_of, command_of, descendants_of, name_of
+from fault_campaign.processes import birth_of, catches, command_of, descendants_of, name_of
 from msk_ray.experiment.layout import MANIFEST_FILE
 from msk_ray.experiment.metrics import read_rows
 from msk_ray.experiment.outcomes import read_ending
@@ -128,6 +128,12 @@ class Sweep:
                 return False
             time.sleep(0.02)
         return True
+
+    def wait_until_it_listens(self) -> None:
+        """Wait until the driver has handlers for signals, which is the first that it does."""
+        assert self._driver is not None
+        while self._driver.poll() is None and not catches(self._driver.pid, signal.SIGHUP):
+            time.sleep(0.005)
 
     def rows(self) -> int:
         """Rows all trials have now."""

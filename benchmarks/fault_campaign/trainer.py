@@ -86,9 +86,6 @@ def _kill_self() -> None:
 
 def drive(arguments: list[str]) -> int:
     """`python -m msk_ray.tune` with trials that can be shot at, and without the dashboard's share of the cores."""
-    from msk_ray import signals
-
-    signals.listen()
     from ray import cloudpickle
 
     from msk_ray.cli import run

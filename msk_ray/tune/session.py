@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import ray
+from ray._private import auto_init_hook
 
 from msk_ray.errors import ClusterLost, DeviceError, MskRayError
 from msk_ray.progress import announce
@@ -38,8 +39,10 @@ def ray_session(address: str | None, dashboard: bool | None = None, trials: bool
         TUNE_DISABLE_SIGINT_HANDLER="1",  # a request to stop lets trials save themselves first
     )
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    # Ray starts a cluster automatically when it is used after `ray.shutdown`.
+    # Ray starts another cluster automatically when it is used after `ray.shutdown`, as a thread of Tune's may do. The
+    # variable is for the processes to come: this one has read it when Ray was imported.
     os.environ["RAY_ENABLE_AUTO_CONNECT"] = "0"
+    auto_init_hook.enable_auto_connect = False
     # Off by default because it runs a program in the cluster; but so can everybody who has the token it requires.
     os.environ.setdefault("RAY_DASHBOARD_ENABLE_PROFILING", "1")
     # Otherwise Ray would give trials a lower priority than everything else on the machine.

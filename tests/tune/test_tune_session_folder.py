@@ -32,6 +32,10 @@ with ray_session(None, trials=False):
     ray.get(worker.pid.remote())
     print("READY", flush=True)
     sys.stdin.readline()
+try:
+    ray.nodes()  # as a thread may that still runs
+except Exception as error:
+    print("refused:", error)
 """
 
 
@@ -101,6 +105,7 @@ def test_nothing_is_left_after_the_end(session: "subprocess.Popen[str]", top: Pa
     assert (home / LINK).resolve().is_relative_to(top.resolve())
     output, _ = session.communicate("\n")
     assert session.returncode == 0, output
+    assert "refused: System error: Ray has not been started yet" in output
     wait_until(lambda: not members_of(session.pid))
     assert list(top.iterdir()) == []
     assert not os.path.lexists(home / LINK)
