@@ -94,7 +94,8 @@ _NO_NAMES = {
 
 
 def _check_keys(node: yaml.MappingNode, numbers: bool) -> None:
-    """Refuse keys that are no text, unless they may be whole numbers, and a duplicate key, of which YAML would take the last value."""
+    """Refuse keys that are no text, except whole numbers if `numbers`, and a duplicate key: YAML would take the last
+    value."""
     seen: set[tuple[str, str]] = set()
     for key, _ in node.value:
         if not isinstance(key, yaml.ScalarNode):
