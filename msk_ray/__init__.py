@@ -1,7 +1,7 @@
 """Policy learning through differentiable MuJoCo Warp, swept with Ray Tune.
 
-What libraries and notebooks use stands here by one name each, and is loaded when it is first asked for: importing
-`msk_ray` loads neither torch nor Warp.
+The public names for libraries and notebooks. Each is loaded on first use: importing `msk_ray` loads neither torch nor
+Warp.
 """
 
 from importlib import import_module
@@ -69,10 +69,10 @@ def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module 'msk_ray' has no attribute {name!r}; it has {', '.join(sorted(_HOMES))}")
     home = import_module(_HOMES[name])
-    # `train` stays the module, which can be called: who imports it must find its other names.
-    found = home if _HOMES[name] == f"msk_ray.{name}" else getattr(home, name)
-    globals()[name] = found
-    return found
+    # `train` is the callable module, not the function, so that `msk_ray.train.X` keeps working.
+    attribute = home if _HOMES[name] == f"msk_ray.{name}" else getattr(home, name)
+    globals()[name] = attribute
+    return attribute
 
 
 def __dir__() -> list[str]:

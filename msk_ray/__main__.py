@@ -20,7 +20,7 @@ COMMANDS = {
     "report": Command("msk_ray.report.__main__", "write an experiment's report: curves, tables, the best policy"),
     "dashboard": Command("msk_ray.dashboard.__main__", "serve the experiments as live pages in a browser"),
     "status": Command("msk_ray.status", "show the progress of experiments, read from their files"),
-    "doctor": Command("msk_ray.doctor", "check that this machine can run trials, and say what to fix"),
+    "doctor": Command("msk_ray.doctor", "check that this machine can run trials, and what to fix"),
     "diagnose": Command(
         "msk_ray.diagnose.__main__", "compare a policy's gradients with float64 differences, by horizon"
     ),
@@ -28,14 +28,14 @@ COMMANDS = {
 }
 
 PLUGINS = Registry("msk-ray", "msk_ray.commands", {})
-"""Commands of the legs and of other packages, by name."""
+"""Commands declared by packages, such as the legs, by name."""
 
 SAVING = ("train", "tune")
-"""The commands that save their state when they are asked to stop."""
+"""Commands that save their state when asked to stop."""
 
 
 def commands() -> dict[str, Command]:
-    """Every command by name: those of the runner, then those that installed packages declare."""
+    """Every command by name: the runner's, then those of installed packages."""
     declared = {name: resolve(PLUGINS.path(name), "msk-ray") for name in PLUGINS.known() if name not in COMMANDS}
     return {**COMMANDS, **declared}
 
@@ -57,7 +57,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     name, *rest = arguments
     if name in SAVING:
-        # Before the imports that take time to load.
+        # Set up before the slow imports.
         signals.listen()
     command = COMMANDS.get(name) or commands().get(name)
     if command is None:

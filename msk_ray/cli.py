@@ -27,7 +27,7 @@ _ADVICE = {
     errno.ENAMETOOLONG: "too long for a file name; write a shorter one",
     errno.EACCES: "permission denied; name another file or folder, or ask its owner",
 }
-"""What a user can do about errors of the operating system that any file may give."""
+"""What a user can do about common file errors of the operating system."""
 
 
 class Command(NamedTuple):
@@ -40,7 +40,7 @@ class Command(NamedTuple):
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser that keeps the line breaks of the examples in its help."""
+    """An argument parser that keeps line breaks in its description and examples."""
 
     def __init__(self, prog: str, description: str, examples: str) -> None:
         super().__init__(
@@ -56,8 +56,8 @@ class Parser(argparse.ArgumentParser):
         return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
-        """Print what is wrong with the command line, on one line that is safe for a terminal, and exit with 2."""
-        # argparse would first name what it misses because of an option that it does not know.
+        """Print the error on one line that is safe for a terminal, and exit with 2."""
+        # Report unknown options first; argparse would report what is missing because of them.
         heads = [word.partition("=")[0] for word in self._words if word.startswith("--") and word != "--"]
         options = [option for option in self._option_string_actions if option.startswith("--")]
         for head in heads:
@@ -69,9 +69,9 @@ class Parser(argparse.ArgumentParser):
 
 
 def typed_command(argv: Sequence[str], *more: str) -> str:
-    """The command line that a user would type for `argv`, with those options of `more` that it does not have yet."""
+    """The command line to type for `argv`, plus those options of `more` that it lacks."""
     program = Path(argv[0])
-    # `python -m msk_ray.tune` shows up as the path of the file it runs.
+    # For `python -m msk_ray.tune`, argv[0] is the path of a file.
     module = _module_of(program)
     if module is None and program.name == "__main__.py":
         module = program.parent.name
@@ -83,12 +83,12 @@ def typed_command(argv: Sequence[str], *more: str) -> str:
 
 
 def shell_join(words: Sequence[str]) -> str:
-    """Words as one types them into a shell, all of them visible."""
+    """Words quoted for a shell, with invisible characters escaped."""
     return " ".join(_quoted(word) for word in words)
 
 
 def option_value(words: Sequence[str], option: str) -> str | None:
-    """The value of a long option among the words of a command line, also abbreviated; the last one counts."""
+    """The value of a long option in the words of a command line, also if abbreviated; the last one counts."""
     value = None
     for place, word in enumerate(words):
         head, separator, attached = word.partition("=")
@@ -98,7 +98,7 @@ def option_value(words: Sequence[str], option: str) -> str | None:
 
 
 def with_option(words: Sequence[str], option: str, value: str) -> list[str]:
-    """The words of a command line with another value for a long option, where it was or at their end."""
+    """The words of a command line with a long option's value replaced, or the option appended."""
     changed, rest, place = [], iter(words), None
     for word in rest:
         head, separator, _ = word.partition("=")
@@ -113,31 +113,30 @@ def with_option(words: Sequence[str], option: str, value: str) -> list[str]:
 
 
 def _means(word: str, option: str) -> bool:
-    """Whether a word is an option, or as much of it as argparse needs to tell it from others."""
+    """Whether a word is an option, or an abbreviation that argparse accepts for it."""
     return len(word) > len("--x") and option.startswith(word)
 
 
 def _quoted(word: str) -> str:
-    r"""A word as a shell reads it. What cannot be seen is written as bash and zsh do: `$'a\x1bb'`."""
+    r"""A word quoted for a shell. Invisible characters are escaped as in bash and zsh: `$'a\x1bb'`."""
     if word.isprintable():
         return shlex.quote(word)
     return f"$'{''.join(_escaped(character) for character in word)}'"
 
 
 def _escaped(character: str) -> str:
-    """A character between `$'` and `'`."""
+    """A character, escaped for use between `$'` and `'`."""
     if character.isprintable() and character not in "'\\":
         return character
-    # Python keeps a byte that is not UTF-8 as half a character.
+    # Python represents a byte that is not UTF-8 as a lone surrogate.
     kept = "surrogateescape" if "\udc80" <= character <= "\udcff" else "surrogatepass"
     return "".join(f"\\x{byte:02x}" for byte in character.encode(errors=kept))
 
 
 def _module_of(program: Path) -> str | None:
-    """The module of this package that a file belongs to, in this checkout or another one; None if it is no such module.
+    """The name of the package's module in a file, of this checkout or another one; None if it is not one.
 
-    Decided by comparing with this package's files, because the checkout's folder, or any other in the path, may be
-    called msk_ray too.
+    Found by comparing with this package's files, because any folder in the path may be called msk_ray too.
     """
     package = Path(__file__).resolve().parent
     for place, part in enumerate(program.parts):
@@ -152,15 +151,15 @@ _at_once = False
 
 
 def end_at_once() -> None:
-    """Have `run` end this process itself, as something in it would wait for ever at the interpreter's end."""
+    """Let `run` end this process without the interpreter's shutdown, because something would wait there forever."""
     global _at_once
     _at_once = True
 
 
 def run(main: Callable[[Sequence[str] | None], int], argv: Sequence[str] | None = None) -> int:
-    """Run an entry point: an error that the user can fix becomes one line on stderr and a non-zero exit code.
+    """Run an entry point. Errors that the user can fix become one line on stderr and a non-zero exit code.
 
-    In a program that listens to `signals`, a request to stop for which `main` had nothing to save ends it with 75.
+    If the program listens to `signals`, and `main` had nothing to save on a request to stop, the exit code is 75.
     """
     code = 1
     try:
@@ -173,14 +172,14 @@ def run(main: Callable[[Sequence[str] | None], int], argv: Sequence[str] | None 
     finally:
         if _at_once:
             for stream in (sys.stdout, sys.stderr):
-                with contextlib.suppress(OSError, ValueError):  # nobody reads it
+                with contextlib.suppress(OSError, ValueError):  # nobody reads the output
                     stream.flush()
             os._exit(code)
 
 
 def _run(main: Callable[[Sequence[str] | None], int], argv: Sequence[str] | None) -> int:
-    # `python -m` looks for modules in the current folder, a console script does not. A class that a configuration names
-    # by import path must be found either way.
+    # Unlike `python -m`, console scripts do not search the current folder, but a class named in a configuration must be
+    # found either way.
     if "" not in sys.path:
         sys.path.append("")
     stop = signals.current()
@@ -214,8 +213,8 @@ def _run(main: Callable[[Sequence[str] | None], int], argv: Sequence[str] | None
             stop.settle()
 
 
-class _Outliving(io.TextIOBase):
-    """An unbuffered standard stream that continues in a file once nobody reads it."""
+class _RedirectableStream(io.TextIOBase):
+    """An unbuffered standard stream that continues in a file once its reader has gone."""
 
     def __init__(self, descriptor: int, log: Path, descriptors: Sequence[int]) -> None:
         self._descriptor = descriptor
@@ -240,7 +239,7 @@ class _Outliving(io.TextIOBase):
         return os.isatty(self._descriptor)
 
     def _move(self, error: OSError) -> None:
-        """Redirect this stream to the file, and the other one too if it is the same pipe or terminal."""
+        """Redirect this stream to the file, and also the other one if it is the same pipe or terminal."""
         try:
             file = os.open(self._log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
         except OSError as fault:
@@ -255,10 +254,10 @@ class _Outliving(io.TextIOBase):
 
 
 @contextlib.contextmanager
-def outliving(log: Path) -> Iterator[None]:
-    """Let a program continue when nobody reads its output any more: from then on, the output goes to a file.
+def surviving_closed_output(log: Path) -> Iterator[None]:
+    """Context in which a program continues when its output's reader has gone: output then goes to a file.
 
-    Standard output and error stay redirected after this returns, for child processes and for Python at its exit.
+    Standard output and error stay redirected afterwards, for child processes and Python's shutdown.
 
     Args:
         log: the file; created only when it is needed.
@@ -268,7 +267,9 @@ def outliving(log: Path) -> Iterator[None]:
     """
     descriptors = [_descriptor(stream) for stream in (sys.stdout, sys.stderr)]
     known = [descriptor for descriptor in descriptors if descriptor is not None]
-    out, err = (None if descriptor is None else _Outliving(descriptor, log, known) for descriptor in descriptors)
+    out, err = (
+        None if descriptor is None else _RedirectableStream(descriptor, log, known) for descriptor in descriptors
+    )
     for stream in (sys.stdout, sys.stderr):
         if stream is not None:
             stream.flush()
@@ -277,8 +278,8 @@ def outliving(log: Path) -> Iterator[None]:
 
 
 def _descriptor(stream: object) -> int | None:
-    """The file descriptor of a standard stream; None if it has none, as under a test runner or if it was closed from
-    the start."""
+    """The file descriptor of a standard stream; None if it has none, for example under a test runner, or if it was
+    closed from the start."""
     if stream is None:
         return None
     try:

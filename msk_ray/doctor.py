@@ -27,7 +27,7 @@ from msk_ray.progress import COMPILING, announce
 DESCRIPTION = """\
 Check that this machine can run trials: versions, GPU and driver, gradients of one step, Ray, the storage folder.
 
-Each line says ok, or what to fix. Exit code: 0 if there is nothing to fix, 1 otherwise."""
+Prints ok or FIX for each check. Exit code: 0 if there is nothing to fix, 1 otherwise."""
 
 EXAMPLES = """\
   python -m msk_ray.doctor
@@ -36,9 +36,9 @@ EXAMPLES = """\
   python -m msk_ray.doctor --repeat ant --set execution.deterministic=true      # does this trial repeat bit for bit?"""
 
 RAY_LIMIT_S = 90.0
-"""Ray starts within seconds; on a loaded machine with a cold disk it may take ten times as long."""
+"""Limit on Ray's start [s]: normally seconds, but ten times as long on a busy machine with a cold disk."""
 MIN_FREE_GB = 2.0
-"""About what the checkpoints and logs of a sweep take."""
+"""Rough size of a sweep's checkpoints and logs."""
 GRADIENT_TOLERANCE = 1e-2
 RAY_PROBE = [sys.executable, "-m", "msk_ray.tune.ray_probe"]
 _SLOW_S = 0.5
@@ -46,7 +46,7 @@ _SLOW_S = 0.5
 
 @dataclass(frozen=True)
 class Finding:
-    """What a check found."""
+    """The result of a check."""
 
     subject: str
     text: str
@@ -56,7 +56,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class GpuFacts:
-    """What driver, torch and Warp report about GPUs."""
+    """Facts about GPUs as reported by driver, torch and Warp."""
 
     driver: str | None
     """Version of the NVIDIA driver; None without one."""
@@ -85,7 +85,7 @@ def parser() -> Parser:
         "--storage", type=Path, default=Path("runs"), metavar="DIR", help="folder of experiments (default: runs/)"
     )
     p.add_argument(
-        "--repeat", metavar="CONFIG", help="only this: train a trial twice and say where the two runs begin to differ"
+        "--repeat", metavar="CONFIG", help="only train a trial twice, and print where the two runs begin to differ"
     )
     p.add_argument("--epochs", type=int, metavar="N", help="epochs to train with --repeat (default: 3)")
     p.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help=SET_HELP)
@@ -114,13 +114,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 @dataclass(frozen=True)
 class Check:
-    """A check, and what to say before it."""
+    """A check and its announcement."""
 
     findings: Callable[[], list[Finding]]
     beginning: str = ""
-    """What it is about to do, for one that takes seconds."""
+    """Line to print before a slow check."""
     needed: bool = False
-    """Whether its findings, if there are any, end the examination."""
+    """Whether to skip the remaining checks if it has findings."""
 
 
 def _report(checks: list[Check]) -> int:
@@ -140,7 +140,7 @@ def _report(checks: list[Check]) -> int:
 
 
 def check_repeat(name: str, overrides: Sequence[str], device: str | None, epochs: int) -> Finding:
-    """Whether a trial does the same twice, to the last bit; if not, where it begins to differ."""
+    """Whether a trial repeats to the last bit; if not, where it begins to differ."""
     from msk_ray.config import load_config
     from msk_ray.repeat import compare
 
@@ -150,11 +150,11 @@ def check_repeat(name: str, overrides: Sequence[str], device: str | None, epochs
     if config.execution.gpus > 1:
         raise ConfigError("--repeat compares trials of one process: write --set execution.gpus=1")
     place = device or _first_device()
-    found, count = compare(config, place, epochs)
-    if found is None:
+    difference, count = compare(config, place, epochs)
+    if difference is None:
         return Finding("repeat", f"{epochs} epoch(s) on {place} twice: {count} tensors are equal to the last bit")
     cure = "" if config.execution.deterministic or place == "cpu" else "; write execution.deterministic: true"
-    return Finding("repeat", f"two runs on {place} differ first {found}{cure}", True)
+    return Finding("repeat", f"two runs on {place} differ first {difference}{cure}", True)
 
 
 def _first_device() -> str:
@@ -195,7 +195,7 @@ def check_imports() -> list[Finding]:
 
 
 def package_findings(wanted: dict[str, str], installed: dict[str, str]) -> list[Finding]:
-    """One finding on all packages that fit, and one on each that does not.
+    """One finding for all packages with a right version, and one for each other package.
 
     Args:
         wanted: name → version specifier.
@@ -221,7 +221,7 @@ def check_gpus(device: str | None) -> list[Finding]:
 
 
 def gpu_findings(facts: GpuFacts, device: str | None) -> list[Finding]:
-    """What the facts mean for trials on `device` (None: the first GPU)."""
+    """Findings from the facts for trials on `device` (None: the first GPU)."""
     wants_gpu = device is not None and device != "cpu"
     if not facts.driver_gpus and not facts.torch_gpus and not facts.warp_gpus:
         if wants_gpu:
@@ -235,17 +235,17 @@ def gpu_findings(facts: GpuFacts, device: str | None) -> list[Finding]:
                 "gpu", f"CUDA_VISIBLE_DEVICES={facts.visible!r} hides all GPUs: unset it, or pass --device cpu", True
             )
         ]
-    found = []
+    findings = []
     if facts.torch_cuda is None:
-        found.append(Finding("gpu", "torch is a CPU-only build: install one with CUDA from pytorch.org", True))
+        findings.append(Finding("gpu", "torch is a CPU-only build: install one with CUDA from pytorch.org", True))
     elif not facts.torch_gpus:
-        found.append(Finding("gpu", _no_gpu("torch", facts.torch_cuda, facts), True))
+        findings.append(Finding("gpu", _no_gpu("torch", facts.torch_cuda, facts), True))
     if facts.warp_cuda is None:
-        found.append(Finding("gpu", "Warp is a build without CUDA: pip install --force-reinstall warp-lang", True))
+        findings.append(Finding("gpu", "Warp is a build without CUDA: pip install --force-reinstall warp-lang", True))
     elif not facts.warp_gpus or (facts.driver_cuda is not None and facts.driver_cuda[0] < facts.warp_cuda[0]):
-        found.append(Finding("gpu", _no_gpu("Warp", "{}.{}".format(*facts.warp_cuda), facts), True))
-    if found:
-        return found
+        findings.append(Finding("gpu", _no_gpu("Warp", "{}.{}".format(*facts.warp_cuda), facts), True))
+    if findings:
+        return findings
     if wants_gpu and (index := _index(device)) is not None and index >= facts.torch_gpus:
         last = facts.torch_gpus - 1
         return [Finding("gpu", f"{device} was requested; the GPUs are cuda:0 to cuda:{last}: name one of them", True)]
@@ -275,7 +275,7 @@ def check_gradient(device: str | None) -> Finding:
         model = env_class(env).build_model(env, PhysicsConfig())
         result = check_gradients(Simulation(model, nworld=4, substeps=1, device=where))
     except (MskRayError, RuntimeError, ValueError, OSError) as error:
-        # Compilers, drivers and memory allocation fail with errors of these types, and the error is the finding.
+        # Compilers, drivers and memory allocation fail with these errors, which become the finding.
         return Finding("gradient", f"one step on {where} failed: {_one_line(error)}", True)
     seconds = time.monotonic() - started
     text = f"one step on {where}: largest relative error {result.max_rel_error:.1e} ({seconds:.0f} s with compilation)"
@@ -289,7 +289,7 @@ def check_ray(limit_s: float = RAY_LIMIT_S) -> Finding:
     started = time.monotonic()
     package = str(Path(msk_ray.__file__).resolve().parent.parent)
     paths = [package, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
-    # Its output goes to a file: Ray's daemons would inherit a pipe and keep its reader waiting after the probe has
+    # Redirect output to a file: Ray's daemons would inherit a pipe, and keep its reader waiting after the probe has
     # ended.
     with tempfile.TemporaryFile("w+") as output:
         process = subprocess.Popen(
@@ -354,7 +354,7 @@ def _write_as_a_trial_does(folder: Path) -> float:
 
 @contextmanager
 def _made(folder: Path) -> Iterator[None]:
-    """Remove afterwards the folders that the check itself has created."""
+    """Context that removes the folders created by the check."""
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         yield
@@ -368,7 +368,7 @@ def _gpu_facts() -> GpuFacts:
     import torch
     import warp as wp
 
-    # The import sets Warp's log level, so that Warp does not list the devices when it starts.
+    # This import sets Warp's log level, so that Warp does not list devices when it starts.
     import msk_ray.step.forward  # noqa: F401
 
     wp.init()

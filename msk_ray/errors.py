@@ -15,11 +15,11 @@ _STORAGE_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.ERO
 
 
 class CheckpointError(MskRayError):
-    """A checkpoint is missing, incomplete, or belongs to another configuration."""
+    """A checkpoint is missing, damaged, or of another configuration."""
 
 
 class ExportError(MskRayError):
-    """An exported policy does not compute what its checkpoint does."""
+    """An exported policy computes something else than its checkpoint."""
 
 
 class StorageError(MskRayError):
@@ -27,31 +27,31 @@ class StorageError(MskRayError):
 
 
 class StorageFailure(StorageError):
-    """Writing failed while the work was running: the disk is full or gone. What was saved before is complete, and the
-    work can be resumed from it."""
+    """Writing failed during the work: the disk is full or gone. Everything saved before is complete, and the work can
+    be resumed from it."""
 
     exit_code = 75  # EX_TEMPFAIL
 
 
 class LoggerError(MskRayError):
-    """A logger raised an exception. What it was given is in the trial's own record."""
+    """A logger raised an exception. Its rows are in the trial's own `metrics.jsonl`."""
 
 
 class OwnershipLost(StorageFailure):
-    """Another process has become the owner of a folder that this one was writing to, or the folder has disappeared."""
+    """Another process has taken over a folder that this one was writing to, or the folder has disappeared."""
 
 
 class ClusterLost(MskRayError):
-    """The Ray node that this process belongs to has died. Trials continue from their checkpoints in a new Ray."""
+    """This process's Ray node has died. Trials can continue from their checkpoints in a new session."""
 
     exit_code = 75  # EX_TEMPFAIL
 
 
 def storage_failure(error: BaseException) -> StorageFailure | None:
-    """The storage failure that is, or has caused, an exception; None if it has another cause."""
+    """The storage failure that an exception is or was caused by; None if it has another cause."""
     seen: BaseException | None = error
     while seen is not None:
-        # Ray wraps an exception from another process in one of the same class, which carries it as `cause`.
+        # Ray wraps an exception from another process in one of the same class, with attribute `cause`.
         inner = getattr(seen, "cause", None)
         if isinstance(inner, BaseException):
             seen = inner
@@ -65,6 +65,6 @@ def storage_failure(error: BaseException) -> StorageFailure | None:
 
 
 class RankLost(MskRayError):
-    """A process of a trial that has several died. The trial continues from its last checkpoint."""
+    """One of a trial's several processes died. The trial can continue from its last checkpoint."""
 
     exit_code = 75  # EX_TEMPFAIL

@@ -1,7 +1,7 @@
-"""Read and write regular files only, within limits, and completely or not at all; check that folders are writable.
+"""Reading regular files within limits, writing atomically, and checking that folders are writable.
 
-A folder of experiments may come from anywhere: where a file should be, there may be a pipe or a device, which would
-block a reader for good or fill its memory, or a link to a file that is nobody's business.
+A folder of experiments may come from anywhere. Instead of a file, it may contain a pipe or device, which would block a
+reader or fill its memory, or a link to a private file.
 """
 
 import contextlib
@@ -17,10 +17,10 @@ from typing import Any, BinaryIO
 from msk_ray.errors import StorageError, StorageFailure
 
 STALE_S = 3600.0
-"""Age [s] after which a temporary file counts as abandoned by its writer."""
+"""Age after which a temporary file counts as abandoned [s]."""
 _PART = ".part"
 _TAIL = 1 << 16
-"""Bytes in which the last lines of a file are looked for."""
+"""Number of bytes at the end of a file in which to look for its last lines."""
 _KINDS = {
     stat.S_IFIFO: "a pipe",
     stat.S_IFCHR: "a device",
@@ -32,17 +32,17 @@ _KINDS = {
 
 
 class UnusableFile(ValueError):
-    """What has a file's name is no regular file, or too large to be read. The message says which."""
+    """A path is not a regular file, or the file is too large. The message says which."""
 
 
 def open_file(path: Path, *, follow: bool = False) -> BinaryIO:
-    """A regular file, opened for reading; nothing else can block or be read.
+    """Open a regular file for reading; never blocks on, or reads, anything else.
 
     Args:
-        follow: open what a symbolic link leads to, where a user names the file.
+        follow: follow a symbolic link, for a file named by the user.
 
     Raises:
-        UnusableFile: it is something else.
+        UnusableFile: it is not a regular file.
         OSError: it does not exist, or cannot be opened.
     """
     return os.fdopen(_open(path, os.O_RDONLY, follow), "rb")
@@ -52,23 +52,23 @@ def read_file(path: Path, limit: int, *, follow: bool = False) -> bytes:
     """The content of a regular file.
 
     Args:
-        limit: bytes that it may have.
-        follow: read what a symbolic link leads to, where a user names the file.
+        limit: maximum size [B].
+        follow: follow a symbolic link, for a file named by the user.
 
     Raises:
-        UnusableFile: it is something else, or larger.
+        UnusableFile: it is not a regular file, or larger.
         OSError: it does not exist, or cannot be read.
     """
     with open_file(path, follow=follow) as file:
         if os.fstat(file.fileno()).st_size <= limit:
-            data = file.read(limit + 1)  # it may grow meanwhile
+            data = file.read(limit + 1)  # it may be growing
             if len(data) <= limit:
                 return data
     raise UnusableFile(f"larger than {_in_words(limit)}")
 
 
 def last_lines(path: Path, count: int) -> list[str]:
-    """The last lines of a text file, however large it is; what is not UTF-8 is replaced.
+    """The last lines of a text file of any size; bytes that are not UTF-8 are replaced.
 
     Raises:
         UnusableFile: it is no regular file.
@@ -80,13 +80,13 @@ def last_lines(path: Path, count: int) -> list[str]:
 
 
 def append_text(path: Path, text: str, *, sync: bool = False) -> None:
-    """Add text to a regular file, which is created if there is none.
+    """Append text to a regular file; creates it if necessary.
 
     Args:
-        sync: return only when it would survive a loss of power.
+        sync: return only once the text would survive a power loss.
 
     Raises:
-        StorageFailure: the disk is full, or something else has the file's name.
+        StorageFailure: the disk is full, or the path is not a regular file.
     """
     try:
         with os.fdopen(_open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, False), "ab") as file:
@@ -101,7 +101,7 @@ def append_text(path: Path, text: str, *, sync: bool = False) -> None:
 
 
 def _open(path: Path, flags: int, follow: bool) -> int:
-    """A descriptor of a regular file. Opening does not wait for another end, as a pipe's would."""
+    """A descriptor of a regular file. Opening does not block, not even on a pipe."""
     flags |= os.O_NONBLOCK | os.O_CLOEXEC | (0 if follow else os.O_NOFOLLOW)
     try:
         descriptor = os.open(path, flags, 0o644)
@@ -156,7 +156,7 @@ def check_writable(path: Path) -> None:
 
 
 def _check_text(path: Path) -> None:
-    """Refuse a folder whose path is not text: libraries that write below it would fail once the work has begun."""
+    """Raise if a folder's path is not UTF-8: libraries that write to it would fail in the middle of the work."""
     try:
         str(path.absolute()).encode()
     except UnicodeEncodeError:
@@ -170,14 +170,14 @@ def _cannot_write(path: Path, error: OSError) -> StorageError:
 
 
 def write_bytes(path: Path, payload: bytes) -> None:
-    """Write `payload` to `path` so that a reader never sees half a file.
+    """Write `payload` to `path` atomically: readers never see a partial file.
 
-    If the process is killed right afterwards, the file is there; if the machine loses power, it or the one before.
+    After a kill of the process, the new file is there; after a power loss, the new or the old one.
 
     Raises:
         StorageFailure: the disk is full or the folder not writable; an existing file is left unchanged.
     """
-    # Another process, perhaps on another host, may write the same file: each has its own temporary file.
+    # Another process, perhaps on another host, may write the same file, so the temporary name is unique.
     temporary = path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}{_PART}")
     try:
         with temporary.open("wb") as file:
@@ -191,7 +191,7 @@ def write_bytes(path: Path, payload: bytes) -> None:
 
 
 def remove_stale(folder: Path) -> None:
-    """Remove temporary files left by processes killed while writing: no file takes `STALE_S` to write."""
+    """Remove temporary files of processes killed while writing, older than `STALE_S`."""
     for path in folder.glob(f".*{_PART}"):
         with contextlib.suppress(FileNotFoundError):  # its writer, or another process calling this, was faster
             if time.time() - path.stat().st_mtime > STALE_S:

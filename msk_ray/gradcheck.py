@@ -42,7 +42,7 @@ EXAMPLES = """\
   python -m msk_ray.gradcheck my_robot.xml --json > gradients.json"""
 
 MANY_EXCLUDED = 0.25
-"""Share of excluded states above which the table adds a note."""
+"""Share of excluded states above which a note follows the table."""
 
 
 def _positive(kind: type) -> Any:
@@ -52,7 +52,7 @@ def _positive(kind: type) -> Any:
             raise argparse.ArgumentTypeError(f"must be above zero, not {text}")
         return value
 
-    parse.__name__ = kind.__name__  # argparse names it where the text is no number
+    parse.__name__ = kind.__name__  # argparse shows this name if the text is not a number
     return parse
 
 
@@ -69,12 +69,12 @@ def parser() -> Parser:
         "--mode",
         default="tape_per_substep",
         metavar="MODE",
-        help="backward mode (default: %(default)s); fd_jacobian works with any model, an unknown name lists all modes",
+        help="backward mode (default: %(default)s); fd_jacobian works with any model; an unknown name lists all modes",
     )
     p.add_argument(
         "--integrator",
         choices=("Euler", "implicitfast", "RK4"),
-        help="check the model with this integrator instead of its own, as if its file said so",
+        help="use this integrator instead of the model's own",
     )
     p.add_argument("--substeps", type=_positive(int), default=1, metavar="N", help="physics steps (default: 1)")
     p.add_argument(
@@ -88,8 +88,8 @@ def parser() -> Parser:
         "--parameters",
         default="",
         metavar="NAMES",
-        help="comma-separated fields of the model whose gradients are compared too, such as body_mass,opt.gravity; "
-        "all for every one that the model has (default: none)",
+        help="also compare gradients of these model fields, comma-separated, such as body_mass,opt.gravity; "
+        "all: every field that the model has (default: none)",
     )
     p.add_argument("--worlds", type=_positive(int), default=8, metavar="W", help="states of each kind (default: 8)")
     p.add_argument(
@@ -124,7 +124,7 @@ def parser() -> Parser:
         "--nconmax",
         type=_positive(int),
         metavar="N",
-        help="contacts per world (default: from a probe, growing with use)",
+        help="contacts per world (default: from a short probe, grows when needed)",
     )
     p.add_argument("--njmax", type=_positive(int), metavar="N", help="constraint rows per world (default: likewise)")
     p.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
@@ -136,10 +136,10 @@ def _listed(text: str) -> list[str]:
 
 
 def load_model(path: Path) -> "tuple[mujoco.MjModel, dict[str, int]]":
-    """Compile a model file; with it, limits of iterations that a trial's solver has to keep to.
+    """Compile a model file; also returns the solver's iteration limits, for a trial's config.
 
     Raises:
-        ConfigError: MuJoCo does not accept it.
+        ConfigError: MuJoCo cannot load it.
     """
     import mujoco
 
@@ -230,7 +230,7 @@ def _finite(value: float | None) -> float | None:
 
 
 def as_json(result: "GradientCheck", model: str, tolerance: float, unsupported: list[str]) -> dict[str, Any]:
-    """The result as JSON types; one entry per state and input, null for values that are not finite or not defined."""
+    """The result as JSON types: an entry per state and input, null for non-finite and undefined values."""
     return {
         "model": model,
         "mode": result.mode,
@@ -274,7 +274,7 @@ def _excluded(result: "GradientCheck") -> str:
 
 
 def _unconverged(result: "GradientCheck") -> str:
-    """What to change where the solver has not converged; empty where it has."""
+    """What to change if the solver has not converged; empty if it has."""
     if not result.unconverged:
         return ""
     return (
@@ -309,14 +309,14 @@ def print_table(result: "GradientCheck", model: str, tolerance: float) -> None:
             f"{min(ratios):.4f} … {max(ratios):.4f}" if ratios else "-",
             style=style,
         )
-    # A pipe or file has no width: wide enough that no column is cut.
+    # A pipe or file has no width: use one at which no column is cut.
     console = Console(width=None if sys.stdout.isatty() else 120, soft_wrap=True, highlight=False)
     console.print(table)
     console.print(_excluded(result))
     if result.parameter_kinks:
         console.print(f"{result.parameter_kinks} elements of parameters left out at a kink of their own")
     if result.checked and result.excluded > MANY_EXCLUDED * (result.checked + result.excluded):
-        console.print("note: many states were left out; the result only covers the others")
+        console.print("note: many states were left out; the result covers only the others")
     if share := result.diagnostics.get("approximated_share", 0.0):
         console.print(f"approximated contacts, by the nearest law: in {share:.1%} of the substeps")
     if note := _unconverged(result):

@@ -1,7 +1,7 @@
-"""The processes that train one trial together: each steps its share of the worlds, all hold the same networks.
+"""The processes that train one trial together: each steps its share of the worlds, and all hold the same networks.
 
-They draw the same numbers for all worlds and keep their own part of them, average gradients, and gather what is learned
-from. So a trial is the same, to rounding, however many processes it has, and so are its checkpoints.
+Each draws the random numbers of all worlds and uses its own part. They average gradients, and gather observations,
+rewards and targets. So results and checkpoints do not depend on the number of processes, except for rounding.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,9 +16,10 @@ from torch import Tensor
 
 T = TypeVar("T")
 _ALL_GATHER = getattr(dist, "all_gather_single", dist.all_gather_into_tensor)
-"""Its name before torch 2.13 is deprecated since."""
+"""A function of torch that 2.13 has renamed; the old name is deprecated."""
 _FOR_EVER = timedelta(days=365)
-"""A process may wait for another that evaluates or compiles; whoever started them notices those that die or hang."""
+"""Timeout of collectives: long, because a process may wait for another that evaluates or compiles. The parent notices
+processes that die or hang."""
 
 
 class Group:
@@ -33,30 +34,29 @@ class Group:
     size = 1
 
     def mean(self, tensors: Sequence[Tensor]) -> None:
-        """Replace each of these floating-point tensors by its mean over all processes."""
+        """Replace each of these floating-point tensors, in place, by its mean over all processes."""
 
     def gather(self, part: Tensor, dim: int = 0) -> Tensor:
-        """The values of all worlds, from those of the W worlds of each process, along axis `dim`."""
+        """Values of all N·W worlds along axis `dim`, from the values of each process's W worlds."""
         return part
 
     def own(self, whole: Tensor, dim: int = 0) -> Tensor:
-        """The values of this process's W worlds, from those of all N·W, along axis `dim`."""
+        """Values of this process's W worlds along axis `dim`, from the values of all N·W worlds."""
         return whole
 
     def collect(self, value: T) -> list[T]:
-        """A value of every process, ordered by rank; small, because it is sent through the host's memory."""
+        """The values of all processes, by rank. For small values, because they are pickled through the host."""
         return [value]
 
     def any(self, flag: bool) -> bool:
         """Whether a flag is set in any process."""
         return any(self.collect(flag))
 
-    def tell(self, *order: Any) -> None:
-        """In process 0: send an order to the others, which wait for one in `told`; without arguments, that it was the
-        last."""
+    def send_order(self, *order: Any) -> None:
+        """In process 0: send an order to the others, which wait in `receive_order`. Without arguments: the end."""
 
-    def told(self) -> tuple[Any, ...]:
-        """In the others: the next order; empty after the last."""
+    def receive_order(self) -> tuple[Any, ...]:
+        """In the others: the next order; empty at the end."""
         return ()
 
 
@@ -64,19 +64,19 @@ ALONE = Group()
 
 
 class PeerLost(RuntimeError):
-    """A collective operation failed, as when another process has died."""
+    """A collective operation failed, for example because another process has died."""
 
 
 class ProcessGroup(Group):
     """One of several processes on one host: gloo between CPUs, NCCL between GPUs, one GPU each.
 
-    A recorded CUDA graph may contain `mean` and `gather`. All processes then have to record and replay it together, and
-    no two streams may run them at the same time.
+    Recorded CUDA graphs may contain `mean` and `gather`. Then all processes must record and replay together, and two
+    streams must not run them at the same time.
 
     Args:
         rank, size: as in `Group`.
-        device: this process's, "cpu" or "cuda:N"; its default (`use_device`).
-        meeting: file that the processes find each other through; it must not exist yet.
+        device: this process's device, "cpu" or "cuda:N", already its default (`use_device`).
+        meeting: file by which the processes find each other; it must not exist yet.
     """
 
     def __init__(self, rank: int, size: int, device: str, meeting: Path) -> None:
@@ -111,26 +111,26 @@ class ProcessGroup(Group):
         return whole.chunk(self.size, dim)[self.rank]
 
     def collect(self, value: T) -> list[T]:
-        found: list[Any] = [None] * self.size
+        values: list[Any] = [None] * self.size
         with _named():
-            dist.all_gather_object(found, value)
-        return found
+            dist.all_gather_object(values, value)
+        return values
 
-    def tell(self, *order: Any) -> None:
+    def send_order(self, *order: Any) -> None:
         with _named():
             dist.broadcast_object_list([order], src=0)
 
-    def told(self) -> tuple[Any, ...]:
+    def receive_order(self) -> tuple[Any, ...]:
         order: list[Any] = [None]
         with _named():
             dist.broadcast_object_list(order, src=0)
-        found: tuple[Any, ...] = order[0]
-        return found
+        message: tuple[Any, ...] = order[0]
+        return message
 
 
 @contextmanager
 def _named() -> Iterator[None]:
-    """Give the errors of a collective operation, which are of many types, their name."""
+    """Context that turns the errors of a collective operation into `PeerLost`."""
     try:
         yield
     except RuntimeError as error:

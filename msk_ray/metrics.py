@@ -1,7 +1,7 @@
-"""The figures that a trial logs: what each is, in which unit, how the processes of a trial combine it, how it is drawn.
+"""Registry of the metrics that a trial logs: description, unit, reduction over processes, and how they are drawn.
 
-Figures are for people: what steers a trial is a typed value. A name that is not listed, such as one of an algorithm or
-environment from outside, is its own description and is averaged.
+Metrics are for people; trials are steered by typed values. An unlisted name, for example of a user's algorithm or
+environment, serves as its own description, and is averaged.
 """
 
 import math
@@ -11,22 +11,22 @@ from typing import Literal, NamedTuple
 
 
 class Metric(NamedTuple):
-    """One figure of the log."""
+    """One logged metric."""
 
     name: str
     """Its name; `*` stands for any part."""
     meaning: str
-    """What it is, with its unit."""
+    """Description with unit."""
     over: Literal["mean", "smallest", "largest"] = "mean"
-    """How those of equal parts of the worlds become that of all."""
+    """How values of equal parts of the worlds combine."""
     logarithmic: bool = False
-    """Whether its axis is."""
+    """Whether its axis is logarithmic."""
     health: bool = False
-    """Whether the report draws it among the signs of healthy gradients."""
+    """Whether the report draws it among the gradient diagnostics."""
 
 
 SCORE = "eval/score"
-"""By which trials are ranked; higher is better."""
+"""The score, by which trials are ranked; higher is better."""
 BEST_SCORE = "eval/best_score"
 REWARD = "train/reward"
 EPISODE_RETURN = "train/episode_return"
@@ -54,23 +54,23 @@ METRICS = (
     Metric("randomize/*_max", "largest number drawn", over="largest"),
 )
 HEALTH = tuple(metric for metric in METRICS if metric.health)
-"""What the report draws of gradients and physics, in this order."""
+"""Gradient and physics diagnostics that the report draws, in this order."""
 
 _DIAGNOSTICS = {metric.name.partition("/")[2]: metric.name for metric in METRICS if "/" in metric.name}
 
 
 def metric(name: str) -> Metric:
-    """What is known of a figure."""
+    """The entry of a metric."""
     return next((known for known in METRICS if fnmatch(name, known.name)), Metric(name, name))
 
 
 def diagnostic(name: str) -> str:
-    """The metric of a diagnostic of the simulation: of its gradients where the list says so, else of its physics."""
+    """Metric name of a simulation diagnostic: `grad/...` if that is listed, otherwise `physics/...`."""
     return _DIAGNOSTICS.get(name, f"physics/{name}")
 
 
 def of_all_processes(name: str, values: Sequence[float]) -> float:
-    """A figure of all worlds from those of equal parts of them; NaN if one of these is."""
+    """Combine a metric's values of equal parts of the worlds; NaN if one of them is."""
     if any(math.isnan(value) for value in values):
         return math.nan
     match metric(name).over:

@@ -1,4 +1,4 @@
-"""The GPUs that the driver lists. Asking torch or Warp for a name would allocate GPU memory in this process."""
+"""The GPUs listed by the driver. Asking torch or Warp would allocate GPU memory in this process."""
 
 import shutil
 import subprocess
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class DriverView:
-    """What nvidia-smi reports, regardless of CUDA_VISIBLE_DEVICES."""
+    """Report of nvidia-smi, regardless of CUDA_VISIBLE_DEVICES."""
 
     driver: str | None
     """Version of the driver; None without a working one."""

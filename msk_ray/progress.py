@@ -8,12 +8,12 @@ from msk_ray.text import printable
 
 
 class ProgressLine:
-    """Shows epoch, speed, scores and time left: updated in place on a terminal, a line every ten seconds elsewhere."""
+    """Shows epoch, speed, scores and time left: in place on a terminal, elsewhere as a line every ten seconds."""
 
     def __init__(self, epochs: int) -> None:
         self._epochs = epochs
         self._first: tuple[int, float] | None = None
-        """The first epoch shown, and when: the time before it includes compilation."""
+        """First epoch shown and its time, to exclude compilation from the speed."""
         self._last_line = -1e9
         self._terminal = sys.stdout.isatty()
         self._score = ""
@@ -32,7 +32,7 @@ class ProgressLine:
         parts = [
             f"epoch {epoch}/{self._epochs}",
             f"{row[STEPS_PER_SECOND]:,.0f} env steps/s",
-            # An algorithm from outside need not have it.
+            # A user's algorithm need not have it.
             f"reward {row[REWARD]:.3f}" if REWARD in row else "",
             self._score,
             "not recorded: two to three times as slow" if row.get("train/unrecordable") else "",
@@ -55,12 +55,12 @@ COMPILING = "kernels that are not in Warp's cache are compiled first: up to a mi
 
 
 def announce(text: str) -> None:
-    """Say what a command is about to do; the next lines may take a while."""
+    """Print what a command is about to do, because it may take a while."""
     print(f"{printable(text)} ...", flush=True)
 
 
 class Pace:
-    """Says how far a command is and how long the rest takes: after two seconds of work, then every ten."""
+    """Prints a command's progress and time left, after two seconds and then every ten."""
 
     FIRST_S, EVERY_S = 2.0, 10.0
 
@@ -75,7 +75,7 @@ class Pace:
         self._due = self._start + self.FIRST_S
 
     def __call__(self, done: int) -> None:
-        """Tell it that so many are done."""
+        """Report that `done` units are done."""
         now = time.monotonic()
         if now < self._due or not 0 < done < self._total:
             return

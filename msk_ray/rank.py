@@ -1,6 +1,6 @@
-"""`python -m msk_ray.rank`: one process of a trial that has several; only `training.parallel` starts it.
+"""`python -m msk_ray.rank`: one of a trial's several processes, started by `training.parallel`.
 
-It ends with its parent, however that ends. This comes before the imports that take seconds.
+It is killed when its parent ends, however that happens. This is set up before the slow imports.
 """
 
 import ctypes
@@ -13,12 +13,12 @@ _PR_SET_PDEATHSIG = 1
 
 
 def end_with_parent(parent: int) -> None:
-    """Have the kernel kill this process when the thread that started it ends, in the process `parent`."""
+    """Let the kernel kill this process when the thread of process `parent` that started it ends."""
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL) != 0:
         raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG) failed")
     if os.getppid() != parent:
-        os._exit(1)  # it had ended before
+        os._exit(1)  # the parent had already ended
 
 
 def main() -> None:
@@ -28,7 +28,7 @@ def main() -> None:
     from msk_ray.training.parallel import serve
 
     serve(Connection(descriptor))
-    # Not by the interpreter's end: NCCL waits there for graphs that still refer to it.
+    # Skip the interpreter's shutdown, in which NCCL would wait for graphs that still refer to it.
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(0)

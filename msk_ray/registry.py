@@ -1,4 +1,4 @@
-"""Classes that a configuration names: by a short name, or from anywhere as `package.module:Class`."""
+"""Finding classes named in a configuration, by a short name or as `package.module:Class`."""
 
 import difflib
 import traceback
@@ -20,7 +20,7 @@ def resolve(path: str, key: str) -> Any:
         key: the setting that contains it, for errors.
 
     Raises:
-        ConfigError: it is not such a path, the module is not found, fails during its import, or has no such name.
+        ConfigError: the path is malformed, the module is not found or fails to import, or it has no such name.
     """
     module_name, _, attribute = path.partition(":")
     if not all(part.isidentifier() for part in (*module_name.split("."), attribute)):
@@ -48,16 +48,16 @@ def resolve_class(path: str, key: str, base: type[T]) -> type[T]:
     """The class at an import path, a subclass of `base`.
 
     Raises:
-        ConfigError: as for `resolve`, or the object is not such a class, or lacks methods that `base` asks for.
+        ConfigError: as for `resolve`, or the object is not a subclass, or does not implement all methods of `base`.
     """
-    found = resolve(path, key)
+    target = resolve(path, key)
     wanted = f"{base.__module__}.{base.__qualname__}"
-    if not (isinstance(found, type) and issubclass(found, base)):
+    if not (isinstance(target, type) and issubclass(target, base)):
         raise ConfigError(f"{key}: {path} is not a subclass of {wanted}")
-    lacking = sorted(getattr(found, "__abstractmethods__", ()))
+    lacking = sorted(getattr(target, "__abstractmethods__", ()))
     if lacking:
         raise ConfigError(f"{key}: {path} lacks {', '.join(lacking)}: write what {wanted} describes")
-    return found
+    return target
 
 
 def _broken(module: str, key: str, error: Exception) -> ConfigError:
@@ -76,7 +76,7 @@ class Registry:
     Args:
         key: the setting that takes the names, for errors.
         group: the entry-point group in which installed packages declare theirs.
-        own: the package's own.
+        own: the package's own names.
     """
 
     def __init__(self, key: str, group: str, own: Mapping[str, str]) -> None:
@@ -89,23 +89,23 @@ class Registry:
         return list(dict.fromkeys([*self._own, *(point.name for point in entry_points(group=self._group))]))
 
     def find(self, name: str) -> str | None:
-        """The import path of a short name; None if there is none of that name.
+        """The import path of a short name; None if the name is unknown.
 
         Raises:
-            ConfigError: installed packages declare it differently.
+            ConfigError: several installed packages declare it.
         """
         if name in self._own:
             return self._own[name]
-        found = sorted({point.value for point in entry_points(group=self._group, name=name)})
-        if len(found) > 1:
-            raise ConfigError(f"{self.key} {name!r} is declared by several packages: write {' or '.join(found)}")
-        return found[0] if found else None
+        paths = sorted({point.value for point in entry_points(group=self._group, name=name)})
+        if len(paths) > 1:
+            raise ConfigError(f"{self.key} {name!r} is declared by several packages: write {' or '.join(paths)}")
+        return paths[0] if paths else None
 
     def path(self, name: Any) -> str:
         """The import path of a short name, or `name` itself if it is one.
 
         Raises:
-            ConfigError: there is no such short name.
+            ConfigError: the short name is unknown.
         """
         known = self.known
         if not isinstance(name, str):
@@ -113,9 +113,9 @@ class Registry:
             raise ConfigError(f"{self.key}: {what}; write {', '.join(known())} or package.module:Class")
         if ":" in name:
             return name
-        found = self.find(name)
-        if found is None:
+        path = self.find(name)
+        if path is None:
             near = difflib.get_close_matches(name, known(), n=1)
             hint = f"did you mean {near[0]!r}?" if near else f"write {', '.join(known())} or package.module:Class"
             raise ConfigError(f"{self.key}: unknown name {brief(name)}; {hint}")
-        return found
+        return path

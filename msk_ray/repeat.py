@@ -1,4 +1,4 @@
-"""Whether a trial repeats: train it twice, each time in a fresh process, and compare every tensor by its bits."""
+"""Checks whether a trial repeats: trains it twice, in fresh processes, and compares every tensor bit by bit."""
 
 import itertools
 import json
@@ -15,7 +15,7 @@ from msk_ray.errors import MskRayError, SimulationError
 
 @dataclass(frozen=True)
 class Difference:
-    """Where two runs part."""
+    """The first stage in which two runs differ."""
 
     epoch: int
     """Counted from 1; 0 is the start."""
@@ -28,12 +28,12 @@ class Difference:
         return f"{where}, stage {self.stage}: {', '.join(self.tensors)}"
 
 
-Noted = tuple[int, str, str, str]
+StageDigest = tuple[int, str, str, str]
 """Epoch, stage, tensor and digest."""
 
 
-def first_difference(first: list[Noted], second: list[Noted]) -> Difference | None:
-    """The first stage in which two runs differ, None if they are the same to the last bit."""
+def first_difference(first: list[StageDigest], second: list[StageDigest]) -> Difference | None:
+    """The first stage in which two runs differ; None if they are equal to the last bit."""
     for a, b in itertools.zip_longest(first, second):
         if a != b:
             epoch, stage = (a or b)[:2]
@@ -44,12 +44,12 @@ def first_difference(first: list[Noted], second: list[Noted]) -> Difference | No
 
 
 def compare(config: Config, device: str, epochs: int) -> tuple[Difference | None, int]:
-    """Train the first epochs of a trial twice, with other numbers of threads offered, which must not matter.
+    """Train the first epochs of a trial twice, with different values of OMP_NUM_THREADS, which must not matter.
 
     Args:
         config: the trial.
         device: cpu or cuda:N.
-        epochs: how many.
+        epochs: number of epochs.
 
     Returns:
         The first difference, and the number of tensors compared.
@@ -61,11 +61,11 @@ def compare(config: Config, device: str, epochs: int) -> tuple[Difference | None
     return first_difference(first, second), len(first)
 
 
-def run_once(config: Config, device: str, epochs: int, threads: int) -> list[Noted]:
-    """What a process notes that trains the first epochs of a trial, where OMP_NUM_THREADS offers so many threads.
+def run_once(config: Config, device: str, epochs: int, threads: int) -> list[StageDigest]:
+    """Digests of the first epochs of a trial, trained in a fresh process with OMP_NUM_THREADS set to `threads`.
 
     Raises:
-        SimulationError: it fails.
+        SimulationError: the trial fails.
     """
     changed = {
         "trial.epochs": max(epochs, config.trial.epochs),
@@ -86,21 +86,21 @@ def run_once(config: Config, device: str, epochs: int, threads: int) -> list[Not
 
 
 def _train(path: Path, device: str, epochs: int, out: Path) -> None:
-    """Train here, and write what was noted."""
-    from msk_ray.algorithms.witness import Witness
+    """Entry point of that process: train, and write the digests."""
+    from msk_ray.algorithms.digest_log import DigestLog
     from msk_ray.config import load_config
     from msk_ray.training import Trainer
 
-    witness = Witness()
+    digest_log = DigestLog()
     trainer = Trainer(load_config(path), out.parent / "trial", device)
-    trainer.algorithm.witness = witness
+    trainer.algorithm.digest_log = digest_log
     trainer.algorithm.note_state()
     for epoch in range(1, epochs + 1):
-        witness.epoch = epoch
+        digest_log.epoch = epoch
         trainer.run_epoch()
         trainer.algorithm.note_state()
     trainer.close()
-    out.write_text(json.dumps(witness.noted))
+    out.write_text(json.dumps(digest_log.digests))
 
 
 if __name__ == "__main__":

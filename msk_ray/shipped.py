@@ -1,7 +1,7 @@
-"""Files that come with the package: the folders `configs/`, `tune_spaces/` and `policies/`.
+"""Files shipped with the package: the folders `configs/`, `tune_spaces/` and `policies/`.
 
-In a checkout they lie beside the package, in an installation within it. A user names their files as in a checkout, or
-by name alone, and may have folders of the same names, which come first.
+In a checkout they are beside the package, in an installation inside it. Users give a path as in a checkout, or a name
+alone. Folders of the same names in the current folder come first.
 """
 
 from pathlib import Path
@@ -26,7 +26,7 @@ def find_shipped(name: str | Path, folder: str, suffix: str) -> Path | None:
         name: a path, relative to the current folder or, below `folder`, to `shipped_folder()`; or the name of a file of
             `folder` without its suffix.
         folder: one of `CONFIGS`, `SPACES` and `POLICIES`.
-        suffix: of the files in it, such as ".yaml".
+        suffix: the files' suffix, such as ".yaml".
     """
     candidates = [Path(name)]
     if Path(name).parts[:1] == (folder,):
@@ -37,7 +37,7 @@ def find_shipped(name: str | Path, folder: str, suffix: str) -> Path | None:
 
 
 def is_name(text: str | Path) -> bool:
-    """Whether a text is the name of a file without its suffix, rather than a path."""
+    """Whether a text is a file name without suffix, and not a path."""
     return Path(text).name == str(text) and Path(text).suffix not in _SUFFIXES
 
 
@@ -47,7 +47,7 @@ def shipped_names(folder: str, suffix: str) -> list[str]:
 
 
 def is_shipped(path: Path) -> bool:
-    """Whether a file belongs to the package, so that nothing may be written beside it."""
+    """Whether a file is shipped with the package, so that nothing may be written beside it."""
     return any(path.resolve().is_relative_to(shipped_folder() / folder) for folder in (CONFIGS, SPACES, POLICIES))
 
 

@@ -1,9 +1,8 @@
-"""Signals that ask a program to stop: from its first line to its last they mean "save everything, exit with 75".
+"""Signals that ask a program to stop, which at any time means "save everything, exit with 75".
 
-What a signal does depends on the phase. While modules are imported, nothing has started and the process ends at once.
-Later the running code is interrupted, as by Ctrl-C. A loop that can save its work (`StopRequest.deferred`) is only
-notified, and stops by itself at its next safe point. This module imports only the standard library, so that it can be
-the first import of a program.
+The effect depends on the phase. While modules are imported, the process ends at once. Later the running code is
+interrupted, as by Ctrl-C. A loop that can save its work (`StopRequest.deferred`) is only notified, and stops at its
+next safe point. This module imports only the standard library, so that it can be a program's first import.
 """
 
 import contextlib
@@ -19,7 +18,7 @@ NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP)
 
 
 class StopRequest:
-    """Set by the first of `NUMBERS` that arrives; a second SIGINT interrupts the running code.
+    """A request to stop: set by the first of the signals `NUMBERS`; a second SIGINT interrupts the running code.
 
     SIGHUP, which a closing terminal sends, stays ignored if it already is (nohup).
 
@@ -36,14 +35,14 @@ class StopRequest:
         self._deferred = False
 
     def install(self) -> None:
-        """Install the handlers, again if a library has replaced them."""
+        """Install the handlers, or reinstall them after a library has replaced them."""
         for number in NUMBERS:
             if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, self.receive)
 
     @contextlib.contextmanager
     def deferred(self) -> Iterator[None]:
-        """For a loop that checks this object to know whether to stop.
+        """Context for a loop that checks this object to know whether to stop.
 
         Raises:
             KeyboardInterrupt: on entry, if a stop has already been requested.
@@ -60,13 +59,13 @@ class StopRequest:
     def settle(self) -> None:
         """Ignore further requests, because the work is done and the exit code known.
 
-        Ignored rather than handled, because an exiting interpreter removes its handlers before it has ended.
+        Signals are ignored, not handled, because an exiting interpreter removes its handlers before it has ended.
         """
         for number in NUMBERS:
             signal.signal(number, signal.SIG_IGN)
 
     def receive(self, number: int, frame: FrameType | None = None) -> None:
-        """Handle a signal of this number."""
+        """Handle a signal."""
         first = self.signal is None
         if first:
             self.signal = signal.Signals(number)
@@ -76,7 +75,7 @@ class StopRequest:
             return
         if self.loading:
             # An exception raised here would hit a half-imported module.
-            with contextlib.suppress(OSError):  # the terminal may be closed, and nobody reads
+            with contextlib.suppress(OSError):  # the terminal may be closed
                 os.write(2, f"stopped by {self.signal.name} before anything started\n".encode())  # type: ignore[union-attr]
             os._exit(RESUMABLE)
         if self.insisted or not self._deferred:
@@ -90,8 +89,8 @@ _current: StopRequest | None = None
 
 
 def listen() -> StopRequest:
-    """Start to listen for the life of this process; call it in the first line of a program. While the program is
-    `loading`, a request ends it."""
+    """Listen from now on; call this in the first line of a program. While the program is `loading`, a request ends
+    it."""
     global _current
     if _current is None:
         _current = StopRequest()
@@ -101,13 +100,13 @@ def listen() -> StopRequest:
 
 
 def current() -> StopRequest | None:
-    """The listener; None in a program in which signals have their default effect."""
+    """The listener; None if this program does not listen."""
     return _current
 
 
 @contextlib.contextmanager
 def listening() -> Iterator[StopRequest]:
-    """The listener; if there is none, as under a test runner, one for this block."""
+    """Context with the listener; if there is none, as under a test runner, a temporary one."""
     global _current
     if _current is not None:
         yield _current

@@ -36,11 +36,11 @@ if TYPE_CHECKING:
 DESCRIPTION = """\
 Show the progress of every trial of an experiment; without EXPERIMENT, list the experiments.
 
-It only reads files, so it works while the sweep runs, after it has died, and from another machine on a shared storage.
+Only reads files, so it works while the sweep runs, after it has died, and from another machine with shared storage.
 
-  running      has written something lately    interrupted  the sweep was stopped or has died: --resume continues it
+  running      has recently written files      interrupted  the sweep was stopped or has died: --resume continues it
   waiting      not started yet                 stale        silent for ten of its epochs, although the sweep runs
-  otherwise: how it ended, such as finished, asha, plateau, nonfinite, error"""
+  otherwise its outcome, such as finished, asha, plateau, nonfinite, error"""
 
 EXAMPLES = """\
   python -m msk_ray.status                              # the experiments in runs/
@@ -48,7 +48,7 @@ EXAMPLES = """\
   python -m msk_ray.status ant_ablate --storage /shared/runs"""
 
 WIDE = 140
-"""Columns of a terminal from which hosts, GPU models and reasons are shown too."""
+"""Terminal width from which hosts, GPU models and reasons are shown too."""
 _STYLES = {
     State.RUNNING: "green",
     State.STALE: "yellow",
@@ -92,8 +92,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 @contextmanager
 def _without_collecting() -> Iterator[None]:
-    """Python looks for no unreachable cycles: a table of thousands of trials has hardly any, and
-    looking for them takes a sixth of the time."""
+    """Context without garbage collection, which takes a sixth of the time for a table of thousands of trials."""
     gc.disable()
     try:
         yield
@@ -105,7 +104,7 @@ def find(name: str, storage: Path) -> Path:
     """The folder of the experiment with this name or path.
 
     Raises:
-        StorageError: there is none.
+        StorageError: there is no such experiment.
     """
     for path in (storage / name, Path(name)):
         if path.is_dir():
@@ -133,7 +132,7 @@ def view(observer: StatusReader, width: int, rows: int | None = None) -> "Render
     lines.append(trial_table(shown, width))
     if len(shown) < len(statuses):
         lines.append(Text(f"... and {len(statuses) - len(shown)} more", style="dim"))
-    if width < WIDE:  # a wide table has a column for this
+    if width < WIDE:  # wide tables have a column for this
         bad = (Outcome.ERROR, Outcome.OUT_OF_MEMORY)
         told = [s for s in shown if s.damages or s.state is State.UNREADABLE or s.outcome in bad]
         lines += [Text(printable(f"{s.id}: {s.note}"), style="red") for s in told]
@@ -180,14 +179,14 @@ def trial_table(statuses: Sequence[TrialStatus], width: int) -> "Table":
     seeds = len({status.seed for status in statuses}) > 1
     for status in statuses:
         style = "red" if status.outcome in _FAILED else _STYLES.get(status.state, "")
-        # As Text: rich would take brackets and colons in a label for markup and emoji.
+        # As Text, because rich would read brackets and colons in a label as markup and emoji.
         table.add_row(*(Text(printable(cell)) for cell in _cells(status, wide, seeds)), style=style)
     return table
 
 
 def _cells(status: TrialStatus, wide: bool, seeds: bool) -> list[str]:
     progress, device = status.progress, status.device
-    # "stopped_asha" is an outcome's name; in a narrow column "asha" says the same.
+    # Shorten outcomes such as "stopped_asha" to "asha" for a narrow column.
     state = (status.outcome if wide else status.outcome.removeprefix("stopped_")) or str(status.state)
     model = "" if device.gpu == "cpu" else device.name
     gpu = f"{device.host}:{device.gpu} {model}".strip() if wide and device.host else device.gpu
@@ -229,7 +228,7 @@ def _watch(observer: StatusReader, interval: float) -> int:
                 console.print(view(observer, _width()))
                 time.sleep(interval)
     except KeyboardInterrupt:
-        pass  # the way to leave
+        pass  # the usual way to quit
     console.print(view(observer, _width()))
     return 0
 
@@ -239,7 +238,7 @@ def _watch_terminal(observer: StatusReader, console: "Console", interval: float)
 
     with Live(console=console, screen=True, auto_refresh=False) as live:
         while not _over(observer):
-            # The heading, the table's two lines and a note below it need room too.
+            # Leave room for the heading, the table's two lines and a note.
             live.update(view(observer, _width(), console.height - 6), refresh=True)
             time.sleep(interval)
 
@@ -270,7 +269,7 @@ def _list(storage: Path) -> int:
 
 
 def _summary(experiment: Experiment) -> tuple[str, str, str, str]:
-    """Trials, best scores, states and question of an experiment, printable; each environment's best on its own line."""
+    """An experiment's trials, best scores, states and question, printable; each environment's best on its own line."""
     try:
         statuses = StatusReader(experiment).look(time.time())
         question = experiment.manifest().get("question") or ""
@@ -294,7 +293,7 @@ def _seconds(text: str) -> float:
 
 
 def _width() -> int:
-    # A pipe or file has no width: wide enough for most names.
+    # A pipe or file has no width: use one that fits most names.
     return shutil.get_terminal_size((120, 40)).columns
 
 

@@ -1,7 +1,7 @@
-"""Make text from files and users safe for display on a terminal or in a Markdown page.
+"""Makes text from files and users safe for display on a terminal or in a Markdown page.
 
-A label or an error may contain anything. Printed unchanged on a terminal, an escape sequence could clear the screen,
-rename the window or overwrite earlier output, and text after a newline could pass for a line of ours.
+A label or an error may contain anything. On a terminal, an escape sequence could clear the screen, rename the window or
+overwrite earlier output, and text after a newline could look like a line of this program.
 """
 
 import html
@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 _HIDDEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}
-"""Unicode categories that are not visible: controls, format (direction of writing), surrogates, separators."""
+"""Unicode categories of invisible characters: controls, format (direction of writing), surrogates, separators."""
 
 
 def printable(text: str) -> str:
@@ -21,12 +21,13 @@ def printable(text: str) -> str:
 
 
 def printable_lines(text: str) -> str:
-    """The same for text of several lines, which stay separate."""
+    """The same for text of several lines, keeping line breaks."""
     return "\n".join(printable(line) for line in text.split("\n"))
 
 
 def markdown_text(text: str) -> str:
-    """Text for a paragraph of Markdown, shown literally: no HTML, links or pictures, and nothing hidden."""
+    """Text escaped for a paragraph of Markdown, so that it is shown literally: no HTML, links, pictures or hidden
+    text."""
     return "\n".join(_markdown(line) for line in text.split("\n"))
 
 
@@ -50,7 +51,7 @@ def describe(value: Any) -> str:
 
 def _markdown(line: str) -> str:
     escaped = html.escape(printable(line).replace("\\", "\\\\"), quote=False)
-    # A closing bracket before a parenthesis or another bracket is what makes a link or a picture.
+    # A closing bracket followed by a parenthesis or another bracket makes a link or a picture.
     return escaped.replace("](", "]\\(").replace("][", "]\\[").replace("`", "\\`")
 
 

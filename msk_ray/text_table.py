@@ -6,8 +6,8 @@ from msk_ray.text import printable
 
 
 def text_table(header: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> str:
-    """A table for a terminal of `width` columns; the last column is cut, never the others. Control characters in a cell
-    are shown, not obeyed."""
+    """A table for a terminal of `width` columns; only the last column is cut. Control characters in cells are
+    escaped."""
     body = [[printable(cell) for cell in row] for row in (header, *rows)]
     widths = [max(len(line[column]) for line in body) for column in range(len(header))]
     lines = []

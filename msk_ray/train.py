@@ -1,11 +1,11 @@
 """`python -m msk_ray.train`, and `msk_ray.train(config, ...)`: one trial in this process, without Ray.
 
-The module is callable because `msk_ray.train` names two things: the function for users of the library, and this module
+The module is callable because `msk_ray.train` has two meanings: the function for users of the library, and this module
 once it is imported.
 """
 
 if __name__ == "__main__":
-    # Before the imports that take time to load.
+    # Set up before the slow imports.
     from msk_ray import signals
 
     signals.listen()
@@ -22,7 +22,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-from msk_ray.cli import TERMINAL_LOG, Parser, outliving, run, typed_command
+from msk_ray.cli import TERMINAL_LOG, Parser, run, surviving_closed_output, typed_command
 from msk_ray.config import SET_HELP, Config, load_config
 from msk_ray.errors import CheckpointError, ConfigError, StorageError
 from msk_ray.experiment.environment import environment
@@ -39,11 +39,11 @@ if TYPE_CHECKING:
     from msk_ray.training import ParallelTrainer, Trainer
 
 DESCRIPTION = """\
-Train one policy, by SHAC or another algorithm: one trial, in this process, without Ray.
+Train one policy with SHAC or another algorithm: one trial, in this process, without Ray.
 
 Writes into the log folder: config.yaml (every setting), env.json (command, commit, versions, device), metrics.jsonl
-(one row per epoch), TensorBoard events and checkpoints/ with the newest two and best.pt, the trained policy with the
-highest evaluation score (until the first score, the untrained policy)."""
+(one row per epoch), TensorBoard events, and checkpoints/ with the newest two and best.pt, the trained policy with the
+highest evaluation score (the untrained policy until the first score)."""
 
 EXAMPLES = """\
   python -m msk_ray.train --config cartpole
@@ -70,12 +70,12 @@ def parser() -> Parser:
     p.add_argument(
         "--score-at-once",
         action="store_true",
-        help="score each policy when it is due; on a GPU, several are otherwise scored together, which takes less time",
+        help="score each policy immediately; by default, several are scored together on a GPU, which is faster",
     )
     p.add_argument(
         "--force",
         action="store_true",
-        help="take over the log folder although its owner seems to run (check first); the other process then stops",
+        help="take over the log folder even if its owner seems to be running (check first); that process then stops",
     )
     return p
 
@@ -90,7 +90,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     _check_logdir(logdir, args.resume)
     logdir = logdir.resolve()
     words = sys.argv if argv is None else [__file__, *argv]
-    with listening() as stop, owned(logdir, args.force) as ownership, outliving(logdir / TERMINAL_LOG):
+    with listening() as stop, owned(logdir, args.force) as ownership, surviving_closed_output(logdir / TERMINAL_LOG):
         try:
             return _train(config, args, ownership, stop, typed_command(words, "--resume"))
         except KeyboardInterrupt:
@@ -98,7 +98,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 if waiting := _waiting(logdir):
                     print(f"{waiting} not scored yet, so best.pt may be an early one: --resume scores what waits")
                 raise
-            # Not between two epochs: kernels are still being prepared, or the disk is slow.
+            # Outside the epochs: kernels are still being compiled, or the disk is slow.
             begun = (logdir / "checkpoints").is_dir()
             command = typed_command(words, *(["--resume"] if begun else []))
             print(f"stopped by {stop.signal.name}; continue with: {printable(command)}")
@@ -106,7 +106,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _check_logdir(logdir: Path, resume: bool) -> None:
-    """Refuse to write over another trial."""
+    """Raise if the folder holds another trial."""
     if (logdir / "metrics.jsonl").exists() and not resume:
         raise StorageError(
             f"{logdir} already holds a trial: add --resume (in Python resume=True) to continue it, or choose another "
@@ -121,17 +121,17 @@ def _check_logdir(logdir: Path, resume: bool) -> None:
 
 
 @dataclass(frozen=True)
-class Trained:
-    """A trial that has run all its epochs."""
+class TrainingResult:
+    """Result of a trial that has run all its epochs."""
 
     logdir: Path
     """Its folder, with config.yaml, metrics.jsonl and checkpoints/."""
     epochs: int
     """Number of epochs trained."""
     best_score: float
-    """Highest evaluation score of the trained policy; -inf if no evaluation gave one."""
+    """Highest evaluation score of the trained policy; -inf if there is none."""
     best_checkpoint: Path
-    """Checkpoint of that policy, for `load_policy`; of the untrained policy if no evaluation gave a score."""
+    """Checkpoint of that policy, for `load_policy`; the untrained policy if there is no score."""
 
 
 def train(
@@ -143,7 +143,7 @@ def train(
     force: bool = False,
     score_at_once: bool = False,
     on_epoch: Callable[[dict[str, float]], None] | None = None,
-) -> Trained:
+) -> TrainingResult:
     """Train one policy in this process, like the command, but without printing.
 
     To continue an interrupted call from its last checkpoint, repeat it with `resume`.
@@ -157,9 +157,9 @@ def train(
         logdir: folder of the trial.
         device: cpu or cuda:N, the first of `execution.gpus`; by default the first GPU, or the CPU if there is none.
         resume: continue from the newest complete checkpoint in `logdir`.
-        force: take over the folder although its owner seems to be running.
-        score_at_once: score each policy when it is due. Otherwise, on a GPU, several are scored together, at most two
-            minutes later, and their scores are then added to their rows in `metrics.jsonl`.
+        force: take over the folder even if its owner seems to be running.
+        score_at_once: score each policy immediately. By default, several are scored together on a GPU, at most two
+            minutes later, and scores are then added to the rows in `metrics.jsonl`.
         on_epoch: called with each epoch's row of metrics.
 
     Raises:
@@ -186,12 +186,12 @@ def train(
                     on_epoch(row)
         finally:
             trainer.close()
-    return Trained(trainer.logdir, trainer.epoch, trainer.best_score, trainer.best_checkpoint)
+    return TrainingResult(trainer.logdir, trainer.epoch, trainer.best_score, trainer.best_checkpoint)
 
 
 def _choose_device(asked: str | None) -> str:
-    """The device asked for, else the first GPU, else the CPU; loads torch."""
-    # torch reads this when it is imported: threads that wait for work should sleep, not spin.
+    """The requested device, else the first GPU, else the CPU; loads torch."""
+    # Torch reads this when it is imported: idle threads should sleep, not spin.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     import torch
 
@@ -201,7 +201,7 @@ def _choose_device(asked: str | None) -> str:
 def _trainer(
     config: Config, logdir: Path, device: str, resume: bool, score_at_once: bool
 ) -> "Trainer | ParallelTrainer":
-    """A trainer of the trial in `logdir`, at its start."""
+    """A trainer for the trial in `logdir`, before its first epoch."""
     # torch and Warp take seconds to load; a wrong command line should not wait for them.
     from msk_ray.training import MOST_TOGETHER, make_trainer
     from msk_ray.training.checkpoint import newest_valid_checkpoint
@@ -240,7 +240,7 @@ def _train(
     if trainer.together > 1:
         print(f"policies are scored {trainer.together} at a time, after two minutes at most (or --score-at-once)")
     progress = ProgressLine(config.trial.epochs)
-    # However it ends, loggers write out the rows that they still hold.
+    # Loggers flush their rows in any case.
     with stop.deferred(), closing(trainer):
         while not trainer.finished and not stop:
             ownership.check()
@@ -269,7 +269,7 @@ def _train(
 
 
 def _waiting(logdir: Path) -> str:
-    """How many policies wait for their scores, in words; empty if none does."""
+    """Text on how many policies are waiting to be scored; empty if none."""
     from msk_ray.training.checkpoint import unscored_checkpoints
 
     count = len(unscored_checkpoints(logdir / "checkpoints"))
@@ -277,7 +277,7 @@ def _waiting(logdir: Path) -> str:
 
 
 def _untrained_score(logdir: Path) -> str:
-    """What the policy scored before training, in words; empty if it was not evaluated."""
+    """Text on the untrained policy's score; empty if it was not evaluated."""
     first = next(iter(read_rows(logdir)), {})
     return f" (untrained {first[SCORE]:.1f})" if first.get("epoch") == 0 and SCORE in first else ""
 

@@ -192,7 +192,11 @@ def test_a_trial_that_does_not_repeat(
 
 
 def test_where_two_runs_begin_to_differ() -> None:
-    one: list[repeat.Noted] = [(0, "worlds", "qpos", "a"), (1, "draws", "noise", "b"), (1, "rollout", "rewards", "c")]
+    one: list[repeat.StageDigest] = [
+        (0, "worlds", "qpos", "a"),
+        (1, "draws", "noise", "b"),
+        (1, "rollout", "rewards", "c"),
+    ]
     assert repeat.first_difference(one, list(one)) is None
     other = [*one[:2], (1, "rollout", "rewards", "d")]
     assert repeat.first_difference(one, other) == repeat.Difference(1, "rollout", ("rewards",))

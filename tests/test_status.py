@@ -14,7 +14,7 @@ from processes import Launcher, wait_until
 
 from msk_ray.cli import run
 from msk_ray.config import dump_yaml
-from msk_ray.experiment.attempts import FIRST, Attempt, Reduced
+from msk_ray.experiment.attempts import FIRST, Attempt, WorldReduction
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import progress_of
 from msk_ray.experiment.outcomes import Ending, Outcome, write_ending
@@ -249,7 +249,7 @@ def test_a_trial_with_half_its_worlds_says_so(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    Attempt(Reduced(64, 32, "no room", cleared=True)).write(experiment.trial_folder(experiment.trials()[0].id))
+    Attempt(WorldReduction(64, 32, "no room", cleared=True)).write(experiment.trial_folder(experiment.trials()[0].id))
     monkeypatch.setenv("COLUMNS", str(width))
     assert run(main, [experiment.name, "--storage", str(experiment.path.parent)]) == 0
     lines = capsys.readouterr().out.splitlines()

@@ -13,7 +13,7 @@ from fault_campaign.killed import calls_of, die_within
 from fault_campaign.reference import Reference
 from fault_campaign.tally import Tally
 from msk_ray.experiment import layout
-from msk_ray.experiment.attempts import Attempt, Reduced, load_attempt
+from msk_ray.experiment.attempts import Attempt, WorldReduction, load_attempt
 from msk_ray.experiment.checkpoint_file import read_checkpoint_file, write_checkpoint_file
 from msk_ray.experiment.metrics import load_metrics
 from msk_ray.experiment.outcomes import Ending, Outcome, load_ending, write_ending
@@ -135,8 +135,8 @@ def _writers(old: bytes, new: bytes) -> list[Writer]:
         ),
         Writer(
             layout.HALVED_FILE,
-            lambda f: Attempt(Reduced(8, 4, "old")).write(f),
-            lambda f: Attempt(Reduced(8, 4, "old", cleared=True)).write(f),
+            lambda f: Attempt(WorldReduction(8, 4, "old")).write(f),
+            lambda f: Attempt(WorldReduction(8, 4, "old", cleared=True)).write(f),
             load_attempt,
         ),
         Writer(

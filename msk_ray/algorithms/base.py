@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from msk_ray.algorithms.witness import Witness
+from msk_ray.algorithms.digest_log import DigestLog
 from msk_ray.config import ALGORITHMS, AlgorithmSettings, Config, resolve_class
 from msk_ray.config.packages import require
 from msk_ray.envs import Env
@@ -34,8 +34,8 @@ class EpochResult:
 class Algorithm(ABC):
     """Learns a policy for one environment, epoch by epoch.
 
-    With settings that are `parallel`, it may run in several processes at the same time, each with an environment of its
-    own share of the worlds, whose `group` they use to learn the same.
+    If its settings are `parallel`, it may run in several processes at once. Each has an environment with its share of
+    the worlds, and they exchange gradients through the environment's `group`, so that all learn the same.
 
     A subclass needs `policy_network` and `update`; its settings, if it has any, are `Settings`. A resumed trial draws
     the same numbers from torch's global generator again.
@@ -45,13 +45,13 @@ class Algorithm(ABC):
         settings: the algorithm's part of it, of type `Settings`.
         env: the worlds it trains in.
         network: the policy, on the environment's device.
-        witness: notes what every stage of an epoch computes, if that is wanted.
+        digest_log: records digests of what every stage of an epoch computes; None to record nothing.
     """
 
-    witness: Witness | None = None
+    digest_log: DigestLog | None = None
     Settings: ClassVar[type[AlgorithmSettings]] = AlgorithmSettings
     counts_episodes: ClassVar[bool] = False
-    """Whether the result of every epoch says how many episodes ended, which some settings of environments need."""
+    """Whether every epoch's result counts the episodes that ended; some environment settings need that count."""
 
     def __init__(self, config: Config, env: Env[Any], network: nn.Module | None = None) -> None:
         """
@@ -61,7 +61,7 @@ class Algorithm(ABC):
             network: the policy; None creates a new `policy_network`.
 
         Raises:
-            ConfigError: a setting asks for what the algorithm does not do.
+            ConfigError: the algorithm does not support a setting.
         """
         if env.reads_episode_lengths and not self.counts_episodes:
             raise ConfigError(
@@ -90,10 +90,10 @@ class Algorithm(ABC):
         """
 
     def run_epoch(self, epoch: int) -> EpochResult:
-        """`update` between the beginning and the end of the environment's epoch.
+        """Tell the environment that an epoch begins, call `update`, and tell it that the epoch has ended.
 
         Raises:
-            ConfigError: the algorithm says `counts_episodes` and did not.
+            ConfigError: the algorithm has `counts_episodes`, but returned no count.
             SimulationError: as `update`.
         """
         self.env.begin_epoch(epoch)
@@ -119,18 +119,18 @@ class Algorithm(ABC):
         return action
 
     def remarks(self) -> list[str]:
-        """What makes training worse or slower than it could be, a line on each, to be repeated when it ends."""
+        """Warnings to repeat when training ends: one line for each thing that makes it worse or slower."""
         return []
 
     def note_state(self) -> None:
-        """Let the witness, if there is one, note the worlds and everything that is saved as a module."""
-        if self.witness is None:
+        """Record digests of the worlds and of all saved modules, if there is a `digest_log`."""
+        if self.digest_log is None:
             return
         physics, action, age, numbers = self.env.state.detach()
-        self.witness.note("worlds", {**physics._asdict(), "action": action, "age": age, "numbers": numbers})
+        self.digest_log.note("worlds", {**physics._asdict(), "action": action, "age": age, "numbers": numbers})
         for name, module in self.modules().items():
             states = {key: value for key, value in module.state_dict().items() if isinstance(value, Tensor)}
-            self.witness.note(f"module {name}", states)
+            self.digest_log.note(f"module {name}", states)
 
     def parameter_hash(self) -> str:
         """Digest of everything that is saved as a module: 32 hexadecimal digits."""
@@ -139,7 +139,7 @@ class Algorithm(ABC):
     def state_dict(self) -> dict[str, Any]:
         """Everything that a later `load_state_dict` needs to continue exactly, including the environment's state.
 
-        In a group, every process has to call it.
+        In a group, every process must call it.
 
         Raises:
             RuntimeError: the processes of the group hold different modules.
@@ -159,8 +159,8 @@ class Algorithm(ABC):
         """Continue from a `state_dict`."""
         for name, module in self.modules().items():
             module.load_state_dict(state["modules"][name])
-        # Generator states are host tensors whatever device they drive. Older checkpoints have none: SHAC's draws come
-        # from generators of its own.
+        # Generator states are host tensors, also for a GPU's generator. Older checkpoints have none, because SHAC
+        # draws from its own generators.
         if "torch_generator" in state:
             torch.set_rng_state(state["torch_generator"].cpu())
         if "torch_cuda_generator" in state and self.env.device.type == "cuda":
@@ -185,7 +185,7 @@ class Algorithm(ABC):
 def _check_equal(modules: Mapping[str, Mapping[str, Tensor]], group: Group) -> None:
     if group.size == 1:
         return
-    # Equal bits have equal sums; NaN would not equal itself.
+    # Compare digests, because NaN does not equal itself.
     sums = {
         f"{name}.{key}": float(value.double().sum()).hex()
         for name, state in modules.items()
@@ -204,22 +204,25 @@ def algorithm_class(config: Config) -> type[Algorithm]:
     """The class of the algorithm that a trial runs.
 
     Raises:
-        ConfigError: there is none of that name, it lacks a method, has settings of another type, or needs a package
-            that is not installed.
+        ConfigError: the name is unknown, or the class misses a method, takes settings of another type, or needs a
+            package that is not installed.
     """
     require(config.algorithm_settings.packages, f"algorithm.name: {config.algorithm.name}")
     path = ALGORITHMS.path(config.algorithm.name)
-    found: type[Algorithm] = resolve_class(path, ALGORITHMS.key, Algorithm)  # type: ignore[type-abstract]
-    if not isinstance(config.algorithm_settings, found.Settings):
-        wanted, given = f"{found.Settings.__module__}.{found.Settings.__qualname__}", type(config.algorithm_settings)
+    algorithm: type[Algorithm] = resolve_class(path, ALGORITHMS.key, Algorithm)  # type: ignore[type-abstract]
+    if not isinstance(config.algorithm_settings, algorithm.Settings):
+        wanted, given = (
+            f"{algorithm.Settings.__module__}.{algorithm.Settings.__qualname__}",
+            type(config.algorithm_settings),
+        )
         raise ConfigError(f"algorithm.name: {path} takes settings of type {wanted}, not {given.__qualname__}")
-    return found
+    return algorithm
 
 
 def simulation_metrics(env: Env[Any]) -> dict[str, float]:
     """The simulation's diagnostics since the last call, and the range of randomized parameters, by metric name.
 
-    In a group, of all processes, each of which has to call it.
+    In a group, over all processes; every process must call it.
 
     Raises:
         SimulationError: contacts or constraint rows were lost to a full buffer.
@@ -231,7 +234,7 @@ def simulation_metrics(env: Env[Any]) -> dict[str, float]:
 
 
 class Clock:
-    """Measures how long parts of an epoch take on the device, without making the host wait until they are asked for."""
+    """Measures how long each part of an epoch takes on the device; the host waits only when the times are read."""
 
     def __init__(self, device: torch.device) -> None:
         self._device = device
@@ -246,7 +249,7 @@ class Clock:
         return event
 
     def mark(self, name: str) -> None:
-        """A part has ended that began at the mark before, or when the clock was created."""
+        """End the part that began at the previous mark, or when the clock was created."""
         self._names.append(name)
         self._times.append(self._now())
 

@@ -49,7 +49,7 @@ class EpisodeTracker:
 
 
 def _running_sum(values: Tensor) -> Tensor:
-    """Sums over the first axis up to each place."""
+    """Cumulative sums over the first axis."""
     if values.is_cuda and torch.are_deterministic_algorithms_enabled():
-        return torch.stack(list(accumulate(values)))  # torch's own has no fixed order there
+        return torch.stack(list(accumulate(values)))  # torch.cumsum has no fixed order on a GPU
     return values.cumsum(0)

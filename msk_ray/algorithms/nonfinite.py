@@ -1,4 +1,4 @@
-"""Where an observation or a reward was not finite, in words.
+"""Error messages that say where an observation or reward was not finite.
 
 Axes: H env steps of a rollout, W worlds, O observation, T reward terms.
 """
@@ -12,12 +12,16 @@ from torch import Tensor
 from msk_ray.envs import Env
 from msk_ray.errors import Failure, SimulationError
 
-_CAUSES = "a division by 0, or a root or logarithm of what can be 0 or less"
+_CAUSES = "a division by 0, or a root or logarithm of a number that can be 0 or negative"
 
 
 def nonfinite_observation(env: Env[Any], observations: Tensor, epoch: int, done: int = 0) -> SimulationError | None:
-    """The error for observations (H, W, O) of an epoch, counted from 0, after so many env steps of it; None if all are
-    finite. Waits for the device."""
+    """The error for non-finite observations (H, W, O); None if all are finite. Waits for the device.
+
+    Args:
+        epoch: counted from 0.
+        done: env steps of the epoch before these.
+    """
     place = _first(observations)
     if place is None:
         return None
@@ -32,10 +36,9 @@ def nonfinite_observation(env: Env[Any], observations: Tensor, epoch: int, done:
 
 
 def nonfinite_reward(env: Env[Any], terms: Sequence[Tensor], epoch: int) -> SimulationError:
-    """The error for an epoch, counted from 0, whose mean reward is not finite, from the terms (W, T) of each of its H
-    steps. Waits for the device.
+    """The error for an epoch, counted from 0, with a non-finite mean reward. Waits for the device.
 
-    In a group, they are those of this process.
+    `terms` are the reward terms (W, T) of each of its H steps, in this process's worlds.
     """
     values = torch.stack(list(terms))
     place = _first(values)
@@ -54,7 +57,7 @@ def nonfinite_reward(env: Env[Any], terms: Sequence[Tensor], epoch: int) -> Simu
 
 
 def _first(values: Tensor) -> tuple[int, int, int] | None:
-    """The place (step, world, column) of the first value that is not finite."""
+    """Index (step, world, column) of the first value that is not finite."""
     places = (~values.isfinite()).nonzero()
     if not len(places):
         return None

@@ -33,40 +33,40 @@ ALGORITHMS = Registry(
     "msk_ray.algorithms",
     {"shac": "msk_ray.algorithms.shac.algorithm:Shac", "ppo": "msk_ray.algorithms.ppo.algorithm:Ppo"},
 )
-"""Classes of algorithms. Those of the package have their settings in the config's section of the same name."""
+"""Classes of algorithms. The package's own have their settings in the config's section of the same name."""
 
 
 class AlgorithmSettings(Section):
-    """The settings of an algorithm, and what it declares."""
+    """An algorithm's settings, and facts about it that other settings depend on."""
 
     differentiates: ClassVar[bool] = True
-    """Whether it needs gradients of the simulation; if not, it reads none of their settings."""
+    """Whether it needs gradients of the simulation; if not, settings of gradients are unused."""
     reads_not: ClassVar[frozenset[str]] = frozenset()
-    """Settings of the sections `actor` and `critic`, dotted, that it does not read."""
+    """Dotted settings in the sections `actor` and `critic` that it does not use."""
     packages: ClassVar[Mapping[str, str]] = {}
-    """Optional modules that it needs, and what to install for each."""
+    """Optional modules that it needs → what to install."""
     length: ClassVar[str | None] = None
     """Its setting for the number of env steps that a world takes in an epoch."""
     parallel: ClassVar[bool] = False
     """Whether several processes can train one trial (`execution.gpus`)."""
 
     def env_steps(self, nworld: int, epochs: int) -> int:
-        """The largest number of env steps that a number of epochs of W worlds can take.
+        """Upper bound on the env steps that this many epochs of W worlds take.
 
         Raises:
-            ConfigError: the algorithm does not say.
+            ConfigError: the algorithm does not define it.
         """
         raise ConfigError(
-            f"{type(self).__qualname__} does not say how many env steps an epoch takes: write its method env_steps, "
+            f"{type(self).__qualname__} does not say how many env steps an epoch takes: define its method env_steps, "
             "or scheduler.time_attr: epoch"
         )
 
     def shortened(self, epochs: int) -> dict[str, Any]:
-        """Settings that make each of `epochs` epochs last about a second, to check that everything runs."""
+        """Settings for a smoke test: each of `epochs` epochs lasts about a second."""
         return {}
 
     def shortest(self) -> dict[str, Any]:
-        """Settings of an epoch that launches every kernel and does little else."""
+        """Settings for a minimal epoch that launches every kernel, to compile them."""
         return {}
 
     def check(self, config: Config) -> None:
@@ -77,26 +77,26 @@ class AlgorithmSettings(Section):
         """
 
     def unread(self) -> dict[str, str]:
-        """Settings of this section, dotted, that nothing reads because of others, and the reason for each."""
+        """Dotted settings of this section that have no effect because of others → the reason."""
         return {}
 
 
 class UndeclaredAlgorithm(AlgorithmSettings, Undeclared):
-    """The recorded settings of an algorithm that cannot be found here."""
+    """Recorded settings of an algorithm whose class is not installed here."""
 
     parallel = True
 
 
 class EntropyConfig(Section):
-    """Bonus α for the policy's entropy, as in SAPO (Xing et al. 2024, arXiv:2412.12089); values become soft values."""
+    """Entropy bonus, as in SAPO (Xing et al. 2024, arXiv:2412.12089); values become soft values."""
 
     coefficient: PositiveFloat = 0.01
     """α [reward per nat], or its initial value if there is a target."""
     target: float | None = None
     """Entropy per action dimension [nat] to which α is adapted; null keeps α. Uniform actions have ln 2 = 0.69."""
     normalize: bool = False
-    """Pay α for (H + |T|) / 2|T| in place of the entropy H, where T is the target of all action dimensions together: 0
-    at T = −|T|, as in SAPO, so that α does not depend on the number of actions."""
+    """Multiply α with (H + |T|) / 2|T| instead of the entropy H, where T is the target summed over action dimensions.
+    As in SAPO, this is 0 at H = −|T|, and α does not depend on the number of actions."""
 
     @model_validator(mode="after")
     def _normalized_by_something(self) -> EntropyConfig:
@@ -108,7 +108,7 @@ class EntropyConfig(Section):
 class ExplorationSchedule(Section):
     """Factor on the standard deviation of actions: `start` at epoch 0, `end` from epoch `epochs` on, linear between.
 
-    The deviation itself is learned all the while.
+    The standard deviation itself is still learned.
     """
 
     start: NonNegative
@@ -134,13 +134,13 @@ class ShacConfig(AlgorithmSettings):
     lam: Fraction = 0.95
     """λ of the TD(λ) targets."""
     critic_iterations: Count = 16
-    """Passes over the rollout per epoch; with `critic_tolerance`, the largest number of them."""
+    """Passes over the rollout per epoch; with `critic_tolerance`, at most this many."""
     critic_tolerance: PositiveFloat | None = None
-    """Stop the passes when the loss changes by less than this share of itself per pass, on average over the last four
-    (in AHAC, by less than an absolute number); null: all passes. A recorded fit computes all passes, and leaves out the
-    optimiser's steps of those after the stop."""
+    """Stop when the loss changes by less than this share of itself per pass, averaged over the last four passes (AHAC
+    has an absolute threshold); null: never stop early. A recorded fit computes all passes, but skips the optimiser's
+    steps after the stop."""
     critic_batches: Count = 4
-    """Minibatches a pass."""
+    """Minibatches per pass."""
     target_critic_alpha: Fraction = 0.2
     """target ← α·target + (1 − α)·critic after each epoch."""
     actor_lr: Rate = 2e-3
@@ -148,9 +148,9 @@ class ShacConfig(AlgorithmSettings):
     critic_lr: Rate = 2e-3
     """Learning rate of the critic."""
     lr_schedule: Literal["linear", "constant"] = "linear"
-    """`linear` decreases from the given rate towards `final_lr`, which would follow the last epoch."""
+    """`linear` decreases from the given rate towards `final_lr`, reached after the last epoch."""
     final_lr: Rate = 1e-5
-    """Learning rate at which the linear schedule ends; a lower given rate stays as it is."""
+    """Learning rate at which the linear schedule ends; lower given rates stay constant."""
     weight_decay: NonNegative = 0.0
     """Decoupled weight decay of AdamW, for actor and critic; 0: Adam. SAPO has 0.01."""
     actor_grad_norm: PositiveFloat | None = 1.0
@@ -158,26 +158,26 @@ class ShacConfig(AlgorithmSettings):
     critic_grad_norm: PositiveFloat | None = 1.0
     """Norm to which each critic's gradient is clipped; null: no clipping."""
     state_bptt: bool = True
-    """Let gradients flow through the state from one env step to the next; False cuts them after each step."""
+    """Let gradients flow through the state from one env step to the next; false detaches the state at each step."""
     state_grad_clip: PositiveFloat | None = None
     """Bound on each world's state cotangent between env steps, in units of reward; null: no bound.
 
-    The loss is a mean over H·W, so a cotangent of norm c/(H·W) in a world is what a single reward of c would give.
+    The loss is a mean over H·W, so a single reward of c gives a cotangent of norm c/(H·W).
     """
     entropy: EntropyConfig | None = None
-    """Bonus for the policy's entropy; null: none."""
+    """Entropy bonus; null: none."""
     actor_value: Literal["smaller", "mean"] = "smaller"
-    """Which of two critics' values counts in the actor's loss; the critic's targets always use the smaller, and SAPO
-    the mean for the actor."""
+    """How two critics' values are combined in the actor's loss; SAPO uses the mean. The critic's targets always use the
+    smaller value."""
     exploration: ExplorationSchedule | None = None
     """Factor on the standard deviation of the actions by epoch; null: 1."""
     normalize_return: bool = False
     """Divide rewards by the running standard deviation of the return."""
     reward_scale: Annotated[float, Field(ge=1e-6, le=1e6)] = 1.0
-    """Factor on the rewards of training; scores are without it."""
+    """Factor on rewards in training; scores are not scaled."""
 
     def env_steps(self, nworld: int, epochs: int) -> int:
-        """The sum over epochs of horizon × worlds; a horizon that follows something counts as its `longest`."""
+        """Sum over epochs of horizon × worlds; an adaptive horizon counts as its `longest`."""
         horizon = self.horizon
         if isinstance(horizon, HorizonSchedule):
             return nworld * sum(horizon.at(epoch) for epoch in range(epochs))
@@ -201,7 +201,7 @@ class ShacConfig(AlgorithmSettings):
         return {"horizon": 2, "critic_iterations": 1, "critic_batches": 1}
 
     def check(self, config: Config) -> None:
-        """Refuse critic batches that do not divide a rollout, and settings that others leave without meaning."""
+        """Refuse critic batches that do not divide a rollout, and settings that contradict others."""
         horizon, nworld = self.horizon, config.env.nworld
         if isinstance(horizon, HorizonSchedule):
             shortest = min(horizon.start, horizon.end)
@@ -222,7 +222,7 @@ class ShacConfig(AlgorithmSettings):
             raise ValueError(f"shac.horizon.contact: {config.env.name} has no contacts; write a number")
 
     def unread(self) -> dict[str, str]:
-        """Settings that another one switches off."""
+        """Settings that have no effect because of another setting."""
         unread = {}
         if self.lr_schedule == "constant":
             unread["final_lr"] = "lr_schedule is constant"
@@ -247,11 +247,11 @@ class PpoConfig(AlgorithmSettings):
     length: ClassVar[str | None] = "steps"
 
     steps: Count = 24
-    """Env steps a world takes in an epoch."""
+    """Env steps per world and epoch."""
     passes: Count = 5
     """Passes over an epoch's steps."""
     minibatches: Count = 4
-    """Minibatches a pass."""
+    """Minibatches per pass."""
     clip: PositiveFloat = 0.2
     """Bound on how much the ratio of new to old probabilities, and the value, may change in an epoch."""
     gamma: Fraction = 0.99
@@ -259,13 +259,13 @@ class PpoConfig(AlgorithmSettings):
     lam: Fraction = 0.95
     """λ of the generalised advantage estimate."""
     lr: Rate = 1e-3
-    """Adam's rate, or its initial value if it is adaptive."""
+    """Adam's learning rate, or its initial value if the schedule is adaptive."""
     lr_schedule: Literal["adaptive", "constant"] = "adaptive"
     """`adaptive` divides or multiplies the rate by 1.5, between 1e-5 and 1e-2, to hold `desired_kl`."""
     desired_kl: PositiveFloat = 0.01
     """Divergence of the new policy from the old one [nat]."""
     entropy_coefficient: NonNegative = 0.0
-    """Weight of the bonus for the policy's entropy."""
+    """Weight of the entropy bonus."""
 
     def env_steps(self, nworld: int, epochs: int) -> int:
         """Worlds × steps × epochs."""
@@ -280,7 +280,7 @@ class PpoConfig(AlgorithmSettings):
         return {"steps": 2, "passes": 1, "minibatches": 1}
 
     def check(self, config: Config) -> None:
-        """Refuse minibatches that do not divide an epoch, and what PPO cannot do."""
+        """Refuse minibatches that do not divide an epoch, and settings that PPO does not support."""
         if (self.steps * config.env.nworld) % self.minibatches:
             raise ValueError(
                 f"ppo.minibatches {self.minibatches} must divide ppo.steps × env.nworld "
@@ -293,7 +293,7 @@ class PpoConfig(AlgorithmSettings):
             raise ValueError("curriculum: ppo trains without one; write curriculum: null, or algorithm.name: shac")
 
     def unread(self) -> dict[str, str]:
-        """Settings that another one switches off."""
+        """Settings that have no effect because of another setting."""
         return {"desired_kl": "lr_schedule is constant"} if self.lr_schedule == "constant" else {}
 
 
@@ -338,7 +338,7 @@ class AlgorithmConfig(Section):
 
 
 def settings_from_outside(name: Any) -> type[AlgorithmSettings]:
-    """The settings that the algorithm at this import path, or of this installed name, declares.
+    """The settings class of the algorithm with this import path or installed name.
 
     Raises:
         ConfigError: there is no such algorithm, or it declares something else.

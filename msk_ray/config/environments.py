@@ -31,16 +31,16 @@ SETTINGS = Registry(
         "humanoid": "msk_ray.envs.humanoid.config:HumanoidSettings",
     },
 )
-"""Settings that can be imported without their environment, which loads torch. A name that is only in `ENVIRONMENTS`
-uses the settings of its class."""
+"""Settings that can be imported without their environment, which loads torch. For other names, the environment's class
+is asked."""
 
 
 class UndeclaredReward(Reward, Undeclared):
-    """Whatever is recorded."""
+    """A reward section with any settings."""
 
 
 class UndeclaredEnv(EnvSettings, Undeclared):
-    """The recorded settings of an environment that cannot be found here."""
+    """Recorded settings of an environment whose class is not installed here."""
 
     reads_physics = frozenset(PhysicsConfig.names())
 
@@ -48,10 +48,10 @@ class UndeclaredEnv(EnvSettings, Undeclared):
 
 
 def settings_class(name: Any) -> type[EnvSettings]:
-    """The settings that the environment of this name, or at this import path, declares.
+    """The settings class of the environment with this name or import path.
 
     Raises:
-        ConfigError: there is no such environment, or its declaration lacks something.
+        ConfigError: there is no such environment, or its settings class is incomplete.
     """
     path = ENVIRONMENTS.path(name)
     light = SETTINGS.find(name)

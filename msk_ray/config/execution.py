@@ -1,4 +1,4 @@
-"""How a trial is computed, as opposed to what: devices, kernels, buffers, files. No part of a trial's id."""
+"""How a trial is computed, as opposed to what it computes: devices, kernels, buffers, files. Not part of its id."""
 
 from typing import Annotated, Any, Literal
 
@@ -18,31 +18,31 @@ class ExecutionConfig(Section):
     """How a trial is computed. Results differ by rounding at most; what is trained is the same."""
 
     gpus: Annotated[int, Field(ge=1, le=64)] = 1
-    """Number of GPUs, all of one host, that the worlds are spread over, with a process for each; on the CPU, of
-    processes. It must divide `env.nworld`."""
+    """Number of GPUs of one host that share the worlds, with one process each; on the CPU, number of processes. It must
+    divide `env.nworld`."""
     threads: Count = 1
-    """Number of CPU threads of torch. Sums depend on it by rounding; therefore it comes from this setting, never from
-    the machine. Networks of a few hundred units gain nothing from more than one."""
+    """Number of torch's CPU threads. It changes rounding, so it comes from this setting and never from the machine.
+    Networks of a few hundred units gain nothing from more than one."""
     deterministic: bool = False
     """Add everything up in a fixed order, so that a GPU repeats the trial bit for bit (docs/runner/repeat.md)."""
     solver_kernels: Literal["mujoco_warp", "fused"] = "mujoco_warp"
-    """Kernels of the constraint solver. `fused` is one for all iterations of Newton's method, with a warp for each
-    world: for models of up to 60 degrees of freedom."""
+    """Kernels of the constraint solver. `fused` runs all of Newton's iterations in one kernel, with a warp per world:
+    for models of up to 60 degrees of freedom."""
     jacobian: Literal["dense", "sparse"] | None = None
-    """How mujoco_warp stores the Jacobian of the constraints; null: as the model says. Which one takes less time and
-    memory on a GPU depends on the model."""
+    """How mujoco_warp stores the constraint Jacobian; null: as the model says. Which is faster and smaller on a GPU
+    depends on the model."""
     nconmax: Count | None = None
-    """Contacts per world; null: a bound from the geometry or, if that is large, the result of a probe, which grows with
-    use. A given number does not grow."""
+    """Contacts per world. null: a bound from the geometry or, if that is large, the result of a short probe, which
+    grows when needed. A given number does not grow."""
     njmax: Count | None = None
-    """Constraint rows per world; null as for nconmax."""
+    """Constraint rows per world; null: as for nconmax."""
     capture: Annotated[Literal["auto", "off", False], AfterValidator(_off)] = "auto"
-    """`auto`: on CUDA, epochs are recorded as graphs and replayed; an environment that makes the host wait for the
-    device runs operation by operation, and a warning says where. `off`: always so, to debug. A CPU has no graphs."""
+    """`auto`: on CUDA, record epochs as graphs and replay them; an environment that makes the host wait for the device
+    runs operation by operation instead, with a warning that says where. `off`: never record, to debug."""
     checkpoint_interval: Count = 10
     """Epochs between checkpoints."""
     keep_checkpoints: Annotated[int, Field(ge=2)] = 2
-    """Number of newest checkpoints kept, in addition to the best."""
+    """Number of newest checkpoints to keep, in addition to the best."""
     loggers: Annotated[tuple[Text, ...], Field(max_length=16)] = ("tensorboard",)
     """Loggers in addition to `metrics.jsonl`: `tensorboard`, `wandb`, `mlflow`, or package.module:Class."""
 
@@ -65,7 +65,7 @@ class ExecutionConfig(Section):
         return self
 
     def check_integrator(self, integrator: str | None) -> None:
-        """Refuse an integrator that these settings cannot step by.
+        """Refuse an integrator that these settings do not support.
 
         Raises:
             ValueError: the message says what to write instead.
@@ -79,7 +79,7 @@ class ExecutionConfig(Section):
             )
 
     def check_order(self, integrator: str | None) -> None:
-        """Refuse what leaves sums without a fixed order although `deterministic` asks for one.
+        """Refuse settings that are incompatible with `deterministic`, because they leave sums without a fixed order.
 
         Raises:
             ValueError: the message says what to write instead.

@@ -1,4 +1,4 @@
-"""How long rollouts are: constant, by schedule, or following what a trial measures."""
+"""Rollout length: constant, by schedule, or adapted to what a trial measures."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from msk_ray.errors import ConfigError, brief
 
 
 class HorizonSchedule(Section):
-    """Rollout length by epoch: `start` at epoch 0, `end` from epoch `epochs` on, linear between."""
+    """Rollout length that changes linearly from `start` at epoch 0 to `end` at epoch `epochs`, and stays there."""
 
     kind: Literal["schedule"] = "schedule"
     start: Count
@@ -72,7 +72,7 @@ HORIZONS: Mapping[str, type[Section]] = {
     "adaptive": AdaptiveHorizon,
     "contact": ContactHorizon,
 }
-"""Settings of each kind of horizon that changes."""
+"""Settings of a varying horizon, by kind."""
 
 
 def horizon_class(kind: Any) -> type[Section]:

@@ -33,13 +33,13 @@ def parse_config(data: Mapping[str, Any], source: str = "config") -> Config:
 
 
 def parse_recorded(data: Mapping[str, Any], source: str, *, shown: bool = False) -> Config:
-    """The configuration in a trial's files, written by this version or an earlier one.
+    """A trial's recorded configuration, written by this version or an earlier one.
 
     Args:
-        shown: it is only shown: of a class that cannot be found here (`Config.undeclared`), take what is recorded.
+        shown: for display only: if a class cannot be found here (`Config.undeclared`), accept its settings as recorded.
 
     Raises:
-        ConfigError: as for `parse_config`, or a setting that no longer exists had an effect.
+        ConfigError: as for `parse_config`, or a removed setting had an effect.
     """
     settings = current_settings(data) if isinstance(data, Mapping) else data
     if not shown:
@@ -51,7 +51,7 @@ def parse_recorded(data: Mapping[str, Any], source: str, *, shown: bool = False)
 
 
 def read_config(path: Path) -> dict[str, Any]:
-    """The settings of a config file merged into those of the file that it `extends`, if any, in the current spelling.
+    """The settings of a config file, merged into those of the file it `extends`, if any, in the current spelling.
 
     `extends` is a path relative to the file, and only one level deep: an extended file may not extend another.
 
@@ -70,17 +70,17 @@ def read_config(path: Path) -> dict[str, Any]:
 
 
 def find_config(path: str | Path) -> Path:
-    """The file of a config's path, or of its name in `configs/` of the current folder or of the package; a path to no
-    file is returned as it is, for `read_config` to describe.
+    """The file with this path, or of this name in `configs/` of the current folder or of the package. A path without a
+    file is returned unchanged; `read_config` reports it.
 
     Raises:
-        ConfigError: there is none of that name; the message lists the known ones.
+        ConfigError: the name is unknown; the message lists the known ones.
     """
-    found = find_shipped(path, CONFIGS, ".yaml")
-    if found is None and is_name(path):
+    shipped = find_shipped(path, CONFIGS, ".yaml")
+    if shipped is None and is_name(path):
         known = ", ".join(shipped_names(CONFIGS, ".yaml"))
         raise ConfigError(f"unknown config {brief(str(path))}; known: {known}, or give a path to a .yaml file")
-    return Path(path) if found is None else found
+    return Path(path) if shipped is None else shipped
 
 
 def load_config(path: str | Path, overrides: Iterable[str] = ()) -> Config:
@@ -99,10 +99,9 @@ def load_config(path: str | Path, overrides: Iterable[str] = ()) -> Config:
 
 
 def refuse_ignored(values: Mapping[str, Any], configs: Iterable[Config], source: str) -> None:
-    """Refuse dotted settings that the algorithm of none of the trials reads. `source` names them in errors.
+    """Refuse dotted settings that no trial's algorithm uses. `source` names them in errors.
 
-    A file may hold settings for algorithms that the trial does not run, but settings given for the trial itself may
-    not.
+    A config file may hold settings for other algorithms; settings given on the command line or in a space may not.
 
     Raises:
         ConfigError: the message names the first of them.
@@ -117,29 +116,29 @@ def refuse_ignored(values: Mapping[str, Any], configs: Iterable[Config], source:
 
 
 def _named(data: Any) -> dict[str, type[BaseModel]]:
-    """Sections, dotted, whose settings depend on the `name` or `kind` in or beside them, if it can be found."""
-    found: dict[str, type[BaseModel]] = {}
+    """Settings classes of the dotted sections that depend on a `name` or `kind`, where that is valid."""
+    sections: dict[str, type[BaseModel]] = {}
     if not isinstance(data, Mapping):
-        return found
-    with contextlib.suppress(ConfigError):  # this is the error that is described
-        found["env"] = settings_class(env_name(data))
+        return sections
+    with contextlib.suppress(ConfigError):  # the invalid name is reported by its own check
+        sections["env"] = settings_class(env_name(data))
     algorithm = data.get("algorithm")
     name = algorithm.get("name") if isinstance(algorithm, Mapping) else None
     if isinstance(name, str) and name not in BUILT_IN:
         with contextlib.suppress(ConfigError):
-            found["algorithm.settings"] = settings_from_outside(name)
+            sections["algorithm.settings"] = settings_from_outside(name)
     shac = data.get("shac")
     horizon = shac.get("horizon") if isinstance(shac, Mapping) else None
     if isinstance(horizon, Mapping):
         with contextlib.suppress(ConfigError):
-            found["shac.horizon"] = horizon_class(horizon.get("kind"))
-    return found
+            sections["shac.horizon"] = horizon_class(horizon.get("kind"))
+    return sections
 
 
 def describe_fault(
     error: ValidationError, root: type[BaseModel] = Config, *, named: Mapping[str, type[BaseModel]] | None = None
 ) -> str:
-    """The first error found while validating a `root`, and how many more there are, on one line.
+    """The first error of validating a `root`, and how many more there are, on one line.
 
     Args:
         error: the error that the validation raised.
@@ -147,7 +146,7 @@ def describe_fault(
         named: open sections of `root`, dotted, with the class that each was validated as.
     """
     faults = error.errors()
-    # A misspelt key is often missing under its right name too; report the misspelling.
+    # A misspelt key often makes the right one missing too; report the misspelling.
     first = min(faults, key=lambda fault: fault["type"] != "extra_forbidden")
     location = [shortened(str(part)) for part in first["loc"]]
     where = ".".join(location)
@@ -191,11 +190,11 @@ def _subsection_with(section: type[BaseModel], key: str, named: Mapping[str, typ
 
 
 def _model_at(root: type[BaseModel], sections: list[str], named: Mapping[str, type[BaseModel]]) -> type[BaseModel]:
-    """The section of `root` that contains an error."""
+    """The settings class of the section of `root` that contains an error."""
     model: Any = root
     for depth, section in enumerate(sections):
         model = named.get(".".join(sections[: depth + 1]), model.model_fields[section].annotation)
         if not _is_model(model):  # it may be null
             model = next(option for option in get_args(model) if _is_model(option))
-    found: type[BaseModel] = model
-    return found
+    model_there: type[BaseModel] = model
+    return model_there

@@ -1,4 +1,4 @@
-"""Merge settings: the one rule that `--set`, `extends` and search spaces follow.
+"""Merging settings: one rule for `--set`, `extends` and search spaces.
 
 A mapping is merged into the existing section key by key; any other value replaces the existing one. Where a setting
 accepts mappings of several kinds (by their `kind`; `env` and `algorithm` by their `name`), a mapping of another kind
@@ -81,7 +81,7 @@ def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def leaves(key: str, value: Any) -> Iterator[tuple[str, Any]]:
-    """Dotted keys of the values within a value, and these values; mappings are sections."""
+    """The values inside a value by dotted key; mappings are sections."""
     if isinstance(value, Mapping) and value:
         for name, item in value.items():
             yield from leaves(f"{key}.{name}", item)
@@ -103,6 +103,6 @@ def _laid_over(path: list[str], old: Any, new: Any) -> Any:
 
 
 def _another_kind(path: list[str], old: Mapping[str, Any], new: Mapping[str, Any]) -> bool:
-    """Whether two mappings for the same setting describe different things."""
+    """Whether two mappings for the same setting are of different kinds."""
     tag = "name" if path in (["env"], ["algorithm"]) else "kind"
     return tag in new and tag in old and new[tag] != old[tag]

@@ -1,4 +1,4 @@
-"""Packages that are needed only by those who use them: the extras of this package."""
+"""Optional dependencies: this package's extras."""
 
 from collections.abc import Mapping
 from importlib.util import find_spec
@@ -7,10 +7,10 @@ from msk_ray.errors import ConfigError
 
 
 def require(packages: Mapping[str, str], user: str) -> None:
-    """Refuse what needs packages that are not installed, without importing any.
+    """Raise if packages are not installed, without importing them.
 
     Args:
-        packages: module → what `pip install` takes.
+        packages: module → argument of `pip install`.
         user: the setting that needs them, with its value.
 
     Raises:

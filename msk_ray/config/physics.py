@@ -1,4 +1,4 @@
-"""How a model is built, stepped and differentiated, and which environments read which of these settings."""
+"""How a model is built, stepped and differentiated; and groups of these settings, for environments to declare."""
 
 from typing import Literal
 
@@ -25,11 +25,11 @@ GRADIENTS = frozenset(
 )
 """Settings of how steps are differentiated."""
 SOLVING = frozenset((*("tolerance", "iterations", "ls_iterations", "cone"),))
-"""Those of the constraint solver, which a model without contacts and limits does not need."""
+"""Settings of the constraint solver, for models with contacts or limits."""
 CONTACTS = frozenset(("solref", "solimp", "solreffriction"))
-"""Those of contacts, in models that declare their own."""
+"""Settings of contacts, for models that declare their own."""
 ACTIVATION = frozenset(("fd.eps_act",))
-"""Those of models whose actuators have a state."""
+"""Settings for models with actuator activations."""
 
 
 class FdConfig(Section):
@@ -46,7 +46,7 @@ class FdConfig(Section):
 
 
 class PhysicsConfig(Section):
-    """How the model is built, stepped and differentiated. Fields left null keep the variant's value."""
+    """How the model is built, stepped and differentiated. null keeps the variant's value."""
 
     variant: Text | None = None
     """Named physics of the environment: for hopper, cheetah and humanoid `published` or `matched`, for ant also
@@ -64,10 +64,10 @@ class PhysicsConfig(Section):
     tolerance: PositiveFloat | None = None
     """Constraint solver tolerance; mujoco_warp's default is 1e-6."""
     iterations: Count | None = None
-    """Constraint solver iteration limit; null: that of the environment, for a model from a file its own but at least
+    """Iteration limit of the constraint solver; null: the environment's. For a model file: its own, but at least
     100."""
     ls_iterations: Count | None = None
-    """Line search iteration limit; null: likewise, but at least 50."""
+    """Iteration limit of the line search; null: likewise, but at least 50."""
     integrator: Literal["Euler", "implicitfast", "RK4"] | None = None
     cone: Literal["pyramidal", "elliptic"] | None = None
     """Friction cone. The pyramid's edges make contact gradients explode over long horizons; the ellipse has none."""
@@ -76,12 +76,12 @@ class PhysicsConfig(Section):
     solimp: Vec5 | None = None
     """Contact impedance d0, dwidth, width [m], midpoint, power."""
     solreffriction: Vec2 | None = None
-    """Solver reference of only the friction directions [s, ratio], set on contact pairs; needs the elliptic cone.
+    """Solver reference of the friction directions only [s, ratio], set on contact pairs; needs the elliptic cone.
 
     Friction acts like a damper with this time constant: (0.02, 1) sticks, (1, 1) is viscous. `(0, 0)` uses solref.
     """
     randomize: RandomizeConfig | None = None
-    """Parameters of the model that are drawn for each world and episode, in training only; null: the model's own."""
+    """Model parameters to draw at random for each world and episode, in training only; null: none."""
 
     @model_validator(mode="after")
     def _friction_direction_needs_ellipse(self) -> "PhysicsConfig":
@@ -91,7 +91,7 @@ class PhysicsConfig(Section):
 
     @classmethod
     def names(cls) -> list[str]:
-        """Every setting of the section that some environments do not read, dotted within it."""
+        """Every setting of the section that only some environments read, dotted."""
         return [
             *(name for name in cls.model_fields if name not in ("fd", "randomize")),
             *(f"fd.{name}" for name in FdConfig.model_fields),

@@ -1,4 +1,4 @@
-"""Model parameters that are drawn per world and episode while training."""
+"""Model parameters to draw at random for each world and episode in training."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from msk_ray.config.sections import Section, Text
 
 
 class Draw(Section):
-    """The numbers from which one field of the model is drawn."""
+    """Distribution of one model field."""
 
     low: PositiveFloat
     high: PositiveFloat
     distribution: Literal["uniform", "log_uniform"] = "uniform"
     """`log_uniform` draws factors of 1/2 and 2 equally often."""
     mode: Literal["scale", "value"] = "scale"
-    """`scale` multiplies what the model has, `value` replaces it."""
+    """`scale` multiplies the model's value, `value` replaces it."""
     each: bool = False
-    """One number for each element instead of one for all of them."""
+    """Draw a number for each element, instead of one for all."""
     only: Annotated[tuple[Text, ...], Field(max_length=1024)] | None = None
     """Names of the elements to change; null: all."""
 
@@ -30,20 +30,20 @@ class Draw(Section):
 
 
 class Scaling(Draw):
-    """The numbers by which one field of the model is multiplied."""
+    """Distribution of a factor on one model field."""
 
     mode: Literal["scale"] = "scale"
 
 
 class RandomizeConfig(Section):
-    """Fields of the model, named as in MuJoCo's MjModel, each with what it is drawn from; null: as in the model."""
+    """Distributions of model fields, named as in MuJoCo's MjModel; null: not randomized."""
 
     geom_friction: Draw | None = None
     """Sliding friction of geoms."""
     pair_friction: Draw | None = None
-    """Sliding friction of contact pairs, which do not read that of their geoms."""
+    """Sliding friction of contact pairs, which ignore their geoms' friction."""
     body_mass: Scaling | None = None
-    """Mass of bodies, and their inertia by the same factor."""
+    """Mass of bodies; scales their inertia by the same factor."""
     dof_damping: Draw | None = None
     """Damping of joints, by the joint's name [N s/m, N m s/rad]."""
     dof_armature: Draw | None = None
@@ -55,7 +55,7 @@ class RandomizeConfig(Section):
     actuator_gear: Scaling | None = None
     """Gear of actuators, which scales forces and lengths."""
     actuator_gain: Scaling | None = None
-    """Strength of actuators: gain and bias by the same factor, so that a servo keeps its target."""
+    """Strength of actuators: scales gain and bias by the same factor, so that servos keep their targets."""
     gravity: Scaling | None = None
     """Gravity."""
 
@@ -72,7 +72,7 @@ class RandomizeConfig(Section):
 
     @property
     def drawn(self) -> dict[str, Draw]:
-        """What is drawn, by field."""
+        """Distributions by field, without null ones."""
         return {name: draw for name in type(self).model_fields if (draw := getattr(self, name)) is not None}
 
     def __str__(self) -> str:

@@ -1,6 +1,6 @@
-"""Settings as earlier versions spelt them, and the content of a trial that its id is a hash of.
+"""Settings as earlier versions spelt them, and the part of a trial's settings that its id is a hash of.
 
-Files and records of earlier versions are read in either spelling; on the command line the old one is refused.
+Files and records may use either spelling; on the command line the old one is refused.
 """
 
 import copy
@@ -12,14 +12,14 @@ from pydantic import BaseModel
 from msk_ray.errors import ConfigError, brief
 
 SCHEMA = 2
-"""Number of the scheme by which trials get their ids; it is part of what is hashed."""
+"""Version of the scheme of trial ids; it is hashed too."""
 
 _EXECUTION = {
     "trial": ("gpus", "threads", "deterministic", "checkpoint_interval", "keep_checkpoints", "loggers"),
     "physics": ("solver_kernels", "jacobian", "nconmax", "njmax"),
     "shac": ("capture",),
 }
-"""Settings that have moved into `execution`, by the section that they were in until version 0.2."""
+"""Settings now in `execution`, by their section until version 0.2."""
 _MOVED = {f"{section}.{name}": f"execution.{name}" for section, names in _EXECUTION.items() for name in names}
 
 _REMOVED: dict[str, Any] = {
@@ -54,8 +54,7 @@ _REMOVED: dict[str, Any] = {
     "shac.normalize_obs": True,
     "trial.seeds": dict.fromkeys(("policy", "states", "noise", "minibatches")),
 }
-"""Settings that no longer exist, with the only value that can still be read: what is done now. An ellipsis stands for
-any value."""
+"""Removed settings, with the only value still accepted in files, which is what is done now. An ellipsis accepts any."""
 _REMOVED_FROM_LEGS: dict[str, Any] = {
     "assist.balance": 800.0,
     "assist.lateral": 800.0,
@@ -79,9 +78,9 @@ _REMOVED_FROM_ENVS: dict[str, dict[str, Any]] = {
     "myoleg26": {**_REMOVED_FROM_LEGS, "terrain.seed": 0, "terrain.start": 0.8, "terrain.step_depth": 0.6},
     "myosuite_walk": {"assist.balance": 800.0, "assist.lateral": 800.0, "assist.support": 0.0},
 }
-"""The same of the section of each environment of the package, dotted within it."""
+"""The same for the section of each of the package's environments, dotted within it."""
 _REMOVED_FROM_SPACES: dict[str, Any] = {"smoke": {"overrides": {}, "max_trials": 8}}
-"""The same of a space file's own settings."""
+"""The same for a space file's own settings."""
 REMOVED = "has been removed; leave it out, or use version 0.2"
 
 
@@ -101,7 +100,7 @@ def current_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Nested settings in the current spelling.
 
     Raises:
-        ConfigError: one of them no longer exists and had an effect.
+        ConfigError: a removed setting had an effect.
     """
     of_env = _REMOVED_FROM_ENVS.get(env_name(settings) or "", {})
     result = _without({**_REMOVED, **{f"env.{name}": value for name, value in of_env.items()}}, settings)
@@ -126,7 +125,7 @@ def current_values(values: Mapping[str, Any]) -> dict[str, Any]:
     """Dotted keys and their values in the current spelling.
 
     Raises:
-        ConfigError: one of them no longer exists and had an effect.
+        ConfigError: a removed setting had an effect.
     """
     result: dict[str, Any] = {}
     for key, value in values.items():
@@ -173,8 +172,8 @@ def _taken(settings: dict[str, Any], dotted: str) -> Iterator[Any]:
 
 
 def _with_kind(horizon: Any) -> Any:
-    """A horizon of before kinds had names, or the horizons of an operator; a mapping that only changes some settings is
-    left as it is."""
+    """Add the `kind` to a horizon, or to an operator's horizons, as older versions wrote them. Mappings that only
+    change some of a horizon's settings stay unchanged."""
     if isinstance(horizon, list):
         return [_with_kind(item) for item in horizon]
     if not isinstance(horizon, Mapping) or "kind" in horizon:
@@ -201,9 +200,9 @@ def newer_spelling(dotted: str) -> str | None:
 
 
 def changed_settings(section: BaseModel) -> dict[str, Any]:
-    """Plain data of the settings that differ from the defaults of their section.
+    """Plain data of the settings that differ from their defaults.
 
-    A setting that is added later, with a default that changes nothing, leaves it as it is.
+    Adding a setting to the program, with a default that changes nothing, does not change this data.
     """
     changed: dict[str, Any] = {}
     data = section.model_dump(mode="json")

@@ -31,7 +31,7 @@ from msk_ray.errors import ConfigError, brief
 
 
 def _declared_settings(value: Any, info: ValidationInfo) -> Any:
-    """The `env` section as the settings that the environment it names declares."""
+    """Validate the `env` section with the settings class of the environment that it names."""
     if isinstance(value, EnvSettings) or not isinstance(value, Mapping):
         return value
     try:
@@ -44,7 +44,7 @@ def _declared_settings(value: Any, info: ValidationInfo) -> Any:
 
 
 class ContactStart(Section):
-    """Contact physics at the start of a curriculum; fields left null keep the values of the trial's physics."""
+    """Contact physics at the start of a curriculum; null keeps the trial's value."""
 
     solref: tuple[PositiveFloat, PositiveFloat] | None = None
     """Contact time constant [s] and damping ratio."""
@@ -59,7 +59,7 @@ class ContactStart(Section):
 
 
 class ContactCurriculum(Section):
-    """Train with softer contacts first, and move to those of `physics` step by step."""
+    """Train with softer contacts first, and move step by step to the contacts of `physics`."""
 
     start: ContactStart
     epochs: Count
@@ -80,7 +80,7 @@ class ActorConfig(NetworkConfig):
     log_std: float = -1.0
     """Initial log standard deviation, before tanh."""
     state_std: bool = False
-    """Let the standard deviation depend on the observation, as in SAPO; False learns one for all states."""
+    """Let the standard deviation depend on the observation, as in SAPO; false: one for all observations."""
     output_gain: PositiveFloat = 1.0
     """Gain of the last layer's initial weights; a small gain starts near action 0 for every observation."""
 
@@ -89,11 +89,11 @@ class CriticConfig(NetworkConfig):
     """Value network(s)."""
 
     count: Annotated[int, Field(ge=1, le=2)] = 1
-    """Number of critics; with two, the smaller value counts."""
+    """Number of critics; with two, the smaller value is used."""
 
 
 class EvaluationConfig(Section):
-    """Deterministic evaluation on fixed seeds, by which alone policies are ranked."""
+    """Deterministic evaluation on fixed seeds: the only score by which policies are ranked."""
 
     interval: Count = 10
     """Epochs between evaluations."""
@@ -107,16 +107,16 @@ class EvaluationConfig(Section):
 
 
 class TrialConfig(Section):
-    """Length, seed and start of a trial."""
+    """Length, seed and starting point of a trial."""
 
     epochs: Count = 500
-    """Updates of the policy."""
+    """Number of policy updates."""
     seed: Whole = 0
-    """Seed of everything that is drawn but the episodes of evaluations (`evaluation.seed`)."""
+    """Seed of all random numbers, except the episodes of evaluations (`evaluation.seed`)."""
     start_from: Text | None = None
-    """Checkpoint of another trial, such as a best.pt, from whose networks and observation statistics this one starts;
-    null starts from random networks. Optimisers and worlds are new either way; so is the critic if the file has only a
-    policy, which may then get worse before it gets better."""
+    """Checkpoint of another trial, such as a best.pt: start from its networks and observation statistics. null: start
+    from random networks. Optimisers and worlds start new either way. If the file has a policy only, the critic starts
+    untrained, and the policy may get worse before it gets better."""
 
 
 class Config(Section):
@@ -144,7 +144,7 @@ class Config(Section):
         return self.algorithm.settings
 
     def check_installed(self) -> None:
-        """Refuse settings that need packages, or a model, that are not on this machine. Loads none of them.
+        """Raise if a package or model that the settings need is not on this machine. Loads nothing.
 
         Raises:
             ConfigError: the message names what to install.
@@ -155,17 +155,17 @@ class Config(Section):
 
     @property
     def algorithm_section(self) -> str:
-        """The section of those settings, dotted."""
+        """The dotted section of these settings."""
         return self.algorithm.name if self.algorithm.name in BUILT_IN else "algorithm.settings"
 
     @property
     def undeclared(self) -> str:
-        """Why the class of its environment, or of its algorithm, cannot be found; empty if both are there."""
+        """Why the environment's or algorithm's class cannot be found; empty if both can."""
         return next((s.why for s in (self.env, self.algorithm_settings) if isinstance(s, Undeclared)), "")
 
     @property
     def ignored(self) -> list[str]:
-        """Sections and settings, dotted, that the trial's algorithm does not read. They have their defaults."""
+        """Dotted sections and settings that the trial's algorithm does not use. They have their defaults."""
         return ignored_settings(self.algorithm.name, self.algorithm_settings)
 
     @model_validator(mode="after")
@@ -225,7 +225,7 @@ class Config(Section):
         return self
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain data that `parse_config` reads back, without what the algorithm ignores."""
+        """Plain data for `parse_config`, without settings that the algorithm does not use."""
         data = self.model_dump(mode="json")
         for key in self.ignored:
             *sections, name = key.split(".")
@@ -241,7 +241,7 @@ class Config(Section):
 
 
 def _at_default(owner: Section, name: str, path: list[str]) -> Any:
-    """A setting at its default, or a section with the setting at `path` in it at its default."""
+    """The default of a setting, or a section with the setting at `path` reset to its default."""
     if not path:
         return type(owner).model_fields[name].get_default(call_default_factory=True)
     section: Section = getattr(owner, name)

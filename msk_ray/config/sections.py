@@ -16,26 +16,26 @@ Count = Annotated[int, Field(gt=0, lt=2**31)]
 Whole = Annotated[int, Field(ge=0, lt=2**31)]
 """A whole number of at least 0."""
 Rate = Annotated[float, Field(ge=1e-10, le=100.0)]
-"""A learning rate. A smaller one would change no weight that is kept in float32."""
+"""A learning rate. A smaller one would not change float32 weights."""
 Text = Annotated[str, Field(max_length=4096)]
 SMALLEST, LARGEST = 1e-30, 1e30
-"""Range of the size of numbers other than 0: what is computed from them has to fit into float32."""
+"""Range of the magnitude of numbers other than 0, so that results fit into float32."""
 
 
 SHOWN = "shown"
-"""Context of validation of settings that are only shown: a class that cannot be found does not hide them."""
+"""Validation context for settings that are only displayed: a class that cannot be found is then no error."""
 
 
 class Section(BaseModel):
-    """A frozen group of settings that refuses unknown keys, `true` for a number, and numbers that are not finite or
-    beyond `SMALLEST` and `LARGEST`."""
+    """A frozen group of settings. Refuses unknown keys, `true` where a number is expected, and numbers that are not
+    finite or outside `SMALLEST` to `LARGEST`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False)
 
     @model_validator(mode="before")
     @classmethod
     def _no_truth_for_numbers(cls, data: Any) -> Any:
-        # Python accepts True as 1. Here, before any conversion, it is replaced by something that is not a number.
+        # Pydantic accepts True as 1. Replace it before conversion by something that is not a number.
         if not isinstance(data, dict):
             return data
         numeric = _without_truth(cls)
@@ -51,7 +51,7 @@ class Section(BaseModel):
 
 
 class _NotANumber:
-    """Stands for a `true` or `false` where neither is allowed, until it is refused."""
+    """Placeholder for a `true` or `false` that is not allowed, until validation refuses it."""
 
     def __init__(self, value: bool) -> None:
         self._value = value
@@ -81,7 +81,7 @@ def _without_truth(section: type[Section]) -> frozenset[str]:
 
 
 def _takes_truth(annotation: Any) -> bool:
-    # True and False may also be among a few values, as for a word that YAML reads as one of them.
+    # A Literal may contain True or False, for a word such as `off` that YAML reads as false.
     return (
         annotation in (bool, Any)
         or isinstance(annotation, bool)
@@ -90,9 +90,9 @@ def _takes_truth(annotation: Any) -> bool:
 
 
 class Undeclared(Section):
-    """Recorded settings of a class that cannot be found here: enough to show the trials that had them.
+    """Recorded settings of a class that is not installed here, enough to display their trials.
 
-    It is the last of several bases, which decides whether unknown keys are accepted.
+    Must be the last base class, because that one decides whether unknown keys are accepted.
     """
 
     model_config = ConfigDict(extra="allow")
@@ -101,20 +101,20 @@ class Undeclared(Section):
 
     @classmethod
     def because(cls, why: str, settings: Any) -> Self:
-        """The settings, and why their declaration cannot be found."""
-        found = cls.model_validate(settings)
-        found._why = why
-        return found
+        """The settings, with the reason why their class cannot be found."""
+        section = cls.model_validate(settings)
+        section._why = why
+        return section
 
     @property
     def why(self) -> str:
-        """Why their declaration cannot be found."""
+        """Why their class cannot be found."""
         return self._why
 
 
 class Reward(Section):
-    """The weights and shapes of an environment's reward. Their defaults are the reference reward, under which policies
-    are scored whatever they were trained on."""
+    """Weights and shapes of an environment's reward. The defaults are the reference reward: policies are scored under
+    it, whatever reward they were trained with."""
 
     terms: ClassVar[tuple[Term, ...]] = ()
     """The terms whose weights it has; empty if its environment computes them in one method."""
@@ -123,17 +123,17 @@ class Reward(Section):
 
 
 class EnvSettings(Section):
-    """The settings of every environment, and what it declares."""
+    """Settings that every environment has, and facts that its class declares."""
 
     variants: ClassVar[tuple[str, ...]] = ()
-    """Named physics of the environment; the first is the one that policies are scored under."""
+    """Named physics of the environment; policies are scored under the first."""
     pyramidal_variants: ClassVar[frozenset[str]] = frozenset()
-    """The named physics whose friction cone is a pyramid unless `physics.cone` says otherwise."""
+    """The named physics with a pyramidal friction cone, unless `physics.cone` is set."""
     reads_physics: ClassVar[frozenset[str]]
-    """Settings of the physics section that it reads, dotted if nested, such as `fd.eps_act`; others are refused."""
+    """Dotted settings of the physics section that it uses, such as `fd.eps_act`; others are refused."""
 
     conditions: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
-    """Harder circumstances that policies can be evaluated under, by name: dotted settings of the config."""
+    """Harder conditions for evaluating policies: name → dotted settings of the config."""
 
     name: Text
     """The environment: a short name, or package.module:Class."""
@@ -144,23 +144,23 @@ class EnvSettings(Section):
     control_timestep: PositiveFloat = 1.0 / 60.0
     """Duration of an env step [s]."""
     stochastic_reset: bool = True
-    """Draw random initial states; False starts every episode in the same state."""
+    """Draw random initial states; false: start every episode in the same state."""
     spread_resets: bool = False
-    """Begin training with episodes of ages spread over `episode_length`; otherwise all worlds that do not fall reset in
-    the same env steps. Evaluations always begin at age 0."""
+    """Start training with episode ages spread over `episode_length`; otherwise all worlds that do not fall reset at the
+    same time. Evaluations always start at age 0."""
     reward: Reward = Reward()
 
     def check_installed(self) -> None:
-        """Refuse an environment whose packages or files are not on this machine.
+        """Raise if packages or files that the environment needs are not on this machine.
 
         Raises:
             ConfigError: the message names what to install.
         """
 
     def unread(self) -> dict[str, str]:
-        """Settings of this section, dotted, that nothing reads because of others, and the reason for each.
+        """Dotted settings of this section that have no effect because of others → the reason.
 
-        Those that terms of the reward need are not among them.
+        Without those that terms of the reward need.
         """
         return {}
 

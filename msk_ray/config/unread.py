@@ -1,6 +1,6 @@
-"""Settings that have no effect in a trial, because its environment or another setting leaves them unread.
+"""Settings that have no effect in a trial, because its environment or another setting makes them unused.
 
-They are refused, because a sweep over one would run the same trial under many names.
+They are refused: a sweep over one would run the same trial many times under different names.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def unread_settings(config: Config) -> Iterator[tuple[str, str]]:
-    """(dotted key, why nothing reads it) of each such setting that is not at its default."""
+    """(dotted key, reason) of each setting without effect that is not at its default."""
     for key, why in _unread(config).items():
         *sections, name = key.split(".")
         owner: Any = config
@@ -50,7 +50,7 @@ def _unread_of(env: EnvSettings) -> dict[str, str]:
 
 
 def _unread_by_backward(config: Config) -> list[str]:
-    """Fields of the physics section that the backward mode leaves unread."""
+    """Fields of the physics section that the backward mode does not use."""
     state = ["fd.eps_qpos", "fd.eps_qvel", "fd.eps_act"]
     match config.physics.backward:
         case "fd_jacobian":

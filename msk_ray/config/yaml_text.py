@@ -1,5 +1,4 @@
-"""The one reader of YAML: only plain data, within limits, so that no file can hang the program or exhaust its
-memory."""
+"""Reading YAML: plain data only, within limits, so that no file can hang the program or exhaust its memory."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,7 +9,7 @@ import yaml
 from msk_ray.errors import ConfigError, brief, shortened
 
 MAX_BYTES = 1 << 20
-"""Largest file or value [B]: a space of thousands of variants takes a tenth of it."""
+"""Largest file or value [B]; a space of thousands of variants needs a tenth of it."""
 MAX_DEPTH = 32
 """Largest nesting depth of mappings and lists."""
 MAX_NODES = 200_000
@@ -23,14 +22,14 @@ class _NotSettings(yaml.YAMLError):
 
 
 class _Loader(yaml.SafeLoader):
-    """PyYAML's safe loader, with limits on the expanded size of a document, and without duplicate keys."""
+    """PyYAML's safe loader with limits on a document's expanded size; refuses duplicate keys."""
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
         self.number_keys = False
         self._depth = 0
         self._extent: dict[yaml.Node, tuple[int, int]] = {}
-        """Number of values in, and depth below, each node that has been read, with aliases expanded."""
+        """(number of values, depth) of each node read, with aliases expanded."""
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         alias = self.check_event(yaml.AliasEvent)
@@ -48,7 +47,7 @@ class _Loader(yaml.SafeLoader):
             raise _NotSettings("an alias refers to a value that contains it")
         if node not in self._extent:
             if isinstance(node, yaml.ScalarNode) and not node.value.isascii():
-                node.value.encode()  # half a character, written as an escape, could never be printed
+                node.value.encode()  # an escaped lone surrogate could never be printed
             children: list[yaml.Node] = []
             if isinstance(node, yaml.SequenceNode):
                 children = node.value
@@ -90,12 +89,12 @@ _NO_NAMES = {
         ("null", "null"),
     )
 }
-"""What a key may be read as if it is not in quotes, by its tag."""
+"""How YAML may read an unquoted key, by tag."""
 
 
 def _check_keys(node: yaml.MappingNode, numbers: bool) -> None:
-    """Refuse keys that are no text, except whole numbers if `numbers`, and a duplicate key: YAML would take the last
-    value."""
+    """Refuse keys that are not text, or whole numbers if `numbers`, and duplicate keys, of which PyYAML would keep the
+    last."""
     seen: set[tuple[str, str]] = set()
     for key, _ in node.value:
         if not isinstance(key, yaml.ScalarNode):

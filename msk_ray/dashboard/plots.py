@@ -9,7 +9,7 @@ from msk_ray.config import current_key
 from msk_ray.errors import ConfigError
 from msk_ray.experiment.trial import Trial
 from msk_ray.report.reading import Reading
-from msk_ray.sweep.operators import Listed, Operator, Range, parse_operator
+from msk_ray.sweep.operators import NamedValues, Operator, Range, parse_operator
 from msk_ray.sweep.search.tpe import distribution
 
 MISSING = "Optuna's plots need optuna and plotly: pip install 'msk-ray[dashboard]'"
@@ -99,7 +99,7 @@ def _params(trial: Trial, parameters: Mapping[str, Operator]) -> dict[str, Any] 
     """A trial's values in Optuna's form; None if the space does not allow one of them."""
     params: dict[str, Any] = {}
     for key, op in parameters.items():
-        if isinstance(op, Listed):
+        if isinstance(op, NamedValues):
             label = trial.changed.get(key)
             if label not in [level.label for level in op.levels]:
                 return None

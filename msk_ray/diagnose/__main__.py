@@ -26,7 +26,7 @@ cosine      1: both gradients have the same direction; below about 0.9 the horiz
 norm ratio  1: both have the same length; far above 1, products of Jacobians explode
 cotangent   norm of the gradient to the starting state [reward], which shac.state_grad_clip bounds
 
-A config is diagnosed with a new policy, a checkpoint with its own. Writes table.md, rows.json and quality.png."""
+Give a config to use a new policy, or a checkpoint to use its policy. Writes table.md, rows.json and quality.png."""
 
 EXAMPLES = """\
   python -m msk_ray.diagnose configs/ant.yaml --variants matched published
@@ -40,12 +40,12 @@ def parser() -> Parser:
     p.add_argument(
         "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help=f"for a config: {SET_HELP}"
     )
-    p.add_argument("--variants", nargs="+", metavar="NAME", help="named physics (default: all of the environment)")
+    p.add_argument("--variants", nargs="+", metavar="NAME", help="named physics (default: all of the environment's)")
     p.add_argument(
         "--states",
         nargs="+",
         choices=("reset", "standing", "gait"),
-        help="where trajectories start (default: all that apply)",
+        help="where trajectories start (default: all possible ones)",
     )
     p.add_argument(
         "--horizons",
@@ -103,7 +103,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(f"{'physics':24}{'from':10}{'horizon':>8}{'cosine: median, least':>24}{'norm ratio':>20}{'cotangent':>12}")
     chosen: Sequence[str | None] = args.variants or known or (None,)
     pace = Pace("comparisons", len(chosen) * len(states) * len(args.horizons) * args.worlds)
-    found = probe(
+    comparisons = probe(
         subject,
         chosen,
         states,
@@ -113,7 +113,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         seed=args.seed,
         device=args.device,
     )
-    for row in found:
+    for row in comparisons:
         rows.append(row)
         pace(len(rows))
         if len(rows) % args.worlds == 0:
@@ -123,7 +123,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _check(args: argparse.Namespace) -> None:
-    """Refuse what can be refused before torch and Warp are loaded."""
+    """Check the arguments before torch and Warp are loaded."""
     for name in ("worlds", "directions"):
         if getattr(args, name) < 1:
             raise ConfigError(f"--{name} must be at least 1, not {getattr(args, name)}")
@@ -136,7 +136,7 @@ def _check(args: argparse.Namespace) -> None:
 
 
 def _write(rows: "Sequence[Quality]", worlds: int, output: Path) -> None:
-    """Write what was found as a table, as data and as a picture, and say where."""
+    """Write the results as a table, JSON and a picture, and print where."""
     from msk_ray.diagnose.picture import draw
 
     header = ["physics", "from", "horizon", "cosine: median, least", "norm ratio", "cotangent"]

@@ -1,4 +1,4 @@
-"""What environments measure of a state, computed by C MuJoCo in float64: a reference for gradients, without gradients.
+"""Kinematics and tendon lengths by C MuJoCo in float64: a reference for gradients, itself without gradients.
 
 Axes: W worlds, B bodies.
 """
@@ -15,7 +15,7 @@ from msk_ray.step.autograd.tendon_lengths import Tendons
 
 
 class ExactKinematics(Kinematics):
-    """`Kinematics` of any number of worlds on the CPU."""
+    """`Kinematics` by C MuJoCo, for any number of worlds."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self.model = model
@@ -26,15 +26,15 @@ class ExactKinematics(Kinematics):
 
     def __call__(self, qpos: Tensor, qvel: Tensor) -> Frames:
         """Frames of the states qpos (W, nq) and qvel (W, nv)."""
-        found = []
+        frames = []
         twist = np.zeros(6)
         for data in _worlds(self.model, qpos, qvel):
             twists = np.zeros((self.model.nbody, 6))
             for body in range(self.model.nbody):
                 mujoco.mj_objectVelocity(self.model, data, mujoco.mjtObj.mjOBJ_XBODY, body, twist, 0)
                 twists[body] = twist
-            found.append(np.hstack((data.xpos, np.roll(data.xquat, -1, axis=1), twists)))
-        values = self._tensor(np.stack(found))
+            frames.append(np.hstack((data.xpos, np.roll(data.xquat, -1, axis=1), twists)))
+        values = self._tensor(np.stack(frames))
         pos, quat, angvel, linvel = values.split((3, 4, 3, 3), dim=-1)
         return Frames(self, pos, quat, linvel, angvel)
 
@@ -43,15 +43,15 @@ class ExactKinematics(Kinematics):
 
 
 class ExactTendons(Tendons):
-    """`Tendons` of any number of worlds on the CPU."""
+    """`Tendons` by C MuJoCo, for any number of worlds."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self._model = model
 
     def __call__(self, qpos: Tensor, qvel: Tensor) -> tuple[Tensor, Tensor]:
         """Lengths and rates, each (W, ntendon), of states qpos (W, nq) and qvel (W, nv)."""
-        found = [(d.ten_length.copy(), d.ten_velocity.copy()) for d in _worlds(self._model, qpos, qvel)]
-        length, rate = (torch.from_numpy(np.stack(part)) for part in zip(*found, strict=True))
+        tendons = [(d.ten_length.copy(), d.ten_velocity.copy()) for d in _worlds(self._model, qpos, qvel)]
+        length, rate = (torch.from_numpy(np.stack(part)) for part in zip(*tendons, strict=True))
         return length, rate
 
 

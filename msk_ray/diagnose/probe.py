@@ -1,8 +1,8 @@
 """The policy gradient of an environment's reward over several horizons, compared with float64 differences.
 
-The gradient is that of the undiscounted return of H env steps of the deterministic policy, without resets and without
-the critic's bootstrap. The reference is C MuJoCo in float64 under the same policy and reward, displaced along random
-directions in parameter space, because a policy has too many parameters to displace each one.
+The gradient is of the undiscounted return over H env steps of the deterministic policy, without resets and without the
+critic's bootstrap. The reference is C MuJoCo in float64 with the same policy and reward: central differences along
+random directions in parameter space, because a policy has too many parameters for one difference each.
 """
 
 import copy
@@ -25,7 +25,7 @@ from msk_ray.step.check import Oracle, Point
 from msk_ray.training import SavedPolicy, load_policy
 
 STATE_KINDS = ("reset", "standing", "gait")
-"""Where trajectories start: new resets; settled under zero action; in the policy's own motion after a while."""
+"""Where trajectories start: a new reset; settled under zero action; in the policy's own motion."""
 
 _SETTLE, _STRIDE = 60, 120
 """Env steps before a standing state and before a gait state."""
@@ -37,7 +37,7 @@ Step = Callable[[Tensor, StepState], StepState]
 
 @dataclass(frozen=True)
 class Subject:
-    """What is diagnosed: a trial's settings and a policy for it, trained or new."""
+    """The subject of a diagnosis: a trial's settings and a policy, trained or new."""
 
     config: Config
     saved: SavedPolicy | None
@@ -51,7 +51,7 @@ class Subject:
         """
         if self.saved is not None:
             return self.saved.network(env)
-        # Some algorithms draw their networks from the global generator.
+        # Some algorithms draw weights from the global generator.
         torch.manual_seed(self.config.trial.seed)
         algorithm = algorithm_class(self.config)
         return algorithm.policy_network(self.config, env.obs_size, env.action_size).to(env.device)
@@ -65,7 +65,7 @@ def read_subject(path: Path, overrides: Sequence[str] = ()) -> Subject:
     """
     if path.suffix == ".pt":
         if overrides:
-            raise ConfigError("--set works with a config; a checkpoint comes with its own settings")
+            raise ConfigError("--set works with a config only; a checkpoint has its own settings")
         saved = load_policy(path)
         return Subject(saved.config, saved)
     return Subject(load_config(path, overrides), None)
@@ -80,9 +80,9 @@ class Quality:
     horizon: int
     world: int
     cosine: float
-    """Cosine between the derivatives along the directions, backpropagated and by differences."""
+    """Cosine between backpropagated derivatives along the directions and those by differences."""
     norm_ratio: float
-    """Norm of the first divided by that of the second."""
+    """Norm of the backpropagated derivatives divided by the norm of the differences."""
     norm: float
     """Norm of the backpropagated gradient to all parameters [reward]."""
     cotangent: float
@@ -109,7 +109,7 @@ def probe(
         horizons: env steps H.
         worlds: starting states of each kind.
         directions: random directions in parameter space.
-        seed: of starting states and directions.
+        seed: seed of starting states and directions.
         device: where Warp runs.
 
     Raises:
@@ -121,7 +121,7 @@ def probe(
     for variant in variants:
         physics = subject.config.physics if variant is None else PhysicsConfig(variant=variant)
         env = make_env(subject.config.env, physics, worlds, device, seed)
-        # Finite differences would include forces that the gradient does not: leave them out of both.
+        # Disable forces that finite differences would include but the gradient does not.
         env.ignore_contact_forces = True
         network = subject.network(env)
         for state in states:
@@ -136,7 +136,7 @@ def _starting_state(env: Env[Any], network: nn.Module, kind: str) -> EnvState:
     env.state = env.reset_state()
     for _ in range({"reset": 0, "standing": _SETTLE, "gait": _STRIDE}[kind]):
         action = network(env.observation()) if kind == "gait" else torch.zeros_like(env.state.action)
-        # A world whose episode ends before is reset, so that all worlds count.
+        # Worlds whose episode ends before are reset, so that all worlds count.
         env.step(action)
     if kind == "gait" and int(env.state.age.max()) < _STRIDE:
         raise SimulationError(f"the policy falls in every world within {_STRIDE} env steps: it has no gait to diagnose")
@@ -146,7 +146,7 @@ def _starting_state(env: Env[Any], network: nn.Module, kind: str) -> EnvState:
 def _returns(env: Env[Any], network: nn.Module, step: Step, start: EnvState, horizons: Sequence[int]) -> list[Tensor]:
     """Return (W,) of the first H env steps for each horizon."""
     total = torch.zeros_like(start.action[:, 0])
-    found = []
+    returns = []
     env.state = start
     for t in range(1, horizons[-1] + 1):
         action = network(env.observation())
@@ -155,9 +155,9 @@ def _returns(env: Env[Any], network: nn.Module, step: Step, start: EnvState, hor
         total = total + env.reward_terms(physics, action, env.observation_of(reached)).sum(-1)
         env.state = reached
         if t in horizons:
-            found.append(total)
+            returns.append(total)
     env.state = start
-    return found
+    return returns
 
 
 def _compare(
@@ -201,10 +201,9 @@ def _compare(
 
 @torch.enable_grad()
 def _acting(owner: nn.Module, network: nn.Module, obs: Tensor) -> list[nn.Parameter]:
-    """The parameters of `owner`, a copy of `network`, on which a deterministic action depends; log σ is not among
-    them."""
-    found = torch.autograd.grad(network(obs.detach()).sum(), list(network.parameters()), allow_unused=True)
-    return [p for p, gradient in zip(owner.parameters(), found, strict=True) if gradient is not None]
+    """Parameters of `owner`, a copy of `network`, that affect the deterministic action; log σ does not."""
+    gradients = torch.autograd.grad(network(obs.detach()).sum(), list(network.parameters()), allow_unused=True)
+    return [p for p, gradient in zip(owner.parameters(), gradients, strict=True) if gradient is not None]
 
 
 @torch.no_grad()
@@ -241,7 +240,7 @@ def _differences(
 
 
 def _double(env: Env[Any]) -> Env[Any]:
-    """The environment with its constants in float64 on the CPU: for observations and rewards, not for steps."""
+    """A copy of the environment in float64 on the CPU, for observations and rewards, not for steps."""
     ideal = copy.copy(env)
     for name, value in vars(env).items():
         setattr(ideal, name, _in_double(value))
@@ -251,7 +250,7 @@ def _double(env: Env[Any]) -> Env[Any]:
 
 
 def _in_double(value: Any) -> Any:
-    """Tensors, also within tuples, lists and dicts, in float64 on the CPU; anything else unchanged."""
+    """Tensors, also in tuples, lists and dicts, as float64 on the CPU; anything else unchanged."""
     match value:
         case Tensor():
             return value.cpu().double() if value.is_floating_point() else value.cpu()

@@ -24,7 +24,7 @@ from msk_ray.envs.records import EnvState
 from msk_ray.envs.terms import terms_without_gradient
 from msk_ray.errors import ConfigError, MskRayError, shortened
 from msk_ray.step import StepState
-from msk_ray.step.autograd.memory import is_out_of_memory
+from msk_ray.step.autograd.out_of_memory import is_out_of_memory
 
 if TYPE_CHECKING:
     from msk_ray.envs.base import Env

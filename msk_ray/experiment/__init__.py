@@ -1,2 +1,1 @@
-"""The files of experiments and trials: their names, how they are written, and how they are read back in any condition.
-No Ray, no torch."""
+"""The files of experiments and trials: names, writing, and reading them back, damaged or not. No Ray, no torch."""

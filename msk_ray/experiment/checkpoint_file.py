@@ -1,4 +1,4 @@
-"""The format of a checkpoint: one file that contains its own checksums and is always replaced as a whole.
+"""The checkpoint format: one file with checksums inside, always replaced as a whole.
 
     msk_ray checkpoint 2 <SHA-256 of the next line>\\n
     {"bytes": ..., "sha256": <of the payload>, "epoch": ..., ...}\\n
@@ -30,12 +30,11 @@ _DIGEST = 64
 _HEAD_LIMIT = 1 << 16
 """Maximum length of a head [bytes]."""
 _LIMIT = 1 << 36
-"""Maximum size of a checkpoint [bytes]: a hundred times that of two million ants."""
+"""Maximum size of a checkpoint [bytes]; two million ants need a hundredth of it."""
 
 
 def write_checkpoint_file(path: Path, payload: bytes, facts: Mapping[str, Any]) -> None:
-    """Write a checkpoint to `path`. If the process dies at any moment, the complete old or the complete new one is
-    there.
+    """Write a checkpoint to `path` atomically: after a crash, either the complete old or the complete new one is there.
 
     Args:
         payload: content of the checkpoint.
@@ -49,7 +48,7 @@ def write_checkpoint_file(path: Path, payload: bytes, facts: Mapping[str, Any]) 
     assert len(line) < _HEAD_LIMIT // 2
     first = _NAME + b"%d " % FORMAT + hashlib.sha256(line).hexdigest().encode()
     write_bytes(path, b"\n".join([first, line, payload]))
-    # The manifest of an earlier checkpoint of format 1; it does not apply to the new file.
+    # The manifest of an earlier checkpoint of format 1, which does not describe the new file.
     _old_manifest(path).unlink(missing_ok=True)
 
 
@@ -60,7 +59,7 @@ def remove_checkpoint_file(path: Path) -> None:
 
 
 def read_facts(path: Path) -> dict[str, Any]:
-    """The facts of a checkpoint: format, bytes, sha256 of its payload, and those given when it was written.
+    """The facts of a checkpoint: format, bytes and sha256 of its payload, and the facts given to `write`.
 
     The payload is not read, but the length of the file is checked.
 
@@ -110,9 +109,9 @@ def _read_head(path: Path, file: BinaryIO) -> tuple[dict[str, Any], int]:
             field(facts, "epoch", int)
     except ValueError as error:
         raise CheckpointError(f"{path} is no checkpoint of a trial: {error}") from None
-    found = os.fstat(file.fileno()).st_size - begin
-    if found != size:
-        raise _torn(path, found, facts)
+    size_on_disk = os.fstat(file.fileno()).st_size - begin
+    if size_on_disk != size:
+        raise _torn(path, size_on_disk, facts)
     if size > _LIMIT:
         raise CheckpointError(f"{path} has {size} bytes, more than any checkpoint")
     return facts, begin
@@ -121,7 +120,7 @@ def _read_head(path: Path, file: BinaryIO) -> tuple[dict[str, Any], int]:
 def _find_head(path: Path, file: BinaryIO) -> tuple[dict[str, Any], int]:
     head = file.read(_HEAD_LIMIT)
     if not head.startswith(_NAME):
-        # Not all manifests have the size.
+        # Some manifests lack the size.
         return {"bytes": os.fstat(file.fileno()).st_size, **_read_old_manifest(path)}, 0
     first, _, rest = head.partition(b"\n")
     line, newline, _ = rest.partition(b"\n")
@@ -152,14 +151,14 @@ def _read_old_manifest(path: Path) -> dict[str, Any]:
     except ValueError as error:
         raise CheckpointError(f"cannot read {_old_manifest(path)}: {cut(error)}") from None
     if facts.get("format") != 1:
-        found = f"{facts.get('format')!r:.40}"
-        raise CheckpointError(f"{_old_manifest(path)} has checkpoint format {found}, this version reads 1 there")
+        written = f"{facts.get('format')!r:.40}"
+        raise CheckpointError(f"{_old_manifest(path)} has checkpoint format {written}, this version reads 1 there")
     return facts
 
 
-def _torn(path: Path, found: int, facts: Mapping[str, Any]) -> CheckpointError:
+def _torn(path: Path, size: int, facts: Mapping[str, Any]) -> CheckpointError:
     return CheckpointError(
-        f"{path} is torn: {found} bytes of {facts.get('bytes')!r:.40}, checksum differs; use an older one of "
+        f"{path} is torn: {size} bytes of {facts.get('bytes')!r:.40}, checksum differs; use an older one of "
         f"{path.parent}"
     )
 

@@ -1,7 +1,7 @@
-"""The one reader of an experiment's files, which may be damaged or come from anywhere: unusable parts are named with
-file and line, and do not hide the rest.
+"""Reading an experiment's files, which may be damaged or come from anywhere: unusable parts are reported with file and
+line, and do not hide the rest.
 
-Every file is a regular one, and within `Limits`; what is not counts as damaged, and neither blocks nor fills memory.
+A file that is not regular, or exceeds its `Limits`, counts as damaged, so that it neither blocks nor fills the memory.
 
 The consequences of a damaged file:
 
@@ -49,34 +49,34 @@ _TEXT_LIMIT = 100
 
 @dataclass(frozen=True)
 class Limits:
-    """How much a file may hold."""
+    """Limits on the size of a file."""
 
     size: int
     """Bytes."""
     count: int
     """Values, or lines of a file of lines."""
     undecodable: bool = False
-    """Whether a text may stand for bytes that are no UTF-8, as an argument of a command line may."""
+    """Whether texts may contain escaped bytes that are not UTF-8, as command-line arguments may."""
 
 
 RECORD = Limits(16 << 20, 200_000)
-"""Of a file about one trial, one owner, one machine."""
+"""Limits of a file about one trial, owner or machine."""
 WITH_COMMAND = Limits(16 << 20, 200_000, undecodable=True)
-"""The same with a command line in it."""
+"""The same for a file with a command line in it."""
 CATALOGUE = Limits(512 << 20, 20_000_000)
-"""Of a file with an entry for each of an experiment's trials."""
+"""Limits of a file with an entry for each trial of an experiment."""
 LOG = Limits(512 << 20, 4_000_000)
-"""Of a file of lines."""
+"""Limits of a file of lines."""
 LINE = Limits(1 << 20, 10_000)
-"""Of one of its lines."""
+"""Limits of one of its lines."""
 _SURROGATE = re.compile(rb"\\u[dD][89A-Fa-f]")
 DEPTH = 32
-"""Objects and lists inside each other, in any file."""
+"""Largest nesting depth of objects and lists, in any file."""
 
 
 @dataclass(frozen=True)
 class Damage:
-    """A part of a file that cannot be used."""
+    """An unusable part of a file."""
 
     path: Path
     what: str
@@ -88,10 +88,10 @@ class Damage:
 
 
 class DamagedFile(StorageError):
-    """A file does not hold what it should."""
+    """A file has unusable content."""
 
     def __init__(self, damage: Damage, advice: str = "") -> None:
-        super().__init__(damage, advice)  # both, so that the error survives pickling between processes
+        super().__init__(damage, advice)  # both arguments, so that the error survives pickling between processes
         self.damage = damage
         self.advice = advice
 
@@ -100,19 +100,19 @@ class DamagedFile(StorageError):
 
 
 def describe_damages(damages: Sequence[Damage], root: Path) -> list[str]:
-    """A line for each damaged file, with its path relative to `root`: how many of its lines were skipped, and what is
-    wrong with the first."""
+    """A line for each damaged file, with its path relative to `root`, the number of skipped lines, and what is wrong
+    with the first one."""
     files: dict[Path, list[Damage]] = {}
     for damage in damages:
         files.setdefault(damage.path, []).append(damage)
     lines = []
-    for path, found in files.items():
-        first = found[0]
+    for path, in_file in files.items():
+        first = in_file[0]
         name = Path(os.path.relpath(path, root)).as_posix()
         if first.line is None:
             lines.append(f"{name}: {first.what}")
         else:
-            count = "1 line" if len(found) == 1 else f"{len(found)} lines"
+            count = "1 line" if len(in_file) == 1 else f"{len(in_file)} lines"
             lines.append(f"{name}: {count} skipped; line {first.line}: {first.what}")
     return lines
 
@@ -128,7 +128,7 @@ def read_bytes(path: Path, limits: Limits = RECORD) -> bytes | None:
     """The content of a file; None if there is no such file.
 
     Raises:
-        DamagedFile: it is no regular file, or larger than the limit.
+        DamagedFile: it is not a regular file, or exceeds the limit.
         StorageFailure: the storage does not give it.
     """
     try:
@@ -190,14 +190,13 @@ def read_object(path: Path, build: Callable[[dict[str, Any]], T], limits: Limits
 def read_lines(path: Path, build: Callable[[dict[str, Any]], T]) -> tuple[list[T], tuple[Damage, ...]]:
     """The values stored as JSON objects in the lines of a file, and the lines that cannot be used.
 
-    An unusable last line without a line end comes from a writer that is still writing or was killed: it counts as not
-    written.
+    An unusable last line without a line end comes from a writer that is still writing or was killed; it is ignored.
 
     Args:
         build: creates a value from a line's object; raises ValueError that says what is wrong.
 
     Raises:
-        DamagedFile: it is no regular file, or larger than the limits.
+        DamagedFile: it is not a regular file, or exceeds the limits.
         StorageFailure: the storage does not give it.
     """
     data = read_bytes(path, LOG) or b""
@@ -205,35 +204,35 @@ def read_lines(path: Path, build: Callable[[dict[str, Any]], T]) -> tuple[list[T
         raise DamagedFile(Damage(path, f"more than {LOG.count} lines"))
     lines = data.split(b"\n")
     unfinished = lines.pop()
-    found: list[T] = []
+    values: list[T] = []
     damages = []
     for number, line in enumerate(lines, start=1):
         try:
-            found.append(build(parse_object(line, LINE)))
+            values.append(build(parse_object(line, LINE)))
         except ValueError as error:
             damages.append(Damage(path, cut(error), number))
     if unfinished:
-        with contextlib.suppress(ValueError):  # not written, as said above
-            found.append(build(parse_object(unfinished, LINE)))
-    return found, tuple(damages)
+        with contextlib.suppress(ValueError):  # an incomplete last line is ignored
+            values.append(build(parse_object(unfinished, LINE)))
+    return values, tuple(damages)
 
 
 def _load(data: bytes, undecodable: bool) -> Any:
     try:
         return orjson.loads(data)
     except orjson.JSONDecodeError:
-        # It does not accept NaN either, and its messages are less precise.
+        # orjson does not accept NaN, and its messages are less precise.
         value = json.loads(data.decode("utf-8"))
     if not undecodable and _SURROGATE.search(data):
         try:
             json.dumps(value, ensure_ascii=False).encode()
         except UnicodeEncodeError:
-            raise ValueError("half a character, which no page could show") from None
+            raise ValueError("a lone surrogate, which no page could show") from None
     return value
 
 
 def parse_object(data: bytes, limits: Limits = RECORD) -> dict[str, Any]:
-    """A JSON object. NaN and infinity, which JSON does not have, are accepted as numbers that are not finite.
+    """Parse a JSON object. Also accepts NaN and infinity, which JSON does not have.
 
     Raises:
         ValueError: it is not a JSON object, or exceeds the limits; the message says why.
@@ -241,7 +240,7 @@ def parse_object(data: bytes, limits: Limits = RECORD) -> dict[str, Any]:
     if len(data) > limits.size:
         raise ValueError(f"larger than {limits.size} bytes")
     opened = data.count(b"[") + data.count(b"{")
-    # There cannot be more values than these; commas in texts make it fewer. Counted before any of them is made.
+    # An upper bound on the number of values, checked before parsing creates any of them.
     if opened + data.count(b",") > limits.count:
         raise ValueError(f"more than {limits.count} values")
     try:
@@ -277,7 +276,7 @@ def _not_text(error: UnicodeDecodeError) -> str:
 
 
 def field(data: Mapping[str, Any], name: str, kind: type[T]) -> T:
-    """A field of an object; true and false do not count as numbers.
+    """A field of an object, of type `kind`; true and false are not numbers.
 
     Raises:
         ValueError: it is missing or of another kind.
@@ -317,7 +316,7 @@ def texts(values: Iterable[Any]) -> bool:
 
 
 def cut(error: object) -> str:
-    """A message on one short line."""
+    """A message cut to one short line."""
     text = " ".join(str(error).split())
     return text if len(text) <= _TEXT_LIMIT else text[: _TEXT_LIMIT - 1] + "…"
 

@@ -29,7 +29,7 @@ _ENVIRONMENT = {
 
 
 def read_environment(path: Path) -> tuple[dict[str, Any], list[Damage]]:
-    """What an experiment ran with, as far as it is recorded, and the damaged parts of its file.
+    """The recorded part of what an experiment ran with, and the damaged parts of its file.
 
     Raises:
         StorageFailure: the storage does not give it.
@@ -37,19 +37,19 @@ def read_environment(path: Path) -> tuple[dict[str, Any], list[Damage]]:
     damages: list[Damage] = []
 
     def usable(data: dict[str, Any]) -> dict[str, Any]:
-        found = {}
+        values = {}
         for name in data.keys() & _ENVIRONMENT.keys():
             if data[name] is None:
-                continue  # not known, which null says
+                continue  # null: not known
             try:
                 value: Any = field(data, name, _ENVIRONMENT[name])
                 inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
                 if not texts(inner):
                     raise ValueError(f"{name} holds something else than texts")
-                found[name] = value
+                values[name] = value
             except ValueError as error:
                 damages.append(Damage(path, cut(error)))
-        return {name: found[name] for name in _ENVIRONMENT if name in found}
+        return {name: values[name] for name in _ENVIRONMENT if name in values}
 
     try:
         return read_object(path, usable, WITH_COMMAND) or {}, damages
@@ -61,7 +61,7 @@ def environment(device: str | None = None) -> dict[str, Any]:
     """What the experiment ran with: versions, command, and the machine it was started on.
 
     Args:
-        device: model of the GPU of a trial on its own, or `cpu`; the trials of an experiment each record theirs.
+        device: for a single training run, its GPU's model or `cpu`; the trials of an experiment record their own.
     """
     driver = ask_driver()
     return {
@@ -89,6 +89,6 @@ def _commit() -> str | None:
             ["git", "-C", str(root), "status", "--porcelain"], capture_output=True, text=True, check=True
         )
     except (OSError, subprocess.CalledProcessError):
-        # git is not installed, or refuses a folder of another owner: null means that the commit is unknown.
+        # git is not installed, or refuses a folder of another owner: the commit is unknown.
         return None
     return head.stdout.strip() + ("+" if changes.stdout.strip() else "")

@@ -9,9 +9,9 @@ SCHEDULER_LOG_FILE = "reports.jsonl"
 SUMMARY_FILE = "summary.json"
 """Written by a driver, with the table, when it ends normally."""
 NOTES_FILE = "notes.json"
-"""What people have written about trials."""
+"""Notes that people have written about trials."""
 STOP_FILE = "stop"
-"""While this file is in the experiment's folder, trials save themselves and end at their next epoch."""
+"""While the experiment's folder contains this file, trials save themselves and end at their next epoch."""
 
 CONFIG_FILE = "config.yaml"
 METRICS_FILE = "metrics.jsonl"
@@ -24,7 +24,7 @@ OUTPUT_FILE = "output.log"
 ERROR_FILE = "error.txt"
 HANG_FILE = "hang.txt"
 ABANDONED = "abandoned"
-"""Subfolder of a trial with the files of the attempt with all its worlds."""
+"""Subfolder of a trial that was restarted with half its worlds, with the files of its first attempt."""
 
 
 def best_checkpoint(folder: Path) -> Path:

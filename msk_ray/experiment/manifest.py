@@ -1,4 +1,4 @@
-"""An experiment's folder: its files, its owner, and how it is read back.
+"""An experiment's folder: its files, its owner, and its manifest.
 
 runs/<experiment>/
     manifest.json     the trials: ids, changed parameters, full configs
@@ -39,7 +39,7 @@ MAX_TRIALS = 100_000
 STORAGE = "runs"
 """Folder of experiments unless another is given."""
 REMEMBERED = ("halve_worlds", "early_stopping")
-"""Options that --resume keeps unless it overrides them."""
+"""Options that --resume keeps unless they are given again."""
 
 
 @dataclass(frozen=True)
@@ -54,12 +54,12 @@ class Experiment:
         return self.path.name
 
     def resume_command(self) -> str:
-        """The command that continues the experiment: the original one with --resume, which keeps the latest values of
-        `REMEMBERED`, and with the name and the storage folder that the experiment has now."""
+        """The command that continues the experiment: the original one with --resume and the experiment's current name
+        and storage folder. --resume keeps the latest values of `REMEMBERED`."""
         flags = {f"--{no}{option.replace('_', '-')}" for option in REMEMBERED for no in ("", "no-")}
         argv = read_environment(self.path / ENVIRONMENT_FILE)[0].get("command")
         if not argv:
-            # The command is lost, or was never complete; its options are not recorded anywhere else.
+            # The command is lost or incomplete; its options are not recorded anywhere else.
             return "python -m msk_ray.tune --resume, with the options it was started with"
         words = [word for word in argv if word not in flags]
         if Path(option_value(words, "--storage") or STORAGE).resolve() != self.path.parent.resolve():
@@ -92,7 +92,7 @@ class Experiment:
         folder = self.trial_folder(trial_id)
         self.check_there()
         try:
-            folder.mkdir(exist_ok=True)  # without those above it: an experiment that was moved is not begun again
+            folder.mkdir(exist_ok=True)  # without parents, so that an experiment that was moved is not started again
         except OSError as error:
             raise StorageFailure(f"cannot write {folder}: {error.strerror or error}") from error
         return folder
@@ -112,7 +112,7 @@ class Experiment:
                 ) from error
 
     def lost(self, trial_id: str | None = None) -> StorageFailure | None:
-        """The error that `check_there` raises, if any."""
+        """The error that `check_there` would raise; None if it would not."""
         try:
             self.check_there(trial_id)
         except StorageFailure as failure:
@@ -123,7 +123,7 @@ class Experiment:
         """Whether trials should save themselves and end.
 
         Raises:
-            StorageFailure: the experiment has disappeared, and with it any such request.
+            StorageFailure: the experiment has disappeared.
         """
         if self.stop_file.exists():
             return True
@@ -145,13 +145,13 @@ class Experiment:
         return manifest
 
     def begin(self, space: str, question: str, trials: Sequence[Trial], options: Mapping[str, Any]) -> None:
-        """Write the manifest of a new experiment, after all other files: a folder with a manifest is complete.
+        """Write the manifest of a new experiment, as the last of its files: a folder with a manifest is complete.
 
         Args:
             space: name of its space.
             question: the question that it answers.
-            trials: all trials that are known.
-            options: options of the command line.
+            trials: all trials known so far.
+            options: command-line options.
         """
         manifest = {
             "format": FORMAT,
@@ -168,7 +168,7 @@ class Experiment:
         """The trials of the manifest.
 
         Args:
-            shown: they are only shown, as far as they are known: see `parse_recorded`.
+            shown: for display only; see `parse_recorded`.
         """
         trials = []
         for entry in self.manifest()["trials"]:
@@ -178,23 +178,23 @@ class Experiment:
         return trials
 
     def clear_endings(self, outcomes: Collection[Outcome]) -> None:
-        """Remove the endings of trials that ended in one of these ways, so that they continue."""
+        """Remove the endings of trials with one of these outcomes, so that they continue."""
         for trial in self.trials():
             folder = self.trial_folder(trial.id)
             ending = read_ending(folder)
             if ending is not None and ending.outcome in outcomes:
                 (folder / OUTCOME_FILE).unlink()
 
-    def said(self, option: str) -> bool | None:
-        """The value that a command line gave for one of `REMEMBERED`; None if none did, so that the space decides."""
-        said: bool | None = (self.manifest().get("options") or {}).get(option)
-        return said
+    def remembered(self, option: str) -> bool | None:
+        """The value that a command line gave for one of `REMEMBERED`; None if none did, and the space decides."""
+        value: bool | None = (self.manifest().get("options") or {}).get(option)
+        return value
 
-    def say(self, **options: bool | None) -> None:
-        """Record the values that this command line gives for such options; None changes nothing."""
+    def remember(self, **options: bool | None) -> None:
+        """Record the values that this command line gives for `REMEMBERED`; None changes nothing."""
         manifest = self.manifest()
-        said = {option: value for option, value in options.items() if value is not None}
-        write_json(self.path / MANIFEST_FILE, manifest | {"options": (manifest.get("options") or {}) | said})
+        given = {option: value for option, value in options.items() if value is not None}
+        write_json(self.path / MANIFEST_FILE, manifest | {"options": (manifest.get("options") or {}) | given})
 
     def extension(self) -> dict[str, Any]:
         """How the experiment has been extended since it was created: epochs, samples, seeds."""
@@ -207,7 +207,7 @@ class Experiment:
         write_json(self.path / MANIFEST_FILE, self.manifest() | extended | {"trials": _entries(trials)})
 
     def clear_outgrown(self) -> None:
-        """Take back the endings of trials that finished before their epochs were extended."""
+        """Remove the endings of trials that finished before their epochs were extended."""
         for trial in self.trials():
             folder = self.trial_folder(trial.id)
             ending = read_ending(folder)
@@ -223,18 +223,18 @@ class Experiment:
 
 
 def has_begun(path: Path) -> bool:
-    """Whether the folder holds a whole experiment, which --resume goes on with, or whose manifest it refuses."""
+    """Whether the folder holds an experiment with a manifest, readable or not."""
     return os.path.lexists(path / MANIFEST_FILE)
 
 
 def refuse_old(path: Path) -> None:
-    """Raise StorageError where there is an experiment already."""
+    """Raise StorageError if there already is an experiment."""
     if has_begun(path):
         raise StorageError(f"{path} already holds an experiment: add --resume to continue it, or pass another --name")
 
 
 def default_name(space: str, smoke: bool) -> str:
-    """The name of an experiment that was given none.
+    """A default name for an experiment.
 
     Args:
         space: name or file of its space, as given.
@@ -244,10 +244,10 @@ def default_name(space: str, smoke: bool) -> str:
 
 
 def check_name(name: str) -> str:
-    """An experiment's name, which becomes a folder's.
+    """Check an experiment's name, which becomes a folder name.
 
     Raises:
-        StorageError: it would not be a plain folder name.
+        StorageError: it is not a plain folder name.
     """
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}", name):
         raise StorageError(f"--name {brief(name)}: use at most 128 letters, digits, '.', '_' and '-'")
@@ -255,7 +255,7 @@ def check_name(name: str) -> str:
 
 
 def _manifest(data: dict[str, Any]) -> dict[str, Any]:
-    """The checked content of a manifest.
+    """Check the content of a manifest.
 
     Raises:
         ValueError: this version cannot read it.
@@ -308,7 +308,7 @@ def own(path: Path, *, new: bool, force: bool = False) -> Iterator[Ownership]:
     Args:
         path: its folder; created for a new experiment.
         new: whether to start the experiment rather than continue it.
-        force: take it over although its driver seems to run.
+        force: take it over even if its driver seems to be running.
 
     Raises:
         StorageError: the experiment already exists, or does not; another driver is running; the folder cannot be

@@ -1,4 +1,4 @@
-"""Read a trial's `metrics.jsonl`, separately from writing it, because readers should not have to load torch."""
+"""Reading a trial's `metrics.jsonl`. Writing is elsewhere, so that readers need not load torch."""
 
 import math
 import statistics
@@ -12,18 +12,18 @@ from msk_ray.experiment.layout import METRICS_FILE
 from msk_ray.metrics import SCORE
 
 HASH = "hash/parameters"
-"""The first 48 bits of the digest of the trial's weights and statistics when it was evaluated, as a whole number."""
+"""The first 48 bits of the hash of the trial's weights and statistics at the evaluation, as a whole number."""
 EPOCH_LIMIT = 10**9
-"""No trial has this many epochs."""
+"""Upper bound on the number of epochs."""
 RECENT = 10
-"""Number of newest rows from which the speed is computed."""
+"""Number of newest rows used to compute the speed."""
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """One deterministic evaluation of a trial's policy after it was trained for an epoch or more.
+    """One deterministic evaluation of a trial's policy after at least one epoch.
 
-    The score before training is drawn in curves but counts nowhere, because it is not a result of the trial.
+    The score before training appears in curves only, because it is not a result of the trial.
     """
 
     epoch: int
@@ -33,7 +33,7 @@ class Evaluation:
 
     @classmethod
     def from_row(cls, row: Mapping[str, float]) -> "Evaluation | None":
-        """The evaluation in a row of metrics; None when the epoch had none, or the policy was not trained yet."""
+        """The evaluation in a row of metrics; None if the epoch had none, or the policy was not trained yet."""
         if SCORE not in row or row["epoch"] <= 0:
             return None
         return cls(int(row["epoch"]), int(row["env_steps"]), float(row["seconds"]), float(row[SCORE]))
@@ -48,23 +48,23 @@ class Metrics:
     """A trial's metrics."""
 
     rows: tuple[dict[str, Any], ...] = ()
-    """In order of epoch, each epoch once: its latest row. As in the file, a value that is not finite is None, and named
-    in the row's `nonfinite`."""
+    """The latest row of each epoch, in order of epoch. As in the file, non-finite values are None, and named in the
+    row's `nonfinite`."""
     damages: tuple[Damage, ...] = ()
 
 
 def load_metrics(path: Path) -> Metrics:
-    """A trial's metrics, without the lines that are damaged; none if there is no such file.
+    """A trial's metrics without damaged lines; empty if there is no file.
 
     Raises:
         DamagedFile: it is no regular file, or too large.
         StorageFailure: the storage does not give it.
     """
     try:
-        found, damages = read_lines(path, _row)
+        lines, damages = read_lines(path, _row)
     except DamagedFile as error:
         raise DamagedFile(error.damage, "remove it, and the trial continues without its earlier rows") from None
-    rows = {row["epoch"]: row for row in found}
+    rows = {row["epoch"]: row for row in lines}
     return Metrics(tuple(rows[epoch] for epoch in sorted(rows)), damages)
 
 
@@ -86,7 +86,7 @@ def _row(row: dict[str, Any]) -> dict[str, Any]:
         if name == "nonfinite":
             if not isinstance(value, list) or not texts(value):
                 raise ValueError("nonfinite is no list of names")
-        elif value is not None and not is_number(value):  # None was not finite when it was written
+        elif value is not None and not is_number(value):  # None stands for a value that was not finite
             raise ValueError(f"{name:.40} is no finite number")
     if SCORE in row:
         number(row, "env_steps")
@@ -95,7 +95,7 @@ def _row(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _all_finite(row: Mapping[str, Any]) -> bool:
-    """A fast check whether all values are finite numbers, as in most rows. It may be False although they are."""
+    """A fast check that all values are finite numbers, as in most rows. It may return False although they are."""
     try:
         return set(map(type, row.values())) <= {int, float} and math.isfinite(sum(row.values()))
     except OverflowError:
@@ -110,22 +110,22 @@ def with_nan(row: Mapping[str, Any]) -> dict[str, float]:
 
 
 def read_rows(folder: Path) -> list[dict[str, float]]:
-    """A trial's metrics, each epoch once. Values the file marks as not finite are NaN.
+    """A trial's metrics, each epoch once. Values that were not finite are NaN.
 
     Raises:
-        StorageFailure: the storage does not give them.
+        StorageFailure: the storage cannot be read.
     """
     return [with_nan(row) for row in load_metrics(folder / METRICS_FILE).rows]
 
 
 def evaluations_of(rows: Sequence[Mapping[str, float]]) -> list[Evaluation]:
     """The evaluations of trained policies among rows of metrics."""
-    found = (Evaluation.from_row(row) for row in rows)
-    return [evaluation for evaluation in found if evaluation is not None]
+    evaluations = (Evaluation.from_row(row) for row in rows)
+    return [evaluation for evaluation in evaluations if evaluation is not None]
 
 
 def last_figures(rows: Sequence[Mapping[str, float]], names: Sequence[str]) -> tuple[float, ...] | None:
-    """These metrics of the last evaluation of a trained policy; None if one of them is missing there or not finite."""
+    """These metrics at the last evaluation of a trained policy; None if one is missing or not finite."""
     evaluated = [row for row in rows if Evaluation.from_row(row) is not None]
     values = tuple(evaluated[-1].get(name, math.nan) for name in names) if evaluated else (math.nan,)
     return values if all(map(math.isfinite, values)) else None
@@ -141,7 +141,7 @@ class TrialProgress:
     env_steps_per_s: float | None = None
     """Median over the newest rows."""
     seconds_per_epoch: float | None = None
-    """Mean over the newest rows [s]; None while only the first epoch is known, which includes compilation."""
+    """Mean over the newest rows [s]; None after only one epoch, whose time includes compilation."""
 
 
 def progress_of(rows: Sequence[Mapping[str, float]]) -> TrialProgress:

@@ -1,4 +1,4 @@
-"""What people write about trials, kept in the experiment's folder."""
+"""Notes that people write about trials, stored in the experiment's folder."""
 
 from pathlib import Path
 from typing import Any
@@ -9,7 +9,7 @@ from msk_ray.experiment.layout import NOTES_FILE
 from msk_ray.files import write_json
 
 LONGEST = 2000
-"""Characters of a note."""
+"""Maximum length of a note, in characters."""
 
 
 def read_notes(experiment: Path) -> tuple[dict[str, str], list[Damage]]:
@@ -25,7 +25,7 @@ def read_notes(experiment: Path) -> tuple[dict[str, str], list[Damage]]:
 
 
 def load_notes(experiment: Path) -> dict[str, str]:
-    """Note by trial id; none if nobody has written any.
+    """Note by trial id; empty if there are none.
 
     Raises:
         DamagedFile: the file cannot be used.

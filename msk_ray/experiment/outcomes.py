@@ -11,11 +11,11 @@ from msk_ray.experiment.layout import OUTCOME_FILE
 from msk_ray.files import write_json
 
 _LONGEST = 10_000
-"""Characters of a reason."""
+"""Maximum length of a reason, in characters."""
 
 
 class Outcome(StrEnum):
-    """Names of the ways a trial can end."""
+    """How a trial can end."""
 
     FINISHED = "finished"
     """Ran to its last epoch."""
@@ -46,7 +46,7 @@ FAILURES = {Outcome.NONFINITE, Outcome.DIVERGED, Outcome.OUT_OF_MEMORY, Outcome.
 
 @dataclass(frozen=True)
 class Ending:
-    """A trial's outcome and the reason in words."""
+    """A trial's outcome, and the reason as text."""
 
     outcome: Outcome
     why: str
@@ -57,12 +57,12 @@ class Ending:
 
     @property
     def cut(self) -> bool:
-        """Whether the trial ended before its end without failing, so that its score might have risen."""
+        """Whether the trial was stopped before its last epoch without failing, so that its score might have risen."""
         return not self.failed and self.outcome not in (Outcome.FINISHED, Outcome.WALL_TIME)
 
 
 def write_ending(folder: Path, ending: Ending) -> None:
-    """Write `ending` to a trial's folder, completely or not at all; of an endless reason, the beginning."""
+    """Write `ending` to a trial's folder atomically; a reason that is too long is cut."""
     write_json(folder / OUTCOME_FILE, asdict(replace(ending, why=shortened(ending.why, _LONGEST))))
 
 
@@ -77,8 +77,8 @@ def load_ending(folder: Path) -> Ending | None:
 
 
 def read_ending(folder: Path) -> Ending | None:
-    """The same, for continuing trials: a trial whose ending cannot be used counts as not ended. `TrialSnapshot` names
-    the damage."""
+    """The same, for continuing trials: None if the file is damaged, so that the trial continues. `TrialSnapshot`
+    reports the damage."""
     try:
         return load_ending(folder)
     except DamagedFile:

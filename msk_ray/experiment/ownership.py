@@ -8,8 +8,8 @@ storage and does not outlive its owner:
 - An owner on this machine is looked up among the processes by number and start time, so that a killed one is known to
   be dead at once. An owner on another machine is judged by the age of the lock's last touch: stale after `STALE_S`.
   Both times that this needs, the touch and now, come from the file server; the clocks of the hosts do not matter.
-- A process that finds a stale lock renames it, checks that it was the one it judged, and links its own. An owner that
-  was wrongly judged dead, perhaps because it was frozen, finds another name in the file, or none, and must stop
+- A process that finds a stale lock renames it, checks that it is still the one it read, and links its own. An owner
+  wrongly taken for dead, perhaps because it was frozen, finds another name in the file, or none, and must stop
   (`Ownership.check`) without touching anything.
 """
 
@@ -50,7 +50,7 @@ class Owner:
     machine: str
     """Boot and process-number namespace, within which `pid` is valid."""
     token: str
-    """A random token, drawn when the lock was taken."""
+    """Random token of this lock."""
     began: str
     """Date and time, for people."""
     serves: str | None = None
@@ -62,8 +62,8 @@ class Owner:
 
 
 @dataclass(frozen=True)
-class _Found:
-    """A lock found in a folder."""
+class _Lock:
+    """The lock in a folder, as read."""
 
     owner: Owner | None
     """None if the file is damaged; then only its age can be judged."""
@@ -82,7 +82,7 @@ class _Found:
 
 
 class Ownership:
-    """A lock that is held: a thread touches it until `release`."""
+    """A lock held by this process: a thread touches it until `release`."""
 
     def __init__(
         self, folder: Path, owner: Owner, above: Path | None, on_loss: Callable[[OwnershipLost], None] | None
@@ -107,7 +107,7 @@ class Ownership:
         self._thread.start()
 
     def __getstate__(self) -> dict[str, Any]:
-        # Ray pickles whatever its callbacks refer to into its own state, which is never read back.
+        # Ray pickles everything its callbacks refer to into its own state, which is never read back.
         return {"folder": self.folder, "owner": self.owner}
 
     def check(self, now: bool = False) -> None:
@@ -117,7 +117,7 @@ class Ownership:
             now: check even if the last check is recent.
 
         Raises:
-            OwnershipLost: another has taken it over, it is gone, or it has been unreadable for so long that it may be.
+            OwnershipLost: it is gone, another process has taken it over, or may have while it was unreadable.
         """
         if self._lost is None and (now or time.monotonic() - self._seen > _CHECKED_S):
             self._look()
@@ -156,7 +156,7 @@ class Ownership:
         except FileNotFoundError as error:
             self._lost = OwnershipLost(f"{error.filename} does not exist: moved, removed or taken over")
         except OSError as error:
-            # The storage may not answer for a moment. After a longer time, others may have judged this owner dead.
+            # Storage may be unavailable for a moment. After a longer time, others may have taken this owner for dead.
             if time.monotonic() - self._seen > STALE_S / 2:
                 self._lost = OwnershipLost(f"cannot keep the lock {self.folder / LOCK_FILE}: {error.strerror}")
 
@@ -180,7 +180,7 @@ def acquire(folder: Path, *, force: bool = False) -> Ownership:
 def acquire_for(
     folder: Path, above: Path, serves: str, on_loss: Callable[[OwnershipLost], None], patience_s: float = 2 * STALE_S
 ) -> Ownership:
-    """Become the owner of a folder on behalf of the owner of a folder above it, for as long as that owner stays.
+    """Become the owner of a folder on behalf of the owner of its parent experiment, while that owner holds it.
 
     If a living process holds the folder, wait for it: one that serves an earlier owner notices that and stops.
 
@@ -223,22 +223,22 @@ def _take(folder: Path, owner: Owner, force: bool, patience_s: float) -> None:
     waited = 0.0
     try:
         while not _link(folder, owner):
-            found = _find(folder)
-            if found is None:
-                continue  # released, or taken over, this moment
-            if found.stale or force:
-                _remove(folder, found)
+            lock = _find(folder)
+            if lock is None:
+                continue  # just released or taken over
+            if lock.stale or force:
+                _remove(folder, lock)
             elif waited >= patience_s:
-                raise StorageError(_refusal(folder, found))
+                raise StorageError(_refusal(folder, lock))
             else:
                 time.sleep(_WAIT_S)
-                waited += _WAIT_S  # ticks: time in which this process is stopped does not count
+                waited += _WAIT_S  # counted in waits, so that time while this process is stopped does not count
     except OSError as error:
         raise StorageFailure(f"cannot write {folder / LOCK_FILE}: {error.strerror or error}") from error
 
 
 def has_living_owner(folder: Path, now: float) -> bool | None:
-    """Whether a folder's owner is alive, for readers: nothing is written, so an owner on another machine is judged by
+    """Whether a folder's owner is alive, without writing anything: the age of another machine's lock is measured by
     this machine's clock.
 
     Args:
@@ -252,7 +252,7 @@ def has_living_owner(folder: Path, now: float) -> bool | None:
         owner, touched = _read_lock(folder / LOCK_FILE)
     except OSError:
         return None
-    return not _Found(owner, max(0.0, now - touched)).stale
+    return not _Lock(owner, max(0.0, now - touched)).stale
 
 
 @contextlib.contextmanager
@@ -265,12 +265,12 @@ def owned(folder: Path, force: bool = False) -> Iterator[Ownership]:
         ownership.release()
 
 
-def _refusal(folder: Path, found: _Found) -> str:
-    wait = f"wait {max(1.0, STALE_S - found.age_s):.0f} s; "
-    if found.owner is None:
-        return f"{folder}: {found}: if nothing is at work there, {wait}--force takes it over"
-    left = "" if found.owner.alive_here() else f"if it is dead, {wait}"
-    return f"{folder} is in use by {found}: stop that first; {left}--force takes it over"
+def _refusal(folder: Path, lock: _Lock) -> str:
+    wait = f"wait {max(1.0, STALE_S - lock.age_s):.0f} s; "
+    if lock.owner is None:
+        return f"{folder}: {lock}: if nothing is at work there, {wait}--force takes it over"
+    left = "" if lock.owner.alive_here() else f"if it is dead, {wait}"
+    return f"{folder} is in use by {lock}: stop that first; {left}--force takes it over"
 
 
 def _link(folder: Path, owner: Owner) -> bool:
@@ -288,7 +288,7 @@ def _link(folder: Path, owner: Owner) -> bool:
         except FileExistsError:
             return False
         except OSError:
-            # A file system without links. A process that reads it before it is written sees a damaged, recent lock.
+            # No hard links here. A process that reads the file before it is written sees a damaged, recent lock.
             try:
                 descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
             except FileExistsError:
@@ -300,7 +300,7 @@ def _link(folder: Path, owner: Owner) -> bool:
         temporary.unlink(missing_ok=True)
 
 
-def _find(folder: Path) -> _Found | None:
+def _find(folder: Path) -> _Lock | None:
     """The lock in a folder, and how long ago it was touched; None if there is none."""
     probe = folder / f".{LOCK_FILE}.{uuid.uuid4().hex}.part"
     try:
@@ -312,13 +312,13 @@ def _find(folder: Path) -> _Found | None:
         now = probe.stat().st_mtime
     finally:
         probe.unlink(missing_ok=True)
-    return _Found(owner, max(0.0, now - touched))
+    return _Lock(owner, max(0.0, now - touched))
 
 
 def _read_lock(lock: Path) -> tuple[Owner | None, float]:
-    """The owner that a lock names, None if it is damaged or no regular file; and when it was touched last."""
+    """The owner named in a lock, None if the file is damaged; and when it was last touched."""
     try:
-        with open_file(lock) as file:  # opening asks the file server again
+        with open_file(lock) as file:  # opening the file makes a network file system refresh it
             return _owner_in(file.read(RECORD.size)), os.fstat(file.fileno()).st_mtime
     except UnusableFile:
         return None, lock.lstat().st_mtime
@@ -326,34 +326,35 @@ def _read_lock(lock: Path) -> tuple[Owner | None, float]:
 
 def _owner_in(data: bytes) -> Owner | None:
     try:
-        found = parse_object(data)
-        texts = (field(found, name, str) for name in ("host", "birth", "machine", "token", "began"))
+        record = parse_object(data)
+        texts = (field(record, name, str) for name in ("host", "birth", "machine", "token", "began"))
         host, birth, machine, token, began = texts
-        serves = None if found.get("serves") is None else field(found, "serves", str)
-        return Owner(host, field(found, "pid", int), birth, machine, token, began, serves)
+        serves = None if record.get("serves") is None else field(record, "serves", str)
+        return Owner(host, field(record, "pid", int), birth, machine, token, began, serves)
     except ValueError:
         return None
 
 
-def _remove(folder: Path, found: _Found) -> None:
-    """Remove a lock, if it is still the one that was found."""
-    judged = None if found.owner is None else found.owner.token
+def _remove(folder: Path, lock: _Lock) -> None:
+    """Remove a lock, if it is still the same."""
+    token = None if lock.owner is None else lock.owner.token
     aside = folder / f".{LOCK_FILE}.{uuid.uuid4().hex}.part"
     try:
-        if _token_in(folder / LOCK_FILE) != judged:
-            return  # another was faster
+        if _token_in(folder / LOCK_FILE) != token:
+            return  # another process was faster
         os.rename(folder / LOCK_FILE, aside)
     except FileNotFoundError:
         return  # likewise
-    if _token_in(aside) != judged:
-        # The owner changed in between: put it back. If a third process has linked its own by then, the second will see.
+    if _token_in(aside) != token:
+        # Another process took over in between: put its lock back. If a third has linked its own, the second will
+        # notice.
         with contextlib.suppress(FileExistsError):
             os.link(aside, folder / LOCK_FILE)
     aside.unlink(missing_ok=True)
 
 
 def _token_in(lock: Path) -> str | None:
-    """None if it is damaged."""
+    """The token in a lock; None if the file is damaged."""
     owner, _ = _read_lock(lock)
     return None if owner is None else owner.token
 

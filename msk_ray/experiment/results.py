@@ -1,4 +1,4 @@
-"""The trials of an experiment with the content of their folders, for tables and for resuming."""
+"""Results of an experiment's trials, read from their folders, for tables and for resuming."""
 
 import math
 import os
@@ -46,17 +46,17 @@ class TrialRecord:
 
     @property
     def ending(self) -> Ending | None:
-        """None: not ended, whether running, waiting or interrupted."""
+        """None while it has not ended: running, waiting or interrupted."""
         return self.snapshot.ending
 
     @property
     def attempt(self) -> Attempt:
-        """The scores of one with fewer worlds do not compare with the others'."""
+        """Scores of an attempt with half the worlds are not comparable with the others."""
         return self.snapshot.attempt
 
     @property
     def best(self) -> Evaluation | None:
-        """The evaluation of the trained policy with the highest score; None if there was none with a score."""
+        """The trained policy's evaluation with the highest score; None if no evaluation has a score."""
         finite = [evaluation for evaluation in self.evaluations if math.isfinite(evaluation.score)]
         return max(finite, key=lambda evaluation: evaluation.score) if finite else None
 
@@ -67,7 +67,7 @@ class TrialRecord:
 
     @property
     def cut(self) -> bool:
-        """Whether it has not reached its end and has not failed, so that its score might still have risen."""
+        """Whether it neither reached its end nor failed, so that its score might have risen further."""
         return self.ending.cut if self.ending is not None else bool(self.evaluations)
 
     @property
@@ -87,7 +87,7 @@ def read_records(experiment: Experiment) -> list[TrialRecord]:
 
 
 def records_by_environment(records: Sequence[TrialRecord]) -> dict[str, list[TrialRecord]]:
-    """Records by environment: only scores of one environment can be compared."""
+    """Records by environment; scores of different environments are not comparable."""
     return by_environment(records, lambda record: record.trial.environment)
 
 
@@ -113,16 +113,16 @@ def unlisted_trials(
         parameters: dotted keys that the space varies.
 
     Returns:
-        The trials, read from the `config.yaml` of their folders, and those of these files that cannot be used.
+        The trials, read from the `config.yaml` of their folders, and the unusable ones among these files.
     """
     root = experiment.path / "trials"
     folders = [path for path in root.iterdir() if path.name not in listed and path.is_dir()] if root.is_dir() else []
-    found: list[Trial] = []
+    trials: list[Trial] = []
     damages = []
     for folder in sorted(folders):
         path = folder / "config.yaml"
         if not os.path.lexists(path):
-            continue  # made, but nothing was written into it
+            continue  # created, but nothing was written to it
         try:
             config = parse_recorded(read_settings(path), str(path), shown=True)
             settings = config.as_dict()
@@ -131,8 +131,8 @@ def unlisted_trials(
             damages.append(Damage(path, cut(f"no settings of a trial: {error}")))
             continue
         changed = {key: describe(value) for key, value in values.items()}
-        found.append(Trial(len(listed) + len(found), folder.name, changed, values, config))
-    return found, damages
+        trials.append(Trial(len(listed) + len(trials), folder.name, changed, values, config))
+    return trials, damages
 
 
 def _at(settings: Mapping[str, Any], dotted: str) -> Any:

@@ -1,4 +1,4 @@
-"""The result of an experiment as a table, a list and plain data."""
+"""An experiment's results as tables, text and plain data."""
 
 import shlex
 import statistics
@@ -20,7 +20,7 @@ def result_rows(records: Sequence[TrialRecord]) -> list[tuple[str, ...]]:
 
 
 def variant_rows(records: Sequence[TrialRecord]) -> list[tuple[str, ...]]:
-    """One row per variant of one environment, the highest mean first: how many seeds, and the mean, standard deviation,
+    """One row per variant of one environment, highest mean first: number of seeds, and mean, standard deviation,
     minimum and maximum of their best scores."""
     groups: dict[str, list[TrialRecord]] = {}
     for record in records:
@@ -34,7 +34,7 @@ def variant_rows(records: Sequence[TrialRecord]) -> list[tuple[str, ...]]:
             continue
         counts = {
             "before the end": sum(record.cut for record in scored),
-            "with half the worlds": sum(record.attempt.reduced is not None for record in scored),
+            "with half the worlds": sum(record.attempt.reduction is not None for record in scored),
         }
         remarks = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
         seeds = f"{len(scores)} ({remarks})" if remarks else str(len(scores))
@@ -85,7 +85,7 @@ def table_document(experiment: Path, question: str, records: Sequence[TrialRecor
                 )
         best = bests.get(environment)
         if best is not None:
-            half = f", {best.attempt}" if best.attempt.reduced is not None else ""
+            half = f", {best.attempt}" if best.attempt.reduction is not None else ""
             variant = markdown_text(printable(best.trial.variant))
             parts.append(f"Best policy: `{_relative(best)}` ({variant}, seed {best.trial.seed}{half}).\n")
     if (note := reduced_note(records)) is not None:
@@ -104,7 +104,7 @@ def outcome_name(record: TrialRecord) -> str:
 
 def reduced_note(records: Sequence[TrialRecord]) -> str | None:
     """A note for the reader of a table on trials with half their worlds; None if there are none."""
-    count = sum(record.attempt.reduced is not None for record in records)
+    count = sum(record.attempt.reduction is not None for record in records)
     if not count:
         return None
     trials = "1 trial" if count == 1 else f"{count} trials"
@@ -123,7 +123,7 @@ def _row(record: TrialRecord) -> tuple[str, ...]:
         "-" if best is None else f"{best.score:.5g}",
         "-" if best is None else str(best.epoch),
         f"{record.epochs_done}/{trial.epochs}",
-        # Here, not with the reason: a terminal may cut that.
+        # Not after the reason, which a terminal may cut off.
         outcome_name(record) + record.attempt.mark,
         f"trials/{trial.id}",
         "; ".join(part for part in (str(record.attempt), record.ending.why if record.ending else "") if part),
@@ -131,7 +131,7 @@ def _row(record: TrialRecord) -> tuple[str, ...]:
 
 
 def _facts(record: TrialRecord) -> dict[str, Any]:
-    best, reduced = record.best, record.attempt.reduced
+    best, reduction = record.best, record.attempt.reduction
     return {
         "id": record.trial.id,
         "environment": record.trial.environment,
@@ -145,7 +145,7 @@ def _facts(record: TrialRecord) -> dict[str, Any]:
         "seconds": record.seconds,
         "outcome": outcome_name(record),
         "why": record.ending.why if record.ending is not None else "",
-        "halved": None if reduced is None else {"asked": reduced.asked, "worlds": reduced.worlds},
+        "halved": None if reduction is None else {"asked": reduction.asked, "worlds": reduction.worlds},
         "folder": f"trials/{record.trial.id}",
         "best_checkpoint": str(_relative(record)) if record.best_checkpoint else None,
     }

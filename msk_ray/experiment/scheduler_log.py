@@ -1,7 +1,7 @@
-"""The evaluations that the early-stopping rule was told, in their original order.
+"""Log of the evaluations given to the early-stopping rule, in their order.
 
-The trials' own records contain neither the order between trials nor which of their last rows had reached the driver
-when it died; and a rule that is told an evaluation twice judges it twice, the second time against more trials.
+The trials' own records contain neither the order across trials nor which of their last rows had reached the driver when
+it died. And a rule must not get an evaluation twice: it would compare it again, with more trials.
 """
 
 import json
@@ -17,7 +17,7 @@ from msk_ray.files import append_text, write_bytes
 
 @dataclass(frozen=True)
 class LogEntry:
-    """One evaluation as it reached the driver."""
+    """One evaluation as the driver received it."""
 
     trial: str
     epoch: int
@@ -27,7 +27,7 @@ class LogEntry:
     ended: bool
     """Whether the trial had ended on its own."""
     attempt: int = 1
-    """The attempt at the trial; results of earlier attempts no longer count."""
+    """Number of the attempt at the trial; results of earlier attempts are ignored."""
 
     def time(self, attribute: str) -> float:
         """Progress as `env_steps`, `epoch` or `seconds`."""
@@ -35,22 +35,22 @@ class LogEntry:
 
 
 class SchedulerLog:
-    """The entries of an experiment, one JSON object per line."""
+    """The log of an experiment, one JSON object per line."""
 
     def __init__(self, path: Path, guard: Callable[[], None] = lambda: None) -> None:
         """
         Args:
             path: path of the file.
-            guard: called before it is written; raises if another driver owns the experiment by now.
+            guard: called before each write; raises if another driver owns the experiment by now.
         """
         self._path = path
         self._guard = guard
 
     def read(self) -> tuple[list[LogEntry], tuple[Damage, ...]]:
-        """All entries, and the lines that cannot be used; an incomplete last line, left by a crash, is removed.
+        """All entries, and the unusable lines; an incomplete last line, left by a crash, is removed.
 
         Raises:
-            StorageFailure: the storage does not give it, or the torn line cannot be cut off.
+            StorageFailure: the storage cannot be read, or the incomplete line cannot be removed.
         """
         data = read_bytes(self._path, LOG) or b""
         whole, newline, torn = data.rpartition(b"\n")
@@ -59,7 +59,7 @@ class SchedulerLog:
         return read_lines(self._path, _entry)
 
     def append(self, entry: LogEntry) -> None:
-        """Add one entry; once this returns, the entry survives a crash.
+        """Append an entry; once this returns, the entry survives a crash.
 
         Raises:
             StorageFailure: the disk is full or gone, or the guard raises it.
@@ -79,7 +79,7 @@ def _entry(data: dict[str, Any]) -> LogEntry:
         epoch,
         env_steps,
         number(data, "seconds"),
-        # It may be NaN, which is written as such and handled by the rule.
+        # It may be NaN, which is written as NaN; the rule handles it.
         float(data["score"]) if isinstance(data.get("score"), float) else number(data, "score"),
         field(data, "ended", bool),
         field(data, "attempt", int),

@@ -1,4 +1,4 @@
-"""The one reader of a trial's folder: the content of its files at one moment, in any condition."""
+"""Reading a trial's folder: the content of its files at one moment, in any condition."""
 
 import math
 from collections.abc import Callable
@@ -25,13 +25,13 @@ from msk_ray.experiment.ownership import has_living_owner
 
 T = TypeVar("T")
 _BEATS = (METRICS_FILE, DEVICE_FILE, OUTPUT_FILE)
-"""Files that a trial's process writes to as long as it lives."""
+"""Files that a living trial's process writes to."""
 SILENT_EPOCHS = 10
 """A trial is silent when it has written nothing for this many of its own epochs ..."""
 SILENT_S = 60.0
 """... and for at least this long [s]."""
 SILENT_STARTING_S = 600.0
-"""The same for a process that has not done an epoch yet: it may be compiling."""
+"""The same before the first epoch has ended, because the process may be compiling [s]."""
 
 
 class State(StrEnum):
@@ -39,11 +39,11 @@ class State(StrEnum):
 
     RUNNING = "running"
     STALE = "stale"
-    """Silent for too long, although the driver of its experiment is alive: it hangs, or its machine has died."""
+    """Silent for too long although the experiment's driver is alive: it hangs, or its machine has died."""
     INTERRUPTED = "interrupted"
-    """It has begun and not ended, and its experiment has no driver: stopped or dead, it can be resumed."""
+    """Started but not ended, and the experiment has no driver: it was stopped or died, and can be resumed."""
     WAITING = "waiting"
-    """It has not started, or not since its sweep was resumed."""
+    """Not started, or not yet since its sweep was resumed."""
     ENDED = "ended"
     UNREADABLE = "unreadable"
     """Its files do not say which trial it is."""
@@ -51,11 +51,11 @@ class State(StrEnum):
 
 @dataclass(frozen=True)
 class Device:
-    """The device assigned to a trial's process."""
+    """The device of a trial's process."""
 
     host: str = ""
     gpu: str = "-"
-    """Index on its host, or `cpu`."""
+    """Index of the GPU on its host, or `cpu`."""
     name: str = ""
     """Model of the GPU, or `cpu`; empty if it is not known."""
 
@@ -75,7 +75,7 @@ class TrialSnapshot:
     device: Device
     state: State
     age: float | None
-    """Time since its process last wrote something [s]; None if it never did."""
+    """Time since its process last wrote a file [s]; None if it never did."""
     damages: tuple[Damage, ...]
     """What was skipped."""
 
@@ -105,7 +105,7 @@ class TrialSnapshot:
 
 
 class TrialReader:
-    """Reads trials' folders, again and again; metrics that have not changed are not read twice."""
+    """Reads trials' folders repeatedly; unchanged metrics files are not read again."""
 
     def __init__(self, keep_rows: bool = True) -> None:
         """
@@ -114,11 +114,11 @@ class TrialReader:
         """
         self._keep_rows = keep_rows
         self._driver: tuple[Path, float, bool | None] = (Path(), math.nan, None)
-        """Experiment, time, and whether its driver was alive then, None without a lock: asked once for all trials."""
+        """(experiment, time, whether its driver was alive then; None without a lock): looked up once for all trials."""
         self._seen: dict[Path, tuple[tuple[int, int], tuple[tuple[dict[str, float], ...], TrialProgress, Metrics]]] = {}
 
     def read(self, folder: Path, now: float) -> TrialSnapshot:
-        """A trial's folder at `now` [s since the epoch]; no content of it makes this fail."""
+        """A trial's folder at `now` [s since the epoch]; never fails, whatever the folder contains."""
         damages: list[Damage] = []
         rows, progress, metrics = self._metrics(folder / METRICS_FILE, damages)
         damages += metrics.damages
@@ -135,13 +135,13 @@ class TrialReader:
         return TrialSnapshot(folder, rows, progress, ending, attempt, device, state, age, tuple(damages))
 
     def _state(self, folder: Path, progress: TrialProgress, age: float, now: float) -> State:
-        """The state of a trial that has begun and not ended."""
+        """The state of a trial that has started and not ended."""
         experiment, beat = folder.parent.parent, _last_beat(folder)
         if self._driver[:2] != (experiment, now):
             self._driver = experiment, now, has_living_owner(experiment, now)
         driven, summary = self._driver[2], _modified(experiment / SUMMARY_FILE)
         if summary is not None and (beat is None or beat < summary):
-            # The driver writes the summary at its very end: whoever drives now has not restarted this trial yet.
+            # The driver writes the summary at its very end: a newer driver has not restarted this trial yet.
             return State.WAITING if driven else State.INTERRUPTED
         if driven is False:
             return State.INTERRUPTED
@@ -160,14 +160,14 @@ class TrialReader:
             return seen[1]
         metrics = _try(lambda: load_metrics(path), Metrics(), path, damages)
         rows = tuple(with_nan(row) for row in metrics.rows)
-        found = rows if self._keep_rows else (), progress_of(rows), Metrics((), metrics.damages)
+        reading = rows if self._keep_rows else (), progress_of(rows), Metrics((), metrics.damages)
         if not damages:
-            self._seen[path] = stamp, found
-        return found
+            self._seen[path] = stamp, reading
+        return reading
 
 
 def read_trial(folder: Path, now: float = 0.0) -> TrialSnapshot:
-    """A trial's folder at `now` [s since the epoch], which is only used to tell running trials from silent ones."""
+    """A trial's folder at `now` [s since the epoch], which only serves to tell running trials from silent ones."""
     return TrialReader().read(folder, now)
 
 
@@ -205,7 +205,7 @@ def _last_beat(folder: Path) -> float | None:
 def _patience(folder: Path, progress: TrialProgress) -> float:
     """How long a trial may write nothing before it counts as silent [s]."""
     started, metrics = _modified(folder / DEVICE_FILE), _modified(folder / METRICS_FILE)
-    # A process younger than the metrics, as after a retry, has not completed an epoch yet.
+    # After a retry, the process is younger than the metrics, and has not completed an epoch yet.
     starting = metrics is None or (started is not None and started >= metrics)
     if starting or progress.seconds_per_epoch is None:
         return SILENT_STARTING_S

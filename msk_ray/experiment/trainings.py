@@ -1,4 +1,4 @@
-"""Trials on their own, which `python -m msk_ray.train` runs, as their files show them."""
+"""Status of single training runs (`python -m msk_ray.train`), read from their files."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,19 +14,19 @@ from msk_ray.experiment.ownership import has_living_owner
 from msk_ray.experiment.snapshot import State, TrialReader
 
 FOLDER = "train"
-"""Subfolder of a storage folder in which `train` puts them by default."""
+"""Default subfolder of a storage folder for training runs."""
 _CONFIG = "config.yaml"
 
 
 @dataclass(frozen=True)
 class Training:
-    """How a trial on its own stands."""
+    """Status of a training run."""
 
     name: str
     """Its folder, relative to the storage folder."""
     environment: str
     epochs: int
-    """Planned epochs; 0 if they are not known."""
+    """Planned epochs; 0 if unknown."""
     state: State
     progress: TrialProgress
     note: str = ""
@@ -34,14 +34,14 @@ class Training:
 
 
 class TrainingReader:
-    """Reads the trials of a storage folder again and again; metrics that have not changed are not read twice."""
+    """Reads the training runs of a storage folder repeatedly; unchanged metrics files are not read again."""
 
     def __init__(self, storage: Path) -> None:
         self._storage = storage
         self._reader = TrialReader(keep_rows=False)
 
     def look(self, now: float) -> list[Training]:
-        """All of them at `now` [s since the epoch], by name."""
+        """All training runs at `now` [s since the epoch], by name."""
         return [self._training(folder, now) for folder in find_trainings(self._storage)]
 
     def _training(self, folder: Path, now: float) -> Training:
@@ -49,7 +49,7 @@ class TrainingReader:
         notes = describe_damages(seen.damages, folder)
         settings: Mapping[str, Any] = {}
         try:
-            # As plain data: its environment may be a class that cannot be imported here.
+            # Read as plain data, because its environment's class may not be installed here.
             settings = read_yaml(folder / _CONFIG)
         except MskRayError as error:
             notes.append(str(error))
@@ -66,12 +66,12 @@ class TrainingReader:
 
 
 def find_trainings(storage: Path) -> list[Path]:
-    """Folders of trials on their own in a storage folder, or in its subfolder `train`."""
-    found = [
+    """Folders of training runs in a storage folder and in its subfolder `train`."""
+    folders = [
         path
         for parent in (storage, storage / FOLDER)
         if parent.is_dir()
         for path in parent.iterdir()
         if (path / METRICS_FILE).is_file() and not (path / MANIFEST_FILE).exists()
     ]
-    return sorted(found)
+    return sorted(folders)

@@ -1,4 +1,4 @@
-"""One trial of an experiment: its name, its varied settings, and its full settings."""
+"""One trial of an experiment: its id, its varied settings, and its full settings."""
 
 import hashlib
 import json
@@ -38,7 +38,7 @@ class Trial:
 
     @property
     def environment(self) -> str:
-        """Name of the environment it runs in. Scores of different environments cannot be compared."""
+        """Name of its environment. Scores of different environments are not comparable."""
         return self.config.env.name
 
     @property
@@ -48,13 +48,13 @@ class Trial:
 
     @property
     def label(self) -> str:
-        """Id, changed parameters and seed on one line of printable characters, for Ray's lists and profiles."""
-        # A profile separates its frames by semicolons.
+        """Id, changed parameters and seed on one printable line, for Ray's lists and profiles."""
+        # Profiles separate frames by semicolons.
         return printable(f"{self.id} {self.variant} seed={self.seed}").replace(";", ",")
 
 
 def by_environment(items: Iterable[T], environment: Callable[[T], str]) -> dict[str, list[T]]:
-    """Items by the name of their environment, environments and items in the order given."""
+    """Items by environment name, in the order given."""
     groups: dict[str, list[T]] = {}
     for item in items:
         groups.setdefault(environment(item), []).append(item)
@@ -62,7 +62,7 @@ def by_environment(items: Iterable[T], environment: Callable[[T], str]) -> dict[
 
 
 def variant_text(changed: Mapping[str, str]) -> str:
-    """`actor_lr=0.002, horizon=16, hard friction`: keys without their sections, and whole sections by label alone."""
+    """`actor_lr=0.002, horizon=16, hard friction`: keys without sections; for whole sections only the label."""
     parts = [f"{short_key(key)}={value}" if "." in key else value for key, value in changed.items()]
     return ", ".join(parts) or "base"
 
@@ -74,15 +74,15 @@ def short_key(key: str) -> str:
 
 
 def trial_id(config: Config) -> str:
-    """First digits of the SHA-256 of what differs from the defaults, apart from `execution`. What is trained alike has
-    the same id on every machine, and in every version with the same `SCHEMA`."""
+    """First digits of the SHA-256 of all settings that differ from their defaults, except `execution`. The same
+    training has the same id on every machine, and in every version with the same `SCHEMA`."""
     trained = {name: value for name, value in changed_settings(config).items() if name != "execution"}
     text = json.dumps({"schema": SCHEMA, **trained}, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()[:ID_DIGITS]
 
 
 def with_epochs(trial: Trial, epochs: int) -> Trial:
-    """The same trial, with the same id, of another length."""
+    """The same trial, with the same id, but another number of epochs."""
     longer = trial.config.trial.model_copy(update={"epochs": epochs})
     return replace(trial, config=trial.config.model_copy(update={"trial": longer}))
 

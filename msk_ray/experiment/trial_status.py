@@ -1,4 +1,4 @@
-"""The progress of an experiment, read from its files: while it runs, after it has died, or from another machine."""
+"""Progress of an experiment, read from its files: while it runs, after it has died, or from another machine."""
 
 import math
 from collections.abc import Sequence
@@ -27,18 +27,18 @@ class TrialStatus:
     variant: str
     seed: int
     environment: str
-    """Name of the environment it runs in; empty if that is not known."""
+    """Name of its environment; empty if unknown."""
     epochs: int
     """Planned epochs."""
     state: State
     progress: TrialProgress
     device: Device
     heartbeat_age: float | None
-    """Time since its process last wrote something [s]; None if it never did."""
+    """Time since its process last wrote a file [s]; None if it never did."""
     outcome: str = ""
-    """Name of its ending, if it has one."""
+    """Name of its outcome, if it has ended."""
     note: str = ""
-    """Why it ended, what it does before its first epoch has ended, or what is wrong with its files."""
+    """Why it ended, what it is doing before its first epoch has ended, or what is wrong with its files."""
     attempt: Attempt = FIRST
     damages: tuple[Damage, ...] = ()
     """What was skipped in its files."""
@@ -53,11 +53,11 @@ class TrialStatus:
 
 
 FIRST_EPOCH = "compiles kernels that are not in Warp's cache, records and trains its first epoch"
-"""What a running trial does that has no epoch yet."""
+"""What a running trial does before its first epoch has ended."""
 
 
 class StatusReader:
-    """Reads an experiment repeatedly; a file that has not changed is not read twice."""
+    """Reads an experiment repeatedly; unchanged files are not read again."""
 
     def __init__(self, experiment: Experiment) -> None:
         self.experiment = experiment
@@ -66,14 +66,14 @@ class StatusReader:
         self._manifest: tuple[int, int] | None = None
 
     def look(self, now: float) -> list[TrialStatus]:
-        """All trials at `now` [s since the epoch], those at work first, then by environment and score.
+        """All trials at `now` [s since the epoch]: running ones first, then by environment and score.
 
         Raises:
             StorageError: the folder holds no readable experiment.
         """
-        found = [self._status(trial, now) for trial in self._known()]
-        found += self._unlisted({status.id for status in found}, now)
-        return sorted(found, key=_order)
+        statuses = [self._status(trial, now) for trial in self._known()]
+        statuses += self._unlisted({status.id for status in statuses}, now)
+        return sorted(statuses, key=_order)
 
     def _known(self) -> list[Trial]:
         stamp = file_stamp(self.experiment.path / MANIFEST_FILE)
@@ -82,13 +82,13 @@ class StatusReader:
         return self._trials
 
     def _unlisted(self, listed: set[str], now: float) -> list[TrialStatus]:
-        """Trials suggested by a search: the manifest contains them only at the end."""
+        """Trials suggested by a search, which are in the manifest only at the end."""
         if all(path.name in listed for path in _subfolders(self.experiment.path / "trials")):
             return []
         try:
             varied = list(read_settings(self.experiment.path / SPACE_FILE).get("parameters") or {})
         except (MskRayError, TypeError):
-            varied = []  # their settings are known all the same; only what sets them apart is not
+            varied = []  # their settings are known anyway; only the varied ones are not marked
         trials, damages = unlisted_trials(self.experiment, listed, varied)
         return [self._status(trial, now) for trial in trials] + [self._unreadable(damage) for damage in damages]
 
@@ -122,12 +122,12 @@ class StatusReader:
 
 
 def counts(statuses: Sequence[TrialStatus]) -> dict[State, int]:
-    """How many trials are in each state; states without trials are left out."""
+    """Number of trials in each state; states without trials are omitted."""
     return {state: n for state in State if (n := sum(status.state is state for status in statuses))}
 
 
 def remaining(statuses: Sequence[TrialStatus]) -> float | None:
-    """Seconds until the experiment is done, at most; None while none of its trials runs at a known speed."""
+    """Upper bound on the seconds until the experiment is done; None while no running trial's speed is known."""
     running = [s for s in statuses if s.state is State.RUNNING]
     idle = [s for s in statuses if s.state in (State.WAITING, State.STALE, State.INTERRUPTED)]
     return eta(
@@ -138,8 +138,8 @@ def remaining(statuses: Sequence[TrialStatus]) -> float | None:
 
 
 def bests_of(statuses: Sequence[TrialStatus]) -> dict[str, TrialStatus]:
-    """The trial with the highest score of each environment, in the order of their names: scores of different
-    environments cannot be compared. Environments without a score are left out."""
+    """The trial with the highest score by environment, in order of their names. Environments without a score are
+    omitted."""
     groups = by_environment(statuses, lambda status: status.environment)
     scored = {
         name: [(s.progress.best, s) for s in groups[name] if s.progress.best is not None] for name in sorted(groups)
@@ -163,13 +163,13 @@ def describe_bests(statuses: Sequence[TrialStatus], *, ids: bool) -> str:
 
 def find_experiments(storage: Path) -> list[Path]:
     """Folders in a storage folder that are experiments, complete or not; the newest last."""
-    found = [
+    folders = [
         path
         for path in _subfolders(storage)
         if any((path / part).exists() for part in (MANIFEST_FILE, SPACE_FILE, ENVIRONMENT_FILE))
-        and not (path / METRICS_FILE).exists()  # a trial on its own
+        and not (path / METRICS_FILE).exists()  # a single training run
     ]
-    return sorted(found, key=lambda path: (path.stat().st_mtime, path.name))
+    return sorted(folders, key=lambda path: (path.stat().st_mtime, path.name))
 
 
 def _order(status: TrialStatus) -> tuple[int, str, float]:

@@ -5,11 +5,11 @@ from importlib import metadata
 
 
 def installed_versions(packages: Iterable[str]) -> dict[str, str]:
-    """Version of each package that is installed; a checkout that is not installed has none."""
-    found = {}
+    """Versions of those packages that are installed; a checkout on the path is not."""
+    versions = {}
     for package in packages:
         try:
-            found[package] = metadata.version(package)
+            versions[package] = metadata.version(package)
         except metadata.PackageNotFoundError:
             continue
-    return found
+    return versions

@@ -1,4 +1,4 @@
-"""Environments behind Gymnasium's interfaces, for algorithms from elsewhere.
+"""Environments with Gymnasium's interfaces, for other libraries' algorithms.
 
 `BatchedEnv` steps all worlds at once in MuJoCo Warp, `SingleEnv` one world in C MuJoCo. Importing this package needs
 gymnasium: pip install 'msk-ray[gym]'.

@@ -21,11 +21,11 @@ Array = TypeVar("Array", np.ndarray, Tensor)
 
 
 class BatchedEnv(VectorEnv[Array, Array, Array], Generic[Array]):
-    """W worlds in MuJoCo Warp, on the CPU or a GPU, with the reward and the physics that the config trains on.
+    """W worlds in MuJoCo Warp, on the CPU or a GPU, with the config's training reward and physics.
 
     A world whose episode ended is reset in the same step (`AutoresetMode.SAME_STEP`): the observation is then the first
     one of its next episode, and `infos["final_obs"]` (W, O) has the last one of the episode before, valid where
-    `infos["_final_obs"]` (W,). `infos["diverged"]` (W,) says whose physics exceeded all bounds, which counts as
+    `infos["_final_obs"]` (W,). `infos["diverged"]` (W,) says whether a world's physics diverged, which counts as
     terminated.
 
     Args:
@@ -68,7 +68,7 @@ class BatchedEnv(VectorEnv[Array, Array, Array], Generic[Array]):
 
     @torch.no_grad()
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
-        """Start a new episode in every world, drawn from `seed` or, without one, continuing the draws before.
+        """Start a new episode in every world, drawn from `seed`, or else from the continued random stream.
 
         Raises:
             ConfigError: options are given; there are none.
@@ -81,7 +81,7 @@ class BatchedEnv(VectorEnv[Array, Array, Array], Generic[Array]):
 
     @torch.no_grad()
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        """Advance all worlds under actions (W, A), which are clipped to [-1, 1].
+        """Step all worlds with actions (W, A), clipped to [-1, 1].
 
         Raises:
             SimulationError: contacts or constraint rows were lost to a full buffer.
@@ -93,7 +93,7 @@ class BatchedEnv(VectorEnv[Array, Array, Array], Generic[Array]):
                 f"({self.num_envs}, {self.env.action_size})"
             )
         transition = self.env.step(given.clamp(-1.0, 1.0))
-        # On a GPU a lost contact is only known once the step has ended; until then its worlds would look diverged.
+        # On a GPU a lost contact is known only after the step; without waiting, its worlds would look diverged.
         self.env.sim.settle()
         done = transition.terminated | transition.truncated
         infos = {
@@ -106,5 +106,5 @@ class BatchedEnv(VectorEnv[Array, Array, Array], Generic[Array]):
         return obs, reward, terminated, truncated, infos
 
     def _array(self, value: Tensor) -> Array:
-        # A copy: on the CPU, numpy would share the memory of tensors that later steps read again.
+        # A copy, because on the CPU numpy shares the memory of tensors that later steps read again.
         return cast(Array, value.clone() if self._torch else value.cpu().numpy().copy())

@@ -1,4 +1,4 @@
-"""A simulation of one world in C MuJoCo, in float64, in the place of one in MuJoCo Warp."""
+"""A stand-in for `Simulation`: one world in C MuJoCo, in float64."""
 
 from collections.abc import Mapping
 
@@ -13,15 +13,15 @@ from msk_ray.step.forward.solver_limits import SolverLimits, own_limits
 
 
 class CSimulation(Simulation):
-    """`step` and `contact_forces` of one world on the CPU, without gradients. The rest is that of a `Simulation`.
+    """`step` and `contact_forces` of one world on the CPU, without gradients. The rest is inherited.
 
-    A step continues in float64 where the one before ended, if it is given the state that that one returned.
+    If a step is given the state that the last one returned, it continues from that state in float64.
 
     Args:
-        limits: most iterations of the solver; None: the model's, but at least 100 and 50.
+        limits: iteration limits of the solver; None: the model's, but at least 100 and 50.
 
     Attributes:
-        data: MuJoCo's state, as the last step left it.
+        data: MuJoCo's state after the last step.
     """
 
     def __init__(self, model: mujoco.MjModel, substeps: int, limits: SolverLimits | None = None) -> None:
@@ -39,7 +39,7 @@ class CSimulation(Simulation):
         xfrc_applied: Tensor | None = None,
         parameters: Mapping[str, Tensor] | None = None,
     ) -> StepState:
-        """Advance the world by one env step; shapes as for `Simulation.step` with W = 1.
+        """Take one env step; shapes as for `Simulation.step` with W = 1.
 
         Raises:
             UnsupportedModelError: forces or parameters are given.
@@ -71,7 +71,7 @@ class CSimulation(Simulation):
         wrench = np.zeros(6)
         for index, contact in enumerate(self.data.contact):
             mujoco.mj_contactForce(self.model, self.data, index, wrench)
-            # Rows of the frame are the axes; the force is that of the first geom on the second.
+            # Rows of the frame are its axes; the force acts from the first geom on the second.
             force = contact.frame.reshape(3, 3).T @ wrench[:3]
             for geom, sign in zip(contact.geom, (-1.0, 1.0), strict=True):
                 if geom >= 0:

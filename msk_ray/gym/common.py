@@ -1,4 +1,4 @@
-"""What both interfaces share: which environment, and its spaces."""
+"""Code that both interfaces share: config, spaces, seeds."""
 
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from msk_ray.errors import ConfigError
 
 
 def read(config: Config | str | Path) -> Config:
-    """A config, given as such, by its file, or by its name in `configs/`.
+    """A config from a Config, a file, or a name in `configs/`.
 
     Raises:
         ConfigError: as for `load_config`.
@@ -21,18 +21,18 @@ def read(config: Config | str | Path) -> Config:
 
 
 def refuse_options(options: dict[str, Any] | None) -> None:
-    """Raise ConfigError for options of a reset: there are none."""
+    """Raise ConfigError if options are given to a reset, which takes none."""
     if options:
         raise ConfigError(f"reset takes no options, but got {', '.join(options)}: leave them out")
 
 
 def observation_space(env: Env[Any]) -> spaces.Box:
-    """Observations of one world, (O,)."""
+    """Observation space of one world, (O,)."""
     return spaces.Box(-np.inf, np.inf, (env.obs_size,), np.float32)
 
 
 def action_space(env: Env[Any]) -> spaces.Box:
-    """Actions of one world, (A,)."""
+    """Action space of one world, (A,)."""
     return spaces.Box(-1.0, 1.0, (env.action_size,), np.float32)
 
 

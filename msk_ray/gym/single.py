@@ -18,14 +18,14 @@ from msk_ray.gym.common import action_space, observation_space, read, refuse_opt
 class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """One world in C MuJoCo on the CPU, with the reward and the physics that the config trains on.
 
-    `info["diverged"]` says whether the physics exceeded all bounds, which counts as terminated; `info["terms"]` has the
+    `info["diverged"]` says whether the physics diverged, which counts as terminated; `info["terms"]` has the
     weighted parts of the reward by name.
 
     Args:
         config: a config, its file, or its name in `configs/`.
 
     Raises:
-        ConfigError: the config is refused, or draws parameters of the model, which one world cannot have.
+        ConfigError: the config is invalid, or randomizes model parameters, which a single world does not support.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012 - as in the base class
@@ -34,8 +34,7 @@ class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         config = read(config)
         if config.physics.randomize is not None:
             raise ConfigError(
-                "physics.randomize: a single environment has the model's own parameters; set it to null, or use "
-                "BatchedEnv"
+                "physics.randomize: a single environment cannot randomize the model; set it to null, or use BatchedEnv"
             )
         self.env = make_env(config.env, config.physics, 1, "cpu", config.trial.seed, differentiable=False)
         self.env.sim = self._simulation = CSimulation(self.env.model, self.env.sim.substeps, self.env.sim.batch.limits)
@@ -50,18 +49,18 @@ class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     @property
     def data(self) -> mujoco.MjData:
-        """MuJoCo's state as the last step left it; a reset shows in it with the next step."""
+        """MuJoCo's state after the last step; a reset appears in it with the next step."""
         return self._simulation.data
 
     @torch.no_grad()
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start a new episode, drawn from `seed` or, without one, continuing the draws before; the first is then drawn
-        from a random seed.
+        """Start a new episode, drawn from `seed`, or else from the continued random stream, which starts at a random
+        seed.
 
         Raises:
-            ConfigError: options are given; there are none.
+            ConfigError: options are given.
         """
         super().reset(seed=seed)
         refuse_options(options)
@@ -73,7 +72,7 @@ class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     @torch.no_grad()
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Advance the world under an action (A,), which is clipped to [-1, 1]."""
+        """Step the world with an action (A,), clipped to [-1, 1]."""
         given = torch.as_tensor(action, dtype=torch.float32)
         if given.shape != self.action_space.shape:
             raise ConfigError(f"the action has shape {tuple(given.shape)}, not {self.action_space.shape}")

@@ -1,4 +1,4 @@
-"""`BatchedEnv` behind the interface that algorithms of Stable-Baselines3 take."""
+"""`BatchedEnv` with the interface of Stable-Baselines3."""
 
 from pathlib import Path
 from typing import Any
@@ -26,18 +26,18 @@ class StableBaselinesEnv(VecEnv):
         super().__init__(self.batched.num_envs, self.batched.single_observation_space, self.batched.single_action_space)
 
     def reset(self) -> np.ndarray:
-        """Observations (W, O) of new episodes, from the first of the seeds that `seed` set, if it was called."""
+        """Observations (W, O) of new episodes, drawn from the first seed given to `seed`, if any."""
         obs, _ = self.batched.reset(seed=self._seeds[0])
         self._reset_seeds()
         return obs
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Take actions (W, A) for `step_wait`."""
+        """Store actions (W, A) for `step_wait`."""
         self._actions = actions
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Observations, rewards, ends of episodes, and for each world a dictionary that has `terminal_observation` and
-        `TimeLimit.truncated` where its episode ended."""
+        """Observations, rewards, ends of episodes, and a dictionary per world, with `terminal_observation` and
+        `TimeLimit.truncated` if its episode ended."""
         obs, reward, terminated, truncated, infos = self.batched.step(self._actions)
         done = terminated | truncated
         details: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
@@ -52,25 +52,25 @@ class StableBaselinesEnv(VecEnv):
         """Nothing to close."""
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """An attribute of the batched environment, once for each of the worlds asked for."""
+        """An attribute of the batched environment, repeated for each world asked for."""
         value = getattr(self.batched, attr_name)
         return [value for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Worlds have no attributes of their own to set.
+        """Worlds have no own attributes to set.
 
         Raises:
             NotImplementedError: always.
         """
-        raise NotImplementedError("worlds of a batch have no attributes of their own: set those of `batched`")
+        raise NotImplementedError("worlds of a batch have no own attributes: set those of `batched`")
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        """Worlds have no methods of their own to call.
+        """Worlds have no own methods to call.
 
         Raises:
             NotImplementedError: always.
         """
-        raise NotImplementedError("worlds of a batch have no methods of their own: call those of `batched`")
+        raise NotImplementedError("worlds of a batch have no own methods: call those of `batched`")
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
         """No world is wrapped."""

@@ -9,17 +9,17 @@ from msk_ray.config.schema import ActorConfig
 from msk_ray.networks.mlp import make_mlp
 
 _LOG_STD_RANGE = (-5.0, 2.0)
-"""Of a standard deviation that depends on the observation; that of SAPO."""
+"""Bounds of log σ where σ depends on the observation, as in SAPO."""
 
 
 class Actor(nn.Module):
     """Action tanh(μ(obs) + σ·noise), or tanh(μ(obs)) if deterministic.
 
-    σ is the same for all observations, or a linear function of μ's last hidden layer gives its logarithm, which starts
-    at the same value everywhere.
+    σ is the same for all observations, or log σ is a linear function of μ's last hidden layer, which starts at the same
+    value everywhere.
 
     Attributes:
-        log_std: log σ (A,) for all observations; None if it depends on them.
+        log_std: log σ (A,) for all observations; None if σ depends on them.
     """
 
     def __init__(self, config: ActorConfig, obs_size: int, action_size: int, generator: torch.Generator) -> None:
@@ -38,8 +38,7 @@ class Actor(nn.Module):
         """Actions (..., A) in (-1, 1) for normalised observations (..., O).
 
         Args:
-            noise: standard normal numbers (..., A), through which the sample is differentiable; None for the
-                deterministic action.
+            noise: standard normal numbers (..., A), by reparametrisation; None for the deterministic action.
         """
         mean, log_std = self._gaussian(obs)
         if noise is not None:

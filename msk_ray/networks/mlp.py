@@ -12,10 +12,10 @@ _ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "silu": nn.SiLU, "rel
 
 
 class Mlp(nn.Sequential):
-    """Layers one after the other.
+    """Sequential layers.
 
     Attributes:
-        instead: called in the network's place while it is set.
+        instead: if set, called instead of the layers.
     """
 
     instead: Callable[[Tensor], Tensor] | None = None

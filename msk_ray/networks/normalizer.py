@@ -40,6 +40,6 @@ class RunningMeanStd(nn.Module):
         return self.fixed()(x)
 
     def fixed(self) -> Callable[[Tensor], Tensor]:
-        """`normalize` with the statistics that there are now, for many calls until the next `update`."""
+        """`normalize` with the current statistics fixed, for many calls before the next `update`."""
         scale = torch.rsqrt(self.var + _EPSILON)
         return lambda x: (x - self.mean) * scale

@@ -1,4 +1,4 @@
-"""One number for all weights and statistics of a trial: two runs whose numbers are equal have learned the same bits."""
+"""A hash of all weights and statistics of a trial: runs with equal hashes have learned the same bits."""
 
 from collections.abc import Mapping
 from hashlib import blake2b
@@ -10,11 +10,11 @@ from torch import Tensor
 def parameter_hash(modules: Mapping[str, Mapping[str, object]]) -> str:
     """Digest of named tensors: 32 hexadecimal digits.
 
-    It depends on names, types, shapes and bits, and neither on the order of the modules nor on their device.
+    It depends on names, types, shapes and bits, not on the modules' order or device.
 
     Args:
-        modules: state of each module by name, as `torch.nn.Module.state_dict` gives it; what is no tensor in it, such
-            as a number that a module keeps, counts by its text.
+        modules: state of each module by name, as `torch.nn.Module.state_dict` gives it. Values that are not tensors,
+            such as numbers, are hashed as text.
     """
     digest = blake2b(digest_size=16)
     for module in sorted(modules):
@@ -26,12 +26,12 @@ def parameter_hash(modules: Mapping[str, Mapping[str, object]]) -> str:
 
 
 def tensor_hash(value: Tensor) -> str:
-    """Digest of one tensor, by its type, shape and bits: 32 hexadecimal digits."""
+    """Digest of one tensor's type, shape and bits: 32 hexadecimal digits."""
     return blake2b(_bytes_of(value), digest_size=16).hexdigest()
 
 
 def as_number(digest: str) -> float:
-    """The first 12 digits of a digest as a number, which rows of metrics can hold exactly."""
+    """The first 12 digits of a digest as a number that a metrics row holds exactly."""
     return float(int(digest[:12], 16))
 
 

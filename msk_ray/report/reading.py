@@ -250,7 +250,7 @@ class Reading:
     @property
     def reduced(self) -> list[TrialReading]:
         """Trials that run with half their worlds."""
-        return [trial for trial in self.trials if trial.attempt.reduced is not None]
+        return [trial for trial in self.trials if trial.attempt.reduction is not None]
 
     @property
     def seeds(self) -> set[int]:

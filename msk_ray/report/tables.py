@@ -134,7 +134,7 @@ def variant_rows(reading: Reading, baseline: str | None) -> list[VariantRow]:
                 at if pair else None,
                 own,
                 {name: value for name, value in means.items() if value is not None},
-                sum(trial.attempt.reduced is not None and trial.score is not None for trial in trials),
+                sum(trial.attempt.reduction is not None and trial.score is not None for trial in trials),
                 sum(trial.cut and trial.score is not None for trial in trials),
                 _mean_of(at_best, "env_steps"),
                 _mean_of(at_best, "seconds"),

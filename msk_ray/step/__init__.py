@@ -1,11 +1,11 @@
 """The differentiable step: batches of MuJoCo Warp worlds whose steps are autograd functions of torch tensors.
 
-A library of its own: it needs mujoco, mujoco_warp, warp, numpy and torch, and imports nothing else of `msk_ray`.
+A stand-alone library: it needs mujoco, mujoco_warp, warp, numpy and torch, and imports nothing else from `msk_ray`.
 
 | package | contents |
 |---|---|
 | `forward` | batches of worlds in Warp: buffers, recorded graphs, the fused solver, sums in a fixed order; no torch |
-| `adjoint` | the exact pullback of one `mujoco_warp.step`; its formula stands atop `adjoint/step.py`; no torch |
+| `adjoint` | the exact pullback of one `mujoco_warp.step`; the formula is at the top of `adjoint/step.py`; no torch |
 | `autograd` | `Simulation` and its backward modes, kinematics, tendons: where torch and Warp meet |
 | `check` | gradients against float64 central differences of C MuJoCo |
 """
@@ -46,7 +46,7 @@ __all__ = sorted(name for names in _HOMES.values() for name in names)
 
 
 def __getattr__(name: str) -> Any:
-    """Names are loaded where they are first used, so that `forward` and `adjoint` work without torch."""
+    """Load names on first use, so that `forward` and `adjoint` work without torch."""
     for home, names in _HOMES.items():
         if name in names:
             value = getattr(import_module(f"{__name__}.{home}"), name)

@@ -5,7 +5,7 @@ from enum import StrEnum
 
 
 def shortened(text: str, limit: int = 80) -> str:
-    """A text cut to at most `limit` characters, ending in dots if something was left out."""
+    """A text cut to at most `limit` characters, ending in dots if it was cut."""
     return text if len(text) <= limit else f"{text[: limit - 3]}..."
 
 
@@ -14,18 +14,18 @@ _BRIEF.maxstring = _BRIEF.maxother = _BRIEF.maxlong = 60
 
 
 def brief(value: object) -> str:
-    """The `repr` of a value for an error message, short however large the value is."""
+    """The `repr` of a value for an error message, cut if it is long."""
     return shortened(_BRIEF.repr(value), 160)
 
 
 class MskRayError(Exception):
-    """Base of every error whose cause is outside the code; entry points print it as one line and exit with 2."""
+    """Base class of errors whose cause is outside the code; entry points print them as one line and exit with 2."""
 
     exit_code = 2
 
 
 class ConfigError(MskRayError):
-    """A configuration, search space or command line asks for something that does not exist or is not possible."""
+    """A configuration, search space or command line asks for something unknown or impossible."""
 
 
 class DeviceError(MskRayError):
@@ -33,11 +33,11 @@ class DeviceError(MskRayError):
 
 
 class UnsupportedModelError(MskRayError):
-    """A model feature cannot be differentiated by the chosen backward mode."""
+    """The chosen backward mode cannot differentiate a feature of the model."""
 
 
 class Failure(StrEnum):
-    """How a simulation can fail; a trial's outcome has the same name."""
+    """How a simulation can fail; a trial's outcome gets the same name."""
 
     DIVERGED = "diverged"
     """Worlds diverged, or contacts or constraint rows were lost."""
@@ -51,7 +51,7 @@ class SimulationError(MskRayError):
     """The physics could not be computed with these settings."""
 
     def __init__(self, message: str, failure: Failure = Failure.DIVERGED) -> None:
-        super().__init__(message, failure)  # both, so that the error survives pickling between processes
+        super().__init__(message, failure)  # both arguments, so that the error survives pickling between processes
         self.message = message
         self.failure = failure
 

@@ -1,1 +1,1 @@
-"""What a sweep tries and when it stops a trial: search spaces, trials, strategies and rules. No Ray, no torch."""
+"""What a sweep tries, and when it stops a trial: search spaces, trials, searches and rules. No Ray, no torch."""

@@ -17,14 +17,14 @@ _DECIDING = (
     "trial.epochs",
     "env.nworld",
 )
-"""Settings, and sections of settings, that determine how many env steps a trial takes."""
+"""Settings and sections that determine how many env steps a trial takes."""
 
 
 def env_steps_budget(config: Config) -> int:
-    """The most env steps a trial can take to its last epoch.
+    """The largest number of env steps that a trial can take to its last epoch.
 
     Raises:
-        ConfigError: its algorithm does not say.
+        ConfigError: its algorithm does not define it.
     """
     return config.algorithm_settings.env_steps(config.env.nworld, config.trial.epochs)
 
@@ -34,7 +34,7 @@ def longest_budget(file: SpaceFile, configs: Iterable[Config]) -> float:
 
     Args:
         file: the space, with its scheduler.
-        configs: configs of the trials; for a search `extreme_configs`, because its trials are not known yet.
+        configs: the trials' configs; for a search, whose trials are not known yet, `extreme_configs`.
     """
     attribute = file.scheduler.time_attr
     if attribute == "env_steps":
@@ -45,13 +45,14 @@ def longest_budget(file: SpaceFile, configs: Iterable[Config]) -> float:
 
 
 def extreme_configs(space: Space) -> list[Config]:
-    """Configs that include the longest one that a search can suggest: all combinations of what determines the length.
+    """Configs among which is the longest one that a search can suggest: all combinations of parameters that change the
+    length.
 
-    A trial's length rises or falls with each number that it depends on, so the two ends of a range are enough. Other
-    parameters have their first level or lower end.
+    A trial's length is monotonic in each number, so the two ends of a range are enough. Other parameters have their
+    first level or lower end.
 
     Raises:
-        ConfigError: the base, an end of a range or such a combination is not a valid config, or trials would run in
+        ConfigError: the base, an end of a range or a combination is not a valid config, or trials would run in
             several environments.
     """
     base = base_settings(space)

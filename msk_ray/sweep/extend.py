@@ -1,7 +1,6 @@
-"""`--extend`: more trials or more epochs for an experiment that exists. Pure: lists of trials in, a list out.
+"""`--extend`: more trials or epochs for an existing experiment. Pure: lists of trials in, a list out.
 
-A trial always keeps its id, and so its folder: the id is the hash of its original settings, before any extension of its
-epochs.
+A trial keeps its id, and so its folder: the id is the hash of its settings before any extension of its epochs.
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,7 +36,7 @@ def parse_extension(texts: Sequence[str]) -> dict[str, Any]:
 
 
 def extended_space(data: Mapping[str, Any], extension: Mapping[str, Any]) -> dict[str, Any]:
-    """A space's plain data with the samples and seeds of an extension."""
+    """A space's plain data with an extension's samples and seeds."""
     return {**data, **{kind: extension[kind] for kind in ("samples", "seeds") if kind in extension}}
 
 
@@ -47,7 +46,7 @@ def extend_trials(recorded: Sequence[Trial], planned: Sequence[Trial], epochs: i
     Args:
         recorded: the experiment's current trials.
         planned: the trials of the extended space, with the space's epochs.
-        epochs: new length of every trial; None leaves it.
+        epochs: new length of every trial; None keeps it.
 
     Raises:
         ConfigError: the extension would drop trials or shorten them, or trials have different lengths.

@@ -1,4 +1,4 @@
-"""Start an experiment of a space, or open one to continue it."""
+"""Create an experiment, or open one to continue it."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -44,13 +44,13 @@ def reopen(
 
     Args:
         path: its folder.
-        trials: the current trials of the (extended) space, for comparison; None trusts the manifest.
+        trials: the (extended) space's current trials, for comparison; None accepts those of the manifest.
         extension: what to extend: epochs, samples, seeds.
-        own_trials: the trials that the command line which started it would give now.
+        own_trials: trials that the experiment's original command line would give now.
 
     Raises:
-        StorageError: there is none, it cannot be written, or its trials are not those of the current space.
-        ConfigError: the extension would remove something.
+        StorageError: there is no experiment, it cannot be written, or its trials are not those of the current space.
+        ConfigError: the extension would remove trials or epochs.
     """
     experiment = Experiment(path)
     if not path.is_dir():
@@ -75,21 +75,21 @@ def reopen(
             f"--resume: the space no longer gives the trials of {path}: {difference}; undo that in the space or its "
             f"base, or {other}"
         )
-    # Also without a new extension: an earlier one may have been interrupted right after writing its manifest.
+    # Even without a new extension: an earlier one may have been interrupted right after writing its manifest.
     experiment.clear_outgrown()
     experiment.stop_file.unlink(missing_ok=True)
     return experiment
 
 
 def write_space(experiment: Experiment, space: Space) -> None:
-    """Record the space, with all settings of its scheduler: a default may change, and the rungs with it."""
+    """Record the space with all scheduler settings written out, because a default that changes would move the rungs."""
     written = space.file.model_dump(mode="json", exclude_unset=True)
     written["scheduler"] = space.file.scheduler.model_dump(mode="json")
     write_text(experiment.path / SPACE_FILE, dump_yaml(written))
 
 
 def check_scheduler(experiment: Experiment, space: Space) -> None:
-    """Refuse to continue with a rule other than the one that has stopped trials so far.
+    """Raise if the space's rule is not the one that has stopped trials so far.
 
     Raises:
         StorageError: the space's scheduler is not the recorded one.
@@ -98,7 +98,7 @@ def check_scheduler(experiment: Experiment, space: Space) -> None:
         path = experiment.path / SPACE_FILE
         recorded = read_file(read_settings(path), str(path), recorded=True).scheduler.model_dump()
     except MskRayError as error:
-        # Only this check and the report depend on it.
+        # Only this check and the report use the record.
         text = " ".join(str(error).split())
         print(f"it is not known whether the space's scheduler is still the one that stopped trials: {printable(text)}")
         return
@@ -115,13 +115,13 @@ def check_scheduler(experiment: Experiment, space: Space) -> None:
 
 
 def difference_of(recorded: list[Trial], now: list[Trial]) -> str | None:
-    """How two lists of trials differ, on one line; None if they are the same."""
+    """How two lists of trials differ, on one line; None if they are equal."""
     old, new = {trial.id: trial for trial in recorded}, {trial.id: trial for trial in now}
     gone = [trial for trial in recorded if trial.id not in new]
     added = [trial for trial in now if trial.id not in old]
     if not gone and not added:
         return None
-    # Trials at the same position were most likely one trial before an edit, and the edit is the best description.
+    # Trials at the same position are most likely the same one before and after an edit, so describe the edit.
     for before, after in zip(gone, added, strict=False):
         if before.index == after.index:
             return f"trial {before.index} changed: {describe_changes(before.config, after.config)}"

@@ -1,4 +1,4 @@
-"""Trials that a search suggests as it goes: its choice for each is recorded in the trial's folder, for resuming."""
+"""Trials suggested by a search. Its choices are recorded in the trials' folders, for resuming."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -18,15 +18,15 @@ from msk_ray.sweep.trials import base_settings, make_trial
 
 @dataclass(frozen=True)
 class SearchTrial:
-    """A trial of a search, with the search's choice."""
+    """A trial, with the search's choice."""
 
     trial: Trial
     params: dict[str, Any]
-    """Dotted key → value; for a listed value, its label."""
+    """Dotted key → value; the label for a value of a list."""
 
 
 def search_trial(space: Space, base: Mapping[str, Any], params: Mapping[str, Any]) -> Trial:
-    """The trial of a search's choice."""
+    """The trial for a search's choice."""
     values, changed = {}, {}
     for key, op in space.sampled.items():
         level = op.recorded(params[key])
@@ -35,20 +35,20 @@ def search_trial(space: Space, base: Mapping[str, Any], params: Mapping[str, Any
 
 
 def write_params(folder: Path, params: Mapping[str, Any]) -> None:
-    """Record a search's choice in the trial's folder, once: the ages of these files tell `recover` which came first."""
+    """Record a search's choice in the trial's folder, once: `recover` orders trials by the age of these files."""
     if not (folder / PARAMS_FILE).exists():
         write_json(folder / PARAMS_FILE, dict(params))
 
 
 def recover(experiment: Experiment, space: Space) -> list[SearchTrial]:
-    """All trials that a search has suggested so far, in the order in which they were started, and numbered in it.
+    """All trials that a search has suggested so far, numbered in the order in which they were started.
 
     Raises:
         StorageError: the current space gives other trials.
     """
     base = base_settings(space)
     files = sorted(experiment.path.glob(f"trials/*/{PARAMS_FILE}"), key=lambda path: (path.stat().st_mtime, path))
-    found: list[SearchTrial] = []
+    trials: list[SearchTrial] = []
     for file in files:
         try:
             recorded = read_object(file, dict)
@@ -56,7 +56,7 @@ def recover(experiment: Experiment, space: Space) -> list[SearchTrial]:
             advice = f"the search's choice is not known: remove {file.parent}, and the search suggests another trial"
             raise DamagedFile(error.damage, advice) from None
         if recorded is None:
-            continue  # removed since it was found
+            continue  # removed in the meantime
         params = current_values(recorded)
         try:
             trial = search_trial(space, base, params)
@@ -64,15 +64,15 @@ def recover(experiment: Experiment, space: Space) -> list[SearchTrial]:
             raise _changed(file, f"{error}") from error
         if trial.id != file.parent.name:
             trial = replace(trial, id=_recorded_id(file, trial))
-        found.append(SearchTrial(replace(trial, index=len(found)), params))
-    return found
+        trials.append(SearchTrial(replace(trial, index=len(trials)), params))
+    return trials
 
 
 def _recorded_id(file: Path, trial: Trial) -> str:
-    """The id under which an equal trial is recorded: version 0.2 had others.
+    """The id under which an equal trial is recorded; version 0.2 computed other ids.
 
     Raises:
-        StorageError: the recorded trial is another one.
+        StorageError: the recorded trial has other settings.
     """
     config = file.parent / CONFIG_FILE
     if not config.exists() or trial_id(parse_recorded(read_yaml(config), str(config))) != trial.id:

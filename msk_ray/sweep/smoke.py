@@ -1,4 +1,4 @@
-"""`--smoke`: the same space in minutes, to check that every part of it runs."""
+"""`--smoke`: a short version of a space, to check in minutes that every part of it runs."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ EVALUATION_STEPS = 32
 
 
 def without_early_stopping(space: Space) -> Space:
-    """The space without early stopping by scores: each trial runs to its end. pbt stays, because it ends no trial."""
+    """The space without early stopping by scores, so that each trial runs to its end. pbt stays: it ends no trial."""
     file = space.file
     changes: dict[str, Any] = {"stop": file.stop.without_scores()}
     if file.scheduler.ends_trials:
@@ -26,12 +26,12 @@ def without_early_stopping(space: Space) -> Space:
 
 
 def shrink(space: Space, trials: list[Trial]) -> list[Trial]:
-    """A few short trials in which every value of every factor occurs at least once."""
+    """A few short trials, in which every value of every factor occurs at least once."""
     base = base_settings(space)
     short: dict[str, Trial] = {}
     chosen = cover(trials)[:TRIALS]
-    # Two variants that differ only in what is shortened become equal, and one of them is enough. A single trial would
-    # test neither concurrency nor comparison, so further ones join until there are two.
+    # Variants that differ only in shortened settings become equal; keep one of them. A single trial would test neither
+    # concurrency nor comparison, so add further ones until there are two.
     spare = [trial for trial in trials if trial not in chosen]
     for place, trial in enumerate([*chosen, *spare]):
         if place >= len(chosen) and len(short) >= 2:
@@ -43,7 +43,7 @@ def shrink(space: Space, trials: list[Trial]) -> list[Trial]:
 
 
 def cover(trials: list[Trial]) -> list[Trial]:
-    """A small set of trials, chosen greedily in order, with every level of every factor and only the first seed."""
+    """A small set of trials, chosen greedily, with every level of every factor and only the first seed."""
     missing = {pair for trial in trials for pair in trial.changed.items()}
     pool = [trial for trial in trials if trial.seed == trials[0].seed]
     chosen: list[Trial] = []
@@ -58,7 +58,7 @@ def cover(trials: list[Trial]) -> list[Trial]:
 
 
 def shorten(config: Config) -> dict[str, Any]:
-    """Dotted settings that make a trial last seconds: few epochs, worlds and steps, and short epochs."""
+    """Dotted settings with which a trial takes seconds: few epochs, worlds and steps, and short epochs."""
     steps = config.evaluation.steps or config.env.episode_length
     own = config.algorithm_settings.shortened(EPOCHS)
     return {

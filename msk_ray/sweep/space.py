@@ -1,4 +1,4 @@
-"""The search space file: a question, a base config, and what varies."""
+"""The search space file: a question, a base config, and what to vary."""
 
 import math
 import re
@@ -24,9 +24,9 @@ MAX_SEEDS = 100_000
 
 
 class AblateSpec(Section):
-    """One factor at a time: the baseline, and each variant merged into it. Keys are dotted config keys.
+    """Varies one factor at a time: runs the baseline, and each variant merged into it. Keys are dotted config keys.
 
-    Grids beside it repeat all of them for each of their points.
+    With grids beside it, all of these run at every grid point.
     """
 
     label: Text = "baseline"
@@ -42,7 +42,7 @@ class AblateSpec(Section):
 
 
 class ResourcesSpec(Section):
-    """The resources of a trial, and how often it is retried."""
+    """Resources of a trial, and how failures are handled."""
 
     gpus_per_trial: Annotated[float, Field(gt=0.0)] = 1.0
     """GPUs per trial if there are any; below 1, trials share a GPU."""
@@ -50,9 +50,9 @@ class ResourcesSpec(Section):
     """CPU cores per trial; at least its `execution.threads`."""
     max_concurrent: Count | None = None
     max_failures: Whole = 3
-    """How often a trial whose process or node has died is retried from its checkpoint."""
+    """How often to retry a trial from its checkpoint after its process or node has died."""
     hang_s: Annotated[float, Field(gt=0.0)] | None = 1800.0
-    """Seconds without an epoch after which a trial's process is ended and restarted; null waits for ever."""
+    """Time without an epoch after which a trial's process is killed and restarted [s]; null: wait forever."""
     halve_worlds_on_oom: bool = False
     """Restart a trial that runs out of memory once, from the beginning, with half its worlds."""
 
@@ -70,29 +70,29 @@ class SpaceFile(Section):
     """Dotted config keys that are varied, each with one operator."""
     ablate: AblateSpec | None = None
     seeds: str | int | list[int] = "0"
-    """Seeds every trial is run with: "0-4", "0,3", 7 or [0, 3]."""
+    """Seeds of every variant: "0-4", "0,3", 7 or [0, 3]."""
     max_trials: Annotated[Count, Field(le=MAX_TRIALS)] = 2000
-    """Largest number of trials of the space; more are refused before any is created."""
+    """Largest number of trials; a space with more is refused before any trial is created."""
     samples: Count = 1
-    """Random draws of the sampled parameters (choice, uniform, loguniform, randint) for each point of the grid."""
+    """Random draws of the sampled parameters (choice, uniform, loguniform, randint) per grid point."""
     sample_seed: Whole = 0
-    """Seed of those draws, of a search, and of what pbt exchanges."""
+    """Seed of these draws, of a search, and of pbt's exchanges."""
     search: Text = "random"
-    """`random` resolves all trials in advance; otherwise the search that suggests them, by name or import path."""
+    """`random`: draw all trials in advance. Otherwise the search that suggests them, by name or import path."""
     objectives: dict[Text, Literal["minimize", "maximize"]] = Field(default_factory=dict)
-    """What a search looks for instead of the highest score: metrics of the last evaluation, such as eval/fall_rate."""
+    """What a search optimises instead of the score: metrics of the last evaluation, such as eval/fall_rate."""
     scheduler: Annotated[SerializeAsAny[SchedulerSpec], BeforeValidator(read_scheduler)] = NoScheduler()
     stop: StopSpec = StopSpec()
     resources: ResourcesSpec = ResourcesSpec()
 
     @property
     def searches(self) -> bool:
-        """Whether trials are suggested one by one as results come in, rather than known in advance."""
+        """Whether trials are suggested one by one as results arrive, instead of known in advance."""
         return self.search != "random"
 
 
 class Space(Section):
-    """A checked search space, with its operators and seeds read."""
+    """A checked search space, with parsed operators and seeds."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
 
@@ -104,17 +104,17 @@ class Space(Section):
 
     @property
     def sampled(self) -> dict[str, Operator]:
-        """The parameters that are drawn rather than enumerated."""
+        """Parameters that are drawn."""
         return {key: op for key, op in self.parameters.items() if not op.enumerated}
 
     @property
     def grids(self) -> dict[str, Operator]:
-        """The parameters whose values are all tried."""
+        """Parameters that are enumerated."""
         return {key: op for key, op in self.parameters.items() if op.enumerated}
 
 
 def find_space(name: str) -> Path:
-    """The file of a space's path, or of its name in `tune_spaces/` of the current folder or of the package.
+    """The space file with this path, or of this name in `tune_spaces/` of the current folder or of the package.
 
     Raises:
         ConfigError: there is none; the message lists the known spaces.
@@ -138,7 +138,7 @@ def load_space(path: Path) -> Space:
 
 
 def recorded_space(path: Path) -> Space:
-    """Read and check the space that an experiment has recorded.
+    """Read and check the space recorded by an experiment.
 
     Raises:
         ConfigError: as for `load_space`.
@@ -147,10 +147,10 @@ def recorded_space(path: Path) -> Space:
 
 
 def read_space(path: Path) -> dict[str, Any]:
-    """The plain data of a space file, in today's spelling.
+    """The plain data of a space file, in the current spelling.
 
     Raises:
-        ConfigError: it cannot be read, or sets what no longer exists.
+        ConfigError: it cannot be read, or has a removed setting.
     """
     data = current_space(read_yaml(path))
 
@@ -170,7 +170,7 @@ def read_file(data: Any, source: str, *, recorded: bool = False) -> SpaceFile:
     """Check a space's plain data without its base. `source` names it in errors.
 
     Args:
-        recorded: whether an experiment has recorded it, perhaps with an earlier version.
+        recorded: whether the data is an experiment's record, perhaps of an earlier version.
 
     Raises:
         ConfigError: with the first error on one line.
@@ -182,12 +182,12 @@ def read_file(data: Any, source: str, *, recorded: bool = False) -> SpaceFile:
 
 
 def _named(data: Any) -> dict[str, type[BaseModel]]:
-    """Sections whose settings are declared by the class that they name, if it can be found."""
+    """Settings classes of the sections that name a class, where that is valid."""
     scheduler = data.get("scheduler") if isinstance(data, Mapping) else None
     try:
         return {"scheduler": scheduler_class(scheduler.get("kind"))} if isinstance(scheduler, Mapping) else {}
     except ConfigError:
-        return {}  # the fault described is this one
+        return {}  # the invalid name is reported by its own check
 
 
 def parse_space(data: Mapping[str, Any], path: Path, *, recorded: bool = False) -> Space:
@@ -214,7 +214,7 @@ def parse_seeds(text: str | int | list[int]) -> tuple[int, ...]:
     """Seeds written as "0-4", "0,3,10-12", 7 or [0, 3], in order and without repeats.
 
     Raises:
-        ConfigError: not such a list.
+        ConfigError: not a valid list of seeds.
     """
     seeds: dict[int, None] = {}
     ranges = _seed_ranges(text)
@@ -226,7 +226,7 @@ def parse_seeds(text: str | int | list[int]) -> tuple[int, ...]:
 
 
 def _seed_ranges(text: str | int | list[int]) -> list[tuple[int, int]]:
-    """(first, last) of each piece of a list of seeds, without expanding it."""
+    """(first, last) of each part of a list of seeds, without expanding it."""
     pieces = [str(piece) for piece in text] if isinstance(text, list) else str(text).split(",")
     ranges = []
     for piece in pieces:
@@ -241,7 +241,7 @@ def _seed_ranges(text: str | int | list[int]) -> list[tuple[int, int]]:
 
 
 def _check_count(file: SpaceFile, parameters: Mapping[str, Operator]) -> None:
-    """Refuse a space with more than `max_trials` trials, counted before any is created."""
+    """Raise if a space has more than `max_trials` trials, before creating any."""
     seeds = sum(last - first + 1 for first, last in _seed_ranges(file.seeds))
     grids = [len(op.levels) for op in parameters.values() if op.enumerated]
     variants = math.prod(grids) * (file.samples if file.ablate is None else len(file.ablate.variants) + 1)
@@ -253,7 +253,7 @@ def _check_count(file: SpaceFile, parameters: Mapping[str, Operator]) -> None:
 
 
 def _check_seeds(file: SpaceFile, parameters: Mapping[str, Operator]) -> None:
-    """Refuse `trial.seed` where the section `seeds` would replace it."""
+    """Raise if a space sets `trial.seed`, which the section `seeds` would replace."""
     places = [("overrides", file.overrides)]
     places += [("parameters", {key: level.value}) for key, op in parameters.items() for level in op.extremes()]
     if file.ablate is not None:
@@ -262,13 +262,12 @@ def _check_seeds(file: SpaceFile, parameters: Mapping[str, Operator]) -> None:
     for place, values in places:
         if any(leaf == "trial.seed" for key, value in values.items() for leaf, _ in leaves(key, value)):
             raise ConfigError(
-                f"{place}.trial.seed: seeds have a section of their own; write seeds: 0-4 (--seeds 0-4 on the command "
-                "line)"
+                f"{place}.trial.seed: seeds have their own section; write seeds: 0-4 (--seeds 0-4 on the command line)"
             )
 
 
 def _check_combination(file: SpaceFile, parameters: Mapping[str, Operator], seeds: tuple[int, ...]) -> None:
-    """Refuse settings that are valid separately but not together."""
+    """Raise for settings that are valid separately but not together."""
     sampled = {key: op for key, op in parameters.items() if not op.enumerated}
     if file.ablate is not None and (sampled or file.searches):
         raise ConfigError("ablate varies one factor at a time: beside it write only grids, and search: random")

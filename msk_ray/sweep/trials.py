@@ -1,4 +1,4 @@
-"""From a space to its trials: every combination resolved, checked against the config schema, and given a stable id."""
+"""From a space to its trials: resolves every combination, validates its config, and computes its id."""
 
 import difflib
 import itertools
@@ -10,18 +10,18 @@ from typing import Any
 from msk_ray.config import Config, leaves, overlay, parse_config, read_config, refuse_ignored
 from msk_ray.errors import ConfigError
 from msk_ray.experiment.trial import ID_DIGITS, Trial, trial_id, variant_text, with_epochs
-from msk_ray.sweep.operators import Level, Listed, Operator
+from msk_ray.sweep.operators import Level, NamedValues, Operator
 from msk_ray.sweep.rules.per_environment import refuse_several
 from msk_ray.sweep.space import Space
 
 
 def resolve_trials(space: Space) -> list[Trial]:
-    """All trials of an enumerable space, in the order in which they start: every variant with the first seed, then with
-    the next seed.
+    """All trials of an enumerable space, in the order in which they start: every variant with the first seed, then
+    every variant with the next.
 
     Raises:
-        ConfigError: a setting that does not exist or fit, two parameters that set the same key, two trials that come
-            out equal, or several environments for a scheduler that cannot keep them apart.
+        ConfigError: a setting is unknown or invalid, two parameters set the same key, two trials are equal, or the
+            scheduler does not support several environments.
     """
     base = base_settings(space)
     check_ranges(space, base)
@@ -49,10 +49,10 @@ def resolve_trials(space: Space) -> list[Trial]:
 
 
 def base_settings(space: Space) -> dict[str, Any]:
-    """The space's base config with its own overrides laid over it, as nested plain data, checked.
+    """The space's base config with its overrides, as nested plain data, validated.
 
     Raises:
-        ConfigError: the base cannot be read, or is no valid config.
+        ConfigError: the base cannot be read, or is not a valid config.
     """
     settings = overlay(read_config(space.base_path), space.file.overrides)
     parse_config(settings, f"{space.name}: {space.base_path.name} with the space's overrides")
@@ -62,10 +62,10 @@ def base_settings(space: Space) -> dict[str, Any]:
 def make_trial(
     space: Space, base: Mapping[str, Any], changed: dict[str, str], values: dict[str, Any], seed: int, index: int
 ) -> Trial:
-    """The trial that `values` (dotted key → value) and a seed make of the base settings.
+    """The trial of the base settings with `values` (dotted key → value) and a seed.
 
     Raises:
-        ConfigError: the result is no valid config.
+        ConfigError: the result is not a valid config.
     """
     name = f"{space.name}: trial {index} ({variant_text(changed)})"
     config = parse_config(overlay(overlay(base, values), {"trial.seed": seed}), name)
@@ -73,10 +73,10 @@ def make_trial(
 
 
 def with_recorded_ids(planned: Sequence[Trial], recorded: Sequence[Trial]) -> list[Trial]:
-    """Planned trials under the ids that the same trials are recorded under.
+    """Planned trials, with the ids under which the same trials are recorded.
 
-    Ids differ after an extension, which leaves ids but not epochs as they were, and in experiments of version 0.2,
-    which hashed whole settings.
+    Recorded ids differ after an extension, which changes epochs but not ids, and in experiments of version 0.2, which
+    hashed all settings.
     """
     one_length = len({trial.epochs for trial in recorded}) == 1 == len({trial.epochs for trial in planned})
 
@@ -91,9 +91,9 @@ def with_recorded_ids(planned: Sequence[Trial], recorded: Sequence[Trial]) -> li
 
 
 def check_ranges(space: Space, base: Mapping[str, Any]) -> None:
-    """Refuse a range one end of which is no valid setting: found now rather than by the unlucky draw.
+    """Validate both ends of every range in advance, so that no later draw is invalid.
 
-    Other parameters stand at their first level or lower end meanwhile.
+    Other parameters have their first level or lower end.
 
     Raises:
         ConfigError: naming the parameter and the end.
@@ -107,11 +107,11 @@ def check_ranges(space: Space, base: Mapping[str, Any]) -> None:
 
 
 def check_algorithms_read(space: Space, configs: Iterable[Config]) -> None:
-    """Refuse what a space sets or varies if the algorithm of none of its trials reads it.
+    """Refuse settings of a space that no trial's algorithm uses.
 
     Args:
         space: the space.
-        configs: of its trials, or of one trial for each algorithm that a search can choose.
+        configs: its trials' configs, or one for each algorithm that a search can choose.
 
     Raises:
         ConfigError: naming the setting.
@@ -128,7 +128,7 @@ def check_algorithms_read(space: Space, configs: Iterable[Config]) -> None:
 
 
 def _variants(space: Space) -> Iterator[tuple[dict[str, str], dict[str, Any]]]:
-    """(labels, values) of every variant, seeds apart."""
+    """(labels, values) of every variant, without seeds."""
     if space.file.ablate is not None:
         for point in grid_points(space.grids):
             labels = {key: level.label for key, level in point.items()}
@@ -137,7 +137,7 @@ def _variants(space: Space) -> Iterator[tuple[dict[str, str], dict[str, Any]]]:
                 yield {**labels, **label}, {**values, **changes}
         return
     rng = random.Random(space.file.sample_seed)
-    # The draw is the outer loop: more samples append trials and leave the earlier ones as they are.
+    # Draws are the outer loop, so that more samples append trials and keep the earlier ones.
     for _ in range(space.file.samples):
         for point in grid_points(space.grids):
             drawn = {key: op.draw(rng) for key, op in space.sampled.items()}
@@ -146,7 +146,7 @@ def _variants(space: Space) -> Iterator[tuple[dict[str, str], dict[str, Any]]]:
 
 
 def grid_points(grids: Mapping[str, Operator]) -> Iterator[dict[str, Level]]:
-    """Every combination of the grids' levels; the last parameter turns fastest."""
+    """Every combination of the grids' levels; the last parameter varies fastest."""
     for combination in itertools.product(*(op.levels for op in grids.values())):
         yield dict(zip(grids, combination, strict=True))
 
@@ -160,11 +160,11 @@ def _ablations(space: Space) -> Iterator[tuple[dict[str, str], dict[str, Any]]]:
 
 
 def _check_collisions(space: Space) -> None:
-    """Refuse two parameters that set the same config key, and two values of one that tables could not tell apart."""
+    """Refuse parameters that set the same config key, and values of a parameter with the same label."""
     owner: dict[str, str] = {}
     for key, op in space.parameters.items():
         values: dict[str, Any] = {}
-        for level in op.levels if isinstance(op, Listed) else ():
+        for level in op.levels if isinstance(op, NamedValues) else ():
             if values.setdefault(level.label, level.value) != level.value:
                 raise ConfigError(
                     f"{space.name}: parameters.{key}: two values are both shown as {level.label}; give each a label: "
@@ -183,10 +183,10 @@ def _check_collisions(space: Space) -> None:
 
 
 def find_trial(trials: list[Trial], text: str) -> Trial:
-    """The trial that a number or (the beginning of) an id means.
+    """The trial with this number, or with an id that begins with this text.
 
     Raises:
-        ConfigError: there is none, or more than one.
+        ConfigError: there is no such trial, or more than one.
     """
     if text.isdecimal() and len(text) < ID_DIGITS and int(text) < len(trials):
         return trials[int(text)]

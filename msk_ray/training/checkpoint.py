@@ -1,4 +1,4 @@
-"""Checkpoints that are either complete or absent: PyTorch states in files with their own checksums."""
+"""Checkpoints, which are either complete or absent: PyTorch states in files with checksums."""
 
 import io
 import re
@@ -49,7 +49,7 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     facts, payload = read_checkpoint_file(path)
     try:
         state = torch.load(io.BytesIO(payload), map_location="cpu", weights_only=True)
-    except Exception as error:  # of whatever type: what the bytes mean decides what the unpickler raises
+    except Exception as error:  # any type: damaged bytes make the unpickler raise anything
         why = str(error).strip().splitlines()[:1] or [""]
         raise CheckpointError(
             f"{path} holds no state of a trial ({type(error).__name__}: {why[0]:.120}); use an older one of "
@@ -60,12 +60,12 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
             f"{path} holds no state of a trial (a {type(state).__name__}); use an older one of {path.parent}"
         )
     if "algorithm" not in state and "shac" in state:
-        # As versions wrote it that knew no other algorithm.
+        # The format of versions that had SHAC only.
         state["algorithm"] = state.pop("shac")
     # Older checkpoints have no digest.
     if "parameters" in facts and parameter_hash(state["algorithm"]["modules"]) != facts["parameters"]:
         raise CheckpointError(
-            f"{path} is damaged: its weights are not those of which it says {facts['parameters']!r:.40}; use an older "
+            f"{path} is damaged: its weights do not match their hash {facts['parameters']!r:.40}; use an older "
             f"one of {path.parent}"
         )
     return facts, state
@@ -77,22 +77,22 @@ def epoch_checkpoints(folder: Path) -> list[Path]:
 
 
 def milestones(folder: Path) -> list[tuple[int, Path]]:
-    """The policies kept along a trial's way, as (epoch, path), oldest first."""
+    """Policies saved during a trial, as (epoch, path), oldest first."""
     return _numbered(folder, _POLICY_NAME)
 
 
 def milestone_path(folder: Path, epoch: int) -> Path:
-    """Where the policy of an epoch is kept."""
+    """Path of the policy saved at an epoch."""
     return folder / f"policy_{epoch:06d}.pt"
 
 
 def unscored_checkpoints(folder: Path) -> list[tuple[int, Path]]:
-    """States of a trial whose policies wait for their scores, as (epoch, path), oldest first."""
+    """Trial states that still have to be scored, as (epoch, path), oldest first."""
     return _numbered(folder, _UNSCORED_NAME)
 
 
 def unscored_path(folder: Path, epoch: int) -> Path:
-    """Where the state of an epoch waits for the score of its policy."""
+    """Path of an epoch's state that still has to be scored."""
     return folder / f"unscored_{epoch:06d}.pt"
 
 
@@ -103,7 +103,7 @@ def _numbered(folder: Path, name: re.Pattern[str]) -> list[tuple[int, Path]]:
 
 
 def newest_valid_checkpoint(folder: Path) -> tuple[Path | None, list[str]]:
-    """The newest numbered checkpoint that reads whole, and a line on each newer one that does not."""
+    """The newest numbered checkpoint that is intact, and a line for each newer one that is not."""
     faults = []
     for path in epoch_checkpoints(folder):
         try:

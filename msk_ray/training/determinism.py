@@ -15,7 +15,7 @@ _here = False
 
 
 def use_determinism(config: Config, device: str) -> None:
-    """Make torch use algorithms that repeat bit for bit, if the trial wants them, or those that it had before.
+    """Switch torch to algorithms that repeat bit for bit if the trial wants them, otherwise back to its previous ones.
 
     Raises:
         ConfigError: CUDA has started in this process with a workspace of cuBLAS that does not repeat.
@@ -23,7 +23,7 @@ def use_determinism(config: Config, device: str) -> None:
     global _here
     wanted = config.execution.deterministic
     if wanted and device != "cpu" and os.environ.get(_WORKSPACE) not in _SIZES:
-        # cuBLAS reads it when it starts, which it does with the first product: something is allocated by then.
+        # cuBLAS reads the variable at the first matrix product; memory is allocated by then.
         if torch.cuda.is_initialized() and torch.cuda.memory_reserved(device) > 0:
             raise ConfigError(
                 f"execution.deterministic: CUDA runs already without {_WORKSPACE}: set {_WORKSPACE}={_SIZES[0]} in the "
@@ -32,7 +32,7 @@ def use_determinism(config: Config, device: str) -> None:
         os.environ[_WORKSPACE] = _SIZES[0]
     if wanted and not torch.are_deterministic_algorithms_enabled():
         torch.use_deterministic_algorithms(True)
-        # It would only fill memory that nobody reads before writing to it.
+        # Filling uninitialised memory only costs time here: nothing reads it before writing.
         torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
         _here = True
     elif not wanted and _here:

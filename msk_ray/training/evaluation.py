@@ -19,9 +19,9 @@ from msk_ray.training.policy_group import Policy, PolicyGroup, streams_for
 
 OnStep = Callable[[StepState, Tensor], None]
 _CHECK_EVERY = 25
-"""Env steps between looks at whether any world still runs."""
+"""Env steps between checks whether any episode is still running."""
 _EAGER_STEPS = 2
-"""Env steps before one is recorded: kernels are compiled in the first, and buffers made in both."""
+"""Env steps before one is recorded: they compile kernels and allocate buffers."""
 
 
 class Episodes(NamedTuple):
@@ -34,7 +34,7 @@ class Episodes(NamedTuple):
     fell: Tensor
     """Whether it ended with a fall, shape (W,) bool; not counting those that diverged."""
     diverged: Tensor
-    """Whether it ended because the physics exceeded all bounds, shape (W,) bool."""
+    """Whether it ended because the physics diverged, shape (W,) bool."""
     terms: Tensor
     """Return of each reward term, shape (W, T)."""
     outcomes: dict[str, Tensor]
@@ -43,11 +43,11 @@ class Episodes(NamedTuple):
     """Whether it succeeded, shape (W,) bool; None if the environment defines no success or all episodes ended early."""
 
     def cpu(self) -> "Episodes":
-        """The same on the CPU."""
+        """A copy on the CPU."""
         return self._mapped(Tensor.cpu)
 
     def worlds(self, chosen: slice, *, success: bool) -> "Episodes":
-        """Those of some worlds; without their success if that is not wanted."""
+        """The episodes of some worlds, with or without their success."""
         part = self._mapped(lambda value: value[chosen])
         return part if success else part._replace(success=None)
 
@@ -75,8 +75,8 @@ class Evaluator:
         config: the trial's config; its `evaluation` section sets worlds, steps and seed.
         device: "cpu" or "cuda:N".
         physics: physics to use instead of the reference.
-        varied: parameters of the model that are other than its own. What training draws does not apply.
-        policies: number of policies that can be run at the same time, each in `evaluation.nworld` worlds of its own.
+        varied: model parameters to override. Randomization in training does not apply here.
+        policies: number of policies that can run at the same time, each in its own `evaluation.nworld` worlds.
     """
 
     def __init__(
@@ -130,7 +130,7 @@ class Evaluator:
             seed: seed of the initial states; None: `evaluation.seed`.
             on_step: called with the physical state before each env step and the controls (W, nu) of that step, and
                 once more at the end with the last state and the controls that led to it.
-            pace: told after each env step how many are done.
+            pace: called after each env step with the number of steps done.
 
         Raises:
             SimulationError: contacts or constraint rows were lost to a full buffer.
@@ -138,7 +138,7 @@ class Evaluator:
         return self._episodes([policy], seed, on_step, pace)[0]
 
     def run(self, policies: Sequence[Policy]) -> list[dict[str, float]]:
-        """Evaluate policies from raw observations (W, O) to actions (W, A). Each gets the figures that it gets alone.
+        """Evaluate policies from raw observations (W, O) to actions (W, A), with the same results as one by one.
 
         Returns:
             For each its `score` and the standard deviation over worlds, mean episode `length`, `fall_rate`,
@@ -152,10 +152,10 @@ class Evaluator:
         return [figures for some in at_once for figures in self._run(some)]
 
     def check_recorded(self) -> None:
-        """Refuse an environment that wants more worlds recorded than `run` has.
+        """Raise if the environment wants to record more worlds than `run` has.
 
         Raises:
-            ConfigError: it does.
+            ConfigError: it wants too many.
         """
         wanted = self.env.recorded_worlds
         if wanted > self._worlds:
@@ -165,7 +165,7 @@ class Evaluator:
             )
 
     def _run(self, policies: Sequence[Policy]) -> list[dict[str, float]]:
-        """The figures of each of at most as many policies as there is room for."""
+        """The figures of each policy; at most `policies` of them."""
         recorded = self.env.recorded_worlds
         if not recorded:
             return [self._figures(episodes) for episodes in self._episodes(policies)]
@@ -176,10 +176,10 @@ class Evaluator:
         def keep(state: StepState, control: Tensor) -> None:
             states.append(StepState(*(part[chosen] for part in state)))
 
-        found = self._episodes(policies, on_step=keep)
+        per_policy = self._episodes(policies, on_step=keep)
         kept = StepState(*(torch.stack(parts).cpu() for parts in zip(*states, strict=True)))
         figures = []
-        for k, episodes in enumerate(found):
+        for k, episodes in enumerate(per_policy):
             lengths = [int(length) for length in episodes.length[:recorded]]
             trajectories = [
                 StepState(*(part[: length + 1, k * recorded + world] for part in kept))
@@ -196,7 +196,7 @@ class Evaluator:
         on_step: OnStep | None = None,
         pace: Callable[[int], None] | None = None,
     ) -> list[Episodes]:
-        """The episodes of each of at most as many policies as there is room for."""
+        """The episodes of each policy; at most `policies` of them."""
         env = self.env
         before = self._generators.state()
         env.generator.manual_seed(self._seed if seed is None else seed)
@@ -236,12 +236,12 @@ class Evaluator:
         return record.episodes()
 
     def _records_steps(self) -> bool:
-        """Whether an env step can be recorded as it is: mujoco_warp's solver ends in a loop that a graph of torch's
-        cannot hold."""
+        """Whether an env step can be recorded; torch graphs cannot hold the conditional loop of mujoco_warp's
+        solver."""
         return bool(self._streams) and self.env.sim.batch.kernels.fused_solver
 
     def _reset(self) -> None:
-        """Put the worlds of every policy into the same initial states."""
+        """Reset every policy's worlds to the same initial states."""
         drawn = self.env.draw_episodes(self._worlds)
         *physics, numbers = (t.repeat(self._policies, 1) for t in (*drawn.physics, drawn.numbers))
         self.env.stock_resets(Resets(StepState(*physics), numbers))
@@ -263,13 +263,13 @@ class Evaluator:
 
 
 class _RecordedStep:
-    """An env step of all policies, with what is counted of it, as one CUDA graph.
+    """An env step of all policies, and the bookkeeping of its episodes, as one CUDA graph.
 
     Args:
-        env: the worlds; their state is kept in tensors of its own until `leave`.
+        env: the worlds; until `leave`, their state is in the graph's own tensors.
         policy: the policies.
-        record: what the steps are counted in.
-        stream: where to record.
+        record: collects the episodes.
+        stream: CUDA stream to record on.
 
     Raises:
         RuntimeError: the environment makes the host wait for the device.
@@ -297,7 +297,7 @@ class _RecordedStep:
         self._work.replay()
 
     def leave(self) -> None:
-        """Give the environment the state that was reached."""
+        """Copy the state reached back to the environment."""
         self._env.state = self._state
         self._env.release_graph()
 
@@ -314,7 +314,7 @@ def _recorded_step(
         return _RecordedStep(env, policy, record, stream)
     except RuntimeError as error:
         torch.cuda.empty_cache()
-        env.generator.set_state(drawn)  # so that the next step draws what it would without the attempt
+        env.generator.set_state(drawn)  # so that the failed attempt does not change what the next step draws
         warnings.warn(
             f"an evaluation runs operation by operation: its steps cannot be recorded ({str(error).splitlines()[0]})",
             stacklevel=2,
@@ -323,12 +323,12 @@ def _recorded_step(
 
 
 class _Record:
-    """What happens in the first episodes of all worlds. It counts in place, so that counting can be recorded.
+    """Collects the first episode of every world, in place, so that it can be recorded.
 
     Args:
         env: the worlds.
-        policies: number of policies; worlds beyond theirs are left out.
-        worlds: worlds of each.
+        policies: number of policies; further worlds are ignored.
+        worlds: number of worlds per policy.
     """
 
     def __init__(self, env: Env[Any], policies: int, worlds: int) -> None:
@@ -342,11 +342,11 @@ class _Record:
         self._outcomes: dict[str, Tensor] = {}
         self._tail: list[dict[str, Tensor]] = []
         self._ended = [False] * policies
-        """Whether all episodes of a policy were seen to have ended before the last step."""
+        """Whether all episodes of a policy had ended at the last check."""
 
     def add(self, transition: Transition, outcome: dict[str, Tensor], *, in_tail: bool) -> None:
-        """Count an env step in the worlds whose episode has not ended; keep its outcome terms for `Env.success` if it
-        is in the tail of the episodes."""
+        """Add an env step to the worlds still in their first episode; near its end, also keep the outcome terms for
+        `Env.success`."""
         alive = self._alive
         counted = {name: value.masked_fill(~alive, 0.0) for name, value in outcome.items()}
         self._score += transition.reward.masked_fill(~alive, 0.0)
@@ -363,7 +363,7 @@ class _Record:
         alive &= ~transition.terminated
 
     def all_ended(self) -> bool:
-        """Look which policies have ended all their episodes; waits for the device."""
+        """Check which policies have ended all their episodes; waits for the device."""
         running = torch.stack([self._alive[part].any() for part in self._parts]).tolist()
         self._ended = [ended or not runs for ended, runs in zip(self._ended, running, strict=True)]
         return all(self._ended)

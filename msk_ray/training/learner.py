@@ -1,4 +1,4 @@
-"""The worlds and the algorithm of a trial, in the process that leads it and in those that follow."""
+"""A trial's worlds and algorithm, in its leading process and in the following ones."""
 
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
@@ -15,12 +15,12 @@ from msk_ray.errors import CheckpointError
 from msk_ray.group import ALONE, Group
 from msk_ray.training.checkpoint import read_checkpoint
 from msk_ray.training.determinism import use_determinism
-from msk_ray.training.memory import named_out_of_memory
+from msk_ray.training.out_of_memory import named_out_of_memory
 from msk_ray.training.threads import use_threads
 
 
 def make_algorithm(config: Config, device: str, group: Group = ALONE) -> Algorithm:
-    """The algorithm of a trial, at its start, in the worlds of this process.
+    """A trial's algorithm before training, in this process's worlds.
 
     Raises:
         ConfigError, DeviceError, UnsupportedModelError: as their messages say.
@@ -46,7 +46,7 @@ def make_algorithm(config: Config, device: str, group: Group = ALONE) -> Algorit
 
 
 def naming_memory(config: Config, device: str) -> AbstractContextManager[None]:
-    """Name the settings to lower where the memory of the device does not suffice for a trial."""
+    """Context that turns out-of-memory errors into ones that name the settings to lower."""
     length = config.algorithm_settings.length
     other = [] if length is None else [f"{config.algorithm_section}.{length}"]
     worlds = config.env.nworld // config.execution.gpus
@@ -57,7 +57,7 @@ def start_from(algorithm: Algorithm, path: str) -> list[str]:
     """Give an algorithm the networks and statistics of another trial's checkpoint.
 
     Returns:
-        Names of its modules that the checkpoint does not have and that begin untrained.
+        Names of modules that are not in the checkpoint and start untrained.
 
     Raises:
         CheckpointError: it is missing, incomplete, or does not fit.
@@ -80,7 +80,7 @@ def start_from(algorithm: Algorithm, path: str) -> list[str]:
 
 
 def check_generators(path: Path, saved: Tensor, device: torch.device) -> None:
-    """Refuse generators of the other kind of device: they draw other numbers, and their states do not fit."""
+    """Raise if generator states come from another kind of device: they do not fit, and draw other numbers."""
     if len(saved) == len(torch.Generator(device=device).get_state()):
         return
     there, here, option = ("CPU", "GPU", "cpu") if device.type == "cuda" else ("GPU", "CPU", "cuda:0")
@@ -105,16 +105,16 @@ def _to_device(value: Any, device: Any) -> Any:
 
 
 def follow(config: Config, device: str, group: Group) -> None:
-    """Train this process's share of a trial's worlds as the group's first process tells it to, until the last order.
+    """Train this process's share of a trial's worlds, following the group's first process until it says stop.
 
-    The first process runs a `Trainer`, and tells of every call in which all processes take part.
+    The first process runs a `Trainer`, and announces every call in which all processes take part.
 
     Raises:
         ConfigError, DeviceError, UnsupportedModelError, SimulationError, CheckpointError: as their messages say.
     """
     with naming_memory(config, device):
         algorithm = make_algorithm(config, device, group)
-        while order := group.told():
+        while order := group.receive_order():
             match order:
                 case ("start_from", path):
                     start_from(algorithm, path)

@@ -1,4 +1,4 @@
-"""What the bits of a trial's results depend on besides its settings: the device, its driver and the packages."""
+"""Device, driver and package versions, on which the bits of a trial's results depend besides its settings."""
 
 import platform
 from pathlib import Path
@@ -21,7 +21,7 @@ def device_name(device: str) -> str:
 
 
 def machine(device: str, deterministic: bool) -> dict[str, Any]:
-    """Device, driver and versions of a trial, and whether it is meant to repeat bit for bit."""
+    """Device, driver, versions, and whether the trial is meant to repeat bit for bit."""
     return {
         "device": device_name(device),
         "driver": ask_driver().driver if device.startswith("cuda") else None,
@@ -40,13 +40,13 @@ def record_machine(folder: Path, device: str, deterministic: bool) -> None:
 
 
 def machine_differences(folder: Path, device: str) -> str | None:
-    """What differs between the machine that a trial began on and this one, in words; None if nothing is known to."""
+    """How this machine differs from the one that the trial began on, as text; None if no difference is known."""
     before, _ = read_environment(folder / ENVIRONMENT_FILE)
-    found, name = [], device_name(device)
+    differences, name = [], device_name(device)
     if before.get("device", name) != name:
-        found.append(f"{before['device']}, now {name}")
+        differences.append(f"{before['device']}, now {name}")
     now = installed_versions(_PACKAGES)
     for package, version in before.get("packages", {}).items():
         if package in _PACKAGES[1:] and version != now.get(package):
-            found.append(f"{package} {version}, now {now.get(package)}")
-    return "; ".join(found) or None
+            differences.append(f"{package} {version}, now {now.get(package)}")
+    return "; ".join(differences) or None

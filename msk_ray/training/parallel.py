@@ -1,8 +1,8 @@
-"""A trial in several processes, one for each GPU, and the one that starts them and answers for them.
+"""A trial in several processes, one per GPU, plus a parent that starts them and relays calls.
 
-That one computes nothing. It passes calls on to process 0, which runs the `Trainer`; the others follow it. If any of
-them fails or dies, even while the others wait for it inside a GPU, it kills them all and raises the error of the one
-that failed first. They die with it, too.
+The parent computes nothing. It relays calls to process 0, which runs the `Trainer`; the others follow process 0. If one
+fails or dies, even while the others wait for it in a collective operation, the parent kills them all and raises the
+first error. If the parent dies, they die too.
 """
 
 import contextlib
@@ -30,24 +30,24 @@ from msk_ray.group import PeerLost, ProcessGroup
 from msk_ray.signals import NUMBERS
 from msk_ray.step import use_device
 from msk_ray.training.learner import follow
-from msk_ray.training.place import Place
 from msk_ray.training.trainer import Trainer
+from msk_ray.training.trial_folder import TrialFolder
 
 _PATIENCE_S = 5.0
-"""How long the others may take to report too, once one has died [s]."""
+"""How long to wait for the others' errors once one process has died [s]."""
 _SCORING_S = 60.0
-"""The same once a simulation has failed [s]: process 0, where it usually fails too, then scores the policies before."""
+"""The same after a simulation error [s]: process 0, which usually fails too, first scores the waiting policies."""
 _END_S = 60.0
-"""How long processes that have done all their work may take to end [s]."""
+"""How long processes may take to exit after their work is done [s]."""
 
 
 def make_trainer(config: Config, logdir: Path, device: str, together: int = 1) -> "Trainer | ParallelTrainer":
-    """The trainer of a trial: in this process, or in `execution.gpus` others.
+    """A trial's trainer: in this process, or for `execution.gpus` above 1 in that many others.
 
     Args:
         config: every setting.
         logdir: folder of the trial.
-        device: cpu or cuda:N, of several the first.
+        device: cpu or cuda:N, the first one if there are several.
         together: number of policies to score at the same time, as for `Trainer`.
 
     Raises:
@@ -58,7 +58,7 @@ def make_trainer(config: Config, logdir: Path, device: str, together: int = 1) -
 
 @dataclass(frozen=True)
 class _Setup:
-    """What a process needs to know first."""
+    """First message to a process."""
 
     rank: int
     config: Config
@@ -78,7 +78,7 @@ class _Call:
 
 @dataclass(frozen=True)
 class _Answer:
-    """The result of a call, and what has become of the trainer."""
+    """The result of a call, and the trainer's state after it."""
 
     result: Any
     epoch: int
@@ -92,7 +92,7 @@ class _Failure:
     error: Exception
 
 
-class ParallelTrainer(Place):
+class ParallelTrainer(TrialFolder):
     """A `Trainer` in `execution.gpus` processes, each with its GPU and an equal part of the worlds.
 
     Every error ends all of them; the trial continues from its newest checkpoint in another trainer. Call `close` at the
@@ -128,7 +128,7 @@ class ParallelTrainer(Place):
 
     @property
     def best_score(self) -> float:
-        """Highest evaluation score of the trained policy so far, -inf before the first; that of `best.pt`."""
+        """Highest evaluation score of the trained policy so far, -inf before the first, which is that of `best.pt`."""
         return self._best_score
 
     @best_score.setter
@@ -155,13 +155,13 @@ class ParallelTrainer(Place):
 
     def restore_latest(self) -> tuple[Path | None, list[str]]:
         """As `Trainer.restore_latest`."""
-        found: tuple[Path | None, list[str]] = self._call("restore_latest")
-        return found
+        reply: tuple[Path | None, list[str]] = self._call("restore_latest")
+        return reply
 
     def remarks(self) -> list[str]:
         """As `Trainer.remarks`."""
-        found: list[str] = self._call("remarks")
-        return found
+        reply: list[str] = self._call("remarks")
+        return reply
 
     def close(self) -> None:
         """Flush the logs and end the processes; nothing if they have ended."""
@@ -203,21 +203,21 @@ class ParallelTrainer(Place):
         raise self._reason(failures)
 
     def _reason(self, failures: dict[int, Exception | None]) -> Exception:
-        """Why the processes failed: what one of them said, but for what follows from the death of another.
+        """Why the processes failed: the first error that is not a consequence of another process's death.
 
         Args:
-            failures: errors by rank, in their order; None of a process that died.
+            failures: errors by rank, in order of arrival; None for a process that died.
         """
         said = [(number, error) for number, error in sorted(failures.items()) if error is not None]
         for number, error in said:
             if isinstance(error, MskRayError):
                 return _in_rank(error, number)
         for number in (number for number, error in failures.items() if error is None):
-            return RankLost(f"{self._ranks[number].fate()}; a resumed trial continues from its last checkpoint")
+            return RankLost(f"{self._ranks[number].exit_text()}; a resumed trial continues from its last checkpoint")
         return next((error for _, error in said if not isinstance(error, PeerLost)), said[0][1])
 
     def _end(self) -> None:
-        """Leave nothing behind."""
+        """Kill all processes and close their connections."""
         for rank in self._ranks:
             rank.end()
         self._ranks = []
@@ -225,19 +225,19 @@ class ParallelTrainer(Place):
 
 
 class _Rank:
-    """One of the processes, from the side of the one that started it.
+    """One of the processes, seen from the parent.
 
-    It does not react to signals that ask to stop: the process that started it decides what happens then.
+    The process ignores signals that ask it to stop: the parent decides what to do.
     """
 
     def __init__(self, number: int) -> None:
         self.number = number
         self.connection, theirs = Pipe()
-        # This interpreter's path, so that whatever a configuration names is found there too.
+        # This interpreter's import path, so that classes named in the configuration are found there too.
         path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
         environment = {"GLOO_SOCKET_IFNAME": "lo", **os.environ, "PYTHONPATH": path}
         command = [sys.executable, "-P", "-m", "msk_ray.rank", str(theirs.fileno()), str(os.getpid())]
-        # A process starts with the signals blocked that its parent has blocked.
+        # A child inherits blocked signals.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, NUMBERS)
         try:
             self.process = subprocess.Popen(
@@ -248,7 +248,7 @@ class _Rank:
             theirs.close()
 
     def send(self, message: "_Setup | _Call") -> None:
-        """Send a message; to a process that has died, nothing: `receive` tells."""
+        """Send a message; ignored if the process has died, which `receive` reports."""
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             self.connection.send(message)
 
@@ -260,21 +260,21 @@ class _Rank:
             return None
         return message
 
-    def fate(self) -> str:
-        """How it ended."""
+    def exit_text(self) -> str:
+        """How the process ended, as text."""
         code = self.process.wait()
         how = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
         return f"process {self.number} of the trial (pid {self.process.pid}) {how}"
 
     def end(self) -> None:
-        """Kill it if it still runs."""
+        """Kill the process if it is still running."""
         self.process.kill()
         self.process.wait()
         self.connection.close()
 
 
 def serve(connection: Connection) -> None:
-    """What each of the processes does.
+    """Main function of each process.
 
     Args:
         connection: to the process that started this one, which sends a `_Setup` first.
@@ -304,14 +304,14 @@ def _lead(setup: _Setup, group: ProcessGroup, connection: Connection) -> None:
     finally:
         trainer.close()
     connection.send(_Answer(None, trainer.epoch, trainer.best_score))
-    group.tell()
+    group.send_order()
 
 
 def _devices(first: str, count: int) -> list[str]:
     """The device of each process.
 
     Raises:
-        DeviceError: there are not as many.
+        DeviceError: there are fewer devices.
     """
     if not first.startswith("cuda"):
         return [first] * count
@@ -328,14 +328,14 @@ def _devices(first: str, count: int) -> list[str]:
 
 
 def _patience(number: int, error: Exception | None) -> float:
-    """How long to wait for what the others say of the failure of a process [s]."""
+    """How long to wait for further errors after a process has failed [s]."""
     if number == 0 and isinstance(error, MskRayError):
-        return 0.0  # this is the reason, whatever they say
+        return 0.0  # this is the cause, whatever the others report
     return _SCORING_S if isinstance(error, SimulationError) else _PATIENCE_S
 
 
 def _in_rank(error: MskRayError, number: int) -> MskRayError:
-    """The same error, whose message names the process if it is not the first."""
+    """The same error; unless it comes from process 0, its message names the process."""
     if number > 0:
         message = f"process {number} of the trial: {error}"
         error.args = (message, *error.args[1:])
@@ -345,10 +345,10 @@ def _in_rank(error: MskRayError, number: int) -> MskRayError:
 
 
 def _portable(error: Exception) -> Exception:
-    """The same error, or one that says the same if it cannot be sent to another process."""
+    """The error, or one with the same text if it cannot be pickled."""
     try:
         pickle.loads(pickle.dumps(error))
-    except Exception:  # whatever a class from outside does when it is pickled
+    except Exception:  # any type: pickling may run foreign code
         copy = RuntimeError(f"{type(error).__name__}: {error}")
         for note in getattr(error, "__notes__", ()):
             copy.add_note(note)

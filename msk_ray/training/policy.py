@@ -1,4 +1,4 @@
-"""A policy read from a checkpoint, without the means to train it."""
+"""A policy read from a checkpoint, for inference only."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,7 +20,7 @@ Batch = TypeVar("Batch", Tensor, np.ndarray)
 
 
 class Sizes(NamedTuple):
-    """How many numbers go into a policy, and come out of it."""
+    """A policy's input and output sizes."""
 
     obs: int
     action: int
@@ -30,8 +30,8 @@ class Sizes(NamedTuple):
 class SavedPolicy:
     """The deterministic policy of a checkpoint and the trial it comes from.
 
-    It can be called: `policy(obs)` gives actions (..., A) in [-1, 1] for raw observations (..., O), without gradients,
-    as a tensor for a tensor and as an array for an array.
+    `policy(obs)` returns actions (..., A) in [-1, 1] for raw observations (..., O), without gradients: a tensor for a
+    tensor, an array for an array.
     """
 
     path: Path
@@ -39,7 +39,7 @@ class SavedPolicy:
     epoch: int
     env_steps: int
     sha256: str
-    """Hash of the checkpoint's content, which identifies evaluations and pictures."""
+    """Hash of the checkpoint's content; evaluations and pictures are stored under it."""
     modules: dict[str, Any]
     """States of the policy's modules, by name; in a trial's full checkpoint, all modules of its algorithm."""
     sizes: Sizes

@@ -13,28 +13,28 @@ from msk_ray.step.autograd.capture import Recording, fill
 Policy = Callable[[Tensor], Tensor]
 """Raw observations (W, O) to actions (W, A)."""
 _STREAMS = 5
-"""One on which a group is recorded, and others on which its policies run."""
+"""One stream to record a group on, and others to run its policies on."""
 
 
 def streams_for(device: torch.device) -> list[torch.cuda.Stream]:
-    """CUDA streams for groups of policies, none on another device.
+    """CUDA streams for groups of policies; empty for a CPU.
 
-    Make them once: cuBLAS keeps a workspace for each stream that it was used on.
+    Create them once: cuBLAS keeps a workspace for every stream it has run on.
     """
     return [torch.cuda.Stream(device) for _ in range(_STREAMS)] if device.type == "cuda" else []
 
 
 class PolicyGroup:
-    """Policies as one: raw observations (W, O) of all worlds to actions (W, A); 0 in worlds that no policy has.
+    """Several policies as one: raw observations (W, O) of all worlds to actions (W, A); 0 in worlds without a policy.
 
-    On CUDA, several policies run side by side, and what they launch is recorded in the second call and then replayed:
-    launched one by one, their small kernels would take longer than the step of all worlds.
+    On CUDA, the policies run in parallel on several streams; the second call records their launches, and later calls
+    replay them. Launched one by one, their small kernels would take longer than the step of all worlds.
 
     Args:
         policies: they must not change while the group is used.
         worlds: number of worlds of each.
         env: the worlds, at least `worlds` for each policy.
-        streams: those of `streams_for` the device, which no other group uses at the same time.
+        streams: from `streams_for`; no other group may use them at the same time.
     """
 
     def __init__(
@@ -48,13 +48,13 @@ class PolicyGroup:
         self._recording: Recording[Tensor] | None = None
         self._obs: Tensor | None = None
         if self._records:
-            # torch hands out the same streams again after 32: a recording that still runs may share a workspace.
+            # torch reuses its 32 streams in turn: a recording that is still running may share a workspace.
             torch.cuda.synchronize(env.device)
 
     def __call__(self, obs: Tensor) -> Tensor:
         if not self._records:
             return self._act(obs)
-        if self._obs is None:  # the first call prepares what cannot be made while recording
+        if self._obs is None:  # the first call creates what cannot be created while recording
             self._obs = obs.clone()
             return self._act(obs)
         if self._recording is None:
@@ -62,10 +62,10 @@ class PolicyGroup:
         if self._recording is None:
             return self._act(obs)
         fill([self._obs], [obs])
-        return self._recording.replay().clone()  # the state keeps it while the next replay overwrites it
+        return self._recording.replay().clone()  # the caller keeps it, and the next replay overwrites it
 
     def act(self, obs: Tensor) -> Tensor:
-        """The same, launched one by one, to be recorded as a part of something larger."""
+        """The same, launched one by one, for recording as a part of a larger graph."""
         return self._act_side_by_side(obs) if self._records else self._act(obs)
 
     def _act(self, obs: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
-"""Torch's threads on the CPU: their number comes from the trial's settings, whatever the machine has.
+"""Number of torch's CPU threads: set by the trial, not by the machine.
 
-By default torch uses one per core, and threads that wait for work spin. On a machine that is also busy with something
-else, small networks then take many times as long; and sums over a different number of parts round differently.
+By default torch uses one thread per core, and idle threads spin. On a busy machine small networks then take many times
+as long. The number of threads also changes rounding, because sums are split among them.
 """
 
 import torch

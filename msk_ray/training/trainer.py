@@ -35,10 +35,10 @@ from msk_ray.training.evaluation import Evaluator
 from msk_ray.training.learner import check_generators, load_state, make_algorithm, naming_memory, start_from
 from msk_ray.training.loggers import TrialLog
 from msk_ray.training.machine import machine_differences, record_machine
-from msk_ray.training.place import Place
 from msk_ray.training.policy import SavedPolicy, Sizes
 from msk_ray.training.policy_group import Policy
-from msk_ray.training.unscored import UnscoredPolicies
+from msk_ray.training.trial_folder import TrialFolder
+from msk_ray.training.unscored_policies import UnscoredPolicies
 
 # Settings that may differ between a checkpoint and the trial that continues from it.
 _EXTENDABLE = {"trial": {"epochs"}, "execution": set(ExecutionConfig.model_fields)}
@@ -47,15 +47,15 @@ _MILESTONES = 8
 MOST_TOGETHER = 32
 """Policies scored together on a GPU."""
 _LONGEST_WAIT_S = 120.0
-"""How long a policy waits for others to be scored with [s]."""
+"""How long a policy waits to be scored together with others [s]."""
 
 
-class Trainer(Place):
+class Trainer(TrialFolder):
     """One trial in this process.
 
     Writes `config.yaml`, `metrics.jsonl`, `checkpoints/` and the files of its loggers under `logdir`. The checkpoints
-    are the newest complete states, `best.pt` (until the first evaluation the untrained policy), and at about every
-    eighth of training the policy (`policy_*.pt`). Call `run_epoch` until `finished`; call `restore_latest` first to
+    are the newest complete states, `best.pt` (the untrained policy until the first evaluation), and a policy
+    (`policy_*.pt`) at about every eighth of the training. Call `run_epoch` until `finished`, after `restore_latest` to
     continue from the newest complete checkpoint, which on CPU gives exactly the metrics of an uninterrupted run.
 
     Args:
@@ -63,10 +63,10 @@ class Trainer(Place):
         logdir: the folder.
         device: "cpu" or "cuda:N".
         together: number of policies to score at the same time. On a GPU, 16 take hardly longer than one. A policy then
-            waits until there are that many, or two minutes have passed, or training ends; until then its row has no
-            score. Scores and best.pt are the same in the end. A logger that takes rows only once makes it 1.
-        group: the processes that train the trial, of which this is the first; it tells the others, which `follow`, what
-            they all take part in. `make_trainer` starts them.
+            waits until there are that many, or two minutes have passed, or training ends; its row gets the score later.
+            Final scores and best.pt are the same. A logger without `write_late` forces 1.
+        group: the processes that train the trial. This one is the first, and tells the others, which run `follow`,
+            every call in which all take part. `make_trainer` starts them.
 
     Attributes:
         env: the worlds used for training in this process.
@@ -85,7 +85,7 @@ class Trainer(Place):
                 f"execution.gpus {config.execution.gpus}: a Trainer is one process; start this trial with "
                 "msk_ray.train or msk_ray.training.make_trainer"
             )
-        # What cannot be found is reported before anything is written.
+        # Report missing files before writing anything.
         algorithm_class(config)
         resolve_device(device)
         super().__init__(config, logdir)
@@ -101,7 +101,7 @@ class Trainer(Place):
         for folder in (logdir, self.checkpoints):
             remove_stale(folder)
         if not epoch_checkpoints(self.checkpoints):
-            # Otherwise the file describes what those were trained under, until one of them is resumed.
+            # With checkpoints, the file keeps describing how they were trained, until one of them is resumed.
             self._write_config()
             record_machine(logdir, device, config.execution.deterministic)
         self._device = device
@@ -139,7 +139,7 @@ class Trainer(Place):
         started = time.perf_counter()
         try:
             with self._memory():
-                self._group.tell("update", self.epoch)
+                self._group.send_order("update", self.epoch)
                 result = self.algorithm.run_epoch(self.epoch)
         except SimulationError:
             self._score_despite_failure()
@@ -159,7 +159,7 @@ class Trainer(Place):
         return row
 
     def score_waiting(self) -> None:
-        """Score the policies that wait for it, for example because training stops here.
+        """Score the waiting policies, for example because training stops here.
 
         Raises:
             SimulationError: as for `run_epoch`.
@@ -187,8 +187,7 @@ class Trainer(Place):
             changed: dotted settings that may differ from those it was written under.
 
         Raises:
-            CheckpointError: it is missing, incomplete, was written under other settings, or on a GPU and is to continue
-                on a CPU, or the other way round.
+            CheckpointError: it is missing, incomplete, was written under other settings, or on another kind of device.
         """
         state = _expect(path, read_checkpoint(path))
         recorded = parse_recorded(state["config"], f"{path}: its settings")
@@ -210,14 +209,14 @@ class Trainer(Place):
         if moved := machine_differences(self.logdir, self._device):
             warnings.warn(f"{path.name} is of another machine, so bits will differ: {moved}", stacklevel=2)
         self._write_config()
-        self._group.tell("load", str(path))
+        self._group.send_order("load", str(path))
         load_state(self.algorithm, state)
         self.epoch, self.env_steps = state["epoch"], state["env_steps"]
         self._seconds = state["seconds"]
         self._damages = self._log.rewind(self.epoch)
         rows = read_metrics(self.logdir / METRICS_FILE)
         self._unreadable = self._unscored.rewind(self.epoch, {row["epoch"] for row in rows if SCORE in row})
-        # A policy may have got its score after the checkpoint.
+        # A policy may have been scored after the checkpoint.
         scores = (row[SCORE] for row in rows if row["epoch"] > 0 and row.get(SCORE) is not None)
         self.best_score = max(state["best_score"], *scores, -math.inf)
 
@@ -225,7 +224,7 @@ class Trainer(Place):
         """Continue from the newest complete checkpoint, or from the start if there is none.
 
         Returns:
-            Its path or None, and a line on each newer checkpoint that is incomplete and on damaged metrics.
+            Its path or None, and a line for each newer, incomplete checkpoint and for damaged metrics.
         """
         path, faults = newest_valid_checkpoint(self.checkpoints)
         if path is not None:
@@ -241,7 +240,7 @@ class Trainer(Place):
         write_bytes(self.logdir / "config.yaml", dump_yaml(self.config.as_dict()).encode())
 
     def remarks(self) -> list[str]:
-        """What made training worse or slower than it could be, a line on each."""
+        """Warnings: a line for each thing that made training worse or slower."""
         return self.algorithm.remarks()
 
     def close(self) -> None:
@@ -250,7 +249,7 @@ class Trainer(Place):
 
     def _start_from(self, path: str | None) -> None:
         if path is not None:
-            self._group.tell("start_from", path)
+            self._group.send_order("start_from", path)
             if missing := start_from(self.algorithm, path):
                 warnings.warn(
                     f"trial.start_from: {path} has no {' and no '.join(missing)}, which begin untrained: the policy "
@@ -259,14 +258,14 @@ class Trainer(Place):
                 )
 
     def _begin(self) -> None:
-        """Everything before the first epoch. The untrained policy is there to look at; it has no score in `best.pt`, so
-        that any trained policy replaces it."""
+        """Evaluate and save the untrained policy. Its `best.pt` has no score, so that any trained policy replaces
+        it."""
         self._start_from(self.config.trial.start_from)
         write_checkpoint(self.best_checkpoint, self._state(), {"epoch": 0, "best_score": None})
         self._log.write(self._row(self._evaluate()))
 
     def _evaluate(self) -> dict[str, float]:
-        """Score the policy, with those that wait, or let it wait too. Returns what is known for its row."""
+        """Score the policy together with the waiting ones, or let it wait. Returns what is known for its row."""
         started = time.perf_counter()
         full = len(self._unscored.epochs) + 1 >= self.together
         if full or self.finished or self._unscored.waited_s >= _LONGEST_WAIT_S:
@@ -277,10 +276,10 @@ class Trainer(Place):
         return {"time/evaluation_s": time.perf_counter() - started}
 
     def _score_others(self, own: list[Policy]) -> tuple[list[dict[str, float]], float]:
-        """Score policies together with all that wait, and write the rows of the latter once more, with their scores.
+        """Score policies together with the waiting ones, and rewrite the waiting ones' rows with their scores.
 
         Returns:
-            The figures of `own`, and the seconds that the evaluation of the others is counted with.
+            The figures of `own`, and the share of the time that the others took [s].
         """
         started = time.perf_counter()
         waiting = list(self._unscored.epochs)
@@ -289,14 +288,14 @@ class Trainer(Place):
         if not policies:
             return [], 0.0
         if waiting:
-            # It has not had as many steps as training to learn how large its buffers have to be.
+            # It has taken fewer steps than training to learn how large its buffers must be.
             self.evaluator.env.sim.reserve(self.env.sim.capacity)
         figures = self.evaluator.run(policies)
         each_s = (time.perf_counter() - started) / len(policies)
         rows = {int(row["epoch"]): row for row in read_rows(self.logdir)} if waiting else {}
-        for epoch, found in zip(waiting, figures, strict=False):
+        for epoch, scores in zip(waiting, figures, strict=False):
             state = states.pop(epoch)
-            late = self._record(epoch, found, partial(dict, state), parameter_hash(state["algorithm"]["modules"]))
+            late = self._record(epoch, scores, partial(dict, state), parameter_hash(state["algorithm"]["modules"]))
             row = rows.get(epoch)
             if row is None:
                 row = {key: state[key] for key in ("epoch", "env_steps", "seconds")}
@@ -310,11 +309,11 @@ class Trainer(Place):
         sizes, modules = Sizes(*state["sizes"]), state["algorithm"]["modules"]
         saved = SavedPolicy(path, self.config, epoch, state["env_steps"], "", modules, sizes)
         cuda = [self.env.device] if self.env.device.type == "cuda" else []
-        with torch.random.fork_rng(cuda):  # new networks draw weights, which training must not notice
+        with torch.random.fork_rng(cuda):  # drawing weights must not change training's random numbers
             return saved.on(self.evaluator.env)
 
     def _score_despite_failure(self) -> None:
-        """Training has failed; the policies before that get their scores all the same."""
+        """Score the waiting policies although training has failed."""
         try:
             self.score_waiting()
         except SimulationError as error:
@@ -323,12 +322,12 @@ class Trainer(Place):
     def _record(
         self, epoch: int, figures: dict[str, float], state: Callable[[], dict[str, Any]], parameters: str
     ) -> dict[str, float]:
-        """Keep the policy of an epoch if it is the best or a milestone. Returns the metrics of its evaluation.
+        """Save the policy of an epoch if it is the best or a milestone. Returns the metrics of its evaluation.
 
         Args:
-            epoch: the policy's.
-            figures: what its evaluation found.
-            state: everything needed to continue from there.
+            epoch: the policy's epoch.
+            figures: results of its evaluation.
+            state: the trial's complete state then.
             parameters: digest of the trial's modules then.
         """
         score = figures["score"]
@@ -363,8 +362,8 @@ class Trainer(Place):
         return {"epoch": self.epoch, "env_steps": self.env_steps, "seconds": self._seconds, **metrics}
 
     def _state(self) -> dict[str, Any]:
-        """Everything needed to continue from here."""
-        self._group.tell("state_dict")
+        """The trial's complete state."""
+        self._group.send_order("state_dict")
         return {
             "config": self.config.as_dict(),
             "epoch": self.epoch,
@@ -381,7 +380,7 @@ def precompile(config: Config, device: str, logdir: Path) -> None:
 
     It uses few worlds: kernels do not depend on their number, and the trial itself reports a device that is too small.
     """
-    TrialLog(logdir, config)  # a missing logger must be reported before the trials start
+    TrialLog(logdir, config)  # report a missing logger before trials start
     own = config.algorithm_settings.shortest()
     tiny = {
         "env.nworld": 2,
@@ -399,7 +398,7 @@ def precompile(config: Config, device: str, logdir: Path) -> None:
 
 
 def _changed_rounding(before: ExecutionConfig, now: ExecutionConfig) -> str:
-    """`execution.gpus 2, now 1; …`: the settings by which results now round otherwise; empty if none do."""
+    """`execution.gpus 2, now 1; …`: changed settings that change rounding; empty if none."""
     names = ("gpus", "threads", "deterministic", "solver_kernels", "jacobian")
     values = ((name, getattr(before, name), getattr(now, name)) for name in names)
     return "; ".join(f"execution.{name} {old}, now {new}" for name, old, new in values if old != new)

@@ -1,7 +1,7 @@
 """`python -m msk_ray.tune`: an experiment of many trials, one GPU each, with Ray Tune."""
 
 if __name__ == "__main__":
-    # Before the imports that take time to load.
+    # Set up before the slow imports.
     from msk_ray import signals
 
     signals.listen()
@@ -13,7 +13,7 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from msk_ray.cli import TERMINAL_LOG, outliving, run
+from msk_ray.cli import TERMINAL_LOG, run, surviving_closed_output
 from msk_ray.config import Config, combine, dump_yaml, parse_overrides
 from msk_ray.config.packages import require
 from msk_ray.errors import ClusterLost, ConfigError, MskRayError
@@ -63,17 +63,17 @@ def _trials_of(options: Options, space: Space) -> tuple[Space, list[Trial]]:
 
 
 def _resolve(space: Space) -> list[Trial]:
-    """The space's trials; none for a search, whose settings are checked as far as they are known.
+    """The space's trials; none for a search, whose known settings are validated instead.
 
     Raises:
-        ConfigError: also where a package is missing, which would otherwise be found after Ray has started.
+        ConfigError: the space is invalid, or a package is missing, which would otherwise show up after Ray has started.
     """
     if space.file.searches:
         require(search_class(space.file.search).packages, f"search: {space.file.search}")
         configs = extreme_configs(space)
         _check_all(configs, space)
         if "execution.gpus" in space.sampled:
-            raise ConfigError("execution.gpus: all trials of an experiment have as many GPUs each; write one number")
+            raise ConfigError("execution.gpus: all trials of an experiment have the same number: write one number")
         return []
     trials = resolve_trials(space)
     _check_all([trial.config for trial in trials], space)
@@ -82,19 +82,19 @@ def _resolve(space: Space) -> list[Trial]:
 
 
 def _check_all(configs: Sequence[Config], space: Space) -> None:
-    """Refuse trials for which this machine lacks a package, or that ask for more threads than they get."""
+    """Raise if a trial needs a package that this machine lacks, or more threads than it gets."""
     for config in configs:
         config.check_installed()
     check_threads(configs, space.file.resources)
 
 
 def _processes(space: Space, trials: list[Trial]) -> int:
-    """`execution.gpus` of all trials; there are none if a search suggests them."""
+    """`execution.gpus` of the trials, which are not known yet if a search suggests them."""
     return processes_of([trial.config for trial in trials] or extreme_configs(space))
 
 
 def _read_space(options: Options, extension: Mapping[str, Any]) -> Space:
-    """The space with the command line's changes merged in, checked again as a whole."""
+    """The space with the command line's changes merged in, validated again as a whole."""
     path = options.space
     data = read_space(path)
     changes = parse_overrides(options.overrides)
@@ -104,11 +104,11 @@ def _read_space(options: Options, extension: Mapping[str, Any]) -> Space:
             raise ConfigError(f"--set {key}: the space varies it; edit {path.name}, or set another key")
     if changes:
         overrides = data.get("overrides") or {}
-        if isinstance(overrides, dict):  # else the space is refused for that
+        if isinstance(overrides, dict):  # otherwise validation reports it
             data["overrides"] = combine(overrides, changes.items())
     if options.halve_worlds is not None:
         resources = data.get("resources") or {}
-        if isinstance(resources, dict):  # else the space is refused for that
+        if isinstance(resources, dict):  # otherwise validation reports it
             data["resources"] = {**resources, "halve_worlds_on_oom": options.halve_worlds}
     if options.seeds is not None:
         data["seeds"] = options.seeds
@@ -159,7 +159,7 @@ def _debug(options: Options, space: Space, trial: Trial) -> int:
         )
     )
     ending = run_trial(trial, folder, device, space.file.stop, make_trainer, hooks)
-    assert ending is not None  # nobody pauses it
+    assert ending is not None  # there is no pause hook
     print(f"{ending.outcome}: {printable(ending.why)}")
     return 1 if read_record(trial, folder).errored else 0
 
@@ -190,7 +190,7 @@ def _run(
         if not options.going_on:
             ownership = stack.enter_context(own(path, new=True, force=options.force))
             experiment = opening.create(path, space, trials, options.as_data())
-        stack.enter_context(outliving(path / TERMINAL_LOG))
+        stack.enter_context(surviving_closed_output(path / TERMINAL_LOG))
         try:
             with session.ray_session(options.address):
                 if options.address is not None:
@@ -206,7 +206,7 @@ def _run(
                 return _stopped(stop, experiment)
             write_report(experiment)
         except KeyboardInterrupt:
-            # There is nothing to save while Ray starts, kernels are compiled, or the report is written.
+            # While Ray starts, kernels are compiled or the report is written, there is nothing to save.
             if stop.signal is None or stop.insisted:
                 raise
             return _stopped(stop, experiment)
@@ -224,7 +224,7 @@ def _go_on(
 ) -> tuple[Experiment, list[Trial]]:
     """The experiment to continue, and its recorded trials; none if a search suggests them."""
     searching = space.file.searches
-    another_rule = recorded is not None and options.early_stopping != recorded.said("early_stopping")
+    another_rule = recorded is not None and options.early_stopping != recorded.remembered("early_stopping")
     if recorded is not None and not another_rule:
         opening.check_scheduler(recorded, space)
     experiment = opening.reopen(
@@ -234,22 +234,22 @@ def _go_on(
         None if recorded is None else lambda: _as_started(options, recorded),
     )
     if searching:
-        # Otherwise the manifest would contain them only at the end.
+        # A search's trials enter the manifest only at the end.
         experiment.set_trials(made.trial for made in recover(experiment, space))
     else:
-        # As recorded: with their original ids, and the epochs they were extended to.
+        # As recorded: with their original ids and extended epochs.
         trials = experiment.trials()
     experiment.clear_endings(options.retried)
     if another_rule:
         opening.write_space(experiment, space)
     if options.early_stopping is False:
         _name_stopped(experiment)
-    experiment.say(**options.remembered())
+    experiment.remember(**options.remembered())
     return experiment, trials
 
 
 def _as_started(options: Options, recorded: Experiment) -> list[Trial]:
-    """The trials that the command line which started an experiment would give now; none if it would be refused."""
+    """Trials that the experiment's original command line would give now; none if it would be refused."""
     original = options.as_started(recorded)
     try:
         return [] if original is None else _trials_of(original, _read_space(original, recorded.extension()))[1]
@@ -264,7 +264,7 @@ def _stopped(stop: StopRequest, experiment: Experiment) -> int:
 
 
 def _name_stopped(experiment: Experiment) -> None:
-    """Say that trials stopped before --no-early-stopping was given stay stopped, and how to continue them."""
+    """Print that trials stopped before --no-early-stopping stay stopped, and how to continue them."""
     endings = [read_ending(experiment.trial_folder(trial.id)) for trial in experiment.trials()]
     stopped = [ending.outcome for ending in endings if ending is not None and ending.cut]
     if stopped:

@@ -9,7 +9,7 @@ def check_reachable(address: str) -> None:
     """Check that something listens at HOST:PORT, because Ray itself would try for minutes. Other addresses pass.
 
     Raises:
-        OSError: nothing does.
+        OSError: nothing listens there.
     """
     host, _, port = address.rpartition(":")
     if "://" not in address and port.isdecimal():

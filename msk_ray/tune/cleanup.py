@@ -1,7 +1,7 @@
-"""Ends the processes of a Ray and removes its folder. As a program, it does so once the driver has ended, by whatever.
+"""Ends the processes of a Ray session and removes its folder. As a program, does so when the driver has ended.
 
-As a program it imports only the standard library. Its arguments are the folder, and the driver's process id; the driver
-holds the other end of its standard input.
+The program imports only the standard library. Its arguments are the folder and the driver's process id; it notices the
+driver's end, however it ends, because the driver holds the other end of its standard input.
 """
 
 import os
@@ -14,32 +14,32 @@ from contextlib import suppress
 from pathlib import Path
 
 KEEP = b"keep"
-"""What the driver writes to have the folder kept."""
+"""Message from the driver to keep the folder."""
 _POLL_S = 0.02
 
 
 def end_processes(folder: Path, spared: Collection[int], limit_s: float = 20.0) -> None:
-    """Kill all processes of a folder, and wait until they have ended: those in whose environment it is Ray's folder,
-    and those that have a file in it open for writing.
+    """Kill all processes of a session folder, and wait until they have ended: those with the folder in their
+    environment, and those with a file in it open for writing.
 
     Args:
         folder: Ray's folder.
-        spared: processes that are left alone.
-        limit_s: how long to wait at most [s]; a process may be held up in the kernel.
+        spared: processes not to kill.
+        limit_s: longest time to wait [s]; a process may hang in the kernel.
     """
     deadline = time.monotonic() + limit_s
     while time.monotonic() < deadline:
-        found = [pid for pid in _own_processes() if pid not in spared and _belongs(pid, folder)]
-        if not found:
+        pids = [pid for pid in _own_processes() if pid not in spared and _belongs(pid, folder)]
+        if not pids:
             return
-        for pid in found:
+        for pid in pids:
             _kill(pid, folder)
         time.sleep(_POLL_S)
 
 
 def _own_processes() -> Iterator[int]:
     for entry in Path("/proc").iterdir():
-        with suppress(OSError):  # it has ended meanwhile
+        with suppress(OSError):  # it has just ended
             if entry.name.isdigit() and entry.stat().st_uid == os.geteuid():
                 yield int(entry.name)
 
@@ -49,25 +49,25 @@ def _belongs(pid: int, folder: Path) -> bool:
 
     Some of Ray's processes write their name over their environment; their logs are open.
     """
-    with suppress(OSError):  # it has ended meanwhile
+    with suppress(OSError):  # it has just ended
         if f"RAY_TMPDIR={folder}".encode() in Path(f"/proc/{pid}/environ").read_bytes().split(b"\0"):
             return True
         for entry in Path(f"/proc/{pid}/fd").iterdir():
-            with suppress(OSError):  # it has been closed meanwhile
+            with suppress(OSError):  # it has just been closed
                 if os.readlink(entry).startswith(f"{folder}/") and _writes(pid, entry.name):
                     return True
     return False
 
 
 def _writes(pid: int, descriptor: str) -> bool:
-    """Whether a descriptor of a process is open for writing; somebody may be reading the logs."""
+    """Whether a process's descriptor is open for writing; mere readers of the logs do not count."""
     lines = Path(f"/proc/{pid}/fdinfo/{descriptor}").read_text().splitlines()
     facts = dict(line.split(":", 1) for line in lines if ":" in line)
     return int(facts["flags"], 8) & os.O_ACCMODE != os.O_RDONLY
 
 
 def _kill(pid: int, folder: Path) -> None:
-    """Kill a process that belongs to a folder, and no other one that has been given its number since."""
+    """Kill a process of a folder, but not another process that has reused its number."""
     with suppress(ProcessLookupError):
         handle = os.pidfd_open(pid)
         try:
@@ -78,8 +78,8 @@ def _kill(pid: int, folder: Path) -> None:
 
 
 def main() -> None:
-    """Wait for the driver's end, or for its word that it is time."""
-    # They are meant for the driver, whose end is the only reason to end.
+    """Wait until the driver ends or asks to clean up."""
+    # Signals are meant for the driver; only its end ends this process.
     for number in signal.valid_signals() - {signal.SIGKILL, signal.SIGSTOP, signal.SIGCHLD}:
         signal.signal(number, signal.SIG_IGN)
     folder, driver = Path(sys.argv[1]), int(sys.argv[2])

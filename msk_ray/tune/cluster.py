@@ -1,4 +1,5 @@
-"""`python -m msk_ray.tune.cluster`: have all nodes of a Ray cluster joined? For scripts that start one."""
+"""`python -m msk_ray.tune.cluster`: checks whether all nodes of a Ray cluster have joined, for scripts that start
+one."""
 
 import sys
 import time
@@ -47,7 +48,7 @@ def _alive(address: str) -> int:
     """The number of nodes alive.
 
     Raises:
-        OSError: nothing answers.
+        OSError: nothing answers at the address.
     """
     check_reachable(address)
     ray.init(address=address, logging_level="ERROR", log_to_driver=False)

@@ -1,4 +1,4 @@
-"""What the terminal shows while an experiment runs: a line per event, and from time to time an overview."""
+"""Terminal output while an experiment runs: a line per event, and a periodic overview."""
 
 import math
 import sys
@@ -15,7 +15,7 @@ from msk_ray.text import printable, printable_lines
 
 STATUS_INTERVAL_S = 30.0
 BEFORE_FIRST = "compiles kernels that are not in Warp's cache, records, then trains"
-"""What a trial does before its first evaluation."""
+"""What a trial is doing before its first evaluation."""
 
 
 @dataclass
@@ -29,13 +29,13 @@ class _Running:
 
 
 class Console:
-    """Prints what it is told about the trials. It decides nothing, and reads neither from Ray nor from disk."""
+    """Prints events of trials. Decides nothing, and reads neither Ray nor the disk."""
 
     def __init__(self, waiting: Iterable[Trial], concurrent: int) -> None:
         """
         Args:
-            waiting: trials still to run, as far as they are known.
-            concurrent: trials that run at the same time.
+            waiting: known trials that are still to run.
+            concurrent: number of trials that run at the same time.
         """
         self._waiting = {trial.id: trial for trial in waiting}
         self._environments = dict.fromkeys(trial.environment for trial in self._waiting.values())
@@ -44,16 +44,16 @@ class Console:
         self._begun: set[str] = set()
         self._ended = 0
         self._bests: dict[str, tuple[float, Trial]] = {}
-        """The best score of each trial that has reported one, and the trial."""
+        """(best score, trial) of each trial that has reported a score."""
         self._attempts: dict[str, Attempt] = {}
         self._seconds_per_epoch: dict[str, float] = {}
         self._start = time.monotonic()
         self._last_status = self._start
-        # Kept, because Ray's own output is redirected while trials run.
+        # The terminal, stored because sys.stdout is redirected while trials run.
         self._out = sys.stdout
 
     def say(self, text: str) -> None:
-        """Print some lines, with the time since the start."""
+        """Print lines with the time since the start."""
         shown = printable_lines(text)
         print(f"[{format_duration(time.monotonic() - self._start):>6}] {shown}", file=self._out, flush=True)
 
@@ -73,13 +73,13 @@ class Console:
         self._environments.setdefault(trial.environment)
         run.epoch, run.score = epoch, score
         if run.first_epoch is None:
-            # The speed counts from the first result: the time before includes start-up and compilation.
+            # Measure speed from the first result on; before that is start-up and compilation.
             run.first_epoch, run.since = epoch, time.monotonic()
         elif epoch > run.first_epoch:
             self._seconds_per_epoch[trial.id] = (time.monotonic() - run.since) / (epoch - run.first_epoch)
         run.best = max(run.best, best)
         if not math.isfinite(run.best):
-            return  # no score has been a number yet
+            return  # no finite score yet
         before = self._best_in(trial.environment)
         if trial.id not in self._bests or run.best > self._bests[trial.id][0]:
             self._bests[trial.id] = run.best, trial
@@ -89,15 +89,15 @@ class Console:
             self.say(f"{trial.id} best so far{where}: score {run.best:.5g}{when}{self._suffix(trial)}")
 
     def retried(self, trial: Trial, why: str) -> None:
-        """A trial's process has ended early, and another one will take its place."""
+        """A trial's process has died and will be replaced."""
         self._running.pop(trial.id, None)
         self._waiting[trial.id] = trial
         self.say(f"{trial.id} {why}; retrying from its newest checkpoint")
 
     def attempted_again(self, trial: Trial, attempt: Attempt) -> None:
-        """A trial is to have another attempt."""
+        """A trial will have another attempt."""
         self._running.pop(trial.id, None)
-        # Its scores with all its worlds are set aside.
+        # Scores with all its worlds no longer count.
         self._bests.pop(trial.id, None)
         self._seconds_per_epoch.pop(trial.id, None)
         self._waiting[trial.id] = trial
@@ -118,11 +118,11 @@ class Console:
         self.say(f"{trial.id} error: {why}; see {where}{self._suffix(trial)}")
 
     def left(self, trial: Trial) -> None:
-        """A trial's process has ended and the trial has not."""
+        """A trial's process has ended, but not the trial."""
         self._running.pop(trial.id, None)
 
     def tick(self) -> None:
-        """Print the overview if the last one was long ago."""
+        """Print the overview if it is due."""
         if time.monotonic() - self._last_status >= STATUS_INTERVAL_S:
             self._last_status = time.monotonic()
             self.say(self.status())
@@ -156,13 +156,13 @@ class Console:
         return "\n".join(lines)
 
     def _best_in(self, environment: str) -> tuple[float, Trial] | None:
-        """The best score in an environment and its trial: scores of different ones cannot be compared."""
-        found = [best for best in self._bests.values() if best[1].environment == environment]
-        return max(found, key=lambda best: best[0], default=None)
+        """The best score in an environment, and its trial."""
+        bests = [best for best in self._bests.values() if best[1].environment == environment]
+        return max(bests, key=lambda best: best[0], default=None)
 
     def _name(self, trial: Trial) -> str:
         return f"{printable(trial.variant)} seed={trial.seed}{self._suffix(trial)}"
 
     def _suffix(self, trial: Trial) -> str:
-        """What distinguishes the trial's attempt, in brackets."""
+        """The trial's attempt in parentheses, if it is not the first."""
         return self._attempts.get(trial.id, FIRST).suffix

@@ -1,4 +1,4 @@
-"""What a trial runs on: GPUs if there are any, unless something else was requested."""
+"""Devices of trials: GPUs if there are any, unless requested otherwise."""
 
 import math
 import time
@@ -21,16 +21,16 @@ class Placement:
 
     @property
     def device(self) -> str:
-        """Name of the device inside the trial's process, which sees only its own GPU."""
+        """Device name inside the trial's process, which sees only its own GPUs."""
         return "cuda:0" if self.gpus else "cpu"
 
     def concurrent(self, total_gpus: float, total_cpus: float, limit: int | None) -> int:
         """Number of trials that fit at the same time, at least one."""
-        # A trial that needs its whole share on one GPU cannot use what is left over on two.
+        # A trial cannot combine leftover shares of several GPUs.
         if self.gpus >= 1:
             by_gpu = total_gpus // self.gpus
         else:
-            # 1 // 0.2 is 4: a fifth has no exact binary form.
+            # The tolerance is for rounding: 1 // 0.2 is 4.
             by_gpu = total_gpus * int(1 / self.gpus + 1e-6) if self.gpus else float("inf")
         fitting = max(1, int(min(by_gpu, total_cpus // self.cpus)))
         return fitting if limit is None else min(fitting, limit)
@@ -39,18 +39,18 @@ class Placement:
 def choose_placement(
     resources: ResourcesSpec, gpus_per_trial: float | None, cpu: bool, gpus: int, processes: int = 1
 ) -> Placement:
-    """Where trials run.
+    """Decide what each trial runs on.
 
     Args:
         resources: the space's section.
-        gpus_per_trial: what the command line requests explicitly.
-        cpu: whether it requests CPUs.
-        gpus: number of GPUs available, where a trial has several of one host.
+        gpus_per_trial: --gpus-per-trial, if given.
+        cpu: whether --cpu is given.
+        gpus: number of GPUs available; for trials with several GPUs, on one host.
         processes: `execution.gpus` of the trials.
 
     Raises:
-        ConfigError: the request makes no sense.
-        DeviceError: there are not enough GPUs for it.
+        ConfigError: the request is contradictory.
+        DeviceError: there are not enough GPUs.
     """
     if gpus_per_trial is not None:
         if cpu:
@@ -79,19 +79,19 @@ def processes_of(configs: Iterable[Config]) -> int:
     """`execution.gpus` of an experiment's trials.
 
     Raises:
-        ConfigError: it is not the same in all of them.
+        ConfigError: it differs between trials.
     """
-    found = sorted({config.execution.gpus for config in configs})
-    if len(found) > 1:
+    counts = sorted({config.execution.gpus for config in configs})
+    if len(counts) > 1:
         raise ConfigError(
-            f"execution.gpus is {' and '.join(map(str, found))}: trials of one experiment have as many GPUs each; "
-            "start an experiment for each number"
+            f"execution.gpus is {' and '.join(map(str, counts))}: all trials of an experiment have the same "
+            "number; start an experiment for each"
         )
-    return found[0] if found else 1
+    return counts[0] if counts else 1
 
 
 def check_threads(configs: Iterable[Config], resources: ResourcesSpec) -> None:
-    """Refuse trials that use more threads than they have cores.
+    """Raise if trials use more threads than they have cores.
 
     Raises:
         ConfigError: the message says what to write.
@@ -107,11 +107,11 @@ def check_threads(configs: Iterable[Config], resources: ResourcesSpec) -> None:
 def wait_for_memory(
     share: float, free_share: Callable[[], float], limit_s: float, pause: Callable[[float], None] = time.sleep
 ) -> float | None:
-    """Wait for the GPU memory of a process that has died: drivers give it back seconds later.
+    """Wait until a dead process's GPU memory is free, which takes drivers some seconds.
 
     Args:
         share: the trial's share of the GPU's memory.
-        free_share: returns the share that is free now.
+        free_share: returns the share of the memory that is free now.
         limit_s: how long to wait [s].
         pause: sleeps for a number of seconds.
 
@@ -119,7 +119,7 @@ def wait_for_memory(
         None once nearly all of `share` is free; otherwise the share that is free after `limit_s`.
     """
     for _ in range(math.ceil(limit_s / _PAUSE_S)):
-        # Every process holds a few hundred megabytes for its own context.
+        # Every process needs a few hundred megabytes for its own CUDA context.
         if free_share() >= 0.9 * share:
             return None
         pause(_PAUSE_S)
@@ -128,7 +128,7 @@ def wait_for_memory(
 
 
 def local_gpus() -> int:
-    """GPUs of this machine that CUDA can use."""
+    """Number of this machine's GPUs that CUDA can use."""
     import torch
 
     return torch.cuda.device_count()

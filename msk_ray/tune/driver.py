@@ -33,7 +33,7 @@ from msk_ray.experiment.trial import Trial, by_environment
 from msk_ray.progress import announce, format_duration
 from msk_ray.signals import StopRequest, listening
 from msk_ray.sweep.budget import extreme_configs, longest_budget
-from msk_ray.sweep.operators import Listed
+from msk_ray.sweep.operators import NamedValues
 from msk_ray.sweep.rules.early_stopping import Pruner
 from msk_ray.sweep.rules.per_environment import PerEnvironment
 from msk_ray.sweep.rules.population import PopulationBasedTraining
@@ -44,9 +44,9 @@ from msk_ray.sweep.space import Space
 from msk_ray.sweep.trials import base_settings
 from msk_ray.tune.console import Console
 from msk_ray.tune.devices import Placement
+from msk_ray.tune.experiment_watch import ExperimentWatch, remove_remains
 from msk_ray.tune.gauges import StateGauge
 from msk_ray.tune.interrupts import run_in_thread
-from msk_ray.tune.presence import Presence, remove_remains
 from msk_ray.tune.queue import Identify, Suggestions, TrialList
 from msk_ray.tune.ray_watch import RayWatch
 from msk_ray.tune.schedulers import METRIC, Population, PruningScheduler
@@ -58,7 +58,7 @@ from msk_ray.tune.worker_prestart import WorkerPrestart, nodes_for
 
 @dataclass(frozen=True)
 class Plan:
-    """Everything that determines how an experiment's trials are run."""
+    """Everything that determines how an experiment's trials run."""
 
     experiment: Experiment
     space: Space
@@ -70,25 +70,25 @@ class Plan:
     precompile: Precompile | None = precompile
     """Compiles a config's kernels on a node before trials start; None if there is nothing to compile."""
     prestart: bool = True
-    """Whether processes are kept ready for the next trials."""
+    """Whether to keep processes ready for the next trials."""
     ownership: Ownership | None = None
-    """Ownership of the experiment; None if nobody else can know of it."""
+    """Ownership of the experiment; None for one that no other process can know of."""
 
     def guard(self) -> None:
         """Check that this driver still owns the experiment.
 
         Raises:
-            OwnershipLost: it does not.
+            OwnershipLost: another process does.
         """
         if self.ownership is not None:
             self.ownership.check()
 
 
 def run_trials(plan: Plan) -> bool:
-    """Run the trials that have not ended yet. Needs a Ray session.
+    """Run all trials that have not ended yet. Needs a Ray session.
 
     Returns:
-        False if a request to stop ended it early; the experiment can be resumed.
+        False if it was asked to stop and ended early; the experiment can be resumed.
 
     Raises:
         StorageFailure: the disk is full or gone; the experiment can be resumed once it is back.
@@ -139,7 +139,7 @@ def run_trials(plan: Plan) -> bool:
         )
         _fit(plan, job, supervisor, stop, watch, remaining, suggested)
         if not plan.trials:
-            # A search suggests trials as it goes; they enter the manifest once they are known.
+            # Add the trials that a search has suggested to the manifest.
             experiment.set_trials(supervisor.started)
         return not stop
 
@@ -149,7 +149,7 @@ def _journal(plan: Plan) -> SchedulerLog:
 
 
 def _finish_pruning(plan: Plan) -> None:
-    """Write the ending of a trial that the rule had just stopped when the driver died."""
+    """Write the ending of a trial that the rule stopped just before the driver died."""
     spec = plan.space.file.scheduler
     reports, damages = _journal(plan).read()
     for line in describe_damages(damages, plan.experiment.path):
@@ -160,7 +160,7 @@ def _finish_pruning(plan: Plan) -> None:
     folder = plan.experiment.trial_folder(reports[-1].trial)
     if ending is None or read_ending(folder) is not None:
         return
-    # The scores of one attempt do not end another.
+    # Scores of an earlier attempt must not end this one.
     if reports[-1].attempt == read_attempt(folder).number:
         write_ending(folder, ending)
 
@@ -174,17 +174,17 @@ def _fit(
     remaining: list[Trial],
     suggested: list[SearchTrial],
 ) -> None:
-    """Run the trials that remain, and let all that are told of them do their part.
+    """Run the remaining trials, with all callbacks.
 
     Raises:
-        StorageFailure: the disk is full or gone, also where only a trial has noticed.
+        StorageFailure: the disk is full or gone, even if only a trial has noticed.
         ClusterLost: Ray has died or does not answer.
         Exception: whatever else ends Tune's loop.
     """
     file = plan.space.file
     resources = {"cpu": plan.placement.cpus} | ({"gpu": plan.placement.gpus} if plan.placement.gpus else {})
     identify = partial(_identify, job)
-    # A search ends by itself; a list of trials is used once as the parameter space.
+    # A search decides its number of samples; a list of trials is a parameter space to run once.
     search: Any
     if file.searches:
         search, samples = _suggestions(plan, suggested, identify), -1
@@ -209,16 +209,16 @@ def _fit(
             name="tune",
             storage_path=str(plan.experiment.path),
             verbose=0,
-            # The supervisor comes first: it writes the endings that only the driver knows.
+            # The supervisor comes first, because it writes the endings that only the driver knows.
             callbacks=[
                 supervisor,
                 states,
-                Presence(plan.experiment, watch.guarding(plan.guard)),
+                ExperimentWatch(plan.experiment, watch.guarding(plan.guard)),
                 *([ahead] if plan.prestart else []),
             ],
             stop=_StopWhen(supervisor),
             failure_config=tune.FailureConfig(max_failures=file.resources.max_failures),
-            # None are deleted: only a population has them, and another member may be about to take one over.
+            # Keep all: only populations have checkpoints here, and another member may be about to read one.
             checkpoint_config=tune.CheckpointConfig(num_to_keep=None),
         ),
     )
@@ -231,7 +231,7 @@ def _fit(
         remove_remains(plan.experiment)
         if watch.lost is not None:
             raise watch.lost from error
-        # The driver may meet a full disk before any trial does.
+        # The driver may be the first to notice a full disk.
         failure = supervisor.storage_failure or storage_failure(error) or plan.experiment.lost()
         if failure is None:
             raise
@@ -242,7 +242,7 @@ def _fit(
 
 
 def _scheduler(plan: Plan, job: Job, supervisor: Supervisor) -> Population | PruningScheduler:
-    """The rule that compares trials, in the state that the recorded evaluations leave it in."""
+    """The rule that compares trials, after replaying the recorded evaluations."""
     spec = plan.space.file.scheduler
     if isinstance(spec, PopulationBasedTraining):
         return Population(spec, _budget(plan), plan.space.sampled, plan.space.file.sample_seed)
@@ -254,12 +254,12 @@ def _scheduler(plan: Plan, job: Job, supervisor: Supervisor) -> Population | Pru
 
 
 def _identify(job: Job, config: Mapping[str, Any]) -> str:
-    # Until a trial starts, Tune keeps placeholders where the other values of a listed one will be.
+    # Until a trial starts, Tune keeps placeholders for values of a list.
     return config["id"] if "id" in config else job.trial_of(config).id
 
 
 def _suggestions(plan: Plan, suggested: list[SearchTrial], identify: Identify) -> Suggestions:
-    """The space's search, told the results of its suggestions so far."""
+    """The space's search, with the results of its suggestions so far."""
     begun, scored = [], []
     for earlier in suggested:
         record = read_record(earlier.trial, plan.experiment.trial_folder(earlier.trial.id))
@@ -268,7 +268,7 @@ def _suggestions(plan: Plan, suggested: list[SearchTrial], identify: Identify) -
         else:
             scored.append((earlier.params, record))
     file = plan.space.file
-    # With the original seed, the original draws would be repeated.
+    # The original seed would repeat the original draws.
     seed = file.sample_seed + len(suggested)
     given = (file.objectives,) if file.objectives else ()
     search = search_class(file.search)(plan.space.sampled, seed, *given)
@@ -289,15 +289,15 @@ def _advised(failure: StorageFailure) -> StorageFailure:
 
 @contextmanager
 def _log_to(path: Path) -> Iterator[None]:
-    """Redirect Ray's logs, output and warnings in this process to a file; the console says what matters."""
+    """Redirect Ray's logs, output and warnings in this process to a file; the console prints what matters."""
     logger = logging.getLogger("ray")
     handlers, level = logger.handlers, logger.level
     file = logging.FileHandler(path, encoding="utf-8")
     file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     logger.handlers = [file]
     logger.setLevel(logging.INFO)
-    # Ray warns about settings chosen here on purpose, such as a new process for each trial, and prints notices of dead
-    # workers without using a logger.
+    # Ray warns about settings chosen on purpose, such as a new process for each trial, and prints messages about dead
+    # workers without a logger.
     with warnings.catch_warnings(), path.open("a", encoding="utf-8") as log, redirect_stdout(log), redirect_stderr(log):
         warnings.filterwarnings("ignore", category=UserWarning, module=r"ray\.")
         try:
@@ -309,7 +309,7 @@ def _log_to(path: Path) -> Iterator[None]:
 
 
 class _StopWhen(Stopper):
-    """Ends the whole experiment once a request to stop has been carried out."""
+    """Ends the experiment once all trials have saved themselves after a request to stop."""
 
     def __init__(self, supervisor: Supervisor) -> None:
         self._supervisor = supervisor
@@ -323,10 +323,10 @@ class _StopWhen(Stopper):
 
 def _param_space(job: Job, remaining: list[Trial]) -> dict[str, Any]:
     if not job.trials:
-        return {}  # the search gives everything
+        return {}  # the search supplies everything
     if not job.population:
         return {"id": tune.grid_search([trial.id for trial in remaining])}
-    # The settings of a population's members change: each starts with those last recorded in its folder.
+    # Settings of a population's members change: each starts with those last recorded in its folder.
     params = {trial.id: _current_params(job, trial) for trial in remaining}
     return {
         "id": tune.grid_search(list(params)),
@@ -349,8 +349,8 @@ def _current_params(job: Job, trial: Trial) -> dict[str, Any]:
 
 
 def _pruner(plan: Plan) -> Pruner:
-    """The rule that ends trials, without any evaluations yet; for several environments, one for each with its own
-    rungs."""
+    """The rule that ends trials, without evaluations yet; with several environments, one rule with its own rungs for
+    each."""
     spec = plan.space.file.scheduler
     groups = by_environment(plan.trials, lambda trial: trial.environment)
     if len(groups) < 2:
@@ -360,38 +360,38 @@ def _pruner(plan: Plan) -> Pruner:
 
 
 def _budget(plan: Plan, trials: Sequence[Trial] | None = None) -> float:
-    """The longest possible duration of a trial, of all of them if none are given, in the scheduler's unit of time;
-    infinite if no rule asks for it."""
+    """The largest budget of a trial in the scheduler's unit of time, over all trials if none are given; infinite if no
+    rule needs it."""
     scheduler = plan.space.file.scheduler
     if not (scheduler.ends_trials or scheduler.exchanges):
-        return math.inf  # an algorithm from outside need not say how many env steps it takes
+        return math.inf  # a user's algorithm need not define its number of env steps
     configs = [trial.config for trial in trials or plan.trials] or extreme_configs(plan.space)
     return longest_budget(plan.space.file, configs)
 
 
 def _first_suggestion(job: Job) -> Trial:
-    """A placeholder, with the same model, for the trials that a search will suggest."""
+    """A stand-in with the same model for the trials that a search will suggest."""
     params = {
-        key: op.extremes()[0].label if isinstance(op, Listed) else op.extremes()[0].value
+        key: op.extremes()[0].label if isinstance(op, NamedValues) else op.extremes()[0].value
         for key, op in job.space.sampled.items()
     }
     return job.trial_of({"params": params})
 
 
-def with_kernels_of_their_own(trials: Iterable[Trial]) -> list[Trial]:
-    """One trial for each model and algorithm, which launch kernels of their own, and for each set of loggers: those
-    that are not there are found out along the way."""
-    found: dict[str, Trial] = {}
+def one_per_kernel_set(trials: Iterable[Trial]) -> list[Trial]:
+    """One trial for each combination of model, algorithm and loggers: different models and algorithms need different
+    kernels, and missing loggers are reported early."""
+    representatives: dict[str, Trial] = {}
     for trial in trials:
         c = trial.config
         key = (c.env.name, c.physics, c.evaluation.variant, c.algorithm.name, c.execution)
-        found.setdefault(repr(key), trial)
-    return list(found.values())
+        representatives.setdefault(repr(key), trial)
+    return list(representatives.values())
 
 
 def _precompile(plan: Plan, trials: Sequence[Trial]) -> None:
     """Compile the kernels of every distinct model once on every node, so that trials find them in Warp's cache."""
-    models = with_kernels_of_their_own(trials)
+    models = one_per_kernel_set(trials)
     nodes = nodes_for(plan.placement)
     started = time.monotonic()
     print(f"compiling kernels of {len(models)} model(s) on {len(nodes)} node(s) ...", flush=True)

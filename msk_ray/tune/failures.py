@@ -1,4 +1,4 @@
-"""What an exception in a trial says about it: where it comes from, and whether another process would meet it again."""
+"""Classifies exceptions of trials: where they come from, and whether a retry would meet them again."""
 
 import re
 import sysconfig
@@ -12,16 +12,16 @@ _PACKAGE = Path(msk_ray.__file__).resolve().parent
 _LIBRARIES = tuple(Path(sysconfig.get_path(name)).resolve() for name in ("purelib", "platlib"))
 _PYTHON = Path(sysconfig.get_path("stdlib")).resolve()
 _LASTING = (FileNotFoundError, FileExistsError, IsADirectoryError, NotADirectoryError, PermissionError)
-"""Errors of files that stay, if the user's own code has named the file."""
+"""File errors that a retry would meet again, if the user's own code has named the file."""
 _DEVICE_ERRORS = {"AcceleratorError", "DistError", "OutOfMemoryError"}
-"""Classes of torch, which only trials import."""
+"""Names of torch's exception classes; only trials import torch."""
 _FRAME = re.compile(r'File "(.+)", line (\d+), in (\S+)')
 _DEVICE_WORDS = re.compile(r"\b(CUDA|cuBLAS|cuDNN|NCCL|NVML)\b", re.IGNORECASE)
 
 
 def repeats(error: BaseException) -> bool:
-    """Whether a new process would most likely meet an exception again: all but those of the operating system, of a
-    device, of other processes and of Ray. Training is deterministic."""
+    """Whether a new process would most likely meet an exception again. Training is deterministic, so all but those of
+    the operating system, devices, other processes and Ray."""
     classes = type(error).__mro__
     if isinstance(error, MemoryError) or any(of.__module__.partition(".")[0] == "ray" for of in classes):
         return False
@@ -36,7 +36,7 @@ def repeats(error: BaseException) -> bool:
 
 
 def described(error: BaseException) -> str:
-    """An exception on one line, with file and line: of the user's own code, if that was running."""
+    """An exception on one line, with file and line, if possible in the user's own code."""
     if isinstance(error, SystemExit):
         text = f"sys.exit({error.code!r}) was called"
     else:
@@ -45,15 +45,15 @@ def described(error: BaseException) -> str:
     frames = list(_frames(error))
     own = [frame for frame in frames if _is_own(frame)]
     package = [frame for frame in frames if _PACKAGE in Path(frame.filename).parents]
-    for found in (own, package, frames):
-        if found:
-            frame = found[-1]
+    for candidates in (own, package, frames):
+        if candidates:
+            frame = candidates[-1]
             return f"{text} ({Path(frame.filename).name}:{frame.lineno}, in {frame.name})"
     return text
 
 
 def _frames(error: BaseException) -> Iterator[traceback.FrameSummary]:
-    """The calls that led to an exception, the outermost first; those in another process are in its notes."""
+    """The call stack of an exception, outermost first; a part in another process is in its notes."""
     yield from traceback.extract_tb(error.__traceback__)
     for note in getattr(error, "__notes__", ()):
         for filename, line, name in _FRAME.findall(note):
@@ -61,7 +61,7 @@ def _frames(error: BaseException) -> Iterator[traceback.FrameSummary]:
 
 
 def _is_own(frame: traceback.FrameSummary) -> bool:
-    """Whether a frame is of neither this package, nor a library, nor Python itself."""
+    """Whether a frame is neither in this package, nor in a library, nor in Python itself."""
     path = Path(frame.filename)
     return path.is_absolute() and not _in_python(frame) and not any(f in path.parents for f in (_PACKAGE, *_LIBRARIES))
 

@@ -25,10 +25,10 @@ from msk_ray.text_table import text_table
 
 
 def finish(experiment: Experiment) -> int:
-    """Write and print the results that are on disk.
+    """Write and print the results on disk.
 
     Returns:
-        How many trials ended in an error.
+        Number of trials that ended in an error.
 
     Raises:
         StorageFailure: the disk is full or gone, or the experiment has disappeared.
@@ -53,7 +53,7 @@ def finish(experiment: Experiment) -> int:
     if (note := reduced_note(records)) is not None:
         print(f"\n{note}")
     for environment, best in best_records(records).items():
-        assert best.best is not None  # or it would not be the best
+        assert best.best is not None  # every best trial has an evaluation
         where = f" in {environment}" if len(groups) > 1 else ""
         name = f"{best.trial.variant} seed={best.trial.seed}{best.attempt.suffix}{where}"
         print(f"\nbest trial   {best.trial.id}: {printable(name)}, score {best.best.score:.5g}")
@@ -64,10 +64,10 @@ def finish(experiment: Experiment) -> int:
 
 
 def write_report(experiment: Experiment) -> None:
-    """Have `python -m msk_ray.report` write the experiment's page and print its path.
+    """Run `python -m msk_ray.report`, which writes the experiment's page and prints its path.
 
-    It runs in a separate process, because it draws with OpenGL and simulates the best policy, and a failure there must
-    not affect the results above.
+    A separate process, because the report draws with OpenGL and simulates the best policy, and its failure must not
+    affect the results above.
     """
     announce("writing the report")
     command = [sys.executable, "-m", "msk_ray.report", str(experiment.path)]

@@ -20,20 +20,20 @@ FIGURES = {
     "msk_ray_env_steps_per_s": STEPS_PER_SECOND,
     "msk_ray_episode_return": EPISODE_RETURN,
 }
-"""Gauge → metric. Ray serves a gauge as `ray_` and its name."""
+"""Gauge → metric. Ray adds `ray_` to a gauge's name."""
 STATE = "msk_ray_trial_state"
-"""1 for a trial's current state (`waiting`, `running` or how it ended); an earlier state goes to 0 and is dropped."""
+"""1 for a trial's current state (`waiting`, `running` or its outcome); earlier states are set to 0 and dropped."""
 
 
 REPEAT_S = 5.0
-"""Interval at which every value is set again [s]."""
+"""Interval at which values are set again [s]."""
 
 
-class Kept:
-    """Values of gauges that stay until they are dropped.
+class LastingGauges:
+    """Gauge values that last until they are dropped.
 
-    Ray exports a value once after it was set, and stops serving it if it is not set again within 20 s: a lasting state,
-    or a score between two evaluations, would disappear. Therefore a thread sets every value again periodically.
+    Ray stops serving a value that is not set again within 20 s, so a lasting state, or a score between evaluations,
+    would disappear. A thread therefore sets every value again periodically.
     """
 
     def __init__(self) -> None:
@@ -78,7 +78,7 @@ class TrialGauges:
 
     def __init__(self, experiment: str, trial: Trial) -> None:
         tags = _tags(experiment, trial)
-        self._kept = Kept()
+        self._values = LastingGauges()
         self._gauges = {}
         for name, metric in FIGURES.items():
             gauge = Gauge(name, description=metric, tag_keys=tuple(tags))
@@ -89,29 +89,29 @@ class TrialGauges:
         """Set the values of a row of metrics."""
         for metric, gauge in self._gauges.items():
             if metric in row:
-                self._kept.set(gauge, row[metric])
+                self._values.set(gauge, row[metric])
 
     def close(self) -> None:
-        """No longer show anything."""
-        self._kept.close()
+        """Drop all values."""
+        self._values.close()
 
 
 class StateGauge(Callback):
-    """What each trial is doing, set by the driver: a trial's process cannot say that it has died."""
+    """Each trial's state, set by the driver, because a dead process cannot report its death."""
 
     def __init__(
         self, experiment: Experiment, waiting: Iterable[Trial], trial_of: Callable[[dict[str, Any]], Trial]
     ) -> None:
         """
         Args:
-            experiment: where endings are read; they must be written before this callback is called.
+            experiment: to read endings from; they must be written before this callback is called.
             waiting: trials still to run.
             trial_of: the trial that a Tune config stands for.
         """
         self._experiment = experiment
         self._trial_of = trial_of
         self._states: dict[str, str] = {}
-        self._kept = Kept()
+        self._values = LastingGauges()
         self._gauge = Gauge(
             STATE,
             description="1 at a trial's present state",
@@ -125,8 +125,8 @@ class StateGauge(Callback):
         return {}
 
     def close(self) -> None:
-        """No longer show anything."""
-        self._kept.close()
+        """Drop all values."""
+        self._values.close()
 
     def on_trial_start(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         self._set(self._trial_of(trial.config), "running")
@@ -146,12 +146,12 @@ class StateGauge(Callback):
         tags = _tags(self._experiment.name, trial)
         before = self._states.get(trial.id)
         if before is not None:
-            self._kept.drop(self._gauge, tags | {"state": before})
-        self._kept.set(self._gauge, 1, tags | {"state": state})
+            self._values.drop(self._gauge, tags | {"state": before})
+        self._values.set(self._gauge, 1, tags | {"state": state})
         self._states[trial.id] = state
 
 
 def _tags(experiment: str, trial: Trial) -> dict[str, str]:
-    # Ray allows no other characters in tags.
+    # Ray only allows ASCII in tags.
     variant = printable(trial.variant).replace("→", "->").encode("ascii", "backslashreplace").decode()
     return {"experiment": experiment, "trial": trial.id, "variant": variant, "seed": str(trial.seed)}

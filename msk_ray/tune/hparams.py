@@ -8,26 +8,25 @@ from msk_ray.experiment.trial import Trial
 from msk_ray.metrics import BEST_SCORE, SCORE
 
 METRICS = (BEST_SCORE, SCORE, "progress/env_steps")
-"""Scalars of the trial that the table shows with its settings."""
+"""Scalars that the table shows beside a trial's settings."""
 
 
 FILE = "events.out.tfevents.0000000000.hparams"
-"""Event file of the settings. TensorBoard reads the files of a folder in the order of their names, which begin with the
-second they were made, and follows the last one. Zero puts the settings before the scalars: within one second, the
-numbers at the end of usual names decide, as text, and 10 comes before 9."""
+"""Event file of the settings. TensorBoard reads a folder's files in order of their names, which begin with the time of
+their creation, and follows the last one. Time 0 puts the settings before the scalars."""
 
 
 def log_hparams(folder: Path, trial: Trial) -> None:
-    """Write a trial's settings into an event file of its folder; the scores come from the trial's own scalars.
+    """Write a trial's settings to an event file in its folder; scores come from the trial's scalars.
 
-    A trial without the logger `tensorboard` has no such file. A further attempt writes the same file.
+    Does nothing for trials without the logger `tensorboard`. A further attempt overwrites the file.
 
     Raises:
         StorageFailure: the disk is full or the folder not writable.
     """
     if "tensorboard" not in trial.config.execution.loggers:
         return
-    # These load torch, which importing this module should not.
+    # imported here, because they load torch
     from tensorboard.compat.proto.event_pb2 import Event
     from tensorboard.summary.writer.record_writer import RecordWriter
     from torch.utils.tensorboard.summary import hparams
@@ -48,9 +47,9 @@ def log_hparams(folder: Path, trial: Trial) -> None:
 
 
 def hparams_of(trial: Trial) -> dict[str, float | str]:
-    """Seed and changed parameters by name: numbers unchanged, everything else as text."""
-    found: dict[str, float | str] = {"seed": trial.seed}
+    """Seed and varied parameters by name: numbers unchanged, everything else as text."""
+    hparams: dict[str, float | str] = {"seed": trial.seed}
     for key, text in trial.changed.items():
         value = trial.values.get(key)
-        found[key] = value if isinstance(value, int | float) else text
-    return found
+        hparams[key] = value if isinstance(value, int | float) else text
+    return hparams

@@ -1,7 +1,7 @@
-"""Signals and Ray: only the driver receives requests to stop, whatever Ray does in the same process.
+"""Signals and Ray: only the driver handles requests to stop, whatever Ray does in the same process.
 
-Ray's daemons and the trials' processes receive none of these signals, even if one is sent to the whole process group or
-control group (`timeout`, systemd, `kill -- -PGID`): trials are asked to save themselves, and Ray ends when they have.
+Ray's daemons and the trials' processes ignore these signals, even if one is sent to the whole process or control group
+(`timeout`, systemd, `kill -- -PGID`): the driver asks trials to save themselves, and ends Ray when they have.
 """
 
 import signal
@@ -18,12 +18,12 @@ from msk_ray.tune.ray_watch import RayWatch
 from msk_ray.tune.session_folder import SessionFolder
 
 KEPT_FROM_CHILDREN = {signal.SIGHUP, signal.SIGTERM, signal.SIGUSR1, signal.SIGTSTP}
-"""Blocked in Ray's processes, which inherit that; Ray itself does the same with SIGINT. SIGTSTP (Ctrl-Z) stops the
-driver alone: a trial that is stopped cannot be told from one that hangs."""
+"""Blocked in Ray's processes, which inherit the mask; Ray itself blocks SIGINT that way. SIGTSTP (Ctrl-Z) must stop the
+driver alone: a suspended trial looks like one that hangs."""
 _TICK_S = 1.0
 _POLL_S = 0.05
 _LAST_WORD_S = 180.0
-"""How long Tune's loop may take to end, after a request to stop [s]; more than trials get to save themselves."""
+"""How long Tune's loop may take to end after a request to stop [s]; longer than trials may take to save themselves."""
 _SHUTDOWN_LIMIT_S = 30.0
 """How long `ray.shutdown` may take [s]."""
 _LAST_POLL_S = 2.0
@@ -31,11 +31,11 @@ _LAST_POLL_S = 2.0
 
 @contextmanager
 def starting_ray() -> Iterator[None]:
-    """For `ray.init`: the processes it starts do not receive the signals above, and this program's handlers are
-    restored. It is not interrupted: an exception between a `fork` and its end can leave a lock behind, or be lost.
+    """Context for `ray.init`: the processes it starts block the signals above, and this program's handlers are restored
+    afterwards. Signals are deferred, because an exception during a `fork` can leave a lock behind, or be lost.
 
     Raises:
-        KeyboardInterrupt: this program was asked to stop in the meantime.
+        KeyboardInterrupt: this program was asked to stop meanwhile.
     """
     stop = current()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, KEPT_FROM_CHILDREN)
@@ -43,37 +43,37 @@ def starting_ray() -> Iterator[None]:
         try:
             yield
         except SystemExit as error:
-            # Ray's own handler, installed at the start of `ray.init`, exits like this.
+            # Ray's own handler, installed by `ray.init`, exits like this.
             if stop is None or error.code != signal.SIGTERM:
                 raise
             stop.receive(signal.SIGTERM)
         finally:
             if stop is not None:
                 stop.install()
-            # A signal that arrived in the meantime is handled now.
+            # Handle a signal that has arrived meanwhile.
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
     if stop:
         raise KeyboardInterrupt
 
 
 def end_ray(folder: SessionFolder | None, lost: bool = False, keep: bool = False) -> None:
-    """`ray.shutdown` with a limit, and the end of all that a Ray of our own has started.
+    """`ray.shutdown` with a time limit; also kills everything that our own Ray has started.
 
-    Ray's daemons do not hear that they are asked to go, because `starting_ray` has blocked the signal in them: they are
-    ended as soon as this process does not need them any more. A Ray that does not answer is left as it is; this process
-    must not wait for it at its own end.
+    Ray's daemons do not receive SIGTERM, because `starting_ray` has blocked it in them: they are killed as soon as this
+    process no longer needs them. A Ray that does not answer is left alone; this process must not wait for it when it
+    exits.
 
     Args:
-        folder: of a Ray of our own.
-        lost: whether it is known not to answer.
-        keep: whether Ray's logs are kept.
+        folder: our own Ray's folder, if it is ours.
+        lost: whether Ray is known not to answer.
+        keep: whether to keep Ray's logs.
 
     Raises:
         ClusterLost: Ray did not answer.
-        KeyboardInterrupt: this program was asked to stop in the meantime; Ray has been ended all the same.
+        KeyboardInterrupt: this program was asked to stop meanwhile; Ray has been shut down anyway.
     """
     stop = current()
-    # A daemon, because it may never end.
+    # a daemon thread, because it may never end
     thread = threading.Thread(target=ray.shutdown, name="ray.shutdown", daemon=True)
     waited = 0.0
     try:
@@ -83,7 +83,7 @@ def end_ray(folder: SessionFolder | None, lost: bool = False, keep: bool = False
             thread.join(_POLL_S)
             waited += _POLL_S
             if stop is not None:
-                stop.install()  # Ray's end takes SIGTERM's handler away, in the kernel where Python does not see it
+                stop.install()  # Ray's shutdown removes SIGTERM's handler in the kernel, unseen by Python
             if folder is not None and not ray.is_initialized():
                 folder.end_processes()
     finally:
@@ -102,7 +102,7 @@ def end_ray(folder: SessionFolder | None, lost: bool = False, keep: bool = False
 
 
 def run_in_thread(work: Callable[[], object], stop: StopRequest, watch: RayWatch) -> None:
-    """Run Tune's loop in a thread, where it receives no signals and cannot keep this thread from receiving them.
+    """Run Tune's loop in another thread, so that this one can always handle signals.
 
     Raises:
         ClusterLost: Ray has died or does not answer, or the loop did not end when asked to.
@@ -116,17 +116,17 @@ def run_in_thread(work: Callable[[], object], stop: StopRequest, watch: RayWatch
         except BaseException as error:
             failure.append(error)
 
-    # A daemon: one that waits for a dead cluster must not keep the process.
+    # A daemon thread: if it waits for a dead cluster, it must not keep the process alive.
     thread = threading.Thread(target=body, name="tune", daemon=True)
     thread.start()
-    # Ticks rather than a clock: time during which this process itself is stopped does not count.
+    # Count ticks instead of time, so that time while this process is suspended does not count.
     waited = 0.0
     while thread.is_alive():
         thread.join(_TICK_S)
         waited += _TICK_S if stop else 0.0
         lost = watch.look(_TICK_S)
         if lost is not None:
-            thread.join(_TICK_S)  # it raises that too, unless it waits for Ray
+            thread.join(_TICK_S)  # the loop raises this itself, unless it waits for Ray
             raise lost
         if waited > _LAST_WORD_S:
             raise ClusterLost(

@@ -1,4 +1,4 @@
-"""What our own Ray on this machine exposes to others: its ports, its token, and its dashboard."""
+"""Our own Ray on this machine, and its access from outside: ports, token, dashboard."""
 
 import os
 import secrets
@@ -19,27 +19,27 @@ from msk_ray.errors import ClusterLost, StorageError
 TOKEN_FILE = Path(".ray") / "auth_token"
 """Where Ray keeps the token of local sessions, relative to the home folder."""
 STARTS = 3
-"""How often Ray's daemons are started before giving up."""
+"""How often to try to start Ray's daemons."""
 
 
 def start_local(dashboard: bool | None, options: Mapping[str, Any]) -> Any:
     """Start a Ray for this process only, and connect to it.
 
     Args:
-        dashboard: whether to start one; None starts it if its packages (ray[default]) are installed.
-        options: for `ray.init`.
+        dashboard: whether to start one; None: only if its packages (ray[default]) are installed.
+        options: arguments of `ray.init`.
 
     Returns:
         The result of `ray.init`.
 
     Raises:
-        ClusterLost: its daemons do not start, because the machine is too busy.
+        ClusterLost: its daemons do not start in time, because the machine is too busy.
     """
-    # Workers must import the package this process runs, wherever it was started from.
+    # Workers must import the same package as this process.
     package = str(Path(msk_ray.__file__).resolve().parent.parent)
     paths = [package, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
     os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys(paths))
-    # The dashboard finds its profiler among the programs of this environment, activated or not.
+    # The dashboard looks for its profiler in PATH; this environment may not be activated.
     programs = [*os.environ.get("PATH", os.defpath).split(os.pathsep), str(Path(sys.executable).parent)]
     os.environ["PATH"] = os.pathsep.join(dict.fromkeys(programs))
     timed_out: Exception | None = None
@@ -48,11 +48,11 @@ def start_local(dashboard: bool | None, options: Mapping[str, Any]) -> Any:
             print("Ray's daemons did not start within 30 s on this busy machine; starting them again ...", flush=True)
         try:
             with loopback_only():
-                # By default Ray would join any cluster whose address a `ray start` on this machine has left behind.
+                # By default Ray would join a cluster whose address a `ray start` on this machine has left behind.
                 return ray.init("local", include_dashboard=dashboard, dashboard_host="127.0.0.1", **options)
         except Exception as error:
-            # Ray has no class of its own for this, and no setting for how long it waits. What it has started ends with
-            # this process.
+            # Ray has no exception class for this, and no setting for the timeout. What it has started ends with this
+            # process.
             if "node timed out during startup" not in str(error):
                 raise
             timed_out = error
@@ -65,9 +65,9 @@ def start_local(dashboard: bool | None, options: Mapping[str, Any]) -> Any:
 def loopback_only() -> Iterator[None]:
     """A Ray started inside this block listens only on the loopback interface.
 
-    Ray gives every server the address of its node, for which it uses the machine's own address even if told 127.0.0.1;
-    with the switch below, its default on macOS and Windows, it uses the loopback address. The switch is read from the
-    environment when Ray is imported, so it is set here instead.
+    Ray's servers listen on the node's address, which is the machine's own address even if told 127.0.0.1. With the
+    switch below, the default on macOS and Windows, it is the loopback address. Ray reads the switch from the
+    environment only when it is imported, so set it in Ray's module here.
     """
     before = ray_constants.ENABLE_RAY_CLUSTER
     ray_constants.ENABLE_RAY_CLUSTER = False
@@ -78,9 +78,9 @@ def loopback_only() -> Iterator[None]:
 
 
 def make_token_private() -> None:
-    """Create the token file of local sessions, or restrict the existing one, so that nobody else can read it.
+    """Create the token file of local sessions, or restrict its permissions, so that nobody else can read it.
 
-    Anyone who has the token can run programs as this user, and Ray writes it with the permissions of an ordinary file.
+    Anyone with the token can run programs as this user, but Ray writes it readable for others.
 
     Raises:
         StorageError: the file cannot be written, or belongs to another user.
@@ -106,7 +106,7 @@ def make_token_private() -> None:
 
 
 def way_in() -> str:
-    """How to log in to the dashboard of the Ray that this process uses, printed after its address."""
+    """How to log in to the dashboard, to print after its address."""
     if os.environ.get("RAY_AUTH_MODE", "").lower() != "token":
         return ""
     if os.environ.get("RAY_AUTH_TOKEN"):
@@ -120,7 +120,7 @@ def _own_token() -> bool:
 
 
 def _make(path: Path) -> None:
-    """Create the token unless it exists. It appears complete at once: another session may read it at any time."""
+    """Create the token file unless it exists, atomically: another session may read it at any time."""
     if path.exists():
         return
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -128,7 +128,7 @@ def _make(path: Path) -> None:
     try:
         with os.fdopen(descriptor, "w") as file:
             file.write(secrets.token_hex(32))
-        # Another session may have been faster: its token is used.
+        # If another session was faster, use its token.
         with suppress(FileExistsError):
             os.link(temporary, path)
     finally:

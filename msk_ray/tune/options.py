@@ -17,10 +17,10 @@ from msk_ray.sweep.extend import parse_extension
 from msk_ray.sweep.space import find_space, parse_seeds
 
 DESCRIPTION = """\
-Run a search space: many trials side by side, one GPU (or CPU core) each, scored by deterministic evaluation,
-with hopeless ones stopped early.
+Run the trials of a search space in parallel, one GPU (or CPU core) each. Score them by deterministic evaluation,
+and stop poor ones early.
 
-Writes runs/EXPERIMENT/: a folder for each trial, and at the end summary.json, table.md and report/."""
+Writes a folder for each trial to runs/EXPERIMENT/, and at the end summary.json, table.md and report/."""
 
 EXAMPLES = """\
   python -m msk_ray.tune --space cartpole_smoke --cpu               # minutes on two cores
@@ -28,10 +28,10 @@ EXAMPLES = """\
   python -m msk_ray.tune --space ant_ablate --smoke --cpu           # does everything run?
   python -m msk_ray.tune --space ant_lr --seeds 0-4 --gpus-per-trial 0.5
   python -m msk_ray.tune --space ant_lr --set trial.epochs=100 --name ant_lr_short
-  python -m msk_ray.tune --space ant_ablate --no-early-stopping --name ant_ablate_whole   # to rank what is varied
+  python -m msk_ray.tune --space ant_ablate --no-early-stopping --name ant_ablate_whole   # to compare variants
   python -m msk_ray.tune --space ant_lr --resume                    # after Ctrl-C, a crash or a lost node
-  python -m msk_ray.tune --space ant_lr --extend epochs=600         # it has ended; continue to more epochs
-  python -m msk_ray.tune --space ant_lr --debug-trial 3             # only that trial, in this process, without Ray
+  python -m msk_ray.tune --space ant_lr --extend epochs=600         # train a finished experiment for more epochs
+  python -m msk_ray.tune --space ant_lr --debug-trial 3             # one trial in this process, without Ray
 
 exit codes: 0 all trials ended, 1 some ended in an error, 2 refused before any work started, 75 stopped on request and
 resumable."""
@@ -53,13 +53,13 @@ def parser() -> Parser:
     p.add_argument(
         "--early-stopping",
         action=argparse.BooleanOptionalAction,
-        help="whether scores end trials (asha, median, stop.plateau, stop.target) as the space says, or all trials "
-        "run to their end; with --resume, as before",
+        help="enable or disable stopping by score (asha, median, stop.plateau, stop.target); default: as the "
+        "space says, with --resume unchanged",
     )
     p.add_argument(
         "--smoke",
         action="store_true",
-        help="shrink to minutes: every value of every factor, few epochs, no early stopping",
+        help="run in minutes: every value of every factor, few epochs, no early stopping",
     )
     p.add_argument("--dry-run", action="store_true", help="print the resolved trials and stop")
     p.add_argument(
@@ -70,8 +70,8 @@ def parser() -> Parser:
     where.add_argument(
         "--halve-worlds",
         action=argparse.BooleanOptionalAction,
-        help="restart a trial that runs out of memory once, with half of its env.nworld, and say so in all tables; "
-        "by default as the space says (resources.halve_worlds_on_oom); with --resume, as before",
+        help="restart a trial that runs out of memory once, with half of its env.nworld (tables mark it); default: as "
+        "the space says (resources.halve_worlds_on_oom), with --resume unchanged",
     )
     where.add_argument("--cpu", action="store_true", help="run on CPU cores even if there are GPUs")
     where.add_argument("--max-concurrent", type=int, metavar="N", help="at most N trials at a time")
@@ -79,31 +79,31 @@ def parser() -> Parser:
         "--address",
         metavar="HOST:PORT",
         default=os.environ.get("RAY_ADDRESS") or None,
-        help="use a running Ray cluster (default: that of RAY_ADDRESS) instead of starting Ray; 'auto' finds the "
+        help="use a running Ray cluster (default: RAY_ADDRESS) instead of starting Ray; 'auto' finds the "
         "cluster that `ray start` started on this machine",
     )
     where.add_argument(
         "--storage", type=Path, default=Path("runs"), metavar="DIR", help="folder of experiments (default: runs/)"
     )
-    where.add_argument("--name", help="name of the experiment (default: that of the space)")
-    where.add_argument("--resume", action="store_true", help="continue an experiment that was interrupted")
+    where.add_argument("--name", help="name of the experiment (default: the space's name)")
+    where.add_argument("--resume", action="store_true", help="continue an interrupted experiment")
     where.add_argument(
         "--start-or-resume",
         action="store_true",
-        help="--resume if the experiment exists, start it if not: for schedulers that run the same command again",
+        help="start the experiment, or resume it if it exists: for job schedulers that repeat the same command",
     )
     where.add_argument(
         "--force",
         action="store_true",
-        help="take over the experiment although its driver seems to run (check first); the other driver then stops",
+        help="take over the experiment even if its driver seems to be running (check first); that driver then stops",
     )
     where.add_argument(
         "--extend",
         action="append",
         default=[],
         metavar="KIND=TOTAL",
-        help="extend an experiment that has ended: epochs=N (trials that ran to their end continue to N), samples=N or "
-        "seeds=LIST (new trials beside the old ones); the values are totals, not additions",
+        help="extend an ended experiment: epochs=N (finished trials continue to N), samples=N or seeds=LIST "
+        "(adds trials); values are new totals, not additions",
     )
     where.add_argument(
         "--retry-errored", action="store_true", help="with --resume: retry trials that ended in an error"
@@ -111,7 +111,7 @@ def parser() -> Parser:
     where.add_argument(
         "--retry",
         metavar="OUTCOMES",
-        help="the same for other outcomes, such as nonfinite,diverged: from their newest checkpoint",
+        help="with --resume: retry trials with these outcomes, such as nonfinite,diverged",
     )
     return p
 
@@ -121,14 +121,14 @@ class Options:
     """The options of a sweep."""
 
     space: Path
-    """The space's file."""
+    """The space file."""
     path: Path
     """The experiment's folder, absolute; it may not exist yet."""
     overrides: tuple[str, ...] = ()
     """Settings for all trials, `KEY=VALUE`."""
     seeds: str | None = None
     early_stopping: bool | None = None
-    """Whether scores end trials; None: as the space says."""
+    """Whether scores may end trials; None: as the space says."""
     halve_worlds: bool | None = None
     """Whether a trial that runs out of memory gets another attempt; None: as the space says."""
     smoke: bool = False
@@ -156,17 +156,16 @@ class Options:
         return Experiment(self.path) if self.going_on and has_begun(self.path) else None
 
     def remembering(self, experiment: Experiment | None) -> "Options":
-        """These options, completed by those of the experiment's earlier command lines."""
+        """These options, completed from the experiment's earlier command lines."""
         if experiment is None:
             return self
         known: dict[str, Any] = {
-            name: experiment.said(name) if now is None else now for name, now in self.remembered().items()
+            name: experiment.remembered(name) if now is None else now for name, now in self.remembered().items()
         }
         return replace(self, **known)
 
     def as_started(self, experiment: Experiment) -> "Options | None":
-        """These options, with what the command line that started the experiment said of its trials; None if that is
-        not recorded."""
+        """These options, with the trials' settings of the experiment's original command line; None if not recorded."""
         said = experiment.manifest().get("options") or {}
         space, overrides, seeds, smoke = (said.get(name) for name in ("space", "overrides", "seeds", "smoke"))
         if not (isinstance(space, str) and isinstance(overrides, list) and texts(overrides)):
@@ -176,7 +175,7 @@ class Options:
         return replace(self, space=Path(space), overrides=tuple(overrides), seeds=seeds, smoke=smoke)
 
     def remembered(self) -> dict[str, bool | None]:
-        """The options that an experiment remembers, by name."""
+        """Options that an experiment remembers, by name."""
         return {name: getattr(self, name) for name in REMEMBERED}
 
     def as_data(self) -> dict[str, Any]:
@@ -186,11 +185,11 @@ class Options:
 
 
 def read_options(argv: Sequence[str] | None) -> Options:
-    """The options of a command line.
+    """Parse a command line.
 
     Raises:
-        ConfigError: incompatible options, or a space that does not exist.
-        StorageError: a name that no experiment can have.
+        ConfigError: options are incompatible, or the space does not exist.
+        StorageError: the experiment's name is invalid.
     """
     args = parser().parse_args(argv)
     space = find_space(args.space)
@@ -231,7 +230,7 @@ def read_options(argv: Sequence[str] | None) -> Options:
 
 
 def _retried(args: argparse.Namespace) -> frozenset[Outcome]:
-    """The outcomes whose trials are retried."""
+    """Outcomes to retry."""
     known = [str(outcome) for outcome in Outcome if outcome is not Outcome.FINISHED]
     names = args.retry.split(",") if args.retry is not None else []
     for name in names:

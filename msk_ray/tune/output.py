@@ -1,4 +1,4 @@
-"""What a trial's process prints, in a file of limited size."""
+"""Redirects a trial process's output to a file of limited size."""
 
 import os
 import sys
@@ -6,13 +6,13 @@ import time
 from pathlib import Path
 
 LIMIT = 16 << 20
-"""Size above which the middle of a trial's output is left out [B]."""
+"""Size above which the middle of a trial's output is cut out [B]."""
 KEPT_FIRST, KEPT_LAST = 1 << 20, 4 << 20
-"""How much of its beginning and of its end stays [B]."""
+"""Size of its beginning and of its end that are kept [B]."""
 
 
 def redirect_output(path: Path) -> None:
-    """Append everything that this process prints, from any language, to a file."""
+    """Append all output of this process, also from native code, to a file."""
     file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
     sys.stdout.flush()
     sys.stderr.flush()
@@ -22,10 +22,9 @@ def redirect_output(path: Path) -> None:
 
 
 def limit_output(path: Path) -> None:
-    """Leave out the middle of a file that has become larger than `LIMIT`, and say so there.
+    """Cut the middle out of a file that has become larger than `LIMIT`, and say so there.
 
-    The file stays the same one, because this process's children may write to it too; what is printed at this very
-    moment may be lost.
+    Edits the file in place, because child processes may have it open too; output during the edit may be lost.
     """
     size = path.stat().st_size
     if size <= LIMIT:

@@ -1,8 +1,8 @@
-"""Which trial Tune runs next: those of a list or of a search, and again those that get another attempt.
+"""Which trial Tune runs next: from a list or a search, or again for another attempt.
 
-Another attempt needs a new process, because the previous one still holds its memory, and Tune starts a new process for
-what it considers a new trial. So a trial whose process ended without an ending, but with a later attempt in its folder,
-is handed to Tune again.
+Another attempt needs a new process, because the old one still holds its memory, and Tune starts a new process only for
+a new trial. So if a trial's process has stopped before the trial's end and the folder holds another attempt, Tune gets
+the trial again.
 """
 
 import copy
@@ -28,7 +28,7 @@ Identify = Callable[[Mapping[str, Any]], str]
 
 
 class _Runs:
-    """Tune's trials that have not ended, and the Tune configs of those to run again."""
+    """Tune's unfinished trials, and the Tune configs to run again."""
 
     def __init__(self, experiment: Experiment, identify: Identify) -> None:
         self._experiment = experiment
@@ -37,12 +37,12 @@ class _Runs:
         self.again: deque[Mapping[str, Any]] = deque()
 
     def began(self, ray_id: str, config: Mapping[str, Any]) -> None:
-        """A trial has been handed to Tune."""
+        """Tune has got a trial."""
         attempt = read_attempt(self._experiment.trial_folder(self._identify(config)))
         self._running[ray_id] = config, attempt.number
 
     def ended(self, ray_id: str) -> Mapping[str, Any] | None:
-        """Tune has finished with a trial. Returns its config, unless the trial is to run again."""
+        """Tune has finished with a trial. Returns its config, or None if the trial will run again."""
         config, attempt = self._running.pop(ray_id)
         folder = self._experiment.trial_folder(self._identify(config))
         if read_ending(folder) is None and read_attempt(folder).number > attempt:
@@ -51,15 +51,15 @@ class _Runs:
         return config
 
     def __bool__(self) -> bool:
-        """Whether any trial may still run again."""
+        """Whether a trial may still have to run again."""
         return bool(self._running or self.again)
 
 
 class TrialList(BasicVariantGenerator):
-    """A list of trials, as Tune's own generator creates them from the parameter space."""
+    """Trials of a list, created by Tune's own generator from the parameter space."""
 
     def __init__(self, experiment: Experiment, identify: Identify, max_concurrent: int | None) -> None:
-        # Tune does not limit a given generator; this one limits itself.
+        # Tune does not limit concurrency for a given generator, so limit it here.
         super().__init__(max_concurrent=max_concurrent or 0)
         self._runs = _Runs(experiment, identify)
         self._given: Any = None
@@ -95,7 +95,7 @@ class TrialList(BasicVariantGenerator):
 
     def set_finished(self) -> None:
         super().set_finished()
-        # Set by the generator itself at the end of its list, or by Tune when everything stops.
+        # Set by the generator at the end of its list, or by Tune when it stops.
         self._stopped = self._stopped or not self._asking
 
     def is_finished(self) -> bool:
@@ -103,14 +103,14 @@ class TrialList(BasicVariantGenerator):
         return self._stopped or (finished and not self._runs)
 
     def save_to_dir(self, dirpath: str, session_str: str) -> None:
-        """Nothing: an experiment is resumed from its trials' folders."""
+        """Does nothing: experiments are resumed from their trials' folders."""
 
     def has_checkpoint(self, dirpath: str) -> bool:
         return False
 
 
 class Suggestions(Searcher):
-    """What a search suggests; it is told the best score of each trial that has ended, or its objectives."""
+    """Trials suggested by a search, which gets the best score of each ended trial, or its objectives."""
 
     def __init__(
         self,
@@ -123,12 +123,12 @@ class Suggestions(Searcher):
     ) -> None:
         """
         Args:
-            experiment: whose trials they are.
+            experiment: the trials' experiment.
             identify: the id of the trial that a Tune config stands for.
-            search: already told the results of the trials that have ended.
-            begun: earlier suggestions whose trials have not ended: they are tried first.
-            samples: trials to run, including those already started.
-            objectives: metrics that the search is told instead of the best score, if there are any.
+            search: the search, with the results of ended trials.
+            begun: earlier suggestions that have not ended; they run first.
+            samples: number of trials, including those already started.
+            objectives: metrics that the search gets instead of the best score, if any.
         """
         super().__init__(metric=METRIC, mode="max")
         self._runs = _Runs(experiment, identify)
@@ -139,7 +139,7 @@ class Suggestions(Searcher):
         self._best: dict[str, float] = {}
 
     def suggest(self, trial_id: str) -> Any:
-        """The Tune config of the next trial; None while none should start."""
+        """The Tune config of the next trial; None if none should start now."""
         if self._runs.again:
             config = self._runs.again.popleft()
         elif self._left > 0:
@@ -169,4 +169,4 @@ class Suggestions(Searcher):
             self._search.tell(config["params"], best)
 
     def save(self, checkpoint_path: str) -> None:
-        """Nothing: an experiment is resumed from its trials' folders."""
+        """Does nothing: experiments are resumed from their trials' folders."""

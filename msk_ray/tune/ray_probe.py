@@ -1,6 +1,6 @@
 """`python -m msk_ray.tune.ray_probe`: start Ray as a sweep does, run one task, and print the result as JSON.
 
-It is a separate process because a time limit on the start of Ray can only be enforced from outside.
+A separate process, because a time limit on Ray's start can only be enforced from outside.
 """
 
 import json
@@ -12,7 +12,7 @@ from msk_ray.tune.session import ray_session
 
 
 def _versions() -> dict[str, str]:
-    """Runs in a worker, which must find the package too."""
+    """Runs in a worker, which must be able to import the package."""
     import msk_ray
 
     return {"msk_ray": msk_ray.__version__, "python": sys.version.split()[0]}

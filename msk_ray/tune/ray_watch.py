@@ -1,4 +1,4 @@
-"""Whether the Ray that this process is connected to is still there."""
+"""Watches whether this process's Ray session is alive."""
 
 import threading
 from collections.abc import Callable
@@ -9,19 +9,19 @@ from ray._private.worker import global_worker
 from msk_ray.errors import ClusterLost
 
 _VITAL = ("gcs_server", "raylet")
-"""Daemons without which nothing works."""
+"""Essential daemons of Ray."""
 
 
 class RayWatch:
-    """Asks Ray from time to time whether the node of this process is alive, from a thread of its own: Ray waits for an
-    answer without a limit, and ends this process after a minute without one.
+    """Asks Ray periodically, from a separate thread, whether this process's node is alive. Without that, Ray would wait
+    for an answer without a limit, and end this process after a minute.
 
-    Used as a context manager, around the time in which it is asked.
+    A context manager: the thread runs inside the block.
     """
 
     INTERVAL_S = 2.0
     LIMIT_S = 40.0
-    """How long Ray may be silent [s]: less than the minute after which Ray itself ends this process."""
+    """How long Ray may be silent [s]; less than the minute after which Ray itself ends this process."""
 
     def __init__(self) -> None:
         self._id = ray.get_runtime_context().get_node_id()
@@ -30,7 +30,7 @@ class RayWatch:
         self._refusal: Exception | None = None
         self._node_died = False
         self.lost: ClusterLost | None = None
-        """Why Ray is lost; None as long as it is not."""
+        """Why Ray is lost; None if it is not."""
 
     def __enter__(self) -> "RayWatch":
         threading.Thread(target=self._ask, name="ray watch", daemon=True).start()
@@ -40,10 +40,10 @@ class RayWatch:
         self._ended.set()
 
     def look(self, passed_s: float) -> ClusterLost | None:
-        """Why Ray is lost, if it is.
+        """Update and return why Ray is lost; None if it is not.
 
         Args:
-            passed_s: time since the last look [s], as far as it counts.
+            passed_s: time since the last check [s], without time while this process was suspended.
         """
         self._silent_s += passed_s
         died = _dead_daemon()
@@ -59,11 +59,11 @@ class RayWatch:
         return self.lost
 
     def guarding(self, guard: Callable[[], None]) -> Callable[[], None]:
-        """A check for whoever is about to write: `guard`, and whether Ray is lost. What Tune makes of trials then is
-        not true of them.
+        """A check to call before writing: `guard`, and that Ray is not lost. Once it is, Tune reports wrong states of
+        trials.
 
         Raises:
-            ClusterLost: from the check.
+            ClusterLost: raised by the check.
         """
 
         def check() -> None:
@@ -77,7 +77,7 @@ class RayWatch:
         while not self._ended.wait(self.INTERVAL_S):
             try:
                 nodes = ray.nodes()
-            except Exception as error:  # of Ray's own making; the limit decides
+            except Exception as error:  # any of Ray's exceptions; the time limit decides
                 self._refusal = error
                 continue
             self._silent_s, self._refusal = 0.0, None
@@ -85,7 +85,7 @@ class RayWatch:
 
 
 def _dead_daemon() -> str | None:
-    """A vital daemon, started by this process, that has ended."""
+    """Name of an essential daemon, started by this process, that has died; None if all are alive."""
     if global_worker.node is None:
         return None
     return next((name for name, _ in global_worker.node.dead_processes() if name in _VITAL), None)

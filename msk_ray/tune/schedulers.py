@@ -1,4 +1,4 @@
-"""The rules that compare trials, in Ray Tune's terms."""
+"""Adapters of the rules that compare trials to Ray Tune's schedulers."""
 
 import random
 from collections.abc import Callable, Mapping
@@ -13,15 +13,15 @@ from msk_ray.sweep.rules.early_stopping import Pruner
 from msk_ray.sweep.rules.population import PopulationBasedTraining as PopulationSpec
 
 METRIC = "score"
-"""What trials report to Tune; `eval/score` under a name Tune does not take for a nested key."""
+"""Key under which trials report `eval/score`; Tune would read a slash as a nested key."""
 BEST = "best"
-"""The highest score so far; no trial reports what its policy scored untrained."""
+"""Key of the highest score so far, without the score of the untrained policy."""
 
 
 class PruningScheduler(FIFOScheduler):
-    """Stops the trials that a `Pruner` names, and records why.
+    """Stops trials as a `Pruner` decides, and records why.
 
-    A result that arrives again, from a trial that was resumed from its checkpoint, has already been judged.
+    Results that arrive again, from a trial resumed from its checkpoint, are ignored.
     """
 
     def __init__(
@@ -34,17 +34,17 @@ class PruningScheduler(FIFOScheduler):
     ) -> None:
         """
         Args:
-            pruner: the rule, in the state recorded by the journal.
+            pruner: the rule, with the journal replayed.
             time_attr: key of a result at which trials are compared.
-            journal: what the rule has been told so far; new results are appended.
-            identify: id of the trial that a Ray trial runs.
-            on_stop: called with the id and the ending before the trial is stopped.
+            journal: log of the rule's inputs; new results are appended.
+            identify: id of a Ray trial's trial.
+            on_stop: called with a trial's id and ending before stopping it.
         """
         super().__init__()
         self._pruner = pruner
         self._time_attr = time_attr
         self._journal = journal
-        # The first result of another attempt is new, whatever the previous attempt has reported.
+        # The first result of a new attempt counts, whatever the previous attempt has reported.
         self._heard = {report.trial: (report.attempt, report.epoch) for report in journal.read()[0]}
         self._identify = identify
         self._on_stop = on_stop
@@ -70,7 +70,7 @@ class PruningScheduler(FIFOScheduler):
         if report.attempt > heard[0]:
             self._pruner.forget(trial_id)
         ending = self._pruner.report(trial_id, report.time(self._time_attr), report.score)
-        # A trial that has ended by itself still counts for the others, but has its own outcome.
+        # A trial that has ended on its own counts for the others, but keeps its outcome.
         if ending is None or result["ended"]:
             return TrialScheduler.CONTINUE
         self._on_stop(trial_id, ending)
@@ -80,24 +80,24 @@ class PruningScheduler(FIFOScheduler):
 class Population(PopulationBasedTraining):
     """Population-based training over the sampled ranges of a space.
 
-    Values stay inside their ranges, and a member that continues from a better one keeps its identity: Ray by itself
-    would let values leave the ranges, and copy the better member's whole config, including its identity.
+    Unlike in Ray's own class, values stay inside their ranges, and a member that continues from a better one keeps its
+    id; Ray would copy the better member's whole config.
 
-    Ray draws from Python's global generator. Here, an exchange draws from the seed, the member and its progress: the
-    same in every run, whatever other members do meanwhile, and after a resume. Which members are the better ones still
-    depends on who has reported by then.
+    Ray draws from Python's global generator. Here, the seed, the member and its progress determine an exchange's draws,
+    so that they are the same in every run and after a resume. Which members are better still depends on the results
+    available by then.
     """
 
     FACTORS = (0.8, 1.2)
-    """By one of which an exchanged value is changed."""
+    """Factors by which exchanged values change."""
 
     def __init__(self, spec: PopulationSpec, budget: float, sampled: Mapping[str, Operator], seed: int) -> None:
         """
         Args:
-            spec: the section of the space.
+            spec: the space's `scheduler` section.
             budget: length of the longest trial, in the unit of `spec.time_attr`.
-            sampled: parameters that are drawn, of which those with a range are exchanged.
-            seed: of all draws.
+            sampled: the sampled parameters; those with a range are exchanged.
+            seed: seed of all draws.
         """
         self._ranges = {key: op for key, op in sampled.items() if isinstance(op, Range)}
         self._seed = seed

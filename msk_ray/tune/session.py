@@ -19,33 +19,33 @@ from msk_ray.tune.session_folder import SessionFolder
 
 @contextmanager
 def ray_session(address: str | None, dashboard: bool | None = None, trials: bool = True) -> Iterator[None]:
-    """Our own Ray on this machine, or the one at `address`.
+    """Context of a Ray session: our own on this machine, or the one at `address`.
 
     Args:
         address: address of a running cluster.
-        dashboard: whether to start one; None starts it if its packages (ray[default]) are installed.
+        dashboard: whether to start one; None: only if its packages (ray[default]) are installed.
         trials: whether trials will run; then every process imports what they need as soon as it starts.
 
     Raises:
         DeviceError: the cluster at `address` cannot be reached.
-        StorageError: our own Ray has no place for its files or its token.
-        ClusterLost: it does not start, or does not end.
+        StorageError: there is no suitable folder for our own Ray's files or token.
+        ClusterLost: Ray does not start, or does not shut down.
     """
     os.environ.update(
         RAY_AIR_NEW_OUTPUT="0",
-        RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO="1",  # a trial without GPUs sees none, rather than all
+        RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO="1",  # a trial without GPUs must see none, not all
         TUNE_DISABLE_AUTO_CALLBACK_LOGGERS="1",  # trials write their own metrics, at once
-        TUNE_DISABLE_STRICT_METRIC_CHECKING="1",  # a trial asked to stop may not have been evaluated yet
-        TUNE_DISABLE_SIGINT_HANDLER="1",  # a request to stop lets trials save themselves first
+        TUNE_DISABLE_STRICT_METRIC_CHECKING="1",  # a trial may stop before its first evaluation
+        TUNE_DISABLE_SIGINT_HANDLER="1",  # on a request to stop, trials first save themselves
     )
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    # Ray starts another cluster automatically when it is used after `ray.shutdown`, as a thread of Tune's may do. The
-    # variable is for the processes to come: this one has read it when Ray was imported.
+    # Otherwise Ray would start a cluster when it is used after `ray.shutdown`, as a thread of Tune's may do. The
+    # variable is for later processes: this one read it when Ray was imported.
     os.environ["RAY_ENABLE_AUTO_CONNECT"] = "0"
     auto_init_hook.enable_auto_connect = False
-    # Off by default because it runs a program in the cluster; but so can everybody who has the token it requires.
+    # Off by default because it lets users run programs, but it needs the token, and anyone with the token can anyway.
     os.environ.setdefault("RAY_DASHBOARD_ENABLE_PROFILING", "1")
-    # Otherwise Ray would give trials a lower priority than everything else on the machine.
+    # Otherwise Ray would run trials at a low priority.
     os.environ.setdefault("RAY_worker_niceness", "0")
     common: dict[str, Any] = {
         "logging_level": "ERROR",
@@ -88,6 +88,6 @@ def _init(address: str | None, dashboard: bool | None, common: dict[str, Any]) -
 
 
 def cluster_gpus(processes: int = 1) -> int:
-    """GPUs that the Ray session has for trials; those of the largest node for trials of several processes."""
+    """Number of the Ray session's GPUs; for trials with several GPUs, the number on the largest node."""
     of_nodes = [int(node["Resources"].get("GPU", 0)) for node in ray.nodes() if node["Alive"]]
     return max(of_nodes, default=0) if processes > 1 else sum(of_nodes)

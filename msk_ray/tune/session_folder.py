@@ -1,7 +1,7 @@
-"""The folder of a Ray of our own: only its owner can enter it, and nothing of it stays behind.
+"""The folder of our own Ray session, which only its owner can enter, and which is always removed.
 
-Ray makes its folders readable and writable for everybody (0777), and trusts what it finds there: its sockets, logs and
-service files. So it gets a folder inside one that other users of the machine cannot enter.
+Ray creates its folders with mode 0777, and trusts the sockets, logs and service files in them. So it gets a folder
+inside one that other users of the machine cannot enter.
 """
 
 import fcntl
@@ -20,26 +20,26 @@ from msk_ray.signals import NUMBERS
 from msk_ray.tune import cleanup
 
 VARIABLE = "RAY_TMPDIR"
-"""Where Ray, and all that Ray starts, makes its folder `ray`."""
+"""Environment variable: the folder in which Ray, and everything it starts, creates its folder `ray`."""
 PREFIX = "msk-"
 LINK = Path(".ray") / "latest"
-"""A link to the folder of the newest Ray of this user, relative to the home folder."""
+"""Link to the folder of this user's newest Ray session, relative to the home folder."""
 MODE = 0o700
 _SOCKET_BYTES = 107
-"""The longest path of a socket."""
+"""Maximum length of a socket's path."""
 _LONGEST_SOCKET = "ray/session_2026-11-24_11-19-09_123456_4194304/sockets/dash_TaskEventsHead"
-"""With the largest process id that Linux has."""
+"""Part of the path that Ray adds, with the largest process id that Linux has."""
 _RANDOM_CHARACTERS = 8
-"""That `tempfile.mkdtemp` adds to the prefix."""
+"""Length of what `tempfile.mkdtemp` adds to the prefix."""
 _CLEANUP_LIMIT_S = 30.0
 
 
 class SessionFolder:
-    """A new folder for one Ray, and a process that waits until this one has ended, however it ends.
+    """A new folder for one Ray session, and a process that cleans up after this one, however it ends.
 
-    That process then ends all processes that were started with this folder as theirs, and removes the folder. While it
-    or this process lives, one of them holds a lock on the folder; a folder without one is removed by the next sweep of
-    the same user.
+    The cleaning process kills all processes that were started with this folder, and removes the folder. While it or
+    this process lives, one of them holds a lock on the folder; the same user's next sweep removes folders without a
+    lock.
 
     Attributes:
         path: the folder.
@@ -48,7 +48,7 @@ class SessionFolder:
     def __init__(self) -> None:
         """
         Raises:
-            StorageError: there is no place for it.
+            StorageError: there is no suitable place for it.
         """
         parent = _parent()
         _remove_abandoned(parent)
@@ -65,29 +65,29 @@ class SessionFolder:
 
     @property
     def logs(self) -> Path:
-        """Where Ray keeps its logs."""
+        """Folder of Ray's logs."""
         return self.path / "ray" / "session_latest" / "logs"
 
     def end_processes(self) -> None:
-        """End the processes that belong to this folder, except this one."""
+        """Kill this folder's processes, except this one and the cleaning process."""
         cleanup.end_processes(self.path, {os.getpid(), self._cleanup.pid})
 
     def close(self, keep: bool = False) -> None:
-        """End the processes that belong to this folder, and remove it; does nothing the second time.
+        """Kill this folder's processes and remove it; does nothing the second time.
 
         Args:
-            keep: leave the folder, with Ray's logs, until the next sweep of this user.
+            keep: keep the folder, with Ray's logs, until this user's next sweep.
         """
         if self._cleanup.stdin is None:
             return
-        with suppress(BrokenPipeError):  # somebody has killed it
+        with suppress(BrokenPipeError):  # someone has killed it
             if keep:
                 self._cleanup.stdin.write(cleanup.KEEP)
             self._cleanup.stdin.close()
         self._cleanup.stdin = None
         try:
             code = self._cleanup.wait(_CLEANUP_LIMIT_S)
-        except subprocess.TimeoutExpired:  # somebody has stopped it
+        except subprocess.TimeoutExpired:  # someone has suspended it
             self._cleanup.kill()
             code = self._cleanup.wait()
         if code:
@@ -103,7 +103,7 @@ class SessionFolder:
         os.close(self._lock)
 
     def _link(self) -> None:
-        """Have `~/.ray/latest` lead to Ray's files, whose folder has another name each time."""
+        """Let `~/.ray/latest` point to Ray's files, because the folder's name changes each time."""
         link = Path.home() / LINK
         try:
             link.parent.mkdir(parents=True, exist_ok=True)
@@ -115,16 +115,16 @@ class SessionFolder:
 
     def _unlink(self) -> None:
         link = Path.home() / LINK
-        with suppress(OSError):  # it is gone, or was never made
+        with suppress(OSError):  # it is gone, or was never created
             if os.readlink(link) == str(self.path / "ray"):
                 link.unlink()
 
 
 def _parent() -> Path:
-    """The folder to make a folder in: the one that RAY_TMPDIR names, or else TMPDIR or /tmp.
+    """The parent for session folders: RAY_TMPDIR if set, otherwise TMPDIR or /tmp.
 
     Raises:
-        StorageError: none of them is fit.
+        StorageError: none of them is suitable.
     """
     named = os.environ.get(VARIABLE)
     if named:
@@ -142,7 +142,7 @@ def _parent() -> Path:
 
 
 def _unfit(place: Path) -> str | None:
-    """Why Ray's folder cannot be made in this one; None if it can."""
+    """Why Ray's folder cannot be created in this one; None if it can."""
     if not place.is_absolute():
         return "not an absolute path"
     if not place.is_dir():
@@ -163,15 +163,15 @@ def _unfit(place: Path) -> str | None:
 
 
 def _unmapped() -> int:
-    """The user that owns the files of those whom a container does not know, root among them."""
+    """User id that owns, inside a container, the files of users unknown to it, such as the host's root."""
     return int(Path("/proc/sys/kernel/overflowuid").read_text())
 
 
 def _make(parent: Path) -> tuple[Path, int]:
-    """A new folder that only this user can enter, and the descriptor of a lock on it."""
+    """Create a folder that only this user can enter, with a lock; returns the lock's descriptor too."""
     while True:
         path = Path(tempfile.mkdtemp(prefix=PREFIX, dir=parent))  # mode 0700
-        with suppress(FileNotFoundError):  # another sweep has taken it for an abandoned one
+        with suppress(FileNotFoundError):  # another sweep has removed it as abandoned
             lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
             fcntl.flock(lock, fcntl.LOCK_EX)
             if os.path.exists(path) and os.path.samestat(os.fstat(lock), path.lstat()):
@@ -180,7 +180,7 @@ def _make(parent: Path) -> tuple[Path, int]:
 
 
 def _remove_abandoned(parent: Path) -> None:
-    """Remove the folders of this user's sweeps that were killed together with the process that would have done it."""
+    """Remove folders of this user's sweeps that were killed together with their cleaning process."""
     for path in parent.glob(f"{PREFIX}{'?' * _RANDOM_CHARACTERS}"):
         try:
             lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
@@ -200,8 +200,8 @@ def _remove_abandoned(parent: Path) -> None:
 
 
 def _start_cleanup(path: Path, lock: int) -> "subprocess.Popen[bytes]":
-    """The process that cleans up; it keeps the lock, and imports nothing but the standard library."""
-    # It ignores signals, but not from its first moment on.
+    """Start the cleaning process, which keeps the lock, and imports only the standard library."""
+    # It ignores signals, but not yet while it starts.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {*NUMBERS, signal.SIGTSTP})
     try:
         return subprocess.Popen(

@@ -1,4 +1,4 @@
-"""The driver's decisions while trials run: when everything stops, and the endings that no trial can write itself."""
+"""The driver's decisions while trials run: when to stop everything, and endings that trials cannot write themselves."""
 
 import pickle
 import time
@@ -23,13 +23,13 @@ from msk_ray.tune.console import Console
 from msk_ray.tune.schedulers import BEST, METRIC
 
 SHUTDOWN_GRACE_S = 120.0
-"""Time [s] in which trials must reach the end of their epoch and save, after a request to stop."""
+"""How long trials may take to end their epoch and save after a request to stop [s]."""
 LONGEST_STEP_S = 5.0
-"""The most that a step of Tune's loop counts [s]: if it took longer, this process was stopped or asleep."""
+"""Longest time that a step of Tune's loop counts for [s]: if it took longer, this process was suspended."""
 
 
 class Supervisor(Callback):
-    """Follows the trials: records the endings that only the driver sees, stops everything on request, and informs the
+    """Follows the trials: records endings that only the driver sees, stops everything on request, and informs the
     console."""
 
     def __init__(
@@ -44,13 +44,13 @@ class Supervisor(Callback):
     ) -> None:
         """
         Args:
-            experiment: whose trials they are.
-            trial_of: the trial that a Tune config stands for.
-            console: informed of what happens.
-            stop: checked between any two events.
-            guard: called before anything is written; raises if another driver owns the experiment by now.
-            waiting: trials still to run, as far as they are known.
-            started: trials started before, in that order.
+            experiment: the trials' experiment.
+            trial_of: the trial of a Tune config.
+            console: prints events.
+            stop: request to stop, checked after each event.
+            guard: called before each write; raises if another driver owns the experiment by now.
+            waiting: known trials that are still to run.
+            started: trials started before, in order.
         """
         self._experiment = experiment
         self._trial_of = trial_of
@@ -62,24 +62,24 @@ class Supervisor(Callback):
         """Running trials, and the attempt of each."""
         self._saving: set[str] = set()
         self.started: list[Trial] = list(started)
-        """Trials that were started, in that order, each once, with its position."""
+        """Started trials, in order, with their positions."""
         self._stopping = False
         self._stopping_s = 0.0
         self._last_step = time.monotonic()
         self.storage_failure: StorageFailure | None = None
-        """The error of a trial that could not write; everything is stopped then, because every trial would meet it."""
+        """Error of a trial that could not write. Then everything is stopped, because every trial would meet it."""
 
     def __getstate__(self) -> dict[str, Any]:
-        # Ray pickles callbacks into its own state, which is never read back: resuming begins from the trials' folders.
+        # Ray pickles callbacks into its own state, which is never read: resuming starts from the trials' folders.
         return {}
 
     def waiting(self) -> int:
-        """How many trials are to start or to start again, as far as they are known."""
+        """Number of known trials that are still to start, or to start again."""
         return len(self._waiting)
 
     @property
     def stopped(self) -> bool:
-        """Whether a request to stop has been carried out: every running trial has saved itself, or time is up."""
+        """Whether, after a request to stop, every running trial has saved itself, or time is up."""
         return self._stopping and (not self._saving or self._stopping_s > SHUTDOWN_GRACE_S)
 
     def on_step_end(self, iteration: int, trials: list[Any], **info: Any) -> None:
@@ -113,7 +113,7 @@ class Supervisor(Callback):
     def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         if not self._meet_storage_failure(trial):
             mine = self._trial_of(trial.config)
-            # It has no process until Tune starts another one, which may take as long as the other trials.
+            # It has no process until Tune starts a new one, which may wait for the other trials.
             self._attempts.pop(mine.id, None)
             self._saving.discard(mine.id)
             self._waiting.add(mine.id)
@@ -133,7 +133,7 @@ class Supervisor(Callback):
             self._waiting.add(mine.id)
             self.console.attempted_again(mine, attempt)
         else:
-            self.console.left(mine)  # paused by a request to stop, or never begun
+            self.console.left(mine)  # paused by a request to stop, or never started
 
     def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         if self._meet_storage_failure(trial):
@@ -148,12 +148,12 @@ class Supervisor(Callback):
         self.console.failed(mine, ending.why, folder)
 
     def pruned(self, trial_id: str, ending: Ending) -> None:
-        """A scheduler stops a trial, whose process will not get to write its ending."""
+        """A scheduler stops a trial; its process cannot write its ending."""
         self._guard()
         write_ending(self._experiment.trial_folder(trial_id), ending)
 
     def _meet_storage_failure(self, trial: Any) -> bool:
-        """Whether the disk failed for a trial; then all trials are stopped, which is not an ending for any."""
+        """Whether the disk failed for a trial. Then all trials are stopped, without an ending."""
         error = _error_of(trial)
         failure = None if error is None else storage_failure(error)
         if failure is None:
@@ -174,12 +174,12 @@ class Supervisor(Callback):
         self._stopping = True
         self._saving = set(self._attempts)
         try:
-            self._experiment.check_there()  # Ray may have made another folder in its place, which stays empty
+            self._experiment.check_there()  # Ray may have created an empty folder in its place
             self._experiment.stop_file.touch()
         except StorageFailure as failure:
             self.console.say(f"trials are not asked to stop: {failure}")
         except OSError as error:
-            # Then the trials fail on the same disk at their next row, and stop there.
+            # The trials will fail on the same disk at their next row, and stop.
             self.console.say(f"cannot write {self._experiment.stop_file}: {error.strerror}")
 
     def _reason(self, mine: Trial, trial: Any) -> str:
@@ -190,7 +190,7 @@ class Supervisor(Callback):
 def _error_of(trial: Any) -> Exception | None:
     """The exception that ended a Ray trial's process; None if there was none.
 
-    Ray's own accessor reads it from the storage, where the file arrives later, or never if the disk is full.
+    Ray's own accessor reads a file, which arrives later, or never if the disk is full.
     """
     path = trial.pickled_error_file
     if path is None or not Path(path).is_file():

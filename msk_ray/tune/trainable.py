@@ -1,4 +1,4 @@
-"""What Ray Tune runs in a trial's process: `run_trial` with results for Tune, gauges, and its output in a file."""
+"""What Ray Tune runs in a trial's process: `run_trial`, with results for Tune, gauges, and output in a file."""
 
 import faulthandler
 import json
@@ -33,15 +33,15 @@ from msk_ray.tune.gauges import TrialGauges
 from msk_ray.tune.hparams import log_hparams
 from msk_ray.tune.output import limit_output, redirect_output
 from msk_ray.tune.schedulers import BEST, METRIC
-from msk_ray.tune.trial_run import Handed, Hooks, MakeTrainer, TrainerLike, run_trial
+from msk_ray.tune.trial_run import Hooks, MakeTrainer, MemberCheckpoint, TrainerLike, run_trial
 
 MEMORY_LIMIT_S = 60.0
-"""How long a trial waits for the memory of its GPU [s]."""
+"""How long a trial waits for its GPU's memory to be free [s]."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """What the process of a trial needs besides its Tune config."""
+    """What a trial's process needs besides its Tune config."""
 
     experiment: Experiment
     space: Space
@@ -53,7 +53,7 @@ class Job:
     """GPUs per trial, 0 on CPU."""
     make_trainer: MakeTrainer
     owner: str | None = None
-    """Token of the experiment's owner; None if it has none."""
+    """Token of the experiment's owner; None without an owner."""
 
     @property
     def population(self) -> bool:
@@ -61,9 +61,8 @@ class Job:
         return self.space.file.scheduler.exchanges
 
     def trial_of(self, config: Mapping[str, Any]) -> Trial:
-        """The trial that a Tune config stands for.
-
-        It is `{id}`, `{id, params}` in a population, where params move, or `{params}` from a search.
+        """The trial of a Tune config: `{id}`, `{id, params}` in a population, whose params change, or `{params}` from a
+        search.
         """
         params = config.get("params", {})
         if "id" not in config:
@@ -76,7 +75,7 @@ class Job:
 
 
 def make_trainable(job: Job, resources: dict[str, float]) -> type[tune.Trainable]:
-    """The class whose actors run the trials, each with these resources of a node."""
+    """The actor class that runs trials, with these resources."""
 
     def train(config: dict[str, Any]) -> None:
         trial = job.trial_of(config)
@@ -90,10 +89,10 @@ def make_trainable(job: Job, resources: dict[str, float]) -> type[tune.Trainable
             with _owned(folder, job):
                 in_frame_named(trial.label, lambda: work(trial, folder))
         except _StoppedByTune:
-            sys.exit(0)  # how Tune ends the thread of a trial
+            sys.exit(0)  # Tune ends a trial's thread like this
         except Exception as error:
-            # Whatever failed first on a full disk, perhaps a line of output: the driver must be told about the disk.
-            # The same holds for a missing file when the whole folder is missing.
+            # On a full disk anything may fail first, even a line of output: tell the driver about the disk.
+            # Likewise, report a missing folder, not the missing file in it.
             failure = storage_failure(error) or job.experiment.lost(trial.id)
             if failure is None or failure is error:
                 raise
@@ -139,14 +138,14 @@ def make_trainable(job: Job, resources: dict[str, float]) -> type[tune.Trainable
                 job.space.file.stop,
                 job.make_trainer,
                 hooks,
-                _handed_checkpoint(job, Path(scratch)) if job.population else None,
+                _member_checkpoint(job, Path(scratch)) if job.population else None,
                 job.space.file.resources.halve_worlds_on_oom,
             )
 
-    # From the function itself, Tune would create a class `ImplicitFunc` whose actors all look alike.
+    # For the function alone, Tune would create a class `ImplicitFunc`, and all actors would have that name.
     class TrialActor(wrap_function(tune.with_resources(train, resources))):  # type: ignore[misc]
         def __repr__(self) -> str:
-            """Names the actor in Ray's dashboard, in its lists, and in front of its lines of output."""
+            """Name of the actor in Ray's dashboard and lists, and before its lines of output."""
             return job.trial_of(self.config).label
 
     TrialActor.__qualname__ = TrialActor.__name__
@@ -154,7 +153,7 @@ def make_trainable(job: Job, resources: dict[str, float]) -> type[tune.Trainable
 
 
 class _StoppedByTune(BaseException):
-    """Tune has ended this trial, by `sys.exit`, which a trial's own code may call too."""
+    """Tune has ended this trial. Tune uses SystemExit, but so may a trial's own code."""
 
 
 def in_frame_named(name: str, call: Callable[[], None]) -> None:
@@ -171,8 +170,8 @@ def in_frame_named(name: str, call: Callable[[], None]) -> None:
 def _owned(folder: Path, job: Job) -> Iterator[None]:
     """Own a trial's folder on behalf of the driver that started this process.
 
-    A process left over from an earlier driver, or from a node that Ray has given up, holds it until it notices that.
-    The process that serves the experiment's current owner wins, and waits for the other.
+    A process left over from an earlier driver, or on a node that Ray has given up, may still hold it until it notices.
+    This process waits for that one.
     """
     if job.owner is None:
         yield
@@ -185,14 +184,14 @@ def _owned(folder: Path, job: Job) -> Iterator[None]:
 
 
 def _leave(lost: OwnershipLost) -> None:
-    """End this process at once: another one may already be writing to the same files."""
+    """Exit at once, because another process may already be writing to the same files."""
     os.write(2, f"{lost}; this process ends\n".encode())
     os._exit(lost.exit_code)
 
 
 def _reporter(attempt: int) -> Callable[[Evaluation, bool, TrainerLike], None]:
-    """Sends results to Tune, but no state: a retried trial continues from its own folder, where an incomplete newest
-    checkpoint is skipped; Ray would use that checkpoint at every retry."""
+    """Sends results to Tune without a checkpoint. Retried trials continue from their own folder, where an incomplete
+    newest checkpoint is skipped; Ray would use it at every retry."""
 
     def report(evaluation: Evaluation, ended: bool, trainer: TrainerLike) -> None:
         tune.report(_figures(evaluation, ended, trainer.best_score, attempt))
@@ -201,7 +200,7 @@ def _reporter(attempt: int) -> Callable[[Evaluation, bool, TrainerLike], None]:
 
 
 def _report_with_checkpoint(evaluation: Evaluation, ended: bool, trainer: TrainerLike) -> None:
-    """Sends results with state, which Ray passes on to another member of the population."""
+    """Sends results with a checkpoint, which Ray passes on to another member of the population."""
     path = trainer.save()
     with tempfile.TemporaryDirectory() as folder:
         shutil.copy(path, folder)
@@ -221,19 +220,19 @@ def _figures(evaluation: Evaluation, ended: bool, best: float, attempt: int) -> 
     }
 
 
-def _handed_checkpoint(job: Job, scratch: Path) -> Handed | None:
-    """The checkpoint that Ray gives to this trial, if any: its own after a crash, or a better member's."""
-    handed = tune.get_checkpoint()
-    if handed is None:
+def _member_checkpoint(job: Job, scratch: Path) -> MemberCheckpoint | None:
+    """The checkpoint that Ray gives this trial, if any: its own after a crash, or a better member's."""
+    checkpoint = tune.get_checkpoint()
+    if checkpoint is None:
         return None
-    handed.to_directory(str(scratch))
-    return Handed(min(scratch.glob("epoch_*.pt")), frozenset((*job.space.sampled, "trial.seed")))
+    checkpoint.to_directory(str(scratch))
+    return MemberCheckpoint(min(scratch.glob("epoch_*.pt")), frozenset((*job.space.sampled, "trial.seed")))
 
 
 class _Watch:
-    """Ends this process if it gives no sign of life for `limit_s`, and writes its stacks to a file.
+    """Writes this process's stacks to a file and ends it, if `alive` is not called for `limit_s`.
 
-    faulthandler counts in a thread outside Python, so that a call that hangs in a device driver is caught too.
+    faulthandler's timer runs in a thread outside Python, so it also catches calls that hang in a device driver.
     """
 
     def __init__(self, limit_s: float | None, file: TextIO | None) -> None:
@@ -242,13 +241,13 @@ class _Watch:
         self.alive()
 
     def alive(self) -> None:
-        """Restart the count."""
+        """Restart the timer."""
         if self._limit_s is not None and self._file is not None:
             faulthandler.dump_traceback_later(self._limit_s, exit=True, file=self._file)
 
     @contextmanager
     def suspended(self) -> Iterator[None]:
-        """Pause the count in a block: sending a result waits for the driver, which may be stopped, asleep or busy."""
+        """Pause the timer in a block: sending a result waits for the driver, which may be suspended or busy."""
         faulthandler.cancel_dump_traceback_later()
         try:
             yield
@@ -273,7 +272,7 @@ def _watchdog(folder: Path, limit_s: float | None) -> Iterator[_Watch]:
 
 
 def _wait_for_gpu(share: float) -> None:
-    """Wait until a process that had a GPU of this trial before has given its memory back."""
+    """Wait until the memory of earlier processes on this trial's GPUs is free."""
     import torch
 
     def free_share() -> float:
@@ -292,7 +291,7 @@ def _wait_for_gpu(share: float) -> None:
 
 
 def _record_device(path: Path, gpus: float) -> None:
-    """Record which host, process and GPUs the trial was given, as evidence that it had them to itself."""
+    """Record the trial's host, process and GPUs, as evidence that it had them to itself."""
     facts = {
         "host": platform.node(),
         "pid": os.getpid(),

@@ -1,4 +1,4 @@
-"""Run one trial from its current state to its end. Independent of Ray, so it can be stepped through in a debugger."""
+"""Run one trial from its current state to its end. Independent of Ray, for use in a debugger."""
 
 import bdb
 import math
@@ -32,7 +32,7 @@ from msk_ray.tune.failures import described, repeats
 
 
 class TrainerLike(Protocol):
-    """What a trial needs of `msk_ray.training.Trainer`."""
+    """The part of `msk_ray.training.Trainer` that a trial uses."""
 
     epoch: int
     best_score: float
@@ -52,42 +52,42 @@ class TrainerLike(Protocol):
 
 
 MakeTrainer = Callable[[Config, Path, str], TrainerLike]
-"""Makes the trainer of a config, in a folder, on a device."""
+"""(config, folder, device) → trainer."""
 Precompile = Callable[[Config, str, Path], None]
-"""Compiles the kernels of a config, for a device; what else it writes goes into a folder."""
+"""Compiles a config's kernels for a device; other files go to the folder."""
 
 
 def make_trainer(config: Config, folder: Path, device: str) -> TrainerLike:
-    """`msk_ray.training.make_trainer`; torch is loaded by the process that calls this, and not by the driver."""
+    """`msk_ray.training.make_trainer`, imported by the calling process, so that the driver does not load torch."""
     from msk_ray import training
 
     return training.make_trainer(config, folder, device)
 
 
 def precompile(config: Config, device: str, folder: Path) -> None:
-    """`msk_ray.training.precompile`, in the same way."""
+    """`msk_ray.training.precompile`, likewise."""
     from msk_ray import training
 
     training.precompile(config, device, folder)
 
 
 @dataclass(frozen=True)
-class Handed:
-    """A checkpoint that a trial of a population is given, perhaps by a better member."""
+class MemberCheckpoint:
+    """The checkpoint from which a population's member continues: its own, or a better member's."""
 
     path: Path
     changed: frozenset[str]
-    """Dotted settings that may differ from those it was written under."""
+    """Dotted settings that may differ from the checkpoint's."""
 
 
 @dataclass(frozen=True)
 class Hooks:
-    """How the caller follows a trial and can pause it."""
+    """Callbacks by which the caller follows a trial and can pause it."""
 
     on_epoch: Callable[[Mapping[str, float]], None] = field(default=lambda row: None)
     """Called with every row of metrics."""
     on_evaluation: Callable[[Evaluation, bool, TrainerLike], None] = field(default=lambda e, last, trainer: None)
-    """Called after each evaluation with whether the trial has ended, and the trainer."""
+    """Called after each evaluation with the evaluation, whether the trial has ended, and the trainer."""
     pause: Callable[[], bool] = field(default=lambda: False)
     """Called before every epoch; True makes the trial save itself and return."""
 
@@ -99,21 +99,21 @@ def run_trial(
     stop: StopSpec,
     make_trainer: MakeTrainer,
     hooks: Hooks,
-    handed: Handed | None = None,
+    member_checkpoint: MemberCheckpoint | None = None,
     may_halve: bool = False,
 ) -> Ending | None:
     """Train until the trial ends, at its last epoch or by one of its own rules.
 
-    Continues from the newest complete checkpoint in `folder`, or from the one that is handed to it. The ending is
-    written to `folder`, which must exist: a trial whose folder was moved does not start again.
+    Continues from `member_checkpoint`, or else from the newest complete checkpoint in `folder`. The ending is written
+    to `folder`, which must exist: a trial whose folder was moved does not start again.
 
     Args:
-        may_halve: whether the trial may be restarted once, with half its worlds, when it runs out of memory. A trial
-            that already has half of them keeps them in any case.
+        may_halve: whether the trial may restart once with half its worlds if it runs out of memory. A trial that
+            already has half of them continues with these in any case.
 
     Returns:
-        How it ended; None if it was paused before its end, or must be run again in a new process, which holds no memory
-        of this attempt: then `folder` holds the next attempt.
+        How it ended. None if it was paused, or must run again in a new process because it is out of memory; then
+        `folder` holds the next attempt.
 
     Raises:
         StorageFailure: the disk is full, or the disk or folder is gone; the trial can continue once it is back.
@@ -131,22 +131,22 @@ def run_trial(
         done = None
     if done is not None:
         return done
-    # The error of an earlier attempt stays in the trial's output; this file is about the latest one.
+    # This file is about the latest attempt; the trial's output keeps earlier errors.
     (folder / ERROR_FILE).unlink(missing_ok=True)
     attempt = FIRST
     try:
-        # The process that decided on it may have died before starting it.
+        # The process that recorded the attempt may have died before starting it.
         attempt = _attempt_in(folder).begin(folder)
-        if attempt.reduced is not None:
+        if attempt.reduction is not None:
             print(attempt, flush=True)
-        ending = _train(attempt.effective(trial), folder, device, stop, make_trainer, hooks, handed)
+        ending = _train(attempt.effective(trial), folder, device, stop, make_trainer, hooks, member_checkpoint)
     except SimulationError as error:
         if error.failure is Failure.OUT_OF_MEMORY:
             ending = _out_of_memory(trial, folder, str(error), attempt, may_halve)
         else:
             ending = Ending(Outcome(error.failure.value), str(error))
     except (StorageFailure, RankLost, bdb.BdbQuit):
-        # The trial has not ended: it continues once the disk has space, or in new processes, or who debugs it is done.
+        # The trial has not ended: it can continue once the disk has space, in new processes, or after debugging.
         raise
     except MskRayError as error:
         ending = Ending(Outcome.ERROR, str(error))
@@ -168,15 +168,15 @@ def _attempt_in(folder: Path) -> Attempt:
         return load_attempt(folder)
     except DamagedFile as error:
         advice = (
-            'how many worlds the trial has is not known: write {"asked": N, "worlds": HALF, "why": "", "cleared": '
+            'the number of worlds is unknown: write {"asked": N, "worlds": HALF, "why": "", "cleared": '
             "true} into it and add --resume --retry error"
         )
         raise DamagedFile(error.damage, advice) from None
 
 
 def _out_of_memory(trial: Trial, folder: Path, why: str, attempt: Attempt, may_halve: bool) -> Ending | None:
-    """How a trial ends that does not fit on its device; None if there will be another attempt."""
-    if attempt.reduced is None and not may_halve:
+    """The ending of a trial that does not fit on its device; None if there will be another attempt."""
+    if attempt.reduction is None and not may_halve:
         return Ending(Outcome.OUT_OF_MEMORY, why)
     try:
         following = attempt.next(trial, why)
@@ -194,13 +194,13 @@ def _train(
     stop: StopSpec,
     make_trainer: MakeTrainer,
     hooks: Hooks,
-    handed: Handed | None,
+    member_checkpoint: MemberCheckpoint | None,
 ) -> Ending | None:
     trainer = make_trainer(trial.config, folder, device)
     try:
-        if handed is not None:
-            trainer.restore(handed.path, handed.changed)
-            # best.pt belongs to this trial; with a better member's best score it would never be replaced.
+        if member_checkpoint is not None:
+            trainer.restore(member_checkpoint.path, member_checkpoint.changed)
+            # The best score belongs to this trial's best.pt; with a better member's score, it would never be replaced.
             own = [e.score for e in evaluations_of(read_rows(folder)) if math.isfinite(e.score)]
             trainer.best_score = max(own, default=-math.inf)
         else:
@@ -216,7 +216,7 @@ def _train(
                 print("starting", flush=True)
         note = str(read_attempt(folder))
         if note:
-            # For anyone who reads only these settings, which restoring has written.
+            # Restoring has rewritten the settings; note the attempt for people who read only this file.
             settings = folder / "config.yaml"
             write_text(settings, f"# {note} asked for\n{settings.read_text(encoding='utf-8')}")
         return _loop(trial, folder, stop, trainer, hooks)
@@ -230,7 +230,7 @@ def _loop(trial: Trial, folder: Path, stop: StopSpec, trainer: TrainerLike, hook
         seen = evaluations_of(rows)
         ending = stop.ending(History(rows[-1], seen, trial.epochs, rows[-1]["seconds"])) if rows else None
         if seen:
-            # The process may have died between the checkpoint and its result; a repeated result changes nothing.
+            # The process may have died after the checkpoint and before its result; a repeated result is ignored.
             hooks.on_evaluation(seen[-1], ending is not None, trainer)
         if ending is not None:
             return ending
@@ -240,7 +240,7 @@ def _loop(trial: Trial, folder: Path, stop: StopSpec, trainer: TrainerLike, hook
         hooks.on_epoch(row)
         evaluation = Evaluation.from_row(row)
         if evaluations is None:
-            # It also has the evaluation before the first epoch, which no row returned here shows.
+            # Read from the file, which also has the evaluation before the first epoch.
             evaluations = evaluations_of([r for r in read_rows(folder) if r["epoch"] <= row["epoch"]])
         elif evaluation is not None:
             evaluations.append(evaluation)
@@ -249,7 +249,7 @@ def _loop(trial: Trial, folder: Path, stop: StopSpec, trainer: TrainerLike, hook
             return ending
         if evaluation is not None:
             if ending is not None:
-                # Before the result is sent: whoever receives the last evaluation must find the ending.
+                # Write the ending first: the receiver of the last evaluation must find it.
                 write_ending(folder, ending)
             hooks.on_evaluation(evaluation, ending is not None, trainer)
         if ending is not None:

@@ -1,9 +1,9 @@
-"""Start processes for the next trials ahead of time, with everything imported: the imports are the longest part of a
+"""Start processes for the next trials in advance, with all imports done, because imports are the slowest part of a
 start.
 
-Every trial still gets its own process. A waiting process does not use a GPU: CUDA is initialised when a trial starts in
-it, on the GPU assigned to that trial. Ray has no public interface for such processes, so this may fail with another
-version of Ray. Then one line says so, trials start a few seconds later, and nothing else changes.
+Every trial still gets its own process. A waiting process uses no GPU: CUDA is initialised when a trial starts in it, on
+that trial's GPU. Ray has no public interface for this, so it may fail with another version of Ray. Then one line says
+so, trials start a few seconds later, and nothing else changes.
 """
 
 import importlib
@@ -17,19 +17,19 @@ from ray.tune import Callback
 from msk_ray.tune.devices import Placement
 
 MODULES = ("msk_ray.training", "msk_ray.tune.trainable")
-"""What a trial's process imports."""
+"""Modules that a trial's process imports."""
 KEEP_S = 24 * 3600
 """How long Ray keeps an unused process [s]; unused processes end with the driver."""
 _CALL_LIMIT_S = 10.0
 
 
 def import_all() -> None:
-    """Run by every process of a trial as soon as it starts; the trial itself reports what cannot be imported."""
-    # Numerical libraries read this when they are imported; a trial sets its own (`execution.threads`).
+    """Run by every trial process when it starts. Failed imports are reported later by the trial."""
+    # Numerical libraries read this when imported; a trial sets its own number (`execution.threads`).
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # threads that wait for work sleep rather than spin
-    # CUDA reads this once, when it is initialised. If an import did that, the trial should fail without a GPU rather
-    # than run on another trial's.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle threads sleep instead of spinning
+    # CUDA reads this once, when it is initialised. If an import initialised it, the trial must fail without a GPU, not
+    # run on another trial's.
     visible = os.environ.get("CUDA_VISIBLE_DEVICES")
     os.environ["CUDA_VISIBLE_DEVICES"] = ""
     for name in MODULES:
@@ -41,7 +41,7 @@ def import_all() -> None:
 
 
 HOOK = f"{import_all.__module__}.{import_all.__name__}"
-"""For the runtime environment of Ray's session."""
+"""Part of the Ray session's runtime environment."""
 
 
 def nodes_for(placement: Placement) -> list[dict[str, Any]]:
@@ -54,9 +54,9 @@ def _fits(resources: dict[str, float], placement: Placement) -> bool:
 
 
 class WorkerPrestart(Callback):
-    """Once a started trial trains, makes sure that enough idle processes wait for the next trials.
+    """Keeps enough idle processes waiting for the next trials, from the first training epoch of a started trial on.
 
-    It does not do so as soon as a trial starts: on a machine with few cores, the imports would slow the trial down.
+    Not earlier, because on a machine with few cores the imports would slow down the start.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class WorkerPrestart(Callback):
         Args:
             placement: resources of a trial.
             limit: number of trials at the same time, on all nodes.
-            waiting: how many trials have not started yet.
+            waiting: returns the number of trials that have not started yet.
             say: prints a line.
         """
         self._placement = placement
@@ -92,7 +92,7 @@ class WorkerPrestart(Callback):
             return
         try:
             self._due = not self._prestart(waiting)
-        except Exception as error:  # any error of another version of Ray, or of a node that is dying
+        except Exception as error:  # any error: another version of Ray, or a dying node
             self._due, self._probe = False, None
             reason = f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
             if reason not in self._said:
@@ -100,7 +100,7 @@ class WorkerPrestart(Callback):
                 self._say(f"no process was started ahead of time, so trials start a few seconds later: {reason}")
 
     def _prestart(self, waiting: int) -> bool:
-        """Start the processes that may be needed; False while the trials' environment is not known yet."""
+        """Start the processes needed; False while the trials' runtime environment is not known yet."""
         if self._probe is None:
             self._probe = _environment_of_trials()
         if not ray.wait([self._probe], timeout=0)[0]:
@@ -122,7 +122,7 @@ def start_processes(node: dict[str, Any], count: int, environment: str) -> None:
         environment: serialised runtime environment of the trials that will use them.
 
     Raises:
-        Exception: any error of Ray's internals; grpc.RpcError if the node does not answer.
+        Exception: any error of Ray's internals, such as grpc.RpcError if the node does not answer.
     """
     from ray._private.grpc_utils import init_grpc_channel
     from ray.core.generated import common_pb2, node_manager_pb2, node_manager_pb2_grpc
@@ -139,8 +139,8 @@ def start_processes(node: dict[str, Any], count: int, environment: str) -> None:
 
 
 def _environment_of_trials() -> Any:
-    """A serialised reference to the runtime environment: Tune gives trials' processes their own, merged over that of
-    Ray's session, and Ray does not use processes of another one."""
+    """The trials' runtime environment, serialised: Tune merges its own over the Ray session's, and Ray only reuses
+    processes with the same one."""
     from ray.tune.execution.class_cache import DEFAULT_ENV_VARS, ENV_VARS_TO_PROPAGATE
 
     variables = DEFAULT_ENV_VARS | {name: os.environ[name] for name in ENV_VARS_TO_PROPAGATE if name in os.environ}

@@ -39,7 +39,7 @@ KUBERNETES = "1.30"
 """The oldest release that is still looked after by all three clouds; newer ones only add fields."""
 
 Check = Callable[[Any], None]
-Place = tuple[str | int, ...]
+KeyPath = tuple[str | int, ...]
 
 
 class Wrong(Exception):
@@ -156,7 +156,7 @@ def passes(check: Check, document: Any) -> bool:
     return True
 
 
-def keys(node: Any, above: Place = ()) -> Iterator[Place]:
+def keys(node: Any, above: KeyPath = ()) -> Iterator[KeyPath]:
     """Where every key of nested mappings is."""
     for key, child in node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ():
         if isinstance(node, dict):
@@ -164,11 +164,11 @@ def keys(node: Any, above: Place = ()) -> Iterator[Place]:
         yield from keys(child, (*above, key))
 
 
-def matches(place: Place, pattern: tuple[str, ...]) -> bool:
+def matches(place: KeyPath, pattern: tuple[str, ...]) -> bool:
     return len(place) == len(pattern) and all(p in ("*", key) for key, p in zip(place, pattern, strict=True))
 
 
-def misspelt(document: Any, place: Place) -> Any:
+def misspelt(document: Any, place: KeyPath) -> Any:
     """A copy with two letters of one key swapped."""
     # Not deepcopy: YAML's aliases would change everywhere.
     changed = json.loads(json.dumps(document))

@@ -16,7 +16,7 @@ from msk_ray.errors import CheckpointError
 from msk_ray.evaluate.__main__ import main, positive
 from msk_ray.evaluate.measure import Bench, Request, figures
 from msk_ray.evaluate.stored import read_evaluations, store_evaluation
-from msk_ray.experiment.attempts import Attempt, Reduced
+from msk_ray.experiment.attempts import Attempt, WorldReduction
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.results import best_records, read_records
 from msk_ray.training import load_policy, read_metrics
@@ -86,7 +86,7 @@ def test_an_experiment_is_ranked_and_a_torn_policy_is_named(
     torn = Experiment(folder).trials()[1].id
     with (folder / "trials" / torn / "checkpoints" / "best.pt").open("ab") as file:
         file.write(b"x")
-    Attempt(Reduced(16, 8, "no room", cleared=True)).write(folder / "trials" / Experiment(folder).trials()[0].id)
+    Attempt(WorldReduction(16, 8, "no room", cleared=True)).write(folder / "trials" / Experiment(folder).trials()[0].id)
     assert run(main, ["small", "--storage", str(tmp_path), "--device", "cpu"]) == 1
     data = json.loads((folder / "eval.json").read_text())
     (ranked,) = data["rankings"]

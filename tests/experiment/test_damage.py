@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from msk_ray.config import dump_yaml
 from msk_ray.errors import MskRayError, StorageFailure
 from msk_ray.experiment import damage
-from msk_ray.experiment.attempts import Attempt, Reduced, load_attempt
+from msk_ray.experiment.attempts import Attempt, WorldReduction, load_attempt
 from msk_ray.experiment.damage import DamagedFile, read_object
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import load_metrics
@@ -143,7 +143,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Experiment:
         (own / "device.json").write_text(json.dumps({"host": "h", "visible": "", "count": 0, "name": "cpu"}))
         (own / "config.yaml").write_text(dump_yaml(trial.config.as_dict()))
         write_ending(own, Ending(Outcome.FINISHED, "all 4 epochs done"))
-    Attempt(Reduced(8, 4, "no room", cleared=True)).write(own)
+    Attempt(WorldReduction(8, 4, "no room", cleared=True)).write(own)
     (made.path / "summary.json").write_text("{}")
     return made
 

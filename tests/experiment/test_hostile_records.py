@@ -20,7 +20,7 @@ from msk_ray.config import dump_yaml
 from msk_ray.errors import CheckpointError, MskRayError
 from msk_ray.evaluate.stored import read_evaluations
 from msk_ray.experiment import layout
-from msk_ray.experiment.attempts import Attempt, Reduced
+from msk_ray.experiment.attempts import Attempt, WorldReduction
 from msk_ray.experiment.checkpoint_file import read_checkpoint_file, read_facts, write_checkpoint_file
 from msk_ray.experiment.damage import CATALOGUE, DEPTH, LINE, read_object
 from msk_ray.experiment.manifest import MAX_TRIALS, Experiment
@@ -79,7 +79,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Experiment:
         (own / layout.OUTPUT_FILE).write_text("starting\n")
         (own / layout.ERROR_FILE).write_text("ValueError: it is over\n")
         write_checkpoint_file(own / BEST, b"weights", {"epoch": 4})
-        Attempt(Reduced(8, 4, "no room", cleared=True)).write(own)
+        Attempt(WorldReduction(8, 4, "no room", cleared=True)).write(own)
         write_ending(own, Ending(Outcome.FINISHED, "all 4 epochs done"))
         write_note(made.path, trial.id, "mine")
     SchedulerLog(made.path / layout.SCHEDULER_LOG_FILE).append(LogEntry("a", 1, 10, 0.5, 1.0, False))

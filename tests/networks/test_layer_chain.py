@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from msk_ray.config.schema import CriticConfig
-from msk_ray.networks.chain import Chain
+from msk_ray.networks.layer_chain import Chain
 from msk_ray.networks.mlp import make_mlp
 
 

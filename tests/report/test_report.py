@@ -15,7 +15,7 @@ from msk_ray.cli import run
 from msk_ray.config import dump_yaml
 from msk_ray.errors import ConfigError
 from msk_ray.experiment import snapshot
-from msk_ray.experiment.attempts import Attempt, Reduced
+from msk_ray.experiment.attempts import Attempt, WorldReduction
 from msk_ray.experiment.damage import DamagedFile
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.notes import load_notes, write_note
@@ -288,7 +288,7 @@ def test_half_the_worlds_are_said_wherever_a_score_is(experiment: Experiment) ->
     assert "half the worlds" not in page_of(experiment)
     best = read_experiment(experiment, time.time()).best
     assert best is not None
-    Attempt(Reduced(64, 32, "no room", cleared=True)).write(best.folder)
+    Attempt(WorldReduction(64, 32, "no room", cleared=True)).write(best.folder)
     page = " ".join(page_of(experiment).split())
     note = f"with half the requested worlds, after running out of memory with all of them (<code>{best.trial.id}<"
     assert note in page

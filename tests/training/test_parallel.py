@@ -162,7 +162,7 @@ class Speaker:
     def send(self, message: Any) -> None:
         pass
 
-    def fate(self) -> str:
+    def exit_text(self) -> str:
         return f"process {self.number} is dead"
 
     def end(self) -> None:

@@ -72,7 +72,7 @@ def test_a_checkpoint_of_other_weights_than_it_says_is_damaged(tmp_path: Path, m
     monkeypatch.setattr("msk_ray.training.checkpoint.parameter_hash", lambda modules: "0" * 32)
     write_checkpoint(path, state, {"epoch": 1})
     monkeypatch.undo()
-    with pytest.raises(CheckpointError, match="damaged: its weights are not those"):
+    with pytest.raises(CheckpointError, match="damaged: its weights do not match"):
         read_checkpoint(path)
 
 

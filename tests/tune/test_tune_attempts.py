@@ -13,7 +13,7 @@ from msk_ray.cli import run
 from msk_ray.config import dump_yaml, read_yaml
 from msk_ray.errors import ConfigError
 from msk_ray.experiment import attempts
-from msk_ray.experiment.attempts import FIRST, Attempt, Reduced, read_attempt
+from msk_ray.experiment.attempts import FIRST, Attempt, WorldReduction, read_attempt
 from msk_ray.experiment.layout import ABANDONED, SCHEDULER_LOG_FILE
 from msk_ray.experiment.metrics import read_rows
 from msk_ray.experiment.outcomes import Ending, Outcome, read_ending, write_ending
@@ -163,11 +163,11 @@ def test_a_process_killed_after_the_decision_halves_no_second_time(
             patch.setattr(Path, "rename", rename_once)
         with pytest.raises(Killed):
             attempt(trial, tmp_path)
-    assert read_attempt(tmp_path) == Attempt(Reduced(8, 4, "out_of_memory: made up", cleared=False))
+    assert read_attempt(tmp_path) == Attempt(WorldReduction(8, 4, "out_of_memory: made up", cleared=False))
     ending = attempt(trial, tmp_path)
     assert ending is not None
     assert ending.outcome is Outcome.FINISHED
-    assert read_attempt(tmp_path) == Attempt(Reduced(8, 4, "out_of_memory: made up", cleared=True))
+    assert read_attempt(tmp_path) == Attempt(WorldReduction(8, 4, "out_of_memory: made up", cleared=True))
     assert epochs(tmp_path) == list(range(21))
     assert epochs(tmp_path / ABANDONED) == [0, 1, 2, 3, 4]
     assert (tmp_path / ABANDONED / "checkpoints" / "epoch_000004.pt").is_file()
@@ -259,7 +259,7 @@ def test_a_stop_that_was_not_carried_out_is_void_once_the_worlds_are_halved(
     for name, score in ((good, 2.0), (bad, 1.0)):  # at the rung, half of 20 epochs × 64 env steps
         SchedulerLog(experiment.path / SCHEDULER_LOG_FILE).append(LogEntry(name, 10, 640, 1.0, score, False))
     if halved_after:
-        Attempt(Reduced(8, 4, "no room")).write(experiment.trial_folder(bad))
+        Attempt(WorldReduction(8, 4, "no room")).write(experiment.trial_folder(bad))
     driver._finish_pruning(driver.Plan(experiment, space, trials, Placement(0.0, 1), None))
     ending = read_ending(experiment.trial_folder(bad))
     assert (ending and ending.outcome) == (None if halved_after else Outcome.STOPPED_ASHA)
@@ -308,7 +308,7 @@ def test_tables_say_so(make_space: Any, tmp_path: Path) -> None:
         (folder / "metrics.jsonl").write_text(json.dumps(row) + "\n")
         write_ending(folder, Ending(Outcome.FINISHED, "all 20 epochs done"))
     assert reduced_note(read_records(experiment)) is None
-    Attempt(Reduced(8, 4, "no room", cleared=True)).write(experiment.trial_folder(trials[3].id))
+    Attempt(WorldReduction(8, 4, "no room", cleared=True)).write(experiment.trial_folder(trials[3].id))
     records = read_records(experiment)
     best = result_rows(records)[0]
     assert best[6] == "finished, half the worlds"

@@ -55,7 +55,7 @@ def test_a_value_is_set_again_and_again_until_it_is_dropped(
     """Ray serves a value for 20 s after it was set and no longer."""
     monkeypatch.setattr(gauges, "REPEAT_S", 0.01)
     gauge: Any = FakeGauge("g", "", ("trial",))
-    kept = gauges.Kept()
+    kept = gauges.LastingGauges()
     kept.set(gauge, 1, {"trial": "a"})
     kept.set(gauge, 2, {"trial": "a"})
     kept.set(gauge, 3, {"trial": "b"})

@@ -3,12 +3,12 @@
 from typing import Any
 
 from msk_ray.sweep.trials import resolve_trials
-from msk_ray.tune.driver import with_kernels_of_their_own
+from msk_ray.tune.driver import one_per_kernel_set
 
 
 def test_each_algorithm_launches_kernels_of_its_own(make_space: Any) -> None:
     space = make_space(
         parameters={"algorithm.name": {"grid": ["ppo", "shac"]}, "trial.epochs": {"grid": [4, 5]}}, seeds="0-1"
     )
-    found = with_kernels_of_their_own(resolve_trials(space))
+    found = one_per_kernel_set(resolve_trials(space))
     assert [trial.variant for trial in found] == ["algorithm=ppo, epochs=4", "algorithm=shac, epochs=4"]

@@ -30,7 +30,7 @@ from stub_trainer import (
 )
 
 from msk_ray.errors import StorageFailure
-from msk_ray.experiment.attempts import Attempt, Reduced, read_attempt
+from msk_ray.experiment.attempts import Attempt, WorldReduction, read_attempt
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import read_rows
 from msk_ray.experiment.outcomes import Outcome
@@ -230,5 +230,7 @@ def test_a_driver_killed_after_the_decision_goes_on_with_half_the_worlds(make_sp
     completed, (record,) = go(make_space(parameters={BEHAVIOUR: {"grid": [LATE_CROWD]}}), path, True)
     assert completed
     assert outcomes([record]) == ["finished"]
-    assert record.attempt == Attempt(Reduced(8, 4, "out_of_memory: made up", cleared=True)) == read_attempt(folder)
+    assert (
+        record.attempt == Attempt(WorldReduction(8, 4, "out_of_memory: made up", cleared=True)) == read_attempt(folder)
+    )
     assert [row["epoch"] for row in read_rows(folder)] == list(range(21))

@@ -13,7 +13,7 @@ from msk_ray.sweep.space import Space
 from msk_ray.sweep.trials import resolve_trials
 from msk_ray.tune import supervisor
 from msk_ray.tune.console import Console
-from msk_ray.tune.presence import remove_remains
+from msk_ray.tune.experiment_watch import remove_remains
 from msk_ray.tune.supervisor import LONGEST_STEP_S, SHUTDOWN_GRACE_S, Supervisor
 
 

@@ -112,8 +112,8 @@ def test_a_pipe_that_nobody_reads_does_not_matter(
 @pytest.mark.parametrize("redirection", [">&-", "| true"])
 def test_no_line_is_lost_and_the_exit_code_is_its_own(redirection: str, tmp_path: Path) -> None:
     code = (
-        "import sys, time; from pathlib import Path; from msk_ray.cli import outliving\n"
-        "with outliving(Path('log')):\n"
+        "import sys, time; from pathlib import Path; from msk_ray.cli import surviving_closed_output\n"
+        "with surviving_closed_output(Path('log')):\n"
         "    time.sleep(0.5)\n"
         "    print('a' * 100_000); print('ü', flush=True); print('to stderr', file=sys.stderr)\n"
         "print('after'); sys.exit(75)"

@@ -78,7 +78,7 @@ class Ppo(Algorithm):
 
     @classmethod
     def policy_network(cls, config: Config, obs_size: int, action_size: int) -> GaussianPolicy:
-        """A policy with weights drawn from torch's global generator, and statistics without any observation yet."""
+        """A policy with weights drawn from torch's global generator, and empty observation statistics."""
         noise = {"class_name": "GaussianDistribution", "init_std": 1.0, "std_type": "log"}
         return GaussianPolicy(_network(config.actor, "actor", obs_size, action_size, noise))
 
@@ -106,13 +106,15 @@ class Ppo(Algorithm):
         try:
             rewards, done, diverged = self._collect(epoch)
             clock.mark("rollout")
-            if self.witness is not None:
+            if self.digest_log is not None:
                 storage = self.ppo.storage
-                self.witness.note("rollout", {**storage.observations, "rewards": rewards, "actions": storage.actions})
+                self.digest_log.note(
+                    "rollout", {**storage.observations, "rewards": rewards, "actions": storage.actions}
+                )
             values = self.ppo.storage.values.mean()
             losses = self.ppo.update()
         except (RuntimeError, ValueError):
-            # What torch raises for a mean or standard deviation that is NaN, for one.
+            # Torch raises this for a mean or standard deviation that is NaN, for example.
             self._check("weights", self._weights())
             seen, done = self.env.observation()[None], self.ppo.storage.step
             if (fault := nonfinite_observation(self.env, seen, epoch, done)) is not None:
@@ -156,7 +158,7 @@ class Ppo(Algorithm):
 
     @torch.no_grad()
     def _collect(self, epoch: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Fill rsl_rl's storage; rewards (H, W), ends of episodes (H, W) bool, and how many worlds diverged."""
+        """Fill rsl_rl's storage; returns rewards (H, W), ends of episodes (H, W) bool, and how many worlds diverged."""
         env, ppo = self.env, self.ppo
         env.state = env.state.detach()
         env.stock_resets(env.draw_resets(self.settings.steps))

@@ -1,4 +1,4 @@
-"""The part of an epoch that changes the actor. The host looks at nothing in it, so that it can be recorded."""
+"""The part of an epoch that updates the actor. It never waits for the device, so that it can be recorded."""
 
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -8,15 +8,15 @@ import torch
 from torch import Tensor
 
 from msk_ray.algorithms.shac import returns
+from msk_ray.algorithms.shac.cotangent_gate import CotangentGate, CotangentRecord
 from msk_ray.algorithms.shac.entropy import EntropyBonus
-from msk_ray.algorithms.shac.gate import CotangentGate, CotangentRecord
 from msk_ray.algorithms.shac.half_batch_cosine import HalfBatchCosine
 from msk_ray.algorithms.shac.optimizer import RateAdam, clip_gradients
 from msk_ray.algorithms.shac.rollout import Rollout, collect
 from msk_ray.config import ContactHorizon, ShacConfig
 from msk_ray.envs import Env, EnvState, Resets
 from msk_ray.networks import Critic, PolicyNetwork, RunningMeanStd
-from msk_ray.networks.calls import Calls
+from msk_ray.networks.network_calls import NetworkCalls
 from msk_ray.step import StepState
 
 MAX_NONFINITE_SHARE = 0.05
@@ -24,13 +24,13 @@ MAX_NONFINITE_SHARE = 0.05
 
 
 class EpochInputs(NamedTuple):
-    """What an epoch starts from and draws; H horizon, W worlds."""
+    """An epoch's start state and random draws; H horizon, W worlds."""
 
     state: EnvState
     resets: Resets
-    """What the worlds whose episodes end go on with, H·W of them."""
+    """States in which worlds start their next episode, H·W of them."""
     noise: Tensor
-    """Standard normal numbers of the actions, (H, W, A)."""
+    """Standard normal noise of the actions, (H, W, A)."""
 
     def tensors(self) -> list[Tensor]:
         """All tensors in a fixed order."""
@@ -38,7 +38,7 @@ class EpochInputs(NamedTuple):
         return [*physics, *others, *self.resets.physics, self.resets.numbers, self.noise]
 
     def copies(self) -> "EpochInputs":
-        """The same in memory of its own."""
+        """A copy in new memory."""
         physics, *others = self.state
         return EpochInputs(
             EnvState(StepState(*(t.clone() for t in physics)), *(t.clone() for t in others)),
@@ -48,24 +48,24 @@ class EpochInputs(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Rolled:
-    """A rollout with its graph, before anything was learned from it."""
+class RolloutGraph:
+    """A rollout with its autograd graph, before the update."""
 
     rollout: Rollout
     state: EnvState
-    """Of the worlds after it."""
+    """The worlds' state after the rollout."""
     gate: CotangentGate
     halves: HalfBatchCosine
-    calls: Calls | None
-    """Those of the actor's network, whose gradients are still to be added up; None if autograd does it."""
+    calls: NetworkCalls | None
+    """Calls of the actor's network, to add up its gradients afterwards; None if autograd adds them up."""
 
 
 @dataclass(frozen=True)
-class Judged:
-    """A rollout's loss, and what the critic is to learn from it; obs and targets are of all worlds of the group."""
+class RolloutLoss:
+    """The actor's loss for a rollout, and the critic's data, which cover all worlds of the group."""
 
     loss: Tensor
-    """The actor's, with its graph."""
+    """The actor's loss, with its graph."""
     value: Tensor
     """Mean value of the states reached."""
     raw: Tensor
@@ -83,7 +83,7 @@ class Judged:
 
 @dataclass(frozen=True)
 class ActorOutcome:
-    """The results of one epoch, all detached, on the device; of all worlds of the group, but for state and terms."""
+    """Results of one epoch, detached, on the device, of the whole group; `state` and `terms` of this process only."""
 
     state: EnvState
     """Of this process's worlds."""
@@ -106,16 +106,16 @@ class ActorUpdate:
     """Rollout, loss, backward pass and the actor's step.
 
     Args:
-        settings: those of SHAC.
+        settings: SHAC's settings.
         env: the worlds.
         network: the policy.
         target_critic: values of the states reached.
-        return_statistics: statistics of the discounted return, or None if rewards are not divided by it.
+        return_statistics: statistics of the discounted return; None if rewards are not normalised.
         entropy: the bonus for the policy's entropy, or None.
         optimizer: the actor's.
 
     Attributes:
-        discounted: the running discounted return of each world of the group, which `return_statistics` are of.
+        discounted: running discounted return of each world of the group, the input of `return_statistics`.
     """
 
     def __init__(
@@ -138,15 +138,15 @@ class ActorUpdate:
         self._group = env.group
         self.discounted = torch.zeros(env.nworld * env.group.size, device=env.device)
 
-    def roll(self, inputs: EpochInputs) -> Rolled:
-        """Roll the policy out over as many env steps as there is noise."""
+    def roll_out(self, inputs: EpochInputs) -> RolloutGraph:
+        """Roll the policy out over H env steps, the length of `inputs.noise`."""
         env, c = self._env, self._settings
-        # A cotangent of norm 1/(H·W) is what a reward of one in one world sends back through the mean loss.
+        # Through the mean loss, a reward of 1 in one world sends back a cotangent of norm 1/(H·W).
         bound = None if c.state_grad_clip is None else c.state_grad_clip / (len(inputs.noise) * env.nworld)
         gate = CotangentGate(bound, env.nworld, env.device)
-        # Recorded CUDA graphs keep autograd's order of kernels, and a layer whose output has two readers its own call.
+        # Only on a CPU and for a plain network: a log σ layer would read the last hidden layer too.
         alone = self._actor.log_std_layer is None and env.device.type == "cpu"
-        calls = Calls(self._actor.mean) if alone else None
+        calls = NetworkCalls(self._actor.mean) if alone else None
         halves = HalfBatchCosine(self._actor, self._group, () if calls is None else (calls,))
         env.state = inputs.state
         env.stock_resets(inputs.resets)
@@ -161,41 +161,41 @@ class ActorUpdate:
                 with_neg_log_prob=self._entropy is not None,
                 with_contact=isinstance(c.horizon, ContactHorizon),
             )
-        return Rolled(rollout, env.state.detach(), gate, halves, calls)
+        return RolloutGraph(rollout, env.state.detach(), gate, halves, calls)
 
-    def judge(self, rolled: Rolled) -> Judged:
-        """Value the states that were reached, by the target critic: the actor's loss, and the critic's targets."""
-        c, rollout, gather = self._settings, rolled.rollout, self._group.gather
+    def compute_loss(self, graph: RolloutGraph) -> RolloutLoss:
+        """The actor's loss and the critic's targets, from the target critic's values of the states reached."""
+        c, rollout, gather = self._settings, graph.rollout, self._group.gather
         loss, next_values, rewards = self._loss(rollout)
         values = next_values.detach()
         targets = returns.td_lambda_targets(rewards, values, rollout.terminated, rollout.done, c.gamma, c.lam)
         raw = gather(rollout.obs, dim=1)
         normalised = self._normalizer.normalize(raw)
-        return Judged(loss, values.mean(), raw, normalised, gather(targets, dim=1))
+        return RolloutLoss(loss, values.mean(), raw, normalised, gather(targets, dim=1))
 
-    def learn(self, rolled: Rolled, judged: Judged) -> ActorOutcome:
+    def update_actor(self, graph: RolloutGraph, rollout_loss: RolloutLoss) -> ActorOutcome:
         """Take the actor's step along the rollout's gradient, and update the statistics.
 
-        The step is left out where more worlds than `MAX_NONFINITE_SHARE` had a gradient that was not finite, or the
-        policy's gradient is not finite: the metrics say so.
+        The step is skipped if a larger share of worlds than `MAX_NONFINITE_SHARE` had a non-finite gradient, or if the
+        policy's gradient is not finite; the metrics report it.
 
-        Outside a group `gather` and `mean` change nothing. In one, each process sent back the gradient of the mean over
-        its own worlds, of which there are as many everywhere.
+        `gather` and `mean` do nothing without a group. In a group, each process computes the gradient of the mean over
+        its own worlds, and all have the same number of worlds.
         """
-        c, rollout, gather = self._settings, rolled.rollout, self._group.gather
+        c, rollout, gather = self._settings, graph.rollout, self._group.gather
         self._optimizer.zero_grad()
-        judged.loss.backward()
-        if rolled.calls is not None:
-            rolled.calls.add_gradients()
+        rollout_loss.loss.backward()
+        if graph.calls is not None:
+            graph.calls.add_gradients()
         self._group.mean([p.grad for p in self._actor.parameters() if p.grad is not None])
-        cotangents = rolled.gate.record(self._group)
+        cotangents = graph.gate.record(self._group)
         limit = float("inf") if c.actor_grad_norm is None else c.actor_grad_norm
         norm = clip_gradients(list(self._actor.parameters()), limit)
         failed = (cotangents.nonfinite_share > MAX_NONFINITE_SHARE) | ~norm.isfinite()
         self._optimizer.step(skip=failed)
-        self._normalizer.update(judged.raw.flatten(0, 1))
+        self._normalizer.update(rollout_loss.raw.flatten(0, 1))
         detached = gather(rollout.rewards.detach(), dim=1)
-        means = {"train/actor_loss": judged.loss.detach(), "train/value": judged.value}
+        means = {"train/actor_loss": rollout_loss.loss.detach(), "train/value": rollout_loss.value}
         if rollout.neg_log_prob is not None:
             means["train/entropy"] = rollout.neg_log_prob.detach().mean()
         self._group.mean(list(means.values()))
@@ -204,15 +204,15 @@ class ActorUpdate:
             "train/reward": detached.mean(),
             "train/diverged": gather(rollout.diverged, dim=1).sum(),
             "grad/actor_norm": norm,
-            "grad/halves_cosine": rolled.halves.cosine(),
-            "train/std": self._actor.std(judged.normalised).detach().mean(),
+            "grad/halves_cosine": graph.halves.cosine(),
+            "train/std": self._actor.std(rollout_loss.normalised).detach().mean(),
         }
         if rollout.contact is not None:
             weight = float(self._env.model.body_mass.sum() * -self._env.model.opt.gravity[2])
             metrics["train/contact"] = (gather(rollout.contact, dim=1) / weight).square().mean().sqrt()
         return ActorOutcome(
-            rolled.state,
-            *judged.for_critic,
+            graph.state,
+            *rollout_loss.for_critic,
             detached,
             rollout.terms,
             gather(rollout.done, dim=1),
@@ -221,7 +221,7 @@ class ActorUpdate:
         )
 
     def _loss(self, rollout: Rollout) -> tuple[Tensor, Tensor, Tensor]:
-        """The actor's loss, values of the states reached (H, W) and detached rewards, both for the critic's targets."""
+        """The actor's loss; and for the critic, values of the states reached and detached rewards, both (H, W)."""
         c = self._settings
         rewards = c.reward_scale * rollout.rewards
         if self._entropy is not None:

@@ -88,15 +88,15 @@ class Shac(Algorithm):
 
     def modules(self) -> dict[str, nn.Module]:
         """Policy, critics and statistics."""
-        found = {**self.network.parts(), "critic": self.critic, "target_critic": self.target_critic}
-        return found if self.return_statistics is None else found | {"return_statistics": self.return_statistics}
+        modules = {**self.network.parts(), "critic": self.critic, "target_critic": self.target_critic}
+        return modules if self.return_statistics is None else modules | {"return_statistics": self.return_statistics}
 
     def update(self, epoch: int) -> EpochResult:
         """Train one epoch, counted from 0.
 
         Returns:
-            Env steps, and metrics with seconds spent in rollout, backward and critic. From recorded epochs, loss and
-            time of the critic are those of the epoch before, because its fit still runs.
+            Env steps, and metrics with seconds spent in rollout, backward and critic. In recorded epochs, the critic's
+            loss and time are from the previous epoch, because this epoch's fit is still running.
 
         Raises:
             SimulationError: an observation or a reward is not finite, too many worlds had a gradient that is not, the
@@ -107,14 +107,14 @@ class Shac(Algorithm):
         actor_lr = self._rate(c.actor_lr, epoch)
         self.actor_optimizer.set_rate(actor_lr)
         inputs = self._draw(horizon, epoch)
-        if self.witness is not None:
-            self.witness.note("draws", {"noise": inputs.noise, **inputs.state.physics._asdict()})
+        if self.digest_log is not None:
+            self.digest_log.note("draws", {"noise": inputs.noise, **inputs.state.physics._asdict()})
         outcome = self._runner.run(inputs, self._rate(c.critic_lr, epoch))
-        if self.witness is not None:
-            rolled = {"observations": outcome.obs, "rewards": outcome.rewards, "ends of episodes": outcome.done}
-            self.witness.note("rollout", {**rolled, **outcome.state.physics._asdict()})
-            self.witness.note("values", {"targets of the critic": outcome.targets})
-            self.witness.note("gradients", {"policy": torch.cat([p.flatten() for p in self.actor.parameters()])})
+        if self.digest_log is not None:
+            rollout = {"observations": outcome.obs, "rewards": outcome.rewards, "ends of episodes": outcome.done}
+            self.digest_log.note("rollout", {**rollout, **outcome.state.physics._asdict()})
+            self.digest_log.note("values", {"targets of the critic": outcome.targets})
+            self.digest_log.note("gradients", {"policy": torch.cat([p.flatten() for p in self.actor.parameters()])})
         seconds = self._runner.seconds()
         self.env.sim.settle()
         cotangents = outcome.cotangents.statistics(1.0 / (horizon * self.env.nworld))
@@ -122,7 +122,7 @@ class Shac(Algorithm):
         metrics = {**outcome.metrics, **cotangents.metrics(), **episodes}
         if self._runner.last_loss is not None:
             metrics["train/critic_loss"] = self._runner.last_loss
-        # One transfer: reading each number would make the host wait as many times.
+        # One transfer, so that the host waits once and not for each number.
         values = torch.stack([value.float() for value in metrics.values()]).tolist()
         numbers = dict(zip(metrics, values, strict=True))
         self._check_finite(outcome, numbers, epoch)
@@ -141,11 +141,11 @@ class Shac(Algorithm):
         return EpochResult(horizon * self._worlds, numbers, round(numbers["train/episodes"]))
 
     def remarks(self) -> list[str]:
-        """Why epochs are not recorded, if they should be."""
+        """Why epochs are not recorded, although they should be."""
         return [] if self._runner.refusal is None else [f"{UNRECORDED}: {self._runner.refusal}"]
 
     def note_state(self) -> None:
-        """Let the witness, if there is one, note worlds and modules, once the critic's fit has ended."""
+        """Record digests of worlds and modules, once the critic's fit has ended, if there is a `digest_log`."""
         self._runner.join()
         super().note_state()
 
@@ -191,7 +191,7 @@ class Shac(Algorithm):
             self.env.sim.batch.unrolled_iterations = state["iterations"]
 
     def _rate(self, rate: float, epoch: int) -> float:
-        """The learning rate at an epoch that was `rate` at the first."""
+        """The learning rate at an epoch, if it was `rate` at the first."""
         c = self.settings
         return learning_rate_at(rate, c.final_lr, c.lr_schedule, epoch, self.config.trial.epochs)
 
@@ -222,10 +222,10 @@ class Shac(Algorithm):
         return stood
 
     def _check_finite(self, outcome: ActorOutcome, numbers: Mapping[str, float], epoch: int) -> None:
-        """Raise SimulationError for a reward that is not finite, or a gradient along which no step was taken.
+        """Raise SimulationError for a non-finite reward, or a non-finite gradient for which the step was skipped.
 
         Args:
-            outcome: of the epoch.
+            outcome: the epoch's results.
             numbers: its metrics, by name.
             epoch: counted from 0.
         """
@@ -243,7 +243,7 @@ class Shac(Algorithm):
             raise SimulationError(
                 f"nonfinite_gradient: the state cotangent of {lost:.1%} of the worlds was not finite "
                 f"({allowed:.0%} may be); shorten shac.horizon, set shac.state_grad_clip or "
-                "soften the contacts; or look in observe and reward_terms for the slope of a root or norm at 0",
+                "soften the contacts; or look in observe and reward_terms for a root or norm at 0",
                 Failure.NONFINITE,
             )
         raise SimulationError(
@@ -251,9 +251,9 @@ class Shac(Algorithm):
         )
 
     def prepare_fit(self, rows: int, rate: float) -> Tensor:
-        """Set the critic's rate, and draw the orders in which a fit passes over so many rows, (passes, rows).
+        """Set the critic's learning rate, and draw a random order of the rows for each pass of a fit, (passes, rows).
 
-        The fit before must have ended: it reads its rate until then.
+        The previous fit must have ended, because it reads the rate.
         """
         self.critic_fit.optimizer.set_rate(rate)
         return self.critic_fit.draw_orders(rows, self.settings.critic_iterations, self.generator)

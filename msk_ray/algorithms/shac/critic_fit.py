@@ -6,7 +6,7 @@ from torch import Tensor, nn
 from msk_ray.algorithms.shac.optimizer import RateAdam, clip, clip_flat, views_of
 from msk_ray.group import ALONE, Group
 from msk_ray.networks import Critic
-from msk_ray.networks.chain import Chain
+from msk_ray.networks.layer_chain import Chain
 
 _WINDOW = 4
 """Changes of the loss from pass to pass that count together."""
@@ -40,7 +40,7 @@ class CriticFit:
         group: Group = ALONE,
     ) -> None:
         device = next(critic.parameters()).device
-        # Kept, because a module looks for its parameters everywhere below it each time.
+        # Stored, because `parameters()` walks all submodules on every call.
         self._members = [list(member.parameters()) for member in critic.members]
         self._parameters = [parameter for member in self._members for parameter in member]
         self._critic = critic
@@ -69,17 +69,17 @@ class CriticFit:
             passes.append(torch.stack(losses).mean())
             if self._tolerance is not None:
                 settled = self._settled(passes, settled)
-                # A recorded fit cannot ask: there, the passes left change nothing.
+                # A recorded fit cannot stop early: there, the remaining passes change nothing.
                 if settled.device.type == "cpu" and settled:
                     break
         return passes[-1]
 
     def _settled(self, passes: list[Tensor], before: Tensor | None) -> Tensor:
-        """Whether the loss has stopped changing, a bool scalar on the device; once it has, it stays so."""
+        """Whether the loss has stopped changing, a bool scalar on the device; once true, it stays true."""
         assert self._tolerance is not None
         if len(passes) <= _WINDOW:
             return torch.zeros((), dtype=torch.bool, device=passes[-1].device)
-        # The mean of the last changes is that between their ends.
+        # The mean of the last changes is the difference of their ends, divided by their number.
         change = (passes[-1] - passes[-1 - _WINDOW]).abs() / _WINDOW
         settled = change < self._tolerance * passes[-1]
         return settled if before is None else settled | before
@@ -92,11 +92,11 @@ class CriticFit:
         return mean
 
     def _by_autograd(self, obs: Tensor, targets: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """The loss of rows, and the gradient along which the step goes, by parameter."""
+        """The loss of these rows, and the clipped gradient of each parameter."""
         with torch.enable_grad():
             loss = (self._critic(obs) - targets).square().mean()
-            found = torch.autograd.grad(loss, self._parameters)
-        mean, gradients = loss.detach(), list(found)
+            gradients = list(torch.autograd.grad(loss, self._parameters))
+        mean = loss.detach()
         self._group.mean([mean, *gradients])
         if self._grad_norm is None:
             return mean, gradients
@@ -105,7 +105,7 @@ class CriticFit:
         return mean, [gradient for member in clipped for gradient in member]
 
     def _by_hand(self, obs: Tensor, targets: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """The same on a CPU, without the notes of autograd, which take it longer than what they are about."""
+        """The same by hand on a CPU, where autograd's bookkeeping takes longer than the arithmetic."""
         assert self._passes is not None
         loss = obs.new_zeros(())
         for member in self._passes:
@@ -121,7 +121,7 @@ class _Pass:
     """Loss and gradient of one network on a CPU.
 
     Attributes:
-        gradient: that of the last `run`, in one piece (N,); `parts` are views of it by parameter.
+        gradient: the last `run`'s gradient as one tensor (N,); `parts` are views of it by parameter.
     """
 
     def __init__(self, member: nn.Module) -> None:
@@ -131,7 +131,7 @@ class _Pass:
         self.parts = views_of(self.gradient, parameters)
 
     def run(self, obs: Tensor, targets: Tensor, weight: float) -> Tensor:
-        """The mean squared error of rows, times a weight."""
+        """Mean squared error of these rows, times a weight."""
         values, kept = self._chain.forward(obs)
         error = values - targets[:, None]
         scale = weight / len(obs)

@@ -1,4 +1,4 @@
-"""Contacts that start soft and become those of the trial's physics during training."""
+"""Contacts that start soft and harden during training, up to the trial's own physics."""
 
 import math
 from collections.abc import Sequence
@@ -12,9 +12,9 @@ from msk_ray.errors import ConfigError
 
 
 def between(start: Sequence[float], end: Sequence[float], progress: float) -> list[float]:
-    """Numbers between `start` (progress 0) and `end` (1): geometric if both are positive, otherwise linear.
+    """Interpolates from `start` (progress 0) to `end` (1): geometrically if both are positive, otherwise linearly.
 
-    Time constants span decades, where equal steps would change nothing at first and everything in the end.
+    Time constants span decades, so linear steps would change little at first and nearly everything at the end.
     """
     mixed = []
     for a, b in zip(start, end, strict=True):
@@ -26,7 +26,7 @@ def between(start: Sequence[float], end: Sequence[float], progress: float) -> li
 
 
 class ContactSchedule:
-    """Sets an environment's contact pairs to those of the curriculum.
+    """Sets the contact parameters of an environment's pairs along the curriculum.
 
     Raises:
         ConfigError: the model's contacts are not explicit pairs.
@@ -49,12 +49,12 @@ class ContactSchedule:
         self._apply()
 
     def advance(self) -> None:
-        """Take the step that follows an epoch."""
+        """Take one step, after an epoch."""
         self.set_progress(self.progress + 1.0 / self.config.epochs)
 
     def set_progress(self, progress: float) -> None:
         """Go to a point of the curriculum."""
-        # Sums of 1/epochs may miss 1 by rounding.
+        # Sums of 1/epochs may fall short of 1 by rounding.
         self.progress = 1.0 if progress > 1.0 - 1e-9 else progress
         self._apply()
 
@@ -67,7 +67,7 @@ class ContactSchedule:
                 continue
             rows = []
             for row, solref in zip(end, self._ends["solref"], strict=True):
-                # A zero solreffriction stands for solref.
+                # In MuJoCo, solreffriction 0 means "use solref".
                 target = solref if name == "solreffriction" and not row.any() else row
                 rows.append(between(list(start[name]), list(target), self.progress))
             fields[name] = np.array(rows)

@@ -9,23 +9,23 @@ import torch
 from torch import Tensor, nn
 
 from msk_ray.group import ALONE, Group
-from msk_ray.networks.calls import Calls
+from msk_ray.networks.network_calls import NetworkCalls
 
 
 class HalfBatchCosine:
     """Splits the gradient of one backward pass into the parts of the two halves of the worlds.
 
     A linear layer's weight gradient is the sum over steps and worlds of (output cotangent) ⊗ (input). Both are
-    available during the pass, so the sum over either half costs one matrix product per layer afterwards and no second
+    available during the pass, so each half's gradient costs one matrix product per layer afterwards, not another
     pass.
 
     Args:
         network: its linear layers are observed; inputs have shape (W, n) with the worlds first.
-        group: the processes that the worlds are spread over.
-        calls: what else records calls of its layers.
+        group: the processes that share the worlds.
+        calls: recorders of network calls, for layers that hooks do not see.
     """
 
-    def __init__(self, network: nn.Module, group: Group = ALONE, calls: Sequence[Calls] = ()) -> None:
+    def __init__(self, network: nn.Module, group: Group = ALONE, calls: Sequence[NetworkCalls] = ()) -> None:
         self._group = group
         self._calls = calls
         self._layers = [m for m in network.modules() if isinstance(m, nn.Linear)]
@@ -34,7 +34,7 @@ class HalfBatchCosine:
 
     @contextmanager
     def watching(self) -> Iterator[None]:
-        """Observe the calls of the network inside this block."""
+        """Context in which the network's calls are observed."""
         handles = [m.register_forward_hook(self._saw) for m in self._layers]
         try:
             yield
@@ -74,7 +74,7 @@ class HalfBatchCosine:
             yield torch.stack(inputs), torch.stack(outputs)
 
     def _parts(self, nworld: int) -> tuple[slice, slice]:
-        """Which of this process's worlds belong to either half of all worlds."""
+        """Which of this process's worlds belong to the first and to the second half of all worlds."""
         first, half = self._group.rank * nworld, self._group.size * nworld // 2
         middle, end = (min(max(bound - first, 0), nworld) for bound in (half, 2 * half))
         return slice(0, middle), slice(middle, end)

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from msk_ray.algorithms.shac.gate import Norms
+from msk_ray.algorithms.shac.cotangent_gate import Norms
 from msk_ray.algorithms.shac.schedules import adapted_horizon, contact_horizon, horizon_at
 from msk_ray.config import AdaptiveHorizon, ContactHorizon, HorizonSchedule
 
@@ -25,7 +25,7 @@ class RolloutLength:
         return horizon_at(self._config, epoch)
 
     def follow(self, norms: Norms | None, contact: float | None) -> None:
-        """Take note of an epoch's cotangents, and of its contact force [weight of the body] if that was measured."""
+        """Adapt the horizon to an epoch's cotangents, or to its contact force [body weights] if measured."""
         if isinstance(self._config, AdaptiveHorizon):
             assert self._length is not None
             self._length = adapted_horizon(self._config, self._length, math.nan if norms is None else float(norms.p90))

@@ -1,4 +1,4 @@
-"""Adam whose state stays in the same memory."""
+"""Adam with its state at fixed addresses, for recorded graphs."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -15,7 +15,7 @@ _NORM_EPSILON = 1e-6
 
 @torch.no_grad()
 def clip_gradients(parameters: Iterable[nn.Parameter], limit: float) -> Tensor:
-    """Bound the joint norm of the gradients and return it as it was; infinity for no bound."""
+    """Clip the joint norm of the gradients in place, and return the norm before; infinity for no bound."""
     used = [parameter for parameter in parameters if parameter.grad is not None]
     clipped, norm = clip([parameter.grad for parameter in used if parameter.grad is not None], limit)
     for parameter, part in zip(used, clipped, strict=True):
@@ -25,9 +25,9 @@ def clip_gradients(parameters: Iterable[nn.Parameter], limit: float) -> Tensor:
 
 @torch.no_grad()
 def clip(gradients: Sequence[Tensor], limit: float) -> tuple[list[Tensor], Tensor]:
-    """Gradients whose joint norm is at most `limit`, in one piece of memory, and their norm before.
+    """Gradients clipped to joint norm `limit`, as views of one tensor, and their norm before.
 
-    One tensor takes few kernels; torch's own function, with many, differs by rounding.
+    One tensor needs few kernels. torch's clip_grad_norm_ uses many, and rounds differently.
     """
     flat = torch.cat([gradient.flatten() for gradient in gradients])
     norm = clip_flat(flat, limit)
@@ -36,7 +36,7 @@ def clip(gradients: Sequence[Tensor], limit: float) -> tuple[list[Tensor], Tenso
 
 @torch.no_grad()
 def clip_flat(gradient: Tensor, limit: float) -> Tensor:
-    """Bound the norm of one tensor (N,), in place, and return it as it was; infinity for no bound."""
+    """Clip the norm of one tensor (N,) in place, and return the norm before; infinity for no bound."""
     norm = torch.linalg.vector_norm(gradient)
     if limit < float("inf"):
         gradient.mul_((limit / (norm + _NORM_EPSILON)).clamp_max(1.0))
@@ -44,13 +44,13 @@ def clip_flat(gradient: Tensor, limit: float) -> Tensor:
 
 
 def views_of(flat: Tensor, like: Sequence[Tensor]) -> list[Tensor]:
-    """One tensor (N,) as tensors of these shapes, one after the other."""
+    """Consecutive parts of one tensor (N,), in these shapes."""
     parts = flat.split([tensor.numel() for tensor in like])
     return [part.view_as(tensor) for part, tensor in zip(parts, like, strict=True)]
 
 
 class RateAdam:
-    """Adam (Kingma and Ba 2015, arXiv:1412.6980), or AdamW, whose learning rate changes during training.
+    """Adam (Kingma and Ba 2015, arXiv:1412.6980), or AdamW, with a learning rate that can change during training.
 
     One kernel steps all parameters. Step count and rate live on their device, so that a recorded graph follows them.
     It does what `torch.optim.AdamW(fused=True)` does, without that class: its first instance imports torch's compiler,
@@ -88,16 +88,16 @@ class RateAdam:
 
     @torch.no_grad()
     def step(self, skip: Tensor | None = None) -> None:
-        """Take a step with the present gradients; parameters without one stay as they are.
+        """Take a step along the current gradients; parameters without a gradient stay unchanged.
 
         Args:
-            skip: a bool scalar; True leaves parameters and moments as they are. The host does not wait for it.
+            skip: a bool scalar; True leaves parameters and moments unchanged. The host does not wait for it.
         """
         self.step_along([parameter.grad for parameter in self._parameters], skip)
 
     @torch.no_grad()
     def step_along(self, gradients: Sequence[Tensor | None], skip: Tensor | None = None) -> None:
-        """The same with these gradients, one for each parameter."""
+        """Take a step along these gradients, one per parameter."""
         used = [k for k, gradient in enumerate(gradients) if gradient is not None]
         skipped = None if skip is None else skip.float()
         self._count += 1 if skipped is None else 1 - skipped
@@ -129,14 +129,14 @@ class RateAdam:
         return [part for tensor in tensors for part in tensor.view(-1).split(self._piece)]
 
     def state_dict(self) -> dict[str, Any]:
-        """Step count and moments by the parameters' numbers, as torch's optimisers write them."""
+        """Step count and moments by parameter index, as torch's optimisers write them."""
         moments = enumerate(zip(self._means, self._squares, strict=True))
         return {"state": {k: {"step": self._count, "exp_avg": mean, "exp_avg_sq": sq} for k, (mean, sq) in moments}}
 
     @torch.no_grad()
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from a state, also one of torch's Adam, or written on another device."""
-        unused = {"step": 0.0, "exp_avg": 0.0, "exp_avg_sq": 0.0}  # torch's have no entry before the first step
+        """Continue from a `state_dict`, also from one of torch's Adam or of another device."""
+        unused = {"step": 0.0, "exp_avg": 0.0, "exp_avg_sq": 0.0}  # torch's Adam has no entries before its first step
         for k, (mean, square) in enumerate(zip(self._means, self._squares, strict=True)):
             loaded = state["state"].get(k, unused)
             mean.copy_(torch.as_tensor(loaded["exp_avg"]))

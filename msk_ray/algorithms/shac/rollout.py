@@ -1,11 +1,11 @@
-"""One rollout over the horizon under the current policy, with its graph."""
+"""One rollout of the current policy over the horizon, with its autograd graph."""
 
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from msk_ray.algorithms.shac.gate import CotangentGate
+from msk_ray.algorithms.shac.cotangent_gate import CotangentGate
 from msk_ray.envs import Env
 from msk_ray.networks import Actor, RunningMeanStd
 
@@ -45,11 +45,10 @@ def collect(
     with_neg_log_prob: bool = False,
     with_contact: bool = False,
 ) -> Rollout:
-    """Roll the policy out for as many steps as `noise` (H, W, A) has, from the current state of the worlds, which have
-    a stock of resets.
+    """Roll the policy out for H steps of noise (H, W, A), from the worlds' current state. Resets must be in stock.
 
-    A new graph starts at the first state. If `state_bptt` is false, a new one starts at every state, so that an
-    action's gradient comes only from its own step. `normalizer` is held fixed during the rollout.
+    The graph starts at the first state. If `state_bptt` is false, the state is detached at every step, so that an
+    action gets a gradient from its own step only. `normalizer` is held fixed during the rollout.
     """
     env.state = env.state.detach()
     raw, reached, rewards, terms, terminated, done, diverged = [], [], [], [], [], [], []
@@ -65,7 +64,7 @@ def collect(
             action = actor(normalize(obs), step_noise)
         transition = env.step(gate.screen(action))
         if with_contact:
-            # Of the last substep, so before the next step; each contact acts on two geoms. A diverged world has none.
+            # Read before the next step overwrites it. Halved, as each contact acts on two geoms; 0 in diverged worlds.
             force = 0.5 * env.sim.contact_forces().norm(dim=-1).sum(-1)
             contacts.append(force.masked_fill(transition.diverged, 0.0))
         raw.append(obs.detach())

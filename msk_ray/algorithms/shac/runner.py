@@ -1,4 +1,4 @@
-"""How an epoch's work is run: operation by operation, or as recorded CUDA graphs."""
+"""Runs an epoch's work operation by operation, or as recorded CUDA graphs."""
 
 import traceback
 import warnings
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from msk_ray.algorithms.base import Clock
-from msk_ray.algorithms.shac.actor_update import ActorOutcome, ActorUpdate, EpochInputs, Judged, Rolled
+from msk_ray.algorithms.shac.actor_update import ActorOutcome, ActorUpdate, EpochInputs, RolloutGraph, RolloutLoss
 from msk_ray.envs import Env
 from msk_ray.step.autograd.capture import Recording, fill
 from msk_ray.step.autograd.stepper import Engine
@@ -20,27 +20,27 @@ from msk_ray.step.forward.iterations import limits_for, reached
 
 
 class CriticWork(Protocol):
-    """What a runner does with the critic."""
+    """The critic as a runner uses it."""
 
     def prepare_fit(self, rows: int, rate: float) -> Tensor:
-        """Set the rate of the next fit, and draw its orders of so many rows, (passes, rows)."""
+        """Set the learning rate of the next fit, and draw its orders of the rows, (passes, rows)."""
 
     def fit_critic(self, obs: Tensor, targets: Tensor, orders: Tensor) -> Tensor:
         """Fit the critic to observations (N, O) and targets (N,) in these orders, and return the loss."""
 
     def move_target(self) -> None:
-        """Let the target critic follow the critic that was fitted."""
+        """Move the target critic towards the fitted critic."""
 
 
 UNRECORDED = "epochs run operation by operation, not as recorded graphs, and take two to three times as long"
 _MOST_HORIZONS = 3
-"""Recordings kept of epochs, and of fits, one for each horizon: each holds the memory of all its work."""
+"""Largest number of recordings to keep, one per horizon: each keeps all its memory allocated."""
 _FEWEST_ITERATIONS = 6
-"""Solver iterations unrolled in a substep where worlds need fewer: the first epochs may hardly touch the ground."""
+"""Least number of solver iterations to unroll in a substep: early epochs may hardly touch the ground."""
 _RARE_SHARE = 1e-3
-"""Share of a substep's worlds that may need as many solver iterations as are unrolled there, or more, at first."""
+"""When unrolling: share of a substep's worlds that may reach the number of unrolled solver iterations."""
 _LIMITED_SHARE = 3e-3
-"""Share of them that may do so before more are unrolled."""
+"""Later: share of them above which more iterations are unrolled."""
 _MOST_ITERATIONS = 48
 """Beyond this many in a substep, unrolled iterations cost more than recording saves."""
 
@@ -52,8 +52,8 @@ class EagerRunner:
 
     Attributes:
         recorded: whether the last epoch was replayed from a recording.
-        last_loss: the critic's loss, as far as it is known; None before the first fit.
-        refusal: why epochs are no longer recorded although they should be; None if they may be.
+        last_loss: the critic's newest known loss; None before the first fit.
+        refusal: why epochs are no longer recorded, although they should be; None otherwise.
     """
 
     recorded = False
@@ -73,7 +73,7 @@ class EagerRunner:
         return self.last_loss
 
     def resume(self, loss: Tensor | None) -> None:
-        """Go on after a fit that had this `newest_loss`."""
+        """Continue after a fit with this loss."""
         self.last_loss = loss
 
     def run(self, inputs: EpochInputs, critic_rate: float) -> ActorOutcome:
@@ -88,22 +88,22 @@ class EagerRunner:
 
     def _run_actor(self, inputs: EpochInputs) -> ActorOutcome:
         self._clock = Clock(self._device)
-        rolled = self._actor.roll(inputs)
+        graph = self._actor.roll_out(inputs)
         self._clock.mark("rollout")
-        outcome = self._actor.learn(rolled, self._actor.judge(rolled))
+        outcome = self._actor.update_actor(graph, self._actor.compute_loss(graph))
         self._clock.mark("backward")
         self._env.release_graph()
         return outcome
 
     def join(self) -> None:
-        """Let what follows on the current stream wait for all work that was started."""
+        """Make the current stream wait for all work started so far."""
 
     def seconds(self) -> dict[str, float]:
         """How long the parts of the last epoch took [s], by name; waits for them."""
         return self._clock.seconds()
 
     def adapt(self) -> None:
-        """Take note of how many iterations the solver took in the last epoch; waits for it."""
+        """Adapt the number of unrolled solver iterations to the last epoch; waits for it."""
 
 
 @dataclass
@@ -111,9 +111,9 @@ class _Epoch:
     """A recorded epoch of one horizon."""
 
     inputs: EpochInputs
-    roll: Recording[Rolled]
-    judge: Recording[Judged]
-    learn: Recording[ActorOutcome]
+    roll_out: Recording[RolloutGraph]
+    compute_loss: Recording[RolloutLoss]
+    update_actor: Recording[ActorOutcome]
 
 
 @dataclass
@@ -130,22 +130,22 @@ class _Recordings:
 
     engine: Engine
     epochs: OrderedDict[int, _Epoch] = field(default_factory=OrderedDict)
-    """By horizon, the one used last at the end."""
+    """Recorded epochs by horizon, most recently used last."""
     warm: set[int] = field(default_factory=set)
     """Horizons that have run eagerly, so that every kernel and buffer exists."""
 
 
 class RecordedRunner(EagerRunner):
-    """Replays recorded epochs, one recording for each horizon; the critic is fitted beside what follows.
+    """Replays recorded epochs, one recording per horizon, and fits the critic in parallel.
 
-    A fit needs a rollout's targets, and is needed when the next rollout is judged: it runs beside the backward pass and
-    the next rollout. The target critic, which the backward pass reads, follows once the fit has ended. The mathematics
-    are those of one after the other. `last_loss` is the loss of the fit before.
+    A fit needs a rollout's targets, and must end before the next rollout's loss is computed: it runs in parallel with
+    the backward pass and the next rollout. The target critic, which the backward pass reads, is updated after the fit.
+    Results are the same as of running everything in sequence. `last_loss` is the loss of the previous fit.
 
     The first epoch of a horizon runs eagerly. Work that cannot be recorded, because an environment waits for the
     device, runs eagerly from then on; a warning says why and where. In a group, all processes record and replay the
-    same, because recordings contain collective operations, which have to be recorded everywhere or nowhere. Nothing
-    else may use them while the critic is fitted, so that the fit has to wait for the backward pass there.
+    same work, because recordings contain collective operations. Two collectives must not run at the same time, so
+    there the fit waits for the backward pass.
 
     Args:
         env: the worlds.
@@ -156,15 +156,15 @@ class RecordedRunner(EagerRunner):
         self._group = env.group
         self._kept = _Recordings(env.sim.engine)
         self._fits: dict[tuple[torch.Size, torch.Size], _Fit | None] = {}
-        # The GPU starts blocks of the actor's kernels first, and fills what is left of it with the critic's: only a
-        # stream of higher priority than the usual one can be preferred.
+        # With a higher priority, the actor's kernels start first, and the critic's fill what is left of the GPU. Only
+        # a stream above the default priority is preferred.
         self._recording = torch.cuda.Stream(env.device, priority=-1)
         self._first = torch.cuda.Stream(env.device, priority=-1)
         self._side = torch.cuda.Stream(env.device)
         self._fitted = torch.cuda.Event()
         self._ready = torch.cuda.Event()
         self._target_behind = False
-        """Whether the target critic has yet to follow the fit that was started last."""
+        """Whether the target critic has not been updated since the last fit was started."""
         self._fit_clock: Clock | None = None
         self._fit_s: float | None = None
         self._newest_loss: Tensor | None = None
@@ -201,27 +201,27 @@ class RecordedRunner(EagerRunner):
     def _replay(self, epoch: _Epoch, inputs: EpochInputs, critic_rate: float) -> ActorOutcome:
         self._clock = Clock(self._device)
         fill(epoch.inputs.tensors(), inputs.tensors())
-        epoch.roll.replay()
+        epoch.roll_out.replay()
         self._clock.mark("rollout")
         self.join()
-        judged = epoch.judge.replay()
+        rollout_loss = epoch.compute_loss.replay()
         alone = self._group.size == 1
-        offered = self._offer(*judged.for_critic) if alone else None
-        outcome = epoch.learn.replay()
+        offered = self._offer(*rollout_loss.for_critic) if alone else None
+        outcome = epoch.update_actor.replay()
         self._clock.mark("backward")
         self._env.state = outcome.state
-        # After the backward pass is under way, because this makes the host wait for the fit before.
+        # Only once the backward pass is running, because this makes the host wait for the previous fit.
         self._start_fit(self._offer(outcome.obs, outcome.targets) if offered is None else offered, critic_rate)
         return outcome
 
     def _offer(self, obs: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
-        """Keep what a fit is to read, and the loss of the fit before, which has ended on the device by now."""
+        """Copy what the next fit reads, and keep the loss of the previous fit, which has ended by now."""
         if self._newest_loss is not None:
             self.last_loss = self._newest_loss.clone()
         fit = self._fits.get((obs.shape, targets.shape))
         if fit is None:
             offered = obs.clone(), targets.clone()
-        else:  # whose last replay has ended
+        else:  # its last replay has ended
             offered = fit.inputs[0], fit.inputs[1]
             fill(offered, (obs, targets))
         self._ready.record(torch.cuda.current_stream(self._device))
@@ -259,11 +259,11 @@ class RecordedRunner(EagerRunner):
         batch = self._env.sim.batch
         if self.refusal is not None or not batch.stages.unrolls:
             return
-        # Empty, if a batch with larger buffers has just taken the place of the one that the epoch ran in.
+        # Empty if a batch with larger buffers has just replaced the epoch's.
         counts = batch.iterations.read()
         before, most = batch.unrolled_iterations, batch.limits.iterations
         limits = before or (_FEWEST_ITERATIONS,) * batch.substeps
-        # A trial that is resumed starts with an epoch that is not recorded, and must adapt as if it were.
+        # A resumed trial starts with an unrecorded epoch, and must adapt as if it were recorded.
         resumed = batch.ordered and before is not None
         if resumed and max(limits) > _MOST_ITERATIONS:
             self._refuse(_TOO_MANY)
@@ -303,12 +303,12 @@ class RecordedRunner(EagerRunner):
         warnings.warn(f"{UNRECORDED}: {why}", stacklevel=2)
 
     def _epoch(self, inputs: EpochInputs) -> _Epoch | None:
-        """The recording of an epoch with this horizon; None if it has to run eagerly."""
+        """The recorded epoch of this horizon; None if it must run eagerly."""
         if self.refusal is not None:
             return None
         engine, horizon = self._env.sim.engine, len(inputs.noise)
         if self._group.any(self._kept.engine is not engine):
-            self._kept = _Recordings(engine)  # recordings step the buffers of the engine they were made with
+            self._kept = _Recordings(engine)  # recordings use the buffers of the engine they were made with
         kept = self._kept
         if horizon in kept.epochs:
             kept.epochs.move_to_end(horizon)
@@ -327,18 +327,24 @@ class RecordedRunner(EagerRunner):
         buffers = inputs.copies()
         before = self._env.state
         try:
-            roll = Recording(lambda: self._actor.roll(buffers), self._recording)
-            judge = Recording(lambda: self._actor.judge(roll.result), self._recording, pool=roll.pool)
-            learn = Recording(lambda: self._actor.learn(roll.result, judge.result), self._recording, pool=roll.pool)
+            roll_out = Recording(lambda: self._actor.roll_out(buffers), self._recording)
+            compute_loss = Recording(
+                lambda: self._actor.compute_loss(roll_out.result), self._recording, pool=roll_out.pool
+            )
+            update_actor = Recording(
+                lambda: self._actor.update_actor(roll_out.result, compute_loss.result),
+                self._recording,
+                pool=roll_out.pool,
+            )
         finally:
             self._env.state = before
-            self._env.stock_resets(None)  # those of the recording are in its memory
+            self._env.stock_resets(None)  # the recording's resets are in its own memory
             self._env.release_graph()
-        return _Epoch(buffers, roll, judge, learn)
+        return _Epoch(buffers, roll_out, compute_loss, update_actor)
 
     def _fit(self, inputs: tuple[Tensor, ...]) -> _Fit | None:
-        """The recording of a fit of this size; None if it has to run eagerly."""
-        shapes = (inputs[0].shape, inputs[1].shape)  # which decide that of the orders
+        """The recorded fit of this size; None if it must run eagerly."""
+        shapes = (inputs[0].shape, inputs[1].shape)  # the shape of the orders follows from them
         if shapes not in self._fits:
             self._fits[shapes] = None
             return None
@@ -353,14 +359,14 @@ class RecordedRunner(EagerRunner):
 
 
 def _first(error: BaseException) -> BaseException:
-    """The error that made the capture invalid, which ends in another one."""
+    """The first error of a failed capture: it invalidates the capture, whose end raises another error."""
     while error.__context__ is not None:
         error = error.__context__
     return error
 
 
 def _place(error: BaseException) -> str:
-    """File and line in which the work was when recording it failed: the innermost outside torch and Warp."""
+    """File and line where recording failed: the innermost frame outside torch and Warp."""
     frames = traceback.extract_tb(error.__traceback__)
     own = [f for f in frames if not {"torch", "warp", "mujoco_warp"} & set(Path(f.filename).parts)]
     frame = (own or frames)[-1]

@@ -21,7 +21,7 @@ def learning_rate_at(initial: float, final: float, schedule: str, epoch: int, ep
 
 
 def adapted_horizon(config: AdaptiveHorizon, horizon: float, cotangent: float) -> float:
-    """Horizon after an epoch at `horizon` (not rounded) whose cotangents had this 90th percentile [reward].
+    """Next horizon, after an epoch at `horizon` (not rounded) with this 90th percentile of cotangent norms [reward].
 
     H ← H (target / p90)^ADAPTATION within bounds. A percentile that is not finite shrinks H by 2^ADAPTATION.
     """
@@ -30,7 +30,7 @@ def adapted_horizon(config: AdaptiveHorizon, horizon: float, cotangent: float) -
 
 
 def contact_horizon(config: ContactHorizon, horizon: float, multiplier: float, contact: float) -> tuple[float, float]:
-    """Horizon and multiplier after an epoch at `horizon` (not rounded) with this contact force [weight of the body].
+    """Next horizon and multiplier φ, after an epoch at `horizon` (not rounded) with this contact force [body weights].
 
     φ ← φ + ADAPTATION (contact / config.contact − 1) within ±1, then H ← H (1 − ADAPTATION·φ) within bounds.
     """

@@ -27,7 +27,7 @@ class StepState(NamedTuple):
     """Actuator activations, shape (W, na)."""
 
 
-class Applied(NamedTuple):
+class ExternalForces(NamedTuple):
     """Forces from outside the model, held over the substeps of an env step."""
 
     qfrc: Tensor
@@ -52,18 +52,18 @@ class InputGradients(NamedTuple):
     xfrc_applied: Tensor | None = None
     """Shape (W, nbody, 6)."""
     parameters: Tensor | None = None
-    """Those of parameters of the model side by side, in the order in which they were asked for, shape (W, N)."""
+    """Gradients of model parameters, concatenated in the order requested, shape (W, N)."""
 
     @classmethod
-    def of(cls, found: Mapping[str, Tensor | None], parameters: Tensor | None = None) -> Self:
-        """Those of inputs by name; one that is missing is None."""
+    def of(cls, gradients: Mapping[str, Tensor | None], parameters: Tensor | None = None) -> Self:
+        """From gradients by input name; missing ones are None."""
         return cls(
-            found.get("ctrl"),
-            found.get("qpos"),
-            found.get("qvel"),
-            found.get("act"),
-            found.get("qfrc_applied"),
-            found.get("xfrc_applied"),
+            gradients.get("ctrl"),
+            gradients.get("qpos"),
+            gradients.get("qvel"),
+            gradients.get("act"),
+            gradients.get("qfrc_applied"),
+            gradients.get("xfrc_applied"),
             parameters,
         )
 
@@ -78,26 +78,26 @@ class Needs(NamedTuple):
     qfrc_applied: bool = False
     xfrc_applied: bool = False
     parameters: tuple[str, ...] = ()
-    """Names of parameters of the model."""
+    """Names of model parameters."""
 
 
 INPUTS = ("ctrl", "qpos", "qvel", "act", "qfrc_applied", "xfrc_applied")
-"""What a step is differentiated with respect to besides parameters, in the order of `InputGradients` and `Needs`."""
+"""Inputs of a step that can have gradients, besides parameters, in the order of `InputGradients` and `Needs`."""
 
 
 class Backward(ABC):
     """One way to differentiate an env step: records what it needs of the forward pass, then pulls cotangents back.
 
-    A Simulation calls `attach` once, replays `launch_step` for every forward pass, calls `record` right after it if a
-    gradient will be needed, and `vjp` once for each recorded step, latest first; `jacobian` instead where the whole
-    Jacobian is wanted.
+    A Simulation calls `attach` once, replays `launch_step` for every forward pass, and calls `record` right after it if
+    a gradient will be needed. Then it calls `vjp` once for each recorded step, latest first, or `jacobian` for the
+    whole Jacobian.
     """
 
     name: str
     covers_applied: ClassVar[bool] = False
-    """Whether it differentiates steps under applied forces, which `record` then gets."""
+    """Whether it differentiates steps with applied forces, which `record` then gets."""
     covers_parameters: ClassVar[bool] = False
-    """Whether `vjp` gives gradients of parameters of the model; their recorded values are in the model by then."""
+    """Whether `vjp` gives gradients of model parameters. Their recorded values are in the model when it is called."""
 
     @abstractmethod
     def attach(self, batch: WorldBatch) -> None:
@@ -108,13 +108,14 @@ class Backward(ABC):
         """
 
     def fresh(self) -> Self:
-        """A mode with the same settings, to attach to another batch. `attach` must set everything but the settings."""
+        """A mode with the same settings, to attach to another batch. Everything except settings must be set in
+        `attach`."""
         return copy.copy(self)
 
     def launch_step(self, batch: WorldBatch) -> None:
-        """Launch one env step. A mode that keeps per-substep data overrides this; it is captured as a graph.
+        """Launch one env step, which is captured as a graph. A mode that stores data per substep overrides this.
 
-        It begins with `batch.begin_step()` and ends with `batch.end_step(data)`.
+        Must begin with `batch.begin_step()` and end with `batch.end_step(data)`.
         """
         batch.launch_step()
 
@@ -124,11 +125,11 @@ class Backward(ABC):
 
     @abstractmethod
     def record(
-        self, ctrl: Tensor, start: StepState, end: StepState, applied: Applied | None = None
+        self, ctrl: Tensor, start: StepState, end: StepState, applied: ExternalForces | None = None
     ) -> tuple[Tensor, ...]:
-        """Tensors of the last step that `vjp` will need. They must not alias buffers that the next step overwrites.
+        """Tensors of the last step that `vjp` will need, not aliasing buffers that the next step overwrites.
 
-        `applied` is only given where there are applied forces.
+        `applied` is None for a step without applied forces.
         """
 
     @abstractmethod
@@ -140,7 +141,7 @@ class Backward(ABC):
     ) -> tuple[Tensor, Tensor]:
         """(A, B) of the recorded step in tangent space, shapes (W, S, S) and (W, S, nu) with S = 2 nv + na.
 
-        This one takes a `vjp` for each row; a mode that knows a faster way overrides it.
+        This implementation calls `vjp` for each row; a mode with a faster way overrides it.
 
         Args:
             saved: what `record` returned for the step.
@@ -151,12 +152,12 @@ class Backward(ABC):
         rows = []
         for row in range(state_size(end)):
             cotangents = unit_cotangents(tangent, end, range(row, row + 1), 1)
-            found = self.vjp(saved, StepState(*(part[0] for part in cotangents)), needs)
-            rows.append(rows_of(tangent, start, found))
+            gradients = self.vjp(saved, StepState(*(part[0] for part in cotangents)), needs)
+            rows.append(rows_of(tangent, start, gradients))
         return torch.stack([a for a, _ in rows], dim=1), torch.stack([b for _, b in rows], dim=1)
 
-    def forget(self) -> None:  # noqa: B027 - a mode that gathers nothing has nothing to forget
-        """Forget what diagnostics were gathered."""
+    def forget(self) -> None:  # noqa: B027 - optional
+        """Reset diagnostics."""
 
     def diagnostics(self) -> dict[str, float]:
         """Diagnostics gathered since the last call, by metric name."""

@@ -6,7 +6,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from msk_ray.step.autograd.backward import Applied, StepState
+from msk_ray.step.autograd.backward import ExternalForces, StepState
 from msk_ray.step.forward import WorldBatch, joined_stream
 
 
@@ -28,9 +28,9 @@ def stream_of(device: torch.device) -> wp.Stream | None:
     return joined_stream() or wp.stream_from_torch(torch.cuda.current_stream(device))
 
 
-def applied_of(data: Any) -> Applied:
+def applied_of(data: Any) -> ExternalForces:
     """Torch views of the applied forces of a mujoco_warp.Data."""
-    return Applied(*(wp.to_torch(a, requires_grad=False) for a in (data.qfrc_applied, data.xfrc_applied)))
+    return ExternalForces(*(wp.to_torch(a, requires_grad=False) for a in (data.qfrc_applied, data.xfrc_applied)))
 
 
 class BatchTensors:
@@ -43,7 +43,7 @@ class BatchTensors:
         self._applied = applied_of(data)
         self._pushed = False
 
-    def load(self, ctrl: Tensor, start: StepState, applied: Applied | None = None) -> None:
+    def load(self, ctrl: Tensor, start: StepState, applied: ExternalForces | None = None) -> None:
         """Copy an env step's inputs in: ctrl (W, nu), the state before it, and applied forces if it has some."""
         with torch.no_grad():
             self._ctrl.copy_(ctrl)

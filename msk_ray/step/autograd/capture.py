@@ -1,4 +1,4 @@
-"""Torch's operations and the steps of simulations recorded together as one CUDA graph."""
+"""Records torch operations and simulation steps together as one CUDA graph."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, Generic, TypeVar
@@ -15,19 +15,19 @@ T = TypeVar("T")
 class Recording(Generic[T]):
     """Work recorded once as a CUDA graph. Recording it runs none of it.
 
-    The work must have run before, eagerly, so that kernels are compiled, lazily made buffers exist and libraries have
-    chosen their algorithms. It must do the same on the same memory every time: it reads inputs from tensors that exist
-    before, and leaves results in `result`, whose memory the next replay overwrites. It may differentiate, including
-    through the step of a Simulation.
+    The work must have run eagerly before, so that kernels are compiled, lazy buffers exist and libraries have chosen
+    their algorithms. It must do the same on the same memory every time: it reads inputs from existing tensors, and
+    writes results to `result`, whose memory the next replay overwrites. It may differentiate, including through the
+    step of a Simulation.
 
     Args:
         work: what to record.
-        stream: where to record it. Recordings that run at the same time need different ones: libraries such as cuBLAS
-            keep a workspace for each stream, which both would write to.
+        stream: stream to record on. Recordings that run at the same time need different streams, because libraries such
+            as cuBLAS have one workspace per stream.
         pool: memory shared with recordings that are replayed one after the other in the order of their recording.
 
     Attributes:
-        result: what `work` returned; its tensors have contents after the first replay.
+        result: the return value of `work`; its tensors have contents after the first replay.
 
     Raises:
         RuntimeError: the work waits for the device, for example with `.item()`, or draws numbers from a generator.
@@ -35,7 +35,7 @@ class Recording(Generic[T]):
 
     def __init__(self, work: Callable[[], T], stream: torch.cuda.Stream, pool: Any = None) -> None:
         self._graph = torch.cuda.CUDAGraph()
-        # Backward passes stay on this thread, because Warp's current stream belongs to a thread.
+        # Keep backward passes on this thread, because Warp's current stream is per thread.
         with (
             torch.cuda.device(stream.device),
             torch.autograd.set_multithreading_enabled(False),

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator
 import torch
 from torch import Tensor
 
-from msk_ray.step.autograd.backward import INPUTS, Applied, Backward, InputGradients, Needs, StepState
+from msk_ray.step.autograd.backward import INPUTS, Backward, ExternalForces, InputGradients, Needs, StepState
 from msk_ray.step.autograd.buffers import device_of
 from msk_ray.step.autograd.jacobian import state_size
 from msk_ray.step.autograd.stepper import Stepper
@@ -21,17 +21,17 @@ class FdJacobian(Backward):
     Works with every model and integrator that mujoco_warp steps. Cost: 2·(nu + 2·nv + na) extra worlds per world, fewer
     if some inputs need no gradient.
 
-    Accuracy: rounding of float32 is divided by the perturbation, and a kink or jump inside it is mistaken for a slope.
+    Accuracy: float32 rounding is divided by the perturbation, and a kink or jump inside it appears as a slope.
     Medians over 1 to 16 substeps with the defaults: 1e-6 to 5e-4 on a cartpole, 1e-5 to 1e-3 on a standing ant.
-    On an ant moving in contact 1e-4 to 1e-3 for ctrl and qvel, but there a qpos gradient is wrong by any factor
-    where a contact begins or ends inside the perturbation: a tenth of the states at 1 substep, half of them at 16.
+    On an ant moving in contact 1e-4 to 1e-3 for ctrl and qvel; but the qpos gradient is wrong by any factor if a
+    contact begins or ends inside the perturbation: in a tenth of the states at 1 substep, in half of them at 16.
 
     Args:
         eps_ctrl: perturbation of ctrl [its own unit]. eps_qpos: perturbation of qpos along a tangent direction [m,
         rad]. eps_qvel: perturbation of qvel [m/s, rad/s]. eps_act: perturbation of act [its own unit]; small because
-        that of a resting muscle is just above its clamp at 0. eps_applied: perturbation of an applied force, as a share
-        of the model's weight [N] or, for a torque, of that at 1 m [N m]. max_worlds: perturbed copies are run in chunks
-        of at most this many worlds.
+        a resting muscle's activation is just above its clamp at 0. eps_applied: perturbation of an applied force, as a
+        share of the model's weight [N]; for a torque, of weight × 1 m [N m]. max_worlds: largest number of worlds in
+        which perturbed copies run at the same time.
     """
 
     name = "fd_jacobian"
@@ -60,7 +60,7 @@ class FdJacobian(Backward):
         self._tangent = Tangent(batch.mjm, self._device)
 
     def record(
-        self, ctrl: Tensor, start: StepState, end: StepState, applied: Applied | None = None
+        self, ctrl: Tensor, start: StepState, end: StepState, applied: ExternalForces | None = None
     ) -> tuple[Tensor, ...]:
         return (ctrl, *start, end.qpos, *(applied or ()))
 
@@ -91,25 +91,25 @@ class FdJacobian(Backward):
         """Column by column: the perturbed copies give whole columns of (A, B)."""
         columns = self._columns(("qpos", "qvel", "act", "ctrl"))
         size = state_size(end)
-        found = torch.empty((len(columns), self._batch.nworld, size), device=self._device)
+        slopes = torch.empty((len(columns), self._batch.nworld, size), device=self._device)
         for chunk, changes in self._derivatives(columns, self._inputs(saved)[0]):
-            found[chunk.start : chunk.stop] = changes
-        a, b = found.permute(1, 2, 0).split([size, len(columns) - size], dim=-1)
+            slopes[chunk.start : chunk.stop] = changes
+        a, b = slopes.permute(1, 2, 0).split([size, len(columns) - size], dim=-1)
         return a.contiguous(), b.contiguous()
 
     def diagnostics(self) -> dict[str, float]:
-        """Share of perturbed copies whose solver met an iteration limit since the last call."""
+        """Share of perturbed copies that reached a solver iteration limit since the last call."""
         shares = [copies.diagnostics()["solver_limit_share"] for copies in self._copies.values()]
         return {"fd_solver_limit_share": max(shares, default=0.0)}
 
     def _inputs(self, saved: tuple[Tensor, ...]) -> tuple[dict[str, Tensor], Tensor]:
-        """The inputs of a recorded step by name, each (W, n), and qpos after it."""
+        """The inputs of a recorded step by name, each (W, n), and qpos after the step."""
         *state, qpos_end = saved[:5]
         forces = zip((_QFRC, _XFRC), (force.flatten(1) for force in saved[5:]), strict=False)
         return dict(zip(("ctrl", *StepState._fields), state, strict=True)) | dict(forces), qpos_end
 
     def _columns(self, names: Iterable[str]) -> list[tuple[str, int]]:
-        """(input, entry) of each input's perturbations."""
+        """(input, entry) of each perturbation."""
         return [(name, i) for name in names for i in range(self._sizes[name])]
 
     def _derivatives(self, columns: list[tuple[str, int]], inputs: dict[str, Tensor]) -> Iterator[tuple[range, Tensor]]:
@@ -137,8 +137,8 @@ class FdJacobian(Backward):
         if any(name == "qpos" for name, _ in chunk):
             spread["qpos"] = self._tangent.integrate(spread["qpos"], deltas)
         ctrl, qpos, qvel, act, *forces = (value.flatten(0, 2) for value in spread.values())
-        applied = Applied(forces[0], forces[1].unflatten(-1, (-1, 6))) if forces else None
-        end = copies.advance(ctrl, StepState(qpos, qvel, act), applied)
+        applied = ExternalForces(forces[0], forces[1].unflatten(-1, (-1, 6))) if forces else None
+        end = copies.step(ctrl, StepState(qpos, qvel, act), applied)
         copies.engine.settle()
         ends = [value.view(*shape, -1)[:, : len(chunk)] for value in end]
         changes = [self._tangent.difference(ends[0][1], ends[0][0]), *(e[0] - e[1] for e in ends[1:])]

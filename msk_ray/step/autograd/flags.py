@@ -1,11 +1,11 @@
-"""Flags of worlds, which a host can look at without waiting only where they are in its own memory."""
+"""Flags of worlds, which the host can read without waiting only on a CPU."""
 
 from torch import Tensor
 
 
 def known_none(flags: Tensor) -> bool:
-    """Whether no flag is set, on a CPU; on a GPU, where to know it the host would wait, False.
+    """Whether no flag is set. On a GPU always False, because the host would have to wait.
 
-    Where it is true, operations on chosen worlds can be left out, with their derivatives: they would copy everything.
+    If True, operations on flagged worlds, which would copy all worlds, can be skipped, with their derivatives.
     """
     return flags.device.type == "cpu" and not flags.any()

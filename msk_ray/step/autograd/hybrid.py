@@ -4,7 +4,7 @@ from typing import Any
 
 from torch import Tensor
 
-from msk_ray.step.autograd.backward import Applied, Backward, InputGradients, Needs, StepState
+from msk_ray.step.autograd.backward import Backward, ExternalForces, InputGradients, Needs, StepState
 from msk_ray.step.autograd.tangent import Tangent
 from msk_ray.step.forward import WorldBatch
 
@@ -13,8 +13,8 @@ class Hybrid(Backward):
     """Gradients of the state from one mode and of the control from another, for diagnosis.
 
     Args:
-        state: the mode that gives the gradients of (qpos, qvel, act). Its `launch_step` runs.
-        ctrl: the mode that gives the gradient of ctrl; one that needs no `launch_step` of its own (fd_jacobian).
+        state: mode for gradients of (qpos, qvel, act). Its `launch_step` runs.
+        ctrl: mode for the gradient of ctrl; it must not need its own `launch_step` (fd_jacobian does not).
     """
 
     name = "hybrid"
@@ -32,12 +32,12 @@ class Hybrid(Backward):
         self.ctrl.attach(batch)
 
     def launch_step(self, batch: WorldBatch) -> None:
-        self._stepping().launch_step(batch)
+        self._step_mode().launch_step(batch)
 
     def last_data(self, batch: WorldBatch) -> Any:
-        return self._stepping().last_data(batch)
+        return self._step_mode().last_data(batch)
 
-    def _stepping(self) -> Backward:
+    def _step_mode(self) -> Backward:
         """The mode whose launches compute the step."""
         own = [m for m in (self.state, self.ctrl) if type(m).launch_step is not Backward.launch_step]
         assert len(own) <= 1, "two modes that each launch the step in their own way cannot be combined"
@@ -45,16 +45,16 @@ class Hybrid(Backward):
 
     @property
     def covers_applied(self) -> bool:  # type: ignore[override]
-        """Whether both modes do."""
+        """Whether both modes cover applied forces."""
         return self.state.covers_applied and self.ctrl.covers_applied
 
     @property
     def covers_parameters(self) -> bool:  # type: ignore[override]
-        """Whether the mode of the state does."""
+        """Whether the state's mode covers parameters."""
         return self.state.covers_parameters
 
     def record(
-        self, ctrl: Tensor, start: StepState, end: StepState, applied: Applied | None = None
+        self, ctrl: Tensor, start: StepState, end: StepState, applied: ExternalForces | None = None
     ) -> tuple[Tensor, ...]:
         forces = () if applied is None else (applied,)
         first, second = (mode.record(ctrl, start, end, *forces) for mode in (self.state, self.ctrl))
@@ -62,7 +62,7 @@ class Hybrid(Backward):
         return (*first, *second)
 
     def _split(self, saved: tuple[Tensor, ...]) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
-        """What each of the modes has recorded."""
+        """The tensors recorded by each of the two modes."""
         first = self._splits[len(saved)]  # steps with and without applied forces differ in length
         return saved[:first], saved[first:]
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Linearization(NamedTuple):
-    """x' = end + A δx + B δu to first order around one state and control; entries as of MuJoCo's mjd_transitionFD."""
+    """x' = end + A δx + B δu to first order around a state and control; ordered as in MuJoCo's mjd_transitionFD."""
 
     A: Tensor
     """∂(state after) / ∂(state before), shape (W, S, S)."""
@@ -28,7 +28,7 @@ class Linearization(NamedTuple):
 
 
 def state_size(end: StepState) -> int:
-    """S, the entries of a state in tangent space."""
+    """S, the size of a state in tangent space."""
     return 2 * end.qvel.shape[-1] + end.act.shape[-1]
 
 
@@ -39,7 +39,7 @@ def unit_cotangents(tangent: Tangent, end: StepState, rows: range, count: int) -
         tangent: the joints of the model.
         end: the state after the step.
         rows: the entries.
-        count: R, at least as many; cotangents beyond the rows are zero.
+        count: R, at least the number of rows; further cotangents are zero.
 
     Returns:
         Cotangents of shapes (R, W, nq), (R, W, nv) and (R, W, na).
@@ -51,11 +51,11 @@ def unit_cotangents(tangent: Tangent, end: StepState, rows: range, count: int) -
     return end._replace(qpos=tangent.lift(end.qpos.expand(shape), qpos), qvel=qvel, act=act)
 
 
-def rows_of(tangent: Tangent, start: StepState, found: InputGradients) -> tuple[Tensor, Tensor]:
+def rows_of(tangent: Tangent, start: StepState, gradients: InputGradients) -> tuple[Tensor, Tensor]:
     """Rows of A and B, (..., W, S) and (..., W, nu), from gradients of the same leading shape at `start`."""
-    assert found.qpos is not None
-    assert found.qvel is not None
-    assert found.act is not None
-    assert found.ctrl is not None
-    qpos = tangent.project(start.qpos.expand(found.qpos.shape), found.qpos)
-    return torch.cat((qpos, found.qvel, found.act), dim=-1), found.ctrl
+    assert gradients.qpos is not None
+    assert gradients.qvel is not None
+    assert gradients.act is not None
+    assert gradients.ctrl is not None
+    qpos = tangent.project(start.qpos.expand(gradients.qpos.shape), gradients.qpos)
+    return torch.cat((qpos, gradients.qvel, gradients.act), dim=-1), gradients.ctrl

@@ -20,13 +20,13 @@ from msk_ray.step.errors import ConfigError
 from msk_ray.step.forward import Graph, WorldBatch
 
 Names = str | int | Sequence[str | int]
-"""One name or id, which drops the axis n of the result, or several."""
+"""One name or id, for results without axis n, or several."""
 
 
 def as_named(values: Tensor, names: Names) -> Tensor:
-    """Values (W, n, ·) of what was named, without the axis n for one name.
+    """Values (W, n, ·) of named elements, without axis n for a single name.
 
-    Reading one element by its id on the device would make the host wait, so that no epoch could be recorded.
+    Squeezing avoids indexing with an id on the device, which would make the host wait and prevent recording.
     """
     return values.squeeze(1) if isinstance(names, str | int) else values
 
@@ -64,7 +64,7 @@ class _Constants(NamedTuple):
 class Kinematics:
     """Computes `Frames` for states of `nworld` worlds.
 
-    Its launches are recorded once, apart from those of the step, and share no buffers with it.
+    Its launches are recorded once, separately from the step, and share no buffers with it.
 
     Args:
         batch: the worlds.
@@ -117,14 +117,14 @@ class Kinematics:
         return grad_qpos.clone(), grad_qvel.clone()
 
     def indices(self, kind: str, names: Names) -> Tensor:
-        """Ids of bodies, sites or geoms by name or id, (n,); n is 1 for one.
+        """Ids of bodies, sites or geoms by name or id, (n,); n is 1 for a single one.
 
         Args:
             kind: `body`, `site` or `geom`.
             names: one name or id, or several.
 
         Raises:
-            ConfigError: the model has none of that name.
+            ConfigError: the model has no such element.
         """
         key = (kind, names if isinstance(names, str | int) else tuple(names))
         if key not in self._found:
@@ -149,8 +149,8 @@ class Kinematics:
 
     def place(self, kind: str) -> tuple[Tensor, Tensor, Tensor]:
         """Body, position [m] and orientation (w, x, y, z) in the body's frame of each site or geom."""
-        found: tuple[Tensor, Tensor, Tensor] = getattr(self, f"_{kind}_places")
-        return found
+        frame: tuple[Tensor, Tensor, Tensor] = getattr(self, f"_{kind}_places")
+        return frame
 
     @cached_property
     def _site_places(self) -> tuple[Tensor, Tensor, Tensor]:
@@ -200,7 +200,7 @@ class Frames:
         return as_named(self._pos[:, self._kinematics.indices("body", body)], body)
 
     def orientation(self, body: Names) -> Tensor:
-        """Orientation of bodies as unit quaternions (w, x, y, z), (W, 4) or (W, n, 4)."""
+        """Orientation of bodies, unit quaternions (w, x, y, z), (W, 4) or (W, n, 4)."""
         return as_named(self._quat[:, self._kinematics.indices("body", body)], body)
 
     def velocity(self, body: Names) -> Tensor:
@@ -223,7 +223,7 @@ class Frames:
         return self._point("site", site)[0]
 
     def site_orientation(self, site: Names) -> Tensor:
-        """Orientation of sites as unit quaternions (w, x, y, z), (W, 4) or (W, n, 4)."""
+        """Orientation of sites, unit quaternions (w, x, y, z), (W, 4) or (W, n, 4)."""
         ids = self._kinematics.indices("site", site)
         body, _, quat = self._kinematics.place("site")
         own = self._quat[:, body[ids]]
@@ -261,7 +261,7 @@ class Frames:
         about = own + c.mass[:, None] * torch.linalg.cross(position, velocity)
         total = as_named(torch.einsum("nb,wbk->wnk", members, about), body)
         mass = as_named((members @ c.mass)[None, :, None], body)
-        # Σ m r × v about the origin is that about the centre of mass plus M c × v_c.
+        # Σ m r × v about the origin equals the sum about the centre of mass plus M c × v_c.
         return total - mass * torch.linalg.cross(self.center_of_mass(body), self.com_velocity(body))
 
     @cached_property

@@ -1,4 +1,4 @@
-"""The backward modes by name: the one place where a name becomes an object."""
+"""The backward modes by name."""
 
 from collections.abc import Callable
 from typing import Any
@@ -26,7 +26,7 @@ def make_backward(name: str, **options: Any) -> Backward:
     """A backward mode by name; `options` are its constructor's arguments.
 
     Raises:
-        ConfigError: no such mode, or it does not take one of the options.
+        ConfigError: unknown mode, or it does not take one of the options.
     """
     mode = BACKWARD_MODES.get(name)
     if mode is None:

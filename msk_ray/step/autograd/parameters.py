@@ -1,4 +1,4 @@
-"""Parameters of the model as tensors: their shapes, their way into a batch's model, and what follows from them.
+"""Model parameters as tensors: checks of their shapes, and writing them, with derived fields, into a batch's model.
 
 Axes: W worlds, B bodies, G geoms.
 """
@@ -36,11 +36,11 @@ class ParameterTensors:
 
     @torch.no_grad()
     def load(self, values: Mapping[str, Tensor]) -> None:
-        """Write `values`, each for all worlds or with a row per world; a parameter without one gets the model's own."""
+        """Write `values`, each for all worlds or with a row per world; other parameters get the model's own values."""
         if not self._views:
             return
         self._replayed |= _recording(self._device)
-        # Held, so that no other tensor gets the memory of one of them.
+        # A reference keeps their memory from being reused by other tensors.
         self._loaded = {name: (value.detach(), value._version) for name, value in values.items()}
         values = dict(values)
         if "body_mass" in values:
@@ -53,9 +53,9 @@ class ParameterTensors:
             view.copy_(value.reshape((*rows, *view.shape[1:])))
 
     def hold(self, values: Mapping[str, Tensor]) -> None:
-        """Write `values` if other ones, or changed ones, were written last.
+        """Write `values`, unless the same unchanged tensors were written last.
 
-        It always writes them once a graph has recorded a write: a replay may have written others since.
+        Once a graph has recorded a write, always writes: a replay may have written other values since.
         """
         if self._replayed or _recording(self._device) or not self._holds(values):
             self.load(values)
@@ -72,7 +72,7 @@ class ParameterTensors:
 
     @cached_property
     def _subtrees(self) -> Tensor:
-        """1 where the column's body carries the row's, or is it, else 0; (B, B)."""
+        """Entry (i, j) is 1 if body i is body j or a descendant of it, else 0; shape (B, B)."""
         out = torch.eye(self._model.nbody)
         for body in range(self._model.nbody - 1, 0, -1):
             out[:, self._model.body_parentid[body]] += out[:, body]
@@ -88,18 +88,18 @@ class ParameterTensors:
         ]
 
     def _bounds(self, size: Tensor) -> tuple[Tensor, Tensor]:
-        """Bounding radius (..., G) and box (..., G, 6) of geoms of these sizes, as MuJoCo's compiler finds them."""
+        """Bounding radius (..., G) and box (..., G, 6) of geoms of these sizes, as MuJoCo's compiler computes them."""
         radius, half, third = size.unbind(-1)
         ball, capsule, cylinder, ellipsoid, box = self._kinds
         bound = self._nominal["geom_rbound"].expand(radius.shape).clone()
-        for found, value in (
+        for of_type, value in (
             (ball, radius),
             (capsule, radius + half),
             (cylinder, torch.hypot(radius, half)),
             (ellipsoid, size.amax(-1)),
             (box, size.norm(dim=-1)),
         ):
-            bound = torch.where(found, value, bound)
+            bound = torch.where(of_type, value, bound)
         length = torch.where(box | ellipsoid, third, torch.where(cylinder, half, torch.where(capsule, bound, radius)))
         width = torch.where(box | ellipsoid, half, radius)
         centre, extent = self._nominal["geom_aabb"].expand(*radius.shape, 6).split(3, -1)
@@ -113,8 +113,8 @@ def _recording(device: torch.device) -> bool:
     return device.type == "cuda" and torch.cuda.is_current_stream_capturing()
 
 
-def check_values(model: mujoco.MjModel, nworld: int, values: Mapping[str, Tensor], place: torch.device) -> None:
-    """Raise ConfigError where a value has another shape, dtype or device than the model's field of that name."""
+def check_values(model: mujoco.MjModel, nworld: int, values: Mapping[str, Tensor], device: torch.device) -> None:
+    """Raise ConfigError for a value with another shape than the model's field, or a wrong dtype or device."""
     for name, value in values.items():
         shape = PARAMETERS[name].value(model).shape
         if value.shape not in (shape, (nworld, *shape)):
@@ -124,7 +124,7 @@ def check_values(model: mujoco.MjModel, nworld: int, values: Mapping[str, Tensor
             )
         if value.dtype != torch.float32:
             raise ConfigError(f"step: parameter {name} is {value.dtype}: write {name}.float()")
-        if value.device != place:
+        if value.device != device:
             raise ConfigError(
-                f"step: parameter {name} is on {value.device}, the simulation on {place}: write .to({str(place)!r})"
+                f"step: parameter {name} is on {value.device}, the simulation on {device}: write .to({str(device)!r})"
             )

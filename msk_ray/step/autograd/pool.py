@@ -1,4 +1,4 @@
-"""One buffer for many small Warp arrays, so that a recorded step is copied in or out by one operation."""
+"""One buffer for many small Warp arrays, so that one operation copies a recorded step in or out."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,18 +11,18 @@ _ALIGN = 64  # words; keeps every array on a 256-byte boundary
 
 
 class Pool:
-    """First collects claims, then places them all in one allocation and provides the arrays."""
+    """Collects requests for arrays, then creates them all in one allocation."""
 
     def __init__(self, device: wp.Device) -> None:
         self._device = device
         self._claims: list[tuple[Callable[[wp.array], None], tuple[int, ...], Any]] = []
 
     def floats(self, holder: dict[str, wp.array], name: str, *shape: int) -> None:
-        """Claim a float32 array, which will be stored in holder[name]."""
+        """Request a float32 array, which `allocate` stores in holder[name]."""
         self._claims.append((lambda array: holder.__setitem__(name, array), shape, wp.float32))
 
     def adopt(self, holder: Any, name: str) -> None:
-        """Claim the place of the array `holder.name`, which is replaced by a copy there."""
+        """Request that `allocate` moves the array `holder.name` into the buffer."""
         old = getattr(holder, name)
         assert old.is_contiguous, name
         assert wp.types.type_size_in_bytes(old.dtype) % 4 == 0, name
@@ -34,7 +34,7 @@ class Pool:
         self._claims.append((place, old.shape, old.dtype))
 
     def allocate(self) -> Tensor:
-        """Place all arrays; returns the buffer as one float32 tensor, which must outlive them."""
+        """Create all arrays; returns the buffer as one float32 tensor, which must outlive them."""
         offsets, total = [], 0
         for _, shape, dtype in self._claims:
             offsets.append(total)

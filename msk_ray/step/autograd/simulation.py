@@ -1,7 +1,6 @@
 """`Simulation`: a batch of worlds whose step is an autograd function of torch tensors."""
 
 from collections.abc import Iterable, Mapping
-from types import MappingProxyType
 from typing import Any
 
 import mujoco
@@ -10,7 +9,7 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from msk_ray.step.autograd.backward import Applied, Backward, Needs, StepState
+from msk_ray.step.autograd.backward import Backward, ExternalForces, Needs, StepState
 from msk_ray.step.autograd.flags import known_none
 from msk_ray.step.autograd.jacobian import Linearization
 from msk_ray.step.autograd.modes import make_backward
@@ -52,15 +51,15 @@ def resolve_device(device: str) -> torch.device:
 
 
 def use_device(device: str) -> None:
-    """Make a device the default of torch and Warp in this process, which then leaves other GPUs alone.
+    """Make a device the default of torch and Warp in this process, so that it uses no other GPU.
 
     Raises:
         DeviceError: there is no such device.
     """
-    found = resolve_device(device)
-    if found.type == "cuda":
-        torch.cuda.set_device(found)
-        wp.set_device(str(found))
+    target = resolve_device(device)
+    if target.type == "cuda":
+        torch.cuda.set_device(target)
+        wp.set_device(str(target))
 
 
 class WarpSimStep(torch.autograd.Function):
@@ -73,11 +72,11 @@ class WarpSimStep(torch.autograd.Function):
         ctx: Any, sim: "Simulation", parameters: StepParameters, ctrl: Tensor, *inputs: Any
     ) -> tuple[Tensor, Tensor, Tensor]:
         start, forces = StepState(*inputs[:3]), inputs[4:]
-        end, saved = sim.recorded(ctrl, start, Applied(*forces) if forces else None, parameters)
-        # The engine that computed this step: the simulation may continue with another.
+        end, saved = sim.record(ctrl, start, ExternalForces(*forces) if forces else None, parameters)
+        # This step's engine, because the simulation may continue with another one.
         ctx.engine = sim.engine
         ctx.names, ctx.wanted = tuple(parameters.values), parameters.wanted
-        ctx.bundle = parameters.bundle  # alive for the steps that follow with the same values
+        ctx.bundle = parameters.bundle  # kept alive for further steps with the same values
         ctx.save_for_backward(*parameters.values.values(), *saved)
         return end
 
@@ -91,9 +90,9 @@ class WarpSimStep(torch.autograd.Function):
         cotangent = StepState(qpos, qvel, act)
         ctx.engine.batch.check_model()
         ctx.engine.settle()
-        ctx.engine.have_parameters(dict(zip(ctx.names, values, strict=True)))
-        found = ctx.engine.backward.vjp(saved, cotangent, Needs(*on_state, *on_forces)._replace(parameters=wanted))
-        # A linear map takes zero to zero, even in a world whose Jacobian is not finite: 0 × NaN must not leak out.
+        ctx.engine.set_parameters(dict(zip(ctx.names, values, strict=True)))
+        gradients = ctx.engine.backward.vjp(saved, cotangent, Needs(*on_state, *on_forces)._replace(parameters=wanted))
+        # A zero cotangent has a zero gradient, even if a world's Jacobian is not finite: 0 × NaN must not leak out.
         unused = torch.cat(cotangent, dim=-1).eq(0).all(-1)
         all_used = known_none(unused)
 
@@ -102,13 +101,13 @@ class WarpSimStep(torch.autograd.Function):
                 return g
             return g.masked_fill(unused.view(-1, *[1] * (g.dim() - 1)), 0.0)
 
-        states = (masked(g) for g in (found.ctrl, found.qpos, found.qvel, found.act))
-        forces = (masked(g) for g in (found.qfrc_applied, found.xfrc_applied)[: len(on_forces)])
-        return (None, None, *states, found.parameters, *forces)
+        states = (masked(g) for g in (gradients.ctrl, gradients.qpos, gradients.qvel, gradients.act))
+        forces = (masked(g) for g in (gradients.qfrc_applied, gradients.xfrc_applied)[: len(on_forces)])
+        return (None, None, *states, gradients.parameters, *forces)
 
 
 class Simulation:
-    """`nworld` worlds of one model, advanced by `mujoco_warp.step` × `substeps` under each control.
+    """`nworld` worlds of one model, stepped by `substeps` calls of `mujoco_warp.step` under each control.
 
     Args:
         model: the compiled MuJoCo model; its timestep is the substep's.
@@ -118,14 +117,14 @@ class Simulation:
             forward only.
         device: "cpu", "cuda" or "cuda:N".
         capacity: contacts and constraint rows per world. Where it is 0, a bound from the geometry if that is small,
-            otherwise 1.5 times what a short probe in C MuJoCo needed, which grows with use.
+            otherwise 1.5 times what a short probe in C MuJoCo needed, which grows when a step needs more.
         tolerance: solver tolerance, which may be below mujoco_warp's floor of 1e-6.
-        kernels: which kernels steps are made of: `Kernels(ordered=True)` adds everything up in a fixed order, so that a
-            GPU repeats steps and gradients bit for bit; `Kernels(fused_solver=True)` solves constraints in one launch;
-            `Kernels(iterations=1, ls_iterations=5)` stops the solver early. Otherwise it gets the model's limits of
-            iterations, but at least 100 and 50: gradients need a solver that has converged.
+        kernels: `Kernels(ordered=True)` sums in a fixed order, so that a GPU repeats steps and gradients bit for bit;
+            `Kernels(fused_solver=True)` solves constraints in one launch; `Kernels(iterations=1, ls_iterations=5)`
+            stops the solver early. By default its limits are the model's, but at least 100 and 50 iterations, because
+            gradients need a converged solver.
 
-    The model must not be edited while the simulation exists; if it was, the next step or backward pass raises an error.
+    Do not edit the model while the simulation exists: the next step or backward pass would raise an error.
 
     Raises:
         UnsupportedModelError: the model cannot be stepped, or not differentiated by `backward`.
@@ -157,7 +156,7 @@ class Simulation:
         self.tangent = Tangent(model, self.device)
         self._bundles = Bundles(model, nworld)
         self._widths = (("ctrl", model.nu), ("qpos", model.nq), ("qvel", model.nv), ("act", model.na))
-        self._place = torch.empty(0, device=self.device).device
+        self._tensor_device = torch.empty(0, device=self.device).device
         mode = make_backward(backward) if isinstance(backward, str) else backward
         batch = WorldBatch(
             model,
@@ -213,17 +212,17 @@ class Simulation:
         xfrc_applied: Tensor | None = None,
         parameters: Mapping[str, Tensor] | None = None,
     ) -> StepState:
-        """Advance all worlds by one env step; a pure, differentiable function of its arguments.
+        """Step all worlds by one env step; a pure, differentiable function of its arguments.
 
         Args:
             ctrl: shape (W, nu). qpos: (W, nq). qvel: (W, nv). act: (W, na). float32 on `device`.
             qfrc_applied: forces on the degrees of freedom [N, N m], (W, nv), held over the substeps; None for none.
             xfrc_applied: force [N] and torque [N m] on each body at its centre of mass, in world coordinates,
                 (W, nbody, 6), held likewise.
-            parameters: values of fields of the model for this step, by their name in MjModel (body_mass, opt.gravity),
-                each in the field's shape for all worlds, or with a row per world in front. Everything else is as in
-                the model; what MuJoCo has computed from it stays as it is (docs/step/parameters.md). The first step
-                with another name is recorded again.
+            parameters: values of model fields for this step, by their name in MjModel (body_mass, opt.gravity), each in
+                the field's shape for all worlds, or with a row per world in front. Other fields keep the model's
+                values, also those that MuJoCo's compiler has derived (docs/step/parameters.md). The first step with a
+                new name records the graph again.
 
         Returns:
             New tensors (qpos, qvel, act).
@@ -241,7 +240,7 @@ class Simulation:
         inputs = (ctrl, qpos, qvel, act, given.bundle, *(applied or ()))
         if torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs):
             return StepState(*WarpSimStep.apply(self, given, *inputs))
-        return self.advance(ctrl, StepState(qpos, qvel, act), applied, given.values)
+        return self._stepper.step(ctrl, StepState(qpos, qvel, act), applied, given.values)
 
     @torch.no_grad()
     def linearize(
@@ -257,14 +256,14 @@ class Simulation:
     ) -> Linearization:
         """Jacobians of one env step of every world, in tangent space: x' = end + A δx + B δu to first order.
 
-        By the backward mode: exact with the tapes, whose rows run as further worlds, without another forward pass;
-        from perturbed copies with fd_jacobian. Clips of gradients do not act on them.
+        Computed by the backward mode: exactly with the tapes, with one more world per row and without another forward
+        pass; from perturbed copies with fd_jacobian. Gradients are not clipped here.
 
         Args:
             ctrl, qpos, qvel, act, qfrc_applied, xfrc_applied, parameters: as for `step`.
 
         Returns:
-            A (W, 2 nv + na, 2 nv + na), B (W, 2 nv + na, nu) and the state after the step. Entries are ordered as by
+            A (W, 2 nv + na, 2 nv + na), B (W, 2 nv + na, nu) and the state after the step. Entries are ordered as in
             MuJoCo's mjd_transitionFD: positions in tangent space, velocities, activations.
 
         Raises:
@@ -274,26 +273,26 @@ class Simulation:
         self.require_backward()
         applied, values = self._checked((ctrl, qpos, qvel, act), qfrc_applied, xfrc_applied, parameters)
         start = StepState(qpos, qvel, act)
-        end, saved = self.recorded(ctrl, start, applied, self._bundles.of(values))
+        end, saved = self.record(ctrl, start, applied, self._bundles.of(values))
         self.engine.settle()
         return Linearization(*self.require_backward().jacobian(saved, start, end, self.tangent), end)
 
     def open_parameters(self, names: Iterable[str]) -> None:
-        """Let `step` take these parameters. `step` does it itself; call this to have the recording done beforehand.
+        """Prepare `step` for these parameters. `step` does this itself; call it to record the graph in advance.
 
         Raises:
-            ConfigError: a name is no parameter, or the model has none of it.
+            ConfigError: unknown parameter, or the model has no such elements.
             UnsupportedModelError: the model uses something with which the parameter cannot be varied.
         """
         self._stepper.open_parameters(names)
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """Names of the parameters that are open."""
+        """Names of the parameters that `step` is prepared for."""
         return self.batch.parameters
 
     def settle(self) -> None:
-        """Wait for all steps so far.
+        """Wait until all steps so far have finished.
 
         Raises:
             SimulationError: one of them lost contacts or constraint rows.
@@ -319,12 +318,12 @@ class Simulation:
         qfrc: Tensor | None,
         xfrc: Tensor | None,
         parameters: Mapping[str, Tensor] | None,
-    ) -> tuple[Applied | None, dict[str, Tensor]]:
-        """Applied forces and parameters of a step whose arguments are all in order; opens the parameters."""
+    ) -> tuple[ExternalForces | None, dict[str, Tensor]]:
+        """Check a step's arguments and open its parameters; returns applied forces and parameters."""
         self._check_inputs(*inputs)
         values = dict(parameters or {})
         self.open_parameters(values)
-        check_values(self.model, self.nworld, values, self._place)
+        check_values(self.model, self.nworld, values, self._tensor_device)
         return self._applied(qfrc, xfrc), values
 
     def _check_input(self, name: str, value: Tensor, *shape: int) -> None:
@@ -335,44 +334,33 @@ class Simulation:
             )
         if value.dtype != torch.float32:
             raise ConfigError(f"step: {name} is {value.dtype}: write {name}.float()")
-        if value.device != self._place:
+        if value.device != self._tensor_device:
             raise ConfigError(
-                f"step: {name} is on {value.device}, the simulation on {self._place}: write "
-                f"{name}.to({str(self._place)!r})"
+                f"step: {name} is on {value.device}, the simulation on {self._tensor_device}: write "
+                f"{name}.to({str(self._tensor_device)!r})"
             )
 
-    def _applied(self, qfrc: Tensor | None, xfrc: Tensor | None) -> Applied | None:
+    def _applied(self, qfrc: Tensor | None, xfrc: Tensor | None) -> ExternalForces | None:
         """Both kinds of applied forces, checked; None if there are none."""
         if qfrc is None and xfrc is None:
             return None
         nv, nbody = self.model.nv, self.model.nbody
-        applied = Applied(
-            torch.zeros((self.nworld, nv), device=self._place) if qfrc is None else qfrc,
-            torch.zeros((self.nworld, nbody, 6), device=self._place) if xfrc is None else xfrc,
+        applied = ExternalForces(
+            torch.zeros((self.nworld, nv), device=self._tensor_device) if qfrc is None else qfrc,
+            torch.zeros((self.nworld, nbody, 6), device=self._tensor_device) if xfrc is None else xfrc,
         )
         self._check_input("qfrc_applied", applied.qfrc, nv)
         self._check_input("xfrc_applied", applied.xfrc, nbody, 6)
         return applied
 
-    def advance(
-        self,
-        ctrl: Tensor,
-        start: StepState,
-        applied: Applied | None = None,
-        parameters: Mapping[str, Tensor] = MappingProxyType({}),
-    ) -> StepState:
-        """The forward pass alone, outside autograd; `parameters` must be open."""
-        self.engine.have_parameters(parameters)
-        return self._stepper.advance(ctrl, start, applied)
-
-    def recorded(
-        self, ctrl: Tensor, start: StepState, applied: Applied | None, parameters: StepParameters
+    def record(
+        self, ctrl: Tensor, start: StepState, applied: ExternalForces | None, parameters: StepParameters
     ) -> tuple[StepState, tuple[Tensor, ...]]:
-        """The forward pass, and what the backward mode needs of it.
+        """One env step outside autograd, and the tensors that the backward mode needs to differentiate it.
 
         Raises:
             ConfigError: the simulation has no backward mode.
-            UnsupportedModelError: the mode does not cover applied forces, or parameters of which one needs a gradient.
+            UnsupportedModelError: the mode does not cover applied forces, or gradients of parameters.
         """
         mode = self.require_backward()
         if parameters.wanted and not mode.covers_parameters:
@@ -381,29 +369,29 @@ class Simulation:
                 f"backward={TapePerSubstep.name!r}"
             )
         if applied is None:
-            end = self.advance(ctrl, start, parameters=parameters.values)
-            # The step may have replaced the mode by one with larger buffers.
+            end = self._stepper.step(ctrl, start, None, parameters.values)
+            # Ask again: the step may have replaced the mode by one with larger buffers.
             return end, self.require_backward().record(ctrl, start, end)
         if not mode.covers_applied:
             raise UnsupportedModelError(
                 f"backward mode {mode.name} does not differentiate steps with applied forces: write "
                 "backward='tape_per_substep', or leave qfrc_applied and xfrc_applied out"
             )
-        end = self.advance(ctrl, start, applied, parameters.values)
+        end = self._stepper.step(ctrl, start, applied, parameters.values)
         return end, self.require_backward().record(ctrl, start, end, applied)
 
     @property
     def capacity(self) -> Capacity:
-        """Contacts and constraint rows per world that currently fit."""
+        """Current room for contacts and constraint rows per world."""
         return self.batch.capacity
 
     def reserve(self, capacity: Capacity) -> None:
-        """Enlarge the buffers to at least `capacity` per world, unless the constructor's fixes them."""
+        """Enlarge the buffers to at least `capacity` per world, unless the constructor fixed them."""
         self._stepper.reserve(capacity)
 
     def diagnostics(self) -> dict[str, float]:
-        """Diagnostics since the last call: share of worlds at a solver limit, largest shares of the buffers for
-        contacts and rows that a step used, and those of the backward mode. Buffers that are nearly full grow.
+        """Diagnostics since the last call: share of worlds at a solver limit, largest used shares of the contact and
+        row buffers, and the backward mode's diagnostics. Enlarges buffers that are nearly full.
 
         Raises:
             SimulationError: contacts or constraint rows were lost to a full buffer.

@@ -1,7 +1,7 @@
-"""Values of parameters of the model on their way into autograd: together, so that a step's gradient is one tensor.
+"""Model parameters as autograd inputs, bundled so that a step's gradient for all of them is one tensor.
 
 A rollout takes many steps with the same values. If each value were an input of each step, autograd would sum their
-gradients one by one: for the ant's 30 parameters as many small kernels a step as its whole pullback has.
+gradients one by one: for the ant's 30 parameters, that would be as many small kernels per step as the whole pullback.
 """
 
 import weakref
@@ -17,15 +17,15 @@ from msk_ray.step.forward.parameters import PARAMETERS
 
 
 class StepParameters(NamedTuple):
-    """Parameters of the model in a step."""
+    """Model parameters of a step."""
 
     values: dict[str, Tensor]
     """Their values by name, outside autograd."""
     wanted: tuple[str, ...]
     """Names of those that need a gradient."""
     bundle: Tensor | None
-    """What autograd takes for them: a tensor without contents, (W, N), whose gradient is theirs side by side, with a
-    row per world; None if `wanted` is empty."""
+    """Autograd input that represents them: a tensor without contents, (W, N), whose gradient is the concatenation of
+    theirs, with a row per world; None if `wanted` is empty."""
 
 
 class _Bundle(torch.autograd.Function):
@@ -53,10 +53,10 @@ class _Bundle(torch.autograd.Function):
 
 
 class Bundles:
-    """Makes the bundle of a step's parameters, one for all steps that follow each other with the same values.
+    """Makes the bundle of a step's parameters, shared by consecutive steps with the same values.
 
     Args:
-        model: whose parameters they are.
+        model: the parameters' model.
         nworld: number of worlds.
     """
 
@@ -76,7 +76,7 @@ class Bundles:
         if last is None:
             own = [torch.Size(PARAMETERS[name].value(self._model).shape) for name in wanted]
             last = _Bundle.apply(self._nworld, own, *wanted.values())
-            # Weakly: autograd's graph of the values must not outlive the steps that use it.
+            # Weak references, so that autograd's graph of the values does not outlive the steps that use it.
             self._key = [(name, weakref.ref(value), value._version) for name, value in wanted.items()]
             self._last = weakref.ref(last)
         return last

@@ -1,11 +1,11 @@
-"""Env steps of tensors, on recorded graphs whose buffers grow if a step needs more."""
+"""Env steps on torch tensors: replays of recorded graphs, whose buffers grow when a step needs more."""
 
 from collections.abc import Iterable, Mapping
 
 import warp as wp
 from torch import Tensor
 
-from msk_ray.step.autograd.backward import Applied, Backward, StepState
+from msk_ray.step.autograd.backward import Backward, ExternalForces, StepState
 from msk_ray.step.autograd.buffers import BatchTensors, device_of, stream_of, wait_for
 from msk_ray.step.autograd.parameters import ParameterTensors
 from msk_ray.step.forward import Graph, WorldBatch, joined_stream
@@ -13,13 +13,13 @@ from msk_ray.step.forward.capacity import Capacity
 from msk_ray.step.forward.contact_forces import ContactForces
 
 _NEARLY_FULL = 0.75
-"""Share of a buffer in use above which it grows between epochs, before a step needs more."""
+"""Share of a buffer in use above which `diagnostics` enlarges it, before a step overflows."""
 
 
 class Engine:
     """One batch, the graph of its step and the backward mode attached to it: everything with a fixed size.
 
-    A recorded env step is pulled back by the engine that computed it, even if others have replaced it since.
+    The engine that computed an env step also pulls it back, even if another engine has replaced it since.
     """
 
     def __init__(self, batch: WorldBatch, backward: Backward | None) -> None:
@@ -33,37 +33,37 @@ class Engine:
         self._launches = batch.launch_step if backward is None else lambda: backward.launch_step(batch)
         self._record()
         self._unseen = False
-        self._touch: ContactForces | None = None
+        self._contact_forces: ContactForces | None = None
 
     def _record(self) -> None:
-        """Prepare the step, which runs once for that on CUDA."""
+        """Record the step's graph. On CUDA this runs the step once."""
         self._graph = Graph(self._launches, self.batch.device)
         self._limits = self.batch.unrolled_iterations
         for watch in (self.batch.losses, self.batch.iterations):
-            watch.read()  # of that run, whose state is nobody's
+            watch.read()  # discard what the run for recording reported
         if self.backward is not None:
             self.backward.forget()
 
     def contact_forces(self) -> Tensor:
         """Force of the contacts on every geom [N] in the last substep of the last step, (W, G, 3)."""
-        if self._touch is None:
+        if self._contact_forces is None:
             data = self.batch.data if self.backward is None else self.backward.last_data(self.batch)
-            self._touch = ContactForces(self.batch.model, data)
-            self._touch_graph = Graph(self._touch.launch, self.batch.device)
-        self._touch_graph.replay(stream_of(self.device))
-        force: Tensor = wp.to_torch(self._touch.force, requires_grad=False)
+            self._contact_forces = ContactForces(self.batch.model, data)
+            self._forces_graph = Graph(self._contact_forces.launch, self.batch.device)
+        self._forces_graph.replay(stream_of(self.device))
+        force: Tensor = wp.to_torch(self._contact_forces.force, requires_grad=False)
         return force.clone()
 
-    def have_parameters(self, values: Mapping[str, Tensor]) -> None:
-        """Put these values of the batch's parameters into its model, and its own values for all others, unless they
-        were the last that were put there.
+    def set_parameters(self, values: Mapping[str, Tensor]) -> None:
+        """Write these values of open parameters into the batch's model, and the model's own values for the others;
+        skipped if the same values were written last.
 
-        A change that leaves no trace in a tensor's version is not seen, as in everything that autograd keeps.
+        In-place edits that bypass a tensor's `_version` go unnoticed, as they do in autograd.
         """
         self._parameters.hold(values)
 
-    def advance(self, ctrl: Tensor, start: StepState, applied: Applied | None = None) -> StepState:
-        """One env step, even if it lost contacts or rows."""
+    def replay(self, ctrl: Tensor, start: StepState, applied: ExternalForces | None = None) -> StepState:
+        """The state after one env step, even if the step lost contacts or constraint rows."""
         if self.batch.ordered and self._limits != self.batch.unrolled_iterations and joined_stream() is None:
             self.settle()
             self._record()
@@ -73,9 +73,9 @@ class Engine:
         return self._buffers.read()
 
     def settle(self) -> None:
-        """Raise SimulationError if any step so far lost something. Waits for the device, once after each step.
+        """Wait for the device, and raise SimulationError if a step so far lost contacts or constraint rows.
 
-        While steps are being captured, none has run yet, and nothing can be known.
+        Does nothing while steps are being captured: none of them has run yet.
         """
         if joined_stream() is not None:
             return
@@ -92,7 +92,7 @@ class Engine:
         """
         self.settle()
         _, limited, used = self.batch.losses.read()
-        room = self.batch.capacity.at_least(Capacity(1, 1))  # a model that can have none uses none of it
+        room = self.batch.capacity.at_least(Capacity(1, 1))  # avoids 0 / 0 in models without contacts
         figures = {
             "solver_limit_share": limited,
             "contacts_share": used.contacts / room.contacts,
@@ -102,10 +102,10 @@ class Engine:
 
 
 class Stepper:
-    """Steps a batch; on CPU, where a loss is known at once, a step that lost something is repeated with larger buffers.
+    """Steps a batch, and handles steps that lost contacts or constraint rows because a buffer was too small.
 
-    On CUDA the results of such a step are NaN, and the first call after the device has run the step raises an error, at
-    the latest when it is pulled back.
+    On CPU such a step is repeated with larger buffers. On CUDA its results are NaN, and the first call after the device
+    has run it raises an error, at the latest its backward pass.
 
     Attributes:
         engine: the engine that computed the last step.
@@ -115,37 +115,47 @@ class Stepper:
         self.engine = Engine(batch, backward)
         self._retired: list[Engine] = []
 
-    def advance(self, ctrl: Tensor, start: StepState, applied: Applied | None = None) -> StepState:
-        """The state after one env step under `ctrl` (W, nu) and applied forces.
+    def step(
+        self,
+        ctrl: Tensor,
+        start: StepState,
+        applied: ExternalForces | None = None,
+        parameters: Mapping[str, Tensor] | None = None,
+    ) -> StepState:
+        """The state after one env step under `ctrl` (W, nu), applied forces and values of open parameters.
+
+        `parameters` None keeps the values of the last call.
 
         Raises:
             SimulationError: a step lost contacts or constraint rows, on CUDA perhaps an earlier one.
             ConfigError: the MjModel was edited.
         """
+        if parameters is not None:
+            self.engine.set_parameters(parameters)
         self.engine.batch.check_model()
         self.engine.batch.raise_losses()
-        end = self.engine.advance(ctrl, start, applied)
+        end = self.engine.replay(ctrl, start, applied)
         # On CUDA this may be the loss of an earlier step, from which this one started.
-        while self.engine.device.type == "cpu" and self.engine.batch.losses.heard():
+        while self.engine.device.type == "cpu" and self.engine.batch.losses.any_lost():
             self._replace(self.engine.batch.larger())
-            end = self.engine.advance(ctrl, start, applied)
+            end = self.engine.replay(ctrl, start, applied)
         return end
 
     def reserve(self, wanted: Capacity) -> None:
-        """Enlarge the buffers to at least `wanted` per world, as far as they may grow."""
+        """Enlarge the buffers to at least `wanted` per world, up to the limit on their growth."""
         batch = self.engine.batch
         allowed = batch.growth(wanted)
         if allowed != batch.capacity:
             self._replace(batch.resized(batch.nworld, allowed))
 
     def open_parameters(self, names: Iterable[str]) -> None:
-        """Let the named fields of the model have a value for each world, from the next step on."""
+        """Give each world its own value of the named model fields, from the next step on."""
         if not set(names) <= set(self.engine.batch.parameters):
             self._replace(self.engine.batch.with_parameters(names))
 
     def diagnostics(self) -> dict[str, float]:
-        """Diagnostics since the last call, the largest if there were several engines; enlarges buffers that are
-        filling.
+        """Diagnostics since the last call, the largest over the engines used since; enlarges buffers that are nearly
+        full.
 
         Raises:
             SimulationError: a step lost contacts or constraint rows.

@@ -43,7 +43,7 @@ def quat_log(q: Tensor) -> Tensor:
     q = torch.where(q[..., :1] < 0, -q, q)
     w, v = q[..., :1], q[..., 1:]
     sin = v.norm(dim=-1, keepdim=True)
-    # angle / sin(angle/2) tends to 2 / w as the rotation tends to none.
+    # angle / sin(angle/2) → 2 / w as the rotation → 0.
     scale = torch.where(sin > 1e-8, 2.0 * torch.atan2(sin, w) / sin.clamp_min(1e-8), 2.0 / w.clamp_min(0.5))
     return scale * v
 
@@ -56,7 +56,7 @@ def quat_rotate(q: Tensor, v: Tensor) -> Tensor:
 
 
 class Tangent:
-    """The position of each joint of a model in qpos (nq) and in the tangent space (nv)."""
+    """Tangent-space arithmetic for a model: maps joints between qpos (nq) and the tangent space (nv)."""
 
     def __init__(self, model: mujoco.MjModel, device: torch.device) -> None:
         self.nq, self.nv = model.nq, model.nv

@@ -1,8 +1,8 @@
 """`tape_per_substep` and `tape_all`: exact gradients by the adjoint of every substep.
 
-Both tapes checkpoint each substep's state and acceleration, in one buffer that is copied out per recorded env step.
-`tape_per_substep` recomputes the position and velocity stages in the backward pass (the acceleration is known, so
-nothing is solved); `tape_all` keeps them.
+Both tapes checkpoint each substep's state and acceleration in one buffer, which is copied for each recorded env step.
+`tape_per_substep` recomputes the position and velocity stages in the backward pass (the acceleration is known, so there
+is no solve); `tape_all` stores them.
 """
 
 import warnings
@@ -23,8 +23,8 @@ from msk_ray.step.adjoint.stages.recomputed import recomputed
 from msk_ray.step.adjoint.stages.residual import ResidualGauge
 from msk_ray.step.autograd.backward import (
     INPUTS,
-    Applied,
     Backward,
+    ExternalForces,
     InputGradients,
     Needs,
     StepState,
@@ -37,9 +37,9 @@ from msk_ray.step.errors import UnsupportedModelError
 from msk_ray.step.forward import Graph, WorldBatch
 
 UNCONVERGED_BOUND = 0.01
-"""Share of the substeps of all worlds that may be unconverged before there is a warning."""
+"""Share of unconverged substeps, over all worlds, above which there is a warning."""
 JACOBIAN_WORLDS = 131072
-"""Worlds in which `jacobian` pulls rows back at the same time; further rows follow."""
+"""Largest number of worlds in which `jacobian` pulls rows back at the same time."""
 
 # Arrays of mujoco_warp.Data that the adjoint of a substep reads, besides the checkpointed state.
 _KEPT_DATA = (
@@ -56,18 +56,18 @@ _KEPT_CONTACT = (
 
 
 def _solved(data: Any, mjm: mujoco.MjModel) -> wp.array:
-    """The acceleration that the arrays of `data` belong to; after RK4, those of the last stage."""
+    """The acceleration to which the other arrays of `data` belong; for RK4, the last stage's."""
     return data.qacc_warmstart if mjm.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else data.qacc
 
 
 class _Tape(Backward):
-    """The shared part of the two tapes: checkpoints, the backward graph, and reading its results.
+    """The shared part of the two tapes: checkpoints, and the backward graph.
 
     Args:
         substep_grad_clip: bound on the Euclidean norm of each world's state cotangent between substeps, in the
             cotangent's own units; the direction is kept. None for no bound.
-        residual_tolerance: a world's substep is counted as unconverged where the solver left more than this share of
-            its forces unbalanced, |Ma - τ - Jᵀf| / |(Ma, τ, Jᵀf)|. There is a warning, once, when a hundredth are.
+        residual_tolerance: a world's substep counts as unconverged if the solver left more than this share of its
+            forces unbalanced, |Ma - τ - Jᵀf| / |(Ma, τ, Jᵀf)|. Warns once if more than a hundredth are.
     """
 
     covers_applied = True
@@ -80,7 +80,7 @@ class _Tape(Backward):
     ) -> None:
         self.substep_grad_clip = substep_grad_clip
         self.residual_tolerance = residual_tolerance
-        self._warned: set[str] = set()  # shared with the modes that take the place of this one
+        self._warned: set[str] = set()  # shared with the modes that replace this one
 
     def attach(self, batch: WorldBatch) -> None:
         mjm, worlds = batch.mjm, batch.nworld
@@ -117,14 +117,14 @@ class _Tape(Backward):
         self._rows: dict[int, TapePerSubstep] = {}
 
     def _prepare(self, pool: Pool) -> None:
-        """Claim further arrays in the buffer that is copied out per recorded step."""
+        """Request further arrays in the buffer that is copied for each recorded step."""
 
     @abstractmethod
     def _pull_back(self, k: int, qvel_next: wp.array, *extras: Any) -> None:
         """Launch the pullback of substep k; `qvel_next` (W, nv) is the velocity after it."""
 
     def record(
-        self, ctrl: Tensor, start: StepState, end: StepState, applied: Applied | None = None
+        self, ctrl: Tensor, start: StepState, end: StepState, applied: ExternalForces | None = None
     ) -> tuple[Tensor, ...]:
         forces = () if applied is None else (force.detach().clone() for force in applied)
         return (ctrl.detach().clone(), self._saved.clone(), *forces)
@@ -138,19 +138,19 @@ class _Tape(Backward):
         self._saved.copy_(kept)
         for view, value in zip(self._applied, forces, strict=False):
             view.copy_(value)
-        found = self.pull(cotangent, bool(forces), needs.parameters)
+        gradients = self.pull(cotangent, bool(forces), needs.parameters)
         if forces:
-            for view in self._applied:  # the next step may have none
+            for view in self._applied:  # the next step may have no applied forces
                 view.zero_()
         return InputGradients.of(
-            {name: getattr(found, name).clone() for name in INPUTS if getattr(needs, name)},
-            found.parameters,
+            {name: getattr(gradients, name).clone() for name in INPUTS if getattr(needs, name)},
+            gradients.parameters,
         )
 
     def ready(self, applied: bool, names: tuple[str, ...] = ()) -> None:
-        """Prepare the backward pass of steps with or without applied forces, with the gradients of some parameters.
+        """Record the backward pass of steps with or without applied forces, with gradients of the named parameters.
 
-        On CUDA it runs once for that, which leaves the checkpoints undefined.
+        On CUDA this runs it once, which leaves the checkpoints undefined.
         """
         if (applied, names) not in self._graphs:
             if names and self._batch.ordered:
@@ -169,22 +169,22 @@ class _Tape(Backward):
             self._adjoint.touch_counter.clear()
 
     def pull(self, cotangent: StepState, applied: bool, names: tuple[str, ...] = ()) -> InputGradients:
-        """Replay the backward pass of the step whose checkpoints are in place; the result lasts until the next."""
+        """Replay the backward pass of the step whose checkpoints are loaded; the next call overwrites the result."""
         for view, value in zip(self.cotangent, cotangent, strict=True):
             view.copy_(value)
         self._graphs[applied, names].replay(stream_of(self._device))
-        found = InputGradients(self._grad_ctrl, *self.cotangent)
+        gradients = InputGradients(self._grad_ctrl, *self.cotangent)
         if applied:
             forces = self._adjoint.cover_applied()
             views = (wp.to_torch(a, requires_grad=False) for a in (forces.grad_qfrc, forces.grad_xfrc))
-            found = found._replace(**dict(zip(("qfrc_applied", "xfrc_applied"), views, strict=True)))
+            gradients = gradients._replace(**dict(zip(("qfrc_applied", "xfrc_applied"), views, strict=True)))
         if names:
             rows = wp.to_torch(self._parameters[names].rows, requires_grad=False)
-            found = found._replace(parameters=rows.index_select(1, self._columns[names]))
-        return found
+            gradients = gradients._replace(parameters=rows.index_select(1, self._columns[names]))
+        return gradients
 
     def load(self, ctrl: Tensor, states: Sequence[dict[str, wp.array]], forces: Sequence[Tensor]) -> None:
-        """Take the step of a batch of w worlds, W / w copies of each: its control, checkpoints and applied forces."""
+        """Load a step of a batch of w worlds, W / w copies of each: its control, checkpoints and applied forces."""
         self.ready(bool(forces))
         pairs = [(self._ctrl, ctrl), *zip(self._applied, forces, strict=False)]
         for here, there in zip(self.checkpoints, states, strict=True):
@@ -194,14 +194,14 @@ class _Tape(Backward):
 
     @property
     def checkpoints(self) -> list[dict[str, wp.array]]:
-        """Checkpoints of a step: the states before each substep, and the last one."""
+        """Checkpoints of a step: the states before each substep, and the final one."""
         return [*self._states, self._last]
 
     @torch.no_grad()
     def jacobian(
         self, saved: tuple[Tensor, ...], start: StepState, end: StepState, tangent: Tangent
     ) -> tuple[Tensor, Tensor]:
-        """As many rows at once as fit in `JACOBIAN_WORLDS` worlds. Not clipped."""
+        """Pulls back as many rows at once as fit in `JACOBIAN_WORLDS` worlds, without clipping."""
         self._warn_of_unconverged(self._gauge.unconverged())
         ctrl, kept, *forces = saved
         self._saved.copy_(kept)
@@ -211,22 +211,22 @@ class _Tape(Backward):
             self._rows[width] = TapePerSubstep()
             self._rows[width].attach(self._batch.resized(width * worlds))
         self._rows[width].load(ctrl, self.checkpoints, forces)
-        found = []
+        rows = []
         for first in range(0, size, width):
             chunk = range(first, min(first + width, size))
             cotangents = unit_cotangents(tangent, end, chunk, width)
             gradients = self._rows[width].pull(StepState(*(part.flatten(0, 1) for part in cotangents)), bool(forces))
             split = {n: getattr(gradients, n).clone().unflatten(0, (width, worlds)) for n in INPUTS[:4]}
-            found.append(rows_of(tangent, start, InputGradients.of(split)))
-        a, b = (torch.cat(parts)[:size].transpose(0, 1).contiguous() for parts in zip(*found, strict=True))
+            rows.append(rows_of(tangent, start, InputGradients.of(split)))
+        a, b = (torch.cat(parts)[:size].transpose(0, 1).contiguous() for parts in zip(*rows, strict=True))
         return a, b
 
     def bytes_recorded(self) -> int:
-        """Size of the data of one recorded env step, for all worlds together, without its control."""
+        """Size of one recorded env step's data [B], of all worlds together, without its control."""
         return self._saved.numel() * self._saved.element_size()
 
     def launch_backward(self, with_applied: bool = False, names: tuple[str, ...] = ()) -> None:
-        """Launch the pullback of a whole env step: from `cotangent` of its end to the same buffers for its start."""
+        """Launch the pullback of a whole env step, from `cotangent` of its end to the start's, in the same buffers."""
         applied = self._adjoint.cover_applied() if with_applied else None
         parameters = self._parameters[names] if names else None
         for extra in (applied, parameters):
@@ -263,13 +263,12 @@ class _Tape(Backward):
 
     @property
     def _counts(self) -> bool:
-        """Whether anything is reported as a share of the substeps that were pulled back."""
+        """Whether a diagnostic is a share of the substeps pulled back."""
         return self.substep_grad_clip is not None or self._adjoint.touch_counter.present
 
     def _approximated_share(self, substeps: int) -> float:
-        """Share of all worlds' substeps whose gradient went through a contact without a derivative of its own.
-
-        Warns the first time it is above zero.
+        """Share of all worlds' substeps with a contact whose gradient is approximated. Warns when it is first above
+        zero.
         """
         count, pairs = self._adjoint.touch_counter.read()
         share = count / substeps
@@ -283,7 +282,7 @@ class _Tape(Backward):
         return share
 
     def _warn_of_unconverged(self, share: float) -> None:
-        """Warn the first time that a share of the substeps is above the bound."""
+        """Warn when the share of unconverged substeps is first above the bound."""
         if share <= UNCONVERGED_BOUND or "unconverged" in self._warned:
             return
         self._warned.add("unconverged")

@@ -32,7 +32,7 @@ class _TendonState(torch.autograd.Function):
 class Tendons:
     """Length [m] and rate [m/s] of every tendon of a batch, with exact gradients.
 
-    It shares the batch's `Data`, which every launch overwrites, so it must not run between the launches of a step.
+    Shares the batch's `Data`, which every launch overwrites, so it must not run between the launches of a step.
 
     Raises:
         UnsupportedModelError: the model has no tendons.

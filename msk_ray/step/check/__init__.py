@@ -4,10 +4,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from msk_ray.step.check.chain import ChainComparison, check_chain
     from msk_ray.step.check.check import Comparison, GradientCheck, Limits, check_gradients
     from msk_ray.step.check.nonfinite import NonFinite
     from msk_ray.step.check.oracle import Linearization, Oracle, Point
+    from msk_ray.step.check.policy_gradient import ChainComparison, check_chain
     from msk_ray.step.check.states import STATE_KINDS, make_states
 
 __all__ = [
@@ -26,7 +26,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "chain": ("ChainComparison", "check_chain"),
+    "policy_gradient": ("ChainComparison", "check_chain"),
     "check": ("Comparison", "GradientCheck", "Limits", "check_gradients"),
     "nonfinite": ("NonFinite",),
     "oracle": ("Linearization", "Oracle", "Point"),
@@ -35,10 +35,10 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Names are loaded where they are first used: the command says what it does before torch is there."""
+    """Load names on first use, so that the command can print before torch is loaded."""
     for home, names in _HOMES.items():
         if name in names:
-            found = getattr(import_module(f"{__name__}.{home}"), name)
-            globals()[name] = found
-            return found
+            attribute = getattr(import_module(f"{__name__}.{home}"), name)
+            globals()[name] = attribute
+            return attribute
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -21,24 +21,24 @@ from msk_ray.step.forward.parameters import check_names
 from msk_ray.step.forward.solver_limits import ENOUGH, SolverLimits
 
 _VANISHING = 1e-9
-"""A reference gradient below this share of its cotangent is zero up to the rounding of the differences."""
+"""A reference gradient below this share of its cotangent counts as zero: it is rounding of the differences."""
 _STANDARD_GRAVITY = 9.81
 
 
 @dataclass(frozen=True)
 class Limits:
-    """When a state is left out of the comparison."""
+    """Limits above which a state is left out of the comparison."""
 
     step_disagreement: float = 1e-3
-    """Kink: the reference's two step sizes differ by more than this, relative; the reference may then itself be wrong
-    by 1 % of that."""
+    """Kink: derivatives with the reference's two step sizes differ by more than this, relative. The reference itself
+    may then be wrong by 1 % of that."""
     side_disagreement: float = 1e-2
-    """Kink: the reference's one-sided differences differ by more than this, relative; smooth, stiff contact has
-    3e-3."""
+    """Kink: the reference's one-sided differences differ by more than this, relative. In smooth, stiff contact they
+    differ by 3e-3."""
     forward_mismatch: float = 3e-5
     """Forward mismatch: Warp's results differ from C MuJoCo's by more than this, relative to the motion of the step.
 
-    Float32 alone gives up to 2e-5 on an ant in contact over 16 substeps; another contact frame 4e-5 to 1e-1.
+    Float32 rounding gives up to 2e-5 on an ant in contact over 16 substeps; a different contact frame 4e-5 to 1e-1.
     """
 
 
@@ -51,7 +51,7 @@ class Comparison:
     world: int
     """Index among the states of that kind."""
     input: str
-    """ctrl, qpos, qvel, act or the name of a parameter."""
+    """ctrl, qpos, qvel, act, or a parameter's name."""
     rel_error: float
     """‖g − g_ref‖ / ‖g_ref‖; where the reference vanishes, ‖g‖ / ‖cotangent‖. Infinite where g is not finite."""
     cosine: float | None
@@ -69,16 +69,16 @@ class GradientCheck:
     worlds: int
     """States of each kind."""
     limits: SolverLimits = ENOUGH
-    """Most iterations of the solver and of each line search."""
+    """Iteration limits of the solver and of each line search."""
     results: list[Comparison] = field(default_factory=list)
     kinks: int = 0
     """States left out because the step is not differentiable there."""
     forward_mismatches: int = 0
-    """States left out because Warp's own forward pass differs from C MuJoCo's there."""
+    """States left out because Warp's forward pass differs from C MuJoCo's."""
     checked: int = 0
     """States compared."""
     parameter_kinks: int = 0
-    """Elements of parameters left out at such states, because the step is not differentiable by them there."""
+    """Elements of parameters left out because the step is not differentiable by them."""
     diagnostics: dict[str, float] = field(default_factory=dict)
     """Diagnostics of the simulation and its backward mode, the largest over the kinds of state."""
     nonfinite: list[NonFinite] = field(default_factory=list)
@@ -91,12 +91,13 @@ class GradientCheck:
 
     @property
     def unconverged(self) -> bool:
-        """Whether the solver had not converged in more of the substeps than may be."""
+        """Whether the solver had not converged in too many substeps."""
         return self.diagnostics.get("solver_unconverged_substeps", 0.0) > UNCONVERGED_BOUND
 
     @property
     def max_rel_error(self) -> float:
-        """The largest relative error; infinite where anything is not finite or nothing could be compared: a failure."""
+        """The largest relative error; infinite, which means failure, if anything is not finite or nothing was
+        compared."""
         if self.nonfinite:
             return math.inf
         return max((r.rel_error for r in self.results), default=math.inf)
@@ -119,11 +120,11 @@ def compare(gradient: Array, reference: Array, cotangent_norm: float) -> tuple[f
 
 
 def forward_mismatch(oracle: Oracle, start: Point, expected: Point, actual: Point) -> float:
-    """How far a float32 step ends from the float64 one, relative to the motion of that step; infinite if not finite.
+    """Difference between a float32 step and the float64 one, relative to the step's motion; infinite if not finite.
 
-    Positions are compared with their own change, velocities with the speeds before and after, both with a
-    floor of one env step of free fall; activations absolutely, because they are of order one. Rounding of the state
-    itself, which no step can avoid, is subtracted from the difference of positions.
+    Differences of positions are relative to their change, of velocities to the speeds before and after, both at least
+    one env step of free fall; of activations absolute, because these are of order one. Unavoidable rounding of the
+    state itself is subtracted from the difference of positions.
     """
     if not all(np.all(np.isfinite(v)) for v in (actual.qpos, actual.qvel, actual.act)):
         return math.inf
@@ -166,9 +167,9 @@ def check_gradients(
         sim: the simulation, with a backward mode; its number of worlds W is the number of states of each kind.
         states: kinds of state, from `STATE_KINDS`.
         seed: seed of the states and cotangents.
-        limits: what counts as a kink and as a forward mismatch.
-        parameters: fields of the model whose gradients are compared too, at the model's own values.
-        pace: told after each state how many are done.
+        limits: limits for kinks and forward mismatches.
+        parameters: model fields whose gradients are compared too, at the model's own values.
+        pace: called after each state with the number of states done.
 
     Returns:
         The comparisons; if every state was excluded there are none, and `max_rel_error` is infinite.
@@ -190,7 +191,7 @@ def check_gradients(
     for kind in dict.fromkeys(states):
         points = make_states(model, kind, worlds, seed)
         rng = np.random.default_rng([seed, list(STATE_KINDS).index(kind), 1])
-        # Rounded, so that both sides use the same cotangents.
+        # Rounded to float32, so that both sides use the same cotangents.
         cotangents = rng.standard_normal((worlds, 2 * model.nv + model.na)).astype(np.float32).astype(np.float64)
         ends, gradients = simulated_gradients(sim, points, cotangents, parameters)
         for name, figure in sim.diagnostics().items():

@@ -1,4 +1,4 @@
-"""Names of the elements of a step's Jacobian that are not finite."""
+"""Names the non-finite elements of a step's Jacobian."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,21 +11,21 @@ from msk_ray.step.check.oracle import INPUTS, Array, Point
 from msk_ray.step.check.pullback import simulated_gradients
 
 _SHOWN = 4
-"""Number of elements that a line names; the others are counted."""
+"""Largest number of elements named on a line; further ones are counted."""
 
 
 @dataclass(frozen=True)
 class NonFinite:
-    """What is not finite at one state."""
+    """The non-finite elements at one state."""
 
     state: str
     """Kind of state."""
     world: int
     """Index among the states of that kind."""
     results: tuple[str, ...]
-    """Results of the step that are not finite, or whose gradient is not."""
+    """Results of the step that are non-finite, or have a non-finite gradient."""
     inputs: tuple[str, ...]
-    """Inputs by which the gradient is not finite; none where the step itself is not."""
+    """Inputs with a non-finite gradient; empty if the step itself is not finite."""
 
     def __str__(self) -> str:
         where = f"state {self.world} of {self.state}"
@@ -40,7 +40,7 @@ def _few(names: Sequence[str]) -> str:
 
 
 def dof_names(model: mujoco.MjModel) -> list[str]:
-    """A name for every degree of freedom: that of its joint, and its index within the joint."""
+    """A name for every degree of freedom: its joint's name, and its index within the joint."""
     out = []
     for joint in range(model.njnt):
         name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint)
@@ -74,14 +74,14 @@ def element_names(model: mujoco.MjModel) -> dict[str, list[str]]:
 def find_nonfinite(
     sim: Simulation, kind: str, world: int, point: Point, end: Point, gradients: dict[str, Array]
 ) -> NonFinite | None:
-    """The parts of a step's results and gradients that are not finite; None if all are finite.
+    """The non-finite elements of a step's results and gradients; None if all are finite.
 
     Args:
-        kind: kind of the state.
+        kind: kind of state.
         world: index among the states of that kind.
         point: the inputs of the step.
         end: its results in Warp.
-        gradients: by input, of some cotangent at this state.
+        gradients: gradients by input, for some cotangent at this state.
     """
     names = element_names(sim.model)
     parameters = [name for name in gradients if name not in INPUTS]

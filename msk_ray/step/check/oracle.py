@@ -1,6 +1,6 @@
 """Derivatives of an env step by float64 central differences of C MuJoCo.
 
-Independent of everything that it checks: no Warp, no torch, no adjoint, only `mj_step` called at perturbed inputs.
+Independent of what it checks: no Warp, no torch, no adjoint, only calls of `mj_step` with perturbed inputs.
 
 Axes: R = 2 nv + na rows, the tangent of (qpos', qvel', act'); nu, nv, na as in MuJoCo.
 """
@@ -24,14 +24,14 @@ INPUTS = ("ctrl", "qpos", "qvel", "act")
 FINE_STEP, COARSE_STEP = 1e-6, 1e-5
 """The two perturbations [each input's own unit].
 
-Above the rounding of float64 by enough that the fine one still has eight digits, and the coarse one wide enough to
-reach across a kink that float32 rounding of the state could cross.
+The fine one is large enough for eight digits in float64. The coarse one is wide enough to reach across a kink that
+float32 rounding of the state could cross.
 """
 
 _COLUMN_STEPS, _COLUMN_SIDES = 1e-3, 1e-2
-"""Disagreements above which the step is not differentiable by an element of a parameter."""
+"""Disagreements above which the step counts as not differentiable by a parameter's element."""
 _SMALL_COLUMN = 1e-3
-"""Share of the largest column below which an element's derivative is not judged by itself."""
+"""Share of the largest column; smaller columns are compared with this share instead of their own size."""
 
 _DIVERGED = (
     mujoco.mjtWarning.mjWARN_BADQPOS,
@@ -42,7 +42,7 @@ _DIVERGED = (
 
 @dataclass(frozen=True)
 class Point:
-    """The inputs of one env step, or with `ctrl` held, its results."""
+    """The inputs of one env step; also its results, with the same `ctrl`."""
 
     ctrl: Array
     """Controls, shape (nu,)."""
@@ -61,7 +61,7 @@ class Linearization:
     end: Point
     """Results of the step."""
     jacobian: Mapping[str, Array]
-    """Derivative of the tangent of (qpos', qvel', act') by each input, shape (R, columns of that input)."""
+    """Derivative of the tangent of (qpos', qvel', act') by each input, shape (R, columns of the input)."""
     step_disagreement: Mapping[str, float]
     """By input, ‖J(fine) − J(coarse)‖ / ‖J(fine)‖.
 
@@ -76,10 +76,10 @@ class Linearization:
     """
 
     bent: Mapping[str, NDArray[np.bool_]]
-    """By parameter, the elements by which the step is not differentiable here, (columns of it,)."""
+    """By parameter, flags of the elements by which the step is not differentiable here, (columns of it,)."""
 
     def at_kink(self, step_limit: float, side_limit: float) -> bool:
-        """Whether the step is not differentiable here by its control or its state, within the reach of COARSE_STEP."""
+        """Whether the step has a kink in its control or state within COARSE_STEP."""
         # Written so that a NaN counts as a kink.
         return not all(
             self.step_disagreement[name] <= step_limit and self.side_disagreement[name] <= side_limit
@@ -93,7 +93,7 @@ class Linearization:
 
 
 def reference_model(model: mujoco.MjModel) -> mujoco.MjModel:
-    """A copy whose solver runs to float64 convergence and whose step depends only on (ctrl, qpos, qvel, act).
+    """A copy of the model whose solver converges in float64, and whose step depends on (ctrl, qpos, qvel, act) only.
 
     The constraint problem is convex with one optimum, so the solver, its warm start and its iteration limits may be
     changed without changing the exact step.
@@ -105,8 +105,7 @@ def reference_model(model: mujoco.MjModel) -> mujoco.MjModel:
     option.iterations = 200
     option.ls_tolerance = 1e-12
     option.ls_iterations = 200
-    # A warm start carries the solver's rounding from one evaluation into the next; an automatic reset would turn a
-    # divergence into a plausible state.
+    # A warm start would carry rounding from one evaluation to the next; an automatic reset would hide a divergence.
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_WARMSTART | mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     return reference
 
@@ -114,7 +113,7 @@ def reference_model(model: mujoco.MjModel) -> mujoco.MjModel:
 def _bent(fine: Array, steps: Array, sides: Array) -> NDArray[np.bool_]:
     """Columns of a parameter's derivative (R, columns) that depend on the size or the side of the difference."""
     size = np.linalg.norm(fine, axis=0)
-    # Beside a large column, a small one is rounding.
+    # A column that is small beside the largest one is rounding.
     scale = np.maximum(size, _SMALL_COLUMN * size.max(initial=0.0)) + np.finfo(float).tiny
     smooth = (np.linalg.norm(steps, axis=0) <= _COLUMN_STEPS * scale) & (
         np.linalg.norm(sides, axis=0) <= _COLUMN_SIDES * scale
@@ -128,8 +127,8 @@ class Oracle:
     Args:
         model: the compiled model; it is not changed.
         substeps: calls of `mj_step` per env step, under one control.
-        parameters: fields of the model by which steps are differentiated too. They are changed in place: what MuJoCo
-            has computed from them is held fixed.
+        parameters: model fields to differentiate by, too. They are changed in place; fields that MuJoCo's compiler has
+            computed from them stay fixed.
     """
 
     def __init__(self, model: mujoco.MjModel, substeps: int, parameters: Sequence[str] = ()) -> None:
@@ -140,7 +139,7 @@ class Oracle:
 
     @property
     def sizes(self) -> dict[str, int]:
-        """Columns of each input."""
+        """Number of columns of each input."""
         inputs = {"ctrl": self.model.nu, "qpos": self.model.nv, "qvel": self.model.nv, "act": self.model.na}
         return inputs | {name: field.columns for name, field in self._fields.items()}
 
@@ -172,7 +171,7 @@ class Oracle:
         return bool(np.any(data.contact.efc_address >= 0))
 
     def displaced(self, point: Point, name: str, column: int, amount: float) -> Point:
-        """`point` with one input moved by `amount` along one coordinate, along a tangent direction for qpos."""
+        """`point` with one input moved by `amount` along one coordinate; for qpos along a tangent direction."""
         fields = {key: getattr(point, key).copy() for key in INPUTS}
         if name == "qpos":
             direction = np.zeros(self.model.nv)
@@ -183,7 +182,7 @@ class Oracle:
         return Point(**fields)
 
     def difference(self, start: Point, end: Point) -> Array:
-        """Tangent (R,) that leads from `start` to `end`; its qpos rows are in the tangent space at `start`."""
+        """Tangent vector (R,) from `start` to `end`; its qpos rows are in the tangent space at `start`."""
         rotation = np.zeros(self.model.nv)
         mujoco.mj_differentiatePos(self.model, rotation, 1.0, start.qpos, end.qpos)
         return np.concatenate((rotation, end.qvel - start.qvel, end.act - start.act))
@@ -194,7 +193,7 @@ class Oracle:
         Costs 1 + 4·(nu + 2 nv + na + elements of parameters) env steps.
 
         Raises:
-            SimulationError: the state, or one next to it, diverged.
+            SimulationError: this state or a perturbed one diverged.
         """
         end = self.step(point)
         jacobian: dict[str, Array] = {}
@@ -209,7 +208,7 @@ class Oracle:
             forward_coarse, backward_coarse = self._one_sided(point, end, name, columns, COARSE_STEP)
             coarse = (forward_coarse + backward_coarse) / 2.0
             scale = max(float(np.linalg.norm(fine)), np.finfo(float).tiny)
-            # Richardson: the error of a central difference is proportional to the square of its step; this cancels it.
+            # Richardson extrapolation cancels the error of central differences, which is quadratic in the step.
             ratio = (COARSE_STEP / FINE_STEP) ** 2
             jacobian[name] = fine + (fine - coarse) / (ratio - 1.0)
             steps[name] = float(np.linalg.norm(fine - coarse)) / scale

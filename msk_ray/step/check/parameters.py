@@ -1,4 +1,4 @@
-"""Fields of an MjModel, displaced element by element."""
+"""Perturbs fields of an MjModel element by element."""
 
 import copy
 from collections.abc import Iterator
@@ -13,17 +13,17 @@ from msk_ray.step.forward.parameters import PARAMETERS
 
 _INERTIAL = ("body_mass", "body_inertia", "dof_armature")
 _TYPICAL = 0.1
-"""An element is displaced in proportion to itself, but at least to this share of the largest in its place."""
+"""A perturbation is proportional to the element, but at least to this share of the largest element in its place."""
 
 _ABSENT = 100.0
-"""Scale of a spring, damper or friction loss that is zero in the whole model: one of 1e-6 drowns in the rounding of a
-step, and in what C MuJoCo's solver resolves."""
+"""Scale of a spring, damper or friction loss that is zero in the whole model: 1e-6 would vanish in a step's rounding,
+and below what C MuJoCo's solver resolves."""
 
 
 class ParameterField:
-    """One parameter of a model, whose elements are columns; a quaternion has three, its rotations in the local frame.
+    """One parameter of a model. Each element is a column; a quaternion has three, its rotations in the local frame.
 
-    C MuJoCo takes short cuts where frames coincide with their body's: they are switched off in the model.
+    Disables C MuJoCo's shortcuts for frames that coincide with their body's.
     """
 
     def __init__(self, model: mujoco.MjModel, name: str) -> None:
@@ -43,17 +43,17 @@ class ParameterField:
 
     @property
     def columns(self) -> int:
-        """Number of elements, or of rotations of quaternions."""
+        """Number of columns."""
         rows, width = self._values.shape
         return rows * (3 if self._quaternion else width)
 
     def scale(self, column: int) -> float:
-        """Size of one element, in whose proportion it is displaced."""
+        """Scale of an element, to which its perturbation is proportional."""
         return 1.0 if self._quaternion else float(self._scale.flat[column])
 
     @contextmanager
     def displaced(self, column: int, amount: float) -> Iterator[None]:
-        """The model with one element moved by `amount`."""
+        """Context with one element of the model moved by `amount`."""
         row, part = divmod(column, 3 if self._quaternion else self._values.shape[1])
         before: NDArray[np.float64] = self._values[row].copy()
         moved = before.copy()
@@ -76,7 +76,7 @@ class ParameterField:
             return
         self._values[row] = values
         if self._name in _INERTIAL and np.any(model.dof_simplenum):
-            # The inertia of such dofs is not computed but stored.
+            # MuJoCo stores the inertia of such dofs instead of computing it.
             fresh = copy.copy(model)
             mujoco.mj_setConst(fresh, mujoco.MjData(fresh))
             model.dof_M0[:] = fresh.dof_M0

@@ -28,7 +28,7 @@ def _nominal(sim: Simulation, name: str) -> Tensor:
 
 
 def _columns(name: str, value: Tensor, gradient: Tensor) -> Tensor:
-    """A parameter's gradient, one row per world; that of a quaternion by its rotations in the local frame."""
+    """A parameter's gradient, one row per world; for quaternions by rotations in the local frame."""
     if PARAMETERS[name].quaternion:
         gradient = 0.5 * quat_multiply(quat_conjugate(value.detach()), gradient)[..., 1:]
     return gradient.reshape(len(gradient), -1)
@@ -46,7 +46,7 @@ def simulated_gradients(
     Args:
         points: one per world.
         cotangents: tangent cotangents of (qpos', qvel', act'), shape (W, R).
-        parameters: fields of the model whose gradients are wanted too, at the model's own values.
+        parameters: model fields to differentiate by, too, at the model's own values.
 
     Returns:
         The results, and by input and parameter the gradients, shape (W, columns).
@@ -57,8 +57,8 @@ def simulated_gradients(
     weights = torch.as_tensor(cotangents, dtype=torch.float32, device=sim.device)
     on_qpos, on_qvel, on_act = weights.split([sim.model.nv, sim.model.nv, sim.model.na], dim=1)
     raw = StepState(sim.tangent.lift(end.qpos.detach(), on_qpos), on_qvel, on_act)
-    found = inputs | values
-    gradients = dict(zip(found, torch.autograd.grad(end, list(found.values()), list(raw)), strict=True))
+    leaves = inputs | values
+    gradients = dict(zip(leaves, torch.autograd.grad(end, list(leaves.values()), list(raw)), strict=True))
     gradients["qpos"] = sim.tangent.project(inputs["qpos"].detach(), gradients["qpos"])
     gradients |= {name: _columns(name, value, gradients[name]) for name, value in values.items()}
     arrays = [_numpy(value) for value in end]

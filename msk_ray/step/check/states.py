@@ -1,7 +1,7 @@
 """States at which gradients are checked, one generator per kind, deterministic by seed.
 
-All are rolled out by C MuJoCo in float64 and then rounded to float32, so that Warp and the reference start from the
-same numbers.
+C MuJoCo computes all of them in float64. They are then rounded to float32, so that Warp and the reference start from
+the same numbers.
 """
 
 from collections.abc import Callable
@@ -13,19 +13,20 @@ from msk_ray.step.check.oracle import Array, Oracle, Point
 from msk_ray.step.errors import ConfigError
 
 _SETTLING_TIME = 0.5
-"""How long a standing pose falls into its contacts [s]."""
+"""How long a standing pose settles into its contacts [s]."""
 _ROLLOUT_TIME = 2.0
 """Length of a contact or policy rollout [s]."""
 _CONTROL_INTERVAL = 1.0 / 60.0
-"""How long a rollout holds each control [s], whatever the substeps under test, so that all see the same states."""
+"""How long a rollout holds each control [s]; independent of the substeps under test, so that all have the same
+states."""
 _INSIDE = 0.9
-"""Share of a control range that is used: a control at its bound is on a kink of the clamp."""
+"""Share of a control range to use, because the clamp has kinks at its bounds."""
 
 
 def _span(model: mujoco.MjModel) -> tuple[Array, Array]:
     """Middle and half width of the usable control range of each actuator, each (nu,).
 
-    Without a range, [0, 1] for a muscle, whose activation dynamics clamp to it, and [-1, 1] for others.
+    Without a range: [0, 1] for a muscle, whose activation dynamics clamp to it, otherwise [-1, 1].
     """
     limited = model.actuator_ctrllimited.astype(bool)
     lowest = np.where(model.actuator_dyntype == mujoco.mjtDyn.mjDYN_MUSCLE, 0.0, -1.0)
@@ -44,12 +45,12 @@ def _gentle_ctrl(model: mujoco.MjModel, rng: np.random.Generator) -> Array:
     middle, half = _span(model)
     rest = np.clip(0.0, middle - half, middle + half)
     nudge = 0.05 * half * rng.standard_normal(model.nu)
-    # Away from the bound on which the rest value may be.
+    # Move away from the bound, in case the rest value is on it.
     return rest + np.where(rest == 0.0, nudge, np.abs(nudge) * np.sign(middle - rest))
 
 
 def _random_act(model: mujoco.MjModel, rng: np.random.Generator) -> Array:
-    """Activations inside their range, or in [0, 1] if they have none."""
+    """Random activations inside their range, or in [0, 1] without one."""
     low, high = np.zeros(model.na), np.ones(model.na)
     for actuator in range(model.nu):
         if model.actuator_actlimited[actuator]:
@@ -84,7 +85,7 @@ def _settled(oracle: Oracle) -> Point:
 
 
 def standing(oracle: Oracle, worlds: int, rng: np.random.Generator) -> list[Point]:
-    """The starting pose settled into its contacts, then nudged differently in every world.
+    """The starting pose, settled into its contacts, then nudged differently in every world.
 
     The nudges (1 mm or mrad, 1 cm/s, controls of 5 %) make the worlds different and move them off kinks such as a
     muscle excitation of exactly zero.
@@ -118,7 +119,7 @@ def random(oracle: Oracle, worlds: int, rng: np.random.Generator) -> list[Point]
 def contact(oracle: Oracle, worlds: int, rng: np.random.Generator) -> list[Point]:
     """One state in contact from each of `worlds` rollouts under random controls, which change every env step.
 
-    If the model touched nothing in any rollout, states are drawn from all of each rollout.
+    If no rollout has any contact, draws from all states.
     """
     rollouts = []
     for _ in range(worlds):
@@ -135,7 +136,7 @@ def contact(oracle: Oracle, worlds: int, rng: np.random.Generator) -> list[Point
         if choices:
             picked.append(choices[rng.integers(len(choices))])
     if len(picked) < worlds:
-        # Some rollouts stayed in the air; the others provide their states too.
+        # Replace rollouts without contact by further states of the others.
         pool = [point for visited in rollouts for touching, point in visited if touching]
         picked += [pool[rng.integers(len(pool))] for _ in range(worlds - len(picked))]
     return picked
@@ -171,7 +172,7 @@ def make_states(model: mujoco.MjModel, kind: str, worlds: int, seed: int) -> lis
     """`worlds` states of one kind, rounded to float32.
 
     Raises:
-        ConfigError: no such kind.
+        ConfigError: unknown kind.
         SimulationError: the model diverges during a rollout.
     """
     generate = STATE_KINDS.get(kind)

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-# Before anything initialises Warp: a line for each of some thirty modules loaded would bury what a user wants to see.
+# Set before anything initialises Warp, which would otherwise print a line for each of thirty modules.
 wp.config.log_level = wp.LOG_WARNING
 
 from msk_ray.step.forward.no_gpu import start_quietly  # noqa: E402

@@ -1,4 +1,4 @@
-"""Groups of arrays that kernels take together: found in what holds them, or allocated."""
+"""Groups of arrays that kernels take as one argument: gathered from other structures, or allocated."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -7,10 +7,10 @@ import warp as wp
 
 
 def gather(kind: Any, *holders: Any) -> Any:
-    """A group of the arrays that `holders` have under the names of its fields; the first holder that has one counts.
+    """A group filled with the arrays that `holders` have under its fields' names; the first holder that has one counts.
 
     Raises:
-        AttributeError: no holder has a field.
+        AttributeError: no holder has an array of that name.
         TypeError: an array has another dtype or number of axes.
     """
     group = kind()
@@ -29,7 +29,7 @@ def allocate(kind: Any, *shape: int) -> Any:
 
 
 def allocate_rows(kind: Any, worlds: int, widths: Mapping[str, int], width: int) -> Any:
-    """The same for arrays (worlds, width), with another width for the fields named in `widths`."""
+    """The same for arrays (worlds, width); `widths` gives other widths by field."""
     group = kind()
     for name, field in kind.vars.items():
         setattr(group, name, wp.zeros((worlds, widths.get(name, width)), dtype=field.type.dtype))

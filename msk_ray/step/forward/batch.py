@@ -11,25 +11,25 @@ import warp as wp
 from numpy.typing import NDArray
 
 from msk_ray.step.errors import ConfigError, UnsupportedModelError
-from msk_ray.step.forward.accepted import check_accepted
 from msk_ray.step.forward.capacity import UNKNOWN, Capacity, default_capacity, geometric_bound, scalar_rows
 from msk_ray.step.forward.fused import FusedSolver, check_fused
 from msk_ray.step.forward.graph import joined_stream
 from msk_ray.step.forward.iterations import IterationWatch
+from msk_ray.step.forward.model_support import check_model_support
+from msk_ray.step.forward.model_watch import ModelWatch, seal
 from msk_ray.step.forward.ordered import OrderedStages, check_ordered
 from msk_ray.step.forward.overflow import LossWatch, cured, loss_error, needed
 from msk_ray.step.forward.parameters import check_names, open_arrays, structure
-from msk_ray.step.forward.sealed import ModelWatch, seal
-from msk_ray.step.forward.solver_limits import choose_limits, tell_raised
+from msk_ray.step.forward.solver_limits import choose_limits, warn_raised_limits
 from msk_ray.step.forward.stages import PACKAGE, ComposedStages, Kernels, PackageStages, Stages, dense, with_options
-from msk_ray.step.forward.standing import StandingCylinders, stands_on_planes
+from msk_ray.step.forward.standing_cylinders import StandingCylinders, has_cylinders_and_planes
 
 
 def refresh_velocity(mjm: mujoco.MjModel, model: Any, data: Any) -> None:
-    """Launch the velocity stage early where constraints are built from it.
+    """Launch the velocity stage early, for models with connect and weld constraints.
 
-    mujoco_warp 4.0.0 builds connect and weld rows in its position stage from the body velocities in `data`, which are
-    those of the step before unless this comes first. C MuJoCo takes the present ones.
+    mujoco_warp 4.0.0 builds their rows in its position stage from the body velocities in `data`, which are still the
+    previous step's unless this comes first. C MuJoCo uses the current ones.
     """
     if np.any(np.isin(mjm.eq_type, [int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)])):
         mjw.kinematics(model, data)
@@ -45,28 +45,28 @@ class WorldBatch:
 
     Args:
         mjm: the C MuJoCo model, which must not change while the batch lives.
-        capacity: contacts and constraint rows a world. Where it is 0, a bound from the geometry where that is small,
-            else what a short probe in C MuJoCo needed and half as much again.
-        tolerance: solver tolerance, below mujoco_warp's floor of 1e-6 if wanted.
-        kernels: which kernels a step is made of, and how many iterations its solver may take.
+        capacity: contacts and constraint rows per world. Where it is 0, a bound from the geometry if that is small,
+            otherwise 1.5 times what a short probe in C MuJoCo needed.
+        tolerance: solver tolerance; it may be below mujoco_warp's floor of 1e-6.
+        kernels: kernels of a step, and limits on its solver's iterations.
 
     Attributes:
         mjm: the C MuJoCo model.
-        model, data: mujoco_warp's copies on the device. The model's arrays cannot be replaced, as recorded graphs
-            would not follow.
+        model, data: mujoco_warp's copies on the device. The model's arrays must not be replaced, because recorded
+            graphs keep using the old ones.
         nworld: number of worlds W.
-        parameters: names of the fields of the model that have a value for each world.
-        structure: the MjModel with everything present that these may switch on.
-        substeps: physics steps an env step.
+        parameters: names of the model fields that have a value for each world.
+        structure: the MjModel with all features enabled that these parameters may enable.
+        substeps: physics steps per env step.
         device: the Warp device.
         stages: launches of a step and of its parts.
-        limits: most iterations of the solver and of each line search.
+        limits: iteration limits of the solver and of each line search.
         capacity: contacts and rows per world that fit into `data`.
-        losses: what steps lost to full buffers; check it between steps.
-        iterations: how many iterations the solver took in each substep.
-        unrolled_iterations: the solver's iteration limit in each substep of steps that are recorded into another
-            library's capture, and of all steps in a fixed order. In a capture the loop is unrolled, so that each
-            iteration costs time even where no world needs it. None: the model's limit.
+        losses: contacts and rows lost to full buffers; check it between steps.
+        iterations: counts the solver's iterations in each substep.
+        unrolled_iterations: the solver's iteration limit in each substep, for steps recorded into another library's
+            capture, and for all steps with ordered sums. In a capture the loop is unrolled, so that each iteration
+            costs time even if no world needs it. None: the model's limit.
 
     Raises:
         UnsupportedModelError: mujoco_warp cannot load the model, or would step it unlike C MuJoCo.
@@ -84,7 +84,7 @@ class WorldBatch:
         tolerance: float | None = None,
         kernels: Kernels = PACKAGE,
     ) -> None:
-        check_accepted(mjm)
+        check_model_support(mjm)
         if kernels.ordered:
             check_ordered(mjm)
         if kernels.fused_solver:
@@ -100,7 +100,7 @@ class WorldBatch:
         self.stages: Stages
         self._model, self.stages = self._load(nworld)
         if self._solves:
-            tell_raised(mjm, kernels.iterations, kernels.ls_iterations)
+            warn_raised_limits(mjm, kernels.iterations, kernels.ls_iterations)
         self.unrolled_iterations: tuple[int, ...] | None = None
         self._watch = ModelWatch(mjm)
         self._given = capacity
@@ -117,22 +117,22 @@ class WorldBatch:
         return geometric_bound(self.structure) != Capacity(0, 0)
 
     def _load(self, nworld: int) -> tuple[Any, Stages]:
-        """mujoco_warp's copy of the model, sealed, and the launches of its step."""
+        """mujoco_warp's copy of the model, sealed, and the stages of its step."""
         with wp.ScopedDevice(self.device):
             try:
                 model = mjw.put_model(self.structure)
             except (NotImplementedError, ValueError) as error:
                 raise UnsupportedModelError(f"mujoco_warp cannot load the model: {error}{_advice(error)}") from error
             if self._tolerance is not None:
-                # put_model clamps to 1e-6; the adjoint holds at the optimum only, so it may ask for less.
+                # put_model clamps to 1e-6, but the adjoint is exact at the optimum only, and may need less.
                 model.opt.tolerance = wp.array([self._tolerance], dtype=float)
             model.opt.iterations, model.opt.ls_iterations = self.limits
-            model.opt.warn_overflow = 0  # read back by `losses`, not printed from kernels
-            model.ncam = model.nlight = 0  # nothing looks: two launches less a substep
+            model.opt.warn_overflow = 0  # `losses` reports overflows; kernels need not print them
+            model.ncam = model.nlight = 0  # unused: saves two launches per substep
             if not self._solves:
-                model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT  # nothing looks for what cannot be
+                model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT  # skip constraints: no rows possible
             open_arrays(self.mjm, model, self.parameters, nworld)
-            if stands_on_planes(self.structure):
+            if has_cylinders_and_planes(self.structure):
                 model.callback.contactfilter = StandingCylinders(self.structure).launch
             stages = self._make_stages(model)
         seal(model, "batch.model")
@@ -146,7 +146,7 @@ class WorldBatch:
 
     @property
     def ordered(self) -> bool:
-        """Whether everything is added up in a fixed order."""
+        """Whether all sums have a fixed order."""
         return self.kernels.ordered
 
     @property
@@ -160,21 +160,21 @@ class WorldBatch:
         with wp.ScopedDevice(self.device):
             self.data = mjw.make_data(self.structure, nworld=nworld, nconmax=capacity.contacts, njmax=capacity.rows)
             if capacity.rows == 0:
-                # Integrators read M qacc where the solver leaves it, which mujoco_warp leaves out without rows: then it
+                # Integrators read M qacc from the output of the solver, which mujoco_warp skips without rows: then it
                 # is the smooth force.
                 self.data.efc.Ma = self.data.qfrc_smooth
         self.losses = LossWatch(self.data, self.device)
         self.iterations = IterationWatch(self.substeps, nworld, self.device)
 
     def resized(self, nworld: int, capacity: Capacity | None = None) -> "WorldBatch":
-        """Another batch of the same model, which both share, with `nworld` worlds."""
+        """Another batch with `nworld` worlds, which shares this one's model."""
         self.check_model()
         other = copy.copy(self)
         other._allocate(nworld, capacity or self.capacity)
         return other
 
     def with_parameters(self, names: Iterable[str]) -> "WorldBatch":
-        """Another batch of as many worlds, in whose model the named fields have a value for each world too.
+        """Another batch with as many worlds, whose model also has a value of the named fields for each world.
 
         Raises:
             ConfigError: a name is no parameter, or the model has none of it.
@@ -194,11 +194,11 @@ class WorldBatch:
         return other
 
     def check_model(self, thorough: bool = False) -> None:
-        """Raise ConfigError if the MjModel was edited since; meshes and height fields are compared if `thorough`."""
+        """Raise ConfigError if the MjModel was edited; `thorough` also compares meshes and height fields."""
         self._watch.check(thorough)
 
     def growth(self, wanted: Capacity) -> Capacity:
-        """The part of `wanted` that may be allocated: sizes that were given stay, and so do bounds of the geometry."""
+        """`wanted`, limited to what may be allocated: given sizes stay fixed, and geometric bounds are not exceeded."""
         if self._bound is not None:
             wanted = wanted.at_most(self._bound)
         return Capacity(
@@ -207,7 +207,7 @@ class WorldBatch:
         )
 
     def larger(self) -> "WorldBatch":
-        """The batch to repeat a step with that lost something here; waits for the device.
+        """A larger batch in which to repeat a step that lost something; waits for the device.
 
         Raises:
             SimulationError: the user fixed the buffer sizes, or larger ones would not help.
@@ -221,12 +221,12 @@ class WorldBatch:
 
     def raise_losses(self) -> None:
         """Raise SimulationError if a step that the device has finished lost contacts or constraint rows."""
-        if self.losses.heard():
+        if self.losses.any_lost():
             lost, _, peak = self.losses.read()
             raise loss_error(lost, self.capacity, needed(lost, self.capacity, peak))
 
     def begin_step(self) -> None:
-        """Launch what makes an env step independent of the one before."""
+        """Launch the resets that make an env step independent of the previous one."""
         self.data.qacc_warmstart.zero_()
         self.data.time.zero_()
 
@@ -238,16 +238,16 @@ class WorldBatch:
         self.end_step(self.data)
 
     def end_step(self, data: Any) -> None:
-        """Launch the look for losses of an env step whose last substep was made in `data`: its last launch.
+        """Launch the check for losses, as the last launch of an env step whose last substep was computed in `data`.
 
-        Worlds that lost contacts or rows get NaN for (qpos, qvel, act), so that nothing can take them for states.
+        Worlds that lost contacts or rows get NaN for (qpos, qvel, act), so that nothing mistakes them for states.
         """
         self.losses.launch(data)
 
     def launch_substep(self, data: Any, k: int) -> None:
         """Launch substep k of an env step on `data`, this batch's own or another of the same model and size."""
         captured = joined_stream() is not None
-        # In a fixed order, what is recorded and what is not have to stop at the same iteration.
+        # With ordered sums, recorded and eager steps must stop at the same iteration.
         limited = self.stages.unrolls and (captured or self.ordered)
         model = self._limited(k, conditional=not captured) if limited else self.model
         refresh_velocity(self.mjm, model, data)
@@ -264,13 +264,13 @@ class WorldBatch:
         return with_options(self.model, graph_conditional=conditional, iterations=limit)
 
     def set_contact_pairs(self, fields: dict[str, NDArray[np.float64]]) -> None:
-        """Change what contact pairs are made of, from the next step on; recorded graphs follow.
+        """Change parameters of contact pairs, from the next step on, also in recorded graphs.
 
-        The MjModel keeps what it was compiled with.
+        The MjModel is not changed.
 
         Args:
-            fields: of solref (P, 2), solreffriction (P, 2), solimp (P, 5), friction (P, 5), those that change, for the
-                P pairs in the model's order.
+            fields: new values of solref (P, 2), solreffriction (P, 2), solimp (P, 5) or friction (P, 5), for the P
+                pairs in the model's order.
 
         Raises:
             ConfigError: one of them is an open parameter, whose value is an argument of the step.
@@ -283,7 +283,7 @@ class WorldBatch:
             )
         for name, value in fields.items():
             array = getattr(self.model, f"pair_{name}")
-            # In place: a recorded graph reads this memory.
+            # In place, because recorded graphs read this memory.
             array.assign(np.asarray(value, np.float32).reshape(*array.shape, -1))
 
 

@@ -13,18 +13,19 @@ from msk_ray.step.forward.geom_pairs import candidate_pairs, contacts_of, rows_p
 _LARGEST_BOUND = 256
 """Contacts per world up to which the geometric bound is allocated; above it a probe measures what is needed."""
 _MARGIN = 1.5
-"""Room beyond what the probe saw: a policy takes the model to places that random controls do not."""
+"""Factor on what the probe needed, because a policy reaches states that random controls do not."""
 _PROBE_TIME = 1.0
-"""Simulated time of each of the probe's rollouts [s]."""
+"""Simulated time of each rollout of the probe [s]."""
 _PROBE_STEPS = 5000
-"""Steps of all rollouts together, at most."""
+"""Largest number of steps of all rollouts together."""
 _PROBE_WORK = 400_000
-"""Steps times what one costs, in degrees of freedom and twentieths of a pair; a clock would not be repeatable."""
+"""Limit on steps × cost of a step, in degrees of freedom plus a twentieth of the pairs. A time limit would not
+repeat."""
 _RANDOM_STARTS = 6
 _CONTROL_INTERVAL = 0.05
 """How long a probe holds each random control [s]."""
 _LOOKS = 25
-"""Times each rollout is looked at."""
+"""Number of samples of each rollout."""
 
 Array = NDArray[np.float64]
 
@@ -33,25 +34,25 @@ class Capacity(NamedTuple):
     """Room of one world. mujoco_warp pools the contacts of all worlds, but not their rows."""
 
     contacts: int = 0
-    """Contacts, and pairs of geoms near enough to be looked at, whichever are more."""
+    """The larger one of the number of contacts and the number of pairs that pass the broad phase."""
     rows: int = 0
     """Constraint rows."""
 
     def at_least(self, other: "Capacity") -> "Capacity":
-        """The larger of both, one by one."""
+        """Elementwise maximum."""
         return Capacity(max(self.contacts, other.contacts), max(self.rows, other.rows))
 
     def at_most(self, other: "Capacity") -> "Capacity":
-        """The smaller of both, one by one."""
+        """Elementwise minimum."""
         return Capacity(min(self.contacts, other.contacts), min(self.rows, other.rows))
 
 
 UNKNOWN: Final = Capacity()
-"""To be found from the model."""
+"""Sizes to determine from the model."""
 
 
 class _Counter:
-    """Bounds on what mujoco_warp can need at a pose, from the pairs of geoms that touch or come near there."""
+    """Upper bounds on the room that mujoco_warp needs at a pose, from the pairs of geoms that touch or are near."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self._model = model
@@ -61,12 +62,12 @@ class _Counter:
         self._place = np.full((model.ngeom, model.ngeom), -1, dtype=np.int32)
         self._place[self._pairs[:, 0], self._pairs[:, 1]] = np.arange(len(self._pairs))
         self._first, self._second = self._pairs.T
-        self._radii = model.geom_rbound[self._pairs].sum(axis=1)  # a plane's is zero
+        self._radii = model.geom_rbound[self._pairs].sum(axis=1)  # a plane's rbound is zero
         planes = model.geom_type[self._pairs] == mujoco.mjtGeom.mjGEOM_PLANE
         self._flat = np.flatnonzero(planes.any(axis=1))
         self._planes = np.where(planes[:, 0], self._first, self._second)[self._flat]
         self._side = np.where(planes[:, 0], 1.0, -1.0)[self._flat]
-        # mujoco_warp's filters add both margins up, and take a listed pair's own instead.
+        # mujoco_warp's filters use the sum of both margins; for an explicit pair, its own.
         self._reach = (model.geom_margin + model.geom_gap)[self._pairs].sum(axis=1)
         for a, b, margin, gap in zip(
             model.pair_geom1, model.pair_geom2, model.pair_margin, model.pair_gap, strict=True
@@ -80,7 +81,7 @@ class _Counter:
         return len(self._pairs)
 
     def __call__(self, data: mujoco.MjData) -> Capacity:
-        # By pairs that touch: mujoco_warp and C MuJoCo may return another number of contacts for the same pair.
+        # Count by touching pairs, because mujoco_warp and C MuJoCo may return different numbers of contacts for a pair.
         geoms = np.sort(np.asarray(data.contact.geom).reshape(-1, 2), axis=1)
         of_geoms = geoms[:, 0] >= 0
         touching = np.unique(self._place[geoms[of_geoms, 0], geoms[of_geoms, 1]])
@@ -90,7 +91,7 @@ class _Counter:
         return Capacity(max(contacts, data.ncon, self._near(data)), max(rows, data.nefc))
 
     def _near(self, data: mujoco.MjData) -> int:
-        """Pairs whose bounding spheres meet: no fewer than mujoco_warp's broad phase lets through."""
+        """Pairs with overlapping bounding spheres: at least those that pass mujoco_warp's broad phase."""
         between = data.geom_xpos[self._second] - data.geom_xpos[self._first]
         gap = np.sqrt(np.einsum("pi,pi->p", between, between)) - self._radii
         # Height over a plane, whose normal is the z axis of its frame.
@@ -100,22 +101,23 @@ class _Counter:
 
 
 _LEAST = Capacity(48, 64)
-"""What mujoco_warp gives a small model; less saves nothing."""
+"""mujoco_warp's own minimum; less would save nothing."""
 
 
 def scalar_rows(model: mujoco.MjModel) -> int:
     """Largest number of rows that do not come from contacts."""
     limits = int(np.sum(model.jnt_limited)) + 2 * int(np.sum(model.tendon_limited))
     friction = int(np.sum(model.dof_frictionloss > 0)) + int(np.sum(model.tendon_frictionloss > 0))
-    # A hinge or slide limit can be active on both sides at once inside its margin.
+    # Both sides of a hinge or slide limit can be active at once, within its margin.
     return 2 * limits + friction + 6 * model.neq
 
 
 def geometric_bound(model: mujoco.MjModel) -> Capacity | None:
-    """Room that no pose can exceed, or None where a geometry sets no bound (height fields, distance fields, flexes).
+    """Upper bound on the room for any pose; None if the geometry gives no bound (height fields, distance fields,
+    flexes).
 
-    Counts every pair of geoms that the collision masks or explicit pairs let through; the parent filter is not
-    applied, so the bound errs upwards. It is zero for a model without contacts and other constraints.
+    Counts every pair of geoms that collision masks or explicit pairs allow. The parent filter is not applied, so the
+    bound may be too large. It is zero for a model without contacts and other constraints.
     """
     off, bit = model.opt.disableflags, mujoco.mjtDisableBit
     if off & bit.mjDSBL_CONSTRAINT:
@@ -134,10 +136,10 @@ def geometric_bound(model: mujoco.MjModel) -> Capacity | None:
 
 
 def default_capacity(model: mujoco.MjModel) -> tuple[Capacity, Capacity | None]:
-    """Room to start with, and the room that is never exceeded (None where unknown).
+    """Initial room, and the room that is never exceeded (None if unknown).
 
-    They are the same where the geometry allows few contacts. Otherwise the first is what a short probe needed and half
-    as much again, and may have to grow.
+    They are equal if the geometry allows only few contacts. Otherwise the first is 1.5 times what a short probe needed,
+    and may have to grow.
     """
     bound = geometric_bound(model)
     if bound is not None and bound.contacts <= _LARGEST_BOUND:
@@ -151,18 +153,18 @@ def default_capacity(model: mujoco.MjModel) -> tuple[Capacity, Capacity | None]:
 
 
 def _rounded(size: float) -> int:
-    """Up to the next multiple of eight, so that models alike in size share compiled kernels."""
+    """Round up to a multiple of eight, so that models of similar size share compiled kernels."""
     return 8 * math.ceil(size / 8.0)
 
 
 _PROBED: dict[bytes, Capacity] = {}
-"""Results by fingerprint: training and evaluation make a simulation each of the same model."""
+"""Results by model fingerprint, because training and evaluation each make a simulation of the same model."""
 
 
 def probe(model: mujoco.MjModel) -> Capacity:
-    """The most that rollouts of C MuJoCo need: from keyframes, at rest, and dropped at random under random controls.
+    """Largest need over rollouts of C MuJoCo: from keyframes, at rest, and dropped at random under random controls.
 
-    Deterministic; a second or two of one core. What it returns covers the poses it saw, not all there are.
+    Deterministic; takes a second or two on one core. The result covers the poses visited, not all possible ones.
     """
     buffer = np.empty(mujoco.mj_sizeModel(model), dtype=np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
@@ -201,7 +203,8 @@ def _control_range(model: mujoco.MjModel) -> tuple[Array, Array]:
 
 
 def _random_pose(model: mujoco.MjModel, rng: np.random.Generator) -> Array:
-    """Joints anywhere in the middle of their ranges; free bodies turned anyhow and lifted by a quarter of the model."""
+    """Random joints in the middle of their ranges; free bodies turned at random and lifted by a quarter of the
+    model."""
     qpos = model.qpos0.copy()
     for joint in range(model.njnt):
         kind, at = model.jnt_type[joint], model.jnt_qposadr[joint]

@@ -36,10 +36,10 @@ class ContactForces:
     """Sums contact forces by geom.
 
     Args:
-        model, data: a batch's, as a step leaves them: contacts then belong to the state before its last substep.
+        model, data: a batch's, after a step: the contacts belong to the state before its last substep.
 
     Attributes:
-        force: on each geom, in world coordinates [N], vec3, shape (W, G).
+        force: force on each geom in world coordinates [N], vec3, shape (W, G).
     """
 
     def __init__(self, model: Any, data: Any) -> None:
@@ -50,7 +50,7 @@ class ContactForces:
             self.force = wp.zeros((data.nworld, model.ngeom), dtype=wp.vec3)
 
     def launch(self) -> None:
-        """Launch `force` of the contacts in `data`."""
+        """Launch the computation of `force` from the contacts in `data`."""
         data = self._data
         with wp.ScopedDevice(data.qpos.device):
             self.force.zero_()

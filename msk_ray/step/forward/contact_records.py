@@ -1,4 +1,4 @@
-"""Contacts as mujoco_warp has them when collision detection ends, to be copied whole."""
+"""Copies of whole contacts, as mujoco_warp stores them after collision detection."""
 
 import warp as wp
 
@@ -9,9 +9,9 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class ContactRecords:
-    """Contacts whole, to be moved: all that mujoco_warp has of them when collision detection ends, (C,).
+    """All arrays that mujoco_warp has of contacts after collision detection, (C,), for moving contacts.
 
-    No contact has rows yet, so their addresses are not part of it.
+    Without the addresses of constraint rows, which do not exist yet.
     """
 
     dist: wp.array[float]

@@ -1,10 +1,10 @@
-"""Pairs of geoms that a model lets collide, and the contacts that mujoco_warp can return for one of them."""
+"""Pairs of geoms that can collide, and how many contacts mujoco_warp can return for each."""
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-# Contacts mujoco_warp can return for one pair of geoms, by the less common of the two types.
+# Largest number of contacts that mujoco_warp returns for a pair of geoms, by the less common of the two types.
 _CONTACTS_PER_PAIR = {
     mujoco.mjtGeom.mjGEOM_SPHERE: 1,
     mujoco.mjtGeom.mjGEOM_ELLIPSOID: 1,
@@ -14,14 +14,14 @@ _CONTACTS_PER_PAIR = {
     mujoco.mjtGeom.mjGEOM_MESH: 8,
 }
 _UNBOUNDED = 1 << 30
-"""Stands for a geometry whose contacts are not bounded by its type: height fields, signed distance fields."""
+"""Number that means "no bound": height fields and signed distance fields."""
 
 
 def candidate_pairs(model: mujoco.MjModel, filtered: bool) -> NDArray[np.int64]:
-    """Pairs of geoms that the collision masks let through or that are listed, the smaller id first, shape (P, 2).
+    """Pairs of geoms allowed by collision masks or listed explicitly, the smaller id first, shape (P, 2).
 
     Args:
-        filtered: leave out what mujoco_warp leaves out besides: excluded bodies, parent with child, one welded body.
+        filtered: also apply mujoco_warp's other filters: excluded bodies, parent and child, the same welded body.
     """
     a, b = np.triu_indices(model.ngeom, 1)
     one, other = model.geom_contype, model.geom_conaffinity
@@ -37,16 +37,16 @@ def candidate_pairs(model: mujoco.MjModel, filtered: bool) -> NDArray[np.int64]:
             parent1, parent2 = (model.body_weldid[model.body_parentid[w]] for w in (weld1, weld2))
             keep &= ~((weld1 != 0) & (weld2 != 0) & ((parent1 == weld2) | (parent2 == weld1)))
     listed = np.sort(np.stack((model.pair_geom1, model.pair_geom2), axis=1), axis=1)
-    found = np.concatenate((np.stack((a[keep], b[keep]), axis=1), listed))
-    return np.unique(found, axis=0).astype(np.int64).reshape(-1, 2)
+    pairs = np.concatenate((np.stack((a[keep], b[keep]), axis=1), listed))
+    return np.unique(pairs, axis=0).astype(np.int64).reshape(-1, 2)
 
 
 def contacts_of(model: mujoco.MjModel, pairs: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Contacts each pair can have at most, shape (P,); enormous where its types set no bound."""
+    """Largest number of contacts of each pair, shape (P,); enormous if its types give no bound."""
     counts = np.full(model.ngeom, _UNBOUNDED, dtype=np.int64)
     for kind, count in _CONTACTS_PER_PAIR.items():
         counts[model.geom_type == kind] = count
-    # A plane adds none of its own: the other geom decides.
+    # For a plane, the other geom's type decides.
     plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
     counts[plane] = 2 * _UNBOUNDED
     least = counts[pairs].min(axis=1) if len(pairs) else np.zeros(0, np.int64)

@@ -8,12 +8,12 @@ from typing import Any
 import warp as wp
 
 _outer: list[wp.Stream] = []
-"""The stream of the capture that another library has begun, while there is one."""
+"""The stream of another library's ongoing capture, if any."""
 
 
 @contextmanager
 def without_collecting() -> Iterator[None]:
-    """No garbage is collected: a capture fails if CUDA graphs among it are given back."""
+    """Context without garbage collection, because a capture fails if CUDA graphs are freed during it."""
     enabled = gc.isenabled()
     gc.disable()
     try:
@@ -25,13 +25,13 @@ def without_collecting() -> Iterator[None]:
 
 @contextmanager
 def joining_capture(stream: wp.Stream) -> Iterator[list[Any]]:
-    """Within a capture that another library has begun on `stream`: graphs that are replayed become part of it.
+    """Context inside another library's capture on `stream`: replays of graphs become part of that capture.
 
     Args:
         stream: the capturing stream, on which all replays must be requested.
 
     Yields:
-        What has to be kept for as long as the captured graph lives.
+        Objects to keep alive as long as the captured graph.
     """
     kept: list[Any] = []
     wp.capture_begin(stream=stream, external=True)
@@ -40,7 +40,7 @@ def joining_capture(stream: wp.Stream) -> Iterator[list[Any]]:
         yield kept
     except BaseException:
         _outer.pop()
-        with suppress(RuntimeError):  # the capture is invalid already, which the first error says
+        with suppress(RuntimeError):  # the capture is already invalid; the first error is raised
             wp.capture_end(stream=stream)
         raise
     else:
@@ -49,24 +49,25 @@ def joining_capture(stream: wp.Stream) -> Iterator[list[Any]]:
 
 
 def joined_stream() -> wp.Stream | None:
-    """The stream of another library's capture, which may hold no conditional nodes, while launches become part of it.
+    """The stream of another library's capture that launches currently join; None if there is none. Such a capture
+    cannot hold conditional nodes.
 
-    There may be no other wp.Stream of the same CUDA stream: when that one goes, Warp forgets the capture.
+    Create no other wp.Stream of the same CUDA stream: when it is freed, Warp forgets the capture.
     """
     return _outer[-1] if _outer else None
 
 
 class Graph:
-    """Records the Warp work that `launches` issues and replays it without Python in between.
+    """Records the Warp work that `launches` issues, and replays it without Python in between.
 
-    On CUDA this is a CUDA graph, on CPU Warp's own recorded operation stream. Eager launches of one MuJoCo Warp
-    step cost about 2 ms of Python on CPU (0.2 ms replayed) and 4 ms on GPU (0.3 ms replayed), which is why
-    nothing here runs eagerly after start-up.
+    On CUDA this is a CUDA graph, on CPU Warp's own recorded operation stream. Launching one MuJoCo Warp step from
+    Python takes about 2 ms on CPU (0.2 ms replayed) and 4 ms on GPU (0.3 ms replayed), so nothing here runs eagerly
+    after start-up.
 
     `launches` must issue the same kernels on the same arrays every time, and must not read results back. The first run
-    is eager, because it compiles the kernels. On CUDA that happens at construction, where a lack of memory is an error
-    of the start; array contents are undefined after it. On CPU it is the first replay, and only the second one records:
-    recording costs more than running once.
+    is eager, because it compiles the kernels. On CUDA it happens at construction, so that a lack of memory shows up
+    early; array contents are undefined afterwards. On CPU the first replay runs eagerly and the second one records,
+    because recording costs more than running once.
     """
 
     def __init__(self, launches: Callable[[], None], device: wp.Device) -> None:
@@ -81,7 +82,8 @@ class Graph:
     def replay(self, stream: wp.Stream | None = None) -> None:
         """Run the launches, on `stream` if the device is CUDA; within another capture, issue them into it."""
         if joined_stream() is not None:
-            # A graph launched into a capture would be a child graph, which may hold no conditional nodes either.
+            # Launch directly: a graph launched into a capture becomes a child graph, which cannot hold conditional
+            # nodes either.
             with wp.ScopedDevice(self._device), wp.ScopedStream(stream, sync_enter=False):
                 self._launches()
             return

@@ -1,4 +1,4 @@
-"""How many iterations the constraint solver takes, counted on the device."""
+"""Counts the constraint solver's iterations on the device."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 MOST_COUNTED = 127
-"""Worlds that take more iterations count as taking this many."""
+"""Largest number of iterations counted; worlds that take more count as this many."""
 
 
 @wp.kernel(enable_backward=False)
@@ -18,18 +18,18 @@ def count_iterations(
     # Out:
     counts_out: wp.array2d[int],
 ) -> None:
-    """One more world that took as many iterations."""
+    """Add a world to the count for its number of iterations."""
     world = wp.tid()
     wp.atomic_add(counts_out, substep, wp.min(niter_in[world], counts_out.shape[1] - 1), 1)
 
 
 class IterationWatch:
-    """Counts the worlds of each substep of an env step by the iterations that they took.
+    """Counts worlds by the iterations that they took, for each substep of an env step.
 
     Args:
-        substeps: substeps of an env step S.
+        substeps: number of substeps S of an env step.
         nworld: number of worlds.
-        device: where they are.
+        device: their device.
     """
 
     def __init__(self, substeps: int, nworld: int, device: wp.Device) -> None:
@@ -37,7 +37,7 @@ class IterationWatch:
         self._counts = wp.zeros((substeps, MOST_COUNTED + 1), dtype=int, device=device)
 
     def launch(self, data: Any, substep: int) -> None:
-        """Launch the count of a substep that was just made in `data`."""
+        """Launch the count for a substep that was just computed in `data`."""
         wp.launch(
             count_iterations,
             dim=self._nworld,
@@ -47,28 +47,25 @@ class IterationWatch:
         )
 
     def read(self) -> NDArray[np.int64]:
-        """World counts since the last read by substep and iterations, (S, 1 + MOST_COUNTED), which are forgotten.
-
-        Waits for the steps.
-        """
+        """World counts by substep and iterations, (S, 1 + MOST_COUNTED); resets them. Waits for the steps."""
         counts = np.array(self._counts.numpy(), dtype=np.int64)
         self._counts.zero_()
         return counts
 
 
 def limits_for(counts: NDArray[np.int64], rare: float) -> tuple[int, ...]:
-    """For each substep the fewest iterations, at least 1, that no more than this share of the worlds reach.
+    """For each substep, the smallest number of iterations, at least 1, that at most this share of the worlds reach.
 
     Args:
         counts: world counts by substep and iterations, (S, N).
         rare: a share.
     """
     total = np.maximum(counts.sum(axis=1, keepdims=True), 1)
-    reaching = np.cumsum(counts[:, ::-1], axis=1)[:, ::-1] / total  # share of worlds with that many or more
+    reaching = np.cumsum(counts[:, ::-1], axis=1)[:, ::-1] / total  # share of worlds with at least that many
     return tuple(max(1, int(n)) for n in (reaching > rare).sum(axis=1))
 
 
 def reached(counts: NDArray[np.int64], limits: tuple[int, ...]) -> tuple[float, ...]:
-    """Share of the worlds of each substep that took as many iterations as its limit, or more."""
+    """Share of worlds that reached the iteration limit, for each substep."""
     total = np.maximum(counts.sum(axis=1), 1)
     return tuple(float(row[limit:].sum() / n) for row, limit, n in zip(counts, limits, total, strict=True))

@@ -1,8 +1,8 @@
-"""Every private name of mujoco_warp that the package uses, imported here and nowhere else.
+"""Every private name of mujoco_warp that the package uses, imported only here.
 
-`mujoco_warp._src` promises nothing between releases. A test holds each name to its signature, members or size, so that
-a release that changes one fails by that name, before any gradient does. Public names are imported from `mujoco_warp`
-where they are used.
+`mujoco_warp._src` may change in any release. A test checks each name's signature, members or size, so that a release
+that changes one fails by that name, before any gradient is wrong. Public names are imported from `mujoco_warp` where
+they are used.
 """
 
 from mujoco_warp._src.collision_primitive_core import (

@@ -1,11 +1,11 @@
-"""Which bodies carry which, and what acts between different branches of the tree."""
+"""The kinematic tree: ancestors of bodies, and actuators between different branches."""
 
 import mujoco
 import numpy as np
 
 
-def carriers(m: mujoco.MjModel, body: int) -> list[int]:
-    """A body and all that carry it, down to the world."""
+def ancestors(m: mujoco.MjModel, body: int) -> list[int]:
+    """A body and all its ancestors, up to the world."""
     out = [body]
     while out[-1]:
         out.append(int(m.body_parentid[out[-1]]))
@@ -13,13 +13,13 @@ def carriers(m: mujoco.MjModel, body: int) -> list[int]:
 
 
 def one_chain(m: mujoco.MjModel, bodies: set[int]) -> bool:
-    """Whether of any two bodies one carries the other; bodies that are fixed to each other count as one."""
+    """Whether all bodies are on one chain, each an ancestor of the next; welded bodies count as one."""
     moving = {int(m.body_weldid[b]) for b in bodies} - {0}
-    return all(a in carriers(m, b) or b in carriers(m, a) for a in moving for b in moving)
+    return all(a in ancestors(m, b) or b in ancestors(m, a) for a in moving for b in moving)
 
 
 def lone_free_bodies(m: mujoco.MjModel) -> list[int]:
-    """Bodies with a free joint in whose tree nothing else moves."""
+    """Bodies with a free joint whose tree has no other joint."""
     return [
         int(m.jnt_bodyid[joint])
         for joint in np.flatnonzero(m.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE))
@@ -35,25 +35,25 @@ def between_sites(m: mujoco.MjModel) -> np.ndarray:
 
 
 def branching_actuators(m: mujoco.MjModel) -> np.ndarray:
-    """Actuators between sites that couple dofs which the inertia does not: implicitfast drops those slopes."""
-    found = np.zeros(m.nu, dtype=bool)
+    """Actuators between sites that couple dofs not coupled by the inertia: implicitfast drops these derivatives."""
+    branching = np.zeros(m.nu, dtype=bool)
     if m.opt.integrator == int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST):
         for u in np.flatnonzero(between_sites(m)):
-            found[u] = not one_chain(m, {int(m.site_bodyid[s]) for s in m.actuator_trnid[u]})
-    return found
+            branching[u] = not one_chain(m, {int(m.site_bodyid[s]) for s in m.actuator_trnid[u]})
+    return branching
 
 
 def common_bodies(m: mujoco.MjModel) -> np.ndarray:
-    """By actuator, the body that carries both its site and its reference site; 0 for others."""
+    """By actuator, the common ancestor of its site and its reference site; 0 for other actuators."""
     out = np.zeros(m.nu, dtype=np.int32)
     for u in np.flatnonzero(between_sites(m)):
         if m.actuator_trntype[u] == int(mujoco.mjtTrn.mjTRN_SITE):
-            first, second = (carriers(m, int(m.site_bodyid[s])) for s in m.actuator_trnid[u])
+            first, second = (ancestors(m, int(m.site_bodyid[s])) for s in m.actuator_trnid[u])
             out[u] = next(b for b in first if b in second)
     return out
 
 
 def motors_apart(mjm: mujoco.MjModel) -> bool:
-    """Whether every actuator drives a joint of its own."""
+    """Whether every actuator drives a different joint."""
     joints = np.all(mjm.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT))
     return bool(joints) and len(set(mjm.actuator_trnid[:, 0])) == len(mjm.actuator_trnid)

@@ -1,4 +1,4 @@
-"""Warp's start on a machine without a GPU, where its warnings about CUDA say nothing that anybody asked."""
+"""Silences Warp's warnings about CUDA on machines without a GPU."""
 
 import os
 import sys
@@ -8,22 +8,22 @@ from pathlib import Path
 import warp as wp
 
 _DEVICES = ("/dev/nvidiactl", "/dev/nvidia0", "/dev/dxg")
-"""One of these is there wherever Linux, or WSL, has a driver for CUDA."""
+"""One of these exists wherever Linux or WSL has a CUDA driver."""
 _WARNING = b"Warp CUDA "
 
 
 def start_quietly() -> None:
-    """Initialise Warp without its lines about CUDA, if this machine has no GPU. With one, this does nothing: Warp then
-    starts where it is first used, on the devices that are visible there."""
+    """Initialise Warp without its lines about CUDA, if this machine has no GPU. With a GPU, do nothing: Warp then
+    starts at its first use, with the devices visible by then."""
     if sys.platform != "linux" or any(Path(device).exists() for device in _DEVICES):
         return
     try:
         stderr = os.dup(2)
     except OSError:
-        return  # closed: nobody would read them
+        return  # stderr is closed
     try:
         with tempfile.TemporaryFile() as kept:
-            # They are printed by its library, which has no setting for that.
+            # Warp's native library prints them, without a setting to turn it off.
             os.dup2(kept.fileno(), 2)
             try:
                 wp.init()

@@ -11,17 +11,17 @@ from msk_ray.step.errors import SimulationError
 from msk_ray.step.forward.capacity import Capacity
 
 ITERATION_BITS = int(OverflowType.ITERATIONS | OverflowType.LS_ITERATIONS)
-"""The solver stopped at an iteration limit: that costs accuracy, which the residual measures, and loses nothing."""
+"""The solver stopped at an iteration limit. This only costs accuracy, which the residual measures."""
 _CONTACT_BITS = int(OverflowType.BROADPHASE | OverflowType.NARROWPHASE | OverflowType.CCD)
-"""Cured by room for more contacts: pairs looked at, contacts found, and scratch of convex pairs are all sized by it."""
+"""Overflows that room for more contacts fixes: pairs, contacts, and scratch for convex pairs are sized by it."""
 _ROW_BITS = int(OverflowType.NEFC | OverflowType.NJMAX_NNZ)
-"""Cured by room for more rows; the non-zeros of a sparse Jacobian are sized by it too."""
+"""Overflows that room for more rows fixes; it also sizes the non-zeros of a sparse Jacobian."""
 _INCURABLE = {
     OverflowType.HFIELD: "a geom touches more cells of a height field than mujoco_warp keeps: give it coarser cells",
     OverflowType.EPA_HORIZON: "a contact of convex geoms was lost (EPA horizon): make their meshes simpler",
-    OverflowType.NVMAX: "more degrees of freedom were awake than mujoco_warp has room for: switch sleeping off",
+    OverflowType.NVMAX: "more degrees of freedom were awake than mujoco_warp has room for: disable sleeping",
 }
-# CONTACT_MATCH and TACTILE are left out: they touch sensor data alone, which no step or gradient depends on.
+# Without CONTACT_MATCH and TACTILE, which only affect sensor data.
 LOST_BITS = _CONTACT_BITS | _ROW_BITS | int(sum(_INCURABLE))
 _NAN = wp.constant(math.nan)
 
@@ -41,7 +41,7 @@ def note_losses(
     peaks_out: wp.array[int],
     heard_out: wp.array[int],
 ) -> None:
-    """Per world: raise the peaks; where the step lost something, make its results NaN and tell the host."""
+    """Per world: update the peaks; if the step lost something, set its results to NaN and set a flag on the host."""
     world = wp.tid()
     if nefc_in[world] > peaks_out[1]:
         wp.atomic_max(peaks_out, 1, nefc_in[world])
@@ -58,8 +58,8 @@ def note_losses(
 
 
 class LossWatch:
-    """Watches one batch's Data. On CUDA its kernel writes to memory of the host, and only where something was lost, so
-    that asking costs the host one read and the device never waits.
+    """Watches one batch's Data. On CUDA its kernel writes to pinned host memory, and only after a loss, so that a check
+    is one read by the host, and the device never waits.
 
     Args:
         data: the batch's mujoco_warp.Data.
@@ -70,13 +70,14 @@ class LossWatch:
         self._data = data
         self._device = device
         self._peaks = wp.zeros(2, dtype=int, device=device)
-        # Pinned memory has one address for host and device.
+        # Pinned memory has the same address for host and device.
         self._host = wp.zeros(1, dtype=int, device="cpu", pinned=device.is_cuda)
         self._heard_view = self._host.numpy()
         self._heard = wp.array(ptr=self._host.ptr, dtype=int, shape=(1,), device=device, copy=False)
 
     def launch(self, data: Any) -> None:
-        """Launch the look at an env step whose last substep was made in `data`; results are in the batch's own Data."""
+        """Launch the check of an env step whose last substep was computed in `data`; results are in the batch's own
+        Data."""
         own = self._data
         wp.launch(
             note_losses,
@@ -86,21 +87,21 @@ class LossWatch:
             device=self._device,
         )
 
-    def heard(self) -> bool:
-        """Whether a step that the device has finished lost anything. Does not wait for steps that are still running."""
+    def any_lost(self) -> bool:
+        """Whether a finished step lost anything. Does not wait for running steps."""
         return bool(self._heard_view[0])
 
     def read(self) -> tuple[int, float, Capacity]:
-        """Since the last read: bits of what was lost, share of worlds at a solver limit, and the most room in use.
+        """Since the last read: bits of what was lost, share of worlds at a solver limit, and peak use of the buffers.
 
-        Waits for the steps, and forgets what it returns.
+        Waits for the steps, and resets the values.
         """
         bits = np.array(self._data.overflow.numpy())  # a copy: on CPU, numpy() is a view
         contacts, rows = (int(n) for n in self._peaks.numpy())
         self._data.overflow.zero_()
         self._peaks.zero_()
         if self._device.is_cuda:
-            wp.synchronize_stream(self._device.stream)  # not the device: other streams may be at work
+            wp.synchronize_stream(self._device.stream)  # not the whole device, where other streams may be running
         self._heard_view[0] = 0
         lost = int(np.bitwise_or.reduce(bits)) & LOST_BITS
         limited = float(np.mean((bits & ITERATION_BITS) != 0))
@@ -108,7 +109,7 @@ class LossWatch:
 
 
 def needed(lost: int, now: Capacity, peak: Capacity) -> Capacity:
-    """Room to try next after losing `lost`: twice what was too small, or more where the step asked for more."""
+    """Room to try next after losing `lost`: twice what was too small, or more if the step asked for more."""
     wanted = now
     if lost & _CONTACT_BITS:
         wanted = wanted._replace(contacts=max(2 * now.contacts, peak.contacts * 5 // 4))
@@ -118,7 +119,7 @@ def needed(lost: int, now: Capacity, peak: Capacity) -> Capacity:
 
 
 def cured(lost: int, now: Capacity, allowed: Capacity) -> bool:
-    """Whether `allowed` is more of everything that was lost."""
+    """Whether `allowed` is larger in everything that was lost."""
     if lost & ~(_CONTACT_BITS | _ROW_BITS):
         return False
     contacts = not lost & _CONTACT_BITS or allowed.contacts > now.contacts
@@ -126,7 +127,7 @@ def cured(lost: int, now: Capacity, allowed: Capacity) -> bool:
 
 
 def loss_error(lost: int, now: Capacity, wanted: Capacity) -> SimulationError:
-    """The error that says what was lost and what to write."""
+    """The error for what was lost, with what to write."""
     for bit, advice in _INCURABLE.items():
         if lost & int(bit):
             return SimulationError(f"mujoco_warp lost contacts: {advice}")

@@ -1,7 +1,7 @@
-"""Fields of a model whose values a step may take as arguments: one value for all worlds, or one per world.
+"""Model fields whose values can be arguments of a step: one value for all worlds, or one per world.
 
-mujoco_warp reads such a field as `[worldid % shape[0]]`, so an array with a row per world is legal, if it is there
-before launches are recorded. A field is named as in MjModel.
+mujoco_warp reads such a field as `[worldid % shape[0]]`, so an array with a row per world is valid, if it exists before
+launches are recorded. Fields have their names in MjModel.
 """
 
 import copy
@@ -28,11 +28,11 @@ class Parameter:
     """One field of MjModel."""
 
     name: str
-    """As in MjModel: body_mass, opt.gravity."""
+    """Name in MjModel, such as body_mass or opt.gravity."""
     quaternion: bool = False
-    """Whether its elements are unit quaternions, which are differentiated along rotations in the local frame."""
+    """Whether its elements are unit quaternions, differentiated along rotations in the local frame."""
     in_use: float | None = None
-    """Value that makes an element count as present where a zero means that it is absent."""
+    """Placeholder for elements that MuJoCo drops when zero; None if it drops none."""
 
     @property
     def field(self) -> str:
@@ -41,11 +41,11 @@ class Parameter:
 
     @property
     def section(self) -> str:
-        """`opt`, or nothing."""
+        """`opt`, or empty."""
         return self.name.rpartition(".")[0]
 
     def value(self, mjm: mujoco.MjModel) -> np.ndarray:
-        """The field of a model, float64, in MjModel's shape; that of actuators (nu, ...)."""
+        """The field of a model, float64, in MjModel's shape; for actuators (nu, ...)."""
         return np.asarray(attrgetter(self.name)(mjm), dtype=np.float64)
 
     def array(self, model: Any) -> wp.array:
@@ -74,22 +74,22 @@ PARAMETERS: dict[str, Parameter] = {
         *(Parameter(n) for n in ("tendon_solref_fri", "tendon_solimp_fri", "site_pos")),
     )
 }
-"""Every field that can be a parameter."""
+"""Every possible parameter."""
 
 DERIVED = {"body_mass": ("body_subtreemass",), "geom_size": ("geom_rbound", "geom_aabb")}
-"""Fields that follow a parameter's value: the mass below a body, and bounds outside which nothing collides."""
+"""Fields computed from a parameter's value: subtree masses, and bounding volumes for collisions."""
 
 
 def names_of(mjm: mujoco.MjModel) -> list[str]:
-    """Names of the parameters that a model has, except those that it cannot vary."""
+    """Names of the parameters that can be varied in a model."""
     return [name for name, p in PARAMETERS.items() if p.value(mjm).size and not _obstacle(mjm, name)]
 
 
 def check_names(mjm: mujoco.MjModel, names: Iterable[str]) -> None:
-    """Raise unless every name is a parameter of the model that can be varied.
+    """Raise unless every name is a parameter that can be varied in the model.
 
     Raises:
-        ConfigError: no such parameter, or the model has none of it.
+        ConfigError: unknown parameter, or the model has no such elements.
         UnsupportedModelError: the model uses something with which the parameter cannot be varied.
     """
     for name in names:
@@ -113,7 +113,7 @@ def _obstacle(mjm: mujoco.MjModel, name: str) -> str:
     if inertial and mjm.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST and lone_free_bodies(mjm):
         return "implicitfast takes gyroscopic forces of free bodies into its matrix; write integrator='Euler'"
     if name in ("body_ipos", "body_iquat"):
-        # MuJoCo stores the inertia of such a body's dofs as a diagonal.
+        # MuJoCo stores the inertia of this body's dofs as a diagonal.
         simple = [int(b) for b in np.flatnonzero(mjm.body_simple) if mjm.body_dofnum[b]]
         if simple:
             word = mujoco.mj_id2name(mjm, _OBJ.mjOBJ_BODY, simple[0]) or simple[0]
@@ -146,9 +146,9 @@ def _obstacle(mjm: mujoco.MjModel, name: str) -> str:
 
 
 def structure(mjm: mujoco.MjModel, names: Iterable[str]) -> mujoco.MjModel:
-    """The model with everything present that the named parameters may switch on: springs, friction loss.
+    """The model with all features that the named parameters may enable, such as springs and friction loss.
 
-    mujoco_warp and the adjoint leave out what a model does not use, and decide it from this one.
+    mujoco_warp and the adjoint skip features that a model does not use, judging by this model.
     """
     used = [PARAMETERS[name] for name in names if PARAMETERS[name].in_use is not None]
     if not used:
@@ -163,7 +163,7 @@ def structure(mjm: mujoco.MjModel, names: Iterable[str]) -> mujoco.MjModel:
 def open_arrays(mjm: mujoco.MjModel, model: Any, names: Iterable[str], nworld: int) -> None:
     """Give the named arrays of a mujoco_warp.Model one row per world, with the values of `mjm`.
 
-    Arrays that are worked out again for each value, `DERIVED`, get rows too.
+    So do the arrays of `DERIVED`, which are recomputed for each value.
     """
     fields = [field for name in names for field in (name, *DERIVED.get(name, ()))]
     for name in fields:

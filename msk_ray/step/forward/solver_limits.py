@@ -1,4 +1,4 @@
-"""Limits of the constraint solver's iterations, high enough that it converges unless somebody asks for less."""
+"""Iteration limits of the constraint solver, by default high enough for it to converge."""
 
 import warnings
 from typing import Final, NamedTuple
@@ -9,26 +9,26 @@ from msk_ray.step.errors import ConfigError
 
 
 class SolverLimits(NamedTuple):
-    """Most iterations of the constraint solver, and of each of its line searches."""
+    """Iteration limits of the constraint solver and of each line search."""
 
     iterations: int
     ls_iterations: int
 
 
 ENOUGH: Final = SolverLimits(100, 50)
-"""MuJoCo's defaults. A world stops when it has converged, so that a high limit costs only those that need it."""
+"""MuJoCo's defaults. Worlds stop when they have converged, so a high limit only costs time for those that need it."""
 
 
 def own_limits(model: mujoco.MjModel) -> SolverLimits:
-    """Those that the model has."""
+    """The model's limits."""
     return SolverLimits(int(model.opt.iterations), int(model.opt.ls_iterations))
 
 
 def choose_limits(model: mujoco.MjModel, iterations: int | None, ls_iterations: int | None) -> SolverLimits:
-    """Those that are given; for None, the model's, but at least `ENOUGH`.
+    """The given limits; for None, the model's, but at least `ENOUGH`.
 
     Raises:
-        ConfigError: one that is given is below 1.
+        ConfigError: a given limit is below 1.
     """
     chosen = []
     for name, given, own, enough in zip(
@@ -40,8 +40,8 @@ def choose_limits(model: mujoco.MjModel, iterations: int | None, ls_iterations: 
     return SolverLimits(*chosen)
 
 
-def tell_raised(model: mujoco.MjModel, iterations: int | None, ls_iterations: int | None) -> None:
-    """Warn where `choose_limits`, given these, allows more iterations than the model does by itself."""
+def warn_raised_limits(model: mujoco.MjModel, iterations: int | None, ls_iterations: int | None) -> None:
+    """Warn if `choose_limits` with these arguments allows more iterations than the model itself."""
     own, chosen = own_limits(model), choose_limits(model, iterations, ls_iterations)
     given = {"iterations": iterations, "ls_iterations": ls_iterations}
     raised = [name for name in own._fields if given[name] is None and getattr(chosen, name) > getattr(own, name)]

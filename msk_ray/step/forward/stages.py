@@ -1,4 +1,4 @@
-"""The stages of a step: `mujoco_warp.step` as one, or one stage after the other around a solver of this package."""
+"""The stages of a step: `mujoco_warp.step` as a whole, or stage by stage with a solver of this package."""
 
 import copy
 from collections.abc import Callable
@@ -9,44 +9,44 @@ import mujoco_warp as mjw
 import warp as wp
 
 Solver = Callable[[Any, Any], None]
-"""Launches what `mujoco_warp.solve` does, on a model and its Data."""
+"""A replacement for `mujoco_warp.solve`, called with a model and its Data."""
 
 
 class Kernels(NamedTuple):
-    """What a step is made of: which kernels, and how many iterations of the constraint solver at most."""
+    """Choice of a step's kernels, and iteration limits of its constraint solver."""
 
     ordered: bool = False
-    """Add everything up in a fixed order, so that a GPU repeats a step bit for bit; the Jacobian is dense."""
+    """Sum in a fixed order, so that a GPU repeats a step bit for bit; needs a dense Jacobian."""
     fused_solver: bool = False
-    """Solve the constraints in one launch, for small models; the Jacobian is dense."""
+    """Solve constraints in one launch, for small models; needs a dense Jacobian."""
     iterations: int | None = None
-    """Most iterations of the solver; None: the model's, but at least 100, with a warning where that is more."""
+    """Iteration limit of the solver; None: the model's, but at least 100, with a warning if that is more."""
     ls_iterations: int | None = None
-    """Most iterations of each of its line searches; None: the model's, but at least 50, likewise."""
+    """Iteration limit of each line search; None: the model's, but at least 50, likewise."""
 
     @property
     def dense(self) -> bool:
-        """Whether they need a dense Jacobian."""
+        """Whether these kernels need a dense Jacobian."""
         return self.ordered or self.fused_solver
 
 
 PACKAGE: Final = Kernels()
-"""mujoco_warp's."""
+"""mujoco_warp's own kernels."""
 
 
 class Stages(Protocol):
     """Launches of a step and of its parts."""
 
     ordered: bool
-    """Whether they add everything up in a fixed order."""
+    """Whether all sums have a fixed order."""
     unrolls: bool
-    """Whether a recording that joins another library's capture holds every iteration of the solver as launches."""
+    """Whether the solver's iterations are unrolled under torch capture."""
 
     def step(self, model: Any, data: Any) -> None:
         """Launch one physics step."""
 
     def position(self, model: Any, data: Any) -> None:
-        """Launch the position stage, without a factor of the inertia."""
+        """Launch the position stage, without factoring the inertia."""
 
     def tendon(self, model: Any, data: Any) -> None:
         """Launch lengths and Jacobians of tendons."""
@@ -55,11 +55,11 @@ class Stages(Protocol):
         """Launch M - h ∂τ/∂v of the implicitfast integrator, in the layout of M, into `out` (W, nC)."""
 
     def summing(self, model: Any) -> Any:
-        """The model to give to stages of mujoco_warp that are launched one by one."""
+        """The model to pass to mujoco_warp's stages when they are launched one by one."""
 
 
 class PackageStages:
-    """mujoco_warp's."""
+    """mujoco_warp's own kernels."""
 
     ordered = False
     unrolls = True
@@ -86,11 +86,11 @@ class PackageStages:
 
 
 class ComposedStages(PackageStages):
-    """`mujoco_warp.step` of Euler, implicit and implicitfast, stage by stage, around another solver.
+    """`mujoco_warp.step` for Euler, implicit and implicitfast, stage by stage, with another solver.
 
     Args:
         solve: the solver.
-        unrolls: whether it launches its iterations one by one.
+        unrolls: whether the solver's iterations are unrolled under torch capture.
     """
 
     def __init__(self, solve: Solver, unrolls: bool) -> None:
@@ -98,7 +98,7 @@ class ComposedStages(PackageStages):
         self.unrolls = unrolls
 
     def of(self, stage: str, model: Any) -> Any:
-        """The model to give to a stage: inertia, constraint, velocity, actuation, acceleration or integration."""
+        """The model to pass to a stage: inertia, constraint, velocity, actuation, acceleration or integration."""
         return model
 
     def actuation(self, model: Any, data: Any) -> None:
@@ -106,7 +106,7 @@ class ComposedStages(PackageStages):
         mjw.fwd_actuation(self.of("actuation", model), data)
 
     def integrate(self, model: Any, data: Any) -> None:
-        """Launch the step in time."""
+        """Launch the integration."""
         if model.opt.integrator == mjw.IntegratorType.EULER:
             mjw.euler(self.of("acceleration", model), data)
         else:
@@ -127,7 +127,7 @@ class ComposedStages(PackageStages):
 
 
 def dense(mjm: mujoco.MjModel) -> mujoco.MjModel:
-    """The model with a dense Jacobian, the only one that solvers of this package read."""
+    """A copy of the model with a dense Jacobian, which this package's solvers need."""
     if mjm.opt.jacobian == mujoco.mjtJacobian.mjJAC_DENSE:
         return mjm
     changed = copy.copy(mjm)
@@ -138,7 +138,7 @@ def dense(mjm: mujoco.MjModel) -> mujoco.MjModel:
 def with_options(model: Any, **options: Any) -> Any:
     """A copy of mujoco_warp's model with other options and the same arrays."""
     changed, opt = copy.copy(model), copy.copy(model.opt)
-    # The seal is not for these copies, which no recorded graph reads.
+    # These copies are not sealed: no recorded graph reads their attributes.
     for name, value in options.items():
         object.__setattr__(opt, name, value)
     object.__setattr__(changed, "opt", opt)

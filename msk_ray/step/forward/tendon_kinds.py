@@ -13,7 +13,7 @@ def spatial_tendons(m: mujoco.MjModel) -> np.ndarray:
 
 
 def tendon_armature(m: mujoco.MjModel) -> np.ndarray:
-    """Spatial tendons with armature of their own or of an actuator on them, whose inertia turns with the pose."""
+    """Spatial tendons with armature, their own or an actuator's, so that their inertia depends on the pose."""
     has = np.array(m.tendon_armature != 0)
     geared = getattr(m, "actuator_armature", np.zeros(m.nu))
     for u in np.flatnonzero(geared):
@@ -23,17 +23,17 @@ def tendon_armature(m: mujoco.MjModel) -> np.ndarray:
 
 
 def branching_tendons(m: mujoco.MjModel) -> np.ndarray:
-    """Spatial tendons whose velocity-dependent force couples dofs that the inertia does not couple.
+    """Spatial tendons whose velocity-dependent force couples dofs not coupled by the inertia.
 
-    implicitfast drops those slopes.
+    implicitfast drops these derivatives.
     """
     fast = m.opt.integrator == int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
     return between_branches(m) & _depends_on_velocity(m) & fast
 
 
 def between_branches(m: mujoco.MjModel) -> np.ndarray:
-    """Spatial tendons over bodies of which none carries the other."""
-    found = np.zeros(m.ntendon, dtype=bool)
+    """Spatial tendons over bodies on different branches of the tree."""
+    branching = np.zeros(m.ntendon, dtype=bool)
     for tendon in np.flatnonzero(spatial_tendons(m)):
         bodies = {
             int(owner[m.wrap_objid[place]])
@@ -45,17 +45,17 @@ def between_branches(m: mujoco.MjModel) -> np.ndarray:
             )
             if int(m.wrap_type[place]) == int(kind)
         }
-        found[tendon] = not one_chain(m, bodies)
-    return found
+        branching[tendon] = not one_chain(m, bodies)
+    return branching
 
 
 def _depends_on_velocity(m: mujoco.MjModel) -> np.ndarray:
-    """Tendons with a damper of their own, or with an actuator whose force changes with velocity."""
-    found = np.array((m.tendon_damping != 0) | np.any(m.tendon_dampingpoly != 0, axis=-1))
+    """Tendons with a damper, or with an actuator whose force depends on velocity."""
+    damped = np.array((m.tendon_damping != 0) | np.any(m.tendon_dampingpoly != 0, axis=-1))
     muscle, affine = int(mujoco.mjtGain.mjGAIN_MUSCLE), int(mujoco.mjtGain.mjGAIN_AFFINE)
     moving = (m.actuator_gaintype == muscle) | ((m.actuator_gaintype == affine) & (m.actuator_gainprm[:, 2] != 0))
     moving |= (m.actuator_biastype == int(mujoco.mjtBias.mjBIAS_AFFINE)) & (m.actuator_biasprm[:, 2] != 0)
     moving |= (m.actuator_damping != 0) | np.any(m.actuator_dampingpoly != 0, axis=-1)
     for u in np.flatnonzero(moving & (m.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON))):
-        found[m.actuator_trnid[u, 0]] = True
-    return found
+        damped[m.actuator_trnid[u, 0]] = True
+    return damped

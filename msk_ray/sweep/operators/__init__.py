@@ -6,7 +6,7 @@ from typing import Any
 
 from msk_ray.config import Registry, resolve_class
 from msk_ray.errors import ConfigError, brief
-from msk_ray.sweep.operators.base import Level, Listed, Operator, Range
+from msk_ray.sweep.operators.base import Level, NamedValues, Operator, Range
 
 _HERE = "msk_ray.sweep.operators"
 OPERATORS = Registry(
@@ -21,11 +21,11 @@ OPERATORS = Registry(
     },
 )
 
-__all__ = ["OPERATORS", "Level", "Listed", "Operator", "Range", "parse_operator"]
+__all__ = ["OPERATORS", "Level", "NamedValues", "Operator", "Range", "parse_operator"]
 
 
 def parse_operator(key: str, data: Any) -> Operator:
-    """The operator written for parameter `key`: a short name, or `package.module:Class`, and its values.
+    """Parse a parameter's operator: a short name or `package.module:Class`, and its values.
 
     Raises:
         ConfigError: unknown operator, empty list, or values that do not fit.
@@ -44,6 +44,6 @@ def parse_operator(key: str, data: Any) -> Operator:
     where = f"parameters.{key}.{kind}"
     if not isinstance(values, list) or not values:
         raise ConfigError(f"{where}: must be a list, not {brief(values)}")
-    # mypy takes no abstract class where a class is asked for.
+    # mypy does not accept an abstract class as type[T].
     operator: type[Operator] = resolve_class(path, f"parameters.{key}", Operator)  # type: ignore[type-abstract]
     return operator.parse(where, values)

@@ -1,7 +1,7 @@
-"""The operators of a search space: what a space may write for a parameter, to say which values are tried.
+"""The operators of a search space, which say what values of a parameter are tried.
 
-Your own operator is a class derived from `Operator`, `Listed` or `Range`; a space names it by its import path,
-`{"package.module:Class": [...]}`.
+To write your own operator, derive a class from `Operator`, `NamedValues` or `Range`. A space names it by its import
+path: `{"package.module:Class": [...]}`.
 """
 
 import math
@@ -17,7 +17,7 @@ from msk_ray.text import describe
 
 @dataclass(frozen=True)
 class Level:
-    """One value of a parameter and its text in tables."""
+    """One value of a parameter, and how tables show it."""
 
     value: Any
     label: str
@@ -27,21 +27,21 @@ class Operator(ABC):
     """The values of one parameter."""
 
     enumerated: ClassVar[bool] = False
-    """Whether every level is tried, rather than one drawn for each trial."""
+    """Whether every level is tried; if not, one is drawn for each trial."""
     levels: tuple[Level, ...]
     """All values, if they are enumerated."""
 
     @classmethod
     @abstractmethod
     def parse(cls, where: str, values: list[Any]) -> Self:
-        """The operator for the values that a space writes.
+        """Parse the values in a space.
 
         Args:
             where: the key in the space, for errors.
             values: not empty.
 
         Raises:
-            ConfigError: they do not fit.
+            ConfigError: the values are invalid.
         """
 
     @abstractmethod
@@ -50,21 +50,21 @@ class Operator(ABC):
 
     @abstractmethod
     def extremes(self) -> tuple[Level, ...]:
-        """Levels that include the ones that make a trial longest; the first one is used where the parameter does not
+        """Levels among which is the one that makes a trial longest. The first one is used where the parameter does not
         matter."""
 
     def check(self) -> tuple[Level, ...]:
-        """Levels to check against the settings in advance: if they are valid, so is every draw."""
+        """Levels to validate in advance: if they are valid settings, so is every draw."""
         return ()
 
     def recorded(self, written: Any) -> Level:
-        """The level of a search's recorded choice."""
+        """The level that a search has chosen, from its record."""
         return Level(written, describe(written))
 
 
 @dataclass(frozen=True)
-class Listed(Operator):
-    """Named values."""
+class NamedValues(Operator):
+    """A list of values, each with a label."""
 
     levels: tuple[Level, ...]
 
@@ -79,9 +79,9 @@ class Listed(Operator):
         return self.levels
 
     def recorded(self, written: Any) -> Level:
-        """The level with this label; a search chooses among labels."""
-        found = next((level for level in self.levels if level.label == written), None)
-        return super().recorded(written) if found is None else found
+        """The level with this label, because a search chooses among labels."""
+        level = next((known for known in self.levels if known.label == written), None)
+        return super().recorded(written) if level is None else level
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class Range(Operator):
         return cls(low, high)
 
     def draw(self, rng: random.Random) -> Level:
-        """A random value, rounded to 6 digits, so that tables, hashes and YAML all hold the same number."""
+        """A random value, rounded to 6 digits so that tables, hashes and YAML hold the same number."""
         if self.whole:
             number: float = rng.randint(int(self.low), int(self.high))
         elif self.log:
@@ -141,8 +141,8 @@ def _level(value: Any) -> Level:
 
 
 def _number(value: Any) -> int | float | None:
-    """`value` as a number below 2^53 in size, or None. YAML reads 1e-3 as text (it wants 1.0e-3), so text is tried
-    too."""
+    """`value` as a number of magnitude below 2^53, or None. Accepts text too, because YAML reads 1e-3 as text (it wants
+    1.0e-3)."""
     if isinstance(value, str):
         try:
             value = float(value)

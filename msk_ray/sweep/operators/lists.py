@@ -1,17 +1,17 @@
-"""Operators over values that are written out."""
+"""Operators over lists of values."""
 
 from dataclasses import dataclass
 
-from msk_ray.sweep.operators.base import Listed
+from msk_ray.sweep.operators.base import NamedValues
 
 
 @dataclass(frozen=True)
-class Grid(Listed):
-    """Every value is tried, in every combination with other grids."""
+class Grid(NamedValues):
+    """Tries every value, in all combinations with other grids."""
 
     enumerated = True
 
 
 @dataclass(frozen=True)
-class Choice(Listed):
-    """One value is drawn for each trial."""
+class Choice(NamedValues):
+    """Draws one value for each trial."""

@@ -7,18 +7,18 @@ from msk_ray.sweep.operators.base import Range
 
 @dataclass(frozen=True)
 class Uniform(Range):
-    """Every number is as likely as any other."""
+    """Uniform distribution of numbers."""
 
 
 @dataclass(frozen=True)
 class LogUniform(Range):
-    """Every order of magnitude is as likely as any other."""
+    """Log-uniform distribution of numbers."""
 
     log = True
 
 
 @dataclass(frozen=True)
 class RandInt(Range):
-    """Whole numbers, each as likely as any other."""
+    """Uniform distribution of whole numbers."""
 
     whole = True

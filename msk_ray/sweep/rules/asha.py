@@ -21,18 +21,18 @@ class Asha(SchedulerSpec):
     """Stops the worse trials at each rung."""
 
     grace: Share = 0.25
-    """Share of the longest trial's budget within which no trial is stopped. For a search, the longest is the longest it
-    may suggest; an adaptive horizon counts as its `longest`. A small share loses trials that start slowly."""
+    """Share of the longest trial's budget within which no trial is stopped. For a search, the longest trial is the
+    longest it may suggest; an adaptive horizon counts as its `longest`. A small share stops slow starters."""
     reduction: Annotated[float, Field(ge=1.5, le=16)] = 3.0
     """One trial in this many continues past each rung; rungs are grace × reductionⁿ."""
     min_trials: Count | None = None
-    """Number of trials that must have come as far before one is stopped; null: `reduction` rounded up."""
+    """Number of trials that must have reached a rung before one is stopped; null: `reduction` rounded up."""
 
     def pruner(self, budget: float) -> Pruner:
         return SuccessiveHalving(self.rungs(budget), self.reduction, self.min_trials)
 
     def rungs(self, budget: float) -> tuple[float, ...]:
-        """grace · reductionⁿ, as long as it is below the budget."""
+        """grace · reductionⁿ, while below the budget."""
         times = [self.grace * budget]
         while times[-1] * self.reduction < budget:
             times.append(times[-1] * self.reduction)
@@ -42,7 +42,7 @@ class Asha(SchedulerSpec):
 class SuccessiveHalving:
     """ASHA: at each rung one trial in `reduction` continues (rounded up).
 
-    Trials are compared by their best score so far, as in the final ranking; single evaluations vary too much.
+    Trials are compared by their best score so far, as in the final ranking; single evaluations are too noisy.
     """
 
     def __init__(self, rungs: Sequence[float], reduction: float, min_trials: int | None = None) -> None:
@@ -65,10 +65,10 @@ class SuccessiveHalving:
         newest: int | None = None
         for index, (rung, scores) in enumerate(zip(self._rungs, self._scores, strict=True)):
             if time >= rung:
-                # The first result past a rung counts there, whatever follows: repeated rows change nothing.
+                # Only the first result past a rung counts there, so that repeated rows change nothing.
                 scores.setdefault(trial, best)
                 newest = index
-        # Far past its rung, a trial is left to the next one: latecomers should not undo most of its work.
+        # Far past its rung, a trial is only judged at the next one: latecomers should not discard most of its work.
         if newest is None or time >= self._rungs[newest] * math.sqrt(self._reduction):
             return None
         return self._judge(trial, newest)

@@ -1,6 +1,6 @@
-"""Rules that compare trials and stop one because others do better.
+"""Rules that compare trials, and stop one because others do better.
 
-They take evaluations and answer with a reason to stop; replaying recorded evaluations gives the same answers.
+A rule gets evaluations and returns reasons to stop. Replaying recorded evaluations gives the same answers.
 """
 
 from collections.abc import Collection
@@ -22,10 +22,10 @@ class Pruner(Protocol):
     """A rule that compares trials."""
 
     def report(self, trial: str, time: float, score: float) -> Ending | None:
-        """Take one evaluation into account; returns why the trial should end now, or None."""
+        """Record an evaluation; returns why its trial should end now, or None."""
 
     def forget(self, trial: str) -> None:
-        """Forget the results of a trial, because it restarts from the beginning."""
+        """Forget a trial's results, because it restarts from the beginning."""
 
 
 class NeverPrune:
@@ -41,19 +41,19 @@ class NeverPrune:
 class SchedulerSpec(Section):
     """The `scheduler` section of a space: a rule with its settings, which are the fields of its class.
 
-    One of your own is a class derived from this one, named in a space by its import path:
+    To write your own, derive a class from this one, and name its import path in a space:
     `scheduler: {kind: "package.module:Class", setting: value}`.
     """
 
     ends_trials: ClassVar[bool] = True
-    """Whether it ends trials by their scores; if so, --no-early-stopping and --smoke leave it out."""
+    """Whether it ends trials by their scores; if so, --no-early-stopping and --smoke disable it."""
     exchanges: ClassVar[bool] = False
     """Whether trials continue from each other's state and settings."""
 
     kind: Text
     """Name of the rule, or its import path."""
     time_attr: Literal["env_steps", "epoch", "seconds"] = "env_steps"
-    """The progress at which trials are compared. Env steps are fair between horizons, and do not need lockstep."""
+    """Progress at which trials are compared. Env steps are fair across horizons, and do not need lockstep."""
 
     def pruner(self, budget: float) -> Pruner:
         """The rule, without any evaluations yet.
@@ -64,7 +64,7 @@ class SchedulerSpec(Section):
         return NeverPrune()
 
     def rungs(self, budget: float) -> tuple[float, ...]:
-        """Times at which all trials are compared, for pictures; empty if there are none."""
+        """Times at which all trials are compared, for charts; empty if there are none."""
         return ()
 
     def check(self, file: "SpaceFile", ranges: Collection[str]) -> None:

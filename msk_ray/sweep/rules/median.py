@@ -1,4 +1,4 @@
-"""The median rule: a trial that does worse than most others is stopped."""
+"""The median rule: stops a trial that does worse than most others."""
 
 import math
 import statistics
@@ -14,7 +14,7 @@ class Median(SchedulerSpec):
     grace: Share = 0.25
     """Share of the longest trial's budget within which no trial is stopped."""
     min_trials: Count | None = None
-    """Number of other trials that must have come as far before one is stopped; null: 3."""
+    """Number of other trials that must have reached the same time before one is stopped; null: 3."""
 
     def pruner(self, budget: float) -> Pruner:
         return MedianStopping(self.grace * budget, self.min_trials or 3)
@@ -26,8 +26,8 @@ class MedianStopping:
     def __init__(self, grace: float, min_trials: int = 3) -> None:
         """
         Args:
-            grace: time before which nothing is compared.
-            min_trials: number of other trials that must have come as far.
+            grace: time before which no trial is stopped.
+            min_trials: number of other trials that must have reached the same time.
         """
         self._grace = grace
         self._min_trials = min_trials
@@ -38,7 +38,7 @@ class MedianStopping:
             return None
         own = self._history.setdefault(trial, {})
         own[time] = score
-        # In lockstep no other trial has come as far as this one; then compare at the time that enough have reached.
+        # In lockstep no other trial has reached this one's time; then compare at the time that enough have reached.
         for moment in sorted((t for t in own if self._grace <= t <= time), reverse=True):
             means = [
                 statistics.fmean(s for t, s in history.items() if t <= moment)

@@ -21,9 +21,9 @@ class NonFinite(StopRule):
 
 
 def nonfinite_metric(row: Mapping[str, float]) -> str | None:
-    """The first metric that must be finite and is not: the score, a loss, or a gradient norm.
+    """The first non-finite metric among score, losses and gradient norms.
 
-    Other metrics may be undefined, such as the return of episodes in an epoch in which none ended.
+    Other metrics may be undefined, such as the episode return in an epoch without an end of an episode.
     """
     for key, value in row.items():
         if (key == SCORE or key.endswith(("loss", "grad_norm"))) and not math.isfinite(value):

@@ -1,4 +1,4 @@
-"""A rule for each environment of a sweep, because scores of different environments cannot be compared."""
+"""One rule per environment of a sweep, because scores of different environments are not comparable."""
 
 from collections.abc import Iterable, Mapping
 
@@ -8,7 +8,7 @@ from msk_ray.sweep.rules.early_stopping import Pruner
 
 
 class PerEnvironment:
-    """Passes each trial's evaluations to the rule of its environment. Those of unknown trials count for nobody."""
+    """Passes each trial's evaluations to its environment's rule; ignores unknown trials."""
 
     def __init__(self, rules: Mapping[str, Pruner], environments: Mapping[str, str]) -> None:
         """
@@ -28,7 +28,7 @@ class PerEnvironment:
 
 
 def refuse_several(environments: Iterable[str], who: str) -> None:
-    """Refuse to compare trials of different environments where they cannot be kept apart.
+    """Raise if a setting would compare trials of different environments.
 
     Args:
         environments: names of the trials' environments.

@@ -11,7 +11,7 @@ from msk_ray.sweep.rules.stop_rule import History, StopRule
 
 
 class Plateau(StopRule):
-    """Ends a trial when its last `patience` evaluations did not improve on the best before them."""
+    """Ends a trial when its last `patience` evaluations did not improve on the best one before."""
 
     outcome = Outcome.STOPPED_PLATEAU
 

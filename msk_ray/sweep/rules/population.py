@@ -1,4 +1,4 @@
-"""Population-based training: the worst trials continue from the best ones, with slightly changed settings."""
+"""Population-based training: the worst trials continue from the best ones' states, with slightly changed settings."""
 
 from collections.abc import Collection
 from typing import TYPE_CHECKING, Annotated
@@ -13,17 +13,17 @@ if TYPE_CHECKING:
 
 
 class PopulationBasedTraining(SchedulerSpec):
-    """Ends no trial, but lets trials take over the state and settings of others."""
+    """Ends no trial; instead, trials take over the state and settings of better ones."""
 
     ends_trials = False
     exchanges = True
 
     interval: Share = 0.1
-    """Time between two exchanges, as a share of the budget."""
+    """Time between exchanges, as a share of the budget."""
     quantile: Annotated[float, Field(gt=0.0, le=0.5)] = 0.25
     """Share of trials that continue from better ones at an exchange."""
     resample: Annotated[float, Field(ge=0.0, le=1.0)] = 0.25
-    """Probability that an exchanged value is drawn again instead of being changed by a fifth."""
+    """Probability that an exchanged value is redrawn instead of changed by a fifth."""
 
     def check(self, file: "SpaceFile", ranges: Collection[str]) -> None:
         super().check(file, ranges)

@@ -11,7 +11,7 @@ def replay(pruner: Pruner, time_attr: str, reports: Sequence[LogEntry]) -> Endin
     """Replay recorded evaluations.
 
     Returns:
-        The rule's answer to the last one, which the driver may have died before carrying out.
+        The rule's answer to the last evaluation; the driver may have died before carrying it out.
     """
     ending = None
     attempts: dict[str, int] = {}

@@ -1,4 +1,4 @@
-"""The `scheduler` section of a space, with the settings of the rule that it names."""
+"""Validating the `scheduler` section of a space with the settings of the rule that it names."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -21,13 +21,13 @@ SCHEDULERS = Registry(
     },
 )
 RECORDED = {"recorded": True}
-"""Validation context of a space that an experiment has recorded."""
+"""Validation context for a space recorded by an experiment."""
 _SHARED = frozenset({"time_attr", "grace", "reduction", "min_trials", "interval", "quantile", "resample"})
-"""Settings that every rule used to have, read or not, before each had its own."""
+"""Settings that older versions recorded for every rule, used or not."""
 
 
 def scheduler_class(name: Any) -> type[SchedulerSpec]:
-    """The class of a rule, by its name or import path; None stands for `none`.
+    """The class of a rule by name or import path; None means `none`.
 
     Raises:
         ConfigError: there is none.
@@ -36,8 +36,7 @@ def scheduler_class(name: Any) -> type[SchedulerSpec]:
 
 
 def read_scheduler(value: Any, info: ValidationInfo) -> Any:
-    """The section as the settings that its rule declares. In a recorded section, settings of other rules, which nothing
-    reads, are left out."""
+    """Validate the section with its rule's class. In a recorded section, unused settings of other rules are dropped."""
     if isinstance(value, SchedulerSpec) or not isinstance(value, Mapping):
         return value
     try:

@@ -1,4 +1,4 @@
-"""The base of rules by which a trial ends itself, judged only by its own history."""
+"""The base class of rules that end a trial by its own history alone."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -21,7 +21,7 @@ from msk_ray.experiment.outcomes import Outcome
 
 @dataclass(frozen=True)
 class History:
-    """The history of a trial, after an epoch."""
+    """A trial's history after an epoch."""
 
     row: Mapping[str, float]
     """Metrics of the last epoch."""
@@ -41,22 +41,22 @@ class History:
 class StopRule(Section, ABC):
     """A rule with its settings, which are the fields of its class.
 
-    One of your own is a class derived from this one, named in a space by its import path:
+    To write your own, derive a class from this one, and name its import path in a space:
     `stop: {rules: {"package.module:Class": {setting: value}}}`.
     """
 
     outcome: ClassVar[Outcome] = Outcome.STOPPED_RULE
-    """The outcome of a trial that it stops."""
+    """Outcome of trials that it stops."""
     by_score: ClassVar[bool] = True
-    """Whether it decides by scores; if so, --no-early-stopping and --smoke leave it out."""
+    """Whether it decides by scores; if so, --no-early-stopping and --smoke disable it."""
     before_the_end: ClassVar[bool] = False
-    """Whether it is also checked after the last epoch, before that ends the trial."""
+    """Whether it is also checked after the last epoch, whose outcome it then replaces."""
     shorthand: ClassVar[str | None] = None
-    """The setting that a bare value stands for: `target: 5` for `target: {score: 5}`."""
+    """The setting that a bare value sets: `target: 5` means `target: {score: 5}`."""
 
     @abstractmethod
     def why(self, history: History) -> str | None:
-        """Why the trial ends now, in words; None to continue."""
+        """Why the trial ends now, as text; None to continue."""
 
     @model_validator(mode="wrap")
     @classmethod
@@ -66,7 +66,7 @@ class StopRule(Section, ABC):
         try:
             return handler({cls.shorthand: data})
         except ValidationError as error:
-            # The file has no such key: the fault is where the bare value is.
+            # The file has no such key; report the error at the bare value.
             faults = cast(list[InitErrorDetails], [fault | {"loc": fault["loc"][1:]} for fault in error.errors()])
             raise ValidationError.from_exception_data(cls.__name__, faults) from None
 

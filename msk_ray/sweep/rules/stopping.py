@@ -1,4 +1,4 @@
-"""The `stop` section of a space: which rules end its trials."""
+"""The `stop` section of a space: the rules that end its trials."""
 
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any
@@ -16,7 +16,7 @@ from msk_ray.sweep.rules.target import Target
 from msk_ray.sweep.rules.wall_time import WallTime
 
 STOP_RULES = Registry("stop.rules", "msk_ray.stop_rules", {})
-"""Entry points of installed packages; our own rules are fields of the section."""
+"""Rules of installed packages, by entry point; the package's own rules are fields of the section."""
 
 
 def _found(value: Any) -> Any:
@@ -30,7 +30,7 @@ def _rule(name: Any, settings: Any) -> StopRule:
     if isinstance(settings, StopRule):
         return settings
     try:
-        # mypy takes no abstract class where a class is asked for.
+        # mypy does not accept an abstract class as type[T].
         kind = resolve_class(STOP_RULES.path(name), f"stop.rules.{name}", StopRule)  # type: ignore[type-abstract]
     except ConfigError as error:
         raise ValueError(str(error)) from error
@@ -41,7 +41,7 @@ def _rule(name: Any, settings: Any) -> StopRule:
 
 
 class StopSpec(Section):
-    """When a trial ends by itself before its last epoch."""
+    """Rules by which a trial ends before its last epoch."""
 
     nonfinite: NonFinite | None = NonFinite()
     """Written as true or false."""
@@ -49,7 +49,7 @@ class StopSpec(Section):
     wall_time_s: WallTime | None = None
     plateau: Plateau | None = None
     rules: Annotated[dict[str, SerializeAsAny[StopRule]], BeforeValidator(_found)] = Field(default_factory=dict)
-    """Rules of your own: import path, or name of an installed one → its settings."""
+    """Your own rules: import path, or name of an installed rule → its settings."""
 
     @model_validator(mode="before")
     @classmethod
@@ -73,7 +73,7 @@ class StopSpec(Section):
         return self.model_copy(update=left_out | ({"rules": kept} if kept != self.rules else {}))
 
     def ending(self, history: History) -> Ending | None:
-        """How a trial ends after an epoch; None to continue."""
+        """The ending of a trial after an epoch; None to continue."""
         rules = list(self.all_rules())
         finished = history.epoch >= history.epochs
         for rule in sorted(rules, key=lambda rule: not rule.before_the_end):

@@ -1,4 +1,4 @@
-"""Ends a trial that has reached its goal."""
+"""Ends a trial that has reached its target score."""
 
 from msk_ray.experiment.outcomes import Outcome
 from msk_ray.sweep.rules.stop_rule import History, StopRule
@@ -12,7 +12,7 @@ class Target(StopRule):
     shorthand = "score"
 
     score: float
-    """Score at which a trial has reached its goal."""
+    """Target score."""
 
     def why(self, history: History) -> str | None:
         if not history.evaluations or history.evaluations[-1].score < self.score:

@@ -16,7 +16,7 @@ class WallTime(StopRule):
     shorthand = "seconds"
 
     seconds: Annotated[float, Field(gt=0.0)]
-    """Training time that a trial may take, over all its attempts [s]."""
+    """Largest training time of a trial, summed over its attempts [s]."""
 
     def why(self, history: History) -> str | None:
         if history.elapsed_s < self.seconds:

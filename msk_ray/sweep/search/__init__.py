@@ -1,4 +1,4 @@
-"""The searches, which suggest trials one by one as results come in, by name."""
+"""Searches by name. A search suggests trials one by one as results arrive."""
 
 from msk_ray.config import Registry, resolve_class
 from msk_ray.sweep.search.base import Search
@@ -9,10 +9,10 @@ __all__ = ["SEARCHES", "Search", "search_class"]
 
 
 def search_class(name: str) -> type[Search]:
-    """The class of a search, by its name or import path.
+    """The class of a search by name or import path.
 
     Raises:
         ConfigError: there is none.
     """
-    # mypy takes no abstract class where a class is asked for.
+    # mypy does not accept an abstract class as type[T].
     return resolve_class(SEARCHES.path(name), "search", Search)  # type: ignore[type-abstract]

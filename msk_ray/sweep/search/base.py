@@ -1,4 +1,4 @@
-"""The base of searches: a search suggests a trial's values, and is told the result."""
+"""The base class of searches: a search suggests a trial's values, and gets its result."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
@@ -11,55 +11,55 @@ from msk_ray.sweep.operators import Operator
 class Search(ABC):
     """Suggests trials.
 
-    One of your own is a class derived from this one, named in a space by its import path:
+    To write your own, derive a class from this one, and name its import path in a space:
     `search: package.module:Class`.
     """
 
     packages: ClassVar[Mapping[str, str]] = {}
-    """Optional modules that it needs, and what `pip install` takes for each: looked for before anything starts."""
+    """Optional modules that it needs → argument of `pip install`; checked before anything starts."""
     name: ClassVar[str] = ""
-    """Name in messages; by default that of the class."""
+    """Name in messages; by default the class name."""
     several_objectives: ClassVar[bool] = False
-    """Whether it takes `objectives` instead of the score: it is then made with them as a third argument, metric →
-    `minimize` or `maximize`, and told by `tell_objectives`."""
+    """Whether it supports `objectives` instead of the score. Its constructor then gets them as a third argument, metric
+    → `minimize` or `maximize`, and results come by `tell_objectives`."""
 
     def __init__(self, parameters: Mapping[str, Operator], seed: int) -> None:
         """
         Args:
-            parameters: dotted key → the values it may have.
-            seed: seed of its draws, a new one each time an experiment is resumed.
+            parameters: dotted key → operator.
+            seed: seed of its draws; another one each time an experiment is resumed.
 
         Raises:
-            ConfigError: it cannot search such values.
+            ConfigError: it does not support one of the operators.
         """
         self.parameters = dict(parameters)
         self.seed = seed
 
     @abstractmethod
     def ask(self) -> dict[str, Any]:
-        """The values of the next trial, by dotted key; for listed values, their label."""
+        """Values of the next trial by dotted key; the label for values of a list."""
 
     @abstractmethod
     def tell(self, params: Mapping[str, Any], score: float | None) -> None:
-        """Take the result of a trial into account.
+        """Record the result of a trial.
 
         Args:
             params: its values, suggested in this run of the experiment or an earlier one.
-            score: its best score; None if it has none.
+            score: its best score; None if it has no score.
         """
 
     def tell_objectives(self, params: Mapping[str, Any], values: Sequence[float] | None) -> None:
-        """Take the result of a trial into account, where the space has several objectives.
+        """Record the result of a trial of a space with `objectives`.
 
         Args:
             params: as for `tell`.
-            values: at its last evaluation, one for each objective, in order; None if it has none.
+            values: the objectives at its last evaluation, in order; None if there was none.
         """
-        raise NotImplementedError  # only of a search with `several_objectives`
+        raise NotImplementedError  # only called if `several_objectives`
 
     @classmethod
     def check(cls, parameters: Mapping[str, Operator], seeds: Collection[int]) -> None:
-        """Refuse a space that cannot be searched.
+        """Raise if this search does not support a space.
 
         Raises:
             ConfigError: the message says what to write.

@@ -4,13 +4,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 from msk_ray.errors import ConfigError
-from msk_ray.sweep.operators import Listed, Operator, Range
+from msk_ray.sweep.operators import NamedValues, Operator, Range
 from msk_ray.sweep.search.base import Search
 
 
 class OptunaSearch(Search):
-    """Suggests values that resemble the better half of those tried; with several objectives, those that no other trial
-    beats in all of them count as best."""
+    """Suggests values that resemble the better part of those tried; with several objectives, the Pareto-optimal trials
+    count as best."""
 
     packages: ClassVar[Mapping[str, str]] = {"optuna": "msk-ray[optuna]"}
     name = "optuna"
@@ -49,14 +49,14 @@ class OptunaSearch(Search):
 
 
 def distribution(key: str, op: Operator) -> Any:
-    """Optuna's distribution of a parameter; listed values are known by their labels.
+    """Optuna's distribution for a parameter; values of a list are represented by their labels.
 
     Raises:
-        ConfigError: it is of another kind than a list or a range.
+        ConfigError: the operator is neither a list nor a range.
     """
     from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
-    if isinstance(op, Listed):
+    if isinstance(op, NamedValues):
         return CategoricalDistribution([level.label for level in op.levels])
     if not isinstance(op, Range):
         raise ConfigError(f"parameters.{key}: optuna searches lists and ranges, not {type(op).__name__}")

@@ -6,22 +6,22 @@ from typing import Any, ClassVar
 
 
 class Logger(ABC):
-    """Passes a trial's rows on to a place where people look at them. A subclass needs `write`.
+    """Sends a trial's rows to a place where people read them. A subclass needs `write`.
 
-    A row is in `metrics.jsonl` before any logger gets it, and every logger gets it, even if another one fails. An
-    exception ends the trial: as a full or lost disk if it comes from an OSError of that kind, otherwise as a failure of
-    the logger.
+    Rows are in `metrics.jsonl` before loggers get them, and every logger gets them even if another one fails. An
+    exception ends the trial: as a storage failure if an OSError says that the disk is full or gone, otherwise as a
+    failure of the logger.
 
     Attributes:
         folder: the trial's folder.
     """
 
     takes_late: ClassVar[bool] = False
-    """Whether `write_late` is there. If a logger of a trial has none, each policy is scored before its row is written,
-    which on a GPU takes longer than scoring several together."""
+    """Whether the logger has `write_late`. If one of a trial's loggers has not, each policy is scored before its row is
+    written; on a GPU that is slower than scoring several together."""
 
     def __init__(self, folder: Path) -> None:
-        """Do not open anything yet: a trial that cannot be resumed leaves its folder unchanged."""
+        """Open nothing here: a trial that cannot be resumed must leave its folder unchanged."""
         self.folder = folder
 
     @abstractmethod
@@ -29,14 +29,14 @@ class Logger(ABC):
         """Log a row: `epoch`, `env_steps`, `seconds` and metrics such as `eval/score`, all of them finite."""
 
     def write_late(self, row: dict[str, float]) -> None:
-        """Log figures of an earlier row that are known only now: its `epoch`, and `eval/score` and others."""
+        """Log figures that belong to an earlier row: its `epoch`, with `eval/score` and others."""
         raise NotImplementedError
 
-    def config(self, settings: dict[str, Any]) -> None:  # noqa: B027  # a logger may do without
+    def config(self, settings: dict[str, Any]) -> None:  # noqa: B027  # optional
         """Log the trial's settings, nested as in config.yaml; called once before the first row."""
 
-    def rewind(self, epoch: int) -> None:  # noqa: B027  # a logger may do without
-        """The trial continues after `epoch`: rows of later epochs come again. Called before the first row."""
+    def rewind(self, epoch: int) -> None:  # noqa: B027  # optional
+        """Called before the first row of a trial resumed after `epoch`: rows of later epochs will be written again."""
 
-    def close(self) -> None:  # noqa: B027  # a logger may do without
+    def close(self) -> None:  # noqa: B027  # optional
         """Write out everything that is still buffered."""

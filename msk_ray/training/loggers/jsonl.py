@@ -1,4 +1,4 @@
-"""A trial's own record: one JSON object per line, on disk before anything else happens."""
+"""`metrics.jsonl`: one JSON object per line, written before any other logger gets the row."""
 
 import json
 import math
@@ -13,9 +13,9 @@ from msk_ray.files import append_text, write_bytes
 
 
 class JsonLines:
-    """Appends rows to `metrics.jsonl`: what status, reports and a resumed trial read.
+    """Appends rows to `metrics.jsonl`, which status, reports and resumed trials read.
 
-    A value that is not finite is written as null and named in the row's `nonfinite` list: JSON has no NaN.
+    Non-finite values are written as null and named in the row's `nonfinite` list, because JSON has no NaN.
     """
 
     def __init__(self, folder: Path) -> None:

@@ -80,8 +80,8 @@ class MLflow(Logger):
             client.update_run(self._run, status="RUNNING")
             return client
         experiment, trial = run_name(self.folder)
-        found = client.get_experiment_by_name(experiment)
-        number = client.create_experiment(experiment) if found is None else found.experiment_id
+        existing = client.get_experiment_by_name(experiment)
+        number = client.create_experiment(experiment) if existing is None else existing.experiment_id
         self._run = client.create_run(number, run_name=trial).info.run_id
         params = [Param(key, str(value)[:_LONGEST_PARAM]) for key, value in flattened(self._settings).items()]
         for first in range(0, len(params), _PARAMS_AT_ONCE):

@@ -1,4 +1,4 @@
-"""The name of a trial outside its folder."""
+"""A trial's name and id for loggers."""
 
 import uuid
 from pathlib import Path
@@ -13,7 +13,7 @@ def run_name(folder: Path) -> tuple[str, str]:
 
 
 def run_id(folder: Path, file: str) -> str:
-    """An id for the trial, the same each time it is resumed: stored in a file of its folder.
+    """An id that the trial keeps when it is resumed, stored in its folder.
 
     Raises:
         StorageFailure: the file cannot be written.

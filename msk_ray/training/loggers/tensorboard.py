@@ -48,7 +48,7 @@ class TensorBoard(Logger):
         values = [
             Summary.Value(tag=board_tag(name), simple_value=value) for name, value in row.items() if name != "epoch"
         ]
-        # All in one event: `add_scalar` takes a writer's queue and lock for each.
+        # One event for all: `add_scalar` would lock the writer's queue for each value.
         assert self._board.file_writer is not None, "it is open"
         self._board.file_writer.add_summary(Summary(value=values), int(row["epoch"]))
 
@@ -67,7 +67,7 @@ def log_image(folder: Path, tag: str, image: np.ndarray, epoch: int) -> None:
     """Put a picture into TensorBoard.
 
     Args:
-        folder: folder of its event file; not that of a trial's scalars, whose file TensorBoard would then stop reading.
+        folder: for the event file; another one than for scalars, because TensorBoard stops reading the older file.
         tag: the chart's name.
         image: shape (height, width, 3), uint8.
         epoch: its step.

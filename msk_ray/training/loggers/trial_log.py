@@ -29,7 +29,7 @@ class TrialLog:
 
     @property
     def takes_late(self) -> bool:
-        """Whether figures can be added to rows that have been written."""
+        """Whether figures can be added to rows already written."""
         return all(logger.takes_late for logger in self._loggers.values())
 
     def rewind(self, epoch: int) -> tuple[Damage, ...]:
@@ -59,7 +59,7 @@ class TrialLog:
         self._each(lambda logger: logger.write(dict(finite)))
 
     def write_late(self, row: dict[str, float], late: dict[str, float]) -> None:
-        """Add figures to a row that has been written; in `metrics.jsonl` the whole row comes again and replaces it.
+        """Add figures to an earlier row; in `metrics.jsonl` the completed row is appended and replaces the earlier one.
 
         Raises:
             StorageFailure, LoggerError: as for `write`.
@@ -70,7 +70,7 @@ class TrialLog:
         self._each(lambda logger: logger.write_late(dict(finite)))
 
     def close(self) -> None:
-        """Have every logger write out everything that is still buffered.
+        """Flush every logger.
 
         Raises:
             StorageFailure, LoggerError: as for `write`; the rows are in `metrics.jsonl` in any case.
@@ -87,7 +87,7 @@ class TrialLog:
         for name, logger in self._loggers.items():
             try:
                 call(logger)
-            except Exception as error:  # of whatever type: what a logger calls decides
+            except Exception as error:  # any type: loggers call other libraries
                 fault = _named(name, error)
                 fault.__cause__ = error
                 first = first or fault
@@ -102,7 +102,7 @@ def _finite(row: dict[str, float]) -> dict[str, float]:
 def _named(name: str, error: Exception) -> Exception:
     stored = storage_failure(error)
     if stored is None and isinstance(error, OSError) and error.filename is not None:
-        # For example, the trial's folder has disappeared.
+        # e.g. the trial's folder has disappeared
         stored = StorageFailure(f"{error.filename}: {error.strerror or error}")
     if stored is not None:
         return StorageFailure(f"execution.loggers: {name} cannot write: {stored}")

@@ -106,7 +106,7 @@ def test_only_the_world_that_lost_rows_becomes_nan_and_its_rows_are_counted():
     qvel = landing(batch)
     assert np.isnan(qvel[0]).all()
     assert np.isfinite(qvel[1:]).all()
-    assert batch.losses.heard()
+    assert batch.losses.any_lost()
     with pytest.raises(SimulationError, match=r"execution\.njmax: 320 \(now 64"):
         batch.raise_losses()
     batch.raise_losses()  # said once

@@ -27,7 +27,7 @@ class GeomGradients:
 
 
 @wp.struct
-class Placed:
+class GeomShapes:
     """Shapes of geoms and their place in their bodies."""
 
     geom_bodyid: wp.array[int]
@@ -82,7 +82,7 @@ def size_slope(kind: int, size: wp.vec3, mat: wp.mat33, arm: wp.vec3, out: wp.ve
 @wp.kernel
 def pull_geoms(
     # Model:
-    placed: Placed,
+    shapes: GeomShapes,
     # In:
     live_in: wp.array[int],
     nacon_in: wp.array[int],
@@ -106,9 +106,9 @@ def pull_geoms(
     torque = wp.spatial_top(wrenches_in[con, side])
     force = wp.spatial_bottom(wrenches_in[con, side])
     wp.atomic_sub(
-        gradients_out.geom_pos, worldid, geom, wp.transpose(xmat_in[worldid, placed.geom_bodyid[geom]]) @ force
+        gradients_out.geom_pos, worldid, geom, wp.transpose(xmat_in[worldid, shapes.geom_bodyid[geom]]) @ force
     )
-    quat = placed.geom_quat[worldid % placed.geom_quat.shape[0], geom]
+    quat = shapes.geom_quat[worldid % shapes.geom_quat.shape[0], geom]
     wp.atomic_sub(gradients_out.geom_quat, worldid, geom, quat_gradient(quat, wp.transpose(mat) @ torque))
     # The normal leads from the first geom to the second, and the point is half way between both surfaces.
     away = float(1.0)
@@ -116,9 +116,9 @@ def pull_geoms(
         away = -1.0
     out = away * contacts_in.frame[con][0]
     arm = contacts_in.pos[con] - 0.5 * contacts_in.dist[con] * out - geom_xpos_in[worldid, geom]
-    size = placed.geom_size[worldid % placed.geom_size.shape[0], geom]
+    size = shapes.geom_size[worldid % shapes.geom_size.shape[0], geom]
     wp.atomic_sub(
-        gradients_out.geom_size, worldid, geom, size_slope(placed.geom_type[geom], size, mat, arm, out, force)
+        gradients_out.geom_size, worldid, geom, size_slope(shapes.geom_type[geom], size, mat, arm, out, force)
     )
 
 
@@ -130,7 +130,7 @@ class GeomStage(ParameterStage):
     def __init__(self, parts: Parts, gradients: dict[Any, Any]) -> None:
         super().__init__(parts, gradients)
         parts.contacts.keep_wrenches()
-        self._placed = gather(Placed, parts.work.model)
+        self._shapes = gather(GeomShapes, parts.work.model)
 
     def launch(self, at: Substep) -> None:
         work, d, contacts = self.parts.work, at.data, self.parts.contacts
@@ -138,7 +138,7 @@ class GeomStage(ParameterStage):
             pull_geoms,
             dim=(contacts.count, 2),
             inputs=[
-                self._placed,
+                self._shapes,
                 work.live,
                 d.nacon,
                 at.contacts,

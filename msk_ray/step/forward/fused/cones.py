@@ -21,11 +21,11 @@ class Cone:
     normal_rate: float
     """dN/dα."""
     along: float
-    """Part of u in the direction in which it changes, at α = 0."""
+    """Component of u along the direction of its change, at α = 0."""
     along_rate: float
     """|du/dα|."""
     across: float
-    """Square of the other part of u, which does not change."""
+    """Square of the constant component of u."""
     mu: float
     mass: float
     """m."""
@@ -41,7 +41,8 @@ class Cone:
 def update_contact(
     scratch: Scratch, world: int, contact: int, stiffness: wp.array[float], force: wp.array[float], state: wp.array[int]
 ) -> bool:
-    """Forces, states and weights of a contact's rows, by one lane; whether its part of the Hessian may have changed."""
+    """Compute forces, states and weights of a contact's rows, in one lane; returns whether its part of the Hessian may
+    have changed."""
     jar = scratch.jar[world]
     bound = scratch.bound[world]
     weight = scratch.weight[world]
@@ -62,7 +63,7 @@ def update_contact(
             put(weight, p, counts)
             put(force, p, -counts * at(jar, p))
             put_whole(state, p, now)
-        # Rows that leant go back.
+        # Restore rows that were replaced while sliding.
         put(scratch.leaning[world], contact, wp.where(before == SLIDING, -1.0, 0.0))
         return now != before
     mass = cone_mass(at(stiffness, first), mu)
@@ -92,11 +93,11 @@ def lean_rows(
     width: int,
     lane: int,
 ) -> None:
-    """The rows of a contact that add to the Hessian, by all lanes.
+    """Compute the rows of a contact that add to the Hessian, with all lanes.
 
     While it slides, its part of the Hessian is, with zᵢ = φᵢ Jᵢ, the direction û = u / T and p = Σ ûᵢ zᵢ,
-    m μ² (J₀ - p)(J₀ - p)ᵀ + m (μ² - μ N / T) Σ (zᵢ - ûᵢ p)(zᵢ - ûᵢ p)ᵀ: rows with weights that are not negative.
-    Otherwise they are those of J.
+    m μ² (J₀ - p)(J₀ - p)ᵀ + m (μ² - μ N / T) Σ (zᵢ - ûᵢ p)(zᵢ - ûᵢ p)ᵀ: rows with non-negative weights.
+    Otherwise they are the rows of J.
     """
     rows = scratch.rows[world]
     jar = scratch.jar[world]
@@ -118,7 +119,7 @@ def lean_rows(
 
 @wp.func
 def open_cone(scratch: Scratch, world: int, contact: int, stiffness: wp.array[float]) -> Cone:
-    """The contact on the line along the present direction."""
+    """Coefficients of the contact along the current direction."""
     jar = scratch.jar[world]
     rate = scratch.rate[world]
     bound = scratch.bound[world]
@@ -157,7 +158,7 @@ def open_cone(scratch: Scratch, world: int, contact: int, stiffness: wp.array[fl
     if vv > 0.0:
         c.along_rate = wp.sqrt(vv)
         c.along = uv / c.along_rate
-        # |u|² - along² by Lagrange's identity: the difference of two large numbers would be noise.
+        # |u|² - along² by Lagrange's identity, because the difference of two large numbers would be rounding noise.
         squares = float(0.0)
         for p in range(first + 2, end):
             u = at(bound, p) * at(jar, p)
@@ -216,7 +217,7 @@ def cost_at_start(c: Cone) -> float:
 
 @wp.func
 def cone_along(c: Cone, alpha: float) -> wp.vec3:
-    """Cost at α less that at 0, without taking the difference of two large numbers; its first and second derivative."""
+    """Cost at α minus cost at 0, without subtracting large numbers; with its first and second derivative."""
     tangent0 = wp.sqrt(c.along * c.along + c.across)
     state0 = zone(c.normal, tangent0, c.mu)
     gap0 = c.normal - c.mu * tangent0
@@ -234,7 +235,7 @@ def cone_along(c: Cone, alpha: float) -> wp.vec3:
         return wp.vec3(cost, 0.0, 0.0)
     springs = alpha * (c.slope + alpha * c.half_curvature)
     if state == QUADRATIC:
-        # All springs together cost ½ m (1 + μ²)(N² + T²), which is ½ m (μ N + T)² more than sliding does.
+        # All rows as springs cost ½ m (1 + μ²)(N² + T²), which is ½ m (μ N + T)² more than sliding.
         cost = springs
         if state0 == SATISFIED:
             cost = 0.5 * c.mass * (1.0 + c.mu * c.mu) * (normal * normal + squares)

@@ -1,4 +1,4 @@
-"""Dense linear algebra of the lanes of a world. Matrices are column by column, `width` numbers a column."""
+"""Dense linear algebra by the lanes of a world. Matrices are column-major, with `width` numbers per column."""
 
 import math
 
@@ -11,7 +11,7 @@ wp.set_module_options({"enable_backward": False})
 _NAN = wp.constant(math.nan)
 
 
-# Unrolled, so that the numbers of several terms are fetched together.
+# Unrolled, so that several terms are loaded at once.
 @wp.func_native("""
     float total = 0.0f;
 #if defined(__CUDA_ARCH__)
@@ -48,7 +48,7 @@ def multiply(
 
 @wp.func
 def factorize(matrix: wp.array[float], pivot: wp.array[float], size: int, width: int, lane: int) -> None:
-    """L D of a lower triangle L D Lᵀ in its place, and 1 / D; NaN where D is not positive."""
+    """Factor a lower triangle in place into L D of L D Lᵀ, with 1 / D; NaN where D is not positive."""
     for j in range(size):
         for i in range(j + lane, size, lane_count()):
             value = at(matrix, j * width + i) - pair_sum(pivot, matrix, i, j, width, j)
@@ -68,7 +68,7 @@ def solve_factored(
     partial: wp.array[float],
     solution: wp.array[float],
 ) -> None:
-    """solution = (L D Lᵀ)⁻¹ partial, which it overwrites."""
+    """solution = (L D Lᵀ)⁻¹ partial; overwrites `partial`."""
     for k in range(size):
         value = at(partial, k) * at(pivot, k)
         for i in range(k + 1 + lane, size, lane_count()):

@@ -1,8 +1,8 @@
 """The threads that work on one world: the lanes of a warp on a GPU, one on a CPU.
 
-All lanes of a world take the same branches wherever they meet: what they decide by is a `lane_sum`, which has the same
-bits in all of them. Numbers of a world are side by side in memory, and places in it are counted in 32 bits: Warp's own
-64-bit addresses would be most of the work.
+All lanes of a world take the same branches where they synchronise: decisions depend on a `lane_sum`, which has the same
+bits in all lanes. A world's numbers are contiguous in memory and indexed with 32 bits, because computing Warp's 64-bit
+addresses would be most of the work.
 """
 
 import warp as wp
@@ -30,7 +30,7 @@ def lane_count() -> int: ...
 def lane_sync() -> None: ...
 
 
-# What lane i adds to its sum is what lane i ^ offset adds to it, so that all end with the same bits.
+# Lanes i and i ^ offset add the same two numbers, so that all lanes end with the same bits.
 @wp.func_native("""
     float total = x;
 #if defined(__CUDA_ARCH__)

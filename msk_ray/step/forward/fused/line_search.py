@@ -1,4 +1,4 @@
-"""The exact line search: the least cost on the line a + α s along Newton's direction s."""
+"""The exact line search: minimises the cost along a + α s, with Newton's direction s."""
 
 import warp as wp
 
@@ -12,7 +12,7 @@ wp.set_module_options({"enable_backward": False})
 
 _ELLIPTIC = wp.constant(int(ConstraintType.CONTACT_ELLIPTIC))
 _NOISE = wp.constant(8.0 * 1.1920929e-07)
-"""Rounding of a sum of a few dozen numbers, as a share of their size, in float32."""
+"""Relative rounding of a float32 sum of a few dozen numbers."""
 _LEAST_SLOPE = wp.constant(1.0e-6)
 
 
@@ -27,7 +27,7 @@ def friction_cost(loss: float, edge: float, stiffness: float, jar: float) -> flo
 
 @wp.func
 def friction_along(loss: float, stiffness: float, jar: float, rate: float, alpha: float) -> wp.vec3:
-    """Cost at α less that at 0, and its derivatives, of a row of friction loss."""
+    """Cost at α minus cost at 0 of a friction-loss row, and its derivatives."""
     edge = loss / stiffness
     there = jar + alpha * rate
     cost = friction_cost(loss, edge, stiffness, there) - friction_cost(loss, edge, stiffness, jar)
@@ -40,7 +40,7 @@ def friction_along(loss: float, stiffness: float, jar: float, rate: float, alpha
 
 @wp.func
 def spring_along(stiffness: float, jar: float, rate: float, alpha: float) -> wp.vec3:
-    """The same of a row that only pushes."""
+    """The same for a row that only pushes."""
     there = jar + alpha * rate
     if there >= 0.0:
         return wp.vec3(wp.where(jar < 0.0, -0.5 * stiffness * jar * jar, 0.0), 0.0, 0.0)
@@ -52,7 +52,8 @@ def spring_along(stiffness: float, jar: float, rate: float, alpha: float) -> wp.
 
 @wp.func
 def row_along(rows: Rows, scratch: Scratch, w: World, r: int, alpha: float) -> wp.vec3:
-    """Cost at α less that at 0, and its derivatives, of a row that is no equality; 0 of an elliptic contact's."""
+    """Cost at α minus cost at 0 of a row that is not an equality, and its derivatives; 0 for rows of elliptic
+    contacts."""
     if whole(rows.type[w.id], r) == _ELLIPTIC:
         return wp.vec3(0.0)
     stiffness = at(rows.D[w.id], r)
@@ -80,7 +81,7 @@ def row_cost(rows: Rows, scratch: Scratch, w: World, r: int) -> float:
 
 @wp.func
 def cost_along(rows: Rows, scratch: Scratch, w: World, smooth: wp.vec2, alpha: float) -> wp.vec3:
-    """Cost at α less that at 0, and its first and second derivative."""
+    """Cost at α minus cost at 0, and its first and second derivative."""
     total = wp.vec3(0.0)
     for r in range(w.equalities + w.lane, w.rows, lane_count()):
         total += row_along(rows, scratch, w, r, alpha)
@@ -92,7 +93,7 @@ def cost_along(rows: Rows, scratch: Scratch, w: World, smooth: wp.vec2, alpha: f
 
 @wp.func
 def open_rows(rows: Rows, scratch: Scratch, w: World) -> wp.vec2:
-    """J s of every row; of equalities, what they add to slope and curvature at α = 0."""
+    """J s of every row; and what equalities add to slope and curvature at α = 0."""
     jacobian = rows.jacobian[w.id]
     direction = scratch.direction[w.id]
     smooth = wp.vec2(0.0)
@@ -111,17 +112,17 @@ def open_rows(rows: Rows, scratch: Scratch, w: World) -> wp.vec2:
 def search_line(
     rows: Rows, scratch: Scratch, tau: wp.array[float], w: World, least: float, limit: int
 ) -> tuple[float, float, bool]:
-    """Newton's method for the zero of the cost's slope, which halves its bracket where it does not halve the slope.
+    """Newton's method for the zero of the cost's slope; bisects the bracket when a step does not halve the slope.
 
     Args:
         tau: the smooth force.
-        least: the slope below which a point counts as the least; rounding of the slope may raise it.
-        limit: of evaluations.
+        least: slope below which a point counts as the minimum; raised to the rounding of the slope.
+        limit: largest number of evaluations.
 
     Returns:
-        α, by how much it lowers the cost, and whether it was found within the limit.
+        α, the decrease of the cost, and whether it converged within the limit.
     """
-    # What is quadratic everywhere: inertia and equalities.
+    # The quadratic part: inertia and equalities.
     smooth = open_rows(rows, scratch, w)
     for i in range(w.lane, w.nv, lane_count()):
         s = at(scratch.direction[w.id], i)
@@ -142,7 +143,7 @@ def search_line(
     cost = lane_sum(cost)
     slope = start[1] + smooth[0]
     curvature = start[2] + smooth[1]
-    # Of a sum of squares, |Σ D jar rate| <= √(2 cost curvature): the size of the numbers that the slope adds up.
+    # By Cauchy-Schwarz, |Σ D jar rate| <= √(2 cost curvature): the magnitude of the slope's terms.
     size = wp.sqrt(2.0 * cost * start[2]) + wp.abs(smooth[0])
     enough = wp.max(wp.max(least, _LEAST_SLOPE), _NOISE * size)
     best = float(0.0)

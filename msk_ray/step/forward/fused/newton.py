@@ -1,4 +1,4 @@
-"""Newton's method for the constraint forces of a world, by one warp from the first iteration to the last."""
+"""Newton's method for the constraint forces of a world, with all iterations in one warp."""
 
 import warp as wp
 from mujoco_warp import OverflowType
@@ -38,7 +38,7 @@ class Inertia:
 
 @wp.struct
 class Solution:
-    """What else the solver leaves in mujoco_warp's Data."""
+    """Other results of the solver in mujoco_warp's Data."""
 
     qacc: wp.array2d[float]
     Ma: wp.array2d[float]
@@ -49,7 +49,7 @@ class Solution:
 
 @wp.struct
 class Limits:
-    """When the solver stops."""
+    """Stopping criteria of the solver."""
 
     tolerance: wp.array[float]
     ls_tolerance: wp.array[float]
@@ -121,19 +121,19 @@ def iterate(
     scale: float,
     out: Solution,
 ) -> None:
-    """Newton's iterations from the present acceleration on; `scale` is the reciprocal of the trace of M."""
+    """Newton's iterations from the current acceleration; `scale` is the reciprocal of the trace of M."""
     tolerance = limits.tolerance[w.id % limits.tolerance.shape[0]]
     ls_tolerance = limits.ls_tolerance[w.id % limits.ls_tolerance.shape[0]]
     missed = int(0)
     update_rows(rows, scratch, w)
     update_gradient(rows, scratch, smooth, w)
     factor_hessian(scratch, w, given.dof_tri_row, given.dof_tri_col)
-    found = find_direction(scratch, w)
+    norms = find_direction(scratch, w)
     done = bool(False)
     count = int(0)
     while count < limits.iterations and not done:
         multiply(scratch.inertia[w.id], scratch.direction[w.id], w.nv, w.width, w.lane, scratch.moved[w.id])
-        least = tolerance * ls_tolerance * wp.sqrt(found[0]) / scale
+        least = tolerance * ls_tolerance * wp.sqrt(norms[0]) / scale
         alpha, gain, exact = search_line(rows, scratch, smooth, w, least, limits.ls_iterations)
         if not exact:
             missed = _LS_ITERATIONS
@@ -145,8 +145,8 @@ def iterate(
         if not done:
             if changed:
                 factor_hessian(scratch, w, given.dof_tri_row, given.dof_tri_col)
-            found = find_direction(scratch, w)
-            done = 0.5 * scale * found[1] < tolerance
+            norms = find_direction(scratch, w)
+            done = 0.5 * scale * norms[1] < tolerance
     if not done and limits.iterations > 0:
         missed = missed | _ITERATIONS
     if w.lane == 0:
@@ -177,7 +177,7 @@ def solve_world(
     scratch: Scratch,
     out: Solution,
 ) -> None:
-    """The acceleration of least cost of one world, and the forces there. Without rows it is the smooth one."""
+    """Solve one world for its acceleration and constraint forces. Without rows, this is the smooth acceleration."""
     thread = wp.tid()
     w = World()
     w.id = thread // lane_count()

@@ -1,4 +1,4 @@
-"""The constraint problem of one world: min over a of ½ (a - a⁰)ᵀ M (a - a⁰) + Σ s(J a - aref), s being costs of rows.
+"""The constraint problem of one world: min over a of ½ (a - a⁰)ᵀ M (a - a⁰) + Σ s(J a - aref), with s the rows' costs.
 
 Axes: W worlds, R rows, C contacts.
 """
@@ -21,7 +21,7 @@ _LINEARPOS = wp.constant(int(private.ConstraintState.LINEARPOS))
 
 @wp.struct
 class Rows:
-    """mujoco_warp's rows, (W, R), with what contacts add to them, (C,)."""
+    """mujoco_warp's constraint rows, (W, R), with their contacts' data, (C,)."""
 
     type: wp.array2d[int]
     id: wp.array2d[int]
@@ -29,9 +29,9 @@ class Rows:
     aref: wp.array2d[float]
     frictionloss: wp.array2d[float]
     jacobian: wp.array2d[float]
-    """J, (W, ...), row by row."""
+    """J, (W, ...), row-major."""
     stride: int
-    """Numbers of its rows, more than there are degrees of freedom."""
+    """Length of its rows, nv or more."""
     force: wp.array2d[float]
     """Written."""
     state: wp.array2d[int]
@@ -42,23 +42,23 @@ class Rows:
 
 @wp.struct
 class World:
-    """Sizes of one world's problem, known to all of its lanes."""
+    """Sizes of one world's problem, the same in all its lanes."""
 
     id: int
     lane: int
     nv: int
     width: int
-    """nv in whole fours."""
+    """nv rounded up to a multiple of four."""
     rows: int
     equalities: int
     frictions: int
     contacts: int
-    """Elliptic ones."""
+    """Number of elliptic contacts."""
 
 
 @wp.func
 def find_contacts(rows: Rows, scratch: Scratch, w: World, begin: int, impratio: float) -> int:
-    """Number of elliptic contacts among the rows from `begin` on; one of which rows are lost is left out."""
+    """Number of elliptic contacts among the rows from `begin` on, without contacts that lost rows."""
     kind = rows.type[w.id]
     bound = scratch.bound[w.id]
     count = int(0)
@@ -88,7 +88,7 @@ def find_contacts(rows: Rows, scratch: Scratch, w: World, begin: int, impratio: 
 
 @wp.func
 def read_rows(rows: Rows, scratch: Scratch, w: World) -> None:
-    """J a - aref, and the rows as they add to the Hessian."""
+    """Compute J a - aref, and the rows that add to the Hessian."""
     jacobian = rows.jacobian[w.id]
     acc = scratch.acc[w.id]
     for r in range(w.lane, w.rows, lane_count()):
@@ -107,7 +107,7 @@ def read_rows(rows: Rows, scratch: Scratch, w: World) -> None:
 
 @wp.func
 def update_rows(rows: Rows, scratch: Scratch, w: World) -> bool:
-    """Forces, states and weights of all rows at their J a - aref; whether the Hessian may have changed."""
+    """Compute forces, states and weights of all rows from J a - aref; returns whether the Hessian may have changed."""
     stiffness = rows.D[w.id]
     force = rows.force[w.id]
     state = rows.state[w.id]
@@ -149,7 +149,7 @@ def update_rows(rows: Rows, scratch: Scratch, w: World) -> bool:
 
 @wp.func
 def update_gradient(rows: Rows, scratch: Scratch, smooth: wp.array[float], w: World) -> float:
-    """Jᵀ f and the gradient M a - τ - Jᵀ f; returns its square."""
+    """Compute Jᵀ f and the gradient M a - τ - Jᵀ f; returns its squared norm."""
     force = rows.force[w.id]
     jacobian = rows.jacobian[w.id]
     square = float(0.0)
@@ -165,7 +165,7 @@ def update_gradient(rows: Rows, scratch: Scratch, smooth: wp.array[float], w: Wo
 
 @wp.func
 def factor_hessian(scratch: Scratch, w: World, tri_row: wp.array[int], tri_col: wp.array[int]) -> None:
-    """Factors of the Hessian, M plus the weighted squares of the rows, of which each lane adds up some entries."""
+    """Build and factor the Hessian, M + Σ weight · row rowᵀ; each lane computes some entries."""
     rows = scratch.rows[w.id]
     weight = scratch.weight[w.id]
     factor = scratch.factor[w.id]

@@ -1,4 +1,4 @@
-"""What a world's lanes keep between their loops, in memory that is allocated once."""
+"""Scratch memory of the worlds, allocated once."""
 
 from typing import Any
 
@@ -8,22 +8,23 @@ from msk_ray.step.errors import ConfigError
 from msk_ray.step.forward.fused.lanes import WARP
 
 CONE = wp.constant(10)
-"""Numbers that the line search keeps of each elliptic contact."""
+"""Numbers per elliptic contact that the line search stores."""
 _MOST = 2**31 - 1
 
 
 @wp.struct
 class Scratch:
-    """For W worlds of R rows, C elliptic contacts, and P degrees of freedom in whole fours. Every array is (W, ...)."""
+    """Scratch for W worlds of R rows, C elliptic contacts, and P: nv rounded up to a multiple of four. Arrays are (W,
+    ...)."""
 
     inertia: wp.array2d[float]
     """M, symmetric, P²."""
     factor: wp.array2d[float]
-    """The lower triangle of the Hessian, and then L D of its factors L D Lᵀ, column by column, P²."""
+    """The lower triangle of the Hessian, then L D of its factors L D Lᵀ, column-major, P²."""
     pivot: wp.array2d[float]
     """Reciprocals of D, P."""
     rows: wp.array2d[float]
-    """The rows whose weighted squares add to the Hessian: J, but other ones where a contact slides, R P."""
+    """The rows whose weighted squares add to the Hessian: J, but replaced for sliding contacts, R P."""
     jar: wp.array2d[float]
     """J a - aref, R."""
     rate: wp.array2d[float]
@@ -31,11 +32,11 @@ class Scratch:
     weight: wp.array2d[float]
     """Weight of each of `rows`, R."""
     bound: wp.array2d[float]
-    """μ in the first row of an elliptic contact, and the coefficients of friction in its others, R."""
+    """μ in the first row of an elliptic contact, the friction coefficients in its other rows, R."""
     cones: wp.array2d[float]
-    """What the line search knows of each elliptic contact, 10 C."""
+    """Coefficients of each elliptic contact for the line search, 10 C."""
     leaning: wp.array2d[float]
-    """1 / T of each elliptic contact that slides; -1 where one has just ceased to, 0 of the others, C."""
+    """1 / T for sliding elliptic contacts; -1 for those that have just stopped sliding, 0 for others, C."""
     first: wp.array2d[int]
     """First row of each elliptic contact, C."""
     end: wp.array2d[int]
@@ -49,7 +50,7 @@ class Scratch:
     gradient: wp.array2d[float]
     """M a - τ - Jᵀ f, P."""
     partial: wp.array2d[float]
-    """What is left of a system of equations while it is solved, P."""
+    """Partial right-hand side while a system is solved, P."""
     direction: wp.array2d[float]
     """Newton's direction, P."""
     moved: wp.array2d[float]
@@ -57,15 +58,15 @@ class Scratch:
 
 
 def padded(nv: int) -> int:
-    """Degrees of freedom in whole fours."""
+    """nv rounded up to a multiple of four."""
     return -(-nv // 4) * 4
 
 
 def make_scratch(worlds: int, rows: int, nv: int) -> Any:
-    """Arrays for as many worlds, rows a world and degrees of freedom, on the current device.
+    """Arrays for these numbers of worlds, rows per world and degrees of freedom, on the current device.
 
     Raises:
-        ConfigError: the threads would be too many to be counted in 32 bits.
+        ConfigError: there are too many threads for 32-bit indices.
     """
     if worlds * WARP > _MOST:
         raise ConfigError(

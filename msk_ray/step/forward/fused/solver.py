@@ -1,4 +1,4 @@
-"""The solver as a launch, for models that it can take."""
+"""Launching the fused solver, and checking which models it supports."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -15,27 +15,27 @@ from msk_ray.step.forward.fused.problem import Rows
 from msk_ray.step.forward.fused.scratch import make_scratch
 
 MOST_DOFS = 60
-"""Degrees of freedom up to which MuJoCo itself takes a dense Jacobian."""
+"""Number of degrees of freedom up to which MuJoCo itself uses a dense Jacobian."""
 _BLOCK = 64
-"""Threads of a block: two worlds."""
+"""Threads per block: two worlds."""
 
 
 def check_fused(mjm: mujoco.MjModel) -> None:
-    """Raise UnsupportedModelError where a step needs another solver, or solves more than once."""
+    """Raise UnsupportedModelError if the model needs another solver, or more than one solve per step."""
     option = mjm.opt
     known = (
         mujoco.mjtIntegrator.mjINT_EULER,
         mujoco.mjtIntegrator.mjINT_IMPLICIT,
         mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
     )
-    found = {
+    obstacles = {
         "solver CG or PGS": option.solver != mujoco.mjtSolver.mjSOL_NEWTON,
         f"integrator {mujoco.mjtIntegrator(option.integrator).name[6:]}": option.integrator not in known,
         "noslip iterations": option.noslip_iterations > 0,
         "flexes": mjm.nflex > 0,
         f"{mjm.nv} degrees of freedom, more than {MOST_DOFS}": mjm.nv > MOST_DOFS,
     }
-    names = [name for name, present in found.items() if present]
+    names = [name for name, present in obstacles.items() if present]
     if names:
         raise UnsupportedModelError(
             f"the model uses {', '.join(names)}, for which there is no fused solver: write "
@@ -44,17 +44,17 @@ def check_fused(mjm: mujoco.MjModel) -> None:
 
 
 class FusedSolver:
-    """Newton's method of each world in one warp, from its first iteration to its last: one launch a step.
+    """Newton's method with all iterations of a world in one warp: one launch per step.
 
-    The mathematics, the criteria to stop and the results in Data are those of `mujoco_warp.solve` for a dense Jacobian.
-    A world stops when it has converged, and waits for no other.
+    Mathematics, stopping criteria and results in Data are the same as of `mujoco_warp.solve` with a dense Jacobian.
+    Each world stops when it has converged, without waiting for others.
     """
 
     def __init__(self) -> None:
         self._scratch: dict[tuple[int, int, int], Any] = {}
 
     def __call__(self, model: Any, data: Any) -> None:
-        """Launch it on what the stages before it left in `data`."""
+        """Launch the solver on the results of the earlier stages in `data`."""
         if data.njmax == 0 or model.nv == 0:
             mjw.solve(model, data)
             return
@@ -78,7 +78,7 @@ class FusedSolver:
 
 
 def _rows(data: Any) -> Any:
-    """The rows of `data`, with its Jacobian as one row of numbers for each world."""
+    """The rows of `data`, with the Jacobian flattened to one row per world."""
     jacobian = data.efc.J
     worlds, count, width = jacobian.shape
     assert jacobian.is_contiguous, "the rows of the Jacobian are not side by side"

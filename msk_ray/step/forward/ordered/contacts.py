@@ -1,4 +1,4 @@
-"""Contacts in the order of their worlds, geoms and numbers, instead of the order in which threads found them."""
+"""Sorts contacts by world, geoms and number, instead of the order in which threads found them."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def is_before(contacts: ContactRecords, i: int, j: int) -> bool:
-    """Whether contact i of a world comes before its contact j. Ties are contacts of the same place."""
+    """Whether contact i of a world comes before its contact j. Equal keys are at the same place in the sorted order."""
     a, b = contacts.geom[i], contacts.geom[j]
     if a[0] != b[0]:
         return a[0] < b[0]
@@ -78,7 +78,7 @@ def find_first(
     # Out:
     first_out: wp.array[int],
 ) -> None:
-    """Place of each world's first contact in the sorted list."""
+    """Index of each world's first contact in the sorted list."""
     worldid = wp.tid()
     block = worldid // width
     first = int(0)
@@ -99,7 +99,7 @@ def gather_by_world(
     taken_out: wp.array[int],
     member_out: wp.array[int],
 ) -> None:
-    """The contacts of each world side by side, in any order: the next kernel does not depend on it."""
+    """Group contacts by world, in any order within a world: the next kernel does not depend on it."""
     con = wp.tid()
     if con < wp.min(nacon_in[0], worldid_in.shape[0]):
         worldid = worldid_in[con]
@@ -118,7 +118,7 @@ def sort_into(
     source_out: wp.array[int],
     sorted_out: ContactRecords,
 ) -> None:
-    """Copies every contact to its place in the sorted list."""
+    """Copy every contact to its index in the sorted list."""
     i = wp.tid()
     if i >= wp.min(nacon_in[0], member_in.shape[0]):
         return
@@ -143,7 +143,7 @@ def take_back(
     # Out:
     contacts_out: ContactRecords,
 ) -> None:
-    """Copies contacts whose place changed from the sorted list."""
+    """Copy back contacts whose index has changed."""
     i = wp.tid()
     if i < wp.min(nacon_in[0], source_in.shape[0]) and source_in[i] != i:
         copy_contact(sorted_in, i, contacts_out, i)
@@ -153,7 +153,7 @@ class ContactOrder:
     """Sorts the contacts of a `mujoco_warp.Data`, between collision detection and the constraint rows.
 
     Args:
-        data: any Data of the same size as those whose contacts are to be sorted.
+        data: any Data of the same size as the Data whose contacts are to be sorted.
     """
 
     def __init__(self, data: Any) -> None:

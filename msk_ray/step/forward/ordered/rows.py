@@ -1,4 +1,4 @@
-"""Constraint rows in the order of what they belong to, instead of the order in which threads asked for room."""
+"""Sorts constraint rows by their elements, instead of the order in which threads allocated them."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class RowRecords:
-    """Rows whole, to be moved: all but the Jacobian that mujoco_warp has of them before the solver starts, (W, R)."""
+    """All arrays of constraint rows before the solver starts, except the Jacobian, (W, R), for moving rows."""
 
     type: wp.array2d[int]
     id: wp.array2d[int]
@@ -49,10 +49,10 @@ def sort_rows(
     sorted_out: RowRecords,
     jacobian_out: wp.array3d[float],
 ) -> None:
-    """Copies every row to its place: by kind, then by the element it belongs to; rows of one element stay together.
+    """Copy every row to its sorted index: by kind, then by element; rows of one element keep their order.
 
-    The kinds follow each other as mujoco_warp makes them, so that counts of equality, friction and limit rows hold.
-    Rows of one element have consecutive places before, given to it at once.
+    Kinds are in mujoco_warp's order, so that its counts of equality, friction and limit rows hold. Rows of one element
+    are consecutive, because they are allocated together.
     """
     worldid, row = wp.tid()
     count = wp.min(nefc_in[worldid], njmax)
@@ -88,7 +88,7 @@ def take_back(
     rows_out: RowRecords,
     jacobian_out: wp.array3d[float],
 ) -> None:
-    """Copies rows whose place changed from the sorted list."""
+    """Copy back rows whose index has changed."""
     worldid, row = wp.tid()
     if row < wp.min(nefc_in[worldid], njmax) and source_in[worldid, row] != row:
         copy_row(sorted_in, rows_out, worldid, row, row)
@@ -105,7 +105,7 @@ def follow_rows(
     # Out:
     address_out: wp.array2d[int],
 ) -> None:
-    """Tells every contact where its rows went."""
+    """Update every contact's addresses of rows."""
     con = wp.tid()
     if con >= wp.min(nacon_in[0], address_out.shape[0]):
         return
@@ -116,7 +116,7 @@ def follow_rows(
 
 
 class RowOrder:
-    """Sorts the constraint rows of a `mujoco_warp.Data` with a dense Jacobian, once they are made.
+    """Sorts the constraint rows of a `mujoco_warp.Data` with a dense Jacobian, after they are built.
 
     Args:
         data: any Data of the same size as those whose rows are to be sorted.

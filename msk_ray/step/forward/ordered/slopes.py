@@ -1,7 +1,7 @@
-"""The matrix M - h ∂τ/∂v of the implicitfast integrator, to which actuators add in their order.
+"""The matrix M - h ∂τ/∂v of the implicitfast integrator, with the actuators' terms added in order.
 
-In mujoco_warp the threads of all actuators add to it at once. Here its public functions see actuators that do not
-answer to velocity, and so add nothing, and one thread for each entry subtracts what the actuators give.
+In mujoco_warp the threads of all actuators add to it at once. Here its public functions see actuators without velocity
+dependence, which add nothing, and one thread per entry subtracts the actuators' terms.
 """
 
 import copy
@@ -18,8 +18,8 @@ wp.set_module_options({"enable_backward": False})
 
 
 def slopes_apart(mjm: mujoco.MjModel, model: Any) -> bool:
-    """Whether actuators are all that race for this matrix, and a step has no other use of how they answer to velocity:
-    no fluid, no free body that is integrated apart, no DC motor, no delayed control."""
+    """Whether only actuators race for this matrix, and nothing else in a step uses their velocity dependence: no fluid,
+    no separately integrated free body, no DC motor, no delayed control."""
     kinds = [int(value) for value in (*mjm.actuator_dyntype, *mjm.actuator_biastype)]
     motors = any(value == int(mjw.DynType.DCMOTOR) or value == int(mjw.BiasType.DCMOTOR) for value in kinds)
     return not (motors or model.has_fluid or model.body_freeadr.size or model.nhistory)
@@ -42,7 +42,7 @@ def subtract_slopes(
     # Out:
     matrix_out: wp.array2d[float],
 ) -> None:
-    """An entry (i, j) of M - h Σ m_i m_j dF/dv over the actuators, m being their moments."""
+    """Compute an entry (i, j) of M - h Σ m_i m_j dF/dv over the actuators, with their moments m."""
     worldid, pair = wp.tid()
     i = M_fullm_i[pair]
     j = M_fullm_j[pair]
@@ -79,7 +79,7 @@ class SlopeOrder:
         self._still.actuator_gaintype = wp.full_like(model.actuator_gaintype, int(mjw.GainType.FIXED))
         self._still.actuator_biastype = wp.full_like(model.actuator_biastype, int(mjw.BiasType.NONE))
         flags = mujoco.mjtDisableBit.mjDSBL_ACTUATION | mujoco.mjtDisableBit.mjDSBL_DAMPER
-        # As in mujoco_warp, which takes M itself where either is disabled.
+        # As in mujoco_warp, which uses M itself if either is disabled.
         self._active = bool(np.size(mjm.actuator_gaintype)) and not mjm.opt.disableflags & flags
         self._scratch: dict[int, tuple[wp.array, wp.array]] = {}
 
@@ -93,7 +93,7 @@ class SlopeOrder:
         """Launch `mujoco_warp.implicit`."""
         own = data
         if self._active:
-            # It subtracts dampers from M alone. What depends on M only, is done by now.
+            # mujoco_warp subtracts dampers from M. Everything else that reads M is already done.
             own = copy.copy(data)
             own.M = self._arrays(model, data)[1]
             self._subtract(model, data, data.M, own.M)  # writes all entries

@@ -1,8 +1,8 @@
 """mujoco_warp's Newton solver with its two unordered sums, |gradient|² and the Hessian of cones, in a fixed order.
 
-The loop is that of `solver._solve` of mujoco_warp 4.0.0 for a dense Jacobian. Its incremental update of the
-Hessian for pyramids, whose order of rows is that of atomics, is left out: the Hessian is built in every iteration, as
-the package itself does for elliptic cones.
+The loop is the one of `solver._solve` in mujoco_warp 4.0.0 for a dense Jacobian, without its incremental update of the
+Hessian for pyramids, which adds rows in the order of atomics: here the Hessian is rebuilt in every iteration, as
+mujoco_warp itself does for elliptic cones.
 """
 
 from typing import Any
@@ -30,7 +30,7 @@ def gradient(
     gradient_out: wp.array2d[float],
     square_out: wp.array[float],
 ) -> None:
-    """Ma - τ - Jᵀf of every dof; the first dof's thread adds the squares of all of them up, in their order."""
+    """Compute Ma - τ - Jᵀf of every dof; the first dof's thread sums all squares in order."""
     worldid, dof = wp.tid()
     if done_in[worldid]:
         return
@@ -69,7 +69,7 @@ def cone_hessian(
     # Out:
     hessian_out: wp.array3d[float],
 ) -> None:
-    """Adds the curvature of sliding contacts to one entry of a world's Hessian, contact after contact.
+    """Add the curvature of sliding contacts to one entry of a world's Hessian, contact by contact.
 
     With N = μ jar₀, uᵢ = φᵢ jarᵢ, T = |u|, z₀ = μ J₀, zᵢ = φᵢ Jᵢ, p = u·z / T and Dm = D₀ / (μ²(1 + μ²)):
     Dm (z₀ z₀' - μ (z₀ p' + z₀' p) + (μ N / T) p p' + (μ² - μ N / T) Σ zᵢ zᵢ').
@@ -119,7 +119,7 @@ def cone_hessian(
 
 
 def _direction(m: Any, d: Any, context: Any) -> None:
-    """Launch gradient, Hessian and Newton direction at the present acceleration."""
+    """Launch gradient, Hessian and Newton direction at the current acceleration."""
     wp.launch(
         private.update_gradient_zero_grad_dot(False),
         dim=d.nworld,
@@ -173,7 +173,7 @@ def _iteration(m: Any, d: Any, context: Any, nsolving: wp.array) -> None:
 
 
 def solve(m: Any, d: Any) -> None:
-    """Launch what `mujoco_warp.solve` does, for the Newton solver and rows that are sorted."""
+    """Launch the equivalent of `mujoco_warp.solve` for the Newton solver, on sorted rows."""
     if d.njmax == 0 or m.nv == 0:
         mjw.solve(m, d)
         return

@@ -1,4 +1,4 @@
-"""The stages of a step, between which contacts and rows are sorted."""
+"""The stages of a step with ordered sums; contacts and rows are sorted between them."""
 
 import copy
 from typing import Any
@@ -19,9 +19,9 @@ from msk_ray.step.forward.stages import ComposedStages, Solver, with_options
 
 
 def check_ordered(mjm: mujoco.MjModel) -> None:
-    """Raise UnsupportedModelError where sums of a step have no fixed order here."""
+    """Raise UnsupportedModelError for a model whose step has sums without a fixed order here."""
     option = mjm.opt
-    found = {
+    obstacles = {
         "solver CG or PGS": option.solver != mujoco.mjtSolver.mjSOL_NEWTON,
         "integrator RK4": option.integrator == mujoco.mjtIntegrator.mjINT_RK4,
         "noslip iterations": option.noslip_iterations > 0,
@@ -29,7 +29,7 @@ def check_ordered(mjm: mujoco.MjModel) -> None:
         "surface velocities": bool(np.any(getattr(mjm, "geom_surfacevel", np.zeros(0)))),
         "actuators on bodies (adhesion)": bool(np.any(mjm.actuator_trntype == mujoco.mjtTrn.mjTRN_BODY)),
     }
-    names = [name for name, present in found.items() if present]
+    names = [name for name, present in obstacles.items() if present]
     if names:
         raise UnsupportedModelError(
             f"the model uses {', '.join(names)}, whose sums have no fixed order on a GPU: write "
@@ -38,14 +38,14 @@ def check_ordered(mjm: mujoco.MjModel) -> None:
 
 
 def racing(mjm: mujoco.MjModel, model: Any) -> frozenset[str]:
-    """Stages of mujoco_warp in which several threads add to one number that the state depends on, the solver aside.
+    """Stages of mujoco_warp, without the solver, in which several threads add to one number that the state depends on.
 
-    A number to which one thread adds once, after it was set to zero, needs no order, and neither do zeros.
+    A number to which only one thread adds, once, after it was set to zero, needs no order; neither do zeros.
     """
     trees = np.asarray(mjm.tree_dofnum)
-    found = {
+    races_in = {
         "inertia": bool(np.any(mjm.tendon_armature)),
-        # J v of a row is added up in parts.
+        # J v of a row is summed in parts.
         "constraint": model.nv_pad > model.block_dim.contact_jac_tiled,
         "velocity": bool(np.any(mjm.body_gravcomp))
         or any(np.any(getattr(mjm, f"tendon_{name}", 0)) for name in _TENDON_FORCES),
@@ -55,12 +55,12 @@ def racing(mjm: mujoco.MjModel, model: Any) -> frozenset[str]:
         "acceleration": len(trees) > 0 and int(trees.max()) > _DENSE_TREE,
         "integration": mjm.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER and not slopes_apart(mjm, model),
     }
-    return frozenset(name for name, races in found.items() if races)
+    return frozenset(name for name, races in races_in.items() if races)
 
 
 _TENDON_FORCES = ("stiffness", "stiffnesspoly", "damping", "dampingpoly", "armature")
 _DENSE_TREE = 64
-"""Degrees of freedom of a tree up to which mujoco_warp factors its inertia as one dense block."""
+"""Number of degrees of freedom of a tree up to which mujoco_warp factors its inertia as one dense block."""
 
 
 @wp.kernel(enable_backward=False)
@@ -74,7 +74,7 @@ def sum_actuators(
     # Out:
     qfrc_actuator_out: wp.array2d[float],
 ) -> None:
-    """Generalised force of all actuators on a dof, in their order."""
+    """Compute the generalised force of all actuators on a dof, in order."""
     worldid, dof = wp.tid()
     total = float(0.0)
     for u in range(force_in.shape[1]):
@@ -90,9 +90,9 @@ class OrderedStages(ComposedStages):
 
     Args:
         mjm: the MjModel.
-        model: mujoco_warp's model of it, with a dense Jacobian, before it is sealed. Contacts are sorted by its public
-            hook `callback.contactfilter`, which ends collision detection, after what was there before.
-        fused: a solver whose sums have an order by themselves; None for mujoco_warp's with an order.
+        model: mujoco_warp's model of it, with a dense Jacobian, before it is sealed. Contacts are sorted in its public
+            hook `callback.contactfilter`, at the end of collision detection, after an existing callback.
+        fused: a solver with ordered sums; None for the ordered version of mujoco_warp's.
     """
 
     ordered = True
@@ -115,7 +115,7 @@ class OrderedStages(ComposedStages):
         self._rows: dict[tuple[int, int], RowOrder] = {}
 
     def sort_contacts(self, model: Any, data: Any) -> None:
-        """Launch the sort of the contacts that collision detection has found."""
+        """Launch the sort of contacts after collision detection."""
         if self._correct_contacts is not None:
             self._correct_contacts(model, data)
         size = (data.nworld, data.naconmax)
@@ -131,7 +131,7 @@ class OrderedStages(ComposedStages):
         self._rows[size].launch(data)
 
     def position(self, model: Any, data: Any) -> None:
-        """Launch the position stage, and the sort of its rows."""
+        """Launch the position stage and the sort of its rows."""
         if "inertia" in self.racing:
             mjw.fwd_position(self._atomic, data, factorize=False)
         else:
@@ -159,11 +159,11 @@ class OrderedStages(ComposedStages):
             mjw.deriv_smooth_vel(self.of("integration", model), data, out)
 
     def summing(self, model: Any) -> Any:
-        """A model whose sums through atomics Warp adds up in a fixed order."""
+        """A copy of the model with which Warp runs atomic sums in a fixed order."""
         return self._atomic if self.racing else model
 
     def of(self, stage: str, model: Any) -> Any:
-        """The model for a stage, with sums in a fixed order where its threads race."""
+        """The model for a stage; with ordered atomics if the stage's threads race."""
         return self._atomic if stage in self.racing else model
 
     def actuation(self, model: Any, data: Any) -> None:
@@ -181,18 +181,18 @@ class OrderedStages(ComposedStages):
             )
 
     def integrate(self, model: Any, data: Any) -> None:
-        """Launch the step in time."""
+        """Launch the integration."""
         if self._slopes is not None:
             self._slopes.integrate(model, data)
         else:
             super().integrate(model, data)
 
     def _solve_ordered(self, model: Any, data: Any) -> None:
-        # For many degrees of freedom the solver adds rows up in parts.
+        # For many degrees of freedom the solver sums rows in parts.
         many = model.nv > _ROW_DOFS
         fixed = {"graph_conditional": False, "iterations": model.opt.iterations}
         solve(with_options(self._atomic, **fixed) if many else model, data)
 
 
 _ROW_DOFS = 50
-"""Degrees of freedom up to which one thread multiplies a whole row of the Jacobian in mujoco_warp's solver."""
+"""Number of degrees of freedom up to which one thread multiplies a whole Jacobian row in mujoco_warp's solver."""

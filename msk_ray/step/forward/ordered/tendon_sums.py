@@ -1,8 +1,8 @@
-"""Lengths and Jacobians of tendons, added up element after element of their paths.
+"""Lengths and Jacobians of tendons, summed element by element along their paths.
 
-mujoco_warp gives every joint, pair of sites and geom of all tendons a thread, which adds to its tendon's length. Here
-its public `tendon` runs on the first elements of all tendons, then on the second ones, and so on: in each run no two
-threads have the same tendon.
+In mujoco_warp, every joint, pair of sites and geom on a tendon has a thread that adds to the tendon's length. Here its
+public `tendon` runs on the first elements of all tendons, then on the second ones, and so on, so that no two threads of
+a run share a tendon.
 """
 
 import copy
@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 _KINDS = ("jnt", "site_pair", "geom")
-"""Kinds of elements, each with two arrays of the model: the tendon of every element, and where it is."""
+"""Kinds of elements, each with two arrays of the model: the elements' tendons, and their addresses."""
 
 
 @wp.kernel(enable_backward=False)
@@ -39,7 +39,7 @@ class TendonOrder:
         ranks = {kind: _rank(getattr(model, f"tendon_{kind}_adr").numpy()) for kind in _KINDS}
         for k in range(1 + max((int(r.max()) for r in ranks.values() if r.size), default=-1)):
             part = copy.copy(model)
-            # Points of the path, for drawing, which nobody here looks at.
+            # Points of the path are for drawing only, and unused here.
             part.tendon_num = wp.zeros_like(model.tendon_num)
             for kind, rank in ranks.items():
                 for name in (f"tendon_{kind}_adr", f"wrap_{kind}_adr"):
@@ -65,7 +65,7 @@ class TendonOrder:
 
 
 def _rank(tendons: np.ndarray) -> np.ndarray:
-    """How many elements before each one have its tendon."""
+    """For each element, its position along its tendon, from 0."""
     seen: dict[int, int] = {}
     ranks = []
     for tendon in tendons:

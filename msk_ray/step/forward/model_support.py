@@ -1,4 +1,4 @@
-"""Models that a batch does not accept: their step would be another one than C MuJoCo's, without a word."""
+"""Refuses models that mujoco_warp would silently step unlike C MuJoCo."""
 
 from collections.abc import Callable, Iterable
 
@@ -15,30 +15,30 @@ _SLIDING = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
 _LEAST = float(mujoco.mjMINIMP), float(mujoco.mjMAXIMP)
 
 
-def check_accepted(model: mujoco.MjModel) -> None:
-    """Raise UnsupportedModelError, which names what to change, where mujoco_warp steps another model."""
+def check_model_support(model: mujoco.MjModel) -> None:
+    """Raise UnsupportedModelError, with advice, if mujoco_warp would step the model unlike C MuJoCo."""
     for check in (_state, _ignored_actuators, _plugins, _two_sides, _falling_impedances):
         check(model)
 
 
 def _state(model: mujoco.MjModel) -> None:
-    """A step may depend on (qpos, qvel, act) only."""
+    """Refuse state outside (qpos, qvel, act)."""
     hidden = {
         "actuator or sensor delay (nhistory > 0)": getattr(model, "nhistory", 0) > 0,
         "plastic springs (nplastic > 0)": getattr(model, "nplastic", 0) > 0,
         "sleeping (<flag sleep='enable'/>)": bool(model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP),
     }
-    found = [name for name, present in hidden.items() if present]
-    if found:
+    used = [name for name, present in hidden.items() if present]
+    if used:
         raise UnsupportedModelError(
-            f"the model uses {', '.join(found)}: its step depends on state outside (qpos, qvel, act); "
+            f"the model uses {', '.join(used)}: its step depends on state outside (qpos, qvel, act); "
             "remove it from the model"
         )
 
 
 def _ignored_actuators(model: mujoco.MjModel) -> None:
     groups = np.asarray(model.actuator_group)
-    # C MuJoCo has a bit for each of 31 groups.
+    # C MuJoCo has one bit for each of 31 groups.
     off = [u for u in range(len(groups)) if 0 <= groups[u] < 31 and model.opt.disableactuator >> int(groups[u]) & 1]
     if off:
         raise UnsupportedModelError(
@@ -57,7 +57,7 @@ def _plugins(model: mujoco.MjModel) -> None:
 
 
 def _two_sides(model: mujoco.MjModel) -> None:
-    """Both sides of a limit can be within its margin: mujoco_warp makes a row for the nearer one alone."""
+    """Refuse limits with both sides within their margin, because mujoco_warp makes a row for the nearer side only."""
     if model.opt.disableflags & (_OFF.mjDSBL_CONSTRAINT | _OFF.mjDSBL_LIMIT):
         return
     joints = (model.jnt_limited != 0) & np.isin(model.jnt_type, _SLIDING)
@@ -66,9 +66,9 @@ def _two_sides(model: mujoco.MjModel) -> None:
         ("tendon", _OBJ.mjOBJ_TENDON, model.tendon_limited != 0, model.tendon_range, model.tendon_margin),
     ):
         half = 0.5 * (ranges[:, 1] - ranges[:, 0])
-        found = np.flatnonzero(limited & (margins > half))
-        if len(found):
-            i = found[0]
+        narrow = np.flatnonzero(limited & (margins > half))
+        if len(narrow):
+            i = narrow[0]
             raise UnsupportedModelError(
                 f"the limits of {word} {_name(model, kind, i)} have a margin of {margins[i]:g}, above half of their "
                 f"range ({half[i]:g}): mujoco_warp holds one side where C MuJoCo holds both; write a margin of at most "
@@ -77,7 +77,7 @@ def _two_sides(model: mujoco.MjModel) -> None:
 
 
 def _falling_impedances(model: mujoco.MjModel) -> None:
-    """Between its ends, mujoco_warp clamps an impedance to [dmin, dmax], which is dmax where that is less."""
+    """Refuse dmin > dmax, because mujoco_warp clamps the impedance to [dmin, dmax]."""
     flags = model.opt.disableflags
     if flags & _OFF.mjDSBL_CONSTRAINT:
         return
@@ -97,20 +97,20 @@ def _falling_impedances(model: mujoco.MjModel) -> None:
 
 
 def _falls(solimp: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which rows of (N, 5) are clamped."""
+    """Which rows of solimp (N, 5) would be clamped."""
     low, high = np.clip(solimp[:, 0], *_LEAST), np.clip(solimp[:, 1], *_LEAST)
     return np.asarray((low > high) & (solimp[:, 2] > mujoco.mjMINVAL) & (solimp[:, 4] > 1.0))
 
 
-Found = Iterable[tuple[str, NDArray[np.float64]]]
+NamedImpedances = Iterable[tuple[str, NDArray[np.float64]]]
 
 
-def _among(solimp: NDArray[np.float64], present: NDArray[np.bool_], name: Callable[[int], str]) -> Found:
+def _among(solimp: NDArray[np.float64], present: NDArray[np.bool_], name: Callable[[int], str]) -> NamedImpedances:
     solimp = np.asarray(solimp).reshape(-1, 5)
     return ((name(int(i)), solimp[i]) for i in np.flatnonzero(present & _falls(solimp)))
 
 
-def _limits(model: mujoco.MjModel) -> Found:
+def _limits(model: mujoco.MjModel) -> NamedImpedances:
     yield from _among(
         model.jnt_solimp, model.jnt_limited != 0, lambda i: f"the limits of joint {_name(model, _OBJ.mjOBJ_JOINT, i)}"
     )
@@ -121,13 +121,13 @@ def _limits(model: mujoco.MjModel) -> Found:
     )
 
 
-def _equalities(model: mujoco.MjModel) -> Found:
+def _equalities(model: mujoco.MjModel) -> NamedImpedances:
     every = np.ones(model.neq, dtype=bool)
     return _among(model.eq_solimp, every, lambda i: f"equality {_name(model, _OBJ.mjOBJ_EQUALITY, i)}")
 
 
-def _contacts(model: mujoco.MjModel) -> Found:
-    """Impedances of listed pairs, and of the geoms that may touch otherwise, mixed as MuJoCo mixes them."""
+def _contacts(model: mujoco.MjModel) -> NamedImpedances:
+    """Impedances of explicit pairs, and of other pairs that may touch, mixed as in MuJoCo."""
     name = lambda g: _name(model, _OBJ.mjOBJ_GEOM, g)  # noqa: E731
     listed = np.stack((model.pair_geom1, model.pair_geom2), axis=1)
     yield from _among(

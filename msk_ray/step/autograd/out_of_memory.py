@@ -2,7 +2,7 @@
 
 import torch
 
-# Warp and torch's CPU allocator raise plain RuntimeErrors, which can only be recognised by their wording.
+# Warp and torch's CPU allocator raise plain RuntimeErrors, recognisable only by their text.
 _WORDING = ("failed to allocate", "can't allocate memory", "cudaerrormemoryallocation", "error 2: out of memory")
 
 

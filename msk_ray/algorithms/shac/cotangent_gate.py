@@ -27,19 +27,19 @@ class CotangentStatistics(NamedTuple):
     nonfinite_share: Tensor
     """Share of worlds with a cotangent that was not finite, a scalar on the device."""
     norms: Norms | None
-    """None where no finite cotangent passed."""
+    """None if no cotangent was finite."""
 
     def metrics(self) -> dict[str, Tensor]:
-        """The same by metric name."""
-        found = {"grad/nonfinite_share": self.nonfinite_share}
+        """The same values by metric name."""
+        shares = {"grad/nonfinite_share": self.nonfinite_share}
         if self.norms is None:
-            return found
+            return shares
         return {
             "grad/state_median": self.norms.median,
             "grad/state_p90": self.norms.p90,
             "grad/state_max": self.norms.maximum,
             "grad/clipped_share": self.norms.clipped_share,
-            **found,
+            **shares,
         }
 
 
@@ -66,8 +66,8 @@ class CotangentRecord(NamedTuple):
 class CotangentGate:
     """Bounds each world's state cotangent and measures it in one backward pass.
 
-    A few worlds whose cotangents explode over the horizon would otherwise dominate the whole policy gradient. The bound
-    keeps the direction. A world whose cotangent is not finite passes nothing back, and is counted.
+    Without a bound, a few worlds with exploding cotangents would dominate the policy gradient. The bound keeps the
+    direction. A world with a non-finite cotangent passes nothing back, and is counted.
 
     Args:
         bound: largest norm let through; None for no bound.
@@ -77,20 +77,20 @@ class CotangentGate:
     def __init__(self, bound: float | None, nworld: int, device: torch.device) -> None:
         self.bound = bound
         self._largest = torch.finfo(torch.float32).max if bound is None else bound
-        """Of a norm that is let through as it is."""
+        """Largest norm that passes unchanged."""
         self._norms: list[Tensor] = []
         self._nonfinite = torch.zeros(nworld, dtype=torch.bool, device=device)
 
     def __call__(self, state: StepState) -> StepState:
-        """The same state; its cotangent will pass the gate."""
+        """The same state, whose cotangent passes the gate in the backward pass."""
         if not any(t.requires_grad for t in state):
             return state
         return StepState(*_Gate.apply(self, *state))
 
     def screen(self, action: Tensor) -> Tensor:
-        """The same actions (W, A); a world whose cotangent is not finite will pass nothing, and be counted.
+        """The same actions (W, A); in the backward pass, non-finite cotangents are stopped and counted.
 
-        If a step's derivatives overflow internally, the control's cotangent is lost with the state's.
+        Needed besides `state`: derivatives that overflow inside a step spoil the controls' cotangent too.
         """
         return _Screen.apply(self, action) if action.requires_grad else action
 
@@ -116,7 +116,7 @@ class CotangentGate:
         return whole.masked_fill(lost[:, None], 0.0).split([g.shape[-1] for g in cotangent], dim=-1)
 
     def record(self, group: Group = ALONE) -> CotangentRecord:
-        """What was measured, in the worlds of all processes."""
+        """The statistics of this backward pass, over the worlds of all processes."""
         lengths = group.gather(torch.cat(self._norms)) if self._norms else torch.zeros(0, device=self._nonfinite.device)
         nonfinite_share = self._nonfinite.float().mean()
         group.mean([nonfinite_share])

@@ -1,4 +1,4 @@
-"""Policies that wait for their scores."""
+"""Policies waiting to be scored."""
 
 import time
 from collections.abc import Collection
@@ -11,10 +11,10 @@ from msk_ray.training.checkpoint import read_checkpoint, unscored_checkpoints, u
 
 
 class UnscoredPolicies:
-    """The states of a trial whose policies wait for their scores, as files: no death of the process loses one.
+    """Trial states whose policies still have to be scored, stored as files, so that they survive a crash.
 
     Args:
-        folder: of the trial's checkpoints.
+        folder: the trial's checkpoint folder.
 
     Attributes:
         epochs: epochs of the states, oldest first.
@@ -27,11 +27,11 @@ class UnscoredPolicies:
 
     @property
     def waited_s(self) -> float:
-        """How long the oldest has waited in this process [s]; 0 if there is none."""
+        """How long the oldest one has waited in this process [s]; 0 if there is none."""
         return time.monotonic() - self._since if self.epochs else 0.0
 
     def add(self, state: dict[str, Any]) -> None:
-        """Let the policy of a trial's state wait.
+        """Store a trial state, to score its policy later.
 
         Raises:
             StorageFailure: the disk is full or gone.
@@ -51,15 +51,15 @@ class UnscoredPolicies:
         return read_checkpoint(unscored_path(self._folder, epoch))
 
     def remove(self, epoch: int) -> None:
-        """The score of an epoch's policy is recorded."""
+        """Remove the state of an epoch, whose score has been recorded."""
         remove_checkpoint_file(unscored_path(self._folder, epoch))
         self.epochs.remove(epoch)
 
     def rewind(self, epoch: int, scored: Collection[int]) -> list[str]:
-        """Keep those that a trial at `epoch` waits for: up to that epoch, and not among those scored.
+        """Keep only states up to `epoch` that have no score yet, when a trial continues from there.
 
         Returns:
-            A line on each that cannot be read, which gets no score.
+            A line for each unreadable state, which gets no score.
         """
         self.epochs, self._since, faults = [], time.monotonic(), []
         for number, path in unscored_checkpoints(self._folder):

@@ -1,7 +1,8 @@
-"""Layers one after the other and their derivatives, called one by one.
+"""Sequential layers with explicit forward and backward calls.
 
-Autograd notes every operation of a network and takes its notes apart again. On a CPU that takes longer than the
-arithmetic of a small network. Axes: N rows, I inputs and F features of a layer.
+On a CPU, autograd's bookkeeping for each operation takes longer than the arithmetic of a small network.
+
+Axes: N rows, I inputs and F features of a layer.
 """
 
 from collections.abc import Callable, Sequence
@@ -11,8 +12,8 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, nn
 
-Kept = tuple[Tensor, ...]
-"""What a layer's derivative needs of its forward pass, with a row for each row of its input."""
+SavedTensors = tuple[Tensor, ...]
+"""What a layer keeps of its forward pass for its derivative, with a row for each input row."""
 
 _ATEN: Any = torch.ops.aten
 _elu_backward, _silu_backward = _ATEN.elu_backward.default, _ATEN.silu_backward.default
@@ -25,14 +26,14 @@ class Layer(Protocol):
 
     count: int
 
-    def forward(self, x: Tensor, *parameters: Tensor) -> tuple[Tensor, Kept]:
+    def forward(self, x: Tensor, *parameters: Tensor) -> tuple[Tensor, SavedTensors]:
         """Its output (N, F)."""
 
     def backward(
-        self, kept: Kept, parameters: Sequence[Tensor], bar: Tensor, of_x: bool, into: Sequence[Tensor] | None
+        self, kept: SavedTensors, parameters: Sequence[Tensor], bar: Tensor, of_x: bool, into: Sequence[Tensor] | None
     ) -> Tensor | None:
-        """The gradient of its input for the output's cotangent, if that is wanted; writes those of its parameters, if
-        there is something to write into."""
+        """The gradient of its input for the output's cotangent, None unless `of_x`; writes its parameters' gradients
+        into `into`, unless that is None."""
 
 
 class _Linear:
@@ -43,12 +44,12 @@ class _Linear:
     def __init__(self, _: nn.Module) -> None:
         pass
 
-    def forward(self, x: Tensor, *parameters: Tensor) -> tuple[Tensor, Kept]:
+    def forward(self, x: Tensor, *parameters: Tensor) -> tuple[Tensor, SavedTensors]:
         weight, bias = parameters
         return torch.addmm(bias, x, weight.t()), (x,)
 
     def backward(
-        self, kept: Kept, parameters: Sequence[Tensor], bar: Tensor, of_x: bool, into: Sequence[Tensor] | None
+        self, kept: SavedTensors, parameters: Sequence[Tensor], bar: Tensor, of_x: bool, into: Sequence[Tensor] | None
     ) -> Tensor | None:
         (x,) = kept
         if into is not None:
@@ -69,21 +70,21 @@ class _Norm:
         assert isinstance(module, nn.LayerNorm)
         self._shape, self._epsilon = list(module.normalized_shape), module.eps
 
-    def forward(self, x: Tensor, *parameters: Tensor) -> tuple[Tensor, Kept]:
+    def forward(self, x: Tensor, *parameters: Tensor) -> tuple[Tensor, SavedTensors]:
         gain, shift = parameters
         y, mean, scale = torch.native_layer_norm(x, self._shape, gain, shift, self._epsilon)
         return y, (x, mean, scale)
 
     def backward(
-        self, kept: Kept, parameters: Sequence[Tensor], bar: Tensor, of_x: bool, into: Sequence[Tensor] | None
+        self, kept: SavedTensors, parameters: Sequence[Tensor], bar: Tensor, of_x: bool, into: Sequence[Tensor] | None
     ) -> Tensor | None:
         x, mean, scale = kept
         wanted = [of_x, into is not None, into is not None]
-        found = _norm_backward(bar, x, self._shape, mean, scale, *parameters, wanted)
+        gradients = _norm_backward(bar, x, self._shape, mean, scale, *parameters, wanted)
         if into is not None:
-            into[0].copy_(found[1])
-            into[1].copy_(found[2])
-        x_bar: Tensor | None = found[0]
+            into[0].copy_(gradients[1])
+            into[1].copy_(gradients[2])
+        x_bar: Tensor | None = gradients[0]
         return x_bar
 
 
@@ -100,12 +101,12 @@ class _Activation:
     def __init__(self, function: Callable[[Tensor], Tensor], slope: Callable[[Tensor, Tensor, Tensor], Tensor]) -> None:
         self._function, self._slope = function, slope
 
-    def forward(self, x: Tensor, *_: Tensor) -> tuple[Tensor, Kept]:
+    def forward(self, x: Tensor, *_: Tensor) -> tuple[Tensor, SavedTensors]:
         y = self._function(x)
         return y, (x, y)
 
     def backward(
-        self, kept: Kept, parameters: Sequence[Tensor], bar: Tensor, of_x: bool, into: Sequence[Tensor] | None
+        self, kept: SavedTensors, parameters: Sequence[Tensor], bar: Tensor, of_x: bool, into: Sequence[Tensor] | None
     ) -> Tensor | None:
         return self._slope(bar, *kept) if of_x else None
 
@@ -138,7 +139,7 @@ _LAYERS: dict[type[nn.Module], Callable[[nn.Module], Layer]] = {
 
 
 class Chain:
-    """The layers of a network, for rows on a CPU, with its present parameters.
+    """The layers of a network, for rows on a CPU, with its current parameters.
 
     Args:
         network: linear layers, norms and activations, with torch's default constants.
@@ -155,7 +156,7 @@ class Chain:
         ends = list(accumulate((layer.count for layer in self._layers), initial=0))
         self._own = [slice(*ends[k : k + 2]) for k in range(len(self._layers))]
 
-    def forward(self, x: Tensor) -> tuple[Tensor, list[Kept]]:
+    def forward(self, x: Tensor) -> tuple[Tensor, list[SavedTensors]]:
         """The output (N, F) for rows (N, I), and what each layer keeps for `backward`."""
         kept = []
         for layer, own in zip(self._layers, self._own, strict=True):
@@ -163,13 +164,13 @@ class Chain:
             kept.append(of_layer)
         return x, kept
 
-    def backward(self, kept: Sequence[Kept], bar: Tensor, into: Sequence[Tensor]) -> None:
+    def backward(self, kept: Sequence[SavedTensors], bar: Tensor, into: Sequence[Tensor]) -> None:
         """Write the gradients of all parameters for the output's cotangent.
 
         Args:
             kept: what `forward` returned.
             bar: the cotangent (N, F).
-            into: where they go, in the parameters' order and shapes.
+            into: where to write them, in the parameters' order and shapes.
         """
         below: Tensor | None = bar
         for k in reversed(range(len(self._layers))):
@@ -177,8 +178,8 @@ class Chain:
             assert below is not None
             below = self._layers[k].backward(kept[k], self.parameters[own], below, k > 0, into[own])
 
-    def pull(self, kept: Sequence[Kept], bar: Tensor, of_x: bool) -> tuple[Tensor | None, list[Tensor]]:
-        """The gradient of the rows, if that is wanted, and the cotangents of the outputs of all layers."""
+    def pull(self, kept: Sequence[SavedTensors], bar: Tensor, of_x: bool) -> tuple[Tensor | None, list[Tensor]]:
+        """The gradient of the rows, None unless `of_x`, and the cotangents of all layers' outputs."""
         bars = [bar]
         for k in reversed(range(1, len(self._layers))):
             below = self._layers[k].backward(kept[k], self.parameters[self._own[k]], bars[-1], True, None)
@@ -187,13 +188,15 @@ class Chain:
         x_bar = self._layers[0].backward(kept[0], self.parameters[self._own[0]], bars[-1], of_x, None)
         return x_bar, bars[::-1]
 
-    def add_up(self, kept: Sequence[Sequence[Kept]], bars: Sequence[Sequence[Tensor]], into: Sequence[Tensor]) -> None:
-        """Write the gradients of all parameters, added up over calls.
+    def add_up(
+        self, kept: Sequence[Sequence[SavedTensors]], bars: Sequence[Sequence[Tensor]], into: Sequence[Tensor]
+    ) -> None:
+        """Write the gradients of all parameters, summed over calls.
 
         Args:
             kept: what `forward` returned in each call.
             bars: the cotangents that `pull` returned for it.
-            into: where they go.
+            into: where to write them.
         """
         for k, (layer, own) in enumerate(zip(self._layers, self._own, strict=True)):
             if layer.count:

@@ -4,12 +4,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from msk_ray.errors import Failure, SimulationError
-from msk_ray.step.autograd.memory import is_out_of_memory
+from msk_ray.step.autograd.out_of_memory import is_out_of_memory
 
 
 @contextmanager
 def named_out_of_memory(device: str, nworld: int, *lower: str) -> Iterator[None]:
-    """Turn any library's failed allocation into a `SimulationError` that names the settings `lower` as those to lower.
+    """Turn any library's failed allocation into a `SimulationError` that says to lower the settings `lower`.
 
     Raises:
         SimulationError: with `Failure.OUT_OF_MEMORY`; any other exception passes unchanged.

@@ -5,7 +5,7 @@ import torch
 from msk_ray.algorithms.shac.half_batch_cosine import HalfBatchCosine
 from msk_ray.config.schema import ActorConfig
 from msk_ray.networks import Actor
-from msk_ray.networks.calls import Calls
+from msk_ray.networks.network_calls import NetworkCalls
 
 
 def rollout(actor: Actor) -> torch.Tensor:
@@ -23,7 +23,7 @@ def test_gradients_and_the_halves_cosine_are_those_of_autograd() -> None:
     gradients, cosines, totals = [], [], []
     for together in (True, False):
         actor = Actor(ActorConfig(hidden=(6, 5)), 3, 2, torch.Generator().manual_seed(0))
-        calls = [Calls(actor.mean)] if together else []
+        calls = [NetworkCalls(actor.mean)] if together else []
         halves = HalfBatchCosine(actor, calls=calls)
         with halves.watching():
             if together:
@@ -45,7 +45,7 @@ def test_gradients_and_the_halves_cosine_are_those_of_autograd() -> None:
 
 def test_a_network_is_itself_again_afterwards() -> None:
     actor = Actor(ActorConfig(hidden=(6,)), 3, 2, torch.Generator().manual_seed(0))
-    calls = Calls(actor.mean)
+    calls = NetworkCalls(actor.mean)
     with calls.recording():
         pass
     actor(torch.ones(4, 3)).sum().backward()

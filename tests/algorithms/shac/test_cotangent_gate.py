@@ -2,7 +2,7 @@
 
 import torch
 
-from msk_ray.algorithms.shac.gate import CotangentGate
+from msk_ray.algorithms.shac.cotangent_gate import CotangentGate
 from msk_ray.step import StepState
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from msk_ray.config import Config
 
 
-class Place:
+class TrialFolder:
     """What trainers in one process and in several have in common.
 
     Attributes:

@@ -1,4 +1,4 @@
-"""Changes of a model that recorded graphs would follow by halves are refused."""
+"""Refuses edits of a model that recorded graphs would follow only in part."""
 
 import ctypes
 import dataclasses
@@ -11,22 +11,22 @@ import numpy as np
 from msk_ray.step.errors import ConfigError
 
 _SMALL = 1 << 16
-"""Arrays up to this size [B] are compared at every call: everything but meshes, height fields and textures."""
+"""Arrays up to this size are compared at every call [B]: everything but meshes, height fields and textures."""
 _LARGE = ("mesh_vert", "hfield_data")
-"""Larger ones that physics reads, compared where there is time."""
+"""Larger arrays that physics reads, compared only in thorough checks."""
 _memcmp = ctypes.CDLL(None).memcmp
 _memcmp.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t)
 
 
 def seal(holder: Any, path: str) -> None:
-    """Let no attribute of `holder`, a dataclass, or of the dataclasses in it be replaced from now on.
+    """Make attributes of `holder`, a dataclass, and of the dataclasses in it read-only from now on.
 
-    Contents of its arrays can still change in place: recorded graphs read that memory.
+    Its arrays can still change in place, because recorded graphs read their memory.
     """
 
     def refuse(_: Any, name: str, *__: Any) -> NoReturn:
         raise ConfigError(
-            f"{path}.{name} cannot be replaced: recorded steps go on reading the old one; change the MjModel before "
+            f"{path}.{name} cannot be replaced, because recorded steps read the old one; change the MjModel before "
             "making the Simulation, or give its step new values as parameters={...}"
         )
 
@@ -39,10 +39,10 @@ def seal(holder: Any, path: str) -> None:
 
 
 class ModelWatch:
-    """Tells whether an MjModel is still what it was.
+    """Checks whether an MjModel has been edited.
 
-    The model's small arrays lie in a few stretches of one buffer, and those of its options in one struct; both are
-    compared byte by byte with a copy. Between the two, however close, lies memory of others.
+    The model's small arrays are in a few ranges of one buffer, and its options in one struct; both are compared byte by
+    byte with a copy. Memory between the two belongs to others.
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
@@ -64,13 +64,13 @@ class ModelWatch:
         ]
 
     def check(self, thorough: bool = False) -> None:
-        """Raise where the model was edited.
+        """Raise if the model was edited.
 
         Args:
             thorough: compare meshes and height fields too.
 
         Raises:
-            ConfigError: names what was edited.
+            ConfigError: the model was edited; the message names the fields.
         """
         same = all(_memcmp(first, copy, size) == 0 for first, copy, size in self._stretches)
         if same and self._read_options(self._model.opt) == self._scalars:
@@ -86,18 +86,18 @@ class ModelWatch:
 
     def _edited(self) -> list[str]:
         options = zip(self._options, self._read_options(self._model.opt), self._scalars, strict=True)
-        found = [f"opt.{name}" for name, now, then in options if now != then]
-        return found + [name for name, (a, then) in self._arrays.items() if a.tobytes() != then.tobytes()]
+        edited = [f"opt.{name}" for name, now, then in options if now != then]
+        return edited + [name for name, (a, then) in self._arrays.items() if a.tobytes() != then.tobytes()]
 
 
 def _arrays_of(holder: Any) -> dict[str, np.ndarray]:
-    """The arrays that are memory of `holder`; others are made when they are asked for."""
+    """Attributes of `holder` that are views of its memory; others are computed on access."""
     arrays = {name: value for name in dir(holder) if isinstance(value := getattr(holder, name), np.ndarray)}
     return {name: value for name, value in arrays.items() if not value.flags.owndata}
 
 
 def _stretches(arrays: list[np.ndarray]) -> list[tuple[int, int]]:
-    """(address, bytes) of memory that arrays of one allocation fill, apart from gaps for alignment."""
+    """(address, bytes) of the memory ranges filled by arrays of one allocation, with gaps for alignment."""
     merged: list[tuple[int, int]] = []
     for first, end in sorted((a.ctypes.data, a.ctypes.data + a.nbytes) for a in arrays):
         if merged and first - merged[-1][1] < 64:

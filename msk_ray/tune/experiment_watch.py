@@ -11,18 +11,18 @@ from msk_ray.experiment.manifest import Experiment
 
 
 def remove_remains(experiment: Experiment) -> None:
-    """Remove what Ray has written in place of an experiment that has disappeared: Ray creates the folders it writes to,
-    and an experiment that is moved back would end up inside them."""
+    """Remove the folders that Ray has written where an experiment has disappeared. Ray creates the folders it writes
+    to, and an experiment that is moved back would end up inside them."""
     path = experiment.path
     if not path.is_dir() or experiment.lost() is None:
         return
-    # A request to stop is written as soon as something is lost: it may have been between two looks.
+    # A request to stop, written at the first sign of the loss, may be there too.
     if {child.name for child in path.iterdir()} <= {experiment.tune.name, experiment.stop_file.name}:
         shutil.rmtree(path)
 
 
-class Presence(Callback):
-    """Checks from time to time that the experiment's manifest exists; without it, trials cannot save themselves.
+class ExperimentWatch(Callback):
+    """Checks periodically that the experiment's manifest exists, without which trials cannot save themselves.
 
     It also checks that this driver still owns the experiment.
     """

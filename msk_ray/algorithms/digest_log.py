@@ -1,4 +1,4 @@
-"""What was computed, stage by stage, as digests: two runs that are the same give the same list."""
+"""Digests of what was computed, stage by stage: identical runs give identical lists."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -8,8 +8,8 @@ from torch import Tensor
 from msk_ray.networks import tensor_hash
 
 
-class Noted(NamedTuple):
-    """One tensor of a run."""
+class StageDigest(NamedTuple):
+    """The digest of one tensor of a run."""
 
     epoch: int
     """Counted from 1; 0 is the start."""
@@ -18,18 +18,18 @@ class Noted(NamedTuple):
     digest: str
 
 
-class Witness:
+class DigestLog:
     """Keeps digests of the tensors of a run, in the order in which they are computed.
 
     Attributes:
         epoch: the epoch that is being trained, counted from 1; 0 before the first.
-        noted: what was seen.
+        digests: digests recorded so far.
     """
 
     def __init__(self) -> None:
         self.epoch = 0
-        self.noted: list[Noted] = []
+        self.digests: list[StageDigest] = []
 
     def note(self, stage: str, tensors: Mapping[str, Tensor]) -> None:
-        """Keep digests of tensors of a stage; waits for the device."""
-        self.noted += [Noted(self.epoch, stage, name, tensor_hash(value)) for name, value in tensors.items()]
+        """Record digests of a stage's tensors; waits for the device."""
+        self.digests += [StageDigest(self.epoch, stage, name, tensor_hash(value)) for name, value in tensors.items()]

@@ -1,7 +1,7 @@
-"""Calls of a network whose parameters get their gradients together.
+"""Network calls whose parameter gradients are computed together.
 
-In a rollout a network is called once a step. Step by step, autograd multiplies small matrices for each parameter and
-adds the results up; on a CPU that takes longer than one product of all rows.
+A rollout calls the network once per step. For each call, autograd multiplies small matrices for every parameter and
+sums the results; on a CPU one product over all rows is faster.
 """
 
 from collections.abc import Iterator
@@ -12,30 +12,30 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from msk_ray.networks.chain import Chain, Kept
+from msk_ray.networks.layer_chain import Chain, SavedTensors
 from msk_ray.networks.mlp import Mlp
 
 
-class Calls:
-    """Calls of a network with rows (W, I) on a CPU, one operation of autograd each.
+class NetworkCalls:
+    """Calls of a network with rows (W, I) on a CPU, each one autograd operation.
 
-    A backward pass leaves the parameters alone: `add_gradients` comes after it.
+    A backward pass does not touch the parameters: call `add_gradients` after it.
 
     Args:
-        network: whose calls they are, with the parameters it has now.
+        network: the network, with its current parameters.
     """
 
     def __init__(self, network: Mlp) -> None:
         self._network = network
         self._chain = Chain(network)
-        # Parameters are no inputs of the operation, and the first observations have no gradient.
+        # Makes the operation differentiable: parameters are no inputs of it, and first observations need no gradient.
         self._anchor = torch.zeros((), requires_grad=True)
-        self._kept: list[list[Kept]] = []
+        self._kept: list[list[SavedTensors]] = []
         self._bars: dict[int, list[Tensor]] = {}
 
     @contextmanager
     def recording(self) -> Iterator[None]:
-        """Within, calls of the network are recorded here."""
+        """Context in which calls of the network are recorded here."""
         self._network.instead = self
         try:
             yield
@@ -48,18 +48,18 @@ class Calls:
         return y
 
     def add_gradients(self) -> None:
-        """Add the gradients of all calls that a backward pass has come through to those of the parameters."""
+        """Add the gradients of all calls that a backward pass has reached to the parameters' `grad`."""
         if not self._bars:
             return
-        found = [torch.empty_like(parameter, requires_grad=False) for parameter in self._chain.parameters]
+        gradients = [torch.empty_like(parameter, requires_grad=False) for parameter in self._chain.parameters]
         calls = sorted(self._bars)
         with torch.no_grad():
-            self._chain.add_up([self._kept[k] for k in calls], [self._bars[k] for k in calls], found)
-        for parameter, gradient in zip(self._chain.parameters, found, strict=True):
+            self._chain.add_up([self._kept[k] for k in calls], [self._bars[k] for k in calls], gradients)
+        for parameter, gradient in zip(self._chain.parameters, gradients, strict=True):
             parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
 
     def linear(self) -> Iterator[tuple[nn.Linear, list[Tensor], list[Tensor]]]:
-        """Linear layers with their inputs (W, I) and the cotangents of their outputs (W, F) in each of these calls."""
+        """Each linear layer, with its inputs (W, I) and output cotangents (W, F) in the calls reached so far."""
         calls = sorted(self._bars)
         for k, module in enumerate(self._chain.modules):
             if isinstance(module, nn.Linear):
@@ -79,7 +79,7 @@ class _Call(torch.autograd.Function):
     """(calls, rows, a scalar with a gradient) to the network's output."""
 
     @staticmethod
-    def forward(ctx: Any, calls: Calls, x: Tensor, _: Tensor) -> Tensor:
+    def forward(ctx: Any, calls: NetworkCalls, x: Tensor, _: Tensor) -> Tensor:
         y, ctx.call = calls._forward(x.detach())
         ctx.calls = calls
         return y

@@ -14,7 +14,7 @@ from msk_ray.errors import ConfigError
 from msk_ray.step import Simulation, TapePerSubstep
 from msk_ray.step.adjoint.taped_step import TapedStep, WarpState
 from msk_ray.step.forward import WorldBatch
-from msk_ray.step.forward.sealed import ModelWatch
+from msk_ray.step.forward.model_watch import ModelWatch
 
 
 def stepped(model: mujoco.MjModel) -> tuple[Simulation, torch.Tensor]:

@@ -94,16 +94,16 @@ def check_chain(
     results = []
     for world, point in enumerate(points):
         for horizon in horizons:
-            found = _tape_gradient(sim, policy, point, horizon, weights)
+            gradient = _tape_gradient(sim, policy, point, horizon, weights)
             expected = _reference_gradient(oracle, exact, point, horizon, weights)
             norm = float(np.linalg.norm(expected))
             results.append(
                 ChainComparison(
                     horizon,
                     world,
-                    float(np.linalg.norm(found - expected)) / norm,
-                    float(found @ expected) / (float(np.linalg.norm(found)) * norm),
-                    float(np.linalg.norm(found)) / norm,
+                    float(np.linalg.norm(gradient - expected)) / norm,
+                    float(gradient @ expected) / (float(np.linalg.norm(gradient)) * norm),
+                    float(np.linalg.norm(gradient)) / norm,
                     norm,
                 )
             )

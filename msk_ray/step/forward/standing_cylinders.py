@@ -1,10 +1,10 @@
-"""Contacts of cylinders with planes, as C MuJoCo has them, also of one that stands almost upright.
+"""Corrects contacts of cylinders with planes to those of C MuJoCo, for cylinders that stand almost upright.
 
-How far the lowest point of a cylinder's rim is below the middle of its cap is the radius times the sine of its tilt.
-mujoco_warp takes the sine from a difference of numbers near one, in float32: at a tilt of 3e-4 rad nothing is left of
-it, and a contact is off by 3e-4 of the radius, of the order of the depth to which a thing sinks in. And where the axis
-is upright up to rounding, it takes the world's x axis in place of the cylinder's. `callback.contactfilter`, the public
-hook that ends collision detection, replaces distances and points, and adds the contacts that were not seen.
+The lowest point of a cylinder's rim is below the centre of its cap by the radius times the sine of its tilt.
+mujoco_warp computes the sine from a difference of float32 numbers near one: at a tilt of 3e-4 rad it is all rounding,
+and a contact is off by 3e-4 of the radius, the order of a usual penetration depth. And if the axis is upright up to
+rounding, it uses the world's x axis instead of the cylinder's. `callback.contactfilter`, the public hook at the end of
+collision detection, replaces distances and points, and adds missed contacts.
 """
 
 from typing import Any
@@ -21,13 +21,13 @@ from msk_ray.step.forward.mjw_private import plane_cylinder
 wp.set_module_options({"enable_backward": False})
 
 _UPRIGHT = wp.constant(1.0e-12)
-"""Sine of the tilt below which C MuJoCo takes the cylinder's x axis as the way to its lowest point."""
+"""Sine of the tilt below which C MuJoCo takes the cylinder's x axis as the direction to its lowest point."""
 _SIDE = wp.constant(0.8660254037844386)
-"""√3 / 2: two contacts are a third of a turn from the lowest one."""
+"""√3 / 2: two contacts are a third of a turn away from the lowest one."""
 
 
 class Points(wp.types.matrix(shape=(4, 3), dtype=float)):  # type: ignore[misc]
-    """One point a row."""
+    """One point per row."""
 
 
 @wp.func
@@ -74,13 +74,13 @@ def correct_contacts(
     contacts_out: ContactRecords,
     efc_address_out: wp.array2d[int],
 ) -> None:
-    """One thread a contact that was found; of those of a pair that of the least distance adds what was not seen."""
+    """One thread per contact; in each pair, the thread of the contact with the least distance adds missed contacts."""
     con = wp.tid()
     room = contacts_out.dist.shape[0]
     if con >= wp.min(found_in[0], room):
         return
     geoms = contacts_out.geom[con]
-    if geoms[0] < 0 or geoms[1] < 0:  # of a flex
+    if geoms[0] < 0 or geoms[1] < 0:  # a contact of a flex
         return
     if geom_type[geoms[0]] != mjw.GeomType.PLANE or geom_type[geoms[1]] != mjw.GeomType.CYLINDER:
         return
@@ -116,7 +116,7 @@ def correct_contacts(
 
 
 class StandingCylinders:
-    """Launches of the correction, for a model that has planes and cylinders.
+    """Launches the correction, for models with planes and cylinders.
 
     Args:
         mjm: the MjModel.
@@ -127,7 +127,7 @@ class StandingCylinders:
         self._found = wp.zeros(1, dtype=int)
 
     def launch(self, model: Any, data: Any) -> None:
-        """Launch it on what collision detection has found."""
+        """Launch the correction on the contacts of collision detection."""
         wp.copy(self._found, data.nacon)
         wp.launch(
             correct_contacts,
@@ -137,7 +137,7 @@ class StandingCylinders:
         )
 
 
-def stands_on_planes(mjm: mujoco.MjModel) -> bool:
+def has_cylinders_and_planes(mjm: mujoco.MjModel) -> bool:
     """Whether a model has both planes and cylinders."""
     types = set(np.asarray(mjm.geom_type).tolist())
     return {int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_CYLINDER)} <= types
