@@ -227,7 +227,7 @@ def test_what_does_not_fit_is_refused_before_the_first_step(
 
 def test_a_reward_without_a_gradient_is_warned_of_where_one_is_wanted(home: Path) -> None:
     with warnings.catch_warnings():
-        warnings.simplefilter("error")
+        warnings.filterwarnings("error", message="reward_terms")
         _make("Cut", nworld=2)
     with pytest.warns(UserWarning, match="reward_terms of Cut has no gradient to the state or the action"):
         _make("Cut", nworld=2, differentiable=True)
