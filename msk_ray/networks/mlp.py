@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from msk_ray.config import NetworkConfig
+from msk_ray.networks.hidden_layer import hidden_layer
 
 _ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "silu": nn.SiLU, "relu": nn.ReLU, "tanh": nn.Tanh}
 
@@ -41,6 +42,18 @@ def make_mlp(
         layers += [linear, _ACTIVATIONS[config.activation](), nn.LayerNorm(fan_out)]
     layers.append(_linear(sizes[-1], outputs, output_gain, generator))
     return Mlp(*layers)
+
+
+def fused_forward(network: nn.Module, x: Tensor) -> Tensor:
+    """A network of `make_mlp` with ELU, at rows (N, I), with few kernels a layer; equal up to rounding."""
+    assert isinstance(network, nn.Sequential)
+    *hidden, last = network
+    for linear, _, norm in zip(hidden[::3], hidden[1::3], hidden[2::3], strict=True):
+        assert isinstance(linear, nn.Linear)
+        assert isinstance(norm, nn.LayerNorm)
+        x = hidden_layer(x, linear.weight, linear.bias, norm.weight, norm.bias, norm.eps)
+    out: Tensor = last(x)
+    return out
 
 
 def _linear(fan_in: int, fan_out: int, gain: float, generator: torch.Generator) -> nn.Linear:

@@ -43,7 +43,7 @@ class CriticFit:
         # Stored, because `parameters()` walks all submodules on every call.
         self._members = [list(member.parameters()) for member in critic.members]
         self._parameters = [parameter for member in self._members for parameter in member]
-        self._critic = critic
+        self._values = critic.fused if device.type == "cuda" and critic.can_fuse else critic
         self._passes = [_Pass(member) for member in critic.members] if device.type == "cpu" else None
         self._grad_norm = grad_norm
         self._tolerance = tolerance
@@ -94,7 +94,7 @@ class CriticFit:
     def _by_autograd(self, obs: Tensor, targets: Tensor) -> tuple[Tensor, list[Tensor]]:
         """The loss of these rows, and the clipped gradient of each parameter."""
         with torch.enable_grad():
-            loss = (self._critic(obs) - targets).square().mean()
+            loss = (self._values(obs) - targets).square().mean()
             gradients = list(torch.autograd.grad(loss, self._parameters))
         mean = loss.detach()
         self._group.mean([mean, *gradients])

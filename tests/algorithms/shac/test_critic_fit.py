@@ -89,3 +89,19 @@ def test_weight_decay_by_hand() -> None:
     # Adam's step of the rate, after a shrinkage by rate · decay = 1/16.
     for parameter, start in zip(critic.parameters(), before, strict=True):
         assert torch.allclose(parameter, 15 / 16 * start + 0.125, atol=1e-5)
+
+
+def test_fused_layers_fit_alike() -> None:
+    """Ten steps from the same start."""
+    obs = torch.randn(64, 3, generator=torch.Generator().manual_seed(0))
+    orders = torch.arange(64).expand(10, 64)
+    fitted = []
+    for fused in (False, True):
+        critic = Critic(CriticConfig(hidden=(16, 8), count=2), 3, torch.Generator().manual_seed(1))
+        assert critic.can_fuse
+        fit = CriticFit(critic, 1e-2, (0.9, 0.99), 1.0)
+        fit._passes, fit._values = None, critic.fused if fused else critic
+        loss = fit.run(obs, obs[:, 0], orders, 1)
+        fitted.append((critic(obs), loss))
+    torch.testing.assert_close(*fitted, rtol=1e-3, atol=1e-4)
+    assert not torch.equal(fitted[0][0], fitted[1][0])
