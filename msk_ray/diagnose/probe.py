@@ -120,7 +120,7 @@ def probe(
         raise ConfigError("--states gait needs a trained policy: give a checkpoint instead of a config")
     for variant in variants:
         physics = subject.config.physics if variant is None else PhysicsConfig(variant=variant)
-        env = make_env(subject.config.env, physics, worlds, device, seed)
+        env = make_env(subject.config.env, physics, worlds, device, seed, execution=subject.config.execution)
         # Disable forces that finite differences would include but the gradient does not.
         env.ignore_contact_forces = True
         network = subject.network(env)

@@ -60,6 +60,7 @@ class BatchedEnv(VectorEnv[Array, Array, Array], Generic[Array]):
             config.trial.seed,
             differentiable=False,
             randomize=True,
+            execution=config.execution,
         )
         self.single_observation_space = observation_space(self.env)
         self.single_action_space = action_space(self.env)

@@ -36,7 +36,9 @@ class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             raise ConfigError(
                 "physics.randomize: a single environment cannot randomize the model; set it to null, or use BatchedEnv"
             )
-        self.env = make_env(config.env, config.physics, 1, "cpu", config.trial.seed, differentiable=False)
+        self.env = make_env(
+            config.env, config.physics, 1, "cpu", config.trial.seed, differentiable=False, execution=config.execution
+        )
         self.env.sim = self._simulation = CSimulation(self.env.model, self.env.sim.substeps, self.env.sim.batch.limits)
         self.observation_space = observation_space(self.env)
         self.action_space = action_space(self.env)

@@ -286,7 +286,7 @@ def test_a_command_that_is_no_utf8_is_shown_escaped(whole: Experiment, tmp_path:
     path = made.path / layout.ENVIRONMENT_FILE
     path.write_text(json.dumps(json.loads(path.read_text()) | {"command": ["tune", "--storage", "\udcff"]}))
     assert run(report, [str(made.path), "--best", "never"]) == 0
-    assert "\\udcff" in (made.path / "report" / "index.html").read_text()
+    assert "\\xff" in (made.path / "report" / "index.html").read_text()
 
 
 def test_what_is_written_can_be_read_again(tmp_path: Path) -> None:

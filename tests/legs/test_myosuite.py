@@ -147,7 +147,7 @@ def test_what_cannot_be_evaluated_there_is_one_line(
     there = [*inside, "--python", str(stand_in)]
     cases = [
         ([str(trial), *inside, "--python", "gone"], "no file gone; install MyoSuite beside msk_ray: python -m venv"),
-        ([str(trial), "--python", str(stand_in)], "--python: only --in myosuite reads it"),
+        ([str(trial), "--python", str(stand_in)], "--python: only --in reads it"),
         ([str(trial), *there, "--physics", "own"], "--physics: --in myosuite has its own physics"),
         ([str(trial), *there, "--steps", "1001"], "write at most 1000"),
         (

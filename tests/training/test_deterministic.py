@@ -120,7 +120,7 @@ def test_torch_is_as_before_in_the_next_trial(tiny_settings: dict[str, Any]) -> 
 @pytest.mark.parametrize(
     ("change", "write"),
     [
-        ({"execution": {"jacobian": "sparse"}}, "execution.jacobian: dense"),
+        ({"execution": {"jacobian": "sparse", "deterministic": True}}, "execution.jacobian: dense"),
         ({"physics": {"integrator": "RK4"}}, "physics.integrator: Euler or implicitfast"),
         ({"execution": {"gpus": 2, "deterministic": True}}, "execution.gpus: 1"),
     ],

@@ -72,28 +72,6 @@ def test_the_untrained_policy_is_kept_without_a_score_until_a_trained_one_has_on
     assert [row.get("eval/best_score") for row in rows] == [None, None, -2.0, None, -2.0, None, -2.0]
 
 
-def test_a_checkpoint_that_counts_the_untrained_policy_goes_on_without_it(
-    tiny_cartpole: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As older versions wrote it: the best score is the untrained policy's, which no trained one has reached."""
-    monkeypatch.setattr(Evaluator, "run", lambda self, policies: [{"score": -float(trainer.epoch)}])
-    trainer = Trainer(tiny_cartpole, tmp_path, "cpu")
-    for _ in range(4):
-        trainer.run_epoch()
-    newest = trainer.checkpoints / "epoch_000004.pt"
-    trainer.close()
-    for path in (newest, trainer.best_checkpoint):
-        state = read_checkpoint(newest) | {"best_score": 0.0}
-        write_checkpoint(path, state, {"epoch": 4 if path == newest else 0, "best_score": 0.0})
-    trainer = Trainer(tiny_cartpole, tmp_path, "cpu")
-    trainer.restore_latest()
-    assert trainer.best_score == -math.inf
-    while not trainer.finished:
-        trainer.run_epoch()
-    trainer.close()
-    assert read_facts(trainer.best_checkpoint)["epoch"] == 6
-
-
 def test_a_trial_can_start_from_another_ones_networks(tiny_cartpole: Config, tmp_path: Path) -> None:
     train(tiny_cartpole, tmp_path / "first")
     best = tmp_path / "first" / "checkpoints" / "best.pt"

@@ -171,7 +171,7 @@ def test_an_element_at_a_kink_of_its_own_is_left_out_and_counted():
 
 
 def test_the_page_names_every_parameter(root):
-    page = (root / "docs" / "parameters.md").read_text()
+    page = (root / "docs" / "step" / "parameters.md").read_text()
     table = [line for line in page.splitlines() if line.startswith("| `")]
     named = {name.strip(" `") for line in table for name in line.split("|")[1].split(",")}
     assert named == set(PARAMETERS)

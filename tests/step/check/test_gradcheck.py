@@ -10,8 +10,9 @@ from scenes import ant
 
 from msk_ray.cli import run
 from msk_ray.gradcheck import main
-from msk_ray.step import Simulation, TapePerSubstep
+from msk_ray.step import TapePerSubstep
 from msk_ray.step.autograd.modes import BACKWARD_MODES
+from msk_ray.step.autograd.stepper import Stepper
 
 pytestmark = pytest.mark.long
 
@@ -37,11 +38,11 @@ class NanSlope(TapePerSubstep):
         return gradients
 
 
-_ADVANCE = Simulation.advance
+_STEP = Stepper.step
 
 
 def _nan_velocity(sim, ctrl, start, *rest, **named):
-    end = _ADVANCE(sim, ctrl, start, *rest, **named)
+    end = _STEP(sim, ctrl, start, *rest, **named)
     end.qvel[1, 1] = float("nan")
     return end
 
@@ -85,7 +86,7 @@ def test_nonfinite_elements_are_named(cartpole_file, capsys, monkeypatch):
 
 
 def test_a_step_that_is_not_finite_fails_though_no_state_can_be_compared(cartpole_file, capsys, monkeypatch):
-    monkeypatch.setattr(Simulation, "advance", _nan_velocity)
+    monkeypatch.setattr(Stepper, "step", _nan_velocity)
     assert run(main, [str(cartpole_file), *FAST]) == 1
     out = capsys.readouterr().out
     assert "non-finite: state 1 of random: the step's qvel of joint hinge\n" in out
