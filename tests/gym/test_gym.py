@@ -201,7 +201,7 @@ def test_lost_contacts_are_an_error() -> None:
     config = load_config("ant", ["execution.nconmax=1", "execution.njmax=4"])
     env: BatchedEnv[np.ndarray] = BatchedEnv(config, 1)
     env.reset(seed=0)
-    with pytest.raises(SimulationError, match=r"physics\.n(con|j)max"):
+    with pytest.raises(SimulationError, match=r"execution\.n(con|j)max"):
         _fall(env, np.zeros((1, 8), np.float32))
 
 
@@ -215,7 +215,7 @@ def test_tensors_stay_on_the_gpu_and_lost_contacts_are_an_error_there() -> None:
         load_config("ant", ["execution.nconmax=1", "execution.njmax=4"]), 1, "cuda", arrays="torch"
     )
     tight.reset(seed=0)
-    with pytest.raises(SimulationError, match=r"physics\.n(con|j)max"):
+    with pytest.raises(SimulationError, match=r"execution\.n(con|j)max"):
         _fall(tight, torch.zeros(1, 8, device="cuda"))
 
 

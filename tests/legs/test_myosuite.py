@@ -156,7 +156,7 @@ def test_what_cannot_be_evaluated_there_is_one_line(
         ),
         (
             [str(trial), *inside, "--python", sys.executable],
-            "No module named 'myosuite'; install it with python -m venv",
+            "No module named 'myosuite'; install MyoSuite beside msk_ray: python -m venv",
         ),
     ]
     for arguments, why in cases:

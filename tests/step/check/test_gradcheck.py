@@ -111,7 +111,7 @@ def test_contacts_without_a_derivative_are_counted(tmp_path, capsys, height, sha
 
 def test_json(cartpole_file):
     """In a process of its own: standard output must hold the object and nothing else."""
-    command = [sys.executable, "-m", "msk_ray.step.check", str(cartpole_file), *FAST, "--substeps", "4", "--json"]
+    command = [sys.executable, "-m", "msk_ray.gradcheck", str(cartpole_file), *FAST, "--substeps", "4", "--json"]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
