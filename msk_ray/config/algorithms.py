@@ -42,7 +42,7 @@ class AlgorithmSettings(Section):
     differentiates: ClassVar[bool] = True
     """Whether it needs gradients of the simulation; if not, settings of gradients are unused."""
     reads_not: ClassVar[frozenset[str]] = frozenset()
-    """Dotted settings in the sections `actor` and `critic` that it does not use."""
+    """Dotted settings of other sections that it does not use."""
     packages: ClassVar[Mapping[str, str]] = {}
     """Optional modules that it needs → what to install."""
     length: ClassVar[str | None] = None
@@ -241,6 +241,7 @@ class PpoConfig(AlgorithmSettings):
             "actor.state_std",
             "actor.output_gain",
             "critic.count",
+            "execution.capture",
         )
     )
     packages: ClassVar[Mapping[str, str]] = {"rsl_rl": "msk-ray[ppo]"}

@@ -177,3 +177,8 @@ assert load_config(Path({str(tmp_path / "base.yaml")!r})).ppo.steps == 16
 assert not {{"torch", "rsl_rl"}} & set(sys.modules)
 """
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_ppo_has_no_epochs_to_record() -> None:
+    with pytest.raises(ConfigError, match=r"execution\.capture: nothing reads it while algorithm\.name is ppo"):
+        load_config("cartpole", ["algorithm.name=ppo", "execution.capture=off"])
