@@ -281,7 +281,8 @@ def test_a_contact_follows_both_bodies(first: str, second: str, flag: str, flush
     errors, exact = compare(model, poses, COARSE if curved else FINE)
     print(f"{len(errors)} contacts, {np.sum(~exact)} not exact, {np.sort(errors[exact])[-5:]}")
     assert len(errors) >= 12
-    # A cylinder's side on a face is clipped along a line through any rim point that MuJoCo's search has met.
-    assert np.mean(exact) > (0.3 if first == "cylinder" else 0.99)
+    # A cylinder's side on a face is clipped along a line through any rim point that MuJoCo's search has met;
+    # a cap on a face never counts as exact.
+    assert np.mean(exact) > (0.05 if first == "cylinder" else 0.99)
     assert np.median(errors[exact]) < (1e-3 if curved else 1e-6)
     assert errors[exact].max() < 1e-2

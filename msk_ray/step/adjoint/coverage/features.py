@@ -219,8 +219,9 @@ FEATURES: tuple[Feature, ...] = (
         "contact of plane, sphere, capsule, ellipsoid, cylinder, box, mesh, with each other",
         True,
         pairs_of(EXACT_PAIRS, set()),
-        "contacts without a derivative of their own (parallel edges, the side of a cylinder clipped by a face, a "
-        "cylinder upright on a plane) get that of the nearest law; `grad/approximated_share` counts how often",
+        "contacts without a derivative of their own (parallel edges, the side of a cylinder clipped by a face, its cap "
+        "on a face, a cylinder upright on a plane) get that of the nearest law; `grad/approximated_share` counts how "
+        "often",
         counted=True,
     ),
     Feature(

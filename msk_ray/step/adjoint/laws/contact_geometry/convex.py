@@ -94,6 +94,13 @@ def side_by_side(solid1: Solid, solid2: Solid, normal: wp.vec3) -> bool:
 
 
 @wp.func
+def cap_lies_flat(solid: Solid, normal: wp.vec3) -> bool:
+    """Whether a cylinder's cap lies on a face: convex collision clips polygons then, whose corners on the round rim
+    jump with the smallest tilt."""
+    return solid.type == GeomType.CYLINDER and wp.abs(wp.dot(column(solid.mat, 2), normal)) > _LYING
+
+
+@wp.func
 def is_supported(solid: Solid, patch: Patch, normal: wp.vec3, slack: float) -> bool:
     """Whether the surface around a contact has its normal: convex collision may stop before it finds the way out."""
     supported = bool(True)
@@ -231,7 +238,8 @@ def convex_wrenches(
             exact = exact and is_supported(solid1, patch1, n, tilt) and is_supported(solid2, patch2, n, tilt)
             push, regular = touching_wrenches(patch1, patch2, contact, bars, length)
             exact = exact and regular and not side_by_side(solid1, solid2, n)
-    return push, exact and miss < _LOST
+    jumps = is_clipped and faced1 and faced2 and (cap_lies_flat(solid1, n) or cap_lies_flat(solid2, n))
+    return push, exact and miss < _LOST and not jumps
 
 
 @wp.func
