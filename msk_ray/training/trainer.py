@@ -174,10 +174,18 @@ class Trainer(TrialFolder):
 
     def save(self) -> Path:
         """Write a checkpoint of everything and return its path; an existing one is kept."""
-        path = self.checkpoints / f"epoch_{self.epoch:06d}.pt"
+        path = self._checkpoint
         write_checkpoint(path, self._state(), {"epoch": self.epoch, "best_score": _finite(self.best_score)})
         prune_checkpoints(self.checkpoints, self.config.execution.keep_checkpoints)
         return path
+
+    def discard_checkpoint(self) -> None:
+        """Remove the checkpoint of the current epoch, if there is one."""
+        self._checkpoint.unlink(missing_ok=True)
+
+    @property
+    def _checkpoint(self) -> Path:
+        return self.checkpoints / f"epoch_{self.epoch:06d}.pt"
 
     def restore(self, path: Path, changed: Collection[str] = ()) -> None:
         """Continue from a checkpoint.

@@ -44,6 +44,8 @@ class TrainerLike(Protocol):
 
     def save(self) -> Path: ...
 
+    def discard_checkpoint(self) -> None: ...
+
     def restore(self, path: Path, changed: Collection[str]) -> None: ...
 
     def restore_latest(self) -> tuple[Path | None, list[str]]: ...
@@ -219,7 +221,11 @@ def _train(
             # Restoring has rewritten the settings; note the attempt for people who read only this file.
             settings = folder / "config.yaml"
             write_text(settings, f"# {note} asked for\n{settings.read_text(encoding='utf-8')}")
-        return _loop(trial, folder, stop, trainer, hooks)
+        ending = _loop(trial, folder, stop, trainer, hooks)
+        if ending is not None and ending.outcome is Outcome.NONFINITE:
+            # A retry has to repeat the epoch; from its checkpoint it would only find the same row again.
+            trainer.discard_checkpoint()
+        return ending
     finally:
         trainer.close()
 

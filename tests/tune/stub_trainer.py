@@ -139,8 +139,15 @@ class StubTrainer:
         with (self.logdir / "metrics.jsonl").open("a") as file:
             file.write(json.dumps(clean | ({"nonfinite": bad} if bad else {})) + "\n")
 
+    @property
+    def _checkpoint(self) -> Path:
+        return self.logdir / "checkpoints" / f"epoch_{self.epoch:06d}.pt"
+
+    def discard_checkpoint(self) -> None:
+        self._checkpoint.unlink(missing_ok=True)
+
     def save(self) -> Path:
-        path = self.logdir / "checkpoints" / f"epoch_{self.epoch:06d}.pt"
+        path = self._checkpoint
         state = {"epoch": self.epoch, "best_score": self.best_score, "nworld": self.config.env.nworld}
         path.write_text(json.dumps(state | {"trial": self.logdir.name}))
         return path

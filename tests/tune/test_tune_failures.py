@@ -15,6 +15,8 @@ from stub_trainer import BEHAVIOUR, BROKEN_CONNECTION, BUG, EXIT, EXIT_ZERO, INT
 
 from msk_ray.config import Config
 from msk_ray.experiment.checkpoint_file import read_facts, remove_checkpoint_file
+from msk_ray.experiment.layout import OUTCOME_FILE
+from msk_ray.experiment.metrics import read_rows
 from msk_ray.experiment.outcomes import Ending, Outcome, read_ending
 from msk_ray.signals import listening
 from msk_ray.sweep.rules.stopping import StopSpec
@@ -140,7 +142,9 @@ def test_ctrl_c_is_no_error_of_the_trial(make_space: Any, tmp_path: Path, monkey
     assert read_ending(tmp_path / "trial") is None
 
 
-def test_an_infinite_score_is_named_as_nan_is(tiny_cartpole: Config, tmp_path: Path, make_space: Any) -> None:
+def test_an_infinite_score_is_named_as_nan_is_and_a_retry_repeats_its_epoch(
+    tiny_cartpole: Config, tmp_path: Path, make_space: Any
+) -> None:
     from msk_ray.training import Trainer
     from msk_ray.training.evaluation import Evaluator
 
@@ -151,3 +155,8 @@ def test_an_infinite_score_is_named_as_nan_is(tiny_cartpole: Config, tmp_path: P
         ending = run_trial(trial, tmp_path, "cpu", StopSpec(), Trainer, Hooks())
     assert ending == Ending(Outcome.NONFINITE, "eval/score is inf at epoch 2")
     assert read_facts(tmp_path / "checkpoints" / "best.pt")["best_score"] is None  # no policy has a score yet
+    (tmp_path / OUTCOME_FILE).unlink()
+    ending = run_trial(trial, tmp_path, "cpu", StopSpec(), Trainer, Hooks())
+    assert ending is not None
+    assert ending.outcome is Outcome.FINISHED
+    assert all(math.isfinite(row["eval/score"]) for row in read_rows(tmp_path) if "eval/score" in row)
