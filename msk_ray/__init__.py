@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from msk_ray.config import Term as Term
     from msk_ray.config import load_config as load_config
     from msk_ray.envs import Env as Env
+    from msk_ray.envs import Memory as Memory
     from msk_ray.envs import MjcfEnv as MjcfEnv
     from msk_ray.envs import MjcfSettings as MjcfSettings
     from msk_ray.step import Backward as Backward
@@ -48,6 +49,7 @@ _HOMES = {
     "FdJacobian": "msk_ray.step.autograd",
     "Hybrid": "msk_ray.step.autograd",
     "Logger": "msk_ray.training.loggers",
+    "Memory": "msk_ray.envs",
     "MjcfEnv": "msk_ray.envs",
     "MjcfSettings": "msk_ray.envs",
     "Reward": "msk_ray.config",

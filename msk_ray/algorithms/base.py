@@ -126,8 +126,10 @@ class Algorithm(ABC):
         """Record digests of the worlds and of all saved modules, if there is a `digest_log`."""
         if self.digest_log is None:
             return
-        physics, action, age, numbers = self.env.state.detach()
-        self.digest_log.note("worlds", {**physics._asdict(), "action": action, "age": age, "numbers": numbers})
+        state = self.env.state.detach()
+        parts = {"action": state.action, "age": state.age, "numbers": state.numbers}
+        memory = {f"memory {name}": values for name, values in state.memory.items()}
+        self.digest_log.note("worlds", {**state.physics._asdict(), **parts, **memory})
         for name, module in self.modules().items():
             states = {key: value for key, value in module.state_dict().items() if isinstance(value, Tensor)}
             self.digest_log.note(f"module {name}", states)

@@ -151,9 +151,9 @@ def _returns(env: Env[Any], network: nn.Module, step: Step, start: EnvState, hor
     for t in range(1, horizons[-1] + 1):
         action = network(env.observation())
         physics = step(env.control(action), env.state.physics)
-        reached = EnvState(physics, action, env.state.age + 1, env.state.numbers)
+        reached = env.reached(physics, action)
         total = total + env.reward_terms(physics, action, env.observation_of(reached)).sum(-1)
-        env.state = reached
+        env.state = env.carried(reached)
         if t in horizons:
             returns.append(total)
     env.state = start
@@ -224,12 +224,7 @@ def _differences(
         ]
         return StepState(*(torch.from_numpy(np.stack([getattr(e, n) for e in ends])) for n in StepState._fields))
 
-    begin = EnvState(
-        StepState(*(t.double().cpu() for t in start.physics)),
-        start.action.double().cpu(),
-        start.age.cpu(),
-        start.numbers.double().cpu(),
-    )
+    begin = start.mapped(_in_double)
 
     def displaced(direction: np.ndarray) -> Tensor:
         nn.utils.vector_to_parameters(at + _STEP * torch.from_numpy(direction), parameters)

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from msk_ray.envs.base import Env as Env
     from msk_ray.envs.make import env_class as env_class
     from msk_ray.envs.make import make_env as make_env
+    from msk_ray.envs.memory import Memory as Memory
     from msk_ray.envs.mjcf.config import MjcfSettings as MjcfSettings
     from msk_ray.envs.mjcf.env import MjcfEnv as MjcfEnv
     from msk_ray.envs.records import EnvState as EnvState
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "Env": "msk_ray.envs.base",
     "EnvState": "msk_ray.envs.records",
+    "Memory": "msk_ray.envs.memory",
     "MjcfEnv": "msk_ray.envs.mjcf.env",
     "MjcfSettings": "msk_ray.envs.mjcf.config",
     "Resets": "msk_ray.envs.records",

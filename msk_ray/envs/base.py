@@ -5,7 +5,8 @@ Axes: W worlds, O observation, A action.
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import cached_property
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -17,6 +18,7 @@ from msk_ray.config import AS_USUAL, EnvSettings, ExecutionConfig, PhysicsConfig
 from msk_ray.config.rewards import settings_with
 from msk_ray.envs.contract import Contract, versions
 from msk_ray.envs.layout import Entry
+from msk_ray.envs.memory import Memories, Memory, restored
 from msk_ray.envs.options import JACOBIANS
 from msk_ray.envs.randomize import Randomizer
 from msk_ray.envs.records import EnvState, Resets, Transition, rows_where
@@ -44,6 +46,7 @@ class Env(ABC, Generic[SettingsT]):
             states on every device.
         active_terms: the terms that are computed.
         randomizer: parameters of the model that differ between worlds; None for the model's own.
+        next_memory: in `reward_terms` and `fell`, what `remember` has just given.
         ignore_contact_forces: whether contact forces read as 0, for comparisons of gradients, because they carry none.
         group: the processes that the trial's worlds are spread over; here are those of this one.
     """
@@ -116,6 +119,7 @@ class Env(ABC, Generic[SettingsT]):
             self.sim.open_parameters(self.randomizer.parameters)
         self._begin_terms()
         self._fresh: list[Resets] = []
+        self.next_memory: Mapping[str, Tensor] = {}
         self.ignore_contact_forces = False
         self._reached: StepState | None = None
         self._measured: dict[str, tuple[StepState, bool, Any]] = {}
@@ -186,6 +190,27 @@ class Env(ABC, Generic[SettingsT]):
         """Called after each training epoch with its env steps per episode that ended, if known; figures for logs."""
         return {}
 
+    def memories(self) -> Mapping[str, Memory]:
+        """What the worlds remember from one env step to the next, by name. Called once, after `prepare`."""
+        return {}
+
+    @property
+    def memory(self) -> Mapping[str, Tensor]:
+        """What the worlds remember, each (W, size), by name: the part of `self.state`, in whatever method."""
+        return self.state.memory
+
+    def begin_memory(self, state: StepState) -> Mapping[str, Tensor]:
+        """Those of the memories, (W, size), that start with other values than declared in episodes that begin in
+        `state`. `self.state` is the state of the new episodes meanwhile."""
+        return {}
+
+    def remember(self, state: StepState, action: Tensor) -> Mapping[str, Tensor]:
+        """All memories, (W, size), once `action` has led to `state`. Called once a step, before `observe`.
+
+        As in `reward_terms`, `self.state` and `self.memory` are those that the step began with.
+        """
+        return {}
+
     def control(self, action: Tensor) -> Tensor:
         """Controls (W, nu) of the model for actions (W, A) in the current state."""
         return action
@@ -206,8 +231,8 @@ class Env(ABC, Generic[SettingsT]):
     def observe(self, state: StepState, action: Tensor) -> Tensor:
         """Observation (W, O) of a state and the action that led to it.
 
-        Both are those of `self.state` meanwhile, whose `age` and `numbers` are therefore those of the observed state,
-        in `step` as in `observation`.
+        Both are those of `self.state` meanwhile, whose `age`, `numbers` and `memory` are therefore those of the
+        observed state, in `step` as in `observation`.
         """
 
     def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
@@ -250,12 +275,30 @@ class Env(ABC, Generic[SettingsT]):
     def reset_state(self) -> EnvState:
         """Fresh initial states of all worlds."""
         fresh = self._next_resets()
-        return EnvState(
-            fresh.physics,
-            torch.zeros((self.nworld, self.action_size), device=self.device),
-            torch.zeros(self.nworld, dtype=torch.int64, device=self.device),
-            fresh.numbers,
+        return self._begun(
+            EnvState(
+                fresh.physics,
+                torch.zeros((self.nworld, self.action_size), device=self.device),
+                torch.zeros(self.nworld, dtype=torch.int64, device=self.device),
+                fresh.numbers,
+                self._memories.start,
+            )
         )
+
+    def _begun(self, state: EnvState) -> EnvState:
+        """The state with the memories of episodes that begin in it; it has their declared values."""
+        if not self._memories:
+            return state
+        with self._in_state(state), torch.no_grad():
+            values = self.begin_memory(state.physics)
+        self._contract.check_memory("begin_memory", values, state.memory, complete=False)
+        return state._replace(memory=self._memories.begun(values))
+
+    @cached_property
+    def _memories(self) -> Memories:
+        declared = self.memories()
+        self._contract.check_declared(declared)
+        return Memories(declared, self.nworld, self.device)
 
     def spread_ages(self) -> None:
         """Give the worlds ages spread evenly over the episode length: they then reset at different times."""
@@ -271,6 +314,7 @@ class Env(ABC, Generic[SettingsT]):
     def release_graph(self) -> None:
         """Cut the state from the graph, and forget everything else that would keep the graph in memory."""
         self.state = self.state.detach()
+        self.next_memory = {}
         self._reached = None
         self._measured = {}
 
@@ -336,6 +380,7 @@ class Env(ABC, Generic[SettingsT]):
         """
         state, gather = self.state, self.group.gather
         drawn, task = self._split(state.numbers)
+        memory = {name: gather(values.detach()).clone() for name, values in state.memory.items()}
         return {
             "env_generator": self.generator.get_state(),
             "env_state": [gather(t.detach()).clone() for t in (*state.physics, state.action, state.age)],
@@ -344,6 +389,7 @@ class Env(ABC, Generic[SettingsT]):
             if self.randomizer is None
             else {"numbers": gather(drawn).clone(), "generator": self.randomizer.generator.get_state()},
             **({"env_task": gather(task).clone()} if task.shape[1] else {}),
+            **({"env_memory": memory} if memory else {}),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -358,7 +404,11 @@ class Env(ABC, Generic[SettingsT]):
             self.randomizer.generator.set_state(drawn["generator"].cpu())
         if "env_task" in state:
             numbers.append(self.group.own(state["env_task"].to(self.device)))
-        self.state = EnvState(StepState(*physics), action, age, torch.cat(numbers, dim=-1))
+        begun = self._begun(
+            EnvState(StepState(*physics), action, age, torch.cat(numbers, dim=-1), self._memories.start)
+        )
+        memory = {name: self.group.own(values) for name, values in state.get("env_memory", {}).items()}
+        self.state = restored(begun, memory)
         if "capacity" in state:
             # The buffer sizes that the trial had grown to: the next step may need them.
             self.sim.reserve(Capacity(*state["capacity"]))
@@ -369,11 +419,29 @@ class Env(ABC, Generic[SettingsT]):
 
     def observation_of(self, reached: EnvState) -> Tensor:
         """Observation (W, O) of another state; the current one stays what it is."""
-        current, self.state = self.state, reached
-        try:
+        with self._in_state(reached):
             return self.observation()
+
+    @contextmanager
+    def _in_state(self, state: EnvState) -> Iterator[None]:
+        """Inside the block, the worlds are in another state."""
+        before = vars(self).get("state", state)
+        self.state = state
+        try:
+            yield
         finally:
-            self.state = current
+            self.state = before
+
+    def reached(self, state: StepState, action: Tensor) -> EnvState:
+        """The state of all worlds once `action` has led to `state`."""
+        before = self.state
+        if self._memories:
+            self.next_memory = self._memories.ordered(self.remember(state, action))
+        return EnvState(state, action, before.age + 1, before.numbers, self.next_memory)
+
+    def carried(self, state: EnvState) -> EnvState:
+        """A state as the next step begins with it: the gradients of some memories do not cross steps."""
+        return self._memories.carried(state) if self._memories else state
 
     def step(self, action: Tensor, *, auto_reset: bool = True) -> Transition:
         """Advance all worlds under actions (W, A) in [-1, 1] and reset those whose episode ended.
@@ -389,19 +457,20 @@ class Env(ABC, Generic[SettingsT]):
             # `where` sends no cotangent into a diverged world's step, so its gradient cannot reach the batch.
             after = StepState(*(rows_where(diverged, b.detach(), a) for b, a in zip(before, after, strict=True)))
         self._reached, self._diverged = after, diverged
-        reached = EnvState(after, action, self.state.age + 1, self.state.numbers)
-        given = versions(after, action)
+        given = versions(after, action, self.memory)
+        reached = self.reached(after, action)
         obs = self.observation_of(reached)
         terms = self.reward_terms(after, action, obs)
         fell = self.fell(after)
+        self._contract.check_memory("remember", reached.memory, self.memory)
         self._contract.check_results(obs, terms, fell)
-        self._contract.check_unchanged("observe, reward_terms or fell", given, after, action)
+        self._contract.check_unchanged("remember, observe, reward_terms or fell", given, after, action, self.memory)
         if not all_valid:
             terms = terms.masked_fill(diverged[:, None], 0.0)
         reward = terms.sum(-1)
         terminated = diverged | fell
         truncated = (reached.age >= self.config.episode_length) & ~terminated
-        self.state = self._reset_where(terminated | truncated, reached) if auto_reset else reached
+        self.state = self.carried(self._reset_where(terminated | truncated, reached) if auto_reset else reached)
         return Transition(reward, terms.detach(), obs, terminated, truncated, diverged)
 
     def frames(self, state: StepState) -> Frames:
@@ -425,8 +494,8 @@ class Env(ABC, Generic[SettingsT]):
         """Force of all contacts on geoms [N], world coordinates: (W, 3) for one name or id, (W, n, 3) for several.
 
         Values only: no gradient flows through them. They are those of the last substep of the step that led to
-        `state`, and 0 in a world that diverged in it. Only `reward_terms`, `fell` and `outcome_terms` may use them,
-        because `observe` is also called for states that no step has led to.
+        `state`, and 0 in a world that diverged in it. Only `remember`, `reward_terms`, `fell` and `outcome_terms` may
+        use them, because `observe` is also called for states that no step has led to.
 
         Raises:
             ConfigError: no step has just led to `state`, or there is no such geom.
@@ -436,7 +505,7 @@ class Env(ABC, Generic[SettingsT]):
         if state is not self._reached:
             raise ConfigError(
                 f"{type(self).__qualname__}: contact forces belong to a step, not to a state: use them in "
-                "reward_terms, fell or outcome_terms, not in observe"
+                "remember, reward_terms, fell or outcome_terms, not in observe"
             )
         force = self._once("contact_forces", state, self.sim.contact_forces)
         chosen = as_named(force[:, self._kinematics.indices("geom", geom)], geom)

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from msk_ray.config import Reward, Term
 from msk_ray.envs.generators import GlobalGenerators
+from msk_ray.envs.memory import Memory
 from msk_ray.envs.records import EnvState
 from msk_ray.envs.terms import terms_without_gradient
 from msk_ray.errors import ConfigError, MskRayError, shortened
@@ -28,6 +29,9 @@ from msk_ray.step.autograd.out_of_memory import is_out_of_memory
 
 if TYPE_CHECKING:
     from msk_ray.envs.base import Env
+
+Given = Tensor | StepState | Mapping[str, Tensor]
+"""What a method is given: observation or action, a physical state, or memories."""
 
 _BASE = "msk_ray.envs.base"
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -63,6 +67,8 @@ class Contract:
         with self.during("prepare"):
             self._env.prepare()
         with self.during(self.start):
+            self._env.stock_resets(self._env.draw_resets(1))
+        with self.during("begin_memory"):
             self._env.state = self._env.reset_state()
         self.rehearse()
 
@@ -105,9 +111,13 @@ class Contract:
         controls = self.call("control", lambda: env.control(action), state.physics, action)
         self._check("control", controls, (env.nworld, env.model.nu), "one control for each actuator")
         after = StepState(*map(copy, state.physics))
-        reached = EnvState(after, action, state.age + 1, state.numbers)
-        obs = self.call("observe", lambda: env.observation_of(reached), after, action)
         # No step has led to `after`, so that it has no contact forces.
+        env.ignore_contact_forces = True
+        remembered = self.call("remember", lambda: env.remember(after, action), after, action, env.memory)
+        self.check_memory("remember", remembered, env.memory)
+        reached = env.reached(after, action)
+        env.ignore_contact_forces = False
+        obs = self.call("observe", lambda: env.observation_of(reached), after, action)
         env.ignore_contact_forces = True
         for term in env.active_terms:
             self._check_term(term, after, action, obs)
@@ -147,7 +157,7 @@ class Contract:
                 "self.uniform(...) or self.normal(...)"
             )
 
-    def call(self, method: str, call: Callable[[], Any], *given: Tensor | StepState) -> Any:
+    def call(self, method: str, call: Callable[[], Any], *given: Given) -> Any:
         """What a method gives, which must leave the tensors that it is given as they are.
 
         Raises:
@@ -159,7 +169,7 @@ class Contract:
         self.check_unchanged(method, before, *given)
         return result
 
-    def check_unchanged(self, method: str, before: Sequence[int], *given: Tensor | StepState) -> None:
+    def check_unchanged(self, method: str, before: Sequence[int], *given: Given) -> None:
         """Raise ConfigError if the tensors given to methods have other `versions` than before."""
         for (name, tensor), version in zip(_named(given), before, strict=True):
             if tensor._version != version:
@@ -232,6 +242,31 @@ class Contract:
             raise ConfigError(f"{method} of {self._name} returns {_kind(state)}: return StepState(qpos, qvel, act)")
         for name, part, size in zip(StepState._fields, state, (model.nq, model.nv, model.na), strict=True):
             self._check(f"{name} from {method}", part, (count, size))
+
+    def check_declared(self, declared: Any) -> None:
+        """Raise ConfigError if `memories` gives no declarations."""
+        if not isinstance(declared, Mapping):
+            raise ConfigError(f"memories of {self._name} returns {_kind(declared)}: return a dict of Memory by name")
+        for name, memory in declared.items():
+            if not isinstance(memory, Memory) or memory.size < 1:
+                raise ConfigError(
+                    f"{name!r} in memories of {self._name} is {memory!r}: write Memory(size), with the numbers that "
+                    "each world remembers"
+                )
+
+    def check_memory(self, method: str, values: Any, like: Mapping[str, Tensor], *, complete: bool = True) -> None:
+        """Raise ConfigError if a method gives memories that are not like these, or, if `complete`, not all of them."""
+        if not isinstance(values, Mapping):
+            raise ConfigError(f"{method} of {self._name} returns {_kind(values)}: return a dict of tensors by name")
+        for name, value in values.items():
+            if name not in like:
+                raise ConfigError(f"{method} of {self._name} gives {name!r}, which its memories lack: declare it there")
+            self._check(f"{name!r} from {method}", value, tuple(like[name].shape))
+        if complete and (missing := [name for name in like if name not in values]):
+            raise ConfigError(
+                f"{method} of {self._name} gives no {missing[0]!r}: give every memory, an unchanged one as "
+                f"self.memory[{missing[0]!r}]"
+            )
 
     def _check_outcomes(self, outcomes: Any) -> None:
         if not isinstance(outcomes, Mapping):
@@ -309,18 +344,20 @@ class Contract:
         return next((hint for words, hint in _HINTS.items() if words in text), None)
 
 
-def versions(*given: Tensor | StepState) -> list[int]:
+def versions(*given: Given) -> list[int]:
     """How often each of some tensors has been changed in place."""
     return [tensor._version for _, tensor in _named(given)]
 
 
-def _named(given: Sequence[Tensor | StepState]) -> list[tuple[str, Tensor]]:
+def _named(given: Sequence[Given]) -> list[tuple[str, Tensor]]:
     """The tensors among what methods are given, by the names that they have there."""
     names = iter(("action", "obs"))
     found: list[tuple[str, Tensor]] = []
     for value in given:
         if isinstance(value, StepState):
             found += [(f"state.{name}", part) for name, part in value._asdict().items()]
+        elif isinstance(value, Mapping):
+            found += [(f"self.memory[{name!r}]", part) for name, part in value.items()]
         else:
             found.append((next(names), value))
     return found

@@ -3,6 +3,8 @@
 Axes: W worlds, N episodes, O observation, A action.
 """
 
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import torch
@@ -22,10 +24,30 @@ class EnvState(NamedTuple):
     """Env steps since reset, shape (W,), int64."""
     numbers: Tensor
     """Numbers drawn for each world's episode, shape (W, K + T): K by `physics.randomize`, then T of the task."""
+    memory: Mapping[str, Tensor] = MappingProxyType({})
+    """What the worlds remember, each (W, size), by name; attached where that is declared."""
+
+    def tensors(self) -> list[Tensor]:
+        """All tensors in a fixed order."""
+        return [*self.physics, self.action, self.age, self.numbers, *self.memory.values()]
+
+    def mapped(self, change: Callable[[Tensor], Tensor]) -> "EnvState":
+        """The state of changed tensors."""
+        return EnvState(
+            StepState(*map(change, self.physics)),
+            change(self.action),
+            change(self.age),
+            change(self.numbers),
+            {name: change(values) for name, values in self.memory.items()},
+        )
 
     def detach(self) -> "EnvState":
         """The same state, cut from the graph."""
-        return EnvState(StepState(*(t.detach() for t in self.physics)), self.action.detach(), self.age, self.numbers)
+        return self._replace(
+            physics=StepState(*(t.detach() for t in self.physics)),
+            action=self.action.detach(),
+            memory={name: values.detach() for name, values in self.memory.items()},
+        )
 
     def replaced(self, worlds: Tensor, fresh: "EnvState") -> "EnvState":
         """The same state, but in the given worlds (W,) that of `fresh`."""
@@ -34,6 +56,7 @@ class EnvState(NamedTuple):
             rows_where(worlds, fresh.action, self.action),
             torch.where(worlds, fresh.age, self.age),
             rows_where(worlds, fresh.numbers, self.numbers),
+            {name: rows_where(worlds, fresh.memory[name], own) for name, own in self.memory.items()},
         )
 
 

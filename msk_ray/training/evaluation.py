@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from msk_ray.config import Config, PhysicsConfig, RandomizeConfig
-from msk_ray.envs import Env, EnvState, env_class, make_env
+from msk_ray.envs import Env, env_class, make_env
 from msk_ray.envs.generators import GlobalGenerators
 from msk_ray.envs.records import Resets, Transition
 from msk_ray.errors import ConfigError
@@ -278,13 +278,13 @@ class _RecordedStep:
     def __init__(self, env: Env[Any], policy: PolicyGroup, record: "_Record", stream: torch.cuda.Stream) -> None:
         self._env = env
         before = env.state
-        self._state = EnvState(StepState(*(t.clone() for t in before.physics)), *(t.clone() for t in before[1:]))
+        self._state = before.mapped(Tensor.clone)
 
         def work() -> None:
             env.state = self._state
             transition = env.step(policy.act(env.observation()), auto_reset=False)
             record.add(transition, env.outcome_terms(env.state.physics), in_tail=False)
-            fill(_tensors(self._state), _tensors(env.state))
+            fill(self._state.tensors(), env.state.tensors())
 
         try:
             self._work = Recording(work, stream)
@@ -300,10 +300,6 @@ class _RecordedStep:
         """Copy the state reached back to the environment."""
         self._env.state = self._state
         self._env.release_graph()
-
-
-def _tensors(state: EnvState) -> list[Tensor]:
-    return [*state.physics, *state[1:]]
 
 
 def _recorded_step(

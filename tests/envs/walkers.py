@@ -10,7 +10,7 @@ import random
 import numpy as np
 import torch
 
-from msk_ray import MjcfEnv, Reward, StepState
+from msk_ray import Memory, MjcfEnv, Reward, StepState
 
 
 class WalkerReward(Reward):
@@ -48,6 +48,14 @@ _OBSERVE = "return torch.cat((state.qpos, self.scale * state.qvel), -1)"
 _FORWARD = "forward = self.config.reward.forward * state.qvel[:, 0]"
 _TERMS = "return torch.stack((forward, effort), -1)"
 _NAMES = 'reward_names = ("forward", "effort")'
+_METHOD = "    def fell("
+_MEMORY = f"""    def memories(self):
+        return {{"pace": Memory(1)}}
+
+    def remember(self, state, action):
+        return {{"pace": state.qvel}}
+
+{_METHOD}"""
 
 
 class Mistake(NamedTuple):
@@ -192,6 +200,42 @@ MISTAKES = {
         'return {"speed": state.qvel[:, 0]}',
         'return {"fast": state.qvel[:, 0] > 1.0}',
         r"'fast' in outcome_terms of Walker returns torch\.bool, not torch\.float32: write \.float\(\)",
+    ),
+    "memory that is a number": Mistake(
+        _METHOD, f"{_MEMORY.replace('Memory(1)', '1')}", r"'pace' in memories of Walker is 1: write Memory\(size\)"
+    ),
+    "memory not remembered": Mistake(
+        _METHOD, _MEMORY.split("    def remember")[0] + _METHOD, "remember of Walker gives no 'pace': .* self.memory"
+    ),
+    "memory not declared": Mistake(
+        _METHOD,
+        "    def remember" + _MEMORY.split("    def remember")[1],
+        "remember of Walker gives 'pace', .* declare",
+    ),
+    "memory of another size": Mistake(
+        _METHOD,
+        _MEMORY.replace("Memory(1)", "Memory(2)"),
+        r"'pace' from remember of Walker has shape \(4, 1\), not \(4, 2\)",
+    ),
+    "memory in a list": Mistake(
+        _METHOD,
+        _MEMORY.replace('{"pace": state.qvel}', "[state.qvel]"),
+        "remember of Walker returns a list: return a dict of tensors by name",
+    ),
+    "memory written in place": Mistake(
+        _METHOD,
+        _MEMORY.replace('{"pace": state.qvel}', '{"pace": self.memory["pace"].copy_(state.qvel)}'),
+        r"remember of Walker changes self\.memory\['pace'\] in place: write to a copy",
+    ),
+    "start of a memory in float64": Mistake(
+        _METHOD,
+        f"    def begin_memory(self, state):\n        return {{'pace': state.qvel.double()}}\n\n{_MEMORY}",
+        r"'pace' from begin_memory of Walker returns torch\.float64",
+    ),
+    "exception at the start of a memory": Mistake(
+        _METHOD,
+        f"    def begin_memory(self, state):\n        return 1 / 0\n\n{_MEMORY}",
+        r"begin_memory of Walker: ZeroDivisionError: division by zero \(walker\.py:\d+\)$",
     ),
 }
 

@@ -34,14 +34,12 @@ class EpochInputs(NamedTuple):
 
     def tensors(self) -> list[Tensor]:
         """All tensors in a fixed order."""
-        physics, *others = self.state
-        return [*physics, *others, *self.resets.physics, self.resets.numbers, self.noise]
+        return [*self.state.tensors(), *self.resets.physics, self.resets.numbers, self.noise]
 
     def copies(self) -> "EpochInputs":
         """A copy in new memory."""
-        physics, *others = self.state
         return EpochInputs(
-            EnvState(StepState(*(t.clone() for t in physics)), *(t.clone() for t in others)),
+            self.state.mapped(Tensor.clone),
             Resets(StepState(*(t.clone() for t in self.resets.physics)), self.resets.numbers.clone()),
             self.noise.clone(),
         )

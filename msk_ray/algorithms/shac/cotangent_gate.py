@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from msk_ray.envs import EnvState
 from msk_ray.group import ALONE, Group
 from msk_ray.step import StepState
 
@@ -81,11 +82,16 @@ class CotangentGate:
         self._norms: list[Tensor] = []
         self._nonfinite = torch.zeros(nworld, dtype=torch.bool, device=device)
 
-    def __call__(self, state: StepState) -> StepState:
-        """The same state, whose cotangent passes the gate in the backward pass."""
-        if not any(t.requires_grad for t in state):
+    def __call__(self, state: EnvState) -> EnvState:
+        """The same state, where the cotangent of physics and memories passes the gate in the backward pass."""
+        memory = {name: values for name, values in state.memory.items() if values.requires_grad}
+        parts = (*state.physics, *memory.values())
+        if not any(t.requires_grad for t in parts):
             return state
-        return StepState(*_Gate.apply(self, *state))
+        qpos, qvel, act, *others = _Gate.apply(self, *parts)
+        return state._replace(
+            physics=StepState(qpos, qvel, act), memory={**state.memory, **dict(zip(memory, others, strict=True))}
+        )
 
     def screen(self, action: Tensor) -> Tensor:
         """The same actions (W, A); in the backward pass, non-finite cotangents are stopped and counted.

@@ -55,7 +55,7 @@ def collect(
     neg_log_probs, contacts = [], []
     normalize = normalizer.fixed()
     for step_noise in noise:
-        env.state = env.state._replace(physics=gate(env.state.physics)) if state_bptt else env.state.detach()
+        env.state = gate(env.state) if state_bptt else env.state.detach()
         obs = env.observation()
         if with_neg_log_prob:
             action, neg_log_prob = actor.sample(normalize(obs), step_noise)

@@ -3,14 +3,15 @@
 import torch
 
 from msk_ray.algorithms.shac.cotangent_gate import CotangentGate
+from msk_ray.envs import EnvState
 from msk_ray.step import StepState
 
 
 def pulled(gate: CotangentGate, cotangent: torch.Tensor) -> torch.Tensor:
     qpos = torch.zeros_like(cotangent).requires_grad_()
     empty = torch.zeros(len(cotangent), 0)
-    passed = gate(StepState(qpos, empty, empty))
-    passed.qpos.backward(cotangent)
+    passed = gate(EnvState(StepState(qpos, empty, empty), empty, empty, empty))
+    passed.physics.qpos.backward(cotangent)
     return qpos.grad
 
 
