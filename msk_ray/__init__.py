@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from msk_ray.algorithms import Algorithm as Algorithm
     from msk_ray.algorithms import EpochResult as EpochResult
     from msk_ray.config import AlgorithmSettings as AlgorithmSettings
+    from msk_ray.config import Command as Command
     from msk_ray.config import Config as Config
     from msk_ray.config import Cost as Cost
     from msk_ray.config import EnvSettings as EnvSettings
@@ -41,6 +42,7 @@ _HOMES = {
     "AlgorithmSettings": "msk_ray.config",
     "Backward": "msk_ray.step.autograd",
     "Capacity": "msk_ray.step.autograd",
+    "Command": "msk_ray.config",
     "Config": "msk_ray.config",
     "Cost": "msk_ray.config",
     "Env": "msk_ray.envs",

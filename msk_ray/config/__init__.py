@@ -9,6 +9,7 @@ from msk_ray.config.algorithms import (
     PpoConfig,
     ShacConfig,
 )
+from msk_ray.config.commands import Command
 from msk_ray.config.environments import ENVIRONMENTS, settings_class
 from msk_ray.config.execution import AS_USUAL, ExecutionConfig
 from msk_ray.config.horizons import AdaptiveHorizon, ContactHorizon, HorizonSchedule
@@ -47,6 +48,7 @@ __all__ = [
     "AdaptiveHorizon",
     "AlgorithmConfig",
     "AlgorithmSettings",
+    "Command",
     "Config",
     "ContactCurriculum",
     "ContactHorizon",

@@ -14,8 +14,10 @@ import mujoco
 import torch
 from torch import Tensor
 
-from msk_ray.config import AS_USUAL, EnvSettings, ExecutionConfig, PhysicsConfig, Reward, Term
+from msk_ray.config import AS_USUAL, Command, EnvSettings, ExecutionConfig, PhysicsConfig, Reward, Term
+from msk_ray.config.commands import Commands, settings_with_commands
 from msk_ray.config.rewards import settings_with
+from msk_ray.envs import commands
 from msk_ray.envs.contract import Contract, versions
 from msk_ray.envs.layout import Entry
 from msk_ray.envs.memory import Memories, Memory, restored
@@ -46,6 +48,7 @@ class Env(ABC, Generic[SettingsT]):
             states on every device.
         active_terms: the terms that are computed.
         randomizer: parameters of the model that differ between worlds; None for the model's own.
+        command_ranges: smallest and largest values of each command, (2, C), by name; change them in place.
         next_memory: in `reward_terms` and `fell`, what `remember` has just given.
         ignore_contact_forces: whether contact forces read as 0, for comparisons of gradients, because they carry none.
         group: the processes that the trial's worlds are spread over; here are those of this one.
@@ -63,6 +66,8 @@ class Env(ABC, Generic[SettingsT]):
     terms: ClassVar[tuple[Term, ...]] = ()
     """The terms of the reward. Their weights are settings: a class whose `Settings` lack them gets such that have them.
     A class without terms has `reward_terms`, `reward_names`, `without_gradient` and a reward section of its own."""
+    commands: ClassVar[tuple[Command, ...]] = ()
+    """What episodes ask of the policy. Their ranges are settings, as the weights of terms are."""
     reward_names: tuple[str, ...]
     """Names of the T parts of the reward."""
     without_gradient: ClassVar[tuple[str, ...]] = ()
@@ -78,6 +83,8 @@ class Env(ABC, Generic[SettingsT]):
         super().__init_subclass__(**kwargs)
         if cls.terms and hasattr(cls, "Settings"):
             cls.Settings = settings_with(cls.terms, cls.Settings, cls)
+        if cls.commands and hasattr(cls, "Settings"):
+            cls.Settings = settings_with_commands(cls.commands, cls.Settings, cls)
         if "terms" in vars(cls) and "reward_names" not in vars(cls):
             cls.reward_names = tuple(term.name for term in cls.terms if not term.optional)
 
@@ -118,6 +125,9 @@ class Env(ABC, Generic[SettingsT]):
             self.randomizer = Randomizer(physics.randomize, self.model, self.device, seed)
             self.sim.open_parameters(self.randomizer.parameters)
         self._begin_terms()
+        ranges: Commands = getattr(config, "commands", Commands())
+        self._draws, self._drawn = commands.plan(ranges, config.episode_length * config.control_timestep)
+        self.command_ranges = commands.ranges_of(ranges, self.device)
         self._fresh: list[Resets] = []
         self.next_memory: Mapping[str, Tensor] = {}
         self.ignore_contact_forces = False
@@ -161,8 +171,10 @@ class Env(ABC, Generic[SettingsT]):
 
     @classmethod
     def reference_settings(cls, config: SettingsT) -> SettingsT:
-        """`config` with the reward that policies are scored under: the section's defaults; the rest is unchanged."""
-        return config.model_copy(update={"reward": type(config.reward)()})
+        """`config` with the reward and the commands that policies are scored under: the defaults of their sections; the
+        rest is unchanged."""
+        default = {name: type(getattr(config, name))() for name in ("reward", "commands") if hasattr(config, name)}
+        return config.model_copy(update=default)
 
     @classmethod
     def reference_physics(cls, physics: PhysicsConfig, variant: str | None) -> PhysicsConfig:
@@ -335,13 +347,15 @@ class Env(ABC, Generic[SettingsT]):
         """What `count` episodes begin with."""
         physics, task = self.draw_start(count)
         self._contract.check_start(physics, count)
+        if self._drawn:
+            task = torch.cat((task, 0.5 + 0.5 * self.uniform(count, self._drawn)), dim=-1)
         if self.randomizer is None:
             return Resets(physics, task)
         return Resets(physics, torch.cat((self.randomizer.draw(count), task), dim=-1))
 
     def draw_start(self, count: int) -> tuple[StepState, Tensor]:
-        """Initial physical states of `count` episodes, and the T numbers of the task of each, (count, T), such as a
-        speed to walk at."""
+        """Initial physical states of `count` episodes, and numbers of the task of each, (count, T), such as the phase
+        of a gait to begin in: for what no command can say, because the initial state depends on it."""
         return self.draw_physics(count), torch.zeros((count, 0), device=self.device)
 
     def join(self, group: Group) -> None:
@@ -365,11 +379,25 @@ class Env(ABC, Generic[SettingsT]):
         return None if self.randomizer is None else self.randomizer.values(self._split(self.state.numbers)[0])
 
     def task_numbers(self, numbers: Tensor) -> Tensor:
-        """The T columns of the task in `EnvState.numbers`, (W, T)."""
-        return self._split(numbers)[1]
+        """What `draw_start` has drawn of `EnvState.numbers`, (W, T)."""
+        task = self._split(numbers)[1]
+        return task[:, : task.shape[1] - self._drawn] if self._drawn else task
+
+    def command(self, name: str) -> Tensor:
+        """A command (W, C), in the state that `self.state` is: in `reward_terms`, that which `action` was chosen under.
+
+        Raises:
+            ConfigError: the class declares none of this name.
+        """
+        if name not in self._draws:
+            known = ", ".join(self._draws) or "none"
+            raise ConfigError(f"{type(self).__qualname__} has no command {name!r}; its commands: {known}")
+        drawn = self.state.numbers[:, self.state.numbers.shape[1] - self._drawn :]
+        time = self.state.age * self.config.control_timestep
+        return self._draws[name].value(drawn, time, self.command_ranges[name])
 
     def _split(self, numbers: Tensor) -> tuple[Tensor, Tensor]:
-        """Columns of the randomizer (W, K) and of the task (W, T)."""
+        """Columns of the randomizer, (W, K), and of the task: T by `draw_start`, then those of the commands."""
         drawn = 0 if self.randomizer is None else self.randomizer.size
         return numbers[:, :drawn], numbers[:, drawn:]
 
@@ -390,6 +418,7 @@ class Env(ABC, Generic[SettingsT]):
             else {"numbers": gather(drawn).clone(), "generator": self.randomizer.generator.get_state()},
             **({"env_task": gather(task).clone()} if task.shape[1] else {}),
             **({"env_memory": memory} if memory else {}),
+            **({"command_ranges": {n: t.clone() for n, t in self.command_ranges.items()}} if self._drawn else {}),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -404,6 +433,8 @@ class Env(ABC, Generic[SettingsT]):
             self.randomizer.generator.set_state(drawn["generator"].cpu())
         if "env_task" in state:
             numbers.append(self.group.own(state["env_task"].to(self.device)))
+        for name, ranges in state.get("command_ranges", {}).items():
+            self.command_ranges[name].copy_(ranges)
         begun = self._begun(
             EnvState(StepState(*physics), action, age, torch.cat(numbers, dim=-1), self._memories.start)
         )

@@ -23,7 +23,8 @@ class EnvState(NamedTuple):
     age: Tensor
     """Env steps since reset, shape (W,), int64."""
     numbers: Tensor
-    """Numbers drawn for each world's episode, shape (W, K + T): K by `physics.randomize`, then T of the task."""
+    """Numbers drawn for each world's episode, shape (W, K + T): K by `physics.randomize`, then T of the task: those of
+    `Env.draw_start`, and the draws of commands."""
     memory: Mapping[str, Tensor] = MappingProxyType({})
     """What the worlds remember, each (W, size), by name; attached where that is declared."""
 
