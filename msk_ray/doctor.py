@@ -263,6 +263,7 @@ def check_gradient(device: str | None) -> Finding:
     """Gradients of one step of CartPole, compared with float64 differences of C MuJoCo."""
     import torch
 
+    from msk_ray.compiling import count_kernels
     from msk_ray.config import PhysicsConfig
     from msk_ray.envs import env_class
     from msk_ray.envs.cartpole.config import CartPoleSettings
@@ -270,6 +271,7 @@ def check_gradient(device: str | None) -> Finding:
 
     where = device or ("cuda:0" if torch.cuda.is_available() else "cpu")
     env = CartPoleSettings(name="cartpole")
+    count_kernels()
     started = time.monotonic()
     try:
         model = env_class(env).build_model(env, PhysicsConfig())

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from msk_ray.cli import Parser, run
+from msk_ray.compiling import announce_compiling
 from msk_ray.errors import ConfigError, UnsupportedModelError
-from msk_ray.progress import COMPILING, Pace, announce
+from msk_ray.progress import Pace
 
 if TYPE_CHECKING:
     import mujoco
@@ -169,9 +170,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     states, parameters = _listed(args.states), _listed(args.parameters)
     if not args.json:
         kinds = ", ".join(states)
-        announce(
+        announce_compiling(
             f"checking gradients of {args.model} on {args.device}: {args.worlds} states each of {kinds}, "
-            f"{args.substeps} substep(s), by {args.mode}; {COMPILING}"
+            f"{args.substeps} substep(s), by {args.mode}"
         )
     # torch and Warp take seconds to load; a wrong command line should not wait for them.
     from msk_ray.step import Kernels, Simulation

@@ -51,7 +51,7 @@ class ProgressLine:
             print()
 
 
-COMPILING = "kernels that are not in Warp's cache are compiled first: up to a minute or two on a CPU"
+COMPILING = "kernels that are not in Warp's cache are compiled first: up to a minute on a CPU"
 
 
 def announce(text: str) -> None:
@@ -82,6 +82,36 @@ class Pace:
         self._due = now + self.EVERY_S
         left = (now - self._start) / done * (self._total - done)
         print(f"  {done} of {self._total} {self._unit}, about {format_duration(left)} left", flush=True)
+
+
+class KernelCount:
+    """Shows how many kernels are ready and for how long the others have been compiled, from two seconds on: in place on
+    a terminal, elsewhere as a line every ten seconds, and at the end."""
+
+    FIRST_S, EVERY_S = 2.0, 10.0
+
+    def __init__(self) -> None:
+        self._start: float | None = None
+        self._due = 0.0
+        self._shown = False
+        self._terminal = sys.stdout.isatty()
+
+    def __call__(self, done: int, total: int) -> None:
+        """Report that `done` of `total` kernels are ready."""
+        now = time.monotonic()
+        if self._start is None:
+            self._start, self._due, self._shown = now, now + self.FIRST_S, False
+        last = done == total
+        if now >= self._due or (last and self._shown):
+            text = f"kernels {done} of {total}, {format_duration(now - self._start)}"
+            self._shown = True
+            if self._terminal:
+                print(f"\r\x1b[K{text}", end="\n" if last else "", flush=True)
+            else:
+                print(text, flush=True)
+                self._due = now + self.EVERY_S
+        if last:
+            self._start = None
 
 
 def format_duration(seconds: float) -> str:

@@ -23,6 +23,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 from msk_ray.cli import TERMINAL_LOG, Parser, run, surviving_closed_output, typed_command
+from msk_ray.compiling import announce_compiling
 from msk_ray.config import SET_HELP, Config, load_config
 from msk_ray.errors import CheckpointError, ConfigError, StorageError
 from msk_ray.experiment.environment import environment
@@ -31,7 +32,7 @@ from msk_ray.experiment.metrics import read_rows
 from msk_ray.experiment.ownership import Ownership, owned
 from msk_ray.files import check_writable, make_folder, write_json
 from msk_ray.metrics import SCORE
-from msk_ray.progress import COMPILING, ProgressLine, announce
+from msk_ray.progress import ProgressLine, announce
 from msk_ray.signals import RESUMABLE, StopRequest, listening
 from msk_ray.text import printable
 
@@ -230,7 +231,7 @@ def _train(
     device = _choose_device(args.device)
     gpus = config.execution.gpus
     place = device if gpus == 1 else f"{gpus} {'CPU processes' if device == 'cpu' else f'GPUs, the first {device}'}"
-    announce(f"on {place}; {COMPILING}")
+    announce_compiling(f"on {place}")
     trainer = _trainer(config, logdir, device, args.resume, args.score_at_once)
     if args.resume:
         path, faults = trainer.restore_latest()

@@ -15,7 +15,7 @@ from msk_ray.diagnose.__main__ import main as diagnose
 from msk_ray.evaluate.__main__ import main as evaluate
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.gradcheck import main as gradcheck
-from msk_ray.progress import Pace, ProgressLine
+from msk_ray.progress import KernelCount, Pace, ProgressLine
 from msk_ray.visualize.__main__ import main as visualize
 
 COMMANDS = ("gradcheck", "diagnose", "evaluate", "visualize", "gait")
@@ -136,4 +136,22 @@ def test_the_time_left_is_told_after_two_seconds_and_then_every_ten(
     assert capsys.readouterr().out.splitlines() == [
         "  2 of 100 states, about 1m38s left",
         "  12 of 100 states, about 1m28s left",
+    ]
+
+
+def test_kernels_are_counted_after_two_seconds_then_every_ten_and_at_the_end(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now = [0.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    count = KernelCount()
+    for second in range(16):
+        now[0] = float(second)
+        count(second, 15)
+    for done in (15, 16):  # quick: nothing to say
+        count(done, 16)
+    assert capsys.readouterr().out.splitlines() == [
+        "kernels 2 of 15, 2s",
+        "kernels 12 of 15, 12s",
+        "kernels 15 of 15, 15s",
     ]

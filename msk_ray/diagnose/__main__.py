@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from msk_ray.cli import Parser, run
+from msk_ray.compiling import announce_compiling
 from msk_ray.config import SET_HELP
 from msk_ray.errors import CheckpointError, ConfigError
 from msk_ray.files import make_folder, write_text
-from msk_ray.progress import COMPILING, Pace, announce
+from msk_ray.progress import Pace
 
 if TYPE_CHECKING:
     from msk_ray.diagnose.probe import Quality
@@ -75,10 +76,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
     _check(args)
-    announce(
+    announce_compiling(
         f"comparing policy gradients of {args.subject} with float64 differences on {args.device}: {args.worlds} worlds "
-        f"of each kind of state, horizons {', '.join(map(str, args.horizons))}, {args.directions} directions; "
-        f"{COMPILING}"
+        f"of each kind of state, horizons {', '.join(map(str, args.horizons))}, {args.directions} directions"
     )
 
     # torch and Warp take seconds to load; a wrong command line should not wait for them.

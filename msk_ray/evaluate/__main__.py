@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from msk_ray.cli import Parser, run
+from msk_ray.compiling import announce_compiling
 from msk_ray.errors import CheckpointError, ConfigError, MskRayError
 from msk_ray.evaluate import zoo
 from msk_ray.evaluate.elsewhere import SCORINGS, Scorer, find_python, foreign_scoring
@@ -21,7 +22,6 @@ from msk_ray.experiment.layout import EVAL_FILE
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.trial import by_environment
 from msk_ray.files import write_json
-from msk_ray.progress import COMPILING, announce
 from msk_ray.shipped import is_shipped
 from msk_ray.sweep.space import parse_seeds
 from msk_ray.text import printable
@@ -119,7 +119,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _evaluate_zoo(target, args)
     if target.kind is not Kind.EXPERIMENT:
         best_checkpoint(target)  # torch and Warp take seconds to load; a wrong path should not wait for them
-    announce(f"evaluating {_what(target)}; {COMPILING}")
+    announce_compiling(f"evaluating {_what(target)}")
 
     from msk_ray.evaluate import measure
 
@@ -152,7 +152,7 @@ def _evaluate_zoo(target: Target, args: argparse.Namespace) -> int:
             shown = {"elsewhere": "in", "conditions": "with"}.get(option, option)
             raise ConfigError(f"--{shown}: the policies of {target.path} are evaluated as recorded there; leave it out")
     zoo.read_zoo(target.path)  # torch and Warp take seconds to load; a damaged entry should not wait for them
-    announce(f"evaluating the policies of {target.path} as recorded there; {COMPILING}")
+    announce_compiling(f"evaluating the policies of {target.path} as recorded there")
 
     from msk_ray.evaluate import measure
     from msk_ray.step.autograd.simulation import resolve_device

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from msk_ray.cli import Parser, run
+from msk_ray.compiling import announce_compiling
 from msk_ray.errors import CheckpointError, ConfigError
 from msk_ray.evaluate.__main__ import positive
 from msk_ray.evaluate.targets import Target, best_checkpoint, best_trial_folder, find_target, trial_folder_of
 from msk_ray.files import make_folder
-from msk_ray.progress import COMPILING, Pace, announce
+from msk_ray.progress import Pace, announce
 from msk_ray.sweep.space import parse_seeds
 from msk_ray.text_table import text_table
 
@@ -119,7 +120,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
     target = _check(args)
-    announce(f"running {_what(args, target)}; {COMPILING}")
+    announce_compiling(f"running {_what(args, target)}")
     from msk_ray.evaluate.measure import Bench, Request, default_device
     from msk_ray.step.autograd.simulation import resolve_device
     from msk_ray.training import load_policy

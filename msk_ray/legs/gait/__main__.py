@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from msk_ray.cli import Parser, run
+from msk_ray.compiling import announce_compiling
 from msk_ray.errors import ConfigError, brief
 from msk_ray.evaluate.__main__ import positive
 from msk_ray.evaluate.stored import eval_file_of, store_evaluation
 from msk_ray.evaluate.targets import best_checkpoint, find_target, trial_folder_of
 from msk_ray.files import make_folder, write_json
-from msk_ray.progress import COMPILING, announce
 from msk_ray.shipped import is_shipped
 from msk_ray.text_table import text_table
 
@@ -73,7 +73,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         _check_film(args)
     speeds: list[float | None] = [None] if args.speeds is None else [*_speeds(args.speeds)]
     what = paths[0] if len(paths) == 1 else f"{len(paths)} policies"
-    announce(f"measuring the gait of {what}; {COMPILING}")
+    announce_compiling(f"measuring the gait of {what}")
 
     from msk_ray.envs.make import env_class
     from msk_ray.evaluate.measure import Bench, Request, default_device

@@ -5,7 +5,7 @@ Axes: W worlds. `nq, nv, na, nu` as in MuJoCo.
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
@@ -118,6 +118,10 @@ class Backward(ABC):
         Must begin with `batch.begin_step()` and end with `batch.end_step(data)`.
         """
         batch.launch_step()
+
+    def pullbacks(self) -> tuple[Callable[[], None], ...]:
+        """What `vjp` will launch, so that its kernels are compiled together with the step's."""
+        return ()
 
     def last_data(self, batch: WorldBatch) -> Any:
         """The mujoco_warp.Data in which the last substep of an env step was computed."""

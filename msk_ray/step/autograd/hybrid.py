@@ -1,5 +1,6 @@
 """`hybrid`: gradients of the state from one mode, of the control from another."""
 
+from collections.abc import Callable
 from typing import Any
 
 from torch import Tensor
@@ -33,6 +34,9 @@ class Hybrid(Backward):
 
     def launch_step(self, batch: WorldBatch) -> None:
         self._step_mode().launch_step(batch)
+
+    def pullbacks(self) -> tuple[Callable[[], None], ...]:
+        return (*self.state.pullbacks(), *self.ctrl.pullbacks())
 
     def last_data(self, batch: WorldBatch) -> Any:
         return self._step_mode().last_data(batch)

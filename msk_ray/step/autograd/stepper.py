@@ -8,7 +8,7 @@ from torch import Tensor
 from msk_ray.step.autograd.backward import Backward, ExternalForces, StepState
 from msk_ray.step.autograd.buffers import BatchTensors, device_of, stream_of, wait_for
 from msk_ray.step.autograd.parameters import ParameterTensors
-from msk_ray.step.forward import Graph, WorldBatch, joined_stream
+from msk_ray.step.forward import Graph, WorldBatch, compile_kernels, joined_stream
 from msk_ray.step.forward.capacity import Capacity
 from msk_ray.step.forward.contact_forces import ContactForces
 
@@ -37,6 +37,8 @@ class Engine:
 
     def _record(self) -> None:
         """Record the step's graph. On CUDA this runs the step once."""
+        pullbacks = () if self.backward is None else self.backward.pullbacks()
+        compile_kernels(self.batch.device, self._launches, *pullbacks)
         self._graph = Graph(self._launches, self.batch.device)
         self._limits = self.batch.unrolled_iterations
         for watch in (self.batch.losses, self.batch.iterations):

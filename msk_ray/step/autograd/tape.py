@@ -7,7 +7,7 @@ is no solve); `tape_all` stores them.
 
 import warnings
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import mujoco
@@ -146,6 +146,9 @@ class _Tape(Backward):
             {name: getattr(gradients, name).clone() for name in INPUTS if getattr(needs, name)},
             gradients.parameters,
         )
+
+    def pullbacks(self) -> tuple[Callable[[], None], ...]:
+        return (self.launch_backward,)
 
     def ready(self, applied: bool, names: tuple[str, ...] = ()) -> None:
         """Record the backward pass of steps with or without applied forces, with gradients of the named parameters.

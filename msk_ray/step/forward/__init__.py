@@ -10,6 +10,7 @@ from msk_ray.step.forward.no_gpu import start_quietly  # noqa: E402
 start_quietly()
 
 from msk_ray.step.forward.batch import WorldBatch  # noqa: E402
+from msk_ray.step.forward.compilation import compile_kernels, on_compiling  # noqa: E402
 from msk_ray.step.forward.graph import Graph, joined_stream, joining_capture, without_collecting  # noqa: E402
 from msk_ray.step.forward.stages import Kernels  # noqa: E402
 
@@ -17,7 +18,9 @@ __all__ = [
     "Graph",
     "Kernels",
     "WorldBatch",
+    "compile_kernels",
     "joined_stream",
     "joining_capture",
+    "on_compiling",
     "without_collecting",
 ]

@@ -7,6 +7,8 @@ from typing import Any
 
 import warp as wp
 
+from msk_ray.step.forward.compilation import compile_kernels
+
 _outer: list[wp.Stream] = []
 """The stream of another library's ongoing capture, if any."""
 
@@ -64,10 +66,10 @@ class Graph:
     Python takes about 2 ms on CPU (0.2 ms replayed) and 4 ms on GPU (0.3 ms replayed), so nothing here runs eagerly
     after start-up.
 
-    `launches` must issue the same kernels on the same arrays every time, and must not read results back. The first run
-    is eager, because it compiles the kernels. On CUDA it happens at construction, so that a lack of memory shows up
-    early; array contents are undefined afterwards. On CPU the first replay runs eagerly and the second one records,
-    because recording costs more than running once.
+    `launches` must issue the same kernels on the same arrays every time, and must not read results back. Construction
+    compiles the kernels, which leaves array contents undefined. The first run is eager: on CUDA at construction, so
+    that a lack of memory shows up early; on CPU at the first replay, and the second one records, because recording
+    costs more than running once.
     """
 
     def __init__(self, launches: Callable[[], None], device: wp.Device) -> None:
@@ -75,6 +77,7 @@ class Graph:
         self._launches = launches
         self._graph: wp.Graph | None = None
         self._has_run = False
+        compile_kernels(device, launches)
         if device.is_cuda:
             self._run()
             self._record()
