@@ -2,29 +2,39 @@
 PYTHON ?= python3
 VENV   ?= .venv
 RUN    := $(VENV)/bin/python
+# Written once the package, and then everything for tests too, is installed.
+BASE   := $(VENV)/.base
 STAMP  := $(VENV)/.installed
+# Python compiles a file when it is first imported; most are never.
+PIP    := $(RUN) -m pip install --quiet --disable-pip-version-check --no-compile
 WORKERS ?= 4
 # Beside each other, each with a thread of its own: those of torch would wait for each other.
 PYTEST := OMP_NUM_THREADS=1 $(RUN) -m pytest --dist loadfile
 # Whatever people read; tests misspell on purpose.
 PROSE   := README.md CONTRIBUTING.md Makefile benchmarks cluster configs docs lab msk_ray policies tune_spaces
 
-.PHONY: help env demo test test-fast test-all check unit gpu-test gpu-test-all site notebooks bench clean
+.PHONY: help base env demo test test-fast test-all check unit gpu-test gpu-test-all site notebooks bench clean
 
 help:                ## this list
 	@grep -hE '^[a-z-]+: .*##|^[a-z-]+:  *##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 14
 
-env: $(STAMP)        ## a virtual environment in .venv with everything pinned by constraints.txt
+base: $(BASE)        ## a virtual environment in .venv with what the package needs, pinned by constraints.txt
 
-$(STAMP): pyproject.toml constraints.txt
+env: $(STAMP)        ## the same, with what tests, checks and documentation need
+
+$(BASE): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit("msk_ray needs Python 3.11 or newer: make PYTHON=python3.12 ...") if sys.version_info < (3, 11) else None'
 	$(PYTHON) -m venv $(VENV)
-	$(RUN) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
-	# Its models, for tests: MyoSuite itself needs an older MuJoCo.
-	$(RUN) -m pip install --quiet --disable-pip-version-check --no-deps --upgrade --target $(VENV)/share/myosuite myosuite==2.12.2
+	$(PIP) -c constraints.txt -e .
 	touch $@
 
-demo: env            ## a real small Ray Tune sweep (GPU if there is one), ending in its table and report
+$(STAMP): $(BASE)
+	$(PIP) -c constraints.txt -e '.[dev]'
+	# Its models, for tests: MyoSuite itself needs an older MuJoCo.
+	$(PIP) --no-deps --upgrade --target $(VENV)/share/myosuite myosuite==2.12.2
+	touch $@
+
+demo: base           ## a real small Ray Tune sweep (GPU if there is one), ending in its table and report
 	rm -rf runs/demo
 	$(RUN) -m msk_ray.tune --space cartpole_smoke --name demo
 
