@@ -1,9 +1,11 @@
-"""A hidden layer, LayerNorm(ELU(x Wᵀ + b)), whose steps after the product are one kernel forward and two back.
+"""A hidden layer of several networks, LayerNorm(ELU(x Wᵀ + b)): after the product, one kernel forward and two back.
 
-Torch has four kernels for them forward and nine back, of which the sums over rows, for the gradients of biases and of
-the norm's parameters, take most of the time of a fit of many rows. Axes: N rows, F features.
+Torch has four kernels for each network forward and nine back, of which the sums over rows, for the gradients of biases
+and of the norm's parameters, take most of the time of a fit of many rows. Axes: C networks, N rows of each, I inputs,
+F features. Kernels take the rows of all networks, one network after the other.
 """
 
+import math
 from typing import Any
 
 import torch
@@ -18,6 +20,9 @@ _BLOCK = 128
 """Threads of a block: neighbouring features, or the warps of a few rows."""
 _CHUNK = 32
 """Rows that a thread adds up. Sums of chunks are added by torch, so that their order is fixed."""
+_PARTS = 8
+"""Parts of the rows whose products for a weight's gradient are separate, because a product of many rows but few inputs
+and features fills only a little of a GPU."""
 
 wp.set_module_options({"enable_backward": False})
 
@@ -50,8 +55,8 @@ def active_sums(x_in: wp.array2d[float], row: int, width: int, lane: int, step: 
     f"""
     const float* __restrict__ x = x_in.data + (size_t)row * width;
     float* __restrict__ y = y_out.data + (size_t)row * width;
-    const float* __restrict__ gain = gain_in.data;
-    const float* __restrict__ shift = shift_in.data;
+    const float* __restrict__ gain = gain_in.data + network * width;
+    const float* __restrict__ shift = shift_in.data + network * width;
     {_LOOP}
         y[k] = (e - mean) * scale * gain[k] + shift[k];
     }}
@@ -59,10 +64,11 @@ def active_sums(x_in: wp.array2d[float], row: int, width: int, lane: int, step: 
 )
 def write_norm(
     x_in: wp.array2d[float],
-    gain_in: wp.array[float],
-    shift_in: wp.array[float],
+    gain_in: wp.array2d[float],
+    shift_in: wp.array2d[float],
     mean: float,
     scale: float,
+    network: int,
     row: int,
     width: int,
     lane: int,
@@ -75,7 +81,7 @@ def write_norm(
     f"""
     const float* __restrict__ x = x_in.data + (size_t)row * width;
     const float* __restrict__ bar = bar_in.data + (size_t)row * width;
-    const float* __restrict__ gain = gain_in.data;
+    const float* __restrict__ gain = gain_in.data + network * width;
     float sum = 0.0f, products = 0.0f;
     {_LOOP}
         const float h_bar = gain[k] * bar[k];
@@ -87,10 +93,11 @@ def write_norm(
 )
 def pulled_sums(
     x_in: wp.array2d[float],
-    gain_in: wp.array[float],
+    gain_in: wp.array2d[float],
     bar_in: wp.array2d[float],
     mean: float,
     scale: float,
+    network: int,
     row: int,
     width: int,
     lane: int,
@@ -102,8 +109,8 @@ def pulled_sums(
 def activate(
     # In:
     x_in: wp.array2d[float],
-    gain_in: wp.array[float],
-    shift_in: wp.array[float],
+    gain_in: wp.array2d[float],
+    shift_in: wp.array2d[float],
     epsilon: float,
     # Out:
     y_out: wp.array2d[float],
@@ -121,14 +128,15 @@ def activate(
     if lane == 0:
         mean_out[row] = mean
         scale_out[row] = scale
-    write_norm(x_in, gain_in, shift_in, mean, scale, row, width, lane, lane_count(), y_out)
+    network = row // (x_in.shape[0] // gain_in.shape[0])
+    write_norm(x_in, gain_in, shift_in, mean, scale, network, row, width, lane, lane_count(), y_out)
 
 
 @wp.kernel
 def average_rows(
     # In:
     x_in: wp.array2d[float],
-    gain_in: wp.array[float],
+    gain_in: wp.array2d[float],
     mean_in: wp.array[float],
     scale_in: wp.array[float],
     bar_in: wp.array2d[float],
@@ -140,7 +148,8 @@ def average_rows(
     row = thread // lane_count()
     lane = thread % lane_count()
     width = x_in.shape[1]
-    sums = pulled_sums(x_in, gain_in, bar_in, mean_in[row], scale_in[row], row, width, lane, lane_count())
+    network = row // (x_in.shape[0] // gain_in.shape[0])
+    sums = pulled_sums(x_in, gain_in, bar_in, mean_in[row], scale_in[row], network, row, width, lane, lane_count())
     first = lane_sum(sums[0]) / float(width)
     second = lane_sum(sums[1]) / float(width)
     if lane == 0:
@@ -194,7 +203,7 @@ def pull_column(
 def pull_rows_back(
     # In:
     x_in: wp.array2d[float],
-    gain_in: wp.array[float],
+    gain_in: wp.array2d[float],
     mean_in: wp.array[float],
     scale_in: wp.array[float],
     bar_in: wp.array2d[float],
@@ -202,29 +211,32 @@ def pull_rows_back(
     chunk: int,
     # Out:
     x_bar_out: wp.array2d[float],
-    sums_out: wp.array3d[float],
+    sums_out: wp.array4d[float],
 ) -> None:
-    """x̄ = ELU'(x) · scale · (h̄ - mean h̄ - h · mean (h̄ h)), and Σ ȳ h, Σ ȳ and Σ x̄ over each chunk of rows, which is
-    what gain, shift and bias pull back; a thread a feature of a chunk."""
-    part, k = wp.tid()
-    begin = part * chunk
-    end = wp.min(begin + chunk, x_in.shape[0])
-    sums = pull_column(x_in, gain_in[k], mean_in, scale_in, bar_in, means_in, begin, end, k, x_in.shape[1], x_bar_out)
+    """x̄ = ELU'(x) · scale · (h̄ - mean h̄ - h · mean (h̄ h)), and Σ ȳ h, Σ ȳ and Σ x̄ over each chunk of a network's rows,
+    which is what gain, shift and bias pull back; a thread a feature of a chunk."""
+    network, part, k = wp.tid()
+    rows = x_in.shape[0] // gain_in.shape[0]
+    begin = network * rows + part * chunk
+    end = wp.min(begin + chunk, (network + 1) * rows)
+    gain = gain_in[network, k]
+    sums = pull_column(x_in, gain, mean_in, scale_in, bar_in, means_in, begin, end, k, x_in.shape[1], x_bar_out)
     for i in range(3):
-        sums_out[part, i, k] = sums[i]
+        sums_out[network, part, i, k] = sums[i]
 
 
 class _HiddenLayer(torch.autograd.Function):
-    """(x, weight, bias, gain, shift) to the layer's output (N, F), differentiable once in all."""
+    """(x, weight, bias, gain, shift) to the layer's output (C, N, F), differentiable once in all."""
 
     @staticmethod
     def forward(
         ctx: Any, x: Tensor, weight: Tensor, bias: Tensor, gain: Tensor, shift: Tensor, epsilon: float
     ) -> Tensor:
-        inner = torch.addmm(bias, x, weight.t())
+        inner = torch.baddbmm(bias[:, None], x, weight.mT)
         out = torch.empty_like(inner)
-        mean, scale = inner.new_empty((2, len(inner))).unbind()
-        _launch(activate, len(inner), (inner, gain, shift), (out, mean, scale), epsilon)
+        mean, scale = inner.new_empty((2, inner[..., 0].numel())).unbind()
+        rows = inner.flatten(0, 1)
+        _launch(activate, len(rows), (rows, gain, shift), (out.flatten(0, 1), mean, scale), epsilon)
         ctx.save_for_backward(x, weight, inner, gain, mean, scale)
         return out
 
@@ -232,25 +244,28 @@ class _HiddenLayer(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, bar: Tensor) -> tuple[Tensor | None, ...]:
         x, weight, inner, gain, mean, scale = ctx.saved_tensors
-        bar = bar.contiguous()
-        means = inner.new_empty((len(inner), 2))
-        _launch(average_rows, len(inner), (inner, gain, mean, scale, bar), (means,))
+        networks, count, features = inner.shape
+        rows, bar = inner.flatten(0, 1), bar.contiguous().flatten(0, 1)
+        means = inner.new_empty((len(rows), 2))
+        _launch(average_rows, len(rows), (rows, gain, mean, scale, bar), (means,))
         inner_bar = torch.empty_like(inner)
-        parts = -(-len(inner) // _CHUNK)
-        sums = inner.new_empty((parts, 3, inner.shape[1]))
-        given = (inner, gain, mean, scale, bar, means)
-        _launch(pull_rows_back, (parts, inner.shape[1]), given, (inner_bar, sums), _CHUNK)
-        gain_bar, shift_bar, bias_bar = sums.sum(0).unbind()
+        chunks = -(-count // _CHUNK)
+        sums = inner.new_empty((networks, chunks, 3, features))
+        outputs = (inner_bar.flatten(0, 1), sums)
+        _launch(pull_rows_back, (networks, chunks, features), (rows, gain, mean, scale, bar, means), outputs, _CHUNK)
+        gain_bar, shift_bar, bias_bar = sums.sum(1).unbind(1)
         x_bar = inner_bar @ weight if ctx.needs_input_grad[0] else None
-        return x_bar, inner_bar.t() @ x, bias_bar, gain_bar, shift_bar, None
+        parts = (networks, math.gcd(count, _PARTS), -1)
+        products = inner_bar.reshape(*parts, features).mT @ x.reshape(*parts, x.shape[2])
+        return x_bar, products.sum(1), bias_bar, gain_bar, shift_bar, None
 
 
 def hidden_layer(x: Tensor, weight: Tensor, bias: Tensor, gain: Tensor, shift: Tensor, epsilon: float) -> Tensor:
-    """LayerNorm(ELU(x Wᵀ + b)), shape (N, F), float32.
+    """LayerNorm(ELU(x Wᵀ + b)) of each network, shape (C, N, F), float32.
 
     Args:
-        x: (N, I). weight: (F, I). bias: (F,).
-        gain, shift: of the norm, (F,).
+        x: (C, N, I). weight: (C, F, I). bias: (C, F).
+        gain, shift: of the norm, (C, F).
         epsilon: what the norm adds to the variance.
     """
     out: Tensor = _HiddenLayer.apply(x, weight, bias, gain, shift, epsilon)
@@ -258,9 +273,9 @@ def hidden_layer(x: Tensor, weight: Tensor, bias: Tensor, gain: Tensor, shift: T
 
 
 def _launch(
-    kernel: Any, size: int | tuple[int, int], inputs: tuple[Tensor, ...], outputs: tuple[Tensor, ...], *numbers: float
+    kernel: Any, size: int | tuple[int, ...], inputs: tuple[Tensor, ...], outputs: tuple[Tensor, ...], *numbers: float
 ) -> None:
-    """Launch over rows, a warp each, or over (chunks, features), on torch's current stream."""
+    """Launch over rows, a warp each, or over (networks, chunks, features), on torch's current stream."""
     wp.init()
     device = inputs[0].device
     arrays = [[wp.from_torch(t.detach(), requires_grad=False) for t in group] for group in (inputs, outputs)]

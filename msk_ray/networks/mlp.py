@@ -1,7 +1,7 @@
 """The multilayer perceptron that both networks use."""
 
-from collections.abc import Callable
-from itertools import pairwise
+from collections.abc import Callable, Sequence
+from itertools import islice, pairwise
 
 import torch
 from torch import Tensor, nn
@@ -44,16 +44,27 @@ def make_mlp(
     return Mlp(*layers)
 
 
-def fused_forward(network: nn.Module, x: Tensor) -> Tensor:
-    """A network of `make_mlp` with ELU, at rows (N, I), with few kernels a layer; equal up to rounding."""
-    assert isinstance(network, nn.Sequential)
-    *hidden, last = network
-    for linear, _, norm in zip(hidden[::3], hidden[1::3], hidden[2::3], strict=True):
-        assert isinstance(linear, nn.Linear)
+def batched_forward(network: Mlp, parameters: Sequence[Tensor], x: Tensor) -> Tensor:
+    """Outputs (C, N, F) of C networks of `make_mlp` for rows (N, I), all at once; equal to theirs up to rounding.
+
+    Args:
+        network: one of them.
+        parameters: their parameters (C, ...), in the order of `network.parameters()`.
+        x: the rows.
+    """
+    values = iter(parameters)
+    x = x.expand(len(parameters[0]), *x.shape)
+    *hidden, _ = network
+    for activation, norm in zip(hidden[1::3], hidden[2::3], strict=True):
         assert isinstance(norm, nn.LayerNorm)
-        x = hidden_layer(x, linear.weight, linear.bias, norm.weight, norm.bias, norm.eps)
-    out: Tensor = last(x)
-    return out
+        weight, bias, gain, shift = islice(values, 4)
+        if isinstance(activation, nn.ELU):
+            x = hidden_layer(x, weight, bias, gain, shift, norm.eps)
+        else:
+            active = activation(torch.baddbmm(bias[:, None], x, weight.mT))
+            x = nn.functional.layer_norm(active, norm.normalized_shape, eps=norm.eps) * gain[:, None] + shift[:, None]
+    weight, bias = values
+    return torch.baddbmm(bias[:, None], x, weight.mT)
 
 
 def _linear(fan_in: int, fan_out: int, gain: float, generator: torch.Generator) -> nn.Linear:

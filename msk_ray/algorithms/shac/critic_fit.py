@@ -1,11 +1,13 @@
 """Fit the critic to its targets, one minibatch at a time."""
 
-import torch
-from torch import Tensor, nn
+from typing import Protocol
 
-from msk_ray.algorithms.shac.optimizer import RateAdam, clip, clip_flat, views_of
+import torch
+from torch import Tensor
+
+from msk_ray.algorithms.shac.optimizer import RateAdam, clip_rows, views_of
 from msk_ray.group import ALONE, Group
-from msk_ray.networks import Critic
+from msk_ray.networks import BatchedCritic, Critic
 from msk_ray.networks.layer_chain import Chain
 
 _WINDOW = 4
@@ -39,16 +41,12 @@ class CriticFit:
         tolerance: float | None = None,
         group: Group = ALONE,
     ) -> None:
-        device = next(critic.parameters()).device
-        # Stored, because `parameters()` walks all submodules on every call.
-        self._members = [list(member.parameters()) for member in critic.members]
-        self._parameters = [parameter for member in self._members for parameter in member]
-        self._values = critic.fused if device.type == "cuda" and critic.can_fuse else critic
-        self._passes = [_Pass(member) for member in critic.members] if device.type == "cpu" else None
+        on_cpu = next(critic.parameters()).device.type == "cpu"
+        self._gradient = _ByHand(critic, group) if on_cpu else _Batched(critic, group)
         self._grad_norm = grad_norm
         self._tolerance = tolerance
         self._group = group
-        self.optimizer = RateAdam(self._parameters, learning_rate, betas, weight_decay)
+        self.optimizer = RateAdam(critic.parameters(), learning_rate, betas, weight_decay)
 
     def draw_orders(self, rows: int, passes: int, generator: torch.Generator) -> Tensor:
         """A random order of the rows for each pass, (passes, rows)."""
@@ -86,55 +84,63 @@ class CriticFit:
 
     @torch.no_grad()
     def _step(self, obs: Tensor, targets: Tensor, skip: Tensor | None) -> Tensor:
-        find = self._by_autograd if self._passes is None else self._by_hand
-        mean, gradients = find(obs, targets)
-        self.optimizer.step_along(gradients, skip)
-        return mean
-
-    def _by_autograd(self, obs: Tensor, targets: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """The loss of these rows, and the clipped gradient of each parameter."""
-        with torch.enable_grad():
-            loss = (self._values(obs) - targets).square().mean()
-            gradients = list(torch.autograd.grad(loss, self._parameters))
-        mean = loss.detach()
-        self._group.mean([mean, *gradients])
-        if self._grad_norm is None:
-            return mean, gradients
-        each = iter(gradients)
-        clipped = [clip([next(each) for _ in member], self._grad_norm)[0] for member in self._members]
-        return mean, [gradient for member in clipped for gradient in member]
-
-    def _by_hand(self, obs: Tensor, targets: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """The same by hand on a CPU, where autograd's bookkeeping takes longer than the arithmetic."""
-        assert self._passes is not None
-        loss = obs.new_zeros(())
-        for member in self._passes:
-            loss += member.run(obs, targets, 1.0 / len(self._passes))
-        self._group.mean([loss, *(member.gradient for member in self._passes)])
+        loss, flat = self._gradient(obs, targets)
         if self._grad_norm is not None:
-            for member in self._passes:
-                clip_flat(member.gradient, self._grad_norm)
-        return loss, [part for member in self._passes for part in member.parts]
-
-
-class _Pass:
-    """Loss and gradient of one network on a CPU.
-
-    Attributes:
-        gradient: the last `run`'s gradient as one tensor (N,); `parts` are views of it by parameter.
-    """
-
-    def __init__(self, member: nn.Module) -> None:
-        self._chain = Chain(member)
-        parameters = self._chain.parameters
-        self.gradient = torch.zeros(sum(parameter.numel() for parameter in parameters))
-        self.parts = views_of(self.gradient, parameters)
-
-    def run(self, obs: Tensor, targets: Tensor, weight: float) -> Tensor:
-        """Mean squared error of these rows, times a weight."""
-        values, kept = self._chain.forward(obs)
-        error = values - targets[:, None]
-        scale = weight / len(obs)
-        loss = scale * error.square().sum()
-        self._chain.backward(kept, error.mul_(2.0 * scale), self.parts)
+            clip_rows(flat, self._grad_norm)
+        self.optimizer.step_along(self._gradient.parts(flat), skip)
         return loss
+
+
+class _Gradient(Protocol):
+    """Loss and gradient of all C networks, with P parameters each."""
+
+    def __call__(self, obs: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
+        """The loss of these rows, averaged over networks and processes, and its gradient (C, P)."""
+
+    def parts(self, flat: Tensor) -> list[Tensor]:
+        """A gradient (C, P) as one tensor a parameter, in the order of the critic's parameters."""
+
+
+class _Batched:
+    """All networks at once, by autograd."""
+
+    def __init__(self, critic: Critic, group: Group) -> None:
+        self._batched = BatchedCritic(critic)
+        self._group = group
+
+    def __call__(self, obs: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
+        with torch.enable_grad():
+            loss = (self._batched(obs) - targets).square().mean()
+            gradients = torch.autograd.grad(loss, self._batched.parameters)
+        mean, flat = loss.detach(), torch.cat([gradient.flatten(1) for gradient in gradients], dim=1)
+        self._group.mean([mean, flat])
+        return mean, flat
+
+    def parts(self, flat: Tensor) -> list[Tensor]:
+        like = [parameter[0] for parameter in self._batched.parameters]
+        return [part for row in flat for part in views_of(row, like)]
+
+
+class _ByHand:
+    """One network after the other by hand, on a CPU, where autograd's bookkeeping takes longer than the arithmetic."""
+
+    def __init__(self, critic: Critic, group: Group) -> None:
+        self._chains = [Chain(member) for member in critic.members]
+        self._group = group
+        parameters = self._chains[0].parameters
+        self._flat = torch.zeros(len(self._chains), sum(parameter.numel() for parameter in parameters))
+        self._views = [views_of(row, parameters) for row in self._flat]
+
+    def __call__(self, obs: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
+        loss = obs.new_zeros(())
+        scale = 1.0 / (len(self._chains) * len(obs))
+        for chain, into in zip(self._chains, self._views, strict=True):
+            values, kept = chain.forward(obs)
+            error = values - targets[:, None]
+            loss += scale * error.square().sum()
+            chain.backward(kept, error.mul_(2.0 * scale), into)
+        self._group.mean([loss, self._flat])
+        return loss, self._flat
+
+    def parts(self, flat: Tensor) -> list[Tensor]:
+        return [part for views in self._views for part in views]

@@ -30,17 +30,17 @@ def clip(gradients: Sequence[Tensor], limit: float) -> tuple[list[Tensor], Tenso
     One tensor needs few kernels. torch's clip_grad_norm_ uses many, and rounds differently.
     """
     flat = torch.cat([gradient.flatten() for gradient in gradients])
-    norm = clip_flat(flat, limit)
+    norm = clip_rows(flat, limit)
     return views_of(flat, gradients), norm
 
 
 @torch.no_grad()
-def clip_flat(gradient: Tensor, limit: float) -> Tensor:
-    """Clip the norm of one tensor (N,) in place, and return the norm before; infinity for no bound."""
-    norm = torch.linalg.vector_norm(gradient)
+def clip_rows(gradients: Tensor, limit: float) -> Tensor:
+    """Clip the norm of each row of a tensor (..., N) in place, and return the norms before; infinity for no bound."""
+    norms = torch.linalg.vector_norm(gradients, dim=-1)
     if limit < float("inf"):
-        gradient.mul_((limit / (norm + _NORM_EPSILON)).clamp_max(1.0))
-    return norm
+        gradients.mul_((limit / (norms + _NORM_EPSILON)).clamp_max(1.0).unsqueeze(-1))
+    return norms
 
 
 def views_of(flat: Tensor, like: Sequence[Tensor]) -> list[Tensor]:

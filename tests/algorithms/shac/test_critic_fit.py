@@ -3,9 +3,10 @@
 import pytest
 import torch
 
-from msk_ray.algorithms.shac.critic_fit import CriticFit
+from msk_ray.algorithms.shac.critic_fit import CriticFit, _Batched, _ByHand
 from msk_ray.config.schema import CriticConfig
-from msk_ray.networks import Critic
+from msk_ray.group import ALONE
+from msk_ray.networks import BatchedCritic, Critic
 
 
 def fit(passes: int, grad_norm: float | None = 1.0) -> tuple[Critic, float]:
@@ -66,19 +67,34 @@ def test_a_fit_that_has_settled_takes_no_further_steps() -> None:
 
 
 @pytest.mark.parametrize("grad_norm", [1e-3, None])
-def test_gradients_without_autograd_are_its_own(grad_norm: float | None) -> None:
-    """Of two networks, whose norms are bounded apart, for rows that are no power of two."""
+@pytest.mark.parametrize("activation", ["elu", "silu"])
+def test_networks_in_one_batch_fit_as_one_after_the_other(activation: str, grad_norm: float | None) -> None:
+    """Two networks whose norms are bounded apart: gradient of the first rows, and 30 steps of ten rows."""
     generator = torch.Generator().manual_seed(1)
     obs, targets = torch.randn(30, 3, generator=generator), torch.randn(30, generator=generator)
-    fitted = []
-    for by_hand in (True, False):
-        critic = Critic(CriticConfig(hidden=(8, 8), count=2), 3, torch.Generator().manual_seed(0))
+    orders = torch.stack([torch.randperm(30, generator=generator) for _ in range(10)])
+    gradients, fitted = [], []
+    for gradient in (_ByHand, _Batched):
+        config = CriticConfig(hidden=(8, 5), count=2, activation=activation)
+        critic = Critic(config, 3, torch.Generator().manual_seed(0))
+        start = [p.detach().clone() for p in critic.parameters()]
         fit = CriticFit(critic, 1e-2, (0.7, 0.95), grad_norm)
-        fit._passes = fit._passes if by_hand else None
-        assert (fit._passes is not None) == by_hand
-        loss = fit.run(obs, targets, fit.draw_orders(30, 3, torch.Generator().manual_seed(2)), 2)
-        fitted.append([loss, *(p.detach() for p in critic.parameters())])
-    torch.testing.assert_close(*fitted, rtol=1e-4, atol=1e-5)
+        fit._gradient = gradient(critic, ALONE)
+        with torch.no_grad():
+            gradients.append([t.clone() for t in fit._gradient(obs[:10], targets[:10])])
+        loss = fit.run(obs, targets, orders, 3)
+        assert not any(map(torch.equal, start, critic.parameters()))
+        fitted.append({"loss": loss, **critic.state_dict()})
+    torch.testing.assert_close(*gradients, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(*fitted, rtol=1e-5, atol=1e-6)
+
+
+def test_a_batch_computes_what_its_networks_are_loaded_with() -> None:
+    critic, other = (Critic(CriticConfig(hidden=(8,), count=2), 3, torch.Generator().manual_seed(k)) for k in (0, 1))
+    batched = BatchedCritic(critic)
+    critic.load_state_dict(other.state_dict())
+    obs = torch.randn(5, 3)
+    torch.testing.assert_close(batched(obs), other(obs))
 
 
 def test_weight_decay_by_hand() -> None:
@@ -89,19 +105,3 @@ def test_weight_decay_by_hand() -> None:
     # Adam's step of the rate, after a shrinkage by rate · decay = 1/16.
     for parameter, start in zip(critic.parameters(), before, strict=True):
         assert torch.allclose(parameter, 15 / 16 * start + 0.125, atol=1e-5)
-
-
-def test_fused_layers_fit_alike() -> None:
-    """Ten steps from the same start."""
-    obs = torch.randn(64, 3, generator=torch.Generator().manual_seed(0))
-    orders = torch.arange(64).expand(10, 64)
-    fitted = []
-    for fused in (False, True):
-        critic = Critic(CriticConfig(hidden=(16, 8), count=2), 3, torch.Generator().manual_seed(1))
-        assert critic.can_fuse
-        fit = CriticFit(critic, 1e-2, (0.9, 0.99), 1.0)
-        fit._passes, fit._values = None, critic.fused if fused else critic
-        loss = fit.run(obs, obs[:, 0], orders, 1)
-        fitted.append((critic(obs), loss))
-    torch.testing.assert_close(*fitted, rtol=1e-3, atol=1e-4)
-    assert not torch.equal(fitted[0][0], fitted[1][0])
