@@ -34,12 +34,12 @@ class ExactKinematics(Kinematics):
                 mujoco.mj_objectVelocity(self.model, data, mujoco.mjtObj.mjOBJ_XBODY, body, twist, 0)
                 twists[body] = twist
             frames.append(np.hstack((data.xpos, np.roll(data.xquat, -1, axis=1), twists)))
-        values = self._tensor(np.stack(frames))
+        values = self.tensor(np.stack(frames))
         pos, quat, angvel, linvel = values.split((3, 4, 3, 3), dim=-1)
         return Frames(self, pos, quat, linvel, angvel)
 
-    def _tensor(self, values: object, dtype: torch.dtype = torch.float64) -> Tensor:
-        return super()._tensor(values, dtype)
+    def tensor(self, values: object, dtype: torch.dtype = torch.float64) -> Tensor:
+        return super().tensor(values, dtype)
 
 
 class ExactTendons(Tendons):

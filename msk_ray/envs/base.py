@@ -5,7 +5,7 @@ Axes: W worlds, O observation, A action.
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 from typing import Any, ClassVar, Generic, TypeVar
@@ -27,10 +27,13 @@ from msk_ray.envs.records import EnvState, Resets, Transition, rows_where
 from msk_ray.errors import ConfigError
 from msk_ray.group import ALONE, Group
 from msk_ray.step import Backward, Kernels, Simulation, StepState
+from msk_ray.step.autograd.contact_state import Contact, ContactQueries
 from msk_ray.step.autograd.flags import known_none
 from msk_ray.step.autograd.kinematics import Frames, Kinematics, Names, as_named
+from msk_ray.step.autograd.sensors import Readings, Sensors
 from msk_ray.step.autograd.tendon_lengths import Tendons
 from msk_ray.step.forward.capacity import Capacity
+from msk_ray.step.forward.contact_watch import FIGURES
 from msk_ray.step.forward.solver_limits import own_limits
 
 SettingsT = TypeVar("SettingsT", bound=EnvSettings)
@@ -132,7 +135,7 @@ class Env(ABC, Generic[SettingsT]):
         self.next_memory: Mapping[str, Tensor] = {}
         self.ignore_contact_forces = False
         self._reached: StepState | None = None
-        self._measured: dict[str, tuple[StepState, bool, Any]] = {}
+        self._measured: dict[Hashable, tuple[StepState, bool, Any]] = {}
         self._contract = Contract(self)
         self._contract.begin()
 
@@ -533,16 +536,63 @@ class Env(ABC, Generic[SettingsT]):
         """
         if self.ignore_contact_forces:
             return torch.zeros_like(self.frames(state).geom_position(geom))
-        if state is not self._reached:
-            raise ConfigError(
-                f"{type(self).__qualname__}: contact forces belong to a step, not to a state: use them in "
-                "remember, reward_terms, fell or outcome_terms, not in observe"
-            )
+        self._require_step(state, "contact forces")
         force = self._once("contact_forces", state, self.sim.contact_forces)
         chosen = as_named(force[:, self._kinematics.indices("geom", geom)], geom)
         return chosen.masked_fill(self._diverged.view(-1, *[1] * (chosen.dim() - 1)), 0.0)
 
-    def _once(self, what: str, state: StepState, measure: Callable[[], Any]) -> Any:
+    def contact(
+        self, state: StepState, names: Names, kind: str = "geom", against: Names = 0, by: str = "subtree"
+    ) -> Contact:
+        """Contacts of named parts of the model in the step that led to `state`, n = 1 for one name.
+
+        Values only, where and as for `contact_forces`, in each substep.
+
+        Args:
+            state: that state.
+            names, kind, against, by: as for `ContactQueries`.
+
+        Raises:
+            ConfigError: no step has just led to `state`, or there is no such part.
+        """
+        query = self._contact_queries(names, kind, against, by)
+        if self.ignore_contact_forces:
+            self.sim.measure_contacts(query)
+            substeps, size = self.sim.substeps, len(query.primary)
+            return Contact.of(torch.zeros((substeps, self.nworld, size, FIGURES), device=self.device))
+        self._require_step(state, "contacts")
+        contact: Contact = self._once(query, state, lambda: self.sim.contacts(query))
+        return contact.without(self._diverged)
+
+    def sensors(self, state: StepState) -> Readings:
+        """The model's sensors in `state`, by name: `self.sensors(state)["imu"]`, (W, D), is computed when asked.
+
+        Those that are functions of the state carry gradients. Those of forces and accelerations are values of the step
+        that led to `state`, where and as for `contact_forces`.
+        """
+        frames, tendons = lambda: self.frames(state), lambda: self.tendons(state)
+        readings: Readings = self._once(
+            "sensors",
+            state,
+            lambda: Readings(self._sensors, state.qpos, state.qvel, frames, tendons, lambda: self._sensordata(state)),
+        )
+        return readings
+
+    def _sensordata(self, state: StepState) -> Tensor:
+        if self.ignore_contact_forces:
+            self.sim.measure_sensors()
+            return torch.zeros((self.nworld, self.model.nsensordata), device=self.device)
+        self._require_step(state, "sensors of forces and accelerations")
+        return self.sim.sensordata().masked_fill(self._diverged[:, None], 0.0)
+
+    def _require_step(self, state: StepState, what: str) -> None:
+        if state is not self._reached:
+            raise ConfigError(
+                f"{type(self).__qualname__}: {what} belong to a step, not to a state: use them in "
+                "remember, reward_terms, fell or outcome_terms, not in observe"
+            )
+
+    def _once(self, what: Hashable, state: StepState, measure: Callable[[], Any]) -> Any:
         """The result of `measure` for `state`, cached until another state is asked for."""
         grad = torch.is_grad_enabled()
         kept = self._measured.get(what)
@@ -553,11 +603,20 @@ class Env(ABC, Generic[SettingsT]):
     def measure_by(self, kinematics: Kinematics, tendons: Tendons) -> None:
         """Compute `frames` and `tendons` with these, for example with those of a simulation in float64."""
         self._kinematics, self._tendons = kinematics, tendons
+        self._sensors = Sensors(kinematics, lambda: tendons)
         self._measured = {}
 
     @cached_property
     def _kinematics(self) -> Kinematics:
         return Kinematics(self.sim.batch)
+
+    @cached_property
+    def _contact_queries(self) -> ContactQueries:
+        return ContactQueries(self._kinematics)
+
+    @cached_property
+    def _sensors(self) -> Sensors:
+        return Sensors(self._kinematics, lambda: self._tendons)
 
     @cached_property
     def _tendons(self) -> Tendons:

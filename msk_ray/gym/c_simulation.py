@@ -1,19 +1,22 @@
 """A stand-in for `Simulation`: one world in C MuJoCo, in float64."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import mujoco
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from msk_ray.errors import UnsupportedModelError
+from msk_ray.errors import ConfigError, UnsupportedModelError
 from msk_ray.step import Kernels, Simulation, StepState
+from msk_ray.step.autograd.contact_state import Contact
+from msk_ray.step.forward.contact_watch import FIGURES, ContactQuery
 from msk_ray.step.forward.solver_limits import SolverLimits, own_limits
 
 
 class CSimulation(Simulation):
-    """`step` and `contact_forces` of one world on the CPU, without gradients. The rest is inherited.
+    """A step, its contacts and sensors, of one world on the CPU, without gradients. The rest is inherited.
 
     If a step is given the state that the last one returned, it continues from that state in float64.
 
@@ -27,6 +30,7 @@ class CSimulation(Simulation):
     def __init__(self, model: mujoco.MjModel, substeps: int, limits: SolverLimits | None = None) -> None:
         super().__init__(model, 1, substeps, None, "cpu", kernels=Kernels(**(limits._asdict() if limits else {})))
         self.data = mujoco.MjData(model)
+        self._figures: dict[ContactQuery, list[Tensor]] = {}
 
     def step(
         self,
@@ -53,7 +57,11 @@ class CSimulation(Simulation):
         data.ctrl[:] = ctrl[0].numpy()
         own = own_limits(self.model)
         self._limit(self.batch.limits)
-        mujoco.mj_step(self.model, data, self.substeps)
+        self._figures = {query: [] for query in self.batch.contacts.queries}
+        for _ in range(self.substeps):
+            mujoco.mj_step(self.model, data)
+            for query, figures in self._figures.items():
+                figures.append(self._answer(query))
         self._limit(own)
         return self._state()
 
@@ -68,12 +76,47 @@ class CSimulation(Simulation):
         """Force of all contacts on every geom in world coordinates [N], shape (1, G, 3), in the last substep of the
         last step."""
         forces = np.zeros((self.model.ngeom, 3))
-        wrench = np.zeros(6)
-        for index, contact in enumerate(self.data.contact):
-            mujoco.mj_contactForce(self.model, self.data, index, wrench)
-            # Rows of the frame are its axes; the force acts from the first geom on the second.
-            force = contact.frame.reshape(3, 3).T @ wrench[:3]
-            for geom, sign in zip(contact.geom, (-1.0, 1.0), strict=True):
+        for geoms, force in self._contacts():
+            for geom, sign in zip(geoms, (-1.0, 1.0), strict=True):
                 if geom >= 0:
                     forces[geom] += sign * force
         return torch.tensor(forces, dtype=torch.float32)[None]
+
+    def _contacts(self) -> Iterator[tuple[tuple[int, int], NDArray[np.float64]]]:
+        """Both geoms of each contact with constraint rows, and the force [N] on the second in world coordinates."""
+        wrench = np.zeros(6)
+        for index, contact in enumerate(self.data.contact):
+            if contact.efc_address < 0:
+                continue
+            mujoco.mj_contactForce(self.model, self.data, index, wrench)
+            # Rows of the frame are its axes.
+            yield (int(contact.geom[0]), int(contact.geom[1])), contact.frame.reshape(3, 3).T @ wrench[:3]
+
+    def sensordata(self) -> Tensor:
+        """Readings of all sensors in the last substep of the last step, shape (1, nsensordata)."""
+        return torch.tensor(self.data.sensordata, dtype=torch.float32)[None]
+
+    def contacts(self, query: ContactQuery) -> Contact:
+        """Contacts in the substeps of the last step.
+
+        Raises:
+            ConfigError: the last step did not watch these.
+        """
+        if not self._figures.get(query):
+            raise ConfigError("the last step did not watch these contacts: call measure_contacts() before a step")
+        return Contact.of(torch.stack(self._figures[query]))
+
+    def _answer(self, query: ContactQuery) -> Tensor:
+        """Its figures in the last substep, shape (1, n, FIGURES)."""
+        figures = np.zeros((1, len(query.primary), FIGURES))
+        for (first, second), force in self._contacts():
+            for row, primary in zip(figures[0], query.primary, strict=True):
+                if first in primary and second in query.secondary:
+                    row[:3] -= force
+                elif second in primary and first in query.secondary:
+                    row[:3] += force
+                else:
+                    continue
+                row[3] += 1.0
+                row[4] = max(row[4], np.linalg.norm(force))
+        return torch.tensor(figures, dtype=torch.float32)

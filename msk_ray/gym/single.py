@@ -39,7 +39,10 @@ class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.env = make_env(
             config.env, config.physics, 1, "cpu", config.trial.seed, differentiable=False, execution=config.execution
         )
-        self.env.sim = self._simulation = CSimulation(self.env.model, self.env.sim.substeps, self.env.sim.batch.limits)
+        batch = self.env.sim.batch
+        self.env.sim = self._simulation = CSimulation(self.env.model, batch.substeps, batch.limits)
+        for query in batch.contacts.queries:
+            self._simulation.measure_contacts(query)
         self.observation_space = observation_space(self.env)
         self.action_space = action_space(self.env)
         self._begun = False

@@ -20,8 +20,10 @@ MODEL = """<mujoco><option timestep="0.004" integrator="implicitfast" iterations
   <worldbody><geom name="floor" type="plane" size="5 5 1"/>
     <body name="ball" pos="0 0 .5"><freejoint/><geom name="ball" size=".1" mass="2"/>
       <body name="arm" pos="0 0 .1"><joint name="hinge" axis="0 1 0" range="-10 10"/>
+        <site name="tip" pos="0 0 .4"/>
         <geom type="capsule" fromto="0 0 .1 0 0 .4" size=".02" contype="0" conaffinity="0"/></body></body></worldbody>
   <actuator><position name="aim" joint="hinge" kp="5" ctrlrange="0.1 0.5"/></actuator>
+  <sensor><gyro name="spin" site="tip"/><accelerometer name="jolt" site="tip"/></sensor>
   <keyframe><key name="high" qpos="0 0 2 1 0 0 0 0.1" qvel="1 0 0 0 0 0 0"/>
     <key name="low" qpos="0 0 .099 .6 .8 0 0 0"/></keyframe></mujoco>"""
 
@@ -50,6 +52,29 @@ class Ball(MjcfEnv):
 class Feeling(Ball):
     def observe(self, state, action):
         return self.contact_forces(state, "ball")
+
+class Sensing(Ball):
+    without_gradient = ()
+
+    def observe(self, state, action):
+        return torch.cat((self.sensors(state)["spin"], action), -1)
+
+    def reward_terms(self, state, action, obs):
+        contact = self.contact(state, "ball", "body", against="floor", by="geom")
+        jolt = self.sensors(state)["jolt"].norm(dim=-1)
+        return torch.stack((obs.sum(-1) + contact.force[:, 0, 2], jolt + 0.0 * obs.sum(-1)), -1)
+
+    def fell(self, state):
+        self.last = self.contact(state, ["ball", "arm"], "body")
+        return self.last.touching[-1, :, 1]
+
+class Groping(Ball):
+    def observe(self, state, action):
+        return self.contact(state, "ball").force.flatten(1)
+
+class Jolted(Ball):
+    def observe(self, state, action):
+        return self.sensors(state)["jolt"]
 
 class Cut(Ball):
     def reward_terms(self, state, action, obs):
@@ -170,6 +195,32 @@ def test_a_reward_of_frames_has_a_gradient_and_one_of_forces_a_value(home: Path)
     assert qpos.grad.abs().sum() > 0.1
 
 
+def test_sensors_and_contacts_of_a_step(home: Path) -> None:
+    env = _make("Sensing", nworld=2, differentiable=True, env__keyframe="low", env__stochastic_reset=False)
+    data = mujoco.MjData(env.model)
+    state = env.state.physics
+    data.qpos[:], data.qvel[:] = state.qpos[0], state.qvel[0]
+    for _ in range(4):
+        transition = env.step(torch.zeros(2, 1), auto_reset=False)
+        data.qacc_warmstart[:] = 0.0
+        data.ctrl[:] = 0.3
+        mujoco.mj_step(env.model, data, env.sim.substeps)
+    reached = data.sensordata.copy()
+    mujoco.mj_forward(env.model, data)
+    np.testing.assert_allclose(transition.obs[0, :3].detach(), data.sensor("spin").data, atol=1e-4)
+    assert transition.terms[0, 1] == pytest.approx(np.linalg.norm(reached[3:]), rel=1e-2)
+    assert env.last.touching[:, :, 0].all()
+    assert not env.last.touching[:, :, 1].any()
+    assert transition.terms[0, 0] == pytest.approx(float(transition.obs[0].sum() + env.last.force[0, 0, 2]), rel=1e-4)
+    assert env.last.force[0, 0, 2] > 1.0
+    env.state = env.state.detach()
+    qvel = env.state.physics.qvel.clone().requires_grad_()
+    env.state = env.state._replace(physics=env.state.physics._replace(qvel=qvel))
+    env.step(torch.zeros(2, 1)).reward.sum().backward()
+    assert qvel.grad is not None
+    assert qvel.grad.abs().sum() > 0.1
+
+
 def test_what_is_measured_of_a_state_is_computed_once_and_with_gradients_where_asked(home: Path) -> None:
     env = _make(nworld=2)
     state = env.state.physics._replace(qpos=env.state.physics.qpos.clone().requires_grad_())
@@ -205,6 +256,8 @@ def test_a_world_that_diverged_has_no_forces(home: Path) -> None:
         ("Free", {}, "actuator aim has no ctrlrange, so no control for actions of -1 and 1: write a ctrlrange"),
         ("Led", {}, "the keyframe moves mocap body hook, which stays where the model puts it: write mpos and mquat of"),
         ("Feeling", {}, "use them in reward_terms, fell or outcome_terms, not in observe"),
+        ("Groping", {}, "contacts belong to a step, not to a state: use them in reward_terms, fell or outcome_terms"),
+        ("Jolted", {}, "sensors of forces and accelerations belong to a step, not to a state: use them in"),
         ("Flat", {}, r"observe of Flat has shape \(4,\), not \(worlds, entries\) with 4 worlds"),
         ("Strung", {}, "the model has no tendons"),
         ("Homeless", {}, "Homeless has no model: write `mjcf = 'model.xml'` in the class"),

@@ -21,6 +21,7 @@ from msk_ray.errors import ConfigError, SimulationError
 from msk_ray.gym import BatchedEnv, SingleEnv
 from msk_ray.gym.c_simulation import CSimulation
 from msk_ray.gym.stable_baselines import StableBaselinesEnv
+from msk_ray.step.forward.contact_watch import ContactQuery
 from msk_ray.step.forward.solver_limits import SolverLimits
 
 pytestmark = pytest.mark.long
@@ -125,11 +126,21 @@ def test_contact_forces_are_those_of_the_batch() -> None:
     state = env.draw_physics(1)
     state.qpos[:, 2] -= 0.35
     control = torch.full((1, env.model.nu), 0.2)
+    floor = env.model.geom("floor").id
+    query = ContactQuery(((floor,), tuple(range(env.model.ngeom))), (floor,))
     env.sim.step(control, *state)
     simulation.step(control, *state)
     expected, found = env.sim.contact_forces(), simulation.contact_forces()
     assert expected.abs().max() > 10.0
     assert found == pytest.approx(expected, abs=0.02 * float(expected.abs().max()))
+    with pytest.raises(ConfigError, match="did not watch these contacts"):
+        simulation.contacts(query)
+    for each in (env.sim, simulation):
+        each.measure_contacts(query)
+        each.step(control, *state)
+    for one, other in zip(env.sim.contacts(query), simulation.contacts(query), strict=True):
+        assert other.shape == one.shape
+        assert other.float() == pytest.approx(one.float(), abs=0.02 * float(one.float().abs().max()))
 
 
 @pytest.mark.filterwarnings("ignore:the model may stop the constraint solver")

@@ -129,11 +129,16 @@ class Kinematics:
         key = (kind, names if isinstance(names, str | int) else tuple(names))
         if key not in self._found:
             several = [names] if isinstance(names, str | int) else names
-            ids = [self._id(kind, name) for name in several]
+            ids = [self.id(kind, name) for name in several]
             self._found[key] = torch.tensor(ids, device=self._device)
         return self._found[key]
 
-    def _id(self, kind: str, name: str | int) -> int:
+    def id(self, kind: str, name: str | int) -> int:
+        """Id of a `body`, `site` or `geom` by name or id.
+
+        Raises:
+            ConfigError: the model has no such element.
+        """
         accessor = getattr(self.model, kind)
         count = getattr(self.model, f"n{kind}")
         if isinstance(name, int):
@@ -155,18 +160,19 @@ class Kinematics:
     @cached_property
     def _site_places(self) -> tuple[Tensor, Tensor, Tensor]:
         m = self.model
-        return self._tensor(m.site_bodyid, torch.long), self._tensor(m.site_pos), self._tensor(m.site_quat)
+        return self.tensor(m.site_bodyid, torch.long), self.tensor(m.site_pos), self.tensor(m.site_quat)
 
     @cached_property
     def _geom_places(self) -> tuple[Tensor, Tensor, Tensor]:
         m = self.model
-        return self._tensor(m.geom_bodyid, torch.long), self._tensor(m.geom_pos), self._tensor(m.geom_quat)
+        return self.tensor(m.geom_bodyid, torch.long), self.tensor(m.geom_pos), self.tensor(m.geom_quat)
 
     def _load(self, qpos: Tensor, qvel: Tensor) -> None:
         for view, value in zip(self._inputs, (qpos, qvel), strict=True):
             view.copy_(value)
 
-    def _tensor(self, values: object, dtype: torch.dtype = torch.float32) -> Tensor:
+    def tensor(self, values: object, dtype: torch.dtype = torch.float32) -> Tensor:
+        """Numbers of the model on the device of the frames, floats in their precision."""
         return torch.as_tensor(np.array(values), dtype=dtype, device=self._device)
 
     def _constants(self) -> _Constants:
@@ -175,11 +181,11 @@ class Kinematics:
         for body in range(m.nbody - 1, 0, -1):
             subtree[m.body_parentid[body]] += subtree[body]
         return _Constants(
-            self._tensor(m.body_mass),
-            self._tensor(m.body_inertia),
-            self._tensor(m.body_ipos),
-            self._tensor(m.body_iquat),
-            self._tensor(subtree),
+            self.tensor(m.body_mass),
+            self.tensor(m.body_inertia),
+            self.tensor(m.body_ipos),
+            self.tensor(m.body_iquat),
+            self.tensor(subtree),
         )
 
 
@@ -241,6 +247,17 @@ class Frames:
         """Velocity of geoms' centres [m/s], (W, 3) or (W, n, 3)."""
         return self._point("geom", geom)[1]
 
+    def fixed_points(self, bodies: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
+        """Position [m] and velocity [m/s], both (W, n, 3), of points fixed in bodies.
+
+        Args:
+            bodies: ids, (n,).
+            offsets: positions in the bodies' frames [m], (n, 3).
+        """
+        quat = self._quat[:, bodies]
+        arm = quat_rotate(quat, offsets.expand(*quat.shape[:-1], 3))
+        return self._pos[:, bodies] + arm, self._linvel[:, bodies] + torch.linalg.cross(self._angvel[:, bodies], arm)
+
     def center_of_mass(self, body: Names = 0) -> Tensor:
         """Centre of mass of the subtrees of bodies, by default of the whole model [m], (W, 3) or (W, n, 3)."""
         return self._subtree(self._centers[0], body)
@@ -278,8 +295,5 @@ class Frames:
     def _point(self, kind: str, names: Names) -> tuple[Tensor, Tensor]:
         ids = self._kinematics.indices(kind, names)
         body, pos, _ = self._kinematics.place(kind)
-        at = body[ids]
-        quat = self._quat[:, at]
-        arm = quat_rotate(quat, pos[ids].expand(*quat.shape[:-1], 3))
-        velocity = self._linvel[:, at] + torch.linalg.cross(self._angvel[:, at], arm)
-        return as_named(self._pos[:, at] + arm, names), as_named(velocity, names)
+        position, velocity = self.fixed_points(body[ids], pos[ids])
+        return as_named(position, names), as_named(velocity, names)

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from msk_ray.step.autograd.backward import Backward, ExternalForces, Needs, StepState
+from msk_ray.step.autograd.contact_state import Contact
 from msk_ray.step.autograd.flags import known_none
 from msk_ray.step.autograd.jacobian import Linearization
 from msk_ray.step.autograd.modes import make_backward
@@ -21,6 +22,7 @@ from msk_ray.step.autograd.tape import TapePerSubstep
 from msk_ray.step.errors import ConfigError, DeviceError, UnsupportedModelError
 from msk_ray.step.forward import Kernels, WorldBatch
 from msk_ray.step.forward.capacity import UNKNOWN, Capacity
+from msk_ray.step.forward.contact_watch import ContactQuery
 from msk_ray.step.forward.stages import PACKAGE
 
 
@@ -306,6 +308,32 @@ class Simulation:
         before a backward pass, which uses the same buffers.
         """
         return self.engine.contact_forces()
+
+    def measure_sensors(self) -> None:
+        """Take readings of the model's sensors in every step from now on, for `sensordata`."""
+        self.batch.measures_sensors = True
+
+    def sensordata(self) -> Tensor:
+        """MuJoCo's `sensordata` of the last step, (W, nsensordata): values only, of forces and accelerations in its
+        last substep. For sensors that are functions of the state, `Sensors` has those of the state itself, with
+        gradients.
+
+        Raises:
+            ConfigError: the last step took no readings.
+        """
+        return self.engine.sensordata()
+
+    def measure_contacts(self, query: ContactQuery) -> None:
+        """Watch these contacts in every step from now on, for `contacts`."""
+        self.batch.contacts.add(query)
+
+    def contacts(self, query: ContactQuery) -> Contact:
+        """Contacts in the substeps of the last step: values only; read them before the next step.
+
+        Raises:
+            ConfigError: the last step did not watch these.
+        """
+        return Contact.of(self.engine.contacts(query))
 
     def _check_inputs(self, *inputs: Tensor) -> None:
         # Copying into the batch's buffers would broadcast one world to all, and convert dtypes and devices silently.

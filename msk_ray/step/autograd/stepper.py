@@ -1,6 +1,7 @@
 """Env steps on torch tensors: replays of recorded graphs, whose buffers grow when a step needs more."""
 
 from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
 
 import warp as wp
 from torch import Tensor
@@ -8,12 +9,22 @@ from torch import Tensor
 from msk_ray.step.autograd.backward import Backward, ExternalForces, StepState
 from msk_ray.step.autograd.buffers import BatchTensors, device_of, stream_of, wait_for
 from msk_ray.step.autograd.parameters import ParameterTensors
+from msk_ray.step.errors import ConfigError
 from msk_ray.step.forward import Graph, WorldBatch, compile_kernels, joined_stream
 from msk_ray.step.forward.capacity import Capacity
 from msk_ray.step.forward.contact_forces import ContactForces
+from msk_ray.step.forward.contact_watch import ContactQuery
 
 _NEARLY_FULL = 0.75
 """Share of a buffer in use above which `diagnostics` enlarges it, before a step overflows."""
+
+
+class _Recipe(NamedTuple):
+    """What decides the launches of a step, and may change."""
+
+    limits: tuple[int, ...] | None
+    measures_sensors: bool
+    queries: tuple[ContactQuery, ...]
 
 
 class Engine:
@@ -40,17 +51,48 @@ class Engine:
         pullbacks = () if self.backward is None else self.backward.pullbacks()
         compile_kernels(self.batch.device, self._launches, *pullbacks)
         self._graph = Graph(self._launches, self.batch.device)
-        self._limits = self.batch.unrolled_iterations
+        self._recorded = self._recipe()
         for watch in (self.batch.losses, self.batch.iterations):
             watch.read()  # discard what the run for recording reported
         if self.backward is not None:
             self.backward.forget()
 
+    def _recipe(self) -> _Recipe:
+        batch = self.batch
+        limits = batch.unrolled_iterations if batch.ordered else None
+        return _Recipe(limits, batch.measures_sensors, batch.contacts.queries)
+
+    @property
+    def _last_data(self) -> Any:
+        """The mujoco_warp.Data of the last substep."""
+        return self.batch.data if self.backward is None else self.backward.last_data(self.batch)
+
+    def sensordata(self) -> Tensor:
+        """MuJoCo's sensor readings in the last substep of the last step, (W, nsensordata).
+
+        Raises:
+            ConfigError: the step did not take them.
+        """
+        if not self._recorded.measures_sensors:
+            raise ConfigError("the last step took no readings of sensors: call measure_sensors() before a step")
+        readings: Tensor = wp.to_torch(self._last_data.sensordata, requires_grad=False)
+        return readings.clone()
+
+    def contacts(self, query: ContactQuery) -> Tensor:
+        """Answer to a query about the contacts of the last step, (S, W, n, FIGURES).
+
+        Raises:
+            ConfigError: the step did not answer it.
+        """
+        if query not in self._recorded.queries:
+            raise ConfigError("the last step did not watch these contacts: call measure_contacts() before a step")
+        figures: Tensor = wp.to_torch(self.batch.contacts.figures[query], requires_grad=False)
+        return figures.clone()
+
     def contact_forces(self) -> Tensor:
         """Force of the contacts on every geom [N] in the last substep of the last step, (W, G, 3)."""
         if self._contact_forces is None:
-            data = self.batch.data if self.backward is None else self.backward.last_data(self.batch)
-            self._contact_forces = ContactForces(self.batch.model, data)
+            self._contact_forces = ContactForces(self.batch.model, self._last_data)
             self._forces_graph = Graph(self._contact_forces.launch, self.batch.device)
         self._forces_graph.replay(stream_of(self.device))
         force: Tensor = wp.to_torch(self._contact_forces.force, requires_grad=False)
@@ -66,7 +108,7 @@ class Engine:
 
     def replay(self, ctrl: Tensor, start: StepState, applied: ExternalForces | None = None) -> StepState:
         """The state after one env step, even if the step lost contacts or constraint rows."""
-        if self.batch.ordered and self._limits != self.batch.unrolled_iterations and joined_stream() is None:
+        if self._recorded != self._recipe() and joined_stream() is None:
             self.settle()
             self._record()
         self._buffers.load(ctrl, start, applied)

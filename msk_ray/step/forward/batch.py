@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from msk_ray.step.errors import ConfigError, UnsupportedModelError
 from msk_ray.step.forward.capacity import UNKNOWN, Capacity, default_capacity, geometric_bound, scalar_rows
+from msk_ray.step.forward.contact_watch import ContactQuery, ContactWatch
 from msk_ray.step.forward.fused import FusedSolver, check_fused
 from msk_ray.step.forward.graph import joined_stream
 from msk_ray.step.forward.iterations import IterationWatch
@@ -64,6 +65,8 @@ class WorldBatch:
         capacity: contacts and rows per world that fit into `data`.
         losses: contacts and rows lost to full buffers; check it between steps.
         iterations: counts the solver's iterations in each substep.
+        contacts: contacts between groups of geoms in each substep.
+        measures_sensors: whether steps fill `data.sensordata`, which then belongs to the state before the last substep.
         unrolled_iterations: the solver's iteration limit in each substep, for steps recorded into another library's
             capture, and for all steps with ordered sums. In a capture the loop is unrolled, so that each iteration
             costs time even if no world needs it. None: the model's limit.
@@ -102,10 +105,11 @@ class WorldBatch:
         if self._solves:
             warn_raised_limits(mjm, kernels.iterations, kernels.ls_iterations)
         self.unrolled_iterations: tuple[int, ...] | None = None
+        self.measures_sensors = False
         self._watch = ModelWatch(mjm)
         self._given = capacity
         start, self._bound = default_capacity(self.structure) if not all(self._given) else (self._given, None)
-        self._allocate(nworld, Capacity(capacity.contacts or start.contacts, capacity.rows or start.rows))
+        self._allocate(nworld, Capacity(capacity.contacts or start.contacts, capacity.rows or start.rows), ())
 
     def _structure(self) -> mujoco.MjModel:
         model = structure(self.mjm, self.parameters)
@@ -129,6 +133,7 @@ class WorldBatch:
             model.opt.iterations, model.opt.ls_iterations = self.limits
             model.opt.warn_overflow = 0  # `losses` reports overflows; kernels need not print them
             model.ncam = model.nlight = 0  # unused: saves two launches per substep
+            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR  # `launch_substep` enables them
             if not self._solves:
                 model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT  # skip constraints: no rows possible
             open_arrays(self.mjm, model, self.parameters, nworld)
@@ -154,7 +159,7 @@ class WorldBatch:
         """mujoco_warp's model."""
         return self._model
 
-    def _allocate(self, nworld: int, capacity: Capacity) -> None:
+    def _allocate(self, nworld: int, capacity: Capacity, queries: Iterable[ContactQuery]) -> None:
         self.nworld = nworld
         self.capacity = capacity
         with wp.ScopedDevice(self.device):
@@ -165,12 +170,15 @@ class WorldBatch:
                 self.data.efc.Ma = self.data.qfrc_smooth
         self.losses = LossWatch(self.data, self.device)
         self.iterations = IterationWatch(self.substeps, nworld, self.device)
+        self.contacts = ContactWatch(self.model, self.data, self.substeps)
+        for query in queries:
+            self.contacts.add(query)
 
     def resized(self, nworld: int, capacity: Capacity | None = None) -> "WorldBatch":
         """Another batch with `nworld` worlds, which shares this one's model."""
         self.check_model()
         other = copy.copy(self)
-        other._allocate(nworld, capacity or self.capacity)
+        other._allocate(nworld, capacity or self.capacity, self.contacts.queries)
         return other
 
     def with_parameters(self, names: Iterable[str]) -> "WorldBatch":
@@ -190,7 +198,7 @@ class WorldBatch:
         if self._bound is not None:
             other._bound = self._bound._replace(rows=self._bound.rows + more)
         rows = self.capacity.rows + (0 if self._given.rows else more)
-        other._allocate(self.nworld, self.capacity._replace(rows=rows))
+        other._allocate(self.nworld, self.capacity._replace(rows=rows), self.contacts.queries)
         return other
 
     def check_model(self, thorough: bool = False) -> None:
@@ -250,10 +258,13 @@ class WorldBatch:
         # With ordered sums, recorded and eager steps must stop at the same iteration.
         limited = self.stages.unrolls and (captured or self.ordered)
         model = self._limited(k, conditional=not captured) if limited else self.model
+        if self.measures_sensors:
+            model = with_options(model, disableflags=model.opt.disableflags & ~int(mujoco.mjtDisableBit.mjDSBL_SENSOR))
         refresh_velocity(self.mjm, model, data)
         self.stages.step(model, data)
         if self.stages.unrolls:
             self.iterations.launch(data, k)
+        self.contacts.launch(data, k)
 
     def _limited(self, k: int, conditional: bool) -> Any:
         """The model with the iteration limit of substep k, with or without conditional graph nodes; the same arrays."""

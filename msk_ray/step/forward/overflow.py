@@ -19,9 +19,11 @@ _ROW_BITS = int(OverflowType.NEFC | OverflowType.NJMAX_NNZ)
 _INCURABLE = {
     OverflowType.HFIELD: "a geom touches more cells of a height field than mujoco_warp keeps: give it coarser cells",
     OverflowType.EPA_HORIZON: "a contact of convex geoms was lost (EPA horizon): make their meshes simpler",
+    OverflowType.CONTACT_MATCH: "a contact sensor saw more contacts than mujoco_warp keeps: add <numeric "
+    "name='contact_sensor_maxmatch' data='256'/> to <custom> of the model",
     OverflowType.NVMAX: "more degrees of freedom were awake than mujoco_warp has room for: disable sleeping",
 }
-# Without CONTACT_MATCH and TACTILE, which only affect sensor data.
+# Without TACTILE, of sensors that nothing reads.
 LOST_BITS = _CONTACT_BITS | _ROW_BITS | int(sum(_INCURABLE))
 _NAN = wp.constant(math.nan)
 
