@@ -149,6 +149,10 @@ class ParallelTrainer(TrialFolder):
         path: Path = self._call("save")
         return path
 
+    def discard_checkpoint(self) -> None:
+        """As `Trainer.discard_checkpoint`."""
+        self._call("discard_checkpoint")
+
     def restore(self, path: Path, changed: Collection[str] = ()) -> None:
         """As `Trainer.restore`."""
         self._call("restore", path, frozenset(changed))

@@ -255,7 +255,7 @@ def test_a_world_that_diverged_has_no_forces(home: Path) -> None:
         ("Ball", {"env__reward__heigt": 1.0}, "env.reward.heigt: unknown key; did you mean 'height'"),
         ("Free", {}, "actuator aim has no ctrlrange, so no control for actions of -1 and 1: write a ctrlrange"),
         ("Led", {}, "the keyframe moves mocap body hook, which stays where the model puts it: write mpos and mquat of"),
-        ("Feeling", {}, "use them in reward_terms, fell or outcome_terms, not in observe"),
+        ("Feeling", {}, "use them in remember, reward_terms, fell or outcome_terms, not in observe"),
         ("Groping", {}, "contacts belong to a step, not to a state: use them in reward_terms, fell or outcome_terms"),
         ("Jolted", {}, "sensors of forces and accelerations belong to a step, not to a state: use them in"),
         ("Flat", {}, r"observe of Flat has shape \(4,\), not \(worlds, entries\) with 4 worlds"),
