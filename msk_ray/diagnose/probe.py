@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from msk_ray.algorithms import algorithm_class
 from msk_ray.config import Config, PhysicsConfig, load_config
-from msk_ray.diagnose.exact import ExactKinematics, ExactTendons
+from msk_ray.diagnose.exact import ExactGround, ExactKinematics, ExactTendons
 from msk_ray.envs import Env, EnvState, make_env
 from msk_ray.errors import ConfigError, SimulationError
 from msk_ray.step import StepState
@@ -240,7 +240,7 @@ def _double(env: Env[Any]) -> Env[Any]:
     for name, value in vars(env).items():
         setattr(ideal, name, _in_double(value))
     ideal.device = torch.device("cpu")
-    ideal.measure_by(ExactKinematics(env.model), ExactTendons(env.model))
+    ideal.measure_by(ExactKinematics(env.model), ExactTendons(env.model), ExactGround(env.model))
     return ideal
 
 

@@ -29,6 +29,7 @@ from msk_ray.group import ALONE, Group
 from msk_ray.step import Backward, Kernels, Simulation, StepState
 from msk_ray.step.autograd.contact_state import Contact, ContactQueries
 from msk_ray.step.autograd.flags import known_none
+from msk_ray.step.autograd.ground import Ground
 from msk_ray.step.autograd.kinematics import Frames, Kinematics, Names, as_named
 from msk_ray.step.autograd.sensors import Readings, Sensors
 from msk_ray.step.autograd.tendon_lengths import Tendons
@@ -578,6 +579,13 @@ class Env(ABC, Generic[SettingsT]):
         )
         return readings
 
+    @cached_property
+    def ground(self) -> Ground:
+        """Distances to the ground: `self.ground.scan(self.frames(state), "trunk", offsets, reach)` around a body,
+        `self.ground.below(points, reach)`; with the gradient of the slope where rays land.
+        """
+        return Ground(self.sim.batch)
+
     def _sensordata(self, state: StepState) -> Tensor:
         if self.ignore_contact_forces:
             self.sim.measure_sensors()
@@ -600,9 +608,9 @@ class Env(ABC, Generic[SettingsT]):
             kept = self._measured[what] = (state, grad, measure())
         return kept[2]
 
-    def measure_by(self, kinematics: Kinematics, tendons: Tendons) -> None:
-        """Compute `frames` and `tendons` with these, for example with those of a simulation in float64."""
-        self._kinematics, self._tendons = kinematics, tendons
+    def measure_by(self, kinematics: Kinematics, tendons: Tendons, ground: Ground) -> None:
+        """Measure with these, for example with those of a simulation in float64."""
+        self._kinematics, self._tendons, self.ground = kinematics, tendons, ground
         self._sensors = Sensors(kinematics, lambda: tendons)
         self._measured = {}
 

@@ -6,7 +6,7 @@ A stand-alone library: it needs mujoco, mujoco_warp, warp, numpy and torch, and 
 |---|---|
 | `forward` | batches of worlds in Warp: buffers, recorded graphs, the fused solver, sums in a fixed order; no torch |
 | `adjoint` | the exact pullback of one `mujoco_warp.step`; the formula is at the top of `adjoint/step.py`; no torch |
-| `autograd` | `Simulation` and its backward modes, kinematics, tendons: where torch and Warp meet |
+| `autograd` | `Simulation`, backward modes; kinematics, tendons, sensors, ground: where torch and Warp meet |
 | `check` | gradients against float64 central differences of C MuJoCo |
 """
 

@@ -4,7 +4,8 @@ import mujoco
 import numpy as np
 import torch
 
-from msk_ray.diagnose.exact import ExactKinematics, ExactTendons
+from msk_ray.diagnose.exact import ExactGround, ExactKinematics, ExactTendons
+from msk_ray.step.autograd.ground import Ground
 from msk_ray.step.autograd.kinematics import Kinematics
 from msk_ray.step.autograd.tendon_lengths import Tendons
 from msk_ray.step.forward import WorldBatch
@@ -42,3 +43,15 @@ def test_frames_and_tendons_in_float64_are_those_in_float32() -> None:
     assert length.dtype == rate.dtype == torch.float64
     for found, expected in zip(Tendons(batch)(*(part.float() for part in exact)), (length, rate), strict=True):
         np.testing.assert_allclose(found, expected, atol=2e-5)
+
+
+def test_distances_to_the_ground_in_float64_are_those_in_float32() -> None:
+    """Above a step and a floor; past the reach; and with a ball in between, which is no ground."""
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><geom type="plane" size="0 0 1"/><geom type="box" size=".5 .5 .2" rgba="0 0 0 0"/>
+        <body pos="2 0 .3"><freejoint/><geom size=".1"/></body></worldbody></mujoco>"""
+    )
+    points = torch.tensor([[[0.1, 0.2, 1.0], [2.0, 0.0, 1.0], [0.0, 0.0, 2.5]]])
+    exact = ExactGround(model).below(points.double(), 2.0)
+    assert exact.tolist() == [[0.8, 1.0, 2.0]]
+    np.testing.assert_allclose(Ground(WorldBatch(model, 1, 1, "cpu")).below(points, 2.0), exact, atol=1e-6)

@@ -30,6 +30,7 @@ MODEL = """<mujoco><option timestep="0.004" integrator="implicitfast" iterations
 BALL = """
 import torch
 from msk_ray import MjcfEnv, Reward
+from msk_ray.step.autograd.ground import grid
 
 class BallReward(Reward):
     height: float = 2.0
@@ -67,6 +68,19 @@ class Sensing(Ball):
     def fell(self, state):
         self.last = self.contact(state, ["ball", "arm"], "body")
         return self.last.touching[-1, :, 1]
+
+class Looking(Ball):
+    without_gradient = ()
+
+    def prepare(self):
+        self.grid = grid(0.2, 0.2, 0.2).to(self.device)
+
+    def observe(self, state, action):
+        return self.ground.scan(self.frames(state), "ball", self.grid, 3.0)
+
+    def reward_terms(self, state, action, obs):
+        feet = self.frames(state).site_position(["tip"])
+        return torch.stack((obs.sum(-1), self.ground.below(feet, 1.0)[:, 0]), -1)
 
 class Groping(Ball):
     def observe(self, state, action):
@@ -219,6 +233,19 @@ def test_sensors_and_contacts_of_a_step(home: Path) -> None:
     env.step(torch.zeros(2, 1)).reward.sum().backward()
     assert qvel.grad is not None
     assert qvel.grad.abs().sum() > 0.1
+
+
+def test_a_scan_of_the_ground_is_observed(home: Path) -> None:
+    env = _make("Looking", nworld=2, differentiable=True, env__keyframe="high", env__stochastic_reset=False)
+    with torch.no_grad():
+        assert env.observation().tolist() == [[pytest.approx(2.0)] * 4] * 2
+    qpos = env.state.physics.qpos.clone().requires_grad_()
+    env.state = env.state._replace(physics=env.state.physics._replace(qpos=qpos))
+    transition = env.step(torch.zeros(2, 1))
+    assert transition.terms[:, 1].tolist() == [1.0, 1.0], "the tip is out of reach"
+    transition.obs.sum().backward()
+    assert qpos.grad is not None
+    assert qpos.grad[:, 2].tolist() == pytest.approx([4.0, 4.0], rel=1e-4)
 
 
 def test_what_is_measured_of_a_state_is_computed_once_and_with_gradients_where_asked(home: Path) -> None:
