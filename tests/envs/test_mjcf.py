@@ -29,7 +29,8 @@ MODEL = """<mujoco><option timestep="0.004" integrator="implicitfast" iterations
 
 BALL = """
 import torch
-from msk_ray import MjcfEnv, Reward
+from msk_ray import Memory, MjcfEnv, Reward
+from msk_ray.step.autograd.contact_state import AirTime
 from msk_ray.step.autograd.ground import grid
 
 class BallReward(Reward):
@@ -81,6 +82,17 @@ class Looking(Ball):
     def reward_terms(self, state, action, obs):
         feet = self.frames(state).site_position(["tip"])
         return torch.stack((obs.sum(-1), self.ground.below(feet, 1.0)[:, 0]), -1)
+
+class Timing(Ball):
+    def memories(self):
+        return {"air": Memory(4)}
+
+    def remember(self, state, action):
+        contact, air = self.contact(state, "ball"), AirTime.of(self.memory["air"])
+        return {"air": air.after(contact.touching, self.model.opt.timestep).memory}
+
+    def observe(self, state, action):
+        return torch.cat((self.memory["air"], state.qvel), -1)
 
 class Groping(Ball):
     def observe(self, state, action):
@@ -248,6 +260,15 @@ def test_a_scan_of_the_ground_is_observed(home: Path) -> None:
     assert qpos.grad[:, 2].tolist() == pytest.approx([4.0, 4.0], rel=1e-4)
 
 
+@pytest.mark.parametrize(("keyframe", "times"), [("high", [0.04, 0.0, 0.0, 0.0]), ("low", [0.0, 0.04, 0.0, 0.0])])
+def test_time_in_the_air_is_remembered(home: Path, keyframe: str, times: list[float]) -> None:
+    env = _make("Timing", nworld=2, env__keyframe=keyframe, env__stochastic_reset=False)
+    with torch.no_grad():
+        for _ in range(2):
+            obs = env.step(torch.zeros(2, 1)).obs
+    assert obs[:, :4].tolist() == [pytest.approx(times, abs=1e-6)] * 2
+
+
 def test_what_is_measured_of_a_state_is_computed_once_and_with_gradients_where_asked(home: Path) -> None:
     env = _make(nworld=2)
     state = env.state.physics._replace(qpos=env.state.physics.qpos.clone().requires_grad_())
@@ -283,7 +304,7 @@ def test_a_world_that_diverged_has_no_forces(home: Path) -> None:
         ("Free", {}, "actuator aim has no ctrlrange, so no control for actions of -1 and 1: write a ctrlrange"),
         ("Led", {}, "the keyframe moves mocap body hook, which stays where the model puts it: write mpos and mquat of"),
         ("Feeling", {}, "use them in remember, reward_terms, fell or outcome_terms, not in observe"),
-        ("Groping", {}, "contacts belong to a step, not to a state: use them in reward_terms, fell or outcome_terms"),
+        ("Groping", {}, "contacts belong to a step, not to a state: use them in remember, reward_terms"),
         ("Jolted", {}, "sensors of forces and accelerations belong to a step, not to a state: use them in"),
         ("Flat", {}, r"observe of Flat has shape \(4,\), not \(worlds, entries\) with 4 worlds"),
         ("Strung", {}, "the model has no tendons"),
