@@ -305,7 +305,7 @@ class Env(ABC, Generic[SettingsT]):
         """The state with the memories of episodes that begin in it; it has their declared values."""
         if not self._memories:
             return state
-        with self._in_state(state), torch.no_grad():
+        with self.in_state(state), torch.no_grad():
             values = self.begin_memory(state.physics)
         self._contract.check_memory("begin_memory", values, state.memory, complete=False)
         return state._replace(memory=self._memories.begun(values))
@@ -454,11 +454,11 @@ class Env(ABC, Generic[SettingsT]):
 
     def observation_of(self, reached: EnvState) -> Tensor:
         """Observation (W, O) of another state; the current one stays what it is."""
-        with self._in_state(reached):
+        with self.in_state(reached):
             return self.observation()
 
     @contextmanager
-    def _in_state(self, state: EnvState) -> Iterator[None]:
+    def in_state(self, state: EnvState) -> Iterator[None]:
         """Inside the block, the worlds are in another state."""
         before = vars(self).get("state", state)
         self.state = state

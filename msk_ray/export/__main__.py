@@ -16,12 +16,13 @@ DESCRIPTION = """\
 Export a policy for programs that do not have msk_ray: as ONNX, as TorchScript, or both.
 
 The network takes raw observations (batch, O), float32, and returns `action` (batch, A) in [-1, 1] and `ctrl` (batch,
-nu), the controls of the model; normalisation and squashing are inside. If controls depend on the previous action, the
-network also takes `previous_action` (batch, A); if they depend on the state, it has no `ctrl`. Each file is compared
-with the checkpoint's policy on 1000 observations; if any output differs by more than 1e-5, nothing is written.
+nu), the controls of the model; normalisation and squashing are inside. If controls depend on the previous action or on
+memories of the environment, or the observation shows memories, these are further inputs, which the call before gives;
+if controls depend on the state, there is no `ctrl`. Each file is compared with the checkpoint's policy on 1000
+observations, and one with memories over 50 steps; if any output differs by more than 1e-5, nothing is written.
 
-With p.onnx come p.json (order and units of observation and action, control period, joints, origin) and p.mjb, the
-model, for the same version of MuJoCo (mujoco.MjModel.from_binary_path).
+With p.onnx come p.json (order and units of observation and action, memories with their start values, control period,
+joints, origin) and p.mjb, the model, for the same version of MuJoCo (mujoco.MjModel.from_binary_path).
 
 --zoo keeps the policy for evaluate, visualize and export: NAME.pt, which cannot be trained further, and NAME.yaml with
 its settings, its score over --seeds, the commit, the command and the GPU. It updates the table in the folder's

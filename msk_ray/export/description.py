@@ -12,7 +12,7 @@ from msk_ray.errors import ConfigError
 from msk_ray.export.network import CHECKED, TOLERANCE, PolicyToControl
 from msk_ray.training import SavedPolicy
 
-FORMAT = 1
+FORMAT = 2
 
 
 def describe(
@@ -37,22 +37,27 @@ def describe(
             f"observation_layout of {type(env).__qualname__} has {len(layout)} entries for observations of size "
             f"{env.obs_size}"
         )
+    given = policy.memory.given
     return {
         "format": FORMAT,
         "files": dict(files),
-        "input": {"name": "obs", "shape": ["batch", env.obs_size], "dtype": "float32"},
-        "previous_action": {
-            "name": "previous_action",
-            "shape": ["batch", env.action_size],
-            "dtype": "float32",
-            "meaning": "the action of the step before; 0 in the first step of an episode",
-        }
-        if policy.takes_previous
-        else None,
+        "input": {"name": "obs", "shape": ["batch", len(given)], "dtype": "float32"},
+        "memory": [
+            {
+                "input": carried.name,
+                "shape": ["batch", len(carried.start)],
+                "dtype": "float32",
+                "start": carried.start.tolist(),
+                "output": carried.output,
+            }
+            for carried in policy.carried
+        ],
+        "calls": "one for each control period; each input of `memory` is its `start` in the first call of an episode, "
+        "then its `output` of the call before",
         "outputs": policy.outputs,
         "observation": {
-            "size": env.obs_size,
-            "entries": None if layout is None else [entry._asdict() for entry in layout],
+            "size": len(given),
+            "entries": None if layout is None else [layout[place]._asdict() for place in given],
             "description": _own_docstring(type(env)),
         },
         "action": {"size": env.action_size, "range": [-1.0, 1.0], "names": env.action_names()},

@@ -6,10 +6,10 @@ Axes: N observations, O observation, A action, U controls.
 import io
 import logging
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from msk_ray.envs import Env
 from msk_ray.envs.records import EnvState
 from msk_ray.errors import ConfigError, ExportError
+from msk_ray.export.memory import NOISE, carried_memory
 from msk_ray.step import StepState
 
 TOLERANCE = 1e-5
@@ -24,20 +25,36 @@ TOLERANCE = 1e-5
 largest magnitude if that is above 1."""
 CHECKED = 1000
 """Observations on which an exported policy is compared with the checkpoint's."""
+STEPS = 50
+"""Env steps over which one that remembers is compared."""
 WORLDS = 8
 """Worlds whose initial states give the observations."""
-_NOISE = 0.1
 _PACKAGES = ("onnx", "onnxscript", "onnxruntime")
 
 Runner = Callable[..., list[Tensor]]
 """Runs an exported policy on its inputs."""
 
 
-class PolicyToControl(nn.Module):
-    """Raw observations (N, O) to actions (N, A) in [-1, 1] and, unless they depend on the state, controls (N, U).
+class CarriedInput(NamedTuple):
+    """An input that is an output of the call before."""
 
-    If controls depend on the previous action, that is a second input (N, A), 0 in the first step of an episode. The
+    name: str
+    output: str
+    start: Tensor
+    """Its value in the first call of an episode, (size,)."""
+
+
+class PolicyToControl(nn.Module):
+    """Observations (N, O) to actions (N, A) in [-1, 1] and, unless they depend on the state, controls (N, U).
+
+    If controls depend on the previous action, that is a further input (N, A). So are the memories that it carries, each
+    (N, size), which are also outputs, for the next call; entries of the observation that show them are not given. The
     normalisation of the observation and the squashing of the action are inside.
+
+    Attributes:
+        network: from whole observations to actions.
+        memory: the memories that it carries.
+        remarks: what the file cannot do for the environment's memories.
 
     Raises:
         ExportError: the environment's `control` only works for one action per world.
@@ -49,36 +66,73 @@ class PolicyToControl(nn.Module):
             raise ValueError("several worlds are needed to compare their controls")
         self.network = network
         self._env = env
+        self.remarks: list[str] = []
         self.gives_control = not _depends_on_state(env)
+        read = _read_by_control(env) if self.gives_control else set()
+        self.memory = carried_memory(env, read)
+        if lost := read - set(self.memory.start):
+            self.gives_control = False
+            self.memory = carried_memory(env, set())
+            self.remarks.append(f"no ctrl: `control` reads {_quoted(lost)}, which the file cannot carry")
+        if self.memory.outside:
+            self.remarks.append(
+                f"entries of obs depend on {_quoted(self.memory.outside)}, which the file cannot carry: give them too"
+            )
+        self._sizes = [len(start) for start in self.memory.start.values()]
+        self._order = torch.tensor([*self.memory.given, *self.memory.shown]).argsort()
         self.takes_previous = self.gives_control and _depends_on_previous(env)
         if self.gives_control:
             self._try_control()
 
     @property
+    def carried(self) -> list[CarriedInput]:
+        """Its inputs besides the observation."""
+        previous = CarriedInput("previous_action", "action", torch.zeros(self._env.action_size))
+        memories = [
+            CarriedInput(f"memory_{name}", f"next_memory_{name}", start) for name, start in self.memory.start.items()
+        ]
+        return [previous, *memories] if self.takes_previous else memories
+
+    @property
     def inputs(self) -> list[str]:
         """Names of its inputs."""
-        return ["obs", "previous_action"] if self.takes_previous else ["obs"]
+        return ["obs", *(carried.name for carried in self.carried)]
 
     @property
     def outputs(self) -> list[str]:
         """Names of its outputs."""
-        return ["action", "ctrl"] if self.gives_control else ["action"]
+        control = ["ctrl"] if self.gives_control else []
+        return ["action", *control, *(carried.output for carried in self.carried if carried.output != "action")]
 
-    def forward(self, obs: Tensor, previous_action: Tensor | None = None) -> tuple[Tensor, ...]:
-        action = self.network(obs)
-        return (action, self._control(action, previous_action)) if self.gives_control else (action,)
+    def forward(self, obs: Tensor, *carried: Tensor) -> tuple[Tensor, ...]:
+        memories = carried[1:] if self.takes_previous else carried
+        remembered = torch.cat((*memories, obs[:, :0]), -1)
+        whole = obs
+        if self.memory.shown:
+            whole = torch.cat((obs, self.memory.fill(remembered)), -1)[:, self._order]
+        action = self.network(whole)
+        outputs = (action, self._control(action, *carried)) if self.gives_control else (action,)
+        if not memories:
+            return outputs
+        after = self.memory.update(torch.cat((remembered, obs, action), -1))
+        return (*outputs, *after.split(self._sizes, -1))
+
+    def given(self, obs: Tensor) -> Tensor:
+        """The entries (N, ...) of observations (N, O) that are its input."""
+        return obs[:, list(self.memory.given)] if self.memory.shown else obs
 
     def examples(self, obs: Tensor, seed: int) -> tuple[Tensor, ...]:
-        """Its inputs for some observations, with random previous actions."""
-        if not self.takes_previous:
-            return (obs,)
+        """Its inputs for some observations, with random other ones."""
         generator = torch.Generator().manual_seed(seed)
-        return obs, 2.0 * torch.rand((len(obs), self._env.action_size), generator=generator) - 1.0
+        shapes = [(len(obs), len(carried.start)) for carried in self.carried]
+        return self.given(obs), *(2.0 * torch.rand(shape, generator=generator) - 1.0 for shape in shapes)
 
-    def _control(self, action: Tensor, previous: Tensor | None) -> Tensor:
-        if previous is None:
-            return self._env.control(action)
-        with _state(self._env, self._env.state._replace(action=previous)):
+    def _control(self, action: Tensor, *carried: Tensor) -> Tensor:
+        state = self._env.state
+        if self.takes_previous:
+            state, carried = state._replace(action=carried[0]), carried[1:]
+        memory = {**state.memory, **dict(zip(self.memory.start, carried, strict=True))}
+        with self._env.in_state(state._replace(memory=memory)):
             return self._env.control(action)
 
     def _try_control(self) -> None:
@@ -86,7 +140,7 @@ class PolicyToControl(nn.Module):
         for count in (1, self._env.nworld + 1):
             actions = torch.zeros((count, self._env.action_size), device=self._env.device)
             try:
-                control = self._control(actions, actions if self.takes_previous else None)
+                control = self._control(actions, *(c.start.expand(count, -1) for c in self.carried))
             except Exception as error:
                 text = (str(error).splitlines() or [""])[0]
                 raise self._control_error(count, f"{type(error).__name__}: {text}") from error
@@ -96,18 +150,8 @@ class PolicyToControl(nn.Module):
     def _control_error(self, count: int, why: str) -> ExportError:
         return ExportError(
             f"not written: {type(self._env).__qualname__}.control fails for {count} rows of actions ({why}): compute "
-            "it from `action` and `self.state.action` alone, whatever their number of rows"
+            "it from `action`, `self.state.action` and `self.memory` alone, whatever their number of rows"
         )
-
-
-@contextmanager
-def _state(env: Env[Any], state: EnvState) -> Iterator[None]:
-    """The environment in another state, inside the block."""
-    before, env.state = env.state, state
-    try:
-        yield
-    finally:
-        env.state = before
 
 
 @torch.no_grad()
@@ -116,7 +160,7 @@ def _depends_on_state(env: Env[Any]) -> bool:
     generator = torch.Generator().manual_seed(0)
 
     def varied(part: Tensor) -> Tensor:
-        return part + _NOISE * torch.randn(part.shape, generator=generator).to(part)
+        return part + NOISE * torch.randn(part.shape, generator=generator).to(part)
 
     state = env.state
     others = state._replace(
@@ -132,10 +176,26 @@ def _depends_on_previous(env: Env[Any]) -> bool:
     return _controls_differ(env, env.state._replace(action=spread[:, None].repeat(1, env.action_size)))
 
 
+@torch.no_grad()
+def _read_by_control(env: Env[Any]) -> set[str]:
+    """Memories whose values change the controls for the same action."""
+    spread = torch.linspace(-0.9, 0.9, env.nworld, device=env.device)[:, None]
+    memory = env.state.memory
+    return {
+        name
+        for name, values in memory.items()
+        if _controls_differ(env, env.state._replace(memory={**memory, name: values + spread}))
+    }
+
+
+def _quoted(names: Iterable[str]) -> str:
+    return " and ".join(repr(name) for name in names)
+
+
 def _controls_differ(env: Env[Any], state: EnvState) -> bool:
     """Whether worlds in these states have different controls for the same action."""
     action = torch.linspace(-0.9, 0.9, env.action_size, device=env.device).expand(env.nworld, -1)
-    with _state(env, state):
+    with env.in_state(state):
         control = env.control(action)
     return not bool((control == control[:1]).all())
 
@@ -150,7 +210,7 @@ def observations(env: Env[Any], seed: int) -> Tensor:
         env.state = env.reset_state()
         drawn.append(env.observation().cpu())
     obs = torch.cat(drawn)[:CHECKED]
-    return obs + _NOISE * torch.randn(obs.shape, generator=generator)
+    return obs + NOISE * torch.randn(obs.shape, generator=generator)
 
 
 def check_packages() -> None:
@@ -189,7 +249,8 @@ def to_onnx(policy: PolicyToControl, *inputs: Tensor) -> tuple[bytes, Runner]:
             verbose=False,
             input_names=policy.inputs,
             output_names=policy.outputs,
-            dynamic_shapes=tuple({0: batch} for _ in inputs),
+            # All inputs but the first are one parameter, `*carried`.
+            dynamic_shapes=({0: batch}, *([tuple({0: batch} for _ in inputs[1:])] if inputs[1:] else [])),
         )
     assert program is not None
     payload: bytes = program.model_proto.SerializeToString()
@@ -200,6 +261,17 @@ def to_onnx(policy: PolicyToControl, *inputs: Tensor) -> tuple[bytes, Runner]:
         return [torch.as_tensor(part) for part in session.run(None, given)]
 
     return payload, run
+
+
+def compare(policy: PolicyToControl, run: Runner, env: Env[Any], *inputs: Tensor) -> float:
+    """Largest difference between an exported policy and the checkpoint's, on these inputs and, if it carries memories,
+    over steps of its environment.
+
+    Raises:
+        ExportError: it is above `TOLERANCE`, or not a number.
+    """
+    difference = largest_difference(policy, run, *inputs)
+    return max(difference, difference_over_steps(policy, run, env)) if policy.memory.start else difference
 
 
 @torch.no_grad()
@@ -216,16 +288,40 @@ def largest_difference(policy: PolicyToControl, run: Runner, *inputs: Tensor) ->
     outputs += [
         (name, ours[:WORLDS], theirs) for name, ours, theirs in zip(policy.outputs, wanted, single, strict=True)
     ]
+    return max(_difference(*output, f"on one of {len(inputs[0])} observations") for output in outputs)
+
+
+@torch.no_grad()
+def difference_over_steps(policy: PolicyToControl, run: Runner, env: Env[Any]) -> float:
+    """Largest difference in `STEPS` steps of the environment, from one call to the next, of an exported policy's
+    actions and controls from the checkpoint's.
+
+    Raises:
+        ExportError: as for `largest_difference`.
+    """
+    env.state = env.reset_state()
+    carried = [each.start.expand(env.nworld, -1) for each in policy.carried]
     worst = 0.0
-    for name, ours, theirs in outputs:
-        difference = float((ours - theirs).abs().max() / ours.abs().max().clamp_min(1.0))
-        if not difference <= TOLERANCE:
-            raise ExportError(
-                f"not written: its {name} differs from the checkpoint's by {difference:.1e} on one of {len(inputs[0])} "
-                f"observations, more than {TOLERANCE:.0e}"
-            )
-        worst = max(worst, difference)
+    for step in range(STEPS):
+        obs = env.observation()
+        action = policy.network(obs)
+        outputs = dict(zip(policy.outputs, run(policy.given(obs), *carried), strict=True))
+        wanted = {"action": action, **({"ctrl": env.control(action)} if policy.gives_control else {})}
+        for name, ours in wanted.items():
+            worst = max(worst, _difference(name, ours, outputs[name], f"in step {step + 1} of an episode"))
+        carried = [outputs[each.output] for each in policy.carried]
+        env.step(action, auto_reset=False)
     return worst
+
+
+def _difference(name: str, ours: Tensor, theirs: Tensor, where: str) -> float:
+    difference = float((ours - theirs).abs().max() / ours.abs().max().clamp_min(1.0))
+    if not difference <= TOLERANCE:
+        raise ExportError(
+            f"not written: its {name} differs from the checkpoint's by {difference:.1e} {where}, more than "
+            f"{TOLERANCE:.0e}"
+        )
+    return difference
 
 
 @contextmanager
@@ -237,6 +333,7 @@ def _quiet() -> Iterator[None]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", (DeprecationWarning, FutureWarning))
+            warnings.filterwarnings("ignore", "# The axis name: batch will not be used")
             yield
     finally:
         exporter.setLevel(level)

@@ -14,7 +14,7 @@ from msk_ray.export.network import (
     CHECKED,
     WORLDS,
     PolicyToControl,
-    largest_difference,
+    compare,
     observations,
     to_onnx,
     to_torchscript,
@@ -43,7 +43,7 @@ def export(checkpoint: Path, paths: Mapping[str, Path], physics: str) -> Iterato
     checked = {}
     for kind in paths:
         payload, runner = _WRITERS[kind](policy, *inputs)
-        checked[kind] = payload, largest_difference(policy, runner, *inputs)
+        checked[kind] = payload, compare(policy, runner, env, *inputs)
     descriptions: dict[Path, dict[str, str]] = {}
     for kind, path in paths.items():
         payload, difference = checked[kind]
@@ -63,6 +63,7 @@ def export(checkpoint: Path, paths: Mapping[str, Path], physics: str) -> Iterato
             else ""
         )
         yield f"{path}: observation, action, periods{hint}"
+    yield from policy.remarks
 
 
 def policy_to_control(saved: SavedPolicy, physics: str) -> tuple[PolicyToControl, Env[Any], str]:

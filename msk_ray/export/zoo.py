@@ -23,7 +23,7 @@ from msk_ray.experiment.layout import ENVIRONMENT_FILE, best_checkpoint
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import read_rows
 from msk_ray.experiment.snapshot import read_trial
-from msk_ray.export.network import CHECKED, largest_difference, observations, to_torchscript
+from msk_ray.export.network import CHECKED, compare, observations, to_torchscript
 from msk_ray.export.write import policy_to_control
 from msk_ray.files import make_folder, write_bytes, write_text
 from msk_ray.training import SavedPolicy, load_policy
@@ -204,7 +204,7 @@ def _parity(stored: SavedPolicy) -> float:
     policy, env, _ = policy_to_control(stored, REFERENCE)
     seed = stored.config.evaluation.seed
     inputs = policy.examples(observations(env, seed), seed)
-    return largest_difference(policy, to_torchscript(policy, *inputs)[1], *inputs)
+    return compare(policy, to_torchscript(policy, *inputs)[1], env, *inputs)
 
 
 def _update_table(folder: Path) -> str:

@@ -65,7 +65,7 @@ def test_description_and_model_say_what_another_program_needs(exported: Path) ->
         ("cart_velocity", "m/s"),
     ]
     assert about["files"] == {"onnx": "p.onnx", "model": "p.mjb"}
-    assert about["previous_action"] is None
+    assert about["memory"] == []
     assert about["action"]["names"] == about["ctrl"]["names"] == ["force"]
     assert about["ctrl"]["ranges"] == [[-1.0, 1.0]]
     assert about["model"]["start"]["qpos"] == pytest.approx([0.0, np.pi])
@@ -177,13 +177,14 @@ def test_controls_that_depend_on_the_action_before_take_it_as_an_input(env: Cart
             smoothed.step(action, auto_reset=False)
             previous = action
     about = describe(msk_ray.load_policy(CHECKPOINT), policy, smoothed, "own", {})
-    assert about["previous_action"]["shape"] == ["batch", 1]
+    (previous,) = about["memory"]
+    assert (previous["input"], previous["output"], previous["start"]) == ("previous_action", "action", [0.0])
     assert about["ctrl"]["size"] == 1
 
 
 def test_a_control_for_so_many_worlds_alone_is_refused_in_one_line(env: CartPole) -> None:
     buffered = Buffered(env.config, PhysicsConfig(), 4, "cpu", 0, None)
-    wanted = r"Buffered\.control fails for 1 rows of actions \(it returns shape \(4, 1\)\): .*`self.state.action`"
+    wanted = r"Buffered\.control fails for 1 rows of actions \(it returns shape \(4, 1\)\): .*`self.memory`"
     with pytest.raises(ExportError, match=wanted):
         PolicyToControl(torch.nn.Linear(5, 1), buffered)
 
