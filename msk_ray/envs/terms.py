@@ -3,6 +3,8 @@
 Axes: W worlds, T terms.
 """
 
+import math
+
 import torch
 from torch import Tensor
 from torch.autograd.graph import GradientEdge, Node
@@ -29,9 +31,9 @@ def terms_without_gradient(terms: Tensor) -> list[int]:
     ends = _where_assembling_ends(terms)
     found = []
     for column in range(terms.shape[1]):
-        sent = torch.zeros_like(terms)
-        sent[:, column] = float("nan")
-        arrived = torch.autograd.grad(terms, ends, sent, retain_graph=True, allow_unused=True)
+        # Given a cotangent, torch would load its symbolic shapes, which takes most of a second.
+        sent = terms[:, column].sum() * math.nan
+        arrived = torch.autograd.grad(sent, ends, retain_graph=True, allow_unused=True)
         if not any(bool(part.isnan().any()) for part in arrived if part is not None):
             found.append(column)
     return found
