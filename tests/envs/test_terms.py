@@ -1,5 +1,6 @@
 """Which terms of a reward have a gradient, whatever operations put them together."""
 
+import sys
 from collections.abc import Callable
 
 import pytest
@@ -66,3 +67,9 @@ def test_terms_that_are_a_product_of_the_observation_have_its_gradient() -> None
     weights = torch.zeros(5, 2)
     weights[0, 0] = 1.0
     assert terms_without_gradient(torch.addmm(torch.zeros(2), obs, weights)) == []
+
+
+def test_asking_does_not_load_what_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torch.fx.experimental.symbolic_shapes", None)  # importing it raises
+    x = torch.ones(4, requires_grad=True)
+    assert terms_without_gradient(torch.stack([2.0 * x, torch.ones(4)], dim=1)) == [1]

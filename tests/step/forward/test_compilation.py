@@ -120,16 +120,19 @@ def test_a_kernel_that_does_not_compile_raises(reports: list[tuple[int, int]]) -
     assert reports == [(0, 1)]
 
 
+@pytest.mark.parametrize("device", [CPU, pytest.param("cuda:0", marks=pytest.mark.gpu)])
 @pytest.mark.parametrize("mode", ["tape_per_substep", "tape_all", "hybrid"])
-def test_a_simulation_compiles_its_step_and_its_gradient_together(mode: str, reports: list[tuple[int, int]]) -> None:
+def test_a_simulation_compiles_its_step_and_its_gradient_together(
+    mode: str, device: str, reports: list[tuple[int, int]]
+) -> None:
     model = mujoco.MjModel.from_xml_string(
         """<mujoco><worldbody><body><joint name="j" type="slide"/><geom size="0.1"/></body></worldbody>
         <actuator><motor joint="j"/></actuator></mujoco>"""
     )
-    sim = Simulation(model, nworld=2, substeps=2, backward=mode)
+    sim = Simulation(model, nworld=2, substeps=2, backward=mode, device=device)
     assert reports
     done, total = reports[-1]
     assert done == total == reports[0][1]  # all at once
-    ctrl = torch.zeros(2, 1, requires_grad=True)
+    ctrl = torch.zeros(2, 1, device=device, requires_grad=True)
     sim.step(ctrl, *sim.initial_state()).qpos.sum().backward()
     assert reports[-1] == (done, total)
