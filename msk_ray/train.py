@@ -238,6 +238,8 @@ def _train(
         for fault in faults:
             print(f"skipped: {printable(fault)}")
         print(f"resumed from {path}" if path else "no complete checkpoint yet: starting from the beginning")
+    if config.execution.solver_kernels == "auto":
+        print(f"constraint solver: {trainer.solver()}")
     if trainer.together > 1:
         print(f"policies are scored {trainer.together} at a time, after two minutes at most (or --score-at-once)")
     progress = ProgressLine(config.trial.epochs)

@@ -25,9 +25,10 @@ class ExecutionConfig(Section):
     Networks of a few hundred units gain nothing from more than one."""
     deterministic: bool = False
     """Add everything up in a fixed order, so that a GPU repeats the trial bit for bit (docs/runner/repeat.md)."""
-    solver_kernels: Literal["mujoco_warp", "fused"] = "mujoco_warp"
+    solver_kernels: Literal["mujoco_warp", "fused", "auto"] = "mujoco_warp"
     """Kernels of the constraint solver. `fused` runs all of Newton's iterations in one kernel, with a warp per world:
-    for models of up to 60 degrees of freedom."""
+    for models of up to 60 degrees of freedom. `auto` takes it for such models with room for up to 256 constraint rows
+    per world, mujoco_warp's own for others; `train` says which."""
     jacobian: Literal["dense", "sparse"] | None = None
     """How mujoco_warp stores the constraint Jacobian; null: as the model says. Which is faster and smaller on a GPU
     depends on the model."""

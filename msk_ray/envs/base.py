@@ -21,7 +21,7 @@ from msk_ray.envs import commands
 from msk_ray.envs.contract import Contract, versions
 from msk_ray.envs.layout import Entry
 from msk_ray.envs.memory import Memories, Memory, restored
-from msk_ray.envs.options import JACOBIANS
+from msk_ray.envs.options import FUSED_SOLVER, JACOBIANS
 from msk_ray.envs.randomize import Randomizer
 from msk_ray.envs.records import EnvState, Resets, Transition, rows_where
 from msk_ray.errors import ConfigError
@@ -117,7 +117,7 @@ class Env(ABC, Generic[SettingsT]):
             tolerance=physics.tolerance,
             kernels=Kernels(
                 execution.deterministic,
-                execution.solver_kernels == "fused",
+                FUSED_SOLVER[execution.solver_kernels],
                 **self.solver_limits(self.model, physics),
             ),
         )

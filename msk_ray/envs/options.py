@@ -11,6 +11,7 @@ INTEGRATORS = {
 }
 """Integrators by the names that `physics.integrator` takes."""
 _CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
+FUSED_SOLVER = {"mujoco_warp": False, "fused": True, "auto": None}
 JACOBIANS = {"dense": mujoco.mjtJacobian.mjJAC_DENSE, "sparse": mujoco.mjtJacobian.mjJAC_SPARSE}
 
 

@@ -238,7 +238,7 @@ class Evaluator:
     def _records_steps(self) -> bool:
         """Whether an env step can be recorded; torch graphs cannot hold the conditional loop of mujoco_warp's
         solver."""
-        return bool(self._streams) and self.env.sim.batch.kernels.fused_solver
+        return bool(self._streams) and not self.env.sim.batch.stages.unrolls
 
     def _reset(self) -> None:
         """Reset every policy's worlds to the same initial states."""

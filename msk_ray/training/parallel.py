@@ -162,6 +162,11 @@ class ParallelTrainer(TrialFolder):
         reply: tuple[Path | None, list[str]] = self._call("restore_latest")
         return reply
 
+    def solver(self) -> str:
+        """As `Trainer.solver`."""
+        reply: str = self._call("solver")
+        return reply
+
     def remarks(self) -> list[str]:
         """As `Trainer.remarks`."""
         reply: list[str] = self._call("remarks")

@@ -247,6 +247,12 @@ class Trainer(TrialFolder):
     def _write_config(self) -> None:
         write_bytes(self.logdir / "config.yaml", dump_yaml(self.config.as_dict()).encode())
 
+    def solver(self) -> str:
+        """Text on the constraint solver: its kernels, and the size of the problem by which `auto` chooses them."""
+        batch = self.env.sim.batch
+        kernels = "one kernel (fused)" if batch.kernels.fused_solver else "mujoco_warp's kernels"
+        return f"{kernels}, for {batch.mjm.nv} degrees of freedom and room for {batch.capacity.rows} rows per world"
+
     def remarks(self) -> list[str]:
         """Warnings: a line for each thing that made training worse or slower."""
         return self.algorithm.remarks()

@@ -152,6 +152,14 @@ def test_constraints_are_solved_by_the_kernels_asked_for() -> None:
     assert not batch.stages.unrolls
 
 
+@pytest.mark.parametrize(("jacobian", "fused"), [(None, True), ("sparse", False)])
+def test_kernels_may_be_chosen_for_the_model(jacobian: str | None, fused: bool) -> None:
+    execution = {"solver_kernels": "auto", "jacobian": jacobian}
+    config = parse_config(_settings("ant", "tape_all", "") | {"execution": execution})
+    batch = make_env(config.env, config.physics, 2, "cpu", 0, execution=config.execution).sim.batch
+    assert batch.kernels.fused_solver == fused
+
+
 @pytest.mark.parametrize(
     ("other", "write"),
     [

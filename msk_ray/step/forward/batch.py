@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from msk_ray.step.errors import ConfigError, UnsupportedModelError
 from msk_ray.step.forward.capacity import UNKNOWN, Capacity, default_capacity, geometric_bound, scalar_rows
 from msk_ray.step.forward.contact_watch import ContactQuery, ContactWatch
-from msk_ray.step.forward.fused import FusedSolver, check_fused
+from msk_ray.step.forward.fused import FusedSolver, check_fused, choose_fused
 from msk_ray.step.forward.graph import joined_stream
 from msk_ray.step.forward.iterations import IterationWatch
 from msk_ray.step.forward.model_support import check_model_support
@@ -52,6 +52,7 @@ class WorldBatch:
         kernels: kernels of a step, and limits on its solver's iterations.
 
     Attributes:
+        kernels: the same, with the choice of the solver's made.
         mjm: the C MuJoCo model.
         model, data: mujoco_warp's copies on the device. The model's arrays must not be replaced, because recorded
             graphs keep using the old ones.
@@ -96,6 +97,11 @@ class WorldBatch:
         self.substeps = substeps
         self.device = wp.get_device(device)
         self.parameters: tuple[str, ...] = ()
+        self._given = capacity
+        start, self._bound = default_capacity(mjm) if not all(capacity) else (capacity, None)
+        start = Capacity(capacity.contacts or start.contacts, capacity.rows or start.rows)
+        if kernels.fused_solver is None:
+            kernels = kernels._replace(fused_solver=choose_fused(mjm, start.rows))
         self.kernels = kernels
         self.structure = self._structure()
         self._tolerance = tolerance
@@ -107,9 +113,7 @@ class WorldBatch:
         self.unrolled_iterations: tuple[int, ...] | None = None
         self.measures_sensors = False
         self._watch = ModelWatch(mjm)
-        self._given = capacity
-        start, self._bound = default_capacity(self.structure) if not all(self._given) else (self._given, None)
-        self._allocate(nworld, Capacity(capacity.contacts or start.contacts, capacity.rows or start.rows), ())
+        self._allocate(nworld, start, ())
 
     def _structure(self) -> mujoco.MjModel:
         model = structure(self.mjm, self.parameters)

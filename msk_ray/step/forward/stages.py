@@ -17,8 +17,9 @@ class Kernels(NamedTuple):
 
     ordered: bool = False
     """Sum in a fixed order, so that a GPU repeats a step bit for bit; needs a dense Jacobian."""
-    fused_solver: bool = False
-    """Solve constraints in one launch, for small models; needs a dense Jacobian."""
+    fused_solver: bool | None = False
+    """Solve constraints in one launch; needs a dense Jacobian. None: for models that are small enough, as a batch
+    decides when it is made."""
     iterations: int | None = None
     """Iteration limit of the solver; None: the model's, but at least 100, with a warning if that is more."""
     ls_iterations: int | None = None
@@ -27,7 +28,7 @@ class Kernels(NamedTuple):
     @property
     def dense(self) -> bool:
         """Whether these kernels need a dense Jacobian."""
-        return self.ordered or self.fused_solver
+        return self.ordered or bool(self.fused_solver)
 
 
 PACKAGE: Final = Kernels()

@@ -44,6 +44,27 @@ EVERY_ROW = """
 """
 
 
+def robot(limbs: tuple[int, ...], options: str) -> mujoco.MjModel:
+    """A free body with limbs of so many hinges and capsules."""
+    text = ""
+    for limb, links in enumerate(limbs):
+        inner = ""
+        for link in reversed(range(links)):
+            axis = ("0 1 0", "0 0 1", "1 0 0")[link % 3]
+            inner = (
+                f'<body pos="{0.12 if link else 0.1} 0 0"><joint axis="{axis}" range="-50 50" damping=".5" '
+                f'armature=".01"/><geom type="capsule" size=".03" fromto="0 0 0 .12 0 0"/>{inner}</body>'
+            )
+        text += f'<body euler="0 0 {360 * limb / len(limbs):g}">{inner}</body>'
+    return mujoco.MjModel.from_xml_string(
+        f"""<mujoco><option timestep="0.005" integrator="implicitfast" {options}/>
+        <default><geom contype="0" conaffinity="1" friction="0.8 0.02 0.01"/></default>
+        <worldbody><geom type="plane" size="5 5 1" contype="1" conaffinity="0"/>
+          <body pos="0 0 .06"><freejoint/><geom size=".06" mass="3"/>{text}</body>
+        </worldbody></mujoco>"""
+    )
+
+
 def of_config(name: str) -> mujoco.MjModel:
     config = load_config(f"configs/{name}.yaml")
     return env_class(config.env).build_model(config.env, config.physics)
@@ -51,6 +72,8 @@ def of_config(name: str) -> mujoco.MjModel:
 
 MODELS: dict[str, Callable[[], mujoco.MjModel]] = {
     "every_row_elliptic": lambda: mujoco.MjModel.from_xml_string(EVERY_ROW.format(cone="elliptic")),
+    "robot_18_elliptic": lambda: robot((3, 3, 3, 3), 'cone="elliptic" impratio="10"'),
+    "robot_35_pyramidal": lambda: robot((6, 6, 6, 6, 5), 'cone="pyramidal"'),
     "every_row_pyramidal": lambda: mujoco.MjModel.from_xml_string(EVERY_ROW.format(cone="pyramidal")),
     **{
         name: (lambda name=name: of_config(name))  # type: ignore[misc]
@@ -126,6 +149,34 @@ def test_forces_and_states_are_those_of_float64(name: str) -> None:
                 assert data.overflow.numpy()[world] == 0
                 assert 1 <= data.solver_niter.numpy()[world] <= 20
     assert most >= 4
+
+
+def test_the_large_robot_has_more_rows_than_a_warp_has_lanes() -> None:
+    mjm = exact(MODELS["robot_35_pyramidal"]())
+    assert mjm.nv == 35
+    assert touching(mjm, 1).nefc > 100
+
+
+@pytest.mark.parametrize(
+    ("option", "rows", "fused"),
+    [
+        ("", 0, True),
+        ("", 256, True),
+        ("", 257, False),
+        ('jacobian="sparse"', 0, False),
+        ('integrator="RK4"', 0, False),
+        ('solver="CG"', 0, False),
+    ],
+)
+def test_kernels_are_chosen_by_size_and_options(option: str, rows: int, fused: bool) -> None:
+    """A ball on a plane needs four rows; otherwise by the room that was asked for."""
+    mjm = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><option {option}/><worldbody><geom type="plane" size="1 1 1"/>
+        <body><freejoint/><geom size=".1"/></body></worldbody></mujoco>"""
+    )
+    batch = WorldBatch(mjm, 1, 1, "cpu", capacity=Capacity(rows=rows), kernels=Kernels(fused_solver=None))
+    assert batch.kernels.fused_solver == fused
+    assert batch.capacity.rows == (rows or 4)
 
 
 def test_every_kind_of_row_is_among_them() -> None:
@@ -253,7 +304,7 @@ def test_models_of_many_degrees_of_freedom_are_refused() -> None:
 
 def test_more_worlds_than_can_be_counted_are_refused_before_memory_is_taken() -> None:
     with pytest.raises(ConfigError, match=r"room for 67108863 worlds.*solver_kernels: mujoco_warp"):
-        scratch.make_scratch(2**26, 100, 14)
+        scratch.make_scratch(2**26, 100, 14, 0)
 
 
 def test_the_kernel_compiles_for_a_gpu(tmp_path: Path) -> None:

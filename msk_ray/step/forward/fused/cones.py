@@ -90,16 +90,15 @@ def lean_rows(
     jacobian: wp.array[float],
     stride: int,
     nv: int,
-    width: int,
     lane: int,
+    rows: wp.array[float],
 ) -> None:
-    """Compute the rows of a contact that add to the Hessian, with all lanes.
+    """Compute the rows of a contact that add to the Hessian, with all lanes; they lie `stride` apart, as in J.
 
     While it slides, its part of the Hessian is, with zᵢ = φᵢ Jᵢ, the direction û = u / T and p = Σ ûᵢ zᵢ,
     m μ² (J₀ - p)(J₀ - p)ᵀ + m (μ² - μ N / T) Σ (zᵢ - ûᵢ p)(zᵢ - ûᵢ p)ᵀ: rows with non-negative weights.
     Otherwise they are the rows of J.
     """
-    rows = scratch.rows[world]
     jar = scratch.jar[world]
     bound = scratch.bound[world]
     first = whole(scratch.first[world], contact)
@@ -111,10 +110,10 @@ def lean_rows(
             for p in range(first + 1, end):
                 friction = at(bound, p)
                 mean += friction * friction * at(jar, p) * inverse * at(jacobian, p * stride + i)
-        put(rows, first * width + i, at(jacobian, first * stride + i) - mean)
+        put(rows, first * stride + i, at(jacobian, first * stride + i) - mean)
         for p in range(first + 1, end):
             scale = wp.where(inverse > 0.0, at(bound, p), 1.0)
-            put(rows, p * width + i, scale * (at(jacobian, p * stride + i) - at(jar, p) * inverse * mean))
+            put(rows, p * stride + i, scale * (at(jacobian, p * stride + i) - at(jar, p) * inverse * mean))
 
 
 @wp.func

@@ -27,12 +27,10 @@ _MIN = wp.constant(float(MJ_MINVAL))
 
 @wp.struct
 class Inertia:
-    """M in mujoco_warp's layout, and the entries of a triangular matrix of its size."""
+    """M in mujoco_warp's layout."""
 
     M_hinit_i: wp.array[int]
     M_colind: wp.array[int]
-    dof_tri_row: wp.array[int]
-    dof_tri_col: wp.array[int]
     M: wp.array2d[float]
 
 
@@ -90,17 +88,9 @@ def advance(scratch: Scratch, w: World, alpha: float) -> None:
 def find_direction(scratch: Scratch, w: World) -> wp.vec2:
     """Newton's direction s = -H⁻¹ g, with |s|² and -g·s."""
     for i in range(w.lane, w.nv, lane_count()):
-        put(scratch.partial[w.id], i, -at(scratch.gradient[w.id], i))
+        put(scratch.direction[w.id], i, -at(scratch.gradient[w.id], i))
+    solve_factored(scratch.factor[w.id], scratch.pivot[w.id], w.nv, w.width, w.lane, scratch.direction[w.id])
     lane_sync()
-    solve_factored(
-        scratch.factor[w.id],
-        scratch.pivot[w.id],
-        w.nv,
-        w.width,
-        w.lane,
-        scratch.partial[w.id],
-        scratch.direction[w.id],
-    )
     square = float(0.0)
     decrement = float(0.0)
     for i in range(w.lane, w.nv, lane_count()):
@@ -113,7 +103,6 @@ def find_direction(scratch: Scratch, w: World) -> wp.vec2:
 @wp.func
 def iterate(
     rows: Rows,
-    given: Inertia,
     scratch: Scratch,
     smooth: wp.array[float],
     w: World,
@@ -127,7 +116,7 @@ def iterate(
     missed = int(0)
     update_rows(rows, scratch, w)
     update_gradient(rows, scratch, smooth, w)
-    factor_hessian(scratch, w, given.dof_tri_row, given.dof_tri_col)
+    factor_hessian(rows, scratch, w)
     norms = find_direction(scratch, w)
     done = bool(False)
     count = int(0)
@@ -144,7 +133,7 @@ def iterate(
         done = alpha == 0.0 or (gain > 0.0 and scale * gain < tolerance) or slope < tolerance
         if not done:
             if changed:
-                factor_hessian(scratch, w, given.dof_tri_row, given.dof_tri_col)
+                factor_hessian(rows, scratch, w)
             norms = find_direction(scratch, w)
             done = 0.5 * scale * norms[1] < tolerance
     if not done and limits.iterations > 0:
@@ -162,6 +151,7 @@ def solve_world(
     opt_impratio_invsqrt: wp.array[float],
     limits: Limits,
     warm: bool,
+    elliptic: bool,
     # In:
     inertia_in: Inertia,
     ne_in: wp.array[int],
@@ -204,9 +194,9 @@ def solve_world(
     lane_sync()
     impratio = opt_impratio_invsqrt[w.id % opt_impratio_invsqrt.shape[0]]
     w.contacts = find_contacts(rows, scratch, w, w.equalities + w.frictions + nl_in[w.id], impratio)
-    read_rows(rows, scratch, w)
+    read_rows(rows, scratch, w, elliptic)
     multiply(scratch.inertia[w.id], scratch.acc[w.id], nv, w.width, w.lane, scratch.inertial[w.id])
-    iterate(rows, inertia_in, scratch, qfrc_smooth_in[w.id], w, limits, 1.0 / wp.max(_MIN, trace), out)
+    iterate(rows, scratch, qfrc_smooth_in[w.id], w, limits, 1.0 / wp.max(_MIN, trace), out)
     for i in range(w.lane, nv, lane_count()):
         out.qacc[w.id, i] = at(scratch.acc[w.id], i)
         out.Ma[w.id, i] = at(scratch.inertial[w.id], i)

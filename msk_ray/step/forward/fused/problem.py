@@ -7,7 +7,7 @@ import warp as wp
 
 from msk_ray.step.forward import mjw_private as private
 from msk_ray.step.forward.fused.cones import QUADRATIC, SATISFIED, lean_rows, update_contact
-from msk_ray.step.forward.fused.dense import column_sum, factorize, pair_sum
+from msk_ray.step.forward.fused.dense import add_squares, column_sum, factorize
 from msk_ray.step.forward.fused.lanes import at, four, lane_count, lane_sum, lane_sync, put, put_whole, whole
 from msk_ray.step.forward.fused.scratch import Scratch
 from msk_ray.step.forward.mjw_private import ConstraintType, vec5
@@ -31,7 +31,10 @@ class Rows:
     jacobian: wp.array2d[float]
     """J, (W, ...), row-major."""
     stride: int
-    """Length of its rows, nv or more."""
+    """Length of its rows, a multiple of four, nv or more."""
+    squared: wp.array2d[float]
+    """The rows whose weighted squares add to the Hessian: J itself, or with elliptic cones a copy in which the rows of
+    sliding contacts are replaced."""
     force: wp.array2d[float]
     """Written."""
     state: wp.array2d[int]
@@ -87,8 +90,8 @@ def find_contacts(rows: Rows, scratch: Scratch, w: World, begin: int, impratio: 
 
 
 @wp.func
-def read_rows(rows: Rows, scratch: Scratch, w: World) -> None:
-    """Compute J a - aref, and the rows that add to the Hessian."""
+def read_rows(rows: Rows, scratch: Scratch, w: World, elliptic: bool) -> None:
+    """Compute J a - aref, and with elliptic cones copy J."""
     jacobian = rows.jacobian[w.id]
     acc = scratch.acc[w.id]
     for r in range(w.lane, w.rows, lane_count()):
@@ -98,10 +101,10 @@ def read_rows(rows: Rows, scratch: Scratch, w: World) -> None:
         put(scratch.jar[w.id], r, total - at(rows.aref[w.id], r))
         put(scratch.weight[w.id], r, 0.0)
         put_whole(rows.state[w.id], r, SATISFIED)
-    copies = scratch.rows[w.id]
-    for r in range(w.rows):
-        for i in range(w.lane, w.nv, lane_count()):
-            put(copies, r * w.width + i, at(jacobian, r * rows.stride + i))
+    if elliptic:
+        copies = rows.squared[w.id]
+        for k in range(w.lane, w.rows * rows.stride, lane_count()):
+            put(copies, k, at(jacobian, k))
     lane_sync()
 
 
@@ -142,7 +145,7 @@ def update_rows(rows: Rows, scratch: Scratch, w: World) -> bool:
     lane_sync()
     for contact in range(w.contacts):
         if at(scratch.leaning[w.id], contact) != 0.0:
-            lean_rows(scratch, w.id, contact, rows.jacobian[w.id], rows.stride, w.nv, w.width, w.lane)
+            lean_rows(scratch, w.id, contact, rows.jacobian[w.id], rows.stride, w.nv, w.lane, rows.squared[w.id])
     lane_sync()
     return lane_sum(changed) > 0.0
 
@@ -164,17 +167,19 @@ def update_gradient(rows: Rows, scratch: Scratch, smooth: wp.array[float], w: Wo
 
 
 @wp.func
-def factor_hessian(scratch: Scratch, w: World, tri_row: wp.array[int], tri_col: wp.array[int]) -> None:
-    """Build and factor the Hessian, M + Σ weight · row rowᵀ; each lane computes some entries."""
-    rows = scratch.rows[w.id]
-    weight = scratch.weight[w.id]
+def factor_hessian(rows: Rows, scratch: Scratch, w: World) -> None:
+    """Build and factor the Hessian, M + Σ weight · row rowᵀ."""
     factor = scratch.factor[w.id]
-    for e in range(w.lane, tri_row.shape[0], lane_count()):
-        row = whole(tri_row, e)
-        col = whole(tri_col, e)
-        i = wp.max(row, col)
-        j = wp.min(row, col)
-        total = at(scratch.inertia[w.id], j * w.width + i) + pair_sum(weight, rows, i, j, w.width, w.rows)
-        put(factor, j * w.width + i, total)
+    add_squares(
+        scratch.inertia[w.id],
+        scratch.weight[w.id],
+        rows.squared[w.id],
+        w.rows,
+        rows.stride,
+        w.width,
+        w.lane,
+        lane_count(),
+        factor,
+    )
     lane_sync()
     factorize(factor, scratch.pivot[w.id], w.nv, w.width, w.lane)

@@ -20,17 +20,17 @@ class Scratch:
     inertia: wp.array2d[float]
     """M, symmetric, P²."""
     factor: wp.array2d[float]
-    """The lower triangle of the Hessian, then L D of its factors L D Lᵀ, column-major, P²."""
+    """The lower triangle of the Hessian, then L D of its factors L D Lᵀ, symmetric, P²."""
     pivot: wp.array2d[float]
     """Reciprocals of D, P."""
-    rows: wp.array2d[float]
-    """The rows whose weighted squares add to the Hessian: J, but replaced for sliding contacts, R P."""
+    squared: wp.array2d[float]
+    """With elliptic cones, `Rows.squared`, R times its stride."""
     jar: wp.array2d[float]
     """J a - aref, R."""
     rate: wp.array2d[float]
     """J times the direction, R."""
     weight: wp.array2d[float]
-    """Weight of each of `rows`, R."""
+    """Weight of each of `Rows.squared`, R."""
     bound: wp.array2d[float]
     """μ in the first row of an elliptic contact, the friction coefficients in its other rows, R."""
     cones: wp.array2d[float]
@@ -49,8 +49,6 @@ class Scratch:
     """Jᵀ f, P."""
     gradient: wp.array2d[float]
     """M a - τ - Jᵀ f, P."""
-    partial: wp.array2d[float]
-    """Partial right-hand side while a system is solved, P."""
     direction: wp.array2d[float]
     """Newton's direction, P."""
     moved: wp.array2d[float]
@@ -62,8 +60,11 @@ def padded(nv: int) -> int:
     return -(-nv // 4) * 4
 
 
-def make_scratch(worlds: int, rows: int, nv: int) -> Any:
+def make_scratch(worlds: int, rows: int, nv: int, stride: int) -> Any:
     """Arrays for these numbers of worlds, rows per world and degrees of freedom, on the current device.
+
+    Args:
+        stride: length of each row of `squared`; 0 for a model without elliptic cones.
 
     Raises:
         ConfigError: there are too many threads for 32-bit indices.
@@ -74,9 +75,9 @@ def make_scratch(worlds: int, rows: int, nv: int) -> Any:
             "execution.solver_kernels: mujoco_warp"
         )
     width, contacts = padded(nv), rows // 3 + 1  # an elliptic contact has 3 rows or more
-    widths = {"inertia": width * width, "factor": width * width, "rows": rows * width, "cones": CONE * contacts}
+    widths = {"inertia": width * width, "factor": width * width, "squared": rows * stride, "cones": CONE * contacts}
     widths |= dict.fromkeys(("leaning", "first", "end"), contacts)
-    widths |= dict.fromkeys(("pivot", "acc", "inertial", "push", "gradient", "partial", "direction", "moved"), width)
+    widths |= dict.fromkeys(("pivot", "acc", "inertial", "push", "gradient", "direction", "moved"), width)
     kind: Any = Scratch
     scratch = kind()
     for name, field in kind.vars.items():
