@@ -16,6 +16,7 @@ _LEG_TERMS = (
 ENVIRONMENTS: dict[str, dict[str, Any]] = {
     "ant": {"name": "ant"},
     "hopper": {"name": "hopper"},
+    "memory": {"name": "remembering:Remembering"},
     "legs": {
         "name": "myoleg26",
         "clock": True,
@@ -58,11 +59,12 @@ def test_the_watch_sees_an_index_without_axes_and_a_constant() -> None:
 def test_nothing_waits_in_an_env_step_and_its_gradient(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """After one that has made what is made at the first use. Resets are drawn before, as for a recorded epoch.
 
-    On a CPU the host may look at flags of worlds; here it takes the way of a GPU."""
+    On a CPU the host may look at flags of worlds, and at contact forces; here it takes the way of a GPU."""
     for module in ("msk_ray.envs.base", "msk_ray.step.autograd.simulation"):
         monkeypatch.setattr(f"{module}.known_none", lambda flags: False)
     config = parse_config({"env": {**ENVIRONMENTS[name], "nworld": 2}})
     env = make_env(config.env, config.physics, 2, "cpu", 0)
+    env.ignore_contact_forces = True
     action = torch.zeros((2, env.action_size), requires_grad=True)
     step(env, action)
     env.stock_resets(env.draw_resets(1))

@@ -23,8 +23,6 @@ class Filtered(CartPole):
     """A cart with a slow motor, a delayed action, and a history of two angles that it observes; its rewards count
     steps."""
 
-    obs_size = 9
-
     def memories(self) -> Mapping[str, Memory]:
         return {
             "force": Memory(1, start=0.25),

@@ -60,15 +60,17 @@ def episodes(config: Config, recorded: bool, monkeypatch: pytest.MonkeyPatch) ->
     return evaluator._episodes([lift, push])
 
 
-def test_it_counts_what_steps_one_by_one_count(monkeypatch: pytest.MonkeyPatch) -> None:
-    found, expected = (episodes(settings(), recorded, monkeypatch) for recorded in (True, False))
+@pytest.mark.parametrize("name", ["ant", "remembering:Remembering"])
+def test_it_counts_what_steps_one_by_one_count(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Again, "made", 0)
+    found, expected = (episodes(settings(name=name), recorded, monkeypatch) for recorded in (True, False))
     assert Again.made == 1
     assert_equal(found, expected)
 
 
 @pytest.mark.gpu
 @pytest.mark.filterwarnings("error:.*cannot be recorded")
-@pytest.mark.parametrize("name", ["ant", "myoleg26"])
+@pytest.mark.parametrize("name", ["ant", "myoleg26", "remembering:Remembering"])
 @pytest.mark.parametrize("policies", [1, 3])
 def test_recorded_steps_on_a_gpu_have_the_bits_of_steps_one_by_one(
     name: str, policies: int, monkeypatch: pytest.MonkeyPatch

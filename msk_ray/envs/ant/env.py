@@ -33,7 +33,6 @@ class Ant(LimitedBody[AntSettings]):
     ====== ===========================================================
     """
 
-    obs_size = 37
     Settings = AntSettings
     terms = TERMS
 

@@ -24,7 +24,6 @@ class CartPole(Env[CartPoleSettings]):
     """
 
     Settings = CartPoleSettings
-    obs_size = 5
     terms = TERMS
 
     @classmethod

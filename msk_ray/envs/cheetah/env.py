@@ -26,7 +26,6 @@ class Cheetah(PlanarBody[CheetahSettings]):
     ====== ==================================================================
     """
 
-    obs_size = 17
     Settings = CheetahSettings
     terms = TERMS
 

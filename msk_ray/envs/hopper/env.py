@@ -34,7 +34,6 @@ class Hopper(PlanarBody[HopperSettings]):
     ===== ===================================================
     """
 
-    obs_size = 11
     Settings = HopperSettings
     terms = TERMS
 

@@ -41,7 +41,6 @@ class Humanoid(LimitedBody[HumanoidSettings]):
     ====== ==========================================================================================
     """
 
-    obs_size = 76
     Settings = HumanoidSettings
     terms = TERMS
 

@@ -61,6 +61,7 @@ LEGS = {
     "physics": {},
 }
 ONE_KERNEL = {**ANT, "physics": {"variant": "matched"}, "execution": {**ANT["execution"], "solver_kernels": "fused"}}
+MEMORY = {**ANT, "env": {"name": "remembering:Remembering", "nworld": 64}}
 CARTPOLE = {**ANT, "env": {"name": "cartpole", "nworld": 64}, "physics": {}}
 
 
@@ -107,8 +108,8 @@ def after(epochs: int, trainer: Trainer, state: dict[str, Any]) -> tuple[torch.T
 @pytest.mark.usefixtures("uncut")
 @pytest.mark.parametrize(
     "settings",
-    [ANT, CARTPOLE, OPTIONS, LEGS, ONE_KERNEL],
-    ids=["ant", "cartpole", "options", "legs", "one_kernel"],
+    [ANT, CARTPOLE, OPTIONS, LEGS, ONE_KERNEL, MEMORY],
+    ids=["ant", "cartpole", "options", "legs", "one_kernel", "memory"],
 )
 def test_a_recorded_epoch_equals_one_operation_by_operation(settings: dict[str, Any], tmp_path: Path) -> None:
     recorded, eager = make(settings, tmp_path / "a"), make(settings, tmp_path / "b", capture="off")
