@@ -47,8 +47,8 @@ EDITS: dict[str, tuple[str, ...]] = {
         *(r'\{"impact", "footfall", "landing"', r'^    Cost\("footfall", 0\.0, needs', r"^def footfall\(env: LegEnv"),
     ),
     "physics feature": (
-        *(r'^    Feature\("drag of a fluid', r"^    if work\.settings\.fluid", r"^    fluid: bool$"),
-        r"^            fluid=bool\(mjm",
+        *(r'^    Feature\("drag of a fluid', r"^    if work\.settings\.fluid", r"^    fluid(_on)?: bool$"),
+        r"^            fluid(_on)?=bool\(mjm",
     ),
     "actuator type": (
         *(r"^def free_activation\(", r"^def actuator_force\(", r"^def force_velocity_slope\(", r"^def act_step\("),

@@ -207,7 +207,11 @@ class ContactBars:
 
 
 class Substep:
-    """What stages read of a `mujoco_warp.Data`, grouped; everything else is in `data`."""
+    """What stages read of a `mujoco_warp.Data`, grouped; everything else is in `data`.
+
+    Attributes:
+        jacobian: the constraint Jacobian, a full matrix from `ConstraintLaws` on, shape (W, njmax, nv or more).
+    """
 
     def __init__(self, data: Any) -> None:
         self.data = data
@@ -215,3 +219,4 @@ class Substep:
         self.motion = gather(Motion, data)
         self.rows = gather(Rows, data.efc)
         self.contacts = gather(Contacts, data.contact)
+        self.jacobian = data.efc.J

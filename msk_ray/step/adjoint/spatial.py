@@ -26,6 +26,18 @@ def carried(motion: wp.spatial_vectorf, force: wp.spatial_vectorf) -> wp.spatial
 
 
 @wp.func
+def three(x: wp.array2d[float], worldid: int, first: int) -> wp.vec3:
+    """Three neighbours of a row."""
+    return wp.vec3(x[worldid, first], x[worldid, first + 1], x[worldid, first + 2])
+
+
+@wp.func
+def four(x: wp.array2d[float], worldid: int, first: int) -> wp.quat:
+    """Four neighbours of a row, as MuJoCo keeps a quaternion (w, x, y, z)."""
+    return wp.quat(x[worldid, first], x[worldid, first + 1], x[worldid, first + 2], x[worldid, first + 3])
+
+
+@wp.func
 def column(matrix: wp.mat33, k: int) -> wp.vec3:
     """Column k of a matrix."""
     return wp.vec3(matrix[0, k], matrix[1, k], matrix[2, k])

@@ -8,6 +8,8 @@ slope of the constraint forces):
     gradients of (q, v, act, u)  -=  ∂Φ/∂(q, v, act, u).
 """
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any, Protocol
 
 import mujoco
@@ -19,14 +21,14 @@ from msk_ray.step.adjoint.laws.actuators import ActuatorForces
 from msk_ray.step.adjoint.laws.applied_forces import AppliedForces
 from msk_ray.step.adjoint.laws.bodies import Bodies
 from msk_ray.step.adjoint.laws.contacts import ContactForces
-from msk_ray.step.adjoint.laws.equality import AnchorRows
-from msk_ray.step.adjoint.laws.fluid import FluidForces
-from msk_ray.step.adjoint.laws.joint_springs import TurningSprings
+from msk_ray.step.adjoint.laws.equality import launch_anchors
+from msk_ray.step.adjoint.laws.fluid import launch_fluid
+from msk_ray.step.adjoint.laws.joint_springs import launch_turning_springs
 from msk_ray.step.adjoint.laws.rows import ConstraintLaws
-from msk_ray.step.adjoint.laws.scalar_rows import ScalarRows
+from msk_ray.step.adjoint.laws.scalar_rows import launch_scalar_rows
 from msk_ray.step.adjoint.laws.site_pairs import SitePairForces
 from msk_ray.step.adjoint.laws.tendons import Tendons
-from msk_ray.step.adjoint.laws.transmission import TurningTransmissions
+from msk_ray.step.adjoint.laws.transmission import launch_transmissions
 from msk_ray.step.adjoint.stages.integrate import Integrator
 from msk_ray.step.adjoint.stages.solve import LinearSystems
 from msk_ray.step.adjoint.workspace import Workspace
@@ -36,11 +38,8 @@ from msk_ray.step.forward.stages import PackageStages, Stages
 _ANCHORED = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
 
 
-class _Stage(Protocol):
-    """One part of ∂Φ; fields of λ, μ, a and a - â, and the laws of the rows, must be there."""
-
-    def launch(self, at: Substep) -> None:
-        """Launch its kernels at one substep."""
+_Launch = Callable[[Substep], None]
+"""Launches one part of ∂Φ at a substep; fields of λ, μ, a and a - â, and the laws of the rows, must be there."""
 
 
 class Watcher(Protocol):
@@ -86,10 +85,10 @@ class StepAdjoint:
             self.laws = ConstraintLaws(work)
             self.contacts = ContactForces(work, data.naconmax)
             self._systems = LinearSystems(work, self.integrator, self.laws)
-            self._bodies = Bodies(work, self.integrator.damping)
+            self._bodies = Bodies(work)
             self.tendons = Tendons(work) if mjm.ntendon else None
             self.actuators = ActuatorForces(work) if work.settings.actuation else None
-            self._forces = _forces(work, self.laws, self.contacts, self.actuators)
+            self._forces = _forces(work, self.contacts, self.actuators)
 
     def start(self, qpos: wp.array, raw_qpos: wp.array) -> None:
         """Launch the change of a raw cotangent (W, nq) at `qpos` to tangent coordinates, and find the live worlds.
@@ -139,8 +138,10 @@ class StepAdjoint:
         self._bodies.launch_fields(at)
         if self.tendons is not None:
             self.tendons.launch_start(at)
-        for stage in self._forces if applied is None else (*self._forces, applied):
-            stage.launch(at)
+        for launch in self._forces:
+            launch(at)
+        if applied is not None:
+            applied.launch(at)
         if self.tendons is not None:
             self.tendons.launch_pullback(at)
         if parameters is not None:
@@ -148,22 +149,20 @@ class StepAdjoint:
         self._bodies.launch_sweep(at)
 
 
-def _forces(
-    work: Workspace, laws: ConstraintLaws, contacts: ContactForces, actuators: ActuatorForces | None
-) -> list[_Stage]:
-    """The stages that a model needs, in their order."""
-    stages: list[_Stage] = []
+def _forces(work: Workspace, contacts: ContactForces, actuators: ActuatorForces | None) -> list[_Launch]:
+    """The parts that a model needs, in their order."""
+    stages: list[_Launch] = []
     if np.any(np.isin(work.mjm.eq_type, _ANCHORED)):
-        stages.append(AnchorRows(work))
+        stages.append(partial(launch_anchors, work))
     if work.tables.has_scalar_rows:
-        stages.append(ScalarRows(work, laws))
-    stages.append(contacts)
+        stages.append(partial(launch_scalar_rows, work))
+    stages.append(contacts.launch)
     if actuators is not None:
-        stages += [actuators, TurningTransmissions(work, actuators.bars)]
+        stages += [actuators.launch, partial(launch_transmissions, work, actuators.bars)]
         if np.any(between_sites(work.mjm)):
-            stages.append(SitePairForces(work, actuators.bars))
+            stages.append(SitePairForces(work, actuators.bars).launch)
     if work.tables.has_turning_spring:
-        stages.append(TurningSprings(work))
-    if work.settings.fluid:
-        stages.append(FluidForces(work))
+        stages.append(partial(launch_turning_springs, work))
+    if work.settings.fluid_on:
+        stages.append(partial(launch_fluid, work))
     return stages

@@ -60,7 +60,7 @@ class TendonAdjoint:
         self._work = work = Workspace(mjm, model, data, stages)
         with wp.ScopedDevice(work.device):
             self._integrator = Integrator(work)
-            self._bodies = Bodies(work, self._integrator.damping)
+            self._bodies = Bodies(work)
             self._tendons = Tendons(work)
             shape = (work.nworld, mjm.ntendon)
             self.rate, self.length_bar, self.rate_bar = (wp.zeros(shape, dtype=float) for _ in range(3))
@@ -73,12 +73,8 @@ class TendonAdjoint:
         mjw.kinematics(m, data)
         mjw.com_pos(m, data)
         self._work.stages.tendon(m, data)
-        wp.launch(
-            tendon_rates,
-            dim=self.rate.shape,
-            inputs=[self._work.tendon_rows, data.qvel, data.ten_J],
-            outputs=[self.rate],
-        )
+        work = self._work
+        work.launch(tendon_rates, self.rate.shape, Substep(data), rate=self.rate)
 
     def launch_pullback(self, data: Any) -> None:
         """Launch the pullback of `length_bar` and `rate_bar` at the state in `data`."""
@@ -94,11 +90,7 @@ class TendonAdjoint:
         bars = work.tendon_bars
         for array in (bars.lam, bars.qacc, bars.mu, bars.smooth):
             array.zero_()
-        wp.launch(
-            negated,
-            dim=self.rate.shape,
-            inputs=[self.length_bar, self.rate_bar],
-            outputs=[bars.length, bars.qvel],
-        )
+        given = {"length_bar": self.length_bar, "rate_bar": self.rate_bar}
+        work.launch(negated, self.rate.shape, at, **given, length=bars.length, rate=bars.qvel)
         self._tendons.launch_pullback(at)
         self._bodies.launch_sweep(at)

@@ -12,7 +12,7 @@ from scenes import ant, ant_points
 from test_adjoint_features import SCENES, random_points
 
 from msk_ray.step.adjoint import StepAdjoint
-from msk_ray.step.adjoint.groups import State, gather
+from msk_ray.step.adjoint.groups import State, Substep, gather
 from msk_ray.step.adjoint.stages import solve
 from msk_ray.step.adjoint.stages.recompute import recompute_stages
 from msk_ray.step.forward import WorldBatch
@@ -29,7 +29,7 @@ def buffers(holder: object) -> Iterator[tuple[str, wp.array]]:
                 yield name, value
         elif name in _GROUPS:
             yield from ((key, array) for key, array in vars(value).items() if isinstance(array, wp.array))
-        else:
+        elif name != "launch":
             for part in value if isinstance(value, list) else [value]:
                 if type(part).__module__.startswith("msk_ray.step.adjoint"):
                     yield from buffers(part)
@@ -91,3 +91,15 @@ def test_a_group_names_the_array_that_has_changed():
         gather(State, SimpleNamespace(**arrays, qacc=wp.zeros(1, dtype=float)))
     with pytest.raises(TypeError, match=r"'qacc'.*float32"):
         gather(State, SimpleNamespace(**arrays, qacc=wp.zeros((1, 1), dtype=int)))
+
+
+@wp.kernel(enable_backward=False)
+def lonely(qpos_in: wp.array2d[float], wind_chill_in: wp.array[float]):
+    pass
+
+
+def test_a_kernel_names_the_argument_that_nothing_has():
+    batch = WorldBatch(SCENES["plain"](), 1, 1, "cpu")
+    work = StepAdjoint(batch.mjm, batch.model, batch.data).work
+    with pytest.raises(AttributeError, match="'wind_chill_in'"):
+        work.launch(lonely, 1, Substep(batch.data))

@@ -15,7 +15,7 @@ from typing import Any
 import warp as wp
 from mujoco_warp import BiasType, DynType, GainType, JointType, TrnType
 
-from msk_ray.step.adjoint.groups import DofSlopes, Multipliers, State, Substep, TendonBars, allocate, gather
+from msk_ray.step.adjoint.groups import DofSlopes, Multipliers, State, Substep, TendonBars, allocate
 from msk_ray.step.adjoint.workspace import Workspace
 from msk_ray.step.forward.mjw_private import muscle_bias, muscle_dynamics, muscle_gain, muscle_gain_vel_deriv, vec10
 from msk_ray.step.forward.model_tree import motors_apart
@@ -440,18 +440,16 @@ class ActuatorForces:
     """Launches of what actuators give ∂Φ, and of the gradients of controls and activations.
 
     Attributes:
-        settings: their parameters.
         bars: what `transmission` and the gradient of gears take on.
         law_bars: what the gradients of gain, bias and activation take on, once `keep_law` has been called.
     """
 
     def __init__(self, work: Workspace) -> None:
         self._work = work
-        self.settings = gather(ActuatorSettings, work.model)
         self.bars = allocate(ActuatorBars, work.nworld, work.model.nactuator)
         self.law_bars = allocate(ActuatorLawBars, 0, 0)
         self._keeps_law = False
-        self._lanes = work.lanes(work.model.nactuator, meet=not motors_apart(work.mjm))
+        self._meet = not motors_apart(work.mjm)
 
     def keep_law(self) -> None:
         """Let launches recorded from now on write `law_bars`."""
@@ -461,23 +459,7 @@ class ActuatorForces:
 
     def launch(self, at: Substep) -> None:
         """Launch the pullback of all actuators."""
-        work, m, settings = self._work, self._work.model, self._work.settings
-        wp.launch(
-            pull_actuators_kernel(self._keeps_law),
-            dim=(work.nworld, self._lanes),
-            inputs=[
-                self._lanes,
-                m.nactuator,
-                m.opt.timestep,
-                settings.clampctrl,
-                settings.clampact,
-                settings.implicit_all,
-                work.tables.implicit_address,
-                self.settings,
-                work.live,
-                gather(Drive, at.data),
-                at.state,
-                work.multipliers,
-            ],
-            outputs=[work.grad_act, work.grad_ctrl, work.slopes, work.tendon_bars, self.bars, self.law_bars],
+        work, m = self._work, self._work.model
+        work.launch_lanes(
+            pull_actuators_kernel(self._keeps_law), m.nactuator, at, self.bars, self.law_bars, meet=self._meet
         )

@@ -36,7 +36,7 @@ def pull_applied_bodies(
     body_rootid: wp.array[int],
     # In:
     live_in: wp.array[int],
-    xfrc_in: wp.array2d[wp.spatial_vector],
+    xfrc_applied_in: wp.array2d[wp.spatial_vector],
     motion_in: Motion,
     fields_in: Fields,
     # Out:
@@ -51,8 +51,8 @@ def pull_applied_bodies(
     omega = wp.spatial_top(lam)
     if live_in[worldid] != 0:
         xfrc_out[worldid, body] += wp.spatial_vector(u, omega)
-    force = wp.spatial_top(xfrc_in[worldid, body])
-    torque = wp.spatial_bottom(xfrc_in[worldid, body])
+    force = wp.spatial_top(xfrc_applied_in[worldid, body])
+    torque = wp.spatial_bottom(xfrc_applied_in[worldid, body])
     bars_out.lam[worldid, body] = bars_out.lam[worldid, body] - wrench(force, torque, arm)
     # Seen from the body, a force fixed in the world turns back: δΦ = w·(F × u + T × ω) for a rotation w.
     turned = wp.cross(force, u) + wp.cross(torque, omega)
@@ -80,15 +80,5 @@ class AppliedForces:
     def launch(self, at: Substep) -> None:
         """Launch its kernels at one substep."""
         work = self._work
-        wp.launch(
-            pull_applied_dofs,
-            dim=self.grad_qfrc.shape,
-            inputs=[work.live, work.multipliers],
-            outputs=[self.grad_qfrc],
-        )
-        wp.launch(
-            pull_applied_bodies,
-            dim=self.grad_xfrc.shape,
-            inputs=[work.model.body_rootid, work.live, at.data.xfrc_applied, at.motion, work.fields],
-            outputs=[work.bars, self.grad_xfrc],
-        )
+        work.launch(pull_applied_dofs, self.grad_qfrc.shape, at, qfrc=self.grad_qfrc)
+        work.launch(pull_applied_bodies, self.grad_xfrc.shape, at, xfrc=self.grad_xfrc)

@@ -12,17 +12,7 @@ from their own body, so λᵀ(M a + bias) = Σ_b L·(I A + V ×* I V) needs noth
 
 import warp as wp
 
-from msk_ray.step.adjoint.groups import (
-    DofSlopes,
-    FieldBars,
-    Fields,
-    Motion,
-    Multipliers,
-    Springs,
-    State,
-    Substep,
-    gather,
-)
+from msk_ray.step.adjoint.groups import DofSlopes, FieldBars, Fields, Motion, Multipliers, Springs, State, Substep
 from msk_ray.step.adjoint.spatial import carried, wrench
 from msk_ray.step.adjoint.workspace import Workspace
 from msk_ray.step.forward.mjw_private import inert_vec, motion_cross_force, poly_force_deriv
@@ -253,54 +243,19 @@ def sweep_up(
 
 
 class Bodies:
-    """Launches of the sweeps down and up the tree.
+    """Launches of the sweeps down and up the tree."""
 
-    Args:
-        damping: each dof's damping coefficients, shape (W, nv), vec3.
-    """
-
-    def __init__(self, work: Workspace, damping: wp.array) -> None:
-        self._work, self._damping = work, damping
-        self._tree = gather(Tree, work.tables, work.model)
+    def __init__(self, work: Workspace) -> None:
+        self._work = work
         self._cacc_sum = wp.zeros((work.nworld, work.mjm.nbody), dtype=wp.spatial_vector)
 
     def launch_fields(self, at: Substep) -> None:
         """Launch the fields, and their cotangents as far as inertia and gravity give them."""
-        work, m = self._work, self._work.model
-        wp.launch(
-            body_fields,
-            dim=(work.nworld, m.nbody),
-            inputs=[m.opt.gravity, work.settings.gravity, self._tree, at.motion, at.state, work.multipliers],
-            outputs=[work.fields, work.bars],
-        )
+        work = self._work
+        work.launch(body_fields, (work.nworld, work.model.nbody), at)
 
     def launch_sweep(self, at: Substep) -> None:
         """Launch the gradients of (qpos, qvel) from all cotangents."""
-        work, m, settings = self._work, self._work.model, self._work.settings
-        wp.launch(
-            close_velocity,
-            dim=(work.nworld, m.nbody),
-            inputs=[self._tree, at.motion, at.state],
-            outputs=[work.bars, self._cacc_sum],
-        )
-        wp.launch(
-            sweep_up,
-            dim=(work.nworld, m.nv),
-            inputs=[
-                m.opt.timestep,
-                self._tree,
-                work.springs,
-                settings.damper,
-                settings.euler_damping or settings.implicit_all,
-                work.live,
-                self._damping,
-                at.motion,
-                at.state,
-                work.multipliers,
-                work.fields,
-                work.bars,
-                self._cacc_sum,
-                work.slopes,
-            ],
-            outputs=[work.grad_qpos, work.grad_qvel],
-        )
+        work = self._work
+        work.launch(close_velocity, (work.nworld, work.model.nbody), at, cacc_sum=self._cacc_sum)
+        work.launch(sweep_up, (work.nworld, work.model.nv), at, cacc_sum=self._cacc_sum)

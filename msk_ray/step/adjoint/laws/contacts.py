@@ -19,11 +19,10 @@ from msk_ray.step.adjoint.groups import (
     Shapes,
     Substep,
     allocate,
-    gather,
 )
 from msk_ray.step.adjoint.laws.cones import cone_law, cone_slope, vec6
 from msk_ray.step.adjoint.laws.contact_geometry.contact_order import contacts_end
-from msk_ray.step.adjoint.laws.contact_geometry.convex import ConvexContacts
+from msk_ray.step.adjoint.laws.contact_geometry.convex import pull_convex
 from msk_ray.step.adjoint.laws.contact_geometry.primitive_laws import CONVEX_PAIRS
 from msk_ray.step.adjoint.laws.contact_geometry.primitives import PairKinds, pull_geometry_kernel
 from msk_ray.step.adjoint.laws.impedance import row_slopes, stiffness_damping
@@ -267,9 +266,8 @@ class ContactForces:
         mjm = work.mjm
         types = {(int(mjm.geom_type[a]), int(mjm.geom_type[b])) for a, b in colliding_pairs(mjm)}
         self._pull_geometry = pull_geometry_kernel(PairKinds.of(types))
-        self._shapes = gather(Shapes, work.model)
         self._bars = allocate(ContactBars, contacts)
-        self._convex = ConvexContacts(work, contacts) if types & CONVEX_PAIRS else None
+        self._has_convex = bool(types & CONVEX_PAIRS)
 
     def keep_wrenches(self) -> None:
         """Let launches recorded from now on write `contact_wrenches` of the workspace."""
@@ -279,40 +277,8 @@ class ContactForces:
 
     def launch(self, at: Substep) -> None:
         """Launch all of them."""
-        work, m, d = self._work, self._work.model, at.data
-        wp.launch(
-            pull_contacts,
-            dim=self.count,
-            inputs=[
-                work.stages.ordered,
-                m.opt.timestep,
-                m.opt.disableflags,
-                m.opt.impratio_invsqrt,
-                self._shapes,
-                d.nacon,
-                at.rows,
-                work.laws,
-                at.contacts,
-                at.motion,
-                work.fields,
-            ],
-            outputs=[work.bars, self._bars],
-        )
-        wp.launch(
-            self._pull_geometry,
-            dim=self.count,
-            inputs=[
-                work.stages.ordered,
-                self._shapes,
-                work.touch_counter.substep,
-                d.nacon,
-                at.contacts,
-                d.geom_xpos,
-                d.geom_xmat,
-                d.subtree_com,
-                self._bars,
-            ],
-            outputs=[work.bars.moved, work.touch_counter.touches, work.contact_wrenches],
-        )
-        if self._convex is not None:
-            self._convex.launch(at, self._bars)
+        work = self._work
+        work.launch(pull_contacts, self.count, at, self._bars)
+        work.launch(self._pull_geometry, self.count, at, self._bars)
+        if self._has_convex:
+            work.launch(pull_convex, self.count, at, self._bars)

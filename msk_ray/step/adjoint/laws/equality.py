@@ -10,9 +10,9 @@ from both bodies' spins and angular accelerations; `turn_score` holds them and i
 import warp as wp
 from mujoco_warp import ObjType
 
-from msk_ray.step.adjoint.groups import FieldBars, Fields, Motion, RowLaws, Rows, Substep, gather
+from msk_ray.step.adjoint.groups import FieldBars, Fields, Motion, RowLaws, Rows, Substep
 from msk_ray.step.adjoint.laws.impedance import row_slopes
-from msk_ray.step.adjoint.spatial import carried, point_velocity, wrench
+from msk_ray.step.adjoint.spatial import carried, point_velocity, three, wrench
 from msk_ray.step.adjoint.workspace import Workspace
 from msk_ray.step.forward.mjw_private import ConstraintType, EqType, vec5, vec12
 
@@ -190,7 +190,7 @@ def pull_anchors(
         mass = laws_in.slope[worldid, row]
         # ∂Φ/∂jar = D ρ(λ)
         y = mass * rate
-        push = wp.vec3(laws_in.force[worldid, row], laws_in.force[worldid, row + 1], laws_in.force[worldid, row + 2])
+        push = three(laws_in.force, worldid, row)
 
         # All three rows share the impedance at |gap|: slopes at pos = |gap| along the gap.
         solref = anchors.eq_solref[worldid % anchors.eq_solref.shape[0], eq]
@@ -208,9 +208,7 @@ def pull_anchors(
             under = quat_product(conjugate(q2), turned(lam_spin, q1))
             turn_rate = 0.5 * scale * wp.vec3(under[1], under[2], under[3])
             turn_y = laws_in.slope[worldid, row + 3] * turn_rate
-            turn_push = wp.vec3(
-                laws_in.force[worldid, row + 3], laws_in.force[worldid, row + 4], laws_in.force[worldid, row + 5]
-            )
+            turn_push = three(laws_in.force, worldid, row + 3)
         along = wp.vec3(0.0)
         turn_along = wp.vec3(0.0)
         if size > 1.0e-12:
@@ -283,32 +281,6 @@ def pull_anchors(
                 wp.atomic_add(bars_out.moved, worldid, body, total + wrench(moved, torque, arm))
 
 
-class AnchorRows:
-    """Launches of what connect and weld equalities give ∂Φ."""
-
-    def __init__(self, work: Workspace) -> None:
-        self._work = work
-        self._anchors = gather(Anchors, work.model)
-
-    def launch(self, at: Substep) -> None:
-        """Launch the pullback of their rows."""
-        work, m, d = self._work, self._work.model, at.data
-        poses = gather(AnchorPoses, d)
-        wp.launch(
-            pull_anchors,
-            dim=(work.nworld, work.lanes(work.njmax)),
-            inputs=[
-                work.lanes(work.njmax),
-                work.njmax,
-                m.opt.timestep,
-                m.opt.disableflags,
-                self._anchors,
-                d.nefc,
-                at.rows,
-                work.laws,
-                poses,
-                at.motion,
-                work.fields,
-            ],
-            outputs=[work.bars],
-        )
+def launch_anchors(work: Workspace, at: Substep) -> None:
+    """Launch what connect and weld equalities give ∂Φ."""
+    work.launch_lanes(pull_anchors, work.njmax, at)

@@ -9,7 +9,7 @@ import math
 
 import warp as wp
 
-from msk_ray.step.adjoint.groups import FieldBars, Fields, Motion, Substep, gather
+from msk_ray.step.adjoint.groups import FieldBars, Fields, Motion, Substep
 from msk_ray.step.adjoint.spatial import point_velocity, wrench
 from msk_ray.step.adjoint.workspace import Workspace
 from msk_ray.step.forward.mjw_private import quat_to_mat, vec6
@@ -177,24 +177,6 @@ def pull_fluid(
     wp.atomic_add(bars_out.moved, worldid, body, wp.spatial_vector(turn, wp.vec3(0.0)))
 
 
-def fluid_bodies(work: Workspace) -> FluidBodies:
-    """The group for a model."""
-    return gather(FluidBodies, work.model, work.model.opt)
-
-
-class FluidForces:
-    """Launches of what drag gives ∂Φ."""
-
-    def __init__(self, work: Workspace) -> None:
-        self._work = work
-        self._bodies = fluid_bodies(work)
-
-    def launch(self, at: Substep) -> None:
-        """Launch the pullback of all bodies' drag."""
-        work = self._work
-        wp.launch(
-            pull_fluid,
-            dim=(work.nworld, work.model.nbody),
-            inputs=[self._bodies, work.settings.implicit_all, at.data.xmat, at.motion, work.fields],
-            outputs=[work.bars],
-        )
+def launch_fluid(work: Workspace, at: Substep) -> None:
+    """Launch what drag gives ∂Φ."""
+    work.launch(pull_fluid, (work.nworld, work.model.nbody), at)

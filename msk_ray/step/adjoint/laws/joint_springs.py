@@ -6,7 +6,8 @@ d is the displacement from rest, for a rotation its logarithm; that of hinges an
 import warp as wp
 from mujoco_warp import JointType
 
-from msk_ray.step.adjoint.groups import Joints, Springs, Substep
+from msk_ray.step.adjoint.groups import DofSlopes, Joints, Springs, State, Substep
+from msk_ray.step.adjoint.spatial import four, three
 from msk_ray.step.adjoint.workspace import Workspace
 from msk_ray.step.forward.mjw_private import poly_force, quat_sub
 
@@ -41,10 +42,10 @@ def pull_turning_springs(
     joints: Joints,
     springs: Springs,
     # In:
-    qpos_in: wp.array2d[float],
+    state_in: State,
     lam_in: wp.array2d[float],
     # Out:
-    phi_qpos_out: wp.array2d[float],
+    slopes_out: DofSlopes,
 ) -> None:
     """Φ ∋ λ·k(|d|) d: d the displacement from rest, for a rotation its logarithm."""
     worldid, jntid = wp.tid()
@@ -62,39 +63,22 @@ def pull_turning_springs(
         dif = wp.vec3(0.0)
         lam = wp.vec3(0.0)
         for i in range(3):
-            dif[i] = qpos_in[worldid, q + i] - springs.qpos_spring[rest, q + i]
+            dif[i] = state_in.qpos[worldid, q + i] - springs.qpos_spring[rest, q + i]
             lam[i] = lam_in[worldid, v + i]
         slope = spring_slope(stiffness, poly, dif, lam)
         for i in range(3):
-            wp.atomic_add(phi_qpos_out, worldid, v + i, slope[i])
+            wp.atomic_add(slopes_out.qpos, worldid, v + i, slope[i])
         q += 3
         v += 3
-    now = wp.quat(qpos_in[worldid, q], qpos_in[worldid, q + 1], qpos_in[worldid, q + 2], qpos_in[worldid, q + 3])
-    still = wp.quat(
-        springs.qpos_spring[rest, q],
-        springs.qpos_spring[rest, q + 1],
-        springs.qpos_spring[rest, q + 2],
-        springs.qpos_spring[rest, q + 3],
-    )
+    now = four(state_in.qpos, worldid, q)
+    still = four(springs.qpos_spring, rest, q)
     phi = quat_sub(wp.normalize(now), still)
-    turn = wp.vec3(lam_in[worldid, v], lam_in[worldid, v + 1], lam_in[worldid, v + 2])
+    turn = three(lam_in, worldid, v)
     slope = log_rate_pullback(phi, spring_slope(stiffness, poly, phi, turn))
     for i in range(3):
-        wp.atomic_add(phi_qpos_out, worldid, v + i, slope[i])
+        wp.atomic_add(slopes_out.qpos, worldid, v + i, slope[i])
 
 
-class TurningSprings:
-    """Launches of what springs of free and ball joints give ∂Φ."""
-
-    def __init__(self, work: Workspace) -> None:
-        self._work = work
-
-    def launch(self, at: Substep) -> None:
-        """Launch the pullback of these springs."""
-        work = self._work
-        wp.launch(
-            pull_turning_springs,
-            dim=(work.nworld, work.model.njnt),
-            inputs=[work.joints, work.springs, at.state.qpos, work.multipliers.lam],
-            outputs=[work.slopes.qpos],
-        )
+def launch_turning_springs(work: Workspace, at: Substep) -> None:
+    """Launch what springs of free and ball joints give ∂Φ."""
+    work.launch(pull_turning_springs, (work.nworld, work.model.njnt), at, lam=work.multipliers.lam)

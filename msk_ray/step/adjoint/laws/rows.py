@@ -166,43 +166,16 @@ class ConstraintLaws:
         self.scaled = wp.zeros(shape if work.settings.elliptic else (1, 1, 1), dtype=float)
         self._dense = wp.zeros(shape, dtype=float) if work.model.is_sparse else None
 
-    def jacobian(self, at: Substep) -> wp.array:
-        """The constraint Jacobian that `launch` leaves, shape (W, njmax, nv or more)."""
-        return at.data.efc.J if self._dense is None else self._dense
-
     def launch(self, at: Substep) -> None:
         """Launch the Jacobian as a full matrix, the laws and S J."""
-        work, m, d = self._work, self._work.model, at.data
+        work = self._work
         if self._dense is not None:
-            wp.launch(
-                densify_rows,
-                dim=(work.nworld, work.njmax),
-                inputs=[d.nefc, d.efc.J_rownnz, d.efc.J_rowadr, d.efc.J_colind, d.efc.J],
-                outputs=[self._dense],
-            )
-        jacobian = self.jacobian(at)
+            efc = at.data.efc
+            sparse = {"rownnz": efc.J_rownnz, "rowadr": efc.J_rowadr, "colind": efc.J_colind, "sparse": efc.J}
+            work.launch(densify_rows, (work.nworld, work.njmax), at, dense=self._dense, **sparse)
+            at.jacobian = self._dense
         slots = work.lanes(min(_SLOTS, work.njmax), meet=False)
-        wp.launch(
-            row_laws,
-            dim=(work.nworld, slots),
-            inputs=[m.nv, slots, d.nefc, at.rows, jacobian, d.qacc],
-            outputs=[work.laws],
-        )
+        work.launch(row_laws, (work.nworld, slots), at, slots=slots)
         if work.settings.elliptic:
             lanes = work.lanes(_LANES, meet=False)
-            wp.launch(
-                scaled_jacobian,
-                dim=(work.nworld, slots, lanes),
-                inputs=[
-                    m.nv,
-                    m.opt.impratio_invsqrt,
-                    slots,
-                    lanes,
-                    d.nefc,
-                    at.rows,
-                    jacobian,
-                    work.laws,
-                    at.contacts,
-                ],
-                outputs=[self.scaled],
-            )
+            work.launch(scaled_jacobian, (work.nworld, slots, lanes), at, slots=slots, lanes=lanes, scaled=self.scaled)

@@ -15,10 +15,8 @@ from msk_ray.step.adjoint.groups import (
     Substep,
     TendonBars,
     TendonRows,
-    gather,
 )
 from msk_ray.step.adjoint.laws.impedance import row_slopes
-from msk_ray.step.adjoint.laws.rows import ConstraintLaws
 from msk_ray.step.adjoint.laws.tendons import tendon_rate
 from msk_ray.step.adjoint.workspace import Workspace
 from msk_ray.step.forward.capacity import scalar_rows
@@ -269,40 +267,9 @@ def foremost_rows(work: Workspace) -> int:
     return min(scalar_rows(work.mjm), work.njmax)
 
 
-class ScalarRows:
-    """Launches of what the rows of joints, tendons and their equalities give ∂Φ."""
-
-    def __init__(self, work: Workspace, laws: ConstraintLaws) -> None:
-        self._work, self._laws = work, laws
-        self._settings = gather(RowSettings, work.model)
-        self._rows = foremost_rows(work)
-        mjm = work.mjm
-        # Limits of joints alone are rows of different dofs.
-        meet = bool(mjm.neq or mjm.ntendon or np.any(mjm.dof_frictionloss))
-        self._lanes = work.lanes(self._rows, meet=meet)
-
-    def launch(self, at: Substep) -> None:
-        """Launch the pullback of these rows."""
-        work, m, d = self._work, self._work.model, at.data
-        wp.launch(
-            pull_rows,
-            dim=(work.nworld, self._lanes),
-            inputs=[
-                self._lanes,
-                self._rows,
-                m.opt.timestep,
-                m.opt.disableflags,
-                work.joints,
-                work.tendon_rows,
-                self._settings,
-                d.nefc,
-                at.rows,
-                self._laws.jacobian(at),
-                work.laws,
-                at.state,
-                work.multipliers.lam,
-                d.ten_J,
-                d.ten_length,
-            ],
-            outputs=[work.slopes, work.tendon_bars],
-        )
+def launch_scalar_rows(work: Workspace, at: Substep) -> None:
+    """Launch what the rows of joints, tendons and their equalities give ∂Φ."""
+    mjm = work.mjm
+    # Limits of joints alone are rows of different dofs.
+    meet = bool(mjm.neq or mjm.ntendon or np.any(mjm.dof_frictionloss))
+    work.launch_lanes(pull_rows, foremost_rows(work), at, meet=meet, lam=work.multipliers.lam)

@@ -217,17 +217,4 @@ class SitePairForces:
     def launch(self, at: Substep) -> None:
         """Launch the pullback of these actuators."""
         work = self._work
-        wp.launch(
-            pull_site_pairs,
-            dim=(work.nworld, work.lanes(work.model.nactuator)),
-            inputs=[
-                work.lanes(work.model.nactuator),
-                work.model.nactuator,
-                self._pairs,
-                gather(SitePoses, at.data),
-                at.motion,
-                self._bars,
-                work.fields,
-            ],
-            outputs=[work.bars],
-        )
+        work.launch_lanes(pull_site_pairs, work.model.nactuator, at, self._bars, self._pairs)

@@ -10,7 +10,7 @@ On a wrapping geom the ends are tangent points that move over the surface; the r
 
 import warp as wp
 
-from msk_ray.step.adjoint.groups import FieldBars, Fields, Motion, Substep, TendonBars, gather
+from msk_ray.step.adjoint.groups import FieldBars, Fields, Motion, Substep, TendonBars
 from msk_ray.step.adjoint.laws.inside_wrap import inside_score
 from msk_ray.step.adjoint.laws.wrapping import PathPoses, Paths, touch_paths
 from msk_ray.step.adjoint.spatial import carried, point_velocity, wrench
@@ -286,13 +286,11 @@ class TendonPaths:
     """Launches of the tangent points on wrapping geoms, and of what paths give ∂Φ.
 
     Attributes:
-        paths: stretches of path.
         touch, inside: as `touch_paths` leaves them, (W, segments).
     """
 
     def __init__(self, work: Workspace) -> None:
         self._work = work
-        self.paths = gather(Paths, work.tables, work.model)
         shape = (work.nworld, work.tables.segment_tendon.size)
         self.touch = wp.full(shape, wp.spatial_vector(*([MJ_MAXVAL] * 6)), dtype=wp.spatial_vector)
         self.inside = wp.zeros(shape, dtype=wp.vec4)
@@ -300,22 +298,7 @@ class TendonPaths:
     def launch(self, at: Substep) -> None:
         """Launch both."""
         work = self._work
-        poses = gather(PathPoses, at.data)
+        points = {"touch": self.touch, "inside": self.inside}
         if work.tables.has_wrapping:
-            wp.launch(touch_paths, dim=self.touch.shape, inputs=[self.paths, poses], outputs=[self.touch, self.inside])
-        wp.launch(
-            pull_paths,
-            dim=(work.nworld, work.lanes(self.touch.shape[1])),
-            inputs=[
-                work.lanes(self.touch.shape[1]),
-                self.touch.shape[1],
-                self.paths,
-                self.touch,
-                self.inside,
-                poses,
-                at.motion,
-                work.fields,
-                work.tendon_bars,
-            ],
-            outputs=[work.bars],
-        )
+            work.launch(touch_paths, self.touch.shape, at, **points)
+        work.launch_lanes(pull_paths, self.touch.shape[1], at, **points)

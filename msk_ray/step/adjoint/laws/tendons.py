@@ -7,7 +7,7 @@ tendon's J turns with q is worked out in `paths`, segment by segment.
 
 import warp as wp
 
-from msk_ray.step.adjoint.groups import DofSlopes, Multipliers, State, Substep, TendonBars, TendonRows, gather
+from msk_ray.step.adjoint.groups import DofSlopes, Multipliers, State, Substep, TendonBars, TendonRows
 from msk_ray.step.adjoint.laws.tendon_paths import TendonPaths
 from msk_ray.step.adjoint.workspace import Workspace
 from msk_ray.step.forward.mjw_private import WrapType, poly_force_deriv, tendon_damping_total
@@ -193,49 +193,18 @@ class Tendons:
 
     def __init__(self, work: Workspace) -> None:
         self._work = work
-        self._passive = gather(PassiveTendons, work.model)
         self.paths = TendonPaths(work) if work.tables.segment_tendon.size else None
 
     def launch_start(self, at: Substep) -> None:
         """Launch the cotangents that springs and dampers give."""
-        work, m, d, settings = self._work, self._work.model, at.data, self._work.settings
-        wp.launch(
-            start_tendons,
-            dim=(work.nworld, m.ntendon),
-            inputs=[
-                m.opt.timestep,
-                settings.spring,
-                settings.damper,
-                settings.implicit_all,
-                work.tendon_rows,
-                self._passive,
-                work.tables.implicit_address,
-                at.state,
-                d.ten_J,
-                d.ten_length,
-                work.multipliers,
-            ],
-            outputs=[work.tendon_bars],
-        )
+        work = self._work
+        work.launch(start_tendons, (work.nworld, work.model.ntendon), at)
 
     def launch_pullback(self, at: Substep) -> None:
         """Launch what the cotangents give to dofs and bodies."""
-        work, m, d = self._work, self._work.model, at.data
+        work, m = self._work, self._work.model
         lanes = work.lanes(m.ntendon * m.max_ten_J_rownnz)
-        wp.launch(
-            pull_tendons,
-            dim=(work.nworld, lanes),
-            inputs=[
-                lanes,
-                m.ntendon,
-                m.max_ten_J_rownnz,
-                work.tendon_rows,
-                m.tendon_adr,
-                m.wrap_type,
-                d.ten_J,
-                work.tendon_bars,
-            ],
-            outputs=[work.slopes],
-        )
+        count = {"lanes": lanes, "count": m.ntendon, "width": m.max_ten_J_rownnz}
+        work.launch(pull_tendons, (work.nworld, lanes), at, **count)
         if self.paths is not None:
             self.paths.launch(at)

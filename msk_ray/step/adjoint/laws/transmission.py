@@ -6,10 +6,10 @@
 import warp as wp
 from mujoco_warp import JointType, TrnType
 
-from msk_ray.step.adjoint.groups import FieldBars, Fields, Joints, Motion, Multipliers, State, Substep, gather
+from msk_ray.step.adjoint.groups import DofSlopes, FieldBars, Fields, Joints, Motion, Multipliers, State, Substep
 from msk_ray.step.adjoint.laws.actuators import ActuatorBars
 from msk_ray.step.adjoint.laws.joint_springs import log_rate_pullback
-from msk_ray.step.adjoint.spatial import carried, point_velocity, wrench
+from msk_ray.step.adjoint.spatial import carried, four, point_velocity, three, wrench
 from msk_ray.step.adjoint.workspace import Workspace
 from msk_ray.step.forward.mjw_private import quat_to_vel
 
@@ -36,10 +36,10 @@ def pull_turning_joints(
     state_in: State,
     multipliers_in: Multipliers,
     moment_rowadr_in: wp.array2d[int],
-    moment_in: wp.array2d[float],
+    actuator_moment_in: wp.array2d[float],
     actuator_bars_in: ActuatorBars,
     # Out:
-    phi_qpos_out: wp.array2d[float],
+    slopes_out: DofSlopes,
 ) -> None:
     """len = gear·log(q) of a ball joint; in the parent's frame the moment is m = R(q)ᵀ gear.
 
@@ -59,12 +59,7 @@ def pull_turning_joints(
         slope = wp.vec3(0.0)
         if joint == JointType.BALL:
             q = joints.jnt_qposadr[jnt]
-            quat = wp.quat(
-                state_in.qpos[worldid, q],
-                state_in.qpos[worldid, q + 1],
-                state_in.qpos[worldid, q + 2],
-                state_in.qpos[worldid, q + 3],
-            )
+            quat = four(state_in.qpos, worldid, q)
             phi = quat_to_vel(wp.normalize(quat))
             gear = wp.spatial_top(transmissions.actuator_gear[worldid % transmissions.actuator_gear.shape[0], uid])
             slope = actuator_bars_in.length[worldid, uid] * log_rate_pullback(phi, gear)
@@ -73,7 +68,7 @@ def pull_turning_joints(
             first += 3
         if kind == TrnType.JOINTINPARENT:
             bars = actuator_bars_in.rate[worldid, uid]
-            moment = wp.vec3(moment_in[worldid, first], moment_in[worldid, first + 1], moment_in[worldid, first + 2])
+            moment = three(actuator_moment_in, worldid, first)
             x = wp.vec3(0.0)
             for i in range(3):
                 smooth = state_in.qacc[worldid, dof + i] - multipliers_in.excess[worldid, dof + i]
@@ -82,7 +77,7 @@ def pull_turning_joints(
             # m·x = gear·R x ,  d(R x) = R (w × x)
             slope += wp.cross(x, moment)
         for i in range(3):
-            wp.atomic_add(phi_qpos_out, worldid, dof + i, slope[i])
+            wp.atomic_add(slopes_out.qpos, worldid, dof + i, slope[i])
 
 
 @wp.kernel
@@ -136,48 +131,9 @@ def pull_sites(
         wp.atomic_add(bars_out.moved, worldid, body, carried(total, load) + wrench(wp.cross(force, spin), turn, arm))
 
 
-class TurningTransmissions:
-    """Launches of what the turning of moments gives ∂Φ."""
-
-    def __init__(self, work: Workspace, bars: ActuatorBars) -> None:
-        self._work, self._bars = work, bars
-        self._transmissions = gather(Transmissions, work.model)
-
-    def launch(self, at: Substep) -> None:
-        """Launch the pullback of such joints and of sites, as far as the model has them."""
-        work, m, d = self._work, self._work.model, at.data
-        if work.tables.has_turning_transmission:
-            wp.launch(
-                pull_turning_joints,
-                dim=(work.nworld, work.lanes(m.nactuator)),
-                inputs=[
-                    work.lanes(m.nactuator),
-                    m.nactuator,
-                    work.joints,
-                    self._transmissions,
-                    at.state,
-                    work.multipliers,
-                    d.moment_rowadr,
-                    d.actuator_moment,
-                    self._bars,
-                ],
-                outputs=[work.slopes.qpos],
-            )
-        if work.tables.has_site_transmission:
-            wp.launch(
-                pull_sites,
-                dim=(work.nworld, work.lanes(m.nactuator)),
-                inputs=[
-                    work.lanes(m.nactuator),
-                    m.nactuator,
-                    m.body_rootid,
-                    m.site_bodyid,
-                    self._transmissions,
-                    d.site_xpos,
-                    d.site_xmat,
-                    at.motion,
-                    self._bars,
-                    work.fields,
-                ],
-                outputs=[work.bars],
-            )
+def launch_transmissions(work: Workspace, bars: ActuatorBars, at: Substep) -> None:
+    """Launch what the turning of moments gives ∂Φ, for such joints and for sites, as far as the model has them."""
+    if work.tables.has_turning_transmission:
+        work.launch_lanes(pull_turning_joints, work.model.nactuator, at, bars)
+    if work.tables.has_site_transmission:
+        work.launch_lanes(pull_sites, work.model.nactuator, at, bars)

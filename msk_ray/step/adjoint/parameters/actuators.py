@@ -19,7 +19,6 @@ from msk_ray.step.adjoint.groups import (
     State,
     Substep,
     TendonRows,
-    gather,
 )
 from msk_ray.step.adjoint.laws.actuators import (
     ActuatorBars,
@@ -30,7 +29,7 @@ from msk_ray.step.adjoint.laws.actuators import (
 )
 from msk_ray.step.adjoint.parameters.base import ParameterStage, Parts, TimestepGradient
 from msk_ray.step.adjoint.parameters.inertia import rotation
-from msk_ray.step.adjoint.spatial import point_velocity
+from msk_ray.step.adjoint.spatial import four, point_velocity
 from msk_ray.step.forward.mjw_private import quat_to_vel, vec10
 
 wp.set_module_options({"enable_backward": False})
@@ -102,14 +101,7 @@ def gear_rates_of_joint(
         out.mu[i] = multipliers_in.mu[worldid, j]
         out.smooth[i] = state_in.qacc[worldid, j] - multipliers_in.excess[worldid, j]
     if turn >= 0:
-        quat = wp.normalize(
-            wp.quat(
-                state_in.qpos[worldid, q],
-                state_in.qpos[worldid, q + 1],
-                state_in.qpos[worldid, q + 2],
-                state_in.qpos[worldid, q + 3],
-            )
-        )
+        quat = wp.normalize(four(state_in.qpos, worldid, q))
         if kind == JointType.BALL:
             phi = quat_to_vel(quat)
             for i in range(3):
@@ -258,28 +250,7 @@ class ActuatorStage(ParameterStage):
         return parts.actuators is not None
 
     def launch(self, at: Substep) -> None:
-        work, m, d = self.parts.work, self.parts.work.model, at.data
-        lanes = work.lanes(m.nactuator)
-        wp.launch(
-            pull_actuator_parameters,
-            dim=(work.nworld, lanes),
-            inputs=[
-                work.joints,
-                work.tendon_rows,
-                self._actuators.settings,
-                m.nactuator,
-                lanes,
-                work.live,
-                self._actuators.bars,
-                self._actuators.law_bars,
-                gather(Drive, d),
-                gather(Levers, m, d),
-                at.state,
-                at.motion,
-                work.multipliers,
-                work.fields,
-                d.ten_J,
-                d.ten_length,
-            ],
-            outputs=self.gradients,
+        actuators = self._actuators
+        self.work.launch_lanes(
+            pull_actuator_parameters, self.work.model.nactuator, at, actuators.bars, actuators.law_bars, *self.gradients
         )

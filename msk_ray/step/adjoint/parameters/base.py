@@ -61,7 +61,7 @@ class ParameterStage(ABC):
     kinds: ClassVar[tuple[Any, ...]]
 
     def __init__(self, parts: Parts, gradients: dict[Any, Any]) -> None:
-        self.parts = parts
+        self.parts, self.work = parts, parts.work
         self.gradients = [gradients[kind] for kind in self.kinds]
 
     @classmethod

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from msk_ray.step.adjoint.groups import Contacts, Fields, Motion, RowLaws, Rows, Shapes, Substep, gather
+from msk_ray.step.adjoint.groups import Contacts, Fields, Motion, RowLaws, Rows, Shapes, Substep
 from msk_ray.step.adjoint.laws.contacts import components, relative_rates, row_count
 from msk_ray.step.adjoint.laws.impedance import impedance, stiffness_damping
 from msk_ray.step.adjoint.parameters.base import ParameterStage, Parts, TimestepGradient
@@ -211,31 +211,10 @@ class MaterialStage(ParameterStage):
 
     def __init__(self, parts: Parts, gradients: dict[Any, Any]) -> None:
         super().__init__(parts, gradients)
-        work, mjm = parts.work, parts.work.mjm
-        self._shapes, self._materials = gather(Shapes, work.model), gather(Materials, work.model)
+        mjm = parts.work.mjm
         pairs = np.full((max(mjm.ngeom, 1),) * 2, -1, dtype=np.int32)
         pairs[mjm.pair_geom1, mjm.pair_geom2] = pairs[mjm.pair_geom2, mjm.pair_geom1] = np.arange(mjm.npair)
         self._pair_of = wp.array(pairs, dtype=int)
 
     def launch(self, at: Substep) -> None:
-        work, m, d = self.parts.work, self.parts.work.model, at.data
-        wp.launch(
-            pull_materials,
-            dim=self.parts.contacts.count,
-            inputs=[
-                m.opt.timestep,
-                m.opt.disableflags,
-                m.opt.impratio_invsqrt,
-                self._shapes,
-                self._materials,
-                self._pair_of,
-                work.live,
-                d.nacon,
-                at.rows,
-                work.laws,
-                at.contacts,
-                at.motion,
-                work.fields,
-            ],
-            outputs=self.gradients,
-        )
+        self.work.launch(pull_materials, self.parts.contacts.count, at, *self.gradients, pair_of=self._pair_of)

@@ -10,7 +10,7 @@ from typing import Any
 import warp as wp
 from mujoco_warp import GeomType
 
-from msk_ray.step.adjoint.groups import Contacts, Substep, gather
+from msk_ray.step.adjoint.groups import Contacts, Substep
 from msk_ray.step.adjoint.parameters.base import ParameterStage, Parts, quat_gradient
 from msk_ray.step.adjoint.spatial import column
 
@@ -87,7 +87,7 @@ def pull_geoms(
     live_in: wp.array[int],
     nacon_in: wp.array[int],
     contacts_in: Contacts,
-    wrenches_in: wp.array2d[wp.spatial_vector],
+    contact_wrenches_in: wp.array2d[wp.spatial_vector],
     xmat_in: wp.array2d[wp.mat33],
     geom_xpos_in: wp.array2d[wp.vec3],
     geom_xmat_in: wp.array2d[wp.mat33],
@@ -103,8 +103,8 @@ def pull_geoms(
         return
     geom = contacts_in.geom[con][side]
     mat = geom_xmat_in[worldid, geom]
-    torque = wp.spatial_top(wrenches_in[con, side])
-    force = wp.spatial_bottom(wrenches_in[con, side])
+    torque = wp.spatial_top(contact_wrenches_in[con, side])
+    force = wp.spatial_bottom(contact_wrenches_in[con, side])
     wp.atomic_sub(
         gradients_out.geom_pos, worldid, geom, wp.transpose(xmat_in[worldid, shapes.geom_bodyid[geom]]) @ force
     )
@@ -130,22 +130,6 @@ class GeomStage(ParameterStage):
     def __init__(self, parts: Parts, gradients: dict[Any, Any]) -> None:
         super().__init__(parts, gradients)
         parts.contacts.keep_wrenches()
-        self._shapes = gather(GeomShapes, parts.work.model)
 
     def launch(self, at: Substep) -> None:
-        work, d, contacts = self.parts.work, at.data, self.parts.contacts
-        wp.launch(
-            pull_geoms,
-            dim=(contacts.count, 2),
-            inputs=[
-                self._shapes,
-                work.live,
-                d.nacon,
-                at.contacts,
-                work.contact_wrenches,
-                d.xmat,
-                d.geom_xpos,
-                d.geom_xmat,
-            ],
-            outputs=self.gradients,
-        )
+        self.work.launch(pull_geoms, (self.parts.contacts.count, 2), at, *self.gradients)

@@ -8,12 +8,10 @@ gravity, α the angular one and I the inertia about it, what a body gives Φ is
 linear in the ten inertial parameters once the point is fixed.
 """
 
-from typing import Any
-
 import warp as wp
 
-from msk_ray.step.adjoint.groups import Fields, Motion, Substep, gather
-from msk_ray.step.adjoint.parameters.base import ParameterStage, Parts, quat_gradient
+from msk_ray.step.adjoint.groups import Fields, Motion, Substep
+from msk_ray.step.adjoint.parameters.base import ParameterStage, quat_gradient
 from msk_ray.step.adjoint.spatial import point_velocity
 
 wp.set_module_options({"enable_backward": False})
@@ -126,24 +124,5 @@ class InertiaStage(ParameterStage):
 
     kinds = (InertiaGradients,)
 
-    def __init__(self, parts: Parts, gradients: dict[Any, Any]) -> None:
-        super().__init__(parts, gradients)
-        self._inertias = gather(Inertias, parts.work.model)
-
     def launch(self, at: Substep) -> None:
-        work, m = self.parts.work, self.parts.work.model
-        wp.launch(
-            pull_inertia,
-            dim=(work.nworld, m.nbody),
-            inputs=[
-                m.opt.gravity,
-                work.settings.gravity,
-                self._inertias,
-                work.live,
-                at.data.xfrc_applied,
-                at.data.xmat,
-                at.motion,
-                work.fields,
-            ],
-            outputs=self.gradients,
-        )
+        self.work.launch(pull_inertia, (self.work.nworld, self.work.model.nbody), at, *self.gradients)

@@ -6,6 +6,7 @@ from mujoco_warp import JointType
 from msk_ray.step.adjoint.groups import Joints, Multipliers, Springs, State, Substep
 from msk_ray.step.adjoint.laws.joint_springs import log_rate_pullback, spring_slope
 from msk_ray.step.adjoint.parameters.base import ParameterStage, quat_gradient
+from msk_ray.step.adjoint.spatial import four, three
 from msk_ray.step.forward.mjw_private import poly_force_deriv, quat_sub
 
 wp.set_module_options({"enable_backward": False})
@@ -105,22 +106,10 @@ def pull_joints(
             )
             q += 3
             v += 3
-        now = wp.quat(
-            state_in.qpos[worldid, q],
-            state_in.qpos[worldid, q + 1],
-            state_in.qpos[worldid, q + 2],
-            state_in.qpos[worldid, q + 3],
-        )
-        still = wp.quat(
-            springs.qpos_spring[rest, q],
-            springs.qpos_spring[rest, q + 1],
-            springs.qpos_spring[rest, q + 2],
-            springs.qpos_spring[rest, q + 3],
-        )
+        now = four(state_in.qpos, worldid, q)
+        still = four(springs.qpos_spring, rest, q)
         phi = quat_sub(wp.normalize(now), still)
-        turn = wp.vec3(
-            multipliers_in.lam[worldid, v], multipliers_in.lam[worldid, v + 1], multipliers_in.lam[worldid, v + 2]
-        )
+        turn = three(multipliers_in.lam, worldid, v)
         pull += wp.dot(turn, phi)
         # log(exp(-w) exp(φ)) = φ - Jr(-φ)⁻¹ w
         back = log_rate_pullback(-phi, spring_slope(stiffness, poly, phi, turn))
@@ -136,20 +125,4 @@ class JointStage(ParameterStage):
     kinds = (JointGradients,)
 
     def launch(self, at: Substep) -> None:
-        work, m, settings = self.parts.work, self.parts.work.model, self.parts.work.settings
-        wp.launch(
-            pull_joints,
-            dim=(work.nworld, m.njnt),
-            inputs=[
-                m.opt.timestep,
-                settings.spring,
-                settings.damper,
-                settings.euler_damping or settings.implicit_all,
-                work.joints,
-                work.springs,
-                work.live,
-                at.state,
-                work.multipliers,
-            ],
-            outputs=self.gradients,
-        )
+        self.work.launch(pull_joints, (self.work.nworld, self.work.model.njnt), at, *self.gradients)

@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from msk_ray.step.adjoint.groups import Fields, Motion, Substep, TendonBars, gather
+from msk_ray.step.adjoint.groups import Fields, Motion, Substep, TendonBars
 from msk_ray.step.adjoint.laws.inside_wrap import inside_score
 from msk_ray.step.adjoint.laws.tendon_paths import Rates, Twists, fields_of, rates_of, segment_turn, weigh, wrap_score
 from msk_ray.step.adjoint.laws.wrapping import PathPoses, Paths
@@ -184,29 +184,14 @@ class PathStage(ParameterStage):
         super().__init__(parts, gradients)
         assert parts.tendons is not None
         assert parts.tendons.paths is not None
-        self._launched = parts.tendons.paths
-        self._quats = gather(WrapQuats, parts.work.model)
+        self._paths = parts.tendons.paths
 
     @classmethod
     def applies(cls, parts: Parts) -> bool:
         return parts.tendons is not None and parts.tendons.paths is not None
 
     def launch(self, at: Substep) -> None:
-        work, paths = self.parts.work, self._launched
-        wp.launch(
-            pull_path_parameters,
-            dim=paths.touch.shape,
-            inputs=[
-                paths.paths,
-                self._quats,
-                work.live,
-                paths.touch,
-                paths.inside,
-                gather(PathPoses, at.data),
-                at.data.xmat,
-                at.motion,
-                work.fields,
-                work.tendon_bars,
-            ],
-            outputs=self.gradients,
+        paths = self._paths
+        self.work.launch(
+            pull_path_parameters, paths.touch.shape, at, *self.gradients, touch=paths.touch, inside=paths.inside
         )

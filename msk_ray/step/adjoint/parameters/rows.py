@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 from mujoco_warp import DisableBit, JointType
 
-from msk_ray.step.adjoint.groups import Joints, RowLaws, Rows, State, Substep, TendonRows, gather
+from msk_ray.step.adjoint.groups import Joints, RowLaws, Rows, State, Substep, TendonRows
 from msk_ray.step.adjoint.laws.impedance import row_slopes, stiffness_damping
 from msk_ray.step.adjoint.laws.scalar_rows import RowSettings, foremost_rows, solver_parameters
 from msk_ray.step.adjoint.laws.tendons import tendon_rate
@@ -234,50 +234,9 @@ class RowStage(ParameterStage):
 
     def __init__(self, parts: Parts, gradients: dict[Any, Any]) -> None:
         super().__init__(parts, gradients)
-        self._settings = gather(RowSettings, parts.work.model)
-        self._ranges, self._losses = gather(RowRanges, parts.work.model), gather(Losses, parts.work.model)
         self._rows = foremost_rows(parts.work)
 
     def launch(self, at: Substep) -> None:
-        work, m, d = self.parts.work, self.parts.work.model, at.data
-        wp.launch(
-            pull_row_parameters,
-            dim=(work.nworld, work.lanes(self._rows)),
-            inputs=[
-                m.opt.timestep,
-                m.opt.disableflags,
-                work.joints,
-                self._settings,
-                self._ranges,
-                self._rows,
-                work.lanes(self._rows),
-                work.live,
-                d.nefc,
-                at.rows,
-                self.parts.laws.jacobian(at),
-                work.laws,
-                at.state,
-                work.multipliers.lam,
-                d.ten_length,
-            ],
-            outputs=self.gradients,
-        )
-        wp.launch(
-            pull_absent_friction,
-            dim=(work.nworld, work.lanes(m.nv + m.ntendon)),
-            inputs=[
-                m.nv,
-                m.opt.timestep,
-                m.opt.disableflags,
-                self._settings,
-                self._losses,
-                work.tendon_rows,
-                m.nv + m.ntendon,
-                work.lanes(m.nv + m.ntendon),
-                work.live,
-                at.state,
-                work.multipliers.lam,
-                d.ten_J,
-            ],
-            outputs=self.gradients[:1],
-        )
+        work, m = self.work, self.work.model
+        work.launch_lanes(pull_row_parameters, self._rows, at, *self.gradients, lam=work.multipliers.lam)
+        work.launch_lanes(pull_absent_friction, m.nv + m.ntendon, at, *self.gradients, lam=work.multipliers.lam)

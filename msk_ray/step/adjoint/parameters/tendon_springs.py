@@ -1,12 +1,10 @@
 """Stiffness, damping and rest length of tendons: Φ ∋ ρ(λ) (k(x) x + c ρ(v)), and h κ c with implicit integration."""
 
-from typing import Any
-
 import warp as wp
 
-from msk_ray.step.adjoint.groups import Multipliers, State, Substep, TendonRows, gather
+from msk_ray.step.adjoint.groups import Multipliers, State, Substep, TendonRows
 from msk_ray.step.adjoint.laws.tendons import PassiveTendons, implicit_pairs, stretch_of, tendon_rate
-from msk_ray.step.adjoint.parameters.base import ParameterStage, Parts
+from msk_ray.step.adjoint.parameters.base import ParameterStage
 from msk_ray.step.forward.mjw_private import poly_force_deriv
 
 wp.set_module_options({"enable_backward": False})
@@ -70,28 +68,5 @@ class TendonStage(ParameterStage):
 
     kinds = (TendonGradients,)
 
-    def __init__(self, parts: Parts, gradients: dict[Any, Any]) -> None:
-        super().__init__(parts, gradients)
-        self._passive = gather(PassiveTendons, parts.work.model)
-
     def launch(self, at: Substep) -> None:
-        work, m, d, settings = self.parts.work, self.parts.work.model, at.data, self.parts.work.settings
-        wp.launch(
-            pull_tendon_parameters,
-            dim=(work.nworld, m.ntendon),
-            inputs=[
-                m.opt.timestep,
-                settings.spring,
-                settings.damper,
-                settings.implicit_all,
-                work.tendon_rows,
-                self._passive,
-                work.tables.inertia_address,
-                work.live,
-                at.state,
-                d.ten_J,
-                d.ten_length,
-                work.multipliers,
-            ],
-            outputs=self.gradients,
-        )
+        self.work.launch(pull_tendon_parameters, (self.work.nworld, self.work.model.ntendon), at, *self.gradients)

@@ -17,7 +17,7 @@ wp.set_module_options({"enable_backward": False})
 def pull_step_of_position(
     # In:
     live_in: wp.array[int],
-    qpos_bar_in: wp.array2d[float],
+    grad_qpos_in: wp.array2d[float],
     qvel_next_in: wp.array2d[float],
     # Out:
     gradient_out: TimestepGradient,
@@ -25,7 +25,7 @@ def pull_step_of_position(
     """h̄ += q̄'·v' of one dof, in tangent coordinates at q'."""
     worldid, j = wp.tid()
     if live_in[worldid] != 0:
-        wp.atomic_add(gradient_out.timestep, worldid, qpos_bar_in[worldid, j] * qvel_next_in[worldid, j])
+        wp.atomic_add(gradient_out.timestep, worldid, grad_qpos_in[worldid, j] * qvel_next_in[worldid, j])
 
 
 @wp.kernel
@@ -35,7 +35,7 @@ def pull_step_of_velocity(
     inertia_address: wp.array2d[int],
     # In:
     live_in: wp.array[int],
-    inertia_in: wp.array2d[float],
+    M_in: wp.array2d[float],
     rhs_in: wp.array2d[float],
     state_in: State,
     multipliers_in: Multipliers,
@@ -50,7 +50,7 @@ def pull_step_of_velocity(
     for i in range(inertia_address.shape[0]):
         address = inertia_address[wp.max(i, j), wp.min(i, j)]
         if address >= 0:
-            lost += inertia_in[worldid, address] * multipliers_in.excess[worldid, i]
+            lost += M_in[worldid, address] * multipliers_in.excess[worldid, i]
     smooth = state_in.qacc[worldid, j] - multipliers_in.excess[worldid, j]
     slope = rhs_in[worldid, j] * smooth - multipliers_in.mu[worldid, j] * lost
     wp.atomic_add(gradient_out.timestep, worldid, slope / opt_timestep[worldid % opt_timestep.shape[0]])
@@ -62,27 +62,7 @@ class TimestepStage(ParameterStage):
     kinds = (TimestepGradient,)
 
     def launch_first(self, at: Substep, qvel_next: wp.array) -> None:
-        work = self.parts.work
-        wp.launch(
-            pull_step_of_position,
-            dim=(work.nworld, work.model.nv),
-            inputs=[work.live, work.grad_qpos, qvel_next],
-            outputs=self.gradients,
-        )
+        self.work.launch(pull_step_of_position, self.work.rhs.shape, at, *self.gradients, qvel_next=qvel_next)
 
     def launch(self, at: Substep) -> None:
-        work, m = self.parts.work, self.parts.work.model
-        wp.launch(
-            pull_step_of_velocity,
-            dim=(work.nworld, m.nv),
-            inputs=[
-                m.opt.timestep,
-                work.tables.inertia_address,
-                work.live,
-                at.data.M,
-                self.parts.integrator.rhs,
-                at.state,
-                work.multipliers,
-            ],
-            outputs=self.gradients,
-        )
+        self.work.launch(pull_step_of_velocity, self.work.rhs.shape, at, *self.gradients)

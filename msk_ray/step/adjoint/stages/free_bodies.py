@@ -13,15 +13,8 @@ import math
 import warp as wp
 
 from msk_ray.step.adjoint.groups import DofSlopes, Motion, Multipliers, State, Substep
-from msk_ray.step.adjoint.laws.fluid import (
-    FluidBodies,
-    body_frame,
-    drag_of,
-    drag_slope,
-    flow_past,
-    fluid_bodies,
-    seen_from,
-)
+from msk_ray.step.adjoint.laws.fluid import FluidBodies, body_frame, drag_of, drag_slope, flow_past, seen_from
+from msk_ray.step.adjoint.spatial import three
 from msk_ray.step.adjoint.workspace import Workspace
 from msk_ray.step.forward.mjw_private import lu_factor_6x6, lu_solve_6x6, mat66, poly_force_deriv, vec6, vec10
 
@@ -57,15 +50,15 @@ class Gyro:
 
 
 @wp.func
-def inertia_block(free: FreeBodies, dof: int, worldid: int, inertia_in: wp.array2d[float]) -> mat66:
+def inertia_block(free: FreeBodies, dof: int, worldid: int, M_in: wp.array2d[float]) -> mat66:
     """The body's block of M."""
     block = mat66(0.0)
     for i in range(6):
         for j in range(i + 1):
             address = free.inertia_address[dof + i, dof + j]
             if address >= 0:
-                block[i, j] = inertia_in[worldid, address]
-                block[j, i] = inertia_in[worldid, address]
+                block[i, j] = M_in[worldid, address]
+                block[j, i] = M_in[worldid, address]
     return block
 
 
@@ -93,7 +86,7 @@ def gyro_of(
     shift = gyro.mass * (wp.dot(s, s) * wp.identity(n=3, dtype=float) - wp.outer(s, s))
     gyro.inertia = back @ about_centre @ gyro.frame + shift
     dof = free.body_dofadr[body] + 3
-    gyro.spin = wp.vec3(qvel_in[worldid, dof], qvel_in[worldid, dof + 1], qvel_in[worldid, dof + 2])
+    gyro.spin = three(qvel_in, worldid, dof)
     return gyro
 
 
@@ -172,7 +165,7 @@ def hold_free_rows(
     # Model:
     free: FreeBodies,
     # In:
-    inertia_in: wp.array2d[float],
+    M_in: wp.array2d[float],
     # Out:
     step_out: wp.array2d[float],
 ) -> None:
@@ -183,7 +176,7 @@ def hold_free_rows(
         for j in range(i + 1):
             address = free.inertia_address[dof + i, dof + j]
             if address >= 0:
-                step_out[worldid, address] = inertia_in[worldid, address]
+                step_out[worldid, address] = M_in[worldid, address]
 
 
 @wp.kernel
@@ -194,7 +187,7 @@ def solve_free(
     damper_on: bool,
     fluid_on: bool,
     # In:
-    inertia_in: wp.array2d[float],
+    M_in: wp.array2d[float],
     xpos_in: wp.array2d[wp.vec3],
     xmat_in: wp.array2d[wp.mat33],
     damping_in: wp.array2d[wp.vec3],
@@ -214,7 +207,7 @@ def solve_free(
     step = h * implicit_step(
         free, bodies, body, worldid, damper_on, fluid_on, gyro, xmat_in, damping_in, motion_in, state_in.qvel
     )
-    matrix = inertia_block(free, dof, worldid, inertia_in) + step
+    matrix = inertia_block(free, dof, worldid, M_in) + step
     rhs = vec6(0.0)
     acc = vec6(0.0)
     for i in range(6):
@@ -236,7 +229,7 @@ def push_free(
     # Model:
     free: FreeBodies,
     # In:
-    inertia_in: wp.array2d[float],
+    M_in: wp.array2d[float],
     mu_in: wp.array2d[float],
     # Out:
     push_out: wp.array2d[float],
@@ -247,54 +240,26 @@ def push_free(
     mu = vec6(0.0)
     for i in range(6):
         mu[i] = mu_in[worldid, dof + i]
-    push = inertia_block(free, dof, worldid, inertia_in) @ mu
+    push = inertia_block(free, dof, worldid, M_in) @ mu
     for i in range(6):
         push_out[worldid, dof + i] = push[i]
 
 
 class FreeBodySolves:
-    """Launches of the free bodies' own systems.
+    """Launches of the free bodies' own systems."""
 
-    Args:
-        damping: each dof's damping coefficients, shape (W, nv), vec3.
-        rhs: h v̄', shape (W, nv).
-    """
-
-    def __init__(self, work: Workspace, damping: wp.array, rhs: wp.array) -> None:
-        self._work, self._damping, self._rhs = work, damping, rhs
-        self._bodies = fluid_bodies(work)
-        self._free = free = FreeBodies()
-        free.free_body, free.body_subtree_end = work.tables.free_body, work.tables.body_subtree_end
-        free.body_dofadr, free.inertia_address = work.model.body_dofadr, work.tables.inertia_address
+    def __init__(self, work: Workspace) -> None:
+        self._work = work
         self._shape = (work.nworld, work.tables.free_body.size)
 
     def hold(self, at: Substep, step: wp.array) -> None:
         """Launch M into the rows of `step` that belong to free bodies, M + hB in M's sparse layout."""
-        wp.launch(hold_free_rows, dim=self._shape, inputs=[self._free, at.data.M], outputs=[step])
+        self._work.launch(hold_free_rows, self._shape, at, step=step)
 
     def launch(self, at: Substep) -> None:
         """Launch μ, a - â and the slopes of B."""
-        work, d = self._work, at.data
-        wp.launch(
-            solve_free,
-            dim=self._shape,
-            inputs=[
-                self._free,
-                self._bodies,
-                work.settings.damper,
-                work.settings.fluid,
-                d.M,
-                d.xpos,
-                d.xmat,
-                self._damping,
-                at.motion,
-                at.state,
-                self._rhs,
-            ],
-            outputs=[work.multipliers, work.slopes],
-        )
+        self._work.launch(solve_free, self._shape, at)
 
     def push(self, at: Substep, push: wp.array) -> None:
         """Launch M μ of free bodies into `push`, shape (W, nv)."""
-        inputs = [self._free, at.data.M, self._work.multipliers.mu]
-        wp.launch(push_free, dim=self._shape, inputs=inputs, outputs=[push])
+        self._work.launch(push_free, self._shape, at, mu=self._work.multipliers.mu, push=push)

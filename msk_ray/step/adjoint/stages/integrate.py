@@ -6,7 +6,8 @@ Rotations are perturbed on the right (body frame), as MuJoCo's ball and free joi
 import warp as wp
 from mujoco_warp import JointType
 
-from msk_ray.step.adjoint.groups import DofSlopes, Joints, Substep, gather
+from msk_ray.step.adjoint.groups import DofSlopes, Joints, Substep
+from msk_ray.step.adjoint.spatial import three
 from msk_ray.step.adjoint.workspace import Workspace
 from msk_ray.step.forward.mjw_private import dof_damping_total, poly_force_deriv
 
@@ -67,13 +68,13 @@ def pull_position(
     opt_timestep: wp.array[float],
     joints: Joints,
     dampers: DofDampers,
-    implicit_damping: bool,
+    euler_damping: bool,
     # In:
     qvel_in: wp.array2d[float],
     qvel_next_in: wp.array2d[float],
     # Out:
     damping_out: wp.array2d[wp.vec3],
-    step_out: wp.array2d[float],
+    damping_step_out: wp.array2d[float],
     grad_qpos_out: wp.array2d[float],
     grad_qvel_out: wp.array2d[float],
     rhs_out: wp.array2d[float],
@@ -95,8 +96,8 @@ def pull_position(
     elif kind == JointType.BALL:
         count = int(3)
     if kind == JointType.FREE or kind == JointType.BALL:
-        g = wp.vec3(grad_qpos_out[worldid, turn], grad_qpos_out[worldid, turn + 1], grad_qpos_out[worldid, turn + 2])
-        phi = h * wp.vec3(qvel_next_in[worldid, turn], qvel_next_in[worldid, turn + 1], qvel_next_in[worldid, turn + 2])
+        g = three(grad_qpos_out, worldid, turn)
+        phi = h * three(qvel_next_in, worldid, turn)
         # R' = R Exp(hω')  ⇒  δ̄ = Exp(hω') δ̄' ,  ω̄' += h Jr(hω')ᵀ δ̄'
         back = rotation_pullback(phi, g)
         rate = rate_pullback(phi, g)
@@ -125,9 +126,9 @@ def pull_position(
         )
         damping_out[worldid, j] = wp.vec3(linear, poly[0], poly[1])
         # hB = h d(c(|v|) v)/dv, the damping that the Euler integrator treats implicitly
-        step_out[worldid, j] = 0.0
-        if implicit_damping:
-            step_out[worldid, j] = h * poly_force_deriv(linear, poly, qvel_in[worldid, j], 1)
+        damping_step_out[worldid, j] = 0.0
+        if euler_damping:
+            damping_step_out[worldid, j] = h * poly_force_deriv(linear, poly, qvel_in[worldid, j], 1)
         slopes_out.qpos[worldid, j] = 0.0
         slopes_out.qvel[worldid, j] = 0.0
 
@@ -154,9 +155,9 @@ def project(
         v += 3
     if kind == JointType.FREE or kind == JointType.BALL:
         w = qpos_in[worldid, q]
-        u = wp.vec3(qpos_in[worldid, q + 1], qpos_in[worldid, q + 2], qpos_in[worldid, q + 3])
+        u = three(qpos_in, worldid, q + 1)
         gw = raw_in[worldid, q]
-        gu = wp.vec3(raw_in[worldid, q + 1], raw_in[worldid, q + 2], raw_in[worldid, q + 3])
+        gu = three(raw_in, worldid, q + 1)
         # d(q⊗exp δ)/dδ at 0 is ½ q⊗[0, ·]  ⇒  δ̄ = ½ (w ḡ - ḡ_w u - u × ḡ)
         g = 0.5 * (w * gu - gw * u - wp.cross(u, gu))
         for i in range(3):
@@ -190,8 +191,8 @@ def lift(
         v += 3
     if kind == JointType.FREE or kind == JointType.BALL:
         w = qpos_in[worldid, q]
-        u = wp.vec3(qpos_in[worldid, q + 1], qpos_in[worldid, q + 2], qpos_in[worldid, q + 3])
-        g = wp.vec3(tangent_in[worldid, v], tangent_in[worldid, v + 1], tangent_in[worldid, v + 2])
+        u = three(qpos_in, worldid, q + 1)
+        g = three(tangent_in, worldid, v)
         square = w * w + wp.dot(u, u)
         if wp.abs(square - 1.0) > UNIT_ROUNDING:
             g /= square
@@ -207,8 +208,8 @@ def lift(
 def mark_live(
     # In:
     qpos_in: wp.array2d[float],
-    qvel_in: wp.array2d[float],
-    act_in: wp.array2d[float],
+    grad_qvel_in: wp.array2d[float],
+    grad_act_in: wp.array2d[float],
     # Out:
     live_out: wp.array[int],
 ) -> None:
@@ -218,11 +219,11 @@ def mark_live(
     for i in range(qpos_in.shape[1]):
         if qpos_in[worldid, i] != 0.0:
             live = int(1)
-    for i in range(qvel_in.shape[1]):
-        if qvel_in[worldid, i] != 0.0:
+    for i in range(grad_qvel_in.shape[1]):
+        if grad_qvel_in[worldid, i] != 0.0:
             live = int(1)
-    for i in range(act_in.shape[1]):
-        if act_in[worldid, i] != 0.0:
+    for i in range(grad_act_in.shape[1]):
+        if grad_act_in[worldid, i] != 0.0:
             live = int(1)
     live_out[worldid] = live
 
@@ -282,63 +283,31 @@ class Integrator:
     """Launches of the integration of positions, and of what begins and ends an env step's pullback.
 
     Attributes:
-        rhs: h v̄', shape (W, nv).
-        damping: each dof's damping coefficients (c₀, c₁, c₂), shape (W, nv), vec3.
         damping_step: hB where it is diagonal, shape (W, nv).
     """
 
     def __init__(self, work: Workspace) -> None:
         self._work = work
-        shape = (work.nworld, work.mjm.nv)
-        self._dampers = gather(DofDampers, work.model)
-        self.rhs, self.damping_step = wp.zeros(shape, dtype=float), wp.zeros(shape, dtype=float)
-        self.damping = wp.zeros(shape, dtype=wp.vec3)
+        self.damping_step = wp.zeros((work.nworld, work.mjm.nv), dtype=float)
 
     def start(self, qpos: wp.array, raw_qpos: wp.array) -> None:
         """Launch the change of a raw cotangent (W, nq) at `qpos` to tangent coordinates, and find the live worlds."""
         work = self._work
-        wp.launch(
-            project,
-            dim=(work.nworld, work.model.njnt),
-            inputs=[work.joints, qpos, raw_qpos],
-            outputs=[work.grad_qpos],
-        )
-        wp.launch(mark_live, dim=work.nworld, inputs=[raw_qpos, work.grad_qvel, work.grad_act], outputs=[work.live])
+        work.launch(project, (work.nworld, work.model.njnt), None, qpos=qpos, raw=raw_qpos, tangent=work.grad_qpos)
+        work.launch(mark_live, work.nworld, None, qpos=raw_qpos)
         work.grad_ctrl.zero_()
 
     def finish(self, qpos: wp.array, raw_qpos: wp.array) -> None:
         """Launch the change of the tangent gradient at `qpos` to raw coordinates (W, nq)."""
         work = self._work
-        wp.launch(
-            lift,
-            dim=(work.nworld, work.model.njnt),
-            inputs=[work.joints, qpos, work.grad_qpos],
-            outputs=[raw_qpos],
-        )
+        work.launch(lift, (work.nworld, work.model.njnt), None, qpos=qpos, tangent=work.grad_qpos, raw=raw_qpos)
 
     def clip(self, bound: float, clipped: wp.array) -> None:
         """Launch the bound on each world's state cotangent; `clipped` (W,) counts where it acted."""
-        work = self._work
-        wp.launch(
-            clip_norm,
-            dim=work.nworld,
-            inputs=[bound],
-            outputs=[work.grad_qpos, work.grad_qvel, work.grad_act, clipped],
-        )
+        self._work.launch(clip_norm, self._work.nworld, None, bound=bound, clipped=clipped)
 
     def launch(self, at: Substep, qvel_next: wp.array) -> None:
         """Launch the pullback of q' = q ⊕ h v' and the right-hand side of the first linear system."""
         work = self._work
-        wp.launch(
-            pull_position,
-            dim=(work.nworld, work.model.njnt),
-            inputs=[
-                work.model.opt.timestep,
-                work.joints,
-                self._dampers,
-                work.settings.euler_damping,
-                at.state.qvel,
-                qvel_next,
-            ],
-            outputs=[self.damping, self.damping_step, work.grad_qpos, work.grad_qvel, self.rhs, work.slopes],
-        )
+        named = {"qvel": at.state.qvel, "qvel_next": qvel_next, "damping_step": self.damping_step}
+        work.launch(pull_position, (work.nworld, work.model.njnt), at, **named)

@@ -13,7 +13,7 @@ def residual_squares(
     # Model:
     inertia_address: wp.array2d[int],
     # In:
-    inertia_in: wp.array2d[float],
+    M_in: wp.array2d[float],
     qacc_in: wp.array2d[float],
     smooth_in: wp.array2d[float],
     constraint_in: wp.array2d[float],
@@ -27,7 +27,7 @@ def residual_squares(
     for j in range(inertia_address.shape[0]):
         address = inertia_address[wp.max(i, j), wp.min(i, j)]
         if address >= 0:
-            product += inertia_in[worldid, address] * qacc_in[worldid, j]
+            product += M_in[worldid, address] * qacc_in[worldid, j]
     tau = smooth_in[worldid, i]
     push = constraint_in[worldid, i]
     r = product - tau - push

@@ -11,7 +11,8 @@ import mujoco_warp as mjw
 import warp as wp
 from mujoco_warp import DynType, JointType
 
-from msk_ray.step.adjoint.groups import Joints, allocate_rows, gather
+from msk_ray.step.adjoint.groups import Joints, allocate_rows
+from msk_ray.step.adjoint.spatial import four, three
 from msk_ray.step.adjoint.workspace import Workspace
 from msk_ray.step.forward.mjw_private import deriv_expmap, quat_integrate, vec10
 
@@ -70,12 +71,6 @@ def straight_dofs(joints: Joints, jnt: int) -> int:
 
 
 @wp.func
-def three(x: wp.array2d[float], worldid: int, first: int) -> wp.vec3:
-    """Three neighbours of a row."""
-    return wp.vec3(x[worldid, first], x[worldid, first + 1], x[worldid, first + 2])
-
-
-@wp.func
 def act_step(activations: Activations, worldid: int, uid: int, h: float) -> float:
     """How long ȧct acts: h, or less where the filter is integrated exactly."""
     if activations.actuator_dyntype[uid] != DynType.FILTEREXACT:
@@ -112,12 +107,7 @@ def next_stage(
             qvel_out[worldid, v + i] = first_in.qvel[worldid, v + i] + h * a * last_in.qacc[worldid, v + i]
         if turn >= 0:
             q += straight
-            quat = wp.quat(
-                first_in.qpos[worldid, q],
-                first_in.qpos[worldid, q + 1],
-                first_in.qpos[worldid, q + 2],
-                first_in.qpos[worldid, q + 3],
-            )
+            quat = four(first_in.qpos, worldid, q)
             quat = quat_integrate(quat, a * three(last_in.rate, worldid, turn), h)
             for i in range(4):
                 qpos_out[worldid, q + i] = quat[i]
@@ -161,14 +151,11 @@ class Stages:
     """Buffers of the four stages, and the launches that fill them.
 
     Attributes:
-        joints, activations: groups of the model.
         items: the stages.
     """
 
     def __init__(self, work: Workspace) -> None:
         self._work = work
-        self.joints = work.joints
-        self.activations = gather(Activations, work.model)
         widths = {"qpos": work.mjm.nq, "act": work.mjm.na, "act_dot": work.mjm.na}
         self.items = [allocate_rows(Stage, work.nworld, widths, work.mjm.nv) for _ in range(4)]
 
@@ -180,21 +167,13 @@ class Stages:
         for k, stage in enumerate(self.items):
             a, last = (A[k - 1], self.items[k - 1]) if k else (0.0, first)
             if k:
-                wp.launch(
-                    next_stage,
-                    dim=(work.nworld, threads),
-                    inputs=[m.opt.timestep, self.joints, self.activations, a, first, last],
-                    outputs=[data.qpos, data.qvel, data.act],
-                )
+                state = {"qpos": data.qpos, "qvel": data.qvel, "act": data.act}
+                work.launch(next_stage, (work.nworld, threads), None, a=a, first=first, last=last, **state)
             mjw.forward(m, data)
             for name in ("qpos", "qvel", "act", "qacc", "act_dot"):
                 wp.copy(getattr(stage, name), getattr(data, name))
-            wp.launch(
-                stage_rates,
-                dim=(work.nworld, m.njnt),
-                inputs=[m.opt.timestep, self.joints, a, data.qvel, last.rate],
-                outputs=[stage.rate],
-            )
+            rates = {"qvel": data.qvel, "last_rate": last.rate, "rate": stage.rate}
+            work.launch(stage_rates, (work.nworld, m.njnt), None, a=a, **rates)
 
     def restore(self, k: int, data: Any) -> None:
         """Launch the copy of a stage's state and acceleration into `data`."""

@@ -14,6 +14,7 @@ import warp as wp
 
 from msk_ray.step.adjoint.groups import Joints, allocate_rows
 from msk_ray.step.adjoint.laws.joint_springs import log_rate_pullback
+from msk_ray.step.adjoint.spatial import three
 from msk_ray.step.adjoint.stages.integrate import rate_pullback, rotation_pullback
 from msk_ray.step.adjoint.stages.recompute import recompute_stages
 from msk_ray.step.adjoint.stages.rk_stages import (
@@ -23,7 +24,6 @@ from msk_ray.step.adjoint.stages.rk_stages import (
     Stages,
     act_step,
     straight_dofs,
-    three,
     turning_dof,
 )
 from msk_ray.step.adjoint.step import StepAdjoint
@@ -276,39 +276,19 @@ class RungeKutta:
             extras: further gradients that a StepAdjoint's `pull_back` takes.
         """
         adjoint, work, m = self._adjoint, self._work, self._work.model
-        joints, activations, stages = self._stages.joints, self._stages.activations, self._stages.items
-        gradients = [adjoint.grad_qpos, adjoint.grad_qvel, adjoint.grad_act]
+        stages = self._stages.items
         self._stages.launch(data)
-        wp.launch(
-            start_bars,
-            dim=(work.nworld, max(m.njnt, m.nactuator)),
-            inputs=[m.opt.timestep, joints, activations, *stages, *gradients],
-            outputs=[self._bars],
-        )
+        named = {f"stage{k + 1}": stage for k, stage in enumerate(stages)}
+        work.launch(start_bars, (work.nworld, max(m.njnt, m.nactuator)), None, self._bars, **named)
         shape = (work.nworld, max(m.njnt, work.mjm.na))
         counted = adjoint.touch_counter.substep
         for k in reversed(range(4)):
             if k < 3:
                 self._stages.restore(k, data)
                 recompute_stages(work.mjm, m, data, work.stages)
-            wp.launch(
-                enter_stage,
-                dim=shape,
-                inputs=[m.opt.timestep, joints, A[k] if k < 3 else 0.0, _B[k], stages[k].rate],
-                outputs=[self._bars, *gradients],
-            )
+            work.launch(enter_stage, shape, None, self._bars, a=A[k] if k < 3 else 0.0, b=_B[k], rate=stages[k].rate)
             adjoint.touch_counter.substep = counted  # the stages of a substep count as one
             adjoint.pull_back(data, data.qvel, *extras)
-            before = (A[k - 1], stages[k - 1].rate) if k else (0.0, stages[0].rate)
-            wp.launch(
-                leave_stage,
-                dim=shape,
-                inputs=[m.opt.timestep, joints, before[0], *gradients, stages[k].qvel, before[1]],
-                outputs=[self._bars],
-            )
-        wp.launch(
-            finish_bars,
-            dim=(work.nworld, max(work.mjm.nv, work.mjm.na)),
-            inputs=[adjoint.live, self._bars],
-            outputs=gradients,
-        )
+            last = {"a": A[k - 1], "last_rate": stages[k - 1].rate} if k else {"a": 0.0, "last_rate": stages[0].rate}
+            work.launch(leave_stage, shape, None, self._bars, qvel=stages[k].qvel, **last)
+        work.launch(finish_bars, (work.nworld, max(work.mjm.nv, work.mjm.na)), None, self._bars)

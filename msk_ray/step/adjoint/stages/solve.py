@@ -1,7 +1,5 @@
 """The two linear systems of a substep: (M + hB) μ = h v̄' and H λ = M μ with H = M + JᵀSJ."""
 
-from typing import Any
-
 import warp as wp
 
 from msk_ray.step.adjoint.groups import Substep
@@ -25,7 +23,7 @@ def build_matrices(
     inertia_address: wp.array2d[int],
     # In:
     nefc_in: wp.array[int],
-    inertia_in: wp.array2d[float],
+    M_in: wp.array2d[float],
     step_in: wp.array2d[float],
     step_dense: bool,
     jacobian_in: wp.array3d[float],
@@ -45,7 +43,7 @@ def build_matrices(
     address = inertia_address[i, j]
     entry = float(0.0)
     if address >= 0:
-        entry = inertia_in[worldid, address]
+        entry = M_in[worldid, address]
     implicit = entry
     if step_dense:
         if address >= 0:
@@ -93,7 +91,7 @@ def damping_product(
     # Model:
     inertia_address: wp.array2d[int],
     # In:
-    inertia_in: wp.array2d[float],
+    M_in: wp.array2d[float],
     step_in: wp.array2d[float],
     x_in: wp.array2d[float],
     start_in: wp.array2d[float],
@@ -107,7 +105,7 @@ def damping_product(
     for j in range(x_in.shape[1]):
         address = inertia_address[wp.max(i, j), wp.min(i, j)]
         if address >= 0:
-            total += (step_in[worldid, address] - inertia_in[worldid, address]) * x_in[worldid, j]
+            total += (step_in[worldid, address] - M_in[worldid, address]) * x_in[worldid, j]
     y_out[worldid, i] = scale_in * total
     if scale_in < 0.0:
         y_out[worldid, i] = start_in[worldid, i] + scale_in * total
@@ -185,7 +183,7 @@ class LinearSystems:
             self._step = wp.zeros((worlds, work.model.nC), dtype=float)
             self._push = wp.zeros((worlds, nv), dtype=float)
             alone = work.tables.free_body.size > 0
-            self._free = FreeBodySolves(work, integrator.damping, integrator.rhs) if alone else None
+            self._free = FreeBodySolves(work) if alone else None
 
     def launch(self, at: Substep) -> None:
         """Launch the matrices and their solves."""
@@ -195,26 +193,14 @@ class LinearSystems:
             work.stages.slopes(m, d, self._step)
             if self._free is not None:
                 self._free.hold(at, self._step)
-        wp.launch(
-            build_matrices,
-            dim=(work.nworld, m.nv, m.nv),
-            inputs=[
-                settings.elliptic,
-                work.tables.inertia_address,
-                d.nefc,
-                d.M,
-                self._step if settings.implicit_all else self._integrator.damping_step,
-                settings.implicit_all,
-                self._laws.jacobian(at),
-                work.laws.slope,
-                self._laws.scaled,
-            ],
-            outputs=[self._implicit, self._hessian],
-        )
+        named = {"coupled": settings.elliptic, "step_dense": settings.implicit_all, "slope": work.laws.slope}
+        named |= {"step": self._step if settings.implicit_all else self._integrator.damping_step}
+        named |= {"scaled": self._laws.scaled, "implicit": self._implicit, "hessian": self._hessian}
+        work.launch(build_matrices, (work.nworld, m.nv, m.nv), at, **named)
         if settings.implicit_all:
             self._solve_implicit(at)
             return
-        inputs = [self._implicit, self._hessian, self._integrator.rhs, self._integrator.damping_step, d.qacc]
+        inputs = [self._implicit, self._hessian, work.rhs, self._integrator.damping_step, d.qacc]
         outputs = [work.multipliers.mu, work.multipliers.excess, work.multipliers.lam]
         if m.nv <= TILE_LIMIT:
             wp.launch_tiled(solve_tiled(m.nv), dim=work.nworld, inputs=inputs, outputs=outputs, block_dim=_BLOCK)
@@ -223,24 +209,20 @@ class LinearSystems:
 
     def _solve_implicit(self, at: Substep) -> None:
         """μ, a - â and λ where B is a matrix: (M + hB)(a - â) = hB a ,  H λ = h v̄' - hB μ."""
-        d, multipliers, rhs = at.data, self._work.multipliers, self._integrator.rhs
-        self._product(d, d.qacc, 1.0)
+        d, multipliers, rhs = at.data, self._work.multipliers, self._work.rhs
+        self._product(at, d.qacc, 1.0)
         self._solve_two(self._implicit, rhs, self._push, [multipliers.mu, multipliers.excess])
         if self._free is not None:
             self._free.launch(at)
-        self._product(d, multipliers.mu, -1.0)
+        self._product(at, multipliers.mu, -1.0)
         if self._free is not None:
             self._free.push(at, self._push)
         self._solve_two(self._hessian, self._push, self._push, [multipliers.lam, self._push])
 
-    def _product(self, d: Any, x: wp.array, scale: float) -> None:
+    def _product(self, at: Substep, x: wp.array, scale: float) -> None:
         work = self._work
-        wp.launch(
-            damping_product,
-            dim=(work.nworld, work.model.nv),
-            inputs=[work.tables.inertia_address, d.M, self._step, x, self._integrator.rhs, scale],
-            outputs=[self._push],
-        )
+        named = {"step": self._step, "x": x, "start": work.rhs, "scale": scale, "y": self._push}
+        work.launch(damping_product, (work.nworld, work.model.nv), at, **named)
 
     def _solve_two(self, matrix: wp.array, first: wp.array, second: wp.array, outputs: list[wp.array]) -> None:
         worlds, nv, inputs = self._work.nworld, self._work.model.nv, [matrix, first, second]

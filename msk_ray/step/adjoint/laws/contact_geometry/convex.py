@@ -4,12 +4,11 @@ The features that touch are found again from the contact (`patches`, `feet`), an
 (`convex_laws`). A contact that no law reproduces, or that has no derivative, as of two parallel edges, is counted.
 """
 
-import mujoco
 import warp as wp
 from mujoco_warp import GeomType
 
 from msk_ray.step.adjoint.coverage.approximated import Touches, count_touch
-from msk_ray.step.adjoint.groups import ContactBars, Contacts, Meshes, Shapes, Substep, gather
+from msk_ray.step.adjoint.groups import ContactBars, Contacts, FieldBars, Meshes, Shapes
 from msk_ray.step.adjoint.laws.contact_geometry.contact_order import contacts_end
 from msk_ray.step.adjoint.laws.contact_geometry.contact_point import Bars, ContactPoint
 from msk_ray.step.adjoint.laws.contact_geometry.convex_laws import (
@@ -37,7 +36,6 @@ from msk_ray.step.adjoint.laws.contact_geometry.solids import (
 )
 from msk_ray.step.adjoint.laws.contact_geometry.support_points import foot_of, ground_of, unit_of_length
 from msk_ray.step.adjoint.spatial import column, wrench
-from msk_ray.step.adjoint.workspace import Workspace
 from msk_ray.step.forward.mjw_private import make_frame
 
 wp.set_module_options({"enable_backward": False})
@@ -280,9 +278,9 @@ def pull_convex(
     subtree_com_in: wp.array2d[wp.vec3],
     contact_bars_in: ContactBars,
     # Out:
-    moved_bar_out: wp.array2d[wp.spatial_vector],
+    bars_out: FieldBars,
     touches_out: Touches,
-    wrenches_out: wp.array2d[wp.spatial_vector],
+    contact_wrenches_out: wp.array2d[wp.spatial_vector],
 ) -> None:
     """Cotangents of (dist, pos, frame) to wrenches on the two bodies whose displacement moves them."""
     start = wp.tid()
@@ -297,9 +295,9 @@ def pull_convex(
         bars = Bars()
         bars.dist = contact_bars_in.dist[con]
         bars.point = contact_bars_in.pos[con]
-        if wrenches_out.shape[0] > 0:
-            wrenches_out[con, 0] = wp.spatial_vector(wp.vec3(0.0), wp.vec3(0.0))
-            wrenches_out[con, 1] = wp.spatial_vector(wp.vec3(0.0), wp.vec3(0.0))
+        if contact_wrenches_out.shape[0] > 0:
+            contact_wrenches_out[con, 0] = wp.spatial_vector(wp.vec3(0.0), wp.vec3(0.0))
+            contact_wrenches_out[con, 1] = wp.spatial_vector(wp.vec3(0.0), wp.vec3(0.0))
         # A contact that pushes nothing, or whose world has no cotangent, has none either.
         if bars.dist == 0.0 and wp.dot(bars.point, bars.point) == 0.0:
             continue
@@ -315,48 +313,14 @@ def pull_convex(
         push, exact = convex_wrenches(solid1, solid2, meshes, contact, bars, native_ccd, multi_ccd)
         if not exact:
             count_touch(touches_out, worldid, substep, shapes.geom_type.shape[0], geoms[0], geoms[1], type1, type2)
-        if wrenches_out.shape[0] > 0:
-            wrenches_out[con, 0] = wrench(push.force1, push.torque1, contact.point - solid1.pos)
-            wrenches_out[con, 1] = wrench(push.force2, push.torque2, contact.point - solid2.pos)
+        if contact_wrenches_out.shape[0] > 0:
+            contact_wrenches_out[con, 0] = wrench(push.force1, push.torque1, contact.point - solid1.pos)
+            contact_wrenches_out[con, 1] = wrench(push.force2, push.torque2, contact.point - solid2.pos)
         body1 = shapes.geom_bodyid[geoms[0]]
         body2 = shapes.geom_bodyid[geoms[1]]
         if body1 > 0:
             arm = contact.point - subtree_com_in[worldid, shapes.body_rootid[body1]]
-            wp.atomic_add(moved_bar_out, worldid, body1, wrench(push.force1, push.torque1, arm))
+            wp.atomic_add(bars_out.moved, worldid, body1, wrench(push.force1, push.torque1, arm))
         if body2 > 0:
             arm = contact.point - subtree_com_in[worldid, shapes.body_rootid[body2]]
-            wp.atomic_add(moved_bar_out, worldid, body2, wrench(push.force2, push.torque2, arm))
-
-
-class ConvexContacts:
-    """Launches of the part of ∂Φ that goes through the geometry of convex pairs."""
-
-    def __init__(self, work: Workspace, contacts: int) -> None:
-        self._work, self._contacts = work, contacts
-        self._shapes, self._meshes = gather(Shapes, work.model), gather(Meshes, work.model)
-        disabled, bit = work.mjm.opt.disableflags, mujoco.mjtDisableBit
-        self._native_ccd = int(not disabled & bit.mjDSBL_NATIVECCD)
-        self._multi_ccd = int(not disabled & bit.mjDSBL_MULTICCD)
-
-    def launch(self, at: Substep, bars: ContactBars) -> None:
-        """Launch it; `bars` are the cotangents of the contacts' distances, points and frames."""
-        work, d = self._work, at.data
-        wp.launch(
-            pull_convex,
-            dim=self._contacts,
-            inputs=[
-                work.stages.ordered,
-                self._shapes,
-                self._meshes,
-                self._native_ccd,
-                self._multi_ccd,
-                work.touch_counter.substep,
-                d.nacon,
-                at.contacts,
-                d.geom_xpos,
-                d.geom_xmat,
-                d.subtree_com,
-                bars,
-            ],
-            outputs=[work.bars.moved, work.touch_counter.touches, work.contact_wrenches],
-        )
+            wp.atomic_add(bars_out.moved, worldid, body2, wrench(push.force2, push.torque2, arm))

@@ -17,7 +17,7 @@ import warp as wp
 from mujoco_warp import GeomType
 
 from msk_ray.step.adjoint.coverage.approximated import Touches, count_touch
-from msk_ray.step.adjoint.groups import ContactBars, Contacts, Shapes
+from msk_ray.step.adjoint.groups import ContactBars, Contacts, FieldBars, Shapes
 from msk_ray.step.adjoint.laws.contact_geometry.capsule_box import capsule_box_push
 from msk_ray.step.adjoint.laws.contact_geometry.contact_order import contacts_end
 from msk_ray.step.adjoint.laws.contact_geometry.contact_point import Bars, ContactPoint, Geom, PairPush
@@ -175,9 +175,9 @@ def pull_geometry_kernel(kinds: PairKinds) -> Any:
         subtree_com_in: wp.array2d[wp.vec3],
         contact_bars_in: ContactBars,
         # Out:
-        moved_bar_out: wp.array2d[wp.spatial_vector],
+        bars_out: FieldBars,
         touches_out: Touches,
-        wrenches_out: wp.array2d[wp.spatial_vector],
+        contact_wrenches_out: wp.array2d[wp.spatial_vector],
     ) -> None:
         """Cotangents of (dist, pos, frame) to wrenches on the two bodies whose displacement moves them."""
         start = wp.tid()
@@ -226,16 +226,16 @@ def pull_geometry_kernel(kinds: PairKinds) -> Any:
                                 touches_out, worldid, substep, ngeom, geoms[0], geoms[1], geom1.type, geom2.type
                             )
 
-            if wrenches_out.shape[0] > 0:
-                wrenches_out[con, 0] = wrench(push.force1, push.torque1, push.place1 - geom1.pos)
-                wrenches_out[con, 1] = wrench(push.force2, push.torque2, push.place2 - geom2.pos)
+            if contact_wrenches_out.shape[0] > 0:
+                contact_wrenches_out[con, 0] = wrench(push.force1, push.torque1, push.place1 - geom1.pos)
+                contact_wrenches_out[con, 1] = wrench(push.force2, push.torque2, push.place2 - geom2.pos)
             body1 = shapes.geom_bodyid[geoms[0]]
             body2 = shapes.geom_bodyid[geoms[1]]
             if body1 > 0:
                 arm1 = push.place1 - subtree_com_in[worldid, shapes.body_rootid[body1]]
-                wp.atomic_add(moved_bar_out, worldid, body1, wrench(push.force1, push.torque1, arm1))
+                wp.atomic_add(bars_out.moved, worldid, body1, wrench(push.force1, push.torque1, arm1))
             if body2 > 0:
                 arm2 = push.place2 - subtree_com_in[worldid, shapes.body_rootid[body2]]
-                wp.atomic_add(moved_bar_out, worldid, body2, wrench(push.force2, push.torque2, arm2))
+                wp.atomic_add(bars_out.moved, worldid, body2, wrench(push.force2, push.torque2, arm2))
 
     return pull_geometry
