@@ -4,12 +4,14 @@ Axes: W worlds, nv degrees of freedom, B bodies, T tendons, R constraint rows, C
 array is mujoco_warp's has its name there, so that `gather` finds it.
 """
 
+from collections.abc import Mapping
 from typing import Any
 
 import warp as wp
 
 from msk_ray.step.forward.arrays import allocate as allocate
 from msk_ray.step.forward.arrays import allocate_rows as allocate_rows
+from msk_ray.step.forward.arrays import empty as empty
 from msk_ray.step.forward.arrays import gather as gather
 from msk_ray.step.forward.mjw_private import vec5, vec10
 
@@ -206,17 +208,45 @@ class ContactBars:
     frame: wp.array[wp.mat33]
 
 
+@wp.struct
+class GeomGradients:
+    """Gradients by geom, (W, G)."""
+
+    geom_pos: wp.array2d[wp.vec3]
+    geom_quat: wp.array2d[wp.vec4]
+    geom_size: wp.array2d[wp.vec3]
+
+
+@wp.struct
+class TimestepGradient:
+    """Gradient of the time step, (W,), to which every law that has one adds its part."""
+
+    timestep: wp.array[float]
+
+
 class Substep:
     """What stages read of a `mujoco_warp.Data`, grouped; everything else is in `data`.
+
+    Args:
+        gradients: groups of gradients of parameters that are wanted, by their types.
 
     Attributes:
         jacobian: the constraint Jacobian, a full matrix from `ConstraintLaws` on, shape (W, njmax, nv or more).
     """
 
-    def __init__(self, data: Any) -> None:
+    def __init__(self, data: Any, gradients: Mapping[Any, Any] | None = None) -> None:
         self.data = data
+        self._gradients = gradients or {}
         self.state = gather(State, data)
         self.motion = gather(Motion, data)
         self.rows = gather(Rows, data.efc)
         self.contacts = gather(Contacts, data.contact)
         self.jacobian = data.efc.J
+
+    def wants(self, *kinds: Any) -> bool:
+        """Whether gradients of any of these groups are wanted."""
+        return any(kind in self._gradients for kind in kinds)
+
+    def gradient(self, kind: Any) -> Any:
+        """The group of gradients of this type; its arrays have no size where they are not wanted."""
+        return self._gradients[kind] if kind in self._gradients else empty(kind)

@@ -48,3 +48,11 @@ def turning_torque(mat: wp.mat33, bar: wp.mat33) -> wp.vec3:
     """dR = [ω] R  ⇒  torque Σ_k R_k × R̄_k over the columns."""
     out = wp.cross(column(mat, 0), column(bar, 0)) + wp.cross(column(mat, 1), column(bar, 1))
     return out + wp.cross(column(mat, 2), column(bar, 2))
+
+
+@wp.func
+def quat_gradient(q: wp.quat, g: wp.vec3) -> wp.vec4:
+    """2 q⊗[0, g]: the raw gradient of a unit quaternion (w, x, y, z) whose slope along local rotations is g."""
+    u = wp.vec3(q[1], q[2], q[3])
+    r = 2.0 * (q[0] * g + wp.cross(u, g))
+    return wp.vec4(-2.0 * wp.dot(u, g), r[0], r[1], r[2])

@@ -8,7 +8,7 @@ slope of the constraint forces):
     gradients of (q, v, act, u)  -=  ∂Φ/∂(q, v, act, u).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Protocol
 
@@ -44,6 +44,9 @@ _Launch = Callable[[Substep], None]
 
 class Watcher(Protocol):
     """What else is launched in a substep's pullback."""
+
+    gradients: Mapping[Any, Any]
+    """Groups of gradients that laws add to, by their types."""
 
     def launch_first(self, at: Substep, qvel_next: wp.array) -> None:
         """Launch its kernels while the cotangents are those of the state after the substep."""
@@ -129,7 +132,7 @@ class StepAdjoint:
             parameters: gradients of parameters of the model, if some are wanted.
         """
         self.touch_counter.substep += 1
-        at = Substep(data)
+        at = Substep(data, None if parameters is None else parameters.gradients)
         if parameters is not None:
             parameters.launch_first(at, qvel_next)
         self.integrator.launch(at, qvel_next)
@@ -154,8 +157,7 @@ def _forces(work: Workspace, contacts: ContactForces, actuators: ActuatorForces 
     stages: list[_Launch] = []
     if np.any(np.isin(work.mjm.eq_type, _ANCHORED)):
         stages.append(partial(launch_anchors, work))
-    if work.tables.has_scalar_rows:
-        stages.append(partial(launch_scalar_rows, work))
+    stages.append(partial(launch_scalar_rows, work))
     stages.append(contacts.launch)
     if actuators is not None:
         stages += [actuators.launch, partial(launch_transmissions, work, actuators.bars)]

@@ -28,6 +28,14 @@ def allocate(kind: Any, *shape: int) -> Any:
     return group
 
 
+def empty(kind: Any) -> Any:
+    """A group whose arrays have no size, on the current device."""
+    group = kind()
+    for name, field in kind.vars.items():
+        setattr(group, name, wp.zeros((0,) * field.type.ndim, dtype=field.type.dtype))
+    return group
+
+
 def allocate_rows(kind: Any, worlds: int, widths: Mapping[str, int], width: int) -> Any:
     """The same for arrays (worlds, width); `widths` gives other widths by field."""
     group = kind()

@@ -92,6 +92,21 @@ def test_parameters_of_a_feature(name):
         assert max(errors) < 1e-4, parameter
 
 
+def test_damping_of_a_tendon_on_a_free_body_is_explicit_as_in_the_step():
+    """C MuJoCo takes it implicitly, so the oracle is the step's own difference, which is linear in the damping."""
+    model = SCENES["fast_spinning_free"]()
+    sim, points = Simulation(model, 4, 1, tolerance=1e-12), random_points(model, 4, seed=5)
+    weights = torch.as_tensor(random_weights(model, 4, seed=2)["qvel"], dtype=torch.float32)
+
+    def score(damping: torch.Tensor) -> torch.Tensor:
+        return (sim.step(*inputs(points), parameters={"tendon_damping": damping}).qvel * weights).sum(1)
+
+    damping = torch.ones((4, 1), requires_grad=True)
+    (slope,) = torch.autograd.grad(score(damping).sum(), damping)
+    expected = (score(damping.detach() + 0.5) - score(damping.detach() - 0.5)).numpy()
+    assert relative(slope.numpy().ravel(), expected) < 1e-3
+
+
 _SOLIDS = """<mujoco><option timestep=".004"/><default><geom solref=".03 1" contype="0"/></default><worldbody>
 <geom type="plane" size="3 3 1" euler="3 2 0" contype="1"/>
 <geom name="below" type="box" pos="2 0 .1" size=".2 .3 .1" euler="5 3 0" contype="2"/>

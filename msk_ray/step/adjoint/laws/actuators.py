@@ -6,7 +6,7 @@ With m the moment, ρ(x) = m·x and κ = Σ m_i m_j μ_i â_j over the pairs of 
     F = gain(len, v) · drive + bias(len, v)   clamped; drive is the clamped control, act or act'.
 
 `actuator_score` is that law, act' included, and Warp differentiates it once, in `pull_actuators`: for the state, and
-for the law's own parameters if gradients of parameters are wanted.
+for the law's own parameters if their gradients are wanted.
 """
 
 from functools import cache
@@ -15,7 +15,7 @@ from typing import Any
 import warp as wp
 from mujoco_warp import BiasType, DynType, GainType, JointType, TrnType
 
-from msk_ray.step.adjoint.groups import DofSlopes, Multipliers, State, Substep, TendonBars, allocate
+from msk_ray.step.adjoint.groups import DofSlopes, Multipliers, State, Substep, TendonBars, TimestepGradient, allocate
 from msk_ray.step.adjoint.workspace import Workspace
 from msk_ray.step.forward.mjw_private import muscle_bias, muscle_dynamics, muscle_gain, muscle_gain_vel_deriv, vec10
 from msk_ray.step.forward.model_tree import motors_apart
@@ -242,13 +242,12 @@ class ActuatorBars:
 
 
 @wp.struct
-class ActuatorLawBars:
-    """-∂Φ by what the law of one actuator has of its own, (W, U); of no size unless they are wanted."""
+class ActuatorGradients:
+    """Gradients by actuator, (W, U)."""
 
-    gainprm: wp.array2d[vec10]
-    biasprm: wp.array2d[vec10]
-    dynprm: wp.array2d[vec10]
-    timestep: wp.array2d[float]
+    actuator_gainprm: wp.array2d[vec10]
+    actuator_biasprm: wp.array2d[vec10]
+    actuator_dynprm: wp.array2d[vec10]
 
 
 @wp.struct
@@ -347,8 +346,8 @@ def add_to_transmission(
 
 
 @cache
-def pull_actuators_kernel(keeps_law: bool) -> Any:
-    """The kernel that also leaves `ActuatorLawBars`, or the one that pays nothing for them."""
+def pull_actuators_kernel(keeps: bool) -> Any:
+    """The kernel that also adds gradients of the law's own parameters, or the one that pays nothing for them."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def pull_actuators(
@@ -372,7 +371,8 @@ def pull_actuators_kernel(keeps_law: bool) -> Any:
         slopes_out: DofSlopes,
         tendon_bars_out: TendonBars,
         bars_out: ActuatorBars,
-        law_bars_out: ActuatorLawBars,
+        gradients_out: ActuatorGradients,
+        timestep_out: TimestepGradient,
     ) -> None:
         """Gradients of ctrl and act, and cotangents of length and rates; `lanes` threads take all `count` actuators."""
         worldid, lane = wp.tid()
@@ -414,11 +414,13 @@ def pull_actuators_kernel(keeps_law: bool) -> Any:
             bars_out.length[worldid, uid] = -length_slope
             bars_out.rate[worldid, uid] = rate_bar
             bars_out.implicit[worldid, uid] = h * slope * rates.kappa
-            if wp.static(keeps_law):
-                law_bars_out.gainprm[worldid, uid] = law_bar.gainprm
-                law_bars_out.biasprm[worldid, uid] = law_bar.biasprm
-                law_bars_out.dynprm[worldid, uid] = law_bar.dynprm
-                law_bars_out.timestep[worldid, uid] = law_bar.timestep
+            if wp.static(keeps):
+                if live and gradients_out.actuator_gainprm.shape[0] > 0:
+                    gradients_out.actuator_gainprm[worldid, uid] += law_bar.gainprm
+                    gradients_out.actuator_biasprm[worldid, uid] += law_bar.biasprm
+                    gradients_out.actuator_dynprm[worldid, uid] += law_bar.dynprm
+                if live and timestep_out.timestep.shape[0] > 0:
+                    wp.atomic_add(timestep_out.timestep, worldid, law_bar.timestep)
             add_to_transmission(
                 worldid,
                 uid,
@@ -441,25 +443,17 @@ class ActuatorForces:
 
     Attributes:
         bars: what `transmission` and the gradient of gears take on.
-        law_bars: what the gradients of gain, bias and activation take on, once `keep_law` has been called.
     """
 
     def __init__(self, work: Workspace) -> None:
         self._work = work
         self.bars = allocate(ActuatorBars, work.nworld, work.model.nactuator)
-        self.law_bars = allocate(ActuatorLawBars, 0, 0)
-        self._keeps_law = False
         self._meet = not motors_apart(work.mjm)
-
-    def keep_law(self) -> None:
-        """Let launches recorded from now on write `law_bars`."""
-        if not self._keeps_law:
-            self._keeps_law = True
-            self.law_bars = allocate(ActuatorLawBars, self._work.nworld, self._work.model.nactuator)
 
     def launch(self, at: Substep) -> None:
         """Launch the pullback of all actuators."""
-        work, m = self._work, self._work.model
-        work.launch_lanes(
-            pull_actuators_kernel(self._keeps_law), m.nactuator, at, self.bars, self.law_bars, meet=self._meet
-        )
+        kinds = (ActuatorGradients, TimestepGradient)
+        kernel = pull_actuators_kernel(at.wants(*kinds))
+        groups = (self.bars, *(at.gradient(kind) for kind in kinds))
+        meet = self._meet or at.wants(TimestepGradient)
+        self._work.launch_lanes(kernel, self._work.model.nactuator, at, *groups, meet=meet)

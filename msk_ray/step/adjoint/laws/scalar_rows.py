@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import warp as wp
-from mujoco_warp import JointType
+from mujoco_warp import DisableBit, JointType
 
 from msk_ray.step.adjoint.groups import (
     DofSlopes,
@@ -15,8 +15,10 @@ from msk_ray.step.adjoint.groups import (
     Substep,
     TendonBars,
     TendonRows,
+    TimestepGradient,
 )
-from msk_ray.step.adjoint.laws.impedance import row_slopes
+from msk_ray.step.adjoint.laws.impedance import impedance, stiffness_damping
+from msk_ray.step.adjoint.laws.row_score import RowMotion, row_score
 from msk_ray.step.adjoint.laws.tendons import tendon_rate
 from msk_ray.step.adjoint.workspace import Workspace
 from msk_ray.step.forward.capacity import scalar_rows
@@ -76,6 +78,7 @@ class RowSettings:
     """Parameters of the rows of joints, dofs, tendons and equalities."""
 
     qpos0: wp.array2d[float]
+    jnt_range: wp.array2d[wp.vec2]
     jnt_solref: wp.array2d[wp.vec2]
     jnt_solimp: wp.array2d[vec5]
     dof_solref: wp.array2d[wp.vec2]
@@ -128,6 +131,72 @@ def solver_parameters(worldid: int, kind: int, ident: int, settings: RowSettings
     return out
 
 
+@wp.struct
+class RowGradients:
+    """Gradients by joint (W, njnt), dof (W, nv) and tendon (W, T)."""
+
+    dof_frictionloss: wp.array2d[float]
+    dof_solref: wp.array2d[wp.vec2]
+    dof_solimp: wp.array2d[vec5]
+    jnt_range: wp.array2d[wp.vec2]
+    jnt_solref: wp.array2d[wp.vec2]
+    jnt_solimp: wp.array2d[vec5]
+    tendon_frictionloss: wp.array2d[float]
+    tendon_solref_fri: wp.array2d[wp.vec2]
+    tendon_solimp_fri: wp.array2d[vec5]
+    tendon_range: wp.array2d[wp.vec2]
+    tendon_solref_lim: wp.array2d[wp.vec2]
+    tendon_solimp_lim: wp.array2d[vec5]
+
+
+@wp.func
+def add_row_gradients(
+    worldid: int,
+    kind: int,
+    ident: int,
+    bound: int,
+    solref_bar: wp.vec2,
+    solimp_bar: vec5,
+    bound_bar: float,
+    loss_bar: float,
+    gradients_out: RowGradients,
+) -> None:
+    """Adds gradients of one row's solver parameters, and of its friction loss or of bound 0 or 1 of its limit."""
+    range_bar = wp.vec2(0.0)
+    range_bar[bound] = bound_bar
+    if kind == ConstraintType.LIMIT_JOINT:
+        wp.atomic_add(gradients_out.jnt_solref, worldid, ident, solref_bar)
+        wp.atomic_add(gradients_out.jnt_solimp, worldid, ident, solimp_bar)
+        wp.atomic_add(gradients_out.jnt_range, worldid, ident, range_bar)
+    elif kind == ConstraintType.FRICTION_DOF:
+        wp.atomic_add(gradients_out.dof_solref, worldid, ident, solref_bar)
+        wp.atomic_add(gradients_out.dof_solimp, worldid, ident, solimp_bar)
+        wp.atomic_add(gradients_out.dof_frictionloss, worldid, ident, loss_bar)
+    elif kind == ConstraintType.LIMIT_TENDON:
+        wp.atomic_add(gradients_out.tendon_solref_lim, worldid, ident, solref_bar)
+        wp.atomic_add(gradients_out.tendon_solimp_lim, worldid, ident, solimp_bar)
+        wp.atomic_add(gradients_out.tendon_range, worldid, ident, range_bar)
+    elif kind == ConstraintType.FRICTION_TENDON:
+        wp.atomic_add(gradients_out.tendon_solref_fri, worldid, ident, solref_bar)
+        wp.atomic_add(gradients_out.tendon_solimp_fri, worldid, ident, solimp_bar)
+        wp.atomic_add(gradients_out.tendon_frictionloss, worldid, ident, loss_bar)
+
+
+@wp.func
+def bounded_step_slope(
+    disableflags: int, timestep: float, solref: wp.vec2, dmax: float, vel: float, aref: float
+) -> float:
+    """∂jar/∂h of a row, from its aref = -b ρ(v) - k imp pos: the time constant is held above 2 h."""
+    if disableflags & DisableBit.REFSAFE or solref[0] <= 0.0 or solref[0] > 2.0 * timestep:
+        return 0.0
+    damping = stiffness_damping(disableflags, timestep, solref, dmax)[1]
+    # b ∝ 1/h and k ∝ 1/h²
+    slope = 2.0 * (aref + damping * vel) / timestep
+    if solref[1] > 0.0:
+        slope -= damping * vel / timestep
+    return slope
+
+
 @wp.kernel
 def pull_rows(
     lanes: int,
@@ -139,6 +208,7 @@ def pull_rows(
     tendons: TendonRows,
     settings: RowSettings,
     # In:
+    live_in: wp.array[int],
     nefc_in: wp.array[int],
     rows_in: Rows,
     jacobian_in: wp.array3d[float],
@@ -150,8 +220,12 @@ def pull_rows(
     # Out:
     slopes_out: DofSlopes,
     tendon_bars_out: TendonBars,
+    gradients_out: RowGradients,
+    timestep_out: TimestepGradient,
 ) -> None:
-    """Φ ∋ -ρ(λ) f(ρ(a) + b ρ(v) + k imp pos) of every row that joints and tendons make; f also moves with D(pos).
+    """Φ ∋ -ρ(λ) f(ρ(a) + b ρ(v) + k imp pos) of every row that joints and tendons make, with its parameters' gradients.
+
+    f also moves with D(pos). Rows of connects and welds, which share one impedance, give the time step alone.
 
     `lanes` threads take the first `count` rows of a world in turn.
     """
@@ -165,23 +239,43 @@ def pull_rows(
         if s == 0.0 and f == 0.0:
             continue
         ident = rows_in.id[worldid, row]
-        if kind == ConstraintType.EQUALITY:
-            if settings.eq_type[ident] != EqType.JOINT and settings.eq_type[ident] != EqType.TENDON:
-                continue
         solver = solver_parameters(worldid, kind, ident, settings)
         if not solver.known:
             continue
+        timestep = opt_timestep[worldid % opt_timestep.shape[0]]
+        keeps_step = live_in[worldid] != 0 and timestep_out.timestep.shape[0] > 0
+        motion = RowMotion()
+        for j in range(lam_in.shape[1]):
+            motion.lam += jacobian_in[worldid, row, j] * lam_in[worldid, j]
+            motion.vel += jacobian_in[worldid, row, j] * state_in.qvel[worldid, j]
+        if kind == ConstraintType.EQUALITY:
+            if settings.eq_type[ident] != EqType.JOINT and settings.eq_type[ident] != EqType.TENDON:
+                if keeps_step:
+                    aref = rows_in.aref[worldid, row]
+                    step = bounded_step_slope(
+                        opt_disableflags, timestep, solver.solref, solver.solimp[1], motion.vel, aref
+                    )
+                    wp.atomic_sub(timestep_out.timestep, worldid, s * motion.lam * step)
+                continue
 
         pos = rows_in.pos[worldid, row] - rows_in.margin[worldid, row]
-        timestep = opt_timestep[worldid % opt_timestep.shape[0]]
-        slopes = row_slopes(opt_disableflags, timestep, solver.solref, solver.solimp, pos)
-        rate = float(0.0)
-        for j in range(lam_in.shape[1]):
-            rate += jacobian_in[worldid, row, j] * lam_in[worldid, j]
-        # ∂Φ/∂jar = s ρ(λ) =: y
-        y = s * rate
-        vel_bar = slopes.damping * y
-        pos_bar = slopes.stiffness * y - slopes.mass * rate * f
+        kb = stiffness_damping(opt_disableflags, timestep, solver.solref, solver.solimp[1])
+        imp = impedance(solver.solimp, pos)
+        motion.disableflags = opt_disableflags
+        motion.weight = imp / ((1.0 - imp) * rows_in.D[worldid, row])
+        motion.rest = laws_in.jar[worldid, row] - kb[1] * motion.vel - kb[0] * imp * pos
+        if s == 0.0:
+            motion.held = wp.sign(f)
+        loss = rows_in.frictionloss[worldid, row]
+        motion_bar, solref_bar, solimp_bar, away_bar, loss_bar, step_bar = wp.grad(row_score)(
+            motion, solver.solref, solver.solimp, pos, loss, timestep
+        )
+        # The score is -Φ, and ∂Φ/∂jar = s ρ(λ) =: y.
+        y = -motion_bar.rest
+        vel_bar = -motion_bar.vel
+        pos_bar = -away_bar
+        bound = int(0)
+        is_ball = bool(False)
         bars = wp.vec4(pos_bar, vel_bar, -f, y)
 
         if kind == ConstraintType.FRICTION_DOF:
@@ -189,6 +283,7 @@ def pull_rows(
         elif kind == ConstraintType.LIMIT_JOINT:
             dof = joints.jnt_dofadr[ident]
             if joints.jnt_type[ident] == JointType.BALL:
+                is_ball = True
                 adr = joints.jnt_qposadr[ident]
                 turn = quat_angle_axis(
                     wp.vec4(
@@ -209,11 +304,15 @@ def pull_rows(
                 moved = -pos_bar * axis + 0.5 * wp.cross(axis_bar, axis)
                 if turn[3] > 0.0:  # without a rotation there is no axis, and mujoco_warp's row is zero
                     moved += 0.5 / wp.tan(0.5 * turn[3]) * across
+                # pos = max(range) - angle
+                bounds = settings.jnt_range[worldid % settings.jnt_range.shape[0], ident]
+                bound = wp.where(bounds[0] > bounds[1], 0, 1)
                 for i in range(3):
                     wp.atomic_add(slopes_out.qpos, worldid, dof + i, moved[i])
                     wp.atomic_add(slopes_out.qvel, worldid, dof + i, -vel_bar * axis[i])
             else:
                 sign = jacobian_in[worldid, row, dof]
+                bound = wp.where(sign > 0.0, 0, 1)
                 add_joint_row(worldid, dof, sign, pos_bar, vel_bar, slopes_out)
         elif kind == ConstraintType.FRICTION_TENDON:
             bars[0] = 0.0
@@ -221,7 +320,8 @@ def pull_rows(
         elif kind == ConstraintType.LIMIT_TENDON:
             bounds = settings.tendon_range[worldid % settings.tendon_range.shape[0], ident]
             length = ten_length_in[worldid, ident]
-            sign = wp.where(length - bounds[0] < bounds[1] - length, 1.0, -1.0)
+            bound = wp.where(length - bounds[0] < bounds[1] - length, 0, 1)
+            sign = wp.where(bound == 0, 1.0, -1.0)
             add_tendon_row(worldid, ident, sign, bars, tendon_bars_out)
         else:
             # pos = x₁ - p(x₂) ,  ρ(x) = ρ₁(x) - p' ρ₂(x) ,  d(p') = p'' dx₂
@@ -260,6 +360,12 @@ def pull_rows(
                     mixed += y * tendon_rate(tendons, second, jac, state_in.qacc[worldid])
                     add_tendon_row(worldid, second, -bend1, bars, tendon_bars_out)
                     wp.atomic_add(tendon_bars_out.length, worldid, second, -bend2 * mixed)
+        if keeps_step:
+            wp.atomic_add(timestep_out.timestep, worldid, step_bar)
+        if live_in[worldid] != 0 and gradients_out.jnt_range.shape[0] > 0:
+            # pos = q - lower, or upper - q
+            bound_bar = wp.where(bound == 0 and not is_ball, -away_bar, away_bar)
+            add_row_gradients(worldid, kind, ident, bound, solref_bar, solimp_bar, bound_bar, loss_bar, gradients_out)
 
 
 def foremost_rows(work: Workspace) -> int:
@@ -268,8 +374,10 @@ def foremost_rows(work: Workspace) -> int:
 
 
 def launch_scalar_rows(work: Workspace, at: Substep) -> None:
-    """Launch what the rows of joints, tendons and their equalities give ∂Φ."""
+    """Launch what the rows of joints, tendons and their equalities give ∂Φ, as far as the model has them."""
     mjm = work.mjm
     # Limits of joints alone are rows of different dofs.
-    meet = bool(mjm.neq or mjm.ntendon or np.any(mjm.dof_frictionloss))
-    work.launch_lanes(pull_rows, foremost_rows(work), at, meet=meet, lam=work.multipliers.lam)
+    meet = bool(mjm.neq or mjm.ntendon or np.any(mjm.dof_frictionloss)) or at.wants(TimestepGradient)
+    if work.tables.has_scalar_rows or at.wants(TimestepGradient):
+        gradients = (at.gradient(RowGradients), at.gradient(TimestepGradient))
+        work.launch_lanes(pull_rows, foremost_rows(work), at, *gradients, meet=meet, lam=work.multipliers.lam)

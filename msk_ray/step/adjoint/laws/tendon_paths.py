@@ -6,16 +6,22 @@ A tendon's rate under a plain field x is ρ(x) = J x, and a spatial tendon's J t
 
 On a wrapping geom the ends are tangent points that move over the surface; the rate sees them fixed to the geom's body
 (the length is stationary in them), its own change sees them move.
+
+The length itself changes with the path's sites alone by dl = n·dp along the straight pieces, and with a geom that moves
+by (n₀ - n₁)·dp, n₀ and n₁ the directions towards and away from it.
 """
+
+from functools import cache
+from typing import Any
 
 import warp as wp
 
-from msk_ray.step.adjoint.groups import FieldBars, Fields, Motion, Substep, TendonBars
+from msk_ray.step.adjoint.groups import FieldBars, Fields, GeomGradients, Motion, Substep, TendonBars
 from msk_ray.step.adjoint.laws.inside_wrap import inside_score
 from msk_ray.step.adjoint.laws.wrapping import PathPoses, Paths, touch_paths
-from msk_ray.step.adjoint.spatial import carried, point_velocity, wrench
+from msk_ray.step.adjoint.spatial import carried, point_velocity, quat_gradient, turning_torque, wrench
 from msk_ray.step.adjoint.workspace import Workspace
-from msk_ray.step.forward.mjw_private import MJ_MAXVAL, wrap
+from msk_ray.step.forward.mjw_private import MJ_MAXVAL, WrapType, wrap
 
 wp.set_module_options({"enable_backward": False})
 
@@ -93,15 +99,16 @@ def segment_turn(start: wp.vec3, end: wp.vec3, slide: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def end_wrench(arm: wp.vec3, direction: wp.vec3, turn: wp.vec3, rates: Rates, fields: Twists) -> wp.spatial_vectorf:
-    """What one end of a segment pulls back to its own body's displacement.
+def end_place(direction: wp.vec3, turn: wp.vec3, total: wp.spatial_vectorf) -> wp.vec3:
+    """Cotangent of one end's place: the segment turns, and the end's velocity changes as ω × dp."""
+    return turn + wp.cross(direction, wp.spatial_top(total))
 
-    The velocity of the end changes with its place as ω × dp ⇒ p̄ ∋ direction × Σ ρ̄ ω.
-    """
+
+@wp.func
+def end_wrench(arm: wp.vec3, direction: wp.vec3, place_bar: wp.vec3, total: wp.spatial_vectorf) -> wp.spatial_vectorf:
+    """What one end of a segment pulls back to its own body's displacement."""
     zero = wp.vec3(0.0)
-    total = weigh(rates, fields)
-    place = turn + wp.cross(direction, wp.spatial_top(total))
-    return carried(total, wrench(direction, zero, arm)) + wrench(place, zero, arm)
+    return carried(total, wrench(direction, zero, arm)) + wrench(place_bar, zero, arm)
 
 
 @wp.func
@@ -151,135 +158,205 @@ def fields_of(
     return out
 
 
-@wp.kernel
-def pull_paths(
-    lanes: int,
-    count: int,
-    # Model:
-    paths: Paths,
-    # In:
-    touch_in: wp.array2d[wp.spatial_vector],
-    inside_in: wp.array2d[wp.vec4],
-    poses_in: PathPoses,
-    motion_in: Motion,
-    fields_in: Fields,
-    tendon_bars_in: TendonBars,
-    # Out:
-    bars_out: FieldBars,
+@wp.struct
+class SiteGradients:
+    """Gradients by site, (W, S)."""
+
+    site_pos: wp.array2d[wp.vec3]
+
+
+@wp.func
+def sub_point(
+    worldid: int, item: int, body: int, bar: wp.vec3, xmat_in: wp.array2d[wp.mat33], out: wp.array2d[wp.vec3]
 ) -> None:
-    """How J x of a spatial tendon turns with q.
+    """θ̄ -= ∂Φ/∂θ of a place in a body's frame, from its slope in the world's."""
+    wp.atomic_sub(out, worldid, item, wp.transpose(xmat_in[worldid, body]) @ bar)
 
-    `lanes` threads take all `count` stretches of path of a world in turn: those between two sites, with or without a
-    geom.
-    """
-    worldid, lane = wp.tid()
-    for e in range(lane, count, lanes):
-        t = paths.segment_tendon[e]
-        first = paths.segment_first[e]
-        site0 = paths.wrap_objid[first]
-        site1 = paths.wrap_objid[paths.segment_last[e]]
-        body0 = paths.site_bodyid[site0]
-        body1 = paths.site_bodyid[site1]
-        touch = touch_in[worldid, e]
-        straight = touch[0] >= MJ_MAXVAL
-        if straight and body0 == body1:
-            continue  # it turns with its body
-        rates = rates_of(worldid, t, paths.wrap_pulley_scale[first], tendon_bars_in)
-        f0 = fields_of(body0, worldid, rates, fields_in, motion_in.cvel)
-        f1 = fields_of(body1, worldid, rates, fields_in, motion_in.cvel)
-        start = poses_in.site_xpos[worldid, site0]
-        end = poses_in.site_xpos[worldid, site1]
-        com0 = motion_in.subtree_com[worldid, paths.body_rootid[body0]]
-        com1 = motion_in.subtree_com[worldid, paths.body_rootid[body1]]
 
-        place = paths.segment_geom[e]
-        geom = int(0)
-        kind = int(0)
-        radius = float(0.0)
-        side = wp.vec3(MJ_MAXVAL)
-        if place >= 0:
+@wp.func
+def length_by_radius(
+    kind: int,
+    mat: wp.mat33,
+    pos: wp.vec3,
+    touch0: wp.vec3,
+    touch1: wp.vec3,
+    radius: float,
+    push: wp.vec3,
+    inside: bool,
+) -> float:
+    """Slope of a path's length by the radius: ∫ of its curvature along the normal, or n₀ - n₁ there from inside."""
+    arm0 = wp.transpose(mat) @ (touch0 - pos)
+    arm1 = wp.transpose(mat) @ (touch1 - pos)
+    if inside:  # the one point that touches moves outward with the surface
+        if kind == WrapType.CYLINDER:
+            arm0[2] = 0.0
+        return wp.dot(mat @ wp.normalize(arm0), push)
+    if kind == WrapType.SPHERE:
+        return wp.atan2(wp.length(wp.cross(arm0, arm1)), wp.dot(arm0, arm1))
+    rise = arm1[2] - arm0[2]
+    angle = wp.atan2(wp.abs(arm0[0] * arm1[1] - arm0[1] * arm1[0]), arm0[0] * arm1[0] + arm0[1] * arm1[1])
+    arc = radius * angle
+    return angle * arc / wp.sqrt(arc * arc + rise * rise)
+
+
+@cache
+def pull_paths_kernel(keeps: bool) -> Any:
+    """The kernel that also adds gradients of sites and geoms, or the one that pays nothing for them."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def pull_paths(
+        lanes: int,
+        count: int,
+        # Model:
+        paths: Paths,
+        geom_quat: wp.array2d[wp.quat],
+        # In:
+        live_in: wp.array[int],
+        touch_in: wp.array2d[wp.spatial_vector],
+        inside_in: wp.array2d[wp.vec4],
+        poses_in: PathPoses,
+        xmat_in: wp.array2d[wp.mat33],
+        motion_in: Motion,
+        fields_in: Fields,
+        tendon_bars_in: TendonBars,
+        # Out:
+        bars_out: FieldBars,
+        sites_out: SiteGradients,
+        geoms_out: GeomGradients,
+    ) -> None:
+        """How J x of a spatial tendon turns with q, and the gradients of its sites and of geoms that it wraps around.
+
+        `lanes` threads take all `count` stretches of path of a world in turn: those between two sites, with or without
+        a geom.
+        """
+        worldid, lane = wp.tid()
+        for e in range(lane, count, lanes):
+            t = paths.segment_tendon[e]
+            first = paths.segment_first[e]
+            site0 = paths.wrap_objid[first]
+            site1 = paths.wrap_objid[paths.segment_last[e]]
+            body0 = paths.site_bodyid[site0]
+            body1 = paths.site_bodyid[site1]
+            touch = touch_in[worldid, e]
+            straight = touch[0] >= MJ_MAXVAL
+            keeps_sites = bool(False)
+            keeps_geoms = bool(False)
+            if wp.static(keeps):
+                keeps_sites = live_in[worldid] != 0 and sites_out.site_pos.shape[0] > 0
+                keeps_geoms = live_in[worldid] != 0 and geoms_out.geom_pos.shape[0] > 0
+            elif straight and body0 == body1:
+                continue  # it turns with its body
+            share = paths.wrap_pulley_scale[first]
+            pull = share * tendon_bars_in.length[worldid, t]
+            rates = rates_of(worldid, t, share, tendon_bars_in)
+            total0 = weigh(rates, fields_of(body0, worldid, rates, fields_in, motion_in.cvel))
+            total1 = weigh(rates, fields_of(body1, worldid, rates, fields_in, motion_in.cvel))
+            start = poses_in.site_xpos[worldid, site0]
+            end = poses_in.site_xpos[worldid, site1]
+            com0 = motion_in.subtree_com[worldid, paths.body_rootid[body0]]
+            com1 = motion_in.subtree_com[worldid, paths.body_rootid[body1]]
+            zero = wp.vec3(0.0)
+            start_bar = zero
+            end_bar = zero
+            if straight:
+                n = wp.normalize(end - start)
+                if body0 != body1:
+                    slide = point_velocity(total1, end - com1) - point_velocity(total0, start - com0)
+                    turn = segment_turn(start, end, slide)
+                    start_bar = end_place(-n, -turn, total0)
+                    end_bar = end_place(n, turn, total1)
+                    moved0 = end_wrench(start - com0, -n, start_bar, total0)
+                    moved1 = end_wrench(end - com1, n, end_bar, total1)
+                    push_body(body0, worldid, wrench(-n, zero, start - com0), moved0, rates, bars_out)
+                    push_body(body1, worldid, wrench(n, zero, end - com1), moved1, rates, bars_out)
+                if keeps_sites:
+                    sub_point(worldid, site0, body0, start_bar - pull * n, xmat_in, sites_out.site_pos)
+                    sub_point(worldid, site1, body1, end_bar + pull * n, xmat_in, sites_out.site_pos)
+                continue
+
+            place = paths.segment_geom[e]
             geom = paths.wrap_objid[place]
             kind = paths.wrap_type[place]
             radius = paths.geom_size[worldid % paths.geom_size.shape[0], geom][0]
             sidesite = int(wp.round(paths.wrap_prm[place]))
+            side = wp.vec3(MJ_MAXVAL)
             if sidesite >= 0:
                 side = poses_in.site_xpos[worldid, sidesite]
-        zero = wp.vec3(0.0)
-        if straight:
-            n = wp.normalize(end - start)
-            slide = point_velocity(weigh(rates, f1), end - com1) - point_velocity(weigh(rates, f0), start - com0)
-            turn = segment_turn(start, end, slide)
-            moved0 = end_wrench(start - com0, -n, -turn, rates, f0)
-            moved1 = end_wrench(end - com1, n, turn, rates, f1)
-            push_body(body0, worldid, wrench(-n, zero, start - com0), moved0, rates, bars_out)
-            push_body(body1, worldid, wrench(n, zero, end - com1), moved1, rates, bars_out)
-            continue
+            touch0 = wp.spatial_top(touch)
+            touch1 = wp.spatial_bottom(touch)
+            body = paths.geom_bodyid[geom]
+            com = motion_in.subtree_com[worldid, paths.body_rootid[body]]
+            total = weigh(rates, fields_of(body, worldid, rates, fields_in, motion_in.cvel))
+            n0 = wp.normalize(touch0 - start)
+            n1 = wp.normalize(end - touch1)
+            along0 = wp.spatial_vectorf()
+            along1 = wp.spatial_vectorf()
+            along = wp.spatial_vectorf()
+            moved0 = wp.spatial_vectorf()
+            moved1 = wp.spatial_vectorf()
+            moved = wp.spatial_vectorf()
+            touch0_bar = zero
+            touch1_bar = zero
+            if body0 != body:
+                slide = point_velocity(total, touch0 - com) - point_velocity(total0, start - com0)
+                turn = segment_turn(start, touch0, slide)
+                start_bar = end_place(-n0, -turn, total0)
+                along0 = wrench(-n0, zero, start - com0)
+                moved0 = end_wrench(start - com0, -n0, start_bar, total0)
+                # The tangent point's displacement is not the geom's: its cotangent goes through the wrap below.
+                touch0_bar = end_place(n0, turn, total)
+                along += wrench(n0, zero, touch0 - com)
+                moved += end_wrench(touch0 - com, n0, zero, total)
+            if body1 != body:
+                slide = point_velocity(total1, end - com1) - point_velocity(total, touch1 - com)
+                turn = segment_turn(touch1, end, slide)
+                end_bar = end_place(n1, turn, total1)
+                along1 = wrench(n1, zero, end - com1)
+                moved1 = end_wrench(end - com1, n1, end_bar, total1)
+                touch1_bar = end_place(-n1, -turn, total)
+                along += wrench(-n1, zero, touch1 - com)
+                moved += end_wrench(touch1 - com, -n1, zero, total)
+            mat = poses_in.geom_xmat[worldid, geom]
+            pos = poses_in.geom_xpos[worldid, geom]
+            from_start = zero
+            from_end = zero
+            pos_bar = zero
+            mat_bar = wp.mat33(0.0)
+            side_bar = zero
+            radius_bar = float(0.0)
+            spot = inside_in[worldid, e]
+            inside = spot[3] != 0.0
+            if inside:
+                from_start, from_end, pos_bar, mat_bar, radius_bar, _k, _p, _w = wp.grad(inside_score)(
+                    start, end, pos, mat, radius, kind, wp.vec3(spot[0], spot[1], spot[2]), touch0_bar + touch1_bar
+                )
+            else:
+                from_start, from_end, pos_bar, mat_bar, radius_bar, _k, side_bar, _w0, _w1 = wp.grad(wrap_score)(
+                    start, end, pos, mat, radius, kind, side, touch0_bar, touch1_bar
+                )
+            torque = turning_torque(mat, mat_bar)
+            push_body(body0, worldid, along0, moved0 + wrench(from_start, zero, start - com0), rates, bars_out)
+            push_body(body1, worldid, along1, moved1 + wrench(from_end, zero, end - com1), rates, bars_out)
+            push_body(body, worldid, along, moved + wrench(pos_bar, torque, pos - com), rates, bars_out)
+            if sidesite >= 0:
+                owner = paths.site_bodyid[sidesite]
+                if owner > 0:
+                    arm = side - motion_in.subtree_com[worldid, paths.body_rootid[owner]]
+                    wp.atomic_add(bars_out.moved, worldid, owner, wrench(side_bar, zero, arm))
+                if keeps_sites:
+                    sub_point(worldid, sidesite, owner, side_bar, xmat_in, sites_out.site_pos)
+            if keeps_sites:
+                sub_point(worldid, site0, body0, start_bar - pull * n0 + from_start, xmat_in, sites_out.site_pos)
+                sub_point(worldid, site1, body1, end_bar + pull * n1 + from_end, xmat_in, sites_out.site_pos)
+            if keeps_geoms:
+                radius_bar += pull * length_by_radius(kind, mat, pos, touch0, touch1, radius, n0 - n1, inside)
+                sub_point(worldid, geom, body, pull * (n0 - n1) + pos_bar, xmat_in, geoms_out.geom_pos)
+                torque += pull * (wp.cross(touch0 - pos, n0) - wp.cross(touch1 - pos, n1))
+                quat = geom_quat[worldid % geom_quat.shape[0], geom]
+                wp.atomic_sub(geoms_out.geom_quat, worldid, geom, quat_gradient(quat, wp.transpose(mat) @ torque))
+                wp.atomic_sub(geoms_out.geom_size, worldid, geom, wp.vec3(radius_bar, 0.0, 0.0))
 
-        touch0 = wp.spatial_top(touch)
-        touch1 = wp.spatial_bottom(touch)
-        body = paths.geom_bodyid[geom]
-        com = motion_in.subtree_com[worldid, paths.body_rootid[body]]
-        fg = fields_of(body, worldid, rates, fields_in, motion_in.cvel)
-        total = weigh(rates, fg)
-        spin = wp.spatial_top(total)
-        along0 = wp.spatial_vectorf()
-        along1 = wp.spatial_vectorf()
-        along = wp.spatial_vectorf()
-        moved0 = wp.spatial_vectorf()
-        moved1 = wp.spatial_vectorf()
-        moved = wp.spatial_vectorf()
-        touch0_bar = zero
-        touch1_bar = zero
-        if body0 != body:
-            n = wp.normalize(touch0 - start)
-            slide = point_velocity(total, touch0 - com) - point_velocity(weigh(rates, f0), start - com0)
-            turn = segment_turn(start, touch0, slide)
-            along0 = wrench(-n, zero, start - com0)
-            moved0 = end_wrench(start - com0, -n, -turn, rates, f0)
-            # The tangent point's displacement is not the geom's: its cotangent goes through the wrap below.
-            touch0_bar = turn + wp.cross(n, spin)
-            along += wrench(n, zero, touch0 - com)
-            moved += end_wrench(touch0 - com, n, -wp.cross(n, spin), rates, fg)
-        if body1 != body:
-            n = wp.normalize(end - touch1)
-            slide = point_velocity(weigh(rates, f1), end - com1) - point_velocity(total, touch1 - com)
-            turn = segment_turn(touch1, end, slide)
-            along1 = wrench(n, zero, end - com1)
-            moved1 = end_wrench(end - com1, n, turn, rates, f1)
-            touch1_bar = -turn - wp.cross(n, spin)
-            along += wrench(-n, zero, touch1 - com)
-            moved += end_wrench(touch1 - com, -n, wp.cross(n, spin), rates, fg)
-        mat = poses_in.geom_xmat[worldid, geom]
-        pos = poses_in.geom_xpos[worldid, geom]
-        start_bar = zero
-        end_bar = zero
-        pos_bar = zero
-        mat_bar = wp.mat33(0.0)
-        side_bar = zero
-        spot = inside_in[worldid, e]
-        if spot[3] != 0.0:
-            start_bar, end_bar, pos_bar, mat_bar, _r, _k, _p, _w = wp.grad(inside_score)(
-                start, end, pos, mat, radius, kind, wp.vec3(spot[0], spot[1], spot[2]), touch0_bar + touch1_bar
-            )
-        else:
-            start_bar, end_bar, pos_bar, mat_bar, _r, _k, side_bar, _w0, _w1 = wp.grad(wrap_score)(
-                start, end, pos, mat, radius, kind, side, touch0_bar, touch1_bar
-            )
-        # dR = [ω] R  ⇒  torque Σ_k R_k × R̄_k over the columns
-        torque = zero
-        for k in range(3):
-            column = wp.vec3(mat[0, k], mat[1, k], mat[2, k])
-            column_bar = wp.vec3(mat_bar[0, k], mat_bar[1, k], mat_bar[2, k])
-            torque += wp.cross(column, column_bar)
-        push_body(body0, worldid, along0, moved0 + wrench(start_bar, zero, start - com0), rates, bars_out)
-        push_body(body1, worldid, along1, moved1 + wrench(end_bar, zero, end - com1), rates, bars_out)
-        push_body(body, worldid, along, moved + wrench(pos_bar, torque, pos - com), rates, bars_out)
-        sidesite = int(wp.round(paths.wrap_prm[place]))
-        if sidesite >= 0:
-            owner = paths.site_bodyid[sidesite]
-            if owner > 0:
-                arm = side - motion_in.subtree_com[worldid, paths.body_rootid[owner]]
-                wp.atomic_add(bars_out.moved, worldid, owner, wrench(side_bar, zero, arm))
+    return pull_paths
 
 
 class TendonPaths:
@@ -301,4 +378,6 @@ class TendonPaths:
         points = {"touch": self.touch, "inside": self.inside}
         if work.tables.has_wrapping:
             work.launch(touch_paths, self.touch.shape, at, **points)
-        work.launch_lanes(pull_paths, self.touch.shape[1], at, **points)
+        kernel = pull_paths_kernel(at.wants(SiteGradients, GeomGradients))
+        gradients = (at.gradient(SiteGradients), at.gradient(GeomGradients))
+        work.launch_lanes(kernel, self.touch.shape[1], at, *gradients, **points)

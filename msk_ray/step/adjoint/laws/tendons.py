@@ -10,7 +10,7 @@ import warp as wp
 from msk_ray.step.adjoint.groups import DofSlopes, Multipliers, State, Substep, TendonBars, TendonRows
 from msk_ray.step.adjoint.laws.tendon_paths import TendonPaths
 from msk_ray.step.adjoint.workspace import Workspace
-from msk_ray.step.forward.mjw_private import WrapType, poly_force_deriv, tendon_damping_total
+from msk_ray.step.forward.mjw_private import WrapType, tendon_damping_total
 
 wp.set_module_options({"enable_backward": False})
 
@@ -49,15 +49,42 @@ def implicit_pairs(
     return kappa
 
 
+@wp.struct
+class TendonLaw:
+    """What the force of one tendon's spring and damper depends on besides its length and rate."""
+
+    rest: wp.vec2
+    stiffness: wp.float32
+    stiffness_poly: wp.vec2
+    damping: wp.float32
+    """That of actuators included."""
+    damping_poly: wp.vec2
+
+
 @wp.func
-def stretch_of(length: float, rest: wp.vec2) -> float:
-    """x: how far a tendon is out of the dead band of its spring, negative where it is shorter."""
-    x = float(0.0)
-    if length > rest[1]:
-        x = length - rest[1]
-    elif length < rest[0]:
-        x = length - rest[0]
-    return x
+def tendon_score(
+    law: TendonLaw, length: wp.float32, rate: wp.float32, rate_lam: wp.float32, kappa: wp.float32
+) -> wp.float32:
+    """ρ(λ) (k(x) x + c(|ρ|) ρ) + h κ d(cρ)/dρ, x how far a tendon is out of the dead band of its spring."""
+    x = wp.float32(0.0)
+    if length < law.rest[0]:
+        x = length - law.rest[0]
+    elif length > law.rest[1] or law.rest[0] == law.rest[1]:  # without a dead band there is stiffness at rest too
+        x = length - law.rest[1]
+    spring = x * (law.stiffness + law.stiffness_poly[0] * x + law.stiffness_poly[1] * x * x)
+    speed = wp.abs(rate)
+    damper = rate * (law.damping + law.damping_poly[0] * speed + law.damping_poly[1] * speed * speed)
+    slope = law.damping + 2.0 * law.damping_poly[0] * speed + 3.0 * law.damping_poly[1] * speed * speed
+    return rate_lam * (spring + damper) + kappa * slope
+
+
+@wp.struct
+class TendonGradients:
+    """Gradients by tendon, (W, T)."""
+
+    tendon_stiffness: wp.array2d[float]
+    tendon_damping: wp.array2d[float]
+    tendon_lengthspring: wp.array2d[wp.vec2]
 
 
 @wp.struct
@@ -88,34 +115,28 @@ def start_tendons(
     passive: PassiveTendons,
     implicit_address: wp.array2d[int],
     # In:
+    live_in: wp.array[int],
     state_in: State,
     ten_J_in: wp.array2d[float],
     ten_length_in: wp.array2d[float],
     multipliers_in: Multipliers,
     # Out:
     tendon_bars_out: TendonBars,
+    gradients_out: TendonGradients,
 ) -> None:
-    """Starts each tendon's cotangents with those of its spring and damper: Φ ∋ ρ(λ) (k(x) x + c(|ρ(v)|) ρ(v)).
+    """Starts each tendon's cotangents with those of its spring and damper, and adds gradients of their parameters.
 
-    With implicit integration also Φ ∋ h μᵀ B â where B ∋ d(c ρ)/dρ J Jᵀ on the entries that `implicit_address` has.
+    With implicit integration Φ ∋ h μᵀ B â where B ∋ d(c ρ)/dρ J Jᵀ on the entries that `implicit_address` has.
     """
     worldid, t = wp.tid()
+    keeps = live_in[worldid] != 0 and gradients_out.tendon_damping.shape[0] > 0
     rate_v = tendon_rate(tendons, t, ten_J_in[worldid], state_in.qvel[worldid])
     rate_l = tendon_rate(tendons, t, ten_J_in[worldid], multipliers_in.lam[worldid])
-    length_bar = float(0.0)
-    qvel_bar = float(0.0)
-    lam_bar = float(0.0)
-    mu_bar = float(0.0)
-    smooth_bar = float(0.0)
+    law = TendonLaw()
     if spring_on:
-        rest = passive.tendon_lengthspring[worldid % passive.tendon_lengthspring.shape[0], t]
-        stiffness = passive.tendon_stiffness[worldid % passive.tendon_stiffness.shape[0], t]
-        poly = passive.tendon_stiffnesspoly[worldid % passive.tendon_stiffnesspoly.shape[0], t]
-        x = stretch_of(ten_length_in[worldid, t], rest)
-        # A spring without a dead band has its stiffness at rest too.
-        if x != 0.0 or rest[0] == rest[1]:
-            lam_bar += x * (stiffness + poly[0] * x + poly[1] * x * x)
-            length_bar += rate_l * poly_force_deriv(stiffness, poly, x, 0)
+        law.rest = passive.tendon_lengthspring[worldid % passive.tendon_lengthspring.shape[0], t]
+        law.stiffness = passive.tendon_stiffness[worldid % passive.tendon_stiffness.shape[0], t]
+        law.stiffness_poly = passive.tendon_stiffnesspoly[worldid % passive.tendon_stiffnesspoly.shape[0], t]
     if damper_on:
         c, bend = tendon_damping_total(
             passive.tendon_actuatorid,
@@ -129,30 +150,39 @@ def start_tendons(
             worldid,
             t,
         )
-        speed = wp.abs(rate_v)
-        slope = poly_force_deriv(c, bend, rate_v, 1)
-        lam_bar += rate_v * (c + bend[0] * speed + bend[1] * speed * speed)
-        qvel_bar += rate_l * slope
-        start = tendons.ten_J_rowadr[t]
-        held = bool(True)
-        if tendons.ten_J_rownnz[t] > 0:
-            # A tendon of a lone free body acts on no other dofs.
-            held = implicit_address[tendons.ten_J_colind[start], tendons.ten_J_colind[start]] < 0
-        if implicit_all and not held and (c != 0.0 or bend[0] != 0.0 or bend[1] != 0.0):
+        law.damping = c
+        law.damping_poly = bend
+    h = float(0.0)
+    kappa = float(0.0)
+    if implicit_all and damper_on and tendons.ten_J_rownnz[t] > 0:
+        dof = tendons.ten_J_colind[tendons.ten_J_rowadr[t]]
+        damped = law.damping != 0.0 or law.damping_poly[0] != 0.0 or law.damping_poly[1] != 0.0
+        # A tendon of a lone free body, which has no address, acts on no other dofs.
+        if implicit_address[dof, dof] >= 0 and (damped or keeps):
             h = opt_timestep[worldid % opt_timestep.shape[0]]
-            kappa = implicit_pairs(worldid, t, tendons, implicit_address, ten_J_in, state_in, multipliers_in)
-            qvel_bar += h * kappa * wp.sign(rate_v) * (2.0 * bend[0] + 6.0 * bend[1] * speed)
-            rate_mu = tendon_rate(tendons, t, ten_J_in[worldid], multipliers_in.mu[worldid])
-            rate_a = tendon_rate(tendons, t, ten_J_in[worldid], state_in.qacc[worldid])
-            rate_e = tendon_rate(tendons, t, ten_J_in[worldid], multipliers_in.excess[worldid])
-            mu_bar = h * slope * (rate_a - rate_e)
-            smooth_bar = h * slope * rate_mu
+            kappa = h * implicit_pairs(worldid, t, tendons, implicit_address, ten_J_in, state_in, multipliers_in)
+    law_bar, length_bar, qvel_bar, lam_bar, slope = wp.grad(tendon_score)(
+        law, ten_length_in[worldid, t], rate_v, rate_l, kappa
+    )
+    mu_bar = float(0.0)
+    smooth_bar = float(0.0)
+    if h > 0.0:
+        rate_mu = tendon_rate(tendons, t, ten_J_in[worldid], multipliers_in.mu[worldid])
+        rate_a = tendon_rate(tendons, t, ten_J_in[worldid], state_in.qacc[worldid])
+        rate_e = tendon_rate(tendons, t, ten_J_in[worldid], multipliers_in.excess[worldid])
+        mu_bar = h * slope * (rate_a - rate_e)
+        smooth_bar = h * slope * rate_mu
     tendon_bars_out.length[worldid, t] = length_bar
     tendon_bars_out.qvel[worldid, t] = qvel_bar
     tendon_bars_out.lam[worldid, t] = lam_bar
     tendon_bars_out.qacc[worldid, t] = 0.0
     tendon_bars_out.mu[worldid, t] = mu_bar
     tendon_bars_out.smooth[worldid, t] = smooth_bar
+    if keeps and spring_on:
+        gradients_out.tendon_stiffness[worldid, t] -= law_bar.stiffness
+        gradients_out.tendon_lengthspring[worldid, t] -= law_bar.rest
+    if keeps and damper_on:
+        gradients_out.tendon_damping[worldid, t] -= law_bar.damping
 
 
 @wp.kernel
@@ -198,7 +228,7 @@ class Tendons:
     def launch_start(self, at: Substep) -> None:
         """Launch the cotangents that springs and dampers give."""
         work = self._work
-        work.launch(start_tendons, (work.nworld, work.model.ntendon), at)
+        work.launch(start_tendons, (work.nworld, work.model.ntendon), at, at.gradient(TendonGradients))
 
     def launch_pullback(self, at: Substep) -> None:
         """Launch what the cotangents give to dofs and bodies."""

@@ -1,29 +1,45 @@
-"""Gradients of a substep by parameters of the model: one file a family, launched only if one of it is asked for."""
+"""Gradients of a substep by parameters of the model, launched only if they are asked for.
+
+A law whose score holds parameters adds their gradients in its own kernel (`LAW_GRADIENTS`); the families here have
+kernels of their own, one file each.
+"""
 
 import itertools
 from collections.abc import Iterable
+from typing import Any
 
 import warp as wp
 
-from msk_ray.step.adjoint.groups import Substep
-from msk_ray.step.adjoint.parameters.actuators import ActuatorStage
-from msk_ray.step.adjoint.parameters.base import GradientBuffer, ParameterStage, Parts
+from msk_ray.step.adjoint.groups import GeomGradients, Substep, TimestepGradient
+from msk_ray.step.adjoint.laws.actuators import ActuatorGradients
+from msk_ray.step.adjoint.laws.scalar_rows import RowGradients
+from msk_ray.step.adjoint.laws.tendon_paths import SiteGradients
+from msk_ray.step.adjoint.laws.tendons import TendonGradients
+from msk_ray.step.adjoint.parameters.absent_friction import AbsentFrictionStage
+from msk_ray.step.adjoint.parameters.base import GradientBuffer, ParameterStage
 from msk_ray.step.adjoint.parameters.contacts import MaterialStage
+from msk_ray.step.adjoint.parameters.gears import GearStage
 from msk_ray.step.adjoint.parameters.geoms import GeomStage
 from msk_ray.step.adjoint.parameters.inertia import InertiaStage
 from msk_ray.step.adjoint.parameters.joints import JointStage
-from msk_ray.step.adjoint.parameters.paths import PathStage
-from msk_ray.step.adjoint.parameters.rows import RowStage
-from msk_ray.step.adjoint.parameters.tendon_springs import TendonStage
 from msk_ray.step.adjoint.parameters.timestep import TimestepStage
 from msk_ray.step.adjoint.step import StepAdjoint
 from msk_ray.step.forward.parameters import PARAMETERS
 
 STAGES: tuple[type[ParameterStage], ...] = (
-    *(TimestepStage, InertiaStage, JointStage, RowStage, MaterialStage, GeomStage),
-    *(ActuatorStage, TendonStage, PathStage),
+    *(TimestepStage, InertiaStage, JointStage, AbsentFrictionStage, MaterialStage, GeomStage),
+    GearStage,
 )
-"""The families, in the order in which they are launched."""
+"""The families that have launches of their own, in their order."""
+LAW_GRADIENTS: tuple[Any, ...] = (
+    ActuatorGradients,
+    RowGradients,
+    TendonGradients,
+    SiteGradients,
+    GeomGradients,
+    TimestepGradient,
+)
+"""Groups of gradients to which laws add while they are launched for the state."""
 _LANES = 3
 """CUDA streams beside the main one that the families share: each fills a small part of a GPU, and none reads what
 another writes."""
@@ -36,20 +52,23 @@ class ParameterAdjoint:
         rows: gradients of every substep since `start` together, (W, numbers of a world); those of quaternions in raw
             coordinates.
         columns: by name, where a parameter's are in a row.
+        gradients: the groups that laws add to, by their types.
     """
 
     def __init__(self, adjoint: StepAdjoint, names: Iterable[str]) -> None:
         work = adjoint.work
         fields = {name: PARAMETERS[name].field for name in names}
-        parts = Parts(work, adjoint.integrator, adjoint.laws, adjoint.contacts, adjoint.tendons, adjoint.actuators)
-        chosen = [s for s in STAGES if any(not set(fields.values()).isdisjoint(kind.vars) for kind in s.kinds)]
+        asked = set(fields.values())
+        chosen = [s for s in STAGES if any(not asked.isdisjoint(kind.vars) for kind in s.kinds)]
         with wp.ScopedDevice(work.device):
             kinds = dict.fromkeys(kind for stage in chosen for kind in stage.kinds)
+            kinds |= dict.fromkeys(kind for kind in LAW_GRADIENTS if not asked.isdisjoint(kind.vars))
             self._buffer = GradientBuffer(kinds, work.model, work.nworld)
-            self._stages = [stage(parts, self._buffer.groups) for stage in chosen if stage.applies(parts)]
+            self._stages = [stage(adjoint, self._buffer.groups) for stage in chosen if stage.applies(adjoint)]
             self._lanes = [wp.Stream(work.device) for _ in range(_LANES)] if work.device.is_cuda else []
         self._device = work.device
         self.rows: wp.array = self._buffer.rows
+        self.gradients = self._buffer.groups
         self.columns = {name: self._buffer.columns[field] for name, field in fields.items()}
 
     def start(self) -> None:

@@ -7,47 +7,12 @@ integration of activations and positions.
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import warp as wp
 
 from msk_ray.step.adjoint.groups import Substep
-from msk_ray.step.adjoint.laws.actuators import ActuatorForces
-from msk_ray.step.adjoint.laws.contacts import ContactForces
-from msk_ray.step.adjoint.laws.rows import ConstraintLaws
-from msk_ray.step.adjoint.laws.tendons import Tendons
-from msk_ray.step.adjoint.stages.integrate import Integrator
-from msk_ray.step.adjoint.workspace import Workspace
-
-wp.set_module_options({"enable_backward": False})
-
-
-@wp.func
-def quat_gradient(q: wp.quat, g: wp.vec3) -> wp.vec4:
-    """2 q⊗[0, g]: the raw gradient of a unit quaternion (w, x, y, z) whose slope along local rotations is g."""
-    u = wp.vec3(q[1], q[2], q[3])
-    r = 2.0 * (q[0] * g + wp.cross(u, g))
-    return wp.vec4(-2.0 * wp.dot(u, g), r[0], r[1], r[2])
-
-
-@dataclass(frozen=True)
-class Parts:
-    """What the launches of a substep's pullback leave for the parameters."""
-
-    work: Workspace
-    integrator: Integrator
-    laws: ConstraintLaws
-    contacts: ContactForces
-    tendons: Tendons | None
-    actuators: ActuatorForces | None
-
-
-@wp.struct
-class TimestepGradient:
-    """Gradient of the time step, (W,), to which every stage whose law has one adds its part."""
-
-    timestep: wp.array[float]
+from msk_ray.step.adjoint.step import StepAdjoint
 
 
 class ParameterStage(ABC):
@@ -60,12 +25,12 @@ class ParameterStage(ABC):
 
     kinds: ClassVar[tuple[Any, ...]]
 
-    def __init__(self, parts: Parts, gradients: dict[Any, Any]) -> None:
-        self.parts, self.work = parts, parts.work
+    def __init__(self, adjoint: StepAdjoint, gradients: dict[Any, Any]) -> None:
+        self.adjoint, self.work = adjoint, adjoint.work
         self.gradients = [gradients[kind] for kind in self.kinds]
 
     @classmethod
-    def applies(cls, parts: Parts) -> bool:
+    def applies(cls, adjoint: StepAdjoint) -> bool:
         """Whether the model has anything that it differentiates."""
         return True
 

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from msk_ray.step.adjoint.groups import Contacts, Fields, Motion, RowLaws, Rows, Shapes, Substep
+from msk_ray.step.adjoint.groups import Contacts, Fields, Motion, RowLaws, Rows, Shapes, Substep, TimestepGradient
 from msk_ray.step.adjoint.laws.contacts import components, relative_rates, row_count
 from msk_ray.step.adjoint.laws.impedance import impedance, stiffness_damping
-from msk_ray.step.adjoint.parameters.base import ParameterStage, Parts, TimestepGradient
+from msk_ray.step.adjoint.parameters.base import ParameterStage
 from msk_ray.step.adjoint.parameters.contact_laws import ContactMotion, contact_score, pyramid_weight
+from msk_ray.step.adjoint.step import StepAdjoint
 from msk_ray.step.forward.mjw_private import ConstraintType, vec5
 
 wp.set_module_options({"enable_backward": False})
@@ -209,12 +210,12 @@ class MaterialStage(ParameterStage):
 
     kinds = (MaterialGradients, TimestepGradient)
 
-    def __init__(self, parts: Parts, gradients: dict[Any, Any]) -> None:
-        super().__init__(parts, gradients)
-        mjm = parts.work.mjm
+    def __init__(self, adjoint: StepAdjoint, gradients: dict[Any, Any]) -> None:
+        super().__init__(adjoint, gradients)
+        mjm = adjoint.work.mjm
         pairs = np.full((max(mjm.ngeom, 1),) * 2, -1, dtype=np.int32)
         pairs[mjm.pair_geom1, mjm.pair_geom2] = pairs[mjm.pair_geom2, mjm.pair_geom1] = np.arange(mjm.npair)
         self._pair_of = wp.array(pairs, dtype=int)
 
     def launch(self, at: Substep) -> None:
-        self.work.launch(pull_materials, self.parts.contacts.count, at, *self.gradients, pair_of=self._pair_of)
+        self.work.launch(pull_materials, self.adjoint.contacts.count, at, *self.gradients, pair_of=self._pair_of)

@@ -10,20 +10,12 @@ from typing import Any
 import warp as wp
 from mujoco_warp import GeomType
 
-from msk_ray.step.adjoint.groups import Contacts, Substep
-from msk_ray.step.adjoint.parameters.base import ParameterStage, Parts, quat_gradient
-from msk_ray.step.adjoint.spatial import column
+from msk_ray.step.adjoint.groups import Contacts, GeomGradients, Substep
+from msk_ray.step.adjoint.parameters.base import ParameterStage
+from msk_ray.step.adjoint.spatial import column, quat_gradient
+from msk_ray.step.adjoint.step import StepAdjoint
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.struct
-class GeomGradients:
-    """Gradients by geom, (W, G)."""
-
-    geom_pos: wp.array2d[wp.vec3]
-    geom_quat: wp.array2d[wp.vec4]
-    geom_size: wp.array2d[wp.vec3]
 
 
 @wp.struct
@@ -127,9 +119,9 @@ class GeomStage(ParameterStage):
 
     kinds = (GeomGradients,)
 
-    def __init__(self, parts: Parts, gradients: dict[Any, Any]) -> None:
-        super().__init__(parts, gradients)
-        parts.contacts.keep_wrenches()
+    def __init__(self, adjoint: StepAdjoint, gradients: dict[Any, Any]) -> None:
+        super().__init__(adjoint, gradients)
+        adjoint.contacts.keep_wrenches()
 
     def launch(self, at: Substep) -> None:
-        self.work.launch(pull_geoms, (self.parts.contacts.count, 2), at, *self.gradients)
+        self.work.launch(pull_geoms, (self.adjoint.contacts.count, 2), at, *self.gradients)

@@ -11,8 +11,8 @@ linear in the ten inertial parameters once the point is fixed.
 import warp as wp
 
 from msk_ray.step.adjoint.groups import Fields, Motion, Substep
-from msk_ray.step.adjoint.parameters.base import ParameterStage, quat_gradient
-from msk_ray.step.adjoint.spatial import point_velocity
+from msk_ray.step.adjoint.parameters.base import ParameterStage
+from msk_ray.step.adjoint.spatial import point_velocity, quat_gradient
 
 wp.set_module_options({"enable_backward": False})
 

@@ -5,8 +5,8 @@ from mujoco_warp import JointType
 
 from msk_ray.step.adjoint.groups import Joints, Multipliers, Springs, State, Substep
 from msk_ray.step.adjoint.laws.joint_springs import log_rate_pullback, spring_slope
-from msk_ray.step.adjoint.parameters.base import ParameterStage, quat_gradient
-from msk_ray.step.adjoint.spatial import four, three
+from msk_ray.step.adjoint.parameters.base import ParameterStage
+from msk_ray.step.adjoint.spatial import four, quat_gradient, three
 from msk_ray.step.forward.mjw_private import poly_force_deriv, quat_sub
 
 wp.set_module_options({"enable_backward": False})

@@ -7,8 +7,8 @@ besides what constraints give it (a time constant is held above 2 h) and activat
 
 import warp as wp
 
-from msk_ray.step.adjoint.groups import Multipliers, State, Substep
-from msk_ray.step.adjoint.parameters.base import ParameterStage, TimestepGradient
+from msk_ray.step.adjoint.groups import Multipliers, State, Substep, TimestepGradient
+from msk_ray.step.adjoint.parameters.base import ParameterStage
 
 wp.set_module_options({"enable_backward": False})
 

@@ -196,9 +196,10 @@ def solve_free(
     rhs_in: wp.array2d[float],
     # Out:
     multipliers_out: Multipliers,
+    push_out: wp.array2d[float],
     slopes_out: DofSlopes,
 ) -> None:
-    """μ and a - â of each free body, and the slopes that h μᵀ B â has through the body's turning and spin."""
+    """μ, a - â and M μ of each free body, and the slopes that h μᵀ B â has through the body's turning and spin."""
     worldid, k = wp.tid()
     body = free.free_body[k]
     dof = free.body_dofadr[body]
@@ -207,7 +208,8 @@ def solve_free(
     step = h * implicit_step(
         free, bodies, body, worldid, damper_on, fluid_on, gyro, xmat_in, damping_in, motion_in, state_in.qvel
     )
-    matrix = inertia_block(free, dof, worldid, M_in) + step
+    block = inertia_block(free, dof, worldid, M_in)
+    matrix = block + step
     rhs = vec6(0.0)
     acc = vec6(0.0)
     for i in range(6):
@@ -215,34 +217,15 @@ def solve_free(
         acc[i] = state_in.qacc[worldid, dof + i]
     mu = solved(wp.transpose(matrix), rhs)
     excess = solved(matrix, step @ acc)
+    push = block @ mu
     slopes = h * free_slopes(gyro, mu, acc - excess)
     for i in range(6):
         multipliers_out.mu[worldid, dof + i] = mu[i]
         multipliers_out.excess[worldid, dof + i] = excess[i]
+        push_out[worldid, dof + i] = push[i]
     for i in range(3):
         slopes_out.qpos[worldid, dof + 3 + i] += slopes[i]
         slopes_out.qvel[worldid, dof + 3 + i] += slopes[3 + i]
-
-
-@wp.kernel
-def push_free(
-    # Model:
-    free: FreeBodies,
-    # In:
-    M_in: wp.array2d[float],
-    mu_in: wp.array2d[float],
-    # Out:
-    push_out: wp.array2d[float],
-) -> None:
-    """M μ of each free body."""
-    worldid, k = wp.tid()
-    dof = free.body_dofadr[free.free_body[k]]
-    mu = vec6(0.0)
-    for i in range(6):
-        mu[i] = mu_in[worldid, dof + i]
-    push = inertia_block(free, dof, worldid, M_in) @ mu
-    for i in range(6):
-        push_out[worldid, dof + i] = push[i]
 
 
 class FreeBodySolves:
@@ -256,10 +239,6 @@ class FreeBodySolves:
         """Launch M into the rows of `step` that belong to free bodies, M + hB in M's sparse layout."""
         self._work.launch(hold_free_rows, self._shape, at, step=step)
 
-    def launch(self, at: Substep) -> None:
-        """Launch μ, a - â and the slopes of B."""
-        self._work.launch(solve_free, self._shape, at)
-
-    def push(self, at: Substep, push: wp.array) -> None:
-        """Launch M μ of free bodies into `push`, shape (W, nv)."""
-        self._work.launch(push_free, self._shape, at, mu=self._work.multipliers.mu, push=push)
+    def launch(self, at: Substep, push: wp.array) -> None:
+        """Launch μ, a - â, the slopes of B, and M μ into `push`, shape (W, nv)."""
+        self._work.launch(solve_free, self._shape, at, push=push)

@@ -212,11 +212,9 @@ class LinearSystems:
         d, multipliers, rhs = at.data, self._work.multipliers, self._work.rhs
         self._product(at, d.qacc, 1.0)
         self._solve_two(self._implicit, rhs, self._push, [multipliers.mu, multipliers.excess])
-        if self._free is not None:
-            self._free.launch(at)
         self._product(at, multipliers.mu, -1.0)
         if self._free is not None:
-            self._free.push(at, self._push)
+            self._free.launch(at, self._push)
         self._solve_two(self._hessian, self._push, self._push, [multipliers.lam, self._push])
 
     def _product(self, at: Substep, x: wp.array, scale: float) -> None:

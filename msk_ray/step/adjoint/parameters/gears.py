@@ -1,12 +1,9 @@
-"""Gear, gain, bias and activation parameters of actuators.
+"""Gears of actuators; the parameters of gain, bias and activation are in `laws.actuators`.
 
-Slopes by the parameters of gain, bias and activation come from `laws.actuators`, which differentiates the law. The gear
-g enters through the length and its rates, which are linear in it:
+A gear g enters through the length and its rates, which are linear in it:
 
     ḡ = -(∂Φ/∂len · len/g + Σ_x ∂Φ/∂ρ(x) · ρ(x)/g) ,  x = λ, v, μ, â .
 """
-
-from typing import Any
 
 import warp as wp
 from mujoco_warp import JointType, TrnType
@@ -22,27 +19,24 @@ from msk_ray.step.adjoint.groups import (
 )
 from msk_ray.step.adjoint.laws.actuators import (
     ActuatorBars,
-    ActuatorLawBars,
     ActuatorSettings,
     Drive,
     is_held,
 )
-from msk_ray.step.adjoint.parameters.base import ParameterStage, Parts, TimestepGradient
+from msk_ray.step.adjoint.parameters.base import ParameterStage
 from msk_ray.step.adjoint.parameters.inertia import rotation
 from msk_ray.step.adjoint.spatial import four, point_velocity
-from msk_ray.step.forward.mjw_private import quat_to_vel, vec10
+from msk_ray.step.adjoint.step import StepAdjoint
+from msk_ray.step.forward.mjw_private import quat_to_vel
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.struct
-class ActuatorGradients:
+class GearGradients:
     """Gradients by actuator, (W, U)."""
 
     actuator_gear: wp.array2d[wp.spatial_vector]
-    actuator_gainprm: wp.array2d[vec10]
-    actuator_biasprm: wp.array2d[vec10]
-    actuator_dynprm: wp.array2d[vec10]
 
 
 @wp.struct
@@ -169,7 +163,7 @@ def gear_rates_of_site(worldid: int, site: int, levers: Levers, motion_in: Motio
 
 
 @wp.kernel
-def pull_actuator_parameters(
+def pull_gears(
     # Model:
     joints: Joints,
     tendons: TendonRows,
@@ -179,7 +173,6 @@ def pull_actuator_parameters(
     lanes: int,
     live_in: wp.array[int],
     bars_in: ActuatorBars,
-    law_bars_in: ActuatorLawBars,
     drive_in: Drive,
     levers_in: Levers,
     state_in: State,
@@ -189,19 +182,13 @@ def pull_actuator_parameters(
     ten_J_in: wp.array2d[float],
     ten_length_in: wp.array2d[float],
     # Out:
-    gradients_out: ActuatorGradients,
-    timestep_out: TimestepGradient,
+    gradients_out: GearGradients,
 ) -> None:
-    """θ̄ -= ∂Φ/∂θ: what `pull_actuators` has left of the law's own, and gears through length and rates."""
+    """θ̄ -= ∂Φ/∂θ of gears, through length and rates."""
     worldid, lane = wp.tid()
     if live_in[worldid] == 0:
         return
     for uid in range(lane, count, lanes):
-        gradients_out.actuator_gainprm[worldid, uid] += law_bars_in.gainprm[worldid, uid]
-        gradients_out.actuator_biasprm[worldid, uid] += law_bars_in.biasprm[worldid, uid]
-        gradients_out.actuator_dynprm[worldid, uid] += law_bars_in.dynprm[worldid, uid]
-        wp.atomic_add(timestep_out.timestep, worldid, law_bars_in.timestep[worldid, uid])
-
         kind = actuators.actuator_trntype[uid]
         target = actuators.actuator_trnid[uid][0]
         rates = GearRates()
@@ -234,23 +221,16 @@ def pull_actuator_parameters(
         gradients_out.actuator_gear[worldid, uid] += gear_bar
 
 
-class ActuatorStage(ParameterStage):
-    """Launches of the gradients of actuators' parameters."""
+class GearStage(ParameterStage):
+    """Launches of the gradients of gears."""
 
-    kinds = (ActuatorGradients, TimestepGradient)
-
-    def __init__(self, parts: Parts, gradients: dict[Any, Any]) -> None:
-        super().__init__(parts, gradients)
-        assert parts.actuators is not None  # `applies`
-        self._actuators = parts.actuators
-        self._actuators.keep_law()
+    kinds = (GearGradients,)
 
     @classmethod
-    def applies(cls, parts: Parts) -> bool:
-        return parts.actuators is not None
+    def applies(cls, adjoint: StepAdjoint) -> bool:
+        return adjoint.actuators is not None
 
     def launch(self, at: Substep) -> None:
-        actuators = self._actuators
-        self.work.launch_lanes(
-            pull_actuator_parameters, self.work.model.nactuator, at, actuators.bars, actuators.law_bars, *self.gradients
-        )
+        assert self.adjoint.actuators is not None  # `applies`
+        bars = self.adjoint.actuators.bars
+        self.work.launch_lanes(pull_gears, self.work.model.nactuator, at, bars, *self.gradients)
