@@ -72,7 +72,7 @@ the checkout does not ask for; one that appears as the code changes has to be ad
 
 FROM_CTRL_TO_KERNEL = (
     *(r"^class WarpSimStep\(", r"^class Stepper\b", r"^class Engine\b", r"^class BatchTensors\b", r"^class Graph\b"),
-    *(r"^class TapePerSubstep\b", r"^class WorldBatch\b", r"^class Stages\b", r"^def recomputed\("),
+    *(r"^class TapePerSubstep\b", r"^class WorldBatch\b", r"^class Stages\b", r"^def (recomputed|substep_pullback)\("),
     *(r"^class StepAdjoint\b", r"^ *def pull_actuators\("),
 )
 """What the path of a control's tensor goes through, to the kernel of actuators and back."""

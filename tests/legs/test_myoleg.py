@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from needs import slow
+from policy_gradient import check_chain
 
 from msk_ray.config import PhysicsConfig
 from msk_ray.envs import make_env
@@ -20,7 +21,7 @@ from msk_ray.legs.myoleg.model import SUBSTEPS, Couplings, build_myoleg
 from msk_ray.legs.myoleg.source import find_model
 from msk_ray.step import Simulation, StepState, TapePerSubstep
 from msk_ray.step.autograd.tangent import quat_exp, quat_multiply, quat_rotate
-from msk_ray.step.check import check_chain, check_gradients, make_states
+from msk_ray.step.check import check_gradients, make_states
 
 pytestmark = pytest.mark.long
 

@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from policy_gradient import check_chain
 
 from msk_ray.config import PhysicsConfig
 from msk_ray.envs import make_env
@@ -11,7 +12,7 @@ from msk_ray.legs.config import LegReward
 from msk_ray.legs.myoleg26.config import MyoLeg26Settings
 from msk_ray.legs.myoleg26.model import SUBSTEPS, build_myoleg26
 from msk_ray.step import Simulation, TapePerSubstep
-from msk_ray.step.check import check_chain, check_gradients, make_states
+from msk_ray.step.check import check_gradients, make_states
 
 pytestmark = pytest.mark.long
 

@@ -7,12 +7,15 @@ the arrays, so that one thread walks a world's steps in order and nothing that i
 Axes: W worlds, S frames, the world's own first.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
 import warp as wp
+
+from msk_ray.step.adjoint.spatial import three
 
 PLACE = wp.constant(0)
 FREE = wp.constant(1)
@@ -26,6 +29,13 @@ _KIND = {
     mujoco.mjtJoint.mjJNT_SLIDE: 3,
     mujoco.mjtJoint.mjJNT_HINGE: 4,
 }
+
+
+@wp.func
+def quat_at(qpos: wp.array2d[float], worldid: int, first: int) -> wp.quat:
+    """Unit quaternion of a row; qpos holds (w, x, y, z), wp.quat (x, y, z, w)."""
+    u = three(qpos, worldid, first + 1)
+    return wp.normalize(wp.quat(u[0], u[1], u[2], qpos[worldid, first]))
 
 
 @wp.kernel
@@ -66,26 +76,12 @@ def walk_frames(
             linvel_out[worldid, s + 1] = linvel + wp.cross(angvel, arm)
             angvel_out[worldid, s + 1] = angvel
         elif kind == FREE:
-            # qpos holds (w, x, y, z), wp.quat (x, y, z, w).
-            turned = wp.normalize(
-                wp.quat(
-                    qpos_in[worldid, qadr + 4],
-                    qpos_in[worldid, qadr + 5],
-                    qpos_in[worldid, qadr + 6],
-                    qpos_in[worldid, qadr + 3],
-                )
-            )
-            pos_out[worldid, s + 1] = wp.vec3(
-                qpos_in[worldid, qadr], qpos_in[worldid, qadr + 1], qpos_in[worldid, qadr + 2]
-            )
+            turned = quat_at(qpos_in, worldid, qadr + 3)
+            pos_out[worldid, s + 1] = three(qpos_in, worldid, qadr)
             quat_out[worldid, s + 1] = turned
-            linvel_out[worldid, s + 1] = wp.vec3(
-                qvel_in[worldid, vadr], qvel_in[worldid, vadr + 1], qvel_in[worldid, vadr + 2]
-            )
+            linvel_out[worldid, s + 1] = three(qvel_in, worldid, vadr)
             # The angular velocity of a free joint is in the body's own frame.
-            angvel_out[worldid, s + 1] = wp.quat_rotate(
-                turned, wp.vec3(qvel_in[worldid, vadr + 3], qvel_in[worldid, vadr + 4], qvel_in[worldid, vadr + 5])
-            )
+            angvel_out[worldid, s + 1] = wp.quat_rotate(turned, three(qvel_in, worldid, vadr + 3))
         elif kind == SLIDE:
             axis = wp.quat_rotate(quat, step_axis[s])
             travel = (qpos_in[worldid, qadr] - step_reference[s]) * axis
@@ -105,18 +101,9 @@ def walk_frames(
             angvel_out[worldid, s + 1] = spin
         elif kind == BALL:
             arm = wp.quat_rotate(quat, step_offset[s])
-            turned = quat * wp.normalize(
-                wp.quat(
-                    qpos_in[worldid, qadr + 1],
-                    qpos_in[worldid, qadr + 2],
-                    qpos_in[worldid, qadr + 3],
-                    qpos_in[worldid, qadr],
-                )
-            )
+            turned = quat * quat_at(qpos_in, worldid, qadr)
             back = wp.quat_rotate(turned, step_offset[s])
-            spin = angvel + wp.quat_rotate(
-                turned, wp.vec3(qvel_in[worldid, vadr], qvel_in[worldid, vadr + 1], qvel_in[worldid, vadr + 2])
-            )
+            spin = angvel + wp.quat_rotate(turned, three(qvel_in, worldid, vadr))
             pos_out[worldid, s + 1] = pos + arm - back
             quat_out[worldid, s + 1] = turned
             linvel_out[worldid, s + 1] = linvel + wp.cross(angvel, arm) - wp.cross(spin, back)
@@ -151,6 +138,12 @@ class FrameArrays:
         return iter((self.pos, self.quat, self.linvel, self.angvel))
 
 
+def _device_array(values: Sequence[Any], dtype: Any) -> wp.array:
+    width = wp.types.type_size(dtype)
+    host = np.asarray(values, np.int32 if dtype is int else np.float32)
+    return wp.array(host.reshape((-1, width) if width > 1 else -1), dtype=dtype)
+
+
 class FrameWalk:
     """Launches that take (qpos, qvel) to the frames of all bodies, and cotangents of the frames back.
 
@@ -167,49 +160,34 @@ class FrameWalk:
     """
 
     def __init__(self, mjm: mujoco.MjModel, nworld: int, device: wp.Device) -> None:
-        kinds, parents, offsets, quats, axes, references, qposadrs, dofadrs = ([] for _ in range(8))
+        steps: list[tuple[Any, ...]] = []  # in the order of the kernel's arguments
         self.body_frame = np.zeros(mjm.nbody, dtype=np.int64)
-
-        def step(kind: int, parent: int, offset: object, quat: object, axis: object, joint: int | None) -> int:
-            kinds.append(kind)
-            parents.append(parent)
-            offsets.append(offset)
-            quats.append(quat)
-            axes.append(axis)
-            references.append(0.0 if joint is None or kind not in (3, 4) else mjm.qpos0[mjm.jnt_qposadr[joint]])
-            qposadrs.append(0 if joint is None else mjm.jnt_qposadr[joint])
-            dofadrs.append(0 if joint is None else mjm.jnt_dofadr[joint])
-            return len(kinds)
-
-        none = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 1.0)
+        rest, up = (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 1.0)
         for body in range(1, mjm.nbody):
             frame = int(self.body_frame[mjm.body_parentid[body]])
             joints = range(mjm.body_jntadr[body], mjm.body_jntadr[body] + mjm.body_jntnum[body])
             if not any(mjm.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE for j in joints):
                 w, x, y, z = mjm.body_quat[body]
-                frame = step(0, frame, mjm.body_pos[body], (x, y, z, w), none[2], None)
+                steps.append((0, frame, mjm.body_pos[body], (x, y, z, w), up, 0.0, 0, 0))
+                frame = len(steps)
             for j in joints:
-                kind = _KIND[mujoco.mjtJoint(mjm.jnt_type[j])]
-                frame = step(kind, frame, mjm.jnt_pos[j], none[1], mjm.jnt_axis[j], j)
+                kind, qposadr = _KIND[mujoco.mjtJoint(mjm.jnt_type[j])], mjm.jnt_qposadr[j]
+                reference = mjm.qpos0[qposadr] if kind in (3, 4) else 0.0
+                addresses = (qposadr, mjm.jnt_dofadr[j])
+                steps.append((kind, frame, mjm.jnt_pos[j], rest, mjm.jnt_axis[j], reference, *addresses))
+                frame = len(steps)
             self.body_frame[body] = frame
         self._nworld, self._device = nworld, device
         with wp.ScopedDevice(device):
-            self._model = [
-                wp.array(np.asarray(kinds, np.int32), dtype=int),
-                wp.array(np.asarray(parents, np.int32), dtype=int),
-                wp.array(np.asarray(offsets, np.float32).reshape(-1, 3), dtype=wp.vec3),
-                wp.array(np.asarray(quats, np.float32).reshape(-1, 4), dtype=wp.quat),
-                wp.array(np.asarray(axes, np.float32).reshape(-1, 3), dtype=wp.vec3),
-                wp.array(np.asarray(references, np.float32), dtype=float),
-                wp.array(np.asarray(qposadrs, np.int32), dtype=int),
-                wp.array(np.asarray(dofadrs, np.int32), dtype=int),
-            ]
+            dtypes = (int, int, wp.vec3, wp.quat, wp.vec3, float, int, int)
+            columns = zip(*steps, strict=True) if steps else [()] * len(dtypes)
+            self._model = [_device_array(values, dtype) for values, dtype in zip(columns, dtypes, strict=True)]
             self.qpos = wp.zeros((nworld, mjm.nq), dtype=float)
             self.qvel = wp.zeros((nworld, mjm.nv), dtype=float)
             self.grad_qpos, self.grad_qvel = wp.zeros_like(self.qpos), wp.zeros_like(self.qvel)
-            self.frames = FrameArrays.zeros(nworld, len(kinds) + 1)
-            self.bars = FrameArrays.zeros(nworld, len(kinds) + 1)
-        world = np.zeros((nworld, len(kinds) + 1, 4), np.float32)
+            self.frames = FrameArrays.zeros(nworld, len(steps) + 1)
+            self.bars = FrameArrays.zeros(nworld, len(steps) + 1)
+        world = np.zeros((nworld, len(steps) + 1, 4), np.float32)
         world[:, 0, 3] = 1.0
         self.frames.quat.assign(world)
 

@@ -38,6 +38,20 @@ def four(x: wp.array2d[float], worldid: int, first: int) -> wp.quat:
 
 
 @wp.func
+def set_three(x: wp.array2d[float], worldid: int, first: int, values: wp.vec3) -> None:
+    """Write three neighbours of a row."""
+    for i in range(3):
+        x[worldid, first + i] = values[i]
+
+
+@wp.func
+def add_three(x: wp.array2d[float], worldid: int, first: int, values: wp.vec3) -> None:
+    """Add to three neighbours of a row, to which other threads may add too."""
+    for i in range(3):
+        wp.atomic_add(x, worldid, first + i, values[i])
+
+
+@wp.func
 def column(matrix: wp.mat33, k: int) -> wp.vec3:
     """Column k of a matrix."""
     return wp.vec3(matrix[0, k], matrix[1, k], matrix[2, k])

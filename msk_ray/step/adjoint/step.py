@@ -65,7 +65,7 @@ class StepAdjoint:
     `stages` are those of the batch, mujoco_warp's own by default.
 
     Attributes:
-        work, integrator, laws, contacts, tendons, actuators: the stages' buffers and launches that parameters build on.
+        work, integrator, laws, contacts, tendons, actuators: buffers and launches that parameters build on.
         grad_qpos: cotangent of qpos in tangent coordinates, shape (W, nv).
         grad_qvel: shape (W, nv).
         grad_act: shape (W, na).
@@ -154,17 +154,17 @@ class StepAdjoint:
 
 def _forces(work: Workspace, contacts: ContactForces, actuators: ActuatorForces | None) -> list[_Launch]:
     """The parts that a model needs, in their order."""
-    stages: list[_Launch] = []
+    launches: list[_Launch] = []
     if np.any(np.isin(work.mjm.eq_type, _ANCHORED)):
-        stages.append(partial(launch_anchors, work))
-    stages.append(partial(launch_scalar_rows, work))
-    stages.append(contacts.launch)
+        launches.append(partial(launch_anchors, work))
+    launches.append(partial(launch_scalar_rows, work))
+    launches.append(contacts.launch)
     if actuators is not None:
-        stages += [actuators.launch, partial(launch_transmissions, work, actuators.bars)]
+        launches += [actuators.launch, partial(launch_transmissions, work, actuators.bars)]
         if np.any(between_sites(work.mjm)):
-            stages.append(SitePairForces(work, actuators.bars).launch)
+            launches.append(SitePairForces(work, actuators.bars).launch)
     if work.tables.has_turning_spring:
-        stages.append(partial(launch_turning_springs, work))
+        launches.append(partial(launch_turning_springs, work))
     if work.settings.fluid_on:
-        stages.append(partial(launch_fluid, work))
-    return stages
+        launches.append(partial(launch_fluid, work))
+    return launches

@@ -7,7 +7,7 @@ import warp as wp
 from msk_ray.step.adjoint import StepAdjoint
 from msk_ray.step.adjoint.coverage.check import check_supported
 from msk_ray.step.adjoint.stages.integrate import add_into
-from msk_ray.step.adjoint.stages.recomputed import recomputed
+from msk_ray.step.adjoint.stages.substep_pullback import substep_pullback
 from msk_ray.step.forward.batch import WorldBatch
 
 
@@ -48,7 +48,7 @@ class TapedStep:
         self._batch = batch
         with wp.ScopedDevice(batch.device):
             self._adjoint = StepAdjoint(batch.mjm, batch.model, batch.data, stages=batch.stages)
-            self._substep = recomputed(self._adjoint)
+            self._substep = substep_pullback(self._adjoint)
             self._raw = wp.zeros((batch.nworld, batch.mjm.nq), dtype=float)
 
     def __call__(self, ctrl: wp.array, state: WarpState, tape: wp.Tape | None = None) -> WarpState:

@@ -19,8 +19,8 @@ from msk_ray.step.adjoint import StepAdjoint
 from msk_ray.step.adjoint.coverage.check import check_supported
 from msk_ray.step.adjoint.parameters import ParameterAdjoint
 from msk_ray.step.adjoint.stages.pull_counter import PullCounter
-from msk_ray.step.adjoint.stages.recomputed import recomputed
 from msk_ray.step.adjoint.stages.residual import ResidualGauge
+from msk_ray.step.adjoint.stages.substep_pullback import substep_pullback
 from msk_ray.step.autograd.backward import (
     INPUTS,
     Backward,
@@ -306,7 +306,7 @@ class TapePerSubstep(_Tape):
 
     def attach(self, batch: WorldBatch) -> None:
         super().attach(batch)
-        self._substep = recomputed(self._adjoint)
+        self._substep = substep_pullback(self._adjoint)
 
     def launch_step(self, batch: WorldBatch) -> None:
         data = batch.data

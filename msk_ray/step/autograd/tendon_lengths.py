@@ -7,7 +7,7 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from msk_ray.step.adjoint.tendon_lengths import TendonAdjoint
+from msk_ray.step.adjoint.tendon_pullback import TendonAdjoint
 from msk_ray.step.autograd.buffers import stream_of
 from msk_ray.step.errors import UnsupportedModelError
 from msk_ray.step.forward import Graph, WorldBatch

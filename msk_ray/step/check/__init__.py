@@ -7,12 +7,10 @@ if TYPE_CHECKING:
     from msk_ray.step.check.check import Comparison, GradientCheck, Limits, check_gradients
     from msk_ray.step.check.nonfinite import NonFinite
     from msk_ray.step.check.oracle import Linearization, Oracle, Point
-    from msk_ray.step.check.policy_gradient import ChainComparison, check_chain
     from msk_ray.step.check.states import STATE_KINDS, make_states
 
 __all__ = [
     "STATE_KINDS",
-    "ChainComparison",
     "Comparison",
     "GradientCheck",
     "Limits",
@@ -20,13 +18,11 @@ __all__ = [
     "NonFinite",
     "Oracle",
     "Point",
-    "check_chain",
     "check_gradients",
     "make_states",
 ]
 
 _HOMES = {
-    "policy_gradient": ("ChainComparison", "check_chain"),
     "check": ("Comparison", "GradientCheck", "Limits", "check_gradients"),
     "nonfinite": ("NonFinite",),
     "oracle": ("Linearization", "Oracle", "Point"),

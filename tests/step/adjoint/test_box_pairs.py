@@ -8,70 +8,10 @@ import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import pytest
-import warp as wp
-from displacements import displaced, turned
-from mujoco_warp import GeomType
-
-from msk_ray.step.adjoint.groups import Meshes, Shapes, gather
-from msk_ray.step.adjoint.laws.contact_geometry.capsule_box import capsule_box_push
-from msk_ray.step.adjoint.laws.contact_geometry.contact_point import Bars, ContactPoint, Geom
-from msk_ray.step.adjoint.laws.contact_geometry.convex import convex_wrenches, solid_of
-from msk_ray.step.adjoint.laws.contact_geometry.solids import Solid
+from contact_pairs import PlacedContact, displaced, pulled, turned, whole_turned
 
 EPS = 2e-3
 SIZES = {"box": (0.1, 0.07, 0.05), "capsule": (0.04, 0.15, 0.0), "ground": (0.2, 0.15, 0.1)}
-
-
-@wp.func
-def geom_of(solid: Solid) -> Geom:
-    geom = Geom()
-    geom.type = solid.type
-    geom.pos = solid.pos
-    geom.mat = solid.mat
-    geom.size = solid.size
-    return geom
-
-
-@wp.kernel(enable_backward=False)
-def wrenches(
-    shapes: Shapes,
-    meshes: Meshes,
-    native_ccd: int,
-    world: wp.array[int],
-    index: wp.array[int],
-    xpos: wp.array2d[wp.vec3],
-    xmat: wp.array2d[wp.mat33],
-    dist: wp.array[float],
-    point: wp.array[wp.vec3],
-    frame: wp.array[wp.mat33],
-    dist_bar: wp.array[float],
-    pos_bar: wp.array[wp.vec3],
-    normal_bar: wp.array[wp.vec3],
-    out: wp.array2d[wp.vec3],
-):
-    i = wp.tid()
-    solid1 = solid_of(0, world[i], shapes, meshes, xpos, xmat)
-    solid2 = solid_of(1, world[i], shapes, meshes, xpos, xmat)
-    contact = ContactPoint()
-    contact.dist = dist[i]
-    contact.point = point[i]
-    contact.normal = frame[i][0]
-    bars = Bars()
-    bars.dist = dist_bar[i]
-    bars.point = pos_bar[i]
-    bars.normal = normal_bar[i]
-    if solid1.type == GeomType.CAPSULE:
-        forces = capsule_box_push(index[i], geom_of(solid1), geom_of(solid2), contact, bars)
-        out[i, 0] = forces.force1
-        out[i, 1] = forces.torque1
-        out[i, 2] = forces.force2
-        out[i, 3] = forces.torque2
-    else:
-        push, _exact = convex_wrenches(solid1, solid2, meshes, contact, bars, native_ccd, 1)
-        out[i, 0] = push.force1
-        out[i, 1] = push.torque1 + wp.cross(point[i] - solid1.pos, push.force1)
-        out[i, 2] = push.force2
-        out[i, 3] = push.torque2 + wp.cross(point[i] - solid2.pos, push.force2)
 
 
 def two_bodies(shape: str, flag: str, margin: float) -> mujoco.MjModel:
@@ -90,7 +30,6 @@ def touching(model: mujoco.MjModel, shape: str, tilt: float, rng: np.random.Gene
     data = mujoco.MjData(model)
     quat = np.array([np.sqrt(0.5), 0, np.sqrt(0.5), 0]) if shape == "capsule" else np.array([1.0, 0, 0, 0])
     quat = turned(turned(quat, np.array([0, 0, rng.uniform(0, 6.28)])), tilt * np.array([*rng.normal(size=2), 0.0]))
-    # The pair as a whole is turned too: nothing may depend on the world's axes.
     whole = rng.normal(size=3)
     for height in np.arange(0.35, 0.05, -5e-4):
         data.qpos[:3] = (
@@ -101,17 +40,11 @@ def touching(model: mujoco.MjModel, shape: str, tilt: float, rng: np.random.Gene
         mujoco.mj_forward(model, data)
         if data.ncon and float(np.min(data.contact.dist)) < -0.008:
             break
-    rotation = np.zeros(9)
-    whole_quat = turned(np.array([1.0, 0, 0, 0]), whole)
-    mujoco.mju_quat2Mat(rotation, whole_quat)
-    data.qpos[:3] = rotation.reshape(3, 3) @ data.qpos[:3]
-    for address in (3, 10):
-        data.qpos[address : address + 4] = turned(data.qpos[address : address + 4], whole)
-    return np.array(data.qpos)
+    return whole_turned(np.array(data.qpos), whole)
 
 
 def contacts(model: mujoco.MjModel, poses: np.ndarray) -> tuple[list[dict[int, np.ndarray]], np.ndarray, np.ndarray]:
-    """By world: contact index to (dist, point, frame) in 13 numbers; and the geoms' positions and rotations."""
+    """By world: contact index to (dist, point, normal) in 7 numbers; and the geoms' positions and rotations."""
     m = mjw.put_model(model)
     d = mjw.make_data(model, nworld=len(poses), nconmax=16, njmax=64)
     d.qpos.assign(poses.astype(np.float32))
@@ -128,7 +61,7 @@ def contacts(model: mujoco.MjModel, poses: np.ndarray) -> tuple[list[dict[int, n
         d.contact.frame.numpy()[:count],
         strict=True,
     ):
-        found[world][int(index)] = np.concatenate([[dist], point, frame.ravel()])
+        found[world][int(index)] = np.concatenate([[dist], point, frame[0]])
     return found, d.geom_xpos.numpy(), d.geom_xmat.numpy()
 
 
@@ -150,7 +83,7 @@ def test_contact_follows_both_bodies(shape, tilt, flag, margin):
     model = two_bodies(shape, flag, margin)
     poses = [touching(model, shape, tilt, rng) for _ in range(24)]
     found, geom_pos, geom_mat = contacts(model, np.array([moved for p in poses for moved in (p, *displaced(p, EPS))]))
-    rows, differences, weights = [], [], []
+    rows, expected = [], []
     for i in range(len(poses)):
         worlds = found[25 * i : 25 * (i + 1)]
         for index, contact in worlds[0].items():
@@ -158,41 +91,15 @@ def test_contact_follows_both_bodies(shape, tilt, flag, margin):
             if any(index not in w or len(w) != len(worlds[0]) for w in worlds):
                 continue
             weight = np.concatenate([[3.0 * rng.normal()], rng.normal(size=6)])
-            moved = np.array([weight @ w[index][:7] for w in worlds[1:]]).reshape(12, 2)
-            curved = np.abs(moved.sum(1) - 2 * weight @ contact[:7]).max() / EPS
+            moved = np.array([weight @ w[index] for w in worlds[1:]]).reshape(12, 2)
+            curved = np.abs(moved.sum(1) - 2 * weight @ contact).max() / EPS
             if curved > 0.05:  # a kink inside the differences
                 continue
-            rows.append((25 * i, index, contact))
-            differences.append((moved[:, 0] - moved[:, 1]) / (2 * EPS))
-            weights.append(weight)
+            rows.append(PlacedContact(geom_pos[25 * i], geom_mat[25 * i], geom_pos[25 * i], index, contact, weight))
+            expected.append((moved[:, 0] - moved[:, 1]) / (2 * EPS))
     assert len(rows) >= 12
-    base = np.array([r[0] for r in rows])
-    contact = np.array([r[2] for r in rows], np.float32)
-    weight = np.array(weights, np.float32)
-    out, m = wp.zeros((len(rows), 4), dtype=wp.vec3), mjw.put_model(model)
-    wp.launch(
-        wrenches,
-        dim=len(rows),
-        inputs=[
-            gather(Shapes, m),
-            gather(Meshes, m),
-            int(not flag),
-            wp.array(base, dtype=int),
-            wp.array([r[1] for r in rows], dtype=int),
-            wp.array(geom_pos, dtype=wp.vec3),
-            wp.array(geom_mat, dtype=wp.mat33),
-            wp.array(contact[:, 0], dtype=float),
-            wp.array(contact[:, 1:4], dtype=wp.vec3),
-            wp.array(contact[:, 4:].reshape(-1, 3, 3), dtype=wp.mat33),
-            wp.array(weight[:, 0], dtype=float),
-            wp.array(weight[:, 1:4], dtype=wp.vec3),
-            wp.array(weight[:, 4:], dtype=wp.vec3),
-        ],
-        outputs=[out],
-    )
-    got = out.numpy().reshape(len(rows), 12)
-    expected = np.array(differences)
-    error = np.linalg.norm(got - expected, axis=1) / np.linalg.norm(expected, axis=1)
+    wrenches, _exact = pulled(model, rows)
+    error = np.linalg.norm(wrenches - expected, axis=1) / np.linalg.norm(expected, axis=1)
     print(f"{len(rows)} contacts, median {np.median(error):.1e}, largest {error.max():.1e}")
     # Float32 differences: 1e-3 of rounding, and curvature times the step.
     assert np.median(error) < 2e-3

@@ -8,15 +8,9 @@ which `test_box_pairs` compares with MuJoCo Warp.
 from typing import NamedTuple
 
 import mujoco
-import mujoco_warp as mjw
 import numpy as np
 import pytest
-import warp as wp
-from displacements import displaced, turned
-
-from msk_ray.step.adjoint.groups import Meshes, Shapes, gather
-from msk_ray.step.adjoint.laws.contact_geometry.contact_point import Bars, ContactPoint
-from msk_ray.step.adjoint.laws.contact_geometry.convex import convex_wrenches, solid_of
+from contact_pairs import PlacedContact, displaced, pulled, turned, whole_turned
 
 pytestmark = pytest.mark.long
 
@@ -39,42 +33,6 @@ SPREAD = np.random.default_rng(5).normal(size=(400, 3))
 PEBBLE = " ".join(f"{x:.5f}" for x in (SPREAD / np.linalg.norm(SPREAD, axis=1)[:, None] * [0.1, 0.08, 0.05]).ravel())
 """400 corners, so that neighbouring faces lie within MuJoCo's 5° of each other."""
 HILLS = " ".join(f"{h:.2f}" for h in np.random.default_rng(4).uniform(0, 1, 30))
-
-
-@wp.kernel(enable_backward=False)
-def wrenches(
-    shapes: Shapes,
-    meshes: Meshes,
-    multi_ccd: int,
-    native_ccd: int,
-    xpos: wp.array2d[wp.vec3],
-    xmat: wp.array2d[wp.mat33],
-    dist: wp.array[float],
-    point: wp.array[wp.vec3],
-    normal: wp.array[wp.vec3],
-    dist_bar: wp.array[float],
-    point_bar: wp.array[wp.vec3],
-    normal_bar: wp.array[wp.vec3],
-    out: wp.array2d[wp.vec3],
-    exact_out: wp.array[wp.bool],
-):
-    i = wp.tid()
-    contact = ContactPoint()
-    contact.dist = dist[i]
-    contact.point = point[i]
-    contact.normal = normal[i]
-    bars = Bars()
-    bars.dist = dist_bar[i]
-    bars.point = point_bar[i]
-    bars.normal = normal_bar[i]
-    solid1 = solid_of(0, i, shapes, meshes, xpos, xmat)
-    solid2 = solid_of(1, i, shapes, meshes, xpos, xmat)
-    push, exact = convex_wrenches(solid1, solid2, meshes, contact, bars, native_ccd, multi_ccd)
-    out[i, 0] = push.force1
-    out[i, 1] = push.torque1
-    out[i, 2] = push.force2
-    out[i, 3] = push.torque2
-    exact_out[i] = exact
 
 
 def two_bodies(first: str, second: str, flag: str = "", margin: float = 0.0) -> mujoco.MjModel:
@@ -147,58 +105,28 @@ def touching(data: mujoco.MjData, quats: list[np.ndarray], rng: np.random.Genera
         if (found := contacts(data, qpos)) and min(c.dist for c in found) < 0.0:
             qpos[9] -= depth
             break
-    whole = rng.normal(size=3)
-    rotation = np.zeros(9)
-    mujoco.mju_quat2Mat(rotation, turned(np.array([1.0, 0, 0, 0]), whole))
-    qpos[7:10] = rotation.reshape(3, 3) @ qpos[7:10]
-    qpos[3:7], qpos[10:14] = turned(qpos[3:7], whole), turned(qpos[10:14], whole)
-    return qpos
+    return whole_turned(qpos, rng.normal(size=3))
 
 
 def compare(model: mujoco.MjModel, poses: list[np.ndarray], step: Step) -> tuple[np.ndarray, np.ndarray]:
     """Relative errors of all contacts that have differences, and whether each was found exact."""
     rng = np.random.default_rng(0)
     data = mujoco.MjData(model)
-    rows = []
+    rows, expected = [], []
     for qpos in poses:
-        found = contacts(data, qpos)
+        touching = contacts(data, qpos)
         places = (data.geom_xpos.copy(), data.geom_xmat.reshape(-1, 3, 3).copy(), data.xpos[1:].copy())
-        for contact in found:
+        for contact in touching:
             weight = np.concatenate([[3.0 * rng.normal()], rng.normal(size=6)])
             # Only the turn of the normal counts.
             weight[4:] -= (weight[4:] @ contact.normal) * contact.normal
             slope = slopes(data, qpos, contact, weight, step)
             if slope is not None:
-                rows.append((places, contact, weight, slope))
-    m = mjw.put_model(model)
-    out, exact = wp.zeros((len(rows), 4), dtype=wp.vec3), wp.zeros(len(rows), dtype=wp.bool)
-    vectors = [[r[1].point for r in rows], [r[1].normal for r in rows]]
-    disabled, bit = model.opt.disableflags, mujoco.mjtDisableBit
-    wp.launch(
-        wrenches,
-        dim=len(rows),
-        inputs=[
-            gather(Shapes, m),
-            gather(Meshes, m),
-            int(not disabled & bit.mjDSBL_MULTICCD),
-            int(not disabled & bit.mjDSBL_NATIVECCD),
-            wp.array(np.array([r[0][0] for r in rows]), dtype=wp.vec3),
-            wp.array(np.array([r[0][1] for r in rows]), dtype=wp.mat33),
-            wp.array([r[1].dist for r in rows], dtype=float),
-            *(wp.array(np.array(v), dtype=wp.vec3) for v in vectors),
-            wp.array([r[2][0] for r in rows], dtype=float),
-            wp.array(np.array([r[2][1:4] for r in rows]), dtype=wp.vec3),
-            wp.array(np.array([r[2][4:] for r in rows]), dtype=wp.vec3),
-        ],
-        outputs=[out, exact],
-    )
-    got = out.numpy().astype(float)
-    for i, (places, contact, _, _) in enumerate(rows):
-        for side in range(2):
-            got[i, 2 * side + 1] += np.cross(contact.point - places[2][side], got[i, 2 * side])
-    expected = np.array([r[3] for r in rows])
-    errors = np.linalg.norm(got.reshape(-1, 12) - expected, axis=1) / np.linalg.norm(expected, axis=1)
-    return errors, exact.numpy()
+                rows.append(PlacedContact(*places, 0, np.concatenate([[contact.dist], *contact[1:]]), weight))
+                expected.append(slope)
+    wrenches, exact = pulled(model, rows)
+    errors = np.linalg.norm(wrenches - expected, axis=1) / np.linalg.norm(expected, axis=1)
+    return errors, exact
 
 
 def upright_or_lying(rng: np.random.Generator) -> np.ndarray:

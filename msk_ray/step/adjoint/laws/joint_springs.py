@@ -7,7 +7,7 @@ import warp as wp
 from mujoco_warp import JointType
 
 from msk_ray.step.adjoint.groups import DofSlopes, Joints, Springs, State, Substep
-from msk_ray.step.adjoint.spatial import four, three
+from msk_ray.step.adjoint.spatial import add_three, four, three
 from msk_ray.step.adjoint.workspace import Workspace
 from msk_ray.step.forward.mjw_private import poly_force, quat_sub
 
@@ -27,12 +27,12 @@ def log_rate_pullback(phi: wp.vec3, g: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def spring_slope(stiffness: float, poly: wp.vec2, dif: wp.vec3, lam: wp.vec3) -> wp.vec3:
+def spring_slope(stiffness: float, poly: wp.vec2, shift: wp.vec3, lam: wp.vec3) -> wp.vec3:
     """∂/∂d of k(|d|) λ·d, k = k₀ + p₀|d| + p₁|d|²."""
-    r = wp.length(dif)
+    r = wp.length(shift)
     out = poly_force(stiffness, poly, r, 0) * lam
     if r > 0.0:
-        out += (poly[0] / r + 2.0 * poly[1]) * wp.dot(lam, dif) * dif
+        out += (poly[0] / r + 2.0 * poly[1]) * wp.dot(lam, shift) * shift
     return out
 
 
@@ -60,23 +60,18 @@ def pull_turning_springs(
     v = joints.jnt_dofadr[jntid]
     rest = worldid % springs.qpos_spring.shape[0]
     if kind == JointType.FREE:
-        dif = wp.vec3(0.0)
-        lam = wp.vec3(0.0)
-        for i in range(3):
-            dif[i] = state_in.qpos[worldid, q + i] - springs.qpos_spring[rest, q + i]
-            lam[i] = lam_in[worldid, v + i]
-        slope = spring_slope(stiffness, poly, dif, lam)
-        for i in range(3):
-            wp.atomic_add(slopes_out.qpos, worldid, v + i, slope[i])
+        shift = three(state_in.qpos, worldid, q) - three(springs.qpos_spring, rest, q)
+        lam = three(lam_in, worldid, v)
+        slope = spring_slope(stiffness, poly, shift, lam)
+        add_three(slopes_out.qpos, worldid, v, slope)
         q += 3
         v += 3
-    now = four(state_in.qpos, worldid, q)
-    still = four(springs.qpos_spring, rest, q)
-    phi = quat_sub(wp.normalize(now), still)
+    quat = four(state_in.qpos, worldid, q)
+    rest_quat = four(springs.qpos_spring, rest, q)
+    phi = quat_sub(wp.normalize(quat), rest_quat)
     turn = three(lam_in, worldid, v)
     slope = log_rate_pullback(phi, spring_slope(stiffness, poly, phi, turn))
-    for i in range(3):
-        wp.atomic_add(slopes_out.qpos, worldid, v + i, slope[i])
+    add_three(slopes_out.qpos, worldid, v, slope)
 
 
 def launch_turning_springs(work: Workspace, at: Substep) -> None:

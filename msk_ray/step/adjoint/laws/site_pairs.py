@@ -15,7 +15,8 @@ from mujoco_warp import TrnType
 from msk_ray.step.adjoint.groups import FieldBars, Fields, Motion, Substep, gather
 from msk_ray.step.adjoint.laws.actuators import ActuatorBars
 from msk_ray.step.adjoint.laws.joint_springs import log_rate_pullback
-from msk_ray.step.adjoint.spatial import carried, point_velocity, turning_torque, wrench
+from msk_ray.step.adjoint.laws.transmission import push_load, weighted_twist
+from msk_ray.step.adjoint.spatial import point_velocity, turning_torque, wrench
 from msk_ray.step.adjoint.workspace import Workspace
 from msk_ray.step.forward.mjw_private import mul_quat, quat_sub
 from msk_ray.step.forward.model_tree import common_bodies
@@ -93,37 +94,6 @@ def pair_score(
     return gear[0] * (length_bar * length + rate)
 
 
-@wp.func
-def total_field(
-    body: int, worldid: int, rates: wp.vec4, fields_in: Fields, cvel_in: wp.array2d[wp.spatial_vector]
-) -> wp.spatial_vectorf:
-    """Σ ρ̄(x) V(x) of one body."""
-    smooth = fields_in.qacc[worldid, body] - fields_in.excess[worldid, body]
-    out = rates[0] * fields_in.lam[worldid, body] + rates[1] * cvel_in[worldid, body]
-    return out + rates[2] * fields_in.mu[worldid, body] + rates[3] * smooth
-
-
-@wp.func
-def push_load(
-    body: int,
-    worldid: int,
-    rates: wp.vec4,
-    load: wp.spatial_vectorf,
-    total: wp.spatial_vectorf,
-    moved: wp.spatial_vectorf,
-    bars_out: FieldBars,
-) -> None:
-    """Adds a load on one body: ρ̄(x) on every field, and what carrying it along gives; `moved` is its pose's own."""
-    if body > 0:
-        wp.atomic_add(bars_out.lam, worldid, body, rates[0] * load)
-        wp.atomic_add(bars_out.qvel, worldid, body, rates[1] * load)
-        wp.atomic_add(bars_out.mu, worldid, body, rates[2] * load)
-        # â = a - (a - â)
-        wp.atomic_add(bars_out.qacc, worldid, body, rates[3] * load)
-        wp.atomic_add(bars_out.excess, worldid, body, -rates[3] * load)
-        wp.atomic_add(bars_out.moved, worldid, body, carried(total, load) + moved)
-
-
 @wp.kernel
 def pull_site_pairs(
     lanes: int,
@@ -156,9 +126,9 @@ def pull_site_pairs(
         length_bar = actuator_bars_in.length[worldid, uid]
         gear = pairs.actuator_gear[worldid % pairs.actuator_gear.shape[0], uid]
         crank = int(kind == TrnType.SLIDERCRANK)
-        own_field = total_field(body, worldid, rates, fields_in, motion_in.cvel)
-        other_field = total_field(other, worldid, rates, fields_in, motion_in.cvel)
-        common_field = total_field(common, worldid, rates, fields_in, motion_in.cvel)
+        own_field = weighted_twist(body, worldid, rates, fields_in, motion_in.cvel)
+        other_field = weighted_twist(other, worldid, rates, fields_in, motion_in.cvel)
+        common_field = weighted_twist(common, worldid, rates, fields_in, motion_in.cvel)
         centre = motion_in.subtree_com[worldid, pairs.body_rootid[body]]
         other_centre = motion_in.subtree_com[worldid, pairs.body_rootid[other]]
         point = poses_in.site_xpos[worldid, site]

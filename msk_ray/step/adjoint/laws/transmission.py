@@ -9,7 +9,7 @@ from mujoco_warp import JointType, TrnType
 from msk_ray.step.adjoint.groups import DofSlopes, FieldBars, Fields, Joints, Motion, Multipliers, State, Substep
 from msk_ray.step.adjoint.laws.actuators import ActuatorBars
 from msk_ray.step.adjoint.laws.joint_springs import log_rate_pullback
-from msk_ray.step.adjoint.spatial import carried, four, point_velocity, three, wrench
+from msk_ray.step.adjoint.spatial import add_three, carried, four, point_velocity, three, wrench
 from msk_ray.step.adjoint.workspace import Workspace
 from msk_ray.step.forward.mjw_private import quat_to_vel
 
@@ -23,6 +23,45 @@ class Transmissions:
     actuator_trntype: wp.array[int]
     actuator_trnid: wp.array[wp.vec2i]
     actuator_gear: wp.array2d[wp.spatial_vector]
+
+
+@wp.func
+def weighted_dof(worldid: int, dof: int, rates: wp.vec4, state_in: State, multipliers_in: Multipliers) -> float:
+    """Σ ρ̄(x) x of one dof, x = λ, v, μ, â."""
+    smooth = state_in.qacc[worldid, dof] - multipliers_in.excess[worldid, dof]
+    out = rates[0] * multipliers_in.lam[worldid, dof] + rates[1] * state_in.qvel[worldid, dof]
+    return out + (rates[2] * multipliers_in.mu[worldid, dof] + rates[3] * smooth)
+
+
+@wp.func
+def weighted_twist(
+    body: int, worldid: int, rates: wp.vec4, fields_in: Fields, cvel_in: wp.array2d[wp.spatial_vector]
+) -> wp.spatial_vectorf:
+    """Σ ρ̄(x) V(x) of one body."""
+    smooth = fields_in.qacc[worldid, body] - fields_in.excess[worldid, body]
+    out = rates[0] * fields_in.lam[worldid, body] + rates[1] * cvel_in[worldid, body]
+    return out + rates[2] * fields_in.mu[worldid, body] + rates[3] * smooth
+
+
+@wp.func
+def push_load(
+    body: int,
+    worldid: int,
+    rates: wp.vec4,
+    load: wp.spatial_vectorf,
+    total: wp.spatial_vectorf,
+    moved: wp.spatial_vectorf,
+    bars_out: FieldBars,
+) -> None:
+    """Adds a load on one body: ρ̄(x) on every field, and what carrying it along gives; `moved` is its pose's own."""
+    if body > 0:
+        wp.atomic_add(bars_out.lam, worldid, body, rates[0] * load)
+        wp.atomic_add(bars_out.qvel, worldid, body, rates[1] * load)
+        wp.atomic_add(bars_out.mu, worldid, body, rates[2] * load)
+        # â = a - (a - â)
+        wp.atomic_add(bars_out.qacc, worldid, body, rates[3] * load)
+        wp.atomic_add(bars_out.excess, worldid, body, -rates[3] * load)
+        wp.atomic_add(bars_out.moved, worldid, body, carried(total, load) + moved)
 
 
 @wp.kernel
@@ -71,13 +110,10 @@ def pull_turning_joints(
             moment = three(actuator_moment_in, worldid, first)
             x = wp.vec3(0.0)
             for i in range(3):
-                smooth = state_in.qacc[worldid, dof + i] - multipliers_in.excess[worldid, dof + i]
-                x[i] = bars[0] * multipliers_in.lam[worldid, dof + i] + bars[1] * state_in.qvel[worldid, dof + i]
-                x[i] += bars[2] * multipliers_in.mu[worldid, dof + i] + bars[3] * smooth
+                x[i] = weighted_dof(worldid, dof + i, bars, state_in, multipliers_in)
             # m·x = gear·R x ,  d(R x) = R (w × x)
             slope += wp.cross(x, moment)
-        for i in range(3):
-            wp.atomic_add(slopes_out.qpos, worldid, dof + i, slope[i])
+        add_three(slopes_out.qpos, worldid, dof, slope)
 
 
 @wp.kernel
@@ -116,19 +152,11 @@ def pull_sites(
         arm = site_xpos_in[worldid, site] - motion_in.subtree_com[worldid, body_rootid[body]]
         load = wrench(force, torque, arm)
         bars = actuator_bars_in.rate[worldid, uid]
-        smooth = fields_in.qacc[worldid, body] - fields_in.excess[worldid, body]
-        total = bars[0] * fields_in.lam[worldid, body] + bars[1] * motion_in.cvel[worldid, body]
-        total += bars[2] * fields_in.mu[worldid, body] + bars[3] * smooth
-        wp.atomic_add(bars_out.lam, worldid, body, bars[0] * load)
-        wp.atomic_add(bars_out.qvel, worldid, body, bars[1] * load)
-        wp.atomic_add(bars_out.mu, worldid, body, bars[2] * load)
-        # â = a - (a - â)
-        wp.atomic_add(bars_out.qacc, worldid, body, bars[3] * load)
-        wp.atomic_add(bars_out.excess, worldid, body, -bars[3] * load)
+        total = weighted_twist(body, worldid, bars, fields_in, motion_in.cvel)
         # The point moves (p̄ = F × ω), and F and T turn with the body: torques F × u and T × ω.
         spin = wp.spatial_top(total)
         turn = wp.cross(force, point_velocity(total, arm)) + wp.cross(torque, spin)
-        wp.atomic_add(bars_out.moved, worldid, body, carried(total, load) + wrench(wp.cross(force, spin), turn, arm))
+        push_load(body, worldid, bars, load, total, wrench(wp.cross(force, spin), turn, arm), bars_out)
 
 
 def launch_transmissions(work: Workspace, bars: ActuatorBars, at: Substep) -> None:

@@ -15,20 +15,20 @@ from msk_ray.step.adjoint.laws.actuators import ActuatorGradients
 from msk_ray.step.adjoint.laws.scalar_rows import RowGradients
 from msk_ray.step.adjoint.laws.tendon_paths import SiteGradients
 from msk_ray.step.adjoint.laws.tendons import TendonGradients
-from msk_ray.step.adjoint.parameters.absent_friction import AbsentFrictionStage
-from msk_ray.step.adjoint.parameters.base import GradientBuffer, ParameterStage
-from msk_ray.step.adjoint.parameters.contacts import MaterialStage
-from msk_ray.step.adjoint.parameters.gears import GearStage
-from msk_ray.step.adjoint.parameters.geoms import GeomStage
-from msk_ray.step.adjoint.parameters.inertia import InertiaStage
-from msk_ray.step.adjoint.parameters.joints import JointStage
-from msk_ray.step.adjoint.parameters.timestep import TimestepStage
+from msk_ray.step.adjoint.parameters.absent_friction import AbsentFrictionFamily
+from msk_ray.step.adjoint.parameters.base import GradientBuffer, ParameterFamily
+from msk_ray.step.adjoint.parameters.contacts import MaterialFamily
+from msk_ray.step.adjoint.parameters.gears import GearFamily
+from msk_ray.step.adjoint.parameters.geoms import GeomFamily
+from msk_ray.step.adjoint.parameters.inertia import InertiaFamily
+from msk_ray.step.adjoint.parameters.joints import JointFamily
+from msk_ray.step.adjoint.parameters.timestep import TimestepFamily
 from msk_ray.step.adjoint.step import StepAdjoint
 from msk_ray.step.forward.parameters import PARAMETERS
 
-STAGES: tuple[type[ParameterStage], ...] = (
-    *(TimestepStage, InertiaStage, JointStage, AbsentFrictionStage, MaterialStage, GeomStage),
-    GearStage,
+FAMILIES: tuple[type[ParameterFamily], ...] = (
+    *(TimestepFamily, InertiaFamily, JointFamily, AbsentFrictionFamily, MaterialFamily, GeomFamily),
+    GearFamily,
 )
 """The families that have launches of their own, in their order."""
 LAW_GRADIENTS: tuple[Any, ...] = (
@@ -59,12 +59,12 @@ class ParameterAdjoint:
         work = adjoint.work
         fields = {name: PARAMETERS[name].field for name in names}
         asked = set(fields.values())
-        chosen = [s for s in STAGES if any(not asked.isdisjoint(kind.vars) for kind in s.kinds)]
+        chosen = [s for s in FAMILIES if any(not asked.isdisjoint(kind.vars) for kind in s.kinds)]
         with wp.ScopedDevice(work.device):
-            kinds = dict.fromkeys(kind for stage in chosen for kind in stage.kinds)
+            kinds = dict.fromkeys(kind for family in chosen for kind in family.kinds)
             kinds |= dict.fromkeys(kind for kind in LAW_GRADIENTS if not asked.isdisjoint(kind.vars))
             self._buffer = GradientBuffer(kinds, work.model, work.nworld)
-            self._stages = [stage(adjoint, self._buffer.groups) for stage in chosen if stage.applies(adjoint)]
+            self._families = [family(adjoint, self._buffer.groups) for family in chosen if family.applies(adjoint)]
             self._lanes = [wp.Stream(work.device) for _ in range(_LANES)] if work.device.is_cuda else []
         self._device = work.device
         self.rows: wp.array = self._buffer.rows
@@ -77,20 +77,20 @@ class ParameterAdjoint:
 
     def launch_first(self, at: Substep, qvel_next: wp.array) -> None:
         """Launch what comes before the pullback of a substep."""
-        for stage in self._stages:
-            stage.launch_first(at, qvel_next)
+        for family in self._families:
+            family.launch_first(at, qvel_next)
 
     def launch(self, at: Substep) -> None:
         """Launch what one substep adds, when its cotangents are there; what is launched after it waits for all."""
         if not self._lanes:
-            for stage in self._stages:
-                stage.launch(at)
+            for family in self._families:
+                family.launch(at)
             return
         main = wp.get_stream(self._device)
         for lane in self._lanes:
             lane.wait_stream(main)
-        for stage, lane in zip(self._stages, itertools.cycle((main, *self._lanes))):
+        for family, lane in zip(self._families, itertools.cycle((main, *self._lanes))):
             with wp.ScopedStream(lane, sync_enter=False):
-                stage.launch(at)
+                family.launch(at)
         for lane in self._lanes:
             main.wait_stream(lane)

@@ -6,7 +6,7 @@ from msk_ray.step.adjoint.groups import State, Substep, TendonRows
 from msk_ray.step.adjoint.laws.impedance import stiffness_damping
 from msk_ray.step.adjoint.laws.scalar_rows import RowGradients, RowSettings
 from msk_ray.step.adjoint.laws.tendons import tendon_rate
-from msk_ray.step.adjoint.parameters.base import ParameterStage
+from msk_ray.step.adjoint.parameters.base import ParameterFamily
 from msk_ray.step.forward.mjw_private import vec5
 
 wp.set_module_options({"enable_backward": False})
@@ -78,7 +78,7 @@ def pull_absent_friction(
             gradients_out.tendon_frictionloss[worldid, t] = gradients_out.tendon_frictionloss[worldid, t] + slope
 
 
-class AbsentFrictionStage(ParameterStage):
+class AbsentFrictionFamily(ParameterFamily):
     """Launches of the gradients of friction losses of zero."""
 
     kinds = (RowGradients,)

@@ -1,4 +1,4 @@
-"""What the stages that differentiate parameters share.
+"""What the families of parameters that have kernels of their own share.
 
 With λ, μ, a and â held fixed, the gradient of a parameter θ is -∂Φ/∂θ (see `step`), besides what θ does to the
 integration of activations and positions.
@@ -15,12 +15,12 @@ from msk_ray.step.adjoint.groups import Substep
 from msk_ray.step.adjoint.step import StepAdjoint
 
 
-class ParameterStage(ABC):
+class ParameterFamily(ABC):
     """The gradients of one family of parameters.
 
     Attributes:
-        kinds: groups of the gradients to which it adds; their fields are named as in MjModel, without `opt.`. The stage
-            is launched if a field of any of them is asked for.
+        kinds: groups of the gradients to which it adds; their fields are named as in MjModel, without `opt.`. It is
+            launched if a field of any of them is asked for.
     """
 
     kinds: ClassVar[tuple[Any, ...]]

@@ -12,7 +12,7 @@ import warp as wp
 from msk_ray.step.adjoint.groups import Contacts, Fields, Motion, RowLaws, Rows, Shapes, Substep, TimestepGradient
 from msk_ray.step.adjoint.laws.contacts import components, relative_rates, row_count
 from msk_ray.step.adjoint.laws.impedance import impedance, stiffness_damping
-from msk_ray.step.adjoint.parameters.base import ParameterStage
+from msk_ray.step.adjoint.parameters.base import ParameterFamily
 from msk_ray.step.adjoint.parameters.contact_laws import ContactMotion, contact_score, pyramid_weight
 from msk_ray.step.adjoint.step import StepAdjoint
 from msk_ray.step.forward.mjw_private import ConstraintType, vec5
@@ -205,7 +205,7 @@ def pull_materials(
     pull_mix(worldid, geoms[1], geoms[0], 1.0 - mix, materials, friction_bar, solref_bar, solimp_bar, gradients_out)
 
 
-class MaterialStage(ParameterStage):
+class MaterialFamily(ParameterFamily):
     """Launches of the gradients of friction, solref and solimp of contacts."""
 
     kinds = (MaterialGradients, TimestepGradient)

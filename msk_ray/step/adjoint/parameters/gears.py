@@ -23,7 +23,8 @@ from msk_ray.step.adjoint.laws.actuators import (
     Drive,
     is_held,
 )
-from msk_ray.step.adjoint.parameters.base import ParameterStage
+from msk_ray.step.adjoint.laws.transmission import weighted_dof, weighted_twist
+from msk_ray.step.adjoint.parameters.base import ParameterFamily
 from msk_ray.step.adjoint.parameters.inertia import rotation
 from msk_ray.step.adjoint.spatial import four, point_velocity
 from msk_ray.step.adjoint.step import StepAdjoint
@@ -49,30 +50,21 @@ class Levers:
     site_xmat: wp.array2d[wp.mat33]
 
 
-@wp.struct
-class GearRates:
-    """An actuator's length and its rates under λ, v, μ and â, each by component of its gear."""
-
-    length: wp.spatial_vectorf
-    lam: wp.spatial_vectorf
-    vel: wp.spatial_vectorf
-    mu: wp.spatial_vectorf
-    smooth: wp.spatial_vectorf
-
-
 @wp.func
-def gear_rates_of_joint(
+def joint_rate(
     worldid: int,
     jnt: int,
     in_parent: bool,
+    bars: wp.vec4,
+    length_bar: float,
     joints: Joints,
     actuators: ActuatorSettings,
     drive_in: Drive,
     state_in: State,
     multipliers_in: Multipliers,
-) -> GearRates:
-    """Rates of an actuator on a joint; a joint at its actuator force limit has none under λ."""
-    out = GearRates()
+) -> wp.spatial_vectorf:
+    """∂Φ by the gear of an actuator on a joint; at its actuator force limit a joint has no rate under λ."""
+    out = wp.spatial_vectorf()
     kind = joints.jnt_type[jnt]
     dof = joints.jnt_dofadr[jnt]
     q = joints.jnt_qposadr[jnt]
@@ -85,81 +77,47 @@ def gear_rates_of_joint(
         count = int(6)
         turn = int(3)
         q += 3
-    else:
-        out.length[0] = state_in.qpos[worldid, q]
     for i in range(count):
-        j = dof + i
-        if not is_held(worldid, j, actuators, drive_in):
-            out.lam[i] = multipliers_in.lam[worldid, j]
-        out.vel[i] = state_in.qvel[worldid, j]
-        out.mu[i] = multipliers_in.mu[worldid, j]
-        out.smooth[i] = state_in.qacc[worldid, j] - multipliers_in.excess[worldid, j]
-    if turn >= 0:
-        quat = wp.normalize(four(state_in.qpos, worldid, q))
-        if kind == JointType.BALL:
-            phi = quat_to_vel(quat)
-            for i in range(3):
-                out.length[i] = phi[i]
-        if in_parent:
-            mat = rotation(quat)
-            lam = mat @ wp.vec3(out.lam[turn], out.lam[turn + 1], out.lam[turn + 2])
-            vel = mat @ wp.vec3(out.vel[turn], out.vel[turn + 1], out.vel[turn + 2])
-            mu = mat @ wp.vec3(out.mu[turn], out.mu[turn + 1], out.mu[turn + 2])
-            smooth = mat @ wp.vec3(out.smooth[turn], out.smooth[turn + 1], out.smooth[turn + 2])
-            for i in range(3):
-                out.lam[turn + i] = lam[i]
-                out.vel[turn + i] = vel[i]
-                out.mu[turn + i] = mu[i]
-                out.smooth[turn + i] = smooth[i]
+        own = bars
+        if is_held(worldid, dof + i, actuators, drive_in):
+            own[0] = 0.0
+        out[i] = weighted_dof(worldid, dof + i, own, state_in, multipliers_in)
+    if turn < 0:
+        out[0] += length_bar * state_in.qpos[worldid, q]
+        return out
+    quat = wp.normalize(four(state_in.qpos, worldid, q))
+    x = wp.vec3(out[turn], out[turn + 1], out[turn + 2])
+    if in_parent:
+        x = rotation(quat) @ x
+    if kind == JointType.BALL:
+        x += length_bar * quat_to_vel(quat)
+    for i in range(3):
+        out[turn + i] = x[i]
     return out
 
 
 @wp.func
-def gear_rates_of_tendon(
+def tendon_gear_rate(
     worldid: int,
     t: int,
+    bars: wp.vec4,
     tendons: TendonRows,
     actuators: ActuatorSettings,
     drive_in: Drive,
     state_in: State,
     multipliers_in: Multipliers,
     ten_J_in: wp.array2d[float],
-    ten_length_in: wp.array2d[float],
-) -> GearRates:
-    """Rates of an actuator on a tendon."""
-    out = GearRates()
-    out.length[0] = ten_length_in[worldid, t]
+) -> float:
+    """Rate of a tendon under Σ_x ρ̄(x) x, x = λ and v alone: κ holds the others."""
+    rate = float(0.0)
     start = tendons.ten_J_rowadr[t]
     for k in range(start, start + tendons.ten_J_rownnz[t]):
         j = tendons.ten_J_colind[k]
-        lever = ten_J_in[worldid, k]
-        if not is_held(worldid, j, actuators, drive_in):
-            out.lam[0] += lever * multipliers_in.lam[worldid, j]
-        out.vel[0] += lever * state_in.qvel[worldid, j]
-        out.mu[0] += lever * multipliers_in.mu[worldid, j]
-        out.smooth[0] += lever * (state_in.qacc[worldid, j] - multipliers_in.excess[worldid, j])
-    return out
-
-
-@wp.func
-def site_rate(mat: wp.mat33, twist: wp.spatial_vectorf, arm: wp.vec3) -> wp.spatial_vectorf:
-    """Velocity and spin of a site in its own frame."""
-    turned = wp.transpose(mat)
-    return wp.spatial_vector(turned @ point_velocity(twist, arm), turned @ wp.spatial_top(twist))
-
-
-@wp.func
-def gear_rates_of_site(worldid: int, site: int, levers: Levers, motion_in: Motion, fields_in: Fields) -> GearRates:
-    """Rates of an actuator on a site, whose length is zero."""
-    out = GearRates()
-    body = levers.site_bodyid[site]
-    mat = levers.site_xmat[worldid, site]
-    arm = levers.site_xpos[worldid, site] - motion_in.subtree_com[worldid, levers.body_rootid[body]]
-    out.lam = site_rate(mat, fields_in.lam[worldid, body], arm)
-    out.vel = site_rate(mat, motion_in.cvel[worldid, body], arm)
-    out.mu = site_rate(mat, fields_in.mu[worldid, body], arm)
-    out.smooth = site_rate(mat, fields_in.qacc[worldid, body] - fields_in.excess[worldid, body], arm)
-    return out
+        own = wp.vec4(bars[0], bars[1], 0.0, 0.0)
+        if is_held(worldid, j, actuators, drive_in):
+            own[0] = 0.0
+        rate += ten_J_in[worldid, k] * weighted_dof(worldid, j, own, state_in, multipliers_in)
+    return rate
 
 
 @wp.kernel
@@ -191,37 +149,33 @@ def pull_gears(
     for uid in range(lane, count, lanes):
         kind = actuators.actuator_trntype[uid]
         target = actuators.actuator_trnid[uid][0]
-        rates = GearRates()
+        bars = bars_in.rate[worldid, uid]
+        length_bar = bars_in.length[worldid, uid]
+        slope = wp.spatial_vectorf()
         if kind == TrnType.TENDON:
-            rates = gear_rates_of_tendon(
-                worldid, target, tendons, actuators, drive_in, state_in, multipliers_in, ten_J_in, ten_length_in
+            slope[0] = length_bar * ten_length_in[worldid, target] + tendon_gear_rate(
+                worldid, target, bars, tendons, actuators, drive_in, state_in, multipliers_in, ten_J_in
             )
-        elif kind == TrnType.SITE:
-            rates = gear_rates_of_site(worldid, target, levers_in, motion_in, fields_in)
-        elif kind == TrnType.JOINT or kind == TrnType.JOINTINPARENT:  # a slider-crank's gear is no parameter
-            rates = gear_rates_of_joint(
-                worldid,
-                target,
-                kind == TrnType.JOINTINPARENT,
-                joints,
-                actuators,
-                drive_in,
-                state_in,
-                multipliers_in,
-            )
-        bar = bars_in.rate[worldid, uid]
-        gear_bar = -(bar[0] * rates.lam + bar[1] * rates.vel + bars_in.length[worldid, uid] * rates.length)
-        if kind == TrnType.TENDON:
             # κ counts pairs that M couples, and is quadratic in the one gear
             gear = actuators.actuator_gear[worldid % actuators.actuator_gear.shape[0], uid][0]
             if gear != 0.0:
-                gear_bar[0] += 2.0 * bars_in.implicit[worldid, uid] / gear
-        else:
-            gear_bar -= bar[2] * rates.mu + bar[3] * rates.smooth
-        gradients_out.actuator_gear[worldid, uid] += gear_bar
+                slope[0] -= 2.0 * bars_in.implicit[worldid, uid] / gear
+        elif kind == TrnType.SITE:
+            body = levers_in.site_bodyid[target]
+            centre = motion_in.subtree_com[worldid, levers_in.body_rootid[body]]
+            twist = weighted_twist(body, worldid, bars, fields_in, motion_in.cvel)
+            back = wp.transpose(levers_in.site_xmat[worldid, target])
+            rate = back @ point_velocity(twist, levers_in.site_xpos[worldid, target] - centre)
+            slope = wp.spatial_vector(rate, back @ wp.spatial_top(twist))
+        elif kind == TrnType.JOINT or kind == TrnType.JOINTINPARENT:  # a slider-crank's gear is no parameter
+            in_parent = kind == TrnType.JOINTINPARENT
+            slope = joint_rate(
+                worldid, target, in_parent, bars, length_bar, joints, actuators, drive_in, state_in, multipliers_in
+            )
+        gradients_out.actuator_gear[worldid, uid] -= slope
 
 
-class GearStage(ParameterStage):
+class GearFamily(ParameterFamily):
     """Launches of the gradients of gears."""
 
     kinds = (GearGradients,)

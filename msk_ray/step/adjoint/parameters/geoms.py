@@ -11,7 +11,7 @@ import warp as wp
 from mujoco_warp import GeomType
 
 from msk_ray.step.adjoint.groups import Contacts, GeomGradients, Substep
-from msk_ray.step.adjoint.parameters.base import ParameterStage
+from msk_ray.step.adjoint.parameters.base import ParameterFamily
 from msk_ray.step.adjoint.spatial import column, quat_gradient
 from msk_ray.step.adjoint.step import StepAdjoint
 
@@ -114,7 +114,7 @@ def pull_geoms(
     )
 
 
-class GeomStage(ParameterStage):
+class GeomFamily(ParameterFamily):
     """Launches of the gradients of geoms' poses and sizes."""
 
     kinds = (GeomGradients,)

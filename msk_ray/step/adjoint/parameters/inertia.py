@@ -11,7 +11,7 @@ linear in the ten inertial parameters once the point is fixed.
 import warp as wp
 
 from msk_ray.step.adjoint.groups import Fields, Motion, Substep
-from msk_ray.step.adjoint.parameters.base import ParameterStage
+from msk_ray.step.adjoint.parameters.base import ParameterFamily
 from msk_ray.step.adjoint.spatial import point_velocity, quat_gradient
 
 wp.set_module_options({"enable_backward": False})
@@ -119,7 +119,7 @@ def pull_inertia(
     gradients_out.body_iquat[worldid, body] = gradients_out.body_iquat[worldid, body] - quat_gradient(quat, turn)
 
 
-class InertiaStage(ParameterStage):
+class InertiaFamily(ParameterFamily):
     """Launches of the inertial parameters' gradients."""
 
     kinds = (InertiaGradients,)

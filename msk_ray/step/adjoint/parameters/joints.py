@@ -5,8 +5,8 @@ from mujoco_warp import JointType
 
 from msk_ray.step.adjoint.groups import Joints, Multipliers, Springs, State, Substep
 from msk_ray.step.adjoint.laws.joint_springs import log_rate_pullback, spring_slope
-from msk_ray.step.adjoint.parameters.base import ParameterStage
-from msk_ray.step.adjoint.spatial import four, quat_gradient, three
+from msk_ray.step.adjoint.parameters.base import ParameterFamily
+from msk_ray.step.adjoint.spatial import add_three, four, quat_gradient, three
 from msk_ray.step.forward.mjw_private import poly_force_deriv, quat_sub
 
 wp.set_module_options({"enable_backward": False})
@@ -20,31 +20,6 @@ class JointGradients:
     dof_armature: wp.array2d[float]
     jnt_stiffness: wp.array2d[float]
     qpos_spring: wp.array2d[float]
-
-
-@wp.func
-def free_spring(
-    worldid: int,
-    q: int,
-    v: int,
-    rest: int,
-    stiffness: float,
-    poly: wp.vec2,
-    springs: Springs,
-    state_in: State,
-    lam_in: wp.array2d[float],
-    gradients_out: JointGradients,
-) -> float:
-    """Adds the gradients of the rest position of a free joint's translation; returns λ·d."""
-    dif = wp.vec3(0.0)
-    lam = wp.vec3(0.0)
-    for i in range(3):
-        dif[i] = state_in.qpos[worldid, q + i] - springs.qpos_spring[rest, q + i]
-        lam[i] = lam_in[worldid, v + i]
-    slope = spring_slope(stiffness, poly, dif, lam)
-    for i in range(3):
-        gradients_out.qpos_spring[worldid, q + i] = gradients_out.qpos_spring[worldid, q + i] + slope[i]
-    return wp.dot(lam, dif)
 
 
 @wp.kernel
@@ -101,9 +76,10 @@ def pull_joints(
         gradients_out.qpos_spring[worldid, q] = gradients_out.qpos_spring[worldid, q] + slope
     else:
         if kind == JointType.FREE:
-            pull = free_spring(
-                worldid, q, v, rest, stiffness, poly, springs, state_in, multipliers_in.lam, gradients_out
-            )
+            dif = three(state_in.qpos, worldid, q) - three(springs.qpos_spring, rest, q)
+            lam_shift = three(multipliers_in.lam, worldid, v)
+            pull = wp.dot(lam_shift, dif)
+            add_three(gradients_out.qpos_spring, worldid, q, spring_slope(stiffness, poly, dif, lam_shift))
             q += 3
             v += 3
         now = four(state_in.qpos, worldid, q)
@@ -119,7 +95,7 @@ def pull_joints(
     gradients_out.jnt_stiffness[worldid, jnt] = gradients_out.jnt_stiffness[worldid, jnt] - pull
 
 
-class JointStage(ParameterStage):
+class JointFamily(ParameterFamily):
     """Launches of the gradients of damping, armature and springs."""
 
     kinds = (JointGradients,)

@@ -8,7 +8,7 @@ besides what constraints give it (a time constant is held above 2 h) and activat
 import warp as wp
 
 from msk_ray.step.adjoint.groups import Multipliers, State, Substep, TimestepGradient
-from msk_ray.step.adjoint.parameters.base import ParameterStage
+from msk_ray.step.adjoint.parameters.base import ParameterFamily
 
 wp.set_module_options({"enable_backward": False})
 
@@ -56,7 +56,7 @@ def pull_step_of_velocity(
     wp.atomic_add(gradient_out.timestep, worldid, slope / opt_timestep[worldid % opt_timestep.shape[0]])
 
 
-class TimestepStage(ParameterStage):
+class TimestepFamily(ParameterFamily):
     """Launches of what the integration of positions and velocities gives the time step."""
 
     kinds = (TimestepGradient,)

@@ -7,7 +7,7 @@ import warp as wp
 from mujoco_warp import JointType
 
 from msk_ray.step.adjoint.groups import DofSlopes, Joints, Substep
-from msk_ray.step.adjoint.spatial import three
+from msk_ray.step.adjoint.spatial import set_three, three
 from msk_ray.step.adjoint.workspace import Workspace
 from msk_ray.step.forward.mjw_private import dof_damping_total, poly_force_deriv
 
@@ -149,8 +149,7 @@ def project(
     q = joints.jnt_qposadr[jntid]
     v = joints.jnt_dofadr[jntid]
     if kind == JointType.FREE:
-        for i in range(3):
-            tangent_out[worldid, v + i] = raw_in[worldid, q + i]
+        set_three(tangent_out, worldid, v, three(raw_in, worldid, q))
         q += 3
         v += 3
     if kind == JointType.FREE or kind == JointType.BALL:
@@ -160,8 +159,7 @@ def project(
         gu = three(raw_in, worldid, q + 1)
         # d(q⊗exp δ)/dδ at 0 is ½ q⊗[0, ·]  ⇒  δ̄ = ½ (w ḡ - ḡ_w u - u × ḡ)
         g = 0.5 * (w * gu - gw * u - wp.cross(u, gu))
-        for i in range(3):
-            tangent_out[worldid, v + i] = g[i]
+        set_three(tangent_out, worldid, v, g)
     else:
         tangent_out[worldid, v] = raw_in[worldid, q]
 
@@ -185,8 +183,7 @@ def lift(
     q = joints.jnt_qposadr[jntid]
     v = joints.jnt_dofadr[jntid]
     if kind == JointType.FREE:
-        for i in range(3):
-            raw_out[worldid, q + i] = tangent_in[worldid, v + i]
+        set_three(raw_out, worldid, q, three(tangent_in, worldid, v))
         q += 3
         v += 3
     if kind == JointType.FREE or kind == JointType.BALL:
@@ -198,8 +195,7 @@ def lift(
             g /= square
         raw_out[worldid, q] = -2.0 * wp.dot(u, g)
         r = 2.0 * (w * g + wp.cross(u, g))
-        for i in range(3):
-            raw_out[worldid, q + 1 + i] = r[i]
+        set_three(raw_out, worldid, q + 1, r)
     else:
         raw_out[worldid, q] = tangent_in[worldid, v]
 

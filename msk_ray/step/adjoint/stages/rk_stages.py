@@ -12,7 +12,7 @@ import warp as wp
 from mujoco_warp import DynType, JointType
 
 from msk_ray.step.adjoint.groups import Joints, allocate_rows
-from msk_ray.step.adjoint.spatial import four, three
+from msk_ray.step.adjoint.spatial import four, set_three, three
 from msk_ray.step.adjoint.workspace import Workspace
 from msk_ray.step.forward.mjw_private import deriv_expmap, quat_integrate, vec10
 
@@ -111,8 +111,8 @@ def next_stage(
             quat = quat_integrate(quat, a * three(last_in.rate, worldid, turn), h)
             for i in range(4):
                 qpos_out[worldid, q + i] = quat[i]
-            for i in range(3):
-                qvel_out[worldid, turn + i] = first_in.qvel[worldid, turn + i] + h * a * last_in.qacc[worldid, turn + i]
+            qvel = three(first_in.qvel, worldid, turn) + h * a * three(last_in.qacc, worldid, turn)
+            set_three(qvel_out, worldid, turn, qvel)
     if k < activations.actuator_dyntype.shape[0]:
         step = act_step(activations, worldid, k, h)
         start = activations.actuator_actadr[k]
@@ -143,11 +143,10 @@ def stage_rates(
         if a != 0.0:
             phi = opt_timestep[worldid % opt_timestep.shape[0]] * a * three(last_rate_in, worldid, turn)
         rate = deriv_expmap(phi, three(qvel_in, worldid, turn))
-        for i in range(3):
-            rate_out[worldid, turn + i] = rate[i]
+        set_three(rate_out, worldid, turn, rate)
 
 
-class Stages:
+class StageBuffers:
     """Buffers of the four stages, and the launches that fill them.
 
     Attributes:

@@ -14,14 +14,14 @@ import warp as wp
 
 from msk_ray.step.adjoint.groups import Joints, allocate_rows
 from msk_ray.step.adjoint.laws.joint_springs import log_rate_pullback
-from msk_ray.step.adjoint.spatial import three
+from msk_ray.step.adjoint.spatial import set_three, three
 from msk_ray.step.adjoint.stages.integrate import rate_pullback, rotation_pullback
 from msk_ray.step.adjoint.stages.recompute import recompute_stages
 from msk_ray.step.adjoint.stages.rk_stages import (
     A,
     Activations,
     Stage,
-    Stages,
+    StageBuffers,
     act_step,
     straight_dofs,
     turning_dof,
@@ -112,9 +112,8 @@ def start_bars(
             g = three(grad_qpos_in, worldid, turn)
             back = rotation_pullback(phi, g)
             rate = rate_pullback(phi, g)
-            for i in range(3):
-                bars_out.next_rate[worldid, turn + i] = rate[i]
-                bars_out.sum_qpos[worldid, turn + i] = back[i]
+            set_three(bars_out.next_rate, worldid, turn, rate)
+            set_three(bars_out.sum_qpos, worldid, turn, back)
         for i in range(count):
             j = v + i
             bars_out.next_qvel[worldid, j] = grad_qvel_in[worldid, j]
@@ -263,7 +262,7 @@ class RungeKutta:
         self._adjoint, self._work = adjoint, adjoint.work
         work = adjoint.work
         with wp.ScopedDevice(work.device):
-            self._stages = Stages(work)
+            self._stages = StageBuffers(work)
             widths = dict.fromkeys(("act", "next_act", "sum_act"), work.mjm.na)
             self._bars = allocate_rows(StageBars, work.nworld, widths, work.mjm.nv)
 

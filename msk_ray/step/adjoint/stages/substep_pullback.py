@@ -10,7 +10,7 @@ from msk_ray.step.adjoint.stages.runge_kutta import RungeKutta
 from msk_ray.step.adjoint.step import StepAdjoint
 
 
-class RecomputedSubstep(Protocol):
+class SubstepPullback(Protocol):
     """The pullback of one substep."""
 
     def pull_back(self, data: Any, qvel_next: wp.array, *extras: Any) -> None:
@@ -36,7 +36,7 @@ class SingleStage:
         self._adjoint.pull_back(data, qvel_next, *extras)
 
 
-def recomputed(adjoint: StepAdjoint) -> RecomputedSubstep:
+def substep_pullback(adjoint: StepAdjoint) -> SubstepPullback:
     """The pullback for the integrator of the model."""
     if adjoint.work.mjm.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
         return RungeKutta(adjoint)
