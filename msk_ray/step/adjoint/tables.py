@@ -7,6 +7,8 @@ import mujoco
 import numpy as np
 import warp as wp
 
+from msk_ray.step.adjoint.coverage.features import has_spring, joint_transmission, site_transmission
+from msk_ray.step.adjoint.coverage.model_elements import among
 from msk_ray.step.forward.model_tree import lone_free_bodies
 
 _ROTATION_OFFSET = {mujoco.mjtJoint.mjJNT_FREE: 3, mujoco.mjtJoint.mjJNT_BALL: 0}
@@ -64,12 +66,6 @@ def _dof_groups(mjm: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     return first, last
 
 
-def _has_spring(mjm: mujoco.MjModel, joint: int) -> bool:
-    poly = getattr(mjm, "jnt_stiffnesspoly", None)
-    bent = poly is not None and bool(np.any(poly[joint]))
-    return bool(mjm.jnt_stiffness[joint] != 0 or bent)
-
-
 def _segments(mjm: mujoco.MjModel) -> np.ndarray:
     """(tendon, first, geom, last) of every stretch between two sites, shape (segments, 4)."""
     wrap = mujoco.mjtWrap
@@ -86,15 +82,6 @@ def _segments(mjm: mujoco.MjModel) -> np.ndarray:
             elif kinds[1] in (int(wrap.mjWRAP_SPHERE), int(wrap.mjWRAP_CYLINDER)):
                 out.append((tendon, place, place + 1, place + 2))
     return np.array(out, dtype=np.int32).reshape(-1, 4)
-
-
-def _drives_turning_joint(mjm: mujoco.MjModel) -> bool:
-    kinds = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
-    turning = (int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL))
-    return any(
-        int(mjm.actuator_trntype[u]) in kinds and int(mjm.jnt_type[mjm.actuator_trnid[u, 0]]) in turning
-        for u in range(mjm.nu)
-    )
 
 
 def _has_scalar_rows(mjm: mujoco.MjModel) -> bool:
@@ -120,15 +107,10 @@ def build_tables(mjm: mujoco.MjModel, model: Any) -> Tables:
         subtree_end[parent] = max(subtree_end[parent], subtree_end[body])
     first, last = _dof_groups(mjm)
     springs = np.full(mjm.nv, -1, dtype=np.int32)
-    turning = False
-    disabled = bool(mjm.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SPRING)
-    for joint in range(mjm.njnt):
-        if disabled or not _has_spring(mjm, joint):
-            continue
-        if int(mjm.jnt_type[joint]) in (int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)):
-            turning = True
-        else:
-            springs[mjm.jnt_dofadr[joint]] = mjm.jnt_qposadr[joint]
+    enabled = not mjm.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SPRING
+    sprung, turning = has_spring(mjm) & enabled, among(mjm.jnt_type, _ROTATION_OFFSET)
+    straight = sprung & ~turning
+    springs[mjm.jnt_dofadr[straight]] = mjm.jnt_qposadr[straight]
     address = np.full((mjm.nv, mjm.nv), -1, dtype=np.int32)
     nnz, start, column = model.M_rownnz.numpy(), model.M_rowadr.numpy(), model.M_colind.numpy()
     for i in range(mjm.nv):
@@ -160,9 +142,7 @@ def build_tables(mjm: mujoco.MjModel, model: Any) -> Tables:
         segment_last=ints(segments[:, 3].copy()),
         has_wrapping=bool(np.any(segments[:, 2] >= 0)),
         has_scalar_rows=_has_scalar_rows(mjm),
-        has_turning_transmission=_drives_turning_joint(mjm),
-        has_site_transmission=bool(
-            np.any((mjm.actuator_trntype == int(mujoco.mjtTrn.mjTRN_SITE)) & (mjm.actuator_trnid[:, 1] < 0))
-        ),
-        has_turning_spring=turning,
+        has_turning_transmission=bool(joint_transmission(*_ROTATION_OFFSET)(mjm)),
+        has_site_transmission=bool(site_transmission(False)(mjm)),
+        has_turning_spring=bool(np.any(sprung & turning)),
     )

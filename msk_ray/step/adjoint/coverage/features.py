@@ -47,21 +47,23 @@ def _limited(*kinds: int) -> Finder:
     return where(_OBJ.mjOBJ_JOINT, "joint", lambda m: among(m.jnt_type, kinds) & (m.jnt_limited != 0))
 
 
-def _spring(*kinds: int) -> Finder:
-    def test(m: mujoco.MjModel) -> np.ndarray:
-        stiff = np.asarray(m.jnt_stiffness) != 0
-        if hasattr(m, "jnt_stiffnesspoly"):
-            stiff = stiff | np.any(m.jnt_stiffnesspoly != 0, axis=-1)
-        return among(m.jnt_type, kinds) & stiff
+def has_spring(m: mujoco.MjModel) -> np.ndarray:
+    """Which joints have a spring."""
+    stiff = np.asarray(m.jnt_stiffness) != 0
+    return stiff | np.any(m.jnt_stiffnesspoly != 0, axis=-1) if hasattr(m, "jnt_stiffnesspoly") else stiff
 
-    return where(_OBJ.mjOBJ_JOINT, "joint", test)
+
+def _spring(*kinds: int) -> Finder:
+    return where(_OBJ.mjOBJ_JOINT, "joint", lambda m: among(m.jnt_type, kinds) & has_spring(m))
 
 
 def _actuator(field: str, *kinds: int) -> Finder:
     return where(_OBJ.mjOBJ_ACTUATOR, "actuator", lambda m: among(getattr(m, field), kinds))
 
 
-def _joint_transmission(*kinds: int) -> Finder:
+def joint_transmission(*kinds: int) -> Finder:
+    """Actuators that drive joints of some types."""
+
     def test(m: mujoco.MjModel) -> np.ndarray:
         on_joint = among(m.actuator_trntype, (_TRN.mjTRN_JOINT, _TRN.mjTRN_JOINTINPARENT))
         joint = np.clip(m.actuator_trnid[:, 0], 0, max(m.njnt - 1, 0))
@@ -70,7 +72,9 @@ def _joint_transmission(*kinds: int) -> Finder:
     return where(_OBJ.mjOBJ_ACTUATOR, "actuator", test)
 
 
-def _site_transmission(referred: bool) -> Finder:
+def site_transmission(referred: bool) -> Finder:
+    """Actuators at sites, with or without a reference site."""
+
     def test(m: mujoco.MjModel) -> np.ndarray:
         return np.asarray((m.actuator_trntype == int(_TRN.mjTRN_SITE)) & ((m.actuator_trnid[:, 1] >= 0) == referred))
 
@@ -308,15 +312,15 @@ FEATURES: tuple[Feature, ...] = (
         where(_OBJ.mjOBJ_ACTUATOR, "actuator", _foreign_actuator),
         "a motor's currents, temperature and bristles are states with laws of their own; user laws are unknown",
     ),
-    Feature("transmission to hinge and slide joints", True, _joint_transmission(_JNT.mjJNT_HINGE, _JNT.mjJNT_SLIDE)),
+    Feature("transmission to hinge and slide joints", True, joint_transmission(_JNT.mjJNT_HINGE, _JNT.mjJNT_SLIDE)),
     Feature(
         "transmission to free and ball joints, also in the parent's frame",
         True,
-        _joint_transmission(_JNT.mjJNT_FREE, _JNT.mjJNT_BALL),
+        joint_transmission(_JNT.mjJNT_FREE, _JNT.mjJNT_BALL),
         "a rotational servo more than half a turn from its target is not wrapped",
     ),
     Feature("transmission to tendons", True, _actuator("actuator_trntype", _TRN.mjTRN_TENDON)),
-    Feature("transmission to sites", True, _site_transmission(False)),
+    Feature("transmission to sites", True, site_transmission(False)),
     Feature("transmission to sites with a reference site, and slider-cranks", True, _actuators_at(between_sites)),
     Feature(
         "implicitfast with an actuator between sites of different branches",

@@ -100,16 +100,6 @@ class Anchors:
     eq_data: wp.array2d[vec12]
 
 
-@wp.struct
-class AnchorPoses:
-    """Poses of bodies and sites."""
-
-    xpos: wp.array2d[wp.vec3]
-    xquat: wp.array2d[wp.quat]
-    xmat: wp.array2d[wp.mat33]
-    site_xpos: wp.array2d[wp.vec3]
-
-
 @wp.kernel
 def pull_anchors(
     lanes: int,
@@ -122,7 +112,10 @@ def pull_anchors(
     nefc_in: wp.array[int],
     rows_in: Rows,
     laws_in: RowLaws,
-    poses_in: AnchorPoses,
+    xpos_in: wp.array2d[wp.vec3],
+    xquat_in: wp.array2d[wp.quat],
+    xmat_in: wp.array2d[wp.mat33],
+    site_xpos_in: wp.array2d[wp.vec3],
     motion_in: Motion,
     fields_in: Fields,
     # Out:
@@ -158,13 +151,13 @@ def pull_anchors(
         if anchors.eq_objtype[eq] == ObjType.SITE:
             site1 = body1
             site2 = body2
-            point1 = poses_in.site_xpos[worldid, site1]
-            point2 = poses_in.site_xpos[worldid, site2]
+            point1 = site_xpos_in[worldid, site1]
+            point2 = site_xpos_in[worldid, site2]
             body1 = anchors.site_bodyid[site1]
             body2 = anchors.site_bodyid[site2]
             rest = worldid % anchors.site_quat.shape[0]
-            q1 = quat_product(as_vec4(poses_in.xquat[worldid, body1]), as_vec4(anchors.site_quat[rest, site1]))
-            q2 = quat_product(as_vec4(poses_in.xquat[worldid, body2]), as_vec4(anchors.site_quat[rest, site2]))
+            q1 = quat_product(as_vec4(xquat_in[worldid, body1]), as_vec4(anchors.site_quat[rest, site1]))
+            q2 = quat_product(as_vec4(xquat_in[worldid, body2]), as_vec4(anchors.site_quat[rest, site2]))
         else:
             anchor1 = wp.vec3(data[0], data[1], data[2])
             anchor2 = wp.vec3(data[3], data[4], data[5])
@@ -172,10 +165,10 @@ def pull_anchors(
                 # A weld lists its second body's anchor first.
                 anchor1 = wp.vec3(data[3], data[4], data[5])
                 anchor2 = wp.vec3(data[0], data[1], data[2])
-                q1 = quat_product(as_vec4(poses_in.xquat[worldid, body1]), wp.vec4(data[6], data[7], data[8], data[9]))
-                q2 = as_vec4(poses_in.xquat[worldid, body2])
-            point1 = poses_in.xpos[worldid, body1] + poses_in.xmat[worldid, body1] @ anchor1
-            point2 = poses_in.xpos[worldid, body2] + poses_in.xmat[worldid, body2] @ anchor2
+                q1 = quat_product(as_vec4(xquat_in[worldid, body1]), wp.vec4(data[6], data[7], data[8], data[9]))
+                q2 = as_vec4(xquat_in[worldid, body2])
+            point1 = xpos_in[worldid, body1] + xmat_in[worldid, body1] @ anchor1
+            point2 = xpos_in[worldid, body2] + xmat_in[worldid, body2] @ anchor2
         gap = point1 - point2
         turn = wp.vec3(0.0)
         scale = float(0.0)

@@ -8,11 +8,10 @@ At a reference site mujoco_warp leaves out the dofs that carry both sites: twist
 them, the common one.
 """
 
-import mujoco
 import warp as wp
 from mujoco_warp import TrnType
 
-from msk_ray.step.adjoint.groups import FieldBars, Fields, Motion, Substep, gather
+from msk_ray.step.adjoint.groups import FieldBars, Fields, Motion, Substep
 from msk_ray.step.adjoint.laws.actuators import ActuatorBars
 from msk_ray.step.adjoint.laws.joint_springs import log_rate_pullback
 from msk_ray.step.adjoint.laws.transmission import push_load, weighted_twist
@@ -35,17 +34,6 @@ class SitePairs:
     actuator_trnid: wp.array[wp.vec2i]
     actuator_gear: wp.array2d[wp.spatial_vector]
     actuator_cranklength: wp.array2d[float]
-    common_body: wp.array[int]
-    """The body whose motion an actuator does not feel, 0 for none; (nu,)."""
-
-
-@wp.struct
-class SitePoses:
-    """Poses of sites and bodies."""
-
-    site_xpos: wp.array2d[wp.vec3]
-    site_xmat: wp.array2d[wp.mat33]
-    xquat: wp.array2d[wp.quat]
 
 
 @wp.func
@@ -100,8 +88,11 @@ def pull_site_pairs(
     count: int,
     # Model:
     pairs: SitePairs,
+    common_body: wp.array[int],
     # In:
-    poses_in: SitePoses,
+    site_xpos_in: wp.array2d[wp.vec3],
+    site_xmat_in: wp.array2d[wp.mat33],
+    xquat_in: wp.array2d[wp.quat],
     motion_in: Motion,
     actuator_bars_in: ActuatorBars,
     fields_in: Fields,
@@ -110,6 +101,7 @@ def pull_site_pairs(
 ) -> None:
     """What length and rates of an actuator between two sites give both bodies.
 
+    `common_body` is the body whose motion an actuator does not feel, 0 for none; (nu,).
     `lanes` threads take all `count` actuators of a world in turn.
     """
     worldid, lane = wp.tid()
@@ -121,7 +113,7 @@ def pull_site_pairs(
             continue
         body = pairs.site_bodyid[site]
         other = pairs.site_bodyid[other_site]
-        common = pairs.common_body[uid]
+        common = common_body[uid]
         rates = actuator_bars_in.rate[worldid, uid]
         length_bar = actuator_bars_in.length[worldid, uid]
         gear = pairs.actuator_gear[worldid % pairs.actuator_gear.shape[0], uid]
@@ -131,9 +123,9 @@ def pull_site_pairs(
         common_field = weighted_twist(common, worldid, rates, fields_in, motion_in.cvel)
         centre = motion_in.subtree_com[worldid, pairs.body_rootid[body]]
         other_centre = motion_in.subtree_com[worldid, pairs.body_rootid[other]]
-        point = poses_in.site_xpos[worldid, site]
-        origin = poses_in.site_xpos[worldid, other_site]
-        frame = poses_in.site_xmat[worldid, other_site]
+        point = site_xpos_in[worldid, site]
+        origin = site_xpos_in[worldid, other_site]
+        frame = site_xmat_in[worldid, other_site]
         rod = pairs.actuator_cranklength[worldid % pairs.actuator_cranklength.shape[0], uid]
         _k, _g, _r, _l, point_bar, origin_bar, frame_bar, _c, _o, load, other_load, common_load = wp.grad(pair_score)(
             crank,
@@ -155,22 +147,13 @@ def pull_site_pairs(
             # length ∋ gear·log(Rᵀ Q): with Q turning by w in the world, d log = Jr⁻¹ Qᵀ w
             own_rest = pairs.site_quat[worldid % pairs.site_quat.shape[0], site]
             other_rest = pairs.site_quat[worldid % pairs.site_quat.shape[0], other_site]
-            phi = quat_sub(
-                mul_quat(poses_in.xquat[worldid, body], own_rest), mul_quat(poses_in.xquat[worldid, other], other_rest)
-            )
-            torque = poses_in.site_xmat[worldid, site] @ (length_bar * log_rate_pullback(phi, turn))
+            phi = quat_sub(mul_quat(xquat_in[worldid, body], own_rest), mul_quat(xquat_in[worldid, other], other_rest))
+            torque = site_xmat_in[worldid, site] @ (length_bar * log_rate_pullback(phi, turn))
         own_moved = wrench(point_bar, torque, point - centre)
         other_moved = wrench(origin_bar, turning_torque(frame, frame_bar) - torque, origin - other_centre)
         push_load(body, worldid, rates, load, own_field, own_moved, bars_out)
         push_load(other, worldid, rates, other_load, other_field, other_moved, bars_out)
         push_load(common, worldid, rates, common_load, common_field, wp.spatial_vector(), bars_out)
-
-
-class _CommonBodies:
-    """The body that carries both sites of each actuator and whose motion it does not feel, shape (nu,)."""
-
-    def __init__(self, mjm: mujoco.MjModel) -> None:
-        self.common_body = wp.array(common_bodies(mjm), dtype=int)
 
 
 class SitePairForces:
@@ -182,9 +165,9 @@ class SitePairForces:
 
     def __init__(self, work: Workspace, bars: ActuatorBars) -> None:
         self._work, self._bars = work, bars
-        self._pairs = gather(SitePairs, _CommonBodies(work.mjm), work.model)
+        self._common_body = wp.array(common_bodies(work.mjm), dtype=int)
 
     def launch(self, at: Substep) -> None:
         """Launch the pullback of these actuators."""
-        work = self._work
-        work.launch_lanes(pull_site_pairs, work.model.nactuator, at, self._bars, self._pairs)
+        count = self._work.model.nactuator
+        self._work.launch_lanes(pull_site_pairs, count, at, self._bars, common_body=self._common_body)

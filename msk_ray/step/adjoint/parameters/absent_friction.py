@@ -12,14 +12,6 @@ from msk_ray.step.forward.mjw_private import vec5
 wp.set_module_options({"enable_backward": False})
 
 
-@wp.struct
-class Losses:
-    """Friction loss of dofs and tendons."""
-
-    dof_frictionloss: wp.array2d[float]
-    tendon_frictionloss: wp.array2d[float]
-
-
 @wp.kernel
 def pull_absent_friction(
     # Model:
@@ -27,7 +19,8 @@ def pull_absent_friction(
     opt_timestep: wp.array[float],
     opt_disableflags: int,
     settings: RowSettings,
-    losses: Losses,
+    dof_frictionloss: wp.array2d[float],
+    tendon_frictionloss: wp.array2d[float],
     tendons: TendonRows,
     # In:
     count: int,
@@ -52,14 +45,14 @@ def pull_absent_friction(
         solimp = vec5()
         t = place - nv
         if t < 0:
-            loss = losses.dof_frictionloss[worldid % losses.dof_frictionloss.shape[0], place]
+            loss = dof_frictionloss[worldid % dof_frictionloss.shape[0], place]
             lam = lam_in[worldid, place]
             acc = state_in.qacc[worldid, place]
             vel = state_in.qvel[worldid, place]
             solref = settings.dof_solref[worldid % settings.dof_solref.shape[0], place]
             solimp = settings.dof_solimp[worldid % settings.dof_solimp.shape[0], place]
         else:
-            loss = losses.tendon_frictionloss[worldid % losses.tendon_frictionloss.shape[0], t]
+            loss = tendon_frictionloss[worldid % tendon_frictionloss.shape[0], t]
             lam = tendon_rate(tendons, t, ten_J_in[worldid], lam_in[worldid])
             acc = tendon_rate(tendons, t, ten_J_in[worldid], state_in.qacc[worldid])
             vel = tendon_rate(tendons, t, ten_J_in[worldid], state_in.qvel[worldid])

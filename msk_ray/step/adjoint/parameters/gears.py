@@ -40,16 +40,6 @@ class GearGradients:
     actuator_gear: wp.array2d[wp.spatial_vector]
 
 
-@wp.struct
-class Levers:
-    """Sites that actuators act on."""
-
-    body_rootid: wp.array[int]
-    site_bodyid: wp.array[int]
-    site_xpos: wp.array2d[wp.vec3]
-    site_xmat: wp.array2d[wp.mat33]
-
-
 @wp.func
 def joint_rate(
     worldid: int,
@@ -126,13 +116,16 @@ def pull_gears(
     joints: Joints,
     tendons: TendonRows,
     actuators: ActuatorSettings,
+    body_rootid: wp.array[int],
+    site_bodyid: wp.array[int],
     # In:
     count: int,
     lanes: int,
     live_in: wp.array[int],
     bars_in: ActuatorBars,
     drive_in: Drive,
-    levers_in: Levers,
+    site_xpos_in: wp.array2d[wp.vec3],
+    site_xmat_in: wp.array2d[wp.mat33],
     state_in: State,
     motion_in: Motion,
     multipliers_in: Multipliers,
@@ -161,11 +154,11 @@ def pull_gears(
             if gear != 0.0:
                 slope[0] -= 2.0 * bars_in.implicit[worldid, uid] / gear
         elif kind == TrnType.SITE:
-            body = levers_in.site_bodyid[target]
-            centre = motion_in.subtree_com[worldid, levers_in.body_rootid[body]]
+            body = site_bodyid[target]
+            centre = motion_in.subtree_com[worldid, body_rootid[body]]
             twist = weighted_twist(body, worldid, bars, fields_in, motion_in.cvel)
-            back = wp.transpose(levers_in.site_xmat[worldid, target])
-            rate = back @ point_velocity(twist, levers_in.site_xpos[worldid, target] - centre)
+            back = wp.transpose(site_xmat_in[worldid, target])
+            rate = back @ point_velocity(twist, site_xpos_in[worldid, target] - centre)
             slope = wp.spatial_vector(rate, back @ wp.spatial_top(twist))
         elif kind == TrnType.JOINT or kind == TrnType.JOINTINPARENT:  # a slider-crank's gear is no parameter
             in_parent = kind == TrnType.JOINTINPARENT

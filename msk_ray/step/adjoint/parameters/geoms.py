@@ -10,22 +10,12 @@ from typing import Any
 import warp as wp
 from mujoco_warp import GeomType
 
-from msk_ray.step.adjoint.groups import Contacts, GeomGradients, Substep
+from msk_ray.step.adjoint.groups import Contacts, GeomGradients, Shapes, Substep
 from msk_ray.step.adjoint.parameters.base import ParameterFamily
 from msk_ray.step.adjoint.spatial import column, quat_gradient
 from msk_ray.step.adjoint.step import StepAdjoint
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.struct
-class GeomShapes:
-    """Shapes of geoms and their place in their bodies."""
-
-    geom_bodyid: wp.array[int]
-    geom_type: wp.array[int]
-    geom_size: wp.array2d[wp.vec3]
-    geom_quat: wp.array2d[wp.quat]
 
 
 @wp.func
@@ -74,7 +64,8 @@ def size_slope(kind: int, size: wp.vec3, mat: wp.mat33, arm: wp.vec3, out: wp.ve
 @wp.kernel
 def pull_geoms(
     # Model:
-    shapes: GeomShapes,
+    shapes: Shapes,
+    geom_quat: wp.array2d[wp.quat],
     # In:
     live_in: wp.array[int],
     nacon_in: wp.array[int],
@@ -100,7 +91,7 @@ def pull_geoms(
     wp.atomic_sub(
         gradients_out.geom_pos, worldid, geom, wp.transpose(xmat_in[worldid, shapes.geom_bodyid[geom]]) @ force
     )
-    quat = shapes.geom_quat[worldid % shapes.geom_quat.shape[0], geom]
+    quat = geom_quat[worldid % geom_quat.shape[0], geom]
     wp.atomic_sub(gradients_out.geom_quat, worldid, geom, quat_gradient(quat, wp.transpose(mat) @ torque))
     # The normal leads from the first geom to the second, and the point is half way between both surfaces.
     away = float(1.0)

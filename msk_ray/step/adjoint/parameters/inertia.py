@@ -28,17 +28,6 @@ class InertiaGradients:
     gravity: wp.array[wp.vec3]
 
 
-@wp.struct
-class Inertias:
-    """Inertial parameters of bodies."""
-
-    body_rootid: wp.array[int]
-    body_mass: wp.array2d[float]
-    body_inertia: wp.array2d[wp.vec3]
-    body_iquat: wp.array2d[wp.quat]
-    body_gravcomp: wp.array2d[float]
-
-
 @wp.func
 def rotation(q: wp.quat) -> wp.mat33:
     """Matrix of MuJoCo's quaternion (w, x, y, z), kept in a wp.quat in that order."""
@@ -50,7 +39,11 @@ def pull_inertia(
     # Model:
     opt_gravity: wp.array[wp.vec3],
     gravity_on: bool,
-    inertias: Inertias,
+    body_rootid: wp.array[int],
+    body_mass: wp.array2d[float],
+    body_inertia: wp.array2d[wp.vec3],
+    body_iquat: wp.array2d[wp.quat],
+    body_gravcomp: wp.array2d[float],
     # In:
     live_in: wp.array[int],
     xfrc_applied_in: wp.array2d[wp.spatial_vector],
@@ -64,11 +57,11 @@ def pull_inertia(
     worldid, body = wp.tid()
     if body == 0 or live_in[worldid] == 0:
         return
-    mass = inertias.body_mass[worldid % inertias.body_mass.shape[0], body]
-    moments = inertias.body_inertia[worldid % inertias.body_inertia.shape[0], body]
-    quat = inertias.body_iquat[worldid % inertias.body_iquat.shape[0], body]
-    comp = inertias.body_gravcomp[worldid % inertias.body_gravcomp.shape[0], body]
-    arm = motion_in.xipos[worldid, body] - motion_in.subtree_com[worldid, inertias.body_rootid[body]]
+    mass = body_mass[worldid % body_mass.shape[0], body]
+    moments = body_inertia[worldid % body_inertia.shape[0], body]
+    quat = body_iquat[worldid % body_iquat.shape[0], body]
+    comp = body_gravcomp[worldid % body_gravcomp.shape[0], body]
+    arm = motion_in.xipos[worldid, body] - motion_in.subtree_com[worldid, body_rootid[body]]
     lam = fields_in.lam[worldid, body]
     acc = fields_in.cacc[worldid, body]
     vel = motion_in.cvel[worldid, body]

@@ -200,6 +200,15 @@ def lift(
         raw_out[worldid, q] = tangent_in[worldid, v]
 
 
+@wp.func
+def is_zero(x: wp.array2d[float], worldid: int) -> bool:
+    """Whether all of a row is zero; NaN is not."""
+    for i in range(x.shape[1]):
+        if x[worldid, i] != 0.0:
+            return False
+    return True
+
+
 @wp.kernel
 def mark_live(
     # In:
@@ -211,17 +220,8 @@ def mark_live(
 ) -> None:
     """1 for a world whose cotangents are not all zero; only such worlds are given a gradient."""
     worldid = wp.tid()
-    live = int(0)
-    for i in range(qpos_in.shape[1]):
-        if qpos_in[worldid, i] != 0.0:
-            live = int(1)
-    for i in range(grad_qvel_in.shape[1]):
-        if grad_qvel_in[worldid, i] != 0.0:
-            live = int(1)
-    for i in range(grad_act_in.shape[1]):
-        if grad_act_in[worldid, i] != 0.0:
-            live = int(1)
-    live_out[worldid] = live
+    rest = is_zero(qpos_in, worldid) and is_zero(grad_qvel_in, worldid) and is_zero(grad_act_in, worldid)
+    live_out[worldid] = wp.where(rest, 0, 1)
 
 
 @wp.kernel

@@ -197,41 +197,37 @@ def pair_score(geom1: Geom, geom2: Geom, law: ParallelLaw, weights: Bars) -> wp.
     size1 = geom1.size
     size2 = geom2.size
     mat2 = geom2.mat
-    dist_weight = weights.dist
-    pos_weight = weights.point
-    normal_weight = weights.normal
     axis1 = column(geom1.mat, 2)
     axis2 = column(geom2.mat, 2)
-    score = wp.float32(0.0)
+    dist = wp.float32(0.0)
+    pos = wp.vec3(0.0)
+    normal = wp.vec3(0.0)
     if type1 == GeomType.SPHERE and type2 == GeomType.SPHERE:
-        dist_a, pos_a, normal_a = sphere_sphere(pos1, size1[0], pos2, size2[0])
-        score = dist_weight * dist_a + wp.dot(pos_weight, pos_a) + wp.dot(normal_weight, normal_a)
+        dist, pos, normal = sphere_sphere(pos1, size1[0], pos2, size2[0])
     elif type1 == GeomType.SPHERE and type2 == GeomType.CAPSULE:
-        dist_b, pos_b, normal_b = sphere_capsule(pos1, size1[0], pos2, axis2, size2[0], size2[1])
-        score = dist_weight * dist_b + wp.dot(pos_weight, pos_b) + wp.dot(normal_weight, normal_b)
+        dist, pos, normal = sphere_capsule(pos1, size1[0], pos2, axis2, size2[0], size2[1])
     elif type1 == GeomType.SPHERE and type2 == GeomType.CYLINDER:
-        dist_c, pos_c, normal_c = sphere_cylinder_contact(pos1, size1[0], pos2, axis2, size2[0], size2[1])
-        score = dist_weight * dist_c + wp.dot(pos_weight, pos_c) + wp.dot(normal_weight, normal_c)
+        dist, pos, normal = sphere_cylinder_contact(pos1, size1[0], pos2, axis2, size2[0], size2[1])
     elif type1 == GeomType.SPHERE and type2 == GeomType.BOX:
-        dist_d, pos_d, normal_d = sphere_box_contact(pos1, size1[0], pos2, mat2, size2)
-        score = dist_weight * dist_d + wp.dot(pos_weight, pos_d) + wp.dot(normal_weight, normal_d)
+        dist, pos, normal = sphere_box_contact(pos1, size1[0], pos2, mat2, size2)
     elif type1 == GeomType.CAPSULE and type2 == GeomType.CAPSULE:
         if law.kind == CROSSED:
-            dist_e, pos_e, normal_e = capsule_capsule(pos1, axis1, size1[0], size1[1], pos2, axis2, size2[0], size2[1])
-            score = dist_weight * dist_e[0] + wp.dot(pos_weight, pos_e[0]) + wp.dot(normal_weight, normal_e[0])
+            dists, places, normals = capsule_capsule(pos1, axis1, size1[0], size1[1], pos2, axis2, size2[0], size2[1])
+            dist = dists[0]
+            pos = places[0]
+            normal = normals[0]
         elif law.kind == SIDE_BY_SIDE:
             # Whichever end comes to lie inside leads the contact: a pair of such contacts does the mean of both.
-            dist_f, pos_f, normal_f = parallel_contact(pos1, axis1, size1[0], pos2, axis2, size2[0], law, END1)
-            dist_g, pos_g, normal_g = parallel_contact(pos1, axis1, size1[0], pos2, axis2, size2[0], law, END2)
-            score = 0.5 * dist_weight * (dist_f + dist_g) + 0.5 * wp.dot(pos_weight, pos_f + pos_g)
-            score += 0.5 * wp.dot(normal_weight, normal_f + normal_g)
+            dist_a, pos_a, normal_a = parallel_contact(pos1, axis1, size1[0], pos2, axis2, size2[0], law, END1)
+            dist_b, pos_b, normal_b = parallel_contact(pos1, axis1, size1[0], pos2, axis2, size2[0], law, END2)
+            dist = 0.5 * (dist_a + dist_b)
+            pos = 0.5 * (pos_a + pos_b)
+            normal = 0.5 * (normal_a + normal_b)
         else:
-            dist_h, pos_h, normal_h = parallel_contact(pos1, axis1, size1[0], pos2, axis2, size2[0], law, law.kind)
-            score = dist_weight * dist_h + wp.dot(pos_weight, pos_h) + wp.dot(normal_weight, normal_h)
+            dist, pos, normal = parallel_contact(pos1, axis1, size1[0], pos2, axis2, size2[0], law, law.kind)
     elif type1 == GeomType.PLANE and type2 == GeomType.ELLIPSOID:
-        dist_i, pos_i, normal_i = plane_ellipsoid(axis1, pos1, pos2, mat2, size2)
-        score = dist_weight * dist_i + wp.dot(pos_weight, pos_i) + wp.dot(normal_weight, normal_i)
-    return score
+        dist, pos, normal = plane_ellipsoid(axis1, pos1, pos2, mat2, size2)
+    return weights.dist * dist + wp.dot(weights.point, pos) + wp.dot(weights.normal, normal)
 
 
 @wp.func
