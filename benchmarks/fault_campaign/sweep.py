@@ -132,7 +132,7 @@ class Sweep:
     def wait_until_it_listens(self) -> None:
         """Wait until the driver has handlers for signals, which is the first that it does."""
         assert self._driver is not None
-        while self._driver.poll() is None and not catches(self._driver.pid, signal.SIGHUP):
+        while self._driver.poll() is None and not catches(self._driver.pid, signal.SIGTERM):
             time.sleep(0.005)
 
     def rows(self) -> int:
