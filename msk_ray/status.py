@@ -14,18 +14,18 @@ from typing import TYPE_CHECKING
 
 from msk_ray.cli import Parser, run
 from msk_ray.errors import MskRayError, StorageError
-from msk_ray.experiment.damage import count_damages
+from msk_ray.experiment.damage import count_damages, describe_damages
 from msk_ray.experiment.manifest import Experiment
-from msk_ray.experiment.outcomes import Outcome
-from msk_ray.experiment.snapshot import State
-from msk_ray.experiment.trial_status import (
-    StatusReader,
-    TrialStatus,
+from msk_ray.experiment.records import (
+    ExperimentReader,
+    TrialRecord,
     counts,
     describe_bests,
     find_experiments,
+    in_order,
     remaining,
 )
+from msk_ray.experiment.snapshot import State
 from msk_ray.progress import format_duration
 from msk_ray.text import printable, printable_lines
 
@@ -49,14 +49,9 @@ EXAMPLES = """\
 
 WIDE = 140
 """Terminal width from which hosts, GPU models and reasons are shown too."""
-_STYLES = {
-    State.RUNNING: "green",
-    State.STALE: "yellow",
-    State.INTERRUPTED: "yellow",
-    State.UNREADABLE: "red",
-    State.WAITING: "dim",
-}
-_FAILED = (Outcome.ERROR, Outcome.NONFINITE, Outcome.DIVERGED, Outcome.OUT_OF_MEMORY)
+_STYLES = {State.RUNNING: "green", State.STALE: "yellow", State.INTERRUPTED: "yellow", State.WAITING: "dim"}
+FIRST_EPOCH = "compiles kernels that are not in Warp's cache, records and trains its first epoch"
+"""What a running trial does before its first epoch has ended."""
 
 
 def parser() -> Parser:
@@ -82,11 +77,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         if args.watch:
             raise StorageError(f"--watch: which experiment? {_known(args.storage)}")
         return _list(args.storage)
-    observer = StatusReader(Experiment(find(args.experiment, args.storage)))
+    reader = ExperimentReader(Experiment(find(args.experiment, args.storage)), keep_rows=False)
     if args.watch:
-        return _watch(observer, args.interval)
+        return _watch(reader, args.interval)
     with _without_collecting():
-        _console().print(view(observer, _width()))
+        _console().print(view(reader, _width()))
     return 0
 
 
@@ -115,7 +110,7 @@ def find(name: str, storage: Path) -> Path:
     )
 
 
-def view(observer: StatusReader, width: int, rows: int | None = None) -> "RenderableType":
+def view(reader: ExperimentReader, width: int, rows: int | None = None) -> "RenderableType":
     """An experiment as a table for a terminal of `width` columns, with at most `rows` trials.
 
     Raises:
@@ -124,41 +119,45 @@ def view(observer: StatusReader, width: int, rows: int | None = None) -> "Render
     from rich.console import Group
     from rich.text import Text
 
-    statuses = observer.look(time.time())
-    lines: list[RenderableType] = [Text(printable(headline(observer.experiment, statuses)))]
-    if not statuses:
-        return Group(*lines, Text("no trial has started yet"))
-    shown = statuses if rows is None else statuses[: max(1, rows)]
-    lines.append(trial_table(shown, width))
-    if len(shown) < len(statuses):
-        lines.append(Text(f"... and {len(statuses) - len(shown)} more", style="dim"))
-    if width < WIDE:  # wide tables have a column for this
-        bad = (Outcome.ERROR, Outcome.OUT_OF_MEMORY)
-        told = [s for s in shown if s.damages or s.state is State.UNREADABLE or s.outcome in bad]
-        lines += [Text(printable(f"{s.id}: {s.note}"), style="red") for s in told]
-    damages = [damage for status in statuses for damage in status.damages]
+    now = time.time()
+    records, unreadable = reader.look(now, reader.planned())
+    records = in_order(records)
+    lines: list[RenderableType] = [Text(printable(headline(reader.experiment, records)))]
+    if records:
+        shown = records if rows is None else records[: max(1, rows)]
+        lines.append(trial_table(shown, width, now))
+        if len(shown) < len(records):
+            lines.append(Text(f"... and {len(records) - len(shown)} more", style="dim"))
+        if width < WIDE:  # wide tables have a column for this
+            told = [record for record in shown if record.damages or record.errored]
+            lines += [Text(printable(f"{record.trial.id}: {_what(record)}"), style="red") for record in told]
+    else:
+        lines.append(Text("no trial has started yet"))
+    left_out = describe_damages(unreadable, reader.experiment.path)
+    lines += [Text(printable(f"left out: {line}"), style="red") for line in left_out]
+    damages = [damage for record in records for damage in record.damages]
     if damages:
         lines.append(Text(f"skipped: {count_damages(damages)}", style="red"))
-    asked = observer.experiment.stop_file.exists() and any(s.state is not State.ENDED for s in statuses)
-    if asked or any(s.state is State.INTERRUPTED for s in statuses):
-        command = printable(observer.experiment.resume_command())
+    asked = reader.experiment.stop_file.exists() and any(r.state is not State.ENDED for r in records)
+    if asked or any(record.state is State.INTERRUPTED for record in records):
+        command = printable(reader.experiment.resume_command())
         lines.append(Text(f"{'stopped on request' if asked else 'interrupted'}; continue with: {command}"))
     return Group(*lines)
 
 
-def headline(experiment: Experiment, statuses: Sequence[TrialStatus]) -> str:
+def headline(experiment: Experiment, records: Sequence[TrialRecord]) -> str:
     """`ant_lr · 2 running · 3 ended · best 12.3 (1a2b3c4d) · at most 2h05m left`; with several environments, the best
     of each."""
-    parts = [experiment.name, *(f"{n} {state}" for state, n in counts(statuses).items())]
-    if best := describe_bests(statuses, ids=True):
+    parts = [experiment.name, *(f"{n} {state}" for state, n in counts(records).items())]
+    if best := describe_bests(records, ids=True):
         parts.append(f"best {best}")
-    left = remaining(statuses)
+    left = remaining(records)
     if left is not None:
         parts.append(f"at most {format_duration(left)} left")
     return " · ".join(parts)
 
 
-def trial_table(statuses: Sequence[TrialStatus], width: int) -> "Table":
+def trial_table(records: Sequence[TrialRecord], width: int, now: float) -> "Table":
     """One row per trial. Only the column of changes may wrap; a wide table also shows hosts and reasons."""
     from rich import box
     from rich.table import Table
@@ -176,32 +175,39 @@ def trial_table(statuses: Sequence[TrialStatus], width: int) -> "Table":
         table.add_column(heading, justify="right", no_wrap=True)
     if wide:
         table.add_column("why", ratio=2, no_wrap=True, overflow="ellipsis")
-    seeds = len({status.seed for status in statuses}) > 1
-    for status in statuses:
-        style = "red" if status.outcome in _FAILED else _STYLES.get(status.state, "")
+    seeds = len({record.trial.seed for record in records}) > 1
+    for record in records:
+        style = "red" if record.failed else _STYLES.get(record.state, "")
         # As Text, because rich would read brackets and colons in a label as markup and emoji.
-        table.add_row(*(Text(printable(cell)) for cell in _cells(status, wide, seeds)), style=style)
+        table.add_row(*(Text(printable(cell)) for cell in _cells(record, wide, seeds, now)), style=style)
     return table
 
 
-def _cells(status: TrialStatus, wide: bool, seeds: bool) -> list[str]:
-    progress, device = status.progress, status.device
+def _cells(record: TrialRecord, wide: bool, seeds: bool, now: float) -> list[str]:
+    trial, progress, device, left = record.trial, record.progress, record.device, record.seconds_left
     # Shorten outcomes such as "stopped_asha" to "asha" for a narrow column.
-    state = (status.outcome if wide else status.outcome.removeprefix("stopped_")) or str(status.state)
+    state = record.outcome if wide else record.outcome.removeprefix("stopped_")
     model = "" if device.gpu == "cpu" else device.name
     gpu = f"{device.host}:{device.gpu} {model}".strip() if wide and device.host else device.gpu
     cells = [
-        status.id,
-        status.variant + (f", seed {status.seed}" if seeds else "") + status.attempt.suffix,
+        trial.id,
+        trial.variant + (f", seed {trial.seed}" if seeds else "") + record.attempt.suffix,
         state,
-        f"{progress.epoch}/{status.epochs}",
+        f"{progress.epoch}/{trial.epochs}",
         "-" if progress.best is None else f"{progress.best:.4g}",
         short_number(progress.env_steps_per_s) if progress.env_steps_per_s is not None else "-",
         gpu,
-        "-" if status.seconds_left is None else format_duration(status.seconds_left),
-        "-" if status.heartbeat_age is None else format_age(status.heartbeat_age),
+        "-" if left is None else format_duration(left),
+        # The clocks of machines that share a storage differ: a time in the future counts as now.
+        "-" if record.beat is None else format_age(max(0.0, now - record.beat)),
     ]
-    return [*cells, status.note] if wide else cells
+    return [*cells, _what(record)] if wide else cells
+
+
+def _what(record: TrialRecord) -> str:
+    """Why a trial ended, what it is doing before its first epoch has ended, and what is wrong with its files."""
+    starting = [FIRST_EPOCH] if record.state is State.RUNNING and record.epochs_done == 0 else []
+    return "; ".join(filter(None, [*starting, record.why]))
 
 
 def short_number(value: float) -> str:
@@ -217,35 +223,35 @@ def format_age(seconds: float) -> str:
     return f"{seconds / 86400:.0f}d" if seconds >= 2 * 86400 else format_duration(seconds)
 
 
-def _watch(observer: StatusReader, interval: float) -> int:
+def _watch(reader: ExperimentReader, interval: float) -> int:
     """Show the experiment until all its trials have ended, or until Ctrl-C."""
     console = _console()
     try:
         if console.is_terminal:
-            _watch_terminal(observer, console, interval)
+            _watch_terminal(reader, console, interval)
         else:
-            while not _over(observer):
-                console.print(view(observer, _width()))
+            while not _over(reader):
+                console.print(view(reader, _width()))
                 time.sleep(interval)
     except KeyboardInterrupt:
         pass  # the usual way to quit
-    console.print(view(observer, _width()))
+    console.print(view(reader, _width()))
     return 0
 
 
-def _watch_terminal(observer: StatusReader, console: "Console", interval: float) -> None:
+def _watch_terminal(reader: ExperimentReader, console: "Console", interval: float) -> None:
     from rich.live import Live
 
     with Live(console=console, screen=True, auto_refresh=False) as live:
-        while not _over(observer):
+        while not _over(reader):
             # Leave room for the heading, the table's two lines and a note.
-            live.update(view(observer, _width(), console.height - 6), refresh=True)
+            live.update(view(reader, _width(), console.height - 6), refresh=True)
             time.sleep(interval)
 
 
-def _over(observer: StatusReader) -> bool:
-    statuses = observer.look(time.time())
-    return bool(statuses) and all(status.state in (State.ENDED, State.UNREADABLE) for status in statuses)
+def _over(reader: ExperimentReader) -> bool:
+    records, _ = reader.look(time.time(), reader.planned())
+    return bool(records) and all(record.state is State.ENDED for record in records)
 
 
 def _list(storage: Path) -> int:
@@ -271,13 +277,14 @@ def _list(storage: Path) -> int:
 def _summary(experiment: Experiment) -> tuple[str, str, str, str]:
     """An experiment's trials, best scores, states and question, printable; each environment's best on its own line."""
     try:
-        statuses = StatusReader(experiment).look(time.time())
+        reader = ExperimentReader(experiment, keep_rows=False)
+        records, _ = reader.look(time.time(), reader.planned())
         question = experiment.manifest().get("question") or ""
     except MskRayError as error:
         return "-", "-", printable(str(error)), ""
-    states = ", ".join(f"{n} {state}" for state, n in counts(statuses).items()) or "no trial has started yet"
-    bests = printable(describe_bests(statuses, ids=False)).replace(", ", "\n")
-    return str(len(statuses)), bests or "-", states, printable(question)
+    states = ", ".join(f"{n} {state}" for state, n in counts(records).items()) or "no trial has started yet"
+    bests = printable(describe_bests(records, ids=False)).replace(", ", "\n")
+    return str(len(records)), bests or "-", states, printable(question)
 
 
 def _known(storage: Path) -> str:

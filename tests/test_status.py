@@ -19,9 +19,9 @@ from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import progress_of
 from msk_ray.experiment.outcomes import Ending, Outcome, write_ending
 from msk_ray.experiment.ownership import owned
+from msk_ray.experiment.records import ExperimentReader, TrialRecord, best_records, in_order, remaining
 from msk_ray.experiment.snapshot import State
-from msk_ray.experiment.trial_status import FIRST_EPOCH, StatusReader, bests_of, remaining
-from msk_ray.status import main, short_number
+from msk_ray.status import FIRST_EPOCH, main, short_number
 from msk_ray.sweep import opening
 from msk_ray.sweep.space import parse_space
 from msk_ray.sweep.trials import resolve_trials
@@ -77,6 +77,16 @@ def experiment(now: None, tmp_path: Path) -> Experiment:
     return made
 
 
+def records_of(experiment: Experiment) -> list[TrialRecord]:
+    reader = ExperimentReader(experiment, keep_rows=False)
+    return in_order(reader.look(NOW, reader.planned())[0])
+
+
+def record_of(experiment: Experiment, trial: str) -> TrialRecord:
+    (record,) = [record for record in records_of(experiment) if record.trial.id == trial]
+    return record
+
+
 @pytest.fixture
 def driven(experiment: Experiment) -> Iterator[Experiment]:
     """The same while this process is its driver."""
@@ -85,8 +95,8 @@ def driven(experiment: Experiment) -> Iterator[Experiment]:
 
 
 def test_states_from_files(experiment: Experiment) -> None:
-    standings = StatusReader(experiment).look(NOW)
-    assert [s.state for s in standings] == [
+    records = records_of(experiment)
+    assert [s.state for s in records] == [
         State.RUNNING,
         State.INTERRUPTED,
         State.INTERRUPTED,
@@ -94,16 +104,16 @@ def test_states_from_files(experiment: Experiment) -> None:
         State.ENDED,
         State.WAITING,
     ]
-    running = standings[0]
+    running = records[0]
     assert (running.progress.epoch, running.progress.best, running.progress.env_steps_per_s) == (8, 7.0, 12345.0)
     assert running.seconds_left == (20 - 8) * 4.0
-    assert running.heartbeat_age == pytest.approx(5.0, abs=0.1)
-    assert (running.device.gpu, standings[3].device.gpu) == ("3", "cpu")
-    assert [s.outcome for s in standings[3:5]] == ["finished", "stopped_asha"]  # the higher score first
-    best = bests_of(standings).get("cartpole")
-    assert best is standings[3]
+    assert running.beat == pytest.approx(NOW - 5.0, abs=0.1)
+    assert (running.device.gpu, records[3].device.gpu) == ("3", "cpu")
+    assert [s.outcome for s in records[3:5]] == ["finished", "stopped_asha"]  # the higher score first
+    best = best_records(records).get("cartpole")
+    assert best is records[3]
     # One trial at a time and 4 s an epoch: 12 epochs of the running one, 16 and 19 of the silent, 20 of the waiting.
-    assert remaining(standings) == (12 + 16 + 19 + 20) * 4.0
+    assert remaining(records) == (12 + 16 + 19 + 20) * 4.0
 
 
 @pytest.mark.parametrize(("age", "state"), [(59.0, State.RUNNING), (61.0, State.STALE), (-50.0, State.RUNNING)])
@@ -112,7 +122,7 @@ def test_stale_after_a_minute_at_four_seconds_an_epoch(driven: Experiment, age: 
     folder = experiment.trial_folder(experiment.trials()[0].id)
     os.utime(folder / "metrics.jsonl", (NOW - age, NOW - age))
     os.utime(folder / "device.json", (NOW - 900, NOW - 900))
-    assert next(s for s in StatusReader(experiment).look(NOW) if s.id == folder.name).state is state
+    assert record_of(experiment, folder.name).state is state
 
 
 @pytest.mark.parametrize(("age", "state"), [(4.0, State.INTERRUPTED), (6.0, State.RUNNING)])
@@ -122,12 +132,12 @@ def test_a_trial_whose_driver_has_left_is_not_running(experiment: Experiment, ag
     summary.write_text("{}")
     os.utime(summary, (NOW - age, NOW - age))
     trial = experiment.trials()[0].id
-    assert next(s for s in StatusReader(experiment).look(NOW) if s.id == trial).state is state
+    assert record_of(experiment, trial).state is state
 
 
 def test_an_interrupted_trial_waits_for_a_driver_that_resumes_it(driven: Experiment) -> None:
     (driven.path / "summary.json").write_text("{}")
-    assert {s.state for s in StatusReader(driven).look(NOW)} == {State.ENDED, State.WAITING}
+    assert {s.state for s in records_of(driven)} == {State.ENDED, State.WAITING}
 
 
 def test_a_killed_driver_leaves_interrupted_trials_at_once(
@@ -139,10 +149,10 @@ def test_a_killed_driver_leaves_interrupted_trials_at_once(
     killed = launcher.start([sys.executable, "-c", script, str(experiment.path)])
     wait_until(lambda: (experiment.path / "owner.json").exists(), killed)
     trial = experiment.trials()[0].id
-    assert next(s for s in StatusReader(experiment).look(NOW) if s.id == trial).state is State.RUNNING
+    assert record_of(experiment, trial).state is State.RUNNING
     killed.kill()
     killed.wait()
-    assert next(s for s in StatusReader(experiment).look(NOW) if s.id == trial).state is State.INTERRUPTED
+    assert record_of(experiment, trial).state is State.INTERRUPTED
     assert run(main, ["rates", "--storage", str(experiment.path.parent)]) == 0
     shown = " ".join(capsys.readouterr().out.split())
     assert "3 interrupted" in shown
@@ -155,7 +165,7 @@ def test_a_process_that_has_just_started_may_take_minutes_to_compile(driven: Exp
     for age, state in ((500.0, State.RUNNING), (700.0, State.STALE)):
         os.utime(folder / "metrics.jsonl", (NOW - 5000, NOW - 5000))
         os.utime(folder / "device.json", (NOW - age, NOW - age))
-        assert next(s for s in StatusReader(experiment).look(NOW) if s.id == folder.name).state is state
+        assert record_of(experiment, folder.name).state is state
 
 
 def test_a_changed_file_is_read_again_and_another_is_not(
@@ -166,12 +176,12 @@ def test_a_changed_file_is_read_again_and_another_is_not(
     read: list[str] = []
     original = snapshot.load_metrics
     monkeypatch.setattr(snapshot, "load_metrics", lambda path: (read.append(path.parent.name), original(path))[1])
-    observer = StatusReader(experiment)
-    observer.look(NOW)
+    reader = ExperimentReader(experiment, keep_rows=False)
+    reader.look(NOW, reader.planned())
     read.clear()
     folder = experiment.trial_folder(experiment.trials()[0].id)
     (folder / "metrics.jsonl").write_text(json.dumps(row(9, 8.0)) + "\n")
-    first = observer.look(NOW)[0]
+    first = reader.look(NOW, reader.planned())[0][0]
     assert read == [folder.name]
     assert (first.progress.epoch, first.progress.best) == (9, 8.0)
 
@@ -180,17 +190,20 @@ def test_trials_a_search_makes_up_are_found_before_the_manifest_knows_them(exper
     trials = experiment.trials()
     (experiment.trial_folder(trials[0].id) / "config.yaml").write_text(dump_yaml(trials[0].config.as_dict()))
     experiment.set_trials(trials[1:])
-    found = next(s for s in StatusReader(experiment).look(NOW) if s.id == trials[0].id)
-    assert (found.state, found.variant, found.epochs) == (State.RUNNING, "actor_lr=0.01", 20)
+    suggested = record_of(experiment, trials[0].id)
+    assert (suggested.state, suggested.trial.variant, suggested.trial.epochs) == (State.RUNNING, "actor_lr=0.01", 20)
 
 
 def test_what_a_trial_does_before_its_first_epoch_is_said(
-    driven: Experiment, capsys: pytest.CaptureFixture[str]
+    driven: Experiment, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = driven.trial_folder(driven.trials()[4].id)
     fill(folder, [row(0, 1.0)], age=5.0)
-    (found,) = [s for s in StatusReader(driven).look(NOW) if s.id == folder.name]
-    assert (found.state, found.note, found.seconds_left) == (State.RUNNING, FIRST_EPOCH, None)
+    record = record_of(driven, folder.name)
+    assert (record.state, record.seconds_left) == (State.RUNNING, None)
+    monkeypatch.setenv("COLUMNS", "300")
+    assert run(main, ["rates", "--storage", str(driven.path.parent)]) == 0
+    assert FIRST_EPOCH in capsys.readouterr().out
     console = Console(driven.trials(), 1)
     console.started(driven.trials()[4], FIRST)
     console.say(console.status())

@@ -17,7 +17,7 @@ from msk_ray.experiment import layout
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import read_rows
 from msk_ray.experiment.outcomes import Ending, Outcome, write_ending
-from msk_ray.experiment.results import read_records
+from msk_ray.experiment.records import read_records
 from msk_ray.files import write_json
 from msk_ray.report.reading import read_experiment
 from msk_ray.status import main as status

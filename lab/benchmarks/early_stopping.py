@@ -11,7 +11,6 @@ import argparse
 import heapq
 import random
 import sys
-import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,9 +25,8 @@ from msk_ray.errors import ConfigError
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import Evaluation
 from msk_ray.experiment.outcomes import Outcome
-from msk_ray.experiment.results import TrialRecord, read_records
+from msk_ray.experiment.records import TrialRecord, read_records
 from msk_ray.experiment.results_table import outcome_name
-from msk_ray.experiment.trial_status import StatusReader
 from msk_ray.sweep.rules.asha import Asha
 from msk_ray.sweep.rules.early_stopping import Pruner, SchedulerSpec
 from msk_ray.sweep.rules.median import Median
@@ -204,7 +202,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     odds = chances(whole, rule, args.slots, args.orders)
     named = f"{args.kind}, grace {args.grace:g}" + (f", reduction {args.reduction:g}" if args.kind == "asha" else "")
     title = f"Early stopping of {args.experiment.name}, {named}, {args.slots} trials at once"
-    ran_on = sorted({standing.device.name for standing in StatusReader(experiment).look(time.time())} - {""})
+    ran_on = sorted({record.device.name for record in records} - {""})
     text = (
         f"{table(judged)}\n\nOver {odds.orders} random orders of the trials the best of all was kept in "
         f"{odds.kept / odds.orders:.0%}, and a score within {NEAR:.0%} of it in {odds.near / odds.orders:.0%}; the "

@@ -22,7 +22,17 @@ from msk_ray.config.load import (
     refuse_ignored,
 )
 from msk_ray.config.loggers import logger_paths
-from msk_ray.config.overlay import SET_HELP, combine, flattened, leaves, merge, overlay, parse_override, parse_overrides
+from msk_ray.config.overlay import (
+    SET_HELP,
+    combine,
+    flattened,
+    leaves,
+    merge,
+    overlay,
+    parse_override,
+    parse_overrides,
+    value_at,
+)
 from msk_ray.config.physics import FdConfig, PhysicsConfig
 from msk_ray.config.randomize import Draw, RandomizeConfig
 from msk_ray.config.recorded import SCHEMA, changed_settings, current_key, current_space, current_values, env_name
@@ -97,4 +107,5 @@ __all__ = [
     "resolve",
     "resolve_class",
     "settings_class",
+    "value_at",
 ]

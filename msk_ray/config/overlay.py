@@ -7,6 +7,8 @@ replaces the old one, so that kinds never mix. `null` removes a section.
 
 import copy
 from collections.abc import Iterable, Iterator, Mapping
+from functools import reduce
+from operator import getitem
 from typing import Any
 
 from msk_ray.config.yaml_text import MAX_DEPTH, parse_yaml
@@ -87,6 +89,15 @@ def leaves(key: str, value: Any) -> Iterator[tuple[str, Any]]:
             yield from leaves(f"{key}.{name}", item)
     else:
         yield key, value
+
+
+def value_at(settings: Mapping[str, Any], dotted: str) -> Any:
+    """The value of a dotted key in nested settings.
+
+    Raises:
+        KeyError, TypeError: there is no such setting.
+    """
+    return reduce(getitem, dotted.split("."), settings)
 
 
 def flattened(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -19,13 +19,13 @@ from msk_ray.dashboard.plots import can_plot, figures
 from msk_ray.errors import ConfigError, MskRayError, StorageError
 from msk_ray.experiment.layout import EVAL_FILE
 from msk_ray.experiment.manifest import Experiment
+from msk_ray.experiment.records import ExperimentReader, TrialRecord, counts, describe_bests, find_experiments
 from msk_ray.experiment.snapshot import file_stamp
 from msk_ray.experiment.trainings import TrainingReader
-from msk_ray.experiment.trial_status import StatusReader, counts, describe_bests, find_experiments
 from msk_ray.files import UnusableFile, open_file
 from msk_ray.report.best import STRIP, stored_best
 from msk_ray.report.page import Live, Section, command_of, compare, make_section, places_of, render_page
-from msk_ray.report.reading import ExperimentReader, Reading, TrialReading, explain
+from msk_ray.report.reading import Reading, explain, read_again
 
 _READERS, _PAGES = 8, 16
 """How many experiments and pages are kept in memory."""
@@ -49,11 +49,11 @@ class Page:
 class _CachedPage:
     page: Page
     seen: tuple[Any, ...]
-    trials: list[TrialReading]
+    trials: list[TrialRecord]
     due: float
     """When it is checked again, as monotonic time [s]."""
 
-    def fits(self, seen: tuple[Any, ...], trials: list[TrialReading]) -> bool:
+    def fits(self, seen: tuple[Any, ...], trials: list[TrialRecord]) -> bool:
         """Whether the page is still current. A reader returns the same object for a trial that has not changed."""
         same = len(trials) == len(self.trials) and all(a is b for a, b in zip(trials, self.trials, strict=True))
         return same and seen == self.seen
@@ -78,7 +78,8 @@ class Library:
         self._films = films
         self._lock = threading.Lock()
         self._readers: OrderedDict[str, ExperimentReader] = OrderedDict()
-        self._statuses: dict[str, StatusReader] = {}
+        self._rowless: dict[str, ExperimentReader] = {}
+        """For the list of experiments, which needs no curves."""
         self._pages: OrderedDict[tuple[str, ...], _CachedPage] = OrderedDict()
 
     def index(self) -> Page:
@@ -200,7 +201,7 @@ class Library:
     def _cached(
         self,
         key: tuple[str, ...],
-        look: Callable[[], tuple[tuple[Any, ...], list[TrialReading]]],
+        look: Callable[[], tuple[tuple[Any, ...], list[TrialRecord]]],
         render: Callable[[tuple[Any, ...], str], str],
     ) -> Page:
         """The page cached under `key`, made again if `look` sees a change."""
@@ -225,9 +226,9 @@ class Library:
         self._readers.move_to_end(experiment.name)
         while len(self._readers) > _READERS:
             self._readers.popitem(last=False)
-        return reader.read(time.time())
+        return read_again(reader, time.time())
 
-    def _look(self, experiments: Sequence[Experiment]) -> tuple[tuple[Any, ...], list[TrialReading]]:
+    def _look(self, experiments: Sequence[Experiment]) -> tuple[tuple[Any, ...], list[TrialRecord]]:
         readings = [self._read(experiment) for experiment in experiments]
         trials = [trial for reading in readings for trial in reading.trials]
         parts = [part for reading in readings for part in reading.parts()]
@@ -268,17 +269,17 @@ class Library:
     def _rows(self) -> list[tuple[str, ...]]:
         rows: list[tuple[str, ...]] = []
         for path in reversed(find_experiments(self._root)):
-            observer = self._statuses.setdefault(path.name, StatusReader(Experiment(path)))
+            reader = self._rowless.setdefault(path.name, ExperimentReader(Experiment(path), keep_rows=False))
             try:
                 self._check_inside(path)
-                statuses = observer.look(time.time())
+                records, _ = reader.look(time.time(), reader.planned())
                 question = str(Experiment(path).manifest().get("question") or "")
             except MskRayError as error:
                 rows.append((path.name, "", "", explain(error), ""))
                 continue
-            score = describe_bests(statuses, ids=False)
-            state = ", ".join(f"{n} {state}" for state, n in counts(statuses).items()) or "no trial has started yet"
-            rows.append((path.name, str(len(statuses)), score, state, question))
+            score = describe_bests(records, ids=False)
+            state = ", ".join(f"{n} {state}" for state, n in counts(records).items()) or "no trial has started yet"
+            rows.append((path.name, str(len(records)), score, state, question))
         return rows
 
     def _training_rows(self) -> tuple[tuple[str, ...], ...]:

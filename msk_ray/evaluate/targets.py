@@ -8,8 +8,7 @@ from pathlib import Path
 from msk_ray.errors import CheckpointError, StorageError
 from msk_ray.experiment import layout
 from msk_ray.experiment.manifest import Experiment
-from msk_ray.experiment.results import best_records, read_records
-from msk_ray.experiment.trial_status import find_experiments
+from msk_ray.experiment.records import best_records, find_experiments, read_records
 from msk_ray.shipped import POLICIES, find_shipped, shipped_folder, shipped_names
 
 

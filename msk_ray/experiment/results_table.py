@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from msk_ray.experiment.results import TrialRecord, best_records, records_by_environment
+from msk_ray.experiment.records import TrialRecord, best_records, records_by_environment
 from msk_ray.text import markdown_cell, markdown_text, printable
 
 VARIANT_HEADER = ("variant", "seeds", "mean score", "std", "worst", "best")
@@ -15,7 +15,7 @@ HEADER = ("trial", "changed", "seed", "score", "at epoch", "epochs", "stopped", 
 
 def result_rows(records: Sequence[TrialRecord]) -> list[tuple[str, ...]]:
     """One row per trial of one environment, the highest score first."""
-    ordered = sorted(records, key=lambda record: -record.best.score if record.best else float("inf"))
+    ordered = sorted(records, key=lambda record: float("inf") if record.score is None else -record.score)
     return [_row(record) for record in ordered]
 
 
@@ -27,8 +27,8 @@ def variant_rows(records: Sequence[TrialRecord]) -> list[tuple[str, ...]]:
         groups.setdefault(record.trial.variant, []).append(record)
     rows = []
     for variant, group in groups.items():
-        scored = [record for record in group if record.best is not None]
-        scores = [record.best.score for record in scored if record.best is not None]
+        scored = [record for record in group if record.score is not None]
+        scores = [record.score for record in scored if record.score is not None]
         if not scores:
             rows.append((float("-inf"), (variant, "0", "-", "-", "-", "-")))
             continue
@@ -126,7 +126,7 @@ def _row(record: TrialRecord) -> tuple[str, ...]:
         # Not after the reason, which a terminal may cut off.
         outcome_name(record) + record.attempt.mark,
         f"trials/{trial.id}",
-        "; ".join(part for part in (str(record.attempt), record.ending.why if record.ending else "") if part),
+        record.why,
     )
 
 

@@ -1,16 +1,25 @@
 """Reading a trial's folder: the content of its files at one moment, in any condition."""
 
+import contextlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
 from msk_ray.errors import StorageFailure
 from msk_ray.experiment.attempts import FIRST, Attempt, load_attempt
-from msk_ray.experiment.damage import Damage, DamagedFile, cut, field, read_object
-from msk_ray.experiment.layout import DEVICE_FILE, METRICS_FILE, OUTPUT_FILE, SUMMARY_FILE, best_checkpoint
+from msk_ray.experiment.damage import Damage, DamagedFile, cut, describe_damages, field, read_object
+from msk_ray.experiment.layout import (
+    DEVICE_FILE,
+    ERROR_FILE,
+    METRICS_FILE,
+    OUTPUT_FILE,
+    SUMMARY_FILE,
+    best_checkpoint,
+)
 from msk_ray.experiment.metrics import (
     Evaluation,
     Metrics,
@@ -22,6 +31,8 @@ from msk_ray.experiment.metrics import (
 )
 from msk_ray.experiment.outcomes import Ending, Outcome, load_ending
 from msk_ray.experiment.ownership import has_living_owner
+from msk_ray.files import UnusableFile, last_lines
+from msk_ray.metrics import SCORE
 
 T = TypeVar("T")
 _BEATS = (METRICS_FILE, DEVICE_FILE, OUTPUT_FILE)
@@ -32,6 +43,7 @@ SILENT_S = 60.0
 """... and for at least this long [s]."""
 SILENT_STARTING_S = 600.0
 """The same before the first epoch has ended, because the process may be compiling [s]."""
+_TAIL_LINES = 12
 
 
 class State(StrEnum):
@@ -45,8 +57,6 @@ class State(StrEnum):
     WAITING = "waiting"
     """Not started, or not yet since its sweep was resumed."""
     ENDED = "ended"
-    UNREADABLE = "unreadable"
-    """Its files do not say which trial it is."""
 
 
 @dataclass(frozen=True)
@@ -74,14 +84,20 @@ class TrialSnapshot:
     """The scores of one with fewer worlds do not compare with the others'."""
     device: Device
     state: State
-    age: float | None
-    """Time since its process last wrote a file [s]; None if it never did."""
+    beat: float | None
+    """When its process last wrote a file [s since the epoch]; None if it never did."""
     damages: tuple[Damage, ...]
     """What was skipped."""
 
-    @property
+    @cached_property
     def evaluations(self) -> tuple[Evaluation, ...]:
+        """Those of the trained policy."""
         return tuple(evaluations_of(self.rows))
+
+    @cached_property
+    def scored(self) -> tuple[dict[str, float], ...]:
+        """The rows with a finite score, that of the untrained policy too."""
+        return tuple(row for row in self.rows if math.isfinite(row.get(SCORE, math.nan)))
 
     @property
     def epochs_done(self) -> int:
@@ -94,14 +110,69 @@ class TrialSnapshot:
         return seconds if math.isfinite(seconds) else 0.0
 
     @property
+    def score(self) -> float | None:
+        """Highest finite evaluation score of the trained policy; None before the first."""
+        return self.progress.best
+
+    @property
+    def best(self) -> Evaluation | None:
+        """The evaluation with the highest score."""
+        finite = [evaluation for evaluation in self.evaluations if math.isfinite(evaluation.score)]
+        return max(finite, key=lambda evaluation: evaluation.score, default=None)
+
+    @property
+    def best_row(self) -> dict[str, float]:
+        """Its epoch, env steps, seconds, and every finite `eval/` metric."""
+        row = max((row for row in self.scored if row["epoch"] > 0), key=lambda row: row[SCORE], default={})
+        kept = ("epoch", "env_steps", "seconds")
+        return {k: v for k, v in row.items() if (k.startswith("eval/") or k in kept) and math.isfinite(v)}
+
+    def within(self, env_steps: float) -> list[Evaluation]:
+        """The evaluations with a finite score in the first `env_steps`."""
+        return [e for e in self.evaluations if e.env_steps <= env_steps and math.isfinite(e.score)]
+
+    @property
     def best_checkpoint(self) -> Path | None:
-        """Checkpoint of the best evaluation's policy."""
+        """Checkpoint of the best evaluation's policy, or of the untrained one before; None if it is missing."""
         path = best_checkpoint(self.folder)
         return path if path.is_file() else None
 
     @property
+    def cut(self) -> bool:
+        """Whether it neither reached its end nor failed: stopped, interrupted or running. Its score might have risen
+        further."""
+        if self.ending is not None:
+            return self.ending.cut
+        return self.state is not State.WAITING or self.epochs_done > 0
+
+    @property
+    def failed(self) -> bool:
+        return self.ending is not None and self.ending.failed
+
+    @property
     def errored(self) -> bool:
         return self.ending is not None and self.ending.outcome in (Outcome.ERROR, Outcome.OUT_OF_MEMORY)
+
+    @property
+    def outcome(self) -> str:
+        """How it ended, or what it is doing."""
+        return str(self.state if self.ending is None else self.ending.outcome)
+
+    @property
+    def why(self) -> str:
+        """Why it ended, that it has fewer worlds, and what is wrong with its files."""
+        ending = [] if self.ending is None else [self.ending.why]
+        return "; ".join(filter(None, [str(self.attempt), *ending, *describe_damages(self.damages, self.folder)]))
+
+    def tail(self) -> str:
+        """The last lines of its error, or otherwise of its output."""
+        for name in (ERROR_FILE, OUTPUT_FILE):
+            with contextlib.suppress(FileNotFoundError):
+                try:
+                    return "\n".join(last_lines(self.folder / name, _TAIL_LINES))
+                except UnusableFile as error:
+                    return f"({name}: {error})"
+        return ""
 
 
 class TrialReader:
@@ -125,27 +196,28 @@ class TrialReader:
         ending = _try(lambda: load_ending(folder), None, folder, damages)
         attempt = _try(lambda: load_attempt(folder), FIRST, folder, damages)
         device = _try(lambda: read_object(folder / DEVICE_FILE, _device), None, folder, damages) or Device()
-        age = _heartbeat_age(folder, now)
+        beat = _last_beat(folder)
         if ending is not None:
             state = State.ENDED
-        elif age is None:
+        elif beat is None:
             state = State.WAITING
         else:
-            state = self._state(folder, progress, age, now)
-        return TrialSnapshot(folder, rows, progress, ending, attempt, device, state, age, tuple(damages))
+            state = self._state(folder, progress, beat, now)
+        return TrialSnapshot(folder, rows, progress, ending, attempt, device, state, beat, tuple(damages))
 
-    def _state(self, folder: Path, progress: TrialProgress, age: float, now: float) -> State:
+    def _state(self, folder: Path, progress: TrialProgress, beat: float, now: float) -> State:
         """The state of a trial that has started and not ended."""
-        experiment, beat = folder.parent.parent, _last_beat(folder)
+        experiment = folder.parent.parent
         if self._driver[:2] != (experiment, now):
             self._driver = experiment, now, has_living_owner(experiment, now)
         driven, summary = self._driver[2], _modified(experiment / SUMMARY_FILE)
-        if summary is not None and (beat is None or beat < summary):
+        if summary is not None and beat < summary:
             # The driver writes the summary at its very end: a newer driver has not restarted this trial yet.
             return State.WAITING if driven else State.INTERRUPTED
         if driven is False:
             return State.INTERRUPTED
-        if age <= _patience(folder, progress):
+        # The clocks of machines that share a storage differ: a time in the future counts as now.
+        if now - beat <= _patience(folder, progress):
             return State.RUNNING
         return State.INTERRUPTED if driven is None else State.STALE
 
@@ -187,15 +259,6 @@ def _device(facts: dict[str, Any]) -> Device:
         return Device(host, "cpu", "cpu")
     # Without CUDA_VISIBLE_DEVICES a process sees all GPUs and takes the first.
     return Device(host, field(facts, "visible", str) or "0", field(facts, "name", str))
-
-
-def _heartbeat_age(folder: Path, now: float) -> float | None:
-    """Seconds since a trial's process last wrote; None if it never did.
-
-    The clocks of machines that share a storage differ: a time in the future counts as now.
-    """
-    beat = _last_beat(folder)
-    return None if beat is None else max(0.0, now - beat)
 
 
 def _last_beat(folder: Path) -> float | None:

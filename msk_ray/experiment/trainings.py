@@ -8,14 +8,13 @@ from typing import Any
 from msk_ray.config import env_name, read_yaml
 from msk_ray.errors import MskRayError
 from msk_ray.experiment.damage import describe_damages
-from msk_ray.experiment.layout import MANIFEST_FILE, METRICS_FILE
+from msk_ray.experiment.layout import CONFIG_FILE, MANIFEST_FILE, METRICS_FILE
 from msk_ray.experiment.metrics import TrialProgress
 from msk_ray.experiment.ownership import has_living_owner
 from msk_ray.experiment.snapshot import State, TrialReader
 
 FOLDER = "train"
 """Default subfolder of a storage folder for training runs."""
-_CONFIG = "config.yaml"
 
 
 @dataclass(frozen=True)
@@ -50,7 +49,7 @@ class TrainingReader:
         settings: Mapping[str, Any] = {}
         try:
             # Read as plain data, because its environment's class may not be installed here.
-            settings = read_yaml(folder / _CONFIG)
+            settings = read_yaml(folder / CONFIG_FILE)
         except MskRayError as error:
             notes.append(str(error))
         trial = settings.get("trial")

@@ -13,8 +13,9 @@ from msk_ray.evaluate.stored import eval_file_of, read_evaluations, store_evalua
 from msk_ray.evaluate.targets import best_of_trial
 from msk_ray.experiment.checkpoint_file import read_facts
 from msk_ray.experiment.layout import EVAL_FILE
+from msk_ray.experiment.records import TrialRecord
 from msk_ray.files import read_file, write_bytes
-from msk_ray.report.reading import TrialReading, explain
+from msk_ray.report.reading import explain
 
 STRIP = "strip"
 FRAMES = 8
@@ -28,7 +29,7 @@ _LARGEST = 16 << 20
 class Best:
     """What is known of the best trial's best policy."""
 
-    trial: TrialReading
+    trial: TrialRecord
     sha: str | None = None
     """Of the policy's checkpoint; None if there is none that can be read."""
     evaluations: tuple[Mapping[str, Any], ...] = ()
@@ -41,7 +42,7 @@ class Best:
     """What cannot be shown, and why."""
 
 
-def look_at_best(trial: TrialReading, folder: Path, prefix: str, make: bool, device: str | None) -> Best:
+def look_at_best(trial: TrialRecord, folder: Path, prefix: str, make: bool, device: str | None) -> Best:
     """Gather the evaluation and the strip of a trial's best policy.
 
     Args:
@@ -72,7 +73,7 @@ def look_at_best(trial: TrialReading, folder: Path, prefix: str, make: bool, dev
     return replace(best, missing=(*best.missing, *missing))
 
 
-def stored_best(trial: TrialReading, strips: Sequence[Path]) -> Best:
+def stored_best(trial: TrialRecord, strips: Sequence[Path]) -> Best:
     """What is stored about a trial's best policy.
 
     Args:

@@ -9,7 +9,8 @@ import numpy as np
 from msk_ray.errors import ConfigError
 from msk_ray.experiment.layout import SPACE_FILE
 from msk_ray.experiment.outcomes import Outcome
-from msk_ray.metrics import HEALTH
+from msk_ray.experiment.records import TrialRecord
+from msk_ray.metrics import HEALTH, SCORE
 from msk_ray.metrics import metric as describe
 from msk_ray.report.charts import (
     BLUE,
@@ -34,7 +35,7 @@ from msk_ray.report.charts import (
     thin_evenly,
     thin_peaks,
 )
-from msk_ray.report.reading import Reading, TrialReading
+from msk_ray.report.reading import Reading
 from msk_ray.sweep.budget import extreme_configs, longest_budget
 from msk_ray.sweep.space import recorded_space
 from msk_ray.text import printable
@@ -65,7 +66,6 @@ _LOOKS = {
     "interrupted": (GREY, "|"),
     "stale": (GREY, "1"),
     "waiting": (GREY, "."),
-    "unreadable": ("#000000", "1"),
 }
 """How a trial ended → its colour, and its marker on paper."""
 STEPS = Axis("env steps", "count", low=0.0)
@@ -84,7 +84,7 @@ Places = Mapping[Path, int]
 
 
 def learning_curves(
-    groups: Mapping[str, Sequence[TrialReading]],
+    groups: Mapping[str, Sequence[TrialRecord]],
     baseline: str | None,
     name: str,
     places: Places,
@@ -101,7 +101,7 @@ def learning_curves(
         over: the x axis, `env_steps` or `seconds`.
     """
     means = {v: float(np.mean(scores)) for v, trials in groups.items() if (scores := _best_scores(trials))}
-    curves = {v: [t.curve_over(over) for t in groups[v] if len(t.curve[0])] for v in means}
+    curves = {v: [curve for t in groups[v] if len((curve := curve_over(t, over))[0])] for v in means}
     until = {v: _first_end(groups[v], over) for v in means}
     axis, more = _OVER[over]
     ranked = sorted(curves, key=lambda v: -means[v])
@@ -127,7 +127,7 @@ def learning_curves(
             text = f"{printable(variant)}\nmean of {len(curves[variant])} seeds"
             lines.append(Line(style, x, mean, text=text, low=low, high=high, when="unfiltered"))
         for trial in groups[variant]:
-            curve = trial.curve_over(over)
+            curve = curve_over(trial, over)
             if not len(curve[0]):
                 continue
             x, y = map(plain, thin_evenly(*curve, count))
@@ -152,7 +152,7 @@ def learning_curves(
     )
 
 
-def _randomized(groups: Sequence[Sequence[TrialReading]]) -> str:
+def _randomized(groups: Sequence[Sequence[TrialRecord]]) -> str:
     """What is drawn in training and not in evaluation, as a sentence; empty if nothing is."""
     sections = [trials[0].trial.config.physics.randomize for trials in groups]
     drawn = [section for section in sections if section is not None]
@@ -163,14 +163,14 @@ def _randomized(groups: Sequence[Sequence[TrialReading]]) -> str:
     return f" {some} trained with {kinds}, drawn for every episode; every score is of the model as it is."
 
 
-def _first_end(trials: Sequence[TrialReading], over: str) -> float:
+def _first_end(trials: Sequence[TrialRecord], over: str) -> float:
     """Where the first of some trials that ran to their end has its last score; infinite if none did.
 
     Trials take different times, and with adaptive horizons different env steps: beyond this point, a mean of those that
     are left would jump.
     """
     ended = (t for t in trials if t.ending is not None and t.ending.outcome in (Outcome.FINISHED, Outcome.WALL_TIME))
-    return min((float(t.curve_over(over)[0][-1]) for t in ended if len(t.curve[0])), default=math.inf)
+    return min((float(x[-1]) for t in ended if len(x := curve_over(t, over)[0])), default=math.inf)
 
 
 def _mean_and_range(curves: Sequence[Curve], until: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -202,7 +202,7 @@ def _floor(curves: Sequence[Curve]) -> Floor | None:
     return Floor(float(f"{bottom:.3g}"), f"▼ {trials} below this axis, down to {min(lowest):.4g}")
 
 
-def _best_scores(trials: Sequence[TrialReading]) -> list[float]:
+def _best_scores(trials: Sequence[TrialRecord]) -> list[float]:
     return [trial.score for trial in trials if trial.score is not None]
 
 
@@ -264,12 +264,19 @@ def _health_plot(reading: Reading, metric: str, count: int, places: Places) -> P
     )
 
 
-def _health_curve(trial: TrialReading, metric: str) -> Curve | None:
-    values = trial.columns.get(metric)
-    if values is None or not np.isfinite(values).any():
-        return None
-    keep = np.isfinite(values)
-    return trial.columns["env_steps"][keep], values[keep]
+def curve_over(trial: TrialRecord, column: str) -> Curve:
+    """A column of the metrics, such as `env_steps`, and the score, both (N,), of all evaluations with a finite score;
+    the first is that of the untrained policy."""
+    return _curve([row for row in trial.scored if math.isfinite(row.get(column, math.nan))], column, SCORE)
+
+
+def _health_curve(trial: TrialRecord, metric: str) -> Curve | None:
+    rows = [row for row in trial.rows if math.isfinite(row.get(metric, math.nan))]
+    return _curve(rows, "env_steps", metric) if rows else None
+
+
+def _curve(rows: Sequence[Mapping[str, float]], x: str, y: str) -> Curve:
+    return np.array([row.get(x, math.nan) for row in rows]), np.array([row[y] for row in rows])
 
 
 def stopping_map(reading: Reading, name: str, places: Places) -> Picture | None:
@@ -287,7 +294,7 @@ def stopping_map(reading: Reading, name: str, places: Places) -> Picture | None:
     looks = [_LOOKS.get(outcome, (GREY, ".")) for outcome in outcomes]
     rows = []
     for trial in ordered:
-        end = float(trial.columns["env_steps"][-1])
+        end = trial.rows[-1].get("env_steps", math.nan)
         score = "" if trial.score is None else f", best score {trial.score:.5g}"
         label = trial.trial.variant + (f", seed {trial.trial.seed}" if seeds else "")
         text = f"ended at {format_steps(end)} env steps{score}"

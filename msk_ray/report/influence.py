@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
+from msk_ray.experiment.records import TrialRecord
 from msk_ray.experiment.trial import short_key
 from msk_ray.report.charts import (
     BLUE,
@@ -29,7 +30,7 @@ from msk_ray.report.charts import (
     plain,
     rounded,
 )
-from msk_ray.report.reading import Reading, TrialReading
+from msk_ray.report.reading import Reading
 from msk_ray.report.statistics import LEAST, Effect, TrialScore, effects, mean_interval
 from msk_ray.text import printable
 
@@ -196,7 +197,7 @@ def _score_colour(share: float) -> Colour:
     return to_hex(ramp(0.88 * share)), to_hex(ramp(0.22 + 0.78 * share))
 
 
-def _column(factor: str, trials: Sequence[TrialReading]) -> tuple[Axis, list[float]]:
+def _column(factor: str, trials: Sequence[TrialRecord]) -> tuple[Axis, list[float]]:
     """A parameter's axis, and the trials' values on it: numbers, or positions of its levels."""
     name = printable(short_key(factor))
     values = [trial.trial.values.get(factor) for trial in trials]

@@ -19,6 +19,7 @@ from msk_ray import __version__
 from msk_ray.cli import typed_command
 from msk_ray.errors import StorageFailure
 from msk_ray.experiment.manifest import Experiment
+from msk_ray.experiment.records import TrialRecord
 from msk_ray.files import write_text
 from msk_ray.progress import format_duration
 from msk_ray.report.best import Best, strip_bytes
@@ -26,7 +27,7 @@ from msk_ray.report.charts import Picture, format_steps
 from msk_ray.report.curves import gradient_health, learning_curves, stopping_map
 from msk_ray.report.influence import parallel_coordinates, parameter_effects, ranked_effects
 from msk_ray.report.png import png
-from msk_ray.report.reading import Condition, Reading, TrialReading
+from msk_ray.report.reading import Condition, Reading
 from msk_ray.report.tables import (
     VariantRow,
     baseline_of,
@@ -81,11 +82,11 @@ class Section:
     def figures(self) -> list[str]:
         return outcome_figures(self.reading.trials)
 
-    def ordered(self) -> list[TrialReading]:
+    def ordered(self) -> list[TrialRecord]:
         """Trials, the best score first."""
         return sorted(self.reading.trials, key=lambda t: (t.score is None, -(t.score or 0.0), t.trial.index))
 
-    def files(self, trial: TrialReading) -> list[tuple[str, str]]:
+    def files(self, trial: TrialRecord) -> list[tuple[str, str]]:
         """(name, link) of a trial's existing files."""
         return [(Path(name).stem, self.link(trial.folder / name)) for name in FILES if (trial.folder / name).is_file()]
 
@@ -93,8 +94,8 @@ class Section:
         """Kinds of devices, and how many trials ran on each."""
         counts: dict[str, int] = {}
         for trial in self.reading.trials:
-            if trial.device:
-                counts[trial.device] = counts.get(trial.device, 0) + 1
+            if name := trial.device.name:
+                counts[name] = counts.get(name, 0) + 1
         return counts
 
     def link(self, path: Path) -> str:

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 from msk_ray.errors import ConfigError
 from msk_ray.experiment.outcomes import Outcome
+from msk_ray.experiment.records import TrialRecord
 from msk_ray.experiment.snapshot import State
-from msk_ray.report.reading import Reading, TrialReading
+from msk_ray.report.reading import Reading
 from msk_ray.report.statistics import Interval, difference_interval, mean_interval
 
 _PLAIN_FIGURES = ("score", "score_std", "length", "fall_rate", "diverged_rate", "best_score")
@@ -19,7 +20,6 @@ MEANINGS: dict[str, str] = {
     Outcome.DIVERGED: "too many simulated worlds diverged, or contacts were lost",
     Outcome.OUT_OF_MEMORY: "the device has less memory than the settings need",
     Outcome.ERROR: "an exception, or the process died too often",
-    State.UNREADABLE: "the trial's files cannot be read",
     State.INTERRUPTED: "begun and not ended, and nothing is running it: --resume continues it",
     State.STALE: "silent for too long, although the sweep runs",
 }
@@ -100,11 +100,11 @@ def baseline_of(reading: Reading, asked: str | None) -> str | None:
     return variants[0] if variants else None
 
 
-def outcome_figures(trials: Sequence[TrialReading]) -> list[str]:
+def outcome_figures(trials: Sequence[TrialRecord]) -> list[str]:
     """Names of the environment's own outcomes in evaluations, such as `vx` and `success_rate`."""
     names: dict[str, None] = {}
     for trial in trials:
-        names.update(dict.fromkeys(name for name in trial.columns if name.startswith("eval/")))
+        names.update(dict.fromkeys(name for row in trial.scored for name in row if name.startswith("eval/")))
     short = [name.removeprefix("eval/") for name in names]
     return [name for name in short if "/" not in name and name not in _PLAIN_FIGURES]
 
@@ -144,7 +144,7 @@ def variant_rows(reading: Reading, baseline: str | None) -> list[VariantRow]:
 
 
 def _on_equal_terms(
-    trials: Sequence[TrialReading], reference: Sequence[TrialReading]
+    trials: Sequence[TrialRecord], reference: Sequence[TrialRecord]
 ) -> tuple[float | None, tuple[list[float], list[float]] | None]:
     """The env steps at which two groups are compared, and their best scores up to there.
 
@@ -155,21 +155,26 @@ def _on_equal_terms(
     Returns:
         Env steps, None if all ran to their end; and the scores of both groups, None if one has none.
     """
-    begun = [t for t in (*trials, *reference) if not t.cut or t.last_within(math.inf) is not None]
+    begun = [t for t in (*trials, *reference) if not t.cut or t.score is not None]
     counted = {id(t) for t in begun}
     limit = math.inf
     if any(t.cut for t in begun):
         going = [t for t in begun if t.score is not None and not t.failed]
-        limit = min(t.last_within(math.inf) or 0.0 for t in going if t.cut)
+        limit = min(_last_within(t, math.inf) for t in going if t.cut)
         # Trials may be evaluated at different env steps: this is the last step that all of them cover.
-        limit = min(t.last_within(limit) or 0.0 for t in going)
+        limit = min(_last_within(t, limit) for t in going)
 
-    def within(group: Sequence[TrialReading]) -> list[float]:
-        scores = [trial.score_within(limit) for trial in group if id(trial) in counted]
-        return [score for score in scores if score is not None]
+    def within(group: Sequence[TrialRecord]) -> list[float]:
+        scores = [[e.score for e in trial.within(limit)] for trial in group if id(trial) in counted]
+        return [max(own) for own in scores if own]
 
     pair = (within(trials), within(reference))
     return (limit if limit < math.inf else None), (pair if limit > 0.0 and all(pair) else None)
+
+
+def _last_within(trial: TrialRecord, limit: float) -> float:
+    """Env steps of the last evaluation within `limit` env steps; 0 if there is none."""
+    return max((float(e.env_steps) for e in trial.within(limit)), default=0.0)
 
 
 def _mean(scores: Sequence[float]) -> float:
@@ -189,9 +194,9 @@ def by_variant_and_environment(parts: Sequence[Reading]) -> dict[str, list[Varia
     return {name: [by_variant.get(name) for by_variant in rows] for name in names}
 
 
-def failures(reading: Reading) -> list[tuple[str, str, list[TrialReading]]]:
+def failures(reading: Reading) -> list[tuple[str, str, list[TrialRecord]]]:
     """(name, meaning, trials) of each kind of failure, the most frequent first; interrupted trials are included."""
-    by_outcome: dict[str, list[TrialReading]] = {}
+    by_outcome: dict[str, list[TrialRecord]] = {}
     for trial in reading.trials:
         if trial.failed or trial.state in (State.INTERRUPTED, State.STALE):
             by_outcome.setdefault(trial.outcome, []).append(trial)
@@ -207,5 +212,5 @@ def outcome_counts(reading: Reading) -> dict[str, int]:
     return dict(sorted(counts.items(), key=lambda item: -item[1]))
 
 
-def _scores(trials: Sequence[TrialReading]) -> list[float]:
+def _scores(trials: Sequence[TrialRecord]) -> list[float]:
     return [trial.score for trial in trials if trial.score is not None]

@@ -144,7 +144,7 @@ def _rows(trials: Sequence[Trial]) -> list[tuple[str, ...]]:
 
 def _debug(options: Options, space: Space, trial: Trial) -> int:
     """Run one trial in this process, in a separate folder."""
-    from msk_ray.experiment.results import read_record
+    from msk_ray.experiment.records import read_record
     from msk_ray.tune.devices import local_gpus
     from msk_ray.tune.trial_run import Hooks, make_trainer, run_trial
 

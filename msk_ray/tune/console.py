@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from msk_ray.experiment.attempts import FIRST, Attempt
-from msk_ray.experiment.eta import eta
 from msk_ray.experiment.outcomes import Ending, Outcome
+from msk_ray.experiment.records import eta
 from msk_ray.experiment.trial import Trial
 from msk_ray.progress import format_duration
 from msk_ray.text import printable, printable_lines

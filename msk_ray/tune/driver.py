@@ -18,7 +18,7 @@ from ray.exceptions import RayTaskError
 from ray.tune.stopper import Stopper
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from msk_ray.config import Config, parse_recorded
+from msk_ray.config import Config, parse_recorded, value_at
 from msk_ray.errors import ClusterLost, MskRayError, OwnershipLost, StorageFailure, storage_failure
 from msk_ray.experiment.attempts import read_attempt
 from msk_ray.experiment.damage import describe_damages, read_settings
@@ -27,7 +27,7 @@ from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import last_figures
 from msk_ray.experiment.outcomes import read_ending, write_ending
 from msk_ray.experiment.ownership import Ownership
-from msk_ray.experiment.results import read_record
+from msk_ray.experiment.records import read_record
 from msk_ray.experiment.scheduler_log import SchedulerLog
 from msk_ray.experiment.trial import Trial, by_environment
 from msk_ray.progress import announce, format_duration
@@ -274,9 +274,9 @@ def _suggestions(plan: Plan, suggested: list[SearchTrial], identify: Identify) -
     search = search_class(file.search)(plan.space.sampled, seed, *given)
     for params, record in scored:
         if file.objectives:
-            search.tell_objectives(params, last_figures(record.snapshot.rows, list(file.objectives)))
+            search.tell_objectives(params, last_figures(record.rows, list(file.objectives)))
         else:
-            search.tell(params, None if record.best is None else record.best.score)
+            search.tell(params, record.score)
     left = file.samples - len(scored)
     return Suggestions(plan.experiment, identify, search, begun, left, tuple(file.objectives))
 
@@ -340,12 +340,7 @@ def _current_params(job: Job, trial: Trial) -> dict[str, Any]:
     if not written.is_file():
         return params
     settings = parse_recorded(read_settings(written), str(written)).as_dict()
-    for key in params:
-        node: Any = settings
-        for part in key.split("."):
-            node = node[part]
-        params[key] = node
-    return params
+    return {key: value_at(settings, key) for key in params}
 
 
 def _pruner(plan: Plan) -> Pruner:

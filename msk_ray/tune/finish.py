@@ -8,7 +8,7 @@ from msk_ray.cli import shell_join
 from msk_ray.experiment.damage import count_damages, describe_damages
 from msk_ray.experiment.layout import SUMMARY_FILE
 from msk_ray.experiment.manifest import Experiment
-from msk_ray.experiment.results import best_records, read_records, records_by_environment
+from msk_ray.experiment.records import best_records, read_records, records_by_environment
 from msk_ray.experiment.results_table import (
     HEADER,
     VARIANT_HEADER,
@@ -46,7 +46,7 @@ def finish(experiment: Experiment) -> int:
         print("\n" + text_table(HEADER, result_rows(group), width))
         if len({record.trial.seed for record in group}) > 1:
             print("\n" + text_table(VARIANT_HEADER, variant_rows(group), width))
-    damages = [damage for record in records for damage in record.snapshot.damages]
+    damages = [damage for record in records for damage in record.damages]
     if damages:
         print(f"\nskipped {count_damages(damages)}:")
         print("\n".join(describe_damages(damages, experiment.path)))

@@ -18,7 +18,7 @@ from msk_ray.evaluate.measure import Bench, Request, figures
 from msk_ray.evaluate.stored import read_evaluations, store_evaluation
 from msk_ray.experiment.attempts import Attempt, WorldReduction
 from msk_ray.experiment.manifest import Experiment
-from msk_ray.experiment.results import best_records, read_records
+from msk_ray.experiment.records import best_records, read_records
 from msk_ray.training import load_policy, read_metrics
 from msk_ray.training.checkpoint import milestones
 from msk_ray.training.evaluation import Episodes

@@ -168,7 +168,7 @@ def test_a_hostile_record_is_one_line_and_hides_nothing_else(
             assert healthy in shown.out
 
     reading = read_experiment(made, 0.0)
-    told = "\n".join([*reading.warnings, *(f"{trial.fault} {trial.tail()}" for trial in reading.trials)])
+    told = "\n".join([*reading.warnings, *(f"{trial.why} {trial.tail()}" for trial in reading.trials)])
     assert all("\n" not in line for line in reading.warnings)
     assert "secret" not in told
     (intact,) = [trial for trial in reading.trials if trial.trial.id == healthy]

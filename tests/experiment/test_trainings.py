@@ -5,9 +5,9 @@ import time
 from pathlib import Path
 
 from msk_ray.experiment.ownership import owned
+from msk_ray.experiment.records import find_experiments
 from msk_ray.experiment.snapshot import State
 from msk_ray.experiment.trainings import TrainingReader
-from msk_ray.experiment.trial_status import find_experiments
 
 
 def fill(folder: Path, last: int, config: str = "env: {name: 'gone:Robot'}\ntrial: {epochs: 4}\n") -> None:

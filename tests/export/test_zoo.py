@@ -19,7 +19,7 @@ from msk_ray.evaluate.__main__ import main as evaluate
 from msk_ray.evaluate.measure import Bench, Request
 from msk_ray.evaluate.zoo import BEGIN, END, MAX_BYTES, Score, read_zoo, zoo_text
 from msk_ray.experiment.manifest import Experiment
-from msk_ray.experiment.results import best_records, read_records
+from msk_ray.experiment.records import best_records, read_records
 from msk_ray.export import zoo as writing
 from msk_ray.export.__main__ import main as export
 from msk_ray.export.write import export as export_files

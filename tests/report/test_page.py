@@ -12,7 +12,7 @@ from playwright.sync_api import Page
 
 from msk_ray.cli import run
 from msk_ray.experiment.manifest import Experiment
-from msk_ray.experiment.results import best_records, read_records
+from msk_ray.experiment.records import best_records, read_records
 from msk_ray.report.__main__ import main
 from msk_ray.report.best import strip_text
 

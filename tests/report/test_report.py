@@ -20,13 +20,14 @@ from msk_ray.experiment.damage import DamagedFile
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.notes import load_notes, write_note
 from msk_ray.experiment.outcomes import Ending, Outcome, write_ending
+from msk_ray.experiment.records import ExperimentReader
 from msk_ray.report.__main__ import main
 from msk_ray.report.charts import Axis, Chart, Floor, Picture, Plot, Style, thin_evenly
-from msk_ray.report.curves import learning_curves, rung_steps
+from msk_ray.report.curves import curve_over, learning_curves, rung_steps
 from msk_ray.report.influence import ranked_effects
 from msk_ray.report.page import make_section, places_of
 from msk_ray.report.png import png, shorten
-from msk_ray.report.reading import Condition, ExperimentReader, read_experiment
+from msk_ray.report.reading import Condition, read_experiment
 from msk_ray.report.tables import failures, variant_rows
 from msk_ray.sweep import opening
 from msk_ray.sweep.space import parse_space
@@ -255,7 +256,7 @@ def test_a_long_curve_keeps_its_ends_and_extremes() -> None:
 
 def test_only_what_has_changed_is_read_again(experiment: Experiment, monkeypatch: pytest.MonkeyPatch) -> None:
     reader = ExperimentReader(experiment)
-    before = reader.read(time.time())
+    before = read_again(reader, time.time())
     read: list[Path] = []
     load = snapshot.load_metrics
     monkeypatch.setattr(snapshot, "load_metrics", lambda path: read.append(path) or load(path))
@@ -263,7 +264,7 @@ def test_only_what_has_changed_is_read_again(experiment: Experiment, monkeypatch
     changed = before.trials[2].folder
     fill(changed, [0.0, 99.0], Ending(Outcome.FINISHED, "done"))
     write_note(experiment.path, before.trials[3].trial.id, "  look at this\n")
-    after = reader.read(time.time())
+    after = read_again(reader, time.time())
     assert read == [changed / "metrics.jsonl"]
     assert (after.trials[2].score, after.trials[3].note) == (99.0, "look at this")
     assert [a is b for a, b in zip(before.trials, after.trials, strict=True)] == [True] * 2 + [False] * 2 + [True] * 2
@@ -517,7 +518,7 @@ def test_several_algorithms_are_compared_over_seconds_too(several: bool, tmp_pat
     assert ("Evaluation score over seconds of training of 2 variants" in page) == several
     assert (made.path / "report" / "times.png").is_file() == several
     reading = read_experiment(made, time.time())
-    assert [list(x) for x in reading.trials[0].curve_over("seconds")] == [[0.0, 4.0, 8.0], [1.0, 2.0, 3.0]]
+    assert [list(x) for x in curve_over(reading.trials[0], "seconds")] == [[0.0, 4.0, 8.0], [1.0, 2.0, 3.0]]
 
 
 def test_it_says_which_variants_were_trained_with_drawn_parameters(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from lean_ray import lean_ray
 from ray import cloudpickle
 from stub_trainer import StubTrainer
 
-from msk_ray.experiment.results import TrialRecord, read_records
+from msk_ray.experiment.records import TrialRecord, read_records
 from msk_ray.sweep import opening
 from msk_ray.sweep.space import Space
 from msk_ray.sweep.trials import resolve_trials

@@ -17,7 +17,7 @@ from msk_ray.experiment.attempts import FIRST, Attempt, WorldReduction, read_att
 from msk_ray.experiment.layout import ABANDONED, SCHEDULER_LOG_FILE
 from msk_ray.experiment.metrics import read_rows
 from msk_ray.experiment.outcomes import Ending, Outcome, read_ending, write_ending
-from msk_ray.experiment.results import read_records
+from msk_ray.experiment.records import read_records
 from msk_ray.experiment.results_table import reduced_note, result_rows, summary, table_document, variant_rows
 from msk_ray.experiment.scheduler_log import LogEntry, SchedulerLog
 from msk_ray.experiment.trial import Trial

@@ -15,7 +15,7 @@ from processes import Launcher
 
 from msk_ray.config import dump_yaml
 from msk_ray.experiment.manifest import Experiment
-from msk_ray.experiment.results import read_records
+from msk_ray.experiment.records import read_records
 from msk_ray.signals import RESUMABLE
 from msk_ray.sweep.trials import resolve_trials
 from msk_ray.tune.trainable import in_frame_named

@@ -17,7 +17,7 @@ from stub_trainer import HELD_AT
 from msk_ray.config import dump_yaml
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import read_rows
-from msk_ray.experiment.results import read_records
+from msk_ray.experiment.records import read_records
 from msk_ray.signals import RESUMABLE
 
 pytestmark = pytest.mark.long

@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-import time
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +13,8 @@ from msk_ray.config import Config, dump_yaml
 from msk_ray.errors import ConfigError, DeviceError, StorageError
 from msk_ray.experiment.manifest import Experiment, check_name
 from msk_ray.experiment.outcomes import Ending, Outcome, read_ending, write_ending
-from msk_ray.experiment.results import best_records, read_record
+from msk_ray.experiment.records import best_records, read_record, read_records
 from msk_ray.experiment.results_table import markdown, outcome_name, result_rows, summary, table_document, variant_rows
-from msk_ray.experiment.trial_status import StatusReader
 from msk_ray.files import make_folder
 from msk_ray.nvidia_smi import ask_driver
 from msk_ray.status import main as status
@@ -105,7 +103,7 @@ def test_an_untrained_policy_has_no_score(experiment: Experiment, make_space: An
         (7.0, 2, False),
         (None, None, True),
     ]
-    shown = {standing.id: standing.progress.best for standing in StatusReader(experiment).look(time.time())}
+    shown = {record.trial.id: record.score for record in read_records(experiment)}
     assert [shown[trial.id] for trial in trials] == [5.0, None, 7.0, None]
 
 

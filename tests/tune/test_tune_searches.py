@@ -18,7 +18,7 @@ from msk_ray.config import read_yaml
 from msk_ray.errors import StorageError
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import read_rows
-from msk_ray.experiment.results import read_records
+from msk_ray.experiment.records import read_records
 from msk_ray.sweep import opening
 from msk_ray.sweep.search.tpe import OptunaSearch
 from msk_ray.sweep.search_trials import recover

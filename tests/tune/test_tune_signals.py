@@ -19,7 +19,7 @@ from stub_trainer import HELD_AT
 from msk_ray.config import dump_yaml
 from msk_ray.errors import ClusterLost
 from msk_ray.experiment.manifest import Experiment
-from msk_ray.experiment.results import read_records
+from msk_ray.experiment.records import read_records
 from msk_ray.signals import NUMBERS, RESUMABLE, listening
 from msk_ray.tune import interrupts
 
