@@ -9,9 +9,9 @@ from pathlib import Path
 from msk_ray.cli import Parser, run
 from msk_ray.errors import ConfigError
 from msk_ray.evaluate.targets import find_experiment
-from msk_ray.files import make_folder
+from msk_ray.files import make_folder, write_text
 from msk_ray.report.best import Best, look_at_best
-from msk_ray.report.page import command_of, compare, make_section, places_of, write_page
+from msk_ray.report.page import PAGE, command_of, compare, make_section, places_of, render_page
 from msk_ray.report.reading import Condition, Reading, check_folder, read_experiment
 from msk_ray.text import printable
 
@@ -21,7 +21,7 @@ confidence intervals, the effect of each parameter, which trial stopped when and
 outcome, the best policy with its evaluation and film strip, and the command that repeats the experiment.
 
 It only reads files, so it also works while the sweep runs or after it has crashed, and says what is missing. Writes
-EXPERIMENT/report/index.html, with every figure as a PNG file beside it."""
+EXPERIMENT/report/index.html, which saves any of its figures as PNG."""
 
 EXAMPLES = """\
   python -m msk_ray.report demo                            # runs/demo/report/index.html
@@ -80,11 +80,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         for reading, prefix in zip(readings, prefixes, strict=True)
     ]
     sections = [replace(section, best=best) for section, best in zip(sections, bests, strict=True)]
-    page = write_page(sections, together, folder, now, command_of(experiments, args.storage))
+    write_text(folder / PAGE, render_page(sections, together, now, command_of(experiments, args.storage)))
     for reading in whole:
         for warning in reading.warnings:
             print(printable(f"{reading.name}: {warning}"))
-    print(printable(f"report       {page}"))
+    print(printable(f"report       {folder / PAGE}"))
     return 0
 
 

@@ -1,4 +1,4 @@
-"""Charts as plain descriptions: `page/charts.js` draws them on the page, `png.py` for print and papers.
+"""Charts as plain descriptions, which `page/charts.js` draws.
 
 Colours are a string, or a pair of them for light and for dark paper. Trials are named by their position in the page's
 list of trials. What has a `trial` is shown while the reader's filter shows this trial, and leads to it.
@@ -64,8 +64,8 @@ class Style:
     """One of DASHES."""
     width: float = 1.0
     opacity: float = 1.0
-    marker: str = ""
-    """Of points, and of the end of a bar on paper, as matplotlib calls it. The page has `o`, `x` and `_`."""
+    marker: Literal["", "o", "x", "_"] = ""
+    """Of points."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Line:
     """Lower and upper edge of the band at `x`."""
     high: Numbers | None = None
     when: Literal["always", "unfiltered", "filtered"] = "always"
-    """`unfiltered`: until the reader filters trials, and on paper; `filtered`: from then on, in its place."""
+    """`unfiltered`: until the reader filters trials; `filtered`: from then on, in its place."""
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,7 @@ class Picture:
     """A chart of the report, with its words."""
 
     name: str
-    """Name of its PNG file without suffix."""
+    """Its name on the page."""
     alt: str
     """Description of what it shows."""
     caption: str

@@ -51,23 +51,21 @@ _STOPPED = {
     Outcome.NONFINITE,
     Outcome.DIVERGED,
 }
-_LOOKS = {
-    "finished": ("#009E73", "o"),
-    "stopped_target": ("#009E73", "*"),
-    "stopped_asha": ("#E69F00", "x"),
-    "stopped_median": ("#E69F00", "+"),
-    "stopped_plateau": ("#56B4E9", "s"),
-    "wall_time": ("#56B4E9", "D"),
-    "nonfinite": ("#D55E00", "X"),
-    "diverged": ("#D55E00", "v"),
-    "out_of_memory": ("#D55E00", "P"),
-    "error": ("#D55E00", "^"),
-    "running": ("#0072B2", ">"),
-    "interrupted": (GREY, "|"),
-    "stale": (GREY, "1"),
-    "waiting": (GREY, "."),
+_GREEN, _ORANGE, _SKY, _RED = "#009E73", "#E69F00", "#56B4E9", "#D55E00"
+_COLOURS = {
+    "finished": _GREEN,
+    "stopped_target": _GREEN,
+    "stopped_asha": _ORANGE,
+    "stopped_median": _ORANGE,
+    "stopped_plateau": _SKY,
+    "wall_time": _SKY,
+    "nonfinite": _RED,
+    "diverged": _RED,
+    "out_of_memory": _RED,
+    "error": _RED,
+    "running": "#0072B2",
 }
-"""How a trial ended → its colour, and its marker on paper."""
+"""Of how a trial ended; grey for others."""
 STEPS = Axis("env steps", "count", low=0.0)
 _OVER = {
     "env_steps": (STEPS, ""),
@@ -280,7 +278,7 @@ def _curve(rows: Sequence[Mapping[str, float]], x: str, y: str) -> Curve:
 
 
 def stopping_map(reading: Reading, name: str, places: Places) -> Picture | None:
-    """A bar a trial, as long as it ran, its end marked by how it ended; None if none has begun."""
+    """A bar a trial, as long as it ran, in the colour of how it ended; None if none has begun."""
     begun = [trial for trial in reading.trials if trial.epochs_done]
     if not begun:
         return None
@@ -291,7 +289,6 @@ def stopping_map(reading: Reading, name: str, places: Places) -> Picture | None:
     for trial in ordered:
         counts[trial.outcome] = counts.get(trial.outcome, 0) + 1
     outcomes = list(counts)
-    looks = [_LOOKS.get(outcome, (GREY, ".")) for outcome in outcomes]
     rows = []
     for trial in ordered:
         end = trial.rows[-1].get("env_steps", math.nan)
@@ -306,7 +303,7 @@ def stopping_map(reading: Reading, name: str, places: Places) -> Picture | None:
         + ".",
         f"The best score on top. {unknown}Why each one stopped is in the table of trials.",
         Chart(
-            tuple(Style(colour, o, marker=marker) for o, (colour, marker) in zip(outcomes, looks, strict=True)),
+            tuple(Style(_COLOURS.get(outcome, GREY), outcome) for outcome in outcomes),
             (Bars(STEPS, tuple(rows), tuple(rungs), "rung"),),
             zoom=True,
         ),

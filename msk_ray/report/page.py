@@ -1,4 +1,4 @@
-"""The page: one self-contained HTML file, with its figures as PNG beside it."""
+"""The page: one self-contained HTML file."""
 
 import base64
 import os
@@ -17,16 +17,13 @@ from markupsafe import Markup
 
 from msk_ray import __version__
 from msk_ray.cli import typed_command
-from msk_ray.errors import StorageFailure
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.records import TrialRecord
-from msk_ray.files import write_text
 from msk_ray.progress import format_duration
 from msk_ray.report.best import Best, strip_bytes
 from msk_ray.report.charts import Picture, format_steps
 from msk_ray.report.curves import gradient_health, learning_curves, stopping_map
 from msk_ray.report.influence import parallel_coordinates, parameter_effects, ranked_effects
-from msk_ray.report.png import png
 from msk_ray.report.reading import Condition, Reading
 from msk_ray.report.tables import (
     VariantRow,
@@ -263,26 +260,6 @@ def _templates() -> Environment:
         number=_number, signed=_signed, percent=_percent, duration=format_duration, steps=format_steps
     )
     return environment
-
-
-def write_page(sections: Sequence[Section], together: Picture | None, folder: Path, now: float, command: str) -> Path:
-    """Write the page, and its figures as PNG.
-
-    Returns:
-        The page's path.
-
-    Raises:
-        StorageFailure: the folder cannot be written.
-    """
-    pictures = [picture for section in sections for picture in section.pictures.values()]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for picture in [*pictures, *([together] if together is not None else [])]:
-            (folder / f"{picture.name}.png").write_bytes(png(picture.chart))
-    except OSError as error:
-        raise StorageFailure(f"cannot write {folder}: {error.strerror or error}") from error
-    write_text(folder / PAGE, render_page(sections, together, now, command))
-    return folder / PAGE
 
 
 def _uri(png: bytes) -> str:

@@ -8,6 +8,7 @@ from urllib.parse import unquote, urlparse
 
 import pytest
 from needs import need_drawing
+from PIL import Image
 from playwright.sync_api import Page
 
 from msk_ray.cli import run
@@ -72,6 +73,18 @@ def test_all_is_drawn_without_complaints_and_fits(page: Page, reported: Experime
     drawn = page.evaluate(inked)
     assert len(drawn) >= 6
     assert all(200 < width <= inner and colours > 5 for width, colours in drawn)
+
+
+def test_a_figure_is_saved_as_it_is_shown(page: Page) -> None:
+    """Three times as sharp, with curves, axes and legend: several colours beside the paper's."""
+    figure = page.locator("figure[data-figure=curves]")
+    with page.expect_download() as download:
+        figure.get_by_role("button", name="save this figure as PNG").click()
+    assert download.value.suggested_filename == "curves.png"
+    with Image.open(download.value.path()) as image:
+        width = figure.locator(".charts").evaluate("room => room.getBoundingClientRect().width")
+        assert image.width == int(3 * width)
+        assert len(image.convert("RGB").getcolors(1 << 24) or []) > 20
 
 
 def test_charts_are_filtered_hovered_and_zoomed(page: Page) -> None:

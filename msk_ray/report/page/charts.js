@@ -282,6 +282,37 @@ const page = (() => {
     });
   }
 
+  // The figure as it is shown, with its legend, headings and notes, for print and papers.
+  function save(element) {
+    const sharp = 3;
+    const room = element.querySelector(".charts");
+    const frame = room.getBoundingClientRect();
+    const canvas = Object.assign(document.createElement("canvas"), { width: sharp * frame.width, height: sharp * frame.height });
+    const ink = canvas.getContext("2d");
+    ink.scale(sharp, sharp);
+    ink.fillStyle = css("--paper");
+    ink.fillRect(0, 0, frame.width, frame.height);
+    ink.textBaseline = "middle";
+    room.querySelectorAll(".chart, .heading, .entry[aria-pressed=true], .leaves").forEach((part) => {
+      const place = part.getBoundingClientRect();
+      const [left, middle] = [place.left - frame.left, place.top - frame.top + place.height / 2];
+      if (part.classList.contains("chart")) return ink.drawImage(drawn.get(part).chart.renderToCanvas({ pixelRatio: sharp }), left, place.top - frame.top, place.width, place.height);
+      const colour = part.style.getPropertyValue("--colour");
+      if (colour) {
+        Object.assign(ink, { strokeStyle: colour, lineWidth: 3 });
+        ink.setLineDash(part.classList.contains("dashed") ? [5, 3] : []);
+        ink.beginPath();
+        ink.moveTo(left, middle);
+        ink.lineTo(left + 16, middle);
+        ink.stroke();
+      }
+      ink.font = getComputedStyle(part).font;
+      ink.fillStyle = css("--ink");
+      ink.fillText(part.textContent, left + (colour ? 22 : 0), middle);
+    });
+    Object.assign(document.createElement("a"), { href: canvas.toDataURL(), download: `${element.dataset.figure}.png` }).click();
+  }
+
   function drawFigure(element) {
     const name = element.dataset.figure;
     const description = charts[name];
@@ -314,7 +345,8 @@ const page = (() => {
       tools.append(button("+", every(0.5), { "aria-label": "zoom in" }), button("−", every(2), { "aria-label": "zoom out" }), button("all", every(null), { "aria-label": "show the whole range" }));
     }
     if (made.some((m) => m.brush)) tools.append(Object.assign(document.createElement("span"), { textContent: "Drag along an axis to show only the trials that pass there; click the axis to show all." }));
-    if (tools.childNodes.length) room.append(tools);
+    tools.append(button("PNG", () => save(element), { "aria-label": "save this figure as PNG" }));
+    room.append(tools);
   }
 
   // ---- filter
