@@ -1,10 +1,9 @@
-"""Makes text from files and users safe for display on a terminal or in a Markdown page.
+"""Makes text from files and users safe for display on a terminal.
 
 A label or an error may contain anything. On a terminal, an escape sequence could clear the screen, rename the window or
 overwrite earlier output, and text after a newline could look like a line of this program.
 """
 
-import html
 import unicodedata
 from collections.abc import Mapping
 from typing import Any
@@ -25,17 +24,6 @@ def printable_lines(text: str) -> str:
     return "\n".join(printable(line) for line in text.split("\n"))
 
 
-def markdown_text(text: str) -> str:
-    """Text escaped for a paragraph of Markdown, so that it is shown literally: no HTML, links, pictures or hidden
-    text."""
-    return "\n".join(_markdown(line) for line in text.split("\n"))
-
-
-def markdown_cell(text: str) -> str:
-    """The same for one cell of a Markdown table."""
-    return _markdown(text).replace("|", "\\|")
-
-
 def describe(value: Any) -> str:
     """A value as tables show it: `1e-05`, `[0.33, 1]`, `start=8 end=32`."""
     if isinstance(value, bool) or value is None:
@@ -47,12 +35,6 @@ def describe(value: Any) -> str:
     if isinstance(value, list | tuple):
         return "[" + ", ".join(describe(item) for item in value) + "]"
     return str(value)
-
-
-def _markdown(line: str) -> str:
-    escaped = html.escape(printable(line).replace("\\", "\\\\"), quote=False)
-    # A closing bracket followed by a parenthesis or another bracket makes a link or a picture.
-    return escaped.replace("](", "]\\(").replace("][", "]\\[").replace("`", "\\`")
 
 
 def _visible(character: str) -> str:

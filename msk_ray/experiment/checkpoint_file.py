@@ -6,9 +6,6 @@
 
 The first two lines are the head: metadata such as the epoch and the score can be read without the payload. Every bit of
 the file is verified: by the first line, the digest in it, or the digest in the second.
-
-Checkpoints of format 1 are a payload and a separate `<name>.json` with its SHA-256 and the metadata; they can still be
-read.
 """
 
 import contextlib
@@ -20,8 +17,8 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from msk_ray.errors import CheckpointError
-from msk_ray.experiment.damage import LINE, RECORD, cut, field, parse_object
-from msk_ray.files import UnusableFile, open_file, read_file, write_bytes
+from msk_ray.experiment.damage import LINE, cut, field, parse_object
+from msk_ray.files import UnusableFile, open_file, write_bytes
 
 FORMAT = 2
 _NAME = b"msk_ray checkpoint "
@@ -48,14 +45,6 @@ def write_checkpoint_file(path: Path, payload: bytes, facts: Mapping[str, Any]) 
     assert len(line) < _HEAD_LIMIT // 2
     first = _NAME + b"%d " % FORMAT + hashlib.sha256(line).hexdigest().encode()
     write_bytes(path, b"\n".join([first, line, payload]))
-    # The manifest of an earlier checkpoint of format 1, which does not describe the new file.
-    _old_manifest(path).unlink(missing_ok=True)
-
-
-def remove_checkpoint_file(path: Path) -> None:
-    """Delete a checkpoint of any format."""
-    path.unlink()
-    _old_manifest(path).unlink(missing_ok=True)
 
 
 def read_facts(path: Path) -> dict[str, Any]:
@@ -120,13 +109,12 @@ def _read_head(path: Path, file: BinaryIO) -> tuple[dict[str, Any], int]:
 def _find_head(path: Path, file: BinaryIO) -> tuple[dict[str, Any], int]:
     head = file.read(_HEAD_LIMIT)
     if not head.startswith(_NAME):
-        # Some manifests lack the size.
-        return {"bytes": os.fstat(file.fileno()).st_size, **_read_old_manifest(path)}, 0
+        raise CheckpointError(f"{path} is torn: it has no head; use an older one of {path.parent}")
     first, _, rest = head.partition(b"\n")
     line, newline, _ = rest.partition(b"\n")
     number, _, digest = first[len(_NAME) :].partition(b" ")
     if number != b"%d" % FORMAT and number.isdigit():
-        raise CheckpointError(f"{path} has checkpoint format {number.decode()}, this version reads {FORMAT} and 1")
+        raise CheckpointError(f"{path} has checkpoint format {number.decode()}, this version reads {FORMAT}")
     whole = len(digest) == _DIGEST and newline and hashlib.sha256(line).hexdigest().encode() == digest
     if number != b"%d" % FORMAT or not whole:
         raise CheckpointError(f"{path} is torn: the checksum of its head differs; use an older one of {path.parent}")
@@ -134,26 +122,6 @@ def _find_head(path: Path, file: BinaryIO) -> tuple[dict[str, Any], int]:
         return parse_object(line, LINE), len(first) + len(line) + 2
     except ValueError as error:
         raise CheckpointError(f"{path} is no checkpoint of a trial: its head is {cut(error)}") from None
-
-
-def _old_manifest(path: Path) -> Path:
-    """Path of the manifest of a checkpoint of format 1."""
-    return path.with_suffix(".json")
-
-
-def _read_old_manifest(path: Path) -> dict[str, Any]:
-    try:
-        facts = parse_object(read_file(_old_manifest(path), RECORD.size, follow=True))
-    except FileNotFoundError:
-        raise CheckpointError(
-            f"{path} is torn: it has neither a head nor a manifest; use an older one of {path.parent}"
-        ) from None
-    except ValueError as error:
-        raise CheckpointError(f"cannot read {_old_manifest(path)}: {cut(error)}") from None
-    if facts.get("format") != 1:
-        written = f"{facts.get('format')!r:.40}"
-        raise CheckpointError(f"{_old_manifest(path)} has checkpoint format {written}, this version reads 1 there")
-    return facts
 
 
 def _torn(path: Path, size: int, facts: Mapping[str, Any]) -> CheckpointError:

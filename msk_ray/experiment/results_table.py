@@ -1,16 +1,19 @@
 """An experiment's results as tables, text and plain data."""
 
-import shlex
 import statistics
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from msk_ray.experiment.records import TrialRecord, best_records, records_by_environment
-from msk_ray.text import markdown_cell, markdown_text, printable
+from msk_ray.text import printable, printable_lines
+from msk_ray.text_table import text_table
 
 VARIANT_HEADER = ("variant", "seeds", "mean score", "std", "worst", "best")
 HEADER = ("trial", "changed", "seed", "score", "at epoch", "epochs", "stopped", "path", "why")
+_UNCUT = 1 << 20
+"""Width of a table of which nothing is cut."""
 
 
 def result_rows(records: Sequence[TrialRecord]) -> list[tuple[str, ...]]:
@@ -45,10 +48,29 @@ def variant_rows(records: Sequence[TrialRecord]) -> list[tuple[str, ...]]:
     return [texts for _, texts in sorted(rows, key=lambda row: -row[0])]
 
 
-def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table that shows its cells literally, whatever they contain."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(markdown_cell(cell) for cell in line) + " |" for line in lines) + "\n"
+def results_text(records: Sequence[TrialRecord], width: int) -> str:
+    """The trials of each environment, and its variants over seeds if there are several, as tables."""
+    groups = records_by_environment(records)
+    parts = []
+    for environment, group in groups.items():
+        table = text_table(HEADER, result_rows(group), width)
+        parts.append(f"{printable(environment)}\n{table}" if len(groups) > 1 else table)
+        if len({record.trial.seed for record in group}) > 1:
+            parts.append(text_table(VARIANT_HEADER, variant_rows(group), width))
+            if any(record.cut for record in group):
+                parts.append(
+                    "Trials that were interrupted or stopped before their end count with their best score so far, "
+                    "which might have risen further: the report compares variants at equal env steps."
+                )
+    if (note := reduced_note(records)) is not None:
+        parts.append(note)
+    return "\n\n".join(parts)
+
+
+def table_document(name: str, question: str, records: Sequence[TrialRecord]) -> str:
+    """The results of an experiment as Markdown, indented, so that it is shown literally whatever it contains."""
+    parts = [printable(name), printable_lines(question), results_text(records, _UNCUT)]
+    return textwrap.indent("\n\n".join(filter(None, parts)), "    ") + "\n"
 
 
 def summary(name: str, question: str, records: Sequence[TrialRecord]) -> dict[str, Any]:
@@ -62,37 +84,6 @@ def summary(name: str, question: str, records: Sequence[TrialRecord]) -> dict[st
         "best": {environment: _facts(best) for environment, best in best_records(records).items()},
         "trials": [_facts(record) for record in records],
     }
-
-
-def table_document(experiment: Path, question: str, records: Sequence[TrialRecord]) -> str:
-    """The results of an experiment as Markdown.
-
-    Args:
-        experiment: its folder.
-    """
-    parts = [f"# {markdown_text(experiment.name)}\n", f"{markdown_text(question)}\n" if question else ""]
-    groups, bests = records_by_environment(records), best_records(records)
-    for environment, group in groups.items():
-        if len(groups) > 1:
-            parts.append(f"## {markdown_text(environment)}\n")
-        parts.append(markdown(HEADER, result_rows(group)))
-        if len({record.trial.seed for record in group}) > 1:
-            parts += ["By variant, over seeds:\n", markdown(VARIANT_HEADER, variant_rows(group))]
-            if any(record.cut for record in group):
-                parts.append(
-                    "Trials that were interrupted or stopped before their end count with their best score so far, "
-                    "which might have risen further: the report compares variants at equal env steps.\n"
-                )
-        best = bests.get(environment)
-        if best is not None:
-            half = f", {best.attempt}" if best.attempt.reduction is not None else ""
-            variant = markdown_text(printable(best.trial.variant))
-            parts.append(f"Best policy: `{_relative(best)}` ({variant}, seed {best.trial.seed}{half}).\n")
-    if (note := reduced_note(records)) is not None:
-        parts.append(f"{note}\n")
-    command = shlex.join(["python", "-m", "msk_ray.report", experiment.name, "--storage", str(experiment.parent)])
-    parts.append(f"Curves and more: [report](report/index.html), by `{command}`.\n")
-    return "\n".join(part for part in parts if part)
 
 
 def outcome_name(record: TrialRecord) -> str:

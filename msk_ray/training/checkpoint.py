@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from msk_ray.errors import CheckpointError
-from msk_ray.experiment.checkpoint_file import read_checkpoint_file, remove_checkpoint_file, write_checkpoint_file
+from msk_ray.experiment.checkpoint_file import read_checkpoint_file, write_checkpoint_file
 from msk_ray.networks import parameter_hash
 
 _EPOCH_NAME = re.compile(r"epoch_(\d+)\.pt")
@@ -118,4 +118,4 @@ def newest_valid_checkpoint(folder: Path) -> tuple[Path | None, list[str]]:
 def prune_checkpoints(folder: Path, keep: int) -> None:
     """Delete all but the `keep` newest numbered checkpoints."""
     for path in epoch_checkpoints(folder)[keep:]:
-        remove_checkpoint_file(path)
+        path.unlink()

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from msk_ray.errors import CheckpointError
-from msk_ray.experiment.checkpoint_file import remove_checkpoint_file
 from msk_ray.training.checkpoint import read_checkpoint, unscored_checkpoints, unscored_path, write_checkpoint
 
 
@@ -52,7 +51,7 @@ class UnscoredPolicies:
 
     def remove(self, epoch: int) -> None:
         """Remove the state of an epoch, whose score has been recorded."""
-        remove_checkpoint_file(unscored_path(self._folder, epoch))
+        unscored_path(self._folder, epoch).unlink()
         self.epochs.remove(epoch)
 
     def rewind(self, epoch: int, scored: Collection[int]) -> list[str]:
@@ -71,5 +70,5 @@ class UnscoredPolicies:
                 else:
                     self.epochs.append(number)
                     continue
-            remove_checkpoint_file(path)
+            path.unlink()
         return faults

@@ -8,20 +8,11 @@ from msk_ray.cli import shell_join
 from msk_ray.experiment.damage import count_damages, describe_damages
 from msk_ray.experiment.layout import SUMMARY_FILE
 from msk_ray.experiment.manifest import Experiment
-from msk_ray.experiment.records import best_records, read_records, records_by_environment
-from msk_ray.experiment.results_table import (
-    HEADER,
-    VARIANT_HEADER,
-    reduced_note,
-    result_rows,
-    summary,
-    table_document,
-    variant_rows,
-)
+from msk_ray.experiment.records import best_records, read_records
+from msk_ray.experiment.results_table import results_text, summary, table_document
 from msk_ray.files import write_json, write_text
 from msk_ray.progress import announce
 from msk_ray.text import printable
-from msk_ray.text_table import text_table
 
 
 def finish(experiment: Experiment) -> int:
@@ -34,29 +25,21 @@ def finish(experiment: Experiment) -> int:
         StorageFailure: the disk is full or gone, or the experiment has disappeared.
     """
     experiment.check_there()
-    manifest = experiment.manifest()
+    question = experiment.manifest().get("question") or ""
     records = read_records(experiment)
     width = max(100, shutil.get_terminal_size((160, 24)).columns)
-    write_json(experiment.path / SUMMARY_FILE, summary(experiment.name, manifest.get("question") or "", records))
-    write_text(experiment.path / "table.md", table_document(experiment.path, manifest.get("question") or "", records))
-    groups = records_by_environment(records)
-    for environment, group in groups.items():
-        if len(groups) > 1:
-            print(printable(f"\n{environment}"), end="")
-        print("\n" + text_table(HEADER, result_rows(group), width))
-        if len({record.trial.seed for record in group}) > 1:
-            print("\n" + text_table(VARIANT_HEADER, variant_rows(group), width))
+    write_json(experiment.path / SUMMARY_FILE, summary(experiment.name, question, records))
+    write_text(experiment.path / "table.md", table_document(experiment.name, question, records))
+    print("\n" + results_text(records, width))
     damages = [damage for record in records for damage in record.damages]
     if damages:
         print(f"\nskipped {count_damages(damages)}:")
         print("\n".join(describe_damages(damages, experiment.path)))
-    if (note := reduced_note(records)) is not None:
-        print(f"\n{note}")
+    several = len({record.trial.environment for record in records}) > 1
     for environment, best in best_records(records).items():
-        assert best.best is not None  # every best trial has an evaluation
-        where = f" in {environment}" if len(groups) > 1 else ""
+        where = f" in {environment}" if several else ""
         name = f"{best.trial.variant} seed={best.trial.seed}{best.attempt.suffix}{where}"
-        print(f"\nbest trial   {best.trial.id}: {printable(name)}, score {best.best.score:.5g}")
+        print(f"\nbest trial   {best.trial.id}: {printable(name)}, score {best.score:.5g}")
         print(f"best policy  {printable(str(best.best_checkpoint or 'its checkpoint is missing'))}")
     print(printable(f"table        {experiment.path / 'table.md'}"))
     print(printable(f"trials       {experiment.path / 'trials'}"), flush=True)

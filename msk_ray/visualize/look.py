@@ -9,8 +9,6 @@ RELAXED, ACTIVE = np.array([0.16, 0.35, 0.75]), np.array([0.90, 0.10, 0.08])
 """Colours of a muscle at activation 0 and 1."""
 FORCE = (0.95, 0.15, 0.55, 1.0)
 """Colour of contact forces."""
-CUT_FORCE = (1.0, 0.6, 0.1, 1.0)
-"""Colour of contact forces whose arrows are shortened because they would leave the picture."""
 _BODY_ALPHA = 0.4
 _TENDON_WIDTH = 0.005
 """Smallest radius of a muscle's tendon, in units of the model's extent."""
@@ -20,8 +18,6 @@ _ARROW = 2.0
 
 DRAWN_GROUPS = (0, 1, 2)
 """Groups of geoms that MuJoCo draws by default."""
-_MARGIN = 0.97
-"""Share of the picture's half width and height within which arrows end."""
 _HEADLIGHT = {"ambient": 0.35, "diffuse": 0.55, "specular": 0.2}
 """Light from the camera for models without lights, which would be rather dark."""
 _SKY_TOP, _SKY_BOTTOM = np.array([237.0, 242.0, 250.0]), np.array([158.0, 178.0, 204.0])
@@ -110,54 +106,6 @@ def add_background(frame: np.ndarray, depth: np.ndarray, far: float) -> np.ndarr
     share = np.linspace(0.0, 1.0, height)[:, None]
     sky = ((1.0 - share) * _SKY_TOP + share * _SKY_BOTTOM).astype(np.uint8)
     return np.where((depth >= 0.999 * far)[..., None], sky[:, None, :], frame)
-
-
-def fit_arrows(scene: mujoco.MjvScene, aspect: float) -> None:
-    """Shorten arrows of contact forces that start in the picture and would leave it, and change their colour.
-
-    Args:
-        scene: updated for the frame to draw.
-        aspect: width of the picture divided by its height.
-    """
-    view = _View(scene, aspect)
-    for geom in scene.geoms[: scene.ngeom]:
-        arrow = geom.type == mujoco.mjtGeom.mjGEOM_ARROW and np.allclose(geom.rgba, FORCE, atol=1e-3)
-        if not arrow or not view.shows(geom.pos):
-            continue
-        # As MuJoCo draws it: half as long as its size.
-        along = 0.5 * float(geom.size[2]) * geom.mat.reshape(3, 3)[:, 2]
-        if view.shows(geom.pos + along):
-            continue
-        inside, outside = 0.0, 1.0
-        for _ in range(20):
-            middle = 0.5 * (inside + outside)
-            inside, outside = (middle, outside) if view.shows(geom.pos + middle * along) else (inside, middle)
-        geom.size = [geom.size[0], geom.size[1], inside * geom.size[2]]
-        geom.rgba = CUT_FORCE
-
-
-class _View:
-    """What a scene's camera shows."""
-
-    def __init__(self, scene: mujoco.MjvScene, aspect: float) -> None:
-        # Two for stereo pictures; a plain one is taken from between them.
-        left, right = scene.camera[0], scene.camera[1]
-        self._place = 0.5 * (np.array(left.pos) + np.array(right.pos))
-        self._forward, self._up = np.array(left.forward), np.array(left.up)
-        self._right = np.cross(self._forward, self._up)
-        self._near, self._orthographic = float(left.frustum_near), bool(left.orthographic)
-        self._height = 0.5 * (float(left.frustum_top) - float(left.frustum_bottom))
-        self._width = aspect * self._height
-
-    def shows(self, point: np.ndarray) -> bool:
-        """Whether a point (3,) is in the picture, not too close to its edge."""
-        away = np.asarray(point) - self._place
-        depth = float(away @ self._forward)
-        if depth <= self._near:
-            return False
-        scale = 1.0 if self._orthographic else self._near / depth
-        x, y = scale * float(away @ self._right), scale * float(away @ self._up)
-        return abs(x) <= _MARGIN * self._width and abs(y) <= _MARGIN * self._height
 
 
 def muscle_tendons(model: mujoco.MjModel) -> dict[int, list[int]]:

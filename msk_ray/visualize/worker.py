@@ -15,7 +15,7 @@ from typing import BinaryIO
 import mujoco
 import numpy as np
 
-from msk_ray.visualize.look import Look, add_background, default_camera, fit_arrows, has_sky
+from msk_ray.visualize.look import Look, add_background, default_camera, has_sky
 
 PROBE = """<mujoco><worldbody><light pos="0 0 3"/><geom type="box" size="1 1 1" rgba="1 0 0 1"/></worldbody></mujoco>"""
 
@@ -62,7 +62,6 @@ def draw(
             mujoco.mj_forward(model, data)
             look.colour(data.act)
             renderer.update_scene(data, view, option)
-            fit_arrows(renderer.scene, width / height)
             frame = renderer.render()
             if not sky:
                 # Drawn again as depth, which tells where nothing was drawn: there goes the sky.

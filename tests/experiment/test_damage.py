@@ -206,6 +206,6 @@ def test_a_damaged_file_takes_down_neither_status_nor_report_nor_table(
         intact = [trial for trial in reading.trials if trial.trial.id != victim]
         assert [(t.score, t.state, t.note) for t in intact] == [(8.0, State.ENDED, "")] * 2
         summary(made.name, "", records)
-        table_document(made.path, "", records)
+        table_document(made.name, "", records)
         assert [record.score for record in short if record.trial.id != victim] == [8.0, 8.0]
         shutil.rmtree(made.path)

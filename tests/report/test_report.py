@@ -419,7 +419,7 @@ def _best_without_policy(e: Experiment) -> None:
         (_running, ["Trials are still running", "1 running"]),
         (_never_evaluated, ["No trained policy has a score yet", "Too few trained trials with a score"]),
         (_nothing_finite, ["No trained policy has a score yet", "No trial has recorded a gradient yet"]),
-        (_best_without_policy, ["is torn: it has neither a head nor a manifest"]),
+        (_best_without_policy, ["is torn: it has no head"]),
     ],
 )
 def test_every_condition_is_named_and_never_a_traceback(

@@ -315,8 +315,8 @@ def test_tables_say_so(make_space: Any, tmp_path: Path) -> None:
     assert best[8] == "half the worlds: 4 of 8; all 20 epochs done"
     assert [row[6] for row in result_rows(records)[1:]] == ["finished"] * 3
     assert [row[1] for row in variant_rows(records)] == ["2 (1 with half the worlds)", "2"]
-    document = table_document(Path("e"), "Which?", records)
-    assert "seed 1, half the worlds: 4 of 8)" in document
+    document = table_document("e", "Which?", records)
+    assert "half the worlds: 4 of 8; all 20 epochs done" in document
     assert "1 trial ran with half the worlds asked for" in document
     facts = summary("e", "Which?", records)
     assert [trial["halved"] for trial in facts["trials"]] == [None, None, None, {"asked": 8, "worlds": 4}]

@@ -14,10 +14,11 @@ import pytest
 from stub_trainer import BEHAVIOUR, BROKEN_CONNECTION, BUG, EXIT, EXIT_ZERO, INTERRUPT, StubTrainer
 
 from msk_ray.config import Config
-from msk_ray.experiment.checkpoint_file import read_facts, remove_checkpoint_file
+from msk_ray.experiment.checkpoint_file import read_facts
 from msk_ray.experiment.layout import OUTCOME_FILE
 from msk_ray.experiment.metrics import read_rows
 from msk_ray.experiment.outcomes import Ending, Outcome, read_ending
+from msk_ray.files import read_file
 from msk_ray.signals import listening
 from msk_ray.sweep.rules.stopping import StopSpec
 from msk_ray.sweep.trials import resolve_trials
@@ -77,7 +78,7 @@ def test_errors_of_ray_are_not_the_trials() -> None:
 
 def test_a_file_that_the_package_misses_may_be_back(tmp_path: Path) -> None:
     """Where the user's own code has named it, it is not there: see above."""
-    assert not repeats(met(lambda: remove_checkpoint_file(tmp_path / "epoch_000002.pt")))
+    assert not repeats(met(lambda: read_file(tmp_path / "epoch_000002.pt", 1)))
     assert repeats(met((tmp_path / "motion.npz").read_bytes))
 
 
