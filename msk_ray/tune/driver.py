@@ -5,10 +5,9 @@ import math
 import tempfile
 import time
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +46,7 @@ from msk_ray.tune.devices import Placement
 from msk_ray.tune.experiment_watch import ExperimentWatch, remove_remains
 from msk_ray.tune.gauges import StateGauge
 from msk_ray.tune.interrupts import run_in_thread
-from msk_ray.tune.queue import Identify, Suggestions, TrialList
+from msk_ray.tune.queue import Suggestions, TrialList
 from msk_ray.tune.ray_watch import RayWatch
 from msk_ray.tune.schedulers import METRIC, Population, PruningScheduler
 from msk_ray.tune.supervisor import Supervisor
@@ -183,13 +182,12 @@ def _fit(
     """
     file = plan.space.file
     resources = {"cpu": plan.placement.cpus} | ({"gpu": plan.placement.gpus} if plan.placement.gpus else {})
-    identify = partial(_identify, job)
     # A search decides its number of samples; a list of trials is a parameter space to run once.
     search: Any
     if file.searches:
-        search, samples = _suggestions(plan, suggested, identify), -1
+        search, samples = _suggestions(plan, suggested, job), -1
     else:
-        search, samples = TrialList(plan.experiment, identify, plan.max_concurrent), 1
+        search, samples = TrialList(plan.max_concurrent), 1
     ahead = WorkerPrestart(plan.placement, plan.max_concurrent, supervisor.waiting, supervisor.console.say)
     states = StateGauge(plan.experiment, remaining, job.trial_of)
     tuner = tune.Tuner(
@@ -253,12 +251,7 @@ def _scheduler(plan: Plan, job: Job, supervisor: Supervisor) -> Population | Pru
     )
 
 
-def _identify(job: Job, config: Mapping[str, Any]) -> str:
-    # Until a trial starts, Tune keeps placeholders for values of a list.
-    return config["id"] if "id" in config else job.trial_of(config).id
-
-
-def _suggestions(plan: Plan, suggested: list[SearchTrial], identify: Identify) -> Suggestions:
+def _suggestions(plan: Plan, suggested: list[SearchTrial], job: Job) -> Suggestions:
     """The space's search, with the results of its suggestions so far."""
     begun, scored = [], []
     for earlier in suggested:
@@ -278,7 +271,9 @@ def _suggestions(plan: Plan, suggested: list[SearchTrial], identify: Identify) -
         else:
             search.tell(params, record.score)
     left = file.samples - len(scored)
-    return Suggestions(plan.experiment, identify, search, begun, left, tuple(file.objectives))
+    return Suggestions(
+        plan.experiment, lambda config: job.trial_of(config).id, search, begun, left, tuple(file.objectives)
+    )
 
 
 def _advised(failure: StorageFailure) -> StorageFailure:

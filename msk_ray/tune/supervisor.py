@@ -11,7 +11,7 @@ from ray.exceptions import RayActorError
 from ray.tune import Callback
 
 from msk_ray.errors import StorageFailure, storage_failure
-from msk_ray.experiment.attempts import read_attempt
+from msk_ray.experiment.attempts import FIRST, read_attempt
 from msk_ray.experiment.layout import ERROR_FILE, HANG_FILE
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.outcomes import Ending, Outcome, read_ending, write_ending
@@ -114,24 +114,25 @@ class Supervisor(Callback):
         if not self._meet_storage_failure(trial):
             mine = self._trial_of(trial.config)
             # It has no process until Tune starts a new one, which may wait for the other trials.
-            self._attempts.pop(mine.id, None)
+            before = self._attempts.pop(mine.id, FIRST.number)
             self._saving.discard(mine.id)
             self._waiting.add(mine.id)
-            self.console.retried(mine, self._reason(mine, trial))
+            attempt = read_attempt(self._experiment.trial_folder(mine.id))
+            if attempt.number > before:
+                self.console.attempted_again(mine, attempt)
+            else:
+                self.console.retried(mine, self._reason(mine, trial))
 
     def on_trial_complete(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         mine = self._trial_of(trial.config)
         folder = self._experiment.trial_folder(mine.id)
         self._saving.discard(mine.id)
-        before = self._attempts.pop(mine.id, None)
-        ending, attempt = read_ending(folder), read_attempt(folder)
+        self._attempts.pop(mine.id, None)
+        ending = read_ending(folder)
         if ending is not None and ending.outcome is Outcome.ERROR and (folder / ERROR_FILE).is_file():
             self.console.failed(mine, ending.why, folder)
         elif ending is not None:
             self.console.ended(mine, ending)
-        elif before is not None and attempt.number > before:
-            self._waiting.add(mine.id)
-            self.console.attempted_again(mine, attempt)
         else:
             self.console.left(mine)  # paused by a request to stop, or never started
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from ray import tune
+from ray.exceptions import RayActorError
 from ray.tune.trainable import wrap_function
 
 from msk_ray.config import overlay, parse_config
@@ -141,6 +142,8 @@ def make_trainable(job: Job, resources: dict[str, float]) -> type[tune.Trainable
                 _member_checkpoint(job, Path(scratch)) if job.population else None,
                 job.space.file.resources.halve_worlds_on_oom,
             )
+            if read_attempt(folder).number > attempt.number:
+                raise AnotherAttempt
 
     # For the function alone, Tune would create a class `ImplicitFunc`, and all actors would have that name.
     class TrialActor(wrap_function(tune.with_resources(train, resources))):  # type: ignore[misc]
@@ -150,6 +153,20 @@ def make_trainable(job: Job, resources: dict[str, float]) -> type[tune.Trainable
 
     TrialActor.__qualname__ = TrialActor.__name__
     return TrialActor
+
+
+class AnotherAttempt(RayActorError):
+    """The trial goes on in a new process, because this one still holds the memory that it ran out of.
+
+    Tune starts a new process for a trial whose process has failed, and does not count failures of processes that were
+    preempted.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(preempted=True)
+
+    def __reduce__(self) -> tuple[type["AnotherAttempt"], tuple[()]]:
+        return AnotherAttempt, ()
 
 
 class _StoppedByTune(BaseException):

@@ -1,5 +1,6 @@
 """Rules, searches and operators from outside the package, by import path: `own_sweep` is in no line of it."""
 
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -64,18 +65,19 @@ def test_a_search_is_asked_and_told(make_space: Any, tmp_path: Path) -> None:
     search = LowToHigh(space.sampled, 0)
     experiment = opening.create(tmp_path / "e", space, [], {})
     begun = {"shac.actor_lr": 0.0015}
-    suggestions = Suggestions(experiment, lambda config: "x", search, [begun], 3)
+    suggestions = Suggestions(experiment, lambda config: str(config["params"]["shac.actor_lr"]), search, [begun], 3)
     assert suggestions.suggest("a") == {"params": begun}, "what was begun before comes first"
     suggested = suggestions.suggest("b")
     assert suggested["params"]["shac.actor_lr"] == pytest.approx(0.0011)
-    suggestions.on_trial_result("b", {"best": 1.0})
-    suggestions.on_trial_result("b", {"best": 3.0})
-    suggestions.on_trial_complete("b", {"best": 3.0})
+    folder = experiment.trial_folder(str(suggested["params"]["shac.actor_lr"]))
+    folder.mkdir()
+    scores = [9.0, 1.0, 3.0, 2.0]  # the first is of the untrained policy
+    rows = [{"epoch": n, "env_steps": n, "seconds": n, "eval/score": score} for n, score in enumerate(scores)]
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    suggestions.on_trial_complete("b", {})
     suggestions.on_trial_complete("a", error=True)
     assert search.told == [(suggested["params"], 3.0), (begun, None)]
     suggestions.suggest("c")
-    assert suggestions.suggest("d") is None, "one may still begin again"
-    suggestions.on_trial_complete("c", {})
     assert suggestions.suggest("d") == Searcher.FINISHED
 
 
