@@ -41,7 +41,7 @@ ROOMS = (
 
 EDITS: dict[str, tuple[str, ...]] = {
     "environment": (r"^ENVIRONMENTS = Registry", r"^SETTINGS = Registry"),
-    "algorithm": (r"^ALGORITHMS = Registry", r"^BUILT_IN\b", r"^    ppo: PpoConfig", r'^    "PpoConfig",'),
+    "algorithm": (r"^ALGORITHMS = Registry", r"^BUILT_IN\b", r"^    ppo: PpoConfig", r"import PpoConfig as PpoConfig"),
     "reward term of the legs": (
         *(r"^FURTHER = ", r"^CLOCKED = ", r"^_GAINS = ", r"^class LegReward\(", r'^ +case "footfall":'),
         *(r'\{"impact", "footfall", "landing"', r'^    Cost\("footfall", 0\.0, needs', r"^def footfall\(env: LegEnv"),

@@ -37,34 +37,35 @@ if TYPE_CHECKING:
 
 __version__ = "0.3.0"
 
-_HOMES = {
-    "Algorithm": "msk_ray.algorithms",
-    "AlgorithmSettings": "msk_ray.config",
-    "Backward": "msk_ray.step.autograd",
-    "Capacity": "msk_ray.step.autograd",
-    "Command": "msk_ray.config",
-    "Config": "msk_ray.config",
-    "Cost": "msk_ray.config",
-    "Env": "msk_ray.envs",
-    "EnvSettings": "msk_ray.config",
-    "EpochResult": "msk_ray.algorithms",
-    "FdJacobian": "msk_ray.step.autograd",
-    "Hybrid": "msk_ray.step.autograd",
-    "Logger": "msk_ray.training.loggers",
-    "Memory": "msk_ray.envs",
-    "MjcfEnv": "msk_ray.envs",
-    "MjcfSettings": "msk_ray.envs",
-    "Reward": "msk_ray.config",
-    "Simulation": "msk_ray.step.autograd",
-    "StepState": "msk_ray.step.autograd",
-    "TapeAll": "msk_ray.step.autograd",
-    "TapePerSubstep": "msk_ray.step.autograd",
-    "Term": "msk_ray.config",
-    "check_gradients": "msk_ray.step.check",
-    "load_config": "msk_ray.config",
-    "load_policy": "msk_ray.training.policy",
-    "train": "msk_ray.train",
+_NAMES = {
+    "msk_ray.algorithms": ("Algorithm", "EpochResult"),
+    "msk_ray.config": (
+        "AlgorithmSettings",
+        "Command",
+        "Config",
+        "Cost",
+        "EnvSettings",
+        "Reward",
+        "Term",
+        "load_config",
+    ),
+    "msk_ray.envs": ("Env", "Memory", "MjcfEnv", "MjcfSettings"),
+    "msk_ray.step.autograd": (
+        "Backward",
+        "Capacity",
+        "FdJacobian",
+        "Hybrid",
+        "Simulation",
+        "StepState",
+        "TapeAll",
+        "TapePerSubstep",
+    ),
+    "msk_ray.step.check": ("check_gradients",),
+    "msk_ray.train": ("train",),
+    "msk_ray.training.loggers": ("Logger",),
+    "msk_ray.training.policy": ("load_policy",),
 }
+_HOMES = {name: home for home, names in _NAMES.items() for name in names}
 
 __all__ = sorted([*_HOMES, "__version__"])
 

@@ -39,6 +39,15 @@ class Command(NamedTuple):
     """What it does, on one line."""
 
 
+STORAGE: dict[str, Any] = {
+    "type": Path,
+    "default": Path("runs"),
+    "metavar": "DIR",
+    "help": "folder of experiments (default: runs/)",
+}
+"""Of the option `--storage`, which many commands have."""
+
+
 class Parser(argparse.ArgumentParser):
     """An argument parser that keeps line breaks in its description and examples."""
 

@@ -17,7 +17,7 @@ from importlib import metadata
 from pathlib import Path
 
 import msk_ray
-from msk_ray.cli import Parser, run
+from msk_ray.cli import STORAGE, Parser, run
 from msk_ray.config import SET_HELP
 from msk_ray.errors import ConfigError, MskRayError, StorageError
 from msk_ray.files import make_folder
@@ -81,9 +81,7 @@ def parser() -> Parser:
     """The command line."""
     p = Parser("python -m msk_ray.doctor", DESCRIPTION, EXAMPLES)
     p.add_argument("--device", help="cpu or cuda:N (default: the first GPU, or the CPU if there is none)")
-    p.add_argument(
-        "--storage", type=Path, default=Path("runs"), metavar="DIR", help="folder of experiments (default: runs/)"
-    )
+    p.add_argument("--storage", **STORAGE)
     p.add_argument(
         "--repeat", metavar="CONFIG", help="only train a trial twice, and print where the two runs begin to differ"
     )

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from msk_ray.cli import Parser, run
+from msk_ray.cli import STORAGE, Parser, run
 from msk_ray.errors import MskRayError, StorageError
 from msk_ray.experiment.damage import count_damages, describe_damages
 from msk_ray.experiment.manifest import Experiment
@@ -64,9 +64,7 @@ def parser() -> Parser:
     p.add_argument(
         "--interval", type=_seconds, default=2.0, metavar="S", help="seconds between refreshes of --watch (default: 2)"
     )
-    p.add_argument(
-        "--storage", type=Path, default=Path("runs"), metavar="DIR", help="folder of experiments (default: runs/)"
-    )
+    p.add_argument("--storage", **STORAGE)
     return p
 
 

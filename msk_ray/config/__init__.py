@@ -1,111 +1,60 @@
 """The settings of a trial: one frozen, checked tree, read from YAML."""
 
-from msk_ray.config.algorithms import (
-    ALGORITHMS,
-    AlgorithmConfig,
-    AlgorithmSettings,
-    EntropyConfig,
-    ExplorationSchedule,
-    PpoConfig,
-    ShacConfig,
-)
-from msk_ray.config.commands import Command
-from msk_ray.config.environments import ENVIRONMENTS, settings_class
-from msk_ray.config.execution import AS_USUAL, ExecutionConfig
-from msk_ray.config.horizons import AdaptiveHorizon, ContactHorizon, HorizonSchedule
-from msk_ray.config.load import (
-    describe_fault,
-    load_config,
-    parse_config,
-    parse_recorded,
-    read_config,
-    refuse_ignored,
-)
-from msk_ray.config.loggers import logger_paths
-from msk_ray.config.overlay import (
-    SET_HELP,
-    combine,
-    flattened,
-    leaves,
-    merge,
-    overlay,
-    parse_override,
-    parse_overrides,
-    value_at,
-)
-from msk_ray.config.physics import FdConfig, PhysicsConfig
-from msk_ray.config.randomize import Draw, RandomizeConfig
-from msk_ray.config.recorded import SCHEMA, changed_settings, current_key, current_space, current_values, env_name
-from msk_ray.config.schema import (
-    Config,
-    ContactCurriculum,
-    ContactStart,
-    EvaluationConfig,
-    NetworkConfig,
-    TrialConfig,
-)
-from msk_ray.config.sections import EnvSettings, Reward
-from msk_ray.config.terms import Cost, Term
-from msk_ray.config.yaml_text import dump_yaml, parse_settings, parse_yaml, read_yaml
-from msk_ray.registry import Registry, resolve, resolve_class
-
-__all__ = [
-    "ALGORITHMS",
-    "AS_USUAL",
-    "ENVIRONMENTS",
-    "SCHEMA",
-    "SET_HELP",
-    "AdaptiveHorizon",
-    "AlgorithmConfig",
-    "AlgorithmSettings",
-    "Command",
-    "Config",
-    "ContactCurriculum",
-    "ContactHorizon",
-    "ContactStart",
-    "Cost",
-    "Draw",
-    "EntropyConfig",
-    "EnvSettings",
-    "EvaluationConfig",
-    "ExecutionConfig",
-    "ExplorationSchedule",
-    "FdConfig",
-    "HorizonSchedule",
-    "NetworkConfig",
-    "PhysicsConfig",
-    "PpoConfig",
-    "RandomizeConfig",
-    "Registry",
-    "Reward",
-    "ShacConfig",
-    "Term",
-    "TrialConfig",
-    "changed_settings",
-    "combine",
-    "current_key",
-    "current_space",
-    "current_values",
-    "describe_fault",
-    "dump_yaml",
-    "env_name",
-    "flattened",
-    "leaves",
-    "load_config",
-    "logger_paths",
-    "merge",
-    "overlay",
-    "parse_config",
-    "parse_override",
-    "parse_overrides",
-    "parse_recorded",
-    "parse_settings",
-    "parse_yaml",
-    "read_config",
-    "read_yaml",
-    "refuse_ignored",
-    "resolve",
-    "resolve_class",
-    "settings_class",
-    "value_at",
-]
+from msk_ray.config.algorithms import ALGORITHMS as ALGORITHMS
+from msk_ray.config.algorithms import AlgorithmConfig as AlgorithmConfig
+from msk_ray.config.algorithms import AlgorithmSettings as AlgorithmSettings
+from msk_ray.config.algorithms import EntropyConfig as EntropyConfig
+from msk_ray.config.algorithms import ExplorationSchedule as ExplorationSchedule
+from msk_ray.config.algorithms import PpoConfig as PpoConfig
+from msk_ray.config.algorithms import ShacConfig as ShacConfig
+from msk_ray.config.commands import Command as Command
+from msk_ray.config.environments import ENVIRONMENTS as ENVIRONMENTS
+from msk_ray.config.environments import settings_class as settings_class
+from msk_ray.config.execution import AS_USUAL as AS_USUAL
+from msk_ray.config.execution import ExecutionConfig as ExecutionConfig
+from msk_ray.config.horizons import AdaptiveHorizon as AdaptiveHorizon
+from msk_ray.config.horizons import ContactHorizon as ContactHorizon
+from msk_ray.config.horizons import HorizonSchedule as HorizonSchedule
+from msk_ray.config.load import describe_fault as describe_fault
+from msk_ray.config.load import load_config as load_config
+from msk_ray.config.load import parse_config as parse_config
+from msk_ray.config.load import parse_recorded as parse_recorded
+from msk_ray.config.load import read_config as read_config
+from msk_ray.config.load import refuse_ignored as refuse_ignored
+from msk_ray.config.loggers import logger_paths as logger_paths
+from msk_ray.config.overlay import SET_HELP as SET_HELP
+from msk_ray.config.overlay import combine as combine
+from msk_ray.config.overlay import flattened as flattened
+from msk_ray.config.overlay import leaves as leaves
+from msk_ray.config.overlay import merge as merge
+from msk_ray.config.overlay import overlay as overlay
+from msk_ray.config.overlay import parse_override as parse_override
+from msk_ray.config.overlay import parse_overrides as parse_overrides
+from msk_ray.config.overlay import value_at as value_at
+from msk_ray.config.physics import FdConfig as FdConfig
+from msk_ray.config.physics import PhysicsConfig as PhysicsConfig
+from msk_ray.config.randomize import Draw as Draw
+from msk_ray.config.randomize import RandomizeConfig as RandomizeConfig
+from msk_ray.config.recorded import SCHEMA as SCHEMA
+from msk_ray.config.recorded import changed_settings as changed_settings
+from msk_ray.config.recorded import current_key as current_key
+from msk_ray.config.recorded import current_space as current_space
+from msk_ray.config.recorded import current_values as current_values
+from msk_ray.config.recorded import env_name as env_name
+from msk_ray.config.schema import Config as Config
+from msk_ray.config.schema import ContactCurriculum as ContactCurriculum
+from msk_ray.config.schema import ContactStart as ContactStart
+from msk_ray.config.schema import EvaluationConfig as EvaluationConfig
+from msk_ray.config.schema import NetworkConfig as NetworkConfig
+from msk_ray.config.schema import TrialConfig as TrialConfig
+from msk_ray.config.sections import EnvSettings as EnvSettings
+from msk_ray.config.sections import Reward as Reward
+from msk_ray.config.terms import Cost as Cost
+from msk_ray.config.terms import Term as Term
+from msk_ray.config.yaml_text import dump_yaml as dump_yaml
+from msk_ray.config.yaml_text import parse_settings as parse_settings
+from msk_ray.config.yaml_text import parse_yaml as parse_yaml
+from msk_ray.config.yaml_text import read_yaml as read_yaml
+from msk_ray.registry import Registry as Registry
+from msk_ray.registry import resolve as resolve
+from msk_ray.registry import resolve_class as resolve_class

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from msk_ray.cli import Parser, run
+from msk_ray.cli import STORAGE, Parser, run
 from msk_ray.compiling import announce_compiling
 from msk_ray.errors import CheckpointError, ConfigError, MskRayError
 from msk_ray.evaluate import zoo
@@ -92,9 +92,7 @@ def parser() -> Parser:
         + ")",
     )
     p.add_argument("--device", help="cpu or cuda:N (default: the first GPU, or the CPU if there is none)")
-    p.add_argument(
-        "--storage", type=Path, default=Path("runs"), metavar="DIR", help="folder of experiments (default: runs/)"
-    )
+    p.add_argument("--storage", **STORAGE)
     return p
 
 

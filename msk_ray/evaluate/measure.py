@@ -13,7 +13,7 @@ from msk_ray.config import Config, PhysicsConfig, RandomizeConfig, overlay, pars
 from msk_ray.envs import env_class
 from msk_ray.envs.randomize import Randomizer
 from msk_ray.errors import ConfigError
-from msk_ray.experiment.versions import installed_versions
+from msk_ray.experiment.environment import installed_versions
 from msk_ray.progress import Pace
 from msk_ray.training import Evaluator, SavedPolicy
 from msk_ray.training.evaluation import Episodes

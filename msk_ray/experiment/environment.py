@@ -4,12 +4,13 @@ import os
 import platform
 import subprocess
 import sys
+from collections.abc import Iterable
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import msk_ray
 from msk_ray.experiment.damage import WITH_COMMAND, Damage, DamagedFile, cut, field, read_object, texts
-from msk_ray.experiment.versions import installed_versions
 from msk_ray.nvidia_smi import ask_driver
 
 _PACKAGES = ("msk-ray", "torch", "warp-lang", "mujoco", "mujoco-warp", "ray", "numpy")
@@ -76,6 +77,17 @@ def environment(device: str | None = None) -> dict[str, Any]:
         "commit": _commit(),
         **({} if device is None else {"device": device}),
     }
+
+
+def installed_versions(packages: Iterable[str]) -> dict[str, str]:
+    """Versions of those packages that are installed; a checkout on the path is not."""
+    versions = {}
+    for package in packages:
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            continue
+    return versions
 
 
 def _commit() -> str | None:

@@ -3,7 +3,6 @@
 import statistics
 import textwrap
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from msk_ray.experiment.records import TrialRecord, best_records, records_by_environment
@@ -138,9 +137,5 @@ def _facts(record: TrialRecord) -> dict[str, Any]:
         "why": record.ending.why if record.ending is not None else "",
         "halved": None if reduction is None else {"asked": reduction.asked, "worlds": reduction.worlds},
         "folder": f"trials/{record.trial.id}",
-        "best_checkpoint": str(_relative(record)) if record.best_checkpoint else None,
+        "best_checkpoint": f"trials/{record.trial.id}/checkpoints/best.pt" if best and record.best_checkpoint else None,
     }
-
-
-def _relative(record: TrialRecord) -> Path:
-    return Path("trials") / record.trial.id / "checkpoints" / "best.pt"

@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from msk_ray.cli import Parser, run
+from msk_ray.cli import STORAGE, Parser, run
 from msk_ray.errors import ConfigError
 from msk_ray.evaluate.targets import best_checkpoint, find_target
 from msk_ray.files import make_folder
@@ -53,9 +53,7 @@ def parser() -> Parser:
         help="physics of the model: reference (used for scores), own (used in training), or the name of one (default: "
         "reference)",
     )
-    p.add_argument(
-        "--storage", type=Path, default=Path("runs"), metavar="DIR", help="folder of experiments (default: runs/)"
-    )
+    p.add_argument("--storage", **STORAGE)
     zoo = p.add_argument_group("a policy for others to use")
     zoo.add_argument("--zoo", type=Path, metavar="FOLDER/NAME", help="write FOLDER/NAME.pt and FOLDER/NAME.yaml")
     zoo.add_argument("--seeds", metavar="LIST", help="seeds of the initial states for its score (default: 0-4)")

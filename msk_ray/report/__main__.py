@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from msk_ray.cli import Parser, run
+from msk_ray.cli import STORAGE, Parser, run
 from msk_ray.errors import ConfigError
 from msk_ray.evaluate.targets import find_experiment
 from msk_ray.files import make_folder, write_text
@@ -49,9 +49,7 @@ def parser() -> Parser:
         "--out", type=Path, metavar="DIR", help="folder to write to (default: report/ in the first experiment)"
     )
     p.add_argument("--device", help="cpu or cuda:N, to run the best policy (default: the first GPU, or the CPU)")
-    p.add_argument(
-        "--storage", type=Path, default=Path("runs"), metavar="DIR", help="folder of experiments (default: runs/)"
-    )
+    p.add_argument("--storage", **STORAGE)
     return p
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import ray
 
 from msk_ray.cli import Parser, run
-from msk_ray.tune.addresses import check_reachable
+from msk_ray.tune.session import check_reachable
 
 DESCRIPTION = "Exit code: 0 if at least N nodes are alive, 1 if fewer are or nothing answers at the address."
 EXAMPLES = """\

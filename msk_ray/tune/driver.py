@@ -43,13 +43,12 @@ from msk_ray.sweep.space import Space
 from msk_ray.sweep.trials import base_settings
 from msk_ray.tune.console import Console
 from msk_ray.tune.devices import Placement
-from msk_ray.tune.experiment_watch import ExperimentWatch, remove_remains
 from msk_ray.tune.gauges import StateGauge
 from msk_ray.tune.interrupts import run_in_thread
 from msk_ray.tune.queue import Suggestions, TrialList
 from msk_ray.tune.ray_watch import RayWatch
 from msk_ray.tune.schedulers import METRIC, Population, PruningScheduler
-from msk_ray.tune.supervisor import Supervisor
+from msk_ray.tune.supervisor import Supervisor, remove_remains
 from msk_ray.tune.trainable import Job, make_trainable
 from msk_ray.tune.trial_run import MakeTrainer, Precompile, make_trainer, precompile
 from msk_ray.tune.worker_prestart import WorkerPrestart, nodes_for
@@ -208,12 +207,7 @@ def _fit(
             storage_path=str(plan.experiment.path),
             verbose=0,
             # The supervisor comes first, because it writes the endings that only the driver knows.
-            callbacks=[
-                supervisor,
-                states,
-                ExperimentWatch(plan.experiment, watch.guarding(plan.guard)),
-                *([ahead] if plan.prestart else []),
-            ],
+            callbacks=[supervisor, states, *([ahead] if plan.prestart else [])],
             stop=_StopWhen(supervisor),
             failure_config=tune.FailureConfig(max_failures=file.resources.max_failures),
             # Keep all: only populations have checkpoints here, and another member may be about to read one.

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from msk_ray.cli import Parser
+from msk_ray.cli import STORAGE, Parser
 from msk_ray.config import SET_HELP
 from msk_ray.errors import ConfigError
 from msk_ray.experiment.damage import texts
@@ -82,9 +82,7 @@ def parser() -> Parser:
         help="use a running Ray cluster (default: RAY_ADDRESS) instead of starting Ray; 'auto' finds the "
         "cluster that `ray start` started on this machine",
     )
-    where.add_argument(
-        "--storage", type=Path, default=Path("runs"), metavar="DIR", help="folder of experiments (default: runs/)"
-    )
+    where.add_argument("--storage", **STORAGE)
     where.add_argument("--name", help="name of the experiment (default: the space's name)")
     where.add_argument("--resume", action="store_true", help="continue an interrupted experiment")
     where.add_argument(

@@ -1,6 +1,7 @@
 """The Ray session that trials run in: our own on this machine, or a running cluster."""
 
 import os
+import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -11,10 +12,12 @@ from ray._private import auto_init_hook
 from msk_ray.errors import ClusterLost, DeviceError, MskRayError
 from msk_ray.progress import announce
 from msk_ray.tune import worker_prestart
-from msk_ray.tune.addresses import check_reachable
 from msk_ray.tune.interrupts import end_ray, starting_ray
 from msk_ray.tune.local_ray import make_token_private, start_local, way_in
 from msk_ray.tune.session_folder import SessionFolder
+
+_CONNECT_S = 20.0
+"""How long to wait for a cluster's answer [s]."""
 
 
 @contextmanager
@@ -85,6 +88,17 @@ def _init(address: str | None, dashboard: bool | None, common: dict[str, Any]) -
         raise DeviceError(
             f"no Ray cluster at {address} (--address or RAY_ADDRESS): {str(error).splitlines()[0]}"
         ) from error
+
+
+def check_reachable(address: str) -> None:
+    """Check that something listens at HOST:PORT, because Ray itself would try for minutes. Other addresses pass.
+
+    Raises:
+        OSError: nothing listens there.
+    """
+    host, _, port = address.rpartition(":")
+    if "://" not in address and port.isdecimal():
+        socket.create_connection((host, int(port)), timeout=_CONNECT_S).close()
 
 
 def cluster_gpus(processes: int = 1) -> int:

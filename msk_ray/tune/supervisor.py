@@ -1,6 +1,7 @@
 """The driver's decisions while trials run: when to stop everything, and endings that trials cannot write themselves."""
 
 import pickle
+import shutil
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -24,13 +25,15 @@ from msk_ray.tune.schedulers import BEST, METRIC
 
 SHUTDOWN_GRACE_S = 120.0
 """How long trials may take to end their epoch and save after a request to stop [s]."""
+CHECK_S = 2.0
+"""Interval at which the experiment is looked for [s]: without its manifest, trials cannot save themselves."""
 LONGEST_STEP_S = 5.0
 """Longest time that a step of Tune's loop counts for [s]: if it took longer, this process was suspended."""
 
 
 class Supervisor(Callback):
-    """Follows the trials: records endings that only the driver sees, stops everything on request, and informs the
-    console."""
+    """Follows the trials: records endings that only the driver sees, stops everything on request or when the experiment
+    disappears or has another owner, and informs the console."""
 
     def __init__(
         self,
@@ -65,7 +68,7 @@ class Supervisor(Callback):
         """Started trials, in order, with their positions."""
         self._stopping = False
         self._stopping_s = 0.0
-        self._last_step = time.monotonic()
+        self._last_step = self._checked = time.monotonic()
         self.storage_failure: StorageFailure | None = None
         """Error of a trial that could not write. Then everything is stopped, because every trial would meet it."""
 
@@ -82,6 +85,9 @@ class Supervisor(Callback):
         """Whether, after a request to stop, every running trial has saved itself, or time is up."""
         return self._stopping and (not self._saving or self._stopping_s > SHUTDOWN_GRACE_S)
 
+    def on_step_begin(self, iteration: int, trials: list[Any], **info: Any) -> None:
+        self._guard()
+
     def on_step_end(self, iteration: int, trials: list[Any], **info: Any) -> None:
         now = time.monotonic()
         if self._stopping:
@@ -94,6 +100,9 @@ class Supervisor(Callback):
                 f"{self._stop.signal.name}: {len(self._saving)} trials save themselves at the end of their epoch ..."
             )
         self.console.tick()
+        if now - self._checked >= CHECK_S:
+            self._checked = now
+            self._experiment.check_there()
 
     def on_trial_start(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         mine = self._trial_of(trial.config)
@@ -186,6 +195,17 @@ class Supervisor(Callback):
     def _reason(self, mine: Trial, trial: Any) -> str:
         """Why a trial's process ended early, on one line."""
         return printable(_reason(self._experiment.trial_folder(mine.id), trial))
+
+
+def remove_remains(experiment: Experiment) -> None:
+    """Remove the folders that Ray has written where an experiment has disappeared. Ray creates the folders it writes
+    to, and an experiment that is moved back would end up inside them."""
+    path = experiment.path
+    if not path.is_dir() or experiment.lost() is None:
+        return
+    # A request to stop, written at the first sign of the loss, may be there too.
+    if {child.name for child in path.iterdir()} <= {experiment.tune.name, experiment.stop_file.name}:
+        shutil.rmtree(path)
 
 
 def _error_of(trial: Any) -> Exception | None:

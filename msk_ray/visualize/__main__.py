@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from msk_ray.cli import Parser, run
+from msk_ray.cli import STORAGE, Parser, run
 from msk_ray.compiling import announce_compiling
 from msk_ray.errors import CheckpointError, ConfigError
 from msk_ray.evaluate.__main__ import positive
@@ -97,9 +97,7 @@ def parser() -> Parser:
     )
     how.add_argument("--tensorboard", action="store_true", help="also add the strip to the trial's TensorBoard")
     how.add_argument("--device", help="cpu or cuda:N, to simulate (default: the first GPU, or the CPU)")
-    how.add_argument(
-        "--storage", type=Path, default=Path("runs"), metavar="DIR", help="folder of experiments (default: runs/)"
-    )
+    how.add_argument("--storage", **STORAGE)
     return p
 
 

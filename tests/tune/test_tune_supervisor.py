@@ -13,8 +13,7 @@ from msk_ray.sweep.space import Space
 from msk_ray.sweep.trials import resolve_trials
 from msk_ray.tune import supervisor
 from msk_ray.tune.console import Console
-from msk_ray.tune.experiment_watch import remove_remains
-from msk_ray.tune.supervisor import LONGEST_STEP_S, SHUTDOWN_GRACE_S, Supervisor
+from msk_ray.tune.supervisor import LONGEST_STEP_S, SHUTDOWN_GRACE_S, Supervisor, remove_remains
 
 
 def test_time_in_which_the_driver_was_frozen_is_not_the_trials(
