@@ -58,7 +58,7 @@ EDITS: dict[str, tuple[str, ...]] = {
     "search": (r"^SEARCHES = Registry",),
     "scheduler": (r"^SCHEDULERS = Registry",),
     "operator": (r"^OPERATORS = Registry",),
-    "stop rule": (r"^class StopSpec", r"def all_rules", r"def without_scores", r"^STOP_RULES = "),
+    "stop rule": (r"^class StopSpec", r"in \(self\.nonfinite, self\.target", r'in \("target", "plateau"'),
     "logger": (r"^LOGGERS = Registry",),
     "exporter": (r"^_WRITERS = ", r'"--torchscript"', r'"torchscript": args\.torchscript', r'"torchscript": "\.pt"'),
     "command": (r"^COMMANDS = ",),
@@ -152,8 +152,8 @@ def declared(checkout: Path) -> dict[str, list[tuple[str, str]]]:
 
     from msk_ray.config import environments
     from msk_ray.config.schema import Config
-    from msk_ray.sweep.rules import scheduler
-    from msk_ray.sweep.space import SpaceFile
+    from msk_ray.sweep import rules
+    from msk_ray.sweep.space import SpaceFile, scheduler_class
 
     def at(path: str) -> Any:
         module, _, name = path.partition(":")
@@ -166,7 +166,8 @@ def declared(checkout: Path) -> dict[str, list[tuple[str, str]]]:
     settings = inside | {name: getattr(at(path), "Settings", at(path)) for name, path in outside.items()}
     trial = {entry for section in settings.values() for entry in walk(section, "env")}
     trial |= {entry for entry in walk(Config, "") if not entry[0].startswith("env.")}
-    kinds = {name: scheduler.scheduler_class(name) for name in scheduler.SCHEDULERS.known()}
+    registry = getattr(rules, "SCHEDULERS", None) or at("msk_ray.sweep.rules.scheduler:SCHEDULERS")
+    kinds = {name: scheduler_class(name) for name in registry.known()}
     space = {entry for entry in walk(SpaceFile, "") if not entry[0].startswith("scheduler")}
     space |= {entry for section in kinds.values() for entry in walk(section, "scheduler")}
     return {TRIAL: sorted(trial), SPACE: sorted(space)}

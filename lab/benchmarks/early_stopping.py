@@ -28,9 +28,8 @@ from msk_ray.experiment.outcomes import Outcome
 from msk_ray.experiment.records import TrialRecord, read_records
 from msk_ray.experiment.results_table import outcome_name
 from msk_ray.sweep.rules.asha import Asha
-from msk_ray.sweep.rules.early_stopping import Pruner, SchedulerSpec
 from msk_ray.sweep.rules.median import Median
-from msk_ray.sweep.rules.per_environment import refuse_several
+from msk_ray.sweep.rules.scheduler import Pruner, SchedulerSpec, refuse_several
 
 NEAR = 0.01
 """Share of its best score that a sweep may lose and still count as equally good."""

@@ -7,7 +7,7 @@ from typing import Any
 from msk_ray.config import Config, env_name, leaves, overlay, parse_config
 from msk_ray.config.algorithms import BUILT_IN
 from msk_ray.sweep.operators import Operator
-from msk_ray.sweep.rules.per_environment import refuse_several
+from msk_ray.sweep.rules.scheduler import refuse_several
 from msk_ray.sweep.space import Space, SpaceFile
 from msk_ray.sweep.trials import base_settings, check_algorithms_read, check_ranges
 

@@ -4,7 +4,7 @@ from typing import Any
 
 from msk_ray.config import Config
 from msk_ray.experiment.trial import Trial
-from msk_ray.sweep.rules.no_scheduler import NoScheduler
+from msk_ray.sweep.rules.scheduler import NoScheduler
 from msk_ray.sweep.space import Space
 from msk_ray.sweep.trials import base_settings, make_trial
 

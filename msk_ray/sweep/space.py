@@ -14,9 +14,8 @@ from msk_ray.errors import ConfigError, brief
 from msk_ray.experiment.manifest import MAX_TRIALS
 from msk_ray.shipped import CONFIGS, SPACES, find_shipped, is_name, shipped_names
 from msk_ray.sweep.operators import Operator, Range, parse_operator
-from msk_ray.sweep.rules.early_stopping import SchedulerSpec
-from msk_ray.sweep.rules.no_scheduler import NoScheduler
-from msk_ray.sweep.rules.scheduler import RECORDED, read_scheduler, scheduler_class
+from msk_ray.sweep.rules import RECORDED, read_scheduler, scheduler_class
+from msk_ray.sweep.rules.scheduler import NoScheduler, SchedulerSpec
 from msk_ray.sweep.rules.stopping import StopSpec
 from msk_ray.sweep.search import search_class
 

@@ -11,7 +11,7 @@ from msk_ray.config import Config, leaves, overlay, parse_config, read_config, r
 from msk_ray.errors import ConfigError
 from msk_ray.experiment.trial import ID_DIGITS, Trial, trial_id, variant_text, with_epochs
 from msk_ray.sweep.operators import Level, NamedValues, Operator
-from msk_ray.sweep.rules.per_environment import refuse_several
+from msk_ray.sweep.rules.scheduler import refuse_several
 from msk_ray.sweep.space import Space
 
 

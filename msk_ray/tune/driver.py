@@ -33,10 +33,8 @@ from msk_ray.progress import announce, format_duration
 from msk_ray.signals import StopRequest, listening
 from msk_ray.sweep.budget import extreme_configs, longest_budget
 from msk_ray.sweep.operators import NamedValues
-from msk_ray.sweep.rules.early_stopping import Pruner
-from msk_ray.sweep.rules.per_environment import PerEnvironment
 from msk_ray.sweep.rules.population import PopulationBasedTraining
-from msk_ray.sweep.rules.replay import replay
+from msk_ray.sweep.rules.scheduler import PerEnvironment, Pruner, replay
 from msk_ray.sweep.search import search_class
 from msk_ray.sweep.search_trials import SearchTrial, recover
 from msk_ray.sweep.space import Space

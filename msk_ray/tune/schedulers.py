@@ -9,8 +9,8 @@ from ray.tune.schedulers import FIFOScheduler, PopulationBasedTraining, TrialSch
 from msk_ray.experiment.outcomes import Ending
 from msk_ray.experiment.scheduler_log import LogEntry, SchedulerLog
 from msk_ray.sweep.operators import Operator, Range
-from msk_ray.sweep.rules.early_stopping import Pruner
 from msk_ray.sweep.rules.population import PopulationBasedTraining as PopulationSpec
+from msk_ray.sweep.rules.scheduler import Pruner
 
 METRIC = "score"
 """Key under which trials report `eval/score`; Tune would read a slash as a nested key."""

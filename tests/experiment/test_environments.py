@@ -15,7 +15,7 @@ from msk_ray.experiment.trial import by_environment
 from msk_ray.status import main as status
 from msk_ray.sweep.budget import extreme_configs
 from msk_ray.sweep.rules.asha import Asha
-from msk_ray.sweep.rules.per_environment import PerEnvironment
+from msk_ray.sweep.rules.scheduler import PerEnvironment
 from msk_ray.sweep.space import parse_space
 from msk_ray.sweep.trials import resolve_trials
 from msk_ray.tune.console import Console

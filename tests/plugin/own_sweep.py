@@ -7,7 +7,7 @@ from typing import Any, Self
 
 from msk_ray.experiment.outcomes import Ending, Outcome
 from msk_ray.sweep.operators import Level, Operator
-from msk_ray.sweep.rules.early_stopping import NeverPrune, SchedulerSpec
+from msk_ray.sweep.rules.scheduler import NeverPrune, SchedulerSpec
 from msk_ray.sweep.rules.stop_rule import History, StopRule
 from msk_ray.sweep.search import Search
 

@@ -10,7 +10,7 @@ from msk_ray.experiment.scheduler_log import LogEntry
 from msk_ray.sweep.rules.asha import Asha, SuccessiveHalving
 from msk_ray.sweep.rules.median import Median, MedianStopping
 from msk_ray.sweep.rules.plateau import Plateau
-from msk_ray.sweep.rules.replay import replay
+from msk_ray.sweep.rules.scheduler import replay
 from msk_ray.sweep.rules.stop_rule import History
 from msk_ray.sweep.rules.stopping import StopSpec
 

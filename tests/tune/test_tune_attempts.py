@@ -23,7 +23,7 @@ from msk_ray.experiment.scheduler_log import LogEntry, SchedulerLog
 from msk_ray.experiment.trial import Trial
 from msk_ray.signals import RESUMABLE
 from msk_ray.sweep import opening
-from msk_ray.sweep.rules.replay import replay
+from msk_ray.sweep.rules.scheduler import replay
 from msk_ray.sweep.rules.stopping import StopSpec
 from msk_ray.sweep.space import read_file
 from msk_ray.sweep.trials import resolve_trials

@@ -11,9 +11,8 @@ from msk_ray.experiment.outcomes import Ending
 from msk_ray.experiment.scheduler_log import LogEntry, SchedulerLog
 from msk_ray.sweep import opening
 from msk_ray.sweep.rules.asha import Asha
-from msk_ray.sweep.rules.early_stopping import SchedulerSpec
 from msk_ray.sweep.rules.median import Median
-from msk_ray.sweep.rules.replay import replay
+from msk_ray.sweep.rules.scheduler import SchedulerSpec, replay
 from msk_ray.sweep.trials import resolve_trials
 from msk_ray.tune import driver
 from msk_ray.tune.devices import Placement

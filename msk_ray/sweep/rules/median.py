@@ -5,7 +5,7 @@ import statistics
 
 from msk_ray.config.sections import Count
 from msk_ray.experiment.outcomes import Ending, Outcome
-from msk_ray.sweep.rules.early_stopping import Pruner, SchedulerSpec, Share
+from msk_ray.sweep.rules.scheduler import Pruner, SchedulerSpec, Share
 
 
 class Median(SchedulerSpec):

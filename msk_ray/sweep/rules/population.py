@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 from pydantic import Field
 
 from msk_ray.errors import ConfigError
-from msk_ray.sweep.rules.early_stopping import SchedulerSpec, Share
+from msk_ray.sweep.rules.scheduler import SchedulerSpec, Share
 
 if TYPE_CHECKING:
     from msk_ray.sweep.space import SpaceFile

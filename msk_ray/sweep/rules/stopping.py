@@ -1,6 +1,6 @@
 """The `stop` section of a space: the rules that end its trials."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field, SerializeAsAny, ValidationError, model_validator
@@ -19,7 +19,7 @@ STOP_RULES = Registry("stop.rules", "msk_ray.stop_rules", {})
 """Rules of installed packages, by entry point; the package's own rules are fields of the section."""
 
 
-def _found(value: Any) -> Any:
+def _from_outside(value: Any) -> Any:
     """Rules from outside, by name or import path."""
     if not isinstance(value, Mapping):
         return value
@@ -48,7 +48,7 @@ class StopSpec(Section):
     target: Target | None = None
     wall_time_s: WallTime | None = None
     plateau: Plateau | None = None
-    rules: Annotated[dict[str, SerializeAsAny[StopRule]], BeforeValidator(_found)] = Field(default_factory=dict)
+    rules: Annotated[dict[str, SerializeAsAny[StopRule]], BeforeValidator(_from_outside)] = Field(default_factory=dict)
     """Your own rules: import path, or name of an installed rule → its settings."""
 
     @model_validator(mode="before")
@@ -58,25 +58,20 @@ class StopSpec(Section):
             return data
         return data | {"nonfinite": {} if data["nonfinite"] else None}
 
-    def all_rules(self) -> Iterator[StopRule]:
-        """The active rules, in the order in which they are checked."""
-        for rule in (self.nonfinite, self.target, self.wall_time_s, self.plateau):
-            if rule is not None:
-                yield rule
-        yield from self.rules.values()
+    def all_rules(self) -> list[StopRule]:
+        """The active rules, in the order in which they are checked: that of the fields, and then users' own."""
+        return [rule for _, rule in self if isinstance(rule, StopRule)] + list(self.rules.values())
 
     def without_scores(self) -> "StopSpec":
         """The rules that do not decide by scores."""
-        named = {name: getattr(self, name) for name in ("target", "plateau", "wall_time_s", "nonfinite")}
-        left_out = {name: None for name, rule in named.items() if rule is not None and rule.by_score}
+        left_out = {name: None for name, rule in self if isinstance(rule, StopRule) and rule.by_score}
         kept = {name: rule for name, rule in self.rules.items() if not rule.by_score}
         return self.model_copy(update=left_out | ({"rules": kept} if kept != self.rules else {}))
 
     def ending(self, history: History) -> Ending | None:
         """The ending of a trial after an epoch; None to continue."""
-        rules = list(self.all_rules())
         finished = history.epoch >= history.epochs
-        for rule in sorted(rules, key=lambda rule: not rule.before_the_end):
+        for rule in sorted(self.all_rules(), key=lambda rule: not rule.before_the_end):
             if finished and not rule.before_the_end:
                 break
             why = rule.why(history)
