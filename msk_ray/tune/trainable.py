@@ -31,7 +31,6 @@ from msk_ray.sweep.search_trials import search_trial, write_params
 from msk_ray.sweep.space import Space
 from msk_ray.tune.devices import wait_for_memory
 from msk_ray.tune.gauges import TrialGauges
-from msk_ray.tune.hparams import log_hparams
 from msk_ray.tune.output import limit_output, redirect_output
 from msk_ray.tune.schedulers import BEST, METRIC
 from msk_ray.tune.trial_run import Hooks, MakeTrainer, MemberCheckpoint, TrainerLike, run_trial
@@ -104,7 +103,6 @@ def make_trainable(job: Job, resources: dict[str, float]) -> type[tune.Trainable
         redirect_output(output)
         _record_device(folder / DEVICE_FILE, job.gpus)
         attempt = read_attempt(folder)
-        log_hparams(folder, attempt.effective(trial))
         if job.gpus:
             _wait_for_gpu(job.gpus)
         with (
