@@ -21,7 +21,6 @@ from msk_ray.sweep.rules.stopping import StopSpec
 from msk_ray.sweep.space import Space, parse_space
 from msk_ray.sweep.trials import resolve_trials
 from msk_ray.tune.finish import finish
-from msk_ray.tune.hparams import log_hparams
 from msk_ray.tune.trial_run import Hooks, run_trial
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -211,7 +210,6 @@ def sweep(cpu_kernels: None, tmp_path_factory: pytest.TempPathFactory) -> Experi
     for trial in trials:
         own = made.trial_folder(trial.id)
         own.mkdir(parents=True)
-        log_hparams(own, trial)
         run_trial(trial, own, "cpu", StopSpec(), Trainer, Hooks())
     assert finish(made) == 0
     return made

@@ -36,8 +36,6 @@ class Best:
     """Its evaluations in `eval.json`, the canonical one first."""
     strip: Path | None = None
     strip_text: str = ""
-    narrow_strip: Path | None = None
-    """The same frames in rows of two, for a phone."""
     missing: tuple[str, ...] = field(default=())
     """What cannot be shown, and why."""
 
@@ -95,13 +93,8 @@ def stored_best(trial: TrialRecord, strips: Sequence[Path]) -> Best:
     for strip in strips:
         text = strip_text(strip, sha)
         if text is not None:
-            return Best(trial, sha, tuple(entries), strip, text, narrow_strip(strip), tuple(missing))
+            return Best(trial, sha, tuple(entries), strip, text, tuple(missing))
     return Best(trial, sha, tuple(entries), missing=tuple(missing))
-
-
-def narrow_strip(strip: Path) -> Path:
-    """Path of the version of a strip for narrow screens."""
-    return strip.with_name(f"{strip.stem}_narrow.png")
 
 
 def strip_bytes(path: Path) -> bytes:
@@ -116,7 +109,7 @@ def strip_bytes(path: Path) -> bytes:
 
 def strip_text(path: Path, sha: str) -> str | None:
     """Description of a strip; None if it is missing or shows another checkpoint than the one with this hash."""
-    if not path.is_file() or not narrow_strip(path).is_file():
+    if not path.is_file():
         return None
     try:
         with Image.open(io.BytesIO(strip_bytes(path))) as image:
@@ -143,7 +136,7 @@ def _draw(path: Path, out: Path, sha: str, device: str | None) -> None:
     from msk_ray.evaluate.measure import Bench, Request, default_device
     from msk_ray.training import load_policy
     from msk_ray.visualize.episodes import record
-    from msk_ray.visualize.film import grid, strip
+    from msk_ray.visualize.film import strip
     from msk_ray.visualize.look import describe_groups, geom_groups
     from msk_ray.visualize.render import View, headless_backend
     from msk_ray.visualize.strips import episode_frames, log_strip
@@ -164,19 +157,11 @@ def _draw(path: Path, out: Path, sha: str, device: str | None) -> None:
     stamp.add_text(_STAMP, sha)
     stamp.add_text("Description", text)
     image = strip(frames, times)
-    rows = range(0, len(frames), 2)
-    narrow = grid([frames[row : row + 2] for row in rows], [""] * len(rows), [times[row : row + 2] for row in rows])
+    buffer = io.BytesIO()
+    image.save(buffer, "png", pnginfo=stamp)
     out.parent.mkdir(parents=True, exist_ok=True)
-    # The wide one last: once its stamp is on disk, both exist.
-    _save(narrow, narrow_strip(out), PngImagePlugin.PngInfo())
-    _save(image, out, stamp)
+    write_bytes(out, buffer.getvalue())
     trial = path.parent.parent
     if not (trial / "config.yaml").is_file():
         raise CheckpointError(f"{trial} has lost its config.yaml")
     log_strip(image, trial, policy.epoch)
-
-
-def _save(image: Image.Image, path: Path, facts: PngImagePlugin.PngInfo) -> None:
-    buffer = io.BytesIO()
-    image.save(buffer, "png", pnginfo=facts)
-    write_bytes(path, buffer.getvalue())
