@@ -104,12 +104,12 @@ def lines_of(path: Path) -> Counter[str]:
 
 def rooms(checkout: Path) -> dict[str, Counter[str]]:
     """Lines by room; tests, benchmarks and the lab are rooms of their own."""
-    found: dict[str, Counter[str]] = {room: Counter() for room in ("step", "runner", "legs")}
+    lines: dict[str, Counter[str]] = {room: Counter() for room in ("step", "runner", "legs")}
     for path in sorted((checkout / "msk_ray").rglob("*.py")):
-        found[room_of(path, checkout / "msk_ray")] += lines_of(path)
+        lines[room_of(path, checkout / "msk_ray")] += lines_of(path)
     for name in ("tests", "benchmarks", "lab"):
-        found[name] = sum((lines_of(path) for path in sorted((checkout / name).rglob("*.py"))), Counter())
-    return found
+        lines[name] = sum((lines_of(path) for path in sorted((checkout / name).rglob("*.py"))), Counter())
+    return lines
 
 
 def models_in(annotation: Any) -> tuple[list[tuple[type, str]], bool]:
@@ -193,9 +193,9 @@ def set_by_space(data: dict[str, Any]) -> dict[str, set[str]]:
             for value in values if isinstance(values, list) else [values]:
                 trial |= set(flat(value.get("value", value) if isinstance(value, dict) else value, key))
     own = {key: value for key, value in data.items() if key not in ("overrides", "parameters", "ablate", "smoke")}
-    found = set(flat(own)) | {key for key in ("overrides", "parameters") if key in data}
-    found |= {f"ablate.{key}" for key in ablate} | {f"smoke.{key}" for key in smoke}
-    return {TRIAL: trial, SPACE: found}
+    own_keys = set(flat(own)) | {key for key in ("overrides", "parameters") if key in data}
+    own_keys |= {f"ablate.{key}" for key in ablate} | {f"smoke.{key}" for key in smoke}
+    return {TRIAL: trial, SPACE: own_keys}
 
 
 def yaml_of(text: str) -> Any:
@@ -209,27 +209,27 @@ def yaml_of(text: str) -> Any:
 def set_by_pages(checkout: Path) -> dict[str, set[str]]:
     """What examples, and the commands, blocks of YAML and inline code of the pages that users read, give a value."""
     pages = [checkout / "README.md", *(checkout / "policies").glob("*.md"), *(checkout / "docs").rglob("*.md")]
-    found: dict[str, set[str]] = {TRIAL: set(), SPACE: set()}
+    keys_of: dict[str, set[str]] = {TRIAL: set(), SPACE: set()}
     texts = [path.read_text() for path in [*pages, *(checkout / "docs").rglob("*.py")]]
     blocks = [block for text in texts for block in re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)]
     for block in [*blocks, *(path.read_text() for path in (checkout / "docs" / "examples").glob("*.yaml"))]:
         data = yaml.safe_load(block)
         if isinstance(data, dict) and "base" in data:
-            found = {kind: found[kind] | keys for kind, keys in set_by_space(data).items()}
+            keys_of = {kind: keys_of[kind] | keys for kind, keys in set_by_space(data).items()}
         else:
             # A block may show a part of a config, or of a space.
-            found = {kind: keys | set(flat(data)) for kind, keys in found.items()}
+            keys_of = {kind: keys | set(flat(data)) for kind, keys in keys_of.items()}
     for text in texts:
         for key, value in _INLINE.findall(text):
             inside = yaml_of(value)
-            for keys in found.values():
+            for keys in keys_of.values():
                 keys |= set(flat(inside, key)) if isinstance(inside, dict) else {key}
         options = {name.replace("-", "_") for name in re.findall(r"(?<=\s)--([a-z-]+)", text)}
-        found[SPACE] |= {f"resources.{name}" for name in options}
-        found[TRIAL] |= {f"trial.{name}" for name in options}
+        keys_of[SPACE] |= {f"resources.{name}" for name in options}
+        keys_of[TRIAL] |= {f"trial.{name}" for name in options}
         for key, value in _SET.findall(text.replace("\\\n", " ")):
-            found[TRIAL] |= {key, *(f"{key}.{name}" for name in re.findall(r"[{,]\s*([a-z_]+):", value))}
-    return found
+            keys_of[TRIAL] |= {key, *(f"{key}.{name}" for name in re.findall(r"[{,]\s*([a-z_]+):", value))}
+    return keys_of
 
 
 def settings_of(checkout: Path) -> dict[str, Any]:
@@ -271,8 +271,8 @@ def settings_of(checkout: Path) -> dict[str, Any]:
 def places(checkout: Path, patterns: tuple[str, ...]) -> list[str]:
     """Files of the package in which the patterns are found, one for each pattern that is."""
     texts = {path: path.read_text() for path in sorted((checkout / "msk_ray").rglob("*.py"))}
-    found = [next((p for p, text in texts.items() if re.search(each, text, re.MULTILINE)), None) for each in patterns]
-    return [str(path.relative_to(checkout / "msk_ray")) for path in found if path is not None]
+    paths = [next((p for p, text in texts.items() if re.search(each, text, re.MULTILINE)), None) for each in patterns]
+    return [str(path.relative_to(checkout / "msk_ray")) for path in paths if path is not None]
 
 
 def words(paths: list[Path]) -> int:
@@ -282,33 +282,33 @@ def words(paths: list[Path]) -> int:
 
 def measures(checkout: Path) -> tuple[dict[str, str], list[str]]:
     """Every measure of a checkout by its name, and the settings that nobody sets."""
-    found: dict[str, str] = {}
+    figures: dict[str, str] = {}
     kinds = ("code", "docstrings", "comments", "blank")
     counted = rooms(checkout)
     package = sum((counted[room] for room in ("step", "runner", "legs")), Counter())
     for room, lines in {**counted, "msk_ray": package, "msk_ray without legs": package - counted["legs"]}.items():
         each = " + ".join(f"{lines[kind]:,}" for kind in kinds)
-        found[f"lines of {room}: code + docstrings + comments + blank"] = f"{sum(lines.values()):,} = {each}"
+        figures[f"lines of {room}: code + docstrings + comments + blank"] = f"{sum(lines.values()):,} = {each}"
     settings = settings_of(checkout)
     counts = settings["counts"]
-    found["settings: of a trial + of a space"] = f"{counts[TRIAL]} + {counts[SPACE]}"
+    figures["settings: of a trial + of a space"] = f"{counts[TRIAL]} + {counts[SPACE]}"
     for name in ("set by a config", "set by spaces only", "set by the manual or an example only"):
-        found[f"settings {name}"] = str(counts[name])
-    found["settings that nothing shipped sets"] = str(len(settings["never"]))
+        figures[f"settings {name}"] = str(counts[name])
+    figures["settings that nothing shipped sets"] = str(len(settings["never"]))
     for name in ("configs", "tune_spaces", "benchmarks"):
         suffix = "*.py" if name == "benchmarks" else "*.yaml"
         paths = (checkout / name).glob(suffix) if name == "benchmarks" else (checkout / name).rglob(suffix)
-        found[f"files of {name}/"] = str(len(list(paths)))
-    found["words of README.md"] = f"{words([checkout / 'README.md']):,}"
-    found["words of the manual, docs/"] = f"{words(list((checkout / 'docs').rglob('*.md'))):,}"
-    found["words of lab/"] = f"{words(list((checkout / 'lab').glob('*.md'))):,}"
+        figures[f"files of {name}/"] = str(len(list(paths)))
+    figures["words of README.md"] = f"{words([checkout / 'README.md']):,}"
+    figures["words of the manual, docs/"] = f"{words(list((checkout / 'docs').rglob('*.md'))):,}"
+    figures["words of lab/"] = f"{words(list((checkout / 'lab').glob('*.md'))):,}"
     for name, patterns in EDITS.items():
         at = places(checkout, patterns)
         files = len(set(at))
-        found[f"edits for a further {name}"] = f"{len(at)} in {files} file{'s' * (files != 1)}"
+        figures[f"edits for a further {name}"] = f"{len(at)} in {files} file{'s' * (files != 1)}"
     path = places(checkout, FROM_CTRL_TO_KERNEL)
-    found["files from ctrl to a kernel and back"] = str(len(set(path)))
-    return found, settings["never"]
+    figures["files from ctrl to a kernel and back"] = str(len(set(path)))
+    return figures, settings["never"]
 
 
 def commit_of(checkout: Path) -> str:
@@ -327,13 +327,13 @@ def main() -> None:
         print(json.dumps(declared(args.declared)))
         return
     trees = [tree.resolve() for tree in args.checkouts]
-    found = [measures(tree) for tree in trees]
-    rows = [[name, *(figures.get(name, "") for figures, _ in found)] for name in found[-1][0]]
+    measured = [measures(tree) for tree in trees]
+    rows = [[name, *(figures.get(name, "") for figures, _ in measured)] for name in measured[-1][0]]
     table = markdown_table(["", *map(commit_of, trees)], rows)
     command = f"python {' '.join(map(shlex.quote, sys.argv))}"
     text = f"## The house\n\n{datetime.datetime.now(datetime.UTC).date()}\n\n`{command}`\n\n{table}\n"
     if args.never:
-        text += "\nNothing sets, in the last column: " + ", ".join(f"`{name}`" for name in found[-1][1]) + ".\n"
+        text += "\nNothing sets, in the last column: " + ", ".join(f"`{name}`" for name in measured[-1][1]) + ".\n"
     print(text)
     if args.write:
         with (RESULTS / "house.md").open("a", encoding="utf-8") as file:

@@ -33,10 +33,10 @@ def walk_model() -> str:
         for element in list(getattr(spec, kind)):
             spec.delete(element)
     for body in spec.bodies[1:]:
-        found = model.body(body.name)
+        compiled = model.body(body.name)
         body.explicitinertial, body.fullinertia = True, [np.nan] * 6
-        body.mass, body.inertia = found.mass[0], found.inertia
-        body.ipos, body.iquat = found.ipos, found.iquat
+        body.mass, body.inertia = compiled.mass[0], compiled.inertia
+        body.ipos, body.iquat = compiled.ipos, compiled.iquat
     spec.compile()
     out = Path(tempfile.mkdtemp(prefix="myosuite_model_")) / "myolegs.xml"  # below what goes with the tests
     out.write_text(re.sub(r' material="[^"]*"', "", spec.to_xml()))

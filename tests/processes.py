@@ -15,11 +15,11 @@ from fault_campaign.processes import stat_of
 
 def members_of(session: int) -> dict[int, str]:
     """The living processes of a session, and their names."""
-    found = {}
+    processes = {}
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit() and (stat := stat_of(int(entry.name))) and stat[4] == str(session):
-            found[int(entry.name)] = stat[0]
-    return found
+            processes[int(entry.name)] = stat[0]
+    return processes
 
 
 class Launcher:

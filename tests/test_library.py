@@ -69,11 +69,11 @@ def test_the_readme_example_runs(root: Path, tmp_path: Path, monkeypatch: pytest
         example = example.replace(text, instead)
     mujoco.mj_saveLastXML(str(tmp_path / "model.xml"), cartpole())
     monkeypatch.chdir(tmp_path)
-    found: dict[str, Any] = {}
-    exec(example, found)
-    assert found["ctrl"].grad.shape == (64, 1)
-    assert found["ctrl"].grad.abs().min() > 0.0
-    assert found["policy"].epoch == found["trained"].epochs == 2
+    names: dict[str, Any] = {}
+    exec(example, names)
+    assert names["ctrl"].grad.shape == (64, 1)
+    assert names["ctrl"].grad.abs().min() > 0.0
+    assert names["policy"].epoch == names["trained"].epochs == 2
 
 
 def test_training_goes_on_where_it_was_interrupted(tiny_cartpole: msk_ray.Config, tmp_path: Path) -> None:

@@ -26,14 +26,14 @@ def test_nothing_is_imported_from_a_conftest(root: Path) -> None:
 
 
 def test_no_function_outside_kernels_has_more_than_8_parameters(root: Path) -> None:
-    found = []
+    faults = []
     for path in (root / "msk_ray").rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and not _is_kernel(node):
                 count = len(_parameters(node.args))
                 if count > 8:
-                    found.append(f"{path.relative_to(root)}: {node.name} has {count}")
-    assert not found
+                    faults.append(f"{path.relative_to(root)}: {node.name} has {count}")
+    assert not faults
 
 
 def _is_kernel(node: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:

@@ -160,8 +160,8 @@ def test_a_space_sets_nothing_that_no_trial_reads(changes: dict[str, Any], messa
 
 def test_a_search_that_chooses_the_algorithm_is_checked_for_each(tmp_path: Path) -> None:
     choice = {"algorithm.name": {"choice": ["shac", "ppo"]}, "ppo.clip": {"uniform": [0.1, 0.3]}}
-    found = extreme_configs(space(tmp_path, parameters=choice, search="optuna"))
-    assert {config.algorithm.name for config in found} == {"shac", "ppo"}
+    configs = extreme_configs(space(tmp_path, parameters=choice, search="optuna"))
+    assert {config.algorithm.name for config in configs} == {"shac", "ppo"}
     only = {"shac.gamma": {"uniform": [0.9, 0.99]}}
     with pytest.raises(ConfigError, match=r"overrides: ppo\.clip: nothing reads it"):
         extreme_configs(space(tmp_path, parameters=only, overrides={"ppo.clip": 0.1}, search="optuna"))

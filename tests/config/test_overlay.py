@@ -112,9 +112,9 @@ def test_every_way_in_means_the_same(
     """`train --set`, `tune --set`, a space's overrides, a parameter's value, a variant, and a file that extends."""
     (tmp_path / "base.yaml").write_text(dump_yaml(BASE))
     values = parse_overrides(texts)
-    found = {"train": load_config(tmp_path / "base.yaml", texts)}
+    configs = {"train": load_config(tmp_path / "base.yaml", texts)}
     (tmp_path / "child.yaml").write_text(dump_yaml({"extends": "base.yaml", **overlay({}, values)}))
-    found["extends"] = load_config(tmp_path / "child.yaml")
+    configs["extends"] = load_config(tmp_path / "child.yaml")
     data: dict[str, Any] = {"question": "?", "base": "base.yaml"}
     spaces: dict[str, dict[str, Any]] = {
         "overrides": {"overrides": values},
@@ -124,11 +124,13 @@ def test_every_way_in_means_the_same(
         ((key, value),) = values.items()
         spaces["parameter"] = {"parameters": {key: {"grid": [{"label": "this", "value": value}]}}}
     for name, changes in spaces.items():
-        found[name] = resolve_trials(parse_space(data | changes, tmp_path / "small.yaml"))[-1].config
+        configs[name] = resolve_trials(parse_space(data | changes, tmp_path / "small.yaml"))[-1].config
     (tmp_path / "small.yaml").write_text(dump_yaml(data))
     args = ["--space", str(tmp_path / "small.yaml"), *(word for text in texts for word in ("--set", text))]
-    found["tune"] = resolve_trials(tune._read_space(read_options(args), {}))[0].config
-    assert {name: config.as_dict()["shac"][setting] for name, config in found.items()} == dict.fromkeys(found, expected)
+    configs["tune"] = resolve_trials(tune._read_space(read_options(args), {}))[0].config
+    assert {name: config.as_dict()["shac"][setting] for name, config in configs.items()} == dict.fromkeys(
+        configs, expected
+    )
 
 
 def test_set_is_laid_over_a_spaces_own_override(tmp_path: Path) -> None:

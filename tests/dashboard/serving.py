@@ -79,6 +79,6 @@ class Server:
         named = {name.replace("_", "-"): value for name, value in headers.items()}
         connection.request(method, path, body, named)
         answer = connection.getresponse()
-        found = answer.status, answer.read().decode(), answer.headers
+        parts = answer.status, answer.read().decode(), answer.headers
         connection.close()
-        return found
+        return parts

@@ -211,9 +211,9 @@ def orphaned(experiment: Experiment) -> Experiment:
             del config["shac"]
             config["algorithm"] = {"name": "gone_package.learner:Learner", "settings": {"rate": 0.1}}
     (experiment.path / MANIFEST_FILE).write_text(json.dumps(manifest))
-    found = experiment.trial_folder("searched")
-    found.mkdir()
-    (found / "config.yaml").write_text(dump_yaml(manifest["trials"][2]["config"]))
+    folder = experiment.trial_folder("searched")
+    folder.mkdir()
+    (folder / "config.yaml").write_text(dump_yaml(manifest["trials"][2]["config"]))
     return experiment
 
 

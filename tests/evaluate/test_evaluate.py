@@ -175,15 +175,15 @@ def test_figures_by_hand() -> None:
         success=flags,
     )
     run_b = run_a._replace(score=torch.tensor([5.0, 7.0]), fell=torch.tensor([False, False]))
-    found = figures([run_a, run_b], ("a", "b"))
-    assert found["score"] == {"mean": 4.0, "std": pytest.approx(math.sqrt(20 / 3)), "min": 1.0, "max": 7.0}
-    assert found["fall_rate"] == 0.25
-    assert found["diverged_rate"] == 0.5
-    assert found["success_rate"] == 0.5
-    assert found["terms"]["a"]["mean"] == 1.5
+    results = figures([run_a, run_b], ("a", "b"))
+    assert results["score"] == {"mean": 4.0, "std": pytest.approx(math.sqrt(20 / 3)), "min": 1.0, "max": 7.0}
+    assert results["fall_rate"] == 0.25
+    assert results["diverged_rate"] == 0.5
+    assert results["success_rate"] == 0.5
+    assert results["terms"]["a"]["mean"] == 1.5
     # 140 metres in 80 steps; the episodes' own speeds are 1 and 2.
-    assert found["outcomes"]["vx"]["mean"] == 1.75
-    assert (found["outcomes"]["vx"]["min"], found["outcomes"]["vx"]["max"]) == (1.0, 2.0)
+    assert results["outcomes"]["vx"]["mean"] == 1.75
+    assert (results["outcomes"]["vx"]["min"], results["outcomes"]["vx"]["max"]) == (1.0, 2.0)
 
 
 def test_policies_along_the_way_are_those_that_were_evaluated(trial: Path) -> None:

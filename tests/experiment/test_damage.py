@@ -67,9 +67,9 @@ def test_an_odd_line_is_named_and_hides_no_other(odd: bytes, tmp_path: Path) -> 
     path = tmp_path / "metrics.jsonl"
     rows = [json.dumps(row(epoch)).encode() for epoch in range(4)]
     path.write_bytes(b"\n".join([rows[0], rows[1], odd, rows[2], rows[3], b""]))
-    found = load_metrics(path)
-    assert [r["epoch"] for r in found.rows] == [0, 1, 2, 3]
-    (named,) = found.damages
+    metrics = load_metrics(path)
+    assert [r["epoch"] for r in metrics.rows] == [0, 1, 2, 3]
+    (named,) = metrics.damages
     assert (named.path, named.line) == (path, 3)
     assert str(named).startswith(f"{path}, line 3: ")
     assert "\n" not in str(named)
@@ -87,11 +87,11 @@ def test_lines_among_which_others_are_put_are_all_found(others: list[tuple[int, 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "reports.jsonl"
         path.write_bytes(b"\n".join(lines) + b"\n" + b'{"trial": "a", "epoch": 9, "env'[:torn])
-        found, damages = SchedulerLog(path).read()
+        entries, damages = SchedulerLog(path).read()
         again = SchedulerLog(path).read()
-    assert [report for report in found if report in reports] == reports
-    assert len(found) + len(damages) == sum(len(line.split(b"\n")) for line in lines)
-    assert again == (found, damages)
+    assert [report for report in entries if report in reports] == reports
+    assert len(entries) + len(damages) == sum(len(line.split(b"\n")) for line in lines)
+    assert again == (entries, damages)
 
 
 @pytest.mark.long
@@ -108,8 +108,8 @@ def test_a_file_of_anything_is_read_or_refused_in_one_line(data: bytes) -> None:
         read_ending(folder)
         seen = read_trial(folder, time.time())
         assert seen.folder == folder
-        for found in seen.damages:
-            assert "\n" not in str(found)
+        for damage_seen in seen.damages:
+            assert "\n" not in str(damage_seen)
 
 
 def test_what_the_storage_does_not_give_is_no_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -130,10 +130,10 @@ def codes(record: str, damage: str) -> dict[str, int]:
     refused = {layout.MANIFEST_FILE: ("status", "tune"), LOCK_FILE: ("tune",)}.get(record, ())
     if record == layout.METRICS_FILE and damage in IRREGULAR:
         refused = ("tune",)
-    found = {command: 2 if command in refused else 0 for command in ("status", "tune")}
+    expected = {command: 2 if command in refused else 0 for command in ("status", "tune")}
     if (record, damage) == (layout.SUMMARY_FILE, "a folder"):
-        found["tune"] = 75  # it is written, never read, and there is no room for it
-    return found
+        expected["tune"] = 75  # it is written, never read, and there is no room for it
+    return expected
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
@@ -303,9 +303,9 @@ def test_a_row_within_the_limits_is_read_and_one_beyond_is_skipped(tmp_path: Pat
     wide = row(1) | {f"metric/{number}": 1.0 for number in range(LINE.count - 10)}
     wider = row(2) | {f"metric/{number}": 1.0 for number in range(LINE.count + 1)}
     path.write_text("".join(json.dumps(r) + "\n" for r in (wide, wider, row(3))))
-    found = load_metrics(path)
-    assert [r["epoch"] for r in found.rows] == [1, 3]
-    assert str(found.damages[0]).endswith(f"line 2: more than {LINE.count} values")
+    metrics = load_metrics(path)
+    assert [r["epoch"] for r in metrics.rows] == [1, 3]
+    assert str(metrics.damages[0]).endswith(f"line 2: more than {LINE.count} values")
 
 
 @pytest.mark.parametrize("damage", DAMAGES)

@@ -26,11 +26,11 @@ def test_they_are_found_with_their_states(tmp_path: Path) -> None:
     (tmp_path / "train" / "empty").mkdir()
     reader = TrainingReader(tmp_path)
     with owned(tmp_path / "train" / "stopped"):
-        found = {training.name: training for training in reader.look(time.time())}
-    assert list(found) == ["beside", "train/done", "train/stopped", "train/torn"]
-    assert (found["train/done"].state, found["train/stopped"].state) == (State.ENDED, State.RUNNING)
-    done = found["train/done"]
+        trainings = {training.name: training for training in reader.look(time.time())}
+    assert list(trainings) == ["beside", "train/done", "train/stopped", "train/torn"]
+    assert (trainings["train/done"].state, trainings["train/stopped"].state) == (State.ENDED, State.RUNNING)
+    done = trainings["train/done"]
     # Its environment cannot be imported here, which its state does not need.
     assert (done.environment, done.progress.epoch, done.epochs, done.progress.best) == ("gone:Robot", 4, 4, 14.0)
-    assert "not valid YAML" in found["train/torn"].note
+    assert "not valid YAML" in trainings["train/torn"].note
     assert find_experiments(tmp_path) == []

@@ -83,8 +83,8 @@ def test_tensors_and_arrays_say_the_same(batched: BatchedEnv[np.ndarray]) -> Non
     obs, _ = batched.reset(seed=5)
     assert np.array_equal(tensors.reset(seed=5)[0].numpy(), obs)
     action = np.linspace(-2.0, 1.0, 4, dtype=np.float32)[:, None]
-    expected, found = batched.step(action), tensors.step(torch.from_numpy(action))
-    for ours, theirs in zip(expected[:4], found[:4], strict=True):
+    expected, stepped = batched.step(action), tensors.step(torch.from_numpy(action))
+    for ours, theirs in zip(expected[:4], stepped[:4], strict=True):
         assert np.array_equal(ours, theirs.numpy())
     batched.reset(seed=5)
     assert np.array_equal(batched.step(action.clip(-1.0, 1.0))[0], expected[0]), "actions are clipped"
@@ -130,9 +130,9 @@ def test_contact_forces_are_those_of_the_batch() -> None:
     query = ContactQuery(((floor,), tuple(range(env.model.ngeom))), (floor,))
     env.sim.step(control, *state)
     simulation.step(control, *state)
-    expected, found = env.sim.contact_forces(), simulation.contact_forces()
+    expected, forces = env.sim.contact_forces(), simulation.contact_forces()
     assert expected.abs().max() > 10.0
-    assert found == pytest.approx(expected, abs=0.02 * float(expected.abs().max()))
+    assert forces == pytest.approx(expected, abs=0.02 * float(expected.abs().max()))
     with pytest.raises(ConfigError, match="did not watch these contacts"):
         simulation.contacts(query)
     for each in (env.sim, simulation):

@@ -170,14 +170,14 @@ def test_evaluations_at_other_env_steps_are_compared_at_the_newest_common_ones(
 ) -> None:
     """`fast` was stopped at epoch 5; the baseline was evaluated at 4 before that, where `fast` had been at 3."""
     baseline, fast = [(0, 0.0), (4, 40.0), (8, 80.0)], [(0, 0.0), (3, 35.0), (5, 55.0)]
-    found = compared(experiment, {"baseline": baseline, "fast": fast}, Outcome.STOPPED_ASHA)
-    assert (found.compared_at, found.difference) == (400.0, 35.0 - 40.0)
+    row = compared(experiment, {"baseline": baseline, "fast": fast}, Outcome.STOPPED_ASHA)
+    assert (row.compared_at, row.difference) == (400.0, 35.0 - 40.0)
 
 
 def test_what_used_up_its_time_is_a_whole_run(experiment: Experiment) -> None:
     curves = {"baseline": [(0, 0.0), (4, 40.0), (8, 80.0)], "fast": [(0, 0.0), (4, 50.0)]}
-    found = compared(experiment, curves, Outcome.WALL_TIME)
-    assert (found.compared_at, found.difference, found.cut) == (None, 50.0 - 80.0, 0)
+    row = compared(experiment, curves, Outcome.WALL_TIME)
+    assert (row.compared_at, row.difference, row.cut) == (None, 50.0 - 80.0, 0)
 
 
 def test_the_page_says_it_all_and_takes_nothing_for_markup(experiment: Experiment) -> None:

@@ -71,12 +71,12 @@ def test_the_parameter_that_matters_comes_first() -> None:
             for horizon in (8, 16):
                 score = (100.0 if rate == 0.1 else 0.0) + rng.normal()
                 trials.append(TrialScore({"lr": f"{rate}", "h": f"{horizon}"}, {"lr": rate, "h": horizon}, seed, score))
-    found = effects(trials)
-    assert found[0].factor == "lr"
-    assert {effect.factor for effect in found} == {"lr", "h", "seed"}
-    assert found[0].share == pytest.approx(1.0, abs=0.01)
-    assert found[0].spread == pytest.approx(100.0, abs=2.0)
-    assert max(effect.share or 0.0 for effect in found[1:]) < 0.1
+    ranked = effects(trials)
+    assert ranked[0].factor == "lr"
+    assert {effect.factor for effect in ranked} == {"lr", "h", "seed"}
+    assert ranked[0].share == pytest.approx(1.0, abs=0.01)
+    assert ranked[0].spread == pytest.approx(100.0, abs=2.0)
+    assert max(effect.share or 0.0 for effect in ranked[1:]) < 0.1
     assert effects([TrialScore({"lr": "1"}, {"lr": 1}, 0, 5.0)]) == []
 
 

@@ -24,8 +24,8 @@ def ended(experiment: Experiment, outcomes: list[Outcome], epoch: int = 20) -> N
 
 
 def endings(experiment: Experiment) -> list[str | None]:
-    found = [read_ending(experiment.trial_folder(trial.id)) for trial in experiment.trials()]
-    return [ending and str(ending.outcome) for ending in found]
+    endings = [read_ending(experiment.trial_folder(trial.id)) for trial in experiment.trials()]
+    return [ending and str(ending.outcome) for ending in endings]
 
 
 def test_more_epochs_wake_those_that_finished_under_their_old_ids(make_space: Any, tmp_path: Path) -> None:

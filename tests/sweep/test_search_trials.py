@@ -22,5 +22,5 @@ def test_a_trial_that_starts_again_keeps_its_place(make_space: Any, tmp_path: Pa
         os.utime(folder / "params.json", (place, place))
         folders.append(folder)
     write_params(folders[0], suggested[0])  # as its second process does
-    assert [found.params for found in recover(experiment, space)] == suggested
-    assert [found.trial.index for found in recover(experiment, space)] == [0, 1, 2]
+    assert [suggestion.params for suggestion in recover(experiment, space)] == suggested
+    assert [suggestion.trial.index for suggestion in recover(experiment, space)] == [0, 1, 2]

@@ -162,11 +162,11 @@ class StubTrainer:
             self._moved.touch()
 
     def restore_latest(self) -> tuple[Path | None, list[str]]:
-        found = sorted((self.logdir / "checkpoints").glob("epoch_*.pt"))
-        if not found:
+        checkpoints = sorted((self.logdir / "checkpoints").glob("epoch_*.pt"))
+        if not checkpoints:
             return None, []
-        self.restore(found[-1])
-        return found[-1], []
+        self.restore(checkpoints[-1])
+        return checkpoints[-1], []
 
     def close(self) -> None:
         pass

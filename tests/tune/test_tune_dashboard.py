@@ -56,9 +56,9 @@ def line_with(driver: "subprocess.Popen[str]", text: str) -> str:
 
 def get_in(page: Page, line: str) -> None:
     """Do what the terminal's line says."""
-    found = re.fullmatch(r"Ray dashboard: (\S+) \(asks once for the token: (.+)\)", line)
-    assert found is not None, line
-    address, command = found.groups()
+    shown = re.fullmatch(r"Ray dashboard: (\S+) \(asks once for the token: (.+)\)", line)
+    assert shown is not None, line
+    address, command = shown.groups()
     page.goto(address)
     expect(page.get_by_text("Authentication Token Required")).to_be_visible(timeout=LIMIT_MS)
     token = subprocess.run(shlex.split(command), capture_output=True, text=True, check=True).stdout

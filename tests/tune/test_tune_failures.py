@@ -86,10 +86,10 @@ def test_an_exception_is_named_with_file_and_line() -> None:
     def reward_terms() -> None:
         raise ValueError("first line\nsecond line")
 
-    found = re.fullmatch(r"ValueError: first line \((.+):(\d+), in reward_terms\)", described(met(reward_terms)))
-    assert found is not None
-    assert found[1] == Path(__file__).name
-    assert 'raise ValueError("first line' in Path(__file__).read_text().splitlines()[int(found[2]) - 1]
+    match = re.fullmatch(r"ValueError: first line \((.+):(\d+), in reward_terms\)", described(met(reward_terms)))
+    assert match is not None
+    assert match[1] == Path(__file__).name
+    assert 'raise ValueError("first line' in Path(__file__).read_text().splitlines()[int(match[2]) - 1]
 
 
 def test_the_users_own_line_is_named_rather_than_the_librarys() -> None:

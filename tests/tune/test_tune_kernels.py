@@ -10,5 +10,5 @@ def test_each_algorithm_launches_kernels_of_its_own(make_space: Any) -> None:
     space = make_space(
         parameters={"algorithm.name": {"grid": ["ppo", "shac"]}, "trial.epochs": {"grid": [4, 5]}}, seeds="0-1"
     )
-    found = one_per_kernel_set(resolve_trials(space))
-    assert [trial.variant for trial in found] == ["algorithm=ppo, epochs=4", "algorithm=shac, epochs=4"]
+    representatives = one_per_kernel_set(resolve_trials(space))
+    assert [trial.variant for trial in representatives] == ["algorithm=ppo, epochs=4", "algorithm=shac, epochs=4"]

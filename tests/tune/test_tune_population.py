@@ -27,17 +27,17 @@ def exchanges(seed: int, order: list[int], monkeypatch: pytest.MonkeyPatch) -> d
     ]
     operators = {key: parse_operator(key, value) for key, value in RANGES.items()}
     population = Population(Spec(kind="pbt", resample=0.5), 1000.0, operators, seed)
-    found = {}
+    exchanges = {}
 
     def exploit(self: Any, trial: Any, controller: Any, upper: list[Any], lower: list[Any]) -> None:
         (better,) = upper
-        found[trial.config["id"]] = better.config["id"], population._get_new_config(trial, better)
+        exchanges[trial.config["id"]] = better.config["id"], population._get_new_config(trial, better)
 
     monkeypatch.setattr(PopulationBasedTraining, "_checkpoint_or_exploit", exploit)
     for place in order:
         population._trial_state[members[place]] = SimpleNamespace(last_perturbation_time=100.0)
         population._checkpoint_or_exploit(members[place], None, members[4:], members[:4])
-    return found
+    return exchanges
 
 
 def test_exchanges_repeat_whatever_the_order_and_what_else_draws(monkeypatch: pytest.MonkeyPatch) -> None:

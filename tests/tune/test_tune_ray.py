@@ -156,10 +156,10 @@ def test_what_has_gone_stops_the_sweep_and_is_not_made_again(
     assert completed
     assert outcomes(records) == ["finished", "finished"]
     for record in records:
-        found = read_rows(record.folder)
-        assert [row["epoch"] for row in found] == list(range(61))
+        resumed = read_rows(record.folder)
+        assert [row["epoch"] for row in resumed] == list(range(61))
         kept = rows[record.trial.id]
-        assert [row["eval/score"] for row in kept[::2]] == [row["eval/score"] for row in found[: len(kept) : 2]]
+        assert [row["eval/score"] for row in kept[::2]] == [row["eval/score"] for row in resumed[: len(kept) : 2]]
         # One process more: it went on from its checkpoint rather than from nothing.
         assert processes_in(record.folder) == before[record.trial.id] + 1
 

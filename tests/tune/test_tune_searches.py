@@ -226,11 +226,11 @@ def _processes_of_trials() -> list[int]:
     def parent(pid: int) -> int:
         return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
 
-    found = []
+    pids = []
     for path in Path("/proc").glob("[0-9]*/environ"):
         with contextlib.suppress(OSError):  # gone since it was listed
             text = path.read_bytes()
             pid = int(path.parent.name)
             if b"PL_DISABLE_FORK" in text and parent(parent(pid)) == os.getpid():
-                found.append(pid)
-    return found
+                pids.append(pid)
+    return pids
