@@ -48,6 +48,17 @@ STORAGE: dict[str, Any] = {
 """Of the option `--storage`, which many commands have."""
 
 
+def seconds(text: str) -> float:
+    """An interval of an option, at least 0.1 [s]."""
+    value = float(text)
+    if not 0.1 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"at least 0.1, not {text}")
+    return value
+
+
+seconds.__name__ = "number"  # argparse names it where the text is none
+
+
 class Parser(argparse.ArgumentParser):
     """An argument parser that keeps line breaks in its description and examples."""
 

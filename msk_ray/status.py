@@ -1,6 +1,5 @@
 """`python -m msk_ray.status`: the progress of experiments, read from their files."""
 
-import argparse
 import difflib
 import gc
 import shlex
@@ -12,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from msk_ray.cli import STORAGE, Parser, run
+from msk_ray.cli import STORAGE, Parser, run, seconds
 from msk_ray.errors import MskRayError, StorageError
 from msk_ray.experiment.damage import count_damages, describe_damages
 from msk_ray.experiment.manifest import Experiment
@@ -62,7 +61,7 @@ def parser() -> Parser:
     )
     p.add_argument("--watch", action="store_true", help="refresh until all trials have ended")
     p.add_argument(
-        "--interval", type=_seconds, default=2.0, metavar="S", help="seconds between refreshes of --watch (default: 2)"
+        "--interval", type=seconds, default=2.0, metavar="S", help="seconds between refreshes of --watch (default: 2)"
     )
     p.add_argument("--storage", **STORAGE)
     return p
@@ -288,13 +287,6 @@ def _summary(experiment: Experiment) -> tuple[str, str, str, str]:
 def _known(storage: Path) -> str:
     names = [path.name for path in find_experiments(storage)]
     return f"there are {', '.join(names[-5:])}" if names else "it holds none; give another --storage"
-
-
-def _seconds(text: str) -> float:
-    value = float(text)
-    if not 0.1 <= value < float("inf"):
-        raise argparse.ArgumentTypeError(f"at least 0.1, not {text}")
-    return value
 
 
 def _width() -> int:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from aiohttp import web
 
-from msk_ray.cli import Parser, run
+from msk_ray.cli import Parser, run, seconds
 from msk_ray.dashboard.app import make_runner
 from msk_ray.dashboard.films import Films
 from msk_ray.dashboard.guard import Access
@@ -50,7 +50,7 @@ def parser() -> Parser:
     p.add_argument("--port", type=_port, default=8321, metavar="N", help="port (default: %(default)s; 0: any free one)")
     p.add_argument(
         "--refresh",
-        type=_seconds,
+        type=seconds,
         default=5.0,
         metavar="S",
         help="check the files for changes every S seconds (default: 5)",
@@ -75,16 +75,6 @@ def _port(text: str) -> int:
     if not text.isdecimal() or int(text) > 65535:
         raise argparse.ArgumentTypeError(f"must be a whole number from 0 to 65535, not {text}")
     return int(text)
-
-
-def _seconds(text: str) -> float:
-    value = float(text)
-    if not 0.1 <= value < float("inf"):
-        raise argparse.ArgumentTypeError(f"at least 0.1, not {text}")
-    return value
-
-
-_seconds.__name__ = "number"  # argparse names it where the text is none
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -192,9 +192,8 @@ class Experiment:
 
     def remember(self, **options: bool | None) -> None:
         """Record the values that this command line gives for `REMEMBERED`; None changes nothing."""
-        manifest = self.manifest()
         given = {option: value for option, value in options.items() if value is not None}
-        write_json(self.path / MANIFEST_FILE, manifest | {"options": (manifest.get("options") or {}) | given})
+        self._change(options=(self.manifest().get("options") or {}) | given)
 
     def extension(self) -> dict[str, Any]:
         """How the experiment has been extended since it was created: epochs, samples, seeds."""
@@ -203,8 +202,7 @@ class Experiment:
 
     def extend(self, trials: Iterable[Trial], extension: Mapping[str, Any]) -> None:
         """Replace the manifest's list of trials by a longer one, and record the extension."""
-        extended = {"extended": self.extension() | dict(extension)}
-        write_json(self.path / MANIFEST_FILE, self.manifest() | extended | {"trials": _entries(trials)})
+        self._change(extended=self.extension() | dict(extension), trials=_entries(trials))
 
     def clear_outgrown(self) -> None:
         """Remove the endings of trials that finished before their epochs were extended."""
@@ -219,7 +217,10 @@ class Experiment:
 
     def set_trials(self, trials: Iterable[Trial]) -> None:
         """Replace the manifest's list of trials."""
-        write_json(self.path / MANIFEST_FILE, self.manifest() | {"trials": _entries(trials)})
+        self._change(trials=_entries(trials))
+
+    def _change(self, **parts: Any) -> None:
+        write_json(self.path / MANIFEST_FILE, self.manifest() | parts)
 
 
 def has_begun(path: Path) -> bool:

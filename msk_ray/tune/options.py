@@ -3,7 +3,7 @@
 import argparse
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -206,25 +206,10 @@ def read_options(argv: Sequence[str] | None) -> Options:
         raise ConfigError("--extend: a smoke run cannot be extended; leave out --smoke")
     if args.seeds is not None:
         parse_seeds(args.seeds)
-    return Options(
-        space=space,
-        path=path,
-        overrides=tuple(args.overrides),
-        seeds=args.seeds,
-        early_stopping=args.early_stopping,
-        halve_worlds=args.halve_worlds,
-        smoke=args.smoke,
-        dry_run=args.dry_run,
-        debug_trial=args.debug_trial,
-        gpus_per_trial=args.gpus_per_trial,
-        cpu=args.cpu,
-        max_concurrent=args.max_concurrent,
-        address=args.address,
-        resume=resume,
-        force=args.force,
-        extension=extension,
-        retried=retried,
-    )
+    named = {option.name for option in fields(Options)}
+    given = {name: value for name, value in vars(args).items() if name in named}
+    computed = {"space": space, "path": path, "overrides": tuple(args.overrides), "resume": resume}
+    return Options(**given | computed, extension=extension, retried=retried)
 
 
 def _retried(args: argparse.Namespace) -> frozenset[Outcome]:
