@@ -19,7 +19,7 @@ from msk_ray.dashboard.plots import can_plot, figures
 from msk_ray.errors import ConfigError, MskRayError, StorageError
 from msk_ray.experiment.layout import EVAL_FILE
 from msk_ray.experiment.manifest import Experiment
-from msk_ray.experiment.records import ExperimentReader, TrialRecord, counts, describe_bests, find_experiments
+from msk_ray.experiment.records import ExperimentReader, counts, describe_bests, find_experiments
 from msk_ray.experiment.snapshot import file_stamp
 from msk_ray.experiment.trainings import TrainingReader
 from msk_ray.files import UnusableFile, open_file
@@ -49,14 +49,9 @@ class Page:
 class _CachedPage:
     page: Page
     seen: tuple[Any, ...]
-    trials: list[TrialRecord]
+    """What it was made from. A reader returns the same object for a trial that has not changed."""
     due: float
     """When it is checked again, as monotonic time [s]."""
-
-    def fits(self, seen: tuple[Any, ...], trials: list[TrialRecord]) -> bool:
-        """Whether the page is still current. A reader returns the same object for a trial that has not changed."""
-        same = len(trials) == len(self.trials) and all(a is b for a, b in zip(trials, self.trials, strict=True))
-        return same and seen == self.seen
 
 
 class Library:
@@ -85,7 +80,7 @@ class Library:
     def index(self) -> Page:
         """The list of experiments."""
         with self._lock:
-            return self._cached((), lambda: ((self._rows(), self._training_rows()), []), self._render_index)
+            return self._cached((), lambda: (self._rows(), self._training_rows()), self._render_index)
 
     def page(self, names: Sequence[str]) -> Page:
         """The page of one experiment, or of several side by side.
@@ -201,7 +196,7 @@ class Library:
     def _cached(
         self,
         key: tuple[str, ...],
-        look: Callable[[], tuple[tuple[Any, ...], list[TrialRecord]]],
+        look: Callable[[], tuple[Any, ...]],
         render: Callable[[tuple[Any, ...], str], str],
     ) -> Page:
         """The page cached under `key`, made again if `look` sees a change."""
@@ -209,10 +204,10 @@ class Library:
         if kept is not None and time.monotonic() < kept.due:
             return kept.page
         started = time.monotonic()
-        seen, trials = look()
-        if kept is None or not kept.fits(seen, trials):
+        seen = look()
+        if kept is None or kept.seen != seen:
             version = sha256(f"{key}{time.time_ns()}".encode()).hexdigest()[:16]
-            kept = _CachedPage(Page(version, render(seen, version)), seen, trials, 0.0)
+            kept = _CachedPage(Page(version, render(seen, version)), seen, 0.0)
             self._pages[key] = kept
             while len(self._pages) > _PAGES:
                 self._pages.popitem(last=False)
@@ -228,14 +223,12 @@ class Library:
             self._readers.popitem(last=False)
         return read_again(reader, time.time())
 
-    def _look(self, experiments: Sequence[Experiment]) -> tuple[tuple[Any, ...], list[TrialRecord]]:
+    def _look(self, experiments: Sequence[Experiment]) -> tuple[Any, ...]:
         readings = [self._read(experiment) for experiment in experiments]
-        trials = [trial for reading in readings for trial in reading.trials]
         parts = [part for reading in readings for part in reading.parts()]
         evaluated = [file_stamp(part.best.folder / EVAL_FILE) for part in parts if part.best is not None]
         drawn = [(path, file_stamp(path)) for experiment in experiments for path in _strips(experiment)]
-        told = [(r.question, r.created, r.space_text, r.environment, r.warnings, r.condition) for r in readings]
-        return (told, evaluated, drawn, [self._film(part) for part in parts]), trials
+        return readings, evaluated, drawn, [self._film(part) for part in parts]
 
     def _film(self, part: Reading) -> Film | None:
         best = part.best

@@ -4,24 +4,12 @@ from pathlib import Path
 from typing import Any
 
 from msk_ray.errors import ConfigError
-from msk_ray.experiment.damage import CATALOGUE, Damage, DamagedFile, field, read_object, texts
+from msk_ray.experiment.damage import CATALOGUE, field, read_object, texts
 from msk_ray.experiment.layout import NOTES_FILE
 from msk_ray.files import write_json
 
 LONGEST = 2000
 """Maximum length of a note, in characters."""
-
-
-def read_notes(experiment: Path) -> tuple[dict[str, str], list[Damage]]:
-    """Note by trial id, and the file if it is damaged.
-
-    Raises:
-        StorageFailure: the storage does not give it.
-    """
-    try:
-        return load_notes(experiment), []
-    except DamagedFile as error:
-        return {}, [error.damage]
 
 
 def load_notes(experiment: Path) -> dict[str, str]:

@@ -12,11 +12,11 @@ from typing import Any
 
 from msk_ray.config import parse_settings
 from msk_ray.errors import MskRayError, StorageError
-from msk_ray.experiment.damage import Damage, count_damages, describe_damages, read_text
+from msk_ray.experiment.damage import Damage, DamagedFile, count_damages, describe_damages, read_text
 from msk_ray.experiment.environment import read_environment
 from msk_ray.experiment.layout import ENVIRONMENT_FILE, MANIFEST_FILE, OUTPUT_FILE, SPACE_FILE
 from msk_ray.experiment.manifest import Experiment
-from msk_ray.experiment.notes import read_notes
+from msk_ray.experiment.notes import load_notes
 from msk_ray.experiment.records import ExperimentReader, TrialRecord, best_record, records_by_environment
 from msk_ray.experiment.snapshot import State
 from msk_ray.experiment.trial import Trial
@@ -147,9 +147,13 @@ def read_again(reader: ExperimentReader, now: float) -> Reading:
             warnings.append(f"Which trials were planned is not known: {explain(error)}.")
     text, space = _read_space(experiment.path / SPACE_FILE, warnings)
     environment, damages = _read_environment(experiment.path, warnings)
-    notes, damaged = read_notes(experiment.path)
+    notes = {}
+    try:
+        notes = load_notes(experiment.path)
+    except DamagedFile as error:
+        damages.append(error.damage)
     records, unreadable = reader.look(now, planned, notes)
-    damages = [*damages, *damaged, *(damage for record in records for damage in record.damages)]
+    damages += [damage for record in records for damage in record.damages]
     warnings += [f"A trial is left out: {line}." for line in describe_damages(unreadable, experiment.path)]
     unknown = dict.fromkeys(r.trial.config.undeclared for r in records if r.trial.config.undeclared)
     warnings += [f"Trials are shown as recorded, and cannot be evaluated here: {why}." for why in unknown]
