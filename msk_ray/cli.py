@@ -48,6 +48,13 @@ STORAGE: dict[str, Any] = {
 """Of the option `--storage`, which many commands have."""
 
 
+def positive(text: str) -> int:
+    """A whole number of at least 1, within the range of Warp and CUDA."""
+    if not text.isdecimal() or not 1 <= int(text) < 2**31:
+        raise argparse.ArgumentTypeError(f"must be a whole number of at least 1 and below 2^31, not {text}")
+    return int(text)
+
+
 def seconds(text: str) -> float:
     """An interval of an option, at least 0.1 [s]."""
     value = float(text)

@@ -140,6 +140,7 @@ def _report(checks: list[Check]) -> int:
 def check_repeat(name: str, overrides: Sequence[str], device: str | None, epochs: int) -> Finding:
     """Whether a trial repeats to the last bit; if not, where it begins to differ."""
     from msk_ray.config import load_config
+    from msk_ray.evaluate.measure import default_device
     from msk_ray.repeat import compare
 
     if epochs < 1:
@@ -147,18 +148,12 @@ def check_repeat(name: str, overrides: Sequence[str], device: str | None, epochs
     config = load_config(name, overrides)
     if config.execution.gpus > 1:
         raise ConfigError("--repeat compares trials of one process: write --set execution.gpus=1")
-    place = device or _first_device()
+    place = device or default_device()
     difference, count = compare(config, place, epochs)
     if difference is None:
         return Finding("repeat", f"{epochs} epoch(s) on {place} twice: {count} tensors are equal to the last bit")
     cure = "" if config.execution.deterministic or place == "cpu" else "; write execution.deterministic: true"
     return Finding("repeat", f"two runs on {place} differ first {difference}{cure}", True)
-
-
-def _first_device() -> str:
-    import torch
-
-    return "cuda:0" if torch.cuda.is_available() else "cpu"
 
 
 def check_python() -> list[Finding]:
@@ -259,15 +254,14 @@ def gpu_findings(facts: GpuFacts, device: str | None) -> list[Finding]:
 
 def check_gradient(device: str | None) -> Finding:
     """Gradients of one step of CartPole, compared with float64 differences of C MuJoCo."""
-    import torch
-
     from msk_ray.compiling import count_kernels
     from msk_ray.config import PhysicsConfig
     from msk_ray.envs import env_class
     from msk_ray.envs.cartpole.config import CartPoleSettings
+    from msk_ray.evaluate.measure import default_device
     from msk_ray.step import Simulation, check_gradients
 
-    where = device or ("cuda:0" if torch.cuda.is_available() else "cpu")
+    where = device or default_device()
     env = CartPoleSettings(name="cartpole")
     count_kernels()
     started = time.monotonic()

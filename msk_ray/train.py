@@ -194,9 +194,9 @@ def _choose_device(asked: str | None) -> str:
     """The requested device, else the first GPU, else the CPU; loads torch."""
     # Torch reads this when it is imported: idle threads should sleep, not spin.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    import torch
+    from msk_ray.evaluate.measure import default_device
 
-    return asked or ("cuda:0" if torch.cuda.is_available() else "cpu")
+    return asked or default_device()
 
 
 def _trainer(

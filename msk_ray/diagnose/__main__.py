@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from msk_ray.cli import Parser, run
+from msk_ray.cli import Parser, positive, run
 from msk_ray.compiling import announce_compiling
 from msk_ray.config import SET_HELP
 from msk_ray.errors import CheckpointError, ConfigError
@@ -51,17 +51,17 @@ def parser() -> Parser:
     p.add_argument(
         "--horizons",
         nargs="+",
-        type=int,
+        type=positive,
         default=[1, 4, 8, 16, 32],
         metavar="H",
         help="lengths of trajectories, in env steps (default: 1 4 8 16 32)",
     )
     p.add_argument(
-        "--worlds", type=int, default=4, metavar="W", help="starting states of each kind (default: %(default)s)"
+        "--worlds", type=positive, default=4, metavar="W", help="starting states of each kind (default: %(default)s)"
     )
     p.add_argument(
         "--directions",
-        type=int,
+        type=positive,
         default=16,
         metavar="N",
         help="random directions in the space of the policy's weights (default: %(default)s)",
@@ -124,11 +124,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _check(args: argparse.Namespace) -> None:
     """Check the arguments before torch and Warp are loaded."""
-    for name in ("worlds", "directions"):
-        if getattr(args, name) < 1:
-            raise ConfigError(f"--{name} must be at least 1, not {getattr(args, name)}")
-    if min(args.horizons) < 1:
-        raise ConfigError(f"--horizons must be at least 1, not {min(args.horizons)}")
     if args.seed < 0:
         raise ConfigError(f"--seed must not be negative, not {args.seed}")
     if args.subject.suffix == ".pt" and not args.subject.is_file():

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from msk_ray.cli import STORAGE, Parser, run
+from msk_ray.cli import STORAGE, Parser, positive, run
 from msk_ray.compiling import announce_compiling
 from msk_ray.errors import CheckpointError, ConfigError, MskRayError
 from msk_ray.evaluate import zoo
@@ -94,13 +94,6 @@ def parser() -> Parser:
     p.add_argument("--device", help="cpu or cuda:N (default: the first GPU, or the CPU if there is none)")
     p.add_argument("--storage", **STORAGE)
     return p
-
-
-def positive(text: str) -> int:
-    """A whole number of at least 1, within the range of Warp and CUDA."""
-    if not text.isdecimal() or not 1 <= int(text) < 2**31:
-        raise argparse.ArgumentTypeError(f"must be a whole number of at least 1 and below 2^31, not {text}")
-    return int(text)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -7,10 +7,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from msk_ray.cli import STORAGE, Parser, run
+from msk_ray.cli import STORAGE, Parser, positive, run
 from msk_ray.compiling import announce_compiling
 from msk_ray.errors import CheckpointError, ConfigError
-from msk_ray.evaluate.__main__ import positive
 from msk_ray.evaluate.targets import Target, best_checkpoint, best_trial_folder, find_target, trial_folder_of
 from msk_ray.files import make_folder
 from msk_ray.progress import Pace, announce

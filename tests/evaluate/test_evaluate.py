@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 import torch
 
-from msk_ray.cli import run
+from msk_ray.cli import positive, run
 from msk_ray.config import parse_config
 from msk_ray.errors import CheckpointError
-from msk_ray.evaluate.__main__ import main, positive
+from msk_ray.evaluate.__main__ import main
 from msk_ray.evaluate.measure import Bench, Request, figures
 from msk_ray.evaluate.stored import read_evaluations, store_evaluation
 from msk_ray.experiment.attempts import Attempt, WorldReduction

@@ -7,10 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from msk_ray.cli import Parser, run
+from msk_ray.cli import Parser, positive, run
 from msk_ray.compiling import announce_compiling
 from msk_ray.errors import ConfigError, brief
-from msk_ray.evaluate.__main__ import positive
 from msk_ray.evaluate.stored import eval_file_of, store_evaluation
 from msk_ray.evaluate.targets import best_checkpoint, find_target, trial_folder_of
 from msk_ray.files import make_folder, write_json
