@@ -8,7 +8,7 @@ from typing import Any
 
 from PIL import Image, PngImagePlugin
 
-from msk_ray.errors import CheckpointError, MskRayError
+from msk_ray.errors import MskRayError
 from msk_ray.evaluate.stored import eval_file_of, read_evaluations, store_evaluation
 from msk_ray.evaluate.targets import best_of_trial
 from msk_ray.experiment.checkpoint_file import read_facts
@@ -139,7 +139,7 @@ def _draw(path: Path, out: Path, sha: str, device: str | None) -> None:
     from msk_ray.visualize.film import strip
     from msk_ray.visualize.look import describe_groups, geom_groups
     from msk_ray.visualize.render import View, headless_backend
-    from msk_ray.visualize.strips import episode_frames, log_strip
+    from msk_ray.visualize.strips import episode_frames
 
     headless_backend()
     policy = load_policy(path)
@@ -161,7 +161,3 @@ def _draw(path: Path, out: Path, sha: str, device: str | None) -> None:
     image.save(buffer, "png", pnginfo=stamp)
     out.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(out, buffer.getvalue())
-    trial = path.parent.parent
-    if not (trial / "config.yaml").is_file():
-        raise CheckpointError(f"{trial} has lost its config.yaml")
-    log_strip(image, trial, policy.epoch)

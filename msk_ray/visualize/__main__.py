@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from msk_ray.cli import STORAGE, Parser, positive, run
 from msk_ray.compiling import announce_compiling
 from msk_ray.errors import CheckpointError, ConfigError
-from msk_ray.evaluate.targets import Target, best_checkpoint, best_trial_folder, find_target, trial_folder_of
+from msk_ray.evaluate.targets import Target, best_checkpoint, best_trial_folder, find_target
 from msk_ray.files import make_folder
 from msk_ray.progress import Pace, announce
 from msk_ray.sweep.space import parse_seeds
@@ -94,7 +94,6 @@ def parser() -> Parser:
         metavar="LIST",
         help="groups of geoms to draw, such as 0,3 (default: 0,1,2, and the robot's own if it has no geom in these)",
     )
-    how.add_argument("--tensorboard", action="store_true", help="also add the strip to the trial's TensorBoard")
     how.add_argument("--device", help="cpu or cuda:N, to simulate (default: the first GPU, or the CPU)")
     how.add_argument("--storage", **STORAGE)
     return p
@@ -151,7 +150,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(episode_table(recording))
     if drawing:
         _say_groups(args, recording.model)
-        _draw(args, recording, policy.path, policy.epoch)
+        _draw(args, recording)
     return 0
 
 
@@ -174,8 +173,6 @@ def _check(args: argparse.Namespace) -> Target:
         )
     if args.no_render and args.geom_groups is not None:
         raise ConfigError("--geom-groups: --no-render draws nothing; leave out one of the two")
-    if args.tensorboard and not args.strip:
-        raise ConfigError("--tensorboard needs --strip FILE")
     _check_files(args)
     if drawing:
         from msk_ray.visualize.render import headless_backend
@@ -243,7 +240,7 @@ def _say_groups(args: argparse.Namespace, model: "mujoco.MjModel") -> None:
         print(f"{drawn}; --geom-groups chooses")
 
 
-def _draw(args: argparse.Namespace, recording: "Recording", checkpoint: Path, epoch: int) -> None:
+def _draw(args: argparse.Namespace, recording: "Recording") -> None:
     from msk_ray.visualize.film import save_image, strip, write_frames, write_video
     from msk_ray.visualize.render import View
     from msk_ray.visualize.strips import episode_frames
@@ -260,10 +257,6 @@ def _draw(args: argparse.Namespace, recording: "Recording", checkpoint: Path, ep
         image = strip(*episode_frames(recording, args.frames or 8, View(width, height, args.camera, args.geom_groups)))
         save_image(image, args.strip)
         print(f"strip of {args.frames or 8} frames in {args.strip}")
-        if args.tensorboard:
-            from msk_ray.visualize.strips import log_strip
-
-            print(f"TensorBoard: {log_strip(image, trial_folder_of(checkpoint), epoch)}")
 
 
 def _film(recording: "Recording", fps: float, view: "View") -> Iterator["np.ndarray"]:

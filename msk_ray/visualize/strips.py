@@ -5,19 +5,13 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from msk_ray.errors import CheckpointError
 from msk_ray.evaluate.measure import Bench, Request
 from msk_ray.experiment.layout import best_checkpoint
 from msk_ray.training import load_policy
 from msk_ray.training.checkpoint import milestones
-from msk_ray.training.loggers.tensorboard import log_image
 from msk_ray.visualize.episodes import Recording, record
 from msk_ray.visualize.film import grid
 from msk_ray.visualize.render import View, frames
-
-STRIP_FOLDER = "film"
-"""Subfolder of a trial for strips: TensorBoard follows only the newest event file of a folder, so here they do not stop
-it following the trial's own."""
 
 
 def episode_frames(recording: Recording, count: int, view: View, world: int = 0) -> tuple[list[np.ndarray], list[str]]:
@@ -66,19 +60,6 @@ def progression(
             + (f", {ending} after {recording.length(0) * recording.timestep:.1f} s" if ending != "time" else "")
         )
     return grid(rows, titles, captions), titles
-
-
-def log_strip(image: Image.Image, trial: Path, epoch: int) -> Path:
-    """Add a strip to a trial's TensorBoard as `film/evaluation`, at its policy's epoch.
-
-    Raises:
-        CheckpointError: `trial` is not the folder of a trial.
-    """
-    if not (trial / "config.yaml").is_file():
-        raise CheckpointError(f"--tensorboard: {trial} is not a trial's folder")
-    folder = trial / STRIP_FOLDER
-    log_image(folder, "film/evaluation", np.asarray(image), epoch)
-    return folder
 
 
 def _spread(length: int, count: int) -> np.ndarray:

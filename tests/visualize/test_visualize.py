@@ -108,7 +108,7 @@ def test_a_gif_repeats_and_keeps_time(tmp_path: Path) -> None:
         assert np.abs(np.asarray(image.convert("RGB")).astype(int) - 240).max() <= 3, "in a colour of the last one"
 
 
-def test_frames_progression_and_tensorboard(sweep: Experiment, tmp_path: Path, drawing: str) -> None:
+def test_frames_and_progression(sweep: Experiment, tmp_path: Path, drawing: str) -> None:
     folder = Path(shutil.copytree(sweep.trial_folder(sweep.trials()[0].id), tmp_path / "trial"))
     small = ["--size", "64x48", "--device", "cpu", "--frames", "3"]
     assert run(main, [str(folder), "--save-frames", str(tmp_path / "f"), "--fps", "6", "--episodes", "2", *small]) == 0
@@ -119,13 +119,6 @@ def test_frames_progression_and_tensorboard(sweep: Experiment, tmp_path: Path, d
     with Image.open(grid) as image:
         # Four policies along the way and the best, each row of a title, frames, times and a gap.
         assert image.size == (3 * 64 + 2 * 4, 5 * (16 + 48 + 16 + 4) - 4)
-    assert run(main, [str(folder), "--strip", str(tmp_path / "s.png"), "--tensorboard", *small]) == 0
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-    events = EventAccumulator(str(folder / "film")).Reload()
-    assert events.Tags()["images"] == ["film/evaluation"]
-    (shown,) = events.Images("film/evaluation")
-    assert (shown.width, shown.height) == (3 * 64 + 2 * 4, Image.open(tmp_path / "s.png").height)
 
 
 def test_statistics_without_pictures(sweep: Experiment, capsys: pytest.CaptureFixture[str]) -> None:
@@ -305,7 +298,6 @@ def test_a_drawing_process_that_dies_is_reported(drawing: str) -> None:
         (["small"], "there is no display: add --video"),
         (["small", "--no-render", "--video", "a.mp4"], "--no-render draws nothing"),
         (["small", "--video", "a.webm"], "ends in .mp4"),
-        (["small", "--tensorboard", "--no-render"], "needs --strip"),
         (["small", "--no-render", "--fps", "0"], "--fps 0: write a number above 0"),
         (["small", "--no-render", "--speed", "nan"], "--speed nan: write a number above 0"),
         (["small", "--no-render", "--fps", "inf"], "--fps inf: write a number above 0, up to 1000"),

@@ -3,11 +3,9 @@
 from pathlib import Path
 from typing import ClassVar
 
-import numpy as np
 from tensorboard.compat.proto.summary_pb2 import Summary
 from torch.utils.tensorboard import SummaryWriter
 
-from msk_ray.errors import StorageFailure
 from msk_ray.training.loggers.base import Logger
 
 _PROGRESS = ("env_steps", "seconds", "env_steps_per_s")
@@ -61,22 +59,3 @@ class TensorBoard(Logger):
         board, self._board = self._board, None
         if board is not None:
             board.close()
-
-
-def log_image(folder: Path, tag: str, image: np.ndarray, epoch: int) -> None:
-    """Put a picture into TensorBoard.
-
-    Args:
-        folder: for the event file; another one than for scalars, because TensorBoard stops reading the older file.
-        tag: the chart's name.
-        image: shape (height, width, 3), uint8.
-        epoch: its step.
-
-    Raises:
-        StorageFailure: the disk is full or the folder not writable.
-    """
-    try:
-        with SummaryWriter(str(folder)) as board:
-            board.add_image(tag, image, epoch, dataformats="HWC")
-    except OSError as error:
-        raise StorageFailure(f"cannot write {folder}: {error.strerror or error}") from error

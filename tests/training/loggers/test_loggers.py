@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
@@ -20,7 +19,7 @@ from msk_ray.errors import ConfigError, LoggerError, SimulationError, StorageFai
 from msk_ray.experiment.metrics import read_metrics
 from msk_ray.training import Trainer, precompile
 from msk_ray.training.loggers import TrialLog
-from msk_ray.training.loggers.tensorboard import board_tag, log_image
+from msk_ray.training.loggers.tensorboard import board_tag
 
 pytestmark = pytest.mark.long
 
@@ -105,13 +104,6 @@ def test_figures_known_later_are_added_to_their_row(tmp_path: Path) -> None:
     assert [r.get("eval/score") for r in read_metrics(tmp_path / "metrics.jsonl")] == [0.0, None, 20.0]
     assert all(r["a"] == 1.0 for r in read_metrics(tmp_path / "metrics.jsonl"))
     assert not TrialLog(tmp_path / "other", config("tensorboard", "wandb")).takes_late
-
-
-def test_a_picture_in_tensorboard(tmp_path: Path) -> None:
-    log_image(tmp_path / "film", "film/evaluation", np.zeros((4, 6, 3), np.uint8), 7)
-    events = EventAccumulator(str(tmp_path / "film")).Reload()
-    (image,) = events.Images("film/evaluation")
-    assert (image.height, image.width, image.step) == (4, 6, 7)
 
 
 def test_metrics_jsonl_is_written_without_any_logger(tmp_path: Path) -> None:
