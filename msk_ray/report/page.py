@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote
 
 import orjson
@@ -62,22 +61,6 @@ class Section:
     """Folder of the page; links are relative to it."""
     places: Mapping[Path, int]
     """Trials' positions in the page's list."""
-
-    @property
-    def words(self) -> str:
-        return _WORDS[self.reading.condition]
-
-    def rows(self) -> Any:
-        return variant_rows(self.reading, self.baseline)
-
-    def failures(self) -> Any:
-        return failures(self.reading)
-
-    def counts(self) -> dict[str, int]:
-        return outcome_counts(self.reading)
-
-    def figures(self) -> list[str]:
-        return outcome_figures(self.reading.trials)
 
     def ordered(self) -> list[TrialRecord]:
         """Trials, the best score first."""
@@ -255,6 +238,13 @@ def _templates() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
         undefined=StrictUndefined,
+    )
+    environment.globals.update(
+        condition_words=_WORDS,
+        failures=failures,
+        outcome_counts=outcome_counts,
+        outcome_figures=outcome_figures,
+        variant_rows=variant_rows,
     )
     environment.filters.update(
         number=_number, signed=_signed, percent=_percent, duration=format_duration, steps=format_steps
