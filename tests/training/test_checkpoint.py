@@ -1,8 +1,6 @@
 """Checkpoints are whole or refused."""
 
-import hashlib
 import io
-import json
 import pickle
 from pathlib import Path
 
@@ -61,18 +59,6 @@ def test_a_checkpoint_with_the_right_checksum_that_holds_no_state_is_passed_over
     assert len(faults) == 1
     assert "epoch_000010.pt holds no state of a trial" in faults[0]
     assert "\n" not in faults[0]
-
-
-def test_a_checkpoint_of_the_version_before_is_read(tmp_path: Path) -> None:
-    buffer = io.BytesIO()
-    torch.save({"x": torch.arange(3)}, buffer)
-    path = tmp_path / "epoch_000001.pt"
-    path.write_bytes(buffer.getvalue())
-    manifest = {"format": 1, "sha256": hashlib.sha256(buffer.getvalue()).hexdigest(), "epoch": 1}
-    path.with_suffix(".json").write_text(json.dumps(manifest))
-    assert torch.equal(read_checkpoint(path)["x"], torch.arange(3))
-    prune_checkpoints(tmp_path, 0)
-    assert not list(tmp_path.iterdir())
 
 
 def test_the_newest_whole_checkpoint_is_found_past_a_torn_one(tmp_path: Path) -> None:
