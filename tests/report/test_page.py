@@ -217,4 +217,3 @@ def test_the_best_policy_is_shown_and_not_made_twice(reported: Experiment, capsy
     assert "evaluating" not in capsys.readouterr().out
     # A strip of another policy, or a torn one, is not taken for this one's.
     assert strip_text(strip, "another") is None
-    assert list((best.folder / "film").glob("events*"))
