@@ -1,0 +1,90 @@
+"""The settings of the velocity tasks. Source: `mjlab/tasks/velocity` of mjlab 1.6.0."""
+
+import math
+
+from pydantic import PositiveFloat
+
+from msk_ray.config.commands import Command, with_commands
+from msk_ray.config.rewards import reward_section, with_reward
+from msk_ray.config.sections import Count, Fraction, NonNegative, Reward
+from msk_ray.config.terms import Term, terms_in
+from msk_ray.envs.mjcf.config import MjcfSettings
+
+VELOCITY = Command(
+    "velocity",
+    {
+        "lin_vel_x": (-1.5, 2.0),
+        "lin_vel_y": (-1.0, 1.0),
+        "ang_vel_z": (-0.7, 0.7),
+        "heading": (-math.pi, math.pi),
+        # Below a share of mjlab's, the command is another: see `VelocityEnv.velocity_command`.
+        "stand": (0.0, 1.0),
+        "go_ahead": (0.0, 1.0),
+        "turn_to_heading": (0.0, 1.0),
+    },
+    every=(3.0, 8.0),
+)
+"""Velocity forward and to the left [m/s], yaw rate [rad/s], heading [rad], in the ranges that mjlab evaluates with."""
+
+
+class VelocityShape(Reward):
+    """The settings of terms other than their weights."""
+
+    tail: Fraction = 0.0
+    """Share of 1/(1 + x) in the terms `track_linear_velocity` and `track_angular_velocity`, which are e^−x in scores:
+    that has no slope far from the command. For training."""
+
+
+def velocity_terms(*others: Term) -> tuple[Term, ...]:
+    """mjlab's terms with its weights, but for those that differ between its robots."""
+    return terms_in(
+        "msk_ray.robots.terms",
+        Term("track_linear_velocity", 2.0),
+        Term("track_angular_velocity", 2.0),
+        Term("upright", 1.0),
+        Term("pose", 1.0, "variable_posture"),
+        Term("dof_pos_limits", -1.0),
+        Term("action_rate_l2", -0.1),
+        Term("air_time", 0.0, gradient=False, optional=True),
+        Term("foot_clearance", -2.0),
+        Term("foot_swing_height", -0.25, gradient=False),
+        Term("foot_slip", -0.1),
+        Term("soft_landing", -1e-5, gradient=False),
+        *others,
+    )
+
+
+@with_commands(VELOCITY)
+class VelocitySettings(MjcfSettings):
+    """A legged robot that follows commands for its velocity."""
+
+    episode_length: Count = 1000
+    reset_noise: NonNegative = 0.0
+    reset_velocity_noise: NonNegative = 0.0
+    action_range: PositiveFloat = 1.0
+    """mjlab's action for an action of 1 of the policy. mjlab's are not bounded; 1 asks a joint for an angle that its
+    servo, standing still, holds with a quarter of its largest torque."""
+    reward: VelocityShape = VelocityShape()
+
+
+GO1_TERMS = velocity_terms(
+    Term("body_ang_vel", 0.0, optional=True),
+    Term("angular_momentum", 0.0, optional=True),
+)
+G1_TERMS = velocity_terms(
+    Term("body_ang_vel", -0.05),
+    Term("angular_momentum", -0.02),
+    Term("self_collisions", -1.0, gradient=False),
+)
+Go1Reward = reward_section("Go1Reward", __name__, GO1_TERMS, VelocityShape)
+G1Reward = reward_section("G1Reward", __name__, G1_TERMS, VelocityShape)
+
+
+@with_reward(Go1Reward)
+class Go1VelocitySettings(VelocitySettings):
+    """mjlab's `Mjlab-Velocity-Flat-Unitree-Go1`."""
+
+
+@with_reward(G1Reward)
+class G1VelocitySettings(VelocitySettings):
+    """mjlab's `Mjlab-Velocity-Flat-Unitree-G1`."""

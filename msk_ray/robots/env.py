@@ -1,0 +1,277 @@
+"""Legged robots that follow commands for their velocity. Source: `mjlab/tasks/velocity` of mjlab 1.6.0.
+
+Axes: W worlds, J joints but for the free one, F feet.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import ClassVar, Generic, TypeVar
+
+import mujoco
+import torch
+from torch import Tensor
+
+from msk_ray.config import PhysicsConfig
+from msk_ray.envs.layout import Entry, entries, vector
+from msk_ray.envs.memory import Memory
+from msk_ray.envs.mjcf.env import MjcfEnv
+from msk_ray.robots.config import (
+    G1_TERMS,
+    GO1_TERMS,
+    VELOCITY,
+    G1VelocitySettings,
+    Go1VelocitySettings,
+    VelocitySettings,
+)
+from msk_ray.robots.robot import Robot, by_joint
+from msk_ray.robots.robots import G1, GO1
+from msk_ray.step import StepState
+from msk_ray.step.autograd.contact_state import AirTime, Contact
+from msk_ray.step.autograd.tangent import quat_conjugate, quat_multiply, quat_rotate
+
+AnyVelocitySettings = TypeVar("AnyVelocitySettings", bound=VelocitySettings)
+
+_TORQUE_SHARE = 0.25
+"""Share of a servo's largest torque with which it begins to turn to the target of mjlab's action 1."""
+_LIMIT_SHARE = 0.9
+"""Share of a joint's range, about its middle, beyond which the term `dof_pos_limits` counts."""
+_FALLEN = math.radians(70.0)
+"""Tilt of the base from which an episode ends."""
+_START = torch.tensor([0.5, 0.5, 0.02, math.pi])
+"""Half the range of the initial position [m] and yaw [rad]."""
+_START_HEIGHT = 0.03
+"""Mean height of initial states above the keyframe [m]."""
+_SLOW, _FAST = 0.05, 1.5
+"""Commands, in m/s plus rad/s, from which it walks and runs."""
+_SHARES = (0.1, 0.2, 0.3)
+"""Of commands to stand, to walk straight ahead, and to turn to a heading."""
+_SLOWEST_AHEAD = 0.3
+"""Smallest command straight ahead [m/s]."""
+_HEADING_STIFFNESS = 0.5
+"""Yaw rate asked for per error of the heading [1/s]."""
+
+
+class VelocityEnv(MjcfEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
+    """A robot on flat ground whose base is to move as commanded.
+
+    A subclass has `mjcf`, `robot` and `terms` from `msk_ray.robots.terms`. The MJCF has one free joint, which comes
+    first, J hinges with a position servo each, a keyframe with the default pose, a body `terrain`, and the sensors
+    `imu_lin_vel`, `imu_ang_vel` and, for the term `angular_momentum`, `root_angmom`.
+
+    Observation (9 + 3 J + 3), in this order:
+
+    ======= ==========================================================================
+    3       velocity of the IMU in its own axes [m/s]
+    3       angular velocity of the IMU in its own axes [rad/s]
+    3       direction of gravity in the axes of the base
+    J       angles of the joints minus those of the default pose [rad]
+    J       their rates [rad/s]
+    J       last action, as mjlab counts it
+    3       command: velocity forward and to the left [m/s], yaw rate [rad/s]
+    ======= ==========================================================================
+
+    An action turns the targets of the servos away from the default pose; see `control`. Actions and joints are in the
+    order of the MJCF's joints, not in that of its actuators.
+
+    The reward is that of mjlab per second, which multiplies it by the 0.02 s of a step. mjlab measures bodies for it
+    5 ms before the end of a step; here they are measured at the end.
+    """
+
+    Settings = VelocitySettings  # type: ignore[assignment]
+    commands = (VELOCITY,)
+    robot: ClassVar[Robot]
+
+    def prepare(self) -> None:
+        model = self.model
+        hinges = range(1, model.njnt)
+        self.joint_names = [model.joint(joint).name for joint in hinges]
+        servo_of = {int(model.actuator_trnid[servo, 0]): servo for servo in range(model.nu)}
+        servos = [servo_of[joint] for joint in hinges]
+        self.default_pose = self._start.qpos[0, 7:]
+        self.action_size = len(servos)
+        self.action_scale = self._tensor(
+            _TORQUE_SHARE * model.actuator_forcerange[servos, 1] / model.actuator_gainprm[servos, 0]
+        )
+        self._joint_of_servo = torch.tensor(
+            [int(joint) - 1 for joint in model.actuator_trnid[:, 0]], device=self.device
+        )
+        low, high = model.jnt_range[1:].T
+        middle, half = (low + high) / 2.0, _LIMIT_SHARE * (high - low) / 2.0
+        self.joint_limits = self._tensor(middle - half), self._tensor(middle + half)
+        spread = self.robot.pose_spread
+        self._spreads = torch.tensor(
+            [by_joint(values, self.joint_names) for values in (spread.standing, spread.walking, spread.running)],
+            device=self.device,
+        )
+        self._down = torch.tensor([0.0, 0.0, -1.0], device=self.device)
+        self._start_range = _START.to(self.device)
+
+    @classmethod
+    def edit(cls, spec: mujoco.MjSpec, config: AnyVelocitySettings, physics: PhysicsConfig) -> None:
+        """Let the solver converge, which gradients need; mjlab stops it after 10 iterations."""
+        if physics.iterations is None:
+            spec.option.iterations = max(spec.option.iterations, 100)
+        if physics.ls_iterations is None:
+            spec.option.ls_iterations = max(spec.option.ls_iterations, 50)
+
+    # Episodes
+
+    def draw_physics(self, count: int) -> StepState:
+        start = super().draw_physics(count)
+        shift = self._start_range * self.uniform(count, 4)
+        turn = torch.zeros((count, 4), device=self.device)
+        turn[:, 0], turn[:, 3] = torch.cos(shift[:, 3] / 2.0), torch.sin(shift[:, 3] / 2.0)
+        position = start.qpos[:, :3] + shift[:, :3]
+        position[:, 2] += _START_HEIGHT
+        orientation = quat_multiply(turn, start.qpos[:, 3:7])
+        return start._replace(qpos=torch.cat((position, orientation, start.qpos[:, 7:]), dim=-1))
+
+    def fell(self, state: StepState) -> Tensor:
+        return self.frames(state).axis(self.robot.base, 2)[:, 2] < math.cos(_FALLEN)
+
+    def outcome_terms(self, state: StepState) -> dict[str, Tensor]:
+        """`linear_error` [m/s] and `yaw_error` [rad/s] are distances of the base's velocities from the command."""
+        command = self.velocity_command()
+        linear, angular = self.base_velocities(state)
+        return {
+            "linear_error": torch.linalg.vector_norm(command[:, :2] - linear[:, :2], dim=-1),
+            "yaw_error": (command[:, 2] - angular[:, 2]).abs(),
+        }
+
+    # What terms and observation use
+
+    def velocity_command(self) -> Tensor:
+        """Velocity forward and to the left [m/s] and yaw rate [rad/s] asked for in the current state, (W, 3)."""
+        forward, left, turn, heading, *chances = self.command("velocity").unbind(-1)
+        stands, goes_ahead, turns = (chance < share for chance, share in zip(chances, _SHARES, strict=True))
+        w, x, y, z = self.state.physics.qpos[:, 3:7].unbind(-1)
+        error = heading - torch.atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
+        error = torch.remainder(error + math.pi, 2.0 * math.pi) - math.pi
+        toward = (_HEADING_STIFFNESS * error).clamp(*self.command_ranges["velocity"][:, 2])
+        forward = torch.where(goes_ahead, forward.abs().clamp_min(_SLOWEST_AHEAD), forward)
+        left, turn = left.masked_fill(goes_ahead, 0.0), turn.masked_fill(goes_ahead, 0.0)
+        command = torch.stack((forward, left, torch.where(turns, toward, turn)), dim=-1)
+        return command.masked_fill(stands[:, None], 0.0)
+
+    def commanded_speed(self) -> Tensor:
+        """Size of the command, in m/s plus rad/s, (W,)."""
+        command = self.velocity_command()
+        return torch.linalg.vector_norm(command[:, :2], dim=-1) + command[:, 2].abs()
+
+    def is_commanded(self) -> Tensor:
+        """1 where the robot is to move, else 0, (W,)."""
+        return (self.commanded_speed() > _SLOW).float()
+
+    def pose_spread(self) -> Tensor:
+        """Spread of the joints about the default pose that the command allows [rad], (W, J)."""
+        speed = self.commanded_speed()
+        return self._spreads[(speed >= _SLOW).long() + (speed >= _FAST).long()]
+
+    def base_velocities(self, state: StepState) -> tuple[Tensor, Tensor]:
+        """Velocity [m/s] and angular velocity [rad/s] of the base in its own axes, each (W, 3)."""
+        frames, base = self.frames(state), self.robot.base
+        into_base = quat_conjugate(frames.orientation(base))
+        return quat_rotate(into_base, frames.velocity(base)), quat_rotate(into_base, frames.angular_velocity(base))
+
+    def gravity_in(self, state: StepState, body: str) -> Tensor:
+        """Direction of gravity in the axes of a body, (W, 3)."""
+        orientation = self.frames(state).orientation(body)
+        return quat_rotate(quat_conjugate(orientation), self._down.expand(self.nworld, 3))
+
+    def foot_heights(self, state: StepState) -> Tensor:
+        """Heights of the feet above the ground [m], (W, F); 0 below it."""
+        return self.frames(state).site_position(self.robot.feet)[..., 2].clamp_min(0.0)
+
+    def foot_contact(self, state: StepState) -> Contact:
+        """What the feet have touched of the ground in the step that led to `state`."""
+        return self.contact(state, self.robot.foot_parts, self.robot.foot_kind, "terrain", "body")
+
+    def air_time(self) -> AirTime:
+        """Times of the feet in the air and on the ground [s], each (W, F), at the end of the step."""
+        return AirTime.of(self.next_memory["air_time"])
+
+    def landed(self) -> Tensor:
+        """1 for feet whose contact with the ground has begun in this step, else 0, (W, F)."""
+        return self.air_time().first_contact(self.config.control_timestep).float()
+
+    def mjlab_action(self, action: Tensor) -> Tensor:
+        """mjlab's action for one of the policy, both (W, J)."""
+        return self.config.action_range * action
+
+    # Memory
+
+    def memories(self) -> Mapping[str, Memory]:
+        """Times of the feet in the air and on the ground, their heights in the current state, and their largest heights
+        since they left the ground [m]."""
+        feet = len(self.robot.feet)
+        height = Memory(feet, gradient=True)
+        return {"air_time": Memory(4 * feet), "foot_height": height, "peak_height": height}
+
+    def begin_memory(self, state: StepState) -> Mapping[str, Tensor]:
+        return {"foot_height": self.foot_heights(state)}
+
+    def remember(self, state: StepState, action: Tensor) -> Mapping[str, Tensor]:
+        touching = self.foot_contact(state).touching
+        times = AirTime.of(self.memory["air_time"]).after(touching, self.model.opt.timestep)
+        peak, height = self.memory["peak_height"], self.memory["foot_height"]
+        peak = torch.where(touching[-1], peak, torch.maximum(peak, height))
+        return {
+            "air_time": times.memory,
+            "foot_height": self.foot_heights(state),
+            "peak_height": peak.masked_fill(times.first_contact(self.config.control_timestep), 0.0),
+        }
+
+    # Control and observation
+
+    def control(self, action: Tensor) -> Tensor:
+        """Targets of the servos [rad]: the default pose + `action_scale` × `action_range` × action."""
+        target = self.default_pose + self.action_scale * self.mjlab_action(action)
+        return target[:, self._joint_of_servo]
+
+    def action_names(self) -> list[str]:
+        return self.joint_names
+
+    def observe(self, state: StepState, action: Tensor) -> Tensor:
+        sensors = self.sensors(state)
+        return torch.cat(
+            (
+                sensors["imu_lin_vel"],
+                sensors["imu_ang_vel"],
+                self.gravity_in(state, self.robot.base),
+                state.qpos[:, 7:] - self.default_pose,
+                state.qvel[:, 6:],
+                self.mjlab_action(action),
+                self.velocity_command(),
+            ),
+            dim=-1,
+        )
+
+    def observation_layout(self) -> list[Entry]:
+        return [
+            *vector("imu_velocity", "m/s"),
+            *vector("imu_angular_velocity", "rad/s"),
+            *vector("gravity"),
+            *entries((f"{joint}_angle" for joint in self.joint_names), "rad"),
+            *entries((f"{joint}_rate" for joint in self.joint_names), "rad/s"),
+            *entries(f"{joint}_action" for joint in self.joint_names),
+            *entries(("command_forward", "command_left"), "m/s"),
+            Entry("command_yaw_rate", "rad/s"),
+        ]
+
+
+class Go1Velocity(VelocityEnv[Go1VelocitySettings]):
+    """mjlab's `Mjlab-Velocity-Flat-Unitree-Go1`."""
+
+    Settings = Go1VelocitySettings
+    mjcf = "scenes/go1_flat.xml"
+    robot = GO1
+    terms = GO1_TERMS
+
+
+class G1Velocity(VelocityEnv[G1VelocitySettings]):
+    """mjlab's `Mjlab-Velocity-Flat-Unitree-G1`."""
+
+    Settings = G1VelocitySettings
+    mjcf = "scenes/g1_flat.xml"
+    robot = G1
+    terms = G1_TERMS

@@ -1,0 +1,1 @@
+"""Scoring in mjlab's own environments."""

@@ -1,0 +1,214 @@
+"""`evaluate --in mjlab`: a policy in mjlab's unmodified velocity task, in a Python of its own.
+
+mjlab 1.6 needs MuJoCo 3.11 and msk_ray 4.0, so one environment cannot hold both.
+
+Axes: W worlds, O observation, J actions.
+"""
+
+import json
+import subprocess
+import tempfile
+from contextlib import AbstractContextManager
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from msk_ray.config import Config
+from msk_ray.errors import ConfigError, SimulationError
+from msk_ray.evaluate.measure import EvaluationSetup, Request, entry_of
+from msk_ray.robots.config import G1VelocitySettings, Go1VelocitySettings, VelocitySettings
+from msk_ray.robots.mjlab import worker
+from msk_ray.robots.mjlab.elsewhere import MJLAB
+from msk_ray.training import SavedPolicy
+from msk_ray.training.evaluation import Episodes
+from msk_ray.training.threads import use_threads
+
+VERSION: Final = "1.6."
+TASKS: Final[dict[type[VelocitySettings], str]] = {
+    Go1VelocitySettings: "Mjlab-Velocity-Flat-Unitree-Go1",
+    G1VelocitySettings: "Mjlab-Velocity-Flat-Unitree-G1",
+}
+PLAY: Final = "mjlab play"
+PUSHED: Final = "mjlab pushed"
+"""With the pushes and the noise of mjlab's training; friction, encoder bias and centre of mass are random in both."""
+EPISODES_ON_GPU: Final = 256
+EPISODES_ON_CPU: Final = 8
+STEPS: Final = 1000
+
+
+def requests(worlds: int | None, seeds: tuple[int, ...] | None, steps: int | None) -> list[Request]:
+    """With mjlab's settings for playing, and with pushes and noise: 256 episodes of 1000 steps on a GPU, 8 on a CPU,
+    with seed 0, unless other numbers are given."""
+    episodes = EPISODES_ON_GPU if torch.cuda.is_available() else EPISODES_ON_CPU
+    return [Request(name, worlds or episodes, seeds or (0,), steps or STEPS) for name in (PLAY, PUSHED)]
+
+
+def task_of(config: Config) -> str:
+    """The task of mjlab in which a trial's policy acts.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    env = config.env
+    task = next((task for settings, task in TASKS.items() if isinstance(env, settings)), None)
+    if task is None:
+        raise ConfigError(f"--in mjlab: env {env.name} is not a task of mjlab; train on go1_velocity or g1_velocity")
+    if env.control_timestep != VelocitySettings.model_fields["control_timestep"].default:
+        raise ConfigError(
+            f"--in mjlab: trained with a control step of {env.control_timestep:g} s, but mjlab's is 0.02 s; leave out "
+            "env.control_timestep"
+        )
+    return task
+
+
+class MjlabScorer:
+    """Evaluates policies in mjlab.
+
+    Args:
+        python: the interpreter of an environment that has mjlab.
+    """
+
+    def __init__(self, python: Path) -> None:
+        self._python = python.absolute()  # not resolved: a virtual environment's is a link to another
+
+    def check(self, config: Config, request: Request) -> None:
+        """Raise ConfigError if a trial's policy does not act in this environment. Runs nothing."""
+        task_of(config)
+
+    def evaluate(self, policy: SavedPolicy, request: Request) -> dict[str, Any]:
+        """One entry of `eval.json`: what was evaluated, how, and the results. `request` is one of `requests`.
+
+        Raises:
+            ConfigError: the policy does not act in this environment, or mjlab is missing or of another version.
+            SimulationError: mjlab stopped.
+        """
+        task = task_of(policy.config)
+        use_threads(policy.config)
+        assert request.worlds is not None
+        assert request.steps is not None
+        seeds = request.seeds or (0,)
+        asked = {"task": task, "pushed": request.physics == PUSHED, "worlds": request.worlds, "steps": request.steps}
+        runs = []
+        for seed in seeds:
+            with _Worker(self._python, {**asked, "seed": seed}) as running:
+                runs.append(running.episodes(policy))
+        setup = EvaluationSetup(request.physics, False, request.worlds, seeds, request.steps, running.device)
+        return entry_of(policy, setup, runs, running.terms) | {"mjlab": running.versions}
+
+
+class _Worker(AbstractContextManager["_Worker"]):
+    """A process of mjlab's Python. It is ended on exit, if it has not ended by itself.
+
+    Attributes:
+        versions: of the packages there.
+        device: it runs on.
+        terms: names of the parts of the reward.
+    """
+
+    def __init__(self, python: Path, asked: dict[str, Any]) -> None:
+        self._asked = asked
+        self._messages = tempfile.TemporaryFile()  # noqa: SIM115  # closed on exit
+        self._process = subprocess.Popen(
+            # Isolated: this file lies in a folder with a module `mjlab`, and PYTHONPATH is meant for our versions.
+            [str(python), "-I", worker.__file__, json.dumps(asked)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._messages,
+        )
+        try:
+            self._greet()
+        except BaseException:
+            self.__exit__(None, None, None)
+            raise
+
+    def _greet(self) -> None:
+        line = self._out.readline()
+        if not line:
+            raise ConfigError(f"--in mjlab: {self._last_words()}; {MJLAB.install}")
+        hello = json.loads(line)
+        self.versions: dict[str, str] = hello["versions"]
+        self.device: str = hello["device"]
+        self.terms: list[str] = hello["terms"]
+        if not self.versions["mjlab"].startswith(VERSION):
+            raise ConfigError(
+                f"--in mjlab: mjlab {self.versions['mjlab']} has other tasks than {VERSION}x; {MJLAB.install}"
+            )
+        self._actions: int = hello["actions"]
+        self._observations: int = hello["observations"]
+        self._record = worker.record(self._observations, len(self.terms))
+
+    @property
+    def _out(self) -> IO[bytes]:
+        assert self._process.stdout is not None
+        return self._process.stdout
+
+    def episodes(self, policy: SavedPolicy) -> Episodes:
+        """The first episode of each world."""
+        assert isinstance(policy.config.env, VelocitySettings)
+        worlds, scale = self._asked["worlds"], policy.config.env.action_range
+        obs = self._read(np.dtype(("<f4", (self._observations,))))
+        running = np.ones(worlds, dtype=bool)
+        fell = np.zeros(worlds, dtype=bool)
+        length = np.zeros(worlds)
+        sums = {name: np.zeros((worlds, *self._record[name].shape)) for name in _SUMMED}
+        for _ in range(self._asked["steps"]):
+            self._write(scale * policy(obs))
+            step = self._read(self._record)
+            length += running
+            ended = running & step["terminated"]
+            for name, total in sums.items():
+                # A world that fell is elsewhere already when errors are measured.
+                counted = running & ~ended if name in _ERRORS else running
+                total[counted] += step[name][counted]
+            fell |= ended
+            running &= ~ended
+            obs = np.ascontiguousarray(step["obs"])
+        return Episodes(
+            score=torch.from_numpy(sums["reward"]),
+            length=torch.from_numpy(length),
+            fell=torch.from_numpy(fell),
+            diverged=torch.from_numpy(~np.isfinite(sums["reward"])),
+            terms=torch.from_numpy(sums["terms"]),
+            outcomes={name: torch.from_numpy(sums[name]) for name in _ERRORS},
+            success=None,
+        )
+
+    def _write(self, actions: NDArray[np.floating]) -> None:
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(actions.astype("<f4").tobytes())
+            self._process.stdin.flush()
+        except BrokenPipeError:
+            raise SimulationError(f"--in mjlab: {self._last_words()}") from None
+
+    def _read(self, record: np.dtype) -> np.ndarray:
+        """What all worlds sent, (W, ...)."""
+        size = self._asked["worlds"] * record.itemsize
+        data = self._out.read(size)
+        if len(data) < size:
+            raise SimulationError(f"--in mjlab: {self._last_words()}")
+        base, shape = record.subdtype or (record, ())
+        return np.frombuffer(bytearray(data), base).reshape(-1, *shape)
+
+    def _last_words(self) -> str:
+        """The last line that the process wrote before it ended."""
+        self._process.wait()
+        self._messages.seek(0)
+        lines = self._messages.read().decode(errors="replace").split("\n")
+        said = [line.strip() for line in lines if line.strip()]
+        return said[-1] if said else f"it ended with exit code {self._process.returncode}"
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._process.kill()
+        self._process.communicate()
+        self._messages.close()
+
+
+_ERRORS: Final = ("linear_error", "yaw_error")
+_SUMMED: Final = ("reward", "terms", *_ERRORS)

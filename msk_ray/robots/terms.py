@@ -1,0 +1,134 @@
+"""The reward terms of the velocity tasks, under mjlab's names, for classes derived from `VelocityEnv`.
+
+Each gives a value (W,) for the `state` that a step has led to, observed as `obs`, by `action`. The command is that of
+the state in which the step began. Source: `tasks/velocity/mdp/rewards.py` and `envs/mdp/rewards.py` of mjlab 1.6.0.
+
+Axes: W worlds, J joints, F feet.
+"""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from msk_ray.robots.env import VelocityEnv
+from msk_ray.step import StepState
+
+Robots = VelocityEnv[Any]
+
+_SWING_HEIGHT = 0.1
+"""Height that feet should have in swing [m]."""
+_AIR_TIME = 0.05, 0.5
+"""Range of the time in the air that `air_time` rewards [s]."""
+_AIR_TIME_COMMAND = 0.5
+"""Command from which it does, in m/s plus rad/s."""
+_COLLISION_FORCE = 10.0
+"""Force from which a collision counts [N]."""
+
+
+def _closeness(env: Robots, error: Tensor, variance: float) -> Tensor:
+    """e^−x for x = error / variance, and with `env.reward.tail`, in training, a share of 1/(1 + x)."""
+    relative, tail = error / variance, env.config.reward.tail
+    close = torch.exp(-relative)
+    return close if tail == 0.0 else torch.lerp(close, 1.0 / (1.0 + relative), tail)
+
+
+def track_linear_velocity(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """exp(−|v − command|² / 0.25), where v is the base's velocity and the command's vertical part is 0 [m/s].
+
+    In training, `env.reward.tail` gives it a slope far from the command.
+    """
+    velocity, _ = env.base_velocities(state)
+    error = (env.velocity_command()[:, :2] - velocity[:, :2]).square().sum(-1) + velocity[:, 2].square()
+    return _closeness(env, error, 0.25)
+
+
+def track_angular_velocity(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """exp(−|ω − command|² / 0.5), where ω is the base's angular velocity and the command is for yaw alone [rad/s].
+
+    In training, `env.reward.tail` gives it a slope far from the command.
+    """
+    _, spin = env.base_velocities(state)
+    error = (env.velocity_command()[:, 2] - spin[:, 2]).square() + spin[:, :2].square().sum(-1)
+    return _closeness(env, error, 0.5)
+
+
+def upright(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """exp(−s² / 0.2), where s is the sine of the trunk's tilt."""
+    tilt = env.gravity_in(state, env.robot.trunk)[:, :2].square().sum(-1)
+    return torch.exp(-tilt / 0.2)
+
+
+def variable_posture(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """exp(−mean (distance from the default pose / spread)²), where the spread of each joint depends on the command."""
+    distance = (state.qpos[:, 7:] - env.default_pose) / env.pose_spread()
+    return torch.exp(-distance.square().mean(-1))
+
+
+def body_ang_vel(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """(Angular velocity of the trunk about the world's horizontal axes)² [rad²/s²]."""
+    return env.frames(state).angular_velocity(env.robot.trunk)[:, :2].square().sum(-1)
+
+
+def angular_momentum(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """(Angular momentum of the robot about its centre of mass)² [kg² m⁴/s²]."""
+    return env.sensors(state)["root_angmom"].square().sum(-1)
+
+
+def dof_pos_limits(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """Sum over the joints of the angle beyond 90 % of the range [rad]."""
+    low, high = env.joint_limits
+    angles = state.qpos[:, 7:]
+    return (torch.relu(low - angles) + torch.relu(angles - high)).sum(-1)
+
+
+def action_rate_l2(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """Sum of (change of mjlab's action)²."""
+    return env.mjlab_action(action - env.state.action).square().sum(-1)
+
+
+def air_time(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """Number of feet that have been in the air for 0.05 to 0.5 s. No slope."""
+    time, (shortest, longest) = env.air_time().air, _AIR_TIME
+    flying = ((time > shortest) & (time < longest)).sum(-1)
+    return flying.float() * (env.commanded_speed() > _AIR_TIME_COMMAND)
+
+
+def foot_clearance(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """Sum over the feet of |height − 0.1 m| × horizontal speed [m²/s], with the height at the start of the step, as in
+    mjlab, which measures heights once a step."""
+    distance = (env.memory["foot_height"] - _SWING_HEIGHT).abs()
+    return (distance * _foot_speed(env, state)).sum(-1) * env.is_commanded()
+
+
+def foot_swing_height(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """Sum over the feet that land of (largest height in the swing / 0.1 m − 1)². Its slope reaches the step of that
+    height if it is within the horizon; landing has none."""
+    error = env.memory["peak_height"] / _SWING_HEIGHT - 1.0
+    return (error.square() * env.landed()).sum(-1) * env.is_commanded()
+
+
+def foot_slip(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """Sum over the feet on the ground of (horizontal speed)² [m²/s²]; whether they are there has no slope."""
+    on_ground = (env.air_time().contact > 0.0).float()
+    return (_foot_speed(env, state).square() * on_ground).sum(-1) * env.is_commanded()
+
+
+def soft_landing(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """Sum over the feet that land of the force on them [N]. No slope."""
+    force = torch.linalg.vector_norm(env.foot_contact(state).force, dim=-1)
+    return (force * env.landed()).sum(-1) * env.is_commanded()
+
+
+def self_collisions(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """Number of substeps in which a contact between parts of the robot has more than 10 N. No slope.
+
+    mjlab looks at one contact of a substep, whichever comes first; this at the strongest.
+    """
+    contact = env.contact(state, env.robot.base, "subtree", env.robot.base, "subtree")
+    return (contact.strongest[..., 0] > _COLLISION_FORCE).sum(0).float()
+
+
+def _foot_speed(env: Robots, state: StepState) -> Tensor:
+    """Horizontal speeds of the feet [m/s], (W, F)."""
+    return torch.linalg.vector_norm(env.frames(state).site_velocity(env.robot.feet)[..., :2], dim=-1)

@@ -1,0 +1,125 @@
+"""The velocity tasks beyond what mjlab's recorded steps show: starts, shares of commands, gradients."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from msk_ray.config import PhysicsConfig
+from msk_ray.config.environments import settings_class
+from msk_ray.envs import make_env
+from msk_ray.errors import ConfigError
+from msk_ray.robots.env import VelocityEnv
+from msk_ray.robots.robot import by_joint
+from msk_ray.step import StepState
+
+
+def make(nworld: int, robot: str = "go1", *, differentiable: bool = False, **changes: Any) -> VelocityEnv[Any]:
+    name = f"{robot}_velocity"
+    settings = settings_class(name)(name=name, **changes)
+    env = make_env(settings, PhysicsConfig(), nworld, "cpu", 0, differentiable=differentiable)
+    assert isinstance(env, VelocityEnv)
+    return env
+
+
+def test_starts_and_commands_are_drawn_as_mjlab_draws_them() -> None:
+    env = make(1)
+    physics = env.draw_physics(4000)
+    low, high = physics.qpos.amin(0), physics.qpos.amax(0)
+    assert low[:3].tolist() == pytest.approx([-0.5, -0.5, 0.278 + 0.01], abs=2e-3)
+    assert high[:3].tolist() == pytest.approx([0.5, 0.5, 0.278 + 0.05], abs=2e-3)
+    assert (physics.qpos[:, 7:] == env.default_pose).all()
+    assert not physics.qvel.any()
+    yaw = 2.0 * torch.atan2(physics.qpos[:, 6], physics.qpos[:, 3])
+    assert yaw.abs().max() > 3.1
+    assert (yaw > 0).float().mean() == pytest.approx(0.5, abs=0.05)
+
+
+def test_commands_are_those_of_mjlab() -> None:
+    env = make(4000)
+    command = env.velocity_command()
+    standing = (command == 0.0).all(-1)
+    assert standing.float().mean() == pytest.approx(0.1, abs=0.02)
+    ahead = ~standing & (command[:, 1] == 0.0)
+    assert ahead.float().mean() == pytest.approx(0.9 * 0.2, abs=0.02)
+    assert command[ahead, 0].min() == pytest.approx(0.3)
+    assert command[~ahead].amin(0).tolist() == pytest.approx([-1.5, -1.0, -0.7], abs=0.02)
+    assert command.amax(0).tolist() == pytest.approx([2.0, 1.0, 0.7], abs=0.02)
+
+
+def test_a_heading_is_turned_to_the_shorter_way_round() -> None:
+    north, never, always = math.pi / 2.0, [1.0, 1.0], [0.0, 0.0]
+    kinds = {"stand": never, "go_ahead": never, "turn_to_heading": always, "heading": [north, north]}
+    env = make(3, commands={"velocity": kinds})
+    for world, yaw in enumerate((north - 0.4, -math.pi + 0.2, north + 0.1)):
+        turn = torch.tensor([math.cos(yaw / 2.0), 0.0, 0.0, math.sin(yaw / 2.0)])
+        env.state.physics.qpos[world, 3:7] = turn
+    assert env.velocity_command()[:, 2].tolist() == pytest.approx([0.2, -0.7, -0.05], abs=1e-5)
+    kinds["stand"] = always
+    assert not make(3, commands={"velocity": kinds}).velocity_command().any()
+
+
+def test_standing_still_on_the_spot_is_what_a_zero_action_does() -> None:
+    env = make(2, commands={"velocity": {"stand": (0.0, 0.0)}})
+    for _ in range(25):
+        step = env.step(torch.zeros(2, 12))
+    terms = dict(zip(env.reward_names, step.terms[0].tolist(), strict=True))
+    assert terms["track_linear_velocity"] > 1.8
+    assert terms["upright"] > 0.9
+    times = env.air_time()
+    assert times.contact.min() > 0.2
+    assert not times.air.any()
+
+
+def test_a_tail_is_part_of_training_alone() -> None:
+    far = {"commands": {"velocity": {"stand": (1.0, 1.0), "lin_vel_x": (2.0, 2.0)}}}
+    plain, tailed = make(1, **far), make(1, reward={"tail": 0.5}, **far)
+    still, close = (env.step(torch.zeros(1, 12)).terms[0, 0].item() for env in (plain, tailed))
+    assert still < 1e-4
+    assert close == pytest.approx(2.0 * 0.5 / (1.0 + 4.0 / 0.25), rel=0.5)
+    assert type(tailed).reference_settings(tailed.config).reward.tail == 0.0
+
+
+@pytest.mark.parametrize("robot", ["go1", "g1"])
+def test_reward_and_observation_have_the_gradient_of_their_own_values(robot: str) -> None:
+    env = make(1, robot, commands={"velocity": {"stand": (1.0, 1.0), "lin_vel_x": (0.5, 0.5)}}, reward={"tail": 0.5})
+    rng = np.random.default_rng(3)
+    parts = [part[0].numpy().astype(float) for part in env.state.physics[:2]]
+    parts[0][3:7] += 0.1 * rng.normal(size=4)
+    parts[0][3:7] /= np.linalg.norm(parts[0][3:7])
+    parts[0][7:] += 0.1 * rng.normal(size=env.action_size)
+    parts[1] += 0.3 * rng.normal(size=parts[1].size)
+    action = torch.zeros(1, env.action_size)
+    weights = torch.tensor(rng.normal(size=env.obs_size), dtype=torch.float32)
+    env.ignore_contact_forces = True
+
+    def value(arrays: list[torch.Tensor]) -> torch.Tensor:
+        state = StepState(*arrays, env.state.physics.act)
+        env.next_memory = dict(env.remember(state, action))
+        obs = env.observe(state, action)
+        return (obs * weights).sum() + env.reward_terms(state, action, obs).sum()
+
+    inputs = [torch.tensor(p[None], dtype=torch.float32, requires_grad=True) for p in parts]
+    gradients = torch.autograd.grad(value(inputs), inputs)
+    for which, gradient in enumerate(gradients):
+        direction = rng.normal(size=parts[which].shape)
+        if which == 0:
+            direction[3:7] -= parts[0][3:7] * (direction[3:7] @ parts[0][3:7])  # along the sphere of unit quaternions
+        ends = []
+        for sign in (1, -1):
+            moved = [torch.tensor(p[None], dtype=torch.float32) for p in parts]
+            moved[which] = moved[which] + sign * 1e-3 * torch.tensor(direction, dtype=torch.float32)
+            with torch.no_grad():
+                ends.append(float(value(moved)))
+        slope = float((gradient[0] * torch.tensor(direction, dtype=torch.float32)).sum())
+        assert slope == pytest.approx((ends[0] - ends[1]) / 2e-3, rel=1e-2, abs=2e-2)
+
+
+def test_each_joint_has_one_pattern() -> None:
+    assert by_joint({".*hip": 1.0, "knee": 2.0}, ("left_hip", "knee")) == [1.0, 2.0]
+    with pytest.raises(ConfigError, match="no pattern matches joint 'ankle'"):
+        by_joint({"hip": 1.0}, ("hip", "ankle"))
+    with pytest.raises(ConfigError, match="2 patterns match joint 'hip'"):
+        by_joint({"hip": 1.0, "h.*": 2.0}, ("hip",))
