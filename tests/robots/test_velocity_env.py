@@ -1,6 +1,8 @@
 """The velocity tasks beyond what mjlab's recorded steps show: starts, shares of commands, gradients."""
 
 import math
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,9 +13,13 @@ from msk_ray.config import PhysicsConfig
 from msk_ray.config.environments import settings_class
 from msk_ray.envs import make_env
 from msk_ray.errors import ConfigError
+from msk_ray.robots.config import G1_TERMS
 from msk_ray.robots.env import VelocityEnv
-from msk_ray.robots.robot import by_joint
+from msk_ray.robots.robot import PoseSpread, by_joint
+from msk_ray.robots.robots import GO1
 from msk_ray.step import StepState
+
+SCENES = Path(__file__).parents[2] / "msk_ray" / "robots" / "scenes"
 
 
 def make(nworld: int, robot: str = "go1", *, differentiable: bool = False, **changes: Any) -> VelocityEnv[Any]:
@@ -115,6 +121,22 @@ def test_reward_and_observation_have_the_gradient_of_their_own_values(robot: str
                 ends.append(float(value(moved)))
         slope = float((gradient[0] * torch.tensor(direction, dtype=torch.float32)).sum())
         assert slope == pytest.approx((ends[0] - ends[1]) / 2e-3, rel=1e-2, abs=2e-2)
+
+
+class Own(VelocityEnv[Any]):
+    """A robot of a user's."""
+
+    mjcf = str(SCENES / "go1_flat.xml")
+    robot = replace(GO1, pose_spread=PoseSpread(standing={".*": 0.05}, walking={".*": 0.3}, running={".*": 0.5}))
+    terms = G1_TERMS
+
+
+def test_a_class_of_ones_own_has_the_terms_it_lists() -> None:
+    env = Own(Own.Settings(name="own"), PhysicsConfig(), 2, "cpu", 0, None)
+    assert {"angular_momentum", "self_collisions"} < set(env.reward_names)
+    step = env.step(torch.zeros(2, 12))
+    assert step.terms.shape == (2, len(G1_TERMS) - 1), "air_time has no weight"
+    assert torch.isfinite(step.terms).all()
 
 
 def test_each_joint_has_one_pattern() -> None:
