@@ -1,5 +1,6 @@
 """Runs an epoch's work operation by operation, or as recorded CUDA graphs."""
 
+import gc
 import traceback
 import warnings
 from collections import OrderedDict
@@ -294,6 +295,8 @@ class RecordedRunner(EagerRunner):
         if not any(every):
             return epoch
         self._refuse(next(filter(None, every)))
+        # The failed recording is part of reference cycles; freed during a later one, it would spoil that.
+        gc.collect()
         torch.cuda.empty_cache()
         return None
 

@@ -220,8 +220,7 @@ class Frames:
     def axis(self, body: Names, axis: int) -> Tensor:
         """Direction of axis 0, 1 or 2 (x, y, z) of bodies, unit vectors (W, 3) or (W, n, 3)."""
         quat = self.orientation(body)
-        unit = torch.zeros(3, dtype=quat.dtype, device=quat.device)
-        unit[axis] = 1.0
+        unit = torch.eye(3, dtype=quat.dtype, device=quat.device)[axis]
         return quat_rotate(quat, unit.expand(*quat.shape[:-1], 3))
 
     def site_position(self, site: Names) -> Tensor:
