@@ -169,19 +169,23 @@ class Algorithm(ABC):
             torch.cuda.set_rng_state(state["torch_cuda_generator"].cpu(), self.env.device)
         self.env.load_state_dict(state)
 
-    def start_from(self, modules: Mapping[str, Any]) -> None:
+    def start_from(self, modules: Mapping[str, Any]) -> list[str]:
         """Take networks and statistics from another trial's states, by module name.
 
-        Missing modules, such as the critic in a file with only a policy, stay unchanged.
+        Returns:
+            Names of missing modules, such as the critic for a file with only a policy, which stay unchanged.
 
         Raises:
             KeyError: a module that the policy needs is missing.
             RuntimeError: a network has another shape.
         """
-        needed = self.policy_modules(self.network)
+        needed, missing = self.policy_modules(self.network), []
         for name, module in self.modules().items():
             if name in modules or name in needed:
                 module.load_state_dict(modules[name])
+            else:
+                missing.append(name)
+        return missing
 
 
 def _check_equal(modules: Mapping[str, Mapping[str, Tensor]], group: Group) -> None:

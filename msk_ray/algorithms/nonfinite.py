@@ -15,21 +15,24 @@ from msk_ray.errors import Failure, SimulationError
 _CAUSES = "a division by 0, or a root or logarithm of a number that can be 0 or negative"
 
 
-def nonfinite_observation(env: Env[Any], observations: Tensor, epoch: int, done: int = 0) -> SimulationError | None:
+def nonfinite_observation(
+    env: Env[Any], observations: Tensor, epoch: int, done: int = 0, method: str = "observe"
+) -> SimulationError | None:
     """The error for non-finite observations (H, W, O); None if all are finite. Waits for the device.
 
     Args:
         epoch: counted from 0.
         done: env steps of the epoch before these.
+        method: what gave them: `observe` or `observe_critic`.
     """
     place = _first(observations)
     if place is None:
         return None
     step, world, entry = place
-    layout = env.observation_layout()
+    layout = env.observation_layout() if method == "observe" else None
     name = f"entry {entry}" + (f" ({layout[entry].name})" if layout and entry < len(layout) else "")
     return SimulationError(
-        f"nonfinite_observation: {name} of observe is {float(observations[place])} in world {world} before env step "
+        f"nonfinite_observation: {name} of {method} is {float(observations[place])} in world {world} before env step "
         f"{done + step + 1} of epoch {epoch + 1}; look for {_CAUSES}",
         Failure.NONFINITE,
     )

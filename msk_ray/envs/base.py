@@ -1,6 +1,6 @@
 """The base of every environment: stepping, truncation and termination, reset and divergence.
 
-Axes: W worlds, O observation, A action.
+Axes: W worlds, O observation, C what the critic sees, A action.
 """
 
 import math
@@ -67,6 +67,8 @@ class Env(ABC, Generic[SettingsT]):
     action_size: int
     obs_size: int
     """Entries of an observation; that of the first one unless a class sets it."""
+    critic_size: int
+    """Entries of what the critic sees."""
     terms: ClassVar[tuple[Term, ...]] = ()
     """The terms of the reward. Their weights are settings: a class whose `Settings` lack them gets such that have them.
     A class without terms has `reward_terms`, `reward_names`, `without_gradient` and a reward section of its own."""
@@ -250,6 +252,19 @@ class Env(ABC, Generic[SettingsT]):
         Both are those of `self.state` meanwhile, whose `age`, `numbers` and `memory` are therefore those of the
         observed state, in `step` as in `observation`.
         """
+
+    def observe_critic(self, state: StepState, action: Tensor) -> Tensor:
+        """What the critic sees (W, C) of a state and the action that led to it: by default what the policy sees.
+
+        It is needed in training only, and may contain what no sensor of a robot tells, such as the height of its feet
+        or the friction of the floor. Called as `observe` is.
+        """
+        return self.observe(state, action)
+
+    @property
+    def asymmetric(self) -> bool:
+        """Whether the critic sees something other than the policy."""
+        return type(self).observe_critic is not Env.observe_critic
 
     def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
         """Weighted parts (W, T) that sum to the reward for reaching `state`, observed as `obs`, by `action`.
@@ -457,6 +472,20 @@ class Env(ABC, Generic[SettingsT]):
         with self.in_state(reached):
             return self.observation()
 
+    def critic_observation(self) -> Tensor:
+        """What the critic sees of the current state, (W, C)."""
+        state = self.state
+        given = versions(state.physics, state.action, state.memory)
+        seen = self.observe_critic(state.physics, state.action)
+        self._contract.check_width("observe_critic", seen, self.critic_size)
+        self._contract.check_unchanged("observe_critic", given, state.physics, state.action, state.memory)
+        return seen
+
+    def critic_observation_of(self, reached: EnvState) -> Tensor:
+        """What the critic sees of another state, (W, C); the current one stays what it is."""
+        with self.in_state(reached):
+            return self.critic_observation()
+
     @contextmanager
     def in_state(self, state: EnvState) -> Iterator[None]:
         """Inside the block, the worlds are in another state."""
@@ -506,7 +535,7 @@ class Env(ABC, Generic[SettingsT]):
         terminated = diverged | fell
         truncated = (reached.age >= self.config.episode_length) & ~terminated
         self.state = self.carried(self._reset_where(terminated | truncated, reached) if auto_reset else reached)
-        return Transition(reward, terms.detach(), obs, terminated, truncated, diverged)
+        return Transition(reward, terms.detach(), reached, obs, terminated, truncated, diverged)
 
     def frames(self, state: StepState) -> Frames:
         """Positions, orientations and velocities of bodies, sites, geoms and centres of mass in `state` (W worlds).

@@ -101,8 +101,14 @@ class Contract:
 
         action = copy(torch.zeros_like(state.action))
         first = self.call("observe", env.observation, state.physics, state.action)
-        self._check_observation(first)
+        self._check_observation("observe", first)
         self._check_size(first)
+        env.critic_size = env.obs_size
+        if env.asymmetric:
+            given = state.physics, state.action
+            seen = self.call("observe_critic", lambda: env.observe_critic(*given), *given)
+            self._check_observation("observe_critic", seen)
+            env.critic_size = seen.shape[-1]
         moved = self.call("disturbed", lambda: env.disturbed(state.physics), state.physics)
         self._check_state("disturbed", moved, env.nworld)
         force = self.call("applied_force", lambda: env.applied_force(state.physics), state.physics)
@@ -118,6 +124,8 @@ class Contract:
         reached = env.reached(after, action)
         env.ignore_contact_forces = False
         obs = self.call("observe", lambda: env.observation_of(reached), after, action)
+        if env.asymmetric:
+            self.call("observe_critic", lambda: env.critic_observation_of(reached), after, action)
         env.ignore_contact_forces = True
         for term in env.active_terms:
             self._check_term(term, after, action, obs)
@@ -180,12 +188,7 @@ class Contract:
     def check_results(self, obs: Any, terms: Any, fell: Any) -> None:
         """Raise ConfigError if what a step's methods gave is not of the right kind, shape and type."""
         env = self._env
-        self._check_observation(obs)
-        if obs.shape[-1] != env.obs_size:
-            raise ConfigError(
-                f"observe of {self._name} has {obs.shape[-1]} entries, but {env.obs_size} before: the number of "
-                "entries must stay the same"
-            )
+        self.check_width("observe", obs, env.obs_size)
         wanted = (env.nworld, len(env.reward_names))
         if isinstance(terms, Tensor) and terms.shape != wanted:
             raise ConfigError(
@@ -195,13 +198,22 @@ class Contract:
         self._check("reward_terms", terms, wanted, "torch.stack(terms, dim=-1)")
         self._check("fell", fell, (env.nworld,), "a comparison, such as height < 0.5", torch.bool)
 
-    def _check_observation(self, obs: Any) -> None:
+    def check_width(self, method: str, obs: Any, width: int) -> None:
+        """Raise ConfigError if an observation is none, or has another number of entries than before."""
+        self._check_observation(method, obs)
+        if obs.shape[-1] != width:
+            raise ConfigError(
+                f"{method} of {self._name} has {obs.shape[-1]} entries, but {width} before: the number of entries must "
+                "stay the same"
+            )
+
+    def _check_observation(self, method: str, obs: Any) -> None:
         worlds = self._env.nworld
         if isinstance(obs, Tensor) and (obs.dim() != 2 or len(obs) != worlds):
             raise ConfigError(
-                f"observe of {self._name} has shape {tuple(obs.shape)}, not (worlds, entries) with {worlds} worlds"
+                f"{method} of {self._name} has shape {tuple(obs.shape)}, not (worlds, entries) with {worlds} worlds"
             )
-        self._check("observe", obs, None, "torch.cat((state.qpos, state.qvel), dim=-1), for one")
+        self._check(method, obs, None, "torch.cat((state.qpos, state.qvel), dim=-1), for one")
 
     def _check_size(self, obs: Tensor) -> None:
         width = obs.shape[-1]

@@ -78,8 +78,10 @@ class Transition(NamedTuple):
     terms: Tensor
     """Weighted parts of the reward, detached, which sum to it, shape (W, T), named by the environment's
     `reward_names`."""
+    reached: EnvState
+    """The state reached, before any reset, attached."""
     obs: Tensor
-    """Observation of the state reached, before any reset, shape (W, O)."""
+    """Observation of it, shape (W, O)."""
     terminated: Tensor
     """The episode ended by itself (fell, diverged): nothing follows, shape (W,) bool."""
     truncated: Tensor

@@ -69,14 +69,13 @@ def start_from(algorithm: Algorithm, path: str) -> list[str]:
             f"trial.start_from: {error}; train that policy first, or write the path of another"
         ) from error
     try:
-        algorithm.start_from(_to_device(state["algorithm"]["modules"], algorithm.env.device))
+        return algorithm.start_from(_to_device(state["algorithm"]["modules"], algorithm.env.device))
     except (KeyError, TypeError, RuntimeError) as error:
         what = str(error).splitlines()[-1].strip()
         raise CheckpointError(
             f"trial.start_from: {path} does not fit this trial ({what}): give a checkpoint of the same env, algorithm "
             "and networks"
         ) from error
-    return [name for name in algorithm.modules() if name not in state["algorithm"]["modules"]]
 
 
 def check_generators(path: Path, saved: Tensor, device: torch.device) -> None:

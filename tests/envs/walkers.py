@@ -191,6 +191,24 @@ MISTAKES = {
         "    def control(self, action):\n        return action.repeat(1, 2)\n\n    def fell(",
         r"control of Walker has shape \(4, 2\), not \(4, 1\): return one control for each actuator",
     ),
+    "critic's view in float64": Mistake(
+        "    def fell(",
+        "    def observe_critic(self, state, action):\n        return state.qvel.double()\n\n    def fell(",
+        r"observe_critic of Walker returns torch\.float64, not torch\.float32",
+    ),
+    "critic's view of another width": Mistake(
+        "    def fell(",
+        "    def observe_critic(self, state, action):\n"
+        "        return state.qvel.repeat(1, 1 + int(self.state.age.max() > 0))\n\n"
+        "    def fell(",
+        "observe_critic of Walker has 2 entries, but 1 before: the number of entries must stay the same",
+    ),
+    "critic's view written in place": Mistake(
+        "    def fell(",
+        "    def observe_critic(self, state, action):\n        state.qvel[:] = 0.0\n        return state.qvel\n\n"
+        "    def fell(",
+        r"observe_critic of Walker changes state\.qvel in place: write to a copy",
+    ),
     "outcomes without names": Mistake(
         'return {"speed": state.qvel[:, 0]}',
         "return state.qvel[:, 0]",

@@ -18,8 +18,10 @@ from msk_ray.errors import Failure, SimulationError
 if TYPE_CHECKING:
     from rsl_rl.models import MLPModel
 
-_GROUP = "obs"
-"""rsl_rl's observations are named groups; here there is one, which both networks read."""
+_GROUP, _CRITIC_GROUP = "obs", "critic_obs"
+"""rsl_rl's observations are named groups: one for both networks, or one for each if the critic sees something else."""
+_GROUPS = {_GROUP: "observe", _CRITIC_GROUP: "observe_critic"}
+"""The environment's method that gives each."""
 _ACTIVATIONS = {"silu": "swish"}
 """rsl_rl's names of activations that differ from ours."""
 
@@ -53,7 +55,8 @@ class Ppo(Algorithm):
 
         super().__init__(config, env)
         c, device = self.settings, str(env.device)
-        critic = _network(config.critic, "critic", env.obs_size, 1).to(env.device)
+        group = _CRITIC_GROUP if env.asymmetric else _GROUP
+        critic = _network(config.critic, "critic", group, env.critic_size, 1).to(env.device)
         storage = RolloutStorage("rl", env.nworld, c.steps, self._observe(), [env.action_size], device)
         self.ppo = PPO(
             self.network.actor,
@@ -80,7 +83,7 @@ class Ppo(Algorithm):
     def policy_network(cls, config: Config, obs_size: int, action_size: int) -> GaussianPolicy:
         """A policy with weights drawn from torch's global generator, and empty observation statistics."""
         noise = {"class_name": "GaussianDistribution", "init_std": 1.0, "std_type": "log"}
-        return GaussianPolicy(_network(config.actor, "actor", obs_size, action_size, noise))
+        return GaussianPolicy(_network(config.actor, "actor", _GROUP, obs_size, action_size, noise))
 
     @classmethod
     def policy_modules(cls, network: nn.Module) -> dict[str, nn.Module]:
@@ -116,8 +119,7 @@ class Ppo(Algorithm):
         except (RuntimeError, ValueError):
             # Torch raises this for a mean or standard deviation that is NaN, for example.
             self._check("weights", self._weights())
-            seen, done = self.env.observation()[None], self.ppo.storage.step
-            if (fault := nonfinite_observation(self.env, seen, epoch, done)) is not None:
+            if (fault := self._fault(self._observe()[None], epoch, self.ppo.storage.step)) is not None:
                 raise fault from None
             raise
         self._check("losses and weights", [*losses.values(), *self._weights()])
@@ -175,8 +177,8 @@ class Ppo(Algorithm):
             terms.append(transition.terms)
             ends.append(done)
             diverged += transition.diverged.sum()
-        if (error := nonfinite_observation(env, ppo.storage.observations[_GROUP], epoch)) is not None:
-            raise error
+        if (fault := self._fault(ppo.storage.observations, epoch)) is not None:
+            raise fault
         if not bool(torch.stack(rewards).isfinite().all()):
             raise nonfinite_reward(env, terms, epoch)
         ppo.compute_returns(obs)
@@ -188,7 +190,17 @@ class Ppo(Algorithm):
     def _observe(self) -> Any:
         from tensordict import TensorDict
 
-        return TensorDict({_GROUP: self.env.observation()}, batch_size=[self.env.nworld])
+        env = self.env
+        seen = {_GROUP: env.observation()}
+        if env.asymmetric:
+            seen[_CRITIC_GROUP] = env.critic_observation()
+        return TensorDict(seen, batch_size=[env.nworld])
+
+    def _fault(self, observations: Mapping[str, Tensor], epoch: int, done: int = 0) -> SimulationError | None:
+        """As `nonfinite_observation`, for all groups of observations."""
+        seen = observations.items()
+        faults = (nonfinite_observation(self.env, values, epoch, done, _GROUPS[group]) for group, values in seen)
+        return next(filter(None, faults), None)
 
     def _check(self, what: str, values: Iterable[Tensor | float]) -> None:
         finite = [torch.as_tensor(value, device=self.env.device).isfinite().all() for value in values]
@@ -202,6 +214,7 @@ class Ppo(Algorithm):
 def _network(
     config: NetworkConfig,
     name: str,
+    group: str,
     inputs: int,
     outputs: int,
     noise: dict[str, Any] | None = None,
@@ -211,8 +224,8 @@ def _network(
     from rsl_rl.models import MLPModel
 
     return MLPModel(
-        {_GROUP: torch.zeros(1, inputs)},
-        {name: [_GROUP]},
+        {group: torch.zeros(1, inputs)},
+        {name: [group]},
         name,
         outputs,
         hidden_dims=list(config.hidden),

@@ -58,6 +58,15 @@ class RolloutGraph:
     """Calls of the actor's network, to add up its gradients afterwards; None if autograd adds them up."""
 
 
+class Observations(NamedTuple):
+    """What a network saw in a rollout."""
+
+    raw: Tensor
+    """As the environment gives it, (H, W, O)."""
+    normalised: Tensor
+    """As the network was given it, (H, W, O)."""
+
+
 @dataclass(frozen=True)
 class RolloutLoss:
     """The actor's loss for a rollout, and the critic's data, which cover all worlds of the group."""
@@ -66,17 +75,17 @@ class RolloutLoss:
     """The actor's loss, with its graph."""
     value: Tensor
     """Mean value of the states reached."""
-    raw: Tensor
-    """Observations as the environment gives them, (H, W, O)."""
-    normalised: Tensor
-    """The same, normalised, (H, W, O)."""
+    obs: Observations
+    """What the actor saw."""
+    critic_obs: Observations
+    """What the critic saw; `obs` if that is what the actor saw."""
     targets: Tensor
-    """The critic's targets for them, (H, W)."""
+    """The critic's targets, (H, W)."""
 
     @property
     def for_critic(self) -> tuple[Tensor, Tensor]:
-        """Normalised observations (H·W, O) and targets (H·W,)."""
-        return self.normalised.flatten(0, 1), self.targets.flatten()
+        """What the critic sees, normalised, (H·W, C), and targets (H·W,)."""
+        return self.critic_obs.normalised.flatten(0, 1), self.targets.flatten()
 
 
 @dataclass(frozen=True)
@@ -86,7 +95,9 @@ class ActorOutcome:
     state: EnvState
     """Of this process's worlds."""
     obs: Tensor
-    """Normalised observations for the critic, (H·W, O)."""
+    """Normalised observations of the actor, (H, W, O)."""
+    critic_obs: Tensor
+    """What the critic sees, normalised, (H·W, C)."""
     targets: Tensor
     """The critic's targets for them, (H·W,)."""
     rewards: Tensor
@@ -107,6 +118,7 @@ class ActorUpdate:
         settings: SHAC's settings.
         env: the worlds.
         network: the policy.
+        critic_normalizer: statistics of what the critic sees: the network's if that is what the actor sees.
         target_critic: values of the states reached.
         return_statistics: statistics of the discounted return; None if rewards are not normalised.
         entropy: the bonus for the policy's entropy, or None.
@@ -121,6 +133,7 @@ class ActorUpdate:
         settings: ShacConfig,
         env: Env[Any],
         network: PolicyNetwork,
+        critic_normalizer: RunningMeanStd,
         target_critic: Critic,
         return_statistics: RunningMeanStd | None,
         entropy: EntropyBonus | None,
@@ -128,7 +141,8 @@ class ActorUpdate:
     ) -> None:
         self._settings = settings
         self._env = env
-        self._actor, self._normalizer = network.actor, network.normalizer
+        self._network, self._actor, self._normalizer = network, network.actor, network.normalizer
+        self._critic_normalizer = critic_normalizer
         self._target_critic = target_critic
         self._return_statistics = return_statistics
         self._entropy = entropy
@@ -151,8 +165,8 @@ class ActorUpdate:
         with halves.watching(), nullcontext() if calls is None else calls.recording():
             rollout = collect(
                 env,
-                self._actor,
-                self._normalizer,
+                self._network,
+                self._critic_normalizer,
                 inputs.noise,
                 gate,
                 state_bptt=c.state_bptt,
@@ -167,9 +181,19 @@ class ActorUpdate:
         loss, next_values, rewards = self._loss(rollout)
         values = next_values.detach()
         targets = returns.td_lambda_targets(rewards, values, rollout.terminated, rollout.done, c.gamma, c.lam)
-        raw = gather(rollout.obs, dim=1)
-        normalised = self._normalizer.normalize(raw)
-        return RolloutLoss(loss, values.mean(), raw, normalised, gather(targets, dim=1))
+        obs = critic_obs = self._observations(rollout.obs, self._normalizer)
+        if self._asymmetric:
+            critic_obs = self._observations(rollout.critic_obs, self._critic_normalizer)
+        return RolloutLoss(loss, values.mean(), obs, critic_obs, gather(targets, dim=1))
+
+    def _observations(self, own: Tensor, normalizer: RunningMeanStd) -> Observations:
+        """Observations of the whole group, from those (H, W, O) of this process's worlds."""
+        raw = self._group.gather(own, dim=1)
+        return Observations(raw, normalizer.normalize(raw))
+
+    @property
+    def _asymmetric(self) -> bool:
+        return self._critic_normalizer is not self._normalizer
 
     def update_actor(self, graph: RolloutGraph, rollout_loss: RolloutLoss) -> ActorOutcome:
         """Take the actor's step along the rollout's gradient, and update the statistics.
@@ -191,7 +215,9 @@ class ActorUpdate:
         norm = clip_gradients(list(self._actor.parameters()), limit)
         failed = (cotangents.nonfinite_share > MAX_NONFINITE_SHARE) | ~norm.isfinite()
         self._optimizer.step(skip=failed)
-        self._normalizer.update(rollout_loss.raw.flatten(0, 1))
+        self._normalizer.update(rollout_loss.obs.raw.flatten(0, 1))
+        if self._asymmetric:
+            self._critic_normalizer.update(rollout_loss.critic_obs.raw.flatten(0, 1))
         detached = gather(rollout.rewards.detach(), dim=1)
         means = {"train/actor_loss": rollout_loss.loss.detach(), "train/value": rollout_loss.value}
         if rollout.neg_log_prob is not None:
@@ -203,13 +229,14 @@ class ActorUpdate:
             "train/diverged": gather(rollout.diverged, dim=1).sum(),
             "grad/actor_norm": norm,
             "grad/halves_cosine": graph.halves.cosine(),
-            "train/std": self._actor.std(rollout_loss.normalised).detach().mean(),
+            "train/std": self._actor.std(rollout_loss.obs.normalised).detach().mean(),
         }
         if rollout.contact is not None:
             weight = float(self._env.model.body_mass.sum() * -self._env.model.opt.gravity[2])
             metrics["train/contact"] = (gather(rollout.contact, dim=1) / weight).square().mean().sqrt()
         return ActorOutcome(
             graph.state,
+            rollout_loss.obs.normalised,
             *rollout_loss.for_critic,
             detached,
             rollout.terms,
@@ -230,7 +257,7 @@ class ActorUpdate:
             std = torch.sqrt(self._return_statistics.var + 1e-6)
             self._update_return_statistics(self._return_statistics, rewards.detach(), rollout.done)
             rewards = rewards / std
-        each = self._target_critic(rollout.next_obs)
+        each = self._target_critic(rollout.next_critic_obs)
         next_values = each.amin(0)
         in_loss = each.mean(0) if c.actor_value == "mean" else next_values
         # The loss is scaled back so that the learning rate means the same with and without normalised returns.

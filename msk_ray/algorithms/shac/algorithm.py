@@ -34,6 +34,7 @@ class Shac(Algorithm):
     Attributes:
         actor, critic, target_critic: the networks.
         normalizer: observation statistics.
+        critic_normalizer: those of what the critic sees; `normalizer` if that is what the actor sees.
     """
 
     Settings = ShacConfig
@@ -47,7 +48,10 @@ class Shac(Algorithm):
         c = self.settings
         device = env.device
         self.actor, self.normalizer = self.network.actor, self.network.normalizer
-        self.critic = Critic(config.critic, env.obs_size, init).to(device)
+        self.critic_normalizer = self.normalizer
+        if env.asymmetric:
+            self.critic_normalizer = RunningMeanStd((env.critic_size,)).to(device)
+        self.critic = Critic(config.critic, env.critic_size, init).to(device)
         self.target_critic = copy.deepcopy(self.critic).requires_grad_(False)
         self.return_statistics = RunningMeanStd(()).to(device) if c.normalize_return else None
         self.actor_optimizer = RateAdam(self.actor.parameters(), c.actor_lr, _BETAS, c.weight_decay)
@@ -67,7 +71,14 @@ class Shac(Algorithm):
         self._entropy = EntropyBonus(c.entropy, env.action_size, device) if c.entropy is not None else None
         self._contacts = ContactSchedule(config.curriculum, env) if config.curriculum is not None else None
         self._actor_update = ActorUpdate(
-            c, env, self.network, self.target_critic, self.return_statistics, self._entropy, self.actor_optimizer
+            c,
+            env,
+            self.network,
+            self.critic_normalizer,
+            self.target_critic,
+            self.return_statistics,
+            self._entropy,
+            self.actor_optimizer,
         )
         self._runner = (
             RecordedRunner(self._actor_update, self, env)
@@ -89,7 +100,15 @@ class Shac(Algorithm):
     def modules(self) -> dict[str, nn.Module]:
         """Policy, critics and statistics."""
         modules = {**self.network.parts(), "critic": self.critic, "target_critic": self.target_critic}
+        if self.critic_normalizer is not self.normalizer:
+            modules["critic_normalizer"] = self.critic_normalizer
         return modules if self.return_statistics is None else modules | {"return_statistics": self.return_statistics}
+
+    def start_from(self, modules: Mapping[str, Any]) -> list[str]:
+        """As for every algorithm; a critic that saw what its actor saw goes on with that actor's statistics."""
+        if "critic" in modules and "critic_normalizer" not in modules:
+            modules = {**modules, "critic_normalizer": modules["normalizer"]}
+        return super().start_from(modules)
 
     def update(self, epoch: int) -> EpochResult:
         """Train one epoch, counted from 0.
@@ -234,8 +253,10 @@ class Shac(Algorithm):
         rewarded = math.isfinite(numbers["train/reward"])
         if rewarded and lost <= allowed and math.isfinite(norm):
             return
-        seen = outcome.obs.unflatten(0, (-1, self._worlds))
-        if (error := nonfinite_observation(self.env, seen, epoch)) is not None:
+        if (error := nonfinite_observation(self.env, outcome.obs, epoch)) is not None:
+            raise error
+        seen = outcome.critic_obs.unflatten(0, (-1, self._worlds))
+        if (error := nonfinite_observation(self.env, seen, epoch, method="observe_critic")) is not None:
             raise error
         if not rewarded:
             raise nonfinite_reward(self.env, outcome.terms, epoch)

@@ -27,7 +27,7 @@ class CriticWork(Protocol):
         """Set the learning rate of the next fit, and draw its orders of the rows, (passes, rows)."""
 
     def fit_critic(self, obs: Tensor, targets: Tensor, orders: Tensor) -> Tensor:
-        """Fit the critic to observations (N, O) and targets (N,) in these orders, and return the loss."""
+        """Fit the critic to what it saw (N, C) and targets (N,) in these orders, and return the loss."""
 
     def move_target(self) -> None:
         """Move the target critic towards the fitted critic."""
@@ -81,7 +81,7 @@ class EagerRunner:
         """One epoch: the rollout, the actor's step along its gradient, and the fit of the critic at this rate."""
         outcome = self._run_actor(inputs)
         self.last_loss = self._critic.fit_critic(
-            outcome.obs, outcome.targets, self._critic.prepare_fit(outcome.targets.numel(), critic_rate)
+            outcome.critic_obs, outcome.targets, self._critic.prepare_fit(outcome.targets.numel(), critic_rate)
         )
         self._critic.move_target()
         self._clock.mark("critic")
@@ -190,7 +190,7 @@ class RecordedRunner(EagerRunner):
         if epoch is None:
             self.join()
             outcome = self._run_actor(inputs)
-            self._start_fit(self._offer(outcome.obs, outcome.targets), critic_rate)
+            self._start_fit(self._offer(outcome.critic_obs, outcome.targets), critic_rate)
             return outcome
         caller = torch.cuda.current_stream(self._device)
         self._first.wait_stream(caller)
@@ -212,7 +212,7 @@ class RecordedRunner(EagerRunner):
         self._clock.mark("backward")
         self._env.state = outcome.state
         # Only once the backward pass is running, because this makes the host wait for the previous fit.
-        self._start_fit(self._offer(outcome.obs, outcome.targets) if offered is None else offered, critic_rate)
+        self._start_fit(self._offer(outcome.critic_obs, outcome.targets) if offered is None else offered, critic_rate)
         return outcome
 
     def _offer(self, obs: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:

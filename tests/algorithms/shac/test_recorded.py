@@ -63,6 +63,7 @@ LEGS = {
 ONE_KERNEL = {**ANT, "physics": {"variant": "matched"}, "execution": {**ANT["execution"], "solver_kernels": "fused"}}
 MEMORY = {**ANT, "env": {"name": "remembering:Remembering", "nworld": 64}}
 CARTPOLE = {**ANT, "env": {"name": "cartpole", "nworld": 64}, "physics": {}}
+PRIVILEGED = {**CARTPOLE, "env": {"name": "privileged:Privileged", "nworld": 64}}
 
 
 def make(settings: dict[str, Any], folder: Path, capture: str = "auto", **shac: Any) -> Trainer:
@@ -108,8 +109,8 @@ def after(epochs: int, trainer: Trainer, state: dict[str, Any]) -> tuple[torch.T
 @pytest.mark.usefixtures("uncut")
 @pytest.mark.parametrize(
     "settings",
-    [ANT, CARTPOLE, OPTIONS, LEGS, ONE_KERNEL, MEMORY],
-    ids=["ant", "cartpole", "options", "legs", "one_kernel", "memory"],
+    [ANT, CARTPOLE, OPTIONS, LEGS, ONE_KERNEL, MEMORY, PRIVILEGED],
+    ids=["ant", "cartpole", "options", "legs", "one_kernel", "memory", "privileged"],
 )
 def test_a_recorded_epoch_equals_one_operation_by_operation(settings: dict[str, Any], tmp_path: Path) -> None:
     recorded, eager = make(settings, tmp_path / "a"), make(settings, tmp_path / "b", capture="off")
