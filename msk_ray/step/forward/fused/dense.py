@@ -1,49 +1,48 @@
 """Dense linear algebra by the lanes of a world. Matrices are column-major, with `width` numbers per column."""
 
-import math
-
 import warp as wp
-
-from msk_ray.step.forward.fused.lanes import at, lane_count, lane_sync, put
 
 wp.set_module_options({"enable_backward": False})
 
-_NAN = wp.constant(math.nan)
 
-
-# Unrolled, so that several terms are loaded at once.
+# On a GPU, each lane adds up its two numbers together, and several terms are loaded at once.
 @wp.func_native("""
-    float total = 0.0f;
 #if defined(__CUDA_ARCH__)
+    const int other = lane + 32;
+    float y = 0.0f;
+    float z = 0.0f;
     #pragma unroll 4
+    for (int k = 0; k < count; ++k) {
+        const float w = weight.data[k];
+        if (lane < size)
+            y += w * matrix.data[k * width + lane];
+        if (other < size)
+            z += w * matrix.data[k * width + other];
+    }
+    if (lane < size)
+        product.data[lane] = y;
+    if (other < size)
+        product.data[other] = z;
+    __syncwarp();
+#else
+    for (int i = 0; i < size; ++i) {
+        float total = 0.0f;
+        for (int k = 0; k < count; ++k)
+            total += weight.data[k] * matrix.data[k * width + i];
+        product.data[i] = total;
+    }
 #endif
-    for (int k = 0; k < count; ++k)
-        total += weight.data[k] * matrix.data[k * width + i];
-    return total;
 """)
-def column_sum(weight: wp.array[float], matrix: wp.array[float], i: int, width: int, count: int) -> float: ...
-
-
-@wp.func_native("""
-    float total = 0.0f;
-#if defined(__CUDA_ARCH__)
-    #pragma unroll 4
-#endif
-    for (int k = 0; k < count; ++k)
-        total += weight.data[k] * matrix.data[k * width + i] * matrix.data[k * width + j];
-    return total;
-""")
-def pair_sum(weight: wp.array[float], matrix: wp.array[float], i: int, j: int, width: int, count: int) -> float: ...
-
-
-@wp.func
-def multiply(
-    matrix: wp.array[float], vector: wp.array[float], size: int, width: int, lane: int, product: wp.array[float]
+def combine(
+    weight: wp.array[float],
+    matrix: wp.array[float],
+    size: int,
+    width: int,
+    count: int,
+    lane: int,
+    product: wp.array[float],
 ) -> None:
-    """product = matrix vector."""
-    for i in range(lane, size, lane_count()):
-        put(product, i, column_sum(vector, matrix, i, width, size))
-    lane_sync()
+    """product = Σ weight · column over `count` columns of `size` numbers, up to 64."""
 
 
 # A block of 4 x 4 entries takes two loads a row, as many as one entry alone would. Two lanes share a block: one adds up
@@ -64,6 +63,9 @@ def multiply(
         const int i = 4 * above;
         const int j = 4 * (block - above * (above + 1) / 2);
         if (block < blocks) {
+#if defined(__CUDA_ARCH__)
+            #pragma unroll 2
+#endif
             for (int k = lane % parts; k < count; k += parts) {
                 const float w = weight.data[k];
 #if defined(__CUDA_ARCH__)
@@ -111,18 +113,71 @@ def add_squares(
     entries on and below the diagonal."""
 
 
-@wp.func
-def factorize(matrix: wp.array[float], pivot: wp.array[float], size: int, width: int, lane: int) -> None:
-    """Factor a lower triangle in place into L D of L D Lᵀ, with 1 / D; NaN where D is not positive. The upper triangle
-    becomes its mirror image."""
-    for j in range(size):
-        for i in range(j + lane, size, lane_count()):
-            value = at(matrix, j * width + i) - pair_sum(pivot, matrix, i, j, width, j)
-            put(matrix, j * width + i, value)
-            put(matrix, i * width + j, value)
-            if i == j:
-                put(pivot, j, wp.where(value > 0.0, 1.0 / value, _NAN))
-        lane_sync()
+# On a GPU, four columns at a time, of which each lane keeps a row in registers: one round of loads serves four columns.
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    for (int j = 0; j < size; j += 4) {
+        float inverse[4];
+        float across[4][4];
+        for (int base = j; base < size; base += 32) {
+            const int i = base + lane;
+            const int row = i < size ? i : size - 1;
+            float v[4];
+            for (int q = 0; q < 4; ++q)
+                v[q] = matrix.data[(j + q) * width + row];
+            #pragma unroll 4
+            for (int k = 0; k < j; ++k) {
+                const float left = matrix.data[k * width + row] * pivot.data[k];
+                const float4 right = *reinterpret_cast<const float4*>(matrix.data + k * width + j);
+                v[0] -= left * right.x;
+                v[1] -= left * right.y;
+                v[2] -= left * right.z;
+                v[3] -= left * right.w;
+            }
+            #pragma unroll
+            for (int q = 0; q < 4; ++q) {
+                if (base == j) {
+                    const float value = __shfl_sync(0xffffffffu, v[q], q);
+                    inverse[q] = value > 0.0f ? 1.0f / value : nan;
+                    #pragma unroll
+                    for (int r = q + 1; r < 4; ++r)
+                        across[q][r] = __shfl_sync(0xffffffffu, v[q], r);
+                }
+                #pragma unroll
+                for (int r = q + 1; r < 4; ++r)
+                    v[r] -= v[q] * inverse[q] * across[q][r];
+            }
+            if (i < size) {
+                #pragma unroll
+                for (int q = 0; q < 4; ++q)
+                    if (i >= j + q) {
+                        matrix.data[(j + q) * width + i] = v[q];
+                        matrix.data[i * width + j + q] = v[q];
+                    }
+            }
+        }
+        #pragma unroll
+        for (int q = 0; q < 4; ++q)
+            if (lane == q && j + q < size)
+                pivot.data[j + q] = inverse[q];
+        __syncwarp();
+    }
+#else
+    for (int j = 0; j < size; ++j)
+        for (int i = j; i < size; ++i) {
+            float value = matrix.data[j * width + i];
+            for (int k = 0; k < j; ++k)
+                value -= matrix.data[k * width + i] * pivot.data[k] * matrix.data[k * width + j];
+            matrix.data[j * width + i] = value;
+            matrix.data[i * width + j] = value;
+            if (i == j)
+                pivot.data[j] = value > 0.0f ? 1.0f / value : nan;
+        }
+#endif
+""")
+def factorize(matrix: wp.array[float], pivot: wp.array[float], size: int, width: int, lane: int, nan: float) -> None:
+    """Factor a lower triangle in place into L D of L D Lᵀ, with 1 / D; `nan` where D is not positive. The upper
+    triangle becomes its mirror image."""
 
 
 # On a GPU, each lane keeps its two numbers of the solution in registers.

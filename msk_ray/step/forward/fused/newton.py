@@ -3,7 +3,7 @@
 import warp as wp
 from mujoco_warp import OverflowType
 
-from msk_ray.step.forward.fused.dense import multiply, solve_factored
+from msk_ray.step.forward.fused.dense import combine, solve_factored
 from msk_ray.step.forward.fused.lanes import at, lane_count, lane_sum, lane_sync, put
 from msk_ray.step.forward.fused.line_search import search_line
 from msk_ray.step.forward.fused.problem import (
@@ -74,6 +74,12 @@ def read_inertia(given: Inertia, scratch: Scratch, w: World) -> float:
 
 
 @wp.func
+def multiply(scratch: Scratch, w: World, vector: wp.array[float], product: wp.array[float]) -> None:
+    """product = M vector."""
+    combine(vector, scratch.inertia[w.id], w.nv, w.width, w.nv, w.lane, product)
+
+
+@wp.func
 def advance(scratch: Scratch, w: World, alpha: float) -> None:
     """Move along the direction."""
     for i in range(w.lane, w.nv, lane_count()):
@@ -114,30 +120,35 @@ def iterate(
     tolerance = limits.tolerance[w.id % limits.tolerance.shape[0]]
     ls_tolerance = limits.ls_tolerance[w.id % limits.ls_tolerance.shape[0]]
     missed = int(0)
-    update_rows(rows, scratch, w)
-    update_gradient(rows, scratch, smooth, w)
-    factor_hessian(rows, scratch, w)
-    norms = find_direction(scratch, w)
-    done = bool(False)
     count = int(0)
-    while count < limits.iterations and not done:
-        multiply(scratch.inertia[w.id], scratch.direction[w.id], w.nv, w.width, w.lane, scratch.moved[w.id])
-        least = tolerance * ls_tolerance * wp.sqrt(norms[0]) / scale
-        alpha, gain, exact = search_line(rows, scratch, smooth, w, least, limits.ls_iterations)
-        if not exact:
-            missed = _LS_ITERATIONS
-        advance(scratch, w, alpha)
+    alpha = float(0.0)
+    gain = float(0.0)
+    done = bool(False)
+    # Each part is called in one place: it is inlined, and the instructions of the loop should fit the cache.
+    while not done:
         changed = update_rows(rows, scratch, w)
         slope = scale * wp.sqrt(update_gradient(rows, scratch, smooth, w))
-        count += 1
-        done = alpha == 0.0 or (gain > 0.0 and scale * gain < tolerance) or slope < tolerance
+        if count > 0:
+            done = alpha == 0.0 or (gain > 0.0 and scale * gain < tolerance) or slope < tolerance
         if not done:
-            if changed:
+            if changed or count == 0:
                 factor_hessian(rows, scratch, w)
             norms = find_direction(scratch, w)
-            done = 0.5 * scale * norms[1] < tolerance
-    if not done and limits.iterations > 0:
-        missed = missed | _ITERATIONS
+            done = count > 0 and 0.5 * scale * norms[1] < tolerance
+            if not done and count >= limits.iterations:
+                done = True
+                if limits.iterations > 0:
+                    missed = missed | _ITERATIONS
+            if not done:
+                multiply(scratch, w, scratch.direction[w.id], scratch.moved[w.id])
+                least = tolerance * ls_tolerance * wp.sqrt(norms[0]) / scale
+                step = search_line(rows, scratch, smooth, w, least, limits.ls_iterations)
+                alpha = step[0]
+                gain = step[1]
+                if not step[2]:
+                    missed = missed | _LS_ITERATIONS
+                advance(scratch, w, alpha)
+                count += 1
     if w.lane == 0:
         out.overflow[w.id] = out.overflow[w.id] | missed
         out.solver_niter[w.id] = count
@@ -195,7 +206,7 @@ def solve_world(
     impratio = opt_impratio_invsqrt[w.id % opt_impratio_invsqrt.shape[0]]
     w.contacts = find_contacts(rows, scratch, w, w.equalities + w.frictions + nl_in[w.id], impratio)
     read_rows(rows, scratch, w, elliptic)
-    multiply(scratch.inertia[w.id], scratch.acc[w.id], nv, w.width, w.lane, scratch.inertial[w.id])
+    multiply(scratch, w, scratch.acc[w.id], scratch.inertial[w.id])
     iterate(rows, scratch, qfrc_smooth_in[w.id], w, limits, 1.0 / wp.max(_MIN, trace), out)
     for i in range(w.lane, nv, lane_count()):
         out.qacc[w.id, i] = at(scratch.acc[w.id], i)

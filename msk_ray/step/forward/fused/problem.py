@@ -3,11 +3,13 @@
 Axes: W worlds, R rows, C contacts.
 """
 
+import math
+
 import warp as wp
 
 from msk_ray.step.forward import mjw_private as private
 from msk_ray.step.forward.fused.cones import QUADRATIC, SATISFIED, lean_rows, update_contact
-from msk_ray.step.forward.fused.dense import add_squares, column_sum, factorize
+from msk_ray.step.forward.fused.dense import add_squares, combine, factorize
 from msk_ray.step.forward.fused.lanes import at, four, lane_count, lane_sum, lane_sync, put, put_whole, whole
 from msk_ray.step.forward.fused.scratch import Scratch
 from msk_ray.step.forward.mjw_private import ConstraintType, vec5
@@ -17,6 +19,7 @@ wp.set_module_options({"enable_backward": False})
 _ELLIPTIC = wp.constant(int(ConstraintType.CONTACT_ELLIPTIC))
 _LINEARNEG = wp.constant(int(private.ConstraintState.LINEARNEG))
 _LINEARPOS = wp.constant(int(private.ConstraintState.LINEARPOS))
+_NAN = wp.constant(math.nan)
 
 
 @wp.struct
@@ -155,11 +158,10 @@ def update_gradient(rows: Rows, scratch: Scratch, smooth: wp.array[float], w: Wo
     """Compute Jᵀ f and the gradient M a - τ - Jᵀ f; returns its squared norm."""
     force = rows.force[w.id]
     jacobian = rows.jacobian[w.id]
+    combine(force, jacobian, w.nv, rows.stride, w.rows, w.lane, scratch.push[w.id])
     square = float(0.0)
     for i in range(w.lane, w.nv, lane_count()):
-        push = column_sum(force, jacobian, i, rows.stride, w.rows)
-        slope = at(scratch.inertial[w.id], i) - at(smooth, i) - push
-        put(scratch.push[w.id], i, push)
+        slope = at(scratch.inertial[w.id], i) - at(smooth, i) - at(scratch.push[w.id], i)
         put(scratch.gradient[w.id], i, slope)
         square += slope * slope
     lane_sync()
@@ -182,4 +184,4 @@ def factor_hessian(rows: Rows, scratch: Scratch, w: World) -> None:
         factor,
     )
     lane_sync()
-    factorize(factor, scratch.pivot[w.id], w.nv, w.width, w.lane)
+    factorize(factor, scratch.pivot[w.id], w.nv, w.width, w.lane, _NAN)
