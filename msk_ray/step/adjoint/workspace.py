@@ -22,6 +22,7 @@ from msk_ray.step.adjoint.groups import (
 )
 from msk_ray.step.adjoint.launches import Launcher
 from msk_ray.step.adjoint.tables import build_tables
+from msk_ray.step.forward.fused.scratch import padded
 from msk_ray.step.forward.stages import Stages
 
 
@@ -80,6 +81,7 @@ class Workspace:
     """Allocates for `nworld` worlds of one model, on the device of `data`.
 
     Attributes:
+        jacobian_width: length of a row of the full constraint Jacobian, a multiple of four, nv or more.
         live: worlds whose gradient is wanted, shape (W,), int.
         grad_qpos, grad_qvel, grad_act, grad_ctrl: cotangents, in tangent coordinates.
         multipliers, slopes, fields, bars, tendon_bars, laws: as their groups say.
@@ -102,6 +104,7 @@ class Workspace:
         self.device = data.qpos.device
         self.nworld = data.nworld
         self.njmax = data.efc.D.shape[1]
+        self.jacobian_width = padded(mjm.nv) if model.is_sparse else data.efc.J.shape[2]
         self.settings = Settings.of(mjm)
         worlds, nv, nbody = data.nworld, mjm.nv, mjm.nbody
         with wp.ScopedDevice(self.device):

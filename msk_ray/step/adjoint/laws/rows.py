@@ -7,18 +7,30 @@ f = -D·jar; friction loss the same, clamped. Elliptic contacts couple their row
 
 import warp as wp
 
-from msk_ray.step.adjoint.groups import Contacts, RowLaws, Rows, Substep
-from msk_ray.step.adjoint.laws.cones import cone_law, cone_slope, vec6
+from msk_ray.step.adjoint.groups import Contacts, RowLaws, Rows, Substep, allocate_rows
 from msk_ray.step.adjoint.workspace import Workspace
+from msk_ray.step.forward.cone_law import QUADRATIC, SLIDING, cone_mass, zone
+from msk_ray.step.forward.fused.cones import lean_rows, lean_weights
+from msk_ray.step.forward.fused.lanes import at, lane_count, lane_sync, put
 from msk_ray.step.forward.mjw_private import ConstraintType
 
 wp.set_module_options({"enable_backward": False})
 
 _SLOTS = 32
 """Rows of a world that a GPU works on at the same time. Few worlds have more, while the buffer has room for many."""
-_LANES = 2
-"""Threads of a GPU that share a row of S J, each of which works out the law of the row's contact. A thread for each
-entry of the whole buffer took 150 µs for 4096 ants on an H200, and two for each of its rows 75."""
+
+
+@wp.struct
+class Squares:
+    """The constraint part of the Hessian, JᵀSJ, as Σ weight · row rowᵀ; (W, R), and the rows (W, ...) as J's lie."""
+
+    weight: wp.array2d[float]
+    """With elliptic cones; without, the weights are the slopes."""
+    bound: wp.array2d[float]
+    """μ in the first row of an elliptic contact, the friction coefficients in its other rows."""
+    leaning: wp.array2d[float]
+    """1 / T in the first row of an elliptic contact that slides, else 0."""
+    rows: wp.array2d[float]
 
 
 @wp.kernel
@@ -86,88 +98,103 @@ def row_laws(
 
 
 @wp.func
-def scale_row(
+def weigh_row(
     worldid: int,
     row: int,
-    lane: int,
-    lanes: int,
-    # Model:
-    nv: int,
-    impratio_invsqrt: float,
-    # In:
+    impratio: float,
     rows_in: Rows,
-    jacobian_in: wp.array3d[float],
     laws_in: RowLaws,
     contacts_in: Contacts,
-    # Out:
-    scaled_out: wp.array3d[float],
+    out: Squares,
 ) -> None:
-    """Rows of S J that belong to one row: its own, or all of the contact whose first it is."""
-    if rows_in.type[worldid, row] != ConstraintType.CONTACT_ELLIPTIC:
-        for dof in range(lane, nv, lanes):
-            scaled_out[worldid, row, dof] = laws_in.slope[worldid, row] * jacobian_in[worldid, row, dof]
-        return
+    """Weight of a row of an elliptic contact, and what `square_rows` reads of the contact."""
     con = rows_in.id[worldid, row]
-    if row != contacts_in.efc_address[con, 0]:
-        return  # the threads of the contact's first row write all of them
-    dim = contacts_in.dim[con]
-    jar = vec6()
-    mass = vec6()
-    for i in range(dim):
-        jar[i] = laws_in.jar[worldid, row + i]
-        mass[i] = rows_in.D[worldid, row + i]
-    friction = contacts_in.friction[con]
-    cone = cone_law(jar, mass, friction, friction[0] * impratio_invsqrt, dim)
-    for dof in range(lane, nv, lanes):
-        column = vec6()
-        for i in range(dim):
-            column[i] = jacobian_in[worldid, row + i, dof]
-        product = cone_slope(cone, mass, friction, dim, column)
-        for i in range(dim):
-            scaled_out[worldid, row + i, dof] = product[i]
+    first = contacts_in.efc_address[con, 0]
+    jar = laws_in.jar[worldid]
+    mu = contacts_in.friction[con][0] * impratio
+    normal = mu * at(jar, first)
+    squares = float(0.0)
+    for i in range(1, contacts_in.dim[con]):
+        u = contacts_in.friction[con][i - 1] * at(jar, first + i)
+        squares += u * u
+    tangent = wp.sqrt(squares)
+    state = zone(normal, tangent, mu)
+    weight = float(0.0)
+    inverse = float(0.0)
+    if state == QUADRATIC:
+        weight = rows_in.D[worldid, row]
+    elif state == SLIDING:
+        inverse = 1.0 / tangent
+        weights = lean_weights(cone_mass(rows_in.D[worldid, first], mu), mu, normal, inverse)
+        weight = wp.where(row == first, weights[0], weights[1])
+    put(out.weight[worldid], row, weight)
+    put(out.leaning[worldid], row, inverse)
+    if row == first:
+        put(out.bound[worldid], row, mu)
+    else:
+        put(out.bound[worldid], row, contacts_in.friction[con][row - first - 1])
 
 
-@wp.kernel
-def scaled_jacobian(
-    # Model:
-    nv: int,
-    opt_impratio_invsqrt: wp.array[float],
-    # In:
-    slots: int,
-    lanes: int,
-    nefc_in: wp.array[int],
+@wp.func
+def square_rows(
+    worldid: int,
+    count: int,
+    lane: int,
+    impratio: float,
     rows_in: Rows,
-    jacobian_in: wp.array3d[float],
+    jacobian: wp.array[float],
+    stride: int,
     laws_in: RowLaws,
     contacts_in: Contacts,
-    # Out:
-    scaled_out: wp.array3d[float],
+    out: Squares,
 ) -> None:
-    """S J; needed for elliptic cones only, whose S couples the rows of a contact.
-
-    `slots` groups of `lanes` threads take all rows of a world in turn.
-    """
-    worldid, slot, lane = wp.tid()
-    impratio = opt_impratio_invsqrt[worldid % opt_impratio_invsqrt.shape[0]]
-    for row in range(slot, wp.min(nefc_in[worldid], laws_in.jar.shape[1]), slots):
-        scale_row(worldid, row, lane, lanes, nv, impratio, rows_in, jacobian_in, laws_in, contacts_in, scaled_out)
+    """Weights and rows whose squares add up to JᵀSJ, with all lanes of a world; for elliptic cones, whose S couples the
+    rows of a contact."""
+    for row in range(lane, count, lane_count()):
+        if rows_in.type[worldid, row] == ConstraintType.CONTACT_ELLIPTIC:
+            weigh_row(worldid, row, impratio, rows_in, laws_in, contacts_in, out)
+        else:
+            put(out.weight[worldid], row, laws_in.slope[worldid, row])
+            put(out.leaning[worldid], row, 0.0)
+    lane_sync()
+    first = int(0)
+    while first < count:
+        end = first + 1
+        if rows_in.type[worldid, first] == ConstraintType.CONTACT_ELLIPTIC:
+            end = wp.min(first + contacts_in.dim[rows_in.id[worldid, first]], count)
+        inverse = at(out.leaning[worldid], first)
+        lean_rows(
+            first,
+            end,
+            inverse,
+            laws_in.jar[worldid],
+            out.bound[worldid],
+            jacobian,
+            stride,
+            stride,
+            lane,
+            out.rows[worldid],
+        )
+        first = end
+    lane_sync()
 
 
 class ConstraintLaws:
     """Launches of everything about constraint rows that depends on the acceleration alone.
 
     Attributes:
-        scaled: S J for elliptic cones, shape (W, njmax, nv).
+        squares: where the rows of the Hessian are worked out with elliptic cones; of no size for others.
     """
 
     def __init__(self, work: Workspace) -> None:
         self._work = work
-        shape = (work.nworld, work.njmax, work.mjm.nv)
-        self.scaled = wp.zeros(shape if work.settings.elliptic else (1, 1, 1), dtype=float)
+        shape = (work.nworld, work.njmax, work.jacobian_width)
+        worlds = work.nworld if work.settings.elliptic else 0
+        self.squares = allocate_rows(Squares, worlds, {"rows": shape[1] * shape[2]}, work.njmax)
         self._dense = wp.zeros(shape, dtype=float) if work.model.is_sparse else None
 
     def launch(self, at: Substep) -> None:
-        """Launch the Jacobian as a full matrix, the laws and S J."""
+        """Launch the Jacobian as a full matrix, and the laws."""
         work = self._work
         if self._dense is not None:
             efc = at.data.efc
@@ -176,6 +203,3 @@ class ConstraintLaws:
             at.jacobian = self._dense
         slots = work.lanes(min(_SLOTS, work.njmax), meet=False)
         work.launch(row_laws, (work.nworld, slots), at, slots=slots)
-        if work.settings.elliptic:
-            lanes = work.lanes(_LANES, meet=False)
-            work.launch(scaled_jacobian, (work.nworld, slots, lanes), at, slots=slots, lanes=lanes, scaled=self.scaled)

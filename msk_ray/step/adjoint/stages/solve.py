@@ -2,12 +2,15 @@
 
 import warp as wp
 
-from msk_ray.step.adjoint.groups import Substep
-from msk_ray.step.adjoint.laws.rows import ConstraintLaws
+from msk_ray.step.adjoint.groups import Contacts, RowLaws, Rows, Substep
+from msk_ray.step.adjoint.laws.rows import ConstraintLaws, Squares, square_rows
 from msk_ray.step.adjoint.stages.free_bodies import FreeBodySolves
 from msk_ray.step.adjoint.stages.integrate import Integrator
 from msk_ray.step.adjoint.stages.tiles import solve_tiled, solve_two_tiled
 from msk_ray.step.adjoint.workspace import Workspace
+from msk_ray.step.forward.fused.dense import add_squares
+from msk_ray.step.forward.fused.lanes import WARP, at, lane_count, lane_sync, put
+from msk_ray.step.forward.fused.scratch import padded
 
 wp.set_module_options({"enable_backward": False})
 
@@ -19,49 +22,68 @@ _BLOCK = 32
 @wp.kernel
 def build_matrices(
     # Model:
+    nv: int,
     coupled: bool,
     inertia_address: wp.array2d[int],
+    opt_impratio_invsqrt: wp.array[float],
     # In:
     nefc_in: wp.array[int],
     M_in: wp.array2d[float],
     step_in: wp.array2d[float],
     step_dense: bool,
-    jacobian_in: wp.array3d[float],
-    slope_in: wp.array2d[float],
-    scaled_in: wp.array3d[float],
+    rows_in: Rows,
+    laws_in: RowLaws,
+    contacts_in: Contacts,
+    jacobian_in: wp.array2d[float],
+    stride: int,
+    width: int,
     # Out:
-    implicit_out: wp.array3d[float],
-    hessian_out: wp.array3d[float],
+    squares_out: Squares,
+    implicit_out: wp.array2d[float],
+    hessian_out: wp.array2d[float],
 ) -> None:
-    """M + hB and H = M + JᵀSJ as full matrices, one thread an entry of the lower triangle.
+    """M + hB and H = M + JᵀSJ as full matrices, whose rows are `width` numbers apart, by the lanes of a world.
 
-    `step_in` is the diagonal hB, shape (W, nv), or with `step_dense` all of M + hB in M's sparse layout.
+    `step_in` is the diagonal hB, shape (W, nv), or with `step_dense` all of M + hB in M's sparse layout; the rows of
+    `jacobian_in`, one after the other, are `stride` numbers long.
     """
-    worldid, i, j = wp.tid()
-    if j > i:
-        return
-    address = inertia_address[i, j]
-    entry = float(0.0)
-    if address >= 0:
-        entry = M_in[worldid, address]
-    implicit = entry
-    if step_dense:
+    thread = wp.tid()
+    worldid = thread // lane_count()
+    lane = thread % lane_count()
+    implicit = implicit_out[worldid]
+    hessian = hessian_out[worldid]
+    for e in range(lane, nv * nv, lane_count()):
+        i = e // nv
+        j = e % nv
+        address = inertia_address[wp.max(i, j), wp.min(i, j)]
+        entry = float(0.0)
+        step = float(0.0)
         if address >= 0:
-            implicit = step_in[worldid, address]
-    elif i == j:
-        implicit += step_in[worldid, i]
-    implicit_out[worldid, i, j] = implicit
-    implicit_out[worldid, j, i] = implicit
-    # H_ij = M_ij + Σ_r J_ri (S J)_rj
-    for r in range(wp.min(nefc_in[worldid], slope_in.shape[1])):
-        if coupled:
-            entry += jacobian_in[worldid, r, i] * scaled_in[worldid, r, j]
-        else:
-            s = slope_in[worldid, r]
-            if s != 0.0:
-                entry += s * jacobian_in[worldid, r, i] * jacobian_in[worldid, r, j]
-    hessian_out[worldid, i, j] = entry
-    hessian_out[worldid, j, i] = entry
+            entry = M_in[worldid, address]
+            step = entry
+        if step_dense:
+            if address >= 0:
+                step = step_in[worldid, address]
+        elif i == j:
+            step += step_in[worldid, i]
+        put(implicit, i * width + j, step)
+        put(hessian, i * width + j, entry)
+    count = wp.min(nefc_in[worldid], laws_in.jar.shape[1])
+    weight = laws_in.slope[worldid]
+    rows = jacobian_in[worldid]
+    if coupled:
+        impratio = opt_impratio_invsqrt[worldid % opt_impratio_invsqrt.shape[0]]
+        square_rows(worldid, count, lane, impratio, rows_in, rows, stride, laws_in, contacts_in, squares_out)
+        weight = squares_out.weight[worldid]
+        rows = squares_out.rows[worldid]
+    lane_sync()
+    add_squares(hessian, weight, rows, count, stride, width, lane, lane_count(), hessian)
+    lane_sync()
+    for e in range(lane, nv * nv, lane_count()):
+        i = e // nv
+        j = e % nv
+        if j < i:
+            put(hessian, i * width + j, at(hessian, j * width + i))
 
 
 @wp.kernel
@@ -172,13 +194,20 @@ def solve_serial(
     _substitute(hessian_in[worldid], nv, lam_out[worldid])
 
 
+def flat(matrices: wp.array) -> wp.array:
+    """A matrix of each world, (W, R, C), as (W, R C)."""
+    return matrices.reshape((matrices.shape[0], -1))
+
+
 class LinearSystems:
     """Launches of the solves for μ, a - â and λ."""
 
     def __init__(self, work: Workspace, integrator: Integrator, laws: ConstraintLaws) -> None:
         self._work, self._integrator, self._laws = work, integrator, laws
         worlds, nv = work.nworld, work.mjm.nv
-        self._implicit, self._hessian = (wp.zeros((worlds, nv, nv), dtype=float) for _ in range(2))
+        self._width = padded(nv)
+        shape = (worlds, self._width, self._width)
+        self._implicit, self._hessian = (wp.zeros(shape, dtype=float) for _ in range(2))
         if work.settings.implicit_all:
             self._step = wp.zeros((worlds, work.model.nC), dtype=float)
             self._push = wp.zeros((worlds, nv), dtype=float)
@@ -193,10 +222,12 @@ class LinearSystems:
             work.stages.slopes(m, d, self._step)
             if self._free is not None:
                 self._free.hold(at, self._step)
-        named = {"coupled": settings.elliptic, "step_dense": settings.implicit_all, "slope": work.laws.slope}
+        named = {"coupled": settings.elliptic, "step_dense": settings.implicit_all, "width": self._width}
         named |= {"step": self._step if settings.implicit_all else self._integrator.damping_step}
-        named |= {"scaled": self._laws.scaled, "implicit": self._implicit, "hessian": self._hessian}
-        work.launch(build_matrices, (work.nworld, m.nv, m.nv), at, **named)
+        named |= {"jacobian": flat(at.jacobian), "stride": at.jacobian.shape[2]}
+        named |= {"implicit": flat(self._implicit), "hessian": flat(self._hessian)}
+        threads = work.nworld * (WARP if work.device.is_cuda else 1)
+        work.launch(build_matrices, threads, at, self._laws.squares, **named)
         if settings.implicit_all:
             self._solve_implicit(at)
             return

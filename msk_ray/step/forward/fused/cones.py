@@ -69,13 +69,13 @@ def update_contact(
     mass = cone_mass(at(stiffness, first), mu)
     inverse = 1.0 / tangent
     pull = mass * mu * (normal - mu * tangent)
-    turning = mass * (mu * mu - mu * normal * inverse)
-    put(weight, first, mass * mu * mu)
+    weights = lean_weights(mass, mu, normal, inverse)
+    put(weight, first, weights[0])
     put(force, first, -pull)
     put_whole(state, first, SLIDING)
     for p in range(first + 1, end):
         friction = at(bound, p)
-        put(weight, p, turning)
+        put(weight, p, weights[1])
         put(force, p, pull * inverse * friction * friction * at(jar, p))
         put_whole(state, p, SLIDING)
     put(scratch.leaning[world], contact, inverse)
@@ -83,28 +83,31 @@ def update_contact(
 
 
 @wp.func
+def lean_weights(mass: float, mu: float, normal: float, inverse: float) -> wp.vec2:
+    """Weights of a sliding contact's rows in `lean_rows`: of the first, and of each other."""
+    return wp.vec2(mass * mu * mu, mass * (mu * mu - mu * normal * inverse))
+
+
+@wp.func
 def lean_rows(
-    scratch: Scratch,
-    world: int,
-    contact: int,
+    first: int,
+    end: int,
+    inverse: float,
+    jar: wp.array[float],
+    bound: wp.array[float],
     jacobian: wp.array[float],
     stride: int,
-    nv: int,
+    columns: int,
     lane: int,
     rows: wp.array[float],
 ) -> None:
     """Compute the rows of a contact that add to the Hessian, with all lanes; they lie `stride` apart, as in J.
 
-    While it slides, its part of the Hessian is, with zᵢ = φᵢ Jᵢ, the direction û = u / T and p = Σ ûᵢ zᵢ,
-    m μ² (J₀ - p)(J₀ - p)ᵀ + m (μ² - μ N / T) Σ (zᵢ - ûᵢ p)(zᵢ - ûᵢ p)ᵀ: rows with non-negative weights.
-    Otherwise they are the rows of J.
+    While it slides, with 1 / T as `inverse`, its part of the Hessian is, with zᵢ = φᵢ Jᵢ, the direction û = u / T and
+    p = Σ ûᵢ zᵢ, m μ² (J₀ - p)(J₀ - p)ᵀ + m (μ² - μ N / T) Σ (zᵢ - ûᵢ p)(zᵢ - ûᵢ p)ᵀ: rows with non-negative weights.
+    Otherwise they are the rows of J, and `inverse` is not positive.
     """
-    jar = scratch.jar[world]
-    bound = scratch.bound[world]
-    first = whole(scratch.first[world], contact)
-    end = whole(scratch.end[world], contact)
-    inverse = at(scratch.leaning[world], contact)
-    for i in range(lane, nv, lane_count()):
+    for i in range(lane, columns, lane_count()):
         mean = float(0.0)
         if inverse > 0.0:
             for p in range(first + 1, end):

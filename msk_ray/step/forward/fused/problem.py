@@ -147,8 +147,20 @@ def update_rows(rows: Rows, scratch: Scratch, w: World) -> bool:
             changed = 1.0
     lane_sync()
     for contact in range(w.contacts):
-        if at(scratch.leaning[w.id], contact) != 0.0:
-            lean_rows(scratch, w.id, contact, rows.jacobian[w.id], rows.stride, w.nv, w.lane, rows.squared[w.id])
+        inverse = at(scratch.leaning[w.id], contact)
+        if inverse != 0.0:
+            lean_rows(
+                whole(scratch.first[w.id], contact),
+                whole(scratch.end[w.id], contact),
+                inverse,
+                scratch.jar[w.id],
+                scratch.bound[w.id],
+                rows.jacobian[w.id],
+                rows.stride,
+                w.nv,
+                w.lane,
+                rows.squared[w.id],
+            )
     lane_sync()
     return lane_sum(changed) > 0.0
 
