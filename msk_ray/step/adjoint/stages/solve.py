@@ -254,8 +254,10 @@ class LinearSystems:
         work.launch(damping_product, (work.nworld, work.model.nv), at, **named)
 
     def _solve_two(self, matrix: wp.array, first: wp.array, second: wp.array, outputs: list[wp.array]) -> None:
+        """Solve for both sides; small systems only for the first where both are one array."""
         worlds, nv, inputs = self._work.nworld, self._work.model.nv, [matrix, first, second]
         if nv <= TILE_LIMIT:
-            wp.launch_tiled(solve_two_tiled(nv), dim=worlds, inputs=inputs, outputs=outputs, block_dim=_BLOCK)
+            kernel = solve_two_tiled(nv, first is not second)
+            wp.launch_tiled(kernel, dim=worlds, inputs=inputs, outputs=outputs, block_dim=_BLOCK)
         else:
             wp.launch(solve_two_serial, dim=worlds, inputs=[nv, *inputs], outputs=outputs)

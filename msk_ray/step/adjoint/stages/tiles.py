@@ -44,8 +44,8 @@ def solve_tiled(nv: int) -> Any:
 
 
 @cache
-def solve_two_tiled(nv: int) -> Any:
-    """A⁻¹ of two right-hand sides, for nv up to TILE_LIMIT."""
+def solve_two_tiled(nv: int, second: bool) -> Any:
+    """A⁻¹ of one right-hand side or of a second as well, for nv up to TILE_LIMIT."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def kernel(
@@ -62,7 +62,8 @@ def solve_two_tiled(nv: int) -> Any:
         wp.tile_cholesky_inplace(matrix)
         first = wp.tile_load(first_in[worldid], shape=wp.static(nv))
         wp.tile_store(first_out[worldid], wp.tile_cholesky_solve(matrix, first))
-        second = wp.tile_load(second_in[worldid], shape=wp.static(nv))
-        wp.tile_store(second_out[worldid], wp.tile_cholesky_solve(matrix, second))
+        if wp.static(second):
+            other = wp.tile_load(second_in[worldid], shape=wp.static(nv))
+            wp.tile_store(second_out[worldid], wp.tile_cholesky_solve(matrix, other))
 
     return kernel
