@@ -1,6 +1,7 @@
 """The launches of one substep's pullback, apart from the modes that use them."""
 
 from collections.abc import Iterator
+from pathlib import Path
 from types import SimpleNamespace
 
 import mujoco_warp as mjw
@@ -80,6 +81,15 @@ def test_large_models_solve_serially_to_the_same(name, monkeypatch):
     monkeypatch.setattr(solve, "TILE_LIMIT", 0)
     for key, value in pulled(model, points, poison=False).items():
         assert relative(value, tiled[key]) < 1e-5, key
+
+
+def test_the_matrices_compile_for_a_gpu(tmp_path: Path):
+    """Their sums have a part of their own there."""
+    wp.compile_aot_module(solve.build_matrices.module, arch=90, module_dir=str(tmp_path), use_ptx=True)
+    (found,) = tmp_path.glob("*.ptx")
+    text = found.read_text()
+    assert ".entry build_matrices" in text
+    assert "shfl.sync" in text
 
 
 def test_a_group_names_the_array_that_has_changed():
