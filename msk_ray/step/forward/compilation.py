@@ -48,6 +48,8 @@ def compile_kernels(device: wp.Device, *works: Callable[[], None]) -> None:
     """
     global _done
     wanted = [v for v in _variants(device, works) if (device.alias, *v) not in _ready]
+    # The longest decides when all are ready.
+    wanted.sort(key=_length, reverse=True)
     if not wanted:
         return
     total = _done + len(wanted)
@@ -69,6 +71,12 @@ def compile_kernels(device: wp.Device, *works: Callable[[], None]) -> None:
 def _report(total: int) -> None:
     if _listener is not None:
         _listener(_done, total)
+
+
+def _length(variant: _Variant) -> int:
+    """Length of the source of a module's kernels, without the functions that they call."""
+    module, _ = variant
+    return sum(len(kernel.adj.source) for kernel in module.kernels.values())
 
 
 def _load(device: wp.Device, variant: _Variant) -> None:

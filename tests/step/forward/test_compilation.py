@@ -27,6 +27,15 @@ def double(x: wp.array[float]):
 
 
 @wp.kernel(module="unique", enable_backward=False)
+def add_one_or_two(x: wp.array[float]):
+    i = wp.tid()
+    if x[i] > 0.0:
+        x[i] = x[i] + 1.0
+    else:
+        x[i] = x[i] + 2.0
+
+
+@wp.kernel(module="unique", enable_backward=False)
 def of_any_type(x: wp.array[wp.Float]):
     i = wp.tid()
     x[i] = x[i] + x.dtype(1.0)
@@ -83,6 +92,20 @@ def test_a_generic_kernel_waits_for_its_launch(reports: list[tuple[int, int]]) -
     assert reports == []
     work()
     assert x.numpy().tolist() == [2.0] * 3
+
+
+def test_the_longest_is_compiled_first(reports: list[tuple[int, int]], monkeypatch: pytest.MonkeyPatch) -> None:
+    started = []
+    monkeypatch.setattr(compilation, "_MOST_THREADS", 1)
+    monkeypatch.setattr(compilation, "_load", lambda device, variant: started.append(variant[0]))
+    x = ones()
+
+    def work() -> None:
+        wp.launch(double, dim=3, inputs=[x], device=CPU)
+        wp.launch(add_one_or_two, dim=3, inputs=[x], device=CPU)
+
+    compile_kernels(wp.get_device(CPU), work)
+    assert started == [add_one_or_two.module, double.module]
 
 
 def test_other_threads_launch_meanwhile() -> None:

@@ -1,4 +1,8 @@
-"""The solves of a small model, one block a world, with matrices in the block's shared memory."""
+"""The solves of a small model, one block a world, with matrices in the block's shared memory.
+
+Factors are upper triangles as in mujoco_warp, and blocks as large: its device code for a matrix of this size, which
+takes five seconds to compile, serves here too.
+"""
 
 from functools import cache
 from typing import Any
@@ -28,17 +32,18 @@ def solve_tiled(nv: int) -> Any:
         damping = wp.tile_load(damping_in[worldid], shape=wp.static(nv))
         qacc = wp.tile_load(qacc_in[worldid], shape=wp.static(nv))
         implicit = wp.tile_load(implicit_in[worldid], shape=(wp.static(nv), wp.static(nv)))
-        wp.tile_cholesky_inplace(implicit)
+        wp.tile_cholesky_inplace(implicit, fill_mode="upper")
         # (M + hB) μ = h v̄'
-        mu = wp.tile_cholesky_solve(implicit, rhs)
+        mu = wp.tile_cholesky_solve(implicit, rhs, fill_mode="upper")
         wp.tile_store(mu_out[worldid], mu)
         # â = (M + hB)⁻¹ M a  ⇒  a - â = (M + hB)⁻¹ hB a
-        wp.tile_store(excess_out[worldid], wp.tile_cholesky_solve(implicit, wp.tile_map(wp.mul, damping, qacc)))
+        push = wp.tile_map(wp.mul, damping, qacc)
+        wp.tile_store(excess_out[worldid], wp.tile_cholesky_solve(implicit, push, fill_mode="upper"))
         # M μ = h v̄' - hB μ ,  H λ = M μ
-        push = wp.tile_map(wp.sub, rhs, wp.tile_map(wp.mul, damping, mu))
+        rest = wp.tile_map(wp.sub, rhs, wp.tile_map(wp.mul, damping, mu))
         hessian = wp.tile_load(hessian_in[worldid], shape=(wp.static(nv), wp.static(nv)))
-        wp.tile_cholesky_inplace(hessian)
-        wp.tile_store(lam_out[worldid], wp.tile_cholesky_solve(hessian, push))
+        wp.tile_cholesky_inplace(hessian, fill_mode="upper")
+        wp.tile_store(lam_out[worldid], wp.tile_cholesky_solve(hessian, rest, fill_mode="upper"))
 
     return kernel
 
@@ -59,11 +64,11 @@ def solve_two_tiled(nv: int, second: bool) -> Any:
     ) -> None:
         worldid = wp.tid()
         matrix = wp.tile_load(matrix_in[worldid], shape=(wp.static(nv), wp.static(nv)))
-        wp.tile_cholesky_inplace(matrix)
+        wp.tile_cholesky_inplace(matrix, fill_mode="upper")
         first = wp.tile_load(first_in[worldid], shape=wp.static(nv))
-        wp.tile_store(first_out[worldid], wp.tile_cholesky_solve(matrix, first))
+        wp.tile_store(first_out[worldid], wp.tile_cholesky_solve(matrix, first, fill_mode="upper"))
         if wp.static(second):
             other = wp.tile_load(second_in[worldid], shape=wp.static(nv))
-            wp.tile_store(second_out[worldid], wp.tile_cholesky_solve(matrix, other))
+            wp.tile_store(second_out[worldid], wp.tile_cholesky_solve(matrix, other, fill_mode="upper"))
 
     return kernel
