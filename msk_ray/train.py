@@ -34,6 +34,7 @@ from msk_ray.files import check_writable, make_folder, write_json
 from msk_ray.metrics import SCORE
 from msk_ray.progress import ProgressLine, announce
 from msk_ray.signals import RESUMABLE, StopRequest, listening
+from msk_ray.step.garbage import lasting_imports
 from msk_ray.text import printable
 
 if TYPE_CHECKING:
@@ -194,7 +195,8 @@ def _choose_device(asked: str | None) -> str:
     """The requested device, else the first GPU, else the CPU; loads torch."""
     # Torch reads this when it is imported: idle threads should sleep, not spin.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    from msk_ray.evaluate.measure import default_device
+    with lasting_imports():
+        from msk_ray.evaluate.measure import default_device
 
     return asked or default_device()
 

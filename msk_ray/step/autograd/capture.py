@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from msk_ray.step.autograd.buffers import stream_of
-from msk_ray.step.forward import joining_capture, without_collecting
+from msk_ray.step.forward import joining_capture
+from msk_ray.step.garbage import without_collecting
 
 T = TypeVar("T")
 

@@ -11,7 +11,7 @@ start_quietly()
 
 from msk_ray.step.forward.batch import WorldBatch  # noqa: E402
 from msk_ray.step.forward.compilation import compile_kernels, on_compiling  # noqa: E402
-from msk_ray.step.forward.graph import Graph, joined_stream, joining_capture, without_collecting  # noqa: E402
+from msk_ray.step.forward.graph import Graph, joined_stream, joining_capture  # noqa: E402
 from msk_ray.step.forward.stages import Kernels  # noqa: E402
 
 __all__ = [
@@ -22,5 +22,4 @@ __all__ = [
     "joined_stream",
     "joining_capture",
     "on_compiling",
-    "without_collecting",
 ]

@@ -1,6 +1,5 @@
 """A fixed sequence of Warp launches, recorded once and replayed."""
 
-import gc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
@@ -8,21 +7,10 @@ from typing import Any
 import warp as wp
 
 from msk_ray.step.forward.compilation import compile_kernels
+from msk_ray.step.garbage import without_collecting
 
 _outer: list[wp.Stream] = []
 """The stream of another library's ongoing capture, if any."""
-
-
-@contextmanager
-def without_collecting() -> Iterator[None]:
-    """Context without garbage collection, because a capture fails if CUDA graphs are freed during it."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
 
 
 @contextmanager
