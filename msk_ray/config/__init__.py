@@ -34,7 +34,10 @@ from msk_ray.config.overlay import value_at as value_at
 from msk_ray.config.physics import FdConfig as FdConfig
 from msk_ray.config.physics import PhysicsConfig as PhysicsConfig
 from msk_ray.config.randomize import Draw as Draw
+from msk_ray.config.randomize import ModelRandomization as ModelRandomization
+from msk_ray.config.randomize import Push as Push
 from msk_ray.config.randomize import RandomizeConfig as RandomizeConfig
+from msk_ray.config.randomize import Spread as Spread
 from msk_ray.config.recorded import SCHEMA as SCHEMA
 from msk_ray.config.recorded import changed_settings as changed_settings
 from msk_ray.config.recorded import current_key as current_key

@@ -13,14 +13,15 @@ SettingsT = TypeVar("SettingsT", bound=EnvSettings)
 _EVERY = "every"
 
 
-def _ascending(span: tuple[float, float]) -> tuple[float, float]:
+def ascending(span: tuple[float, float]) -> tuple[float, float]:
+    """The same numbers, if they are in order."""
     if span[0] > span[1]:
         raise PydanticCustomError("order", "write the smaller number first")
     return span
 
 
-Span = Annotated[tuple[float, float], AfterValidator(_ascending)]
-Period = Annotated[tuple[PositiveFloat, PositiveFloat], AfterValidator(_ascending)]
+Span = Annotated[tuple[float, float], AfterValidator(ascending)]
+Period = Annotated[tuple[PositiveFloat, PositiveFloat], AfterValidator(ascending)]
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,15 @@
-"""Model parameters to draw at random for each world and episode in training."""
+"""What is drawn at random in training: parameters of the model, and what disturbs a policy beside them."""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, PositiveFloat, model_validator
+from pydantic import AfterValidator, Field, PositiveFloat, model_validator
 
-from msk_ray.config.sections import Section, Text
+from msk_ray.config.commands import Period, ascending
+from msk_ray.config.sections import NonNegative, Section, Text, Whole
+
+Steps = Annotated[tuple[Whole, Whole], AfterValidator(ascending)]
 
 
 class Draw(Section):
@@ -35,7 +38,42 @@ class Scaling(Draw):
     mode: Literal["scale"] = "scale"
 
 
-class RandomizeConfig(Section):
+class Spread(Section):
+    """Distribution about 0, in the unit of what is disturbed: one of both."""
+
+    uniform: PositiveFloat | None = None
+    """Largest size."""
+    normal: PositiveFloat | None = None
+    """Standard deviation."""
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> Spread:
+        if (self.uniform is None) == (self.normal is None):
+            raise ValueError("write one of uniform, normal")
+        return self
+
+    def __str__(self) -> str:
+        return f"±{self.uniform:g}" if self.uniform is not None else f"σ {self.normal:g}"
+
+
+Spreads = Annotated[dict[Text, Spread], Field(min_length=1, max_length=1024)]
+"""Distributions by name of entries of the observation, or by pattern such as `*_angle`."""
+
+
+class Push(Section):
+    """Kicks: sudden changes of velocity."""
+
+    every: Period
+    """Shortest and longest time from one to the next [s], uniform."""
+    velocity: Annotated[dict[Text, Annotated[tuple[NonNegative, ...], Field(max_length=6)]], Field(min_length=1)]
+    """Largest change of each velocity of a joint, by the joint's name [m/s, rad/s]: of a free joint x, y, z of the
+    world, then about x, y, z of the body."""
+
+    def __str__(self) -> str:
+        return f"every {self.every[0]:g} to {self.every[1]:g} s"
+
+
+class ModelRandomization(Section):
     """Distributions of model fields, named as in MuJoCo's MjModel; null: not randomized."""
 
     geom_friction: Draw | None = None
@@ -59,11 +97,26 @@ class RandomizeConfig(Section):
     gravity: Scaling | None = None
     """Gravity."""
 
+
+class RandomizeConfig(ModelRandomization):
+    """Model fields, and disturbances beside them; null: none."""
+
+    observation_noise: Spreads | None = None
+    """Noise of entries of the observation, another one in every env step."""
+    observation_bias: Spreads | None = None
+    """Error of entries of the observation that stays the same for an episode, such as that of an encoder."""
+    observation_delay: Steps | None = None
+    """Fewest and most env steps by which observations are late, one number for an episode."""
+    control_delay: Steps | None = None
+    """Fewest and most env steps by which controls reach the actuators late, one number for an episode."""
+    push: Push | None = None
+    """Kicks."""
+
     @model_validator(mode="after")
     def _drawable(self) -> RandomizeConfig:
-        if not self.drawn:
+        if not self._written:
             raise ValueError(f"physics.randomize: write at least one of {', '.join(type(self).model_fields)}")
-        for name, draw in self.drawn.items():
+        for name, draw in self.parameters.items():
             if draw.low > draw.high:
                 raise ValueError(
                     f"physics.randomize.{name}: low {draw.low:g} is above high {draw.high:g}; exchange them"
@@ -71,9 +124,25 @@ class RandomizeConfig(Section):
         return self
 
     @property
-    def drawn(self) -> dict[str, Draw]:
-        """Distributions by field, without null ones."""
-        return {name: draw for name in type(self).model_fields if (draw := getattr(self, name)) is not None}
+    def _written(self) -> dict[str, Any]:
+        """Settings that are not null."""
+        return {name: value for name in type(self).model_fields if (value := getattr(self, name)) is not None}
+
+    @property
+    def parameters(self) -> dict[str, Draw]:
+        """Distributions of fields of the model, by field."""
+        return {name: value for name, value in self._written.items() if isinstance(value, Draw)}
+
+    @property
+    def disturbs(self) -> bool:
+        """Whether there is anything but parameters of the model."""
+        return len(self.parameters) < len(self._written)
 
     def __str__(self) -> str:
-        return ", ".join(f"{name} {draw}" for name, draw in self.drawn.items())
+        return ", ".join(f"{name} {_text(value)}" for name, value in self._written.items())
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, dict):
+        return " and ".join(f"{name} {spread}" for name, spread in value.items())
+    return f"{value[0]} to {value[1]} env steps" if isinstance(value, tuple) else str(value)

@@ -19,6 +19,7 @@ from msk_ray.config.commands import Commands, settings_with_commands
 from msk_ray.config.rewards import settings_with
 from msk_ray.envs import commands
 from msk_ray.envs.contract import Contract, versions
+from msk_ray.envs.disturbances import Disturbances
 from msk_ray.envs.layout import Entry
 from msk_ray.envs.memory import Memories, Memory, restored
 from msk_ray.envs.options import FUSED_SOLVER, JACOBIANS
@@ -127,7 +128,8 @@ class Env(ABC, Generic[SettingsT]):
         self.action_size = self.model.nu
         self.generator = torch.Generator(device=self.device).manual_seed(seed)
         self.randomizer: Randomizer | None = None
-        if physics.randomize is not None:
+        self._randomize, self._seed = physics.randomize, seed
+        if physics.randomize is not None and physics.randomize.parameters:
             self.randomizer = Randomizer(physics.randomize, self.model, self.device, seed)
             self.sim.open_parameters(self.randomizer.parameters)
         self._begin_terms()
@@ -329,7 +331,14 @@ class Env(ABC, Generic[SettingsT]):
     def _memories(self) -> Memories:
         declared = self.memories()
         self._contract.check_declared(declared)
-        return Memories(declared, self.nworld, self.device)
+        own = {} if self.disturbances is None else self.disturbances.memories()
+        return Memories({**declared, **own}, self.nworld, self.device)
+
+    @cached_property
+    def disturbances(self) -> Disturbances | None:
+        """What else than parameters of the model differs from the environment as it is scored; made after `prepare`."""
+        drawn = self._randomize
+        return Disturbances(drawn, self, self._seed) if drawn is not None and drawn.disturbs else None
 
     def spread_ages(self) -> None:
         """Give the worlds ages spread evenly over the episode length: they then reset at different times."""
@@ -368,9 +377,14 @@ class Env(ABC, Generic[SettingsT]):
         self._contract.check_start(physics, count)
         if self._drawn:
             task = torch.cat((task, 0.5 + 0.5 * self.uniform(count, self._drawn)), dim=-1)
-        if self.randomizer is None:
-            return Resets(physics, task)
-        return Resets(physics, torch.cat((self.randomizer.draw(count), task), dim=-1))
+        drawn = [source.draw(count) for source in self.randomized.values()]
+        return Resets(physics, torch.cat((*drawn, task), dim=-1) if drawn else task)
+
+    @property
+    def randomized(self) -> dict[str, Randomizer | Disturbances]:
+        """What draws the numbers of `physics.randomize` for an episode, in the order of `EnvState.numbers`."""
+        both = {"randomizer": self.randomizer, "disturbances": self.disturbances}
+        return {name: source for name, source in both.items() if source is not None}
 
     def draw_start(self, count: int) -> tuple[StepState, Tensor]:
         """Initial physical states of `count` episodes, and numbers of the task of each, (count, T), such as the phase
@@ -381,8 +395,8 @@ class Env(ABC, Generic[SettingsT]):
         """Become the worlds of one process of a group, each of which has as many, in their initial states."""
         self.group = group
         self.generator.manual_seed(self.generator.initial_seed())
-        if self.randomizer is not None:
-            self.randomizer.generator.manual_seed(self.randomizer.generator.initial_seed())
+        for source in self.randomized.values():
+            source.generator.manual_seed(source.generator.initial_seed())
         self.state = self.reset_state()
 
     def stock_resets(self, drawn: Resets | None) -> None:
@@ -395,11 +409,16 @@ class Env(ABC, Generic[SettingsT]):
     @property
     def parameters(self) -> dict[str, Tensor] | None:
         """Values of the model's fields that differ between worlds, by name; None for the model's own."""
-        return None if self.randomizer is None else self.randomizer.values(self._split(self.state.numbers)[0])
+        return None if self.randomizer is None else self.randomizer.values(self._numbers["randomizer"])
+
+    @property
+    def disturbance_numbers(self) -> Tensor:
+        """The numbers of `disturbances`, (W, D)."""
+        return self._numbers["disturbances"]
 
     def task_numbers(self, numbers: Tensor) -> Tensor:
         """What `draw_start` has drawn of `EnvState.numbers`, (W, T)."""
-        task = self._split(numbers)[1]
+        task = self._split(numbers)["task"]
         return task[:, : task.shape[1] - self._drawn] if self._drawn else task
 
     def command(self, name: str) -> Tensor:
@@ -415,10 +434,15 @@ class Env(ABC, Generic[SettingsT]):
         time = self.state.age * self.config.control_timestep
         return self._draws[name].value(drawn, time, self.command_ranges[name])
 
-    def _split(self, numbers: Tensor) -> tuple[Tensor, Tensor]:
-        """Columns of the randomizer, (W, K), and of the task: T by `draw_start`, then those of the commands."""
-        drawn = 0 if self.randomizer is None else self.randomizer.size
-        return numbers[:, :drawn], numbers[:, drawn:]
+    @property
+    def _numbers(self) -> dict[str, Tensor]:
+        return self._split(self.state.numbers)
+
+    def _split(self, numbers: Tensor) -> dict[str, Tensor]:
+        """Columns of each source of `randomized`, and of the `task`: T by `draw_start`, then those of the commands."""
+        sizes = {name: source.size for name, source in self.randomized.items()}
+        sizes["task"] = numbers.shape[1] - sum(sizes.values())
+        return dict(zip(sizes, numbers.split(list(sizes.values()), dim=1), strict=True))
 
     def state_dict(self) -> dict[str, Any]:
         """The state of the worlds, their parameters, the generators, and the buffer sizes that the simulation has.
@@ -426,16 +450,19 @@ class Env(ABC, Generic[SettingsT]):
         In a group, of the worlds of all processes, each of which has to call it.
         """
         state, gather = self.state, self.group.gather
-        drawn, task = self._split(state.numbers)
+        numbers = {name: gather(part).clone() for name, part in self._numbers.items()}
+        task = numbers["task"]
         memory = {name: gather(values.detach()).clone() for name, values in state.memory.items()}
         return {
             "env_generator": self.generator.get_state(),
             "env_state": [gather(t.detach()).clone() for t in (*state.physics, state.action, state.age)],
             "capacity": tuple(map(max, zip(*self.group.collect(tuple(self.sim.capacity)), strict=True))),
-            "randomizer": None
-            if self.randomizer is None
-            else {"numbers": gather(drawn).clone(), "generator": self.randomizer.generator.get_state()},
-            **({"env_task": gather(task).clone()} if task.shape[1] else {}),
+            "randomizer": None,
+            **{
+                name: {"numbers": numbers[name], "generator": source.generator.get_state()}
+                for name, source in self.randomized.items()
+            },
+            **({"env_task": task} if task.shape[1] else {}),
             **({"env_memory": memory} if memory else {}),
             **({"command_ranges": {n: t.clone() for n, t in self.command_ranges.items()}} if self._drawn else {}),
         }
@@ -446,10 +473,9 @@ class Env(ABC, Generic[SettingsT]):
         self.generator.set_state(state["env_generator"].cpu())
         *physics, action, age = map(self.group.own, state["env_state"])
         numbers = [torch.zeros((self.nworld, 0), device=self.device)]
-        if self.randomizer is not None:
-            drawn = state["randomizer"]
-            numbers.append(self.group.own(drawn["numbers"].to(self.device)))
-            self.randomizer.generator.set_state(drawn["generator"].cpu())
+        for name, source in self.randomized.items():
+            numbers.append(self.group.own(state[name]["numbers"].to(self.device)))
+            source.generator.set_state(state[name]["generator"].cpu())
         if "env_task" in state:
             numbers.append(self.group.own(state["env_task"].to(self.device)))
         for name, ranges in state.get("command_ranges", {}).items():
@@ -464,8 +490,11 @@ class Env(ABC, Generic[SettingsT]):
             self.sim.reserve(Capacity(*state["capacity"]))
 
     def observation(self) -> Tensor:
-        """Observation (W, O) of the current state."""
-        return self.observe(self.state.physics, self.state.action)
+        """Observation (W, O) of the current state, as the policy is given it."""
+        return self._given(self.observe(self.state.physics, self.state.action))
+
+    def _given(self, obs: Tensor) -> Tensor:
+        return obs if self.disturbances is None else self.disturbances.observation(obs)
 
     def observation_of(self, reached: EnvState) -> Tensor:
         """Observation (W, O) of another state; the current one stays what it is."""
@@ -500,8 +529,13 @@ class Env(ABC, Generic[SettingsT]):
         """The state of all worlds once `action` has led to `state`."""
         before = self.state
         if self._memories:
-            self.next_memory = self._memories.ordered(self.remember(state, action))
+            self.next_memory = self._memories.ordered(self.remembered(state, action))
         return EnvState(state, action, before.age + 1, before.numbers, self.next_memory)
+
+    def remembered(self, state: StepState, action: Tensor) -> Mapping[str, Tensor]:
+        """What `remember` gives, and the memories of disturbances."""
+        own = {} if self.disturbances is None else self.disturbances.remember(action)
+        return {**self.remember(state, action), **own}
 
     def carried(self, state: EnvState) -> EnvState:
         """A state as the next step begins with it: the gradients of some memories do not cross steps."""
@@ -514,7 +548,10 @@ class Env(ABC, Generic[SettingsT]):
         is that of the state before the step, cut from the graph.
         """
         before = self.disturbed(self.state.physics)
-        control, force = self.control(action), self.applied_force(before)
+        control = self.control(action)
+        if self.disturbances is not None:
+            before, control = self.disturbances.pushed(before), self.disturbances.control(control)
+        force = self.applied_force(before)
         after = self.sim.step(control, *before, qfrc_applied=force, parameters=self.parameters)
         diverged = ~self._is_valid(after)
         if not (all_valid := known_none(diverged)):
@@ -523,8 +560,10 @@ class Env(ABC, Generic[SettingsT]):
         self._reached, self._diverged = after, diverged
         given = versions(after, action, self.memory)
         reached = self.reached(after, action)
-        obs = self.observation_of(reached)
-        terms = self.reward_terms(after, action, obs)
+        with self.in_state(reached):
+            observed = self.observe(after, action)
+            obs = self._given(observed)
+        terms = self.reward_terms(after, action, observed)
         fell = self.fell(after)
         self._contract.check_memory("remember", reached.memory, self.memory)
         self._contract.check_results(obs, terms, fell)

@@ -35,11 +35,16 @@ class Draws(NamedTuple):
         if self.every is None:
             share = draws[:, 0]
         else:
-            shortest, longest = self.every
-            ends = (shortest + (longest - shortest) * draws[:, :-1, -1]).cumsum(-1)
-            current = (time[:, None] >= ends).sum(-1)
-            share = draws.take_along_dim(current[:, None, None], 1)[:, 0, :-1]
+            share = draws.take_along_dim(self.times_drawn(drawn, time)[:, None, None], 1)[:, 0, :-1]
         return torch.lerp(ranges[0], ranges[1], share)
+
+    def times_drawn(self, drawn: Tensor, time: Tensor) -> Tensor:
+        """How often the command has been drawn again since the episode began, (W,); arguments as for `value`."""
+        assert self.every is not None
+        shortest, longest = self.every
+        until_next = drawn[:, self.columns].unflatten(-1, (self.times, -1))[:, :-1, -1]
+        ends = (shortest + (longest - shortest) * until_next).cumsum(-1)
+        return (time[:, None] >= ends).sum(-1)
 
 
 def plan(commands: Commands, seconds: float) -> tuple[dict[str, Draws], int]:

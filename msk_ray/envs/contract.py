@@ -119,7 +119,7 @@ class Contract:
         after = StepState(*map(copy, state.physics))
         # No step has led to `after`, so that it has no contact forces.
         env.ignore_contact_forces = True
-        remembered = self.call("remember", lambda: env.remember(after, action), after, action, env.memory)
+        remembered = self.call("remember", lambda: env.remembered(after, action), after, action, env.memory)
         self.check_memory("remember", remembered, env.memory)
         reached = env.reached(after, action)
         env.ignore_contact_forces = False

@@ -1,4 +1,5 @@
-"""The generators of random numbers that every library of a process shares: draws from them do not repeat."""
+"""Generators of random numbers: those of an environment, and those that every library of a process shares, draws from
+which do not repeat."""
 
 import random
 from collections.abc import Mapping
@@ -6,6 +7,11 @@ from typing import Any
 
 import numpy as np
 import torch
+
+
+def seed_stream(generator: torch.Generator, seed: int, stream: int) -> None:
+    """Seed a generator so that its numbers are others than those of other streams, and than those of `seed` itself."""
+    generator.manual_seed(int(np.random.SeedSequence((seed, stream)).generate_state(1)[0]))
 
 
 class GlobalGenerators:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from msk_ray.config import Draw, RandomizeConfig
 from msk_ray.envs.friction import friction_without_effect
+from msk_ray.envs.generators import seed_stream
 from msk_ray.errors import ConfigError
 
 
@@ -44,7 +45,6 @@ _FIELDS = {
 
 
 _STREAM = 1
-"""Sets the seed of the numbers apart from others that are made from the same."""
 
 
 class Randomizer:
@@ -73,10 +73,10 @@ class Randomizer:
         self.generator = torch.Generator(device=device)
         self.seed(seed)
         self._device = device
-        chosen = {name: _chosen(model, name, draw) for name, draw in config.drawn.items()}
+        chosen = {name: _chosen(model, name, draw) for name, draw in config.parameters.items()}
         owners = {name: _owners(model, name, rows) for name, rows in chosen.items()}
-        self._widths = {n: len(set(owners[n])) if draw.each else 1 for n, draw in config.drawn.items()}
-        bounds = [_bounds(draw) for name, draw in config.drawn.items() for _ in range(self._widths[name])]
+        self._widths = {n: len(set(owners[n])) if draw.each else 1 for n, draw in config.parameters.items()}
+        bounds = [_bounds(draw) for name, draw in config.parameters.items() for _ in range(self._widths[name])]
         self._low, high, log = (self._tensor(part) for part in zip(*bounds, strict=True))
         self._span = high - self._low
         self.size = len(self._low)
@@ -89,9 +89,7 @@ class Randomizer:
 
     def seed(self, seed: int) -> None:
         """Draw from now on as after construction with this seed, the environment's."""
-        # With the seed of the generator of initial states, the numbers would be the very ones these are drawn from.
-        own = int(np.random.SeedSequence((seed, _STREAM)).generate_state(1)[0])
-        self.generator.manual_seed(own)
+        seed_stream(self.generator, seed, _STREAM)
 
     def draw(self, count: int) -> Tensor:
         """Numbers of `count` episodes, (count, K)."""
@@ -122,7 +120,7 @@ class Randomizer:
         """(const (n,), slope (K, n)) of every array with n entries."""
         linear: dict[str, tuple[Tensor, Tensor]] = {}
         first = 0
-        for name, draw in config.drawn.items():
+        for name, draw in config.parameters.items():
             field = _FIELDS[name]
             places = {owner: first + (k if draw.each else 0) for k, owner in enumerate(dict.fromkeys(owners[name]))}
             for array in field.arrays:

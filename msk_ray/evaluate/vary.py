@@ -6,7 +6,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from msk_ray.config import RandomizeConfig
+from msk_ray.config import ModelRandomization, RandomizeConfig
 from msk_ray.errors import ConfigError, brief
 from msk_ray.text_table import text_table
 
@@ -23,7 +23,7 @@ def parse_vary(text: str) -> list[RandomizeConfig]:
         ConfigError: there is no such field, or a value is no positive number.
     """
     name, equals, values = text.partition("=")
-    known = list(RandomizeConfig.model_fields)
+    known = list(ModelRandomization.model_fields)
     if not equals or name not in known:
         raise ConfigError(f"--vary {brief(text)}: write FIELD=VALUE,VALUE with one of {', '.join(known)}")
     return [_at(name, value.strip()) for value in values.split(",")]

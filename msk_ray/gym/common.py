@@ -37,7 +37,7 @@ def action_space(env: Env[Any]) -> spaces.Box:
 
 
 def seed_env(env: Env[Any], seed: int) -> None:
-    """Draw initial states, and randomized parameters, from a seed."""
+    """Draw initial states, and all of `physics.randomize`, from a seed."""
     env.generator.manual_seed(seed)
-    if env.randomizer is not None:
-        env.randomizer.seed(seed)
+    for source in env.randomized.values():
+        source.seed(seed)

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import torch
+from disturbed import DISTURBANCES
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from msk_ray.config import parse_config
@@ -21,6 +22,7 @@ ENVIRONMENTS: dict[str, dict[str, Any]] = {
     "memory": {"name": "remembering:Remembering"},
     "go1": {"name": "go1_velocity"},
     "g1": {"name": "g1_velocity"},
+    "disturbances": {"name": "cartpole"},
     "legs": {
         "name": "myoleg26",
         "clock": True,
@@ -30,6 +32,8 @@ ENVIRONMENTS: dict[str, dict[str, Any]] = {
         "reward": dict.fromkeys(_LEG_TERMS, 0.1),
     },
 }
+
+RANDOMIZED = {"disturbances": DISTURBANCES}
 
 
 def _modules_calling() -> Iterator[str]:
@@ -77,8 +81,8 @@ def test_nothing_waits_in_an_env_step_and_its_gradient(name: str, monkeypatch: p
     On a CPU the host may look at flags of worlds, and at contact forces; here it takes the way of a GPU."""
     for module in ("msk_ray.envs.base", "msk_ray.step.autograd.simulation"):
         monkeypatch.setattr(f"{module}.known_none", lambda flags: False)
-    config = parse_config({"env": {**ENVIRONMENTS[name], "nworld": 2}})
-    env = make_env(config.env, config.physics, 2, "cpu", 0)
+    config = parse_config({"env": {**ENVIRONMENTS[name], "nworld": 2}, "physics": {"randomize": RANDOMIZED.get(name)}})
+    env = make_env(config.env, config.physics, 2, "cpu", 0, randomize=True)
     env.ignore_contact_forces = True
     action = torch.zeros((2, env.action_size), requires_grad=True)
     step(env, action)

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import torch
+from disturbed import DISTURBANCES
 
 from msk_ray.algorithms.shac import runner
 from msk_ray.config import parse_config
@@ -64,6 +65,7 @@ ONE_KERNEL = {**ANT, "physics": {"variant": "matched"}, "execution": {**ANT["exe
 MEMORY = {**ANT, "env": {"name": "remembering:Remembering", "nworld": 64}}
 CARTPOLE = {**ANT, "env": {"name": "cartpole", "nworld": 64}, "physics": {}}
 PRIVILEGED = {**CARTPOLE, "env": {"name": "privileged:Privileged", "nworld": 64}}
+DISTURBED = {**CARTPOLE, "physics": {"randomize": DISTURBANCES}}
 
 
 def make(settings: dict[str, Any], folder: Path, capture: str = "auto", **shac: Any) -> Trainer:
@@ -109,8 +111,8 @@ def after(epochs: int, trainer: Trainer, state: dict[str, Any]) -> tuple[torch.T
 @pytest.mark.usefixtures("uncut")
 @pytest.mark.parametrize(
     "settings",
-    [ANT, CARTPOLE, OPTIONS, LEGS, ONE_KERNEL, MEMORY, PRIVILEGED],
-    ids=["ant", "cartpole", "options", "legs", "one_kernel", "memory", "privileged"],
+    [ANT, CARTPOLE, OPTIONS, LEGS, ONE_KERNEL, MEMORY, PRIVILEGED, DISTURBED],
+    ids=["ant", "cartpole", "options", "legs", "one_kernel", "memory", "privileged", "disturbed"],
 )
 def test_a_recorded_epoch_equals_one_operation_by_operation(settings: dict[str, Any], tmp_path: Path) -> None:
     recorded, eager = make(settings, tmp_path / "a"), make(settings, tmp_path / "b", capture="off")

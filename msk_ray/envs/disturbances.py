@@ -1,0 +1,268 @@
+"""What disturbs a policy in training beside parameters of the model: errors and delays of observations, late controls,
+kicks.
+
+All of it is a function of numbers that are drawn when an episode begins, of the episode's age, and of memories: a step
+draws nothing, so that it gives the same observation as often as it is asked.
+
+Axes: W worlds, O observation, D numbers drawn for an episode, E entries with an error.
+"""
+
+import math
+from collections.abc import Iterator, Mapping
+from fnmatch import fnmatchcase
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import torch
+from torch import Tensor
+
+from msk_ray.config import Push, RandomizeConfig, Spread
+from msk_ray.envs.commands import Draws
+from msk_ray.envs.generators import seed_stream
+from msk_ray.envs.memory import Memory
+from msk_ray.errors import ConfigError
+from msk_ray.step import StepState
+
+if TYPE_CHECKING:
+    from msk_ray.envs.base import Env
+
+_STREAM = 2
+_OBSERVATIONS, _CONTROLS, _STEPS = "earlier observations", "earlier controls", "earlier steps"
+"""Memories: observations and controls of earlier env steps, the newest first, and how many steps are in there."""
+_BITS = 24
+"""Bits of a uniform number in float32."""
+_LOW_HALF = 0xFFFFFFFF
+
+
+class Disturbances:
+    """The disturbances of a `randomize` section in all worlds of an environment.
+
+    Args:
+        config: the section.
+        env: the environment, prepared.
+        seed: the environment's; the generator is another one, so that initial states, commands and parameters of the
+            model are those of a trial without disturbances.
+
+    Attributes:
+        generator: source of the numbers of episodes.
+        size: D.
+
+    Raises:
+        ConfigError: the environment has no such entries or joints, or does not name its entries.
+    """
+
+    def __init__(self, config: RandomizeConfig, env: "Env[Any]", seed: int) -> None:
+        self._env = env
+        self.generator = torch.Generator(device=env.device)
+        self.seed(seed)
+        names = _entry_names(config, env)
+        self._noise = _Errors("observation_noise", config.observation_noise, names, env.device)
+        self._bias = _Errors("observation_bias", config.observation_bias, names, env.device)
+        self._observation_delay, self._control_delay = config.observation_delay, config.control_delay
+        self._kicks = None if config.push is None else _Kicks(config.push, env)
+        widths = {
+            "noise": int(self._noise.size > 0),
+            "bias": self._bias.size,
+            "observation_delay": int(self._observation_delay is not None),
+            "control_delay": int(self._control_delay is not None),
+            "push": 0 if self._kicks is None else self._kicks.size,
+        }
+        self.size = sum(widths.values())
+        self._entry_count = len(names)
+        self._widths = widths
+
+    def seed(self, seed: int) -> None:
+        """Draw from now on as after construction with this seed, the environment's."""
+        seed_stream(self.generator, seed, _STREAM)
+
+    def draw(self, count: int) -> Tensor:
+        """Numbers of `count` episodes, uniform in [0, 1), (count, D)."""
+        return torch.rand((count, self.size), generator=self.generator, device=self._env.device)
+
+    def memories(self) -> dict[str, Memory]:
+        """Memories of its own, with the gradients that late observations and controls have."""
+        late = {
+            _OBSERVATIONS: _most(self._observation_delay) * self._entry_count,
+            _CONTROLS: _most(self._control_delay) * self._env.model.nu,
+        }
+        kept = {name: Memory(size, gradient=True) for name, size in late.items() if size}
+        return {**kept, _STEPS: Memory(1)} if kept else {}
+
+    def remember(self, action: Tensor) -> dict[str, Tensor]:
+        """Its memories after a step by `action`. `self.state` of the environment is that which the step began in."""
+        env = self._env
+        newest: dict[str, Tensor] = {}
+        if _OBSERVATIONS in env.memory:
+            newest[_OBSERVATIONS] = env.observe(env.state.physics, env.state.action)
+        if _CONTROLS in env.memory:
+            newest[_CONTROLS] = env.control(action)
+        if not newest:
+            return {}
+        kept = {name: torch.cat((new, env.memory[name][:, : -new.shape[1]]), dim=-1) for name, new in newest.items()}
+        return {**kept, _STEPS: env.memory[_STEPS] + 1.0}
+
+    def pushed(self, state: StepState) -> StepState:
+        """A state as a step begins with it, after a kick if it is time for one."""
+        return state if self._kicks is None else self._kicks.applied(state, self._numbers("push"))
+
+    def control(self, control: Tensor) -> Tensor:
+        """The controls (W, nu) that reach the actuators in this step, when these are sent."""
+        if self._control_delay is None:
+            return control
+        late = self._late(self._control_delay, "control_delay")
+        return _of_earlier(control, self._env.memory.get(_CONTROLS), late)
+
+    def observation(self, obs: Tensor) -> Tensor:
+        """What the policy is given (W, O) where the environment observes `obs` in its current state."""
+        if self._entry_count not in (0, obs.shape[1]):
+            raise ConfigError(
+                f"observation_layout of {type(self._env).__qualname__} names {self._entry_count} entries of an "
+                f"observation of {obs.shape[1]}: name each"
+            )
+        age = self._env.state.age
+        if self._observation_delay is not None:
+            late = self._late(self._observation_delay, "observation_delay")
+            obs = _of_earlier(obs, self._env.memory.get(_OBSERVATIONS), late)
+            age = age - late
+        if self._bias.size:
+            obs = self._bias.added(obs, self._numbers("bias"))
+        if self._noise.size:
+            # The noise of the step in which it was observed.
+            obs = self._noise.added(obs, uniform_hash(self._numbers("noise")[:, 0], age, self._noise.size))
+        return obs
+
+    def _late(self, delay: tuple[int, int], name: str) -> Tensor:
+        """Env steps by which something is late, (W,) int64: at most those of the episode that have been."""
+        if not _most(delay):
+            return torch.zeros_like(self._env.state.age)
+        fewest, most = delay
+        drawn = fewest + (self._numbers(name)[:, 0] * (most - fewest + 1)).long()
+        return torch.minimum(drawn, self._env.memory[_STEPS][:, 0].long())
+
+    def _numbers(self, name: str) -> Tensor:
+        """The numbers (W, n) for one of the settings."""
+        every = self._env.disturbance_numbers
+        return every.split(list(self._widths.values()), dim=-1)[list(self._widths).index(name)]
+
+
+class _Errors:
+    """Errors of some entries of the observation."""
+
+    def __init__(
+        self, setting: str, spreads: Mapping[str, Spread] | None, names: list[str], device: torch.device
+    ) -> None:
+        chosen = dict(sorted(_chosen(setting, spreads or {}, names)))
+        self.size = len(chosen)
+        self._entries = torch.tensor(list(chosen), dtype=torch.int64, device=device)
+        sizes = [spread.uniform or spread.normal or 0.0 for spread in chosen.values()]
+        self._sizes = torch.tensor(sizes, device=device)
+        normal = [spread.normal is not None for spread in chosen.values()]
+        self._normal = torch.tensor(normal, device=device) if any(normal) else None
+
+    def added(self, obs: Tensor, uniform: Tensor) -> Tensor:
+        """Observations (W, O) with errors made from uniform numbers in [0, 1), (W, E)."""
+        share = 2.0 * uniform - 1.0
+        if self._normal is not None:
+            inside = share.clamp(-1.0 + 2.0**-_BITS, 1.0 - 2.0**-_BITS)
+            share = torch.where(self._normal, math.sqrt(2.0) * torch.erfinv(inside), share)
+        return obs.index_add(1, self._entries, self._sizes * share)
+
+
+class _Kicks:
+    """Kicks, drawn as a command that changes is."""
+
+    def __init__(self, push: Push, env: "Env[Any]") -> None:
+        self._env = env
+        self._step_s = env.config.control_timestep
+        dofs = dict(_kicked(push, env.model))
+        times = math.ceil(env.config.episode_length * self._step_s / push.every[0])
+        self.size = times * (len(dofs) + 1)
+        self._draws = Draws(slice(0, self.size), times, push.every)
+        self._dofs = torch.tensor(list(dofs), dtype=torch.int64, device=env.device)
+        largest = torch.tensor(list(dofs.values()), device=env.device)
+        self._ranges = torch.stack((-largest, largest))
+
+    def applied(self, state: StepState, drawn: Tensor) -> StepState:
+        """The state after the kick, if any, of the current age, from the numbers (W, size)."""
+        age = self._env.state.age
+        before, now = ((steps * self._step_s) for steps in (age - 1, age))
+        begins = self._draws.times_drawn(drawn, now) > self._draws.times_drawn(drawn, before)
+        kick = self._draws.value(drawn, now, self._ranges) * begins[:, None]
+        return state._replace(qvel=state.qvel.index_add(1, self._dofs, kick))
+
+
+def uniform_hash(seed: Tensor, step: Tensor, count: int) -> Tensor:
+    """Uniform numbers in [0, 1), (W, count), another row for each step (W,) int64 of each seed (W,) in [0, 1).
+
+    They are hashes of seed, step and column by the function `lowbias32` of https://github.com/skeeto/hash-prospector.
+    """
+    columns = torch.arange(count, device=seed.device)
+    row = _hash(_hash((seed * 2.0**_BITS).long()) + step)
+    return (_hash(row[:, None] + _hash(columns)) >> (32 - _BITS)) * 2.0**-_BITS
+
+
+def _hash(values: Tensor) -> Tensor:
+    """Hashes in [0, 2³²) of the low 32 bits of int64 values."""
+    values = values & _LOW_HALF
+    values = ((values ^ (values >> 16)) * 0x7FEB352D) & _LOW_HALF
+    values = ((values ^ (values >> 15)) * 0x846CA68B) & _LOW_HALF
+    return values ^ (values >> 16)
+
+
+def _most(delay: tuple[int, int] | None) -> int:
+    return 0 if delay is None else delay[1]
+
+
+def _of_earlier(current: Tensor, earlier: Tensor | None, late: Tensor) -> Tensor:
+    """In each world the values (W, n) of `late` (W,) env steps ago, of the current ones and earlier ones (W, k n)."""
+    if earlier is None:
+        return current
+    chosen = current
+    for steps, values in enumerate(earlier.split(current.shape[1], dim=1), start=1):
+        chosen = torch.where((late == steps)[:, None], values, chosen)
+    return chosen
+
+
+def _entry_names(config: RandomizeConfig, env: "Env[Any]") -> list[str]:
+    """Names of all entries of the observation, if a setting needs them."""
+    observed = ("observation_noise", "observation_bias", "observation_delay")
+    needing = [name for name in observed if getattr(config, name) is not None]
+    if not needing:
+        return []
+    layout = env.observation_layout()
+    if layout is None:
+        raise ConfigError(
+            f"physics.randomize.{needing[0]}: {type(env).__qualname__} does not name the entries of its observation: "
+            "write its method observation_layout"
+        )
+    return [entry.name for entry in layout]
+
+
+def _chosen(setting: str, spreads: Mapping[str, Spread], names: list[str]) -> Iterator[tuple[int, Spread]]:
+    """Entries of the observation, and the distributions of their errors."""
+    key, taken = f"physics.randomize.{setting}", dict[int, str]()
+    for pattern, spread in spreads.items():
+        entries = [i for i, name in enumerate(names) if fnmatchcase(name, pattern)]
+        if not entries:
+            raise ConfigError(f"{key}: no entry of the observation is {pattern!r}; it has {', '.join(names)}")
+        for entry in entries:
+            if entry in taken:
+                raise ConfigError(f"{key}: {names[entry]!r} is both {taken[entry]!r} and {pattern!r}; leave one out")
+            taken[entry] = pattern
+            yield entry, spread
+
+
+def _kicked(push: Push, model: mujoco.MjModel) -> Iterator[tuple[int, float]]:
+    """Degrees of freedom, and the largest changes of their velocities."""
+    key, joints = "physics.randomize.push.velocity", [model.joint(i).name or str(i) for i in range(model.njnt)]
+    for name, largest in push.velocity.items():
+        if name not in joints:
+            raise ConfigError(f"{key}: the model has no joint {name!r}; it has {', '.join(joints) or 'none'}")
+        joint = joints.index(name)
+        first = int(model.jnt_dofadr[joint])
+        size = int((model.dof_jntid == joint).sum())
+        if len(largest) != size:
+            raise ConfigError(
+                f"{key}.{name}: write {size} numbers, one for each velocity of the joint, not {len(largest)}"
+            )
+        yield from zip(range(first, first + size), largest, strict=True)

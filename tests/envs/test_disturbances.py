@@ -1,0 +1,264 @@
+"""What disturbs a policy in training: errors, delays and kicks, their gradients, scores without them, resumption."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from disturbed import DISTURBANCES
+from torch import Tensor
+
+from msk_ray.config import Config, PhysicsConfig, overlay, parse_config
+from msk_ray.envs import Env, make_env
+from msk_ray.envs.cartpole.env import CartPole
+from msk_ray.envs.disturbances import uniform_hash
+from msk_ray.errors import ConfigError
+from msk_ray.group import Group
+from msk_ray.training import Trainer
+from msk_ray.training.evaluation import Evaluator
+
+W = 64
+
+
+def cartpole(worlds: int = W, length: int = 40, seed: int = 0, **randomize: Any) -> Env[Any]:
+    config = parse_config({"env": {"name": "cartpole", "episode_length": length}})
+    physics = PhysicsConfig.model_validate({"randomize": randomize or None})
+    return make_env(config.env, physics, worlds, "cpu", seed, randomize=True)
+
+
+def clean(env: Env[Any]) -> Tensor:
+    return env.observe(env.state.physics, env.state.action)
+
+
+def test_noise_is_that_of_its_distribution_and_the_same_for_as_often_as_it_is_asked() -> None:
+    env = cartpole(512, observation_noise=DISTURBANCES["observation_noise"])
+    noise = []
+    for _ in range(20):
+        noise.append(env.observation() - clean(env))
+        assert torch.equal(noise[-1], env.observation() - clean(env))
+        transition = env.step(torch.zeros(512, 1))
+        assert torch.equal(transition.obs, env.observation())
+    every = torch.stack(noise)
+    assert not every[..., 2:4].any()
+    assert float(every[..., :2].abs().max()) == pytest.approx(0.5, abs=1e-3)
+    assert every.std((0, 1)).tolist() == pytest.approx([0.5 / math.sqrt(3.0)] * 2 + [0.0, 0.0, 0.2], rel=0.02)
+    assert every.mean((0, 1)).tolist() == pytest.approx([0.0] * 5, abs=0.01)
+    kinds = torch.corrcoef(
+        torch.stack((every[:-1, :-1, 0], every[1:, :-1, 0], every[:-1, 1:, 0], every[:-1, :-1, 1])).flatten(1)
+    )
+    assert float((kinds - torch.eye(4)).abs().max()) < 0.04, "steps, worlds and entries have noise of their own"
+
+
+def test_a_hash_has_every_value_once_in_a_while() -> None:
+    drawn = uniform_hash(torch.linspace(0.0, 1.0, 101)[:-1], torch.arange(100), 1000)
+    assert torch.histc(drawn, 10, 0.0, 1.0).tolist() == pytest.approx([1e4] * 10, rel=0.03)
+    assert float(drawn.min()) >= 0.0
+    assert float(drawn.max()) < 1.0
+    assert len(drawn.unique()) > 0.99 * drawn.numel()
+
+
+def test_a_bias_stays_for_an_episode_and_rewards_are_of_the_clean_observation() -> None:
+    env, plain = cartpole(length=5, observation_bias={"cart_position": {"uniform": 0.1}}), cartpole(length=5)
+    seen = []
+    for _ in range(10):
+        seen.append((env.observation() - plain.observation())[:, 0])
+        action = torch.zeros(W, 1)
+        assert torch.equal(env.step(action).terms, plain.step(action).terms)
+    for episode in (seen[:5], seen[5:]):
+        torch.testing.assert_close(torch.stack(episode), episode[0].expand(5, W), atol=1e-6, rtol=0.0)
+        assert 0.05 < float(episode[0].abs().max()) <= 0.1
+    assert (seen[0] - seen[5]).abs().min() > 1e-5
+
+
+def test_a_late_observation_is_that_of_an_earlier_step_with_its_noise() -> None:
+    noise = {"cart_position": {"uniform": 0.1}}
+    late, prompt = cartpole(observation_noise=noise, observation_delay=[2, 2]), cartpole(observation_noise=noise)
+    late.state = late.state._replace(numbers=torch.cat((prompt.state.numbers, late.state.numbers[:, 1:]), dim=1))
+    given, prompts = [], []
+    for step in range(6):
+        given.append(late.observation())
+        prompts.append(prompt.observation())
+        assert torch.equal(given[-1], prompts[max(step - 2, 0)])
+        action = 0.1 * step * torch.ones(W, 1)
+        obs = late.step(action).obs
+        prompt.step(action)
+        assert torch.equal(obs, late.observation())
+
+
+def test_each_episode_has_a_delay_of_its_own_even_where_ages_are_spread() -> None:
+    env = cartpole(length=10, observation_delay=[0, 2])
+    env.spread_ages()
+    past, delays = [clean(env)], []
+    for step in range(2):
+        env.step(torch.ones(W, 1))
+        past.append(clean(env))
+        lag = torch.stack([(env.observation() == earlier).all(-1) for earlier in reversed(past)]).float().argmax(0)
+        going = env.state.age > step
+        delays.append(lag[going])
+        assert bool((torch.stack([(env.observation() == p).all(-1) for p in past]).any(0) | ~going).all())
+    assert set(delays[-1].tolist()) == {0, 1, 2}
+
+
+def test_late_controls_act_later_with_their_gradient() -> None:
+    env, prompt = cartpole(control_delay=[2, 2]), cartpole()
+    actions = [torch.full((W, 1), 0.1 * (step + 1), requires_grad=True) for step in range(5)]
+    for env_, given in ((env, actions), (prompt, [actions[0], actions[0], actions[0], actions[1], actions[2]])):
+        for action in given:
+            env_.step(action)
+    torch.testing.assert_close(env.state.physics, prompt.state.physics, rtol=0.0, atol=0.0)
+    gradients = [torch.autograd.grad(e.state.physics.qvel.sum(), actions, allow_unused=True) for e in (env, prompt)]
+    for mine, expected in zip(*gradients, strict=True):
+        mine, expected = (torch.zeros(W, 1) if g is None else g for g in (mine, expected))
+        torch.testing.assert_close(mine, expected, rtol=1e-5, atol=1e-7)
+    assert gradients[1][2] is not None
+    assert not (torch.zeros(1) if gradients[0][4] is None else gradients[0][4]).any()
+
+
+def test_the_gradient_goes_through_errors_and_late_observations_as_through_clean_ones() -> None:
+    env = cartpole(observation_delay=[1, 1], observation_noise=DISTURBANCES["observation_noise"])
+    first, second = (torch.zeros(W, 1, requires_grad=True) for _ in range(2))
+    env.step(first)
+    expected = torch.autograd.grad(clean(env).sum(), first, retain_graph=True)[0]
+    obs = env.step(second).obs
+    to_first, to_second = torch.autograd.grad(obs.sum(), (first, second), allow_unused=True)
+    assert torch.equal(to_first, expected)
+    assert to_second is None or not to_second.any()
+
+
+def test_kicks_come_in_their_time_and_size() -> None:
+    kicked, plain = (cartpole(256, push=p) if p else cartpole(256) for p in (DISTURBANCES["push"], None))
+    assert kicked.disturbances is not None
+    sizes, steps = [], []
+    for step in range(39):
+        plain.state = plain.state._replace(physics=kicked.state.physics)
+        change = kicked.disturbances.pushed(kicked.state.physics).qvel - kicked.state.physics.qvel
+        assert not change[:, 1].any()
+        if step == 0:
+            assert not change.any()
+        hit = change[:, 0] != 0.0
+        sizes.append(change[hit, 0])
+        steps.append(hit)
+        kicked.step(torch.zeros(256, 1))
+        plain.step(torch.zeros(256, 1))
+        moved = (kicked.state.physics.qvel != plain.state.physics.qvel).any(-1)
+        assert torch.equal(moved, hit)
+    every = torch.cat(sizes)
+    assert 0.45 < float(every.abs().max()) <= 0.5
+    assert abs(float(every.mean())) < 0.05
+    # One in 0.06 s on average, which is 3.6 env steps.
+    assert float(torch.stack(steps).float().mean()) == pytest.approx(1.0 / 3.6, rel=0.1)
+
+
+def test_initial_states_and_parameters_are_those_without_disturbances() -> None:
+    mass = {"body_mass": {"low": 0.5, "high": 2.0}}
+    both, alone = cartpole(**DISTURBANCES, **mass), cartpole(**mass)
+    assert torch.equal(both.state.physics.qpos, alone.state.physics.qpos)
+    assert torch.equal(both.parameters["body_mass"], alone.parameters["body_mass"])
+    assert cartpole().disturbances is None
+    assert cartpole().state.numbers.shape == (W, 0)
+
+
+@pytest.fixture
+def config(tiny_settings: dict[str, Any]) -> Config:
+    """A CartPole trial of seconds under all disturbances."""
+    return parse_config(overlay(tiny_settings, {"physics.randomize": DISTURBANCES, "env.episode_length": 4}))
+
+
+def test_scores_are_to_the_bit_those_without(config: Config) -> None:
+    plain = config.model_copy(update={"physics": PhysicsConfig()})
+    policy = lambda obs: obs[:, :1].tanh()  # noqa: E731
+    ours, without = (Evaluator(c, "cpu").episodes(policy).score for c in (config, plain))
+    assert torch.equal(ours, without)
+    assert make_env(config.env, config.physics, 2, "cpu", 0).disturbances is None
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("algorithm", ["shac", "ppo"])
+def test_a_resumed_trial_is_the_same_to_the_bit(config: Config, tmp_path: Path, algorithm: str) -> None:
+    settings = config.as_dict()
+    if algorithm == "ppo":
+        del settings["shac"]
+        settings |= {"algorithm": {"name": "ppo"}, "ppo": {"steps": 8}}
+    trial = parse_config(settings)
+    hashes = []
+    for name, stops in (("whole", []), ("cut", [3])):
+        for stop in (*stops, None):
+            trainer = Trainer(trial, tmp_path / name, "cpu")
+            if stop is None and stops:
+                trainer.restore_latest()
+            while not trainer.finished and trainer.epoch != stop:
+                trainer.run_epoch()
+            hashes.append(trainer.algorithm.parameter_hash())
+            trainer.close()
+    assert hashes[0] == hashes[-1]
+    assert hashes[1] != hashes[0]
+
+
+class Half(Group):
+    """One of two processes, which nobody else has to be there for."""
+
+    size = 2
+
+    def own(self, values: Tensor, dim: int = 0) -> Tensor:
+        return values.chunk(2, dim)[self.rank]
+
+
+def test_the_processes_of_a_group_have_the_disturbances_of_one() -> None:
+    whole = cartpole(8, **DISTURBANCES)
+    for rank in range(2):
+        half, group = cartpole(4, **DISTURBANCES), Half()
+        group.rank = rank
+        half.join(group)
+        assert torch.equal(half.state.numbers, whole.state.numbers.chunk(2)[rank])
+
+
+class Unnamed(CartPole):
+    """Does not say what its observation is."""
+
+    def observation_layout(self) -> None:  # type: ignore[override]
+        return None
+
+
+REFUSED: dict[str, tuple[dict[str, Any], str]] = {
+    "unknown entry": ({"observation_noise": {"pole": {"uniform": 1.0}}}, "no entry .* is 'pole'; it has cart_position"),
+    "entry twice": (
+        {"observation_bias": {"*": {"uniform": 1.0}, "pole_rate": {"normal": 1.0}}},
+        "'pole_rate' is both '\\*' and 'pole_rate'; leave one out",
+    ),
+    "two distributions": (
+        {"observation_noise": {"*": {"uniform": 1.0, "normal": 1.0}}},
+        "write one of uniform, normal",
+    ),
+    "no distribution": ({"observation_noise": {"*": {}}}, "write one of uniform, normal"),
+    "delay of part steps": ({"control_delay": [0, 0.5]}, "control_delay"),
+    "delay the other way round": ({"observation_delay": [2, 1]}, "write the smaller number first"),
+    "unknown joint": ({"push": {"every": [1, 2], "velocity": {"root": [1]}}}, "no joint 'root'; it has"),
+    "too many velocities": (
+        {"push": {"every": [1, 2], "velocity": {"slider": [1, 1]}}},
+        "slider: write 1 numbers, one for each velocity of the joint, not 2",
+    ),
+    "nothing": ({"push": None}, "write at least one of"),
+}
+
+
+def cartpole_trial(randomize: dict[str, Any]) -> None:
+    trial = parse_config({"env": {"name": "cartpole"}, "physics": {"randomize": randomize}})
+    make_env(trial.env, trial.physics, 2, "cpu", 0, randomize=True)
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_makes_no_sense_is_refused(name: str) -> None:
+    section, why = REFUSED[name]
+    with pytest.raises(ConfigError, match=why):
+        cartpole_trial(section)
+
+
+def test_entries_without_names_cannot_be_disturbed() -> None:
+    trial = parse_config(
+        {"env": {"name": f"{__name__}:Unnamed"}, "physics": {"randomize": {"observation_delay": [1, 1]}}}
+    )
+    with pytest.raises(
+        ConfigError, match=r"observation_delay: Unnamed does not name .* write its method observation_layout"
+    ):
+        make_env(trial.env, trial.physics, 2, "cpu", 0, randomize=True)
