@@ -35,8 +35,10 @@ from msk_ray.config.physics import FdConfig as FdConfig
 from msk_ray.config.physics import PhysicsConfig as PhysicsConfig
 from msk_ray.config.randomize import Draw as Draw
 from msk_ray.config.randomize import ModelRandomization as ModelRandomization
+from msk_ray.config.randomize import Payload as Payload
 from msk_ray.config.randomize import Push as Push
 from msk_ray.config.randomize import RandomizeConfig as RandomizeConfig
+from msk_ray.config.randomize import Shift as Shift
 from msk_ray.config.randomize import Spread as Spread
 from msk_ray.config.recorded import SCHEMA as SCHEMA
 from msk_ray.config.recorded import changed_settings as changed_settings

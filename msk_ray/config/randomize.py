@@ -9,6 +9,7 @@ from pydantic import AfterValidator, Field, PositiveFloat, model_validator
 from msk_ray.config.commands import Period, ascending
 from msk_ray.config.sections import NonNegative, Section, Text, Whole
 
+Names = Annotated[tuple[Text, ...], Field(max_length=1024)]
 Steps = Annotated[tuple[Whole, Whole], AfterValidator(ascending)]
 
 
@@ -23,7 +24,7 @@ class Draw(Section):
     """`scale` multiplies the model's value, `value` replaces it."""
     each: bool = False
     """Draw a number for each element, instead of one for all."""
-    only: Annotated[tuple[Text, ...], Field(max_length=1024)] | None = None
+    only: Names | None = None
     """Names of the elements to change; null: all."""
 
     def __str__(self) -> str:
@@ -36,6 +37,34 @@ class Scaling(Draw):
     """Distribution of a factor on one model field."""
 
     mode: Literal["scale"] = "scale"
+
+
+class Payload(Section):
+    """Distribution of what is added to one model field, uniform."""
+
+    low: NonNegative
+    high: PositiveFloat
+    each: bool = False
+    """Draw a number for each element, instead of one for all."""
+    only: Names
+    """Names of the elements to change."""
+
+    def __str__(self) -> str:
+        return f"+{self.low:g} to +{self.high:g}"
+
+
+class Shift(Section):
+    """Distribution of a vector that is added to one model field, uniform about 0."""
+
+    size: tuple[NonNegative, NonNegative, NonNegative]
+    """Largest size along x, y and z."""
+    each: bool = False
+    """Draw a vector for each element, instead of one for all."""
+    only: Names | None = None
+    """Names of the elements to change; null: all."""
+
+    def __str__(self) -> str:
+        return "±" + " ±".join(f"{size:g}" for size in self.size)
 
 
 class Spread(Section):
@@ -74,7 +103,7 @@ class Push(Section):
 
 
 class ModelRandomization(Section):
-    """Distributions of model fields, named as in MuJoCo's MjModel; null: not randomized."""
+    """Distributions of factors on model fields, or of their values, named as in MuJoCo's MjModel; null: the model's."""
 
     geom_friction: Draw | None = None
     """Sliding friction of geoms."""
@@ -94,13 +123,23 @@ class ModelRandomization(Section):
     """Gear of actuators, which scales forces and lengths."""
     actuator_gain: Scaling | None = None
     """Strength of actuators: scales gain and bias by the same factor, so that servos keep their targets."""
+    actuator_kp: Scaling | None = None
+    """Stiffness of position servos."""
+    actuator_kd: Scaling | None = None
+    """Damping of position servos."""
     gravity: Scaling | None = None
     """Gravity."""
 
 
 class RandomizeConfig(ModelRandomization):
-    """Model fields, and disturbances beside them; null: none."""
+    """Model fields, what is added to some, and disturbances beside them; null: none."""
 
+    payload: Payload | None = None
+    """Mass added to bodies at their centres [kg]."""
+    body_ipos: Shift | None = None
+    """Centre of mass of bodies [m]."""
+    gravity_shift: Shift | None = None
+    """Gravity, by its direction too [m/s²]."""
     observation_noise: Spreads | None = None
     """Noise of entries of the observation, another one in every env step."""
     observation_bias: Spreads | None = None
@@ -117,7 +156,7 @@ class RandomizeConfig(ModelRandomization):
         if not self._written:
             raise ValueError(f"physics.randomize: write at least one of {', '.join(type(self).model_fields)}")
         for name, draw in self.parameters.items():
-            if draw.low > draw.high:
+            if not isinstance(draw, Shift) and draw.low > draw.high:
                 raise ValueError(
                     f"physics.randomize.{name}: low {draw.low:g} is above high {draw.high:g}; exchange them"
                 )
@@ -129,9 +168,9 @@ class RandomizeConfig(ModelRandomization):
         return {name: value for name in type(self).model_fields if (value := getattr(self, name)) is not None}
 
     @property
-    def parameters(self) -> dict[str, Draw]:
+    def parameters(self) -> dict[str, Draw | Payload | Shift]:
         """Distributions of fields of the model, by field."""
-        return {name: value for name, value in self._written.items() if isinstance(value, Draw)}
+        return {name: value for name, value in self._written.items() if isinstance(value, Draw | Payload | Shift)}
 
     @property
     def disturbs(self) -> bool:

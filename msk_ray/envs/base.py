@@ -256,7 +256,8 @@ class Env(ABC, Generic[SettingsT]):
         """
 
     def observe_critic(self, state: StepState, action: Tensor) -> Tensor:
-        """What the critic sees (W, C) of a state and the action that led to it: by default what the policy sees.
+        """What the critic sees (W, C) of a state and the action that led to it: by default what the policy sees, but
+        undisturbed.
 
         It is needed in training only, and may contain what no sensor of a robot tells, such as the height of its feet
         or the friction of the floor. Called as `observe` is.
@@ -266,7 +267,8 @@ class Env(ABC, Generic[SettingsT]):
     @property
     def asymmetric(self) -> bool:
         """Whether the critic sees something other than the policy."""
-        return type(self).observe_critic is not Env.observe_critic
+        own = type(self).observe_critic is not Env.observe_critic
+        return own or (self.disturbances is not None and self.disturbances.of_observations)
 
     def reward_terms(self, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
         """Weighted parts (W, T) that sum to the reward for reaching `state`, observed as `obs`, by `action`.

@@ -46,6 +46,7 @@ class Disturbances:
     Attributes:
         generator: source of the numbers of episodes.
         size: D.
+        of_observations: whether the policy sees something other than what `observe` gives.
 
     Raises:
         ConfigError: the environment has no such entries or joints, or does not name its entries.
@@ -69,6 +70,7 @@ class Disturbances:
         }
         self.size = sum(widths.values())
         self._entry_count = len(names)
+        self.of_observations = bool(names)
         self._widths = widths
 
     def seed(self, seed: int) -> None:

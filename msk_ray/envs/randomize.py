@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from msk_ray.config import Draw, RandomizeConfig
+from msk_ray.config import Draw, Payload, RandomizeConfig, Shift
 from msk_ray.envs.friction import friction_without_effect
 from msk_ray.envs.generators import seed_stream
 from msk_ray.errors import ConfigError
@@ -34,24 +35,46 @@ _FIELDS = {
     "geom_friction": _Field(("geom_friction",), "geom", slice(0, 1)),
     "pair_friction": _Field(("pair_friction",), "pair", slice(0, 2)),
     "body_mass": _Field(("body_mass", "body_inertia"), "body"),
+    "payload": _Field(("body_mass",), "body"),
+    "body_ipos": _Field(("body_ipos",), "body"),
     "dof_damping": _Field(("dof_damping",), "joint"),
     "dof_armature": _Field(("dof_armature",), "joint"),
     "dof_frictionloss": _Field(("dof_frictionloss",), "joint"),
     "jnt_stiffness": _Field(("jnt_stiffness",), "joint"),
     "actuator_gear": _Field(("actuator_gear",), "actuator"),
     "actuator_gain": _Field(("actuator_gainprm", "actuator_biasprm"), "actuator", slice(0, 3)),
+    "actuator_kp": _Field(("actuator_gainprm", "actuator_biasprm"), "actuator"),
+    "actuator_kd": _Field(("actuator_biasprm",), "actuator"),
     "gravity": _Field(("opt.gravity",), None),
+    "gravity_shift": _Field(("opt.gravity",), None),
 }
 
 
+_SERVO_COLUMNS = {
+    "actuator_kp": {"actuator_gainprm": 0, "actuator_biasprm": 1},
+    "actuator_kd": {"actuator_biasprm": 2},
+}
+"""Where MuJoCo has stiffness and damping of a position servo."""
+
 _STREAM = 1
+
+AnyDraw = Draw | Payload | Shift
+
+
+class _Linear(NamedTuple):
+    """One array as a function of the numbers."""
+
+    const: NDArray[np.float64]
+    slope: NDArray[np.float64]
+    set_by: NDArray[np.object_]
+    """Setting that scales or replaces each entry; empty if none does."""
 
 
 class Randomizer:
     """Draws the numbers of a `randomize` section for every world, and turns them into parameters of the model.
 
     An array is linear in the numbers: const + drawn · slope. A scaled entry has its value in the slope, a replaced one
-    has 1 there, and every other has its value in const.
+    has 1 there, and every other has its value in const, those that something is added to also 1 in the slope.
 
     Args:
         config: the section.
@@ -75,8 +98,12 @@ class Randomizer:
         self._device = device
         chosen = {name: _chosen(model, name, draw) for name, draw in config.parameters.items()}
         owners = {name: _owners(model, name, rows) for name, rows in chosen.items()}
-        self._widths = {n: len(set(owners[n])) if draw.each else 1 for n, draw in config.parameters.items()}
-        bounds = [_bounds(draw) for name, draw in config.parameters.items() for _ in range(self._widths[name])]
+        every = [
+            (name, _bounds(draw) * (len(set(owners[name])) if draw.each else 1))
+            for name, draw in config.parameters.items()
+        ]
+        self._widths = {name: len(bounds) for name, bounds in every}
+        bounds = [bound for _, of_name in every for bound in of_name]
         self._low, high, log = (self._tensor(part) for part in zip(*bounds, strict=True))
         self._span = high - self._low
         self.size = len(self._low)
@@ -118,21 +145,37 @@ class Randomizer:
         owners: Mapping[str, list[int]],
     ) -> dict[str, tuple[Tensor, Tensor]]:
         """(const (n,), slope (K, n)) of every array with n entries."""
-        linear: dict[str, tuple[Tensor, Tensor]] = {}
+        linear: dict[str, _Linear] = {}
         first = 0
         for name, draw in config.parameters.items():
             field = _FIELDS[name]
-            places = {owner: first + (k if draw.each else 0) for k, owner in enumerate(dict.fromkeys(owners[name]))}
+            axes = len(_bounds(draw))
+            step = axes if draw.each else 0
+            places = {owner: first + step * k for k, owner in enumerate(dict.fromkeys(owners[name]))}
             for array in field.arrays:
                 base = np.array(attrgetter(array)(model), dtype=np.float64)
-                const, slope = base.copy(), np.zeros((len(self._low), *base.shape))
+                if array not in linear:
+                    linear[array] = _Linear(
+                        base.copy(), np.zeros((len(self._low), *base.shape)), np.full(base.shape, "", dtype=object)
+                    )
+                const, slope, set_by = linear[array]
                 for element, owner in zip(chosen[name], owners[name], strict=True):
-                    at = _entries(model, name, element, base.ndim)
-                    const[at] = 0.0
-                    slope[places[owner]][at] = base[at] if draw.mode == "scale" else 1.0
-                linear[array] = self._tensor(const.ravel()), self._tensor(slope.reshape(len(slope), -1))
+                    at, place = _entries(model, name, array, element, base.ndim), places[owner]
+                    if isinstance(draw, Shift):
+                        slope[place : place + axes][(slice(None), *np.index_exp[at])] = np.eye(axes)
+                    elif isinstance(draw, Payload):
+                        slope[place][at] = 1.0
+                    else:
+                        if other := next(filter(None, np.ravel(set_by[at])), None):
+                            raise ConfigError(f"physics.randomize: {other} includes {name}; leave one of both out")
+                        set_by[at] = name
+                        const[at] = 0.0
+                        slope[place][at] = base[at] if draw.mode == "scale" else 1.0
             first += self._widths[name]
-        return linear
+        return {
+            array: (self._tensor(const.ravel()), self._tensor(slope.reshape(len(slope), -1)))
+            for array, (const, slope, _) in linear.items()
+        }
 
     def _tensor(self, values: Any) -> Tensor:
         return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=self._device)
@@ -152,21 +195,26 @@ def _names(model: mujoco.MjModel, kind: str) -> list[str]:
     return [mujoco.mj_id2name(model, obj, i) or str(i) for i in range(count)]
 
 
-def _bounds(draw: Draw) -> tuple[float, float, bool]:
-    """Bounds of the uniform number that is drawn, and whether it is a logarithm."""
-    log = draw.distribution == "log_uniform"
-    return (math.log(draw.low), math.log(draw.high), True) if log else (draw.low, draw.high, False)
+def _bounds(draw: AnyDraw) -> list[tuple[float, float, bool]]:
+    """Bounds of each uniform number that is drawn for one element or all, and whether it is a logarithm."""
+    if isinstance(draw, Shift):
+        return [(-size, size, False) for size in draw.size]
+    log = isinstance(draw, Draw) and draw.distribution == "log_uniform"
+    return [(math.log(draw.low), math.log(draw.high), True) if log else (draw.low, draw.high, False)]
 
 
-def _entries(model: mujoco.MjModel, name: str, element: int, axes: int) -> Any:
+def _entries(model: mujoco.MjModel, name: str, array: str, element: int, axes: int) -> Any:
     """Index of the entries of an element that change, in an array of `axes` axes."""
     if _FIELDS[name].element is None:
         return slice(None)
-    return element if axes == 1 else (element, _columns(model, name, element))
+    return element if axes == 1 else (element, _columns(model, name, array, element))
 
 
-def _columns(model: mujoco.MjModel, name: str, element: int) -> slice:
+def _columns(model: mujoco.MjModel, name: str, array: str, element: int) -> slice:
     """Entries of an element that change, in an array with several for each."""
+    if name in _SERVO_COLUMNS:
+        first = _SERVO_COLUMNS[name][array]
+        return slice(first, first + 1)
     if name == "actuator_gain" and model.actuator_gaintype[element] == mujoco.mjtGain.mjGAIN_MUSCLE:
         return slice(2, 4)  # peak force, and the scale that it is computed from if it is not given
     return _FIELDS[name].columns
@@ -179,7 +227,7 @@ def _owners(model: mujoco.MjModel, name: str, elements: Iterable[int]) -> list[i
     return list(elements)
 
 
-def _chosen(model: mujoco.MjModel, name: str, draw: Draw) -> list[int]:
+def _chosen(model: mujoco.MjModel, name: str, draw: AnyDraw) -> list[int]:
     """Rows of a field's arrays that change.
 
     Raises:
@@ -198,15 +246,21 @@ def _chosen(model: mujoco.MjModel, name: str, draw: Draw) -> list[int]:
         wanted = {i for i, n in enumerate(names) if draw.only is None or n in draw.only}
         base = attrgetter(field.arrays[0])(model)
         rows = [row for row, owner in enumerate(_owners(model, name, range(len(base)))) if owner in wanted]
+        if name in _SERVO_COLUMNS:
+            rows = [row for row in rows if model.actuator_biasprm[row, 1]]
         if not rows:
             raise ConfigError(f"{key}: the model has no {field.element} whose value could be drawn; leave it out")
     _refuse_without_effect(model, name, draw, rows)
     return rows
 
 
-def _refuse_without_effect(model: mujoco.MjModel, name: str, draw: Draw, rows: list[int]) -> None:
+def _refuse_without_effect(model: mujoco.MjModel, name: str, draw: AnyDraw, rows: list[int]) -> None:
     field, key = _FIELDS[name], f"physics.randomize.{name}"
+    if not isinstance(draw, Draw):
+        return
     base = np.asarray(attrgetter(field.arrays[0])(model))
+    if name == "actuator_kd":
+        base = base[:, _SERVO_COLUMNS[name][field.arrays[0]]]
     if draw.mode == "scale" and not np.any(base if field.element is None else base[rows]):
         hint = "leave it out" if type(draw) is not Draw else "write mode: value"
         raise ConfigError(f"{key}: it is 0 in the model, which a scale does not change; {hint}")

@@ -50,6 +50,15 @@ def test_noise_is_that_of_its_distribution_and_the_same_for_as_often_as_it_is_as
     assert float((kinds - torch.eye(4)).abs().max()) < 0.04, "steps, worlds and entries have noise of their own"
 
 
+def test_the_critic_sees_the_undisturbed_observation() -> None:
+    env = cartpole(**DISTURBANCES)
+    env.step(torch.zeros(W, 1))
+    assert env.asymmetric
+    assert torch.equal(env.critic_observation(), clean(env))
+    assert not torch.equal(env.observation(), clean(env))
+    assert not cartpole(push=DISTURBANCES["push"]).asymmetric
+
+
 def test_a_hash_has_every_value_once_in_a_while() -> None:
     drawn = uniform_hash(torch.linspace(0.0, 1.0, 101)[:-1], torch.arange(100), 1000)
     assert torch.histc(drawn, 10, 0.0, 1.0).tolist() == pytest.approx([1e4] * 10, rel=0.03)

@@ -85,6 +85,50 @@ def test_a_muscle_is_stronger_by_its_force_not_by_its_range() -> None:
     assert found["actuator_biasprm"][0, 1].tolist()[:3] == (2.0 * bias[1, :3]).tolist()
 
 
+SERVOS = """<mujoco><worldbody><body name="arm"><joint name="j"/><geom size=".1"/></body></worldbody><actuator>
+  <position joint="j" kp="5" kv="1"/><motor joint="j"/><position joint="j" kp="20" kv="3"/></actuator></mujoco>"""
+
+
+def test_stiffness_and_damping_of_servos_are_drawn_apart() -> None:
+    model = mujoco.MjModel.from_xml_string(SERVOS)
+    found = drawn(model, 1, actuator_kp={"low": 2.0, "high": 2.0}, actuator_kd={"low": 0.5, "high": 0.5})
+    assert found["actuator_gainprm"][0, :, 0].tolist() == [10.0, 1.0, 40.0]
+    assert found["actuator_biasprm"][0, :, :3].tolist() == [[0.0, -10.0, -0.5], [0.0] * 3, [0.0, -40.0, -1.5]]
+    with pytest.raises(ConfigError, match="actuator_gain includes actuator_kp; leave one of both out"):
+        drawn(model, 1, actuator_kp={"low": 2.0, "high": 2.0}, actuator_gain={"low": 0.5, "high": 0.5})
+    with pytest.raises(ConfigError, match="actuator_kp: the model has no actuator whose value could be drawn"):
+        drawn(ant(), 1, actuator_kp={"low": 2.0, "high": 2.0})
+
+
+def test_mass_centres_and_gravity_are_added_to_those_of_the_model() -> None:
+    model = ant()
+    torso = [model.body(1).name]
+    found = drawn(
+        model,
+        2000,
+        body_mass={"low": 2.0, "high": 2.0},
+        payload={"low": 0.0, "high": 1.0, "only": torso},
+        body_ipos={"size": [0.01, 0.02, 0.0], "only": torso},
+        gravity_shift={"size": [0.5, 0.5, 0.3]},
+        gravity={"low": 0.5, "high": 0.5},
+    )
+    mass, own = found["body_mass"], torch.tensor(model.body_mass, dtype=torch.float32)
+    assert torch.equal(mass[:, 2:], 2.0 * own[2:].expand(2000, -1))
+    load = mass[:, 1] - 2.0 * own[1]
+    assert (round(float(load.min()), 2), round(float(load.max()), 2)) == (0.0, 1.0)
+    inertia = torch.tensor(model.body_inertia, dtype=torch.float32)
+    assert torch.equal(found["body_inertia"], 2.0 * inertia.expand(2000, -1, -1))
+    centre = found["body_ipos"] - torch.tensor(model.body_ipos, dtype=torch.float32)
+    assert not centre[:, 2:].any()
+    assert centre[:, 1].abs().amax(0).tolist() == pytest.approx([0.01, 0.02, 0.0], rel=0.02)
+    assert abs(float(torch.corrcoef(centre[:, 1, :2].T)[0, 1])) < 0.1
+    gravity = found["opt.gravity"] - torch.tensor([0.0, 0.0, 0.5 * float(model.opt.gravity[2])])
+    assert gravity.abs().amax(0).tolist() == pytest.approx([0.5, 0.5, 0.3], rel=0.02)
+    every = drawn(model, 4, body_ipos={"size": [0.01] * 3, "each": True})["body_ipos"]
+    shift = (every - torch.tensor(model.body_ipos, dtype=torch.float32))[0, 1:]
+    assert len(shift.unique()) == shift.numel()
+
+
 def test_every_world_has_the_gradient_of_its_own_model() -> None:
     model = ant("elliptic")
     points = ant_points(model, 4, seed=2)
@@ -208,6 +252,7 @@ REFUSED = {
     "geom_friction": ({"low": 2.0, "high": 1.0}, r"low 2 is above high 1; exchange them"),
     "body_mass": ({"low": 1.0, "high": 2.0, "mode": "value"}, "scale"),
     "gravity": ({"low": 0.0, "high": 2.0}, "greater than 0"),
+    "payload": ({"low": 0.0, "high": 2.0}, "only"),
 }
 
 
