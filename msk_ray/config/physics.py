@@ -81,7 +81,7 @@ class PhysicsConfig(Section):
     Friction acts like a damper with this time constant: (0.02, 1) sticks, (1, 1) is viscous. `(0, 0)` uses solref.
     """
     randomize: RandomizeConfig | None = None
-    """Model parameters to draw at random for each world and episode, in training only; null: none."""
+    """Model parameters and disturbances to draw at random for each world and episode, in training only; null: none."""
 
     @model_validator(mode="after")
     def _friction_direction_needs_ellipse(self) -> "PhysicsConfig":

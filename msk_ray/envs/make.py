@@ -40,9 +40,10 @@ def make_env(
         config, physics: the sections.
         nworld: number of worlds.
         device: "cpu" or "cuda:N".
-        seed: of initial states and of randomized parameters.
+        seed: of initial states and of `physics.randomize`.
         differentiable: whether steps can be differentiated.
-        randomize: whether `physics.randomize` applies, as in training; otherwise the model keeps its own parameters.
+        randomize: whether `physics.randomize` applies, as in training; otherwise the model keeps its own parameters and
+            nothing is disturbed.
         execution: how steps are computed.
 
     Raises:
