@@ -106,6 +106,16 @@ def temporary_files(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 @pytest.fixture(autouse=True, scope="session")
+def quickly_compiled_kernels() -> None:
+    """Most of what kernels take here is their compilation, which is shorter by half if the compiler improves nothing.
+    Programs that tests start compile theirs as users do."""
+    import warp as wp
+
+    if not wp.is_cuda_available():  # its kernels are to be tested as they are used
+        wp.config.optimization_level = 0
+
+
+@pytest.fixture(autouse=True, scope="session")
 def not_ignored() -> Iterator[None]:
     """SIGHUP and SIGINT do what they do by default, also where the tests run under `nohup` or in the background of a
     shell, where programs ignore them: a shell that a test starts could not be interrupted."""

@@ -65,8 +65,10 @@ def need_cpu_kernels() -> None:
 
 
 def slow(*values: object) -> list[Any]:
-    """Values of a parameter that only `make test-all` tries: others go through the same code."""
-    return [pytest.param(value, marks=pytest.mark.slow) for value in values]
+    """Values of a parameter, or tuples of several, that only `make test-all` tries: others go through the same code."""
+    return [
+        pytest.param(*(value if isinstance(value, tuple) else (value,)), marks=pytest.mark.slow) for value in values
+    ]
 
 
 def need_file(path: Path, command: str) -> Path:

@@ -6,11 +6,12 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from msk_ray.errors import ClusterLost, StorageError
-from msk_ray.tune import local_ray
+from msk_ray.tune import local_ray, session
 
 pytestmark = pytest.mark.long
 
@@ -89,7 +90,17 @@ def test_a_session_is_closed_to_the_network_and_its_token_to_other_users(
     assert token.read_text() not in result.stdout + result.stderr
 
 
-def test_one_line_says_that_there_is_no_dashboard(home: Path) -> None:
+def test_one_line_says_that_there_is_no_dashboard(
+    home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(session, "_init", lambda *args: SimpleNamespace(dashboard_url=""))
+    with session.ray_session(None, trials=False):
+        pass
+    assert capsys.readouterr().out.splitlines()[1:] == ["no Ray dashboard: pip install 'ray[default]' to have one"]
+
+
+@pytest.mark.slow
+def test_ray_starts_without_what_its_dashboard_needs(home: Path) -> None:
     result = subprocess.run([sys.executable, "-c", WITHOUT_DASHBOARD], capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
     assert result.stdout.splitlines()[1:] == ["no Ray dashboard: pip install 'ray[default]' to have one"]

@@ -28,9 +28,10 @@ EPOCHS = 150
 
 @pytest.fixture
 def command(space_data: dict[str, Any], tmp_path: Path) -> list[str]:
-    """A sweep of two trials, a few seconds each."""
+    """A sweep of one trial of a few seconds."""
     space = tmp_path / "small.yaml"
-    space.write_text(dump_yaml(space_data | {"overrides": {"trial.epochs": EPOCHS}}))
+    one = {"parameters": {"shac.actor_lr": {"grid": [0.01]}}, "overrides": {"trial.epochs": EPOCHS}}
+    space.write_text(dump_yaml(space_data | one))
     program = str(Path(__file__).with_name("stub_driver.py"))
     return [sys.executable, program, "--space", str(space), "--cpu", "--storage", str(tmp_path / "runs")]
 
@@ -47,8 +48,8 @@ def experiment(tmp_path: Path) -> Experiment:
 
 
 def began(experiment: Experiment) -> bool:
-    """Whether both trials have reached the epoch that they are held at."""
-    return len(list(experiment.path.glob(f"trials/*/checkpoints/epoch_{HELD_AT:06d}.pt"))) == 2
+    """Whether the trial has reached the epoch that it is held at."""
+    return bool(list(experiment.path.glob(f"trials/*/checkpoints/epoch_{HELD_AT:06d}.pt")))
 
 
 def whole(experiment: Experiment) -> bool:
@@ -79,7 +80,7 @@ def test_a_terminal_that_closes_lets_trials_save_themselves(
     assert (experiment.path / "summary.json").is_file()
     log = (experiment.path / "terminal.log").read_text()
     assert "nobody reads the output any more (Input/output error); it continues here" in log
-    assert "SIGHUP: 2 trials save themselves" in log
+    assert "SIGHUP: 1 trials save themselves" in log
     assert log.rstrip().endswith(f"continue with: python stub_driver.py {shlex.join(command[2:])} --resume")
     for record in read_records(experiment):
         # They saved themselves: the newest checkpoint is of the last epoch done, due or not.
@@ -103,8 +104,8 @@ def test_a_pipe_that_nobody_reads_does_not_matter(
     assert "nobody reads the output any more (Broken pipe)" in log[0]
     lines = [first.rstrip(), *log[1:]]
     # Nothing that was said is lost between the two, and the report's process, a child, says its line there too.
-    assert sum("start  actor_lr=" in line for line in lines) == 2
-    assert sum("finished: all 150 epochs done" in line for line in lines if line.startswith("[")) == 2
+    assert sum("start  actor_lr=" in line for line in lines) == 1
+    assert sum("finished: all 150 epochs done" in line for line in lines if line.startswith("[")) == 1
     assert any(line.startswith("best policy  ") for line in lines)
     assert any(line.startswith("report  ") for line in lines)
 

@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
+from needs import slow
 from oracle import Point, rollout, tighten
 from test_adjoint_features import compare
 
@@ -67,16 +68,24 @@ def landing_points(model: mujoco.MjModel, count: int, on_plane: bool) -> list[Po
     return points
 
 
-@pytest.mark.parametrize("substeps", [1, 8])
+_PAIRS = [
+    *[(shape, "plane") for shape in _SHAPES],
+    *[("sphere", ground) for ground in ("sphere", "capsule", "cylinder", "box")],
+    *[("capsule", ground) for ground in ("capsule", "box")],
+    ("box", "box"),
+    *[(shape, "hills") for shape in ("sphere", "capsule")],
+    *[("mesh", "mesh"), ("mesh", "box"), ("ellipsoid", "mesh"), ("capsule", "mesh")],
+]
+_CHAINED = [("sphere", "plane"), ("box", "box"), ("capsule", "hills"), ("mesh", "box")]
+"""Pairs of which `make test` chains substeps too."""
+
+
 @pytest.mark.parametrize(
-    ("shape", "ground"),
+    ("shape", "ground", "substeps"),
     [
-        *[(shape, "plane") for shape in _SHAPES],
-        *[("sphere", ground) for ground in ("sphere", "capsule", "cylinder", "box")],
-        *[("capsule", ground) for ground in ("capsule", "box")],
-        ("box", "box"),
-        *[(shape, "hills") for shape in ("sphere", "capsule")],
-        *[("mesh", "mesh"), ("mesh", "box"), ("ellipsoid", "mesh"), ("capsule", "mesh")],
+        *[(*pair, 1) for pair in _PAIRS],
+        *[(*pair, 8) for pair in _CHAINED],
+        *slow(*[(*pair, 8) for pair in _PAIRS if pair not in _CHAINED]),
     ],
 )
 def test_exact_pairs(shape, ground, substeps):
@@ -87,8 +96,15 @@ def test_exact_pairs(shape, ground, substeps):
 
 
 @pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
-@pytest.mark.parametrize("condim", [1, 3, 4, 6])
-@pytest.mark.parametrize("option", ["", 'impratio="3"', 'jacobian="sparse"'])
+@pytest.mark.parametrize(
+    ("condim", "option"),
+    [
+        *[(condim, "") for condim in (1, 3, 4, 6)],
+        *[(6, 'impratio="3"'), (3, 'jacobian="sparse"')],
+        *slow(*[(condim, 'impratio="3"') for condim in (1, 3, 4)]),
+        *slow(*[(condim, 'jacobian="sparse"') for condim in (1, 4, 6)]),
+    ],
+)
 def test_contact_dimensions(cone, condim, option):
     model = falling("sphere", "capsule", cone, condim, option)
     worst, kept = compare(model, landing_points(model, 5, False), 4)

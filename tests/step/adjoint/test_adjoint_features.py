@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
+from needs import slow
 from oracle import INPUTS, Point, differences, relative, rollout, simulate, tighten
 from scenes import random_weights
 
@@ -261,8 +262,18 @@ def _wraps(model: mujoco.MjModel, point: Point) -> bool:
     return model.ntendon == 0 or bool(np.any(data.wrap_obj >= 0))
 
 
-@pytest.mark.parametrize("substeps", [1, pytest.param(8, marks=pytest.mark.long)])
-@pytest.mark.parametrize("name", sorted(SCENES))
+CHAINED = ("filter", "muscle", "plain", "rk4_muscle", "site_tendon", "sparse", "weld_bodies")
+"""Scenes of which `make test` chains substeps too; all others take them through the same code."""
+
+
+@pytest.mark.parametrize(
+    ("name", "substeps"),
+    [
+        *[(name, 1) for name in sorted(SCENES)],
+        *[pytest.param(name, 8, marks=pytest.mark.long) for name in CHAINED],
+        *slow(*[(name, 8) for name in sorted(SCENES) if name not in CHAINED]),
+    ],
+)
 def test_feature(name, substeps):
     model = SCENES[name]()
     points = random_points(model, 4, seed=5)
