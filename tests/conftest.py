@@ -3,6 +3,7 @@
 torch is imported where it is needed: the process of pytest-xdist that hands out the tests needs none.
 """
 
+import fcntl
 import signal
 import tempfile
 from collections.abc import Callable, Iterator
@@ -106,13 +107,27 @@ def temporary_files(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 @pytest.fixture(autouse=True, scope="session")
-def quickly_compiled_kernels() -> None:
-    """Most of what kernels take here is their compilation, which is shorter by half if the compiler improves nothing.
-    Programs that tests start compile theirs as users do."""
+def kernels_compile_fast_and_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Half of the time that tests of physics take is the compiler's: here it improves nothing, and of the processes
+    that need the same kernels one compiles them while the others wait. Programs that tests start do as users' do."""
     import warp as wp
+    from warp._src.context import Module
 
-    if not wp.is_cuda_available():  # its kernels are to be tested as they are used
-        wp.config.optimization_level = 0
+    if wp.is_cuda_available():  # its kernels are to be tested as they are used
+        yield
+        return
+    locks = tmp_path_factory.getbasetemp().parent
+    compile_it = Module._compile
+
+    def compile_once(module: Module, *args: Any, **options: Any) -> bool:
+        with (locks / f"{module.name}.lock").open("w") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            return compile_it(module, *args, **options)  # or finds it in the cache
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(wp.config, "optimization_level", 0)
+        patch.setattr(Module, "_compile", compile_once)
+        yield
 
 
 @pytest.fixture(autouse=True, scope="session")
