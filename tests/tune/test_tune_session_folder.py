@@ -1,6 +1,7 @@
 """The folder of a Ray of our own: closed to other users of the machine, and gone afterwards."""
 
 import os
+import shutil
 import signal
 import stat
 import subprocess
@@ -117,8 +118,7 @@ def check_as_another_user(session: "subprocess.Popen[str]", top: Path, home: Pat
     probe.chmod(0o777)
     (probe / "file").touch()
     assert f"renamed: {probe / 'file'}" in as_another_user(lambda: attempts([probe / "file"], home))
-    (probe / "file").unlink(missing_ok=True)
-    probe.rmdir()
+    shutil.rmtree(probe)
 
 
 def private(path: Path) -> bool:
