@@ -125,7 +125,7 @@ def legs26() -> mujoco.MjModel:
 
 
 @needs_myo_sim
-@pytest.mark.parametrize("name", ["myolegs26", "myolegs"])
+@pytest.mark.parametrize("name", ["myolegs", *slow("myolegs26")])
 @pytest.mark.parametrize("substeps", [1, *slow(8)])
 def test_gradients_of_a_step(name: str, substeps: int) -> None:
     model = build_myoleg(MyoLegSettings(name="myoleg", model=name, source="myo_sim"), PhysicsConfig())

@@ -146,24 +146,19 @@ def test_a_population_goes_on_where_it_was(make_space: Any, tmp_path: Path) -> N
 
 
 def test_processes_that_cannot_be_started_ahead_are_said_once_and_cost_no_trial(
-    make_space: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def absent(*args: Any) -> None:
+    def absent() -> None:
         raise AttributeError("no such call in this Ray")
 
-    monkeypatch.setattr(worker_prestart, "start_processes", absent)
-    space = make_space(parameters={}, seeds="0-2", overrides={"trial.epochs": 30})
-    trials = resolve_trials(space)
-    experiment = opening.create(tmp_path / "runs" / "alone", space, trials, {})
-    assert driver.run_trials(driver.Plan(experiment, space, trials, Placement(0.0, 1), 1, StubTrainer, precompile=None))
-    assert outcomes(read_records(experiment)) == ["finished"] * 3
-    shown = capsys.readouterr().out
-    assert (
-        shown.count(
-            "no process was started ahead of time, so trials start a few seconds later: AttributeError: no such call"
-        )
-        == 1
-    )
+    monkeypatch.setattr(worker_prestart, "_environment_of_trials", absent)
+    said: list[str] = []
+    callback = worker_prestart.WorkerPrestart(Placement(0.0, 1), 1, lambda: 2, said.append)
+    for number in range(3):
+        callback.on_trial_start(number, [], None)
+        callback.on_trial_result(number, [], None, {})
+    why = "AttributeError: no such call in this Ray"
+    assert said == [f"no process was started ahead of time, so trials start a few seconds later: {why}"]
 
 
 def test_no_more_at_once_than_asked_for_and_the_next_process_waits(
