@@ -126,5 +126,5 @@ def budget(described: dict[str, object], folder: Path) -> float:
     ("page", "file"), [("algorithms", "random_search"), ("environments", "own_ant"), ("loggers", "table_logger")]
 )
 def test_the_pages_show_these_files(page: str, file: str, root: Path) -> None:
-    (shown,) = re.findall(r"```python\n(.*?)```", (root / "docs" / "runner" / f"{page}.md").read_text(), re.DOTALL)
-    assert shown == (HERE / f"{file}.py").read_text()
+    shown = re.findall(r"```python\n(.*?)```", (root / "docs" / "runner" / f"{page}.md").read_text(), re.DOTALL)
+    assert (HERE / f"{file}.py").read_text() in shown
