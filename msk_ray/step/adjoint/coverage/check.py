@@ -33,11 +33,9 @@ def _few(elements: list[str]) -> str:
 
 
 def table() -> str:
-    """The table as Markdown, feature by mode."""
-    rows = ["| feature | tape_all, tape_per_substep | fd_jacobian | note |", "|---|---|---|---|"]
+    """The table as Markdown."""
+    rows = ["| feature | gradient | note |", "|---|---|---|"]
     for f in FEATURES:
         kept = "exact, approximated where counted" if f.counted else "exact"
-        rows.append(
-            f"| {f.name} | {kept if f.exact else 'raises'} | {'approximate' if f.steps else 'raises'} | {f.note} |"
-        )
+        rows.append(f"| {f.name} | {kept if f.exact else 'raises'} | {f.note} |")
     return "\n".join(rows)

@@ -35,8 +35,6 @@ class Feature:
     """Whether single contacts may be approximated, each of which is counted."""
     instead: str = ""
     """What to write in the model where it is refused."""
-    steps: bool = True
-    """Whether there is a step at all, which finite differences differentiate."""
 
 
 def _joint_type(*kinds: int) -> Finder:
@@ -355,7 +353,6 @@ FEATURES: tuple[Feature, ...] = (
         "plugins",
         False,
         option(lambda m: m.nplugin > 0, "plugin"),
-        "they are programs of their own, which mujoco_warp does not run",
-        steps=False,
+        "they are programs of their own, which mujoco_warp does not run: fd_jacobian refuses them too",
     ),
 )
