@@ -8,7 +8,7 @@ import myosuite_model
 import pytest
 import torch
 import yaml
-from needs import need_file
+from needs import need_file, slow
 
 import msk_ray
 from msk_ray.cli import run
@@ -33,7 +33,16 @@ SECONDS = 3.0
 """How long each trained policy acts here."""
 
 
-@pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.pt")), ids=lambda path: path.stem)
+POLICIES = sorted(SHIPPED.glob("*.pt"))
+ALWAYS = ("ant_hard", "cartpole", "myoleg26")
+"""One of each kind: with contacts, without, with muscles."""
+
+
+@pytest.mark.parametrize(
+    "path",
+    [*(p for p in POLICIES if p.stem in ALWAYS), *slow(*(p for p in POLICIES if p.stem not in ALWAYS))],
+    ids=lambda path: path.stem,
+)
 def test_every_trained_policy_is_exported_and_does_what_is_recorded(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -99,7 +108,7 @@ def test_an_entry_says_what_the_policy_scores_and_where_it_comes_from(made: Path
     assert text.startswith("# Mine\n")
     assert text.endswith(f"{END}\nThe end.\n")
     assert f"| `pole.pt` | {entry.score.mean:.5g} ± {entry.score.std:.3g} | 2 × 4 |" in text
-    assert "old" not in text
+    assert "\nold\n" not in text
 
 
 def test_evaluate_repeats_the_table_or_says_what_differs(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:

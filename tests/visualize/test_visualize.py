@@ -12,7 +12,7 @@ import av
 import mujoco
 import numpy as np
 import pytest
-from needs import need_drawing, need_program
+from needs import need_drawing, need_program, slow
 from PIL import Image
 
 from msk_ray.cli import run
@@ -65,7 +65,7 @@ def drawing() -> str:
     return need_drawing()
 
 
-@pytest.fixture(params=["cartpole", "ant", "myoleg26"])
+@pytest.fixture(params=["cartpole", "myoleg26", *slow("ant")])
 def target(request: pytest.FixtureRequest, sweep: Experiment) -> Path:
     """A trial's folder, or a checkpoint, of each environment."""
     if request.param == "cartpole":
