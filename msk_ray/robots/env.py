@@ -15,6 +15,7 @@ from msk_ray.config import PhysicsConfig
 from msk_ray.envs.layout import Entry, entries, vector
 from msk_ray.envs.memory import Memory
 from msk_ray.envs.mjcf.env import MjcfEnv
+from msk_ray.errors import ConfigError
 from msk_ray.robots.config import (
     G1_TERMS,
     GO1_TERMS,
@@ -51,6 +52,29 @@ _HEADING_STIFFNESS = 0.5
 """Yaw rate asked for per error of the heading [1/s]."""
 
 
+def servos_of(model: mujoco.MjModel) -> list[int]:
+    """The position servo of each joint after the first, which is free.
+
+    Raises:
+        ConfigError: the first joint is not free, another is no hinge, or one has no position servo with a force range.
+    """
+    kinds = [mujoco.mjtJoint(kind) for kind in model.jnt_type]
+    if kinds[:1] != [mujoco.mjtJoint.mjJNT_FREE] or any(kind != mujoco.mjtJoint.mjJNT_HINGE for kind in kinds[1:]):
+        raise ConfigError("a velocity task needs a model whose first joint is free and whose others are hinges")
+    gain, stiffness = model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 1]
+    usable = (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)) & (gain > 0.0) & (stiffness > 0.0)
+    usable &= model.actuator_forcerange[:, 1] > 0.0
+    servo_of = {int(model.actuator_trnid[servo, 0]): int(servo) for servo in usable.nonzero()[0]}
+    for joint in range(1, model.njnt):
+        if joint not in servo_of:
+            name = model.joint(joint).name
+            raise ConfigError(
+                f"joint {name!r} needs a position servo with a force range, such as "
+                f'<position joint="{name}" kp="50" kv="2" forcerange="-40 40"/>'
+            )
+    return [servo_of[joint] for joint in range(1, model.njnt)]
+
+
 class VelocityEnv(MjcfEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
     """A robot on flat ground whose base is to move as commanded.
 
@@ -83,10 +107,8 @@ class VelocityEnv(MjcfEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
 
     def prepare(self) -> None:
         model = self.model
-        hinges = range(1, model.njnt)
-        self.joint_names = [model.joint(joint).name for joint in hinges]
-        servo_of = {int(model.actuator_trnid[servo, 0]): servo for servo in range(model.nu)}
-        servos = [servo_of[joint] for joint in hinges]
+        self.joint_names = [model.joint(joint).name for joint in range(1, model.njnt)]
+        servos = servos_of(model)
         self.default_pose = self._start.qpos[0, 7:]
         self.action_size = len(servos)
         self.action_scale = self._tensor(

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -14,7 +15,7 @@ from msk_ray.config.environments import settings_class
 from msk_ray.envs import make_env
 from msk_ray.errors import ConfigError
 from msk_ray.robots.config import G1_TERMS
-from msk_ray.robots.env import VelocityEnv
+from msk_ray.robots.env import VelocityEnv, servos_of
 from msk_ray.robots.robot import PoseSpread, by_joint
 from msk_ray.robots.robots import GO1
 from msk_ray.step import StepState
@@ -145,3 +146,25 @@ def test_each_joint_has_one_pattern() -> None:
         by_joint({"hip": 1.0}, ("hip", "ankle"))
     with pytest.raises(ConfigError, match="2 patterns match joint 'hip'"):
         by_joint({"hip": 1.0, "h.*": 2.0}, ("hip",))
+
+
+SERVO = '<position joint="knee" kp="50" forcerange="-40 40"/>'
+
+
+@pytest.mark.parametrize(
+    ("joint", "servo", "message"),
+    [
+        ("", SERVO, "first joint is free"),
+        ("<freejoint/>", "", "joint 'knee' needs a position servo with a force range"),
+        ("<freejoint/>", SERVO.replace('forcerange="-40 40"', ""), "force range"),
+        ("<freejoint/>", SERVO.replace("position", "motor").replace('kp="50"', ""), "position servo"),
+    ],
+)
+def test_a_model_whose_joints_cannot_be_moved_is_refused(joint: str, servo: str, message: str) -> None:
+    """Without a force range, no action would move anything."""
+    xml = (
+        f'<mujoco><worldbody><body>{joint}<geom size="0.1"/><body pos="0 0 -0.2"><joint name="knee"/><geom size="0.1"/>'
+        f"</body></body></worldbody><actuator>{servo}</actuator></mujoco>"
+    )
+    with pytest.raises(ConfigError, match=message):
+        servos_of(mujoco.MjModel.from_xml_string(xml))
