@@ -80,7 +80,10 @@ def test_the_settings_of_an_import_path_are_checked_and_kept_whole(outside: Path
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        (None, "env.name: missing; write cartpole, ant, hopper, cheetah, humanoid, myoleg, myoleg26, myosuite_walk or"),
+        (
+            None,
+            "env.name: missing; write cartpole, ant, hopper, cheetah, humanoid, g1_velocity, go1_velocity, myoleg,",
+        ),
         (3, "env.name: 3 is no name; write cartpole"),
         ("antt", "env.name: unknown name 'antt'; did you mean 'ant'?"),
         ("outside_walker:", "env.name: write package.module:Class, not 'outside_walker:'"),

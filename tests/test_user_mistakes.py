@@ -93,7 +93,7 @@ def mistakes() -> list[Mistake]:
         ),
         config(CONFIG + "5: 64\n", "key '5' is a whole number in YAML, not a name; write a name"),
         config("env: {name: cartpol}\n", "env.name: unknown name 'cartpol'; did you mean 'cartpole'?"),
-        config("env: {name: 'robots:Hopper'}\n", "env.name: no module 'robots'; the current folder, PYTHONPATH"),
+        config("env: {name: 'hoppers:Hopper'}\n", "env.name: no module 'hoppers'; the current folder, PYTHONPATH"),
         config(
             "env: {name: 'model.xml'}\n", "env.name: unknown name 'model.xml'; write cartpole, .* package.module:Class"
         ),

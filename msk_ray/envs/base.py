@@ -536,8 +536,8 @@ class Env(ABC, Generic[SettingsT]):
 
     def remembered(self, state: StepState, action: Tensor) -> Mapping[str, Tensor]:
         """What `remember` gives, and the memories of disturbances."""
-        own = {} if self.disturbances is None else self.disturbances.remember(action)
-        return {**self.remember(state, action), **own}
+        values = self.remember(state, action)
+        return values if self.disturbances is None else {**values, **self.disturbances.remember(action)}
 
     def carried(self, state: EnvState) -> EnvState:
         """A state as the next step begins with it: the gradients of some memories do not cross steps."""
