@@ -3,21 +3,17 @@
 MyoSuite 2.12 needs MuJoCo 3.6 and msk_ray 4.0, so one environment cannot hold both.
 """
 
-import json
-import subprocess
-import tempfile
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
-from typing import IO, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from msk_ray.config import Config
-from msk_ray.errors import ConfigError, SimulationError
+from msk_ray.errors import ConfigError
+from msk_ray.evaluate.foreign_process import ForeignProcess
 from msk_ray.evaluate.measure import EvaluationSetup, Request, entry_of
 from msk_ray.legs.myosuite_walk import scoring_worker as worker
 from msk_ray.legs.myosuite_walk.config import MyoSuiteWalkSettings
@@ -115,41 +111,19 @@ def _acting(policy: SavedPolicy) -> _Act:
     return act
 
 
-class _Worker(AbstractContextManager["_Worker"]):
-    """A process of MyoSuite's Python. It is ended on exit, if it has not ended by itself."""
+class _Worker(ForeignProcess):
+    """A process of MyoSuite's Python."""
 
     def __init__(self, python: Path, asked: dict[str, Any]) -> None:
-        self._messages = tempfile.TemporaryFile()  # noqa: SIM115  # closed on exit
-        self._process = subprocess.Popen(
-            # Isolated: this file lies in a folder with a module `myosuite`, and PYTHONPATH is meant for our versions.
-            [str(python), "-I", worker.__file__, json.dumps(asked)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._messages,
-        )
-        try:
-            self._greet()
-        except BaseException:
-            self.__exit__(None, None, None)
-            raise
-
-    def _greet(self) -> None:
-        line = self._out.readline()
-        if not line:
-            raise ConfigError(f"--in myosuite: {self._last_words()}; {MYOSUITE.install}")
-        hello = json.loads(line)
-        self.versions: dict[str, str] = hello["versions"]
+        super().__init__("myosuite", MYOSUITE.install, python, worker.__file__, asked)
+        self.versions: dict[str, str] = self.hello["versions"]
         if not self.versions["myosuite"].startswith(VERSION):
+            self.__exit__(None, None, None)
             raise ConfigError(
                 f"--in myosuite: MyoSuite {self.versions['myosuite']} is another task than {VERSION}x; "
                 f"{MYOSUITE.install}"
             )
-        self._record = worker.record(hello["observations"])
-
-    @property
-    def _out(self) -> IO[bytes]:
-        assert self._process.stdout is not None
-        return self._process.stdout
+        self._record = worker.record(self.hello["observations"])
 
     def episodes(self, act: _Act, count: int, steps: int) -> Episodes:
         """`count` episodes of at most `steps` steps, one after the other, as a tensor entry each."""
@@ -172,40 +146,12 @@ class _Worker(AbstractContextManager["_Worker"]):
 
     def _episode(self, act: _Act, steps: int) -> np.ndarray:
         """Records of one episode, (T,)."""
-        assert self._process.stdin is not None
         found: list[np.ndarray] = []
-        obs = self._read()["obs"]
+        obs = self.read(self._record, 1)[0]["obs"]
         while len(found) < steps:
-            action = act(obs).astype("<f4")
-            try:
-                self._process.stdin.write(action.tobytes())
-                self._process.stdin.flush()
-            except BrokenPipeError:
-                raise SimulationError(f"--in myosuite: {self._last_words()}") from None
-            found.append(self._read())
+            self.write(act(obs))
+            found.append(self.read(self._record, 1)[0])
             obs = found[-1]["obs"]
             if found[-1]["terminated"] or found[-1]["diverged"]:
                 break
         return np.stack(found)
-
-    def _read(self) -> np.ndarray:
-        data = self._out.read(self._record.itemsize)
-        if len(data) < self._record.itemsize:
-            raise SimulationError(f"--in myosuite: {self._last_words()}")
-        found: np.ndarray = np.frombuffer(bytearray(data), self._record)[0]
-        return found
-
-    def _last_words(self) -> str:
-        """The last line that the process wrote before it ended."""
-        self._process.wait()
-        self._messages.seek(0)
-        lines = self._messages.read().decode(errors="replace").split("\n")
-        said: Sequence[str] = [line.strip() for line in lines if line.strip()]
-        return said[-1] if said else f"it ended with exit code {self._process.returncode}"
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._process.kill()
-        self._process.communicate()
-        self._messages.close()

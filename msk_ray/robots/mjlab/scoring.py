@@ -5,20 +5,15 @@ mjlab 1.6 needs MuJoCo 3.11 and msk_ray 4.0, so one environment cannot hold both
 Axes: W worlds, O observation, J actions.
 """
 
-import json
-import subprocess
-import tempfile
-from contextlib import AbstractContextManager
 from pathlib import Path
-from types import TracebackType
-from typing import IO, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from msk_ray.config import Config
-from msk_ray.errors import ConfigError, SimulationError
+from msk_ray.errors import ConfigError
+from msk_ray.evaluate.foreign_process import ForeignProcess
 from msk_ray.evaluate.measure import EvaluationSetup, Request, entry_of
 from msk_ray.robots.config import G1VelocitySettings, Go1VelocitySettings, VelocitySettings
 from msk_ray.robots.mjlab import worker
@@ -100,8 +95,8 @@ class MjlabScorer:
         return entry_of(policy, setup, runs, running.terms) | {"mjlab": running.versions}
 
 
-class _Worker(AbstractContextManager["_Worker"]):
-    """A process of mjlab's Python. It is ended on exit, if it has not ended by itself.
+class _Worker(ForeignProcess):
+    """A process of mjlab's Python.
 
     Attributes:
         versions: of the packages there.
@@ -110,54 +105,31 @@ class _Worker(AbstractContextManager["_Worker"]):
     """
 
     def __init__(self, python: Path, asked: dict[str, Any]) -> None:
+        super().__init__("mjlab", MJLAB.install, python, worker.__file__, asked)
         self._asked = asked
-        self._messages = tempfile.TemporaryFile()  # noqa: SIM115  # closed on exit
-        self._process = subprocess.Popen(
-            # Isolated: this file lies in a folder with a module `mjlab`, and PYTHONPATH is meant for our versions.
-            [str(python), "-I", worker.__file__, json.dumps(asked)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._messages,
-        )
-        try:
-            self._greet()
-        except BaseException:
-            self.__exit__(None, None, None)
-            raise
-
-    def _greet(self) -> None:
-        line = self._out.readline()
-        if not line:
-            raise ConfigError(f"--in mjlab: {self._last_words()}; {MJLAB.install}")
-        hello = json.loads(line)
-        self.versions: dict[str, str] = hello["versions"]
-        self.device: str = hello["device"]
-        self.terms: list[str] = hello["terms"]
+        self.versions: dict[str, str] = self.hello["versions"]
+        self.device: str = self.hello["device"]
+        self.terms: list[str] = self.hello["terms"]
         if not self.versions["mjlab"].startswith(VERSION):
+            self.__exit__(None, None, None)
             raise ConfigError(
                 f"--in mjlab: mjlab {self.versions['mjlab']} has other tasks than {VERSION}x; {MJLAB.install}"
             )
-        self._actions: int = hello["actions"]
-        self._observations: int = hello["observations"]
+        self._observations: int = self.hello["observations"]
         self._record = worker.record(self._observations, len(self.terms))
-
-    @property
-    def _out(self) -> IO[bytes]:
-        assert self._process.stdout is not None
-        return self._process.stdout
 
     def episodes(self, policy: SavedPolicy) -> Episodes:
         """The first episode of each world."""
         assert isinstance(policy.config.env, VelocitySettings)
         worlds, scale = self._asked["worlds"], policy.config.env.action_range
-        obs = self._read(np.dtype(("<f4", (self._observations,))))
+        obs = self.read(np.dtype(("<f4", (self._observations,))), worlds)
         running = np.ones(worlds, dtype=bool)
         fell = np.zeros(worlds, dtype=bool)
         length = np.zeros(worlds)
         sums = {name: np.zeros((worlds, *self._record[name].shape)) for name in _SUMMED}
         for _ in range(self._asked["steps"]):
-            self._write(scale * policy(obs))
-            step = self._read(self._record)
+            self.write(scale * policy(obs))
+            step = self.read(self._record, worlds)
             length += running
             ended = running & step["terminated"]
             for name, total in sums.items():
@@ -176,38 +148,6 @@ class _Worker(AbstractContextManager["_Worker"]):
             outcomes={name: torch.from_numpy(sums[name]) for name in _ERRORS},
             success=None,
         )
-
-    def _write(self, actions: NDArray[np.floating]) -> None:
-        assert self._process.stdin is not None
-        try:
-            self._process.stdin.write(actions.astype("<f4").tobytes())
-            self._process.stdin.flush()
-        except BrokenPipeError:
-            raise SimulationError(f"--in mjlab: {self._last_words()}") from None
-
-    def _read(self, record: np.dtype) -> np.ndarray:
-        """What all worlds sent, (W, ...)."""
-        size = self._asked["worlds"] * record.itemsize
-        data = self._out.read(size)
-        if len(data) < size:
-            raise SimulationError(f"--in mjlab: {self._last_words()}")
-        base, shape = record.subdtype or (record, ())
-        return np.frombuffer(bytearray(data), base).reshape(-1, *shape)
-
-    def _last_words(self) -> str:
-        """The last line that the process wrote before it ended."""
-        self._process.wait()
-        self._messages.seek(0)
-        lines = self._messages.read().decode(errors="replace").split("\n")
-        said = [line.strip() for line in lines if line.strip()]
-        return said[-1] if said else f"it ended with exit code {self._process.returncode}"
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._process.kill()
-        self._process.communicate()
-        self._messages.close()
 
 
 _ERRORS: Final = ("linear_error", "yaw_error")
