@@ -1,12 +1,13 @@
 """The settings of the velocity tasks. Source: `mjlab/tasks/velocity` of mjlab 1.6.0."""
 
 import math
+from typing import Any
 
-from pydantic import PositiveFloat
+from pydantic import PositiveFloat, model_validator
 
 from msk_ray.config.commands import Command, with_commands
 from msk_ray.config.rewards import reward_section, with_reward
-from msk_ray.config.sections import Count, Fraction, NonNegative, Reward
+from msk_ray.config.sections import Count, Fraction, NonNegative, Reward, Section, Whole
 from msk_ray.config.terms import Term, terms_in
 from msk_ray.envs.mjcf.config import MjcfSettings
 
@@ -35,6 +36,36 @@ class VelocityShape(Reward):
     that has no slope far from the command. For training."""
 
 
+class CostSchedule(Section):
+    """Factor on the weights of costs in training: `start` until the epoch `begin`, 1 from the epoch `end` on, linear
+    between.
+
+    A robot that pays mjlab's price for every change of its action from the start learns to stand still, before it has
+    learned to walk; one that pays nothing learns to tremble.
+    """
+
+    start: Fraction
+    begin: Whole
+    end: Count
+
+    @model_validator(mode="after")
+    def _in_order(self) -> "CostSchedule":
+        if self.begin >= self.end:
+            raise ValueError(f"cost_schedule.end has to be greater than begin, {self.begin}")
+        return self
+
+    def at(self, epoch: int) -> float:
+        """The factor at `epoch`, counted from 0."""
+        progress = min(1.0, max(0.0, (epoch - self.begin) / (self.end - self.begin)))
+        return self.start + (1.0 - self.start) * progress
+
+
+def cost_share(settings: Any, epoch: int) -> float:
+    """The factor on costs that the settings of a velocity task ask for at `epoch`."""
+    schedule: CostSchedule | None = settings.cost_schedule
+    return 1.0 if schedule is None else schedule.at(epoch)
+
+
 def velocity_terms(*others: Term) -> tuple[Term, ...]:
     """mjlab's terms with its weights, but for those that differ between its robots."""
     return terms_in(
@@ -44,12 +75,12 @@ def velocity_terms(*others: Term) -> tuple[Term, ...]:
         Term("upright", 1.0),
         Term("pose", 1.0, "variable_posture"),
         Term("dof_pos_limits", -1.0),
-        Term("action_rate_l2", -0.1),
+        Term("action_rate_l2", -0.1, schedule=cost_share),
         Term("air_time", 0.0, gradient=False, optional=True),
-        Term("foot_clearance", -2.0),
-        Term("foot_swing_height", -0.25, gradient=False),
-        Term("foot_slip", -0.1),
-        Term("soft_landing", -1e-5, gradient=False),
+        Term("foot_clearance", -2.0, schedule=cost_share),
+        Term("foot_swing_height", -0.25, gradient=False, schedule=cost_share),
+        Term("foot_slip", -0.1, schedule=cost_share),
+        Term("soft_landing", -1e-5, gradient=False, schedule=cost_share),
         *others,
     )
 
@@ -64,17 +95,19 @@ class VelocitySettings(MjcfSettings):
     action_range: PositiveFloat = 1.0
     """mjlab's action for an action of 1 of the policy. mjlab's are not bounded; 1 asks a joint for an angle that its
     servo, standing still, holds with a quarter of its largest torque."""
+    cost_schedule: CostSchedule | None = None
+    """Factor on the weights of costs in training, all but `dof_pos_limits`; null: 1."""
     reward: VelocityShape = VelocityShape()
 
 
 GO1_TERMS = velocity_terms(
-    Term("body_ang_vel", 0.0, optional=True),
-    Term("angular_momentum", 0.0, optional=True),
+    Term("body_ang_vel", 0.0, schedule=cost_share, optional=True),
+    Term("angular_momentum", 0.0, schedule=cost_share, optional=True),
 )
 G1_TERMS = velocity_terms(
-    Term("body_ang_vel", -0.05),
-    Term("angular_momentum", -0.02),
-    Term("self_collisions", -1.0, gradient=False),
+    Term("body_ang_vel", -0.05, schedule=cost_share),
+    Term("angular_momentum", -0.02, schedule=cost_share),
+    Term("self_collisions", -1.0, gradient=False, schedule=cost_share),
 )
 Go1Reward = reward_section("Go1Reward", __name__, GO1_TERMS, VelocityShape)
 G1Reward = reward_section("G1Reward", __name__, G1_TERMS, VelocityShape)

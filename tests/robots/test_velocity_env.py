@@ -14,7 +14,7 @@ from msk_ray.config import PhysicsConfig
 from msk_ray.config.environments import settings_class
 from msk_ray.envs import make_env
 from msk_ray.errors import ConfigError
-from msk_ray.robots.config import G1_TERMS
+from msk_ray.robots.config import G1_TERMS, CostSchedule
 from msk_ray.robots.env import VelocityEnv, servos_of
 from msk_ray.robots.robot import PoseSpread, by_joint
 from msk_ray.robots.robots import GO1
@@ -87,6 +87,23 @@ def test_a_tail_is_part_of_training_alone() -> None:
     assert still < 1e-4
     assert close == pytest.approx(2.0 * 0.5 / (1.0 + 4.0 / 0.25), rel=0.5)
     assert type(tailed).reference_settings(tailed.config).reward.tail == 0.0
+
+
+def test_costs_rise_in_training_alone() -> None:
+    schedule = CostSchedule(start=0.1, begin=500, end=900)
+    assert [schedule.at(epoch) for epoch in (0, 500, 700, 900, 2000)] == pytest.approx([0.1, 0.1, 0.55, 1.0, 1.0])
+    env = make(1, cost_schedule=schedule)
+    costs = [term.schedule is not None for term in env.active_terms]
+    names = [term.name for term, cost in zip(env.active_terms, costs, strict=True) if not cost]
+    assert names == ["track_linear_velocity", "track_angular_velocity", "upright", "pose", "dof_pos_limits"]
+    assert env._shares.tolist() == [1.0] * len(costs)  # as in scores, which begin no epoch
+    env.begin_epoch(0)
+    assert env._shares.tolist() == pytest.approx([0.1 if cost else 1.0 for cost in costs])
+
+
+def test_costs_that_never_rise_are_refused() -> None:
+    with pytest.raises(ValueError, match="greater than begin"):
+        CostSchedule(start=0.1, begin=500, end=500)
 
 
 @pytest.mark.parametrize("robot", ["go1", "g1"])
