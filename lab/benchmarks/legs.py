@@ -55,7 +55,7 @@ def measure(config: Config, worlds: int, device: str, horizon: int, seconds: flo
 
     def restart() -> None:
         env.state = env.reset_state()
-        env.stock_resets(env.draw_resets(horizon))
+        env.starts.stock(env.starts.draw_steps(horizon, env.group))
 
     def simulate() -> None:
         state = env.reset_state().physics
@@ -90,13 +90,13 @@ def measure(config: Config, worlds: int, device: str, horizon: int, seconds: flo
 
 def recorded(env: Any, actions: torch.Tensor) -> Recording[Any]:
     """Control steps under actions (H, W, A) from one state, and the gradient of their reward, as one CUDA graph."""
-    start, resets = env.reset_state(), env.draw_resets(len(actions))
+    start, resets = env.reset_state(), env.starts.draw_steps(len(actions), env.group)
 
     def work() -> Any:
         # Made here, because autograd would go on using the stream on which it first saw them.
         inputs = actions.clone().requires_grad_()
         env.state = start
-        env.stock_resets(resets)
+        env.starts.stock(resets)
         total = torch.zeros((), device=env.device)
         for action in inputs:
             total = total + env.step(action).reward.mean()
@@ -105,7 +105,7 @@ def recorded(env: Any, actions: torch.Tensor) -> Recording[Any]:
     work()
     recording = Recording(work, torch.cuda.Stream(env.device))
     env.state = start
-    env.stock_resets(None)
+    env.starts.stock(None)
     return recording
 
 

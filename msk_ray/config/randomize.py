@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import AfterValidator, Field, PositiveFloat, model_validator
 
@@ -179,6 +179,10 @@ class RandomizeConfig(ModelRandomization):
 
     def __str__(self) -> str:
         return ", ".join(f"{name} {_text(value)}" for name, value in self._written.items())
+
+
+UNDISTURBED: Final = RandomizeConfig.model_construct()
+"""No setting is written; a section of a file has at least one."""
 
 
 def _text(value: Any) -> str:

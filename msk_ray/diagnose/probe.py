@@ -19,6 +19,7 @@ from msk_ray.algorithms import algorithm_class
 from msk_ray.config import Config, PhysicsConfig, load_config
 from msk_ray.diagnose.exact import ExactGround, ExactKinematics, ExactTendons
 from msk_ray.envs import Env, EnvState, make_env
+from msk_ray.envs.measurements import Measurements
 from msk_ray.errors import ConfigError, SimulationError
 from msk_ray.step import StepState
 from msk_ray.step.check import Oracle, Point
@@ -122,7 +123,7 @@ def probe(
         physics = subject.config.physics if variant is None else PhysicsConfig(variant=variant)
         env = make_env(subject.config.env, physics, worlds, device, seed, execution=subject.config.execution)
         # Disable forces that finite differences would include but the gradient does not.
-        env.ignore_contact_forces = True
+        env.measurements.ignore_contact_forces = True
         network = subject.network(env)
         for state in states:
             start = _starting_state(env, network, state)
@@ -240,7 +241,10 @@ def _double(env: Env[Any]) -> Env[Any]:
     for name, value in vars(env).items():
         setattr(ideal, name, _in_double(value))
     ideal.device = torch.device("cpu")
-    ideal.measure_by(ExactKinematics(env.model), ExactTendons(env.model), ExactGround(env.model))
+    ideal.measurements = Measurements(
+        env.sim, type(env).__qualname__, ExactKinematics(env.model), ExactTendons(env.model), ExactGround(env.model)
+    )
+    ideal.measurements.ignore_contact_forces = env.measurements.ignore_contact_forces
     return ideal
 
 

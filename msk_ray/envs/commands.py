@@ -5,7 +5,7 @@ Axes: N episodes, W worlds, C numbers of a command.
 
 import math
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -47,25 +47,29 @@ class Draws(NamedTuple):
         return (time[:, None] >= ends).sum(-1)
 
 
-def plan(commands: Commands, seconds: float) -> tuple[dict[str, Draws], int]:
-    """The draws of each command for episodes of so many seconds, and how many numbers all take."""
-    draws, first = {}, 0
-    for command in commands.declared:
-        section = getattr(commands, command.name)
-        every = section.every if command.every is not None else None
-        times = 1 if every is None else math.ceil(seconds / every[0])
-        size = times * (len(command.ranges) + (every is not None))
-        draws[command.name] = Draws(slice(first, first + size), times, every)
-        first += size
-    return draws, first
+class DrawnCommands(NamedTuple):
+    """All commands of an environment."""
 
+    draws: Mapping[str, Draws]
+    size: int
+    """How many numbers the draws of all take for an episode."""
+    ranges: Mapping[str, Tensor]
+    """Smallest and largest values of each command, (2, C); they may be changed in place."""
 
-def ranges_of(commands: Commands, device: torch.device) -> dict[str, Tensor]:
-    """Smallest and largest values of each command, (2, C), by name."""
-    settings: Mapping[str, Mapping[str, tuple[float, float]]] = commands.model_dump()
-    return {
-        command.name: torch.tensor(
-            [settings[command.name][part] for part in command.ranges], device=device
-        ).T.contiguous()
-        for command in commands.declared
-    }
+    @classmethod
+    def of(cls, commands: Commands, seconds: float, device: torch.device) -> Self:
+        """Those of a section, for episodes of so many seconds."""
+        draws, ranges, size = {}, {}, 0
+        for command in commands.declared:
+            section = getattr(commands, command.name)
+            every = section.every if command.every is not None else None
+            times = 1 if every is None else math.ceil(seconds / every[0])
+            first, size = size, size + times * (len(command.ranges) + (every is not None))
+            draws[command.name] = Draws(slice(first, size), times, every)
+            spans = [getattr(section, part) for part in command.ranges]
+            ranges[command.name] = torch.tensor(spans, device=device).T.contiguous()
+        return cls(draws, size, ranges)
+
+    def value(self, name: str, drawn: Tensor, time: Tensor) -> Tensor:
+        """A command (W, C); `drawn` and `time` as for `Draws.value`."""
+        return self.draws[name].value(drawn, time, self.ranges[name])

@@ -17,9 +17,11 @@ import torch
 from torch import Tensor
 
 from msk_ray.config import Push, RandomizeConfig, Spread
+from msk_ray.config.randomize import UNDISTURBED
 from msk_ray.envs.commands import Draws
 from msk_ray.envs.generators import seed_stream
 from msk_ray.envs.memory import Memory
+from msk_ray.envs.records import EnvState
 from msk_ray.errors import ConfigError
 from msk_ray.step import StepState
 
@@ -38,8 +40,9 @@ class Disturbances:
     """The disturbances of a `randomize` section in all worlds of an environment.
 
     Args:
-        config: the section.
+        config: the section; None: nothing is disturbed.
         env: the environment, prepared.
+        first: place of the first of its numbers in `EnvState.numbers`.
         seed: the environment's; the generator is another one, so that initial states, commands and parameters of the
             model are those of a trial without disturbances.
 
@@ -52,8 +55,9 @@ class Disturbances:
         ConfigError: the environment has no such entries or joints, or does not name its entries.
     """
 
-    def __init__(self, config: RandomizeConfig, env: "Env[Any]", seed: int) -> None:
-        self._env = env
+    def __init__(self, config: RandomizeConfig | None, env: "Env[Any]", first: int, seed: int) -> None:
+        config = config or UNDISTURBED
+        self._env, self._first = env, first
         self.generator = torch.Generator(device=env.device)
         self.seed(seed)
         names = _entry_names(config, env)
@@ -90,60 +94,62 @@ class Disturbances:
         kept = {name: Memory(size, gradient=True) for name, size in late.items() if size}
         return {**kept, _STEPS: Memory(1)} if kept else {}
 
-    def remember(self, action: Tensor) -> dict[str, Tensor]:
-        """Its memories after a step by `action`. `self.state` of the environment is that which the step began in."""
-        env = self._env
+    def remember(self, before: EnvState, action: Tensor) -> dict[str, Tensor]:
+        """Its memories after a step by `action` from `before`, the current state of the environment."""
+        env, memory = self._env, before.memory
         newest: dict[str, Tensor] = {}
-        if _OBSERVATIONS in env.memory:
-            newest[_OBSERVATIONS] = env.observe(env.state.physics, env.state.action)
-        if _CONTROLS in env.memory:
+        if _OBSERVATIONS in memory:
+            newest[_OBSERVATIONS] = env.observe(before.physics, before.action)
+        if _CONTROLS in memory:
             newest[_CONTROLS] = env.control(action)
         if not newest:
             return {}
-        kept = {name: torch.cat((new, env.memory[name][:, : -new.shape[1]]), dim=-1) for name, new in newest.items()}
-        return {**kept, _STEPS: env.memory[_STEPS] + 1.0}
+        kept = {name: torch.cat((new, memory[name][:, : -new.shape[1]]), dim=-1) for name, new in newest.items()}
+        return {**kept, _STEPS: memory[_STEPS] + 1.0}
 
-    def pushed(self, state: StepState) -> StepState:
-        """A state as a step begins with it, after a kick if it is time for one."""
-        return state if self._kicks is None else self._kicks.applied(state, self._numbers("push"))
+    def pushed(self, physics: StepState, state: EnvState) -> StepState:
+        """`physics` as the step from `state` begins with it, after a kick if it is time for one."""
+        if self._kicks is None:
+            return physics
+        return self._kicks.applied(physics, state.age, self._numbers(state, "push"))
 
-    def control(self, control: Tensor) -> Tensor:
-        """The controls (W, nu) that reach the actuators in this step, when these are sent."""
+    def control(self, control: Tensor, state: EnvState) -> Tensor:
+        """The controls (W, nu) that reach the actuators in the step from `state`, when these are sent."""
         if self._control_delay is None:
             return control
-        late = self._late(self._control_delay, "control_delay")
-        return _of_earlier(control, self._env.memory.get(_CONTROLS), late)
+        late = self._late(self._control_delay, state, "control_delay")
+        return _of_earlier(control, state.memory.get(_CONTROLS), late)
 
-    def observation(self, obs: Tensor) -> Tensor:
-        """What the policy is given (W, O) where the environment observes `obs` in its current state."""
-        if self._entry_count not in (0, obs.shape[1]):
+    def observation(self, obs: Tensor, state: EnvState) -> Tensor:
+        """What the policy is given (W, O) in `state`, which the environment observes as `obs`."""
+        if self._entry_count and obs.shape[-1] != self._entry_count:
             raise ConfigError(
                 f"observation_layout of {type(self._env).__qualname__} names {self._entry_count} entries of an "
-                f"observation of {obs.shape[1]}: name each"
+                f"observation of {obs.shape[-1]}: name each"
             )
-        age = self._env.state.age
+        age = state.age
         if self._observation_delay is not None:
-            late = self._late(self._observation_delay, "observation_delay")
-            obs = _of_earlier(obs, self._env.memory.get(_OBSERVATIONS), late)
+            late = self._late(self._observation_delay, state, "observation_delay")
+            obs = _of_earlier(obs, state.memory.get(_OBSERVATIONS), late)
             age = age - late
         if self._bias.size:
-            obs = self._bias.added(obs, self._numbers("bias"))
+            obs = self._bias.added(obs, self._numbers(state, "bias"))
         if self._noise.size:
             # The noise of the step in which it was observed.
-            obs = self._noise.added(obs, uniform_hash(self._numbers("noise")[:, 0], age, self._noise.size))
+            obs = self._noise.added(obs, uniform_hash(self._numbers(state, "noise")[:, 0], age, self._noise.size))
         return obs
 
-    def _late(self, delay: tuple[int, int], name: str) -> Tensor:
+    def _late(self, delay: tuple[int, int], state: EnvState, name: str) -> Tensor:
         """Env steps by which something is late, (W,) int64: at most those of the episode that have been."""
         if not _most(delay):
-            return torch.zeros_like(self._env.state.age)
+            return torch.zeros_like(state.age)
         fewest, most = delay
-        drawn = fewest + (self._numbers(name)[:, 0] * (most - fewest + 1)).long()
-        return torch.minimum(drawn, self._env.memory[_STEPS][:, 0].long())
+        drawn = fewest + (self._numbers(state, name)[:, 0] * (most - fewest + 1)).long()
+        return torch.minimum(drawn, state.memory[_STEPS][:, 0].long())
 
-    def _numbers(self, name: str) -> Tensor:
+    def _numbers(self, state: EnvState, name: str) -> Tensor:
         """The numbers (W, n) for one of the settings."""
-        every = self._env.disturbance_numbers
+        every = state.numbers[:, self._first : self._first + self.size]
         return every.split(list(self._widths.values()), dim=-1)[list(self._widths).index(name)]
 
 
@@ -174,7 +180,6 @@ class _Kicks:
     """Kicks, drawn as a command that changes is."""
 
     def __init__(self, push: Push, env: "Env[Any]") -> None:
-        self._env = env
         self._step_s = env.config.control_timestep
         dofs = dict(_kicked(push, env.model))
         times = math.ceil(env.config.episode_length * self._step_s / push.every[0])
@@ -184,9 +189,8 @@ class _Kicks:
         largest = torch.tensor(list(dofs.values()), device=env.device)
         self._ranges = torch.stack((-largest, largest))
 
-    def applied(self, state: StepState, drawn: Tensor) -> StepState:
-        """The state after the kick, if any, of the current age, from the numbers (W, size)."""
-        age = self._env.state.age
+    def applied(self, state: StepState, age: Tensor, drawn: Tensor) -> StepState:
+        """The state after the kick, if any, of an age (W,), from the numbers (W, size)."""
         before, now = ((steps * self._step_s) for steps in (age - 1, age))
         begins = self._draws.times_drawn(drawn, now) > self._draws.times_drawn(drawn, before)
         kick = self._draws.value(drawn, now, self._ranges) * begins[:, None]

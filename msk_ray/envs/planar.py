@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from msk_ray.envs.layout import Entry
-from msk_ray.envs.limits import LimitedBody, LimitedT
+from msk_ray.envs.limited_body import LimitedBody, LimitedT
 from msk_ray.step import StepState
 
 

@@ -189,11 +189,11 @@ class _Samples:
 def _undisturbed(env: Env[Any]) -> Iterator[None]:
     """Methods of the environment may be called inside; it is then as before."""
     drawn, state = env.generator.get_state(), env.state
-    env.ignore_contact_forces = True  # no step leads to the states tried
+    env.measurements.ignore_contact_forces = True  # no step leads to the states tried
     try:
         yield
     finally:
-        env.ignore_contact_forces = False
+        env.measurements.ignore_contact_forces = False
         env.generator.set_state(drawn)
         env.state = state
         env.release_graph()

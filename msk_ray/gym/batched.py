@@ -15,7 +15,7 @@ from torch import Tensor
 from msk_ray.config import Config
 from msk_ray.envs import make_env
 from msk_ray.errors import ConfigError
-from msk_ray.gym.common import action_space, observation_space, read, refuse_options, seed_env
+from msk_ray.gym.common import action_space, observation_space, read, refuse_options
 
 Array = TypeVar("Array", np.ndarray, Tensor)
 
@@ -76,7 +76,7 @@ class BatchedEnv(VectorEnv[Array, Array, Array], Generic[Array]):
         """
         refuse_options(options)
         if seed is not None:
-            seed_env(self.env, seed)
+            self.env.seed(seed)
         self.env.state = self.env.reset_state()
         return self._array(self.env.observation()), {}
 

@@ -34,10 +34,3 @@ def observation_space(env: Env[Any]) -> spaces.Box:
 def action_space(env: Env[Any]) -> spaces.Box:
     """Action space of one world, (A,)."""
     return spaces.Box(-1.0, 1.0, (env.action_size,), np.float32)
-
-
-def seed_env(env: Env[Any], seed: int) -> None:
-    """Draw initial states, and all of `physics.randomize`, from a seed."""
-    env.generator.manual_seed(seed)
-    for source in env.randomized.values():
-        source.seed(seed)

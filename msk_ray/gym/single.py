@@ -12,7 +12,7 @@ from msk_ray.config import Config
 from msk_ray.envs import make_env
 from msk_ray.errors import ConfigError
 from msk_ray.gym.c_simulation import CSimulation
-from msk_ray.gym.common import action_space, observation_space, read, refuse_options, seed_env
+from msk_ray.gym.common import action_space, observation_space, read, refuse_options
 
 
 class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -70,7 +70,7 @@ class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         super().reset(seed=seed)
         refuse_options(options)
         if seed is not None or not self._begun:
-            seed_env(self.env, int(self.np_random.integers(2**31)))
+            self.env.seed(int(self.np_random.integers(2**31)))
             self._begun = True
         self.env.state = self.env.reset_state()
         return self.env.observation()[0].numpy().copy(), {}

@@ -135,7 +135,7 @@ class LegEnv(AssistedEnv[AnyLegSettings], Generic[AnyLegSettings]):
 
     def root(self, state: StepState) -> Root:
         """The pelvis in the world, computed once per state."""
-        found: Root = self._once("root", state, lambda: self.measure_root(state))
+        found: Root = self.measurements.once("root", state, lambda: self.measure_root(state))
         return found
 
     @abstractmethod
@@ -269,12 +269,12 @@ class LegEnv(AssistedEnv[AnyLegSettings], Generic[AnyLegSettings]):
 
     def speed(self, state: StepState) -> Tensor:
         """Forward speed [m/s], (W,)."""
-        speed: Tensor = self._once("speed", state, lambda: self.root(state).velocity.unbind(-1)[0])
+        speed: Tensor = self.measurements.once("speed", state, lambda: self.root(state).velocity.unbind(-1)[0])
         return speed
 
     def flexion_rates(self, state: StepState) -> Tensor:
         """Rates of the right and the left hip's flexion [rad/s], (W, 2)."""
-        rates: Tensor = self._once("flexion_rates", state, lambda: state.qvel[:, self._flexion_dofs])
+        rates: Tensor = self.measurements.once("flexion_rates", state, lambda: state.qvel[:, self._flexion_dofs])
         return rates
 
     def metabolic_power(self, state: StepState, action: Tensor) -> Tensor:

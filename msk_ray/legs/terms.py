@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from msk_ray.envs.limits import squared_overshoot
+from msk_ray.envs.limited_body import squared_overshoot
 from msk_ray.legs import costs
 from msk_ray.legs.env import LegEnv
 from msk_ray.step import StepState

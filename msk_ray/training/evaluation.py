@@ -242,9 +242,9 @@ class Evaluator:
 
     def _reset(self) -> None:
         """Reset every policy's worlds to the same initial states."""
-        drawn = self.env.draw_episodes(self._worlds)
+        drawn = self.env.starts.draw(self._worlds)
         *physics, numbers = (t.repeat(self._policies, 1) for t in (*drawn.physics, drawn.numbers))
-        self.env.stock_resets(Resets(StepState(*physics), numbers))
+        self.env.starts.stock(Resets(StepState(*physics), numbers))
         self.env.state = self.env.reset_state()
 
     def _figures(self, e: Episodes) -> dict[str, float]:

@@ -180,7 +180,7 @@ def test_in_a_group_a_checkpoint_has_that_of_all_worlds() -> None:
 def test_recordings_read_and_write_it() -> None:
     """The inputs of a recorded epoch are copies of everything that a rollout begins with."""
     env = rod()
-    inputs = EpochInputs(env.state.detach(), env.draw_resets(2), torch.zeros(2, 4, 1))
+    inputs = EpochInputs(env.state.detach(), env.starts.draw_steps(2, env.group), torch.zeros(2, 4, 1))
     copies = inputs.copies()
     given = {id(t) for t in inputs.tensors()}
     assert {id(t) for t in env.state.memory.values()} & given == set(), "detached"

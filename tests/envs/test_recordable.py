@@ -83,10 +83,10 @@ def test_nothing_waits_in_an_env_step_and_its_gradient(name: str, monkeypatch: p
         monkeypatch.setattr(f"{module}.known_none", lambda flags: False)
     config = parse_config({"env": {**ENVIRONMENTS[name], "nworld": 2}, "physics": {"randomize": RANDOMIZED.get(name)}})
     env = make_env(config.env, config.physics, 2, "cpu", 0, randomize=True)
-    env.ignore_contact_forces = True
+    env.measurements.ignore_contact_forces = True
     action = torch.zeros((2, env.action_size), requires_grad=True)
     step(env, action)
-    env.stock_resets(env.draw_resets(1))
+    env.starts.stock(env.starts.draw_steps(1, env.group))
     with Watch() as watch:
         step(env, action)
     assert watch.seen == []

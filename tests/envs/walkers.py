@@ -98,6 +98,11 @@ MISTAKES = {
     "exception in fell": Mistake(
         _FELL, "return 1 / 0", r"fell of Walker: ZeroDivisionError: division by zero \(walker\.py:\d+\)$"
     ),
+    "exception in memories": Mistake(
+        _METHOD,
+        f"    def memories(self):\n        return {{'pace': Memory(1 // 0)}}\n\n{_METHOD}",
+        "memories of Walker: ZeroDivisionError",
+    ),
     "observation in numpy": Mistake(
         _OBSERVE, "return state.qpos.numpy(force=True)", "observe of Walker returns a numpy array, .* with torch"
     ),

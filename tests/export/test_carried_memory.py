@@ -76,7 +76,7 @@ def test_what_it_can_carry_is_inside_and_the_rest_is_given() -> None:
     assert policy.memory.given == [3, 4, 5, 6, 7, 8]
     assert [each.start.tolist() for each in policy.carried] == [[0.25], [0.0], [0.0, 0.0]]
     assert policy.remarks == ["entries of obs depend on 'height', which the file cannot carry: give them too"]
-    assert not env.ignore_contact_forces
+    assert not env.measurements.ignore_contact_forces
     inputs = policy.examples(network.observations(env, 0), 0)
     for write in (network.to_onnx, network.to_torchscript):
         run = write(policy, *inputs)[1]

@@ -9,6 +9,7 @@ import torch
 
 from msk_ray.config import PhysicsConfig, parse_config
 from msk_ray.envs import make_env
+from msk_ray.envs.reward import WeightedTerms
 from msk_ray.errors import ConfigError
 from msk_ray.legs.assistance import Assistance
 from msk_ray.legs.config import AssistConfig, LegReward
@@ -145,7 +146,8 @@ def test_reward_by_hand(env: MyoLeg26) -> None:
     )  # fmt: skip
     state.act.fill_(0.5)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(env, "_weights", env.weights(LegReward(symmetry=0.1, progress=0.5, stride=0.5)))
+        reward = LegReward(symmetry=0.1, progress=0.5, stride=0.5)
+        patch.setattr(env, "weighted_terms", WeightedTerms.of(env.active_terms, reward, env.device))
         found = terms(env, state, torch.full((2, 26), 0.5))
     # 0.5 m/s to the right, and a trunk that turns rightward by 2 rad/s
     lateral = (0.5 + 0.18 * 2.0) * math.sqrt(env.stand_height / 9.81)

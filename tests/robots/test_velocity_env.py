@@ -117,7 +117,7 @@ def test_reward_and_observation_have_the_gradient_of_their_own_values(robot: str
     parts[1] += 0.3 * rng.normal(size=parts[1].size)
     action = torch.zeros(1, env.action_size)
     weights = torch.tensor(rng.normal(size=env.obs_size), dtype=torch.float32)
-    env.ignore_contact_forces = True
+    env.measurements.ignore_contact_forces = True
 
     def value(arrays: list[torch.Tensor]) -> torch.Tensor:
         state = StepState(*arrays, env.state.physics.act)

@@ -163,7 +163,7 @@ class Ppo(Algorithm):
         """Fill rsl_rl's storage; returns rewards (H, W), ends of episodes (H, W) bool, and how many worlds diverged."""
         env, ppo = self.env, self.ppo
         env.state = env.state.detach()
-        env.stock_resets(env.draw_resets(self.settings.steps))
+        env.starts.stock(env.starts.draw_steps(self.settings.steps, env.group))
         rewards, terms, ends = [], [], []
         diverged = torch.zeros((), dtype=torch.int64, device=env.device)
         obs = self._observe()

@@ -161,7 +161,7 @@ class ActorUpdate:
         calls = NetworkCalls(self._actor.mean) if alone else None
         halves = HalfBatchCosine(self._actor, self._group, () if calls is None else (calls,))
         env.state = inputs.state
-        env.stock_resets(inputs.resets)
+        env.starts.stock(inputs.resets)
         with halves.watching(), nullcontext() if calls is None else calls.recording():
             rollout = collect(
                 env,

@@ -219,7 +219,7 @@ class Shac(Algorithm):
         noise = torch.randn((horizon, self._worlds, env.action_size), generator=self.generator, device=env.device)
         if c.exploration is not None:
             noise *= c.exploration.at(epoch)
-        return EpochInputs(env.state.detach(), env.draw_resets(horizon), env.group.own(noise, dim=1))
+        return EpochInputs(env.state.detach(), env.starts.draw_steps(horizon, env.group), env.group.own(noise, dim=1))
 
     def _adapt(self, entropy: float | None) -> dict[str, float]:
         """Advance entropy bonus and contacts after an epoch.

@@ -341,7 +341,7 @@ class RecordedRunner(EagerRunner):
             )
         finally:
             self._env.state = before
-            self._env.stock_resets(None)  # the recording's resets are in its own memory
+            self._env.starts.stock(None)  # the recording's resets are in its own memory
             self._env.release_graph()
         return _Epoch(buffers, roll_out, compute_loss, update_actor)
 

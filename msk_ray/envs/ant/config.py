@@ -4,7 +4,7 @@ from msk_ray.config.physics import CONTACTS, SOLVING, STEPPING
 from msk_ray.config.rewards import reward_section, with_reward
 from msk_ray.config.sections import Count
 from msk_ray.config.terms import Cost, Term, terms_in
-from msk_ray.envs.limited import EFFORT, JOINT_LIMIT, LimitedSettings
+from msk_ray.envs.limited_settings import EFFORT, JOINT_LIMIT, LimitedSettings
 
 TERMS = terms_in(
     "msk_ray.envs.ant.env",

@@ -10,7 +10,7 @@ from msk_ray.config import PhysicsConfig
 from msk_ray.envs.ant.config import TERMS, AntSettings
 from msk_ray.envs.ant.model import STAND_HEIGHT, STAND_JOINTS, build_ant
 from msk_ray.envs.layout import Entry, entries, floating_body
-from msk_ray.envs.limits import LimitedBody
+from msk_ray.envs.limited_body import LimitedBody
 from msk_ray.step import StepState
 from msk_ray.step.autograd.tangent import quat_exp, quat_multiply, quat_rotate
 

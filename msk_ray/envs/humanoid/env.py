@@ -10,7 +10,7 @@ from msk_ray.config import PhysicsConfig
 from msk_ray.envs.humanoid.config import TERMS, HumanoidSettings
 from msk_ray.envs.humanoid.model import START_HEIGHT, build_humanoid
 from msk_ray.envs.layout import Entry, entries, floating_body
-from msk_ray.envs.limits import LimitedBody
+from msk_ray.envs.limited_body import LimitedBody
 from msk_ray.step import StepState
 from msk_ray.step.autograd.tangent import quat_exp, quat_rotate
 

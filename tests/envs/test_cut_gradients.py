@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from msk_ray.envs.terms import terms_without_gradient
+from msk_ray.envs.cut_gradients import terms_without_gradient
 
 SPEED = torch.tensor((0.5, -1.0, 0.0, 2.0))
 

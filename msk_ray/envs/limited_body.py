@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from msk_ray.envs.base import Env
-from msk_ray.envs.limited import LimitedSettings
+from msk_ray.envs.limited_settings import LimitedSettings
 from msk_ray.step import StepState
 
 _UNIT = 0.1

@@ -15,11 +15,11 @@ class LimitedSettings(EnvSettings):
         return max(0.0, 1.0 - epoch / self.joint_limit_epochs) if self.joint_limit_epochs else 1.0
 
 
-EFFORT = "msk_ray.envs.limits:effort"
+EFFORT = "msk_ray.envs.limited_body:effort"
 JOINT_LIMIT = Cost(
     "joint_limit",
     0.0,
-    "msk_ray.envs.limits:joint_limit",
+    "msk_ray.envs.limited_body:joint_limit",
     needs=("joint_limit_epochs",),
     schedule=LimitedSettings.joint_limit_share,
     optional=True,

@@ -1,0 +1,145 @@
+"""What is measured in a state: frames, tendons, sensors, contacts and the ground.
+
+Axes: W worlds.
+"""
+
+from collections.abc import Callable, Hashable
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from msk_ray.errors import ConfigError
+from msk_ray.step import Simulation, StepState
+from msk_ray.step.autograd.contact_state import Contact, ContactQueries
+from msk_ray.step.autograd.ground import Ground
+from msk_ray.step.autograd.kinematics import Frames, Kinematics, Names, as_named
+from msk_ray.step.autograd.sensors import Readings, Sensors
+from msk_ray.step.autograd.tendon_lengths import Tendons
+from msk_ray.step.forward.contact_watch import FIGURES
+
+
+class Measurements:
+    """Measures states of a simulation, each quantity once, until another state is asked for.
+
+    Contact forces and the readings of some sensors belong to the step that led to a state. They are values without
+    gradient, and 0 in a world that diverged.
+
+    Args:
+        sim: the simulation.
+        owner: name of the environment's class, for messages.
+        kinematics, tendons, ground: instruments other than those of the simulation, such as exact ones in float64.
+
+    Attributes:
+        ignore_contact_forces: whether all that belongs to a step reads as 0, for states that no step has led to and for
+            comparisons of gradients.
+    """
+
+    def __init__(
+        self,
+        sim: Simulation,
+        owner: str,
+        kinematics: Kinematics | None = None,
+        tendons: Tendons | None = None,
+        ground: Ground | None = None,
+    ) -> None:
+        self._sim, self._owner = sim, owner
+        self._instruments = kinematics, tendons, ground
+        self._step: tuple[StepState, Tensor] | None = None
+        self._measured: dict[Hashable, tuple[StepState, bool, Any]] = {}
+        self.ignore_contact_forces = False
+
+    def begin(self, reached: StepState, diverged: Tensor) -> None:
+        """A step has led to `reached`; (W,) bool: in which worlds it diverged."""
+        self._step = reached, diverged
+
+    def forget(self) -> None:
+        """Keep no state, and so no graph, in memory."""
+        self._step = None
+        self._measured = {}
+
+    def once(self, what: Hashable, state: StepState, measure: Callable[[], Any]) -> Any:
+        """The result of `measure` for `state`, kept under the name `what` until another state is asked for."""
+        grad = torch.is_grad_enabled()
+        kept = self._measured.get(what)
+        if kept is None or kept[0] is not state or kept[1] != grad:
+            kept = self._measured[what] = (state, grad, measure())
+        return kept[2]
+
+    def frames(self, state: StepState) -> Frames:
+        """As `Env.frames`."""
+        frames: Frames = self.once("frames", state, lambda: self._kinematics(state.qpos, state.qvel))
+        return frames
+
+    def tendons(self, state: StepState) -> tuple[Tensor, Tensor]:
+        """As `Env.tendons`."""
+        tendons: tuple[Tensor, Tensor] = self.once("tendons", state, lambda: self._tendons(state.qpos, state.qvel))
+        return tendons
+
+    def contact_forces(self, state: StepState, geom: Names) -> Tensor:
+        """As `Env.contact_forces`."""
+        if self.ignore_contact_forces:
+            return torch.zeros_like(self.frames(state).geom_position(geom))
+        diverged = self._diverged_in_step_to(state, "contact forces")
+        force = self.once("contact_forces", state, self._sim.contact_forces)
+        chosen = as_named(force[:, self._kinematics.indices("geom", geom)], geom)
+        return chosen.masked_fill(diverged.view(-1, *[1] * (chosen.dim() - 1)), 0.0)
+
+    def contact(self, state: StepState, names: Names, kind: str, against: Names, by: str) -> Contact:
+        """As `Env.contact`."""
+        query = self._contact_queries(names, kind, against, by)
+        if self.ignore_contact_forces:
+            self._sim.measure_contacts(query)
+            shape = (self._sim.substeps, self._sim.nworld, len(query.primary), FIGURES)
+            return Contact.of(torch.zeros(shape, device=self._sim.device))
+        diverged = self._diverged_in_step_to(state, "contacts")
+        contact: Contact = self.once(query, state, lambda: self._sim.contacts(query))
+        return contact.without(diverged)
+
+    def sensors(self, state: StepState) -> Readings:
+        """As `Env.sensors`."""
+        frames, tendons = lambda: self.frames(state), lambda: self.tendons(state)
+        readings: Readings = self.once(
+            "sensors",
+            state,
+            lambda: Readings(self._sensors, state.qpos, state.qvel, frames, tendons, lambda: self._sensordata(state)),
+        )
+        return readings
+
+    @cached_property
+    def ground(self) -> Ground:
+        """As `Env.ground`."""
+        return self._instruments[2] or Ground(self._sim.batch)
+
+    @cached_property
+    def _kinematics(self) -> Kinematics:
+        return self._instruments[0] or Kinematics(self._sim.batch)
+
+    @cached_property
+    def _tendons(self) -> Tendons:
+        return self._instruments[1] or Tendons(self._sim.batch)
+
+    @cached_property
+    def _contact_queries(self) -> ContactQueries:
+        return ContactQueries(self._kinematics)
+
+    @cached_property
+    def _sensors(self) -> Sensors:
+        return Sensors(self._kinematics, lambda: self._tendons)
+
+    def _sensordata(self, state: StepState) -> Tensor:
+        if self.ignore_contact_forces:
+            self._sim.measure_sensors()
+            return torch.zeros((self._sim.nworld, self._sim.model.nsensordata), device=self._sim.device)
+        diverged = self._diverged_in_step_to(state, "sensors of forces and accelerations")
+        return self._sim.sensordata().masked_fill(diverged[:, None], 0.0)
+
+    def _diverged_in_step_to(self, state: StepState, what: str) -> Tensor:
+        """The worlds (W,) bool that diverged in the step that led to `state`."""
+        if self._step is None or self._step[0] is not state:
+            raise ConfigError(
+                f"{self._owner}: {what} belong to a step, not to a state: use them in "
+                "remember, reward_terms, fell or outcome_terms, not in observe"
+            )
+        return self._step[1]
