@@ -12,10 +12,10 @@ from msk_ray.config.environments import ENVIRONMENTS as ENVIRONMENTS
 from msk_ray.config.environments import settings_class as settings_class
 from msk_ray.config.execution import AS_USUAL as AS_USUAL
 from msk_ray.config.execution import ExecutionConfig as ExecutionConfig
+from msk_ray.config.faults import describe_fault as describe_fault
 from msk_ray.config.horizons import AdaptiveHorizon as AdaptiveHorizon
 from msk_ray.config.horizons import ContactHorizon as ContactHorizon
 from msk_ray.config.horizons import HorizonSchedule as HorizonSchedule
-from msk_ray.config.load import describe_fault as describe_fault
 from msk_ray.config.load import load_config as load_config
 from msk_ray.config.load import parse_config as parse_config
 from msk_ray.config.load import parse_recorded as parse_recorded

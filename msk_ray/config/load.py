@@ -1,18 +1,18 @@
 """Read configurations: from YAML to a checked `Config`, or one line that says what to write instead."""
 
 import contextlib
-import difflib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
 from msk_ray.config.algorithms import BUILT_IN, settings_from_outside
 from msk_ray.config.environments import settings_class
+from msk_ray.config.faults import describe_fault
 from msk_ray.config.horizons import horizon_class
 from msk_ray.config.overlay import leaves, merge, overlay, parse_overrides
-from msk_ray.config.recorded import current_settings, env_name, newer_spelling
+from msk_ray.config.recorded import current_settings, env_name
 from msk_ray.config.schema import Config
 from msk_ray.config.sections import SHOWN
 from msk_ray.config.yaml_text import read_yaml
@@ -133,68 +133,3 @@ def _named(data: Any) -> dict[str, type[BaseModel]]:
         with contextlib.suppress(ConfigError):
             sections["shac.horizon"] = horizon_class(horizon.get("kind"))
     return sections
-
-
-def describe_fault(
-    error: ValidationError, root: type[BaseModel] = Config, *, named: Mapping[str, type[BaseModel]] | None = None
-) -> str:
-    """The first error of validating a `root`, and how many more there are, on one line.
-
-    Args:
-        error: the error that the validation raised.
-        root: the class validated.
-        named: open sections of `root`, dotted, with the class that each was validated as.
-    """
-    faults = error.errors()
-    # A misspelt key often makes the right one missing too; report the misspelling.
-    first = min(faults, key=lambda fault: fault["type"] != "extra_forbidden")
-    location = [shortened(str(part)) for part in first["loc"]]
-    where = ".".join(location)
-    if first["type"] == "extra_forbidden":
-        section = _model_at(root, location[:-1], named or {})
-        known = list(section.model_fields)
-        near = difflib.get_close_matches(location[-1], known, n=1)
-        below = _subsection_with(section, location[-1], (named or {}) if section is root else {})
-        if root is Config and (newer := newer_spelling(where)) is not None:
-            hint = newer
-        elif below is not None:
-            hint = f"write {'.'.join([*location[:-1], below, location[-1]])}"
-        else:
-            hint = f"did you mean {near[0]!r}?" if near else f"known keys: {', '.join(known)}"
-        text = f"{where}: unknown key; {hint}"
-    elif first["type"] == "value_error":
-        text = str(first["ctx"]["error"]) if "ctx" in first else first["msg"]
-    elif first["type"] == "missing":
-        text = f"{where}: missing; write it"
-    else:
-        text = f"{where}: {first['msg']}, not {brief(first['input'])}"
-    more = len(faults) - 1
-    text = shortened(" ".join(text.split()), _MAX_MESSAGE)
-    return text + (f" (and {more} more error{'s' if more > 1 else ''})" if more else "")
-
-
-_MAX_MESSAGE = 400
-
-
-def _is_model(kind: Any) -> bool:
-    return isinstance(kind, type) and issubclass(kind, BaseModel)
-
-
-def _subsection_with(section: type[BaseModel], key: str, named: Mapping[str, type[BaseModel]]) -> str | None:
-    """The section within `section` that has a setting of this name."""
-    for name, field in section.model_fields.items():
-        kind = named.get(name, field.annotation)
-        if _is_model(kind) and key in kind.model_fields:  # type: ignore[union-attr]
-            return name
-    return None
-
-
-def _model_at(root: type[BaseModel], sections: list[str], named: Mapping[str, type[BaseModel]]) -> type[BaseModel]:
-    """The settings class of the section of `root` that contains an error."""
-    model: Any = root
-    for depth, section in enumerate(sections):
-        model = named.get(".".join(sections[: depth + 1]), model.model_fields[section].annotation)
-        if not _is_model(model):  # it may be null
-            model = next(option for option in get_args(model) if _is_model(option))
-    model_there: type[BaseModel] = model
-    return model_there
