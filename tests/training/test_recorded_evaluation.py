@@ -8,7 +8,8 @@ import torch
 
 from msk_ray.config import Config, parse_config
 from msk_ray.training import evaluation
-from msk_ray.training.evaluation import Episodes, Evaluator
+from msk_ray.training.episodes import Episodes
+from msk_ray.training.evaluation import Evaluator
 
 
 class Again:
@@ -52,7 +53,7 @@ def assert_equal(found: list[Episodes], expected: list[Episodes]) -> None:
 
 def episodes(config: Config, recorded: bool, monkeypatch: pytest.MonkeyPatch) -> list[Episodes]:
     monkeypatch.setattr(evaluation, "Recording", Again)
-    monkeypatch.setattr(Evaluator, "_records_steps", lambda _: recorded)
+    monkeypatch.setattr(Evaluator, "_can_record", lambda _: recorded)
     evaluator = Evaluator(config, "cpu", policies=2)
     evaluator._streams = [None]  # type: ignore[list-item]
     group = evaluation.PolicyGroup
@@ -84,8 +85,8 @@ def test_recorded_steps_on_a_gpu_have_the_bits_of_steps_one_by_one(
     )
     evaluator = Evaluator(config, "cuda:0", policies=policies)
     made: list[object] = []
-    record = evaluation._recorded_step
-    monkeypatch.setattr(evaluation, "_recorded_step", lambda *args: made.append(record(*args)) or made[-1])
+    record = evaluation.recorded_step
+    monkeypatch.setattr(evaluation, "recorded_step", lambda *args: made.append(record(*args)) or made[-1])
 
     def act(k: int) -> evaluation.Policy:
         return lambda obs: 0.3 * torch.sin(obs[:, :1] + k + torch.arange(evaluator.env.action_size, device=obs.device))
@@ -93,7 +94,7 @@ def test_recorded_steps_on_a_gpu_have_the_bits_of_steps_one_by_one(
     acting = [act(k) for k in range(policies)]
     found = evaluator._episodes(acting)
     again = evaluator._episodes(acting)
-    monkeypatch.setattr(Evaluator, "_records_steps", lambda _: False)
+    monkeypatch.setattr(Evaluator, "_can_record", lambda _: False)
     expected = evaluator._episodes(acting)
     assert len(made) == 2
     assert None not in made

@@ -19,7 +19,7 @@ from msk_ray.robots.config import G1VelocitySettings, Go1VelocitySettings, Veloc
 from msk_ray.robots.mjlab import worker
 from msk_ray.robots.mjlab.elsewhere import MJLAB
 from msk_ray.training import SavedPolicy
-from msk_ray.training.evaluation import Episodes
+from msk_ray.training.episodes import Episodes
 from msk_ray.training.threads import use_threads
 
 VERSION: Final = "1.6."
