@@ -45,7 +45,7 @@ def make_algorithm(config: Config, device: str, group: Group = ALONE) -> Algorit
     return algorithm(config, env)
 
 
-def naming_memory(config: Config, device: str) -> AbstractContextManager[None]:
+def memory_errors_named(config: Config, device: str) -> AbstractContextManager[None]:
     """Context that turns out-of-memory errors into ones that name the settings to lower."""
     length = config.algorithm_settings.length
     other = [] if length is None else [f"{config.algorithm_section}.{length}"]
@@ -111,7 +111,7 @@ def follow(config: Config, device: str, group: Group) -> None:
     Raises:
         ConfigError, DeviceError, UnsupportedModelError, SimulationError, CheckpointError: as their messages say.
     """
-    with naming_memory(config, device):
+    with memory_errors_named(config, device):
         algorithm = make_algorithm(config, device, group)
         while order := group.receive_order():
             match order:

@@ -3,51 +3,39 @@
 import math
 import time
 import warnings
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from contextlib import AbstractContextManager
-from functools import partial
 from pathlib import Path
 from typing import Any
-
-import torch
 
 from msk_ray.algorithms import algorithm_class
 from msk_ray.config import Config, ExecutionConfig, dump_yaml, overlay, parse_config, parse_recorded
 from msk_ray.errors import CheckpointError, ConfigError, SimulationError, StorageError
 from msk_ray.experiment.damage import Damage, describe_damages
 from msk_ray.experiment.layout import METRICS_FILE
-from msk_ray.experiment.metrics import HASH, read_metrics, read_rows
+from msk_ray.experiment.metrics import read_metrics
 from msk_ray.files import remove_stale, write_bytes
 from msk_ray.group import ALONE, Group
-from msk_ray.metrics import BEST_SCORE, SCORE
-from msk_ray.networks import as_number, parameter_hash
+from msk_ray.metrics import SCORE
 from msk_ray.step.autograd.simulation import resolve_device
 from msk_ray.training.checkpoint import (
     epoch_checkpoints,
-    milestone_path,
     newest_valid_checkpoint,
     prune_checkpoints,
     read_checkpoint,
-    unscored_path,
     write_checkpoint,
 )
 from msk_ray.training.evaluation import Evaluator
-from msk_ray.training.learner import check_generators, load_state, make_algorithm, naming_memory, start_from
+from msk_ray.training.learner import check_generators, load_state, make_algorithm, memory_errors_named, start_from
 from msk_ray.training.loggers import TrialLog
 from msk_ray.training.machine import machine_differences, record_machine
-from msk_ray.training.policy import SavedPolicy, Sizes
-from msk_ray.training.policy_group import Policy
+from msk_ray.training.scoring import Scoring, finite_or_none
 from msk_ray.training.trial_folder import TrialFolder
-from msk_ray.training.unscored_policies import UnscoredPolicies
 
 # Settings that may differ between a checkpoint and the trial that continues from it.
 _EXTENDABLE = {"trial": {"epochs"}, "execution": set(ExecutionConfig.model_fields)}
-_MILESTONES = 8
-"""Number of policies saved during training in addition to the first, for `visualize --progression`."""
 MOST_TOGETHER = 32
 """Policies scored together on a GPU."""
-_LONGEST_WAIT_S = 120.0
-"""How long a policy waits to be scored together with others [s]."""
 
 
 class Trainer(TrialFolder):
@@ -72,7 +60,6 @@ class Trainer(TrialFolder):
         env: the worlds used for training in this process.
         algorithm: the algorithm that trains in them.
         epoch: number of epochs done.
-        best_score: highest evaluation score of the trained policy so far, -inf before the first; that of `best.pt`.
         together: number of policies that are scored at the same time.
 
     Raises:
@@ -92,7 +79,6 @@ class Trainer(TrialFolder):
         self._log = TrialLog(logdir, config)
         self._group = group
         self.env_steps = 0
-        self.best_score = -math.inf
         self._seconds = 0.0
         try:
             self.checkpoints.mkdir(parents=True, exist_ok=True)
@@ -106,14 +92,23 @@ class Trainer(TrialFolder):
             record_machine(logdir, device, config.execution.deterministic)
         self._device = device
         self.together = min(together, self._evaluations) if self._log.takes_late else 1
-        self._unscored = UnscoredPolicies(self.checkpoints)
-        with self._memory():
+        with self._memory_errors_named():
             self.algorithm = make_algorithm(config, device, group)
             self.env = self.algorithm.env
             self.evaluator = Evaluator(config, device, policies=self.together)
             self.evaluator.check_recorded()
+        self._scoring = Scoring(self, self.algorithm, self.evaluator, self._log, self.together)
         self._damages: tuple[Damage, ...] = ()
         self._unreadable: list[str] = []
+
+    @property
+    def best_score(self) -> float:
+        """Highest evaluation score of the trained policy so far, -inf before the first; that of `best.pt`."""
+        return self._scoring.best
+
+    @best_score.setter
+    def best_score(self, score: float) -> None:
+        self._scoring.best = score
 
     @property
     def _evaluations(self) -> int:
@@ -133,12 +128,12 @@ class Trainer(TrialFolder):
             CheckpointError: in the first epoch, if the checkpoint to start from is missing, incomplete, or does not
                 fit.
         """
-        with self._memory():
+        with self._memory_errors_named():
             if self.epoch == 0:
                 self._begin()
         started = time.perf_counter()
         try:
-            with self._memory():
+            with self._memory_errors_named():
                 self._group.send_order("update", self.epoch)
                 result = self.algorithm.run_epoch(self.epoch)
         except SimulationError:
@@ -149,8 +144,8 @@ class Trainer(TrialFolder):
         elapsed = time.perf_counter() - started
         metrics = dict(result.metrics)
         if self.epoch % self.config.evaluation.interval == 0 or self.finished:
-            with self._memory():
-                metrics |= self._evaluate()
+            with self._memory_errors_named():
+                metrics |= self._scoring.evaluate(self.epoch, self._state, last=self.finished)
         self._seconds += time.perf_counter() - started
         row = self._row(metrics | {"env_steps_per_s": result.env_steps / elapsed})
         self._log.write(row)
@@ -165,17 +160,17 @@ class Trainer(TrialFolder):
             SimulationError: as for `run_epoch`.
         """
         started = time.perf_counter()
-        with self._memory():
-            self._score_others([])
+        with self._memory_errors_named():
+            self._scoring.score_waiting()
         self._seconds += time.perf_counter() - started
 
-    def _memory(self) -> AbstractContextManager[None]:
-        return naming_memory(self.config, self._device)
+    def _memory_errors_named(self) -> AbstractContextManager[None]:
+        return memory_errors_named(self.config, self._device)
 
     def save(self) -> Path:
         """Write a checkpoint of everything and return its path; an existing one is kept."""
         path = self._checkpoint
-        write_checkpoint(path, self._state(), {"epoch": self.epoch, "best_score": _finite(self.best_score)})
+        write_checkpoint(path, self._state(), {"epoch": self.epoch, "best_score": finite_or_none(self.best_score)})
         prune_checkpoints(self.checkpoints, self.config.execution.keep_checkpoints)
         return path
 
@@ -223,7 +218,7 @@ class Trainer(TrialFolder):
         self._seconds = state["seconds"]
         self._damages = self._log.rewind(self.epoch)
         rows = read_metrics(self.logdir / METRICS_FILE)
-        self._unreadable = self._unscored.rewind(self.epoch, {row["epoch"] for row in rows if SCORE in row})
+        self._unreadable = self._scoring.rewind(self.epoch, {row["epoch"] for row in rows if SCORE in row})
         # A policy may have been scored after the checkpoint.
         scores = (row[SCORE] for row in rows if row["epoch"] > 0 and row.get(SCORE) is not None)
         self.best_score = max(state["best_score"], *scores, -math.inf)
@@ -241,7 +236,7 @@ class Trainer(TrialFolder):
             self._write_config()
             # An attempt that died before its first checkpoint may have left rows, the last of them incomplete.
             self._damages = self._log.rewind(-1)
-            self._unscored.rewind(-1, ())
+            self._scoring.rewind(-1, ())
         return path, [*faults, *self._unreadable, *describe_damages(self._damages, self.logdir)]
 
     def _write_config(self) -> None:
@@ -276,101 +271,14 @@ class Trainer(TrialFolder):
         it."""
         self._start_from(self.config.trial.start_from)
         write_checkpoint(self.best_checkpoint, self._state(), {"epoch": 0, "best_score": None})
-        self._log.write(self._row(self._evaluate()))
-
-    def _evaluate(self) -> dict[str, float]:
-        """Score the policy together with the waiting ones, or let it wait. Returns what is known for its row."""
-        started = time.perf_counter()
-        full = len(self._unscored.epochs) + 1 >= self.together
-        if full or self.finished or self._unscored.waited_s >= _LONGEST_WAIT_S:
-            figures, others_s = self._score_others([self.algorithm.policy])
-            metrics = self._record(self.epoch, figures[0], self._state, self.algorithm.parameter_hash())
-            return metrics | {"time/evaluation_s": time.perf_counter() - started - others_s}
-        self._unscored.add(self._state())
-        return {"time/evaluation_s": time.perf_counter() - started}
-
-    def _score_others(self, own: list[Policy]) -> tuple[list[dict[str, float]], float]:
-        """Score policies together with the waiting ones, and rewrite the waiting ones' rows with their scores.
-
-        Returns:
-            The figures of `own`, and the share of the time that the others took [s].
-        """
-        started = time.perf_counter()
-        waiting = list(self._unscored.epochs)
-        states = {epoch: self._unscored.state(epoch) for epoch in waiting}
-        policies = [*(self._waiting_policy(*item) for item in states.items()), *own]
-        if not policies:
-            return [], 0.0
-        if waiting:
-            # It has taken fewer steps than training to learn how large its buffers must be.
-            self.evaluator.env.sim.reserve(self.env.sim.capacity)
-        figures = self.evaluator.run(policies)
-        each_s = (time.perf_counter() - started) / len(policies)
-        rows = {int(row["epoch"]): row for row in read_rows(self.logdir)} if waiting else {}
-        for epoch, scores in zip(waiting, figures, strict=False):
-            state = states.pop(epoch)
-            late = self._record(epoch, scores, partial(dict, state), parameter_hash(state["algorithm"]["modules"]))
-            row = rows.get(epoch)
-            if row is None:
-                row = {key: state[key] for key in ("epoch", "env_steps", "seconds")}
-            waited_s = row.get("time/evaluation_s", 0.0)
-            self._log.write_late(row, late | {"time/evaluation_s": waited_s + each_s})
-            self._unscored.remove(epoch)
-        return figures[len(waiting) :], each_s * len(waiting)
-
-    def _waiting_policy(self, epoch: int, state: dict[str, Any]) -> Policy:
-        path = unscored_path(self.checkpoints, epoch)
-        sizes, modules = Sizes(*state["sizes"]), state["algorithm"]["modules"]
-        saved = SavedPolicy(path, self.config, epoch, state["env_steps"], "", modules, sizes)
-        cuda = [self.env.device] if self.env.device.type == "cuda" else []
-        with torch.random.fork_rng(cuda):  # drawing weights must not change training's random numbers
-            return saved.on(self.evaluator.env)
+        self._log.write(self._row(self._scoring.evaluate(0, self._state, last=self.finished)))
 
     def _score_despite_failure(self) -> None:
         """Score the waiting policies although training has failed."""
         try:
             self.score_waiting()
         except SimulationError as error:
-            warnings.warn(f"policies of epochs {self._unscored.epochs} have no score: {error}", stacklevel=2)
-
-    def _record(
-        self, epoch: int, figures: dict[str, float], state: Callable[[], dict[str, Any]], parameters: str
-    ) -> dict[str, float]:
-        """Save the policy of an epoch if it is the best or a milestone. Returns the metrics of its evaluation.
-
-        Args:
-            epoch: the policy's epoch.
-            figures: results of its evaluation.
-            state: the trial's complete state then.
-            parameters: digest of the trial's modules then.
-        """
-        score = figures["score"]
-        if epoch > 0 and math.isfinite(score) and score > self.best_score:
-            self.best_score = score
-            facts = {"epoch": epoch, "best_score": score}
-            write_checkpoint(self.best_checkpoint, state() | {"best_score": score}, facts)
-        if self._at_milestone(epoch):
-            self._write_policy(state(), score)
-        row = {f"eval/{name}": value for name, value in figures.items()} | {HASH: as_number(parameters)}
-        if math.isfinite(self.best_score):
-            row[BEST_SCORE] = self.best_score
-        return row
-
-    def _at_milestone(self, epoch: int) -> bool:
-        """Whether an evaluation is the first one after another eighth of the trial, or the one before training.
-
-        This depends only on the epoch, so that a resumed trial saves the same ones.
-        """
-        epochs, previous = self.config.trial.epochs, epoch - self.config.evaluation.interval
-        return epoch == 0 or _MILESTONES * epoch // epochs > _MILESTONES * previous // epochs
-
-    def _write_policy(self, state: dict[str, Any], score: float) -> None:
-        parts = self.algorithm.policy_modules(self.algorithm.network)
-        modules = {name: value for name, value in state["algorithm"]["modules"].items() if name in parts}
-        facts_of_policy = {key: state[key] for key in ("config", "epoch", "env_steps", "sizes")}
-        policy = {**facts_of_policy, "algorithm": {"modules": modules}}
-        facts = {"epoch": state["epoch"], "score": _finite(score)}
-        write_checkpoint(milestone_path(self.checkpoints, state["epoch"]), policy, facts)
+            warnings.warn(f"policies of epochs {self._scoring.waiting} have no score: {error}", stacklevel=2)
 
     def _row(self, metrics: dict[str, float]) -> dict[str, float]:
         return {"epoch": self.epoch, "env_steps": self.env_steps, "seconds": self._seconds, **metrics}
@@ -426,11 +334,6 @@ def _expect(path: Path, state: dict[str, Any]) -> dict[str, Any]:
     if missing:
         raise CheckpointError(f"{path} holds no trial to continue: {', '.join(missing)} missing")
     return state
-
-
-def _finite(score: float) -> float | None:
-    """A score for a checkpoint's facts, which cannot hold infinity: None before the first evaluation."""
-    return score if math.isfinite(score) else None
 
 
 def _first_difference(
