@@ -17,7 +17,8 @@ from msk_ray.algorithms.shac.curriculum import ContactSchedule
 from msk_ray.algorithms.shac.entropy import EntropyBonus
 from msk_ray.algorithms.shac.horizon import RolloutLength
 from msk_ray.algorithms.shac.optimizer import RateAdam
-from msk_ray.algorithms.shac.runner import UNRECORDED, EagerRunner, RecordedRunner
+from msk_ray.algorithms.shac.recorded_runner import UNRECORDED, RecordedRunner
+from msk_ray.algorithms.shac.runner import EagerRunner
 from msk_ray.algorithms.shac.schedules import learning_rate_at
 from msk_ray.config import Config, ShacConfig
 from msk_ray.envs import Env
@@ -126,14 +127,9 @@ class Shac(Algorithm):
         actor_lr = self._rate(c.actor_lr, epoch)
         self.actor_optimizer.set_rate(actor_lr)
         inputs = self._draw(horizon, epoch)
-        if self.digest_log is not None:
-            self.digest_log.note("draws", {"noise": inputs.noise, **inputs.state.physics._asdict()})
+        self._note_draws(inputs)
         outcome = self._runner.run(inputs, self._rate(c.critic_lr, epoch))
-        if self.digest_log is not None:
-            rollout = {"observations": outcome.obs, "rewards": outcome.rewards, "ends of episodes": outcome.done}
-            self.digest_log.note("rollout", {**rollout, **outcome.state.physics._asdict()})
-            self.digest_log.note("values", {"targets of the critic": outcome.targets})
-            self.digest_log.note("gradients", {"policy": torch.cat([p.flatten() for p in self.actor.parameters()])})
+        self._note_outcome(outcome)
         seconds = self._runner.seconds()
         self.env.sim.settle()
         cotangents = outcome.cotangents.statistics(1.0 / (horizon * self.env.nworld))
@@ -158,6 +154,17 @@ class Shac(Algorithm):
         }
         self._runner.adapt()
         return EpochResult(horizon * self._worlds, numbers, round(numbers["train/episodes"]))
+
+    def _note_draws(self, inputs: EpochInputs) -> None:
+        if self.digest_log is not None:
+            self.digest_log.note("draws", {"noise": inputs.noise, **inputs.state.physics._asdict()})
+
+    def _note_outcome(self, outcome: ActorOutcome) -> None:
+        if self.digest_log is not None:
+            rollout = {"observations": outcome.obs, "rewards": outcome.rewards, "ends of episodes": outcome.done}
+            self.digest_log.note("rollout", {**rollout, **outcome.state.physics._asdict()})
+            self.digest_log.note("values", {"targets of the critic": outcome.targets})
+            self.digest_log.note("gradients", {"policy": torch.cat([p.flatten() for p in self.actor.parameters()])})
 
     def remarks(self) -> list[str]:
         """Why epochs are not recorded, although they should be."""

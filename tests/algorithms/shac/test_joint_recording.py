@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from msk_ray.algorithms.shac.runner import RecordedRunner, _Recordings
+from msk_ray.algorithms.shac.recorded_runner import RecordedRunner, _Recordings
 from msk_ray.group import Group
 from msk_ray.step.forward.solver_limits import SolverLimits
 

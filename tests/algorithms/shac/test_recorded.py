@@ -11,7 +11,7 @@ import pytest
 import torch
 from disturbed import DISTURBANCES
 
-from msk_ray.algorithms.shac import runner
+from msk_ray.algorithms.shac import unrolling
 from msk_ray.config import parse_config
 from msk_ray.envs.cartpole.env import CartPole
 from msk_ray.errors import SimulationError
@@ -76,7 +76,7 @@ def make(settings: dict[str, Any], folder: Path, capture: str = "auto", **shac: 
 @pytest.fixture
 def uncut(monkeypatch: pytest.MonkeyPatch) -> None:
     """Recordings unroll more iterations than any world needs, so that they do what an eager epoch does."""
-    monkeypatch.setattr(runner, "_FEWEST_ITERATIONS", 32)
+    monkeypatch.setattr(unrolling, "FEWEST", 32)
 
 
 @pytest.fixture
