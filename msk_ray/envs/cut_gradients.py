@@ -29,14 +29,14 @@ def terms_without_gradient(terms: Tensor) -> list[int]:
     if not terms.requires_grad:
         return list(range(terms.shape[1]))
     ends = _where_assembling_ends(terms)
-    found = []
+    without = []
     for column in range(terms.shape[1]):
         # Given a cotangent, torch would load its symbolic shapes, which takes most of a second.
         sent = terms[:, column].sum() * math.nan
         arrived = torch.autograd.grad(sent, ends, retain_graph=True, allow_unused=True)
         if not any(bool(part.isnan().any()) for part in arrived if part is not None):
-            found.append(column)
-    return found
+            without.append(column)
+    return without
 
 
 def _where_assembling_ends(terms: Tensor) -> list[GradientEdge]:

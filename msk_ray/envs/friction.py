@@ -34,8 +34,8 @@ def friction_without_effect(model: mujoco.MjModel, draw: Draw, chosen: Collectio
     apart = draw.each and draw.only is not None
     numbers = [{geom} for geom in chosen] if draw.each else [set(chosen)]
     obstacles = [_obstacle(model, names, pairs, number, (low, high)) for number in numbers]
-    found = [obstacle for obstacle in obstacles if obstacle is not None]
-    return found[0] if found and (apart or len(found) == len(obstacles)) else None
+    reasons = [obstacle for obstacle in obstacles if obstacle is not None]
+    return reasons[0] if reasons and (apart or len(reasons) == len(obstacles)) else None
 
 
 def _obstacle(

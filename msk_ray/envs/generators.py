@@ -31,17 +31,17 @@ class GlobalGenerators:
     def state(self) -> Mapping[str, Any]:
         """The states of all, by name."""
         _, keys, place, *rest = np.random.get_state(legacy=True)
-        found: dict[str, Any] = {
+        states: dict[str, Any] = {
             "torch's global generator": torch.get_rng_state().numpy().tobytes(),
             "numpy's global generator": (np.asarray(keys).tobytes(), place, *rest),
         }
         if self._python:
-            found["Python's global generator"] = random.getstate()
+            states["Python's global generator"] = random.getstate()
         if self._device.type == "cuda":
-            found[f"torch's global generator of {self._device}"] = (
+            states[f"torch's global generator of {self._device}"] = (
                 torch.cuda.get_rng_state(self._device).numpy().tobytes()
             )
-        return found
+        return states
 
     def changed(self, before: Mapping[str, Any]) -> str | None:
         """The name of one that has drawn since it had the state of `before`; None if none has."""

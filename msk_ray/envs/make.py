@@ -16,11 +16,11 @@ def env_class(config: EnvSettings) -> type[Env[Any]]:
         ConfigError: there is no such class, it lacks a method, or has settings of another type.
     """
     path = ENVIRONMENTS.path(config.name)
-    found: type[Env[Any]] = resolve_class(path, ENVIRONMENTS.key, Env)  # type: ignore[type-abstract]
-    if not isinstance(config, found.Settings):
-        wanted = f"{found.Settings.__module__}.{found.Settings.__qualname__}"
+    chosen: type[Env[Any]] = resolve_class(path, ENVIRONMENTS.key, Env)  # type: ignore[type-abstract]
+    if not isinstance(config, chosen.Settings):
+        wanted = f"{chosen.Settings.__module__}.{chosen.Settings.__qualname__}"
         raise ConfigError(f"env.name: {path} takes settings of type {wanted}, not {type(config).__qualname__}")
-    return found
+    return chosen
 
 
 def make_env(

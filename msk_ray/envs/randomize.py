@@ -6,7 +6,7 @@ Axes: W worlds, K numbers that are drawn per world and episode.
 import math
 from collections.abc import Iterable, Mapping
 from operator import attrgetter
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import mujoco
 import numpy as np
@@ -69,6 +69,29 @@ class _Linear(NamedTuple):
     set_by: NDArray[np.object_]
     """Setting that scales or replaces each entry; empty if none does."""
 
+    @classmethod
+    def of(cls, base: NDArray[np.float64], numbers: int) -> Self:
+        """The model's array, which no number changes yet."""
+        return cls(base.copy(), np.zeros((numbers, *base.shape)), np.full(base.shape, "", dtype=object))
+
+    def vary(self, name: str, draw: AnyDraw, at: Any, first: int) -> None:
+        """Let the numbers from the one numbered `first` on change the entries `at`, as the setting `name` says.
+
+        Raises:
+            ConfigError: another setting scales or replaces them.
+        """
+        if isinstance(draw, Shift):
+            axes = len(draw.size)
+            self.slope[first : first + axes][(slice(None), *np.index_exp[at])] = np.eye(axes)
+        elif isinstance(draw, Payload):
+            self.slope[first][at] = 1.0
+        else:
+            if other := next(filter(None, np.ravel(self.set_by[at])), None):
+                raise ConfigError(f"physics.randomize: {other} includes {name}; leave one of both out")
+            self.slope[first][at] = self.const[at] if draw.mode == "scale" else 1.0
+            self.const[at] = 0.0
+            self.set_by[at] = name
+
 
 class Randomizer:
     """Draws the numbers of a `randomize` section for every world, and turns them into parameters of the model.
@@ -126,10 +149,10 @@ class Randomizer:
 
     def metrics(self, numbers: Tensor) -> dict[str, float]:
         """Smallest and largest of the numbers (W, K) of each setting, by metric name."""
-        found: dict[str, float] = {}
+        figures: dict[str, float] = {}
         for name, part in zip(self._widths, numbers.split(list(self._widths.values()), dim=1), strict=True):
-            found |= {f"randomize/{name}_min": float(part.min()), f"randomize/{name}_max": float(part.max())}
-        return found
+            figures |= {f"randomize/{name}_min": float(part.min()), f"randomize/{name}_max": float(part.max())}
+        return figures
 
     def values(self, numbers: Tensor) -> dict[str, Tensor]:
         """Values of fields of the model by name, with a row for each of the W worlds with the numbers (W, K)."""
@@ -149,28 +172,15 @@ class Randomizer:
         first = 0
         for name, draw in config.parameters.items():
             field = _FIELDS[name]
-            axes = len(_bounds(draw))
-            step = axes if draw.each else 0
+            step = len(_bounds(draw)) if draw.each else 0
             places = {owner: first + step * k for k, owner in enumerate(dict.fromkeys(owners[name]))}
             for array in field.arrays:
                 base = np.array(attrgetter(array)(model), dtype=np.float64)
                 if array not in linear:
-                    linear[array] = _Linear(
-                        base.copy(), np.zeros((len(self._low), *base.shape)), np.full(base.shape, "", dtype=object)
-                    )
-                const, slope, set_by = linear[array]
+                    linear[array] = _Linear.of(base, len(self._low))
                 for element, owner in zip(chosen[name], owners[name], strict=True):
-                    at, place = _entries(model, name, array, element, base.ndim), places[owner]
-                    if isinstance(draw, Shift):
-                        slope[place : place + axes][(slice(None), *np.index_exp[at])] = np.eye(axes)
-                    elif isinstance(draw, Payload):
-                        slope[place][at] = 1.0
-                    else:
-                        if other := next(filter(None, np.ravel(set_by[at])), None):
-                            raise ConfigError(f"physics.randomize: {other} includes {name}; leave one of both out")
-                        set_by[at] = name
-                        const[at] = 0.0
-                        slope[place][at] = base[at] if draw.mode == "scale" else 1.0
+                    at = _entries(model, name, array, element, base.ndim)
+                    linear[array].vary(name, draw, at, places[owner])
             first += self._widths[name]
         return {
             array: (self._tensor(const.ravel()), self._tensor(slope.reshape(len(slope), -1)))

@@ -4,27 +4,16 @@ Axes: W worlds, N episodes, K numbers by `physics.randomize`.
 """
 
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from msk_ray.envs.disturbances import Disturbances
+from msk_ray.envs.randomize import Randomizer
 from msk_ray.envs.records import Resets
 from msk_ray.group import Group
 from msk_ray.step import StepState
-
-
-class Source(Protocol):
-    """What draws some of the K numbers from a generator of its own."""
-
-    generator: torch.Generator
-    size: int
-
-    def draw(self, count: int) -> Tensor:
-        """Numbers of `count` episodes, (count, size)."""
-
-    def seed(self, seed: int) -> None:
-        """Draw from now on as after construction with this seed, the environment's."""
 
 
 class Starts:
@@ -40,7 +29,7 @@ class Starts:
     def __init__(
         self,
         draw: Callable[[int], tuple[StepState, Tensor]],
-        sources: Mapping[str, Source | None],
+        sources: Mapping[str, Randomizer | Disturbances | None],
         commands: int,
         nworld: int,
     ) -> None:
