@@ -193,6 +193,21 @@ class Trainer(TrialFolder):
             CheckpointError: it is missing, incomplete, was written under other settings, or on another kind of device.
         """
         state = _expect(path, read_checkpoint(path))
+        self._check_continues(path, state, changed)
+        self._write_config()
+        self._group.send_order("load", str(path))
+        load_state(self.algorithm, state)
+        self.epoch, self.env_steps = state["epoch"], state["env_steps"]
+        self._seconds = state["seconds"]
+        self._damages = self._log.rewind(self.epoch)
+        rows = read_metrics(self.logdir / METRICS_FILE)
+        self._unreadable = self._scoring.rewind(self.epoch, {row["epoch"] for row in rows if SCORE in row})
+        # A policy may have been scored after the checkpoint.
+        scores = (row[SCORE] for row in rows if row["epoch"] > 0 and row.get(SCORE) is not None)
+        self.best_score = max(state["best_score"], *scores, -math.inf)
+
+    def _check_continues(self, path: Path, state: dict[str, Any], changed: Collection[str]) -> None:
+        """Raise, as for `restore`, if a checkpoint does not fit this trial; warn if bits will differ."""
         recorded = parse_recorded(state["config"], f"{path}: its settings")
         difference = _first_difference(recorded.as_dict(), self.config.as_dict(), changed)
         if difference:
@@ -207,21 +222,10 @@ class Trainer(TrialFolder):
         check_generators(path, state["algorithm"]["env_generator"], self.algorithm.env.device)
         if recomputed := _changed_rounding(recorded.execution, self.config.execution):
             warnings.warn(
-                f"{path.name} was written with {recomputed}: the same to rounding, not to the bit", stacklevel=2
+                f"{path.name} was written with {recomputed}: the same to rounding, not to the bit", stacklevel=3
             )
         if moved := machine_differences(self.logdir, self._device):
-            warnings.warn(f"{path.name} is of another machine, so bits will differ: {moved}", stacklevel=2)
-        self._write_config()
-        self._group.send_order("load", str(path))
-        load_state(self.algorithm, state)
-        self.epoch, self.env_steps = state["epoch"], state["env_steps"]
-        self._seconds = state["seconds"]
-        self._damages = self._log.rewind(self.epoch)
-        rows = read_metrics(self.logdir / METRICS_FILE)
-        self._unreadable = self._scoring.rewind(self.epoch, {row["epoch"] for row in rows if SCORE in row})
-        # A policy may have been scored after the checkpoint.
-        scores = (row[SCORE] for row in rows if row["epoch"] > 0 and row.get(SCORE) is not None)
-        self.best_score = max(state["best_score"], *scores, -math.inf)
+            warnings.warn(f"{path.name} is of another machine, so bits will differ: {moved}", stacklevel=3)
 
     def restore_latest(self) -> tuple[Path | None, list[str]]:
         """Continue from the newest complete checkpoint, or from the start if there is none.
