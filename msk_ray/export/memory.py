@@ -120,9 +120,11 @@ class _Samples:
         env, state = self._env, self._env.reset_state()
         start = state.memory
         before = {name: self._normal(values) for name, values in start.items()}
-        action = self._normal(state.action).clamp(-1.0, 1.0)
+        previous, action = (self._normal(state.action).clamp(-1.0, 1.0) for _ in range(2))
         age = torch.randint(env.config.episode_length, state.age.shape, generator=self._generator)
-        state = state._replace(physics=self._varied(state.physics), age=age.to(state.age), memory=before)
+        state = state._replace(
+            physics=self._varied(state.physics), action=previous, age=age.to(state.age), memory=before
+        )
         obs = self._observed(state)
         changed = {}
         for name, values in before.items():

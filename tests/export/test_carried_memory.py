@@ -58,6 +58,19 @@ class Held(Filtered):
         return torch.maximum(action, self.memory["force"])
 
 
+class TwoActions(CartPole):
+    """It observes its last two actions."""
+
+    def memories(self) -> Mapping[str, Memory]:
+        return {"older": Memory(1)}
+
+    def remember(self, state: StepState, action: Tensor) -> Mapping[str, Tensor]:
+        return {"older": self.state.action}
+
+    def observe(self, state: StepState, action: Tensor) -> Tensor:
+        return torch.cat((super().observe(state, action), action, self.memory["older"]), -1)
+
+
 def made(kind: type[CartPole]) -> tuple[CartPole, PolicyToControl]:
     settings = CartPoleSettings(name="cartpole")
     env = kind(settings, PhysicsConfig(), 4, "cpu", 0, None)
@@ -104,6 +117,13 @@ def test_a_memory_that_is_no_matrix_product_is_given_and_controls_that_need_it_a
         "no ctrl: `control` reads 'force', which the file cannot carry",
         "entries of obs depend on 'force' and 'height', which the file cannot carry: give them too",
     ]
+
+
+def test_a_history_of_the_action_that_is_observed_is_carried() -> None:
+    env, policy = made(TwoActions)
+    assert policy.inputs == ["obs", "memory_older"]
+    assert policy.memory.given == [0, 1, 2, 3, 4, 5]
+    assert difference_over_steps(policy, lambda *inputs: list(policy(*inputs)), env) <= 1e-5
 
 
 def test_without_memory_nothing_is_carried() -> None:
