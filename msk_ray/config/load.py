@@ -53,7 +53,8 @@ def parse_recorded(data: Mapping[str, Any], source: str, *, shown: bool = False)
 def read_config(path: Path) -> dict[str, Any]:
     """The settings of a config file, merged into those of the file it `extends`, if any, in the current spelling.
 
-    `extends` is a path relative to the file, and only one level deep: an extended file may not extend another.
+    `extends` is a path relative to the file, or the name of a shipped config, and only one level deep: an extended file
+    may not extend another.
 
     Raises:
         ConfigError: as for `read_yaml`, or a chain of `extends`.
@@ -62,7 +63,7 @@ def read_config(path: Path) -> dict[str, Any]:
     base_name = data.pop("extends", None)
     if base_name is None:
         return current_settings(data)
-    base_path = path.parent / str(base_name)
+    base_path = find_config(base_name) if is_name(str(base_name)) else path.parent / str(base_name)
     base = read_yaml(base_path)
     if "extends" in base:
         raise ConfigError(f"{path} extends {base_path}, which extends another file: extend that one directly")

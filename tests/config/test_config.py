@@ -71,6 +71,8 @@ def test_extends_lays_one_file_over_another(tmp_path: Path) -> None:
     (tmp_path / "child.yaml").write_text("extends: base.yaml\nenv: {reward: {up: 0.2}}\n")
     config = load_config(tmp_path / "child.yaml")
     assert (config.env.nworld, config.env.reward.up) == (32, 0.2)
+    (tmp_path / "of_shipped.yaml").write_text("extends: cartpole\nenv: {nworld: 3}\n")
+    assert load_config(tmp_path / "of_shipped.yaml") == load_config("cartpole", ["env.nworld=3"])
     (tmp_path / "grandchild.yaml").write_text("extends: child.yaml\n")
     with pytest.raises(ConfigError, match="extends another file"):
         load_config(tmp_path / "grandchild.yaml")
