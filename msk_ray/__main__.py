@@ -10,10 +10,12 @@ from msk_ray.cli import Command, run
 from msk_ray.registry import Registry, resolve
 
 COMMANDS = {
+    "list": Command("msk_ray.tasks", "list the tasks that can be trained, with their configs and scores"),
     "train": Command("msk_ray.train", "train one policy in this process, without Ray"),
     "tune": Command("msk_ray.tune.__main__", "run a search space as a Ray Tune experiment"),
     "evaluate": Command("msk_ray.evaluate.__main__", "evaluate policies: fixed seeds, no noise, every reward term"),
-    "visualize": Command("msk_ray.visualize.__main__", "watch a policy: viewer, video, frames, film strip"),
+    "play": Command("msk_ray.play.__main__", "watch a task in a viewer: its policy, zero or random actions"),
+    "visualize": Command("msk_ray.visualize.__main__", "draw a policy: video, frames, film strip"),
     "export": Command(
         "msk_ray.export.__main__", "write a policy as ONNX or TorchScript, with its model and description"
     ),

@@ -7,6 +7,7 @@ import difflib
 import errno
 import io
 import os
+import re
 import shlex
 import sys
 import time
@@ -53,6 +54,20 @@ def positive(text: str) -> int:
     if not text.isdecimal() or not 1 <= int(text) < 2**31:
         raise argparse.ArgumentTypeError(f"must be a whole number of at least 1 and below 2^31, not {text}")
     return int(text)
+
+
+def port_number(text: str) -> int:
+    """A port to listen on; 0: any free one."""
+    if not text.isdecimal() or int(text) > 65535:
+        raise argparse.ArgumentTypeError(f"must be a whole number from 0 to 65535, not {text}")
+    return int(text)
+
+
+def geom_group_list(text: str) -> tuple[int, ...]:
+    """Groups of MuJoCo's geoms, such as 0,3."""
+    if re.fullmatch(r"[0-5](,[0-5])*", text) is None:
+        raise argparse.ArgumentTypeError(f"write numbers from 0 to 5, such as 0,3, not {text}")
+    return tuple(sorted({int(group) for group in text.split(",")}))
 
 
 def seconds(text: str) -> float:

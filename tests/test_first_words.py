@@ -18,7 +18,7 @@ from msk_ray.gradcheck import main as gradcheck
 from msk_ray.progress import KernelCount, Pace, ProgressLine
 from msk_ray.visualize.__main__ import main as visualize
 
-COMMANDS = ("gradcheck", "diagnose", "evaluate", "visualize", "gait")
+COMMANDS = ("list", "gradcheck", "diagnose", "evaluate", "play", "visualize", "gait")
 PGS = """<mujoco><option solver="PGS"/><worldbody><body><joint/><geom size=".1"/></body></worldbody></mujoco>"""
 
 

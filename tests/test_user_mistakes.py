@@ -65,7 +65,7 @@ def mistakes() -> list[Mistake]:
 
     return [
         # Names
-        Mistake(any_command.main, "trian --config own.yaml", "no command 'trian'; write one of train, tune"),
+        Mistake(any_command.main, "trian --config own.yaml", "no command 'trian'; write one of list, train, tune"),
         Mistake(train.main, "--config catpole", "unknown config 'catpole'; known: .*cartpole.*, or give a path"),
         Mistake(train.main, "--config gone.yaml", "no such file: gone.yaml; . holds: .*own"),
         Mistake(train.main, "--confg own.yaml", "no option --confg; did you mean --config?"),
@@ -207,7 +207,7 @@ def test_a_mistake_is_answered_in_one_line(
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        ("msk_ray trian", "no command 'trian'; write one of train, tune"),
+        ("msk_ray trian", "no command 'trian'; write one of list, train, tune"),
         (
             "msk_ray.tune --spce space.yaml",
             "no option --spce; did you mean --space? (all options: python -m msk_ray.tune",

@@ -1,6 +1,5 @@
 """`python -m msk_ray.dashboard`: the experiments of a storage folder as live pages in a browser."""
 
-import argparse
 import asyncio
 import contextlib
 import ipaddress
@@ -11,7 +10,7 @@ from pathlib import Path
 
 from aiohttp import web
 
-from msk_ray.cli import Parser, run, seconds
+from msk_ray.cli import Parser, port_number, run, seconds
 from msk_ray.dashboard.app import make_runner
 from msk_ray.dashboard.films import Films
 from msk_ray.dashboard.guard import Access
@@ -47,7 +46,9 @@ def parser() -> Parser:
         help="folder of experiments (default: runs/)",
     )
     p.add_argument("--host", default="127.0.0.1", metavar="ADDRESS", help="address to listen on (default: %(default)s)")
-    p.add_argument("--port", type=_port, default=8321, metavar="N", help="port (default: %(default)s; 0: any free one)")
+    p.add_argument(
+        "--port", type=port_number, default=8321, metavar="N", help="port (default: %(default)s; 0: any free one)"
+    )
     p.add_argument(
         "--refresh",
         type=seconds,
@@ -69,12 +70,6 @@ def parser() -> Parser:
         help="accept requests for this host name, such as a proxy's; IP addresses are always accepted",
     )
     return p
-
-
-def _port(text: str) -> int:
-    if not text.isdecimal() or int(text) > 65535:
-        raise argparse.ArgumentTypeError(f"must be a whole number from 0 to 65535, not {text}")
-    return int(text)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

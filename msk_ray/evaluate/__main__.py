@@ -14,7 +14,7 @@ from msk_ray.errors import CheckpointError, ConfigError, MskRayError
 from msk_ray.evaluate import zoo
 from msk_ray.evaluate.elsewhere import SCORINGS, Scorer, find_python, foreign_scoring
 from msk_ray.evaluate.stored import FORMAT, eval_file_of, store_evaluation
-from msk_ray.evaluate.targets import Kind, Target, best_checkpoint, best_of_trial, find_target
+from msk_ray.evaluate.targets import REFERENCE, Kind, Target, best_checkpoint, best_of_trial, find_target
 from msk_ray.evaluate.vary import HELP, parse_vary, vary_text
 from msk_ray.experiment.attempts import read_attempt
 from msk_ray.experiment.checkpoint_file import read_facts
@@ -101,7 +101,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser().parse_args(argv)
     target = find_target(args.target, args.storage)
     seeds = parse_seeds(args.seeds) if args.seeds is not None else None
-    names = [name.strip() for name in (args.physics or "reference").split(",")]
+    names = [name.strip() for name in (args.physics or REFERENCE).split(",")]
     varied = [None, *(parse_vary(args.vary) if args.vary is not None else [])]
     python = _other_python(args)
     if args.vary is not None and args.conditions is not None:

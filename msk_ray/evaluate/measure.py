@@ -13,6 +13,7 @@ from msk_ray.config import Config, PhysicsConfig, RandomizeConfig, overlay, pars
 from msk_ray.envs import env_class
 from msk_ray.envs.randomize import Randomizer
 from msk_ray.errors import ConfigError
+from msk_ray.evaluate.targets import OWN, REFERENCE
 from msk_ray.experiment.environment import installed_versions
 from msk_ray.progress import Pace
 from msk_ray.training import Evaluator, SavedPolicy
@@ -21,7 +22,6 @@ from msk_ray.training.machine import device_name
 from msk_ray.training.out_of_memory import named_out_of_memory
 from msk_ray.training.threads import use_threads
 
-REFERENCE, OWN = "reference", "own"
 _PACKAGES = ("msk-ray", "torch", "warp-lang", "mujoco", "mujoco-warp")
 
 

@@ -1,4 +1,5 @@
-"""What commands take as a target: a checkpoint, a trial's folder, an experiment, or a folder of policies."""
+"""What commands take as a target: a checkpoint, a trial's folder, an experiment, or a folder of policies; and as a
+physics."""
 
 import difflib
 from dataclasses import dataclass
@@ -10,6 +11,10 @@ from msk_ray.experiment import layout
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.records import best_records, find_experiments, read_records
 from msk_ray.shipped import POLICIES, find_shipped, shipped_folder, shipped_names
+
+REFERENCE, OWN = "reference", "own"
+"""The physics that scores are taken under, and the one that a trial trains on; `--physics` takes these and the names of
+the environment's own."""
 
 
 class Kind(StrEnum):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from msk_ray.cli import STORAGE, Parser, run
 from msk_ray.errors import ConfigError
-from msk_ray.evaluate.targets import best_checkpoint, find_target
+from msk_ray.evaluate.targets import REFERENCE, best_checkpoint, find_target
 from msk_ray.files import make_folder
 from msk_ray.progress import announce
 from msk_ray.sweep.space import parse_seeds
@@ -94,7 +94,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-REFERENCE = "reference"
 _ZOO_OPTIONS = ("seeds", "device", "command", "commit", "machine", "chosen")
 
 

@@ -14,8 +14,8 @@ from msk_ray.algorithms import algorithm_class
 from msk_ray.cli import typed_command
 from msk_ray.config import Config, dump_yaml, flattened, overlay, parse_recorded
 from msk_ray.errors import ConfigError, StorageError
-from msk_ray.evaluate.measure import REFERENCE, Bench, Request
-from msk_ray.evaluate.targets import trial_folder_of
+from msk_ray.evaluate.measure import Bench, Request
+from msk_ray.evaluate.targets import REFERENCE, trial_folder_of
 from msk_ray.evaluate.zoo import BEGIN, BEST_EVALUATION, END, MAX_BYTES, Entry, Training, read_zoo, score_of, zoo_text
 from msk_ray.experiment.checkpoint_file import write_checkpoint_file
 from msk_ray.experiment.environment import read_environment

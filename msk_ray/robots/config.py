@@ -115,9 +115,9 @@ G1Reward = reward_section("G1Reward", __name__, G1_TERMS, VelocityShape)
 
 @with_reward(Go1Reward)
 class Go1VelocitySettings(VelocitySettings):
-    """mjlab's `Mjlab-Velocity-Flat-Unitree-Go1`."""
+    """Unitree's quadruped Go1 follows commands for its velocity. mjlab's `Mjlab-Velocity-Flat-Unitree-Go1`."""
 
 
 @with_reward(G1Reward)
 class G1VelocitySettings(VelocitySettings):
-    """mjlab's `Mjlab-Velocity-Flat-Unitree-G1`."""
+    """Unitree's humanoid G1 follows commands for its velocity. mjlab's `Mjlab-Velocity-Flat-Unitree-G1`."""

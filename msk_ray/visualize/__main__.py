@@ -1,4 +1,4 @@
-"""`python -m msk_ray.visualize`: watch a policy."""
+"""`python -m msk_ray.visualize`: pictures of a policy."""
 
 import argparse
 import re
@@ -7,10 +7,10 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from msk_ray.cli import STORAGE, Parser, positive, run
+from msk_ray.cli import STORAGE, Parser, geom_group_list, positive, run
 from msk_ray.compiling import announce_compiling
 from msk_ray.errors import CheckpointError, ConfigError
-from msk_ray.evaluate.targets import Target, best_checkpoint, best_trial_folder, find_target
+from msk_ray.evaluate.targets import REFERENCE, Target, best_checkpoint, best_trial_folder, find_target
 from msk_ray.files import make_folder
 from msk_ray.progress import Pace, announce
 from msk_ray.sweep.space import parse_seeds
@@ -25,14 +25,14 @@ if TYPE_CHECKING:
     from msk_ray.visualize.render import View
 
 DESCRIPTION = """\
-Watch a policy: in MuJoCo's viewer if there is a display, or as video, frames, film strip or statistics without one.
+Draw a policy's episodes as video, frames or film strip, or print their statistics; no display is needed. msk-ray play
+opens a viewer.
 
 Episodes are as in evaluation: without noise, from fixed initial states, under reference physics unless --physics says
 otherwise. Contact forces are arrows (a force equal to the model's weight is as long as the model is large), muscles go
 from blue (relaxed) to red (active). A trial stands for its best policy, an experiment for its best trial."""
 
 EXAMPLES = """\
-  python -m msk_ray.visualize runs/demo                                  # the viewer
   python -m msk_ray.visualize runs/demo --no-render --episodes 10        # statistics, no pictures
   python -m msk_ray.visualize runs/demo/trials/1a2b3c4d --video out.mp4 --fps 30
   python -m msk_ray.visualize runs/demo --strip out.png --frames 8
@@ -47,8 +47,8 @@ PROGRESSION_FRAMES = 6
 def parser() -> Parser:
     """The command line."""
     p = Parser("python -m msk_ray.visualize", DESCRIPTION, EXAMPLES)
-    p.add_argument("target", nargs="?", metavar="CHECKPOINT|TRIAL|EXPERIMENT", help="what to watch")
-    output = p.add_argument_group("instead of the viewer")
+    p.add_argument("target", nargs="?", metavar="CHECKPOINT|TRIAL|EXPERIMENT", help="what to draw")
+    output = p.add_argument_group("what to make")
     output.add_argument("--no-render", action="store_true", help="print statistics of the episodes, draw nothing")
     output.add_argument("--video", type=Path, metavar="FILE", help="an .mp4, .mkv, .mov or .gif")
     output.add_argument("--save-frames", type=Path, metavar="DIR", help="numbered .png files")
@@ -64,7 +64,7 @@ def parser() -> Parser:
         "--episodes",
         type=positive,
         metavar="N",
-        help="number of episodes (default: 1; with --no-render 10; in the viewer until its window is closed)",
+        help="number of episodes (default: 1; with --no-render 10)",
     )
     how.add_argument(
         "--seed", type=int, metavar="N", help="seed of the initial states (default: the trial's evaluation seed)"
@@ -72,7 +72,7 @@ def parser() -> Parser:
     how.add_argument("--steps", type=positive, metavar="N", help="maximum env steps per episode")
     how.add_argument(
         "--physics",
-        default="reference",
+        default=REFERENCE,
         metavar="NAME",
         help="reference (used for scores), own (used in training), or the name of one (default: reference)",
     )
@@ -83,14 +83,11 @@ def parser() -> Parser:
         help="frames in a strip (default: 8) or in a row of --progression (default: 6)",
     )
     how.add_argument("--fps", type=float, default=30.0, metavar="F", help="frames per simulated second (default: 30)")
-    how.add_argument(
-        "--speed", type=float, default=1.0, metavar="X", help="speed of the viewer (default: 1, real time)"
-    )
     how.add_argument("--size", type=_size, metavar="WxH", help="size of a frame, such as 640x480; both numbers even")
     how.add_argument("--camera", default="", metavar="NAME", help="a camera of the model (default: its first)")
     how.add_argument(
         "--geom-groups",
-        type=_groups,
+        type=geom_group_list,
         metavar="LIST",
         help="groups of geoms to draw, such as 0,3 (default: 0,1,2, and the robot's own if it has no geom in these)",
     )
@@ -104,12 +101,6 @@ def _size(text: str) -> tuple[int, int]:
     if match is None or any(int(n) < 16 or int(n) % 2 for n in match.groups()):
         raise argparse.ArgumentTypeError(f"write WIDTHxHEIGHT, both even and at least 16, such as 640x480, not {text}")
     return int(match[1]), int(match[2])
-
-
-def _groups(text: str) -> tuple[int, ...]:
-    if re.fullmatch(r"[0-5](,[0-5])*", text) is None:
-        raise argparse.ArgumentTypeError(f"write numbers from 0 to 5, such as 0,3, not {text}")
-    return tuple(sorted({int(group) for group in text.split(",")}))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -128,21 +119,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     if args.progression is not None:
         return _progression(args, target, bench, Request(args.physics, 1, seeds, args.steps))
     policy = load_policy(best_checkpoint(target))
-    drawing = args.video or args.save_frames or args.strip
-    if not drawing and not args.no_render:
-        from msk_ray.visualize.viewer import watch
-
-        request = Request(args.physics, 1, seeds, args.steps)
-        print(f"{policy.path}, epoch {policy.epoch}; close the window to end", flush=True)
-        _say_groups(args, bench.evaluator(policy.config, request)[0].env.model)
-        done = watch(bench, policy, request, args.episodes, args.speed, args.geom_groups)
-        print(f"{done} episodes")
-        return 0
     from msk_ray.visualize.episodes import record
     from msk_ray.visualize.render import check_camera
 
     count = args.episodes or (10 if args.no_render else 1)
     request = Request(args.physics, count, seeds, args.steps)
+    drawing = not args.no_render
     if drawing:
         check_camera(bench.evaluator(policy.config, request)[0].env.model, args.camera)
     recording = record(bench, policy, request)
@@ -158,15 +140,18 @@ def _check(args: argparse.Namespace) -> Target:
     """The target. Refuses a command line that cannot work, before anything slow starts."""
     given = args.progression if args.progression is not None else args.target
     if given is None or (args.progression is not None and args.target is not None):
-        raise ConfigError("name one thing to watch: a checkpoint, a trial, or an experiment")
-    for option in ("fps", "speed"):
-        if not 0.0 < getattr(args, option) <= 1000.0:  # NaN is neither
-            raise ConfigError(f"--{option} {getattr(args, option):g}: write a number above 0, up to 1000")
+        raise ConfigError("name one thing to draw: a checkpoint, a trial, or an experiment")
+    if not 0.0 < args.fps <= 1000.0:  # NaN is neither
+        raise ConfigError(f"--fps {args.fps:g}: write a number above 0, up to 1000")
     if args.seed is not None:
         parse_seeds(args.seed)
     target = find_target(given, args.storage)
     best_checkpoint(target)
     drawing = args.video or args.save_frames or args.strip or args.progression is not None
+    if not drawing and not args.no_render:
+        raise ConfigError(
+            "say what to make: --video FILE, --strip FILE, --save-frames DIR, --no-render; msk-ray play opens a viewer"
+        )
     if args.no_render and drawing:
         raise ConfigError(
             "--no-render draws nothing: leave it out, or leave out --video, --save-frames, --strip and --progression"
@@ -178,10 +163,6 @@ def _check(args: argparse.Namespace) -> Target:
         from msk_ray.visualize.render import headless_backend
 
         headless_backend()
-    elif not args.no_render:
-        from msk_ray.visualize.viewer import check_display
-
-        check_display()
     return target
 
 
@@ -204,8 +185,7 @@ def _what(args: argparse.Namespace, target: Target) -> str:
     if args.progression is not None:
         return f"an episode of each policy that {best_trial_folder(target)} saved during training"
     count = args.episodes or (10 if args.no_render else 1)
-    watched = not (args.no_render or args.video or args.save_frames or args.strip)
-    number = "episodes" if watched else "1 episode" if count == 1 else f"{count} episodes at once"
+    number = "1 episode" if count == 1 else f"{count} episodes at once"
     return f"{number} of {best_checkpoint(target)}"
 
 

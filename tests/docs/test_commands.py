@@ -60,7 +60,8 @@ def test_commands_name_options_configs_and_spaces_that_exist(page: Path) -> None
 def test_they_are_found() -> None:
     found = [name for page in PAGES for name, _ in commands_of(page)]
     assert len(found) > 60
-    assert set(found) >= {"train", "tune", "evaluate", "visualize", "export", "gradcheck", "diagnose", "gait", "status"}
+    assert set(found) >= {"list", "train", "tune", "evaluate", "play", "visualize", "export", "gradcheck", "diagnose"}
+    assert set(found) >= {"gait", "status"}
 
 
 def code_of(page: str) -> str:

@@ -17,7 +17,7 @@ CheetahReward = reward_section("CheetahReward", __name__, TERMS)
 
 @with_reward(CheetahReward)
 class CheetahSettings(LimitedSettings):
-    """A planar body on two legs whose reward asks for forward velocity; its episodes end only at the time limit."""
+    """A planar body on two legs whose reward asks for forward velocity. Its episodes end only at the time limit."""
 
     variants = ("matched", "published")
     pyramidal_variants = frozenset(("published",))

@@ -10,8 +10,8 @@ from msk_ray.legs.config import LegSettings
 
 
 class MyoLegSettings(LegSettings):
-    """Legs of an installed myosuite or myo_sim, or of a model file, with the model's own contacts, limits and
-    joints."""
+    """Legs with 80 muscles, or those of a model file, walk at a target speed. The 80 are of an installed myosuite or
+    myo_sim; contacts, limits and joints are the model's own."""
 
     reads_physics = STEPPING | SOLVING | ACTIVATION
 

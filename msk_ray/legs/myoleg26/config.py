@@ -34,7 +34,7 @@ _TERRAIN_READS: dict[str, tuple[str, ...]] = {
 
 
 class MyoLeg26Settings(LegSettings):
-    """Two legs under one trunk, 13 Hill-type muscles each."""
+    """Legs with 26 Hill-type muscles walk at a target speed, or stand. There are 13 muscles each, under one trunk."""
 
     reads_physics = STEPPING | SOLVING | CONTACTS | ACTIVATION
 

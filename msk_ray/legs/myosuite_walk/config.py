@@ -37,7 +37,10 @@ MyoSuiteWalkReward = reward_section("MyoSuiteWalkReward", __name__, TERMS, MyoSu
 
 @with_reward(MyoSuiteWalkReward)
 class MyoSuiteWalkSettings(EnvSettings):
-    """MyoSuite's `myoLegWalk-v0`, with settings that make it easier to learn; scores are without them."""
+    """Legs with 80 muscles walk in MyoSuite's `myoLegWalk-v0`.
+
+    Settings that make it easier to learn are for training; scores are without them.
+    """
 
     reads_physics = STEPPING | SOLVING | ACTIVATION
 

@@ -1,0 +1,1 @@
+"""Watch a task in a viewer: a policy, or actions that are none."""
