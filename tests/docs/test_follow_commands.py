@@ -1,0 +1,96 @@
+"""The page docs/robots/follow_commands.md, from its first command to the last, in tiny sizes."""
+
+import os
+import re
+import runpy
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import pytest
+from needs import need_what_caused
+from test_commands import commands_of
+
+from msk_ray import __main__ as commands
+from msk_ray.play.screen import Screen
+
+pytestmark = pytest.mark.long
+
+TINY = (
+    *("env.nworld=2", "shac.critic_iterations=1", "shac.critic_batches=1", "actor.hidden=[8]", "critic.hidden=[8]"),
+    *("trial.epochs=1", "evaluation.interval=1", "evaluation.nworld=2", "evaluation.steps=3", "execution.loggers=[]"),
+)
+SMALLER = {
+    "gradcheck": ["--worlds", "2", "--states", "random"],
+    "play": ["--episodes", "1", "--steps", "2", "--device", "cpu"],
+    "train": ["--device", "cpu", *(word for setting in TINY for word in ("--set", setting))],
+    "evaluate": ["--worlds", "2", "--steps", "3", "--device", "cpu"],
+    "visualize": ["--steps", "3", "--device", "cpu"],
+    "export": [],
+}
+
+
+class Blind(Screen):
+    """Nobody looks."""
+
+    def is_open(self) -> bool:
+        return True
+
+    def show(self, state: Any, control: Any) -> None:
+        self._take(state, control)
+
+
+@contextmanager
+def blind(args: Any, model: mujoco.MjModel, groups: Any) -> Iterator[Screen]:
+    yield Blind(model)
+
+
+@pytest.fixture
+def page(root: Path) -> Path:
+    return root / "docs" / "robots" / "follow_commands.md"
+
+
+@pytest.fixture
+def folder(page: Path, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder with the files of the page."""
+    text = page.read_text()
+    files = re.findall(r"^## .*?`(\w+\.(?:py|yaml))`$.*?```\w+\n(.*?)```", text, re.DOTALL | re.MULTILINE)
+    assert [name for name, _ in files] == ["my_robot.py", "my_robot.yaml", "follow.py"]
+    for name, content in files:
+        (tmp_path / name).write_text(content)
+    copy = re.search(r"^    (cp .*)$", text, re.MULTILINE)
+    assert copy is not None
+    paths = {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "PYTHONPATH": str(root)}
+    subprocess.run(["bash", "-c", copy[1]], cwd=tmp_path, env=os.environ | paths, check=True)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield tmp_path
+    sys.modules.pop("my_robot", None)
+
+
+def test_its_commands_and_programs_run(
+    page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setattr("msk_ray.play.__main__._screen", blind)
+    done = []
+    for name, words in commands_of(page):
+        if name == "visualize":  # pictures have tests of their own
+            words = [*words[: words.index("--video")], "--no-render"]
+        assert commands.main([name, *words, *SMALLER[name]]) == 0, (name, capsys.readouterr().err)
+        done.append(name)
+    assert done == ["gradcheck", "play", "train", "evaluate", "play", "visualize", "export"]
+    said = capsys.readouterr().out
+    assert re.search(r"episode 1: score .*, 0\.0 s, time", said)
+    try:
+        follow = runpy.run_path("follow.py")
+    except ImportError as error:
+        need_what_caused(error)
+        raise
+    assert list(follow["carried"]) == ["memory_history"], "the history is inside"
+    assert follow["data"].qpos[2] > 0.2, "it stands, as its policy hardly moves"
+    assert capsys.readouterr().out.startswith("after 9.0 s at x = ")
