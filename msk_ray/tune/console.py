@@ -45,6 +45,8 @@ class Console:
         self._ended = 0
         self._bests: dict[str, tuple[float, Trial]] = {}
         """(best score, trial) of each trial that has reported a score."""
+        self._leaders: dict[str, tuple[float, Trial]] = {}
+        """The best of them in each environment."""
         self._attempts: dict[str, Attempt] = {}
         self._seconds_per_epoch: dict[str, float] = {}
         self._start = time.monotonic()
@@ -80,10 +82,9 @@ class Console:
         run.best = max(run.best, best)
         if not math.isfinite(run.best):
             return  # no finite score yet
-        before = self._best_in(trial.environment)
         if trial.id not in self._bests or run.best > self._bests[trial.id][0]:
             self._bests[trial.id] = run.best, trial
-        if before is None or run.best > before[0]:
+        if self._leads(run.best, trial):
             when = f" at epoch {epoch}/{trial.epochs}" if score == run.best else ""
             where = f" in {trial.environment}" if len(self._environments) > 1 else ""
             self.say(f"{trial.id} best so far{where}: score {run.best:.5g}{when}{self._suffix(trial)}")
@@ -99,6 +100,9 @@ class Console:
         self._running.pop(trial.id, None)
         # Scores with all its worlds no longer count.
         self._bests.pop(trial.id, None)
+        self._leaders = {}
+        for score, other in self._bests.values():
+            self._leads(score, other)
         self._seconds_per_epoch.pop(trial.id, None)
         self._waiting[trial.id] = trial
         self.say(f"{trial.id} ran out of memory; it restarts with {attempt}")
@@ -132,7 +136,7 @@ class Console:
         parts = [f"{len(self._running)} running", f"{len(self._waiting)} waiting", f"{self._ended} ended"]
         bests = []
         for environment in self._environments:
-            best = self._best_in(environment)
+            best = self._leaders.get(environment)
             if best is not None:
                 where = f"{environment} " if len(self._environments) > 1 else ""
                 bests.append(f"{where}{best[0]:.5g} ({best[1].id})")
@@ -155,10 +159,13 @@ class Console:
             )
         return "\n".join(lines)
 
-    def _best_in(self, environment: str) -> tuple[float, Trial] | None:
-        """The best score in an environment, and its trial."""
-        bests = [best for best in self._bests.values() if best[1].environment == environment]
-        return max(bests, key=lambda best: best[0], default=None)
+    def _leads(self, score: float, trial: Trial) -> bool:
+        """Whether a score is the best in its trial's environment so far; then it is remembered."""
+        before = self._leaders.get(trial.environment)
+        if before is not None and score <= before[0]:
+            return False
+        self._leaders[trial.environment] = score, trial
+        return True
 
     def _name(self, trial: Trial) -> str:
         return f"{printable(trial.variant)} seed={trial.seed}{self._suffix(trial)}"

@@ -135,6 +135,41 @@ def test_median_in_lockstep_compares_where_the_others_have_been() -> None:
     assert "up to 10" in ending.why
 
 
+class CountedScore(float):
+    """A score that counts how often it is added to another."""
+
+    additions = 0
+
+    def __add__(self, other: float) -> float:
+        CountedScore.additions += 1
+        return float(self) + float(other)
+
+    __radd__ = __add__
+
+
+def test_median_does_not_add_up_the_scores_of_other_trials_at_each_report() -> None:
+    costs = []
+    for others in (4, 40):
+        rule = MedianStopping(grace=10, min_trials=3)
+        for number in range(others):
+            for time in range(10, 30):
+                rule.report(f"{number}", time, CountedScore(number))
+        before = CountedScore.additions
+        assert rule.report("low", 20, CountedScore(-1.0)) is not None
+        costs.append(CountedScore.additions - before)
+    assert costs[0] == costs[1]
+
+
+def test_median_counts_the_newest_score_of_a_time() -> None:
+    rule = MedianStopping(grace=10, min_trials=2)
+    for name in ("a", "b"):
+        rule.report(name, 20, 9.0)
+        rule.report(name, 10, 2.0)
+        rule.report(name, 10, 4.0)
+    assert rule.report("low", 10, 3.9) is not None
+    assert rule.report("fine", 10, 4.0) is None
+
+
 def test_grace_is_a_share_of_the_budget() -> None:
     rule = Asha(kind="asha", grace=0.25, reduction=2.0, min_trials=2).pruner(budget=1000)
     rule.report("a", 249, 1.0)

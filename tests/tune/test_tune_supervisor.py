@@ -7,6 +7,8 @@ from types import SimpleNamespace
 
 import pytest
 
+from msk_ray.experiment.attempts import FIRST
+from msk_ray.experiment.trial import Trial
 from msk_ray.signals import listening
 from msk_ray.sweep import opening
 from msk_ray.sweep.space import Space
@@ -78,6 +80,26 @@ def test_a_trial_that_had_no_process_while_others_saved_themselves_is_not_waited
         assert not driver.stopped
         driver.on_trial_recover(0, [], trial)  # it died instead
         assert driver.stopped
+
+
+def test_a_score_is_not_compared_with_those_of_all_other_trials(
+    make_space: Callable[..., Space], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trials = resolve_trials(make_space(seeds="0-29"))
+    looks: list[Trial] = []
+    environment = Trial.environment.fget
+    assert environment is not None
+    monkeypatch.setattr(Trial, "environment", property(lambda trial: looks.append(trial) or environment(trial)))
+    console = Console(trials, 1)
+    counts = []
+    for score, trial in enumerate(trials):
+        looks.clear()
+        console.evaluated(trial, 10, score, score)
+        counts.append(len(looks))
+    assert counts[-1] == counts[1]
+    # The best starts again, and the next best leads.
+    console.attempted_again(trials[-1], FIRST)
+    assert f"best {len(trials) - 2} ({trials[-2].id})" in console.status()
 
 
 def test_nothing_is_written_into_a_folder_made_in_place_of_an_experiment(
