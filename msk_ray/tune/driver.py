@@ -46,6 +46,7 @@ from msk_ray.tune.interrupts import run_in_thread
 from msk_ray.tune.queue import Suggestions, TrialList
 from msk_ray.tune.ray_watch import RayWatch
 from msk_ray.tune.schedulers import METRIC, Population, PruningScheduler
+from msk_ray.tune.shared_trials import SharedTrials
 from msk_ray.tune.supervisor import Supervisor, remove_remains
 from msk_ray.tune.trainable import Job, make_trainable
 from msk_ray.tune.trial_run import MakeTrainer, Precompile, make_trainer, precompile
@@ -104,7 +105,7 @@ def run_trials(plan: Plan) -> bool:
         experiment,
         space,
         base,
-        {trial.id: trial for trial in plan.trials},
+        SharedTrials(plan.trials),
         plan.placement.device,
         plan.placement.gpus,
         plan.make_trainer,
@@ -309,7 +310,7 @@ class _StopWhen(Stopper):
 
 
 def _param_space(job: Job, remaining: list[Trial]) -> dict[str, Any]:
-    if not job.trials:
+    if not remaining:
         return {}  # the search supplies everything
     if not job.population:
         return {"id": tune.grid_search([trial.id for trial in remaining])}

@@ -39,6 +39,7 @@ def ray_session(address: str | None, dashboard: bool | None = None, trials: bool
         RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO="1",  # a trial without GPUs must see none, not all
         TUNE_DISABLE_AUTO_CALLBACK_LOGGERS="1",  # trials write their own metrics, at once
         TUNE_DISABLE_STRICT_METRIC_CHECKING="1",  # a trial may stop before its first evaluation
+        TUNE_GLOBAL_CHECKPOINT_S="inf",  # Tune's own state grows with every trial, and nothing reads it
         TUNE_DISABLE_SIGINT_HANDLER="1",  # on a request to stop, trials first save themselves
     )
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")

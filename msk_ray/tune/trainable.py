@@ -33,6 +33,7 @@ from msk_ray.tune.devices import wait_for_memory
 from msk_ray.tune.gauges import TrialGauges
 from msk_ray.tune.output import limit_output, redirect_output
 from msk_ray.tune.schedulers import BEST, METRIC
+from msk_ray.tune.shared_trials import SharedTrials
 from msk_ray.tune.trial_run import Hooks, MakeTrainer, MemberCheckpoint, TrainerLike, run_trial
 
 MEMORY_LIMIT_S = 60.0
@@ -46,8 +47,8 @@ class Job:
     experiment: Experiment
     space: Space
     base: dict[str, Any]
-    trials: dict[str, Trial]
-    """Trials by id; empty if a search suggests them."""
+    trials: SharedTrials
+    """None of them if a search suggests them."""
     device: str
     gpus: float
     """GPUs per trial, 0 on CPU."""
