@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from msk_ray.config import Config, parse_config
-from msk_ray.training import evaluation
+from msk_ray.training import evaluation, recorded_evaluation
 from msk_ray.training.episodes import Episodes
 from msk_ray.training.evaluation import Evaluator
 
@@ -52,7 +52,7 @@ def assert_equal(found: list[Episodes], expected: list[Episodes]) -> None:
 
 
 def episodes(config: Config, recorded: bool, monkeypatch: pytest.MonkeyPatch) -> list[Episodes]:
-    monkeypatch.setattr(evaluation, "Recording", Again)
+    monkeypatch.setattr(recorded_evaluation, "Recording", Again)
     monkeypatch.setattr(Evaluator, "_can_record", lambda _: recorded)
     evaluator = Evaluator(config, "cpu", policies=2)
     evaluator._streams = [None]  # type: ignore[list-item]
