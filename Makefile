@@ -7,6 +7,8 @@ BASE   := $(VENV)/.base
 STAMP  := $(VENV)/.installed
 # Python compiles a file when it is first imported; most are never.
 PIP    := $(RUN) -m pip install --quiet --disable-pip-version-check --no-compile
+# What it has compiled is kept: the tests start many processes, and each would spend as long on it as on loading.
+export PYTHONDONTWRITEBYTECODE =
 WORKERS ?= 4
 # Beside each other, each with a thread of its own: those of torch would wait for each other.
 PYTEST := OMP_NUM_THREADS=1 $(RUN) -m pytest --dist loadfile

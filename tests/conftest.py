@@ -109,7 +109,7 @@ def temporary_files(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 @pytest.fixture(autouse=True, scope="session")
 def kernels_compile_fast_and_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Half of the time that tests of physics take is the compiler's: here it improves nothing, and of the processes
-    that need the same kernels one compiles them while the others wait. Programs that tests start do as users' do."""
+    that need the same kernels one compiles them while the others wait. Programs that tests start find them there."""
     import warp as wp
     from warp._src.context import Module
 
@@ -126,6 +126,7 @@ def kernels_compile_fast_and_once(tmp_path_factory: pytest.TempPathFactory) -> I
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(wp.config, "optimization_level", 0)
+        patch.setenv("MSK_RAY_UNOPTIMIZED_KERNELS", "1")
         patch.setattr(Module, "_compile", compile_once)
         yield
 
