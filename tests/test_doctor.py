@@ -160,9 +160,8 @@ def test_without_its_packages_it_says_so_and_stops(
 
 @pytest.fixture
 def small_trial(tmp_path: Path, tiny_settings: dict[str, Any]) -> str:
-    ant = {"env": {"name": "ant", "nworld": 4}, "shac": tiny_settings["shac"] | {"horizon": 4}}
     path = tmp_path / "small.yaml"
-    path.write_text(dump_yaml(tiny_settings | ant))
+    path.write_text(dump_yaml(tiny_settings))
     return str(path)
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import matplotlib
 import pytest
 
+import msk_ray
 from msk_ray.sweep.space import load_space
 from msk_ray.sweep.trials import resolve_trials
 
@@ -34,6 +35,8 @@ def test_ilqr(monkeypatch, capsys, tmp_path):
 
 def test_friction(monkeypatch, capsys, tmp_path):
     picture = tmp_path / "friction.png"
+    load, few = msk_ray.load_config, ("env.nworld=4", "evaluation.nworld=4")
+    monkeypatch.setattr(msk_ray, "load_config", lambda path, changes: load(path, [*changes, *few]))
     try:
         out = run(monkeypatch, capsys, "friction.py", str(picture), "--epochs", "2", "--values", "2")
     finally:

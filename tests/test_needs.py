@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from needs import missing_package, need_program
+from needs import missing_package, need_program, slow
 
 from msk_ray.errors import ConfigError
 
@@ -41,7 +41,7 @@ def test_only_what_is_not_installed_is_missing(monkeypatch: pytest.MonkeyPatch) 
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("ci", "code"), [("", 5), ("true", 2)])
+@pytest.mark.parametrize(("ci", "code"), [("true", 2), *slow(("", 5))])
 def test_gpu_tests_are_collected_without_optional_packages(root: Path, ci: str, code: int) -> None:
     """Fails, with "errors during collection" and no test run, where a file's import of one is an error."""
     files = ["tests/gym/test_gym.py", "tests/visualize/test_visualize.py", "tests/export/test_export.py"]

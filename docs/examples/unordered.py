@@ -1,13 +1,16 @@
 """mujoco_warp 4.0.0 with every flag of `opt.deterministic`: contacts and constraint rows still come in any order.
 
 On a GPU this prints how many contacts and rows are elsewhere in a second run from one state; on a CPU, that none are.
+The number of worlds may be given: python unordered.py 4096
 """
+
+import sys
 
 import mujoco
 import mujoco_warp as mjw
 import numpy as np
 
-WORLDS = 4096
+WORLDS = int(sys.argv[1]) if sys.argv[1:] else 4096
 BALLS = "".join(f'<body pos="{x} {y} .09"><freejoint/><geom size=".1"/></body>' for x in (0, 0.19) for y in (0, 0.19))
 mjm = mujoco.MjModel.from_xml_string(
     f'<mujoco><worldbody><geom type="plane" size="1 1 1"/>{BALLS}</worldbody></mujoco>'

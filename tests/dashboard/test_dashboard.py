@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from needs import slow
 from processes import Launcher, wait_until
 from serving import Server, fill, make
 
@@ -214,6 +215,7 @@ def test_experiments_are_listed_and_compared(page: Any, served: Server, experime
     assert set(statuses) == {200}
 
 
+@pytest.mark.parametrize("page", [375, *slow(1280)], indirect=True)
 def test_optunas_plots_are_drawn_or_what_is_missing_is_said(
     page: Any, served: Server, experiment: Experiment, monkeypatch: pytest.MonkeyPatch
 ) -> None:

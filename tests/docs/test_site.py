@@ -12,6 +12,7 @@ from threading import Thread
 from typing import Any
 
 import pytest
+from needs import slow
 
 from msk_ray import __main__ as commands
 from msk_ray.visualize import __main__ as visualize
@@ -76,7 +77,7 @@ def address(site: Path) -> Iterator[str]:
     server.server_close()
 
 
-@pytest.mark.parametrize("width", [1280, 375])
+@pytest.mark.parametrize("width", [375, *slow(1280)])
 def test_a_browser_finds_no_fault_and_scrolls_down_only(address: str, browser: Any, width: int) -> None:
     page = browser.new_page(viewport={"width": width, "height": 900})
     faults: list[str] = []

@@ -29,7 +29,7 @@ from msk_ray.visualize.__main__ import main as visualize
 pytestmark = pytest.mark.long
 
 SHIPPED = shipped_folder() / "policies"
-SECONDS = 3.0
+SECONDS = 0.5
 """How long each trained policy acts here."""
 
 

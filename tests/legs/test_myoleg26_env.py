@@ -278,11 +278,11 @@ def test_a_resumed_trial_has_the_springs_it_had() -> None:
 
 
 def test_assistance_holds_the_trunk_and_does_not_ring() -> None:
-    env = make(8, assist={"epochs": 10}, reset="mixed")
+    env = make(4, assist={"epochs": 10}, reset="mixed")
     env.begin_epoch(0)
     generator = torch.Generator().manual_seed(0)
     for _ in range(60):
-        env.step((torch.rand((8, 26), generator=generator) - 0.5) * 1.6, auto_reset=False)
+        env.step((torch.rand((4, 26), generator=generator) - 0.5) * 1.6, auto_reset=False)
         qpos, qvel, _ = env.state.physics
         assert qvel[:, :6].abs().max() < 8.0
     assert qpos[:, 3:6].abs().median() < 0.2

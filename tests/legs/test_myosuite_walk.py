@@ -87,19 +87,19 @@ def test_resets_are_those_of_myosuite() -> None:
 
 def test_episodes_may_start_anywhere_in_the_cycle_of_people() -> None:
     """The hips are where the reward wants them, as far as people's reach."""
-    env = make(96, reset="random", cycle=0.5, reward={"footfall": 1.0, "clearance": 1.0})
+    env = make(64, reset="random", cycle=0.5, reward={"footfall": 1.0, "clearance": 1.0})
     q, v, act = env.state.physics
     ahead = env.task_numbers(env.state.numbers)[:, 0]
     elsewhere = act[:, 0] > 0.0
     assert 0.3 < elsewhere.float().mean() < 0.7
     assert not ahead[~elsewhere].any()
-    assert ahead.unique().numel() > 25
+    assert ahead.unique().numel() > 16
     wanted = torch.cos(2.0 * torch.pi * ahead[elsewhere] / 100.0)
     right, left = (q[elsewhere, env.model.joint(f"hip_flexion_{side}").qposadr[0]] for side in "rl")
     assert torch.corrcoef(torch.stack((wanted, right, -left)))[0].min() > 0.95
     assert -v[elsewhere, 1].mean() == pytest.approx(1.2, abs=1e-3)
     assert torch.equal(env.observation()[:, 2 + 33 + 34 + 4 + 2 + 1 + 6], ahead / 100.0)
-    terms = env.step(torch.zeros(96, 80)).terms[:, -2:]
+    terms = env.step(torch.zeros(64, 80)).terms[:, -2:]
     assert (terms[elsewhere] <= 0.0).all()
     assert terms[elsewhere].mean(0)[0] > -0.5, "people's feet stand still when they are on the ground"
     assert not make(2, cycle=1.0, stochastic_reset=False).state.physics.act.any()

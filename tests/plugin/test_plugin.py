@@ -1,6 +1,6 @@
 """An environment from outside: one file that the package does not know goes through every command, as ours do.
 
-`train` and `tune` run once as the console script does, in a folder of the user's; all else runs in this process.
+`tune` runs once as the console script does, in a folder of the user's; all else runs in this process.
 """
 
 import json
@@ -109,11 +109,10 @@ def test_it_is_one_short_file_that_the_package_does_not_know(root: Path) -> None
         assert "hopper:Hopper" not in path.read_text(), path
 
 
-def test_by_import_path_it_trains_and_is_shown_measured_and_diagnosed(
-    user: Command, here: Command, tmp_path: Path
-) -> None:
-    home = tmp_path / "user"
-    _done(user("train", "--config", "hopper.yaml", "--device", "cpu"))
+def test_by_import_path_it_trains_and_is_shown_measured_and_diagnosed(here: Command, tmp_path: Path) -> None:
+    home = _folder(tmp_path / "user")
+    (home / "hopper.py").write_text((HERE / "hopper.py").read_text())
+    _done(here("train", "--config", "hopper.yaml", "--device", "cpu"))
     trial = home / "runs" / "train" / "hopper_seed0"
     assert "no module 'hopper'" not in _done(here("train", "--config", "hopper.yaml", "--device", "cpu", "--resume"))
     text = _done(here("evaluate", str(trial), "--device", "cpu", "--worlds", "4"))

@@ -7,7 +7,7 @@ from typing import Any
 from urllib.parse import unquote, urlparse
 
 import pytest
-from needs import need_drawing
+from needs import need_drawing, slow
 from PIL import Image
 from playwright.sync_api import Page
 
@@ -27,6 +27,9 @@ def reported(sweep: Experiment, tmp_path_factory: pytest.TempPathFactory) -> Exp
     copy = Experiment(Path(shutil.copytree(sweep.path, tmp_path_factory.mktemp("reported") / "small")))
     assert run(main, [str(copy.path), "--device", "cpu"]) == 0
     return copy
+
+
+WHATEVER_THE_WIDTH = pytest.mark.parametrize("window", [375, *slow(1280)], indirect=True)
 
 
 @pytest.fixture(scope="module", params=[1280, 375], ids=["wide", "narrow"])
@@ -75,6 +78,7 @@ def test_all_is_drawn_without_complaints_and_fits(page: Page, reported: Experime
     assert all(200 < width <= inner and colours > 5 for width, colours in drawn)
 
 
+@WHATEVER_THE_WIDTH
 def test_a_figure_is_saved_as_it_is_shown(page: Page) -> None:
     """Three times as sharp, with curves, axes and legend: several colours beside the paper's."""
     figure = page.locator("figure[data-figure=curves]")
@@ -125,6 +129,7 @@ def test_charts_are_filtered_hovered_and_zoomed(page: Page) -> None:
     assert page.complaints == []  # type: ignore[attr-defined]
 
 
+@WHATEVER_THE_WIDTH
 def test_it_is_dark_where_the_reader_wants_it_and_white_on_paper(page: Page) -> None:
     paper = "getComputedStyle(document.body).backgroundColor"
     assert page.evaluate(paper) == "rgb(255, 255, 255)"
@@ -153,6 +158,7 @@ def test_wide_tables_keep_their_first_column(page: Page) -> None:
     assert not frame.evaluate(more)[1]
 
 
+@WHATEVER_THE_WIDTH
 def test_links_resolve(page: Page, reported: Experiment) -> None:
     links = page.evaluate("[...document.querySelectorAll('a')].map(a => a.href)")
     assert len(links) > 20
@@ -165,6 +171,7 @@ def test_links_resolve(page: Page, reported: Experiment) -> None:
             assert Path(unquote(urlparse(target).path)).is_file(), link
 
 
+@WHATEVER_THE_WIDTH
 def test_tables_are_sorted_by_keyboard(page: Page) -> None:
     heading = page.locator("table[data-sortable] th", has_text="score").first
     heading.locator("button").focus()
@@ -187,6 +194,7 @@ def test_tables_are_sorted_by_keyboard(page: Page) -> None:
     assert page.evaluate("[...document.querySelectorAll('h1,h2,h3')].map(h => +h.tagName[1])")[:3] == [1, 2, 2]
 
 
+@WHATEVER_THE_WIDTH
 def test_paper_shows_everything(page: Page) -> None:
     page.emulate_media(media="print")
     page.evaluate("dispatchEvent(new Event('beforeprint'))")

@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 import pytest
+from needs import slow
 
 from msk_ray.step.garbage import lasting_imports, without_collecting
 
@@ -41,7 +42,7 @@ def test_who_collects_nothing_keeps_that() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("package", ["msk_ray.step.autograd", "msk_ray.training"])
+@pytest.mark.parametrize("package", ["msk_ray.training", *slow("msk_ray.step.autograd")])
 def test_kernels_are_imported_so(package: str) -> None:
     code = f"import gc, {package}; print(gc.isenabled(), gc.get_freeze_count() > 200_000)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "True True\n"

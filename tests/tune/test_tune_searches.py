@@ -172,7 +172,7 @@ def test_no_more_at_once_than_asked_for_and_the_next_process_waits(
         def run_epoch(self) -> dict[str, float]:
             row = super().run_epoch()
             if self.config.trial.seed == 0 and not go_on.exists():
-                time.sleep(0.25)
+                time.sleep(1.0)
             return row
 
     seen: set[int] = set()
@@ -196,7 +196,7 @@ def test_no_more_at_once_than_asked_for_and_the_next_process_waits(
         while not ended.exists() and time.monotonic() < deadline:
             seen.update(_processes_of_trials())
 
-    space = make_space(parameters={}, seeds="0-1", overrides={"trial.epochs": 400})
+    space = make_space(parameters={}, seeds="0-1", overrides={"trial.epochs": 100})
     path = tmp_path / "runs" / "patient"
     trials = resolve_trials(space)
     experiment = opening.create(path, space, trials, {})

@@ -156,9 +156,7 @@ def daemon_of(driver: "subprocess.Popen[str]", name: str) -> int:
 
 
 @pytest.mark.parametrize("name", ["gcs_server", *slow("raylet")])
-def test_a_daemon_of_ray_that_dies_ends_the_sweep_resumably(
-    name: str, start: Start, experiment: Experiment, tmp_path: Path
-) -> None:
+def test_a_daemon_of_ray_that_dies_ends_the_sweep_resumably(name: str, start: Start, experiment: Experiment) -> None:
     driver = start()
     wait_until(lambda: held(experiment), driver)
     os.kill(daemon_of(driver, name), signal.SIGKILL)
@@ -166,11 +164,6 @@ def test_a_daemon_of_ray_that_dies_ends_the_sweep_resumably(
     assert driver.returncode == RESUMABLE, output
     assert f"error: Ray's process {name} on this machine has died; continue with --resume\n" in output
     assert has_ended_in_order(output, driver, experiment)
-    (tmp_path / "hold").unlink()
-    again = start("--resume")
-    output, _ = again.communicate()
-    assert again.returncode == 0, output
-    assert [str(record.ending and record.ending.outcome) for record in read_records(experiment)] == ["finished"]
 
 
 @pytest.mark.parametrize("asked", [True, *slow(False)])
