@@ -12,11 +12,15 @@ from typing import Any
 
 import mujoco
 import pytest
+import torch
 from needs import need_what_caused
 from test_commands import commands_of
 
 from msk_ray import __main__ as commands
+from msk_ray.config import load_config
+from msk_ray.envs import make_env
 from msk_ray.play.screen import Screen
+from msk_ray.step import StepState
 
 pytestmark = pytest.mark.long
 
@@ -86,6 +90,9 @@ def test_its_commands_and_programs_run(
     assert done == ["gradcheck", "play", "train", "evaluate", "play", "visualize", "export"]
     said = capsys.readouterr().out
     assert re.search(r"episode 1: score .*, 0\.0 s, time", said)
+    kept = "    state = data.qpos.copy(), data.qvel.copy()\n"
+    program = Path("follow.py").read_text()
+    Path("follow.py").write_text(program.replace("    mujoco.mj_step(", f"{kept}    mujoco.mj_step("))
     try:
         follow = runpy.run_path("follow.py")
     except ImportError as error:
@@ -94,3 +101,15 @@ def test_its_commands_and_programs_run(
     assert list(follow["carried"]) == ["memory_history"], "the history is inside"
     assert follow["data"].qpos[2] > 0.2, "it stands, as its policy hardly moves"
     assert capsys.readouterr().out.startswith("after 9.0 s at x = ")
+    _compare_observation(follow)
+
+
+def _compare_observation(follow: dict[str, Any]) -> None:
+    """The last observation of the program is that of the environment in the same state."""
+    config = load_config("my_robot.yaml")
+    env = make_env(config.env, config.physics, 1, "cpu", 0, differentiable=False)
+    qpos, qvel = (torch.as_tensor(part, dtype=torch.float32)[None] for part in follow["state"])
+    frame = torch.as_tensor(follow["obs"], dtype=torch.float32)[None, :-3]
+    action = frame[:, -env.action_size :] / config.env.action_range
+    assert qvel.abs().max() > 1e-4
+    assert torch.allclose(env.measured(StepState(qpos, qvel, qvel[:, :0]), action), frame, atol=1e-4)
