@@ -363,13 +363,23 @@ def _first_suggestion(job: Job) -> Trial:
 
 def one_per_kernel_set(trials: Iterable[Trial]) -> list[Trial]:
     """One trial for each combination of model, algorithm and loggers: different models and algorithms need different
-    kernels, and missing loggers are reported early."""
+    kernels, and missing loggers are reported early. Models that differ in a time constant or the like share kernels."""
     representatives: dict[str, Trial] = {}
     for trial in trials:
         c = trial.config
-        key = (c.env.name, c.physics, c.evaluation.variant, c.algorithm.name, c.execution)
+        physics = _without_numbers(c.physics.model_dump())
+        key = (c.env.name, physics, c.evaluation.variant, c.algorithm.name, c.execution)
         representatives.setdefault(repr(key), trial)
     return list(representatives.values())
+
+
+def _without_numbers(setting: Any) -> Any:
+    """A setting, with all numbers but whole ones replaced by whether they are zero: kernels read them from arrays."""
+    if isinstance(setting, dict):
+        return {name: _without_numbers(part) for name, part in setting.items()}
+    if isinstance(setting, list | tuple):
+        return [_without_numbers(part) for part in setting]
+    return setting != 0.0 if isinstance(setting, float) else setting
 
 
 def _precompile(plan: Plan, trials: Sequence[Trial]) -> None:
