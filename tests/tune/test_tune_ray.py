@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import pytest
 from needs import slow
+from ray import cloudpickle
 from stub_runs import go, outcomes
 from stub_trainer import (
     BEHAVIOUR,
@@ -36,6 +37,8 @@ from msk_ray.experiment.outcomes import Outcome
 from msk_ray.sweep import opening
 from msk_ray.sweep.rules.stopping import StopSpec
 from msk_ray.sweep.trials import resolve_trials
+from msk_ray.tune.shared_trials import SharedTrials
+from msk_ray.tune.trainable import Job
 from msk_ray.tune.trial_run import Hooks, run_trial
 
 pytestmark = [pytest.mark.usefixtures("stub_session"), pytest.mark.long]
@@ -256,3 +259,15 @@ def test_a_driver_killed_after_the_decision_goes_on_with_half_the_worlds(make_sp
         record.attempt == Attempt(WorldReduction(8, 4, "out_of_memory: made up", cleared=True)) == read_attempt(folder)
     )
     assert [row["epoch"] for row in read_rows(folder)] == list(range(21))
+
+
+def test_what_tune_unpickles_for_each_trial_does_not_grow_with_their_number(make_space: Any, tmp_path: Path) -> None:
+    sizes = []
+    for seeds in ("10-19", "10-99"):
+        space = make_space(seeds=seeds)
+        trials = resolve_trials(space)
+        job = Job(Experiment(tmp_path), space, {}, SharedTrials(trials), "cpu", 0.0, StubTrainer)
+        pickled = cloudpickle.dumps(job)
+        sizes.append(len(pickled))
+        assert cloudpickle.loads(pickled).trial_of({"id": trials[-1].id}) == trials[-1]
+    assert sizes[1] - sizes[0] < 1000, "80 trials have 60 KB"
