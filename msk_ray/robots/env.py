@@ -94,6 +94,8 @@ class VelocityEnv(MjcfEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
     3       command: velocity forward and to the left [m/s], yaw rate [rad/s]
     ======= ==========================================================================
 
+    The critic sees 6 F entries more, as in mjlab; see `observe_critic`.
+
     An action turns the targets of the servos away from the default pose; see `control`. Actions and joints are in the
     order of the MJCF's joints, not in that of its actuators.
 
@@ -223,22 +225,28 @@ class VelocityEnv(MjcfEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
     # Memory
 
     def memories(self) -> Mapping[str, Memory]:
-        """Times of the feet in the air and on the ground, their heights in the current state, and their largest heights
-        since they left the ground [m]."""
+        """Times of the feet in the air and on the ground, their forces on the ground at the end of the step [N], their
+        heights in the current state, and their largest heights since they left the ground [m]."""
         feet = len(self.robot.feet)
         height = Memory(feet, gradient=True)
-        return {"air_time": Memory(4 * feet), "foot_height": height, "peak_height": height}
+        return {
+            "air_time": Memory(4 * feet),
+            "foot_force": Memory(3 * feet),
+            "foot_height": height,
+            "peak_height": height,
+        }
 
     def begin_memory(self, state: StepState) -> Mapping[str, Tensor]:
         return {"foot_height": self.foot_heights(state)}
 
     def remember(self, state: StepState, action: Tensor) -> Mapping[str, Tensor]:
-        touching = self.foot_contact(state).touching
-        times = AirTime.of(self.memory["air_time"]).after(touching, self.model.opt.timestep)
+        contact = self.foot_contact(state)
+        times = AirTime.of(self.memory["air_time"]).after(contact.touching, self.model.opt.timestep)
         peak, height = self.memory["peak_height"], self.memory["foot_height"]
-        peak = torch.where(touching[-1], peak, torch.maximum(peak, height))
+        peak = torch.where(contact.touching[-1], peak, torch.maximum(peak, height))
         return {
             "air_time": times.memory,
+            "foot_force": -contact.force.flatten(1),
             "foot_height": self.foot_heights(state),
             "peak_height": peak.masked_fill(times.first_contact(self.config.control_timestep), 0.0),
         }
@@ -264,6 +272,24 @@ class VelocityEnv(MjcfEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
                 state.qvel[:, 6:],
                 self.mjlab_action(action),
                 self.velocity_command(),
+            ),
+            dim=-1,
+        )
+
+    def observe_critic(self, state: StepState, action: Tensor) -> Tensor:
+        """The undisturbed observation, heights of the feet [m], their times in the air [s], 1 for those on the ground,
+        and sign(f) log(1 + |f|) for each component f of their forces on the ground [N]; (W, 12 + 3 J + 6 F).
+
+        Contacts are those of the step's last substep, without a gradient; mjlab's are those one substep later.
+        """
+        times, force = AirTime.of(self.memory["air_time"]), self.memory["foot_force"]
+        return torch.cat(
+            (
+                self.observe(state, action),
+                self.foot_heights(state),
+                times.air,
+                (times.contact > 0.0).float(),
+                force.sign() * force.abs().log1p(),
             ),
             dim=-1,
         )

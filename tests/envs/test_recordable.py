@@ -63,7 +63,8 @@ class Watch(TorchDispatchMode):
 def step(env: Any, action: torch.Tensor) -> None:
     env.state = env.state.detach()
     action = action + 1e-3 * env.observation().sum(-1, keepdim=True)
-    env.step(torch.tanh(action)).reward.sum().backward()
+    transition = env.step(torch.tanh(action))
+    (transition.reward.sum() + env.critic_observation_of(transition.reached).sum()).backward()
 
 
 def test_the_watch_sees_an_index_without_axes_and_a_constant() -> None:
