@@ -86,7 +86,7 @@ class Spread(Section):
 
 
 Spreads = Annotated[dict[Text, Spread], Field(min_length=1, max_length=1024)]
-"""Distributions by name of entries of the observation, or by pattern such as `*_angle`."""
+"""Distributions by name, or by pattern such as `*_angle`."""
 
 
 class Push(Section):
@@ -141,9 +141,12 @@ class RandomizeConfig(ModelRandomization):
     gravity_shift: Shift | None = None
     """Gravity, by its direction too [m/s²]."""
     observation_noise: Spreads | None = None
-    """Noise of entries of the observation, another one in every env step."""
+    """Noise of entries of the observation by name, another one in every env step."""
     observation_bias: Spreads | None = None
-    """Error of entries of the observation that stays the same for an episode, such as that of an encoder."""
+    """Error of entries of the observation that stays the same for an episode."""
+    encoder_bias: Spreads | None = None
+    """Error of the encoders of joints, by their names, that stays the same for an episode [m, rad]: in entries of the
+    observation called NAME_angle or NAME_position, and in what the joint's position servos do."""
     observation_delay: Steps | None = None
     """Fewest and most env steps by which observations are late, one number for an episode."""
     control_delay: Steps | None = None

@@ -4,23 +4,23 @@ kicks.
 All of it is a function of numbers that are drawn when an episode begins, of the episode's age, and of memories: a step
 draws nothing, so that it gives the same observation as often as it is asked.
 
-Axes: W worlds, O observation, D numbers drawn for an episode, E entries with an error.
+Axes: W worlds, O observation, D numbers drawn for an episode.
 """
 
 import math
-from collections.abc import Iterator, Mapping
-from fnmatch import fnmatchcase
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import mujoco
 import torch
 from torch import Tensor
 
-from msk_ray.config import Push, RandomizeConfig, Spread
+from msk_ray.config import Push, RandomizeConfig
 from msk_ray.config.randomize import UNDISTURBED
 from msk_ray.envs.commands import Draws
 from msk_ray.envs.generators import seed_stream
 from msk_ray.envs.memory import Memory
+from msk_ray.envs.observation_errors import UNIFORM_BITS, EncoderErrors, EntryErrors
 from msk_ray.envs.records import EnvState
 from msk_ray.errors import ConfigError
 from msk_ray.step import StepState
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 _STREAM = 2
 _OBSERVATIONS, _CONTROLS, _STEPS = "earlier observations", "earlier controls", "earlier steps"
 """Memories: observations and controls of earlier env steps, the newest first, and how many steps are in there."""
-_BITS = 24
-"""Bits of a uniform number in float32."""
 _LOW_HALF = 0xFFFFFFFF
 
 
@@ -61,13 +59,15 @@ class Disturbances:
         self.generator = torch.Generator(device=env.device)
         self.seed(seed)
         names = _entry_names(config, env)
-        self._noise = _Errors("observation_noise", config.observation_noise, names, env.device)
-        self._bias = _Errors("observation_bias", config.observation_bias, names, env.device)
+        self._noise = EntryErrors("observation_noise", config.observation_noise, names, env.device)
+        self._bias = EntryErrors("observation_bias", config.observation_bias, names, env.device)
+        self._encoders = EncoderErrors(config.encoder_bias, env.model, names, env.device)
         self._observation_delay, self._control_delay = config.observation_delay, config.control_delay
         self._kicks = None if config.push is None else _Kicks(config.push, env)
         widths = {
             "noise": int(self._noise.size > 0),
             "bias": self._bias.size,
+            "encoders": self._encoders.size,
             "observation_delay": int(self._observation_delay is not None),
             "control_delay": int(self._control_delay is not None),
             "push": 0 if self._kicks is None else self._kicks.size,
@@ -115,10 +115,12 @@ class Disturbances:
 
     def control(self, control: Tensor, state: EnvState) -> Tensor:
         """The controls (W, nu) that reach the actuators in the step from `state`, when these are sent."""
-        if self._control_delay is None:
-            return control
-        late = self._late(self._control_delay, state, "control_delay")
-        return _of_earlier(control, state.memory.get(_CONTROLS), late)
+        if self._control_delay is not None:
+            late = self._late(self._control_delay, state, "control_delay")
+            control = _of_earlier(control, state.memory.get(_CONTROLS), late)
+        if self._encoders.size:
+            control = self._encoders.followed(control, self._numbers(state, "encoders"))
+        return control
 
     def observation(self, obs: Tensor, state: EnvState) -> Tensor:
         """What the policy is given (W, O) in `state`, which the environment observes as `obs`."""
@@ -134,6 +136,8 @@ class Disturbances:
             age = age - late
         if self._bias.size:
             obs = self._bias.added(obs, self._numbers(state, "bias"))
+        if self._encoders.size:
+            obs = self._encoders.added(obs, self._numbers(state, "encoders"))
         if self._noise.size:
             # The noise of the step in which it was observed.
             obs = self._noise.added(obs, uniform_hash(self._numbers(state, "noise")[:, 0], age, self._noise.size))
@@ -151,29 +155,6 @@ class Disturbances:
         """The numbers (W, n) for one of the settings."""
         every = state.numbers[:, self._first : self._first + self.size]
         return every.split(list(self._widths.values()), dim=-1)[list(self._widths).index(name)]
-
-
-class _Errors:
-    """Errors of some entries of the observation."""
-
-    def __init__(
-        self, setting: str, spreads: Mapping[str, Spread] | None, names: list[str], device: torch.device
-    ) -> None:
-        chosen = dict(sorted(_chosen(setting, spreads or {}, names)))
-        self.size = len(chosen)
-        self._entries = torch.tensor(list(chosen), dtype=torch.int64, device=device)
-        sizes = [spread.uniform or spread.normal or 0.0 for spread in chosen.values()]
-        self._sizes = torch.tensor(sizes, device=device)
-        normal = [spread.normal is not None for spread in chosen.values()]
-        self._normal = torch.tensor(normal, device=device) if any(normal) else None
-
-    def added(self, obs: Tensor, uniform: Tensor) -> Tensor:
-        """Observations (W, O) with errors made from uniform numbers in [0, 1), (W, E)."""
-        share = 2.0 * uniform - 1.0
-        if self._normal is not None:
-            inside = share.clamp(-1.0 + 2.0**-_BITS, 1.0 - 2.0**-_BITS)
-            share = torch.where(self._normal, math.sqrt(2.0) * torch.erfinv(inside), share)
-        return obs.index_add(1, self._entries, self._sizes * share)
 
 
 class _Kicks:
@@ -203,8 +184,8 @@ def uniform_hash(seed: Tensor, step: Tensor, count: int) -> Tensor:
     They are hashes of seed, step and column by the function `lowbias32` of https://github.com/skeeto/hash-prospector.
     """
     columns = torch.arange(count, device=seed.device)
-    row = _hash(_hash((seed * 2.0**_BITS).long()) + step)
-    return (_hash(row[:, None] + _hash(columns)) >> (32 - _BITS)) * 2.0**-_BITS
+    row = _hash(_hash((seed * 2.0**UNIFORM_BITS).long()) + step)
+    return (_hash(row[:, None] + _hash(columns)) >> (32 - UNIFORM_BITS)) * 2.0**-UNIFORM_BITS
 
 
 def _hash(values: Tensor) -> Tensor:
@@ -231,7 +212,7 @@ def _of_earlier(current: Tensor, earlier: Tensor | None, late: Tensor) -> Tensor
 
 def _entry_names(config: RandomizeConfig, env: "Env[Any]") -> list[str]:
     """Names of all entries of the observation, if a setting needs them."""
-    observed = ("observation_noise", "observation_bias", "observation_delay")
+    observed = ("observation_noise", "observation_bias", "encoder_bias", "observation_delay")
     needing = [name for name in observed if getattr(config, name) is not None]
     if not needing:
         return []
@@ -242,20 +223,6 @@ def _entry_names(config: RandomizeConfig, env: "Env[Any]") -> list[str]:
             "write its method observation_layout"
         )
     return [entry.name for entry in layout]
-
-
-def _chosen(setting: str, spreads: Mapping[str, Spread], names: list[str]) -> Iterator[tuple[int, Spread]]:
-    """Entries of the observation, and the distributions of their errors."""
-    key, taken = f"physics.randomize.{setting}", dict[int, str]()
-    for pattern, spread in spreads.items():
-        entries = [i for i, name in enumerate(names) if fnmatchcase(name, pattern)]
-        if not entries:
-            raise ConfigError(f"{key}: no entry of the observation is {pattern!r}; it has {', '.join(names)}")
-        for entry in entries:
-            if entry in taken:
-                raise ConfigError(f"{key}: {names[entry]!r} is both {taken[entry]!r} and {pattern!r}; leave one out")
-            taken[entry] = pattern
-            yield entry, spread
 
 
 def _kicked(push: Push, model: mujoco.MjModel) -> Iterator[tuple[int, float]]:

@@ -4,6 +4,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import pytest
 import torch
 from disturbed import DISTURBANCES
@@ -13,6 +14,7 @@ from msk_ray.config import Config, PhysicsConfig, overlay, parse_config
 from msk_ray.envs import Env, make_env
 from msk_ray.envs.cartpole.env import CartPole
 from msk_ray.envs.disturbances import uniform_hash
+from msk_ray.envs.layout import Entry
 from msk_ray.errors import ConfigError
 from msk_ray.group import Group
 from msk_ray.training import Trainer
@@ -78,6 +80,54 @@ def test_a_bias_stays_for_an_episode_and_rewards_are_of_the_clean_observation() 
         torch.testing.assert_close(torch.stack(episode), episode[0].expand(5, W), atol=1e-6, rtol=0.0)
         assert 0.05 < float(episode[0].abs().max()) <= 0.1
     assert (seen[0] - seen[5]).abs().min() > 1e-5
+
+
+class Servo(CartPole):
+    """A position servo in place of the motor."""
+
+    @classmethod
+    def build_model(cls, config: Any, physics: PhysicsConfig) -> mujoco.MjModel:
+        model = super().build_model(config, physics)
+        model.actuator_gear[0, 0], model.actuator_gainprm[0, 0] = 2.0, 5.0
+        model.actuator_biastype[0], model.actuator_biasprm[0, 1] = int(mujoco.mjtBias.mjBIAS_AFFINE), -5.0
+        return model
+
+    def observation_layout(self) -> list[Entry]:
+        return [Entry("slider_position", "m"), *super().observation_layout()[1:]]
+
+
+def servo(**randomize: Any) -> Env[Any]:
+    config = parse_config({"env": {"name": f"{__name__}:Servo", "episode_length": 5}})
+    physics = PhysicsConfig.model_validate({"randomize": randomize or None})
+    return make_env(config.env, physics, W, "cpu", 0, randomize=True)
+
+
+def test_servos_follow_the_bias_of_their_encoders() -> None:
+    """A joint of gear 2 that is shown at q + b goes where an unbiased servo goes with the control − 2 b."""
+    env, plain = servo(encoder_bias={"slid*": {"uniform": 0.1}}), servo()
+    biases = []
+    for _ in range(10):
+        env.state = env.state.detach()
+        plain.state = plain.state._replace(physics=env.state.physics)
+        error = env.observation() - plain.observation()
+        assert not error[:, 1:].any()
+        assert torch.equal(env.critic_observation(), plain.observation())
+        biases.append(error[:, 0])
+        sent = torch.full((W, 1), 0.3, requires_grad=True)
+        same = (0.3 - 2.0 * biases[-1][:, None]).requires_grad_()
+        slopes = []
+        for environment, control in ((env, sent), (plain, same)):
+            environment.step(control, auto_reset=environment is env)
+            reached = environment.state.physics
+            slopes.append(torch.autograd.grad(reached.qpos.sum(), control, allow_unused=True)[0])
+        if len(biases) % 5:  # no reset
+            torch.testing.assert_close(env.state.physics, plain.state.physics, rtol=1e-5, atol=1e-6)
+            torch.testing.assert_close(*slopes, rtol=1e-5, atol=1e-7)
+            assert slopes[0].abs().min() > 1e-4
+    for episode in (biases[:5], biases[5:]):
+        torch.testing.assert_close(torch.stack(episode), episode[0].expand(5, W), atol=1e-6, rtol=0.0)
+        assert 0.05 < float(episode[0].abs().max()) <= 0.1
+    assert (biases[0] - biases[5]).abs().min() > 1e-5
 
 
 def test_a_late_observation_is_that_of_an_earlier_step_with_its_noise() -> None:
@@ -221,6 +271,21 @@ def test_the_processes_of_a_group_have_the_disturbances_of_one() -> None:
         assert torch.equal(half.state.numbers, whole.state.numbers.chunk(2)[rank])
 
 
+class Hidden(Servo):
+    """Does not call the position of the joint by its name."""
+
+    def observation_layout(self) -> list[Entry]:
+        return CartPole.observation_layout(self)
+
+
+def test_a_biased_joint_has_to_be_in_the_observation() -> None:
+    trial = parse_config(
+        {"env": {"name": f"{__name__}:Hidden"}, "physics": {"randomize": {"encoder_bias": {"*": {"uniform": 0.1}}}}}
+    )
+    with pytest.raises(ConfigError, match="does not show joint 'slider' as slider_angle or slider_position"):
+        make_env(trial.env, trial.physics, 2, "cpu", 0, randomize=True)
+
+
 class Unnamed(CartPole):
     """Does not say what its observation is."""
 
@@ -233,6 +298,10 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "entry twice": (
         {"observation_bias": {"*": {"uniform": 1.0}, "pole_rate": {"normal": 1.0}}},
         "'pole_rate' is both '\\*' and 'pole_rate'; leave one out",
+    ),
+    "no servo": (
+        {"encoder_bias": {"slider": {"uniform": 0.1}}},
+        "no position servo of a joint.* write observation_bias",
     ),
     "two distributions": (
         {"observation_noise": {"*": {"uniform": 1.0, "normal": 1.0}}},

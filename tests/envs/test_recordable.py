@@ -33,7 +33,8 @@ ENVIRONMENTS: dict[str, dict[str, Any]] = {
     },
 }
 
-RANDOMIZED = {"disturbances": DISTURBANCES}
+ENCODERS = {"encoder_bias": {"*": {"uniform": 0.015}}}
+RANDOMIZED = {"disturbances": DISTURBANCES, "go1": ENCODERS, "g1": ENCODERS}
 
 
 def _modules_calling() -> Iterator[str]:

@@ -1,0 +1,152 @@
+"""Errors of what a policy is told: of entries of the observation, and of encoders, which servos follow too.
+
+Axes: W worlds, O observation, E entries or joints with an error.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from fnmatch import fnmatchcase
+
+import mujoco
+import torch
+from torch import Tensor
+
+from msk_ray.config import Spread
+from msk_ray.errors import ConfigError
+
+UNIFORM_BITS = 24
+"""Bits of a uniform number in float32."""
+
+
+class EntryErrors:
+    """Errors of some entries of the observation.
+
+    Args:
+        setting: name of the setting in `physics.randomize`.
+        spreads: its distributions, by name or pattern.
+        names: of all entries.
+        device: where observations are.
+
+    Attributes:
+        size: E.
+
+    Raises:
+        ConfigError: there is no such entry, or two distributions are for one.
+    """
+
+    def __init__(
+        self, setting: str, spreads: Mapping[str, Spread] | None, names: list[str], device: torch.device
+    ) -> None:
+        chosen = dict(sorted(_chosen(setting, spreads or {}, names, "entry of the observation")))
+        self.size = len(chosen)
+        self._entries = torch.tensor(list(chosen), dtype=torch.int64, device=device)
+        self._draws = _Draws(list(chosen.values()), device)
+
+    def added(self, obs: Tensor, uniform: Tensor) -> Tensor:
+        """Observations (W, O) with errors made from uniform numbers in [0, 1), (W, E)."""
+        return obs.index_add(1, self._entries, self._draws.of(uniform))
+
+
+class EncoderErrors:
+    """Errors of the encoders of joints with position servos.
+
+    A policy that is shown q + b sends targets in the same, wrong, coordinates: the servo, which reads the same encoder,
+    brings the joint to the target − b.
+
+    Args:
+        spreads: distributions of b by name or pattern of joints [m, rad].
+        model: the model.
+        names: of all entries of the observation; a joint's position is its entry NAME_angle or NAME_position.
+        device: where observations and controls are.
+
+    Attributes:
+        size: E.
+
+    Raises:
+        ConfigError: no such joint has a position servo, two distributions are for one, or the observation does not show
+            its position.
+    """
+
+    def __init__(
+        self, spreads: Mapping[str, Spread] | None, model: mujoco.MjModel, names: list[str], device: torch.device
+    ) -> None:
+        servos = _position_servos(model) if spreads else {}
+        joints = sorted(set(servos.values()))
+        joint_names = [model.joint(joint).name or str(joint) for joint in joints]
+        chosen = dict(sorted(_chosen("encoder_bias", spreads or {}, joint_names, "joint with a position servo")))
+        self.size = len(chosen)
+        self._draws = _Draws(list(chosen.values()), device)
+        self._shown, self._shift = torch.zeros(self.size, len(names)), torch.zeros(self.size, model.nu)
+        for place, which in enumerate(chosen):
+            shown = [f"{joint_names[which]}_{kind}" for kind in ("angle", "position")]
+            entries = [entry for entry, name in enumerate(names) if name in shown]
+            if not entries:
+                raise ConfigError(
+                    f"physics.randomize.encoder_bias: the observation does not show joint {joint_names[which]!r} as "
+                    f"{' or '.join(shown)}: name the entry so in observation_layout, or leave the joint out"
+                )
+            self._shown[place, entries] = 1.0
+            for servo, joint in servos.items():
+                if joint == joints[which]:
+                    self._shift[place, servo] = -float(model.actuator_gear[servo, 0])
+        self._shown, self._shift = self._shown.to(device), self._shift.to(device)
+
+    def added(self, obs: Tensor, uniform: Tensor) -> Tensor:
+        """Observations (W, O) with the errors made from uniform numbers in [0, 1), (W, E)."""
+        return torch.addmm(obs, self._draws.of(uniform), self._shown)
+
+    def followed(self, control: Tensor, uniform: Tensor) -> Tensor:
+        """Controls (W, nu) that bring the joints to where servos with these errors do."""
+        return torch.addmm(control, self._draws.of(uniform), self._shift)
+
+
+class _Draws:
+    """Numbers about 0, each with a distribution of its own."""
+
+    def __init__(self, spreads: Sequence[Spread], device: torch.device) -> None:
+        self._sizes = torch.tensor([spread.uniform or spread.normal or 0.0 for spread in spreads], device=device)
+        normal = [spread.normal is not None for spread in spreads]
+        self._normal = torch.tensor(normal, device=device) if any(normal) else None
+
+    def of(self, uniform: Tensor) -> Tensor:
+        """From uniform numbers in [0, 1), both (W, E)."""
+        share = 2.0 * uniform - 1.0
+        if self._normal is not None:
+            inside = share.clamp(-1.0 + 2.0**-UNIFORM_BITS, 1.0 - 2.0**-UNIFORM_BITS)
+            share = torch.where(self._normal, math.sqrt(2.0) * torch.erfinv(inside), share)
+        return self._sizes * share
+
+
+def _position_servos(model: mujoco.MjModel) -> dict[int, int]:
+    """The joint of each position servo of a hinge or slide joint.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    gain, kinds = model.actuator_gainprm[:, 0], mujoco.mjtJoint
+    servo = (gain > 0.0) & (model.actuator_biasprm[:, 1] == -gain)
+    servo &= model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_FIXED)
+    servo &= model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
+    joints = {int(actuator): int(model.actuator_trnid[actuator, 0]) for actuator in servo.nonzero()[0]}
+    single = (int(kinds.mjJNT_HINGE), int(kinds.mjJNT_SLIDE))
+    joints = {actuator: joint for actuator, joint in joints.items() if int(model.jnt_type[joint]) in single}
+    if not joints:
+        raise ConfigError(
+            "physics.randomize.encoder_bias: the model has no position servo of a joint, whose target it could shift: "
+            "write observation_bias, for the observation alone"
+        )
+    return joints
+
+
+def _chosen(setting: str, spreads: Mapping[str, Spread], names: list[str], kind: str) -> Iterator[tuple[int, Spread]]:
+    """Those of some named things that patterns mean, by number, and the distributions of their errors."""
+    key, taken = f"physics.randomize.{setting}", dict[int, str]()
+    for pattern, spread in spreads.items():
+        matching = [i for i, name in enumerate(names) if fnmatchcase(name, pattern)]
+        if not matching:
+            raise ConfigError(f"{key}: no {kind} is {pattern!r}; it has {', '.join(names)}")
+        for which in matching:
+            if which in taken:
+                raise ConfigError(f"{key}: {names[which]!r} is both {taken[which]!r} and {pattern!r}; leave one out")
+            taken[which] = pattern
+            yield which, spread
