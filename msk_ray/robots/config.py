@@ -1,9 +1,9 @@
 """The settings of the velocity tasks. Source: `mjlab/tasks/velocity` of mjlab 1.6.0."""
 
 import math
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import PositiveFloat, model_validator
+from pydantic import Field, PositiveFloat, model_validator
 
 from msk_ray.config.commands import Command, with_commands
 from msk_ray.config.rewards import reward_section, with_reward
@@ -11,21 +11,26 @@ from msk_ray.config.sections import Count, Fraction, NonNegative, Reward, Sectio
 from msk_ray.config.terms import Term, terms_in
 from msk_ray.envs.mjcf.config import MjcfSettings
 
-VELOCITY = Command(
-    "velocity",
-    {
-        "lin_vel_x": (-1.5, 2.0),
+
+def velocity_command(forward: tuple[float, float], turn: tuple[float, float]) -> Command:
+    """Velocity forward, in a range, and to the left [m/s], yaw rate, in a range [rad/s], and heading [rad]."""
+    ranges = {
+        "lin_vel_x": forward,
         "lin_vel_y": (-1.0, 1.0),
-        "ang_vel_z": (-0.7, 0.7),
+        "ang_vel_z": turn,
         "heading": (-math.pi, math.pi),
         # Below a share of mjlab's, the command is another: see `VelocityEnv.velocity_command`.
         "stand": (0.0, 1.0),
         "go_ahead": (0.0, 1.0),
         "turn_to_heading": (0.0, 1.0),
-    },
-    every=(3.0, 8.0),
-)
-"""Velocity forward and to the left [m/s], yaw rate [rad/s], heading [rad], in the ranges that mjlab evaluates with."""
+    }
+    return Command("velocity", ranges, every=(3.0, 8.0))
+
+
+VELOCITY = velocity_command((-1.5, 2.0), (-0.7, 0.7))
+"""In the ranges that mjlab evaluates with on flat ground."""
+ROUGH_VELOCITY = velocity_command((-1.0, 1.0), (-0.5, 0.5))
+"""In those on rough ground."""
 
 
 class VelocityShape(Reward):
@@ -104,18 +109,38 @@ GO1_TERMS = velocity_terms(
     Term("body_ang_vel", 0.0, schedule=cost_share, optional=True),
     Term("angular_momentum", 0.0, schedule=cost_share, optional=True),
 )
+GO1_ROUGH_TERMS = (
+    *(term for term in GO1_TERMS if term.name != "upright"),
+    *terms_in(
+        "msk_ray.robots.terms",
+        Term("upright", 1.0, "upright_on_ground"),
+        Term("self_collisions", -0.1, gradient=False, schedule=cost_share),
+        Term("shank_collision", -0.1, gradient=False, schedule=cost_share),
+        Term("trunk_head_collision", -0.1, gradient=False, schedule=cost_share),
+    ),
+)
 G1_TERMS = velocity_terms(
     Term("body_ang_vel", -0.05, schedule=cost_share),
     Term("angular_momentum", -0.02, schedule=cost_share),
     Term("self_collisions", -1.0, gradient=False, schedule=cost_share),
 )
 Go1Reward = reward_section("Go1Reward", __name__, GO1_TERMS, VelocityShape)
+Go1RoughReward = reward_section("Go1RoughReward", __name__, GO1_ROUGH_TERMS, VelocityShape)
 G1Reward = reward_section("G1Reward", __name__, G1_TERMS, VelocityShape)
 
 
 @with_reward(Go1Reward)
 class Go1VelocitySettings(VelocitySettings):
     """Unitree's quadruped Go1 follows commands for its velocity. mjlab's `Mjlab-Velocity-Flat-Unitree-Go1`."""
+
+
+@with_commands(ROUGH_VELOCITY)
+@with_reward(Go1RoughReward)
+class Go1VelocityRoughSettings(VelocitySettings):
+    """Unitree's quadruped Go1 follows commands on rough ground. mjlab's `Mjlab-Velocity-Rough-Unitree-Go1`."""
+
+    terrain_rows: Annotated[int, Field(ge=2)] = 10
+    """Rows of patches, from level ground to the hardest."""
 
 
 @with_reward(G1Reward)

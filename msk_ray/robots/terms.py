@@ -6,13 +6,16 @@ the state in which the step began. Source: `tasks/velocity/mdp/rewards.py` and `
 Axes: W worlds, J joints, F feet.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from msk_ray.robots.env import VelocityEnv
 from msk_ray.step import StepState
+
+if TYPE_CHECKING:
+    from msk_ray.robots.rough import Go1VelocityRough
 
 Robots = VelocityEnv[Any]
 
@@ -57,6 +60,11 @@ def upright(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tenso
     """exp(−s² / 0.2), where s is the sine of the trunk's tilt."""
     tilt = env.gravity_in(state, env.robot.trunk)[:, :2].square().sum(-1)
     return torch.exp(-tilt / 0.2)
+
+
+def upright_on_ground(env: "Go1VelocityRough", state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """exp(−s² / 0.2), where s is the sine of the trunk's tilt to the ground around it."""
+    return torch.exp(-env.tilt_to_ground(state) / 0.2)
 
 
 def variable_posture(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
@@ -127,6 +135,16 @@ def self_collisions(env: Robots, state: StepState, action: Tensor, obs: Tensor) 
     """
     contact = env.contact(state, env.robot.base, "subtree", env.robot.base, "subtree")
     return (contact.strongest[..., 0] > _COLLISION_FORCE).sum(0).float()
+
+
+def shank_collision(env: "Go1VelocityRough", state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """Number of substeps in which a shank hits the ground with more than 10 N. No slope."""
+    return env.hits(state, env.shanks).float()
+
+
+def trunk_head_collision(env: "Go1VelocityRough", state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """Number of substeps in which trunk or head hits the ground with more than 10 N. No slope."""
+    return env.hits(state, env.trunk_and_head).float()
 
 
 def _foot_speed(env: Robots, state: StepState) -> Tensor:

@@ -39,7 +39,7 @@ def test_a_config_survives_a_round_trip() -> None:
         (
             {"env": {"name": "swimmer"}},
             "env.name: unknown name 'swimmer'; write cartpole, ant, hopper, cheetah, humanoid, g1_velocity, "
-            "go1_velocity, myoleg, myoleg26, myosuite_walk or package.module:Class",
+            "go1_velocity, go1_velocity_rough, myoleg, myoleg26, myosuite_walk or package.module:Class",
         ),
         ({**CARTPOLE, "shac": {"critic_batches": 7}}, "critic_batches 7 must divide"),
         ({}, "env: missing"),

@@ -24,10 +24,14 @@ from msk_ray.step.autograd.contact_state import AirTime
 RECORDED = Path(__file__).parents[1] / "fixtures" / "mjlab"
 SCENES = Path(__file__).parents[2] / "msk_ray" / "robots" / "scenes"
 ROBOTS = ("go1", "g1")
+TASKS = {"go1": "go1_velocity", "g1": "g1_velocity", "go1_rough": "go1_velocity_rough"}
+ROUGH_ROWS = 4
 OF_JOINTS = ("pose", "dof_pos_limits")
 """Terms of the joints, which mjlab measures at the end of a step; it measures bodies a substep before."""
 OF_A_STEP = (*OF_JOINTS, "action_rate_l2", "air_time", "foot_swing_height", "soft_landing")
 """Terms that do not depend on when in a step bodies are measured."""
+OF_CONTACTS = ("self_collisions", "shank_collision", "trunk_head_collision")
+"""Terms that count contacts. Of several contacts of a part, mjlab sees one."""
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
@@ -58,8 +62,9 @@ class Recorded:
                 if arrays[name].ndim > 1 and name != "soft_limits"
             }
             self.action_scale, self.soft_limits = arrays["action_scale"], arrays["soft_limits"]
-        name = f"{robot}_velocity"
-        settings = settings_class(name)(name=name)
+        name = TASKS[robot]
+        self.rough = robot == "go1_rough"
+        settings = settings_class(name)(name=name, **({"terrain_rows": ROUGH_ROWS} if self.rough else {}))
         count = len(self.steps["reward"])
         weights = dict.fromkeys(("air_time", "body_ang_vel", "angular_momentum"), 1.0)
         reward = settings.reward.model_copy(update=weights)
@@ -87,7 +92,7 @@ class Recorded:
         return StepState(self[f"{kind}qpos"], self[f"{kind}qvel"], self.env.state.physics.act)
 
 
-@pytest.fixture(params=ROBOTS)
+@pytest.fixture(params=[*ROBOTS, pytest.param("go1_rough", marks=pytest.mark.slow)])
 def recorded(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Recorded:
     steps = Recorded(request.param)
     monkeypatch.setattr(steps.env, "velocity_command", lambda: steps["began_command"])
@@ -107,6 +112,8 @@ def test_the_observation_is_mjlabs(recorded: Recorded) -> None:
     layout = env.observation_layout()
     assert layout is not None
     assert len(layout) == env.obs_size == recorded["obs"].shape[1]
+    heights = env.foot_heights(env.state.physics)
+    torch.testing.assert_close(heights, recorded["began_foot_height"], atol=1e-4, rtol=0.0)
 
 
 def test_the_critic_sees_what_mjlabs_sees(recorded: Recorded) -> None:
@@ -132,19 +139,20 @@ def test_each_term_is_mjlabs(recorded: Recorded, monkeypatch: pytest.MonkeyPatch
     force = SimpleNamespace(force=recorded["measured_contact_force"])
     monkeypatch.setattr(env, "foot_contact", lambda state: force)
     measured, end = recorded.state("measured_"), recorded.state()
-    of_states = [term for term in env.active_terms if term.name != "self_collisions"]
+    of_states = [term for term in env.active_terms if term.name not in OF_CONTACTS]
     for term in of_states:
         state = end if term.name in OF_JOINTS else measured
         ours = term.measure(env, state, recorded["action"], recorded["obs"])
         theirs = terms[:, names.index(term.name)]
+        # mjlab scans rough ground for `upright` once a step.
+        atol = 5e-3 if recorded.rough and term.name == "upright" else 1e-3
         torch.testing.assert_close(
-            ours[kept], theirs[kept], atol=1e-3, rtol=1e-5, msg=lambda m, t=term: f"{t.name} {m}"
+            ours[kept], theirs[kept], atol=atol, rtol=1e-5, msg=lambda m, t=term: f"{t.name} {m}"
         )
         assert theirs[kept].std() > 1e-3, f"{term.name} is the same in all recorded steps"
         default = type(env.config.reward)().model_dump()[term.setting]
         assert default == pytest.approx(weights[term.name]), term.name
     assert {term.name for term in env.active_terms} == set(names)
-    assert torch.equal(env.fell(measured), recorded["terminated"])
     assert recorded["terminated"].any()
 
 
@@ -152,19 +160,24 @@ def test_a_step_is_mjlabs(recorded: Recorded) -> None:
     """From the recorded states, with this package's physics, which lets the solver converge."""
     env, kept = recorded.env, recorded.kept
     found = env.step(recorded["action"], auto_reset=False)
-    obs = torch.cat((found.obs[:, :-3], recorded["obs"][:, -3:]), dim=-1)  # the next command is not this one
-    torch.testing.assert_close(obs[kept], recorded["obs"][kept], atol=1e-3, rtol=0.0)
+    command = slice(env.obs_size - 190, env.obs_size - 187) if recorded.rough else slice(-3, None)
+    obs = found.obs.clone()
+    obs[:, command] = recorded["obs"][:, command]  # the next command is not this one
+    assert torch.equal(found.terminated, recorded["terminated"])
+    close = ((obs - recorded["obs"]).abs() <= 1e-3).all(-1)[kept]
+    # Where a foot touches a height field in many places, mjlab's solver stops far from its minimum.
+    assert close.float().mean() > 0.95 if recorded.rough else close.all()
     names = list(recorded.constants["term_names"])
     for k, term in enumerate(env.active_terms):
         ours = (found.terms[:, k] / term.weight_in(env.config.reward))[kept]
         theirs = recorded["terms"][kept, names.index(term.name)]
         if term.name in OF_A_STEP:
             assert (ours - theirs).abs().max() <= 1e-3 + 1e-5 * theirs.abs().max(), term.name
-        elif term.name == "self_collisions":
-            # Of several contacts, mjlab sees one.
-            assert (ours >= theirs).all()
-            assert (ours == theirs).float().mean() > 0.9
-            assert theirs.max() == 4.0
+        elif term.name in OF_CONTACTS:
+            ours, theirs = ours.round(), theirs.round()
+            assert (ours >= theirs).all(), term.name
+            assert (ours == theirs).float().mean() > 0.9, term.name
+            assert theirs.max() == 4.0 or recorded.rough
     times = AirTime.of(env.memory["air_time"])
     for value, name in ((times.air, "air_time"), (times.contact, "contact_time")):
         torch.testing.assert_close(value[kept], recorded[name][kept], atol=1e-6, rtol=0.0)

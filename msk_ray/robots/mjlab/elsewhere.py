@@ -13,8 +13,8 @@ class MjlabScoring:
     """mjlab's own velocity tasks."""
 
     summary = (
-        "mjlab: a policy of env go1_velocity or g1_velocity in the unmodified task of mjlab 1.6, with its settings for "
-        "playing, and then with training's pushes and noise; 256 episodes of 20 s on a GPU, 8 on a CPU"
+        "mjlab: a policy of go1_velocity, go1_velocity_rough or g1_velocity in mjlab 1.6's own task, with its settings "
+        "for playing, and then with training's pushes and noise; 256 episodes of 20 s on a GPU, 8 on a CPU"
     )
     python = Path(".mjlab/bin/python")
     install = (
