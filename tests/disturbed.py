@@ -7,5 +7,6 @@ DISTURBANCES: dict[str, Any] = {
     "observation_bias": {"pole_angle_*": {"uniform": 0.1}},
     "observation_delay": [0, 2],
     "control_delay": [1, 3],
+    "control_delay_substeps": [0, 2],
     "push": {"every": [0.02, 0.1], "velocity": {"slider": [0.5]}},
 }

@@ -89,6 +89,16 @@ class PhysicsConfig(Section):
             raise ValueError("solreffriction only acts with the elliptic cone: write cone: elliptic")
         return self
 
+    @model_validator(mode="after")
+    def _substeps_of_one_step(self) -> "PhysicsConfig":
+        late = self.randomize is not None and self.randomize.control_delay_substeps is not None
+        if late and self.substep_grad_clip is not None:
+            raise ValueError(
+                "substep_grad_clip does not act with randomize.control_delay_substeps, whose substeps are steps of "
+                "their own: leave one out"
+            )
+        return self
+
     @classmethod
     def names(cls) -> list[str]:
         """Every setting of the section that only some environments read, dotted."""

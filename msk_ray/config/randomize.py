@@ -151,6 +151,9 @@ class RandomizeConfig(ModelRandomization):
     """Fewest and most env steps by which observations are late, one number for an episode."""
     control_delay: Steps | None = None
     """Fewest and most env steps by which controls reach the actuators late, one number for an episode."""
+    control_delay_substeps: Steps | None = None
+    """Fewest and most substeps by which they are late besides, fewer than an env step has; one number for an
+    episode."""
     push: Push | None = None
     """Kicks."""
 
@@ -181,14 +184,16 @@ class RandomizeConfig(ModelRandomization):
         return len(self.parameters) < len(self._written)
 
     def __str__(self) -> str:
-        return ", ".join(f"{name} {_text(value)}" for name, value in self._written.items())
+        return ", ".join(f"{name} {_text(name, value)}" for name, value in self._written.items())
 
 
 UNDISTURBED: Final = RandomizeConfig.model_construct()
 """No setting is written; a section of a file has at least one."""
 
 
-def _text(value: Any) -> str:
+def _text(name: str, value: Any) -> str:
     if isinstance(value, dict):
-        return " and ".join(f"{name} {spread}" for name, spread in value.items())
-    return f"{value[0]} to {value[1]} env steps" if isinstance(value, tuple) else str(value)
+        return " and ".join(f"{entry} {spread}" for entry, spread in value.items())
+    if isinstance(value, tuple):
+        return f"{value[0]} to {value[1]} {'substeps' if name.endswith('substeps') else 'env steps'}"
+    return str(value)

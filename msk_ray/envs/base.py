@@ -27,6 +27,7 @@ from msk_ray.envs.records import EnvState, Transition, rows_where
 from msk_ray.envs.rehearsal import rehearse
 from msk_ray.envs.reward import WeightedTerms
 from msk_ray.envs.starts import Starts
+from msk_ray.envs.substep_controls import SubstepControls
 from msk_ray.envs.task import SettingsT, Task
 from msk_ray.errors import ConfigError
 from msk_ray.group import ALONE, Group
@@ -112,7 +113,9 @@ class Env(Task[SettingsT]):
     ) -> Simulation:
         if execution.jacobian is not None:
             self.model.opt.jacobian = JACOBIANS[execution.jacobian]
-        return Simulation(
+        late = physics.randomize is not None and physics.randomize.control_delay_substeps is not None
+        kind = SubstepControls if late else Simulation
+        return kind(
             self.model,
             self.nworld,
             round(self.config.control_timestep / self.model.opt.timestep),

@@ -63,6 +63,12 @@ class Disturbances:
         self._bias = EntryErrors("observation_bias", config.observation_bias, names, env.device)
         self._encoders = EncoderErrors(config.encoder_bias, env.model, names, env.device)
         self._observation_delay, self._control_delay = config.observation_delay, config.control_delay
+        self._substep_delay = config.control_delay_substeps
+        if _most(self._substep_delay) >= env.sim.substeps:
+            raise ConfigError(
+                f"physics.randomize.control_delay_substeps: an env step has {env.sim.substeps} substeps, so write at "
+                f"most {env.sim.substeps - 1}, and whole env steps in control_delay"
+            )
         self._kicks = None if config.push is None else _Kicks(config.push, env)
         widths = {
             "noise": int(self._noise.size > 0),
@@ -70,6 +76,7 @@ class Disturbances:
             "encoders": self._encoders.size,
             "observation_delay": int(self._observation_delay is not None),
             "control_delay": int(self._control_delay is not None),
+            "control_delay_substeps": int(self._substep_delay is not None),
             "push": 0 if self._kicks is None else self._kicks.size,
         }
         self.size = sum(widths.values())
@@ -89,7 +96,7 @@ class Disturbances:
         """Memories of its own, with the gradients that late observations and controls have."""
         late = {
             _OBSERVATIONS: _most(self._observation_delay) * self._entry_count,
-            _CONTROLS: _most(self._control_delay) * self._env.model.nu,
+            _CONTROLS: (_most(self._control_delay) + (self._substep_delay is not None)) * self._env.model.nu,
         }
         kept = {name: Memory(size, gradient=True) for name, size in late.items() if size}
         return {**kept, _STEPS: Memory(1)} if kept else {}
@@ -114,10 +121,20 @@ class Disturbances:
         return self._kicks.applied(physics, state.age, self._numbers(state, "push"))
 
     def control(self, control: Tensor, state: EnvState) -> Tensor:
-        """The controls (W, nu) that reach the actuators in the step from `state`, when these are sent."""
-        if self._control_delay is not None:
-            late = self._late(self._control_delay, state, "control_delay")
-            control = _of_earlier(control, state.memory.get(_CONTROLS), late)
+        """The controls (W, nu) that reach the actuators in the step from `state`, when these are sent; those of each
+        substep, (S, W, nu), if controls may be late by some substeps."""
+        if self._substep_delay is None:
+            return self._arrived(control, state)
+        late = self._drawn(self._substep_delay, state, "control_delay_substeps")
+        return torch.stack([self._arrived(control, state, late > k) for k in range(self._env.sim.substeps)])
+
+    def _arrived(self, control: Tensor, state: EnvState, on_its_way: Tensor | None = None) -> Tensor:
+        """The controls (W, nu) that have reached the actuators: in worlds where the newest is still `on_its_way`, bool
+        (W,), those of one env step before."""
+        if self._control_delay is not None or on_its_way is not None:
+            late = self._drawn(self._control_delay, state, "control_delay")
+            late = late if on_its_way is None else late + on_its_way
+            control = _of_earlier(control, state.memory.get(_CONTROLS), self._possible(late, state))
         if self._encoders.size:
             control = self._encoders.followed(control, self._numbers(state, "encoders"))
         return control
@@ -131,7 +148,7 @@ class Disturbances:
             )
         age = state.age
         if self._observation_delay is not None:
-            late = self._late(self._observation_delay, state, "observation_delay")
+            late = self._possible(self._drawn(self._observation_delay, state, "observation_delay"), state)
             obs = _of_earlier(obs, state.memory.get(_OBSERVATIONS), late)
             age = age - late
         if self._bias.size:
@@ -143,13 +160,17 @@ class Disturbances:
             obs = self._noise.added(obs, uniform_hash(self._numbers(state, "noise")[:, 0], age, self._noise.size))
         return obs
 
-    def _late(self, delay: tuple[int, int], state: EnvState, name: str) -> Tensor:
-        """Env steps by which something is late, (W,) int64: at most those of the episode that have been."""
-        if not _most(delay):
+    def _drawn(self, delay: tuple[int, int] | None, state: EnvState, name: str) -> Tensor:
+        """The delay of each world's episode, (W,) int64."""
+        if delay is None or not delay[1]:
             return torch.zeros_like(state.age)
         fewest, most = delay
-        drawn = fewest + (self._numbers(state, name)[:, 0] * (most - fewest + 1)).long()
-        return torch.minimum(drawn, state.memory[_STEPS][:, 0].long())
+        return fewest + (self._numbers(state, name)[:, 0] * (most - fewest + 1)).long()
+
+    def _possible(self, late: Tensor, state: EnvState) -> Tensor:
+        """Env steps by which something is late, (W,) int64, at most those of the episode that have been."""
+        been = state.memory.get(_STEPS)
+        return late if been is None else torch.minimum(late, been[:, 0].long())
 
     def _numbers(self, state: EnvState, name: str) -> Tensor:
         """The numbers (W, n) for one of the settings."""
