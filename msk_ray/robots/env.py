@@ -286,7 +286,7 @@ class VelocityEnv(MjcfEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
         return torch.cat(
             (
                 self.observe(state, action),
-                self.foot_heights(state),
+                self.memory["foot_height"],
                 times.air,
                 (times.contact > 0.0).float(),
                 force.sign() * force.abs().log1p(),

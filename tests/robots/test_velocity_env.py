@@ -123,7 +123,8 @@ def test_reward_and_observation_have_the_gradient_of_their_own_values(robot: str
         state = StepState(*arrays, env.state.physics.act)
         env.next_memory = dict(env.remember(state, action))
         obs = env.observe(state, action)
-        seen = env.observe_critic(state, action)  # it begins with what the policy sees
+        with env.in_state(env.state._replace(memory=env.next_memory)):
+            seen = env.observe_critic(state, action)  # it begins with what the policy sees
         return (seen * weights).sum() + env.reward_terms(state, action, obs).sum()
 
     inputs = [torch.tensor(p[None], dtype=torch.float32, requires_grad=True) for p in parts]
