@@ -1,6 +1,7 @@
 """What a sweep of thousands of trials costs its driver, its files and those who read them, on a CPU.
 
-    python benchmarks/many_trials.py                            # 2000 trials of 20 rows: half an hour on two idle cores
+    python benchmarks/many_trials.py                            # 2000 trials of 20 rows, a process each
+    python benchmarks/many_trials.py --reuse --limit 1300       # in four processes; stopped after 1300 s
     python benchmarks/many_trials.py --trials 200 --rows 2 20   # two sweeps: what a start costs, and what a report
 
 `python -m msk_ray.tune` with its own driver, Ray and dashboard, where each trial is a process that writes rows and
@@ -219,6 +220,8 @@ def measure(
     wall = time.monotonic() - started
     if code not in (0, RESUMABLE):
         sys.exit(log.read_text(errors="replace")[-3000:])
+    if not list(experiment.glob(f"trials/*/{TIMES_FILE}")):
+        sys.exit(f"no trial has ended within {limit:.0f} s:\n{log.read_text(errors='replace')[-3000:]}")
     times = [json.loads(path.read_text()) for path in experiment.glob(f"trials/*/{TIMES_FILE}")]
     reports = sorted(seconds for _, _, own in times for seconds in own)
     first, half, last = usage.at(0.02), usage.at(0.5), usage.at(1.0)

@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +21,14 @@ from msk_ray.experiment.damage import DamagedFile
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.notes import load_notes, write_note
 from msk_ray.experiment.outcomes import Ending, Outcome, write_ending
-from msk_ray.experiment.records import ExperimentReader
+from msk_ray.experiment.records import ExperimentReader, TrialRecord
 from msk_ray.report.__main__ import main
 from msk_ray.report.charts import Floor, Picture, Plot, thin_evenly
 from msk_ray.report.curves import curve_over, learning_curves, rung_steps
 from msk_ray.report.influence import ranked_effects
-from msk_ray.report.page import make_section, places_of
+from msk_ray.report.page import _templates, make_section, places_of
 from msk_ray.report.reading import Condition, read_again, read_experiment
-from msk_ray.report.tables import failures, variant_rows
+from msk_ray.report.tables import failures, outcome_figures, variant_rows
 from msk_ray.sweep import opening
 from msk_ray.sweep.space import parse_space
 from msk_ray.sweep.trials import base_settings, make_trial, resolve_trials
@@ -192,6 +193,20 @@ def test_the_page_says_it_all_and_takes_nothing_for_markup(experiment: Experimen
     assert "http" not in page.replace("http-equiv", ""), "nothing is fetched"
     for name in ("curves", "effects", "parallel", "stops", "health"):
         assert f'data-figure="{name}"' in page
+
+
+def test_outcomes_are_looked_for_once_and_not_for_each_variant(
+    experiment: Experiment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looks: list[int] = []
+
+    def counted(trials: Sequence[TrialRecord]) -> list[str]:
+        looks.append(len(trials))
+        return outcome_figures(trials)
+
+    monkeypatch.setitem(_templates().globals, "outcome_figures", counted)
+    page_of(experiment, "--best", "never")
+    assert len(looks) == 1
 
 
 def test_an_axis_says_what_leaves_it(experiment: Experiment) -> None:
