@@ -123,7 +123,8 @@ def test_the_critic_sees_what_mjlabs_sees(recorded: Recorded) -> None:
     ours, feet = env.critic_observation(), len(env.robot.feet)
     on_ground = slice(-4 * feet, -3 * feet)
     same = (ours[:, on_ground] == theirs[:, on_ground]).all(-1)
-    assert same.float().mean() > 0.97  # a foot may land or lift in the 5 ms between the two
+    # A foot may land or lift in the 5 ms between the two.
+    assert same.float().mean() > (0.9 if recorded.rough else 0.97)
     torch.testing.assert_close(ours[same], theirs[same], atol=1e-3, rtol=0.0)
     assert theirs[:, on_ground].std() > 0.1
     assert ours[:, -3 * feet :].abs().max() > 3.0
@@ -164,9 +165,10 @@ def test_a_step_is_mjlabs(recorded: Recorded) -> None:
     obs = found.obs.clone()
     obs[:, command] = recorded["obs"][:, command]  # the next command is not this one
     assert torch.equal(found.terminated, recorded["terminated"])
-    close = ((obs - recorded["obs"]).abs() <= 1e-3).all(-1)[kept]
+    close = ((obs - recorded["obs"]).abs() <= 1e-3).all(-1)
     # Where a foot touches a height field in many places, mjlab's solver stops far from its minimum.
-    assert close.float().mean() > 0.95 if recorded.rough else close.all()
+    assert close[kept].float().mean() > 0.95 if recorded.rough else close[kept].all()
+    kept = kept & close
     names = list(recorded.constants["term_names"])
     for k, term in enumerate(env.active_terms):
         ours = (found.terms[:, k] / term.weight_in(env.config.reward))[kept]
