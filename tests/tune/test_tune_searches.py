@@ -186,7 +186,7 @@ def test_no_more_at_once_than_asked_for_and_the_next_process_waits(
     monkeypatch.setattr(worker_prestart, "start_processes", start_and_tell)
 
     def watch() -> None:
-        deadline = time.monotonic() + 100
+        deadline = time.monotonic() + 450
         while not (others and seen - others[0]) and time.monotonic() < deadline:
             seen.update(_processes_of_trials() if others else ())
             time.sleep(0.1)
@@ -196,7 +196,7 @@ def test_no_more_at_once_than_asked_for_and_the_next_process_waits(
         while not ended.exists() and time.monotonic() < deadline:
             seen.update(_processes_of_trials())
 
-    space = make_space(parameters={}, seeds="0-1", overrides={"trial.epochs": 100})
+    space = make_space(parameters={}, seeds="0-1", overrides={"trial.epochs": 400})
     path = tmp_path / "runs" / "patient"
     trials = resolve_trials(space)
     experiment = opening.create(path, space, trials, {})
