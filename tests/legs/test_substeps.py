@@ -21,7 +21,7 @@ from msk_ray.visualize.episodes import Recording, record
 
 SUBSTEPS = 5
 """Of myoleg26: 4 ms of 20 ms."""
-REQUEST = Request(worlds=2, steps=200)
+REQUEST = Request(worlds=2, steps=300)
 QPOS, QVEL, ACT = 1e-5, 1e-3, 1e-6
 """Float32 leaves 1e-6 rad, 5e-5 rad/s and 2e-8 of a control step at the median, 5e-6, 4e-4 and 1e-7 at 99 %."""
 
@@ -66,7 +66,7 @@ def test_every_control_step_ends_in_the_state_that_was_recorded(recording: Recor
     model = recording.model
     for world in range(recording.count):
         recorded, ctrl = parts(recording, world)
-        assert len(ctrl) == 201
+        assert len(ctrl) == 301
         qpos, qvel, act = errors(model, recorded, ctrl)
         assert np.median(qpos) < 0.2 * QPOS
         assert np.median(qvel) < 0.2 * QVEL
@@ -86,11 +86,11 @@ def test_every_control_step_ends_in_the_state_that_was_recorded(recording: Recor
 def test_substeps_are_set_between_the_recorded_states(recording: Recording) -> None:
     recorded, ctrl = parts(recording, 0)
     found = between(recording.model, recorded, ctrl, SUBSTEPS)
-    assert [part.shape for part in found] == [(1001, 18), (1001, 18), (1001, 26)]
+    assert [part.shape for part in found] == [(1501, 18), (1501, 18), (1501, 26)]
     after = repeated(recording.model, recorded, ctrl, SUBSTEPS)
     for part, start, substeps in zip(found, recorded, after, strict=True):
         np.testing.assert_array_equal(part[::SUBSTEPS], start)
-        inside = part[:-1].reshape(200, SUBSTEPS, -1)[:, 1:]
+        inside = part[:-1].reshape(300, SUBSTEPS, -1)[:, 1:]
         np.testing.assert_array_equal(inside, substeps[:, :-1])
     unused = ctrl.copy()
     unused[-1] = np.nan
@@ -106,7 +106,7 @@ def test_the_command_measures_at_substeps(
     assert len(found.episodes) == len(found.qpos) == 2
     for world, (episode, qpos) in enumerate(zip(found.episodes, found.qpos, strict=True)):
         assert episode.timestep == pytest.approx(0.004)
-        assert len(qpos) == len(episode.forward) == len(episode.curves["vertical_force"]["l"]) == 1001
+        assert len(qpos) == len(episode.forward) == len(episode.curves["vertical_force"]["l"]) == 1501
         np.testing.assert_array_equal(qpos[::SUBSTEPS], recording.world(world).qpos)
     assert 110.0 < found.gait["measures"]["cadence"]["value"] < 125.0
     # The strides of the film are those of the measures, at their samples.
@@ -143,7 +143,7 @@ def test_pushes_are_repeated_and_steps_that_diverged_are_not(
     assert qvel[[9, 19, 29]].min() > 0.1, "the state after these steps is the one after a push"
     assert qvel[[10, 20, 30]].max() < 0.02, "which the next step begins with"
     states = command.every_substep(recording, 1, SUBSTEPS)
-    assert len(states.qpos) == 1001
+    assert len(states.qpos) == 1501
     ended = replace(recording, episodes=recording.episodes._replace(diverged=recording.episodes.diverged | True))
     np.testing.assert_array_equal(command.every_substep(ended, 1, SUBSTEPS).qpos, states.qpos[:-5])
 
