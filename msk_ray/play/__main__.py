@@ -34,7 +34,7 @@ red (active). msk-ray visualize makes films and pictures."""
 EXAMPLES = """\
   python -m msk_ray.play ant                             # its best policy in policies/
   python -m msk_ray.play go1_velocity --agent zero       # what does the model do by itself?
-  python -m msk_ray.play hopper:Hopper --agent random    # a class of yours
+  python -m msk_ray.play my_robot:Robot --agent random   # a class of yours
   python -m msk_ray.play --agent runs/demo --browser     # the best policy of an experiment"""
 
 ZOO, ZERO, RANDOM = "zoo", "zero", "random"

@@ -96,9 +96,9 @@ def test_costs_rise_in_training_alone() -> None:
     costs = [term.schedule is not None for term in env.active_terms]
     names = [term.name for term, cost in zip(env.active_terms, costs, strict=True) if not cost]
     assert names == ["track_linear_velocity", "track_angular_velocity", "upright", "pose", "dof_pos_limits"]
-    assert env._shares.tolist() == [1.0] * len(costs)  # as in scores, which begin no epoch
+    assert env.weighted_terms.shares.tolist() == [1.0] * len(costs)  # as in scores, which begin no epoch
     env.begin_epoch(0)
-    assert env._shares.tolist() == pytest.approx([0.1 if cost else 1.0 for cost in costs])
+    assert env.weighted_terms.shares.tolist() == pytest.approx([0.1 if cost else 1.0 for cost in costs])
 
 
 def test_costs_that_never_rise_are_refused() -> None:
