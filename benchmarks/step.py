@@ -69,8 +69,8 @@ def measure(mjm: mujoco.MjModel, worlds: int, device: str, steps: int, repeats: 
         f"{backward:.3f}",
         f"{backward / forward:.2f}",
         f"{contacts:.1f}",
-        f"{tape.bytes_recorded() / worlds:.0f}",
-        f"{whole.bytes_recorded() / worlds:.0f}",
+        f"{tape.bytes_saved() / worlds:.0f}",
+        f"{whole.bytes_saved() / worlds:.0f}",
     ]
 
 

@@ -86,18 +86,18 @@ INPUTS = ("ctrl", "qpos", "qvel", "act", "qfrc_applied", "xfrc_applied")
 
 
 class Backward(ABC):
-    """One way to differentiate an env step: records what it needs of the forward pass, then pulls cotangents back.
+    """One way to differentiate an env step: saves what it needs of the forward pass, then pulls cotangents back.
 
-    A Simulation calls `attach` once, replays `launch_step` for every forward pass, and calls `record` right after it if
-    a gradient will be needed. Then it calls `vjp` once for each recorded step, latest first, or `jacobian` for the
-    whole Jacobian.
+    A Simulation calls `attach` once for each batch, replays `launch_step` for every forward pass, and calls `save`
+    right after it if a gradient will be needed. Then it calls `vjp` once for each saved step, latest first, or
+    `jacobian` for the whole Jacobian.
     """
 
     name: str
     covers_applied: ClassVar[bool] = False
-    """Whether it differentiates steps with applied forces, which `record` then gets."""
+    """Whether it differentiates steps with applied forces, which `save` then gets."""
     covers_parameters: ClassVar[bool] = False
-    """Whether `vjp` gives gradients of model parameters. Their recorded values are in the model when it is called."""
+    """Whether `vjp` gives gradients of model parameters, whose values in the saved step are then in the model."""
 
     @abstractmethod
     def attach(self, batch: WorldBatch) -> None:
@@ -128,7 +128,7 @@ class Backward(ABC):
         return batch.data
 
     @abstractmethod
-    def record(
+    def save(
         self, ctrl: Tensor, start: StepState, end: StepState, applied: ExternalForces | None = None
     ) -> tuple[Tensor, ...]:
         """Tensors of the last step that `vjp` will need, not aliasing buffers that the next step overwrites.
@@ -138,17 +138,17 @@ class Backward(ABC):
 
     @abstractmethod
     def vjp(self, saved: tuple[Tensor, ...], cotangent: StepState, needs: Needs) -> InputGradients:
-        """Vector-Jacobian product of the recorded step: cotangents of its results, in raw coordinates, pulled back."""
+        """Vector-Jacobian product of the saved step: cotangents of its results, in raw coordinates, pulled back."""
 
     def jacobian(
         self, saved: tuple[Tensor, ...], start: StepState, end: StepState, tangent: Tangent
     ) -> tuple[Tensor, Tensor]:
-        """(A, B) of the recorded step in tangent space, shapes (W, S, S) and (W, S, nu) with S = 2 nv + na.
+        """(A, B) of the saved step in tangent space, shapes (W, S, S) and (W, S, nu) with S = 2 nv + na.
 
         This implementation calls `vjp` for each row; a mode with a faster way overrides it.
 
         Args:
-            saved: what `record` returned for the step.
+            saved: what `save` returned for the step.
             start, end: the states before and after it.
             tangent: the joints of the model.
         """

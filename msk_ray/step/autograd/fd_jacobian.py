@@ -59,7 +59,7 @@ class FdJacobian(Backward):
         self._device = device_of(batch)
         self._tangent = Tangent(batch.mjm, self._device)
 
-    def record(
+    def save(
         self, ctrl: Tensor, start: StepState, end: StepState, applied: ExternalForces | None = None
     ) -> tuple[Tensor, ...]:
         return (ctrl, *start, end.qpos, *(applied or ()))
@@ -103,7 +103,7 @@ class FdJacobian(Backward):
         return {"fd_solver_limit_share": max(shares, default=0.0)}
 
     def _inputs(self, saved: tuple[Tensor, ...]) -> tuple[dict[str, Tensor], Tensor]:
-        """The inputs of a recorded step by name, each (W, n), and qpos after the step."""
+        """The inputs of a saved step by name, each (W, n), and qpos after the step."""
         *state, qpos_end = saved[:5]
         forces = zip((_QFRC, _XFRC), (force.flatten(1) for force in saved[5:]), strict=False)
         return dict(zip(("ctrl", *StepState._fields), state, strict=True)) | dict(forces), qpos_end

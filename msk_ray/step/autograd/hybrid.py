@@ -57,16 +57,16 @@ class Hybrid(Backward):
         """Whether the state's mode covers parameters."""
         return self.state.covers_parameters
 
-    def record(
+    def save(
         self, ctrl: Tensor, start: StepState, end: StepState, applied: ExternalForces | None = None
     ) -> tuple[Tensor, ...]:
         forces = () if applied is None else (applied,)
-        first, second = (mode.record(ctrl, start, end, *forces) for mode in (self.state, self.ctrl))
+        first, second = (mode.save(ctrl, start, end, *forces) for mode in (self.state, self.ctrl))
         self._splits[len(first) + len(second)] = len(first)
         return (*first, *second)
 
     def _split(self, saved: tuple[Tensor, ...]) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
-        """The tensors recorded by each of the two modes."""
+        """The tensors saved by each of the two modes."""
         first = self._splits[len(saved)]  # steps with and without applied forces differ in length
         return saved[:first], saved[first:]
 

@@ -13,7 +13,7 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from msk_ray.step.adjoint.body_frames import FrameWalk
+from msk_ray.step.adjoint.forward_kinematics import FrameWalk
 from msk_ray.step.autograd.buffers import stream_of
 from msk_ray.step.autograd.tangent import quat_multiply, quat_rotate
 from msk_ray.step.errors import ConfigError

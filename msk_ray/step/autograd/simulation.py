@@ -74,7 +74,7 @@ class WarpSimStep(torch.autograd.Function):
         ctx: Any, sim: "Simulation", parameters: StepParameters, ctrl: Tensor, *inputs: Any
     ) -> tuple[Tensor, Tensor, Tensor]:
         start, forces = StepState(*inputs[:3]), inputs[4:]
-        end, saved = sim.record(ctrl, start, ExternalForces(*forces) if forces else None, parameters)
+        end, saved = sim.step_and_save(ctrl, start, ExternalForces(*forces) if forces else None, parameters)
         # This step's engine, because the simulation may continue with another one.
         ctx.engine = sim.engine
         ctx.names, ctx.wanted = tuple(parameters.values), parameters.wanted
@@ -275,7 +275,7 @@ class Simulation:
         self.require_backward()
         applied, values = self._checked((ctrl, qpos, qvel, act), qfrc_applied, xfrc_applied, parameters)
         start = StepState(qpos, qvel, act)
-        end, saved = self.record(ctrl, start, applied, self._bundles.of(values))
+        end, saved = self.step_and_save(ctrl, start, applied, self._bundles.of(values))
         self.engine.settle()
         return Linearization(*self.require_backward().jacobian(saved, start, end, self.tangent), end)
 
@@ -381,7 +381,7 @@ class Simulation:
         self._check_input("xfrc_applied", applied.xfrc, nbody, 6)
         return applied
 
-    def record(
+    def step_and_save(
         self, ctrl: Tensor, start: StepState, applied: ExternalForces | None, parameters: StepParameters
     ) -> tuple[StepState, tuple[Tensor, ...]]:
         """One env step outside autograd, and the tensors that the backward mode needs to differentiate it.
@@ -399,14 +399,14 @@ class Simulation:
         if applied is None:
             end = self._stepper.step(ctrl, start, None, parameters.values)
             # Ask again: the step may have replaced the mode by one with larger buffers.
-            return end, self.require_backward().record(ctrl, start, end)
+            return end, self.require_backward().save(ctrl, start, end)
         if not mode.covers_applied:
             raise UnsupportedModelError(
                 f"backward mode {mode.name} does not differentiate steps with applied forces: write "
                 "backward='tape_per_substep', or leave qfrc_applied and xfrc_applied out"
             )
         end = self._stepper.step(ctrl, start, applied, parameters.values)
-        return end, self.require_backward().record(ctrl, start, end, applied)
+        return end, self.require_backward().save(ctrl, start, end, applied)
 
     @property
     def capacity(self) -> Capacity:

@@ -42,18 +42,18 @@ class Engine:
         self._buffers = BatchTensors(batch)
         self._parameters = ParameterTensors(batch)
         self._launches = batch.launch_step if backward is None else lambda: backward.launch_step(batch)
-        self._record()
+        self._capture()
         self._unseen = False
         self._contact_forces: ContactForces | None = None
 
-    def _record(self) -> None:
-        """Record the step's graph. On CUDA this runs the step once."""
+    def _capture(self) -> None:
+        """Capture the step as a graph. On CUDA this runs the step once."""
         pullbacks = () if self.backward is None else self.backward.pullbacks()
         compile_kernels(self.batch.device, self._launches, *pullbacks)
         self._graph = Graph(self._launches, self.batch.device)
-        self._recorded = self._recipe()
+        self._captured = self._recipe()
         for watch in (self.batch.losses, self.batch.iterations):
-            watch.read()  # discard what the run for recording reported
+            watch.read()  # discard what the run for capturing reported
         if self.backward is not None:
             self.backward.forget()
 
@@ -73,7 +73,7 @@ class Engine:
         Raises:
             ConfigError: the step did not take them.
         """
-        if not self._recorded.measures_sensors:
+        if not self._captured.measures_sensors:
             raise ConfigError("the last step took no readings of sensors: call measure_sensors() before a step")
         readings: Tensor = wp.to_torch(self._last_data.sensordata, requires_grad=False)
         return readings.clone()
@@ -84,7 +84,7 @@ class Engine:
         Raises:
             ConfigError: the step did not answer it.
         """
-        if query not in self._recorded.queries:
+        if query not in self._captured.queries:
             raise ConfigError("the last step did not watch these contacts: call measure_contacts() before a step")
         figures: Tensor = wp.to_torch(self.batch.contacts.figures[query], requires_grad=False)
         return figures.clone()
@@ -108,9 +108,9 @@ class Engine:
 
     def replay(self, ctrl: Tensor, start: StepState, applied: ExternalForces | None = None) -> StepState:
         """The state after one env step, even if the step lost contacts or constraint rows."""
-        if self._recorded != self._recipe() and joined_stream() is None:
+        if self._captured != self._recipe() and joined_stream() is None:
             self.settle()
-            self._record()
+            self._capture()
         self._buffers.load(ctrl, start, applied)
         self._graph.replay(stream_of(self.device))
         self._unseen = True

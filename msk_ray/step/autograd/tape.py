@@ -1,6 +1,6 @@
 """`tape_per_substep` and `tape_all`: exact gradients by the adjoint of every substep.
 
-Both tapes checkpoint each substep's state and acceleration in one buffer, which is copied for each recorded env step.
+Both tapes checkpoint each substep's state and acceleration in one buffer, which is copied for each saved env step.
 `tape_per_substep` recomputes the position and velocity stages in the backward pass (the acceleration is known, so there
 is no solve); `tape_all` stores them.
 """
@@ -117,13 +117,13 @@ class _Tape(Backward):
         self._rows: dict[int, TapePerSubstep] = {}
 
     def _prepare(self, pool: Pool) -> None:
-        """Request further arrays in the buffer that is copied for each recorded step."""
+        """Request further arrays in the buffer that is copied for each saved step."""
 
     @abstractmethod
     def _pull_back(self, k: int, qvel_next: wp.array, *extras: Any) -> None:
         """Launch the pullback of substep k; `qvel_next` (W, nv) is the velocity after it."""
 
-    def record(
+    def save(
         self, ctrl: Tensor, start: StepState, end: StepState, applied: ExternalForces | None = None
     ) -> tuple[Tensor, ...]:
         forces = () if applied is None else (force.detach().clone() for force in applied)
@@ -224,8 +224,8 @@ class _Tape(Backward):
         a, b = (torch.cat(parts)[:size].transpose(0, 1).contiguous() for parts in zip(*rows, strict=True))
         return a, b
 
-    def bytes_recorded(self) -> int:
-        """Size of one recorded env step's data [B], of all worlds together, without its control."""
+    def bytes_saved(self) -> int:
+        """Size of one saved env step's data [B], of all worlds together, without its control."""
         return self._saved.numel() * self._saved.element_size()
 
     def launch_backward(self, with_applied: bool = False, names: tuple[str, ...] = ()) -> None:

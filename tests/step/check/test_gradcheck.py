@@ -26,10 +26,10 @@ UNSUPPORTED = """
 class NanSlope(TapePerSubstep):
     """The gradient by the second velocity is NaN where the first velocity of the first state has a cotangent."""
 
-    def record(self, ctrl, start, end):
+    def save(self, ctrl, start, end):
         if not hasattr(self, "_first"):
             self._first = start.qpos[0].clone()
-        return (*super().record(ctrl, start, end), (start.qpos == self._first).all(-1))
+        return (*super().save(ctrl, start, end), (start.qpos == self._first).all(-1))
 
     def vjp(self, saved, cotangent, needs):
         *own, first = saved

@@ -5,8 +5,8 @@ With m the moment, ρ(x) = m·x and κ = Σ m_i m_j μ_i â_j over the pairs of 
     Φ ∋ -ρ(λ) F(len, ρ(v), act, ctrl) - h κ ∂F/∂v (with implicit integration) ,  act' = act + h · rate(act, ctrl)
     F = gain(len, v) · drive + bias(len, v)   clamped; drive is the clamped control, act or act'.
 
-`actuator_score` is that law, act' included, and Warp differentiates it once, in `pull_actuators`: for the state, and
-for the law's own parameters if their gradients are wanted.
+`actuator_potential` is that law, act' included, and Warp differentiates it once, in `pull_actuators`: for the state,
+and for the law's own parameters if their gradients are wanted.
 """
 
 from functools import cache
@@ -110,7 +110,7 @@ def force_velocity_slope(
 
 
 @wp.func
-def actuator_score(
+def actuator_potential(
     law: ActuatorLaw,
     ctrl: wp.float32,
     act: wp.float32,
@@ -125,7 +125,7 @@ def actuator_score(
     if law.clamp_ctrl == 1:
         command = wp.clamp(ctrl, law.ctrlrange[0], law.ctrlrange[1])
     drive = command
-    score = wp.float32(0.0)
+    potential = wp.float32(0.0)
     if law.dyntype != DynType.NONE:
         free = free_activation(law, command, act)
         after = free
@@ -135,12 +135,12 @@ def actuator_score(
         if law.early == 1:
             drive = after
         if law.clamp_next == 1:
-            score = act_weight * after
+            potential = act_weight * after
         else:
-            score = act_weight * free
+            potential = act_weight * free
     if law.implicit == 1:
-        score += slope_weight * force_velocity_slope(law, ctrl, drive, length, velocity)
-    return score + force_weight * actuator_force(law, drive, length, velocity)
+        potential += slope_weight * force_velocity_slope(law, ctrl, drive, length, velocity)
+    return potential + force_weight * actuator_force(law, drive, length, velocity)
 
 
 @wp.struct
@@ -398,8 +398,8 @@ def pull_actuators_kernel(keeps: bool) -> Any:
             )
             length = drive_in.actuator_length[worldid, uid]
 
-            # The score is -Φ and act': force and slope are its derivatives by the weights ρ(λ) and h κ.
-            law_bar, ctrl_bar, act_bar, length_slope, velocity_slope, _act, force, slope = wp.grad(actuator_score)(
+            # The potential is -Φ and act': force and slope are its derivatives by the weights ρ(λ) and h κ.
+            law_bar, ctrl_bar, act_bar, length_slope, velocity_slope, _act, force, slope = wp.grad(actuator_potential)(
                 law, ctrl, act, length, rates.qvel, act_weight, rates.lam, h * rates.kappa
             )
             if law.dyntype != DynType.NONE:

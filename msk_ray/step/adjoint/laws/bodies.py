@@ -178,7 +178,7 @@ def sweep_up(
         excess_bar += bars_in.excess[worldid, b]
     cacc_bar = cacc_sum_in[worldid, body]
 
-    # Fields just before this joint, and V̄ without what only joints before it (or it itself) feel.
+    # Fields just before this joint, and V̄ less what `close_velocity` added for this body's joints before it.
     parent = tree.body_parentid[body]
     lam = fields_in.lam[worldid, parent]
     pure = fields_in.qacc[worldid, parent]

@@ -5,7 +5,7 @@ Sliding, with g = μ (1, -t), tᵢ = φᵢ² jarᵢ / T and m, p as there:
     S = m g gᵀ + κ (diag(φ²) - t tᵀ over the tangents) ,  κ = μ p / T .
 
 The linear systems need S as a matrix, so it is written out here. `parameters.contact_laws` has the work ρ(λ)·f of the
-same forces as a score, which Warp differentiates by material: only where such gradients are wanted, because
+same forces as a potential, which Warp differentiates by material: only where such gradients are wanted, because
 `pull_contacts` would otherwise work out the slopes of the material for every contact.
 """
 

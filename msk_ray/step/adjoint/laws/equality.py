@@ -4,7 +4,7 @@ A connect's rows are the world components of the relative motion of two anchors,
 reference holds the whole acceleration of the anchors, so jar = acc₁ - acc₂ + b (u₁ - u₂) + k imp (p₁ - p₂) with
 acc = A + α × r + ω × u(p), the acceleration of a body-fixed point; gravity, in A of every body, drops out.
 A weld adds three rows for ts·vec(Q), Q = q₂* q₁ the relative orientation and ts its torque scale, whose two rates come
-from both bodies' spins and angular accelerations; `turn_score` holds them and is differentiated as it is.
+from both bodies' spins and angular accelerations; `turn_potential` holds them and is differentiated as it is.
 """
 
 import warp as wp
@@ -41,7 +41,7 @@ def conjugate(q: wp.vec4) -> wp.vec4:
 
 
 @wp.func
-def turn_score(
+def turn_potential(
     q1: wp.vec4,
     q2: wp.vec4,
     spin1: wp.vec3,
@@ -66,9 +66,9 @@ def turn_score(
     under = quat_product(inverse, turned(lam_spin, q1))
     whole = quat_product(inverse, q1)
     motion = 0.5 * (second + damping * first)
-    score = wp.dot(y, wp.vec3(motion[1], motion[2], motion[3]))
-    score -= 0.5 * wp.dot(push, wp.vec3(under[1], under[2], under[3]))
-    return score + wp.dot(place, wp.vec3(whole[1], whole[2], whole[3]))
+    potential = wp.dot(y, wp.vec3(motion[1], motion[2], motion[3]))
+    potential -= 0.5 * wp.dot(push, wp.vec3(under[1], under[2], under[3]))
+    return potential + wp.dot(place, wp.vec3(whole[1], whole[2], whole[3]))
 
 
 @wp.func
@@ -220,7 +220,7 @@ def pull_anchors(
         accel_bar = wp.vec3(0.0)
         under_bar = wp.vec3(0.0)
         if weld:
-            g1, g2, gs1, gs2, ga, gl, _y, _p, _c, _d = wp.grad(turn_score)(
+            g1, g2, gs1, gs2, ga, gl, _y, _p, _c, _d = wp.grad(turn_potential)(
                 q1,
                 q2,
                 spin1,

@@ -4,7 +4,7 @@
     imp = dmin + y(|pos| / width) (dmax - dmin) ,  y a power curve from 0 to 1 through (mid, mid)
 
 They are mujoco_warp's, except where dmin = dmax: there its function takes another branch, which has other slopes by
-dmin and dmax. `row_slopes` differentiates them by position, the scores in `parameters` by everything else too.
+dmin and dmax. `row_slopes` differentiates them by position, the potentials in `parameters` by everything else too.
 """
 
 import warp as wp

@@ -78,7 +78,7 @@ def pull_slope(end: wp.vec2, point: wp.vec2, tangent: wp.vec2) -> wp.float32:
 
 
 @wp.func
-def inside_score(
+def inside_potential(
     start: wp.vec3,
     end: wp.vec3,
     pos: wp.vec3,

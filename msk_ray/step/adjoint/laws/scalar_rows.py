@@ -18,7 +18,7 @@ from msk_ray.step.adjoint.groups import (
     TimestepGradient,
 )
 from msk_ray.step.adjoint.laws.impedance import impedance, stiffness_damping
-from msk_ray.step.adjoint.laws.row_score import RowMotion, row_score
+from msk_ray.step.adjoint.laws.row_potential import RowMotion, row_potential
 from msk_ray.step.adjoint.laws.tendons import tendon_rate
 from msk_ray.step.adjoint.workspace import Workspace
 from msk_ray.step.forward.capacity import scalar_rows
@@ -267,10 +267,10 @@ def pull_rows(
         if s == 0.0:
             motion.held = wp.sign(f)
         loss = rows_in.frictionloss[worldid, row]
-        motion_bar, solref_bar, solimp_bar, away_bar, loss_bar, step_bar = wp.grad(row_score)(
+        motion_bar, solref_bar, solimp_bar, away_bar, loss_bar, step_bar = wp.grad(row_potential)(
             motion, solver.solref, solver.solimp, pos, loss, timestep
         )
-        # The score is -Φ, and ∂Φ/∂jar = s ρ(λ) =: y.
+        # The potential is -Φ, and ∂Φ/∂jar = s ρ(λ) =: y.
         y = -motion_bar.rest
         vel_bar = -motion_bar.vel
         pos_bar = -away_bar

@@ -37,7 +37,7 @@ class SitePairs:
 
 
 @wp.func
-def pair_score(
+def pair_potential(
     crank: wp.int32,
     gear: wp.spatial_vectorf,
     rod: wp.float32,
@@ -64,8 +64,8 @@ def pair_score(
     if crank == 0:
         push = wp.spatial_top(gear)
         turn = wp.spatial_bottom(gear)
-        score = length_bar * wp.dot(wp.transpose(frame) @ away, push) + wp.dot(frame @ push, slide)
-        return score + wp.dot(frame @ turn, wp.spatial_top(own) - wp.spatial_top(other))
+        potential = length_bar * wp.dot(wp.transpose(frame) @ away, push) + wp.dot(frame @ push, slide)
+        return potential + wp.dot(frame @ turn, wp.spatial_top(own) - wp.spatial_top(other))
     # length = s - √det ,  s = a·d ,  det = s² + r² - d·d
     axis = wp.vec3(frame[0, 2], frame[1, 2], frame[2, 2])
     s = wp.dot(away, axis)
@@ -127,7 +127,9 @@ def pull_site_pairs(
         origin = site_xpos_in[worldid, other_site]
         frame = site_xmat_in[worldid, other_site]
         rod = pairs.actuator_cranklength[worldid % pairs.actuator_cranklength.shape[0], uid]
-        _k, _g, _r, _l, point_bar, origin_bar, frame_bar, _c, _o, load, other_load, common_load = wp.grad(pair_score)(
+        _k, _g, _r, _l, point_bar, origin_bar, frame_bar, _c, _o, load, other_load, common_load = wp.grad(
+            pair_potential
+        )(
             crank,
             gear,
             rod,

@@ -17,7 +17,7 @@ from typing import Any
 import warp as wp
 
 from msk_ray.step.adjoint.groups import FieldBars, Fields, GeomGradients, Motion, Substep, TendonBars
-from msk_ray.step.adjoint.laws.inside_wrap import inside_score
+from msk_ray.step.adjoint.laws.inside_wrap import inside_potential
 from msk_ray.step.adjoint.laws.wrapping import PathPoses, Paths, touch_paths
 from msk_ray.step.adjoint.spatial import carried, point_velocity, quat_gradient, turning_torque, wrench
 from msk_ray.step.adjoint.workspace import Workspace
@@ -27,7 +27,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def wrap_score(
+def wrap_potential(
     start: wp.vec3,
     end: wp.vec3,
     pos: wp.vec3,
@@ -327,11 +327,11 @@ def pull_paths_kernel(keeps: bool) -> Any:
             spot = inside_in[worldid, e]
             inside = spot[3] != 0.0
             if inside:
-                from_start, from_end, pos_bar, mat_bar, radius_bar, _k, _p, _w = wp.grad(inside_score)(
+                from_start, from_end, pos_bar, mat_bar, radius_bar, _k, _p, _w = wp.grad(inside_potential)(
                     start, end, pos, mat, radius, kind, wp.vec3(spot[0], spot[1], spot[2]), touch0_bar + touch1_bar
                 )
             else:
-                from_start, from_end, pos_bar, mat_bar, radius_bar, _k, side_bar, _w0, _w1 = wp.grad(wrap_score)(
+                from_start, from_end, pos_bar, mat_bar, radius_bar, _k, side_bar, _w0, _w1 = wp.grad(wrap_potential)(
                     start, end, pos, mat, radius, kind, side, touch0_bar, touch1_bar
                 )
             torque = turning_torque(mat, mat_bar)

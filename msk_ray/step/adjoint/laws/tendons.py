@@ -62,7 +62,7 @@ class TendonLaw:
 
 
 @wp.func
-def tendon_score(
+def tendon_potential(
     law: TendonLaw, length: wp.float32, rate: wp.float32, rate_lam: wp.float32, kappa: wp.float32
 ) -> wp.float32:
     """ρ(λ) (k(x) x + c(|ρ|) ρ) + h κ d(cρ)/dρ, x how far a tendon is out of the dead band of its spring."""
@@ -161,7 +161,7 @@ def start_tendons(
         if implicit_address[dof, dof] >= 0 and (damped or keeps):
             h = opt_timestep[worldid % opt_timestep.shape[0]]
             kappa = h * implicit_pairs(worldid, t, tendons, implicit_address, ten_J_in, state_in, multipliers_in)
-    law_bar, length_bar, qvel_bar, lam_bar, slope = wp.grad(tendon_score)(
+    law_bar, length_bar, qvel_bar, lam_bar, slope = wp.grad(tendon_potential)(
         law, ten_length_in[worldid, t], rate_v, rate_l, kappa
     )
     mu_bar = float(0.0)

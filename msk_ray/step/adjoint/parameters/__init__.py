@@ -1,6 +1,6 @@
 """Gradients of a substep by parameters of the model, launched only if they are asked for.
 
-A law whose score holds parameters adds their gradients in its own kernel (`LAW_GRADIENTS`); the families here have
+A law whose potential holds parameters adds their gradients in its own kernel (`LAW_GRADIENTS`); the families here have
 kernels of their own, one file each.
 """
 

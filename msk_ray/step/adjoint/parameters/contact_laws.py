@@ -1,7 +1,7 @@
 """Friction, solref and solimp of contacts: how the rows of one contact answer to them.
 
-`contact_score` is what a contact gives -Φ, Σ_r ρ_r(λ) f_r(ρ(a) - aref), as a function of its material alone. The law of
-an elliptic contact is in `forward.cone_law`.
+`contact_potential` is what a contact gives -Φ, Σ_r ρ_r(λ) f_r(ρ(a) - aref), as a function of its material alone. The
+law of an elliptic contact is in `forward.cone_law`.
 """
 
 import warp as wp
@@ -16,7 +16,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class ContactMotion:
-    """What stays fixed in the score: rates under λ, a and v, the position, and the scale of D."""
+    """What stays fixed in the potential: rates under λ, a and v, the position, and the scale of D."""
 
     lam: vec6
     acc: vec6
@@ -41,7 +41,7 @@ def pyramid_weight(friction: wp.float32) -> wp.float32:
 
 
 @wp.func
-def edge_score(
+def edge_potential(
     motion: ContactMotion,
     stiffness: wp.float32,
     damping: wp.float32,
@@ -56,14 +56,14 @@ def edge_score(
     if k > 0:
         lam += lean * motion.lam[k]
         jar += lean * (motion.acc[k] + damping * motion.vel[k])
-    score = wp.float32(0.0)
+    potential = wp.float32(0.0)
     if jar < 0.0:
-        score = -lam * mass * jar
-    return score
+        potential = -lam * mass * jar
+    return potential
 
 
 @wp.func
-def cone_score(
+def cone_potential(
     motion: ContactMotion,
     friction: vec5,
     stiffness: wp.float32,
@@ -90,17 +90,17 @@ def cone_score(
         side = wp.sqrt(square)
     normal = mu * jar0
     now = zone(normal, side, mu)
-    score = wp.float32(0.0)
+    potential = wp.float32(0.0)
     if now == QUADRATIC:
-        score = -mass * (motion.lam[0] * jar0 + stuck)
+        potential = -mass * (motion.lam[0] * jar0 + stuck)
     elif now == SLIDING:
         push = cone_mass(mass, mu) * mu * (mu * side - normal)
-        score = push * (motion.lam[0] - across / side)
-    return score
+        potential = push * (motion.lam[0] - across / side)
+    return potential
 
 
 @wp.func
-def contact_score(
+def contact_potential(
     motion: ContactMotion,
     friction: vec5,
     solref: wp.vec2,
@@ -113,19 +113,19 @@ def contact_score(
     imp = impedance(solimp, motion.pos)
     stiffness = kb[0] * imp
     mass = imp / ((1.0 - imp) * motion.weight)
-    score = wp.float32(0.0)
+    potential = wp.float32(0.0)
     if motion.elliptic == 1:
         side_damping = kb[1]
         if solreffriction[0] != 0.0 or solreffriction[1] != 0.0:
             side = stiffness_damping(motion.disableflags, timestep, solreffriction, solimp[1])
             side_damping = side[1]
-        score = cone_score(motion, friction, stiffness, kb[1], side_damping, mass)
+        potential = cone_potential(motion, friction, stiffness, kb[1], side_damping, mass)
     elif motion.dim == 1:
-        score = edge_score(motion, stiffness, kb[1], mass, 0.0, 0, 0)
+        potential = edge_potential(motion, stiffness, kb[1], mass, 0.0, 0, 0)
     else:
         share = mass / pyramid_weight(friction[0])
         for k in range(1, 6):
             if k < motion.dim:
-                score += edge_score(motion, stiffness, kb[1], share, friction[k - 1], k, 2 * k - 2)
-                score += edge_score(motion, stiffness, kb[1], share, -friction[k - 1], k, 2 * k - 1)
-    return score
+                potential += edge_potential(motion, stiffness, kb[1], share, friction[k - 1], k, 2 * k - 2)
+                potential += edge_potential(motion, stiffness, kb[1], share, -friction[k - 1], k, 2 * k - 1)
+    return potential

@@ -13,7 +13,7 @@ from msk_ray.step.adjoint.groups import Contacts, Fields, Motion, RowLaws, Rows,
 from msk_ray.step.adjoint.laws.contacts import components, relative_rates, row_count
 from msk_ray.step.adjoint.laws.impedance import impedance, stiffness_damping
 from msk_ray.step.adjoint.parameters.base import ParameterFamily
-from msk_ray.step.adjoint.parameters.contact_laws import ContactMotion, contact_score, pyramid_weight
+from msk_ray.step.adjoint.parameters.contact_laws import ContactMotion, contact_potential, pyramid_weight
 from msk_ray.step.adjoint.step import StepAdjoint
 from msk_ray.step.forward.mjw_private import ConstraintType, vec5
 
@@ -185,7 +185,7 @@ def pull_materials(
     motion.weight = imp / ((1.0 - imp) * rows_in.D[worldid, first])
     if motion.elliptic == 0 and motion.dim > 1:
         motion.weight = motion.weight / pyramid_weight(friction[0])
-    _m, friction_bar, solref_bar, side_bar, solimp_bar, timestep_bar = wp.grad(contact_score)(
+    _m, friction_bar, solref_bar, side_bar, solimp_bar, timestep_bar = wp.grad(contact_potential)(
         motion, friction, solref, contacts_in.solreffriction[con], solimp, timestep
     )
     wp.atomic_add(timestep_out.timestep, worldid, timestep_bar)

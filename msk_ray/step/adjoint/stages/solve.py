@@ -98,7 +98,7 @@ def solve_two_serial(
     first_out: wp.array2d[float],
     second_out: wp.array2d[float],
 ) -> None:
-    """The same for any nv, one thread a world; the factor overwrites the matrix."""
+    """As `tiles.solve_two_tiled`, for any nv, one thread a world; the factor overwrites the matrix."""
     worldid = wp.tid()
     _factor(matrix_in[worldid], nv)
     for i in range(nv):

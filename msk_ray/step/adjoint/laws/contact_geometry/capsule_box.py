@@ -76,7 +76,7 @@ def capsule_contact(
 
 
 @wp.func
-def capsule_score(
+def capsule_potential(
     pos: wp.vec3,
     axis: wp.vec3,
     radius: float,
@@ -218,9 +218,9 @@ def capsule_box_push(index: int, capsule: Geom, box: Geom, contact: ContactPoint
     centre = contact.point - contact.normal * (radius + 0.5 * contact.dist)
     place = safe_div(wp.dot(centre - capsule.pos, axis), wp.dot(axis, axis))
     law = axis_law(index, place, capsule.pos, axis, capsule.size[1], box.pos, box.mat, box.size)
-    pos_bar, axis_bar, _radius, box_pos_bar, box_mat_bar, _size, _law, _dist, _point, _normal = wp.grad(capsule_score)(
-        capsule.pos, axis, radius, box.pos, box.mat, box.size, law, bars.dist, bars.point, bars.normal
-    )
+    pos_bar, axis_bar, _radius, box_pos_bar, box_mat_bar, _size, _law, _dist, _point, _normal = wp.grad(
+        capsule_potential
+    )(capsule.pos, axis, radius, box.pos, box.mat, box.size, law, bars.dist, bars.point, bars.normal)
     out = PairPush()
     out.force1 = pos_bar
     out.torque1 = wp.cross(axis, axis_bar)

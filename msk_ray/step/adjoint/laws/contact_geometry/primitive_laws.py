@@ -188,7 +188,7 @@ def rim_torque(normal: wp.vec3, axis: wp.vec3, arm: wp.vec3, core_bar: wp.vec3) 
 
 
 @wp.func
-def pair_score(geom1: Geom, geom2: Geom, law: ParallelLaw, weights: Bars) -> wp.float32:
+def pair_potential(geom1: Geom, geom2: Geom, law: ParallelLaw, weights: Bars) -> wp.float32:
     """Weighted sum of (dist, pos, normal) of a contact of a pair; `law` counts for two capsules only."""
     type1 = geom1.type
     type2 = geom2.type
@@ -231,8 +231,8 @@ def pair_score(geom1: Geom, geom2: Geom, law: ParallelLaw, weights: Bars) -> wp.
 
 
 @wp.func
-def is_scored(type1: int, type2: int) -> bool:
-    """Whether `pair_score` knows the pair."""
+def has_potential(type1: int, type2: int) -> bool:
+    """Whether `pair_potential` knows the pair."""
     if type1 == GeomType.SPHERE:
         return (
             type2 == GeomType.SPHERE or type2 == GeomType.CAPSULE or type2 == GeomType.CYLINDER or type2 == GeomType.BOX
@@ -245,25 +245,25 @@ def is_scored(type1: int, type2: int) -> bool:
 @wp.func
 def is_convex_pair(type1: int, type2: int) -> bool:
     """Whether two geoms, types in ascending order, collide by MuJoCo's convex collision, or are boxes."""
-    apart = type1 == GeomType.PLANE or is_scored(type1, type2)
+    apart = type1 == GeomType.PLANE or has_potential(type1, type2)
     return not (apart or (type1 == GeomType.CAPSULE and type2 == GeomType.BOX))
 
 
-SCORED_PAIRS = frozenset(
+POTENTIAL_PAIRS = frozenset(
     {
         *((int(GeomType.SPHERE), int(t)) for t in (GeomType.SPHERE, GeomType.CAPSULE, GeomType.CYLINDER, GeomType.BOX)),
         (int(GeomType.CAPSULE), int(GeomType.CAPSULE)),
         (int(GeomType.PLANE), int(GeomType.ELLIPSOID)),
     }
 )
-"""Geometry types, ascending, that `pair_score` knows."""
+"""Geometry types, ascending, that `pair_potential` knows."""
 
 _SOLIDS = [
     *(GeomType.SPHERE, GeomType.CAPSULE, GeomType.ELLIPSOID, GeomType.CYLINDER, GeomType.BOX, GeomType.MESH),
 ]
 CONVEX_PAIRS = frozenset(
     {(int(a), int(b)) for a in (GeomType.HFIELD, *_SOLIDS) for b in _SOLIDS if a <= b}
-    - SCORED_PAIRS
+    - POTENTIAL_PAIRS
     - {(int(GeomType.CAPSULE), int(GeomType.BOX))}
 )
 """Those for which `is_convex_pair` holds."""

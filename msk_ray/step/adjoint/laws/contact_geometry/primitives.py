@@ -22,13 +22,13 @@ from msk_ray.step.adjoint.laws.contact_geometry.capsule_box import capsule_box_p
 from msk_ray.step.adjoint.laws.contact_geometry.contact_order import contacts_end
 from msk_ray.step.adjoint.laws.contact_geometry.contact_point import Bars, ContactPoint, Geom, PairPush
 from msk_ray.step.adjoint.laws.contact_geometry.primitive_laws import (
-    SCORED_PAIRS,
+    POTENTIAL_PAIRS,
     STANDING_PAIRS,
     ParallelLaw,
     cores_coincide,
+    has_potential,
     is_convex_pair,
-    is_scored,
-    pair_score,
+    pair_potential,
     parallel_law,
     rim_torque,
 )
@@ -66,19 +66,19 @@ def frame_guide(plane: Geom, other: Geom, frame: wp.mat33) -> FrameGuide:
 
 
 @wp.func
-def frame_score(normal: wp.vec3, guide: FrameGuide, weight: wp.mat33) -> wp.float32:
+def frame_potential(normal: wp.vec3, guide: FrameGuide, weight: wp.mat33) -> wp.float32:
     """⟨weight, frame⟩ of the contact frame built from a normal and its guide."""
     axis = guide.axis
-    score = wp.float32(0.0)
+    potential = wp.float32(0.0)
     if guide.kind == ALONG_AXIS:
         b = wp.normalize(axis - normal * wp.dot(normal, axis))
-        score = wp.dot(weight[0], normal) + wp.dot(weight[1], b) + wp.dot(weight[2], wp.cross(normal, b))
+        potential = wp.dot(weight[0], normal) + wp.dot(weight[1], b) + wp.dot(weight[2], wp.cross(normal, b))
     elif guide.kind == BESIDE_AXIS:
-        score = wp.dot(weight[0], normal) + wp.dot(weight[1], axis) + wp.dot(weight[2], wp.cross(normal, axis))
+        potential = wp.dot(weight[0], normal) + wp.dot(weight[1], axis) + wp.dot(weight[2], wp.cross(normal, axis))
     else:
         frame = make_frame(normal)
-        score = wp.dot(weight[0], frame[0]) + wp.dot(weight[1], frame[1]) + wp.dot(weight[2], frame[2])
-    return score
+        potential = wp.dot(weight[0], frame[0]) + wp.dot(weight[1], frame[1]) + wp.dot(weight[2], frame[2])
+    return potential
 
 
 @wp.func
@@ -93,8 +93,8 @@ def geom_of(worldid: int, geomid: int, shapes: Shapes, xpos: wp.array2d[wp.vec3]
 
 
 @wp.func
-def scored_push(index: int, geom1: Geom, geom2: Geom, contact: ContactPoint, bars: Bars) -> PairPush:
-    """Push of contact `index` of a pair that `pair_score` knows, at the geoms' centres."""
+def push_by_potential(index: int, geom1: Geom, geom2: Geom, contact: ContactPoint, bars: Bars) -> PairPush:
+    """Push of contact `index` of a pair that `pair_potential` knows, at the geoms' centres."""
     law = ParallelLaw()
     if geom1.type == GeomType.CAPSULE:
         axis1 = column(geom1.mat, 2)
@@ -103,7 +103,7 @@ def scored_push(index: int, geom1: Geom, geom2: Geom, contact: ContactPoint, bar
     weights = bars
     if cores_coincide(geom1.type, geom2.type, geom1.pos, geom1.size, geom2.pos, geom2.size, contact.dist):
         weights.normal = wp.vec3(0.0)
-    geom1_bar, geom2_bar, _law, _weights = wp.grad(pair_score)(geom1, geom2, law, weights)
+    geom1_bar, geom2_bar, _law, _weights = wp.grad(pair_potential)(geom1, geom2, law, weights)
     out = PairPush()
     out.force1 = geom1_bar.pos
     out.torque1 = turning_torque(geom1.mat, geom1_bar.mat)
@@ -141,8 +141,8 @@ def plane_push(
 class PairKinds(NamedTuple):
     """Kinds of geometry pairs that a model can bring into contact; each costs compile time only where it occurs."""
 
-    scored: bool
-    """A pair that `pair_score` knows."""
+    has_potential: bool
+    """A pair that `pair_potential` knows."""
     capsule_box: bool
     standing: bool
     """A cylinder and a plane."""
@@ -151,7 +151,7 @@ class PairKinds(NamedTuple):
     def of(cls, types: set[tuple[int, int]]) -> "PairKinds":
         """The kinds in a model whose colliding geometry types (ascending) are `types`."""
         return cls(
-            bool(types & SCORED_PAIRS),
+            bool(types & POTENTIAL_PAIRS),
             (int(GeomType.CAPSULE), int(GeomType.BOX)) in types,
             bool(types & STANDING_PAIRS),
         )
@@ -195,7 +195,7 @@ def pull_geometry_kernel(kinds: PairKinds) -> Any:
             contact.point = contacts_in.pos[con]
             contact.normal = contacts_in.frame[con][0]
             guide = frame_guide(geom1, geom2, contacts_in.frame[con])
-            normal_bar, guide_bar, _weight = wp.grad(frame_score)(contact.normal, guide, contact_bars_in.frame[con])
+            normal_bar, guide_bar, _weight = wp.grad(frame_potential)(contact.normal, guide, contact_bars_in.frame[con])
             bars = Bars()
             bars.dist = contact_bars_in.dist[con]
             bars.point = contact_bars_in.pos[con]
@@ -204,10 +204,10 @@ def pull_geometry_kernel(kinds: PairKinds) -> Any:
             index = contacts_in.geomcollisionid[con]
             push = PairPush()
             known = bool(False)
-            if wp.static(kinds.scored):
-                if is_scored(geom1.type, geom2.type):
+            if wp.static(kinds.has_potential):
+                if has_potential(geom1.type, geom2.type):
                     known = bool(True)
-                    push = scored_push(index, geom1, geom2, contact, bars)
+                    push = push_by_potential(index, geom1, geom2, contact, bars)
             if wp.static(kinds.capsule_box):
                 if geom1.type == GeomType.CAPSULE and geom2.type == GeomType.BOX:
                     known = bool(True)

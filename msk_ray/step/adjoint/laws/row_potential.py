@@ -27,7 +27,7 @@ class RowMotion:
 
 
 @wp.func
-def row_score(
+def row_potential(
     motion: RowMotion, solref: wp.vec2, solimp: vec5, pos: wp.float32, loss: wp.float32, timestep: wp.float32
 ) -> wp.float32:
     """-Φ ∋ ρ(λ) f(ρ(a) + b ρ(v) + k imp pos) of one row that pushes."""

@@ -1,8 +1,8 @@
 """Poses and velocities of all bodies as functions of (qpos, qvel), and their pullback by Warp's own differentiation.
 
-The chain of frames from the world to each body is cut into steps: one that goes from a body's parent to where the body
-would be without its joints, and one for each joint. Every step reads the frame before it and writes its own place in
-the arrays, so that one thread walks a world's steps in order and nothing that its adjoint needs is overwritten.
+The chain of frames from the world to each body is cut into links: one that goes from a body's parent to where the body
+would be without its joints, and one for each joint. Every link reads the frame before it and writes its own place in
+the arrays, so that one thread walks a world's links in order and nothing that its adjoint needs is overwritten.
 
 Axes: W worlds, S frames, the world's own first.
 """
@@ -24,10 +24,10 @@ SLIDE = wp.constant(3)
 HINGE = wp.constant(4)
 
 _KIND = {
-    mujoco.mjtJoint.mjJNT_FREE: 1,
-    mujoco.mjtJoint.mjJNT_BALL: 2,
-    mujoco.mjtJoint.mjJNT_SLIDE: 3,
-    mujoco.mjtJoint.mjJNT_HINGE: 4,
+    mujoco.mjtJoint.mjJNT_FREE: FREE,
+    mujoco.mjtJoint.mjJNT_BALL: BALL,
+    mujoco.mjtJoint.mjJNT_SLIDE: SLIDE,
+    mujoco.mjtJoint.mjJNT_HINGE: HINGE,
 }
 
 
@@ -41,14 +41,14 @@ def quat_at(qpos: wp.array2d[float], worldid: int, first: int) -> wp.quat:
 @wp.kernel
 def walk_frames(
     # Model:
-    step_kind: wp.array[int],
-    step_parent: wp.array[int],
-    step_offset: wp.array[wp.vec3],
-    step_quat: wp.array[wp.quat],
-    step_axis: wp.array[wp.vec3],
-    step_reference: wp.array[float],
-    step_qposadr: wp.array[int],
-    step_dofadr: wp.array[int],
+    link_kind: wp.array[int],
+    link_parent: wp.array[int],
+    link_offset: wp.array[wp.vec3],
+    link_quat: wp.array[wp.quat],
+    link_axis: wp.array[wp.vec3],
+    link_reference: wp.array[float],
+    link_qposadr: wp.array[int],
+    link_dofadr: wp.array[int],
     # In:
     qpos_in: wp.array2d[float],
     qvel_in: wp.array2d[float],
@@ -58,21 +58,21 @@ def walk_frames(
     linvel_out: wp.array2d[wp.vec3],
     angvel_out: wp.array2d[wp.vec3],
 ) -> None:
-    """Frame s + 1 from step s; frame 0 is the world and has been written by the host."""
+    """Frame s + 1 from link s; frame 0 is the world and has been written by the host."""
     worldid = wp.tid()
-    for s in range(step_kind.shape[0]):
-        kind = step_kind[s]
-        p = step_parent[s]
+    for s in range(link_kind.shape[0]):
+        kind = link_kind[s]
+        p = link_parent[s]
         pos = pos_out[worldid, p]
         quat = quat_out[worldid, p]
         linvel = linvel_out[worldid, p]
         angvel = angvel_out[worldid, p]
-        qadr = step_qposadr[s]
-        vadr = step_dofadr[s]
+        qadr = link_qposadr[s]
+        vadr = link_dofadr[s]
         if kind == PLACE:
-            arm = wp.quat_rotate(quat, step_offset[s])
+            arm = wp.quat_rotate(quat, link_offset[s])
             pos_out[worldid, s + 1] = pos + arm
-            quat_out[worldid, s + 1] = quat * step_quat[s]
+            quat_out[worldid, s + 1] = quat * link_quat[s]
             linvel_out[worldid, s + 1] = linvel + wp.cross(angvel, arm)
             angvel_out[worldid, s + 1] = angvel
         elif kind == FREE:
@@ -83,26 +83,26 @@ def walk_frames(
             # The angular velocity of a free joint is in the body's own frame.
             angvel_out[worldid, s + 1] = wp.quat_rotate(turned, three(qvel_in, worldid, vadr + 3))
         elif kind == SLIDE:
-            axis = wp.quat_rotate(quat, step_axis[s])
-            travel = (qpos_in[worldid, qadr] - step_reference[s]) * axis
+            axis = wp.quat_rotate(quat, link_axis[s])
+            travel = (qpos_in[worldid, qadr] - link_reference[s]) * axis
             pos_out[worldid, s + 1] = pos + travel
             quat_out[worldid, s + 1] = quat
             linvel_out[worldid, s + 1] = linvel + wp.cross(angvel, travel) + qvel_in[worldid, vadr] * axis
             angvel_out[worldid, s + 1] = angvel
         elif kind == HINGE:
             # The anchor stays, and the body turns about it.
-            arm = wp.quat_rotate(quat, step_offset[s])
-            turned = quat * wp.quat_from_axis_angle(step_axis[s], qpos_in[worldid, qadr] - step_reference[s])
-            back = wp.quat_rotate(turned, step_offset[s])
-            spin = angvel + qvel_in[worldid, vadr] * wp.quat_rotate(quat, step_axis[s])
+            arm = wp.quat_rotate(quat, link_offset[s])
+            turned = quat * wp.quat_from_axis_angle(link_axis[s], qpos_in[worldid, qadr] - link_reference[s])
+            back = wp.quat_rotate(turned, link_offset[s])
+            spin = angvel + qvel_in[worldid, vadr] * wp.quat_rotate(quat, link_axis[s])
             pos_out[worldid, s + 1] = pos + arm - back
             quat_out[worldid, s + 1] = turned
             linvel_out[worldid, s + 1] = linvel + wp.cross(angvel, arm) - wp.cross(spin, back)
             angvel_out[worldid, s + 1] = spin
         elif kind == BALL:
-            arm = wp.quat_rotate(quat, step_offset[s])
+            arm = wp.quat_rotate(quat, link_offset[s])
             turned = quat * quat_at(qpos_in, worldid, qadr)
-            back = wp.quat_rotate(turned, step_offset[s])
+            back = wp.quat_rotate(turned, link_offset[s])
             spin = angvel + wp.quat_rotate(turned, three(qvel_in, worldid, vadr))
             pos_out[worldid, s + 1] = pos + arm - back
             quat_out[worldid, s + 1] = turned
@@ -160,7 +160,7 @@ class FrameWalk:
     """
 
     def __init__(self, mjm: mujoco.MjModel, nworld: int, device: wp.Device) -> None:
-        steps: list[tuple[Any, ...]] = []  # in the order of the kernel's arguments
+        links: list[tuple[Any, ...]] = []  # in the order of the kernel's arguments
         self.body_frame = np.zeros(mjm.nbody, dtype=np.int64)
         rest, up = (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 1.0)
         for body in range(1, mjm.nbody):
@@ -168,26 +168,26 @@ class FrameWalk:
             joints = range(mjm.body_jntadr[body], mjm.body_jntadr[body] + mjm.body_jntnum[body])
             if not any(mjm.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE for j in joints):
                 w, x, y, z = mjm.body_quat[body]
-                steps.append((0, frame, mjm.body_pos[body], (x, y, z, w), up, 0.0, 0, 0))
-                frame = len(steps)
+                links.append((PLACE, frame, mjm.body_pos[body], (x, y, z, w), up, 0.0, 0, 0))
+                frame = len(links)
             for j in joints:
                 kind, qposadr = _KIND[mujoco.mjtJoint(mjm.jnt_type[j])], mjm.jnt_qposadr[j]
-                reference = mjm.qpos0[qposadr] if kind in (3, 4) else 0.0
+                reference = mjm.qpos0[qposadr] if kind in (SLIDE, HINGE) else 0.0
                 addresses = (qposadr, mjm.jnt_dofadr[j])
-                steps.append((kind, frame, mjm.jnt_pos[j], rest, mjm.jnt_axis[j], reference, *addresses))
-                frame = len(steps)
+                links.append((kind, frame, mjm.jnt_pos[j], rest, mjm.jnt_axis[j], reference, *addresses))
+                frame = len(links)
             self.body_frame[body] = frame
         self._nworld, self._device = nworld, device
         with wp.ScopedDevice(device):
             dtypes = (int, int, wp.vec3, wp.quat, wp.vec3, float, int, int)
-            columns = zip(*steps, strict=True) if steps else [()] * len(dtypes)
+            columns = zip(*links, strict=True) if links else [()] * len(dtypes)
             self._model = [_device_array(values, dtype) for values, dtype in zip(columns, dtypes, strict=True)]
             self.qpos = wp.zeros((nworld, mjm.nq), dtype=float)
             self.qvel = wp.zeros((nworld, mjm.nv), dtype=float)
             self.grad_qpos, self.grad_qvel = wp.zeros_like(self.qpos), wp.zeros_like(self.qvel)
-            self.frames = FrameArrays.zeros(nworld, len(steps) + 1)
-            self.bars = FrameArrays.zeros(nworld, len(steps) + 1)
-        world = np.zeros((nworld, len(steps) + 1, 4), np.float32)
+            self.frames = FrameArrays.zeros(nworld, len(links) + 1)
+            self.bars = FrameArrays.zeros(nworld, len(links) + 1)
+        world = np.zeros((nworld, len(links) + 1, 4), np.float32)
         world[:, 0, 3] = 1.0
         self.frames.quat.assign(world)
 
