@@ -11,8 +11,10 @@ import torch
 
 from msk_ray.cli import run
 from msk_ray.config import load_config
+from msk_ray.errors import ConfigError
 from msk_ray.evaluate.__main__ import main
 from msk_ray.evaluate.stored import read_evaluations
+from msk_ray.robots.mjlab.scoring import task_of
 from msk_ray.training import Trainer, load_policy
 
 pytestmark = pytest.mark.long
@@ -153,6 +155,14 @@ def test_what_cannot_be_evaluated_there_is_one_line(
         _version(place, "1.6.0")
     assert "mjlab 2.0.0 has other tasks than 1.6.x" in capsys.readouterr().err
     assert entries(trial) == []
+
+
+def test_a_class_derived_from_a_robot_is_not_that_robot() -> None:
+    config = load_config("go1_velocity")
+    assert task_of(config) == "Mjlab-Velocity-Flat-Unitree-Go1"
+    other = config.env.model_copy(update={"name": "my_robot:TallGo1"})
+    with pytest.raises(ConfigError, match="env my_robot:TallGo1 is not a task of mjlab"):
+        task_of(config.model_copy(update={"env": other}))
 
 
 def _own_python(root: Path) -> Path:
