@@ -94,7 +94,8 @@ class VelocityEnv(MjcfEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
     3       command: velocity forward and to the left [m/s], yaw rate [rad/s]
     ======= ==========================================================================
 
-    The critic sees 6 F entries more, as in mjlab; see `observe_critic`.
+    The critic sees the same, undisturbed. mjlab's critic also sees contacts, forces and air times of the feet, which have
+    no gradient: robots learned more slowly with them (lab/robots.md).
 
     An action turns the targets of the servos away from the default pose; see `control`. Actions and joints are in the
     order of the MJCF's joints, not in that of its actuators.
@@ -225,13 +226,12 @@ class VelocityEnv(MjcfEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
     # Memory
 
     def memories(self) -> Mapping[str, Memory]:
-        """Times of the feet in the air and on the ground, their forces on the ground at the end of the step [N], their
-        heights in the current state, and their largest heights since they left the ground [m]."""
+        """Times of the feet in the air and on the ground [s], their heights in the current state [m], and their largest
+        heights since they left the ground [m]."""
         feet = len(self.robot.feet)
         height = Memory(feet, gradient=True)
         return {
             "air_time": Memory(4 * feet),
-            "foot_force": Memory(3 * feet),
             "foot_height": height,
             "peak_height": height,
         }
@@ -246,7 +246,6 @@ class VelocityEnv(MjcfEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
         peak = torch.where(contact.touching[-1], peak, torch.maximum(peak, height))
         return {
             "air_time": times.memory,
-            "foot_force": -contact.force.flatten(1),
             "foot_height": self.foot_heights(state),
             "peak_height": peak.masked_fill(times.first_contact(self.config.control_timestep), 0.0),
         }
@@ -272,24 +271,6 @@ class VelocityEnv(MjcfEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
                 state.qvel[:, 6:],
                 self.mjlab_action(action),
                 self.velocity_command(),
-            ),
-            dim=-1,
-        )
-
-    def observe_critic(self, state: StepState, action: Tensor) -> Tensor:
-        """The undisturbed observation, heights of the feet [m], their times in the air [s], 1 for those on the ground,
-        and sign(f) log(1 + |f|) for each component f of their forces on the ground [N]; (W, 12 + 3 J + 6 F).
-
-        Contacts are those of the step's last substep, without a gradient; mjlab's are those one substep later.
-        """
-        times, force = AirTime.of(self.memory["air_time"]), self.memory["foot_force"]
-        return torch.cat(
-            (
-                self.observe(state, action),
-                self.memory["foot_height"],
-                times.air,
-                (times.contact > 0.0).float(),
-                force.sign() * force.abs().log1p(),
             ),
             dim=-1,
         )

@@ -79,9 +79,7 @@ class Recorded:
         never = torch.zeros_like(self["began_air_time"])
         times = AirTime(self["began_air_time"], self["began_contact_time"], never, never)
         heights = {name: self[f"began_{name}"] for name in ("foot_height", "peak_height")}
-        scaled = self["began_critic_obs"][:, -3 * len(env.robot.feet) :]
-        force = scaled.sign() * scaled.abs().expm1()
-        memory = {"air_time": times.memory, "foot_force": force, **heights}
+        memory = {"air_time": times.memory, **heights}
         env.state = EnvState(began, self["began_previous_action"], env.state.age, env.state.numbers, memory)
 
     def __getitem__(self, name: str) -> Tensor:
@@ -114,20 +112,6 @@ def test_the_observation_is_mjlabs(recorded: Recorded) -> None:
     assert len(layout) == env.obs_size == recorded["obs"].shape[1]
     heights = env.foot_heights(env.state.physics)
     torch.testing.assert_close(heights, recorded["began_foot_height"], atol=1e-4, rtol=0.0)
-
-
-def test_the_critic_sees_what_mjlabs_sees(recorded: Recorded) -> None:
-    env, theirs = recorded.env, recorded["began_critic_obs"]
-    assert env.asymmetric
-    assert env.critic_size == theirs.shape[1]
-    ours, feet = env.critic_observation(), len(env.robot.feet)
-    on_ground = slice(-4 * feet, -3 * feet)
-    same = (ours[:, on_ground] == theirs[:, on_ground]).all(-1)
-    # A foot may land or lift in the 5 ms between the two.
-    assert same.float().mean() > (0.9 if recorded.rough else 0.97)
-    torch.testing.assert_close(ours[same], theirs[same], atol=1e-3, rtol=0.0)
-    assert theirs[:, on_ground].std() > 0.1
-    assert ours[:, -3 * feet :].abs().max() > 3.0
 
 
 def test_each_term_is_mjlabs(recorded: Recorded, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -186,5 +170,3 @@ def test_a_step_is_mjlabs(recorded: Recorded) -> None:
     torch.testing.assert_close(env.memory["peak_height"][kept], recorded["peak_height"][kept], atol=1e-5, rtol=0.0)
     heights = recorded["critic_obs"][:, env.obs_size :][:, : len(env.robot.feet)]
     torch.testing.assert_close(env.memory["foot_height"][kept], heights[kept], atol=1e-3, rtol=0.0)
-    force = recorded["measured_contact_force"].flatten(1)
-    torch.testing.assert_close(env.memory["foot_force"][kept], force[kept], atol=0.2, rtol=1e-3)
