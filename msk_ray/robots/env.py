@@ -94,8 +94,8 @@ class VelocityEnv(MjcfEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
     3       command: velocity forward and to the left [m/s], yaw rate [rad/s]
     ======= ==========================================================================
 
-    The critic sees the same, undisturbed. mjlab's critic also sees contacts, forces and air times of the feet, which have
-    no gradient: robots learned more slowly with them (lab/robots.md).
+    The critic sees the same, undisturbed. mjlab's also sees contacts, forces and air times of the feet, which have no
+    gradient: robots learned more slowly with them (lab/robots.md).
 
     An action turns the targets of the servos away from the default pose; see `control`. Actions and joints are in the
     order of the MJCF's joints, not in that of its actuators.
