@@ -13,7 +13,8 @@ from scenes import ant, ant_points
 from test_adjoint_features import SCENES, random_points
 
 from msk_ray.step.adjoint import StepAdjoint
-from msk_ray.step.adjoint.groups import State, Substep, gather
+from msk_ray.step.adjoint.groups import Multipliers, State, Substep, gather
+from msk_ray.step.adjoint.launches import Launcher
 from msk_ray.step.adjoint.stages import solve
 from msk_ray.step.adjoint.stages.recompute import recompute_stages
 from msk_ray.step.forward import WorldBatch
@@ -90,6 +91,37 @@ def test_the_matrices_compile_for_a_gpu(tmp_path: Path):
     text = found.read_text()
     assert ".entry build_matrices" in text
     assert "shfl.sync" in text
+
+
+@wp.kernel(enable_backward=False)
+def read_one(damping_in: wp.array2d[wp.vec3]):
+    """Takes what `sweep_up` takes under this name."""
+
+
+@wp.kernel(enable_backward=False)
+def read_group(multipliers_in: Multipliers):
+    """Takes a group."""
+
+
+@pytest.mark.parametrize(
+    ("kernel", "name", "places"),
+    [(read_one, "damping", "work.damping or at.damping"), (read_group, "held", "work.multipliers or at.held")],
+)
+def test_an_argument_that_two_holders_could_give_is_refused(kernel, name, places):
+    """Whatever their order: a new attribute must not take the place of the one that a kernel was written for."""
+    model = SCENES["plain"]()
+    batch = WorldBatch(model, 1, 1, "cpu")
+    work, at = StepAdjoint(model, batch.model, batch.data).work, Substep(batch.data)
+    alone = kernel is read_one
+    own = work.damping if alone else work.multipliers
+    setattr(at, name, own)
+    work.launch(kernel, 1, at)  # one object under both names is no question
+    setattr(at, name, wp.zeros_like(own) if alone else Multipliers())
+    again = Launcher(work)
+    with pytest.raises(ValueError, match=f"{kernel.key} may be {places}"):
+        again(kernel, 1, at)
+    given, named = ((), {"damping": own}) if alone else ((own,), {})
+    again(kernel, 1, at, *given, **named)  # what a launch gives counts
 
 
 def test_a_group_names_the_array_that_has_changed():
