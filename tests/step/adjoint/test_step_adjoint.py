@@ -15,7 +15,7 @@ from test_adjoint_features import SCENES, random_points
 from msk_ray.step.adjoint import StepAdjoint
 from msk_ray.step.adjoint.groups import Multipliers, State, Substep, gather
 from msk_ray.step.adjoint.launches import Launcher
-from msk_ray.step.adjoint.stages import solve
+from msk_ray.step.adjoint.stages import cholesky, solve
 from msk_ray.step.adjoint.stages.recompute import recompute_stages
 from msk_ray.step.forward import WorldBatch
 
@@ -79,7 +79,7 @@ def test_large_models_solve_serially_to_the_same(name, monkeypatch):
     model = ant("elliptic") if name == "ant" else SCENES[name]()
     points = ant_points(model, 3, seed=1) if name == "ant" else random_points(model, 3, seed=5)
     tiled = pulled(model, points, poison=False)
-    monkeypatch.setattr(solve, "TILE_LIMIT", 0)
+    monkeypatch.setattr(cholesky, "TILE_LIMIT", 0)
     for key, value in pulled(model, points, poison=False).items():
         assert relative(value, tiled[key]) < 1e-5, key
 

@@ -4,19 +4,15 @@ import warp as wp
 
 from msk_ray.step.adjoint.groups import Contacts, RowLaws, Rows, Substep
 from msk_ray.step.adjoint.laws.rows import ConstraintLaws, Squares, square_rows
+from msk_ray.step.adjoint.stages.cholesky import solve_both, solve_one
 from msk_ray.step.adjoint.stages.free_bodies import FreeBodySolves
 from msk_ray.step.adjoint.stages.integrate import Integrator
-from msk_ray.step.adjoint.stages.tiles import solve_tiled, solve_two_tiled
 from msk_ray.step.adjoint.workspace import Workspace
 from msk_ray.step.forward.fused.dense import add_squares
 from msk_ray.step.forward.fused.lanes import WARP, at, lane_count, lane_sync, put
 from msk_ray.step.forward.fused.scratch import padded
 
 wp.set_module_options({"enable_backward": False})
-
-# Largest nv whose matrices fit the shared memory of one block (two tiles of nv² floats).
-TILE_LIMIT = 64
-_BLOCK = 32
 
 
 @wp.kernel
@@ -87,28 +83,6 @@ def build_matrices(
 
 
 @wp.kernel
-def solve_two_serial(
-    # Model:
-    nv: int,
-    # In:
-    matrix_in: wp.array3d[float],
-    first_in: wp.array2d[float],
-    second_in: wp.array2d[float],
-    # Out:
-    first_out: wp.array2d[float],
-    second_out: wp.array2d[float],
-) -> None:
-    """As `tiles.solve_two_tiled`, for any nv, one thread a world; the factor overwrites the matrix."""
-    worldid = wp.tid()
-    _factor(matrix_in[worldid], nv)
-    for i in range(nv):
-        first_out[worldid, i] = first_in[worldid, i]
-        second_out[worldid, i] = second_in[worldid, i]
-    _substitute(matrix_in[worldid], nv, first_out[worldid])
-    _substitute(matrix_in[worldid], nv, second_out[worldid])
-
-
-@wp.kernel
 def damping_product(
     # Model:
     inertia_address: wp.array2d[int],
@@ -131,67 +105,6 @@ def damping_product(
     y_out[worldid, i] = scale_in * total
     if scale_in < 0.0:
         y_out[worldid, i] = start_in[worldid, i] + scale_in * total
-
-
-@wp.func
-def _factor(matrix: wp.array2d[float], nv: int) -> None:
-    """Cholesky factor in the lower triangle, in place."""
-    for j in range(nv):
-        pivot = matrix[j, j]
-        for k in range(j):
-            pivot -= matrix[j, k] * matrix[j, k]
-        pivot = wp.sqrt(pivot)
-        matrix[j, j] = pivot
-        for i in range(j + 1, nv):
-            entry = matrix[i, j]
-            for k in range(j):
-                entry -= matrix[i, k] * matrix[j, k]
-            matrix[i, j] = entry / pivot
-
-
-@wp.func
-def _substitute(factor: wp.array2d[float], nv: int, x: wp.array[float]) -> None:
-    """L Lᵀ x = x, in place."""
-    for i in range(nv):
-        entry = x[i]
-        for k in range(i):
-            entry -= factor[i, k] * x[k]
-        x[i] = entry / factor[i, i]
-    for s in range(nv):
-        i = nv - 1 - s
-        entry = x[i]
-        for k in range(i + 1, nv):
-            entry -= factor[k, i] * x[k]
-        x[i] = entry / factor[i, i]
-
-
-@wp.kernel
-def solve_serial(
-    # Model:
-    nv: int,
-    # In:
-    implicit_in: wp.array3d[float],
-    hessian_in: wp.array3d[float],
-    rhs_in: wp.array2d[float],
-    damping_in: wp.array2d[float],
-    qacc_in: wp.array2d[float],
-    # Out:
-    mu_out: wp.array2d[float],
-    excess_out: wp.array2d[float],
-    lam_out: wp.array2d[float],
-) -> None:
-    """The same two solves for any nv, one thread a world; factors overwrite the matrices."""
-    worldid = wp.tid()
-    _factor(implicit_in[worldid], nv)
-    for i in range(nv):
-        mu_out[worldid, i] = rhs_in[worldid, i]
-        excess_out[worldid, i] = damping_in[worldid, i] * qacc_in[worldid, i]
-    _substitute(implicit_in[worldid], nv, mu_out[worldid])
-    _substitute(implicit_in[worldid], nv, excess_out[worldid])
-    for i in range(nv):
-        lam_out[worldid, i] = rhs_in[worldid, i] - damping_in[worldid, i] * mu_out[worldid, i]
-    _factor(hessian_in[worldid], nv)
-    _substitute(hessian_in[worldid], nv, lam_out[worldid])
 
 
 def flat(matrices: wp.array) -> wp.array:
@@ -232,32 +145,19 @@ class LinearSystems:
             self._solve_implicit(at)
             return
         inputs = [self._implicit, self._hessian, work.rhs, self._integrator.damping_step, d.qacc]
-        outputs = [work.multipliers.mu, work.multipliers.excess, work.multipliers.lam]
-        if m.nv <= TILE_LIMIT:
-            wp.launch_tiled(solve_tiled(m.nv), dim=work.nworld, inputs=inputs, outputs=outputs, block_dim=_BLOCK)
-        else:
-            wp.launch(solve_serial, dim=work.nworld, inputs=[m.nv, *inputs], outputs=outputs)
+        solve_both(inputs, [work.multipliers.mu, work.multipliers.excess, work.multipliers.lam])
 
     def _solve_implicit(self, at: Substep) -> None:
         """μ, a - â and λ where B is a matrix: (M + hB)(a - â) = hB a ,  H λ = h v̄' - hB μ."""
         d, multipliers, rhs = at.data, self._work.multipliers, self._work.rhs
         self._product(at, d.qacc, 1.0)
-        self._solve_two(self._implicit, rhs, self._push, [multipliers.mu, multipliers.excess])
+        solve_one(self._implicit, [rhs, self._push], [multipliers.mu, multipliers.excess])
         self._product(at, multipliers.mu, -1.0)
         if self._free is not None:
             self._free.launch(at, self._push)
-        self._solve_two(self._hessian, self._push, self._push, [multipliers.lam, self._push])
+        solve_one(self._hessian, [self._push], [multipliers.lam])
 
     def _product(self, at: Substep, x: wp.array, scale: float) -> None:
         work = self._work
         named = {"step": self._step, "x": x, "start": work.rhs, "scale": scale, "y": self._push}
         work.launch(damping_product, (work.nworld, work.model.nv), at, **named)
-
-    def _solve_two(self, matrix: wp.array, first: wp.array, second: wp.array, outputs: list[wp.array]) -> None:
-        """Solve for both sides; small systems only for the first where both are one array."""
-        worlds, nv, inputs = self._work.nworld, self._work.model.nv, [matrix, first, second]
-        if nv <= TILE_LIMIT:
-            kernel = solve_two_tiled(nv, first is not second)
-            wp.launch_tiled(kernel, dim=worlds, inputs=inputs, outputs=outputs, block_dim=_BLOCK)
-        else:
-            wp.launch(solve_two_serial, dim=worlds, inputs=[nv, *inputs], outputs=outputs)
