@@ -1,7 +1,23 @@
 """Contacts that MuJoCo finds by its convex collision: from the witness points to wrenches on the two bodies.
 
-The features that touch are found again from the contact (`patches`, `feet`), and the law they obey is pulled back
-(`convex_laws`). A contact that no law reproduces, or that has no derivative, as of two parallel edges, is counted.
+The features that touch are found again from the contact, and the law they obey is pulled back (`convex_laws`). The
+patch of each geom (`patches`) is a FACE, also a cylinder's cap; an EDGE, also the side of a cylinder or a capsule; or a
+POINT: a corner, a rim, a capsule's end, anything else that is curved. A height field counts as its faces near the
+contact. Of these rows, the first that fits:
+
+| first geom | second geom | patch that wins | law |
+|---|---|---|---|
+| a face on which the second's lies, in a pair that is clipped | FACE that gives the normal | the first's | standing |
+| FACE | EDGE, POINT, or FACE that is no nearer to the normal | the first's | standing |
+| any | FACE | the second's | standing, with the geoms exchanged |
+| EDGE or POINT | EDGE or POINT | both | touching |
+
+Standing (`standing_wrenches`): a point of the other geom (`support_points`) above the face, by `flat_wrenches`; with
+`height_wrenches` where clipping kept an earlier distance, and `line_wrenches` where it cut a capsule's side. Touching:
+`touching_wrenches`. MuJoCo clips two boxes, and with several contacts per pair any two geoms with faces, or one and a
+capsule.
+
+A contact that no law reproduces, or that has no derivative, as of two parallel edges, is counted.
 """
 
 import warp as wp
@@ -41,20 +57,23 @@ from msk_ray.step.forward.mjw_private import make_frame
 wp.set_module_options({"enable_backward": False})
 
 _LYING = wp.constant(0.99605)
-"""Cosine above which MuJoCo's convex collision takes two faces as lying on each other: cos 0.0889."""
+"""Cosine above which MuJoCo's convex collision takes two faces as lying on each other: its own FACE_TOL, cos 0.0889."""
 _SLACK = wp.constant(1.0e-3)
-"""Sine of the angle by which a normal may miss that of the face that gave it."""
+"""Sine of the angle by which a normal may miss that of the face that gave it: what is left in deep contacts, where
+rounding of the witness points turns it by far less."""
 _MOST_SLACK = wp.constant(5.0e-2)
+"""The same for shallow contacts and curved surfaces; less than the 0.0889 within which MuJoCo takes faces as lying."""
 _WITNESS_ROUNDING = wp.constant(1.0e-7)
-"""Rounding of witness points, in sizes; the normal is the direction between them."""
+"""Rounding of witness points, in sizes, that of float32; the normal is the direction between them."""
 _KEPT = wp.constant(2.0e-5)
-"""How much nearer, in sizes, a distance from before clipping must come."""
+"""How much nearer, in sizes, a distance from before clipping must come: a hundred roundings of a place (`patches`)."""
 _TOUCHED = wp.constant(1.0e-3)
-"""Distance from a face, in sizes, within which a contact may be its."""
+"""Distance from a face, in sizes, within which a contact may be its: wide, because the law's miss decides."""
 _UPWARD = wp.constant(1.0e-5)
-"""Sine of the angle below which a contact's normal is a height field's axis."""
+"""Sine of the angle below which a contact's normal is a height field's axis: only rounding parts the two."""
 _LOST = wp.constant(1.0e-4)
-"""How far, in sizes, the law that comes nearest may miss a contact before the contact counts as approximated."""
+"""How far, in sizes, the law that comes nearest may miss a contact before the contact counts as approximated: five
+times the difference that decides between two candidates."""
 
 
 @wp.func
