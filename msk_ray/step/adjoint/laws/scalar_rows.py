@@ -30,27 +30,14 @@ _PI = wp.constant(math.pi)
 
 
 @wp.func
-def add_joint_row(
-    worldid: int,
-    dof: int,
-    sign: float,
-    pos_bar: float,
-    vel_bar: float,
-    slopes_out: DofSlopes,
-) -> None:
+def add_joint_row(worldid: int, dof: int, sign: float, pos_bar: float, vel_bar: float, slopes_out: DofSlopes) -> None:
     """A row with ρ(x) = sign·x_j and d(pos) = sign·dq_j."""
     wp.atomic_add(slopes_out.qpos, worldid, dof, sign * pos_bar)
     wp.atomic_add(slopes_out.qvel, worldid, dof, sign * vel_bar)
 
 
 @wp.func
-def add_tendon_row(
-    worldid: int,
-    t: int,
-    sign: float,
-    bars: wp.vec4,
-    tendon_bars_out: TendonBars,
-) -> None:
+def add_tendon_row(worldid: int, t: int, sign: float, bars: wp.vec4, tendon_bars_out: TendonBars) -> None:
     """A row with ρ(x) = sign·J_t x and d(pos) = sign·dl; bars are cotangents of (pos, ρ(v), ρ(λ), ρ(a))."""
     wp.atomic_add(tendon_bars_out.length, worldid, t, sign * bars[0])
     wp.atomic_add(tendon_bars_out.qvel, worldid, t, sign * bars[1])
@@ -197,6 +184,93 @@ def bounded_step_slope(
     return slope
 
 
+@wp.func
+def coefficient_bar(bars: wp.vec4, lam: float, vel: float, acc: float) -> float:
+    """Cotangent of a coefficient c of ρ(x) = c x + ..., from x under λ, v and a; bars as for `add_tendon_row`."""
+    return bars[2] * lam + bars[1] * vel + bars[3] * acc
+
+
+@wp.func
+def pull_ball_limit(
+    worldid: int, dof: int, adr: int, bars: wp.vec4, state_in: State, lam_in: wp.array2d[float], slopes_out: DofSlopes
+) -> None:
+    """pos = max(range) - angle ,  ρ(x) = -axis·x ,  d(pos) = -axis·w ,  d(axis) = ½ cot(θ/2) w⊥ + ½ axis × w."""
+    q = state_in.qpos[worldid]
+    turn = quat_angle_axis(wp.vec4(q[adr], q[adr + 1], q[adr + 2], q[adr + 3]))
+    axis = wp.vec3(turn[0], turn[1], turn[2])
+    axis_bar = wp.vec3(0.0)
+    for i in range(3):
+        j = dof + i
+        axis_bar[i] = -coefficient_bar(bars, lam_in[worldid, j], state_in.qvel[worldid, j], state_in.qacc[worldid, j])
+    across = axis_bar - axis * wp.dot(axis, axis_bar)
+    moved = -bars[0] * axis + 0.5 * wp.cross(axis_bar, axis)
+    if turn[3] > 0.0:  # without a rotation there is no axis, and mujoco_warp's row is zero
+        moved += 0.5 / wp.tan(0.5 * turn[3]) * across
+    for i in range(3):
+        wp.atomic_add(slopes_out.qpos, worldid, dof + i, moved[i])
+        wp.atomic_add(slopes_out.qvel, worldid, dof + i, -bars[1] * axis[i])
+
+
+@wp.func
+def bends(data: vec12, x: float) -> wp.vec2:
+    """p'(x) and p''(x) of an equality's polynomial."""
+    bend1 = data[1] + x * (2.0 * data[2] + x * (3.0 * data[3] + x * 4.0 * data[4]))
+    bend2 = 2.0 * data[2] + x * (6.0 * data[3] + x * 12.0 * data[4])
+    return wp.vec2(bend1, bend2)
+
+
+@wp.func
+def pull_joint_equality(
+    worldid: int,
+    ident: int,
+    joints: Joints,
+    settings: RowSettings,
+    bars: wp.vec4,
+    state_in: State,
+    lam_in: wp.array2d[float],
+    slopes_out: DofSlopes,
+) -> None:
+    """pos = x₁ - p(x₂) ,  ρ(x) = ρ₁(x) - p' ρ₂(x) ,  d(p') = p'' dx₂, for two joints or one."""
+    add_joint_row(worldid, joints.jnt_dofadr[settings.eq_obj1id[ident]], 1.0, bars[0], bars[1], slopes_out)
+    second = settings.eq_obj2id[ident]
+    if second >= 0:
+        adr = joints.jnt_qposadr[second]
+        x = state_in.qpos[worldid, adr] - settings.qpos0[worldid % settings.qpos0.shape[0], adr]
+        bend = bends(settings.eq_data[worldid % settings.eq_data.shape[0], ident], x)
+        dof = joints.jnt_dofadr[second]
+        bar = coefficient_bar(bars, lam_in[worldid, dof], state_in.qvel[worldid, dof], state_in.qacc[worldid, dof])
+        add_joint_row(worldid, dof, -bend[0], bars[0], bars[1], slopes_out)
+        wp.atomic_add(slopes_out.qpos, worldid, dof, -bend[1] * bar)
+
+
+@wp.func
+def pull_tendon_equality(
+    worldid: int,
+    ident: int,
+    tendons: TendonRows,
+    settings: RowSettings,
+    bars: wp.vec4,
+    state_in: State,
+    lam_in: wp.array2d[float],
+    ten_J_in: wp.array2d[float],
+    ten_length_in: wp.array2d[float],
+    tendon_bars_out: TendonBars,
+) -> None:
+    """The same for two tendons or one."""
+    add_tendon_row(worldid, settings.eq_obj1id[ident], 1.0, bars, tendon_bars_out)
+    second = settings.eq_obj2id[ident]
+    if second >= 0:
+        rest = settings.tendon_length0[worldid % settings.tendon_length0.shape[0], second]
+        x = ten_length_in[worldid, second] - rest
+        bend = bends(settings.eq_data[worldid % settings.eq_data.shape[0], ident], x)
+        jac = ten_J_in[worldid]
+        lam = tendon_rate(tendons, second, jac, lam_in[worldid])
+        vel = tendon_rate(tendons, second, jac, state_in.qvel[worldid])
+        acc = tendon_rate(tendons, second, jac, state_in.qacc[worldid])
+        add_tendon_row(worldid, second, -bend[0], bars, tendon_bars_out)
+        wp.atomic_add(tendon_bars_out.length, worldid, second, -bend[1] * coefficient_bar(bars, lam, vel, acc))
+
+
 @wp.kernel
 def pull_rows(
     lanes: int,
@@ -270,50 +344,23 @@ def pull_rows(
         motion_bar, solref_bar, solimp_bar, away_bar, loss_bar, step_bar = wp.grad(row_potential)(
             motion, solver.solref, solver.solimp, pos, loss, timestep
         )
-        # The potential is -Φ, and ∂Φ/∂jar = s ρ(λ) =: y.
-        y = -motion_bar.rest
-        vel_bar = -motion_bar.vel
-        pos_bar = -away_bar
+        # The potential is -Φ, and ∂Φ/∂jar = s ρ(λ) is the cotangent of ρ(a).
+        bars = wp.vec4(-away_bar, -motion_bar.vel, -f, -motion_bar.rest)
         bound = int(0)
         is_ball = bool(False)
-        bars = wp.vec4(pos_bar, vel_bar, -f, y)
-
         if kind == ConstraintType.FRICTION_DOF:
-            add_joint_row(worldid, ident, 1.0, 0.0, vel_bar, slopes_out)
+            add_joint_row(worldid, ident, 1.0, 0.0, bars[1], slopes_out)
         elif kind == ConstraintType.LIMIT_JOINT:
             dof = joints.jnt_dofadr[ident]
             if joints.jnt_type[ident] == JointType.BALL:
                 is_ball = True
-                adr = joints.jnt_qposadr[ident]
-                turn = quat_angle_axis(
-                    wp.vec4(
-                        state_in.qpos[worldid, adr],
-                        state_in.qpos[worldid, adr + 1],
-                        state_in.qpos[worldid, adr + 2],
-                        state_in.qpos[worldid, adr + 3],
-                    )
-                )
-                axis = wp.vec3(turn[0], turn[1], turn[2])
-                # ρ(x) = -axis·x ,  d(pos) = -axis·w ,  d(axis) = ½ cot(θ/2) w⊥ + ½ axis × w
-                axis_bar = wp.vec3(0.0)
-                for i in range(3):
-                    v = state_in.qvel[worldid, dof + i]
-                    a = state_in.qacc[worldid, dof + i]
-                    axis_bar[i] = -(bars[2] * lam_in[worldid, dof + i] + vel_bar * v + y * a)
-                across = axis_bar - axis * wp.dot(axis, axis_bar)
-                moved = -pos_bar * axis + 0.5 * wp.cross(axis_bar, axis)
-                if turn[3] > 0.0:  # without a rotation there is no axis, and mujoco_warp's row is zero
-                    moved += 0.5 / wp.tan(0.5 * turn[3]) * across
-                # pos = max(range) - angle
                 bounds = settings.jnt_range[worldid % settings.jnt_range.shape[0], ident]
                 bound = wp.where(bounds[0] > bounds[1], 0, 1)
-                for i in range(3):
-                    wp.atomic_add(slopes_out.qpos, worldid, dof + i, moved[i])
-                    wp.atomic_add(slopes_out.qvel, worldid, dof + i, -vel_bar * axis[i])
+                pull_ball_limit(worldid, dof, joints.jnt_qposadr[ident], bars, state_in, lam_in, slopes_out)
             else:
                 sign = jacobian_in[worldid, row, dof]
                 bound = wp.where(sign > 0.0, 0, 1)
-                add_joint_row(worldid, dof, sign, pos_bar, vel_bar, slopes_out)
+                add_joint_row(worldid, dof, sign, bars[0], bars[1], slopes_out)
         elif kind == ConstraintType.FRICTION_TENDON:
             bars[0] = 0.0
             add_tendon_row(worldid, ident, 1.0, bars, tendon_bars_out)
@@ -321,45 +368,13 @@ def pull_rows(
             bounds = settings.tendon_range[worldid % settings.tendon_range.shape[0], ident]
             length = ten_length_in[worldid, ident]
             bound = wp.where(length - bounds[0] < bounds[1] - length, 0, 1)
-            sign = wp.where(bound == 0, 1.0, -1.0)
-            add_tendon_row(worldid, ident, sign, bars, tendon_bars_out)
+            add_tendon_row(worldid, ident, wp.where(bound == 0, 1.0, -1.0), bars, tendon_bars_out)
+        elif settings.eq_type[ident] == EqType.JOINT:
+            pull_joint_equality(worldid, ident, joints, settings, bars, state_in, lam_in, slopes_out)
         else:
-            # pos = x₁ - p(x₂) ,  ρ(x) = ρ₁(x) - p' ρ₂(x) ,  d(p') = p'' dx₂
-            first = settings.eq_obj1id[ident]
-            second = settings.eq_obj2id[ident]
-            data = settings.eq_data[worldid % settings.eq_data.shape[0], ident]
-            x = float(0.0)
-            if second >= 0:
-                if settings.eq_type[ident] == EqType.JOINT:
-                    adr = joints.jnt_qposadr[second]
-                    x = state_in.qpos[worldid, adr] - settings.qpos0[worldid % settings.qpos0.shape[0], adr]
-                else:
-                    x = (
-                        ten_length_in[worldid, second]
-                        - settings.tendon_length0[worldid % settings.tendon_length0.shape[0], second]
-                    )
-            bend1 = data[1] + x * (2.0 * data[2] + x * (3.0 * data[3] + x * 4.0 * data[4]))
-            bend2 = 2.0 * data[2] + x * (6.0 * data[3] + x * 12.0 * data[4])
-            if settings.eq_type[ident] == EqType.JOINT:
-                add_joint_row(worldid, joints.jnt_dofadr[first], 1.0, pos_bar, vel_bar, slopes_out)
-                if second >= 0:
-                    dof = joints.jnt_dofadr[second]
-                    mixed = (
-                        bars[2] * lam_in[worldid, dof]
-                        + vel_bar * state_in.qvel[worldid, dof]
-                        + y * state_in.qacc[worldid, dof]
-                    )
-                    add_joint_row(worldid, dof, -bend1, pos_bar, vel_bar, slopes_out)
-                    wp.atomic_add(slopes_out.qpos, worldid, dof, -bend2 * mixed)
-            else:
-                add_tendon_row(worldid, first, 1.0, bars, tendon_bars_out)
-                if second >= 0:
-                    jac = ten_J_in[worldid]
-                    mixed = bars[2] * tendon_rate(tendons, second, jac, lam_in[worldid])
-                    mixed += vel_bar * tendon_rate(tendons, second, jac, state_in.qvel[worldid])
-                    mixed += y * tendon_rate(tendons, second, jac, state_in.qacc[worldid])
-                    add_tendon_row(worldid, second, -bend1, bars, tendon_bars_out)
-                    wp.atomic_add(tendon_bars_out.length, worldid, second, -bend2 * mixed)
+            pull_tendon_equality(
+                worldid, ident, tendons, settings, bars, state_in, lam_in, ten_J_in, ten_length_in, tendon_bars_out
+            )
         if keeps_step:
             wp.atomic_add(timestep_out.timestep, worldid, step_bar)
         if live_in[worldid] != 0 and gradients_out.jnt_range.shape[0] > 0:
