@@ -36,6 +36,9 @@ from msk_ray.step.autograd.tangent import Tangent
 from msk_ray.step.errors import UnsupportedModelError
 from msk_ray.step.forward import Graph, WorldBatch
 
+_RESIDUAL_TOLERANCE = 1e-3
+"""A world's substep counts as unconverged if the solver left more than this share of its forces unbalanced,
+|Ma - τ - Jᵀf| / |(Ma, τ, Jᵀf)|."""
 UNCONVERGED_BOUND = 0.01
 """Share of unconverged substeps, over all worlds, above which there is a warning."""
 JACOBIAN_WORLDS = 131072
@@ -66,20 +69,13 @@ class _Tape(Backward):
     Args:
         substep_grad_clip: bound on the Euclidean norm of each world's state cotangent between substeps, in the
             cotangent's own units; the direction is kept. None for no bound.
-        residual_tolerance: a world's substep counts as unconverged if the solver left more than this share of its
-            forces unbalanced, |Ma - τ - Jᵀf| / |(Ma, τ, Jᵀf)|. Warns once if more than a hundredth are.
     """
 
     covers_applied = True
     covers_parameters = True
 
-    def __init__(
-        self,
-        substep_grad_clip: float | None = None,
-        residual_tolerance: float = 1e-3,
-    ) -> None:
+    def __init__(self, substep_grad_clip: float | None = None) -> None:
         self.substep_grad_clip = substep_grad_clip
-        self.residual_tolerance = residual_tolerance
         self._warned: set[str] = set()  # shared with the modes that replace this one
 
     def attach(self, batch: WorldBatch) -> None:
@@ -103,7 +99,7 @@ class _Tape(Backward):
             self._saved = pool.allocate()
             self._raw_qpos = wp.zeros((worlds, mjm.nq), dtype=float)
             self._clipped = wp.zeros(worlds, dtype=int)
-            self._gauge = ResidualGauge(self._adjoint.inertia_address, worlds, self.residual_tolerance)
+            self._gauge = ResidualGauge(self._adjoint.inertia_address, worlds, _RESIDUAL_TOLERANCE)
         self._ctrl = wp.to_torch(batch.data.ctrl, requires_grad=False)
         adjoint = self._adjoint
         self.cotangent = StepState(
