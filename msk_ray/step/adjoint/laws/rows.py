@@ -56,6 +56,11 @@ def densify_rows(
         dense_out[worldid, row, colind_in[worldid, 0, k]] += sparse_in[worldid, 0, k]
 
 
+# This law stands in three more places, which share no function because none computes what another does, to the bit:
+# `update_rows` in `forward/fused/problem.py` keeps the row's state, goes by the row's place and not its type, and lets
+# a NaN of jar push, where a row pushes nothing here; `forward/fused/line_search.py` has costs as differences from the
+# start of a line, which do not cancel; `row_potential` has the force as a function of what sets D and aref, for
+# `wp.grad`, with the state held that was found here.
 @wp.kernel
 def row_laws(
     # Model:
