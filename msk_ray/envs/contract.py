@@ -120,10 +120,6 @@ class Contract:
         """The method that gives initial states."""
         return "draw_start" if self._env.overrides("draw_start") else "draw_physics"
 
-    def check_start(self, state: Any, count: int) -> None:
-        """Raise ConfigError if what `count` episodes begin with is no physical state of as many worlds."""
-        self.check_state(self.start, state, count)
-
     def check_state(self, method: str, state: Any, count: int) -> None:
         """Raise ConfigError if a method gives no physical state of `count` worlds."""
         model = self._env.model
