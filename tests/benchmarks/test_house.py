@@ -26,6 +26,14 @@ def test_every_line_has_one_kind(house: ModuleType, tmp_path: Path) -> None:
     assert house.lines_of(path) == {"docstrings": 5, "blank": 1, "comments": 1, "code": 3}
 
 
+def test_every_folder_has_a_room(house: ModuleType) -> None:
+    package = Path("msk_ray")
+    rooms = [house.room_of(package / name, package) for name in ("robots/env.py", "legs/gait/body.py", "envs/base.py")]
+    assert rooms == ["robots", "legs", "runner"]
+    assert house.room_of(package / "step" / "check" / "check.py", package) == "step"
+    assert house.room_of(package / "robots.py", package) == "runner", "a file is no room"
+
+
 class Inner(BaseModel):
     low: float = 0.0
     high: float = 1.0
@@ -71,3 +79,8 @@ def test_places_are_found_wherever_they_are(house: ModuleType, tmp_path: Path) -
     package.mkdir(parents=True)
     (package / "list.py").write_text("LOGGERS = Registry()\n")
     assert house.places(tmp_path, (r"^LOGGERS = ", r"^GONE = ")) == ["moved/list.py"]
+
+
+def test_every_place_that_an_extension_changes_is_in_this_checkout(house: ModuleType, root: Path) -> None:
+    patterns = [each for group in (*house.EDITS.values(), house.FROM_CTRL_TO_KERNEL) for each in group]
+    assert len(house.places(root, tuple(patterns))) == len(patterns)
