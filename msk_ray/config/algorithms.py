@@ -21,6 +21,7 @@ from pydantic import (
 
 from msk_ray.config.horizons import AdaptiveHorizon, ContactHorizon, Horizon, HorizonSchedule
 from msk_ray.config.physics import GRADIENTS
+from msk_ray.config.schedules import ramp
 from msk_ray.config.sections import SHOWN, Count, Fraction, NonNegative, Rate, Section, Text, Undeclared
 from msk_ray.errors import ConfigError
 from msk_ray.registry import Registry, resolve
@@ -117,7 +118,7 @@ class ExplorationSchedule(Section):
 
     def at(self, epoch: int) -> float:
         """The factor at `epoch`, counted from 0."""
-        return self.start + (self.end - self.start) * min(1.0, epoch / self.epochs)
+        return ramp(self.start, self.end, epoch, self.epochs)
 
 
 class ShacConfig(AlgorithmSettings):

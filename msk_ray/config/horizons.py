@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, PositiveFloat, TypeAdapter, model_validator
 
+from msk_ray.config.schedules import ramp
 from msk_ray.config.sections import Count, Section
 from msk_ray.errors import ConfigError, brief
 
@@ -21,8 +22,7 @@ class HorizonSchedule(Section):
 
     def at(self, epoch: int) -> int:
         """Env steps at `epoch`, counted from 0."""
-        progress = min(1.0, epoch / self.epochs)
-        return round(self.start + (self.end - self.start) * progress)
+        return round(ramp(self.start, self.end, epoch, self.epochs))
 
 
 class _BoundedHorizon(Section):

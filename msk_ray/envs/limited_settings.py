@@ -1,5 +1,6 @@
 """The settings and terms that bodies with motors share."""
 
+from msk_ray.config.schedules import ramp
 from msk_ray.config.sections import EnvSettings, Whole
 from msk_ray.config.terms import Cost
 
@@ -12,7 +13,7 @@ class LimitedSettings(EnvSettings):
 
     def joint_limit_share(self, epoch: int) -> float:
         """What is left of the weight at `epoch`, counted from 0."""
-        return max(0.0, 1.0 - epoch / self.joint_limit_epochs) if self.joint_limit_epochs else 1.0
+        return ramp(1.0, 0.0, epoch, self.joint_limit_epochs) if self.joint_limit_epochs else 1.0
 
 
 EFFORT = "msk_ray.envs.limited_body:effort"

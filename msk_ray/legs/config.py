@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 from pydantic import PositiveFloat, model_validator
 
 from msk_ray.config.rewards import reward_section, with_reward
+from msk_ray.config.schedules import ramp
 from msk_ray.config.sections import Count, EnvSettings, Fraction, NonNegative, Reward, Section, Whole
 from msk_ray.config.terms import Cost, Term, terms_in
 
@@ -42,7 +43,7 @@ class AssistConfig(Section):
 
     def at(self, epoch: int) -> float:
         """Share of the stiffness after `epoch` epochs that count."""
-        return self.share * max(0.0, 1.0 - epoch / self.epochs) ** self.power if self.epochs else 0.0
+        return self.share * ramp(1.0, 0.0, epoch, self.epochs) ** self.power if self.epochs else 0.0
 
     def unread(self) -> dict[str, str]:
         """Settings that nothing reads, with the reason."""

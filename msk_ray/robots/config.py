@@ -1,13 +1,14 @@
 """The settings of the velocity tasks. Source: `mjlab/tasks/velocity` of mjlab 1.6.0."""
 
 import math
-from typing import Annotated, Any
+from typing import Annotated
 
-from pydantic import Field, PositiveFloat, model_validator
+from pydantic import Field, PositiveFloat
 
 from msk_ray.config.commands import Command, with_commands
 from msk_ray.config.rewards import reward_section, with_reward
-from msk_ray.config.sections import Count, Fraction, NonNegative, Reward, Section, Whole
+from msk_ray.config.schedules import CostSchedule, cost_share
+from msk_ray.config.sections import Count, Fraction, NonNegative, Reward
 from msk_ray.config.terms import Term, terms_in
 from msk_ray.envs.mjcf.config import MjcfSettings
 
@@ -39,36 +40,6 @@ class VelocityShape(Reward):
     tail: Fraction = 0.0
     """Share of 1/(1 + x) in the terms `track_linear_velocity` and `track_angular_velocity`, which are e^−x in scores:
     that has no slope far from the command. For training."""
-
-
-class CostSchedule(Section):
-    """Factor on the weights of costs in training: `start` until the epoch `begin`, 1 from the epoch `end` on, linear
-    between.
-
-    A robot that pays mjlab's price for every change of its action from the start learns to stand still, before it has
-    learned to walk; one that pays nothing learns to tremble.
-    """
-
-    start: Fraction
-    begin: Whole
-    end: Count
-
-    @model_validator(mode="after")
-    def _in_order(self) -> "CostSchedule":
-        if self.begin >= self.end:
-            raise ValueError(f"cost_schedule.end has to be greater than begin, {self.begin}")
-        return self
-
-    def at(self, epoch: int) -> float:
-        """The factor at `epoch`, counted from 0."""
-        progress = min(1.0, max(0.0, (epoch - self.begin) / (self.end - self.begin)))
-        return self.start + (1.0 - self.start) * progress
-
-
-def cost_share(settings: Any, epoch: int) -> float:
-    """The factor on costs that the settings of a velocity task ask for at `epoch`."""
-    schedule: CostSchedule | None = settings.cost_schedule
-    return 1.0 if schedule is None else schedule.at(epoch)
 
 
 def velocity_terms(*others: Term) -> tuple[Term, ...]:

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 
-from msk_ray.config import PhysicsConfig
+from msk_ray.config import CostSchedule, PhysicsConfig
 from msk_ray.config.environments import settings_class
 from msk_ray.envs import make_env
 from msk_ray.errors import ConfigError
-from msk_ray.robots.config import G1_TERMS, CostSchedule
+from msk_ray.robots.config import G1_TERMS
 from msk_ray.robots.env import VelocityEnv, servos_of
 from msk_ray.robots.robot import PoseSpread, by_joint
 from msk_ray.robots.robots import GO1

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from msk_ray.algorithms.shac.cotangent_gate import Norms
-from msk_ray.algorithms.shac.schedules import adapted_horizon, contact_horizon, horizon_at
+from msk_ray.algorithms.shac.schedules import adapted_horizon, contact_horizon
 from msk_ray.config import AdaptiveHorizon, ContactHorizon, HorizonSchedule
 
 
@@ -22,7 +22,7 @@ class RolloutLength:
         if isinstance(self._config, AdaptiveHorizon | ContactHorizon):
             assert self._length is not None
             return round(self._length)
-        return horizon_at(self._config, epoch)
+        return self._config if isinstance(self._config, int) else self._config.at(epoch)
 
     def follow(self, norms: Norms | None, contact: float | None) -> None:
         """Adapt the horizon to an epoch's cotangents, or to its contact force [body weights] if measured."""

@@ -2,22 +2,18 @@
 
 import math
 
-from msk_ray.config import AdaptiveHorizon, ContactHorizon, HorizonSchedule
+from msk_ray.config import AdaptiveHorizon, ContactHorizon
+from msk_ray.config.schedules import ramp
 
 ADAPTATION = 0.1
 """Exponent, or share, by which a horizon that follows something changes in an epoch."""
-
-
-def horizon_at(schedule: int | HorizonSchedule, epoch: int) -> int:
-    """Rollout length H in env steps at `epoch`."""
-    return schedule if isinstance(schedule, int) else schedule.at(epoch)
 
 
 def learning_rate_at(initial: float, final: float, schedule: str, epoch: int, epochs: int) -> float:
     """Learning rate at `epoch` of `epochs`: `initial` throughout, or linear towards `final`."""
     if schedule == "constant":
         return initial
-    return initial + (min(final, initial) - initial) * min(1.0, epoch / epochs)
+    return ramp(initial, min(final, initial), epoch, epochs)
 
 
 def adapted_horizon(config: AdaptiveHorizon, horizon: float, cotangent: float) -> float:

@@ -4,14 +4,21 @@ import math
 
 import pytest
 
-from msk_ray.algorithms.shac.schedules import adapted_horizon, contact_horizon, horizon_at, learning_rate_at
+from msk_ray.algorithms.shac.horizon import RolloutLength
+from msk_ray.algorithms.shac.schedules import adapted_horizon, contact_horizon, learning_rate_at
 from msk_ray.config import AdaptiveHorizon, ContactHorizon, ExplorationSchedule, HorizonSchedule
+from msk_ray.config.schedules import ramp
+
+
+def test_a_ramp_is_linear_between_its_ends() -> None:
+    assert [ramp(8.0, 32.0, epoch, 12) for epoch in (0, 3, 6, 12, 100)] == [8.0, 14.0, 20.0, 32.0, 32.0]
+    assert [ramp(1.0, 0.0, epoch, 900, 500) for epoch in (0, 500, 600, 900, 901)] == [1.0, 1.0, 0.75, 0.0, 0.0]
 
 
 def test_horizon_grows_linearly_then_stays() -> None:
-    schedule = HorizonSchedule(start=8, end=32, epochs=12)
-    assert [horizon_at(schedule, e) for e in (0, 3, 6, 12, 100)] == [8, 14, 20, 32, 32]
-    assert horizon_at(16, 50) == 16
+    growing = RolloutLength(HorizonSchedule(start=8, end=32, epochs=12))
+    assert [growing.at(e) for e in (0, 3, 6, 12, 100)] == [8, 14, 20, 32, 32]
+    assert RolloutLength(16).at(50) == 16
 
 
 def test_learning_rate_is_linear_or_constant() -> None:

@@ -1,0 +1,41 @@
+"""Values that change linearly over training, for epochs counted from 0."""
+
+from typing import Any
+
+from pydantic import model_validator
+
+from msk_ray.config.sections import Count, Fraction, Section, Whole
+
+
+def ramp(start: float, end: float, epoch: float, last: int, first: int = 0) -> float:
+    """`start` until the epoch `first`, `end` from the epoch `last` on, linear between."""
+    return start + (end - start) * min(1.0, max(0.0, (epoch - first) / (last - first)))
+
+
+class CostSchedule(Section):
+    """Factor on the weights of costs in training: `start` until the epoch `begin`, 1 from the epoch `end` on, linear
+    between.
+
+    A robot that pays the full price for every change of its action from the start learns to stand still, before it has
+    learned to walk; one that pays nothing learns to tremble.
+    """
+
+    start: Fraction
+    begin: Whole
+    end: Count
+
+    @model_validator(mode="after")
+    def _in_order(self) -> "CostSchedule":
+        if self.begin >= self.end:
+            raise ValueError(f"cost_schedule.end has to be greater than begin, {self.begin}")
+        return self
+
+    def at(self, epoch: int) -> float:
+        """The factor at `epoch`, counted from 0."""
+        return ramp(self.start, 1.0, epoch, self.end, self.begin)
+
+
+def cost_share(settings: Any, epoch: int) -> float:
+    """`Term.schedule` of a cost whose environment has a setting `cost_schedule: CostSchedule | None`."""
+    schedule: CostSchedule | None = settings.cost_schedule
+    return 1.0 if schedule is None else schedule.at(epoch)
