@@ -117,9 +117,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     scorer: Scorer
     requests: Sequence[Request]
     if python is not None:
-        scoring = foreign_scoring(args.elsewhere)
-        scorer = scoring.scorer(python)
-        requests = scoring.requests(args.worlds, seeds, args.steps)
+        scorer = foreign = foreign_scoring(args.elsewhere).scorer(python)
+        requests = foreign.requests(args.worlds, seeds, args.steps)
     else:
         from msk_ray.step.autograd.simulation import resolve_device
 

@@ -4,6 +4,7 @@ A package declares one in the entry-point group `msk_ray.scoring`. Imports no to
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -29,18 +30,8 @@ class Scorer(Protocol):
         """One entry of `eval.json`: what was evaluated, how, and the results."""
 
 
-class ForeignScoring(Protocol):
-    """An entry point in the group `msk_ray.scoring` names an object with these members."""
-
-    summary: str
-    """For `--help`: which policies it evaluates, and in which environment."""
-    python: Path
-    """Path of its interpreter, unless `--python` names another."""
-    install: str
-    """How a user installs it."""
-
-    def scorer(self, python: Path) -> Scorer:
-        """The scorer that runs in this interpreter."""
+class ForeignScorer(Scorer, Protocol):
+    """Evaluates policies in another package."""
 
     def requests(self, worlds: int | None, seeds: tuple[int, ...] | None, steps: int | None) -> "Sequence[Request]":
         """Requests for these numbers of worlds, seeds and steps; None: as is usual there.
@@ -48,6 +39,40 @@ class ForeignScoring(Protocol):
         Raises:
             ConfigError: it does not support one of the numbers.
         """
+
+
+@dataclass(frozen=True)
+class ForeignScoring:
+    """An entry point in the group `msk_ray.scoring` names one."""
+
+    name: str
+    """As `--in` takes it, and its folder."""
+    package: str
+    """Its name in sentences."""
+    requirement: str
+    """What pip installs."""
+    summary: str
+    """For `--help`: which policies it evaluates, and in which environment."""
+    scorer_class: str
+    """Import path of its `ForeignScorer`, which is made with the path of an interpreter."""
+
+    @property
+    def python(self) -> Path:
+        """Path of its interpreter, unless `--python` names another."""
+        return Path(f".{self.name}/bin/python")
+
+    @property
+    def install(self) -> str:
+        """How a user installs it."""
+        return (
+            f"install {self.package} beside msk_ray: python -m venv .{self.name} && .{self.name}/bin/pip install "
+            f"{self.requirement}, then --python {self.python}"
+        )
+
+    def scorer(self, python: Path) -> ForeignScorer:
+        """The scorer that runs in this interpreter."""
+        scorer: ForeignScorer = resolve(self.scorer_class, "--in")(python)
+        return scorer
 
 
 def foreign_scoring(name: str) -> ForeignScoring:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msk_ray.errors import ConfigError, SimulationError
+from msk_ray.evaluate.elsewhere import ForeignScoring
 
 
 class ForeignProcess(AbstractContextManager["ForeignProcess"]):
@@ -20,8 +21,7 @@ class ForeignProcess(AbstractContextManager["ForeignProcess"]):
     It is ended on exit, if it has not ended by itself.
 
     Args:
-        name: of the package, as `--in` takes it.
-        install: how a user installs it.
+        scoring: of the package.
         python: the interpreter.
         script: path of the script.
         asked: what it is asked for, its only argument.
@@ -33,8 +33,8 @@ class ForeignProcess(AbstractContextManager["ForeignProcess"]):
         ConfigError: it ended before it had greeted.
     """
 
-    def __init__(self, name: str, install: str, python: Path, script: str, asked: dict[str, Any]) -> None:
-        self._name = name
+    def __init__(self, scoring: ForeignScoring, python: Path, script: str, asked: dict[str, Any]) -> None:
+        self._name = scoring.name
         self._messages = tempfile.TemporaryFile()  # noqa: SIM115  # closed on exit
         self._process = subprocess.Popen(
             # Isolated: beside the script may lie a module called like the package, and PYTHONPATH is meant for our
@@ -47,7 +47,7 @@ class ForeignProcess(AbstractContextManager["ForeignProcess"]):
         try:
             line = self._out.readline()
             if not line:
-                raise ConfigError(f"--in {name}: {self._last_words()}; {install}")
+                raise ConfigError(f"--in {self._name}: {self._last_words()}; {scoring.install}")
             self.hello: dict[str, Any] = json.loads(line)
         except BaseException:
             self.__exit__(None, None, None)

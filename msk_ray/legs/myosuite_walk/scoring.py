@@ -33,17 +33,6 @@ STEPS: Final = 1000
 _Act = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 
 
-def requests(worlds: int | None, seeds: tuple[int, ...] | None, steps: int | None) -> list[Request]:
-    """One request for each kind of reset: 20 episodes of 1000 steps with seed 0, unless other numbers are given.
-
-    Raises:
-        ConfigError: more than 1000 steps, after which MyoSuite ends an episode.
-    """
-    if steps is not None and steps > STEPS:
-        raise ConfigError(f"--steps {steps}: {ENVIRONMENT} ends an episode after {STEPS} steps; write at most {STEPS}")
-    return [Request(f"myosuite {reset}", worlds or EPISODES, seeds or (0,), steps or STEPS) for reset in RESETS]
-
-
 def check_policy(config: Config) -> None:
     """Raise ConfigError unless a policy of this trial acts in MyoSuite's environment."""
     env = config.env
@@ -69,6 +58,18 @@ class MyoSuiteScorer:
     def check(self, config: Config, request: Request) -> None:
         """Raise ConfigError if a trial's policy does not act in this environment. Runs nothing."""
         check_policy(config)
+
+    def requests(self, worlds: int | None, seeds: tuple[int, ...] | None, steps: int | None) -> list[Request]:
+        """One request for each kind of reset: 20 episodes of 1000 steps with seed 0, unless other numbers are given.
+
+        Raises:
+            ConfigError: more than 1000 steps, after which MyoSuite ends an episode.
+        """
+        if steps is not None and steps > STEPS:
+            raise ConfigError(
+                f"--steps {steps}: {ENVIRONMENT} ends an episode after {STEPS} steps; write at most {STEPS}"
+            )
+        return [Request(f"myosuite {reset}", worlds or EPISODES, seeds or (0,), steps or STEPS) for reset in RESETS]
 
     def evaluate(self, policy: SavedPolicy, request: Request) -> dict[str, Any]:
         """One entry of `eval.json`: what was evaluated, how, and the results. `request` is one of `requests`.
@@ -115,7 +116,7 @@ class _Worker(ForeignProcess):
     """A process of MyoSuite's Python."""
 
     def __init__(self, python: Path, asked: dict[str, Any]) -> None:
-        super().__init__("myosuite", MYOSUITE.install, python, worker.__file__, asked)
+        super().__init__(MYOSUITE, python, worker.__file__, asked)
         self.versions: dict[str, str] = self.hello["versions"]
         if not self.versions["myosuite"].startswith(VERSION):
             self.__exit__(None, None, None)

@@ -37,13 +37,6 @@ EPISODES_ON_CPU: Final = 8
 STEPS: Final = 1000
 
 
-def requests(worlds: int | None, seeds: tuple[int, ...] | None, steps: int | None) -> list[Request]:
-    """With mjlab's settings for playing, and with pushes and noise: 256 episodes of 1000 steps on a GPU, 8 on a CPU,
-    with seed 0, unless other numbers are given."""
-    episodes = EPISODES_ON_GPU if torch.cuda.is_available() else EPISODES_ON_CPU
-    return [Request(name, worlds or episodes, seeds or (0,), steps or STEPS) for name in (PLAY, PUSHED)]
-
-
 def task_of(config: Config) -> str:
     """The task of mjlab in which a trial's policy acts.
 
@@ -76,6 +69,12 @@ class MjlabScorer:
         """Raise ConfigError if a trial's policy does not act in this environment. Runs nothing."""
         task_of(config)
 
+    def requests(self, worlds: int | None, seeds: tuple[int, ...] | None, steps: int | None) -> list[Request]:
+        """With mjlab's settings for playing, and with pushes and noise: 256 episodes of 1000 steps on a GPU, 8 on a
+        CPU, with seed 0, unless other numbers are given."""
+        episodes = EPISODES_ON_GPU if torch.cuda.is_available() else EPISODES_ON_CPU
+        return [Request(name, worlds or episodes, seeds or (0,), steps or STEPS) for name in (PLAY, PUSHED)]
+
     def evaluate(self, policy: SavedPolicy, request: Request) -> dict[str, Any]:
         """One entry of `eval.json`: what was evaluated, how, and the results. `request` is one of `requests`.
 
@@ -107,7 +106,7 @@ class _Worker(ForeignProcess):
     """
 
     def __init__(self, python: Path, asked: dict[str, Any]) -> None:
-        super().__init__("mjlab", MJLAB.install, python, worker.__file__, asked)
+        super().__init__(MJLAB, python, worker.__file__, asked)
         self._asked = asked
         self.versions: dict[str, str] = self.hello["versions"]
         self.device: str = self.hello["device"]
