@@ -23,6 +23,7 @@ from msk_ray.errors import ConfigError, MskRayError, StorageError
 from msk_ray.files import make_folder
 from msk_ray.nvidia_smi import ask_driver
 from msk_ray.progress import COMPILING, announce
+from msk_ray.registry import python_path
 
 DESCRIPTION = """\
 Check that this machine can run trials: versions, GPU and driver, gradients of one step, Ray, the storage folder.
@@ -281,8 +282,6 @@ def check_gradient(device: str | None) -> Finding:
 def check_ray(limit_s: float = RAY_LIMIT_S) -> Finding:
     """Whether Ray starts and a worker runs a task, within `limit_s` seconds."""
     started = time.monotonic()
-    package = str(Path(msk_ray.__file__).resolve().parent.parent)
-    paths = [package, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
     # Redirect output to a file: Ray's daemons would inherit a pipe, and keep its reader waiting after the probe has
     # ended.
     with tempfile.TemporaryFile("w+") as output:
@@ -290,7 +289,7 @@ def check_ray(limit_s: float = RAY_LIMIT_S) -> Finding:
             RAY_PROBE,
             stdout=output,
             stderr=subprocess.STDOUT,
-            env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
+            env=os.environ | {"PYTHONPATH": python_path()},
             start_new_session=True,
         )
         try:

@@ -1,10 +1,13 @@
-"""Finding classes named in a configuration, by a short name or as `package.module:Class`."""
+"""Finding classes named in a configuration, by a short name or as `package.module:Class`, here and in processes that
+are started here."""
 
 import difflib
+import os
 import traceback
 from collections.abc import Mapping
 from importlib import import_module
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Any, TypeVar
 
 from msk_ray.errors import ConfigError, brief
@@ -66,6 +69,12 @@ def _broken(module: str, key: str, error: Exception) -> ConfigError:
     return ConfigError(
         f"{key}: importing {module} failed: {type(error).__name__}: {text} ({frames[-1].filename}:{frames[-1].lineno})"
     )
+
+
+def python_path() -> str:
+    """`PYTHONPATH` for a process that must import this package too: its folder before what is there."""
+    package = str(Path(__file__).resolve().parent.parent)
+    return os.pathsep.join(dict.fromkeys([package, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]))
 
 
 class Registry:

@@ -10,6 +10,7 @@ import pytest
 from msk_ray.config import ENVIRONMENTS, Registry, load_config, parse_config, resolve, settings_class
 from msk_ray.envs import env_class
 from msk_ray.errors import ConfigError
+from msk_ray.registry import python_path
 
 WALKER = """
 from msk_ray.config import EnvSettings, Reward
@@ -155,3 +156,10 @@ def test_reading_a_config_of_ours_loads_neither_torch_nor_warp() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_other_processes_look_for_this_package_first(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", f"/theirs::{root}")
+    assert python_path() == f"{root}:/theirs"
+    monkeypatch.delenv("PYTHONPATH")
+    assert python_path() == str(root)

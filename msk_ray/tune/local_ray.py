@@ -13,8 +13,8 @@ from typing import Any
 import ray
 from ray._private import ray_constants
 
-import msk_ray
 from msk_ray.errors import ClusterLost, StorageError
+from msk_ray.registry import python_path
 
 TOKEN_FILE = Path(".ray") / "auth_token"
 """Where Ray keeps the token of local sessions, relative to the home folder."""
@@ -36,9 +36,7 @@ def start_local(dashboard: bool | None, options: Mapping[str, Any]) -> Any:
         ClusterLost: its daemons do not start in time, because the machine is too busy.
     """
     # Workers must import the same package as this process.
-    package = str(Path(msk_ray.__file__).resolve().parent.parent)
-    paths = [package, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
-    os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys(paths))
+    os.environ["PYTHONPATH"] = python_path()
     # The dashboard looks for its profiler in PATH; this environment may not be activated.
     programs = [*os.environ.get("PATH", os.defpath).split(os.pathsep), str(Path(sys.executable).parent)]
     os.environ["PATH"] = os.pathsep.join(dict.fromkeys(programs))

@@ -12,8 +12,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-import msk_ray
 from msk_ray.errors import DeviceError
+from msk_ray.registry import python_path
 from msk_ray.visualize.look import geom_groups
 
 BACKENDS = ("egl", "osmesa")
@@ -137,9 +137,7 @@ def check_camera(model: mujoco.MjModel, camera: str) -> None:
 
 def _environment(backend: str) -> dict[str, str]:
     """Environment of the drawing process: the platform, and the path of this package."""
-    package = str(Path(msk_ray.__file__).resolve().parent.parent)
-    paths = [package, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(dict.fromkeys(paths))}
+    environment = os.environ | {"PYTHONPATH": python_path()}
     return environment | ({"MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend} if backend else {})
 
 
